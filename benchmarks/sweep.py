@@ -1,9 +1,9 @@
-"""What a sweep costs beside the motions, and what it survives: 10⁷ double pendulums, kills, crowds of workers.
+"""What a sweep costs beside the motions, and what it survives: 10⁷ double pendulums, kills, many workers.
 
     python -m benchmarks.sweep rate --members 1000000      # against bare batches; resident memory; hours for 10⁸
     python -m benchmarks.sweep map --side 2048             # the map of first flips, as a picture
     python -m benchmarks.sweep kills --count 100           # kill -9 at random moments: the bits of an undisturbed run
-    python -m benchmarks.sweep workers                     # processes, dask, two shells: one SHA-256
+    python -m benchmarks.sweep workers                     # processes, dask, two parts: one SHA-256
     python -m benchmarks.sweep poison --members 1000000    # ten members that fail, one of which aborts its process
     python -m benchmarks.sweep plan                        # 10⁸ members described: seconds and memory
 
@@ -246,9 +246,9 @@ def _begin(store: Path, over: dict, unit: int | None = None) -> None:
         _sweep.work = work
 
 
-def _worker(store: Path, **more) -> subprocess.Popen:
-    command = [sys.executable, "-m", "lagjax", "sweep", "run", str(store), "--quiet"]
-    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL, **more)
+def _worker(store: Path, *more: str) -> subprocess.Popen:
+    command = [sys.executable, "-m", "lagjax", "sweep", "run", str(store), "--quiet", *more]
+    return subprocess.Popen(command, cwd=ROOT, stdout=subprocess.DEVNULL)
 
 
 def _done(store: Path) -> set[str]:
@@ -274,16 +274,16 @@ def workers(options: argparse.Namespace) -> dict[str, Any]:
                     run(next(places), over, unit=unit, executor=pool, progress=False).store
                 )
             print(found, flush=True)
-        found["two shells"] = _two_shells(next(places), over, unit)
+        found["two parts"] = _two_parts(next(places), over, unit)
         found |= _by_dask(next(places), over, unit)
         found["isolated"] = digest(run(next(places), over, unit=unit, isolate=True, progress=False).store)
     print("\n".join(f"{sha}  {who}" for who, sha in found.items()))
     return {"members": options.members, "sha256": found, "one": len(set(found.values())) == 1}
 
 
-def _two_shells(store: Path, over: dict, unit: int) -> str:
+def _two_parts(store: Path, over: dict, unit: int) -> str:
     _begin(store, over, unit)
-    shells = [_worker(store), _worker(store)]
+    shells = [_worker(store, "--part", k, "--of", "2") for k in "01"]
     assert [shell.wait() for shell in shells] == [0, 0]
     return digest(store)
 

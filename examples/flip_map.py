@@ -2,9 +2,8 @@
 
 python examples/flip_map.py --side 300 --out out
 
-The sweep is stored in out/flips.zarr. Stopped at any moment and called again it goes on; meanwhile, or on other
-machines that share the disk, `python -m lagjax sweep run out/flips.zarr` helps, and `python -m lagjax sweep status
-out/flips.zarr` tells how far it is.
+The sweep is stored in out/flips.zarr. Stopped at any moment and called again it computes what is missing, and so does
+`python -m lagjax sweep run out/flips.zarr`; `python -m lagjax sweep status out/flips.zarr` tells how far it is.
 """
 
 import argparse

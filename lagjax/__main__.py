@@ -21,7 +21,7 @@ def _run(options: argparse.Namespace) -> int:
     store = Store(options.store.absolute())
     spec = store.spec()
     show = Progress(store, spec, not options.quiet)
-    count = run_store(store, show, options.units)
+    count = run_store(store, show, options.units, (options.part, options.of))
     show.end()
     print(f"{count} units done here\n{status(store)}")
     return 0
@@ -47,7 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     of_sweeps = commands.add_parser("sweep", help="a sweep that lagjax.sweep has begun")
     actions = of_sweeps.add_subparsers(required=True, title="actions")
     for name, command, about in (
-        ("run", _run, "work on units until all are done; in as many shells and on as many machines as you like"),
+        ("run", _run, "compute the units that are missing, or a part of them"),
         ("status", _status, "tell how far it is"),
         ("check", _check, "read all that is done, and tell what is damaged"),
     ):
@@ -56,6 +56,9 @@ def _parser() -> argparse.ArgumentParser:
         action.set_defaults(command=command)
         if name == "run":
             action.add_argument("--units", type=int, help="end after this many units (default: when all are done)")
+            about = "compute part K of N, counted from 0: every N-th unit, as a task of an array of batch jobs"
+            action.add_argument("--part", type=int, default=0, metavar="K", help=about)
+            action.add_argument("--of", type=int, default=1, metavar="N", help="the number of parts (default: 1)")
             action.add_argument("--quiet", action="store_true", help="print no progress")
     return parser
 

@@ -1,6 +1,6 @@
 """`sweep`: one scene for many starts and parameters, a few numbers kept of each motion, in a store that is the job.
 
-over, q0, keep, … ──► Description, Grid ──► Store ──► units, claimed and computed by any number of workers ──► xarray
+over, q0, keep, … ──► Description, Grid ──► Store ──► units, computed by any number of workers ──► xarray
 
 _members       the points of a sweep: axes, the grid of members, its units (`lagjax.designs` has the rules for axes)
 _statistics    statistics of all members, unit by unit, without a list of their values
@@ -9,15 +9,15 @@ _store         the files of a store
 _batch         a batch of members: their motions, the crossings on the way, what is kept of each
 _job           a store with its functions in a process; the computation of a unit
 _begin         stores that are begun: new ones, those with members of another, those that continue its motions
-_workers       claims of units; units in this process, by executors, in a child process
+_workers       units in this process, by executors, in child processes
 _status        the progress of a store
 """
 
 import os
 import warnings
 from collections.abc import Callable
-from contextlib import nullcontext
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -27,12 +27,22 @@ import numpy as np
 from lagjax._hybrid import Hybrid, Scene, require_scene
 from lagjax._sweep._begin import begin, continues, final_states_of, first_look, repair, require_same
 from lagjax._sweep._description import Description, Sections
-from lagjax._sweep._job import Job, compute, precision, uses_doubles
+from lagjax._sweep._job import Job, precision, uses_doubles
 from lagjax._sweep._members import axes_of
 from lagjax._sweep._statistics import Statistics, Summary, from_bytes, merge, summary
 from lagjax._sweep._status import Failure, Progress, Status, status
 from lagjax._sweep._store import NOT_DONE, RESULT, Store
-from lagjax._sweep._workers import Child, run_store, submit, work
+from lagjax._sweep._workers import (
+    look_in_children,
+    require_executor,
+    require_limit,
+    require_part,
+    run_store,
+    submit,
+    units_to_compute,
+    work,
+    work_in_children,
+)
 from lagjax._validate import require_flag
 
 __all__ = [
@@ -120,6 +130,7 @@ def sweep(
     extend: str | Path | None = None,
     executor: Any = None,
     isolate: bool | float = False,
+    part: tuple[int, int] = (0, 1),
     progress: bool = True,
     rtol: float | None = None,
     atol: float | None = None,
@@ -130,9 +141,9 @@ def sweep(
 ) -> Sweep:
     r"""Run `system` for every point of `over`, keep a few numbers of each motion, and store them in a folder.
 
-    The store is the job. Called again with the same description, `sweep` continues where it stopped, also after a
-    failure of the machine at any moment. `python -m lagjax sweep run STORE` in another shell, on another machine that
-    shares the disk, or in an array of batch jobs works on the same units; such workers may join or die at any time.
+    The store is the job. Called again with the same description, `sweep` computes what is missing, also after a
+    failure of the machine at any moment; so does `python -m lagjax sweep run STORE`. Several machines work by an
+    `executor`, or each on its `part` of the units.
 
     **What runs**
 
@@ -172,6 +183,9 @@ def sweep(
       next.
     - `isolate`: compute in a child process. A unit whose child dies, or takes longer than `isolate` seconds over a
       batch (True: 600), is halved until the members that end it are known; these are labelled `crashed`.
+    - `part`: (k, n) computes every n-th unit from the k-th on, as task k of an array of n batch jobs, counted from 0.
+      The tasks share the disk; whichever is first begins the store. What a task that died has left, a later run of
+      any part, or of the whole, computes.
     - `progress`: a line on stderr.
 
     A store knows the scene and `keep` by their code and by all that this reads: helpers, globals, closures, classes
@@ -187,7 +201,8 @@ def sweep(
 
     **Raises** `TypeError` or `ValueError` for what cannot be right, before anything is computed, and for a store that
     was begun with another description, saying what differs; `OSError` for a disk that is full or read-only,
-    `ImportError` without the packages zarr and cloudpickle.
+    `ImportError` without the packages zarr and cloudpickle; with `isolate`, `RuntimeError` for units that end their
+    process without a few members as the reason, after all others are done.
 
     Source: Salmon et al., SC 2011, for the counter-based draws.
 
@@ -221,11 +236,12 @@ def sweep(
     )
     if executor is not None and isolate:
         raise ValueError("isolate is for sweeps of this process: give it, or an executor, whose processes may die too.")
-    axes, place = axes_of(over), _place(store, "store")
-    child = Child(place.path, isolate) if isolate else None
+    if executor is not None:
+        require_executor(executor)
+    axes, place, limit, chosen = axes_of(over), _place(store, "store"), require_limit(isolate), require_part(part)
     other = None if extend is None else _place(extend, "extend")
-    with precision(uses_doubles()), child or nullcontext():
-        if place.exists() and other is not None and not place.spec()["goes_on_from"]:
+    with precision(uses_doubles()):
+        if place.exists() and other is not None and not place.spec()["continues"]:
             other = None  # of which the members were taken: it may be gone
         if other is not None and continues(other, description):
             if isinstance(system, Hybrid):
@@ -235,16 +251,19 @@ def sweep(
                 )
             description = replace(description, left=final_states_of(other, axes, description))
         if not place.exists():
-            begin(place, axes, description, unit, child.look if child else first_look, other)
+            look = first_look if limit is None else partial(look_in_children, limit=limit)
+            begin(place, axes, description, unit, look, other)
         spec = place.spec()
         require_same(place, spec, axes, description)
         job = Job.from_store(place, spec, description)
         repair(job)
-        show = Progress(place, spec, progress)
+        show, units = Progress(place, spec, progress), units_to_compute(job, chosen)
         if executor is not None:
-            submit(job, executor, show)
+            submit(job, units, executor, show)
+        elif limit is not None:
+            work_in_children(job, units, limit, progress)
         else:
-            work(job, show, child.compute if child else compute)
+            work(job, units, show)
     show.end()
     return Sweep(place.path)
 

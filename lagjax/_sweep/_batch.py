@@ -199,18 +199,14 @@ class Batches:
 
     def _find_members_that_raise(self, motions: "_BatchMotions", everyone: np.ndarray) -> dict[int, str]:
         """The members for which `keep` raises in a callback, with the errors: by halves, in equal batches."""
-        found, waiting = {}, [everyone]
-        while waiting and len(found) <= _MOST_RAISE:
-            some = waiting.pop()
+
+        def why_raised(some: np.ndarray) -> str | None:
             try:
                 self._keep_members(motions, np.resize(some, len(everyone)))
             except jax.errors.JaxRuntimeError as error:
-                half = len(some) // 2
-                if half:
-                    waiting += [some[half:], some[:half]]
-                else:
-                    found[int(some[0])] = f"keep raised {_callback_error(error)}"
-        return found if len(found) <= _MOST_RAISE else {}
+                return f"keep raised {_callback_error(error)}"
+
+        return find_failing(everyone, why_raised, _MOST_RAISE)
 
     def _keep_vectorized(self, arrays: tuple, params: PyTree) -> tuple:
         """The result of `keep` for every member, and the change of the energy."""
@@ -310,6 +306,24 @@ def _start_one_by_one(role: str, function: Callable, points: dict[str, np.ndarra
     complaints |= {k: f"{role} raised {type(error).__name__}: {_first_line(error)}" for k, error in errors.items()}
     nothing = jax.tree.map(lambda x: np.full_like(x, np.nan), well)
     return jax.tree.map(lambda *leaves: np.stack(leaves), *(nothing if row is None else row for row in rows))
+
+
+def find_failing(members: np.ndarray, why_failed: Callable[[np.ndarray], str | None], most: int) -> dict[int, str]:
+    """Those of some members that fail, with the reasons, by halving groups that fail; none where more than `most` do.
+
+    `why_failed` says of a group of members why it fails, None where it does not.
+    """
+    found, waiting = {}, [members]
+    while waiting and len(found) <= most:
+        some = waiting.pop()
+        if (why := why_failed(some)) is None:
+            continue
+        half = len(some) // 2
+        if half:
+            waiting += [some[half:], some[:half]]
+        else:
+            found[int(some[0])] = why
+    return found if len(found) <= most else {}
 
 
 def quantities_of(kept: KeptResults) -> list[Quantity]:

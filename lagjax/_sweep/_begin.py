@@ -84,7 +84,7 @@ def begin(
         "batch": _batch_size(description, points, kept), "seconds_per_member": seconds, "conserves": conserves,
         "kept": [{"name": q.name, "shape": q.shape, "dtype": q.dtype.str} for q in quantities],
         **description.described(),
-        "goes_on_from": source_path(description, store), "scene": texts(description, names), "path": users_path(),
+        "continues": source_path(description, store), "scene": texts(description, names), "path": users_path(),
     }  # fmt: skip
     codes = sorted({code_of(item) for item in RESULTS._name_to_item.values()} | set(_batch.NAMES))
     title = f"lagjax sweep over {', '.join(names)}"
@@ -178,7 +178,7 @@ def require_same(store: Store, spec: dict, axes: tuple[Axis, ...], description: 
     require_versions(store, spec)
     names = [name for axis in axes for name in axis.names]
     now = {"axes": [axis.described() for axis in axes], "x64": uses_doubles(), **description.described()}
-    now["goes_on_from"] = source_path(description, store)
+    now["continues"] = source_path(description, store)
     now = json.loads(json.dumps(now))
     words = {"axes": describe_axes}
     lines = [

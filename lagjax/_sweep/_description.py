@@ -8,7 +8,6 @@ what JAX does not trace here, `keep` above all, `_reads.identity` decides it: th
 
 import difflib
 import inspect
-import io
 import pickle
 import sys
 from collections.abc import Callable
@@ -266,26 +265,11 @@ def pack_description(description: Description) -> bytes:
         raise TypeError(f"A function of this sweep cannot be sent to another process: {why}") from why
 
 
-class _Unpickler(pickle.Unpickler):
-    """Finds the classes of this package under the names that they had when the bytes were written."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        """The class or function of this name."""
-        return super().find_class(*_MOVED.get((module, name), (module, name)))
-
-
-_MOVED = {
-    ("lagjax._sweep._scene", "Motions"): (__name__, "Description"),
-    ("lagjax._sweep._scene", "Left"): (__name__, "FinalStates"),
-    ("lagjax._sweep._sections", "Sections"): (__name__, "Sections"),
-}
-
-
 def unpack_description(data: bytes, path: list[str]) -> Description:
     """The description again, modules of the user found along his `path`. Raises `ImportError` where one is not."""
     sys.path += [place for place in path if place not in sys.path]
     try:
-        return _Unpickler(io.BytesIO(data)).load()
+        return pickle.loads(data)
     except (ImportError, AttributeError) as why:
         raise ImportError(
             f"The functions of this sweep cannot be rebuilt here: {why}. They were defined in a module that this "

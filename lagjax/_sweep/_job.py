@@ -140,7 +140,7 @@ def _open_job(path: str, content: str) -> Job:
     spec = store.spec()
     require_versions(store, spec)
     with precision(bool(spec["x64"])):
-        description = _relocate_source(unpack_description(store.scene(), spec["path"]), store, spec["goes_on_from"])
+        description = _relocate_source(unpack_description(store.scene(), spec["path"]), store, spec["continues"])
         names = [name for axis in spec["axes"] for name in axis["names"]]
         if change := difference(spec["scene"], texts(description, names)):
             raise ValueError(f"{store.path}: the scene is not here what it was when the store was begun.\n{change}")

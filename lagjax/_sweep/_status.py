@@ -9,7 +9,6 @@ import numpy as np
 from lagjax._results import show_str
 from lagjax._sweep._members import text_of
 from lagjax._sweep._store import Store
-from lagjax._sweep._workers import claimed_units
 
 WELL = ("successful", "event_occurred")
 _RECENT = 32  # units whose times give the rate
@@ -29,7 +28,7 @@ class Failure(NamedTuple):
 class Status(NamedTuple):
     """The progress of a sweep; print it, or read its fields.
 
-    - `done`, `members`: how many members are done, of how many; `units_done`, `units`, `claimed` alike.
+    - `done`, `members`: how many members are done, of how many; `units_done`, `units` alike.
     - `rate`: recent members per second, None before it is known; `left`: seconds until the end at that rate.
     - `results`: the number of members that ended in each way, by the names of `lagjax.RESULTS`, `crashed` and
       `keep_failed`.
@@ -47,7 +46,6 @@ class Status(NamedTuple):
     members: int
     units_done: int
     units: int
-    claimed: int
     rate: float | None
     left: float | None
     results: dict[str, int]
@@ -61,7 +59,7 @@ class Status(NamedTuple):
 
     def __str__(self) -> str:
         lines = [f"{self.store}", f"done       {self.done:,} of {self.members:,} members, {self.units_done} of "
-                 f"{self.units} units ({self.claimed} claimed)"]  # fmt: skip
+                 f"{self.units} units"]  # fmt: skip
         if self.rate is not None and self.left is not None:
             end = f", {duration(self.left)} left" if self.done < self.members else ""
             lines.append(f"rate       {self.rate:,.0f} members per second{end}")
@@ -106,7 +104,7 @@ def status(store: Store) -> Status:
     slow = {name: why for record in records for name, why in record["slow"].items()}
     return Status(
         store=str(store.path), done=members, members=grid.members, units_done=len(done), units=grid.units,
-        claimed=len(set(claimed_units(store)) - set(done)), rate=rate,
+        rate=rate,
         left=None if rate is None else (grid.members - members) / rate, results=results, failures=failures,
         drift=None if worst is None else (worst[0], worst[1], point(store, spec, worst[1])), slow=slow,
         cpus=tuple(dict.fromkeys(record["cpu"] for record in records if "cpu" in record)), damaged=damaged,

@@ -3,7 +3,6 @@
     STORE/zarr.json, <name>/zarr.json, <name>/c/…    arrays, one chunk a unit: plain numbers and their checksum
     STORE/.sweep/spec.json, scene.pkl                what is swept
     STORE/.sweep/done/UNIT.json, UNIT.npz            a unit that is finished: counts, hashes, statistics
-    STORE/.sweep/claims/, workers/, crashed/         who works on what; members that end their process
     STORE/.sweep/aside/                              files that are being written
     .STORE.begun-…                                   a store that is being made, beside the place that it will take
 
@@ -32,12 +31,11 @@ from lagjax import designs
 from lagjax._sweep._members import Axis, Grid
 from lagjax.designs import Design
 
-FORMAT = 3
-_FORMATS = (2, 3)  # that can be continued; chunks of format 2 have no checksum
+FORMAT = 4
 _CHECKSUM = 4  # bytes of it, at the end of a chunk
 JOB = ".sweep"
 KNOWN = "known"  # the folder of members that were taken from another store
-_LEFT = 3600.0  # seconds without a change after which a file belongs to a dead worker; a live one beats
+_LEFT = 3600.0  # seconds after which a file aside belongs to a dead worker; a live one writes for seconds
 _ABANDONED = 86_400.0  # seconds after which a store that was never made ready is removed; to make one takes minutes
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _REFUSED = (errno.EROFS, errno.EACCES, errno.EPERM)
@@ -98,7 +96,7 @@ class Store:
             raise ValueError(
                 f"{file} cannot be read ({why}): the store is damaged. Its arrays are untouched."
             ) from None
-        if spec.get("format") not in _FORMATS:
+        if spec.get("format") != FORMAT:
             raise ValueError(
                 f"{self.path} is a store of format {spec.get('format')}, written by lagjax "
                 f"{spec.get('versions', {}).get('lagjax')}; this lagjax writes format {FORMAT}. xarray can read it as "
@@ -149,7 +147,7 @@ class Store:
     def create(self, spec: dict, scene: bytes, axes: tuple[Axis, ...], title: str, codes: dict[int, str]) -> None:
         """Make the store with empty arrays and the coordinates."""
         zarr = require_zarr()
-        for folder in ("done", "claims", "workers", "crashed", "aside"):
+        for folder in ("done", "aside"):
             (self.job / folder).mkdir(parents=True)
         group = zarr.create_group(str(self.path), overwrite=False, attributes={"title": title})
         group.attrs["coordinates"] = " ".join(name for axis in axes for name in axis.names)
@@ -203,6 +201,10 @@ class Store:
         """The units that are finished."""
         return {int(name.split(".")[0]) for name in os.listdir(self.job / "done") if name.endswith(".json")}
 
+    def has_finished(self, unit: int) -> bool:
+        """True if a unit is finished."""
+        return (self.job / "done" / f"{unit}.json").exists()
+
     def record(self, unit: int) -> dict:
         """The notes on a finished unit."""
         return json.loads((self.job / "done" / f"{unit}.json").read_text())
@@ -224,8 +226,7 @@ class Store:
         grid, hashes = self.grid(spec), {}
         with self.explain_errors(f"unit {unit} was not written"):
             for q in self.quantities(spec):
-                data = self._chunk(grid, unit, q, values[q.name])
-                data = _append_checksum(data) if spec["format"] >= 3 else data
+                data = _append_checksum(self._chunk(grid, unit, q, values[q.name]))
                 hashes[q.name] = hashlib.sha256(data.data).hexdigest()
                 self.write(self.chunk_file(grid, unit, q.name, q.shape), data, f"{unit}-{q.name}")
             if statistics:
@@ -255,7 +256,7 @@ class Store:
 
     def find_damage(self, spec: dict, units: Iterable[int], whole: bool = False) -> dict[int, str]:
         """The damage of finished units, in words: chunks that lack or have another size or, `whole`, hash."""
-        grid, found, tail = self.grid(spec), {}, _CHECKSUM if spec["format"] >= 3 else 0
+        grid, found = self.grid(spec), {}
         for unit in sorted(units):
             try:
                 hashes = self.record(unit)["sha256"]
@@ -264,7 +265,7 @@ class Store:
                 continue
             for q in self.quantities(spec):
                 file, size = self.chunk_file(grid, unit, q.name, q.shape), q.dtype.itemsize
-                size = tail + size * int(np.prod(grid.chunk + q.shape, dtype=np.int64))
+                size = _CHECKSUM + size * int(np.prod(grid.chunk + q.shape, dtype=np.int64))
                 there = file.stat().st_size if file.exists() else None
                 if there != size:
                     have = "is not there" if there is None else f"has {there} bytes"
@@ -295,7 +296,7 @@ class Store:
             self.write(probe, b"", "probe")
             now = probe.stat().st_mtime  # by the clock of the disk
             probe.unlink(missing_ok=True)
-            for file in (file for folder in ("aside", "workers") for file in (self.job / folder).iterdir()):
+            for file in (self.job / "aside").iterdir():
                 try:
                     if file.stat().st_mtime < now - _LEFT:
                         file.unlink()

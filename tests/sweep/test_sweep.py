@@ -23,7 +23,7 @@ import pytest
 import lagjax
 from lagjax import __main__ as command_line
 from lagjax import designs
-from lagjax._sweep import _description, _job, _statistics, _store, _workers
+from lagjax._sweep import _job, _statistics, _store, _workers
 from lagjax._sweep._members import Grid, axes_of
 from lagjax._sweep._store import Store
 
@@ -143,7 +143,8 @@ def test_crossings_do_not_depend_on_neighbours_and_workers(tmp_path, how, monkey
     ts, rule = jnp.array([0.0, 2.0]), {**RULE, **WITH_CROSSINGS}
     whole = lagjax.sweep(PENDULUM, OVER, ts, **{**rule, "store": tmp_path / "whole"}).open().load()
     store = tmp_path / "store"
-    monkeypatch.setattr("lagjax._sweep.work", lambda *_: _workers.work(*_, 2))  # stopped after two units
+    stopped = lambda job, left, tell: _workers.work(job, left[:2], tell)
+    monkeypatch.setattr("lagjax._sweep.work", stopped)
     lagjax.sweep(PENDULUM, OVER, ts, **{**rule, "store": store, **how})
     monkeypatch.undo()
     data = lagjax.sweep(PENDULUM, OVER, ts, **{**rule, "store": store, **how}).open()
@@ -253,7 +254,7 @@ def begun(folder, units=0, **changes):
     """A store of which so many units are done."""
     with pytest.MonkeyPatch.context() as patch:
         run = _workers.work
-        patch.setattr("lagjax._sweep.work", lambda job, tell, how: run(job, tell, how, units) if units else None)
+        patch.setattr("lagjax._sweep.work", lambda job, left, tell: run(job, left[:units], tell))
         swept(folder, **changes)
     return Store(folder / "store")
 
@@ -264,7 +265,7 @@ def test_goes_on_where_it_stopped(tmp_path, undisturbed):
     times = {unit: (store.job / "done" / f"{unit}.json").stat().st_mtime_ns for unit in store.finished_units()}
     swept(tmp_path)
     assert all((store.job / "done" / f"{unit}.json").stat().st_mtime_ns == t for unit, t in times.items())
-    assert digests(tmp_path) == undisturbed and not os.listdir(store.job / "claims")
+    assert digests(tmp_path) == undisturbed
 
 
 def test_another_process_goes_on(tmp_path, undisturbed, capsys):
@@ -373,8 +374,8 @@ def test_disks_that_refuse(tmp_path, undisturbed, monkeypatch, number, words):
         swept(tmp_path)
     assert error.value.errno == number and "unit" in str(error.value)
     store = Store(tmp_path / "store")
-    with pytest.raises(OSError, match=f"nothing was computed: .*{words}"), _workers.Worker(store):
-        pass
+    with pytest.raises(OSError, match=f"nothing was computed: .*{words}"):
+        store.require_writable()
     done = store.finished_units()
     assert 0 < len(done) < 6 and not store.find_damage(store.spec(), done, whole=True)
     monkeypatch.undo()
@@ -495,66 +496,14 @@ def test_a_store_whose_creation_was_interrupted_is_made_anew(tmp_path, undisturb
         (dict(**WITH_CROSSINGS, solver=diffrax.Tsit5()), "leave solver at None"),
         (dict(isolate="yes"), "isolate must be"),
         (dict(isolate=True, executor=ThreadPoolExecutor()), "or an executor"),
+        (dict(executor=3), "must be a concurrent.futures.Executor"),
+        (dict(part=(20, 20)), r"of which 0 ≤ k < n, as in \(3, 20\); got \(20, 20\)"),
+        (dict(part=3), "part must be two whole numbers"),
     ],
 )
 def test_mistakes_are_sentences(tmp_path, changes, words):
     with pytest.raises((TypeError, ValueError), match=words):
         swept(tmp_path, **changes)
-
-
-# ---- claims ----------------------------------------------------------------------------------------------------------
-
-
-@pytest.fixture
-def store(tmp_path):
-    for folder in ("claims", "workers", "done", "aside"):
-        (tmp_path / ".sweep" / folder).mkdir(parents=True)
-    return Store(tmp_path)
-
-
-def test_one_of_many_gets_a_claim(store):
-    with _workers.Worker(store) as one, _workers.Worker(store) as two:
-        for unit in range(20):
-            with ThreadPoolExecutor(8) as pool:
-                assert sum(pool.map(lambda k, u=unit: (one, two)[k % 2].claim(u), range(8))) == 1
-        one.release(3)
-        assert two.claim(3) and not one.claim(3)
-
-
-@pytest.mark.slow
-def test_claims_of_the_dead_are_taken_whatever_the_clocks(store, monkeypatch):
-    monkeypatch.setattr(_workers, "STALE", 0.2)
-    dead = _workers.Worker(store)
-    dead._identity["place"] = "another machine"
-    dead._beat()
-    os.utime(dead._file, (2**33, 2**33))  # its clock is of another century
-    assert dead.claim(0)
-    with _workers.Worker(store) as other:
-        assert not other.claim(0)  # seen for the first time
-        dead._beat()
-        time.sleep(0.3)
-        assert not other.claim(0)  # it has moved
-        time.sleep(0.3)
-        assert other.claim(0) and not other.claim(0)
-        (store.job / "claims" / "1.0").touch()  # who died between making a claim and writing it
-        assert not other.claim(1)
-        time.sleep(0.3)
-        assert other.claim(1)
-
-
-def test_a_process_that_has_ended_is_dead_at_once(store):
-    gone = _workers.Worker(store)
-    gone._identity["began"] = "0"  # as of a process whose number another one has by now
-    gone._beat()
-    assert gone.claim(0)
-    with _workers.Worker(store) as other:
-        assert other.claim(0)
-
-
-def test_functions_in_stores_of_earlier_files_are_found():
-    for module, name in (("_scene", "Motions"), ("_scene", "Left"), ("_sections", "Sections")):
-        kind = _description.unpack_description(f"clagjax._sweep.{module}\n{name}\n.".encode(), [])
-        assert kind is getattr(_description, {"Motions": "Description", "Left": "FinalStates"}.get(name, name))
 
 
 # ---- to grow ---------------------------------------------------------------------------------------------------------
@@ -623,7 +572,7 @@ def test_a_later_end_goes_on_from_the_states_that_are_kept(tmp_path):
         lagjax.sweep(PENDULUM, OVER, TO_TWO, **{**other, "q0": 0.5})
     with pytest.raises(ValueError, match="does not have the states in which its motions ended"):
         lagjax.sweep(PENDULUM, OVER, TS + 2.0, **{**other, "extend": swept(tmp_path).store})
-    with pytest.raises(ValueError, match=r"goes_on_from: .* in the store, now None"):
+    with pytest.raises(ValueError, match=r"continues: .* in the store, now None"):
         lagjax.sweep(PENDULUM, OVER, TO_TWO, **{**RULE, "keep": keep_end, "store": rest.store})
     (first.store / ".sweep" / "done" / "0.json").unlink()
     with pytest.raises(ValueError, match="1 units are not done"):
@@ -658,8 +607,21 @@ def worker(store, *more):
     return subprocess.Popen(command, env=os.environ | {"PYTHONPATH": root}, stdout=subprocess.PIPE, text=True)
 
 
+def test_parts_of_an_array(tmp_path, undisturbed, capsys):
+    store = begun(tmp_path)
+    swept(tmp_path, part=(1, 4))
+    assert store.finished_units() == {1, 5}
+    run = ["sweep", "run", str(store.path), "--quiet"]
+    assert command_line.main([*run, "--part", "3", "--of", "4"]) == 0 and store.finished_units() == {1, 3, 5}
+    assert command_line.main([*run, "--part", "4", "--of", "4"]) == 1
+    assert "0 ≤ k < n" in capsys.readouterr().err
+    assert command_line.main(run) == 0 and "3 units done here" in capsys.readouterr().out  # what is missing
+    assert digests(tmp_path) == undisturbed
+
+
 @pytest.mark.slow
 def test_two_shells(tmp_path, undisturbed):
+    """Two that compute the same units by mistake write the same bits."""
     store = begun(tmp_path)
     shells = [worker(store) for _ in range(2)]
     told = [shell.communicate()[0] for shell in shells]
@@ -671,7 +633,7 @@ def test_kills_lose_nothing_but_the_unit_in_work(tmp_path, undisturbed):
     store, rng = begun(tmp_path), np.random.default_rng(0)
     for _ in range(3):
         shell = worker(store, "--units", "1")
-        while not os.listdir(store.job / "claims") and shell.poll() is None:
+        while not os.listdir(store.job / "aside") and shell.poll() is None:  # it computes, or writes
             time.sleep(0.001)
         time.sleep(rng.uniform(0.0, 0.3))
         before = store.finished_units()
@@ -807,7 +769,7 @@ def keep_or_abort(trajectory):
 @pytest.mark.slow
 def test_members_that_end_their_process_are_found(tmp_path, undisturbed):
     over = {"length": OVER["length"], "angle": OVER["angle"][2:4]}
-    run = swept(tmp_path, over, keep=keep_or_abort, isolate=True, unit=4)
+    run = swept(tmp_path, over, keep=keep_or_abort, isolate=True, unit=4, progress=True)
     told, data = run.status(), run.open()
     assert [f.member for f in told.failures] == [6, 7] and told.results == {"successful": 10, "crashed": 2}
     assert {f.why for f in told.failures} == {"it ended with status -6"}
@@ -815,6 +777,25 @@ def test_members_that_end_their_process_are_found(tmp_path, undisturbed):
     well = [0, 1, 2, 4, 5]
     np.testing.assert_array_equal(data.end.values[well], whole.end.values[well])
     assert np.isnan(data.end.values[3]).all() and (data.result[3] == 1000).all()
+
+
+@pytest.mark.slow
+def test_a_unit_that_cannot_be_computed_costs_the_others_nothing(tmp_path, undisturbed, monkeypatch):
+    monkeypatch.setattr(_workers, "_MOST", 1)
+    with pytest.raises(RuntimeError, match=r"unit 1 \(it ended with status -6\).* are not done, all others are"):
+        swept(
+            tmp_path, {"length": OVER["length"], "angle": OVER["angle"][2:4]}, keep=keep_or_abort, isolate=True, unit=4
+        )
+    told = lagjax.Sweep(tmp_path / "store").status()
+    assert told.results == {"successful": 8} and told.units_done == 2
+
+
+@pytest.mark.slow
+def test_what_is_raised_in_a_child_is_raised(tmp_path):
+    begun(tmp_path)
+    (tmp_path / "store" / ".sweep" / "scene.pkl").unlink()
+    with pytest.raises(RuntimeError, match=r"(?s)In a child process:.*FileNotFoundError.*scene.pkl"):
+        swept(tmp_path, isolate=True)
 
 
 @pytest.mark.slow
