@@ -74,7 +74,6 @@ class Members:
         return np.array([x if np.ndim(x) == 0 else x[k] for x in self.numbers])
 
     def params_of(self, k: int) -> PyTree:
-        """The parameters of member k."""
         own, rest = eqx.partition(self.params, eqx.is_array_like)
         leaves, structure = jax.tree.flatten(own)
         if not leaves:

@@ -42,7 +42,6 @@ class Constraints(eqx.Module):
 
     @property
     def exist(self) -> bool:
-        """True if there are any constraints."""
         return self.on_positions is not None or self.on_velocities is not None
 
     def f(self, q: Vector, t: Time, params: PyTree) -> Float[Array, " k"]:

@@ -192,7 +192,6 @@ def _exchange(a: Array, this_row: Array, this_column: Array) -> tuple[Array, Arr
 
 
 def _permute_rows(a: Array, order: Int[Array, " n"]) -> Array:
-    """The rows of `a` in this order."""
     return a.at[order].get(mode="promise_in_bounds")
 
 

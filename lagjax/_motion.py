@@ -81,7 +81,6 @@ class Motion(eqx.Module):
 
     @property
     def constrained(self) -> bool:
-        """True if the scene has constraints."""
         return self.constraints.exist
 
     def acceleration(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:

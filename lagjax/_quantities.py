@@ -86,7 +86,6 @@ class _ScalarState:
         return jaxpr
 
     def zeros(self, shape) -> Ids:
-        """Zeros of a shape."""
         return np.full(shape, self.expansion.graph.constant(0.0, "float"))
 
     def jacobian(self, values: Ids, by: str) -> Ids:
@@ -241,7 +240,6 @@ def _derivatives(state: _ScalarState, lagrangian: _Taped, rates: dict) -> tuple[
 
 
 def _constraint_quantities(constraints: Constraints, state: _ScalarState, rates: dict) -> dict[str, Ids]:
-    """The quantities of the constraints."""
     f = a = at_rest = state.zeros(0)
     if constraints.on_positions is not None:
         f = state.evaluate(constraints.on_positions, "q", "t", "params")

@@ -66,7 +66,6 @@ class SceneState(NamedTuple):
 
     @property
     def constrained(self) -> bool:
-        """True if there are constraints."""
         return has_constraints(self.system)
 
     @property

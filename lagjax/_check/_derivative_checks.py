@@ -151,7 +151,6 @@ def _blocks(scene: CheckedScene, round_off):
 
 
 def position_count(scene: CheckedScene) -> int:
-    """The number of constraints on positions, which come first."""
     return scene.derivation.position_count
 
 

@@ -52,7 +52,6 @@ class CheckedScene(NamedTuple):
 
     @property
     def derivation(self) -> Derivation:
-        """The programs of the scene."""
         return self.sample.derivation
 
     @property
@@ -107,12 +106,10 @@ class CheckedScene(NamedTuple):
 
     @property
     def is_lowered(self) -> bool:
-        """True if the scene has programs."""
         return is_lowered(self.derivation)
 
     @property
     def lagrangian(self) -> np.ndarray:
-        """L at the state."""
         return self.measured.here[0]
 
     @property

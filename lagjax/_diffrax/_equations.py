@@ -62,7 +62,6 @@ class ArrayEquations(MotionEquations):
 
     @property
     def constrained(self) -> bool:
-        """True if the scene has constraints."""
         return self.motion.constrained
 
     def projected(self, t, y, params):
@@ -91,7 +90,6 @@ class ScalarEquations(MotionEquations):
 
     @property
     def constrained(self) -> bool:
-        """True if the scene has constraints."""
         return self.projection is not None
 
     def projected(self, t, y, params):

@@ -25,15 +25,12 @@ class _Around(diffrax.AbstractAdaptiveSolver):
     solver: eqx.AbstractVar[diffrax.AbstractSolver]
 
     def order(self, terms) -> int | None:
-        """The order of the solver."""
         return self.solver.order(terms)
 
     def init(self, terms, t0, t1, y0, args):
-        """The state of the solver."""
         return self.solver.init(terms, t0, t1, y0, args)
 
     def func(self, terms, t0, y0, args):
-        """The right-hand side ẏ at (t0, y0)."""
         return self.solver.func(terms, t0, y0, args)
 
 
@@ -182,12 +179,10 @@ class Projected(_Around):
 
     @property
     def term_structure(self):
-        """The terms that the solver takes."""
         return self.solver.term_structure
 
     @property
     def interpolation_cls(self) -> Callable:
-        """The interpolant of the solver."""
         return self.solver.interpolation_cls
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):

@@ -115,7 +115,6 @@ def _has_ended_well(begun: _native.Begun):
 
 
 def _register() -> None:
-    """Register the handlers with XLA, at the first call."""
     with _lock:
         _register_once()
 

@@ -166,7 +166,6 @@ class Flow:
 
     @functools.cached_property
     def kernel(self) -> _native.Kernel:
-        """The machine code."""
         parts = self.program, self.size, self.projection, self.guards, self.groups, self.nesting
         return _native.Kernel(*parts, motion=self._motion_program())
 

@@ -66,7 +66,6 @@ class Line:
 
     @property
     def outputs(self) -> int:
-        """The number of its outputs."""
         return len(self.line.outputs)
 
     @functools.cached_property

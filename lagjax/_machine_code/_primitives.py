@@ -481,7 +481,6 @@ def _compile_sweep(sweep_rows, run_on_host, shapes_of, inner, args, settings):
 
 
 def _jvp_compiled(*args, **settings):
-    """`jvp` of what XLA compiles."""
     flow, tolerances = settings["flow"], settings["tolerances"]
 
     def sweep_rows(ts, y0, params, dy0, dparams):

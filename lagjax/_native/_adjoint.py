@@ -61,7 +61,6 @@ class Adjoint:
     # ---- rounds ----
 
     def _begin(self) -> None:
-        """`begin(job, memory, lanes)`: every lane takes a member."""
         frame = self.motion.function("begin", public=True)
         self.motion.begin(frame, self.start_next)
         frame.finish()

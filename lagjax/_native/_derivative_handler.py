@@ -115,7 +115,6 @@ class _SweepCode:
         self.code.finish()
 
     def read_plan(self, name: str, kind: ir.Type = INTEGER) -> Value:
-        """A field of the plan."""
         return load_at(self.plan, getattr(DerivativePlan, name).offset, kind)
 
     def _carve(self) -> None:

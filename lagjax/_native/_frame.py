@@ -107,7 +107,6 @@ class Memory:
             self.extend(name, rows)
 
     def type_of(self, name: str) -> ir.Type:
-        """The type of the numbers of a field."""
         return DOUBLE if name in _DOUBLES else self.number
 
     def place(self, name: str, *indices: Index) -> Any:
@@ -185,7 +184,6 @@ class Frame:
         self._mask = before
 
     def address(self, name: str, *indices: Index) -> Value:
-        """The address of a vector."""
         return self.code.element(self._memory, self.layout.place(name, *indices))
 
     def vectors(self, name: str, count: int, place: Callable[[Index], tuple] = lambda i: (i,)) -> Vectors:
@@ -221,7 +219,6 @@ class Frame:
         return self.code.lanes_of(x)
 
     def lane(self, index: Value) -> "Lane":
-        """One lane of the memory."""
         return Lane(self, index)
 
     def view(self, layout: Memory) -> "Frame":
@@ -271,7 +268,6 @@ class Frame:
         self.code.call(function, self._job, self._memory, self._integers, *arguments)
 
     def finish(self, result: Value | None = None) -> Code:
-        """End the function."""
         return self.code.finish(result)
 
 
@@ -294,7 +290,6 @@ class Lane:
         return INTEGER if name in LANE else self._frame.layout.type_of(name)
 
     def address(self, name: str, *indices: Index) -> Value:
-        """The address of a number of the lane."""
         frame = self._frame
         if name in LANE:
             return frame.code.element(frame._integers, self._index + LANE.index(name) * frame.width, INTEGER)

@@ -66,7 +66,6 @@ class GpuPrograms:
         self._transpose = functools.cache(lambda form: transpose_for_gpus(self._lane(), self._lane_back(), form))
 
     def form(self, entry: Entry, rtol: float) -> GpuForm:
-        """The form of the program of an entry."""
         return form_for(entry, self._lane(), order_for(rtol))
 
     def motion(self, rtol: float) -> str:

@@ -141,7 +141,6 @@ class _Thread:
         return self._numbers[name]
 
     def whole(self, x: int) -> Value:
-        """A whole number."""
         return self.code.as_value(x, INTEGER)
 
     def words(self, count: int) -> Value:

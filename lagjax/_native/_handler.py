@@ -104,7 +104,6 @@ class Rest(NamedTuple):
 
     @staticmethod
     def size(layout: Memory) -> int:
-        """The size of the rest in doubles."""
         return layout.size + CACHE_LINE + _INTEGERS
 
     @classmethod
@@ -214,12 +213,10 @@ def _address(base: Value, offset: int) -> Value:
 
 
 def load_at(base: Value, offset: int, kind: ir.Type) -> Value:
-    """The value `offset` bytes after the address `base`."""
     return base.code.load(_address(base, offset), kind)
 
 
 def element(array: Value, index: int) -> Value:
-    """An element of an array of pointers."""
     return array.code.load(array.code.element(array, index, POINTER), POINTER)
 
 

@@ -310,7 +310,6 @@ class Code:
         return Value(self, self.builder.sitofp(i.it, self.number))
 
     def as_double(self, i: Value) -> Value:
-        """An integer as a double."""
         return Value(self, self.builder.sitofp(i.it, DOUBLE))
 
     def as_integer(self, x: Value) -> Value:
@@ -322,7 +321,6 @@ class Code:
         return Value(self, self.builder.bitcast(x.it, self._words))
 
     def from_bits(self, x: Value) -> Value:
-        """The code's numbers whose bits are these whole numbers."""
         return Value(self, self.builder.bitcast(self.builder.fptosi(x.it, self._words), self.vector))
 
     @property
@@ -337,11 +335,9 @@ class Code:
         return Value(self, self.builder.gep(base.it, [index.it], source_etype=kind))
 
     def load(self, address: Value, kind: ir.Type) -> Value:
-        """The number or vector at an address."""
         return Value(self, self.builder.load(address.it, typ=kind, align=self._alignment(kind)))
 
     def store(self, x: Value, address: Value) -> None:
-        """Write a number or vector to an address."""
         self.builder.store(x.it, address.it, align=self._alignment(x.it.type))
 
     def load_packed(self, address: Value) -> Value:
@@ -443,11 +439,9 @@ class Code:
         return self.builder.if_then(condition.it)
 
     def call(self, other: "Code", *arguments: Value) -> Value:
-        """Another function of the module."""
         return Value(self, self.builder.call(other.function, [argument.it for argument in arguments]))
 
     def finish(self, result: Value | None = None) -> "Code":
-        """End the function."""
         self.builder.ret_void() if result is None else self.builder.ret(result.it)
         return self
 

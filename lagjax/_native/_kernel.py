@@ -391,7 +391,6 @@ class Kernel:
         )  # fmt: skip
 
     def threads(self, members: int) -> int:
-        """The number of threads for this many members."""
         return min(cores(), max(1, members // (VECTORS_PER_THREAD * self.width)))
 
 

@@ -56,7 +56,6 @@ class Lines:
             yield some, {k: i - n for k, i in enumerate(some) if i >= n}
 
     def room(self, frame: Frame, count: int) -> Numbers:
-        """Room for this many vectors."""
         return [None] * count
 
     def largest(self, code: Code, numbers: Callable[[int], Value], count: int) -> Value:

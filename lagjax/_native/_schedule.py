@@ -34,12 +34,10 @@ class OperationKind(NamedTuple):
 
     @property
     def operands(self) -> int:
-        """The number of its operands."""
         return sum(1 if part is None else part.operands for part in self.parts)
 
     @property
     def results(self) -> int:
-        """The number of its results."""
         return 2 if self.op == "sincos" else 1
 
 

@@ -98,7 +98,6 @@ class SingleMember(TaylorSeries):
 
     @property
     def places_of_sums(self) -> int:
-        """The number of sums of one order that have a place."""
         last = max((run.results[0] + -(-run.count // lanes()) * lanes() for run in self._products[0]), default=0)
         return max(0, last - self.layout.place("sums", 0))
 
@@ -174,12 +173,10 @@ class SingleMember(TaylorSeries):
         return Vectors(len(ranks), column.read, column.write, lambda i: first + ranks[i], column.shift)
 
     def followed_value(self, frame: Frame, j: Value) -> Value:
-        """The value of number j of those that are followed."""
         first = self.layout.place("values", 0)
         return self._load_followed(frame, first + self._value_ranks, j)
 
     def followed_coefficient(self, frame: Frame, j: Value, k: Index) -> Value:
-        """The coefficient of order k > 0 of followed number j."""
         first = self.layout.place("rows", 0, 0)
         return self._load_followed(frame, first + self._row_ranks, j, k * self._stride)
 

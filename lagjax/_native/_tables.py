@@ -87,7 +87,6 @@ class Tables:
             yield [i, i + n], {1: i}
 
     def room(self, frame: Frame, count: int) -> Numbers:
-        """Room for this many vectors."""
         return frame.vectors(self._field(count), count)
 
     def largest(self, code: Code, numbers: Callable[[Value], Value], count: int) -> Value:

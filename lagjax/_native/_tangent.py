@@ -63,7 +63,6 @@ class Tangent:
     # ---- rounds ----
 
     def _begin(self) -> None:
-        """`begin(job, memory, lanes)`: every lane takes a member."""
         frame = self.motion.function("begin", public=True)
         if self.form is not self.motion.form:
             self.form.prepare(frame)

@@ -308,12 +308,10 @@ def order_for(rtol: float) -> int:
 
 
 def integer(code: Code, x: int) -> Value:
-    """An integer as a value."""
     return code.as_value(x, INTEGER)
 
 
 def double(code: Code, x: float) -> Value:
-    """A double as a value."""
     return code.as_value(x, DOUBLE)
 
 

@@ -81,15 +81,12 @@ class FamilyUnknowns(NamedTuple):
 
     @classmethod
     def from_point(cls, point: FamilyPoint) -> "FamilyUnknowns":
-        """The numbers of a point."""
         return cls(point.chain.y, point.chain.period, point.numbers)
 
     def plus(self, other: "FamilyUnknowns", by: float = 1.0) -> "FamilyUnknowns":
-        """Each plus a multiple of the other's."""
         return FamilyUnknowns(*(mine + by * one for mine, one in zip(self, other, strict=True)))
 
     def times(self, by: float) -> "FamilyUnknowns":
-        """Each times a number."""
         return FamilyUnknowns(*(by * mine for mine in self))
 
 
@@ -108,7 +105,6 @@ class Follower:
         self.period_is_free = not arcs.driven and (place is None or not arcs.conserves)
 
     def closing(self, numbers: np.ndarray) -> Closing:
-        """The closing conditions of an orbit with these parameters."""
         return Closing.plain(self.arcs.with_numbers(numbers))
 
     def point(self, y, period, parts, numbers) -> FamilyPoint:

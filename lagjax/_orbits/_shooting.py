@@ -114,7 +114,6 @@ class Chain(NamedTuple):
 
     @property
     def units(self) -> Units:
-        """The units of all."""
         return Units(self.of_state, self.of_time, self.of_length)
 
     def states(self) -> np.ndarray:
@@ -144,7 +143,6 @@ class Chain(NamedTuple):
         return Chain._make([*(x[places] for x in self[:_ARRAYS]), tuple(self.why[k] for k in places.tolist())])
 
     def replace_members(self, places: np.ndarray, others: "Chain") -> "Chain":
-        """The chains with those at indices `places` replaced by `others`."""
         arrays = [np.array(x) for x in self[:_ARRAYS]]
         for mine, new in zip(arrays, others[:_ARRAYS], strict=True):
             mine[places] = new

@@ -256,7 +256,6 @@ class Graph:
         return self.input(table.positions[int(min(max(value, 0), table.count - 1))], "float")
 
     def _kind(self, op: str, operands: tuple[int, ...], attribute: Any) -> str:
-        """The kind of a result."""
         if OPERATIONS[op].is_logical:
             return "bool"
         return attribute if op == "convert" else self.kinds[operands[-1]]
@@ -391,13 +390,11 @@ class Tape(Graph):
     """
 
     def apply(self, op: str, *operands: int, attribute=None) -> int:
-        """The scalar `op(*operands)`; a number, where all operands are."""
         if all(self.nodes[i][0] == "constant" for i in operands):
             return self._fold(op, operands, attribute)
         return self._append_operation(op, operands, attribute, self._kind(op, operands, attribute))
 
     def apply_all(self, op: str, *columns: list[int], attribute=None) -> list[int]:
-        """`apply` for many operands."""
         return [self.apply(op, *operands, attribute=attribute) for operands in zip(*columns, strict=True)]
 
     def power(self, a: int, exponent: int) -> int:

@@ -24,7 +24,6 @@ _WHOLE = ("locate", "floor", "ceil", "round")  # operations whose result is a wh
 
 
 def are_numbers(expansion: Any, ids: Ids) -> bool:
-    """True if all of these scalars are numbers."""
     return all(expansion.graph.value(i) is not None for i in ids.ravel().tolist())
 
 

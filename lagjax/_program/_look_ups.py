@@ -54,7 +54,6 @@ class Located(NamedTuple):
 
 
 def table_of(attribute: "Table | Located") -> Table:
-    """The table that a look-up reads."""
     return attribute.table if isinstance(attribute, Located) else attribute
 
 

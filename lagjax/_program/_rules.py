@@ -94,7 +94,6 @@ class Expansion:
 
     @staticmethod
     def has_pairs(array: np.ndarray) -> bool:
-        """True if any of these numbers is complex."""
         return bool(array.size) and array.max() >= PAIRS
 
     def map(self, op: str, *arrays: np.ndarray, attribute=None) -> np.ndarray:
@@ -161,7 +160,6 @@ class Expansion:
 
 
 def is_complex(dtype) -> bool:
-    """True if numbers of this type are complex."""
     return jnp.issubdtype(dtype, jnp.complexfloating)
 
 

@@ -25,7 +25,6 @@ class Scalars:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        """The shape of the array."""
         return self.ids.shape
 
     def map(self, op: str, *operands) -> "Scalars":

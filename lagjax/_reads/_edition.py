@@ -49,7 +49,6 @@ class Edition:
 
     @classmethod
     def from_function(cls, function: Callable) -> "Edition":
-        """The present edition of a function."""
         is_plain = isinstance(function, types.FunctionType)
         return (_watch_of(function) if is_plain else _Watch(function)).edition()
 
@@ -157,7 +156,6 @@ class _Watch:
         self._known: dict[tuple[str, tuple[int, ...]], Edition] = {}
 
     def edition(self) -> Edition:
-        """The present edition."""
         latest = self._latest
         if latest is not None and latest[0].hold():
             return latest[1]

@@ -77,7 +77,6 @@ class Walk:
         return [("shown", strip_addresses(repr(thing)))]
 
     def describe_array(self, value: Any) -> str:
-        """An array in words."""
         return array_text(value)
 
     # ---- the walk ----
@@ -179,7 +178,6 @@ class Walk:
             return _NOT_FILLED
 
     def _function_attributes(self, function: Any) -> list[tuple[str, Any]]:
-        """The attributes that were set on a function."""
         held, is_plain = getattr(function, "__dict__", {}), isinstance(function, types.FunctionType)
         return [
             (f".{name}", self.read(held, name, x))

@@ -225,14 +225,12 @@ class Batches:
         return jax.jit(jax.vmap(member_drift, in_axes=(0, self._axes[2])))(arrays, params)
 
     def _keep_member(self, trajectory: Trajectory, crossings: Any) -> dict:
-        """The result of `keep` for one member."""
         keep, extras = self.description.keep, {} if self.description.sections is None else {"crossings": crossings}
         kept = keep(trajectory, **extras)
         _require_dict(kept)
         return kept
 
     def _trajectory(self, arrays: tuple, params: PyTree) -> Trajectory:
-        """The trajectory of one member."""
         q, qdot, code, end, stats, mode, transitions = arrays
         scene, hybrid = self.description.system, {"mode": None, "transitions": None, "mode_names": ()}
         if isinstance(scene, Hybrid):
@@ -327,7 +325,6 @@ def find_failing(members: np.ndarray, why_failed: Callable[[np.ndarray], str | N
 
 
 def quantities_of(kept: KeptResults) -> list[Quantity]:
-    """The quantities that are kept, from those of a batch."""
     return [Quantity(name, x.shape[1:], x.dtype) for name, x in kept.values.items()]
 
 

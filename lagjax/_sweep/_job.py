@@ -66,7 +66,6 @@ class Job:
 
 
 def uses_doubles() -> bool:
-    """True if JAX computes in double precision here."""
     return jax.dtypes.canonicalize_dtype(np.float64) == np.float64
 
 

@@ -133,7 +133,6 @@ class Grid:
 
     @property
     def members(self) -> int:
-        """The number of members."""
         return math.prod(self.shape)
 
     @property
@@ -143,7 +142,6 @@ class Grid:
 
     @property
     def units(self) -> int:
-        """The number of units."""
         return math.prod(self.tiles)
 
     def place(self, unit: int) -> tuple[int, ...]:
@@ -156,7 +154,6 @@ class Grid:
         return tuple(slice(i * part, min((i + 1) * part, size)) for i, part, size in parts)
 
     def box_shape(self, unit: int) -> tuple[int, ...]:
-        """The number of members of a unit along each axis."""
         return tuple(s.stop - s.start for s in self.box(unit))
 
     def size(self, unit: int) -> int:

@@ -86,7 +86,6 @@ class Status(NamedTuple):
 
 
 def status(store: Store) -> Status:
-    """The progress of a store."""
     spec = store.spec()
     grid, finished = store.grid(spec), store.finished_units()
     damaged = store.find_damage(spec, finished)
@@ -175,7 +174,6 @@ class Progress:
         print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
 
     def end(self) -> None:
-        """End the line."""
         self._last = 0.0
         self()
         if self.shown:

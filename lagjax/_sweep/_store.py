@@ -109,7 +109,6 @@ class Store:
         return (self.job / "scene.pkl").read_bytes()
 
     def grid(self, spec: dict) -> Grid:
-        """The members and units."""
         return Grid(tuple(spec["shape"]), tuple(spec["chunk"]))
 
     def quantities(self, spec: dict) -> list[Quantity]:
@@ -192,17 +191,14 @@ class Store:
             self.write(file, chunk.astype("<f8", copy=False).data, f"{file.parent.parent.name}-{k}")
 
     def array(self, name: str):
-        """An array of the store, to be read from."""
         return require_zarr().open_array(str(self.path / name), mode="r")
 
     # ---- units ----
 
     def finished_units(self) -> set[int]:
-        """The units that are finished."""
         return {int(name.split(".")[0]) for name in os.listdir(self.job / "done") if name.endswith(".json")}
 
     def has_finished(self, unit: int) -> bool:
-        """True if a unit is finished."""
         return (self.job / "done" / f"{unit}.json").exists()
 
     def record(self, unit: int) -> dict:
