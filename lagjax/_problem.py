@@ -195,10 +195,9 @@ class Batch(eqx.Module):
     def map_members(self, solve: Callable[[Problem], "Solution"]) -> "Solution":
         """`solve` under `jax.vmap` over the members."""
         axes = jax.tree.unflatten(jax.tree.structure(self.params), self.axes)
-        return jax.vmap(lambda *of: solve(self._member_problem(*of)), in_axes=(0, axes))(self.y0, self.params)
-
-    def _member_problem(self, y0, params) -> Problem:
-        return replace(self.member, y0=y0, params=params)
+        return jax.vmap(lambda y0, params: solve(replace(self.member, y0=y0, params=params)), in_axes=(0, axes))(
+            self.y0, self.params
+        )
 
     @property
     def is_known(self) -> bool:

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from lagjax._analysis._scene_state import SceneState
-from lagjax._blame import borders, pieces_of
+from lagjax._blame import borders_of_motion, pieces_of_motion
 
 # Where forces are compared, in sizes of a coordinate. A border within the first distance is at the state: equilibria
 # are known to the square root of rounding at worst, to 1e-12 as a rule. Friction that is rounded off over ten times as
@@ -62,12 +62,7 @@ def require_smooth(scene: SceneState, what: str) -> None:
 
 def _pieces(scene: SceneState) -> list[tuple[str, str, int]]:
     """The borders of the functions of a scene: name, place, and how many numbers each compares."""
-    return [piece for function in _functions(scene) for piece in pieces_of(function, *_state(scene))]
-
-
-def _functions(scene: SceneState) -> list:
-    motion = scene.motion
-    return [f for f in (motion.lagrangian, motion.forces, motion.dissipation) if f is not None]
+    return pieces_of_motion(scene.motion, *_state(scene))
 
 
 def _state(scene: SceneState) -> tuple:
@@ -79,7 +74,7 @@ def _rough(scene: SceneState) -> _Rough:
     n, eps = len(q), jnp.finfo(q.dtype).eps
 
     def sides(y):
-        found = [x for f in _functions(scene) for _, _, x in borders(f, y[:n], y[n:], t, numbers)]
+        found = [x for _, _, x in borders_of_motion(scene.motion, y[:n], y[n:], t, numbers)]
         return jnp.concatenate([jnp.ravel(x) for x in found])
 
     def force(y):

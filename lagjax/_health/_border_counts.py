@@ -14,7 +14,7 @@ from lagjax._blame import pieces_of_motion
 from lagjax._derivation import derivation_of
 from lagjax._health._measure import path_of
 from lagjax._layout import Layout
-from lagjax._machine_code import Flow, StepStore, Tolerances, flow_of
+from lagjax._machine_code import Flow, StepStore, Tolerances, flow_of, portions
 from lagjax._problem import Problem
 from lagjax._program import Unlowerable
 from lagjax._system import System
@@ -61,7 +61,7 @@ def count_borders(members: Members) -> tuple[bool, Met[np.ndarray] | None]:
     columns = [np.broadcast_to(x, members.count) for x in members.numbers]
     params = np.stack(columns, axis=1) if columns else np.zeros((members.count, 0))
     moved = np.flatnonzero(np.isfinite(start).all(axis=1) & (ts[:, 1] != ts[:, 0]) & (steps > 0))
-    for some in _portions(moved, steps * (flow.states + 5 + len(flow.borders.switches))):
+    for some in portions(moved, steps * (flow.states + 5 + len(flow.borders.switches)), LARGEST_PORTION):
         tolerances = Tolerances(rtol, atol, 2 * int(steps[some].max()) + 100)
         _count(flow, (ts[some], start[some], params[some]), tolerances, steps[some], some, nothing)
     return True, nothing
@@ -75,14 +75,6 @@ def is_piecewise(system: System, layout: Layout, params) -> bool:
     except Unlowerable:  # arrays; as `_explain` asks
         rest = np.zeros(layout.size, layout.dtype)
         return bool(pieces_of_motion(derivation.motion, rest, rest, rest.sum(), params))
-
-
-def _portions(places: np.ndarray, numbers: np.ndarray) -> list[np.ndarray]:
-    """The places in portions that need no more than `LARGEST_PORTION` numbers together, or just one place."""
-    if not len(places):
-        return []
-    portion = np.cumsum(numbers[places]) // LARGEST_PORTION
-    return np.split(places, np.flatnonzero(np.diff(portion)) + 1)
 
 
 def _count(

@@ -25,7 +25,7 @@ from lagjax._machine_code._crossing import (
     surfaces_of,
     surfaces_of_event,
 )
-from lagjax._machine_code._derivatives import jvp, project_start_tangents, vjp
+from lagjax._machine_code._derivatives import jvp, portions, project_start_tangents, vjp
 from lagjax._machine_code._flow import Flow, Tolerances, unfit
 from lagjax._machine_code._gpu_launch import adapt_tolerances
 from lagjax._machine_code._steps import KEPT, StepStore
@@ -38,7 +38,7 @@ from lagjax._validate import is_concrete
 
 __all__ = [
     "KEPT", "MOST_GUARDS", "Flow", "Guarded", "Guards", "MachineCode", "Noted", "StepStore", "Surfaces", "Tolerances",
-    "crossing_variation", "flow_of", "jvp", "project_start_tangents", "require_one_number", "surfaces_of",
+    "crossing_variation", "flow_of", "jvp", "portions", "project_start_tangents", "require_one_number", "surfaces_of",
     "tolerances_of", "vector_of", "vjp",
 ]  # fmt: skip
 

@@ -308,7 +308,7 @@ def _steps_of(
     for steps, rows, members in KEPT.runs(ticket):
         waiting[rows] = False
         yield steps, rows, members
-    for places in _portions(np.flatnonzero(waiting), accepted * (flow.states + 4)):
+    for places in portions(np.flatnonzero(waiting), accepted * (flow.states + 4), LARGEST_PORTION):
         store, some_ts = StepStore(), ts if len(ts) == 1 else ts[places]
         room = _ROOM_AGAIN * int(accepted[places].sum()) + len(places)
         again = flow.follow(some_ts, y0[places], params[places], tolerances, store, room)
@@ -364,9 +364,9 @@ def _repeat_rows(x: np.ndarray, rows: int) -> np.ndarray:
     return np.broadcast_to(x, (rows, *x.shape[1:])) if len(x) == 1 else x
 
 
-def _portions(places: np.ndarray, numbers: np.ndarray) -> list[np.ndarray]:
-    """The places in portions that need no more than `LARGEST_PORTION` numbers together, or just one place."""
+def portions(places: np.ndarray, numbers: np.ndarray, largest: int) -> list[np.ndarray]:
+    """The places in portions that need no more than `largest` numbers together, or just one place."""
     if not len(places):
         return []
-    portion = np.cumsum(numbers[places]) // LARGEST_PORTION
+    portion = np.cumsum(numbers[places]) // largest
     return np.split(places, np.flatnonzero(np.diff(portion)) + 1)

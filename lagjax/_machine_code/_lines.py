@@ -106,18 +106,6 @@ def _rows(line: Line, *parts) -> np.ndarray:
     return evaluate(line.line, columns, line.steps).T.reshape(*batch, line.outputs)
 
 
-def _value(x, *, line: Line):
-    return [_rows(line, x)]
-
-
-def _forward(x, v, *, line: Line):
-    return [_rows(line.forward, x, v)]
-
-
-def _back(x, w, *, line: Line):
-    return [_rows(line.back, x, w)]
-
-
 # ---- primitives ------------------------------------------------------------------------------------------------------
 
 value_p, forward_p, back_p = (VaryingPrimitive(f"lagjax_line_{name}") for name in ("value", "forward", "back"))
@@ -150,8 +138,11 @@ def _batch_rule(primitive):
     return lambda arrays, axes, *, line: (primitive.bind(*batch_in_front(arrays, axes), line=line), 0)
 
 
-def _register(primitive, host, width) -> None:
-    """A primitive that `host` computes, `width(line)` numbers a row: at once, or in a callback of what XLA runs."""
+def _register(primitive, of, width) -> None:
+    """A primitive, the line `of(line)` in NumPy, `width(line)` numbers a row: at once, or in a callback of XLA's."""
+
+    def host(*arrays, line: Line):
+        return [_rows(of(line), *arrays)]
 
     def shape(x, *_, line: Line):
         return ShapedArray((*x.shape[:-1], width(line)), np.dtype(float))
@@ -176,9 +167,9 @@ def _register(primitive, host, width) -> None:
     batching.primitive_batchers[primitive] = _batch_rule(primitive)
 
 
-_register(value_p, _value, lambda line: line.outputs)
-_register(forward_p, _forward, lambda line: line.outputs)
-_register(back_p, _back, lambda line: line.count)
+_register(value_p, lambda line: line, lambda line: line.outputs)
+_register(forward_p, lambda line: line.forward, lambda line: line.outputs)
+_register(back_p, lambda line: line.back, lambda line: line.count)
 ad.primitive_jvps[value_p] = _derivative_of_value
 ad.primitive_jvps[forward_p] = _derivative_of_linear(forward_p, lambda line: line.forward)
 ad.primitive_jvps[back_p] = _derivative_of_linear(back_p, lambda line: line.back)

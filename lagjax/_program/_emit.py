@@ -161,7 +161,7 @@ def _fast_function(op: str) -> Callable:
         with set_xla_metadata(inlineable="false"):
             return function(*xs)
 
-    plain = _sine_and_cosine if op == "sincos" else getattr(lax, op)
+    plain = (lambda x: (lax.sin(x), lax.cos(x))) if op == "sincos" else getattr(lax, op)
     of_number = jax.custom_batching.custom_vmap(plain)
 
     @of_number.def_vmap
@@ -185,10 +185,6 @@ def _fast_function(op: str) -> Callable:
         return call_on_lanes(*xs) if any(jnp.ndim(x) for x in xs) else single(*xs)
 
     return call
-
-
-def _sine_and_cosine(x):
-    return lax.sin(x), lax.cos(x)
 
 
 def _align_shapes(values: list) -> list:

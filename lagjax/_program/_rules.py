@@ -137,7 +137,7 @@ class Expansion:
         if (
             name not in MOVES
             and name not in _WITH_BODIES
-            and any(map(_is_complex, [*equation.invars, *equation.outvars]))
+            and any(is_complex(atom.aval.dtype) for atom in [*equation.invars, *equation.outvars])
         ):
             if name not in COMPLEX:
                 raise Unlowerable(f"the primitive `{name}` of complex numbers has no scalar form here")
@@ -161,10 +161,6 @@ class Expansion:
 
 def is_complex(dtype) -> bool:
     return jnp.issubdtype(dtype, jnp.complexfloating)
-
-
-def _is_complex(atom) -> bool:
-    return is_complex(atom.aval.dtype)
 
 
 def kind_of(dtype) -> str:
@@ -278,10 +274,6 @@ def _determinant(name: str, shape: tuple[int, ...], dtype) -> tuple[str, ...]:
 # ---- primitives that only move data ---------------------------------------------------------------------------------
 
 
-def _return_operand(params, x):
-    return x
-
-
 def _slice(params, x):
     strides = params["strides"] or (1,) * x.ndim
     return x[tuple(map(slice, params["start_indices"], params["limit_indices"], strides))]
@@ -310,7 +302,9 @@ def _pad(params, x, value):
 
 
 MOVES: dict[str, Callable] = {
-    **dict.fromkeys(("copy", "copy_p", "stop_gradient", "reduce_precision", "sharding_constraint"), _return_operand),
+    **dict.fromkeys(
+        ("copy", "copy_p", "stop_gradient", "reduce_precision", "sharding_constraint"), lambda params, x: x
+    ),
     "optimization_barrier": lambda params, *xs: xs,
     "slice": _slice,
     "broadcast_in_dim": _broadcast_in_dim,

@@ -160,10 +160,6 @@ def _relativistic_magnetic_exact(t, q0, qdot0, params):
     return _uniform_fields_exact(t, q0, qdot0, heavy)
 
 
-def _speed_squared(q, qdot, t, params):
-    return qdot @ qdot
-
-
 def relativistic_charge_in_magnetic_field() -> Scene:
     """A relativistic charge in a uniform magnetic field, L = −m c² √(1 − v²/c²) + e v·A with A = ½ B × x.
 
@@ -178,6 +174,6 @@ def relativistic_charge_in_magnetic_field() -> Scene:
         q0=np.array([1.0, 0.0, 0.0]),
         qdot0=np.array([0.0, 0.9, 0.3]),
         duration=20.0,
-        invariants={"energy": system.energy, "speed_squared": _speed_squared},
+        invariants={"energy": system.energy, "speed_squared": lambda q, qdot, t, params: qdot @ qdot},
         exact=_relativistic_magnetic_exact,
     )

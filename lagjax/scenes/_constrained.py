@@ -240,10 +240,6 @@ def _particle_on_sphere_exact(t, q0, qdot0, params):
     )
 
 
-def _angular_momentum(q, qdot, t, params):
-    return params["m"] * angular_momentum_z(q, qdot)
-
-
 def particle_on_sphere() -> Scene:
     """A particle that slides without friction on a sphere, L = ½ m v² − m g z, (r² − R²)/(2R) = 0; `Cartesian`.
 
@@ -261,7 +257,10 @@ def particle_on_sphere() -> Scene:
         q0=Cartesian(R * np.sin(theta) * np.cos(phi), R * np.sin(theta) * np.sin(phi), R * np.cos(theta)),
         qdot0=Cartesian(0.0, 0.0, 0.0),
         duration=0.6,
-        invariants={"energy": system.energy, "L_z": _angular_momentum},
+        invariants={
+            "energy": system.energy,
+            "L_z": lambda q, qdot, t, params: params["m"] * angular_momentum_z(q, qdot),
+        },
         exact=_particle_on_sphere_exact,
     )
 
