@@ -11,6 +11,7 @@ does not decide on which side the next step begins.
 """
 
 import itertools
+import math
 from collections.abc import Iterator
 
 from lagjax._native._constants import (
@@ -22,10 +23,13 @@ from lagjax._native._constants import (
     EPS,
     FAINT,
     GROWTH,
+    LARGEST_FALL,
+    LEAST_ORDER,
     MAX_ORDER,
     MOST_CROSSINGS,
     MOST_LOOKS,
     MOST_TURNS,
+    NARROWEST,
     NEARBY,
     NEGLIGIBLE,
     NO_TIME,
@@ -39,12 +43,17 @@ from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._roots import Roots, Touch
 from lagjax._native._saltation import NUMBERS, GuardTable, Saltation
 from lagjax._native._step import absolute_tolerance
-from lagjax._native._taylor import TaylorSeries, double, integer
+from lagjax._native._taylor import TaylorSeries, integer
 from lagjax._program import _borders
-from lagjax._program._borders import BELOW, SQUARED, UP_TO, Feature
+from lagjax._program._borders import BELOW, FALLS, GROWS, RISES, SQUARED, UP_TO, Feature
 from lagjax._program._jump import Jump, Nesting
 
 NOWHERE = 1e300  # a level that no switching number comes to
+
+
+def _least_fall(exponent: float) -> float:
+    """By which factor the base of a power may fall in a step of the least order."""
+    return max(math.exp(-RISE * (LEAST_ORDER - 1) / exponent), LARGEST_FALL)
 
 
 class BorderControl:
@@ -356,7 +365,10 @@ class BorderControl:
         moves, last = self._moves(frame, j, degree, h)
         rise = code.lanes_of(code.as_double(degree)) * (RISE / feature.scale)
         near = ~((moves < rise) & (last < ARGUMENT))
-        if feature.kind in (SQUARED, UP_TO):  # which change by more than their argument does
+        if feature.kind == FALLS:
+            size = code.intrinsic("fabs", self.motion.followed_value(frame, j))
+            near = ~(moves < (1.0 - _least_fall(feature.scale)) * size)
+        if feature.kind in (SQUARED, UP_TO, GROWS):  # which change by more than their argument does
             near = frame.constant(0.0) <= 0.0
         with code.only_if(code.any_lane(near)):
             self._find_feature(frame, j, feature, degree, h)
@@ -377,11 +389,25 @@ class BorderControl:
     def _find_feature(self, frame: Frame, j: Value, feature: Feature, degree: Value, h: Value) -> None:
         """With its argument u: where α + β u is zero, the step ends."""
         code, scale = frame.code, feature.scale
-        u = frame["values", j + (self.motion.series.values - self.motion.series.followed)]
+        u = self.motion.followed_value(frame, j)
         rise = code.lanes_of(code.as_double(degree)) * RISE
         side = code.select(u < 0.0, -1.0, 1.0)
+        of_size, absolute = frame.constant(0.0), frame.constant(ARGUMENT)
         if feature.kind == UP_TO:
             matters, slope, start = code.compare("!=", u, 0.0), side, side * u
+            of_size, absolute = frame.constant(ABRUPT), frame.constant(0.0)
+        elif feature.kind == FALLS:
+            fall = code.maximum(code.library("exp", rise * (-1.0 / scale)), frame.constant(LARGEST_FALL))
+            matters, slope, start = code.compare("!=", u, 0.0), side, side * (u - fall * u)
+            absolute = ARGUMENT * (fall * (side * u))
+        elif feature.kind == GROWS:
+            level = code.maximum(
+                code.library("exp", rise * (1.0 / scale)) * u, frame.constant(math.exp(-FAINT / scale))
+            )
+            matters, slope, start = level > 0.0, frame.constant(-1.0), level - u
+            absolute = ARGUMENT * level
+        elif feature.kind == RISES:
+            matters, slope, start = code.compare("==", u, u), frame.constant(-1.0), rise
         elif feature.kind == SQUARED:
             near = code.maximum(u * u - rise, 0.0)
             level = code.intrinsic("sqrt", code.select(near > FAINT, FAINT, near))
@@ -392,19 +418,28 @@ class BorderControl:
             matters = level < (float("inf") if feature.kind == BELOW else 0.0)
             start = level + slope * u
         self.roots.polynomial(frame, j, degree, h, slope, u - start / slope)
-        of_size, absolute = (ABRUPT, 0.0) if feature.kind == UP_TO else (0.0, ARGUMENT)
-        self._shorten(frame, degree, double(code, of_size), double(code, absolute))
+        if feature.kind == FALLS:  # one that rises is told by fewer terms
+            self.roots.sum_up(frame, degree)
+            rises = frame["falls"] < start
+            size = start + frame["rises"]
+            matters = matters & ~(rises & (self.roots.last_terms(frame, degree) < ARGUMENT * size))
+        self._shorten(frame, degree, of_size, absolute)
         frame.call(self.roots.first_root, degree)
         root = self._place(frame)
-        if feature.kind == UP_TO:
+        if feature.kind in (UP_TO, FALLS):
+            nearby = NEARBY if feature.kind == UP_TO else NARROWEST
             way, whole = frame["root"] * frame["part"], code.intrinsic("fabs", h)
             whole = code.maximum(whole, frame["approach"])
-            far = way * code.intrinsic("fabs", h) > NEARBY * whole
-            past = code.select(far, way * SHORT_OF, way * PAST + NEARBY)
-            comes = matters & far & (frame["root"] < 1.0) & (frame["is_root"] > 0.0)
+            far = way * code.intrinsic("fabs", h) > nearby * whole
+            found = (frame["root"] < 1.0) & (frame["is_root"] > 0.0)
+            comes = matters & far & found
             with frame.where(comes):
                 frame["next_approach"] = whole
-            root = code.select((frame["root"] < 1.0) & (frame["is_root"] > 0.0), past, root)
+            if feature.kind == UP_TO:
+                past = code.select(far, way * SHORT_OF, way * PAST + NEARBY)
+                root = code.select(found, past, root)
+            else:
+                matters = matters & (far | ~found)
         sooner = matters & (root > 0.0) & (root < frame["nearest"]) & code.compare("!=", h, 0.0)
         with frame.where(sooner):
             frame["nearest"] = root

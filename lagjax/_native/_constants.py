@@ -160,8 +160,14 @@ SWITCH_TOLERANCES, MOST_HALVINGS = 16.0, 64
 # `RISE` parts of the order p: then exp(u) is the sum of terms Rᵏ/k! that fall from the last one on, as step control
 # expects.
 FAINT, RISE = 80.0, 0.5
-# The last terms of the argument of a feature, at most.
+# The last terms of the argument of a feature, at most; of a base, in parts of what it falls or rises to.
 ARGUMENT = 0.1
+# A power of u may rise by as much as exp(u) with u; but its base falls to this part of itself at most, to which its
+# series has to tell it. Doubled, a feature a millionth of the way wide takes one step more, of seven.
+LARGEST_FALL = 1 / 64
+# Where a base comes to zero, steps end ever nearer to that; and no more where this part of the first one is left. What
+# is narrower is missed.
+NARROWEST = 2.0**-30
 # Where no series begins beyond a border a step goes `SHORT_OF` the way to it, and when that is less than `NEARBY` of
 # the step, `PAST` times that: if what is beyond matters it fails its check, and half of it does not end at the border.
 # What is narrower is missed. The last terms of the switching number are to be `ABRUPT` of it, at most.

@@ -10,7 +10,8 @@ pieces as further inputs, so that along every step it is smooth; beside it stand
 that decides where a motion begins. A *guard* is a border of a piece: σ (u − level) > 0 on it, with σ = ±1.
 
 Beside them stand *features*: functions that are flat to rounding until their argument comes near, where they change
-within a unit of it, as exp(u) does below u = −80. No series shows one from afar, but its argument has one.
+within a unit of it, as exp(u) does below u = −80, and powers with a base that falls, or rises, by much (`_powers`). No
+series shows one from afar, but its argument has one.
 
 Not followed are `eq` and `ne`, whose border is a point, and what does not change along the motion. Where a root or a
 power that is not whole begins right at a border, as in max(q, 0)**1.5, there is no series to begin with beyond it: such
@@ -28,6 +29,7 @@ from lagjax._program._graph import Graph
 from lagjax._program._look_ups import Located, Table
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, live
+from lagjax._program._powers import find_powers
 from lagjax._program._rounding import rounding
 from lagjax._program._series import LinearSystem, Recurrent, StraightLine
 from lagjax._program._sliding import MOST_SLIDING, Slide, dot, with_sliding
@@ -36,15 +38,18 @@ from lagjax._program._sliding import MOST_SLIDING, Slide, dot, with_sliding
 SIGN, FLOOR, TRUNC, SLIDE, TABLE, CLOCK = range(6)
 LARGEST_WITH_ROUNDING = 500  # operations of numbers that are watched, and whose rounding is: three times as many
 # What a function is flat like: exp(u) below, exp(−|u|) on both sides, exp(−u²), or zero up to a border; and in which
-# units of its argument.
-BELOW, BESIDE, SQUARED, UP_TO = range(4)
+# units of its argument. It is |u| to the minus `scale` that grows as u falls, u to the `scale` as it rises from what is
+# nothing, and exp(u) as it does from anywhere.
+BELOW, BESIDE, SQUARED, UP_TO, FALLS, GROWS, RISES = range(7)
 _FEATURES = {
     "exp": (BELOW, 1.0), "exp2": (BELOW, math.log(2.0)), "expm1": (BELOW, 1.0), "logistic": (BESIDE, 1.0),
     "tanh": (BESIDE, 2.0), "sinh": (BESIDE, 2.0), "cosh": (BESIDE, 2.0), "erf": (SQUARED, 1.0), "erfc": (SQUARED, 1.0),
 }  # fmt: skip
+_EXPONENTIALS = ("exp", "exp2", "expm1", "sinh", "cosh")
 _LARGEST = 10  # operations that one may become: a bound for errors, three are usual
 _COMPARISONS = ("lt", "le", "gt", "ge")
 _PIECEWISE = {*_COMPARISONS, "abs", "max", "min", "sign", "floor", "ceil", "round", "rem", "convert", "locate"}
+_WITHOUT_ANY = {"input", "constant", "add", "sub", "neg", "sin", "cos"}  # no piece, no feature
 _WITHOUT_SERIES = ("rsqrt", "log", "log1p")  # at zero, or −1; besides the operations that are `steep`
 
 
@@ -79,7 +84,7 @@ class Guard(NamedTuple):
 
 
 class Feature(NamedTuple):
-    """A narrow feature: what it is flat like, and in which units of its argument."""
+    """A narrow feature: what it is flat like, and in which units of its argument, or to which power of it."""
 
     kind: int
     scale: float
@@ -166,8 +171,8 @@ def borders(program: Recurrent, size: int, slides: bool = True, watched: int = 0
     Along borders that depend on velocities the motion may slide (`slides`; see `_sliding`). As many of the last outputs
     are `watched` along the motion: what they decide on has borders too.
     """
-    if _PIECEWISE.union(_FEATURES).isdisjoint(op for op, *_ in program.line.nodes):
-        return None  # most scenes, and the largest ones, at no cost
+    if _WITHOUT_ANY.issuperset(op for op, *_ in program.line.nodes):
+        return None
     with np.errstate(all="ignore"):
         rewriting = _Rewriting(program, size, slides, watched)
         return rewriting.build() if rewriting.switches or rewriting.features else None
@@ -189,7 +194,7 @@ class _Rewriting:
         self._extremes: dict[int, tuple] = {}  # the operations that have been decided
         self._one = self.graph.constant(1.0, "float")
         self._moves: list[bool] = []
-        self.features: dict[int, Feature] = {}
+        self.features: dict[tuple[int, int], Feature] = {}  # by the argument, and the kind
         self.abrupt: set[int] = set()
         self.moduli, self.quotients = _moduli(program.line), _floor_divisions(program.line)
         self.decisive = self._decisive()
@@ -197,12 +202,18 @@ class _Rewriting:
         self.borders_of_decisions = {self._compared(i) for i in comparisons} - {None}
         self.places: list[int] = []
         relevant = self.decisive | self.abrupt
-        if any(
-            i in self.moduli or i in self.quotients or self._decides(i) or program.line.nodes[i][0] in _FEATURES
+        self.powers = find_powers(program.line, relevant, size)
+        if self.powers or any(
+            i in self.moduli
+            or i in self.quotients
+            or self._decides(i)
+            or program.line.nodes[i][0] in (*_FEATURES, "pow")
             for i in relevant
         ):
             for i in range(len(program.line.nodes)):
                 self.places.append(self._place(i))
+        for base, exponent in self.powers:
+            self._note_power(self.places[base], exponent)
 
     # ---- which operations decide ----
 
@@ -282,8 +293,10 @@ class _Rewriting:
             return self.graph.apply(op, sign, self.graph.constant(0.0, "float"))
         if i in self.abrupt and self._decides(i):
             self._note_border(op, of)
-        if op in _FEATURES and i in self.decisive and self._is_moving(of[0]):
-            self.features.setdefault(of[0], Feature(*_FEATURES[op]))
+        if op in _FEATURES and i in self.decisive:
+            self._note_feature(of[0], *_FEATURES[op])
+        if op == "pow" and i in self.decisive and self.graph.value(of[1]) is None:
+            self._note_exponent(*of)
         if op == "div" and (quotient := self._direction(*of)) is not None:
             return quotient
         return self.graph.node(op, *of, attribute=attribute)
@@ -434,8 +447,42 @@ class _Rewriting:
             u = self.graph.apply("sub", *of)
         elif op in ("abs", "sign"):
             u = of[0]
-        if u is not None and self._is_moving(u):
-            self.features.setdefault(self.graph.term(u)[1], Feature(UP_TO, 1.0))
+        if u is not None:
+            self._note_feature(self.graph.term(u)[1], UP_TO, 1.0)
+
+    def _note_feature(self, u: int, kind: int, scale: float) -> None:
+        """A function of u, as a feature if u moves."""
+        if self._is_moving(u):
+            known = self.features.get((u, kind), Feature(kind, scale))
+            self.features[u, kind] = Feature(kind, max(scale, known.scale))
+
+    def _note_power(self, base: int, exponent: float) -> None:
+        """A power of a number: one that is to be large by its square, and sums of exponentials by their arguments."""
+        op, operands, _ = self.graph.nodes[base]
+        if op in ("exp", "exp2"):
+            self._note_feature(self.graph.scale(exponent, operands[0]), *_FEATURES[op])
+        elif exponent > 0:
+            self._note_feature(self.graph.apply("mul", base, base), GROWS, exponent / 2)
+        elif arguments := self._exponents(base):
+            for u in arguments:
+                self._note_feature(u, BESIDE, -exponent)
+        else:
+            self._note_feature(base, FALLS, -exponent)
+
+    def _exponents(self, i: int) -> list[int]:
+        """The arguments of the exponentials that a sum consists of, but for what does not move; none of others."""
+        op, operands, _ = self.graph.nodes[self._base_of(i)]
+        if op in ("add", "sub"):
+            parts = [x for x in operands if self._is_moving(x)]
+            found = [self._exponents(x) for x in parts]
+            return sum(found, []) if all(found) else []
+        return [operands[0]] if op in _EXPONENTIALS else []
+
+    def _note_exponent(self, a: int, b: int) -> None:
+        """aᵇ = exp(b log |a|), where b is no constant."""
+        f, moves = self.graph.apply, self._is_moving(a)
+        log = f("log", f("mul", a, a)) if moves else f("log", a)
+        self._note_feature(f("mul", self.graph.scale(0.5, log) if moves else log, b), RISES if moves else BELOW, 1.0)
 
     # ---- the end ----
 
@@ -446,7 +493,7 @@ class _Rewriting:
             tuple(self.graph.nodes), tuple(self.graph.kinds), tuple(self.places[i] for i in program.line.outputs)
         )
         nested = not _below(line, self.switches).isdisjoint(self.pieces)
-        sliding, switches, arguments = self._sliding(line), list(self.switches), list(features)
+        sliding, switches, arguments = self._sliding(line), list(self.switches), [u for u, _ in features]
         linear = program.linear and self._linear(program.linear)
         at_rest = [slide for slide in sliding if slide.order == 1]
         for slides in (sliding, at_rest):
