@@ -375,14 +375,16 @@ class BorderControl:
 
     def _moves(self, frame: Frame, j: Value, degree: Value, h: Value) -> tuple[Value, Value]:
         """The largest change of a number along the step, Σ |cₖ| for k > 0, and the last of these terms."""
-        code, row = frame.code, j + (self.motion.series.rows - self.motion.series.followed)
-        size, sum = code.intrinsic("fabs", h), frame.constant(0.0)
+        code, size, sum = frame.code, frame.code.intrinsic("fabs", h), frame.constant(0.0)
+
+        def coefficient(k: Value) -> Value:
+            return code.intrinsic("fabs", self.motion.followed_coefficient(frame, j, k))
+
         for i in range(3):
-            sum = (sum + code.intrinsic("fabs", frame["rows", row, degree - i])) * size
+            sum = (sum + coefficient(degree - i)) * size
         sum, last = code.variable(sum), code.variable(sum)
         with code.loop(degree, start=3) as i:
-            c = code.intrinsic("fabs", frame["rows", row, degree - i])
-            sum.value = (sum.value + c) * size
+            sum.value = (sum.value + coefficient(degree - i)) * size
             last.value = last.value * size
         return sum.value, last.value
 

@@ -78,7 +78,8 @@ class Integrator:
             fields |= BorderControl.fields(borders)
         jump = parts.jump
         large = is_large(program, projection, guards, more=() if jump is None else [jump.line])
-        alone = large and width == 1 and borders is None and chosen is None and not for_gpus
+        has_pieces = borders is not None and borders.switches
+        alone = large and width == 1 and not has_pieces and chosen is None and not for_gpus
         kind = SingleMember if alone and fills_lanes(series) else TaylorSeries
         self.motion = motion = kind(
             "motion", parts, JOB, fields, large, width, kept=self.guards, number=number

@@ -202,7 +202,7 @@ class _Rewriting:
         self.borders_of_decisions = {self._compared(i) for i in comparisons} - {None}
         self.places: list[int] = []
         relevant = self.decisive | self.abrupt
-        self.powers = find_powers(program.line, relevant, size)
+        self.powers = find_powers(program.line, relevant, self._of_guards, size)
         if self.powers or any(
             i in self.moduli
             or i in self.quotients
@@ -223,8 +223,9 @@ class _Rewriting:
         roots = line.outputs[: self.size] if linear is None else [*linear.right, *linear.entries.values()]
         instead = self.moduli | self.quotients
         needed = _below(line, roots, instead)
+        self._of_guards = _below(line, self.watched, instead)
         if self.watched:  # which may read the solution of a linear system, but not decide on its elimination
-            needed |= _below(line, self.watched, instead) - (_below(line, line.outputs[: self.size]) - needed)
+            needed |= self._of_guards - (_below(line, line.outputs[: self.size]) - needed)
         self.abrupt = self._find_abrupt(needed)
         return needed - self.abrupt
 
@@ -475,7 +476,7 @@ class _Rewriting:
         if op in ("add", "sub"):
             parts = [x for x in operands if self._is_moving(x)]
             found = [self._exponents(x) for x in parts]
-            return sum(found, []) if all(found) else []
+            return [u for some in found for u in some] if all(found) else []
         return [operands[0]] if op in _EXPONENTIALS else []
 
     def _note_exponent(self, a: int, b: int) -> None:
