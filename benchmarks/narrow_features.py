@@ -98,7 +98,7 @@ def quadrature(function: Callable, a: float, b: float, c: float, w: float) -> fl
     return float(np.sum(function(middle[:, None] + half[:, None] * NODES) * WEIGHTS * half[:, None]))
 
 
-def in_time(family: Family, c: float, w: float, rng) -> tuple[np.ndarray, np.ndarray, object]:
+def in_time(family: Family, c: float, w: float, rng) -> tuple[Any, np.ndarray, Any]:
     """The end of a motion under a force A f((t − c) / w), and the exact one."""
     strength = rng.uniform(0.3, 2.0) / (1.0 if family.edge else w)
     numbers = jnp.asarray([strength, c, w], float)
@@ -117,7 +117,7 @@ def in_time(family: Family, c: float, w: float, rng) -> tuple[np.ndarray, np.nda
     return run, np.array([q, v]), c
 
 
-def in_place(family: Family, c: float, w: float, rng) -> tuple[np.ndarray, np.ndarray, object]:
+def in_place(family: Family, c: float, w: float, rng) -> tuple[Any, np.ndarray, Any]:
     """The end of a motion over, or back from, a potential A f((q − c) / w), and the exact one."""
     height = rng.uniform(-0.6, 0.3)
     numbers = jnp.asarray([height, c, w], float)
@@ -135,7 +135,7 @@ def in_place(family: Family, c: float, w: float, rng) -> tuple[np.ndarray, np.nd
     return run, np.array([last, speed(last)]), c
 
 
-def as_guard(family: Family, c: float, w: float, rng) -> tuple[np.ndarray, np.ndarray, object]:
+def as_guard(family: Family, c: float, w: float, rng) -> tuple[Any, np.ndarray, Any]:
     """The times at which f((x − c) / w) of the time, or of a free motion, crosses a level, and the exact ones."""
     level, by_time = rng.uniform(0.2, 0.8), rng.random() < 0.5
     numbers = jnp.asarray([level, c, w], float)
@@ -223,7 +223,9 @@ def compared(seed: int, single: bool) -> tuple[str, float, int, str]:
 
 def main(arguments: list[str] | None = None) -> collections.Counter:
     """Compare so many scenes, print those that are not right, and count them."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.narrow_features", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.narrow_features", description=(__doc__ or "").split("\n")[0]
+    )
     parser.add_argument("--scenes", type=int, default=300)
     parser.add_argument("--first", type=int, default=0, help="the seed of the first one")
     parser.add_argument("--single", action="store_true", help="states in float32, as JAX has them by default")

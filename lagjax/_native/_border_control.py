@@ -22,6 +22,7 @@ from lagjax._native._constants import (
     EARLY,
     EPS,
     FAINT,
+    FAR,
     GROWTH,
     LARGEST_FALL,
     LEAST_ORDER,
@@ -45,7 +46,7 @@ from lagjax._native._saltation import NUMBERS, GuardTable, Saltation
 from lagjax._native._step import absolute_tolerance
 from lagjax._native._taylor import TaylorSeries, integer
 from lagjax._program import _borders
-from lagjax._program._borders import BELOW, FALLS, GROWS, RISES, SQUARED, UP_TO, Feature
+from lagjax._program._borders import BELOW, FALLS, GROWS, SQUARED, UP_TO, Feature
 from lagjax._program._jump import Jump, Nesting
 
 NOWHERE = 1e300  # a level that no switching number comes to
@@ -408,8 +409,6 @@ class BorderControl:
             )
             matters, slope, start = level > 0.0, frame.constant(-1.0), level - u
             absolute = ARGUMENT * level
-        elif feature.kind == RISES:
-            matters, slope, start = code.compare("==", u, u), frame.constant(-1.0), rise
         elif feature.kind == SQUARED:
             near = code.maximum(u * u - rise, 0.0)
             level = code.intrinsic("sqrt", code.select(near > FAINT, FAINT, near))
@@ -419,6 +418,8 @@ class BorderControl:
             level = code.maximum(rise - slope * u, -FAINT)
             matters = level < (float("inf") if feature.kind == BELOW else 0.0)
             start = level + slope * u
+        if feature.kind <= SQUARED:
+            start = code.select(start > FAR, (1.0 - LARGEST_FALL) * start, start)
         self.roots.polynomial(frame, j, degree, h, slope, u - start / slope)
         if feature.kind == FALLS:  # one that rises is told by fewer terms
             self.roots.sum_up(frame, degree)

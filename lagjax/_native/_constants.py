@@ -160,6 +160,8 @@ SWITCH_TOLERANCES, MOST_HALVINGS = 16.0, 64
 # `RISE` parts of the order p: then exp(u) is the sum of terms Rᵏ/k! that fall from the last one on, as step control
 # expects.
 FAINT, RISE = 80.0, 0.5
+# From an argument as large as this on it is not known to a tenth: then the way to the feature is gone in parts.
+FAR = 2.0**40
 # The last terms of the argument of a feature, at most; of a base, in parts of what it falls or rises to.
 ARGUMENT = 0.1
 # A power of u may rise by as much as exp(u) with u; but its base falls to this part of itself at most, to which its

@@ -38,9 +38,9 @@ from lagjax._program._sliding import MOST_SLIDING, Slide, dot, with_sliding
 SIGN, FLOOR, TRUNC, SLIDE, TABLE, CLOCK = range(6)
 LARGEST_WITH_ROUNDING = 500  # operations of numbers that are watched, and whose rounding is: three times as many
 # What a function is flat like: exp(u) below, exp(−|u|) on both sides, exp(−u²), or zero up to a border; and in which
-# units of its argument. It is |u| to the minus `scale` that grows as u falls, u to the `scale` as it rises from what is
-# nothing, and exp(u) as it does from anywhere.
-BELOW, BESIDE, SQUARED, UP_TO, FALLS, GROWS, RISES = range(7)
+# units of its argument. Of powers these are exponents: |u| to the minus `scale` grows as |u| falls, u to the `scale` as
+# it grows from what is nothing.
+BELOW, BESIDE, SQUARED, UP_TO, FALLS, GROWS = range(6)
 _FEATURES = {
     "exp": (BELOW, 1.0), "exp2": (BELOW, math.log(2.0)), "expm1": (BELOW, 1.0), "logistic": (BESIDE, 1.0),
     "tanh": (BESIDE, 2.0), "sinh": (BESIDE, 2.0), "cosh": (BESIDE, 2.0), "erf": (SQUARED, 1.0), "erfc": (SQUARED, 1.0),
@@ -481,9 +481,9 @@ class _Rewriting:
 
     def _note_exponent(self, a: int, b: int) -> None:
         """aᵇ = exp(b log |a|), where b is no constant."""
-        f, moves = self.graph.apply, self._is_moving(a)
-        log = f("log", f("mul", a, a)) if moves else f("log", a)
-        self._note_feature(f("mul", self.graph.scale(0.5, log) if moves else log, b), RISES if moves else BELOW, 1.0)
+        f = self.graph.apply
+        log = self.graph.scale(0.5, f("log", f("mul", a, a))) if self._is_moving(a) else f("log", a)
+        self._note_feature(f("mul", log, b), BELOW, 1.0)
 
     # ---- the end ----
 

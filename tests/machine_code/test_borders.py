@@ -158,6 +158,22 @@ FEATURES = {  # the scene, its start, the acceleration in NumPy, and a step that
         lambda q, v, t: np.sinh(np.clip((q - 5) / 0.03, -99, 99)) / np.cosh(np.clip((q - 5) / 0.03, -99, 99)) ** 2
         / 0.03, 0.01,
     ),
+    "pulses of a power": (
+        particle(lambda q, params: 0.5 * q * q, lambda q, v, t: jnp.cos(t) ** 1000), (1.0, 0.0),
+        lambda q, v, t: -q + np.cos(t) ** 1000, 0.02,
+    ),
+    "a constant to a power": (
+        particle(lambda q, params: 0.6 * 2.0 ** -(((q - 5) / 0.03) ** 2)), (0.0, 1.0),
+        lambda q, v, t: 0.6 * np.log(2) * 2 * (q - 5) / 0.03**2 * 2.0 ** -(((q - 5) / 0.03) ** 2), 0.01,
+    ),
+    "an edge of a root": (
+        particle(lambda q, params: 0.2 * (q - 5) / jnp.sqrt((q - 5) ** 2 + 1e-4)), (0.0, 1.0),
+        lambda q, v, t: -2e-5 * ((q - 5) ** 2 + 1e-4) ** -1.5, 0.005,
+    ),
+    "an exponent that moves": (
+        particle(force=lambda q, v, t: 50 * (0.5 + 0.4 * jnp.sin(t)) ** (9 + 1e3 * (q - 5) ** 2)), (0.0, 1.0),
+        lambda q, v, t: 50 * (0.5 + 0.4 * np.sin(t)) ** (9 + 1e3 * (q - 5) ** 2), 0.01,
+    ),
 }  # fmt: skip
 
 
@@ -193,6 +209,58 @@ def test_a_narrow_feature(name, rtol):
     y, run = end(scene, *y0, 10.0, rtol=rtol)
     np.testing.assert_allclose(y, reference(name, 10.0), atol=300 * rtol + 1e-11)
     assert run.stats["num_steps"] < 150
+
+
+@pytest.mark.parametrize("width", [1e-2, 1e-7])
+def test_what_powers_make_narrow_is_seen_by_guards_and_derivatives(width):
+    free = particle()
+
+    def lorentzian(q, v, params):
+        return 1 / (1 + ((q - 3.3) / params) ** 2) ** 2 - 0.25  # where (q − 3.3)² = params²
+
+    found = lagjax.crossings(free, lorentzian, 0.0, 1.0, (0.0, 10.0), width, count=3)
+    np.testing.assert_allclose(found.t, [3.3 - width, 3.3 + width, np.nan], atol=1e-4 * width + 1e-14)
+
+    pulse = particle(force=lambda q, v, t, params: 2.0 ** -(((t - 3.3) / params) ** 2) / width)
+    derivative = jax.grad(lambda w: last_q(pulse, 0.0, 0.0, 10.0, w))(width)
+    np.testing.assert_allclose(derivative, 6.7 * np.sqrt(np.pi / np.log(2)) / width, rtol=1e-6)
+
+
+def test_an_atom_is_hit_from_any_distance():
+    system = lagjax.System(lambda q, v: 0.5 * v @ v - 4 * ((q @ q) ** -6 - (q @ q) ** -3))
+
+    def rate(t, y):
+        return [*y[2:], *(48 * (y[:2] @ y[:2]) ** -7 - 24 * (y[:2] @ y[:2]) ** -4) * y[:2]]
+
+    for distance in (1e2, 1e4, 1e6):
+        run = lagjax.simulate(system, jnp.array([-distance, 0.7]), jnp.array([2.0, 0.0]), jnp.array([0.0, distance]))
+        # A hundred diameters away the force is 24e-14.
+        exact = solve_ivp(rate, (0, 100), [-100, 0.7, 2.0, 0.0], "DOP853", rtol=1e-12, atol=1e-12, max_step=0.5)
+        np.testing.assert_allclose(run.qdot[-1], exact.y[2:, -1], atol=1e-8)
+
+
+def test_which_powers_are_watched():
+    """What every motion sees from afar, or cannot change by much, costs nothing."""
+    three = (jnp.arange(9.0) ** 1.5).reshape(3, 3)
+    pairs = jnp.array([0, 0, 1]), jnp.array([1, 2, 2])
+
+    def count(potential, q):
+        return len(lagjax.System(lambda q, v: 0.5 * jnp.sum(v * v) - potential(q)).explain(q, q).narrow)
+
+    def of_pairs(power, softening):
+        return lambda q: jnp.sum((jnp.sum((q[pairs[0]] - q[pairs[1]]) ** 2, axis=1) + softening) ** power)
+
+    for softening in (0.0, 0.1):
+        assert count(of_pairs(-0.5, softening), three) == 0
+        assert count(of_pairs(-3, softening), three) == 3
+
+    def of_two(q):
+        return -0.9 / jnp.sqrt((q[0] + 0.1) ** 2 + q[1] ** 2) - 0.1 / jnp.sqrt((q[0] - 0.9) ** 2 + q[1] ** 2)
+
+    assert count(of_two, jnp.ones(2)) == 0
+    assert count(lambda q: jnp.cos(q) / (2 - jnp.cos(q) ** 2), 1.0) == 0
+    assert count(lambda q: jnp.cos(q) / (1 + 1e-4 - jnp.cos(q) ** 2), 1.0) == 1
+    assert count(lambda q: q**4 + q**6, 1.0) == 0
 
 
 # ---- derivatives -----------------------------------------------------------------------------------------------------
