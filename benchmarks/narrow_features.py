@@ -210,10 +210,9 @@ def compared(seed: int, single: bool) -> tuple[str, float, int, str]:
         text = f"{name} in {setting}, c = {c:.4f}, w = {w:.1e}"
         run, exact, more = SETTINGS[setting](family, c, w, rng)
         got = more if setting == "guard" else np.array([run.q[-1], run.qdot[-1]], float)
-        # A time, or a place, is known to some roundings, which are parts of the width.
-        allowed = SLACK * RTOL + 100 * digits + (20 * w if setting == "guard" else 0.0) * 0.01
-        if setting == "guard":
-            allowed = max(0.01 * w, 1e-12) + 1e2 * digits * SPAN
+        allowed = SLACK * RTOL + 100 * digits
+        if setting == "guard":  # whose times are known to a part of the width, or to rounding
+            allowed = max(0.01 * w, 1e-12) + 100 * digits * SPAN
     steps = int(run.stats["num_steps"]) + int(run.stats["num_rejected_steps"]) if hasattr(run, "stats") else 0
     if not bool(run.ok):
         return "named", math.nan, steps, f"{str(getattr(run, 'result', ''))[:100]} {text}"

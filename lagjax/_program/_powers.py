@@ -28,7 +28,6 @@ _LONGEST, _DEEPEST = 16, 8  # factors of a product; sums of products that one is
 _ROOTS = {"sqrt": 0.5, "rsqrt": -0.5, "cbrt": 1 / 3}
 _PRODUCTS = {"mul", "div", "neg", "abs", *_ROOTS}
 _BETWEEN = {"sin": 1.0, "cos": 1.0, "tanh": 1.0, "erf": 1.0, "atan": math.pi / 2, "sign": 1.0}
-_ALL = -math.inf, math.inf
 
 
 class Power(NamedTuple):
@@ -38,35 +37,13 @@ class Power(NamedTuple):
     exponent: float
 
 
-class _Number(NamedTuple):
-    """A number of a program: what it is a product of, without what does not move; and its bounds."""
-
-    factors: dict[int, float]
-    low: float = -math.inf
-    high: float = math.inf
-
-
 def find_powers(line: StraightLine, nodes: Iterable[int], guards: set[int], size: int) -> list[Power]:
     """The powers to watch among these nodes of a program of q, q̇, t and parameters; guards depend on some of them."""
-    numbers: dict[int, _Number] = {}
-    products: dict[int, list[int]] = {i: [] for i in line.outputs}  # and the nodes they are terms, or operands, of
-    for i in sorted(nodes):
-        numbers[i] = _number(line, i, numbers, size)
-        if not _is_product(line, i):
-            for x in line.nodes[i][1]:
-                products.setdefault(x, []).append(i)
-    products = {i: users for i, users in products.items() if i in numbers}
-    holders: dict[int, list[int]] = {}
-    for i in products:
-        for base in numbers[i].factors:
-            holders.setdefault(base, []).append(i)
-    program = _Products(line, numbers, products, holders)
-    found: dict[tuple[int, bool], float] = {}
-    for i in products:
-        for base, e in numbers[i].factors.items():
+    program, found = _Products(line, sorted(nodes), size), {}
+    for i in program.users:
+        for base, e in program.factors.get(i, {}).items():
             if e >= LEAST_POWER or (e < 0 and program.is_hidden(base, i, i in guards)):
-                key = base, e > 0
-                found[key] = max(found.get(key, 0.0), abs(e))
+                found[base, e > 0] = max(found.get((base, e > 0), 0.0), abs(e))
     return [Power(base, e if grows else -e) for (base, grows), e in sorted(found.items())]
 
 
@@ -76,32 +53,75 @@ def _is_product(line: StraightLine, i: int) -> bool:
     return op in _PRODUCTS or (op == "pow" and line.nodes[operands[1]][0] == "constant")
 
 
-class _Products(NamedTuple):
-    """The products in a program that are no part of another one, and what uses them."""
+class _Products:
+    """The numbers of a program as products: what they are products of, of what moves; and what uses whole products.
 
-    line: StraightLine
-    numbers: dict[int, _Number]
-    users: dict[int, list[int]]
-    holders: dict[int, list[int]]
+    A number that moves and has no `factors` here is its own.
+    """
+
+    def __init__(self, line: StraightLine, nodes: list[int], size: int):
+        self.line, self.factors = line, {}
+        self.users: dict[int, list[int]] = {i: [] for i in line.outputs}
+        self._bounds: dict[int, tuple[float, float]] = {}
+        self._squares: dict[int, set[int]] = {}
+        self._moving: set[int] = set()
+        steps = {op for op in {node[0] for node in line.nodes} - {"input", "constant"} if OPERATIONS[op].is_step}
+        for i in nodes:
+            op, operands, value = line.nodes[i]
+            if not operands:
+                if op == "input" and value <= 2 * size:
+                    self._moving.add(i)
+                continue
+            is_product = _is_product(line, i)
+            if not is_product:
+                for x in operands:
+                    self.users.setdefault(x, []).append(i)
+            if op not in steps and not self._moving.isdisjoint(operands):
+                self._moving.add(i)
+                if is_product:
+                    self.factors[i] = self._multiply(i, op, operands)
+        self.holders: dict[int, list[int]] = {}
+        for i in self.users:
+            for base in self.factors_of(i):
+                self.holders.setdefault(base, []).append(i)
+
+    def factors_of(self, i: int) -> dict[int, float]:
+        """The bases of a number, each with its exponent; none of one that does not move."""
+        return self.factors.get(i) or ({i: 1.0} if i in self._moving else {})
+
+    def _multiply(self, i: int, op: str, operands: tuple[int, ...]) -> dict[int, float]:
+        factors = dict(self.factors_of(operands[0]))
+        if op in ("mul", "div"):
+            for base, e in self.factors_of(operands[1]).items():
+                factors[base] = factors.get(base, 0.0) + (e if op == "mul" else -e)
+        elif op != "neg":
+            power = self.line.nodes[operands[1]][2] if op == "pow" else _ROOTS.get(op, 1.0)
+            factors = {base: e * power for base, e in factors.items()}
+        if not all(factors.values()):
+            factors = {base: e for base, e in factors.items() if e}
+        return factors if 0 < len(factors) <= _LONGEST else {i: 1.0}
 
     def is_hidden(self, base: int, i: int, of_guard: bool) -> bool:
         """True if a negative power in product i may change by much along a step, without a trace at its beginning."""
-        exponent, (_, low, high) = self.numbers[i].factors[base], self.numbers[base]
-        least, most = (low, high) if low > 0 else (-high, -low)
-        if least > 0 and math.log(most / least) * -exponent < _SEEN:
+        exponent, squares = self.factors[i][base], self.squares(base)
+        if not of_guard and len(squares) > 1 and -2 * exponent - self.degree(i, squares) <= _SLOWEST:
             return False
-        squares = self.squares(base)
-        if of_guard or len(squares) < 2 or -2 * exponent > _SLOWEST + 1:
-            return True
-        return -2 * exponent - self.degree(i, squares) > _SLOWEST
+        low, high = self.bounds(base)
+        least, most = (low, high) if low > 0 else (-high, -low)
+        return not (least > 0 and math.log(most / least) * -exponent < _SEEN)
 
     def squares(self, i: int) -> set[int]:
         """The numbers whose squares a sum consists of, but for what does not move; none of another sum."""
+        if i not in self._squares:
+            self._squares[i] = self._find_squares(i)
+        return self._squares[i]
+
+    def _find_squares(self, i: int) -> set[int]:
         squares, terms = set(), [i]
         while terms:
             op, operands, _ = self.line.nodes[terms.pop()]
             for x in operands:
-                factors = self.numbers[x].factors
+                factors = self.factors_of(x)
                 if self.line.nodes[x][0] == "add":
                     terms.append(x)
                 elif factors and (op != "add" or list(factors.values()) != [2.0]):
@@ -112,51 +132,33 @@ class _Products(NamedTuple):
 
     def degree(self, i: int, numbers: set[int], left: int = _DEEPEST) -> float:
         """The degree in some numbers of what product i is multiplied with, itself included, where that is least."""
-        own = sum(self.numbers[i].factors.get(x, 0.0) for x in numbers)
+        own = sum(self.factors_of(i).get(x, 0.0) for x in numbers)
         sums = [u for u in self.users[i] if self.line.nodes[u][0] in ("add", "sub")]
         if own or not left or len(sums) < len(self.users[i]) or i in self.line.outputs:
             return own
         holders = [x for u in sums for x in self.holders.get(u, ())]
         return min((self.degree(x, numbers, left - 1) for x in holders), default=0.0)
 
+    def bounds(self, i: int) -> tuple[float, float]:
+        """Bounds of a number, where it is made of sums and products of bounded functions."""
+        known, stack = self._bounds, [i]
+        while stack:
+            op, operands, value = self.line.nodes[stack[-1]]
+            missing = [y for y in operands if y not in known] if op in ("add", "sub", "mul", "neg") else []
+            stack.extend(missing)
+            if not missing:
+                known[stack.pop()] = (float(value), float(value)) if op == "constant" else self._bound(op, operands)
+        return known[i]
 
-def _number(line: StraightLine, i: int, numbers: dict[int, _Number], size: int) -> _Number:
-    """What is known of a node, from what is known of its operands."""
-    op, operands, value = line.nodes[i]
-    if op == "constant":
-        x = float(value)
-        return _Number({}, x, x) if x == x else _Number({})
-    if op == "input":
-        return _Number({i: 1.0} if value <= 2 * size else {})
-    if any(x not in numbers for x in operands):
-        return _Number({i: 1.0})
-    of = [numbers[x] for x in operands]
-    bounds = _bounds(op, operands, of)
-    if OPERATIONS[op].is_step or not any(x.factors for x in of):
-        return _Number({}, *bounds)
-    if not _is_product(line, i):
-        return _Number({i: 1.0}, *bounds)
-    factors = dict(of[0].factors)
-    if op in ("mul", "div"):
-        for base, e in of[1].factors.items():
-            factors[base] = factors.get(base, 0.0) + (e if op == "mul" else -e)
-    else:
-        power = line.nodes[operands[1]][2] if op == "pow" else _ROOTS.get(op, 1.0)
-        factors = {base: e * power for base, e in factors.items()}
-    factors = {base: e for base, e in factors.items() if e}
-    return _Number(factors if 0 < len(factors) <= _LONGEST else {i: 1.0}, *bounds)
-
-
-def _bounds(op: str, operands: tuple[int, ...], of: list[_Number]) -> tuple[float, float]:
-    """Bounds of the result of an operation, where sums and products of bounded functions have them."""
-    if op in _BETWEEN:
-        return -_BETWEEN[op], _BETWEEN[op]
-    if op not in ("add", "sub", "mul", "neg"):
-        return (0.0, math.inf) if op in ("abs", "exp", "sqrt", "cosh") else _ALL
-    (_, a, b), (_, c, d) = of[0], of[-1]
-    if op == "neg":
-        return -b, -a
-    if op != "mul":
-        return (a + c, b + d) if op == "add" else (a - d, b - c)
-    ends = [x * y if x and y else 0.0 for x in (a, b) for y in (c, d)]
-    return (0.0 if operands[0] == operands[1] else min(ends)), max(ends)
+    def _bound(self, op: str, operands: tuple[int, ...]) -> tuple[float, float]:
+        if op in _BETWEEN:
+            return -_BETWEEN[op], _BETWEEN[op]
+        if op not in ("add", "sub", "mul", "neg"):
+            return (0.0, math.inf) if op in ("abs", "exp", "sqrt", "cosh") else (-math.inf, math.inf)
+        (a, b), (c, d) = self._bounds[operands[0]], self._bounds[operands[-1]]
+        if op == "neg":
+            return -b, -a
+        if op != "mul":
+            return (a + c, b + d) if op == "add" else (a - d, b - c)
+        ends = [x * y if x and y else 0.0 for x in (a, b) for y in (c, d)]
+        return (0.0 if operands[0] == operands[1] else min(ends)), max(ends)
