@@ -38,8 +38,8 @@ class Explanation:
     - `borders`: where the accelerations are piecewise: the operation (a sign, a whole part) and what it reads; on the
       array path the operation and its line. `borders_located`: whether steps end exactly there; otherwise they go
       across, and there are no derivatives of a motion that crosses a jump. `narrow`: functions that are flat until
-      their argument comes near (exp,
-      tanh, …), whose arguments machine code watches along every step.
+      their argument comes near (exp, tanh, …), and powers that rise from nothing as their base falls or grows, whose
+      arguments and bases machine code watches along every step.
     - `operations`: scalar operations of one acceleration (with constraints in machine code, where M is regular);
       `traced_operations`: of its derivatives before reduction.
     - `constraints`: the name of every number that is to be zero; `dependent_constraints`: those that, at the state in
