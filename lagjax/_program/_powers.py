@@ -22,7 +22,7 @@ LEAST_POWER = 8
 _SEEN = 3.0
 # By what power of the distance a force may fall that is seen as long as the tolerance resolves where it acts. Measured
 # on flights from 1e2 to 1e9 lengths with impact parameters of 0.01 to 2: none is missed at rtol = 1e-9 and 1e-12, and
-# at 1e-5 those from 1e6 on, whose place rtol leaves open by ten lengths. With 3 in its place, half are from 1e4 on.
+# at 1e-5 those from 1e6 on, whose place rtol leaves open by ten lengths. With 3, those of 1 / r² at 1e-9 as well.
 _SLOWEST = 2.0
 _LONGEST, _DEEPEST = 16, 8  # factors of a product; sums of products that one is looked for in
 _ROOTS = {"sqrt": 0.5, "rsqrt": -0.5, "cbrt": 1 / 3}
