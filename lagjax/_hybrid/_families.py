@@ -172,7 +172,7 @@ def _same_outline(one: System, of_one, other: System, of_other) -> bool:
 
     def outline(system, leaving):
         roles = [getattr(system, role) is None for role in ROLES]
-        return system.path, roles, [(transition.direction, transition.reset is None) for transition in leaving]
+        return system.path, roles, [(t.direction, t.reset is None, t.fires) for t in leaving]
 
     return outline(one, of_one) == outline(other, of_other)
 

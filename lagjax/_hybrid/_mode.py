@@ -68,8 +68,17 @@ class Transition(eqx.Module):
     guard: Function
     direction: int = eqx.field(static=True)
     reset: Function | None
+    fires: str | None = eqx.field(static=True)
 
-    def __init__(self, source: str, target: str, guard: Callable, direction: int = 0, reset: Callable | None = None):
+    def __init__(
+        self,
+        source: str,
+        target: str,
+        guard: Callable,
+        direction: int = 0,
+        reset: Callable | None = None,
+        fires: str | None = None,
+    ):
         for role, name in (("source", source), ("target", target)):
             if not isinstance(name, str):
                 raise TypeError(f"{role} must be the name of a mode; got {name!r}.")
@@ -77,7 +86,11 @@ class Transition(eqx.Module):
             raise ValueError(f"direction must be -1 (falling), +1 (rising) or 0 (both); got {direction!r}.")
         if guard is None:
             raise TypeError(f"The transition from {source!r} to {target!r} has no guard: say where it happens.")
-        self.source, self.target, self.direction = source, target, int(direction)
+        if fires not in (None, "beyond", "crossing"):
+            raise ValueError(f'fires must be "beyond", "crossing" or None; got {fires!r}.')
+        if fires == "beyond" and not direction:
+            raise ValueError('fires="beyond" needs a direction, -1 or +1: zero is left on both sides.')
+        self.source, self.target, self.direction, self.fires = source, target, int(direction), fires
         self.guard = accept(guard, "guard", extras=("t", "params", "multipliers"))
         self.reset = None if reset is None else accept(reset, "reset")
 

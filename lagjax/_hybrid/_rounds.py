@@ -102,17 +102,39 @@ class Ending(NamedTuple):
     steps: jax.Array  # accepted, rejected
     latest: jax.Array  # the number of the transition before, −1 at the beginning
     memory: "GuardMemory"
+    let_out: jax.Array  # (K,), see `Transitions`
 
 
 class GuardMemory(NamedTuple):
     """The sides of every guard just before the last reset, (K,): its value, and the side of its surface.
 
-    Of a guard of another mode the value is NaN. `rounding` is that of the largest terms that a guard has had.
+    Of a guard of another mode the value is NaN. `rounding` and `rate_rounding` are those of the largest terms that a
+    guard and its rate have had.
     """
 
     values: jax.Array
     sides: jax.Array  # −1, +1, or 0 where it is unknown
     rounding: jax.Array
+    rate_rounding: jax.Array
+
+    def clear_rates(self, guarded: Guarded, numbers) -> jax.Array:
+        """The rates of some guards, 0 where rounding decides these."""
+        noise = jnp.maximum(self.rate_rounding[numbers], guarded.rate_rounding)
+        return jnp.where(jnp.abs(guarded.rates) > noise, guarded.rates, 0.0)
+
+
+class Outset(NamedTuple):
+    """The guards of a mode where a motion begins in it, each (K,).
+
+    The `sides` are those from which it comes, as large as what rounding does, and infinite where the transition happens
+    at once. `lasting` is until when those on their surface stay there. Those `beyond` zero in their direction are no
+    crossings; of these the blows that come back are let out.
+    """
+
+    sides: jax.Array
+    lasting: jax.Array
+    beyond: jax.Array
+    blows: jax.Array
 
 
 class TransitionRecord(NamedTuple):
@@ -146,7 +168,8 @@ def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree) -> tu
     first = Ending(
         t=ts[0], y=y0, mode=jnp.asarray(start), going=~inconsistent,
         result=jnp.where(inconsistent, INCONSISTENT, SUCCESSFUL), path=jnp.full((ts.size, y0.size), jnp.nan),
-        modes=jnp.full(ts.size, -1), steps=jnp.zeros(2, int), latest=jnp.asarray(-1), memory=rounds.no_memory(0.0),
+        modes=jnp.full(ts.size, -1), steps=jnp.zeros(2, int), latest=jnp.asarray(-1), memory=rounds.no_memory(0.0, 0.0),
+        let_out=jnp.full(len(plan.transitions), jnp.nan),
     )  # fmt: skip
     leaves, structure = jax.tree.flatten(first)
     first = jax.tree.unflatten(structure, vary_alike(leaves, like=(ts, y0, rounds.groups[0].first.vector)))
@@ -177,9 +200,12 @@ class _Rounds(NamedTuple):
             jnp.asarray(jnp.nan), jnp.full_like(before.y, jnp.nan), jnp.asarray(-1), jnp.asarray(-1)
         )
         place, row = jnp.asarray(self.places)[before.mode]
+        modes = [group.mode(jnp.where(place == index, row, 0)) for index, group in enumerate(self.groups)]
+        guards = [mode.guards_at(before.t, before.y, self.ts[-1]) if mode.leaving else None for mode in modes]
+        before = before._replace(memory=self._note_rounding(before, modes, guards))
         for index, group in enumerate(self.groups):
             here = before.going & (place == index)
-            ending, event, recorded = self._run_mode(group, row, before, here)
+            ending, event, recorded = self._run_mode(group, modes[index], guards[index], before, here)
             after, record = _select(here, ending, after), _select(here & event, recorded, record)
             fired = fired | (here & event)
         spent = fired & (count == self.plan.max_transitions)
@@ -194,12 +220,15 @@ class _Rounds(NamedTuple):
             off = off | (this & self.groups[index].mode(jnp.where(this, row, 0)).is_inconsistent(t, y))
         return off
 
-    def _run_mode(self, group: ModeGroup, row, before: Ending, here) -> tuple[Ending, jax.Array, TransitionRecord]:
+    def _run_mode(
+        self, group: ModeGroup, mode: Mode, guarded: Guarded | None, before: Ending, here
+    ) -> tuple[Ending, jax.Array, TransitionRecord]:
         """One round in this mode of a group for members that are `here`, and whether it ended with a transition."""
-        mode, t_start = group.mode(jnp.where(here, row, 0)), jax.lax.stop_gradient(before.t)
-        sides, rounding, lasting = self._sides(mode, before)
+        t_start, memory = jax.lax.stop_gradient(before.t), before.memory
+        outset = self._outset(group, mode, guarded, before)
         horizon = jnp.where(here, self.ts[-1], t_start)
-        located = mode.solve_to_event(jnp.stack([t_start, horizon]), before.y, sides)
+        noted = jnp.concatenate([outset.sides, memory.rate_rounding[mode.numbers]])
+        located = mode.solve_to_event(jnp.stack([t_start, horizon]), before.y, noted)
         changes = jnp.where(here, located.event, 0)
         t_end = jnp.where(here & (located.result == SUCCESSFUL), self.ts[-1], located.t_end)
 
@@ -211,8 +240,10 @@ class _Rounds(NamedTuple):
         y_end = located.y_end + jnp.where(here, moved.y_end - jax.lax.stop_gradient(moved.y_end), 0.0)
 
         at_once = here & (t_end == t_start)
-        known = before.memory._replace(rounding=rounding), sides, t_end <= lasting
-        exit, memory = self._pass_transition(group, mode, before.mode, changes, at_once, t_end, y_end, known)
+        kinds = jnp.stack([(changes >> (2 * k)) & 3 for k in range(len(mode.leaving))]) if mode.leaving else jnp.zeros(0, int)
+        put = outset.beyond & at_once
+        known = before.memory, outset.sides, t_end <= outset.lasting
+        exit, memory = self._pass_transition(group, mode, before.mode, kinds, at_once, put, t_end, y_end, known)
         event = (changes > 0) & ~exit.piled_up
         result = jnp.where(exit.piled_up, ZENO, jnp.where(here & ~event, located.result, before.result))
         # A reset may give NaN, and a guard that is NaN never fires.
@@ -230,43 +261,48 @@ class _Rounds(NamedTuple):
             steps=before.steps + jnp.stack([located.accepted, located.rejected]),
             latest=exit.number,
             memory=memory,
+            let_out=self._note_let_out(mode, before, here & outset.blows & ~((kinds > 0) & at_once)),
         )
         return after, event, TransitionRecord(exit.t, exit.y, before.mode, exit.target)
 
     def _pass_transition(
-        self, group: ModeGroup, mode: Mode, place, changes, at_once, t, y, known
+        self, group: ModeGroup, mode: Mode, place, kinds, at_once, put, t, y, known
     ) -> tuple[Exit, GuardMemory]:
-        """The state behind the first transition whose bits in `changes` say that its guard falls (1) or rises (2)."""
+        """The state behind the first transition of those whose guard falls (1) or rises (2), as `kinds` (K,) say.
+
+        One whose guard the motion was `put` beyond of is no crossing: it happens at t, whatever varies.
+        """
         no, none = jnp.asarray(False), jnp.asarray(-1)
         exit = Exit(t, y, y, place, none, no, no, jnp.asarray(True))
-        if mode.surfaces is None:
-            return exit, self.no_memory(known[0].rounding)
-        kinds = jnp.stack([(changes >> (2 * k)) & 3 for k in range(len(mode.leaving))])
-        y_here, numbers = _constant_unless(changes > 0, (y, mode.vector))
+        if not mode.leaving:
+            return exit, self.no_memory(known[0].rounding, known[0].rate_rounding)
+        y_here, numbers = _constant_unless((kinds > 0).any(), (y, mode.vector))
         guarded = mode.guards_at(t, y, self.ts[-1])
+        rates = known[0].clear_rates(guarded, mode.numbers)
         earlier = jnp.asarray(False)
         for k, transition in enumerate(mode.leaving):
             taken = (kinds[k] > 0) & ~earlier
             earlier = earlier | taken
             # It changes sign at once, against its rate: the motion that turns it round is lost in rounding.
-            against = jnp.where(kinds[k] == 2, guarded.rates[k] < 0, guarded.rates[k] > 0) & at_once
-            t_zero, y_zero = mode.crossing(k)(taken, t, y_here, numbers)
+            against = jnp.where(kinds[k] == 2, rates[k] < 0, rates[k] > 0) & at_once & ~put[k]
+            t_zero, y_zero = mode.crossing(k)(taken & ~put[k], t, y_here, numbers)
             y_next = state_after(transition, mode.layout, *_constant_unless(taken, (t_zero, y_zero, mode.params)))
             target, number = jnp.asarray(mode.targets[k]), jnp.asarray(mode.numbers[k])
             inconsistent = self.is_inconsistent(target, t_zero, y_next, group.targets[:, k].tolist())
             this = Exit(t_zero, y_zero, y_next, target, number, against, inconsistent, no)
             exit = _select(taken, this, exit)
         exit = exit._replace(guards_defined=~jnp.isnan(guarded.values).any())
-        return exit, self._memory(mode, guarded, kinds, *known)
+        return exit, self._memory(mode, guarded, rates, kinds, *known)
 
     # ---- on which side of its surface every guard is ----
 
-    def no_memory(self, rounding) -> GuardMemory:
+    def no_memory(self, rounding, rate_rounding) -> GuardMemory:
         """Nothing is known of any guard but its rounding."""
         count = len(self.plan.transitions)
-        return GuardMemory(jnp.full(count, jnp.nan), jnp.zeros(count), jnp.broadcast_to(rounding, (count,)))
+        of_all = (jnp.broadcast_to(x, (count,)) for x in (rounding, rate_rounding))
+        return GuardMemory(jnp.full(count, jnp.nan), jnp.zeros(count), *of_all)
 
-    def _memory(self, mode: Mode, guarded: Guarded, kinds, before: GuardMemory, sides, stays) -> GuardMemory:
+    def _memory(self, mode: Mode, guarded: Guarded, rates, kinds, before: GuardMemory, sides, stays) -> GuardMemory:
         """The sides before a reset of the guards of this mode, which began on these `sides`.
 
         A guard that changes comes from the side that it leaves. Another one that is on its surface comes from where it
@@ -274,36 +310,86 @@ class _Rounds(NamedTuple):
         """
         numbers = mode.numbers
         rounding = jnp.maximum(before.rounding[numbers], guarded.rounding)
-        since = jnp.where(stays | (guarded.rates == 0), jnp.sign(sides), -jnp.sign(guarded.rates))
+        since = jnp.where(stays | (rates == 0), jnp.sign(sides), -jnp.sign(rates))
         here = jnp.where(jnp.abs(guarded.values) > rounding + guarded.of_time, jnp.sign(guarded.values), since)
         here = jnp.where(kinds > 0, jnp.where(kinds == 1, 1.0, -1.0), here)
-        nothing = self.no_memory(before.rounding)
-        new = guarded.values, here, rounding
+        nothing = self.no_memory(before.rounding, before.rate_rounding)
+        new = guarded.values, here, rounding, jnp.maximum(before.rate_rounding[numbers], guarded.rate_rounding)
         return GuardMemory(*(x.at[numbers].set(of_mode) for x, of_mode in zip(nothing, new, strict=True)))
 
-    def _sides(self, mode: Mode, before: Ending) -> tuple[jax.Array, jax.Array, jax.Array]:
-        """The sides from which a motion comes that begins in a mode, the rounding of guards, and until when they stay.
+    def _note_rounding(self, before: Ending, modes: list[Mode], guards: list[Guarded | None]) -> GuardMemory:
+        """The memory with the rounding of the guards where a round begins: of its mode, and of other modes.
+
+        A guard of another mode may be the same function. What is computed with that mode's equations says nothing here.
+        """
+        memory, place = before.memory, jnp.asarray(self.places)[before.mode][0]
+        for index, (mode, guarded) in enumerate(zip(modes, guards, strict=True)):
+            if guarded is None:
+                continue
+            here, numbers = place == index, mode.numbers
+            alike = np.array(["multipliers" not in transition.guard.extras for transition in mode.leaving])
+            values = jnp.where((here | alike) & jnp.isfinite(guarded.rounding), guarded.rounding, 0.0)
+            rates = jnp.where(here & jnp.isfinite(guarded.rate_rounding), guarded.rate_rounding, 0.0)
+            memory = memory._replace(
+                rounding=memory.rounding.at[numbers].max(values),
+                rate_rounding=memory.rate_rounding.at[numbers].max(rates),
+            )
+        return memory
+
+    def _outset(self, group: ModeGroup, mode: Mode, guarded: Guarded | None, before: Ending) -> Outset:
+        """The guards of a mode where a motion begins in it.
 
         A guard is on the side where it was, if the reset has not moved it. One that has been followed is on the side
         where it goes; without a reset it has been crossed, and so has a jump. Of others on their surface it is known
-        that they can change in their direction, if in one. A side is as large as what rounding does.
+        that they can change in their direction, if in one. See `Transition` for those that are beyond it.
         """
         memory = before.memory
-        if mode.surfaces is None:
-            return jnp.zeros(0), memory.rounding, jnp.zeros(0)
-        numbers, guarded = mode.numbers, mode.guards_at(before.t, before.y, self.ts[-1])
-        values, was, rounding = (x[numbers] for x in memory)
-        rounding = jnp.maximum(rounding, guarded.rounding)
-        unmoved, followed = jnp.abs(guarded.values - values) <= rounding, numbers == before.latest
-        noise, goes = rounding + guarded.of_time, jnp.sign(guarded.rates)
-        unknown = np.array([-float(transition.direction) for transition in mode.leaving])
+        if guarded is None:
+            return Outset(*jnp.zeros((2, 0)), *jnp.zeros((2, 0), bool))
+        values, was, rounding, _ = (x[mode.numbers] for x in memory)
+        unmoved, followed = jnp.abs(guarded.values - values) <= rounding, mode.numbers == before.latest
+        rates, noise = memory.clear_rates(guarded, mode.numbers), rounding + guarded.of_time
+        goes, ways = jnp.sign(rates), np.array([float(transition.direction) for transition in mode.leaving])
         crossed = np.array([transition.reset is None for transition in mode.leaving]) | mode.surfaces.have_no_rate
-        beyond = jnp.where(goes != 0, goes, jnp.where(crossed, -was, unknown))
-        sides = jnp.where(jnp.abs(guarded.values) > noise, jnp.sign(guarded.values), unknown)
-        sides = jnp.where(unmoved & (was != 0), jnp.where(followed, beyond, was), sides)
-        sides = sides * jnp.maximum(noise, _LEAST)
-        stays = jnp.where(goes == 0, before.t, before.t + 2.0 * noise / jnp.abs(guarded.rates))
-        return sides, memory.rounding.at[numbers].set(rounding), jax.lax.stop_gradient(stays)
+        ahead = jnp.where(goes != 0, goes, jnp.where(crossed, -was, -ways))
+        sides = jnp.where(jnp.abs(guarded.values) > noise, jnp.sign(guarded.values), -ways)
+        sides = jnp.where(unmoved & (was != 0), jnp.where(followed, ahead, was), sides)
+        size = jnp.maximum(noise, _LEAST)
+        stays = jnp.where(goes == 0, before.t, before.t + 2.0 * noise / jnp.abs(rates))
+
+        own = mode.targets == before.mode
+        chosen = np.array([(transition.fires == "beyond", transition.fires is None) for transition in mode.leaving])
+        far = guarded.values * ways > noise
+        leaves = far & (chosen[:, 0] | (chosen[:, 1] & ~own))
+        blows = far & chosen[:, 1] & own & self._are_blows(group, mode, guarded, rates, before)
+        sides = jnp.where(leaves, np.copysign(np.inf, -ways), jnp.where(blows, -ways, sides) * size)
+        return Outset(sides, jax.lax.stop_gradient(stays), leaves | blows, blows)
+
+    def _are_blows(self, group: ModeGroup, mode: Mode, guarded: Guarded, rates, before: Ending) -> jax.Array:
+        """True for every guard, (K,), whose reset keeps it off its surface: turns it round, or puts it back.
+
+        A kick that leaves it to go on does not, nor does a section without a reset.
+        """
+        own = (group.targets == np.array(group.family.modes)[:, None]).any(0)
+        are_blows = jnp.zeros(len(mode.leaving), bool)
+        t, y, params = _constant_unless(False, (before.t, before.y, mode.params))
+        some = [k for k, x in enumerate(mode.leaving) if own[k] and x.reset and x.direction and x.fires is None]
+        if not some:
+            return are_blows
+        states = jnp.stack([state_after(mode.leaving[k], mode.layout, t, y, params) for k in some])
+        after = jax.vmap(mode.guards_at, (None, 0, None))(t, states, self.ts[-1])
+        each, ways = np.arange(len(some)), np.array([mode.leaving[k].direction for k in some])
+        after = jax.tree.map(lambda x: x[each, np.array(some)], after)
+        later = jnp.where(jnp.abs(after.rates) > after.rate_rounding, after.rates, 0.0) * ways
+        turned = jnp.where(rates[np.array(some)] * ways < 0, later >= 0, later <= 0)
+        moved = (guarded.values[np.array(some)] - after.values) * ways
+        return are_blows.at[np.array(some)].set(turned | (moved > after.rounding))
+
+    def _note_let_out(self, mode: Mode, before: Ending, are_let_out) -> jax.Array:
+        """The first times at which guards were let out, (K,), with those of this round."""
+        known = before.let_out[mode.numbers]
+        now = jnp.where(are_let_out & jnp.isnan(known), jax.lax.stop_gradient(before.t), known)
+        return before.let_out.at[mode.numbers].set(now)
 
 
 def _select(condition, new: PyTree, old: PyTree) -> PyTree:

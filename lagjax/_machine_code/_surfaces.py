@@ -8,6 +8,7 @@ from the implicit function: with g the guard and ġ its rate along the motion,
 and the same to second order (`crossing_variation`).
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -26,15 +27,16 @@ PyTree = Any
 
 
 class Guarded(NamedTuple):
-    """The guards at a state, all (G,): their `values`; their `rates` along the motion, 0 where rounding decides these.
+    """The guards at a state, all (G,): their `values`, and their `rates` along the motion.
 
-    And how far a value is moved by its own `rounding`, and by that of the time (`of_time`).
+    And how far a value is moved by its own `rounding`, and by that of the time (`of_time`), and a rate by its own.
     """
 
     values: jax.Array
     rates: jax.Array
     rounding: jax.Array
     of_time: jax.Array
+    rate_rounding: jax.Array
 
 
 class Surfaces(NamedTuple):
@@ -67,9 +69,11 @@ class Surfaces(NamedTuple):
         t, y, numbers, latest = still((t, y, numbers, latest))
         out = outputs(self.complete, 4 * count, jnp.append(y, t), numbers)
         values, rates, sizes, rate_sizes = out.reshape(4, count)
+        errors = outputs(_rate_errors(self.complete, count), count, jnp.append(y, t), numbers)
+        errors = jnp.where(jnp.isfinite(errors), errors, 0.0)  # a root at zero has no slope
         instant = INSTANT * SMALLEST_STEP * jnp.maximum(jnp.abs(t), jnp.abs(latest))
-        clear = jnp.where(jnp.abs(rates) > GUARD_NOISE * rate_sizes, rates, 0.0)
-        return Guarded(values, clear, GUARD_NOISE * sizes, jnp.abs(rates) * instant)
+        rate_rounding = GUARD_NOISE * (rate_sizes + errors)
+        return Guarded(values, rates, GUARD_NOISE * sizes, jnp.abs(rates) * instant, rate_rounding)
 
     @classmethod
     def from_functions(
@@ -95,6 +99,12 @@ class Surfaces(NamedTuple):
         y = jax.ShapeDtypeStruct((2 * n + 1,), derivation.layout.dtype)
         numbers = derivation.numbers
         return cls(lower(values, y, numbers), lower(complete, y, numbers), directions)
+
+
+@functools.lru_cache(maxsize=64)
+def _rate_errors(complete: Program, count: int) -> Program:
+    """The running errors of all ġ in units of round-off: what is left of terms that cancel is not seen in its size."""
+    return complete.rounding_of(range(count, 2 * count), complete.shapes[0].size)
 
 
 def vector_of(numbers: PyTree) -> jax.Array:

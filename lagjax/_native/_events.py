@@ -80,13 +80,14 @@ class Events:
     def fields(guards: int) -> dict:
         """The fields of a thread's memory.
 
-        For every guard its value, the side before the step and at its end, its `Touch` where a motion begins, how it
-        changes there, where it changes on the way and how; how often it has been noted, when it was last gone through,
-        and whether it was zero at the border where the step before ended. For all of them the step before it was cut,
-        how far they can be seen, as a part of it, the first change, and the event.
+        For every guard its value, the side before the step and at its end, how many of its first coefficients are zero
+        where a motion begins, how it changes there, where it changes on the way and how; how often it has been noted,
+        when it was last gone through, whether it was zero at the border where the step before ended, and its leading
+        term with what is rounding of it. For all of them the step before it was cut, how far they can be seen, as a
+        part of it, the first change, and the event.
         """
         each = ("guard", "side", "side_begin", "contact", "met", "root_at", "change", "noted", "noted_begin")
-        each = (*each, "passed_at", "waits", "waited")
+        each = (*each, "passed_at", "waits", "waited", "noise", "lead", "lead_order")
         return dict.fromkeys(each, guards) | dict.fromkeys(("planned", "seen", "is_cut", "first_at", "event"), 1)
 
     def begin(self, frame: Frame, lane: Lane) -> None:
@@ -119,7 +120,10 @@ class Events:
         On the surface, to rounding, that is the side from which the motion comes. Where it goes to the other side, and
         does so in the direction of the guard, that is a change at the start, into `met`. Otherwise, and where nobody
         knows from where it comes, it is the side that the motion goes to. Where it goes its rate says or, where that is
-        zero to rounding too, where it is a little later.
+        zero to rounding too, the first term of its series that is not.
+
+        A motion that remembers may begin beyond the surface, on the other side than it comes from. Where it goes on
+        that is a change at the start, too, and where the side is infinite it is one wherever the motion goes.
         """
         frame = self.motion.function("begin_sides", INTEGER)
         code, (order,), count = frame.code, frame.arguments, self.count
@@ -130,31 +134,69 @@ class Events:
             frame.call(self.guard, order, LITTLE * frame["h"])
             instant = INSTANT * frame["smallest"]
             out = self.motion.evaluate_now(frame, self.complete)
+            rate_noises = [self._rate_noise(frame, i, out[i + 3 * count]) for i in range(count)]
             for i in range(count):
-                before, (value, rate, size, rate_size) = (
-                    self._side_before(frame, i),
-                    (out[i + k * count] for k in range(4)),
-                )
+                of_rate = code.intrinsic("fabs", frame["h"]) * rate_noises[i]
+                frame["noise", i] = GUARD_NOISE * out[i + 2 * count] + of_rate
+            with code.loop(count) as g:
+                self._note_lead(frame, order, g)
+            for i in range(count):
+                before, (value, rate, size) = self._side_before(frame, i), (out[i + k * count] for k in range(3))
                 moved, later, noise = code.intrinsic("fabs", rate), frame["guard", i], GUARD_NOISE * size
+                from_there = code.intrinsic("fabs", before)
                 on_it = code.intrinsic("fabs", value) <= noise + moved * instant
                 if self.remembers:
-                    on_it = on_it | (code.intrinsic("fabs", value) <= code.intrinsic("fabs", before))
-                leaves = moved > GUARD_NOISE * rate_size
-                turn = later - value
-                bends = code.intrinsic("fabs", turn) > noise
+                    on_it = on_it | (code.intrinsic("fabs", value) <= from_there)
+                leaves, order_of_zero = moved > rate_noises[i], frame["lead_order", i]
+                sound = order_of_zero > 0.0
+                turn = code.select(sound, frame["lead", i], later - value)
+                bends = code.intrinsic("fabs", turn) > code.select(sound, 0.0, noise)
                 before = self._sign(frame, before)
                 unclear = code.select(code.compare("!=", before, 0.0), 0.0, later)
                 going = code.select(leaves, rate * frame["forward"], code.select(bends, turn, unclear))
-                met = fresh & on_it & (going * before < 0.0) & (before * float(self.directions[i]) <= 0.0)
+                there = on_it | (value * before < 0.0) if self.remembers else on_it
+                goes_on = (going * before < 0.0) | ~(from_there < float("inf"))
+                met = fresh & there & goes_on & (before * float(self.directions[i]) <= 0.0)
                 kind = code.select(before > 0.0, Change.FALLS, Change.RISES)
                 frame["met", i] = code.select(met, kind, 0.0)
                 stays = met | code.compare("==", going, 0.0)
                 side = code.select(on_it, code.select(stays, before, going), value)
                 with frame.where(fresh):
                     frame["side", i] = self._sign(frame, side)
-                contact = code.select(on_it, code.select(leaves, Touch.VALUE, Touch.RATE), Touch.NONE)
-                frame["contact", i] = code.select(fresh, contact, Touch.NONE)
+                zeros = code.select(leaves, Touch.VALUE, code.select(sound, order_of_zero, Touch.RATE))
+                frame["contact", i] = code.select(fresh & on_it, zeros, Touch.NONE)
         return frame.finish()
+
+    def _note_lead(self, frame: Frame, order: Value, g: Value) -> None:
+        """The first term of guard g behind its rate that is more than its `noise`, and its order, for a whole step.
+
+        The order is one more than the last one where all terms are rounding, and 0 where there is no series.
+        """
+        code, degree, j = frame.code, self.motion.followed_degree(frame.code, order), g + self.first
+
+        def power_after(k: Value) -> Value:
+            return self.motion.followed_coefficient(frame, j, k) * power.value
+
+        power, size = code.variable(frame["h"]), code.variable(frame.constant(0.0))
+        with code.loop(degree + 1, start=1) as k:
+            size.value += code.intrinsic("fabs", power_after(k))
+            power.value = power.value * frame["h"]
+        noise, power = frame["noise", g] + GUARD_NOISE * size.value, code.variable(frame["h"])
+        last = code.select(noise < float("inf"), code.lanes_of(code.as_number(degree + 1)), 0.0)
+        frame["lead", g], frame["lead_order", g] = 0.0, last
+        with code.loop(degree + 1, start=2) as k:
+            power.value = power.value * frame["h"]
+            term = power_after(k)
+            is_first = code.compare("==", frame["lead", g], 0.0) & (code.intrinsic("fabs", term) > noise)
+            with frame.where(is_first):
+                frame["lead", g] = term
+                frame["lead_order", g] = code.lanes_of(code.as_number(k))
+
+    def _rate_noise(self, frame: Frame, i: int, size: Value) -> Value:
+        """How far rounding moves the rate of surface i whose terms have this size; or what is remembered of that."""
+        if self.remembers:
+            return frame["params", self.motion.parameters - self.count + i]
+        return GUARD_NOISE * size
 
     def _side_before(self, frame: Frame, i: int) -> Value:
         """The side of surface i from which a motion comes that begins on it, as a sign; 0 where that is unknown.
@@ -163,7 +205,7 @@ class Events:
         remembered is as large as rounding may have made the guard, before it came near zero.
         """
         if self.remembers:
-            return frame["params", self.motion.parameters - self.count + i]
+            return frame["params", self.motion.parameters - 2 * self.count + i]
         return frame.constant(0.0 if self.notes else -float(self.directions[i]))
 
     def _sign(self, frame: Frame, x: Value) -> Value:
@@ -260,7 +302,7 @@ class Events:
     def _look_closely(self, frame: Frame, order: Value, g: Value, degree: Value, side: Value) -> None:
         code, roots, h = frame.code, self.roots, frame["h"]
         size, value = roots.size(frame, degree), frame["poly", 0]
-        self._leave_surface(frame, g, size)
+        self._leave_surface(frame, g, degree, size)
         moving = code.compare("!=", h, 0.0) & (frame["met", g] <= 0.0)
         unknown = moving & ~(code.intrinsic("fabs", value) < float("inf"))
         with frame.where(unknown):
@@ -293,7 +335,7 @@ class Events:
         """The lanes whose last terms are large, or do not fall: the polynomial may leave out as much as they are."""
         return (last > GUARD_TERMS * size) | ((last > FALL * before) & (last > SEEN * size))
 
-    def _leave_surface(self, frame: Frame, g: Value, size: Value) -> None:
+    def _leave_surface(self, frame: Frame, g: Value, degree: Value, size: Value) -> None:
         """A motion that begins on the surface, or has just gone through it, is not to do so by rounding."""
         code, contact = frame.code, frame["contact", g]
         since = code.intrinsic("fabs", frame["t"] - frame["passed_at", g])
@@ -301,8 +343,9 @@ class Events:
         on = (contact > Touch.NONE) | (known & (code.intrinsic("fabs", frame["poly", 0]) <= CONTINUOUS * size))
         with frame.where(on):
             frame["poly", 0] = 0.0
-        rate = frame["poly", 1]
-        frame["poly", 1] = code.select((contact >= Touch.RATE) & (rate < 0.0), 0.0, rate)
+        with code.only_if(code.any_lane(contact > Touch.VALUE)), code.loop(degree + 1, start=1) as k:
+            c, is_zero = frame["poly", k], contact > code.lanes_of(code.as_number(k))
+            frame["poly", k] = code.select(is_zero & (c < 0.0), 0.0, c)
 
     def _follow_roots(self, frame: Frame, order: Value, g: Value, degree: Value, ahead: Variable, where: Value) -> None:
         """The roots of the polynomial, one after the other, as long as none ends the motion."""

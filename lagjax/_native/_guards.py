@@ -15,8 +15,10 @@ class Guards(NamedTuple):
 
     That ends the motion or, with `notes`, is written down. `values` gives all g. With y the state and the time, the
     outputs of `program` are all g; their rates ġ = Σ ∂g/∂yᵢ ẏᵢ; then Σ |∂g/∂yᵢ yᵢ| and Σ |∂g/∂yᵢ ẏᵢ|, of which
-    round-off is a part. A motion that `remembers` has a number more for each guard, behind its parameters: how far
-    rounding may have moved it, with the sign of the side from which the motion comes, 0 where that is unknown.
+    round-off is a part. A motion that `remembers` has two numbers more for each guard, behind its parameters: how far
+    rounding may have moved them, with the sign of the side from which the motion comes, 0 where that is unknown, and
+    infinite where a motion that is beyond the surface has changed its side wherever it goes; then how far rounding may
+    have moved their rates.
     """
 
     values: Recurrent
@@ -27,8 +29,8 @@ class Guards(NamedTuple):
 
     @property
     def inputs(self) -> int:
-        """The number of sides among the numbers of a member."""
-        return len(self.directions) if self.remembers else 0
+        """How many numbers of a member are remembered."""
+        return 2 * len(self.directions) if self.remembers else 0
 
 
 class Watched(NamedTuple):

@@ -50,6 +50,7 @@ from lagjax._program._matrices import orthogonalize, row_weights, solve_orthogon
 from lagjax._program._memory import machine_memory, operations_that_fit, pause_collections
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, live, sink_negations
+from lagjax._program._rounding import rounding
 from lagjax._program._rules import LARGEST_UNFOLDED, Expansion, expand_primitive, has_own_rules, inputs_of
 from lagjax._program._scalars import Scalars, apply_function, concatenate, scatter, stack
 from lagjax._program._series import LinearSystem, Series, StraightLine, series
@@ -347,6 +348,16 @@ class Program:
         origin = self.origin and self.origin._replace(outputs=tuple(self.origin.outputs[i] for i in positions))
         line = {"nodes": nodes, "kinds": kinds, "outputs": outputs}
         return replace(self, **line, function=function, otherwise=None, linear=None, origin=origin)
+
+    def rounding_of(self, positions: Sequence[int], moving: int) -> "Program":
+        """The program of the running errors of some outputs (see `_rounding`); it has no derivatives."""
+        line = StraightLine(*live(self.nodes, self.kinds, [self.outputs[i] for i in positions]))
+        graph = Graph.from_line(line, 20 * self.budget)
+        with np.errstate(all="ignore"):
+            errors = rounding(graph, line, range(len(line.nodes)), moving)
+        nodes, kinds, outputs = eliminate_dead_code(graph, errors)
+        line = {"nodes": nodes, "kinds": kinds, "outputs": outputs}
+        return replace(self, **line, otherwise=None, linear=None, origin=None)
 
     @functools.cached_property
     def operations(self) -> int:
