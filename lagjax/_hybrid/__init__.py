@@ -19,11 +19,11 @@ import numpy as np
 from lagjax._consistent import require_consistent
 from lagjax._doubles import DOUBLE, compute_in_doubles
 from lagjax._hybrid._mode import Transition
-from lagjax._hybrid._rounds import Ending, RoundPlan, TransitionRecord, hybrid_motion
+from lagjax._hybrid._rounds import IN_ONE_PLACE, Ending, RoundPlan, TransitionRecord, hybrid_motion
 from lagjax._layout import Layout, halves
 from lagjax._machine_code import MachineCode
 from lagjax._problem import Problem
-from lagjax._results import SimulationError, result_from
+from lagjax._results import RESULTS, SimulationError, result_from
 from lagjax._simulate import raise_unless_ok, simulate
 from lagjax._system import System, present_system, require_system
 from lagjax._trajectory import State, Trajectory, Transitions
@@ -160,7 +160,7 @@ def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, reco
     (q, qdot), (q_end, qdot_end), (q_before, qdot_before) = map(halves, (ending.path, ending.y, record.y))
     transitions = Transitions(
         t=record.t, q=restore(q_before), qdot=restore(qdot_before), source=record.source, target=record.target,
-        count=jnp.sum(record.source >= 0),
+        count=jnp.sum(record.source >= 0), order_matters=record.order_matters, let_out=ending.let_out,
     )  # fmt: skip
     return Trajectory(
         ts=jnp.asarray(problem.ts),
@@ -191,7 +191,19 @@ def _raise_unless_ok(modes: dict[str, System], trajectory: Trajectory, layout: L
     try:
         return raise_unless_ok(dataclasses.replace(trajectory, system=system), layout)
     except SimulationError as error:
-        raise SimulationError(f"{error}\nIt was in the mode {name!r}.", trajectory) from None
+        text = f"{error}\nIt was in the mode {name!r}.{_last_transitions(trajectory)}"
+        raise SimulationError(text, trajectory) from None
+
+
+def _last_transitions(trajectory: Trajectory) -> str:
+    """A sentence that names the transitions that go on for ever, where they do."""
+    changes, names = trajectory.transitions, trajectory.mode_names
+    assert changes is not None
+    if trajectory.result not in (RESULTS.zeno, RESULTS.transitions_in_turn) or not int(changes.count):
+        return ""
+    last = [np.asarray(x)[int(changes.count) - 1 :: -1][:IN_ONE_PLACE] for x in (changes.source, changes.target)]
+    pairs = dict.fromkeys(f"{names[i]!r} → {names[j]!r}" for i, j in zip(*last, strict=True))
+    return f" The last transitions were {' and '.join(pairs)}."
 
 
 def _present(modes: dict[str, System], transitions) -> tuple[dict[str, System], list[Transition]]:

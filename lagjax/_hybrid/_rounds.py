@@ -25,14 +25,23 @@ from lagjax._system import System
 
 PyTree = Any
 
-TOO_MANY, INCONSISTENT, ZENO, NOT_FINITE = map(
+TOO_MANY, INCONSISTENT, ZENO, IN_TURN, NOT_FINITE = map(
     code_of,
-    (RESULTS.max_transitions_reached, RESULTS.inconsistent_start, RESULTS.zeno, RESULTS.nonfinite_state),
-)
+    (RESULTS.max_transitions_reached, RESULTS.inconsistent_start, RESULTS.zeno, RESULTS.transitions_in_turn,
+     RESULTS.nonfinite_state),
+)  # fmt: skip
 # How far the logarithms of two ratios of a geometric sequence may differ, as a part of them. Times of a Zeno motion
 # approach a geometric sequence; twice this would take a slowly changing rhythm for one.
 STEADY = 0.05
 _LEAST = 1e-300  # a side of a guard that is exactly zero still has a sign
+# Transitions at one instant that are said to go back and forth: a chain of as many is longer than any that passes on a
+# blow among a few balls. And how long before it the last other one was, in parts of the time: bounces that pile up come
+# as near to their end as rounding lets them.
+IN_ONE_PLACE, APART = 8, 1e-9
+# Blows at one instant that are followed in both orders of the list, and by how much of its largest value a number of the
+# state may differ behind them: far more than rounding of some thirty blows. Twice as many blows settle more of those of
+# restitution below one, whose last ones are small.
+MOST_BLOWS, SAME = 32, 1e-9
 
 
 class RoundPlan(eqx.Module):
@@ -138,12 +147,16 @@ class Outset(NamedTuple):
 
 
 class TransitionRecord(NamedTuple):
-    """One transition: its time, the state before the reset, and the modes on both sides; NaN and −1 without any."""
+    """One transition: its time, the state before the reset, and the modes on both sides; NaN and −1 without any.
+
+    And whether another order of the list leads to another state, where blows meet.
+    """
 
     t: jax.Array
     y: jax.Array
     source: jax.Array
     target: jax.Array
+    order_matters: jax.Array
 
 
 class Exit(NamedTuple):
@@ -157,6 +170,7 @@ class Exit(NamedTuple):
     piled_up: jax.Array  # whether time does not move any more
     inconsistent: jax.Array  # whether the state after the reset is off the constraints of its mode
     guards_defined: jax.Array
+    order_matters: jax.Array
 
 
 @eqx.filter_jit
@@ -175,8 +189,8 @@ def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree) -> tu
     first = jax.tree.unflatten(structure, vary_alike(leaves, like=(ts, y0, rounds.groups[0].first.vector)))
     ending, record = jax.lax.scan(rounds.run_round, first, jnp.arange(plan.max_transitions + 1))
     record = jax.tree.map(lambda x: x[: plan.max_transitions], record)
-    piled_up = (ending.result == TOO_MANY) & _pile_up(record.t, ts[-1])
-    ending = ending._replace(result=jnp.where(piled_up, ZENO, ending.result))
+    named = jnp.where(_go_in_turn(record), IN_TURN, jnp.where(_pile_up(record.t, ts[-1]), ZENO, TOO_MANY))
+    ending = ending._replace(result=jnp.where(ending.result == TOO_MANY, named, ending.result))
     return _lose_unreached(ending, record, (ts, y0, rounds.groups[0].first.vector))
 
 
@@ -197,7 +211,7 @@ class _Rounds(NamedTuple):
         """One round: every group runs the members that are in its modes; the others are given no time."""
         after, fired = before, jnp.asarray(False)
         record = TransitionRecord(
-            jnp.asarray(jnp.nan), jnp.full_like(before.y, jnp.nan), jnp.asarray(-1), jnp.asarray(-1)
+            jnp.asarray(jnp.nan), jnp.full_like(before.y, jnp.nan), jnp.asarray(-1), jnp.asarray(-1), fired
         )
         place, row = jnp.asarray(self.places)[before.mode]
         modes = [group.mode(jnp.where(place == index, row, 0)) for index, group in enumerate(self.groups)]
@@ -263,7 +277,7 @@ class _Rounds(NamedTuple):
             memory=memory,
             let_out=self._note_let_out(mode, before, here & outset.blows & ~((kinds > 0) & at_once)),
         )
-        return after, event, TransitionRecord(exit.t, exit.y, before.mode, exit.target)
+        return after, event, TransitionRecord(exit.t, exit.y, before.mode, exit.target, exit.order_matters)
 
     def _pass_transition(
         self, group: ModeGroup, mode: Mode, place, kinds, at_once, put, t, y, known
@@ -273,7 +287,7 @@ class _Rounds(NamedTuple):
         One whose guard the motion was `put` beyond of is no crossing: it happens at t, whatever varies.
         """
         no, none = jnp.asarray(False), jnp.asarray(-1)
-        exit = Exit(t, y, y, place, none, no, no, jnp.asarray(True))
+        exit = Exit(t, y, y, place, none, no, no, jnp.asarray(True), no)
         if not mode.leaving:
             return exit, self.no_memory(known[0].rounding, known[0].rate_rounding)
         y_here, numbers = _constant_unless((kinds > 0).any(), (y, mode.vector))
@@ -289,10 +303,56 @@ class _Rounds(NamedTuple):
             y_next = state_after(transition, mode.layout, *_constant_unless(taken, (t_zero, y_zero, mode.params)))
             target, number = jnp.asarray(mode.targets[k]), jnp.asarray(mode.numbers[k])
             inconsistent = self.is_inconsistent(target, t_zero, y_next, group.targets[:, k].tolist())
-            this = Exit(t_zero, y_zero, y_next, target, number, against, inconsistent, no)
+            this = Exit(t_zero, y_zero, y_next, target, number, against, inconsistent, no, no)
             exit = _select(taken, this, exit)
-        exit = exit._replace(guards_defined=~jnp.isnan(guarded.values).any())
-        return exit, self._memory(mode, guarded, rates, kinds, *known)
+        memory = self._memory(mode, guarded, rates, kinds, *known)
+        there = (kinds > 0) | (jnp.abs(guarded.values) <= memory.rounding[mode.numbers] + guarded.of_time)
+        order_matters = self._order_matters(group, mode, place, t, y, rates, there & (kinds > 0).any())
+        defined = ~jnp.isnan(guarded.values).any()
+        return exit._replace(guards_defined=defined, order_matters=order_matters), memory
+
+    def _order_matters(self, group: ModeGroup, mode: Mode, place, t, y, rates, there) -> jax.Array:
+        """Whether blows of guards that are `there`, (K,), lead elsewhere if the list is read from its end.
+
+        Blows lead back into their own mode. They are followed in both orders, each as long as its guard goes on in its
+        direction, once before it has been turned.
+        """
+        own = (group.targets == np.array(group.family.modes)[:, None]).any(0)
+        some = [k for k, x in enumerate(mode.leaving) if own[k] and x.reset and x.direction]
+        if len(some) < 2:
+            return jnp.asarray(False)
+        t, y, params = _constant_unless(False, (t, y, mode.params))
+        ways = np.array([mode.leaving[k].direction for k in some])
+        there = (there & (mode.targets == place))[np.array(some)]
+        resets = [lambda y, k=k: state_after(mode.leaving[k], mode.layout, t, y, params) for k in some]
+        orders = jnp.stack([jnp.arange(len(some), 0, -1), jnp.arange(1, len(some) + 1)])
+
+        def going(y):
+            guarded = mode.guards_at(t, y, self.ts[-1])
+            clear = jnp.where(jnp.abs(guarded.rates) > guarded.rate_rounding, guarded.rates, 0.0)
+            return there & (clear[np.array(some)] * ways > 0)
+
+        def blow(y, hits, order):
+            k = jnp.argmax(jnp.where(hits, order, 0))
+            return jnp.where(hits.any(), jnp.stack([reset(y) for reset in resets])[k], y), k
+
+        def follow(carry):
+            states, armed, goes, largest, count = carry
+            hits = armed & goes
+            states, k = jax.vmap(blow)(states, hits, orders)
+            goes = jax.vmap(going)(states)
+            armed = (armed & ~(hits & (jnp.arange(len(some)) == k[:, None]))) | ~goes
+            return states, armed, goes, jnp.maximum(largest, jnp.abs(states).max(0)), count + 1
+
+        def is_moving(carry):
+            _, armed, goes, _, count = carry
+            return (armed & goes).any() & (count < MOST_BLOWS) & (jnp.sum(there) > 1)
+
+        goes = there & (rates[np.array(some)] * ways > 0)
+        states, goes = jnp.stack([y, y]), jnp.stack([goes, goes])
+        first = states, jnp.ones_like(goes), goes, jnp.abs(y), jnp.asarray(0)
+        (one, other), _, _, largest, _ = jax.lax.while_loop(is_moving, follow, first)
+        return (jnp.abs(one - other) > SAME * largest).any()
 
     # ---- on which side of its surface every guard is ----
 
@@ -340,7 +400,7 @@ class _Rounds(NamedTuple):
         """The guards of a mode where a motion begins in it.
 
         A guard is on the side where it was, if the reset has not moved it. One that has been followed is on the side
-        where it goes; without a reset it has been crossed, and so has a jump. Of others on their surface it is known
+        where it goes, or else where it was; without a reset it has been crossed, and so has a jump. Of others on their surface it is known
         that they can change in their direction, if in one. See `Transition` for those that are beyond it.
         """
         memory = before.memory
@@ -351,7 +411,7 @@ class _Rounds(NamedTuple):
         rates, noise = memory.clear_rates(guarded, mode.numbers), rounding + guarded.of_time
         goes, ways = jnp.sign(rates), np.array([float(transition.direction) for transition in mode.leaving])
         crossed = np.array([transition.reset is None for transition in mode.leaving]) | mode.surfaces.have_no_rate
-        ahead = jnp.where(goes != 0, goes, jnp.where(crossed, -was, -ways))
+        ahead = jnp.where(goes != 0, goes, jnp.where(crossed, -was, was))
         sides = jnp.where(jnp.abs(guarded.values) > noise, jnp.sign(guarded.values), -ways)
         sides = jnp.where(unmoved & (was != 0), jnp.where(followed, ahead, was), sides)
         size = jnp.maximum(noise, _LEAST)
@@ -421,6 +481,17 @@ def _pile_up(times, end) -> jax.Array:
     rounding = 4 * float(jnp.finfo(times.dtype).eps) * jnp.abs(times[-1])
     lost = (third <= rounding) & (apart > 1)  # one alone may be two transitions at the same instant
     return lost | ((ratio < 1) & steady & (times[-1] + third * ratio / (1 - ratio) < end))
+
+
+def _go_in_turn(record: TransitionRecord) -> jax.Array:
+    """True if the last transitions of a spent budget, of several kinds, are at one instant to which none pile up."""
+    if record.t.size < IN_ONE_PLACE:
+        return jnp.asarray(False)
+    last, kinds = record.t[-1], record.source * record.t.size + record.target
+    same = jnp.abs(record.t - last) <= 4 * float(jnp.finfo(record.t.dtype).eps) * jnp.abs(last)
+    before = jnp.max(jnp.where(same, -jnp.inf, record.t))
+    both = (kinds[-IN_ONE_PLACE:] != kinds[-1]).any()
+    return same[-IN_ONE_PLACE:].all() & both & (last - before > APART * jnp.abs(last))
 
 
 def _lose_unreached(ending: Ending, record: TransitionRecord, inputs) -> tuple[Ending, TransitionRecord]:

@@ -439,9 +439,8 @@ def test_a_surface_crossed_twice_within_a_step(direction):
     # Two crossings 2e-3, 2e-6 apart in a step of 0.06: between them the guard has the other sign.
     band = lambda q, v, params: (q - params["middle"]) ** 2 - params["half"] ** 2
     half, middle = jnp.array([1e-3, 1e-6, 1e-3, 1e-6]), jnp.array([0.47, 0.47, 0.499, 1e-4])
-    run = lambda half, middle: hybrid(
-        {"a": FREE, "b": FREE}, [lagjax.Transition("a", "b", band, direction)], params={"half": half, "middle": middle}
-    )
+    leave = lagjax.Transition("a", "b", band, direction, fires="crossing")  # +1 is where it starts
+    run = lambda half, middle: hybrid({"a": FREE, "b": FREE}, [leave], params={"half": half, "middle": middle})
     found = jax.jit(jax.vmap(run))(half, middle).transitions
     np.testing.assert_allclose(found.t[:, 0], middle + (half if direction > 0 else -half), rtol=1e-12)
     assert (found.count == 1).all()
