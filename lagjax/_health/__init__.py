@@ -62,6 +62,7 @@ def examine(trajectory, reference=None) -> "Health":
         global_error=None if reference is None else global_error(trajectory, reference),
         borders=counts,
         borders_located=located,
+        guards=_guards(trajectory.transitions),
         outputs=trajectory.ts.shape[-1],
         diagnosis=_diagnosis(trajectory),
         works=names.works,
@@ -69,6 +70,11 @@ def examine(trajectory, reference=None) -> "Health":
         constraint_names=names.constraints,
         **fields,
     )
+
+
+def _guards(transitions) -> tuple[Array, Array] | None:
+    """Whether the order of the list of transitions mattered, and whether a guard was let out, of each member."""
+    return transitions and (transitions.order_matters.any(-1), jnp.isfinite(transitions.let_out).any(-1))
 
 
 def _diagnosis(trajectory) -> str:
@@ -142,6 +148,8 @@ class Health(eqx.Module):
       tolerance decides whether the border is crossed: derivatives that do not exist are NaN. None where that is not
       known: in a hybrid motion, under `jax.jit`, and where `borders_located` is False, because a solver of diffrax has
       stepped across the borders.
+    - `guards`: in a hybrid motion, whether blows met at one instant that do not commute, and whether a guard was let out
+      that was beyond zero where a mode began (`Transitions`); else None.
     - `global_error`: with a reference, the largest |yᵢ − reference| over the components of q and q̇, in units of the
       largest |yᵢ| along the path (and atol/rtol more, as in the tolerances); else None.
     """
@@ -170,6 +178,7 @@ class Health(eqx.Module):
     gradients_time: Float[Array, "*batch"]
     global_error: Extreme | None
     borders: Met[Array] | None
+    guards: tuple[Bool[Array, "*batch"], Bool[Array, "*batch"]] | None
     borders_located: bool = eqx.field(static=True)
     outputs: int = eqx.field(static=True)
     diagnosis: str = eqx.field(static=True)
@@ -216,6 +225,8 @@ class Health(eqx.Module):
                     flags["energy"] &= (of.borders.crossed == 0) & (of.borders.slid == 0)
             elif not of.borders_located:
                 flags["borders"] = of.accepted_steps >= 0
+            if of.guards is not None:
+                flags["order"], flags["let_out"] = of.guards
             if of.global_error is not None:
                 flags["global_error"] = _exceeds(xp, of.global_error, VISIBLE)
         return flags, xp
@@ -395,6 +406,14 @@ _SENTENCES = {
         "Borders: this engine does not locate them, its steps go across what is pieced together in the scene{0}. A "
         "narrow piece may be missed, and there are no derivatives across a jump: `System.explain` says why the motion "
         "is not in machine code, where steps end at borders."
+    ),
+    "order": (
+        "Transitions: blows meet at one instant, and another order of the list leads to another motion{0}. "
+        "`trajectory.transitions.order_matters` says where. Say what happens to both at once in one transition."
+    ),
+    "let_out": (
+        "Transitions: a guard was beyond zero where a mode began, and came back instead of a blow{0}. "
+        "`trajectory.transitions.let_out` says which, and when. Begin on the other side of it."
     ),
     "global_error": (
         "Global error: the motion parts from its reference by a hundredth of its size or more{0}. If its steps are "

@@ -257,7 +257,7 @@ class _Rounds(NamedTuple):
         kinds = jnp.stack([(changes >> (2 * k)) & 3 for k in range(len(mode.leaving))]) if mode.leaving else jnp.zeros(0, int)
         put = outset.beyond & at_once
         known = before.memory, outset.sides, t_end <= outset.lasting
-        exit, memory = self._pass_transition(group, mode, before.mode, kinds, at_once, put, t_end, y_end, known)
+        exit, memory = self._pass_transition(group, mode, before, kinds, at_once, put, t_end, y_end, known)
         event = (changes > 0) & ~exit.piled_up
         result = jnp.where(exit.piled_up, ZENO, jnp.where(here & ~event, located.result, before.result))
         # A reset may give NaN, and a guard that is NaN never fires.
@@ -280,13 +280,13 @@ class _Rounds(NamedTuple):
         return after, event, TransitionRecord(exit.t, exit.y, before.mode, exit.target, exit.order_matters)
 
     def _pass_transition(
-        self, group: ModeGroup, mode: Mode, place, kinds, at_once, put, t, y, known
+        self, group: ModeGroup, mode: Mode, before: Ending, kinds, at_once, put, t, y, known
     ) -> tuple[Exit, GuardMemory]:
         """The state behind the first transition of those whose guard falls (1) or rises (2), as `kinds` (K,) say.
 
-        One whose guard the motion was `put` beyond of is no crossing: it happens at t, whatever varies.
+        One that the motion was `put` beyond is no crossing: it happens when the mode begins, however that varies.
         """
-        no, none = jnp.asarray(False), jnp.asarray(-1)
+        no, none, place = jnp.asarray(False), jnp.asarray(-1), before.mode
         exit = Exit(t, y, y, place, none, no, no, jnp.asarray(True), no)
         if not mode.leaving:
             return exit, self.no_memory(known[0].rounding, known[0].rate_rounding)
@@ -299,7 +299,8 @@ class _Rounds(NamedTuple):
             earlier = earlier | taken
             # It changes sign at once, against its rate: the motion that turns it round is lost in rounding.
             against = jnp.where(kinds[k] == 2, rates[k] < 0, rates[k] > 0) & at_once & ~put[k]
-            t_zero, y_zero = mode.crossing(k)(taken & ~put[k], t, y_here, numbers)
+            crossed = mode.crossing(k)(taken & ~put[k], t, y_here, numbers)
+            t_zero, y_zero = _select(taken & put[k], (before.t, before.y), crossed)
             y_next = state_after(transition, mode.layout, *_constant_unless(taken, (t_zero, y_zero, mode.params)))
             target, number = jnp.asarray(mode.targets[k]), jnp.asarray(mode.numbers[k])
             inconsistent = self.is_inconsistent(target, t_zero, y_next, group.targets[:, k].tolist())
