@@ -4,22 +4,22 @@
     python -m benchmarks.guard_population --scenes 300 --single
 
 Balls that rest on shaken tables, blocks that stick and slip (by a constraint with a multiplier, statically as much held
-as kinetically or more), blocks under inputs that are held from call to call, freewheels, particles that begin beyond the
-wall of a box, jumps that carry a particle beyond another guard, and balls on a sphere that are too fast for it. All
+as kinetically or more), blocks under inputs that are held from call to call, freewheels, particles that begin beyond
+the wall of a box, jumps that carry a particle beyond another guard, and balls on a sphere that are too fast for it. All
 motions between events are in closed form, so that the reference goes from event to event in 40 digits; a guard that is
-zero there to 20 of them is decided by where it is a little later. Scenes in which a guard comes nearer to zero than
-a millionth without going through are drawn again.
+zero there to 20 of them is decided by where it is a little later. Scenes in which a guard comes nearer to zero than a
+millionth without going through are drawn again.
 
-A motion is *right* whose end and whose count of transitions are those of the reference, *named* where it ends in an error
-that says so, and else *wrong*. With `--single` the state and the parameters come in float32, without the x64 switch; the
-reference begins with the numbers as rounded.
+A motion is *right* whose end and whose count of transitions are those of the reference, *named* where it ends in an
+error that says so, and else *wrong*. With `--single` the state and the parameters come in float32, without the x64
+switch; the reference begins with the numbers as rounded.
 """
 
 import argparse
 import collections
 import functools
 import sys
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -43,7 +43,7 @@ class Ambiguous(Exception):
 
 
 class Edge(NamedTuple):
-    """A transition of the reference: the guard of (t, q, v) in a library of functions, its direction, and what follows."""
+    """A transition of the reference: its guard, a function of (xp, t, q, v), its direction, and what follows."""
 
     guard: Callable
     direction: int
@@ -78,7 +78,7 @@ class Scene(NamedTuple):
 # ---- the reference ---------------------------------------------------------------------------------------------------
 
 
-def followed(motions: dict, edges: dict[str, Sequence[Edge]], mode: str, t, end, q, v) -> Motion:
+def followed(motions: dict, edges: Mapping[str, Sequence[Edge]], mode: str, t, end, q, v) -> Motion:
     """The motion in closed form: `motions[mode](xp, t0, q, v)` gives t ↦ (q, v), `edges[mode]` what leaves the mode."""
     with mpmath.workdps(40):
         t, end, count = mpmath.mpf(t), mpmath.mpf(end), 0
@@ -86,7 +86,9 @@ def followed(motions: dict, edges: dict[str, Sequence[Edge]], mode: str, t, end,
         while count <= MOST:
             path = motions[mode](mpmath, t, q, v)
             values = [_value(edge, mpmath, path, t) for edge in edges[mode]]
-            hit = next((k for k, edge in enumerate(edges[mode]) if _fires_at_once(edge, mode, path, t, values[k])), None)
+            hit = next(
+                (k for k, edge in enumerate(edges[mode]) if _fires_at_once(edge, mode, path, t, values[k])), None
+            )
             if hit is None:
                 hit, at = _first_crossing(edges[mode], motions[mode], path, (t, q, v), end)
                 if hit is None:
@@ -121,7 +123,7 @@ def _first_crossing(edges: Sequence[Edge], motion: Callable, path, start, end):
         values = np.broadcast_to(edge.direction * edge.guard(np, times, *floats(times)), times.shape)
         scale = np.abs(values).max()
         rises = np.flatnonzero((values[:-1] < 0) & (values[1:] >= 0))
-        rises = rises[(rises > 0) | (values[0] < -1e-12)]  # where it begins at zero, rounding has decided the first value
+        rises = rises[(rises > 0) | (values[0] < -1e-12)]  # at zero rounding has decided the first value
         tops = (values[1:-1] <= 0) & (values[1:-1] > values[:-2]) & (values[1:-1] > values[2:])
         last = rises[0] if rises.size else POINTS
         if (np.abs(values[1:-1][tops]) < NEAR * scale)[: last - 1].any():
@@ -200,20 +202,29 @@ def table(rng) -> Scene:
 
     edges = {
         "rest": [Edge(lambda xp, t, q, v: G + height(xp, t, 2), -1, "flight")],
-        "flight": [Edge(lambda xp, t, q, v: q[0] - height(xp, t), -1, "rest", lambda t, q, v: (q, [height(mpmath, t, 1)]))],
+        "flight": [
+            Edge(lambda xp, t, q, v: q[0] - height(xp, t), -1, "rest", lambda t, q, v: (q, [height(mpmath, t, 1)]))
+        ],
     }
     start, duration = str(rng.choice(["rest", "flight"])), uniform(rng, 2, 5)
     q, v = height(np, 0.0), height(np, 0.0, 1)
     if start == "flight":
         q, v = rounded(q + uniform(rng, 0.05, 2)), uniform(rng, -3, 3)
-    return Scene("table", start, q, v, duration, p, followed({"rest": rest, "flight": flight}, edges, start, 0, duration, q, v))
+    return Scene(
+        "table", start, q, v, duration, p, followed({"rest": rest, "flight": flight}, edges, start, 0, duration, q, v)
+    )
 
 
 def block_motions(p) -> tuple[dict, dict]:
     """Block of mass 1 under a load, held up to `static`, slowed by `kinetic`."""
     rest = driven(lambda xp, q, v: [(0, p["w"], p["phase"], 0, 1)])
-    slip = {s: driven(lambda xp, q, v, s=s: [(p["a"], p["w"], p["phase"], p["b"] - s * p["kinetic"], 1)]) for s in (1, -1)}
-    stop = lambda t, q, v: (q, [mpmath.mpf(0)])
+    slip = {
+        s: driven(lambda xp, q, v, s=s: [(p["a"], p["w"], p["phase"], p["b"] - s * p["kinetic"], 1)]) for s in (1, -1)
+    }
+
+    def stop(t, q, v):
+        return (q, [mpmath.mpf(0)])
+
     edges = {
         "stick": [
             Edge(lambda xp, t, q, v: pull(p, xp, t) - p["static"], 1, "up"),
@@ -235,9 +246,13 @@ def block(rng) -> Scene:
 
 
 def loop(rng) -> Scene:
-    """The same under inputs that are held for a while each: a motion for each of them, from where the last one ended."""
+    """The same under inputs that are held for a while: a motion for each, from where the last one ended."""
     p = {"static": uniform(rng, 0.5, 1.5), "w": 1.0, "phase": 0.0, "a": 0.0}
-    p["kinetic"], duration, u = rounded(0.8 * p["static"]), uniform(rng, 0.1, 0.6), np.float32(rng.normal(0, 1.2, STEPS))
+    p["kinetic"], duration, u = (
+        rounded(0.8 * p["static"]),
+        uniform(rng, 0.1, 0.6),
+        np.float32(rng.normal(0, 1.2, STEPS)),
+    )
     right = Motion([0.0], [0.0], "stick", 0)
     for x in u:
         begun = followed(*block_motions(p | {"b": float(x)}), right.mode, 0, duration, right.q, right.v)
@@ -254,14 +269,19 @@ def wheel(rng) -> Scene:
         "lock": driven(lambda xp, q, v: [(*load_of, p["m"] + p["M"])] * 2),
         "free": driven(lambda xp, q, v: [(*load_of, p["m"]), (0, p["w"], p["phase"], 0, p["M"])]),
     }
-    join = lambda t, q, v: (q, [v[0] * (1 - share) + v[1] * share] * 2)
+
+    def join(t, q, v):
+        return (q, [v[0] * (1 - share) + v[1] * share] * 2)
+
     edges = {
         "lock": [Edge(lambda xp, t, q, v: pull(p, xp, t) * share, -1, "free")],
         "free": [Edge(lambda xp, t, q, v: v[0] - v[1], 1, "lock", join)],
     }
     start, duration, v = str(rng.choice(["lock", "free"])), uniform(rng, 2, 8), uniform(rng, -1, 1)
     v = np.array([v, v if start == "lock" or rng.random() < 0.3 else uniform(rng, -1, 1)])
-    return Scene("wheel", start, np.zeros(2), v, duration, p, followed(modes, edges, start, 0, duration, np.zeros(2), v))
+    return Scene(
+        "wheel", start, np.zeros(2), v, duration, p, followed(modes, edges, start, 0, duration, np.zeros(2), v)
+    )
 
 
 def wall(rng) -> Scene:
@@ -274,7 +294,9 @@ def wall(rng) -> Scene:
     motion = driven(lambda xp, q, v: [(0, 1, 0, 0, 1)] * d)
 
     def face(i, side):
-        reset = lambda t, q, v: (q, [-e * y if j == i else y for j, y in enumerate(v)])
+        def reset(t, q, v):
+            return (q, [-e * y if j == i else y for j, y in enumerate(v)])
+
         return Edge(lambda xp, t, q, v: q[i] if side < 0 else 1 - q[i], -1, "in", reset)
 
     edges, duration = {"in": [face(i, side) for i in range(d) for side in (-1, 1)]}, uniform(rng, 0.5, 3)
@@ -298,14 +320,17 @@ def jump(rng) -> Scene:
 
 
 def sphere(rng) -> Scene:
-    """A particle on a sphere of radius 1, perhaps too fast for it; it leaves it where the multiplier changes its sign."""
+    """A particle on a sphere of radius 1, perhaps too fast for it; it flies where the multiplier changes its sign."""
     angle, speed, duration = uniform(rng, 0.1, 1.4), uniform(rng, 0.05, 4), uniform(rng, 0.2, 1)
     q, v = np.array([np.sin(angle), np.cos(angle)]), speed * np.array([np.cos(angle), -np.sin(angle)])
     cosine, t = (2 * np.cos(angle) + speed**2 / G) / 3, 0.0
     if abs(cosine - np.cos(angle)) < 1e-3:
         raise Ambiguous
     if cosine < np.cos(angle):
-        rate = lambda x: np.sqrt(speed**2 + 2 * G * (np.cos(angle) - np.cos(x)))
+
+        def rate(x):
+            return np.sqrt(speed**2 + 2 * G * (np.cos(angle) - np.cos(x)))
+
         t = quad(lambda x: 1 / rate(x), angle, np.arccos(cosine), epsabs=1e-13, epsrel=1e-13)[0]
         q = np.array([np.sqrt(1 - cosine**2), cosine])
         v = rate(np.arccos(cosine)) * np.array([q[1], -q[0]])
@@ -313,7 +338,9 @@ def sphere(rng) -> Scene:
     if left < 0.02:
         raise Ambiguous
     right = Motion(q + v * left - [0, G * left**2 / 2], v - [0, G * left], "off", 1)
-    return Scene("sphere", "on", begun[0], begun[1] * np.array([np.cos(angle), -np.sin(angle)]), duration, {"g": G}, right)
+    return Scene(
+        "sphere", "on", begun[0], begun[1] * np.array([np.cos(angle), -np.sin(angle)]), duration, {"g": G}, right
+    )
 
 
 FAMILIES = (table, block, wheel, wall, jump, block, wheel, table, loop, sphere)
@@ -336,9 +363,17 @@ def _table():
     def speed(t, p):
         return p["A"] * p["w"] * jnp.cos(p["w"] * t + p["phase"])
 
-    law = lambda q, v: 0.5 * v**2 - G * q
-    modes = {"rest": lagjax.System(law, constraints=lambda q, t, params: q - height(t, params)), "flight": lagjax.System(law)}
-    land = lambda q, v, t, params: (height(t, params), speed(t, params))
+    def law(q, v):
+        return 0.5 * v**2 - G * q
+
+    modes = {
+        "rest": lagjax.System(law, constraints=lambda q, t, params: q - height(t, params)),
+        "flight": lagjax.System(law),
+    }
+
+    def land(q, v, t, params):
+        return (height(t, params), speed(t, params))
+
     return modes, [
         lagjax.Transition("rest", "flight", lambda q, v, multipliers: multipliers, -1),
         lagjax.Transition("flight", "rest", lambda q, v, t, params: q - height(t, params), -1, land),
@@ -347,7 +382,10 @@ def _table():
 
 def _block():
     law, stop = lambda q, v: 0.5 * v**2, lambda q, v: (q, 0 * v)
-    force = lambda s: lambda q, v, t, params: pull(params, jnp, t) - s * params["kinetic"]
+
+    def force(s):
+        return lambda q, v, t, params: pull(params, jnp, t) - s * params["kinetic"]
+
     modes = {"stick": lagjax.System(law, forces=force(0), velocity_constraints=lambda q, v: v)}
     modes |= {name: lagjax.System(law, forces=force(s)) for name, s in (("up", 1), ("down", -1))}
     return modes, [
@@ -359,8 +397,12 @@ def _block():
 
 
 def _wheel():
-    law = lambda q, v, params: 0.5 * params["m"] * v[0] ** 2 + 0.5 * params["M"] * v[1] ** 2
-    force = lambda q, v, t, params: jnp.stack([pull(params, jnp, t), 0 * t])
+    def law(q, v, params):
+        return 0.5 * params["m"] * v[0] ** 2 + 0.5 * params["M"] * v[1] ** 2
+
+    def force(q, v, t, params):
+        return jnp.stack([pull(params, jnp, t), 0 * t])
+
     modes = {
         "lock": lagjax.System(law, forces=force, velocity_constraints=lambda q, v: v[0] - v[1]),
         "free": lagjax.System(law, forces=force),
@@ -378,7 +420,9 @@ def _wheel():
 
 def _walls(d: int):
     def face(i, side):
-        reset = lambda q, v, params: (q, v.at[i].multiply(-params["e"]))
+        def reset(q, v, params):
+            return (q, v.at[i].multiply(-params["e"]))
+
         return lagjax.Transition("in", "in", lambda q, v: q[i] if side < 0 else 1 - q[i], -1, reset)
 
     modes = {"in": lagjax.System(lambda q, v: 0.5 * v @ v)}
@@ -386,7 +430,9 @@ def _walls(d: int):
 
 
 def _jump():
-    law = lambda q, v: 0.5 * v**2
+    def law(q, v):
+        return 0.5 * v**2
+
     modes = {"f": lagjax.System(law), "g": lagjax.System(lambda q, v, params: 0.5 * v**2 - params["g"] * q)}
     return modes, [
         lagjax.Transition("f", "f", lambda q, v: 1 - q, -1, lambda q, v, params: (q - params["d"], v)),
@@ -395,7 +441,9 @@ def _jump():
 
 
 def _sphere():
-    law = lambda q, v, params: 0.5 * v @ v - params["g"] * q[1]
+    def law(q, v, params):
+        return 0.5 * v @ v - params["g"] * q[1]
+
     modes = {"on": lagjax.System(law, constraints=lambda q: q @ q - 1), "off": lagjax.System(law)}
     return modes, [lagjax.Transition("on", "off", lambda q, v, multipliers: multipliers, -1)]
 
@@ -407,7 +455,9 @@ def runs(family: str, start: str) -> Callable:
 
     def run(q, v, duration, params):
         ts = jnp.stack([jnp.zeros_like(duration), duration])
-        done = lagjax.simulate_hybrid(modes, transitions, start, q, v, ts, params, max_transitions=MOST + 4, throw=False)
+        done = lagjax.simulate_hybrid(
+            modes, transitions, start, q, v, ts, params, max_transitions=MOST + 4, throw=False
+        )
         return done.ok, done.end.q, done.end.qdot, done.transitions.count, done.mode[-1]
 
     return jax.jit(jax.vmap(run))
@@ -445,7 +495,9 @@ def main(arguments: list[str] | None = None) -> collections.Counter:
         given = jax.tree.map(lambda *xs: np.stack(xs).astype(dtype), *given)
         done = run_loops(*given) if family == "loop" else runs(family, start)(*given)
         names = list(scenes_of(family)[0])
-        for (seed, scene), (ok, q, v, count, mode) in zip(some.items(), zip(*map(np.asarray, done), strict=True), strict=True):
+        for (seed, scene), (ok, q, v, count, mode) in zip(
+            some.items(), zip(*map(np.asarray, done), strict=True), strict=True
+        ):
             right, reached = scene.right, np.append(q, v)
             end = np.append(right.q, right.v)
             error = np.abs(reached - end).max() / (1 + np.abs(end).max())
@@ -454,7 +506,10 @@ def main(arguments: list[str] | None = None) -> collections.Counter:
             worst = max(worst, error) if name == "right" else worst
             counts[name] += 1
             if name != "right":
-                print(f"{seed} {name}: {family} from {start!r}: {reached}, {names[mode]!r}, {count} for {right}", flush=True)
+                print(
+                    f"{seed} {name}: {family} from {start!r}: {reached}, {names[mode]!r}, {count} for {right}",
+                    flush=True,
+                )
     print(f"{dict(counts)}; the largest error of a right one {worst:.1e}", file=sys.stderr)
     return counts
 

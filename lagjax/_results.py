@@ -36,13 +36,13 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     )
     zeno = (
         "Transitions follow each other at ever shorter times that add up to a finite one (Zeno), as the bounces of a "
-        "ball do, or at once, as where it lies on the floor: no budget of transitions leads beyond it. End ts before that "
-        "time, or add a transition to a mode at rest, its guard an energy that a bounce brings below a small one, with "
-        "direction=-1."
+        "ball do, or at once, as where it lies on the floor: no budget of transitions leads beyond it. End ts before "
+        "that time, or add a transition to a mode at rest, its guard an energy that a bounce brings below a small one, "
+        "with direction=-1."
     )
     transitions_in_turn = (
-        "Transitions follow each other at one instant, and time does not move: behind each of them the guard of the next "
-        "is beyond zero, or goes there. Let the guards leave room between them, as a thermostat's do, or say "
+        "Transitions follow each other at one instant, and time does not move: behind each of them the guard of the "
+        "next is beyond zero, or goes there. Let the guards leave room between them, as a thermostat's do, or say "
         'fires="crossing" of one that is to wait until it changes sign. What both sides push towards, as a relay does '
         "that rests on its switching line, is one System with sign or where, which slides along it."
     )

@@ -148,8 +148,8 @@ class Health(eqx.Module):
       tolerance decides whether the border is crossed: derivatives that do not exist are NaN. None where that is not
       known: in a hybrid motion, under `jax.jit`, and where `borders_located` is False, because a solver of diffrax has
       stepped across the borders.
-    - `guards`: in a hybrid motion, whether blows met at one instant that do not commute, and whether a guard was let out
-      that was beyond zero where a mode began (`Transitions`); else None.
+    - `guards`: in a hybrid motion, whether blows met at one instant that do not commute, and whether a guard was let
+      out that was beyond zero where a mode began (`Transitions`); else None.
     - `global_error`: with a reference, the largest |yᵢ − reference| over the components of q and q̇, in units of the
       largest |yᵢ| along the path (and atol/rtol more, as in the tolerances); else None.
     """

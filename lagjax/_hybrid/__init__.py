@@ -87,26 +87,27 @@ def simulate_hybrid(
 
     - `modes`: a `System` for each name; all share the structure of `q0` and `params`.
     - `transitions`: from which mode to which, and where. The earliest transition happens; of several at one instant,
-      the first in the list. After it the same law holds as at the start (see `Transition.direction`), for guards at
-      zero to rounding: those that go on in their direction follow at once, as do blows along a row of balls that
-      touch. What a stretch knows the next one remembers: from which side a guard comes that the reset has not moved,
-      and that one without a reset has been crossed.
+      the first in the list. After it the same law holds as at the start (see `Transition`): guards that are at zero
+      to rounding and go on in their direction follow at once, as do blows along a row of balls that touch, and those
+      that are beyond it. What a stretch knows the next one remembers: from which side a guard comes that the reset has
+      not moved, and that one without a reset has been crossed.
     - `max_transitions`: the budget of transitions. A motion that needs more ends there, with the result
       `max_transitions_reached`; or with `zeno` where no budget is enough because the times accumulate, as the bounces
       of a ball do. Intervals that shrink steadily to a sum before `ts[-1]`, or below the rounding of the time, count as
-      accumulating.
+      accumulating. Transitions that go back and forth at one instant end with `transitions_in_turn`.
 
     The other arguments are those of `simulate`, `max_steps` counting for each stretch between transitions. The result
     is a `Trajectory` with two more fields: `mode`, for every output time the place of its mode in `modes` (−1 where it
     was not reached; at the instant of a transition, the mode before it), and `transitions`: `t`, `q`, `qdot` just
     before the reset, and `source`, `target` as places in `modes`, all of length `max_transitions` with NaN or −1 beyond
-    the last, and their `count`.
+    the last, their `count`, whether the order of the list mattered (`order_matters`), and which guards were `let_out`.
 
     `jax.vmap`, `jax.jit` and `jax.grad` work around it, and every member of a batch switches at its own time. Times and
     states of transitions have first and second derivatives with respect to the initial state and params; third
     derivatives are not right. Of several transitions at one instant they are those in the order in which these
     happened: where resets do not commute, or the start touches a guard, derivatives from the other side are others. The
-    time at which a guard jumps through zero is not varied.
+    time at which a guard jumps through zero is not varied, nor is that of a transition whose guard is beyond zero where
+    its mode begins, against that beginning.
 
     Modes whose functions differ by numbers alone, as those of a loop do, share one program where these stand in sums,
     products, comparisons and results: a ladder of many is compiled as fast as one of few.

@@ -44,15 +44,22 @@ MOST_GUARDS = 24  # two bits each in the code of an event, which the kernel keep
 
 
 class Transition(eqx.Module):
-    """A switch from mode `source` to mode `target` where `guard(q, qdot)` changes sign.
+    """A switch from mode `source` to mode `target` where `guard(q, qdot)` changes sign, or has done so.
 
     - `guard`: a real function; it may also ask, by name, for `t`, `params` and `multipliers`, the last as the
       constraints of the mode return them.
     - `direction`: −1 only where the guard falls, +1 only where it rises, 0 for both. A guard that is zero to rounding
-      where a motion begins, and continues in that direction, has been met: the transition happens at once, that of a
+      where a mode begins, and continues in that direction, has been met: the transition happens at once, that of a
       ball on the floor with a velocity into it. One that goes the other way, or a guard of both directions, has to
-      leave zero first. Give contacts a direction.
+      leave zero first. Where it goes is decided by the first coefficient of its series that is not rounding.
+      Give contacts a direction.
     - `reset(q, qdot)` → (q, qdot): the state after the transition; it may also ask for `t` and `params`. None keeps it.
+    - `fires`: what happens where the guard is beyond zero in its direction when the mode begins, at the start or
+      behind a transition. "beyond": it happens at once. "crossing": it waits until the guard has come back and crosses.
+      None decides by the target. To another mode, beyond zero is where `source` ends: at once, whatever the rate. Back
+      into its own mode it is a blow if its reset turns the guard round, or puts it back: at once where the guard goes
+      on; where it comes back it is let out, which `Transitions.let_out` and `health` say. A section, or a kick that
+      leaves the guard to go on, waits.
 
     Raises `TypeError` or `ValueError` for names, guards and directions that are invalid.
 

@@ -38,9 +38,9 @@ _LEAST = 1e-300  # a side of a guard that is exactly zero still has a sign
 # blow among a few balls. And how long before it the last other one was, in parts of the time: bounces that pile up come
 # as near to their end as rounding lets them.
 IN_ONE_PLACE, APART = 8, 1e-9
-# Blows at one instant that are followed in both orders of the list, and by how much of its largest value a number of the
-# state may differ behind them: far more than rounding of some thirty blows. Twice as many blows settle more of those of
-# restitution below one, whose last ones are small.
+# Blows at one instant that are followed in both orders of the list, and by how much of its largest value a number of
+# the state may differ behind them: far more than rounding of some thirty blows. Twice as many blows settle more of
+# those of restitution below one, whose last ones are small.
 MOST_BLOWS, SAME = 32, 1e-9
 
 
@@ -254,7 +254,7 @@ class _Rounds(NamedTuple):
         y_end = located.y_end + jnp.where(here, moved.y_end - jax.lax.stop_gradient(moved.y_end), 0.0)
 
         at_once = here & (t_end == t_start)
-        kinds = jnp.stack([(changes >> (2 * k)) & 3 for k in range(len(mode.leaving))]) if mode.leaving else jnp.zeros(0, int)
+        kinds = (changes >> jnp.arange(0, 2 * len(mode.leaving), 2)) & 3
         put = outset.beyond & at_once
         known = before.memory, outset.sides, t_end <= outset.lasting
         exit, memory = self._pass_transition(group, mode, before, kinds, at_once, put, t_end, y_end, known)
@@ -401,11 +401,11 @@ class _Rounds(NamedTuple):
         """The guards of a mode where a motion begins in it.
 
         A guard is on the side where it was, if the reset has not moved it. One that has been followed is on the side
-        where it goes, or else where it was; without a reset it has been crossed, and so has a jump. Of others on their surface it is known
-        that they can change in their direction, if in one. See `Transition` for those that are beyond it.
+        where it goes, or else where it was; without a reset it has been crossed, and so has a jump. Of others on their
+        surface it is known that they can change in their direction, if in one. For those beyond it see `Transition`.
         """
         memory = before.memory
-        if guarded is None:
+        if guarded is None or mode.surfaces is None:
             return Outset(*jnp.zeros((2, 0)), *jnp.zeros((2, 0), bool))
         values, was, rounding, _ = (x[mode.numbers] for x in memory)
         unmoved, followed = jnp.abs(guarded.values - values) <= rounding, mode.numbers == before.latest

@@ -1,4 +1,4 @@
-"""Guards that are beyond zero where a mode begins, or there to rounding: what happens at once, what waits, what is said."""
+"""Guards that are beyond zero where a mode begins, or zero to rounding: what happens at once, waits, and is said."""
 
 import importlib
 from pathlib import Path
@@ -54,7 +54,7 @@ def test_a_blow_beyond_its_wall_happens_where_the_motion_goes_on():
     np.testing.assert_array_equal(runs.transitions.let_out[:2, 0], [0.0, 0.0])
     health = run(0.5, [BOUNCE]).health()
     assert health.suspicious and "came back instead of a blow" in str(health)
-    # What a reset does not turn round is no blow: a section, and kicks by the place and by the clock, wait for a crossing.
+    # What a reset does not turn round is no blow: a section, and kicks by place and by the clock, wait for a crossing.
     waiting = [
         T("f", "f", lambda q, v: q, -1),
         T("f", "f", lambda q, v: q, -1, lambda q, v: (q, v - 0.1)),
@@ -117,8 +117,8 @@ def test_a_block_that_stops_where_its_load_is_beyond_the_static_limit_goes_on():
                 middle = 0.5 * (low + high)
                 low, high = (low, middle) if abs(load(middle, np)) > static else (middle, high)
             t, side = high, int(np.sign(load(high, np)))
-        stopped = lambda t, y, s=side: s * y[1] + (1e-12 if t <= begun + 1e-9 else 0.0)
-        stopped.terminal, stopped.direction, begun = True, -1, t
+        stopped = lambda t, y, s=side, begun=t: s * y[1] + (1e-12 if t <= begun + 1e-9 else 0.0)
+        stopped.terminal, stopped.direction = True, -1
         force = lambda t, y, s=side: [y[1], load(t, np) - s * kinetic]
         done = solve_ivp(force, (t, 6.0), [q, 0.0], "DOP853", rtol=1e-12, atol=1e-14, events=stopped, max_step=0.02)
         t, q, side = done.t[-1], done.y[0, -1], 0
