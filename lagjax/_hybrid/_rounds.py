@@ -4,6 +4,7 @@ A round runs every member to the end of its time or to the next zero of a guard 
 the way, and puts it into the next mode. Along a round derivatives are those of machine code; at its end see `_mode`.
 """
 
+import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -89,6 +90,13 @@ class ModeGroup(NamedTuple):
     numbers: np.ndarray
     targets: np.ndarray
 
+    @property
+    def blows(self) -> tuple[np.ndarray, np.ndarray]:
+        """The places of transitions that may lead back into their own mode, with a direction and a reset; and these."""
+        own = (self.targets == np.array(self.family.modes)[:, None]).any(0)
+        some = [k for k, x in enumerate(self.first.leaving) if own[k] and x.reset and x.direction]
+        return np.array(some, int), np.array([self.first.leaving[k].direction for k in some])
+
     def mode(self, row) -> Mode:
         """One of its modes."""
         if len(self.family.modes) == 1:
@@ -125,11 +133,6 @@ class GuardMemory(NamedTuple):
     sides: jax.Array  # −1, +1, or 0 where it is unknown
     rounding: jax.Array
     rate_rounding: jax.Array
-
-    def clear_rates(self, guarded: Guarded, numbers) -> jax.Array:
-        """The rates of some guards, 0 where rounding decides these."""
-        noise = jnp.maximum(self.rate_rounding[numbers], guarded.rate_rounding)
-        return jnp.where(jnp.abs(guarded.rates) > noise, guarded.rates, 0.0)
 
 
 class Outset(NamedTuple):
@@ -292,7 +295,7 @@ class _Rounds(NamedTuple):
             return exit, self.no_memory(known[0].rounding, known[0].rate_rounding)
         y_here, numbers = _constant_unless((kinds > 0).any(), (y, mode.vector))
         guarded = mode.guards_at(t, y, self.ts[-1])
-        rates = known[0].clear_rates(guarded, mode.numbers)
+        rates = guarded.clear_rates(known[0].rate_rounding[mode.numbers])
         earlier = jnp.asarray(False)
         for k, transition in enumerate(mode.leaving):
             taken = (kinds[k] > 0) & ~earlier
@@ -318,20 +321,16 @@ class _Rounds(NamedTuple):
         Blows lead back into their own mode. They are followed in both orders, each as long as its guard goes on in its
         direction, once before it has been turned.
         """
-        own = (group.targets == np.array(group.family.modes)[:, None]).any(0)
-        some = [k for k, x in enumerate(mode.leaving) if own[k] and x.reset and x.direction]
-        if len(some) < 2:
+        some, ways = group.blows
+        if some.size < 2:
             return jnp.asarray(False)
         t, y, params = _constant_unless(False, (t, y, mode.params))
-        ways = np.array([mode.leaving[k].direction for k in some])
-        there = (there & (mode.targets == place))[np.array(some)]
-        resets = [lambda y, k=k: state_after(mode.leaving[k], mode.layout, t, y, params) for k in some]
-        orders = jnp.stack([jnp.arange(len(some), 0, -1), jnp.arange(1, len(some) + 1)])
+        there = (there & (mode.targets == place))[some]
+        resets = [functools.partial(state_after, mode.leaving[k], mode.layout, t, params=params) for k in some]
+        orders = jnp.stack([jnp.arange(some.size, 0, -1), jnp.arange(1, some.size + 1)])
 
         def going(y):
-            guarded = mode.guards_at(t, y, self.ts[-1])
-            clear = jnp.where(jnp.abs(guarded.rates) > guarded.rate_rounding, guarded.rates, 0.0)
-            return there & (clear[np.array(some)] * ways > 0)
+            return there & (mode.guards_at(t, y, self.ts[-1]).clear_rates()[some] * ways > 0)
 
         def blow(y, hits, order):
             k = jnp.argmax(jnp.where(hits, order, 0))
@@ -342,16 +341,16 @@ class _Rounds(NamedTuple):
             hits = armed & goes
             states, k = jax.vmap(blow)(states, hits, orders)
             goes = jax.vmap(going)(states)
-            armed = (armed & ~(hits & (jnp.arange(len(some)) == k[:, None]))) | ~goes
+            armed = (armed & ~(hits & (jnp.arange(some.size) == k[:, None]))) | ~goes
             return states, armed, goes, jnp.maximum(largest, jnp.abs(states).max(0)), count + 1
 
         def is_moving(carry):
             _, armed, goes, _, count = carry
             return (armed & goes).any() & (count < MOST_BLOWS) & (jnp.sum(there) > 1)
 
-        goes = there & (rates[np.array(some)] * ways > 0)
+        goes = there & (rates[some] * ways > 0)
         states, goes = jnp.stack([y, y]), jnp.stack([goes, goes])
-        first = states, jnp.ones_like(goes), goes, jnp.abs(y), jnp.asarray(0)
+        first = states, goes | ~goes, goes, jnp.abs(y), jnp.asarray(0)
         (one, other), _, _, largest, _ = jax.lax.while_loop(is_moving, follow, first)
         return (jnp.abs(one - other) > SAME * largest).any()
 
@@ -407,9 +406,9 @@ class _Rounds(NamedTuple):
         memory = before.memory
         if guarded is None or mode.surfaces is None:
             return Outset(*jnp.zeros((2, 0)), *jnp.zeros((2, 0), bool))
-        values, was, rounding, _ = (x[mode.numbers] for x in memory)
+        values, was, rounding, largest = (x[mode.numbers] for x in memory)
         unmoved, followed = jnp.abs(guarded.values - values) <= rounding, mode.numbers == before.latest
-        rates, noise = memory.clear_rates(guarded, mode.numbers), rounding + guarded.of_time
+        rates, noise = guarded.clear_rates(largest), rounding + guarded.of_time
         goes, ways = jnp.sign(rates), np.array([float(transition.direction) for transition in mode.leaving])
         crossed = np.array([transition.reset is None for transition in mode.leaving]) | mode.surfaces.have_no_rate
         ahead = jnp.where(goes != 0, goes, jnp.where(crossed, -was, was))
@@ -431,20 +430,17 @@ class _Rounds(NamedTuple):
 
         A kick that leaves it to go on does not, nor does a section without a reset.
         """
-        own = (group.targets == np.array(group.family.modes)[:, None]).any(0)
+        some, ways = group.blows
         are_blows = jnp.zeros(len(mode.leaving), bool)
-        t, y, params = _constant_unless(False, (before.t, before.y, mode.params))
-        some = [k for k, x in enumerate(mode.leaving) if own[k] and x.reset and x.direction and x.fires is None]
-        if not some:
+        if not some.size:
             return are_blows
+        t, y, params = _constant_unless(False, (before.t, before.y, mode.params))
         states = jnp.stack([state_after(mode.leaving[k], mode.layout, t, y, params) for k in some])
         after = jax.vmap(mode.guards_at, (None, 0, None))(t, states, self.ts[-1])
-        each, ways = np.arange(len(some)), np.array([mode.leaving[k].direction for k in some])
-        after = jax.tree.map(lambda x: x[each, np.array(some)], after)
-        later = jnp.where(jnp.abs(after.rates) > after.rate_rounding, after.rates, 0.0) * ways
-        turned = jnp.where(rates[np.array(some)] * ways < 0, later >= 0, later <= 0)
-        moved = (guarded.values[np.array(some)] - after.values) * ways
-        return are_blows.at[np.array(some)].set(turned | (moved > after.rounding))
+        after = jax.tree.map(lambda x: x[np.arange(some.size), some], after)
+        later, moved = after.clear_rates() * ways, (guarded.values[some] - after.values) * ways
+        turned = jnp.where(rates[some] * ways < 0, later >= 0, later <= 0)
+        return are_blows.at[some].set(turned | (moved > after.rounding))
 
     def _note_let_out(self, mode: Mode, before: Ending, are_let_out) -> jax.Array:
         """The first times at which guards were let out, (K,), with those of this round."""
