@@ -30,10 +30,12 @@ from lagjax._program import (
     Borders,
     Graph,
     Program,
+    StraightLine,
     Unlowerable,
     apply_function,
     borders,
     concatenate,
+    is_smooth,
     lower,
     lower_formula,
     lower_scalars,
@@ -221,16 +223,26 @@ class Derivation:
         Machine code changes over where that comes about, with the numbers of the run at hand; XLA, which has to write
         the program down before it knows them, takes the one that always holds (`Program.complete`).
         """
+        mechanics = self._mechanics
         if (variant := self._recursive_acceleration()) is not None:
-            return replace(variant, otherwise=lambda: self._general_acceleration)
+            return replace(variant, otherwise=lambda: self._general_acceleration, mechanics=mechanics)
         if not self.motion.constrained or self._constant_mass or not self._regular(_ACCELERATION):
             return self._general_acceleration
         variant = self._solution(_ACCELERATION, regular_only=True)
-        return replace(variant, otherwise=lambda: self._general_acceleration)
+        return replace(variant, otherwise=lambda: self._general_acceleration, mechanics=mechanics)
 
     @_lowered_once
     def _general_acceleration(self) -> Program:
-        return self._solution(_ACCELERATION)
+        program, mechanics = self._solution(_ACCELERATION), self._mechanics
+        return program if mechanics is None else replace(program, mechanics=mechanics)
+
+    @_lowered_once
+    def _mechanics(self) -> StraightLine | None:
+        """What decides about the velocities where L jumps (`_kick.Mechanics`); None where nothing is piecewise."""
+        if is_smooth(self.program("lagrangian", "momentum", "rates").line):
+            return None
+        names = "lagrangian", "momentum", "mass_matrix", "jacobian", "rates", "driving"
+        return self.program(*names).line
 
     @_lowered_once
     def multipliers(self) -> Program | None:

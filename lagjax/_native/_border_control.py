@@ -81,6 +81,7 @@ class BorderControl:
             motion.layout.extend_by(saltation.fields_along())
             self.note, self.jump = saltation.note(), saltation.apply()
         self.graze = self._graze(base)
+        self.kick = self._kick(base) if borders.kicking else None
         self.cross = self._cross()
 
     @staticmethod
@@ -112,6 +113,8 @@ class BorderControl:
         )
         fields = {"touch": len(borders.guards), "stays": len(borders.switches), **dict.fromkeys(numbers, 1)}
         fields["level"] = len(borders.guards) if _borders.TABLE in borders.kinds else 0
+        if borders.kicking:
+            fields |= {"kick_before": len(borders.switches), "kick_hit": len(borders.switches), "kicks": 1}
         return fields | Roots.fields(MAX_ORDER + 2) | Saltation.fields(borders)
 
     def begin(self, frame: Frame, lane: Lane) -> None:
@@ -169,9 +172,10 @@ class BorderControl:
         frame["planned_h"], frame["nearest"] = h, 1.0
         frame["crossed"] = frame["beyond"] = 0.0
         if self.pieces:
-            for c, j in enumerate(self.borders.clocks):
+            clocks = sorted(enumerate(self.borders.clocks), key=lambda clock: clock[1] not in self.borders.kicking)
+            for c, j in clocks:
                 self._look_at_clock(frame, c, j, h)
-            if self.table.knots and len(self.borders.clocks) > 1:
+            if self.table.movable and len(self.borders.clocks) > 1:
                 self._note_coincidence(frame, h)
             self._note_levels(frame)
             self._note_slides(frame)
@@ -267,7 +271,10 @@ class BorderControl:
         left, inside = self._time_to_next_knot(frame, j)
         left = code.maximum(left, frame.constant(0.0))
         size = code.intrinsic("fabs", h)
-        sooner = inside & (left < frame["nearest"] * size)
+        nearest = frame["nearest"] * size
+        if self.borders.kicking and j not in self.borders.kicking:  # of several at one instant a kick counts
+            nearest = nearest - self._instant(frame)
+        sooner = inside & (left < nearest)
         with frame.where(sooner):
             frame["nearest"] = left / size
             frame["crossed"] = float(len(self.guards) + 1 + c)
@@ -276,13 +283,12 @@ class BorderControl:
         """Entries of several tables at one instant, one of which may be moved."""
         code, size = frame.code, frame.code.intrinsic("fabs", h)
         count, moves = frame.constant(0.0), frame.constant(0.0)
-        movable = [j for _, j in self.table.knots]
         for j in self.borders.clocks:
             left, inside = self._time_to_next_knot(frame, j)
             distance = code.intrinsic("fabs", left - frame["nearest"] * size)
             at_once = inside & (frame["crossed"] > 0.0) & (distance <= self._instant(frame))
             count = count + code.flag(at_once)
-            if j in movable:
+            if j in self.table.movable:
                 moves = moves + code.flag(at_once)
         with frame.where((count > 1.0) & (moves > 0.0)):
             frame["crossed"] = float(self.table.coincide)
@@ -575,6 +581,8 @@ class BorderControl:
                 frame["h"] = frame["planned_h"]
             if self.note is not None:
                 frame.call(self.note)
+            if self.kick is not None:
+                self._note_kick(frame, crossed)
             self._go_on(frame, crossed, crosses)
             with frame.where(crosses):
                 if self.returns:
@@ -583,6 +591,8 @@ class BorderControl:
                     frame["undecided"] = 1
             if self.borders.nested:
                 frame.call(self.decide)
+            if self.kick is not None:
+                self._kick_or_reflect(frame, crossed, crosses)
             if self.jump is not None:
                 frame.call(self.jump)
             # A border at which a step of no length ends, too, whether it is crossed or only met.
@@ -627,6 +637,90 @@ class BorderControl:
             j = self.table.place(code, g, "piece")
             with frame.where(frame["touch", g] > Touch.NONE):
                 frame["stays", j] = 1
+
+    # ---- where L jumps ----
+
+    def _note_kick(self, frame: Frame, crossed: Value) -> None:
+        """Note the pieces before the border, and which switching number is zero there."""
+        code = frame.code
+        with code.loop(self.pieces) as j:
+            frame["kick_before", j] = self._piece(frame, j)
+            frame["kick_hit", j] = 0.0
+        with code.loop(len(self.guards)) as g:
+            hit, j = code.compare("==", crossed, code.lanes_of(code.as_double(g + 1))), self.table.place(code, g, "piece")
+            with frame.where(hit):
+                frame["kick_hit", j] = 1.0
+
+    def _kick(self, base: int) -> Code:
+        """`()`: the velocities behind the border, in the lanes that are to `kicks`; 2 there if they do not pass it."""
+        frame, motion, kick = self.motion.function("kick"), self.motion, self.borders.kick
+        assert kick is not None
+        code, n, kicks = frame.code, motion.n, frame["kicks"] > 0.0
+        with code.only_if(code.any_lane(kicks)):
+            parameters = motion.parameters * base // n  # of the motion without its tangents
+            inputs = [
+                frame.vectors("y", base, lambda i: (i, 0)), frame.vectors("y", base, lambda i: (i + n, 0)),
+                frame.vectors("t", 1), frame.vectors("params", parameters), frame.vectors("kick_before", self.pieces),
+                frame.vectors("params", self.pieces, lambda i: (i + motion.parameters,)),
+                frame.vectors("kick_hit", self.pieces),
+            ]  # fmt: skip
+            if self.borders.levels_move:  # which do not matter to slopes
+                inputs.append(frame.vectors("kick_hit", self.pieces))
+            out = motion.form.run(frame, kick.line, *inputs)
+            passes = out[base] > 0.0
+            for i in motion.form.each(code, base):
+                with frame.where(kicks & passes):
+                    frame["y", i + n, 0] = out[i]
+                    frame["low", i + n] = 0.0
+            with frame.where(kicks & ~passes):
+                frame["kicks"] = 2.0
+        return frame.finish()
+
+    def _kick_or_reflect(self, frame: Frame, crossed: Value, crosses: Value) -> None:
+        """Give the motion the velocities that it has where L jumps: behind the border, or before it once more."""
+        code, kicks = frame.code, frame.constant(0.0)
+        for j in self.borders.kicking:
+            jumps = crosses & code.compare("!=", self._piece(frame, integer(code, j)), frame["kick_before", j])
+            if self.borders.kinds[j] == _borders.SIGN:  # a motion that begins on the border begins behind it
+                jumps = jumps & code.compare("!=", frame["kick_before", j], 0.0)
+            kicks = code.select(jumps, 1.0, kicks)
+        frame["kicks"] = kicks
+        frame.call(self.kick)
+        reflected = frame["kicks"] > 1.0
+        with code.only_if(code.any_lane(reflected)):
+            with code.loop(self.pieces) as j:
+                with frame.where(reflected):
+                    frame["params", j + self.motion.parameters] = frame["kick_before", j]
+            with code.loop(len(self.guards)) as g:
+                at_border = code.compare("==", crossed, code.lanes_of(code.as_double(g + 1)))
+                with frame.where(reflected):
+                    frame["touch", g] = code.select(at_border, Touch.VALUE, Touch.NONE)
+            frame["kicks"] = code.select(reflected, 1.0, 0.0)
+            frame.call(self.kick)
+        self._decide_by_velocity(frame, kicks > 0.0)
+
+    def _decide_by_velocity(self, frame: Frame, kicked: Value) -> None:
+        """Decide the pieces anew whose switching numbers depend on velocities, which have been kicked."""
+        velocities = range(self.motion.n, self.motion.states)
+        by_velocity = [
+            j
+            for j, node in enumerate(self.borders.switches)
+            if self.borders.kinds[j] != _borders.SLIDE and not self.borders.read_by(node).isdisjoint(velocities)
+        ]
+        if not by_velocity:
+            return
+        for j in range(self.pieces):
+            with frame.where(kicked):
+                frame["stays", j] = 0.0 if j in by_velocity else 1.0
+        for g, guard in enumerate(self.guards):
+            if guard.piece in by_velocity:
+                with frame.where(kicked):
+                    frame["touch", g] = Touch.NONE
+                    if guard.slide >= 0:
+                        frame["params", self.motion.parameters + guard.slide] = 0.0
+        with frame.where(kicked):
+            frame["undecided"] = 1.0
+        frame.call(self.decide)
 
     def _leave(self, frame: Frame, g: Value, hit: Value, again: Value) -> None:
         """Let a sliding motion go on along one side, where its share of that side comes to 0 or 1.

@@ -123,6 +123,7 @@ class _ChosenProgram:
     dtypes: tuple
     linear: Any
     budget: int
+    mechanics: StraightLine | None = None
 
 
 @functools.lru_cache(maxsize=16)
@@ -141,25 +142,36 @@ def choose_parameters(
     programs: list = [program]
     programs += [] if projection is None else [projection.state, projection.velocity_scale]
     programs += [] if guards is None else [guards.values, guards.program]
-    if not any(op in LOOK_UPS for one in programs for op, _, _ in one.line.nodes):
+    mechanics = [m for one in programs if (m := getattr(one, "mechanics", None)) is not None]
+    lines = [*(one.line for one in programs), *mechanics]
+    if not any(op in LOOK_UPS for line in lines for op, _, _ in line.nodes):
         return program, projection, guards, motion, None
-    read = {node[2] - first for one in programs for node in one.line.nodes if node[0] == "input"}
+    read = {node[2] - first for line in lines for node in line.nodes if node[0] == "input"}
     of, kinds = program.size - first, program.dtypes[first:]  # a guard's own program ends before the sides
     read |= set() if guards is None else set(range(of - guards.inputs, of))
     if motion is not None:
-        read |= {node[2] - 2 * nesting.base - 1 for node in motion.line.nodes if node[0] == "input"}
+        of_motion = [motion.line, *([motion.mechanics] if getattr(motion, "mechanics", None) is not None else [])]
+        read |= {node[2] - 2 * nesting.base - 1 for line in of_motion for node in line.nodes if node[0] == "input"}
     own = of // rows
     columns = sorted({i % own for i in read if i >= 0}) if own else []
     positions = tuple(row * own + i for row in range(rows) for i in columns)
 
     def reduce_program(one, first=first, positions=positions):
         place = {first + i: first + k for k, i in enumerate(positions)}
-        nodes = tuple(
-            (op, xs, place.get(a, a) if op == "input" else shift_look_up(a, BESIDE - first) if op in LOOK_UPS else a)
-            for op, xs, a in one.line.nodes
-        )
+
+        def reduce_line(line):
+            nodes = (
+                (op, of, place.get(a, a) if op == "input" else shift_look_up(a, BESIDE - first) if op in LOOK_UPS else a)
+                for op, of, a in line.nodes
+            )
+            return line._replace(nodes=tuple(nodes))
+
         dtypes = (*one.dtypes[:first], *(kinds[i] for i in positions))
-        return _ChosenProgram(one.line._replace(nodes=nodes), first + len(positions), dtypes, one.linear, one.budget)
+        mechanics = getattr(one, "mechanics", None)
+        return _ChosenProgram(
+            reduce_line(one.line), first + len(positions), dtypes, one.linear, one.budget,
+            None if mechanics is None else reduce_line(mechanics),
+        )  # fmt: skip
 
     done = iter([reduce_program(one) for one in programs])
     return (

@@ -37,8 +37,9 @@ class Hit(IntEnum):
 class GuardTable:
     """The guards of all pieces (`_program._borders.Guard`) as constants of a kernel, for loops over them; and `knots`.
 
-    A knot is an entry of a table of parameters that the time is on; one of a table of numbers does not vary. There are
-    no derivatives by knots of several tables that coincide: the acceleration between them is not known.
+    A knot is an entry of a table of parameters that the time is on, or one at which L jumps; another one of a table of
+    numbers neither varies nor matters to tangents. There are no derivatives by knots of several tables that coincide:
+    the acceleration between them is not known.
     """
 
     def __init__(self, motion: TaylorSeries, borders: Borders):
@@ -52,7 +53,12 @@ class GuardTable:
         self.guards = len(borders.guards)
         first = self.guards + 1
         # What is `crossed` at a knot of each piece, and where knots of two do.
-        self.knots = [(first + c, j) for c, j in enumerate(borders.clocks) if borders.moving_table(j) is not None]
+        self.knots = [
+            (first + c, j)
+            for c, j in enumerate(borders.clocks)
+            if borders.moving_table(j) is not None or j in borders.kicking
+        ]
+        self.movable = [j for _, j in self.knots if borders.moving_table(j) is not None]
         self.coincide = first + len(borders.clocks)
 
     def number(self, code: Code, g: Value, name: str) -> Value:
@@ -109,7 +115,9 @@ class GuardTable:
                 with frame.where(both | (where & code.compare("==", frame["crossed"], float(crossed)))):
                     # Where several coincide no rational directions of theirs cancel, to a jump of nothing.
                     frame["hit", j] = math.exp(k)
-                    frame["entry", j] = frame["params", j + self.motion.parameters] + code.flag(frame["h"] > 0.0)
+                    if self.borders.levels_move:
+                        entry = frame["params", j + self.motion.parameters] + code.flag(frame["h"] > 0.0)
+                        frame["entry", j] = entry
                     frame["is_hit"] = Hit.BORDER
             with frame.where(both):
                 frame["is_hit"] = Hit.SEVERAL
@@ -129,7 +137,7 @@ class Saltation:
 
     def __init__(self, motion: TaylorSeries, table: GuardTable, base: int, jump: Jump):
         self.motion, self.base, self.pieces, self.jump = motion, base, motion.pieces, jump
-        self.table, self.several = table, len(table.knots) > 0 and len(table.borders.clocks) > 1
+        self.table, self.several = table, len(table.movable) > 0 and len(table.borders.clocks) > 1
         self.chosen = jump.fixed - 2 * self.pieces
         self.parameters = motion.parameters * self.base // motion.n  # of the motion alone
 
@@ -155,7 +163,15 @@ class Saltation:
 
         return jumps
 
-    def _tangent_jumps(self, frame: Frame, out: Numbers, hit: Value, grazes: Value) -> Callable:
+    def _kicks(self, frame: Frame, hit: Vectors) -> Value | None:
+        """True if L jumps at the border that is `hit`; None where it does nowhere."""
+        kicks = None
+        for j in self.table.borders.kicking:
+            here = frame.code.compare("!=", hit[j], 0.0)
+            kicks = here if kicks is None else kicks | here
+        return kicks
+
+    def _tangent_jumps(self, frame: Frame, out: Numbers, hit: Value, grazes: Value, kicks: Value | None) -> Callable:
         """`(row, i, part)`: the number that is added to coordinate i of a row (part 0), or to its velocity (part 1)."""
         code, n = frame.code, self.base
         first = (len(self.jump.orders) - 1) * 2 * n
@@ -163,10 +179,14 @@ class Saltation:
         is_hit, jump_or_nan = hit > 0.0, self._jump_or_nan(code, hit, grazes > 0.0)
 
         def added(row: int, i: Index, part: int) -> Value:
-            step = jump_or_nan(out[i + ((row - 1) * 2 + part) * n])
-            moves = is_hit & jumps(i) if self.jump.orders[row] == 1 else is_hit
-            if self.jump.orders[row] == 1 and not part:
-                return frame.constant(0.0)
+            step, moves = jump_or_nan(out[i + ((row - 1) * 2 + part) * n]), is_hit
+            if self.jump.orders[row] == 1:
+                if kicks is not None:
+                    moves = is_hit & (kicks | jumps(i)) if part else is_hit & kicks
+                elif part:
+                    moves = is_hit & jumps(i)
+                else:
+                    return frame.constant(0.0)
             return code.select(moves, step, 0.0)
 
         return added
@@ -209,7 +229,8 @@ class Saltation:
                 _field(frame, "params", motion.parameters - numbers, numbers),
             ]  # fmt: skip
             out = motion.form.run(frame, self.jump.line, *parts)
-            added = self._tangent_jumps(frame, out, frame["is_hit"], frame["grazes"])
+            kicks = self._kicks(frame, frame.vectors("hit", self.pieces))
+            added = self._tangent_jumps(frame, out, frame["is_hit"], frame["grazes"], kicks)
             for row in range(1, len(self.jump.orders)):
                 for part in range(2):
                     for i in motion.form.each(code, base):
@@ -274,9 +295,8 @@ class Saltation:
         tangents = [frame.vectors("dy", n, lambda i: (i, 0)), frame.vectors("dy", n, lambda i: (i + n, 0))]
         inputs = self._edge_inputs(numbers, numbers("params", self.motion.pieces, behind))
         out = form.run(frame, jump.line, *inputs, *tangents, frame.vectors("dparams", directions.numbers))
-        added = self._tangent_jumps(
-            frame, out, directions.number_of(frame, "is_hit"), directions.number_of(frame, "grazes")
-        )  # fmt: skip
+        is_hit, grazes = (directions.number_of(frame, name) for name in ("is_hit", "grazes"))
+        added = self._tangent_jumps(frame, out, is_hit, grazes, self._kicks(frame, numbers("hit", self.pieces)))
         for row in range(jump.lower):
             for part in range(2):
                 for i in form.each(frame.code, self.base):
@@ -318,12 +338,15 @@ class Saltation:
         inputs = self._edge_inputs(lambda name, count: frame.vectors(name, count), behind)
         out = motion.form.run(frame, self.jump.accelerations(n), *inputs)
         jumps = self._jumps(code, _some(out, 0, n), _some(out, n, n))
+        kicks = self._kicks(frame, frame.vectors("hit", self.pieces))
         cotangents, sum = motion.form.room(frame, rows * 2 * n), code.variable(frame.constant(0.0))
         for row in range(rows):
             for part in range(2):
                 for i in motion.form.each(code, n):
                     ct = frame["state_ct", i + (part * motion.n + row * n)]
-                    if row == 0:
+                    if row == 0 and kicks is not None:
+                        ct = code.select(kicks | jumps(i) if part else kicks, ct, 0.0)
+                    elif row == 0:
                         ct = code.select(jumps(i), ct, 0.0) if part else frame.constant(0.0)
                     cotangents[i + (2 * row + part) * n] = ct
                     sum.value += code.intrinsic("fabs", ct)

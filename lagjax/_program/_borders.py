@@ -19,13 +19,14 @@ a border is no piece but a feature, and a step that is to pass it begins next to
 """
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Container, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from lagjax._program._differentiation import copy_nodes, gradient_in, pullback
 from lagjax._program._graph import Graph
+from lagjax._program._kick import Jumping, Kick, Mechanics, kick_line
 from lagjax._program._look_ups import Located, Table
 from lagjax._program._memory import pause_collections
 from lagjax._program._operations import OPERATIONS
@@ -99,6 +100,7 @@ class Pieced(NamedTuple):
     dtypes: Sequence[np.dtype]
     linear: Any
     budget: int
+    mechanics: StraightLine | None = None
 
 
 class Borders(NamedTuple):
@@ -109,7 +111,7 @@ class Borders(NamedTuple):
     takes the same and then m flags: it gives the pieces of a state, or the piece that is given where the flag is 1.
     `nested` says whether switching numbers depend on pieces. `tables` (m,) has that of every piece that is one of a
     table; those of a `CLOCK` have no guards. `motion` has the borders of the motion alone, where this is one with
-    tangents (`_jump.with_borders_of_tangents`).
+    tangents (`_jump.with_borders_of_tangents`). `kick` is that at borders at which L jumps, None where there are none.
     """
 
     program: Pieced
@@ -122,6 +124,12 @@ class Borders(NamedTuple):
     features: tuple[Feature, ...]
     tables: tuple[Located | None, ...] = ()
     motion: "Borders | None" = None
+    kick: Kick | None = None
+
+    @property
+    def kicking(self) -> tuple[int, ...]:
+        """The pieces with which L jumps."""
+        return () if self.kick is None else self.kick.pieces
 
     @property
     def clocks(self) -> tuple[int, ...]:
@@ -172,6 +180,12 @@ def borders(program: Recurrent, size: int, slides: bool = True, watched: int = 0
     Along borders that depend on velocities the motion may slide (`slides`; see `_sliding`). As many of the last outputs
     are `watched` along the motion: what they decide on has borders too.
     """
+    if (mechanics := getattr(program, "mechanics", None)) is not None:
+        whole = _append(program, mechanics)
+        with np.errstate(all="ignore"):
+            rewriting = _Rewriting(whole, size, slides, watched + len(mechanics.outputs), len(mechanics.outputs))
+            if rewriting.switches and (found := rewriting.build()).kicking:
+                return found
     if _WITHOUT_ANY.issuperset(op for op, *_ in program.line.nodes):
         return None
     with np.errstate(all="ignore"), pause_collections():
@@ -179,10 +193,29 @@ def borders(program: Recurrent, size: int, slides: bool = True, watched: int = 0
         return rewriting.build() if rewriting.switches or rewriting.features else None
 
 
-class _Rewriting:
-    """The program anew, with an input for every piece where the program decides."""
+def is_smooth(line: StraightLine) -> bool:
+    """True if nothing in a line is piecewise."""
+    return _PIECEWISE.isdisjoint(op for op, *_ in line.nodes)
 
-    def __init__(self, program: Recurrent, size: int, slides: bool, watched: int = 0):
+
+def _append(program: Recurrent, more: StraightLine) -> Pieced:
+    """A program with the outputs of another line of the same inputs behind its own; what both compute is shared."""
+    graph = Graph.from_line(program.line, program.budget + _LARGEST * len(more.nodes) + 1000)
+    kinds = ["float" if np.issubdtype(dtype, np.floating) else np.dtype(dtype).name for dtype in program.dtypes]
+    places = copy_nodes(graph, more, [graph.input(i, kind) for i, kind in enumerate(kinds)])
+    outputs = (*program.line.outputs, *(places[i] for i in more.outputs))
+    line = StraightLine(tuple(graph.nodes), tuple(graph.kinds), outputs)
+    return Pieced(line, program.size, program.dtypes, program.linear, graph.budget)
+
+
+class _Rewriting:
+    """The program anew, with an input for every piece where the program decides.
+
+    As many of its last outputs are the `mechanics` (`_kick.Mechanics`), which the result does not have.
+    """
+
+    def __init__(self, program: Recurrent, size: int, slides: bool, watched: int = 0, mechanics: int = 0):
+        self.mechanics = mechanics
         self.program, self.size, self.moving, self.slides = program, size, 2 * size + 1, slides
         self.watched = program.line.outputs[len(program.line.outputs) - watched :]
         self._jumping: set[int] = set()  # pieces that something may jump with
@@ -495,7 +528,8 @@ class _Rewriting:
             tuple(self.graph.nodes), tuple(self.graph.kinds), tuple(self.places[i] for i in program.line.outputs)
         )
         nested = not _below(line, self.switches).isdisjoint(self.pieces)
-        sliding, switches, arguments = self._sliding(line), list(self.switches), [u for u, _ in features]
+        kicking = self._find_kicking(line) if self.mechanics else {}
+        sliding, switches, arguments = self._sliding(line, kicking), list(self.switches), [u for u, _ in features]
         linear = program.linear and self._linear(program.linear)
         at_rest = [slide for slide in sliding if slide.order == 1]
         for slides in (sliding, at_rest):
@@ -506,14 +540,74 @@ class _Rewriting:
         if done is not None:
             line, places, shares, linear = done
             switches, arguments = [places[i] for i in switches] + shares, [places[i] for i in arguments]
-        count = len(switches)
+        count, kick = len(switches), None
+        if self.mechanics:
+            kick = self._kick(line, switches, kicking)
+            line = line._replace(outputs=line.outputs[: -self.mechanics])
         dtypes = (*program.dtypes, *[np.dtype(float)] * count)
         pieced = Pieced(line, program.size + count, dtypes, linear, _LARGEST * program.budget)
         kinds = (*self.kinds, *[SLIDE] * len(sliding))
         return Borders(
             pieced, tuple(switches), kinds, self._decide(count, sliding), _guards(kinds, sliding), nested,
-            tuple(arguments), tuple(features.values()), (*self.tables, *[None] * len(sliding)),
+            tuple(arguments), tuple(features.values()), (*self.tables, *[None] * len(sliding)), kick=kick,
         )  # fmt: skip
+
+    # ---- where L jumps ----
+
+    def _find_kicking(self, line: StraightLine) -> dict[int, str | None]:
+        """The pieces with which L or p jumps, each with the reason why no closed form holds there, or None."""
+        n, of = self.size, Mechanics.from_nodes(line.outputs[-self.mechanics :], self.size)
+        first, jumping = self.program.size, {}
+        search = Jumping(line, self._decide(len(self.switches), ()), self.switches, n, first)
+        for nodes in ([of.lagrangian, *of.momentum], of.rates):
+            read = {line.nodes[i][2] for i in _below(line, nodes) if line.nodes[i][0] == "input"}
+            candidates = [j for j in range(len(self.switches)) if first + j in read]
+            found = search.find(candidates, nodes, self._levels) if candidates else {}
+            jumping |= {j: nodes is of.rates for j, jumps in found.items() if jumps}
+        velocities = set(range(n, 2 * n))
+
+        def reads_velocity(nodes):
+            below = _below(line, nodes)
+            return not velocities.isdisjoint(line.nodes[i][2] for i in below if line.nodes[i][0] == "input")
+
+        is_quadratic = not reads_velocity([*of.mass_matrix, *of.jacobian])
+        reasons = {}
+        for j, by_constraint in jumping.items():
+            if by_constraint:
+                reasons[j] = "a speed that a constraint prescribes jumps"
+            elif reads_velocity([self.switches[j]]):
+                reasons[j] = "L or the momentum p = dL/dqdot jumps at a border that depends on velocities"
+            else:
+                reasons[j] = None if is_quadratic else "L or the momentum p = dL/dqdot jumps, and L is not quadratic in qdot"
+        return reasons
+
+    def _levels(self, j: int, u: np.ndarray, entries: Callable, draw) -> tuple:
+        """Levels of switching number j near these numbers, and the pieces below and above."""
+        kind, located = self.kinds[j], self.tables[j]
+        if kind == SIGN:
+            return np.zeros_like(u), -np.ones_like(u), np.ones_like(u)
+        if located is not None:
+            inner = int(located.closed)  # what is closed is not there outside of its table
+            index = draw.integers(inner, max(located.table.count - inner, inner + 1), len(u))
+            level = np.where(index < located.table.count - inner, entries(located, index), np.nan)
+            return level, index - 1.0, index + 0.0
+        level = np.round(u)
+        if kind == FLOOR:
+            return level, level - 1.0, level
+        level = np.where(level == 0.0, np.where(u < 0.0, -1.0, 1.0), level)
+        return level, np.where(level > 0.0, level - 1.0, level), np.where(level > 0.0, level, level + 1.0)
+
+    def _kick(self, line: StraightLine, switches: Sequence[int], kicking: dict[int, str | None]) -> Kick:
+        n, size, m = self.size, self.program.size, len(switches)
+        of = Mechanics.from_nodes(line.outputs[-self.mechanics :], n)
+        refused = tuple((j, reason) for j, reason in kicking.items() if reason is not None)
+        if refused or not kicking:
+            return Kick(StraightLine((), (), ()), tuple(kicking), refused)
+        below = [_below(line, [switches[j]]) for j in kicking]
+        reads = [{line.nodes[i][2] for i in nodes if line.nodes[i][0] == "input"} for nodes in below]
+        spatial = [j for j, read in zip(kicking, reads, strict=True) if not read.isdisjoint(range(n))]
+        moves = any(t is not None and t.table.numbers is None for t in self.tables)
+        return Kick(kick_line(line, of, switches, spatial, n, size, m if moves else 0), tuple(kicking))
 
     def _linear(self, linear) -> LinearSystem:
         return LinearSystem(
@@ -524,15 +618,15 @@ class _Rewriting:
             linear.solve,
         )
 
-    def _sliding(self, line: StraightLine) -> list[Slide]:
-        """The borders that a motion may slide along: those of signs that something jumps with.
+    def _sliding(self, line: StraightLine, kicking: Container[int] = ()) -> list[Slide]:
+        """The borders that a motion may slide along: those of signs that something jumps with, but not L.
 
         Those that depend on velocities come first, and are all there or none.
         """
         acting = self._jumping & _below(line, line.outputs[: self.size])
         by_velocity, by_position = [], []
         for j, kind in enumerate(self.kinds if self.slides else ()):
-            if kind == SIGN and self.pieces[j] in acting:
+            if kind == SIGN and self.pieces[j] in acting and j not in kicking:
                 below = _below(line, [self.switches[j]])
                 read = {line.nodes[i][2] for i in below if line.nodes[i][0] == "input"}
                 if not read.isdisjoint(range(self.size, 2 * self.size)):
@@ -650,7 +744,8 @@ def with_outputs(program: Recurrent, more: StraightLine, moving: int) -> Pieced:
             errors = rounding(graph, more, places, moving)
     outputs = (*program.line.outputs, *errors, *(places[i] for i in more.outputs))
     line = StraightLine(tuple(graph.nodes), tuple(graph.kinds), outputs)
-    return Pieced(line, program.size, program.dtypes, program.linear, graph.budget)
+    mechanics = getattr(program, "mechanics", None)
+    return Pieced(line, program.size, program.dtypes, program.linear, graph.budget, mechanics)
 
 
 def reads_inputs(line: StraightLine, nodes: Sequence[int], first: int) -> tuple[bool, ...]:

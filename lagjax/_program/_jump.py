@@ -4,9 +4,9 @@ A motion that is varied crosses the border u = 0 a little later, by δ(y). Seen 
 crosses it, the state jumps: along the field before the border to where u is zero, and the same time back along that
 behind it,
 
-    J(y) = Φ⁺₋δ(Φ⁻_δ(y)),    u(Φ⁻_δ(y)) = 0.
+    J(y) = Φ⁺₋δ(K(Φ⁻_δ(y))),    u(Φ⁻_δ(y)) = 0,
 
-J is the identity at the state of the motion, where δ = 0; its derivatives are not. A first tangent jumps by
+where K is the kick of the velocities if L jumps there (`_kick`), and else nothing. Without a kick J is the identity at the state of the motion, where δ = 0; its derivatives are not. A first tangent jumps by
 
     J′ y′ = y′ + (f⁻ − f⁺) δ′,    δ′ = −∇u·y′ / u̇,
 
@@ -111,12 +111,16 @@ class Jump(NamedTuple):
         of = range((rows - 1) * 2 * n, (2 * rows - 1) * 2 * n)
         dtypes = [np.dtype(float)] * (first + upper)
         line, tables = pullback_and_entries(self.line, dtypes, by, of, varies=lambda table: table.tangents)
-        nodes = []
+        nodes, of_upper = [], []
         for op, operands, attribute in line.nodes:
+            of_upper.append(first <= attribute < first + upper if op == "input" else any(of_upper[i] for i in operands))
             if op == "input" and attribute >= first + upper:
                 attribute -= upper
+            elif op == "eq" and of_upper[-1]:  # all that is read of them is whether a tangent is zero: it is not
+                op, operands, attribute = "constant", (), False
             nodes.append((op, operands, attribute))
-        return line._replace(nodes=tuple(nodes)), tables
+        line = StraightLine(*live(tuple(nodes), line.kinds, line.outputs))
+        return line, tables
 
 
 def with_borders_of_tangents(borders: Borders, size: int, directions: int, member: int) -> Borders:
@@ -209,8 +213,15 @@ class _OverBorder:
         dtypes = [*program.dtypes[: self.moving], *[np.dtype(float)] * (self.pieces + self.chosen)]
         line = StraightLine(*live(program.line.nodes, program.line.kinds, program.line.outputs[:size]))
         self.switch = _switching_number(borders, program.size)
-        self.field, self.switches = (self._add_rows(line, dtypes) for line in (line, self.switch))
+        fixed = self.pieces + self.chosen
+        self.field, self.switches = (self._add_rows(line, dtypes, fixed) for line in (line, self.switch))
         largest = len(self.field.nodes) + len(self.switches.nodes) + len(line.nodes)
+        self.kick = None
+        if borders.kicking and borders.kick is not None:
+            line = borders.kick.line._replace(outputs=borders.kick.line.outputs[:size])
+            kinds = [*program.dtypes[: self.moving], *[np.dtype(float)] * (self.pieces + fixed)]
+            self.kick = self._add_rows(line, kinds, self.pieces + fixed)
+            largest += len(self.kick.nodes)
         self.graph = Graph(_LARGEST * largest + 10_000)
 
     def _leibniz(self) -> list[list[tuple[int, int]]]:
@@ -223,10 +234,10 @@ class _OverBorder:
             terms.append([(place[a], place[b]) for a, b in pairs])
         return terms
 
-    def _add_rows(self, line: StraightLine, dtypes: Sequence) -> StraightLine:
-        """A line of inputs that move, and of some that do not, with all rows of its outputs; rows of inputs alike."""
+    def _add_rows(self, line: StraightLine, dtypes: Sequence, fixed: int) -> StraightLine:
+        """A line of inputs that move, and `fixed` others, with all rows of its outputs; rows of inputs alike."""
         outputs, rows, first = len(line.outputs), 1, self.rows * self.moving
-        kinds = [np.dtype(float)] * (first + self.pieces + self.chosen)
+        kinds = [np.dtype(float)] * (first + fixed)
         kinds[: self.moving] = dtypes[: self.moving]
         line = _renumber_inputs(
             line, {i: i if i < self.moving else i - self.moving + first for i in range(len(dtypes))}
@@ -321,6 +332,8 @@ class _OverBorder:
         rate = tangents_in(graph, self.switch, nodes, dict(enumerate(rates)), {}).get(self.switch.outputs[0], zero)
         delay = self._delay(place, before, hit, rate)
         there = self._flow(place, before, delay)
+        if self.kick is not None:
+            there[n : 2 * n] = self._values(self.kick, there, [*before, *behind, *hit])
         back = self._flow(there, behind, [None if x is None else graph.apply("neg", x) for x in delay])
         results = []
         for row in range(1, self.rows):

@@ -1,0 +1,317 @@
+"""The kick of a motion at a border at which L jumps: its velocities behind the border, from those before it.
+
+A motion is an extremal of ∫ L dt across the border u(q, t) = 0, too. With p = ∂L/∂q̇, h = p·q̇ − L and constraints
+G q̇ = −d this says (Weierstrass and Erdmann's corner conditions)
+
+    p⁺ = p⁻ + μ ∇u + Gᵀλ,    h⁺ = h⁻ − μ ∂u/∂t − λ·d,    G q̇⁺ = −d.
+
+Where u depends on the time alone, μ is not needed: p is continuous but for the constraints' impulses. Where it depends
+on q, p is continuous along the border. For L = ½ q̇·M q̇ + a·q̇ − V both conditions have a closed form: with w the
+velocities for μ = 0, and M n = ∇u + Gᵀν, G n = 0,
+
+    q̇⁺ = w + μ n,    u̇⁺² = b² + 2 c (h⁻ − h⁺(w) − λ·d),    b = ∇u·w + ∂u/∂t,  c = ∇u·n,  μ = (u̇⁺ − b) / c,
+
+and u̇⁺ has the sign of u̇⁻. Where the right side is negative the energy does not suffice: the motion is reflected, which is
+the same with both sides alike and u̇⁺ = −u̇⁻. Source: Gelfand & Fomin, *Calculus of Variations*, §15.
+
+With which pieces L jumps is found at random states of their borders: there a corner is zero to rounding, and a jump is
+not.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax._program._differentiation import copy_nodes, gradient_in
+from lagjax._program._evaluate import evaluate
+from lagjax._program._graph import Graph
+from lagjax._program._look_ups import BESIDE, shift_look_up, table_of
+from lagjax._program._operations import LOOK_UPS
+from lagjax._program._passes import eliminate_dead_code, live
+from lagjax._program._rounding import rounding
+from lagjax._program._series import StraightLine
+from lagjax._program._sliding import dot, eliminate, substitute
+
+_LARGEST = 60  # operations that one may become: a bound for errors
+_STATES = 48  # at which a border is looked for: what jumps does so at nearly all of them
+_ROUNDS, _STEPS = 4, 6  # of Newton's method, with the pieces of the state decided anew in between
+# A difference of both sides counts as a jump where it is this many times as large as its rounding. The bound of the
+# rounding is to first order, and the border is hit to some roundings: a corner was seen at 4 at most.
+_NOISE, _HIT, _EPS = 1e3, 100.0, float(np.finfo(float).eps)
+
+
+class Mechanics(NamedTuple):
+    """What the corner conditions are made of, as nodes: L, p (n,), M (n, n), G (m, n), the rates G q̇ + d and d (m,)."""
+
+    lagrangian: int
+    momentum: tuple[int, ...]
+    mass_matrix: tuple[int, ...]
+    jacobian: tuple[int, ...]
+    rates: tuple[int, ...]
+    driving: tuple[int, ...]
+
+    @classmethod
+    def from_nodes(cls, nodes: Sequence[int], n: int) -> "Mechanics":
+        """The parts of nodes that stand in this order."""
+        m = (len(nodes) - 1 - n - n * n) // (n + 2)
+        ends = np.cumsum([1, n, n * n, m * n, m, m]).tolist()
+        first, *parts = (tuple(nodes[a:b]) for a, b in zip([0, *ends], ends, strict=False))
+        return cls(first[0], *parts)
+
+
+class Kick(NamedTuple):
+    """The kick at borders at which L jumps.
+
+    `line` takes q, q̇, t, the parameters, the m pieces before and behind the border, then the numbers that choose the
+    switching number (`_jump.Jump`). It gives q̇ behind it, and whether the motion passes: 0 where it is reflected, then
+    with the pieces before it on both sides. `pieces` are those with which L jumps, of which `refused` cannot be followed
+    for this reason.
+    """
+
+    line: StraightLine
+    pieces: tuple[int, ...]
+    refused: tuple[tuple[int, str], ...] = ()
+
+
+# ---- the closed form -------------------------------------------------------------------------------------------------
+
+
+def kick_line(
+    line: StraightLine, mechanics: Mechanics, switches: Sequence[int], spatial: Sequence[int], n: int, size: int, more: int
+) -> StraightLine:
+    """The line of a `Kick`. That of the program takes `size` inputs and the pieces; `more` numbers stand behind the hⱼ.
+
+    The pieces `spatial` are those that jump where u depends on positions.
+    """
+    m, graph = len(switches), Graph(_LARGEST * (len(line.nodes) + (n + len(mechanics.rates)) ** 3) + 10_000)
+    sides = _Sides(graph, line, size, m)
+    f, zero, one = graph.apply, graph.constant(0.0, "float"), graph.constant(1.0, "float")
+    before, behind = sides.before, sides.behind
+    v = [graph.input(n + i, "float") for i in range(n)]
+    hit = [graph.input(size + 2 * m + j, "float") for j in range(m + more)]
+    slopes = [zero] * (n + 1)
+    for j in spatial:
+        of_one = gradient_in(graph, line, before, switches[j], [*range(n), 2 * n])
+        slopes = [f("add", x, f("mul", hit[j], g)) for x, g in zip(slopes, of_one, strict=True)]
+    normal, by_time = slopes[:n], slopes[n]
+    change_p, change_l = [sides.difference(i) for i in mechanics.momentum], sides.difference(mechanics.lagrangian)
+    rates = [behind[i] for i in mechanics.rates]
+    solve = _saddle(graph, [behind[i] for i in mechanics.mass_matrix], [behind[i] for i in mechanics.jacobian], n)
+    impulse, still = [f("neg", x) for x in change_p], [zero] * len(rates)
+    d, minus_lambda = solve(impulse, [f("neg", x) for x in rates])
+    w = [f("add", x, y) for x, y in zip(v, d, strict=True)]
+    across, _ = solve(normal, still)
+    # h⁺(w) − h⁻ + λ·d from differences of both sides alone.
+    middle = [f("add", x, f("mul", graph.constant(0.5, "float"), y)) for x, y in zip(v, d, strict=True)]
+    mass = mechanics.mass_matrix
+    moved = [dot(graph, [behind[mass[i * n + k]] for k in range(n)], d) for i in range(n)]
+    gained = f("add", f("sub", dot(graph, change_p, v), change_l), dot(graph, middle, moved))
+    gained = f("sub", gained, dot(graph, minus_lambda, [behind[i] for i in mechanics.driving]))
+    b, c = f("add", dot(graph, normal, w), by_time), dot(graph, normal, across)
+    rate = f("add", dot(graph, normal, v), by_time)
+    in_space = f("gt", c, zero)
+    c = f("select", in_space, one, c)
+    squared = f("sub", f("mul", b, b), f("mul", graph.constant(2.0, "float"), f("mul", c, gained)))
+    squared = f("select", in_space, one, squared)
+    speed = f("sqrt", squared)
+    changes = [f("ne", graph.input(size + j, "float"), graph.input(size + m + j, "float")) for j in spatial]
+    passes = graph.constant(False, "bool")
+    for change in changes:
+        passes = f("or", passes, change)
+    forward = f("eq", f("gt", rate, zero), passes)
+    speed = f("select", forward, f("neg", speed), speed)
+    mu = f("select", in_space, zero, f("div", f("sub", speed, b), c))
+    kicked = [f("add", x, f("mul", mu, y)) for x, y in zip(w, across, strict=True)]
+    lacks = f("lt", squared, zero)
+    return StraightLine(*eliminate_dead_code(graph, [*kicked, f("select", lacks, one, zero)]))
+
+
+class _Sides:
+    """A line on both sides of a border in one graph: behind the `size` inputs the m pieces before it, those behind it."""
+
+    def __init__(self, graph: Graph, line: StraightLine, size: int, m: int):
+        self.graph, self.line = graph, line
+        kinds = {node[2]: kind for node, kind in zip(line.nodes, line.kinds, strict=True) if node[0] == "input"}
+        given = [graph.input(i, kinds.get(i, "float")) for i in range(size + 2 * m)]
+        self.before = copy_nodes(graph, line, given[: size + m])
+        self.behind = copy_nodes(graph, line, [*given[:size], *given[size + m :]])
+        self._differences: dict[int, int] = {}
+
+    def difference(self, i: int) -> int:
+        """The node behind the border less that before it: terms that are alike do not cost its digits."""
+        stack = [i]
+        while stack:
+            k = stack[-1]
+            if k in self._differences:
+                stack.pop()
+                continue
+            missing = [x for x in self._parts(k) if x not in self._differences]
+            if missing:
+                stack += missing
+            else:
+                self._differences[k] = self._subtract(k)
+                stack.pop()
+        return self._differences[i]
+
+    def _parts(self, k: int) -> list[int]:
+        """The operands from whose differences that of a node follows."""
+        (op, operands, _), same = self.line.nodes[k], self._same
+        if same(k):
+            return []
+        if op in ("add", "sub", "neg", "mul"):
+            return list(operands)
+        if op == "div" and same(operands[1]):
+            return [operands[0]]
+        return list(operands[1:]) if op == "select" and same(operands[0]) else []
+
+    def _same(self, k: int) -> bool:
+        return self.before[k] == self.behind[k]
+
+    def _subtract(self, k: int) -> int:
+        f, (op, operands, _), parts = self.graph.apply, self.line.nodes[k], self._parts(k)
+        if self._same(k):
+            return self.graph.constant(0.0, "float")
+        if not parts:
+            return f("sub", self.behind[k], self.before[k])
+        changes = [self._differences[x] for x in parts]
+        if op == "mul":
+            a, b = operands
+            return f("add", f("mul", changes[0], self.behind[b]), f("mul", self.before[a], changes[1]))
+        if op == "div":
+            return f("div", changes[0], self.behind[operands[1]])
+        return f("select", self.behind[operands[0]], *changes) if op == "select" else f(op, *changes)
+
+
+def _saddle(graph: Graph, mass: Sequence[int], jacobian: Sequence[int], n: int):
+    """`(r, c)`: d and −λ with M d − Gᵀλ = r, G d = c."""
+    m, zero = len(jacobian) // n if n else 0, graph.constant(0.0, "float")
+    rows = [[*mass[i * n : (i + 1) * n], *(jacobian[k * n + i] for k in range(m))] for i in range(n)]
+    rows += [[*jacobian[k * n : (k + 1) * n], *[zero] * m] for k in range(m)]
+    lower = eliminate(graph, rows)
+
+    def solve(r: Sequence[int], c: Sequence[int]) -> tuple[list[int], list[int]]:
+        x = substitute(graph, rows, lower, [*r, *c])
+        return x[:n], x[n:]
+
+    return solve
+
+
+# ---- with which pieces L jumps ---------------------------------------------------------------------------------------
+
+
+class Jumping:
+    """The search for the pieces of a program with which some of its numbers jump.
+
+    `line` takes `size` inputs, of which q, q̇ and t come first, and the pieces, whose switching numbers are `switches`;
+    `decide` takes the same and then a flag for each piece (`Borders.decide`).
+    """
+
+    def __init__(self, line: StraightLine, decide: StraightLine, switches: Sequence[int], n: int, size: int):
+        self.moving, self.size, self.m, self.switches = 2 * n + 1, size, len(switches), switches
+        located = [a for op, _, a in (*line.nodes, *decide.nodes) if op in LOOK_UPS]
+        tables = [table for table in map(table_of, located) if table.numbers is None]
+        self.beside = size + 3 * self.m  # where numbers that are only looked up stand, behind all other inputs
+        self.line, self.decide = self._shift(line), self._shift(decide)
+        self.draw, self.tables = np.random.default_rng(0), [self._near(table) for table in dict.fromkeys(tables)]
+
+    def _near(self, attribute):
+        """A look-up in the columns of this search."""
+        table = table_of(attribute)
+        beside = table.numbers is None and table.first >= BESIDE
+        return shift_look_up(attribute, self.beside - BESIDE) if beside else attribute
+
+    def _shift(self, line: StraightLine) -> StraightLine:
+        nodes = ((op, of, self._near(a) if op in LOOK_UPS else a) for op, of, a in line.nodes)
+        return line._replace(nodes=tuple(nodes))
+
+    def _states(self, count: int) -> np.ndarray:
+        """States that nothing speaks for; entries of tables that are parameters increase."""
+        ends = [1 + table.positions[-1] for table in self.tables]
+        columns = self.draw.uniform(0.3, 1.2, (max([self.beside, *ends]), count))
+        columns[: self.moving] *= self.draw.choice([-1.0, 1.0], (self.moving, count))
+        for table in self.tables:
+            columns[table.positions] = np.sort(self.draw.uniform(-1.5, 1.5, (table.count, count)), axis=0)
+        return columns
+
+    def _decide(self, columns: np.ndarray, given: np.ndarray, pieces: np.ndarray) -> np.ndarray:
+        """The pieces (m, S) of states; piece `given` (S,) of each is one of `pieces` (S,), where that is not NaN."""
+        m, first, states = self.m, self.size, np.arange(columns.shape[1])
+        columns = columns.copy()
+        columns[first : first + 2 * m] = 0.0
+        columns[first + given, states] = np.nan_to_num(pieces)
+        columns[first + m + given, states] = ~np.isnan(pieces)
+        found = np.array(evaluate(self.decide, list(columns)))[:m]
+        found[given, states] = np.where(np.isnan(pieces), found[given, states], pieces)
+        return found
+
+    def find(self, candidates: Sequence[int], nodes: Sequence[int], levels: Callable) -> dict[int, bool | None]:
+        """For each of these pieces: whether any of the nodes jumps with it; None where no state is on its border.
+
+        `levels(j, u, entries, draw)` gives levels near the switching number u (S,) of piece j, and the pieces below
+        and above, with `entries(located, index)` those of a table.
+        """
+        with np.errstate(all="ignore"):
+            return self._find(candidates, nodes, levels)
+
+    def _find(self, candidates, nodes, levels) -> dict[int, bool | None]:
+        m, size = self.m, self.size
+        columns, given = self._states(_STATES * len(candidates)), np.repeat(candidates, _STATES)
+        lines, target = [self._distance(j) for j in candidates], np.full((3, len(given)), np.nan)
+        blocks = [slice(k * _STATES, (k + 1) * _STATES) for k in range(len(candidates))]
+        for turn in range(_ROUNDS):
+            columns[size : size + m] = self._decide(columns, given, np.full(len(given), np.nan))
+            for j, line, block in zip(candidates, lines, blocks, strict=True):
+                here = columns[:, block]
+                if not turn:
+                    target[:, block] = levels(j, evaluate(line, list(here))[0], self._entries(here), self.draw)
+                for _ in range(_STEPS):
+                    u, _, *slopes = evaluate(line, list(here))
+                    step = (u - target[0, block]) / sum(s * s for s in slopes)
+                    here[: self.moving] -= np.where(np.isfinite(step), step, 0.0) * np.array(slopes)
+        near = np.zeros(len(given), bool)
+        for line, block in zip(lines, blocks, strict=True):
+            u, error, *_ = evaluate(line, list(columns[:, block]))
+            near[block] = np.abs(u - target[0, block]) <= _HIT * _EPS * (error + np.abs(target[0, block]))
+        for side in range(2):
+            columns[size + side * m : size + (side + 1) * m] = self._decide(columns, given, target[1 + side])
+        values = np.array(evaluate(self._differences(nodes), list(columns)))
+        change, noise = np.abs(values[: len(nodes)]), values[len(nodes) :]
+        known = near & np.isfinite(change).all(axis=0) & np.isfinite(noise).all(axis=0)
+        jumps = known & (change > _NOISE * _EPS * noise).any(axis=0)
+        return {
+            j: bool(jumps[block].any()) if known[block].any() else None
+            for j, block in zip(candidates, blocks, strict=True)
+        }
+
+    def _entries(self, columns: np.ndarray) -> Callable:
+        def entries(located, index: np.ndarray) -> np.ndarray:
+            table = self._near(table_of(located))
+            if table.numbers is not None:
+                return table.entries[index]
+            return columns[table.first + table.stride * index, np.arange(len(index))]
+
+        return entries
+
+    def _differences(self, nodes: Sequence[int]) -> StraightLine:
+        """The differences of nodes on both sides, and the rounding errors of these."""
+        graph = Graph(_LARGEST * len(self.line.nodes) + 10_000)
+        sides = _Sides(graph, self.line, self.size, self.m)
+        changes = [sides.difference(i) for i in nodes]
+        return self._with_rounding(StraightLine(*eliminate_dead_code(graph, changes)), len(changes))
+
+    def _distance(self, j: int) -> StraightLine:
+        """Switching number j, its rounding error, and its slopes by q, q̇ and t."""
+        line = StraightLine(*live(self.line.nodes, self.line.kinds, [self.switches[j]]))
+        return self._with_rounding(line, 1, range(self.moving))
+
+    def _with_rounding(self, line: StraightLine, count: int, by: Sequence[int] = ()) -> StraightLine:
+        graph = Graph(_LARGEST * len(line.nodes) + 10_000)
+        kinds = {node[2]: kind for node, kind in zip(line.nodes, line.kinds, strict=True) if node[0] == "input"}
+        inputs = [graph.input(i, kinds.get(i, "float")) for i in range(1 + max(kinds, default=-1))]
+        places = copy_nodes(graph, line, inputs)
+        errors = rounding(graph, line, places, self.moving)
+        slopes = gradient_in(graph, line, places, line.outputs[0], by) if by else []
+        outputs = [*(places[i] for i in line.outputs), *errors, *slopes]
+        assert len(line.outputs) == count
+        return StraightLine(*eliminate_dead_code(graph, outputs))
