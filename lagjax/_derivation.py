@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._blame import pieces_of_motion
 from lagjax._constraints import velocity_scales
 from lagjax._layout import Layout, dtype_of
 from lagjax._linear import solve_many
@@ -325,6 +326,31 @@ class Derivation:
     def borders(self) -> Borders | None:
         """The decisions of the accelerations along a motion, and their narrow features; None where there are none."""
         return borders(self.acceleration, self.layout.size)
+
+    @functools.cached_property
+    def kicks(self) -> bool:
+        """True if velocities jump at borders of the motion, because L, or a speed that a constraint prescribes, does."""
+        if not pieces_of_motion(self.motion, *self.state_shapes):
+            return False  # most scenes, and the largest ones, at no cost
+        try:
+            return self.borders is not None and bool(self.borders.kicking)
+        except Unlowerable:
+            return False
+
+    @property
+    def kick_refusal(self) -> str | None:
+        """Why velocities behind a border are not known, as the end of a sentence; None where they are."""
+        if not self.kicks or (borders := self.borders) is None or borders.kick is None or not borders.kick.refused:
+            return None
+        piece, reason = borders.kick.refused[0]
+        n, read = self.layout.size, borders.read_by(borders.switches[piece])
+        inputs = (*self.layout.names, *(f"d{name}/dt" for name in self.layout.names), "t")
+        of = ", ".join(inputs[i] for i in sorted(read) if i < 2 * n + 1)
+        return (
+            f"{reason}, where a border of {of} is crossed, and no law says what the velocities are behind it: round it "
+            "off over a width w that the motion resolves (0.5 * (1 + jnp.tanh(x / w)) for x > 0), or take "
+            "samples(..., hold='cubic') where it is sampled"
+        )
 
     @property
     def traced_operations(self) -> int:

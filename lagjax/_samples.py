@@ -193,8 +193,8 @@ def _zero(knots, values, t):
 def _linear(knots, values, t):
     t, (i, inside) = jnp.asarray(t, knots.dtype), _piece(knots, t)
     (x0, x1), (v0, v1) = _window(knots, i, 2), _window(values, i, 2)
-    slope = (v1 - v0) / _expand_like(x1 - x0, v0)
-    return jnp.where(_expand_like(inside, v0), v0 + slope * _expand_like(t - x0, v0), jnp.nan)
+    slope = jnp.where(_expand_like(inside, v0), (v1 - v0) / _expand_like(x1 - x0, v0), jnp.nan)
+    return v0 + slope * _expand_like(t - x0, v0)
 
 
 @jax.jit
@@ -205,7 +205,8 @@ def _cubic(knots, values, t):
     chord = (v1 - v0) / step
     m0, m1 = _slopes(knots, values, i, chord)
     second, third = (3.0 * chord - 2.0 * m0 - m1) / step, (m0 + m1 - 2.0 * chord) / (step * step)
-    return jnp.where(_expand_like(inside, v0), v0 + s * (m0 + s * (second + s * third)), jnp.nan)
+    m0 = jnp.where(_expand_like(inside, v0), m0, jnp.nan)  # and so is the slope of u
+    return v0 + s * (m0 + s * (second + s * third))
 
 
 @jax.jit
@@ -223,8 +224,8 @@ def _band(knots, values, t):
     coefficients = jnp.tensordot(v, _polynomials().astype(knots.dtype), axes=((i.ndim,), (1,)))
     total = [coefficients[..., d] for d in range(_DEGREE + 1)]
     c = _expand_like(2.0 * (t - x0) / (x1 - x0) - 1.0, total[0])
-    u = functools.reduce(lambda u, coefficient: coefficient + c * u, total[::-1])
-    return jnp.where(_expand_like(inside, total[0]), u, jnp.nan)
+    total[1] = jnp.where(_expand_like(inside, total[1]), total[1], jnp.nan)
+    return functools.reduce(lambda u, coefficient: coefficient + c * u, total[::-1])
 
 
 @functools.cache

@@ -30,7 +30,7 @@ from lagjax._machine_code._flow import Flow, Tolerances, unfit
 from lagjax._machine_code._gpu_launch import adapt_tolerances
 from lagjax._machine_code._steps import KEPT, StepStore
 from lagjax._machine_code._surfaces import Guarded, Surfaces, crossing_variation, require_one_number, vector_of
-from lagjax._native import Guards, append_guards
+from lagjax._native import Guards, Nesting, append_guards, pieces_of
 from lagjax._platform import default_platform, has_nvidia_gpu
 from lagjax._problem import AbstractEngine, Batch, Problem, Solution
 from lagjax._program import Program, Unlowerable
@@ -259,11 +259,16 @@ def _make_flow(derivation: Derivation, path: str, guards: Guards | None) -> Flow
         program = program.append_inputs(guards.inputs)
     if reason := unfit(program, n):
         return reason
+    if reason := derivation.kick_refusal:
+        return reason
+    found = pieces_of(program, Nesting(n)) if derivation.kicks else None
     try:
         if guards is not None:
-            append_guards(program, n, guards.values, True)
+            found = append_guards(program, n, guards.values, True).borders
     except Unlowerable as reason:
         return f"of a guard, {reason}"
+    if derivation.kicks and found is None:
+        return "L, or its momentum p = dL/dqdot, jumps at a border that no series leads to"
     return Flow.from_program(program, n, projection, guards)
 
 

@@ -50,6 +50,7 @@ from lagjax._program._borders import BELOW, FALLS, GROWS, SQUARED, UP_TO, Featur
 from lagjax._program._jump import Jump, Nesting
 
 NOWHERE = 1e300  # a level that no switching number comes to
+_AT_END = 16.0  # roundings of the time by which the end of a motion may miss an instant and is still taken to be there
 
 
 def _least_fall(exponent: float) -> float:
@@ -74,6 +75,7 @@ class BorderControl:
             self.stop = self._stop()
             return
         self.table = GuardTable(motion, borders)
+        self.kicks_in_time = borders.kicks_in_time(motion.states)
         self.decide, self.stop = self._decide(), self._stop()
         self.note, self.jump = None, None
         if jump is not None:
@@ -114,7 +116,7 @@ class BorderControl:
         fields = {"touch": len(borders.guards), "stays": len(borders.switches), **dict.fromkeys(numbers, 1)}
         fields["level"] = len(borders.guards) if _borders.TABLE in borders.kinds else 0
         if borders.kicking:
-            fields |= {"kick_before": len(borders.switches), "kick_hit": len(borders.switches), "kicks": 1}
+            fields |= {"kick_before": len(borders.switches), "kick_hit": len(borders.switches), "kicks": 1, "counts": 1}
         return fields | Roots.fields(MAX_ORDER + 2) | Saltation.fields(borders)
 
     def begin(self, frame: Frame, lane: Lane) -> None:
@@ -187,6 +189,9 @@ class BorderControl:
                 self._look_ahead(frame, i, feature, degree, h)
         frame["approach"] = frame["next_approach"]
         cut = frame["nearest"] < 1.0
+        if self.borders.kicking:
+            self._look_at_end(frame, degree, h)
+            cut = cut | self.table.kicks(frame)
         frame["h"] = code.select(cut, frame["nearest"] * h, h)
         frame["cut"] = frame["h"]
         with frame.where(cut):
@@ -275,6 +280,12 @@ class BorderControl:
         if self.borders.kicking and j not in self.borders.kicking:  # of several at one instant a kick counts
             nearest = nearest - self._instant(frame)
         sooner = inside & (left < nearest)
+        if j in self.borders.kicking:  # also at the end of the motion, where the velocities are those behind it
+            located = self.borders.tables[j]
+            assert located is not None
+            is_inner = self._piece(frame, integer(code, j)) < float(located.table.count - 1 - located.closed)
+            at_end = (frame["forward"] > 0.0) & is_inner & code.compare("==", left, nearest) & (size > 0.0)
+            sooner = sooner | (inside & at_end & code.compare("==", frame["crossed"], 0.0))
         with frame.where(sooner):
             frame["nearest"] = left / size
             frame["crossed"] = float(len(self.guards) + 1 + c)
@@ -510,11 +521,14 @@ class BorderControl:
         code = frame.code
         reached = code.compare("==", frame["h"], frame["cut"])
         frame["crossed"] = code.select(reached, frame["crossed"], 0.0)
-        frame["stepped"] = code.compare("!=", frame["h"], 0.0)
+        frame["stepped"] = stepped = code.compare("!=", frame["h"], 0.0)
+        if self.borders.kicking:  # steps that are recorded: those of no length, too, where a kick begins or ends them
+            stepped = stepped | self.table.kicks(frame)
+            frame["counts"] = stepped | (frame["last"] > 0.0)
         at_knot = (frame["stepped"] > 0.0) & (frame["crossed"] > float(len(self.guards)))
         frame["at_knots"] = frame["at_knots"] + code.flag(at_knot)
         for name in ("is_hit", "grazes"):
-            with frame.where(frame["stepped"] > 0.0):
+            with frame.where(stepped):
                 frame[name] = 0.0
         frame.call(self.graze)
 
@@ -527,7 +541,7 @@ class BorderControl:
         frame, motion, n = self.motion.function("graze"), self.motion, self.motion.n
         code, order, by = frame.code, frame.job("order"), [*range(base), *range(n, n + base)]
         line = _borders.gradient(self.borders, by)
-        ends = self.table.crosses_guard(frame) & (frame["stepped"] > 0.0)
+        ends = self.table.crosses_guard(frame) & (frame["counts" if self.borders.kicking else "stepped"] > 0.0)
         with code.only_if(code.any_lane(ends)):
             self.table.note_hit(frame, ends)
             state = motion.move_state(frame, motion.increments(frame, order, frame["h"])[0])
@@ -651,6 +665,30 @@ class BorderControl:
             with frame.where(hit):
                 frame["kick_hit", j] = 1.0
 
+    def _look_at_end(self, frame: Frame, degree: Value, h: Value) -> None:
+        """The step ends at an instant at which L jumps also where that is the end of the motion, to rounding.
+
+        The velocities are those behind it there, in the order of time.
+        """
+        code, one = frame.code, frame.constant(1.0)
+        for g, guard in enumerate(self.guards):
+            if guard.piece not in self.kicks_in_time:
+                continue
+            piece = self._piece(frame, integer(code, guard.piece))
+            side = piece * guard.a + guard.b
+            level = piece * guard.d + guard.e + code.select(piece <= 0.0, frame.constant(guard.below), 0.0)
+            level = level + code.select(piece >= 0.0, frame.constant(guard.above), 0.0)
+            self.roots.polynomial(frame, integer(code, guard.piece), degree, h, side, level)
+            end, slope = code.variable(frame.constant(0.0)), code.variable(frame.constant(0.0))
+            with code.loop(degree + 1) as k:
+                c = frame["poly", k]
+                end.value = end.value + c
+                slope.value = slope.value + c * code.lanes_of(code.as_double(k))
+            noise = _AT_END * EPS * code.intrinsic("fabs", frame["t_end"] / h * slope.value)
+            there = (frame["last"] > 0.0) & (frame["forward"] > 0.0) & code.compare("!=", side, 0.0) & (end.value <= noise)
+            with frame.where(there & code.compare("==", frame["nearest"], one) & code.compare("!=", h, 0.0)):
+                frame["crossed"], frame["beyond"] = float(g + 1), piece * guard.k + guard.l
+
     def _kick(self, base: int) -> Code:
         """`()`: the velocities behind the border, in the lanes that are to `kicks`; 2 there if they do not pass it."""
         frame, motion, kick = self.motion.function("kick"), self.motion, self.borders.kick
@@ -680,7 +718,12 @@ class BorderControl:
         """Give the motion the velocities that it has where L jumps: behind the border, or before it once more."""
         code, kicks = frame.code, frame.constant(0.0)
         for j in self.borders.kicking:
-            jumps = crosses & code.compare("!=", self._piece(frame, integer(code, j)), frame["kick_before", j])
+            piece = self._piece(frame, integer(code, j))
+            if j in self.kicks_in_time and self.borders.kinds[j] == _borders.SIGN:  # back from behind it
+                back = code.compare("==", frame["kick_before", j], 0.0) & (frame["forward"] < 0.0)
+                with frame.where(crosses & back):
+                    frame["kick_before", j] = 0.0 - piece
+            jumps = crosses & code.compare("!=", piece, frame["kick_before", j])
             if self.borders.kinds[j] == _borders.SIGN:  # a motion that begins on the border begins behind it
                 jumps = jumps & code.compare("!=", frame["kick_before", j], 0.0)
             kicks = code.select(jumps, 1.0, kicks)

@@ -169,6 +169,7 @@ class Integrator:
         code, (idle, rounds) = frame.code, frame.arguments
         order, borders = frame.job("order"), self.borders
         crossings = borders if self.motion.pieces else None  # features alone have no pieces
+        kicks = crossings is not None and bool(crossings.borders.kicking)
         with self.motion.rounds(frame, rounds):
             if crossings is not None:
                 frame.call(crossings.decide)
@@ -184,11 +185,11 @@ class Integrator:
             if crossings is not None:
                 crossings.settle(frame)
             with code.only_if(frame.job("room") > 0), code.loop(self.motion.width) as lane:
-                self.output.record(frame, frame.lane(lane))
+                self.output.record(frame, frame.lane(lane), kicks)
             after, rest = self.step.end_time(frame)
             if not self.notes:
-                self.output.write_due(frame, order, after)
-            self.step.advance(frame, after, rest)
+                self.output.write_due(frame, order, after, crossings.table.kicks(frame) if crossings and kicks else None)
+            self.step.advance(frame, after, rest, kicks)
             if crossings is not None:
                 frame.call(crossings.cross)
             if self.projector is not None:

@@ -25,6 +25,7 @@ from lagjax._native._cotangents import Cotangents, add
 from lagjax._native._directions import Directions
 from lagjax._native._frame import Frame, Lane, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
+from lagjax._native._output import instant_about
 from lagjax._native._parts import MotionParts
 from lagjax._native._taylor import TaylorSeries, double
 from lagjax._program._differentiation import pullback, pullback_and_entries, pushforward
@@ -227,10 +228,10 @@ class OrderRecursion:
 
 
 class SeriesSum:
-    """The state at a time within a step, Σ yₖ sᵏ."""
+    """The state at a time within a step, Σ yₖ sᵏ. Where anything `kicks` the motion, a step has outputs at its begin."""
 
-    def __init__(self, motion: TaylorSeries):
-        self.motion = motion
+    def __init__(self, motion: TaylorSeries, kicks: bool = False):
+        self.motion, self.kicks = motion, kicks
 
     def push(self, directions: Directions, frame: Frame, name: str, s: Value, powers: bool = False) -> None:
         """Into a field; the last two powers stay in memory."""
@@ -273,7 +274,10 @@ class SeriesSum:
             index = lane["output"]
             there = (member >= 0) & (index > 0)
             at = frame.time(code.select(there, member, 0), code.select(there, index, 0))
-            return there & ((at - t) * h > 0.0)
+            follows = (at - t) * h > 0.0
+            if self.kicks:
+                follows = follows | ((h > 0.0) & (at >= t - instant_about(code, at)))
+            return there & follows
 
         with code.repeat_while(follows_begin):
             index = lane["output"]

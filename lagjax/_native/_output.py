@@ -1,12 +1,18 @@
 """The records of a run: the states at the output times, the steps for a transpose, and how each member ended."""
 
-from lagjax._native._constants import DONE
+from lagjax._native._constants import DONE, EPS
 from lagjax._native._frame import Frame, Index, Lane
-from lagjax._native._ir import Value
+from lagjax._native._ir import Code, Value
 from lagjax._native._projection import Projector
 from lagjax._native._taylor import TaylorSeries
 
+_INSTANT = 4.0 * EPS  # the largest difference of two times that count as the same, relative to them
 RECORDED = 4  # numbers of a step that are written down before its state: time, size, member, number of the step
+
+
+def instant_about(code: Code, t: Value) -> Value:
+    """The largest difference of a time from `t` that counts as none."""
+    return _INSTANT * code.intrinsic("fabs", t)
 
 
 class Output:
@@ -37,11 +43,17 @@ class Output:
         time = frame.time(lane["member"], code.select(inside, index, 0)) * lane["forward"]
         lane["due"] = code.select(inside, time, float("inf"))
 
-    def write_due(self, frame: Frame, order: Value, after: Value) -> None:
-        """The states at the output times before `after`, the end of the step, one of every lane at a time."""
+    def write_due(self, frame: Frame, order: Value, after: Value, kicks: Value | None) -> None:
+        """The states at the output times before `after`, the end of the step, one of every lane at a time.
+
+        One at the very end belongs to the next step where `kicks` says that this begins with other velocities.
+        """
         code, moving = frame.code, frame.code.compare("!=", frame["h"], 0.0)
         forward, t, low = frame["forward"], frame["t"], frame["t_low"]
         frame["reached"] = after * forward
+        if kicks is not None:
+            with frame.where(kicks & (frame["h"] > 0.0)):
+                frame["reached"] = after - instant_about(code, after)
 
         def due():
             return moving & (frame["due"] <= frame["reached"])
@@ -76,13 +88,15 @@ class Output:
 
     # ---- steps, for their transposes ----
 
-    def record(self, frame: Frame, lane: Lane) -> None:
+    def record(self, frame: Frame, lane: Lane, kicks: bool) -> None:
         """Time, size and first state of the step, whose it is and which, as long as there is room.
 
+        Where anything `kicks` the motion, steps of no length may count as well.
         All threads write rows into one table, in the order in which they come to it.
         """
         code, member = frame.code, lane["member"]
-        with code.only_if((member >= 0) & code.compare("!=", lane["h"], 0.0)):
+        counts = lane["counts"] > 0.0 if kicks else code.compare("!=", lane["h"], 0.0)
+        with code.only_if((member >= 0) & counts):
             number, motion = frame.next("next_row"), self.motion
             with code.only_if(number < frame.job("room")):
                 row = number * (motion.states + RECORDED + motion.recorded_pieces)

@@ -59,6 +59,11 @@ class MotionParts(NamedTuple):
         return 0 if self.borders is None else len(self.borders.switches)
 
     @property
+    def kicks(self) -> bool:
+        """True if L jumps at borders, where the velocities do so, too."""
+        return self.borders is not None and bool(self.borders.kicking)
+
+    @property
     def varied(self) -> list[int]:
         """The inputs of the program that derivatives are taken by: all floats but the time and the pieces."""
         dtypes, time = self.program.dtypes, 2 * self.series.size

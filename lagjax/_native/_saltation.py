@@ -83,6 +83,15 @@ class GuardTable:
             found = found | frame.code.compare("==", frame["crossed"], float(crossed))
         return found
 
+    def kicks(self, frame: Frame) -> Value:
+        """True if a step ends at a border at which L jumps."""
+        found = frame.code.compare("!=", frame["crossed"], frame["crossed"])
+        numbers = [g + 1 for g, guard in enumerate(self.borders.guards) if guard.piece in self.borders.kicking]
+        numbers += [self.guards + 1 + c for c, j in enumerate(self.borders.clocks) if j in self.borders.kicking]
+        for number in [*numbers, *([self.coincide] if self.movable else [])]:
+            found = found | frame.code.compare("==", frame["crossed"], float(number))
+        return found
+
     def note_hit(self, frame: Frame, where: Value | None = None) -> None:
         """The pieces, and which switching number the guard `crossed` has; none where a motion begins on the border.
 
@@ -207,7 +216,7 @@ class Saltation:
     def note(self) -> Code:
         """`()`: the state at the border that a step ends at. Several may be crossed there, one after the other."""
         frame = self.motion.function("note_before")
-        stepped = frame["stepped"] > 0.0
+        stepped = frame["counts" if self.table.borders.kicking else "stepped"] > 0.0
         self.table.note_knot(frame, stepped)
         for i in self.motion.form.each(frame.code, self.motion.states):
             with frame.where(stepped):

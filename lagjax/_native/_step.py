@@ -241,10 +241,13 @@ class StepControl:
         is_last = frame["last"] > 0.0
         return frame.code.select(is_last, frame["t_end"], after), frame.code.select(is_last, 0.0, rest)
 
-    def advance(self, frame: Frame, after: Value, rest: Value) -> None:
-        """The time and the state at the end of the step, what rounding takes carried along; and one step more."""
+    def advance(self, frame: Frame, after: Value, rest: Value, kicks: bool) -> None:
+        """The time and the state at the end of the step, what rounding takes carried along; and one step more.
+
+        Where anything `kicks` the motion, steps of no length may count as well.
+        """
         code, h = frame.code, frame["h"]
-        moving = code.compare("!=", h, 0.0)
+        moving = frame["counts"] > 0.0 if kicks else code.compare("!=", h, 0.0)
         with frame.where(moving):
             frame["t"] = after
             frame["t_low"] = rest

@@ -168,6 +168,11 @@ class Borders(NamedTuple):
         """The nodes whose series are wanted."""
         return self.switches + self.arguments
 
+    def kicks_in_time(self, states: int) -> list[int]:
+        """The pieces with which L jumps whose switching numbers depend on the time alone, but no clocks."""
+        others = (j for j in self.kicking if self.kinds[j] != CLOCK)
+        return [j for j in others if self.read_by(self.switches[j]).isdisjoint(range(states))]
+
     def read_by(self, node: int) -> frozenset[int]:
         """The inputs that a node of the program depends on; pieces are the last ones."""
         nodes = self.program.line.nodes
