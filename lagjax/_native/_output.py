@@ -95,8 +95,7 @@ class Output:
         All threads write rows into one table, in the order in which they come to it.
         """
         code, member = frame.code, lane["member"]
-        counts = lane["counts"] > 0.0 if kicks else code.compare("!=", lane["h"], 0.0)
-        with code.only_if((member >= 0) & counts):
+        with code.only_if((member >= 0) & (lane["counts"] > 0.0 if kicks else code.compare("!=", lane["h"], 0.0))):
             number, motion = frame.next("next_row"), self.motion
             with code.only_if(number < frame.job("room")):
                 row = number * (motion.states + RECORDED + motion.recorded_pieces)

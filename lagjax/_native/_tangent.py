@@ -210,9 +210,9 @@ class Tangent:
         member, output = of_motion["member"], code.as_integer(lane["next_output"])
         inside = (member >= 0) & (output < frame.job("times") - 1)
         at = frame.time(code.select(inside, member, 0), code.select(inside, output, 0))
-        next_begin, h = of_motion["next_begin"], of_motion["h"]
-        due = inside & ((at - next_begin) * h <= 0.0)
+        due = inside & ((at - of_motion["next_begin"]) * of_motion["h"] <= 0.0)
         if self.replay.parts.kicks:  # outputs at the end belong to the next step, forward in time
+            next_begin, h = of_motion["next_begin"], of_motion["h"]
             due = due & code.compare("!=", h, 0.0) & ~((h > 0.0) & (at >= next_begin - instant_about(code, at)))
         lane["s"] = code.select(due, at - of_motion["t"], 0.0)
         lane["is_due"] = code.flag(due)

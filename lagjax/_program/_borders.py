@@ -808,16 +808,23 @@ def _floor_divisions(line: StraightLine) -> dict[int, tuple[int, int]]:
         if op != "round" or nodes[operands[0]][0] != "select":
             continue
         condition, d, lower = nodes[operands[0]][1]
-        if nodes[condition][0] != "and" or nodes[d][0] != "div" or nodes[lower][0] != "sub" or nodes[lower][1][0] != d:
+        if nodes[condition][0] != "and" or nodes[lower][0] != "sub" or nodes[lower][1][0] != d:
             continue
-        whole, y = nodes[d][1]
-        if nodes[whole][0] != "sub":
+        # Division by a power of two is a product, that by one is nothing.
+        factors = [1.0 if nodes[x][0] != "constant" else nodes[x][2] for x in nodes[d][1]]
+        whole = d if nodes[d][0] == "sub" else next((x for x in nodes[d][1] if nodes[x][0] == "sub"), d)
+        if nodes[whole][0] != "sub" or nodes[nodes[whole][1][1]][0] != "rem":
             continue
         x, r = nodes[whole][1]
+        y = nodes[r][1][1]
+        by = nodes[y][2] if nodes[y][0] == "constant" else None
+        is_divided = nodes[d][1] == (whole, y) if nodes[d][0] == "div" else by is not None and math.prod(factors) * by == 1
+        if nodes[d][0] not in ("div", "mul", "sub") or not is_divided:
+            continue
         parts = nodes[condition][1]
         not_zero = any(nodes[p][0] == "ne" and r in nodes[p][1] for p in parts)
         signs = any(nodes[p][0] == "ne" and any(nodes[z] == ("sign", (r,), None) for z in nodes[p][1]) for p in parts)
-        if nodes[r][0] == "rem" and nodes[r][1] == (x, y) and not_zero and signs:
+        if nodes[r][1][0] == x and not_zero and signs:
             found[i] = x, y
     return found
 

@@ -11,11 +11,19 @@ import numpy as np
 
 
 def add(graph, op, a, b):
-    """x + 0 is x; like terms are collected."""
+    """x + 0 is x; like terms are collected, and branches of one condition, of which each is zero where the other counts.
+
+    Those are what the derivative of `where` consists of.
+    """
     if graph.value(a) == 0:
         return b
     if graph.value(b) == 0:
         return a
+    (of_a, x, _), (of_b, y, _) = graph.nodes[a], graph.nodes[b]
+    if of_a == of_b == "select" and x[0] == y[0]:
+        for (_, no, yes), (_, other, zero) in ((x, y), (y, x)):
+            if graph.value(no) == 0 and graph.value(zero) == 0:
+                return select(graph, "select", x[0], other, yes)
     return graph.sum(a, b, 1) if graph.kinds[a] == "float" else graph.node(op, a, b)
 
 
