@@ -106,8 +106,6 @@ def _kind(lagrangian: Callable, rates: Callable, kick: Callable, in_time: bool, 
     return of
 
 
-
-
 # In every one the force of a spring besides, of strength one; slopes are those by u's place or time.
 KINDS: dict[str, Callable] = {
     "potential by place": _kind(

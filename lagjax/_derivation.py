@@ -329,8 +329,8 @@ class Derivation:
 
     @functools.cached_property
     def kicks(self) -> bool:
-        """True if velocities jump at borders of the motion, because L, or a speed that a constraint prescribes, does."""
-        if not pieces_of_motion(self.motion, *self.state_shapes):
+        """True if velocities jump at borders of the motion, as L or a speed that a constraint prescribes does."""
+        if not self.motion.constrained and not pieces_of_motion(self.motion, *self.state_shapes):
             return False  # most scenes, and the largest ones, at no cost
         try:
             return self.borders is not None and bool(self.borders.kicking)
@@ -347,9 +347,8 @@ class Derivation:
         inputs = (*self.layout.names, *(f"d{name}/dt" for name in self.layout.names), "t")
         of = ", ".join(inputs[i] for i in sorted(read) if i < 2 * n + 1)
         return (
-            f"{reason}, where a border of {of} is crossed, and no law says what the velocities are behind it: round it "
-            "off over a width w that the motion resolves (0.5 * (1 + jnp.tanh(x / w)) for x > 0), or take "
-            "samples(..., hold='cubic') where it is sampled"
+            f"{reason}, at a border of {of}: round it off over a width w that the motion resolves, "
+            "0.5 * (1 + jnp.tanh(x / w)) for x > 0, or take samples(..., hold='cubic') where it is sampled"
         )
 
     @property

@@ -93,7 +93,9 @@ def simulate(
     - `progress`: print how far the integration has come; or any diffrax progress meter.
 
     **Borders.** Forces and potentials may have kinks and jumps (`where`, `abs`, `sign`, `clip`, `floor`, …), also in
-    time. Machine code ends a step at every border and begins the next one beyond it; where both sides push towards the
+    time. Where L itself or p = ∂L/∂q̇ jumps, the velocities do: p is continuous at an instant, and along a border in
+    space, across which the energy is (where that does not suffice, the motion is reflected); at the very instant they
+    are those behind it. What cannot be decided so is refused before the run. Machine code ends a step at every border and begins the next one beyond it; where both sides push towards the
     border, as dry friction at rest does, the motion stays on it. First and second derivatives, in every mode, include
     the jumps at borders. Where they do not exist they are NaN: where a border is grazed, and by knots of two inputs
     that coincide (see `samples`). With diffrax, steps shrink at borders and go across, and a derivative over them lacks

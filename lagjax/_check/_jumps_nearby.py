@@ -23,10 +23,17 @@ OF_FORCE = (
     "A motion across it is right: machine code ends a step there, and what is pushed onto it from both sides rests on "
     "it; steps of diffrax shrink, and a motion of diffrax that crosses it has no derivatives."
 )
+# What a jump of L, or of its momentum, means.
+OF_L = (
+    "The velocities jump there in machine code, so that the momentum along the border and the energy are the same on "
+    "both sides, at an instant the whole momentum; where the energy does not suffice, the motion is reflected. Solvers "
+    "of diffrax refuse it."
+)
 _COMPARED = {
     "lagrangian": "L", "momentum": "the momentum", "mass_matrix": "the mass matrix", "force": "the force",
 }  # fmt: skip
-_REACH = 10  # the steps of the search: 2⁻⁹, 2⁻⁸ … 1 sizes of a coordinate
+_REACH = 10  # the steps of the search: 2⁻⁹, 2⁻⁸ … 1 sizes of a coordinate, and a little more
+_BEYOND = 1.01  # so much more, for a border at zero that is a side by itself, as that of q > 0 is seen from below
 
 
 class Discontinuity(NamedTuple):
@@ -54,7 +61,7 @@ def findings(scene: CheckedScene) -> list[Finding]:
         for sign in (1, -1)
     ]
     nearest = min((jump for jump in jumps if jump is not None), default=None)
-    return [] if nearest is None else [_finding(nearest)]
+    return [] if nearest is None else [_finding(nearest, scene)]
 
 
 def _sides_of_states(scene: CheckedScene) -> Callable:
@@ -95,7 +102,7 @@ def _first_jump(scene: CheckedScene, sides: Callable, start, vector, axis, label
     # One step so small that only a border at the state itself lies within it, then longer and longer ones.
     moving = vector != 0
     least = 4 * eps * float(np.max(np.abs(start[moving] / vector[moving]), initial=1.0))
-    reach = [min(least, 2.0**-_REACH), *2.0 ** np.arange(1 - _REACH, 1)]
+    reach = [min(least, 2.0**-_REACH), *_BEYOND * 2.0 ** np.arange(1 - _REACH, 1)]
     here, *ahead = np.asarray(sides(displaced_states([0.0, *reach])))
     past = next((k for k, side in enumerate(ahead) if not np.array_equal(side, here, True)), None)
     if past is None:
@@ -121,16 +128,23 @@ def _first_jump(scene: CheckedScene, sides: Callable, start, vector, axis, label
     return None
 
 
-def _finding(jump: Discontinuity) -> Finding:
-    here = jump.sizes == 0
+def _finding(jump: Discontinuity, scene: CheckedScene) -> Finding:
+    here, derivation = jump.sizes == 0, scene.derivation
     where = "at this state" if here else f"{jump.distance:.3g} away along {jump.direction}"
-    serious = jump.what in ("L", "the momentum")
-    mend = " Smooth it (tanh(v/w) for sign(v)), or make two modes of it with a Transition for lagjax.simulate_hybrid."
-    consequence = {
-        "L": "No force shows a jump of L itself: the motion goes through it as if it were not there." + mend,
-        "the momentum": "The kick that a jump of the momentum gives to the velocity is not seen." + mend,
-    }.get(jump.what, OF_FORCE)
-    if here and not serious:
+    of_l, refusal = jump.what in ("L", "the momentum"), derivation.kick_refusal
+    serious, consequence = of_l and (refusal is not None or not derivation.kicks), OF_FORCE
+    if serious:
+        consequence = (
+            f"{refusal[0].upper()}{refusal[1:]}."
+            if refusal is not None
+            else (
+                "No force shows it, and diffrax goes through it: smooth it, 0.5 * (1 + jnp.tanh(x / w)) for x > 0, "
+                "or make two modes of it with a Transition for lagjax.simulate_hybrid."
+            )
+        )
+    elif of_l:
+        consequence = OF_L
+    elif here:
         consequence = "At this very state `acceleration` is that of one side or between them. " + consequence
     return Finding(
         "discontinuity", "warning" if serious else "advice", (jump.direction,),

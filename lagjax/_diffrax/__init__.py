@@ -66,9 +66,9 @@ class Diffrax(AbstractEngine, eqx.Module):
         """Why a scene is not for it, or the tolerance, or the number of fixed steps, as the end of a sentence."""
         if problem.derivation.kicks:
             return problem.derivation.kick_refusal or (
-                "L, or its momentum p = dL/dqdot, jumps at a border: the velocities jump there, but steps of diffrax go "
-                "across. Machine code ends a step there and has that: leave solver at None, in float64 or float32, on a "
-                "CPU (`System.explain` says why a scene is not for it). Or round the jump off over a width that steps "
+                "L, or its momentum p = dL/dqdot, jumps at a border: the velocities jump there, and steps of diffrax "
+                "go across. Machine code ends a step there and has that: leave solver at None, on a CPU "
+                "(`System.explain` says why a scene is not for it). Or round the jump off over a width that steps "
                 "resolve, 0.5 * (1 + jnp.tanh(x / w)) for x > 0, hold='cubic' for samples"
             )
         if self.dt is None:

@@ -44,7 +44,11 @@ class Adjoint:
         self.motion = motion = self.replay.motion
         self.start_next = self.replay.start_next(self._begin_lane, self._take_member)
         cotangents = Cotangents(motion, parts)
-        series_sum, products, recursion = SeriesSum(motion, parts.kicks), CauchyProducts(motion), OrderRecursion(motion, parts)
+        series_sum, products, recursion = (
+            SeriesSum(motion, parts.kicks),
+            CauchyProducts(motion),
+            OrderRecursion(motion, parts),
+        )
         steps = [
             series_sum.pull(),
             self._transpose_orders(products.pull(), recursion.pull()),

@@ -523,7 +523,7 @@ class BorderControl:
         frame["crossed"] = code.select(reached, frame["crossed"], 0.0)
         frame["stepped"] = stepped = code.compare("!=", frame["h"], 0.0)
         if self.borders.kicking:  # steps that are recorded: those of no length, too, where a kick begins or ends them
-            stepped = stepped | self.table.kicks(frame)
+            stepped = stepped | (self.table.kicks(frame) & ~self._begins_behind(frame))
             frame["counts"] = stepped | (frame["last"] > 0.0)
         at_knot = (frame["stepped"] > 0.0) & (frame["crossed"] > float(len(self.guards)))
         frame["at_knots"] = frame["at_knots"] + code.flag(at_knot)
@@ -606,7 +606,7 @@ class BorderControl:
             if self.borders.nested:
                 frame.call(self.decide)
             if self.kick is not None:
-                self._kick_or_reflect(frame, crossed, crosses)
+                self._kick_or_reflect(frame, self.kick, crossed, crosses)
             if self.jump is not None:
                 frame.call(self.jump)
             # A border at which a step of no length ends, too, whether it is crossed or only met.
@@ -661,9 +661,22 @@ class BorderControl:
             frame["kick_before", j] = self._piece(frame, j)
             frame["kick_hit", j] = 0.0
         with code.loop(len(self.guards)) as g:
-            hit, j = code.compare("==", crossed, code.lanes_of(code.as_double(g + 1))), self.table.place(code, g, "piece")
+            hit, j = (
+                code.compare("==", crossed, code.lanes_of(code.as_double(g + 1))),
+                self.table.place(code, g, "piece"),
+            )
             with frame.where(hit):
                 frame["kick_hit", j] = 1.0
+
+    def _begins_behind(self, frame: Frame) -> Value:
+        """True where a motion begins at an instant at which L jumps: with the velocities behind it, in time's order."""
+        code = frame.code
+        begins = (frame["steps"] <= 0.0) & (frame["forward"] > 0.0)
+        found = frame.constant(0.0) > 0.0
+        for g, guard in enumerate(self.guards):
+            if guard.piece in self.kicks_in_time and self.borders.kinds[guard.piece] == _borders.SIGN:
+                found = found | code.compare("==", frame["crossed"], float(g + 1))
+        return begins & found & code.compare("==", frame["h"], 0.0)
 
     def _look_at_end(self, frame: Frame, degree: Value, h: Value) -> None:
         """The step ends at an instant at which L jumps also where that is the end of the motion, to rounding.
@@ -678,6 +691,7 @@ class BorderControl:
             side = piece * guard.a + guard.b
             level = piece * guard.d + guard.e + code.select(piece <= 0.0, frame.constant(guard.below), 0.0)
             level = level + code.select(piece >= 0.0, frame.constant(guard.above), 0.0)
+            level = frame["level", g] if guard.of_table else level
             self.roots.polynomial(frame, integer(code, guard.piece), degree, h, side, level)
             end, slope = code.variable(frame.constant(0.0)), code.variable(frame.constant(0.0))
             with code.loop(degree + 1) as k:
@@ -685,7 +699,9 @@ class BorderControl:
                 end.value = end.value + c
                 slope.value = slope.value + c * code.lanes_of(code.as_double(k))
             noise = _AT_END * EPS * code.intrinsic("fabs", frame["t_end"] / h * slope.value)
-            there = (frame["last"] > 0.0) & (frame["forward"] > 0.0) & code.compare("!=", side, 0.0) & (end.value <= noise)
+            there = (
+                (frame["last"] > 0.0) & (frame["forward"] > 0.0) & code.compare("!=", side, 0.0) & (end.value <= noise)
+            )
             with frame.where(there & code.compare("==", frame["nearest"], one) & code.compare("!=", h, 0.0)):
                 frame["crossed"], frame["beyond"] = float(g + 1), piece * guard.k + guard.l
 
@@ -714,21 +730,19 @@ class BorderControl:
                 frame["kicks"] = 2.0
         return frame.finish()
 
-    def _kick_or_reflect(self, frame: Frame, crossed: Value, crosses: Value) -> None:
+    def _kick_or_reflect(self, frame: Frame, kick: Code, crossed: Value, crosses: Value) -> None:
         """Give the motion the velocities that it has where L jumps: behind the border, or before it once more."""
         code, kicks = frame.code, frame.constant(0.0)
         for j in self.borders.kicking:
             piece = self._piece(frame, integer(code, j))
-            if j in self.kicks_in_time and self.borders.kinds[j] == _borders.SIGN:  # back from behind it
-                back = code.compare("==", frame["kick_before", j], 0.0) & (frame["forward"] < 0.0)
-                with frame.where(crosses & back):
+            if j in self.kicks_in_time and self.borders.kinds[j] == _borders.SIGN:
+                begins = code.compare("==", frame["kick_before", j], 0.0) & (frame["steps"] <= 1.0)
+                with frame.where(crosses & begins & (frame["forward"] < 0.0)):  # back from behind it
                     frame["kick_before", j] = 0.0 - piece
-            jumps = crosses & code.compare("!=", piece, frame["kick_before", j])
-            if self.borders.kinds[j] == _borders.SIGN:  # a motion that begins on the border begins behind it
-                jumps = jumps & code.compare("!=", frame["kick_before", j], 0.0)
+            jumps = crosses & (frame["counts"] > 0.0) & code.compare("!=", piece, frame["kick_before", j])
             kicks = code.select(jumps, 1.0, kicks)
         frame["kicks"] = kicks
-        frame.call(self.kick)
+        frame.call(kick)
         reflected = frame["kicks"] > 1.0
         with code.only_if(code.any_lane(reflected)):
             with code.loop(self.pieces) as j:
@@ -739,7 +753,7 @@ class BorderControl:
                 with frame.where(reflected):
                     frame["touch", g] = code.select(at_border, Touch.VALUE, Touch.NONE)
             frame["kicks"] = code.select(reflected, 1.0, 0.0)
-            frame.call(self.kick)
+            frame.call(kick)
         self._decide_by_velocity(frame, kicks > 0.0)
 
     def _decide_by_velocity(self, frame: Frame, kicked: Value) -> None:

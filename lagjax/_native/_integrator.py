@@ -188,7 +188,9 @@ class Integrator:
                 self.output.record(frame, frame.lane(lane), kicks)
             after, rest = self.step.end_time(frame)
             if not self.notes:
-                self.output.write_due(frame, order, after, crossings.table.kicks(frame) if crossings and kicks else None)
+                self.output.write_due(
+                    frame, order, after, crossings.table.kicks(frame) if crossings and kicks else None
+                )
             self.step.advance(frame, after, rest, kicks)
             if crossings is not None:
                 frame.call(crossings.cross)

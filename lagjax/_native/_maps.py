@@ -228,7 +228,7 @@ class OrderRecursion:
 
 
 class SeriesSum:
-    """The state at a time within a step, Σ yₖ sᵏ. Where anything `kicks` the motion, a step has outputs at its begin."""
+    """The state at a time within a step, Σ yₖ sᵏ. Where anything `kicks` the motion, outputs are at its begin, too."""
 
     def __init__(self, motion: TaylorSeries, kicks: bool = False):
         self.motion, self.kicks = motion, kicks

@@ -155,7 +155,7 @@ def choose_parameters(
     of, kinds = program.size - first, program.dtypes[first:]  # a guard's own program ends before the sides
     read |= set() if guards is None else set(range(of - guards.inputs, of))
     if motion is not None:
-        of_motion = [motion.line, *([motion.mechanics] if getattr(motion, "mechanics", None) is not None else [])]
+        of_motion = [line for line in (motion.line, getattr(motion, "mechanics", None)) if line is not None]
         read |= {node[2] - 2 * nesting.base - 1 for line in of_motion for node in line.nodes if node[0] == "input"}
     own = of // rows
     columns = sorted({i % own for i in read if i >= 0}) if own else []
@@ -166,7 +166,11 @@ def choose_parameters(
 
         def reduce_line(line):
             nodes = (
-                (op, of, place.get(a, a) if op == "input" else shift_look_up(a, BESIDE - first) if op in LOOK_UPS else a)
+                (
+                    op,
+                    of,
+                    place.get(a, a) if op == "input" else shift_look_up(a, BESIDE - first) if op in LOOK_UPS else a,
+                )
                 for op, of, a in line.nodes
             )
             return line._replace(nodes=tuple(nodes))

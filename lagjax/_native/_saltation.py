@@ -104,7 +104,10 @@ class GuardTable:
             j = self.place(code, g, "piece")
             side = frame["pieces_before", j] * self.number(code, g, "a") + self.number(code, g, "b")
             hit = where & code.compare("==", crossed, code.lanes_of(code.as_double(g + 1)))
-            hit = hit & code.compare("!=", side, 0.0)
+            decided = code.compare("!=", side, 0.0)
+            if self.borders.kicking:  # where L jumps, a motion that begins on the border comes from what L is there
+                decided = decided | self.kicks(frame)
+            hit = hit & decided
             with frame.where(hit):
                 frame["hit", j] = 1
                 frame["is_hit"] = Hit.BORDER

@@ -579,11 +579,20 @@ class _Rewriting:
         reasons = {}
         for j, by_constraint in jumping.items():
             if by_constraint:
-                reasons[j] = "a speed that a constraint prescribes jumps"
+                reasons[j] = "a constraint prescribes a speed that jumps"
             elif reads_velocity([self.switches[j]]):
-                reasons[j] = "L or the momentum p = dL/dqdot jumps at a border that depends on velocities"
+                reasons[j] = (
+                    "L or the momentum p = dL/dqdot jumps, and no law says with what velocities the motion goes on"
+                )
             else:
-                reasons[j] = None if is_quadratic else "L or the momentum p = dL/dqdot jumps, and L is not quadratic in qdot"
+                reasons[j] = (
+                    None
+                    if is_quadratic
+                    else (
+                        "L or the momentum p = dL/dqdot jumps, and L is not quadratic in qdot, so that the velocities "
+                        "behind that are not known in closed form"
+                    )
+                )
         return reasons
 
     def _levels(self, j: int, u: np.ndarray, entries: Callable, draw) -> tuple:
@@ -818,7 +827,9 @@ def _floor_divisions(line: StraightLine) -> dict[int, tuple[int, int]]:
         x, r = nodes[whole][1]
         y = nodes[r][1][1]
         by = nodes[y][2] if nodes[y][0] == "constant" else None
-        is_divided = nodes[d][1] == (whole, y) if nodes[d][0] == "div" else by is not None and math.prod(factors) * by == 1
+        is_divided = (
+            nodes[d][1] == (whole, y) if nodes[d][0] == "div" else by is not None and math.prod(factors) * by == 1
+        )
         if nodes[d][0] not in ("div", "mul", "sub") or not is_divided:
             continue
         parts = nodes[condition][1]

@@ -6,7 +6,8 @@ behind it,
 
     J(y) = Φ⁺₋δ(K(Φ⁻_δ(y))),    u(Φ⁻_δ(y)) = 0,
 
-where K is the kick of the velocities if L jumps there (`_kick`), and else nothing. Without a kick J is the identity at the state of the motion, where δ = 0; its derivatives are not. A first tangent jumps by
+where K is the kick of the velocities if L jumps there (`_kick`), and else nothing. Without one J is the identity at the
+state of the motion, where δ = 0; its derivatives are not. A first tangent jumps by
 
     J′ y′ = y′ + (f⁻ − f⁺) δ′,    δ′ = −∇u·y′ / u̇,
 

@@ -11,8 +11,8 @@ velocities for μ = 0, and M n = ∇u + Gᵀν, G n = 0,
 
     q̇⁺ = w + μ n,    u̇⁺² = b² + 2 c (h⁻ − h⁺(w) − λ·d),    b = ∇u·w + ∂u/∂t,  c = ∇u·n,  μ = (u̇⁺ − b) / c,
 
-and u̇⁺ has the sign of u̇⁻. Where the right side is negative the energy does not suffice: the motion is reflected, which is
-the same with both sides alike and u̇⁺ = −u̇⁻. Source: Gelfand & Fomin, *Calculus of Variations*, §15.
+and u̇⁺ has the sign of u̇⁻. Where the right side is negative the energy does not suffice: the motion is reflected, which
+is the same with both sides alike and u̇⁺ = −u̇⁻. Source: Gelfand & Fomin, *Calculus of Variations*, §15.
 
 With which pieces L jumps is found at random states of their borders: there a corner is zero to rounding, and a jump is
 not.
@@ -65,8 +65,7 @@ class Kick(NamedTuple):
 
     `line` takes q, q̇, t, the parameters, the m pieces before and behind the border, then the numbers that choose the
     switching number (`_jump.Jump`). It gives q̇ behind it, and whether the motion passes: 0 where it is reflected, then
-    with the pieces before it on both sides. `pieces` are those with which L jumps, of which `refused` cannot be followed
-    for this reason.
+    with the pieces before it on both sides. `pieces` are those with which L jumps; some are `refused`, for a reason.
     """
 
     line: StraightLine
@@ -78,7 +77,13 @@ class Kick(NamedTuple):
 
 
 def kick_line(
-    line: StraightLine, mechanics: Mechanics, switches: Sequence[int], spatial: Sequence[int], n: int, size: int, more: int
+    line: StraightLine,
+    mechanics: Mechanics,
+    switches: Sequence[int],
+    spatial: Sequence[int],
+    n: int,
+    size: int,
+    more: int,
 ) -> StraightLine:
     """The line of a `Kick`. That of the program takes `size` inputs and the pieces; `more` numbers stand behind the hⱼ.
 
@@ -128,7 +133,7 @@ def kick_line(
 
 
 class _Sides:
-    """A line on both sides of a border in one graph: behind the `size` inputs the m pieces before it, those behind it."""
+    """A line on both sides of a border in one graph: its `size` inputs, the m pieces before it, the m behind it."""
 
     def __init__(self, graph: Graph, line: StraightLine, size: int, m: int):
         self.graph, self.line = graph, line

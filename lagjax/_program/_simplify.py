@@ -11,7 +11,7 @@ import numpy as np
 
 
 def add(graph, op, a, b):
-    """x + 0 is x; like terms are collected, and branches of one condition, of which each is zero where the other counts.
+    """x + 0 is x; like terms are collected, and two selections of which one is zero where the other is not.
 
     Those are what the derivative of `where` consists of.
     """
