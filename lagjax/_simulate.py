@@ -95,8 +95,9 @@ def simulate(
     **Borders.** Forces and potentials may have kinks and jumps (`where`, `abs`, `sign`, `clip`, `floor`, …), also in
     time. Where L itself or p = ∂L/∂q̇ jumps, the velocities do: p is continuous at an instant, and along a border in
     space, across which the energy is (where that does not suffice, the motion is reflected); at the very instant they
-    are those behind it. What cannot be decided so is refused before the run. Machine code ends a step at every border and begins the next one beyond it; where both sides push towards the
-    border, as dry friction at rest does, the motion stays on it. First and second derivatives, in every mode, include
+    are those behind it. What cannot be decided so is refused before the run, and so is all of it with a solver of
+    diffrax. Machine code ends a step at every border and begins the next one beyond it; where both sides push towards
+    the border, as dry friction at rest does, the motion stays on it. First and second derivatives, in every mode, include
     the jumps at borders. Where they do not exist they are NaN: where a border is grazed, and by knots of two inputs
     that coincide (see `samples`). With diffrax, steps shrink at borders and go across, and a derivative over them lacks
     what a jump of the acceleration adds. So the steps are searched for a jump before a derivative is computed: a motion
