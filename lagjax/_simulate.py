@@ -97,15 +97,15 @@ def simulate(
     space, across which the energy is (where that does not suffice, the motion is reflected); at the very instant they
     are those behind it. What cannot be decided so is refused before the run, and so is all of it with a solver of
     diffrax. Machine code ends a step at every border and begins the next one beyond it; where both sides push towards
-    the border, as dry friction at rest does, the motion stays on it. First and second derivatives, in every mode, include
-    the jumps at borders. Where they do not exist they are NaN: where a border is grazed, and by knots of two inputs
-    that coincide (see `samples`). With diffrax, steps shrink at borders and go across, and a derivative over them lacks
-    what a jump of the acceleration adds. So the steps are searched for a jump before a derivative is computed: a motion
-    that crosses one, at a place that moves with the state or with parameters that are differentiated, raises
-    `SimulationError` in `jax.grad`; its derivatives are NaN with `throw=False`. With an event or an `adjoint` they are
-    NaN in either case, but by the time of a switch that is a parameter, where they lack its jump; with
-    `diffrax.BacksolveAdjoint` nothing is searched. Corners, where the acceleration is continuous, and jumps at known
-    times add nothing to first derivatives.
+    the border, as dry friction at rest does, the motion stays on it. First and second derivatives, in every mode,
+    include the jumps at borders. Where they do not exist they are NaN: where a border is grazed, and by knots of two
+    inputs that coincide (see `samples`). With diffrax, steps shrink at borders and go across, and a derivative over
+    them lacks what a jump of the acceleration adds. So the steps are searched for a jump before a derivative is
+    computed: a motion that crosses one, at a place that moves with the state or with parameters that are
+    differentiated, raises `SimulationError` in `jax.grad`; its derivatives are NaN with `throw=False`. With an event or
+    an `adjoint` they are NaN in either case, but by the time of a switch that is a parameter, where they lack its jump;
+    with `diffrax.BacksolveAdjoint` nothing is searched. Corners, where the acceleration is continuous, and jumps at
+    known times add nothing to first derivatives.
 
     **Values that functions read.** What the event and the functions inside `system` read besides their arguments
     (globals, closures, attributes, helpers) is compared at every call: after `K = 1.0` the motion is that of the new
