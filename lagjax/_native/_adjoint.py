@@ -54,6 +54,8 @@ class Adjoint:
             self._transpose_orders(products.pull(), recursion.pull()),
             ZerothOrder(motion, parts).pull(cotangents),
         ]
+        if (retraction := self.replay.retraction) is not None:
+            steps.append(retraction.pull(cotangents))
         if parts.projection is not None:
             steps.insert(0, ProjectedEnd(motion, parts).pull(cotangents))
         if (saltation := self.replay.saltation()) is not None:

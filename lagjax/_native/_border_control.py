@@ -41,6 +41,7 @@ from lagjax._native._constants import (
 )
 from lagjax._native._frame import Frame, Lane
 from lagjax._native._ir import INTEGER, Code, Value
+from lagjax._native._retraction import Retraction
 from lagjax._native._roots import Roots, Touch
 from lagjax._native._saltation import NUMBERS, GuardTable, Saltation
 from lagjax._native._step import absolute_tolerance
@@ -77,6 +78,8 @@ class BorderControl:
         self.table = GuardTable(motion, borders)
         self.kicks_in_time = borders.kicks_in_time(motion.states)
         self.decide, self.stop = self._decide(), self._stop()
+        self.retraction = borders.retraction and Retraction(motion, borders, nesting)
+        self.retract = self.retraction and self.retraction.apply(is_run=True)
         self.note, self.jump = None, None
         if jump is not None:
             saltation = Saltation(motion, self.table, base, jump)
@@ -582,6 +585,8 @@ class BorderControl:
         code = frame.code
         stepped, crossed = frame["stepped"] > 0.0, frame["crossed"]
         crosses, was_cut = crossed > 0.0, code.compare("!=", frame["cut"], frame["planned_h"])
+        if self.retraction is not None:  # borders that are left before the step begins do not take the state
+            self.retraction.undo(frame, ~stepped)
         with code.loop(len(self.guards)) as g:
             ends = stepped & (frame["touch", g] < Touch.SLIDING)
             with frame.where(ends):

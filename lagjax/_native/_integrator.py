@@ -77,7 +77,8 @@ class Integrator:
         if borders is not None:
             fields |= BorderControl.fields(borders)
         jump = parts.jump
-        large = is_large(program, projection, guards, more=() if jump is None else [jump.line])
+        more = [line for line in (jump and jump.line, borders and borders.retraction) if line]
+        large = is_large(program, projection, guards, more=more)
         has_pieces = borders is not None and borders.switches
         alone = large and width == 1 and not has_pieces and chosen is None and not for_gpus
         kind = SingleMember if alone and fills_lanes(series) else TaylorSeries
@@ -173,6 +174,8 @@ class Integrator:
         with self.motion.rounds(frame, rounds):
             if crossings is not None:
                 frame.call(crossings.decide)
+                if crossings.retract is not None:
+                    frame.call(crossings.retract)
             frame.call(self.motion.coefficients, order)
             self.step.choose(frame, order)
             if borders is not None:
@@ -185,7 +188,8 @@ class Integrator:
             if crossings is not None:
                 crossings.settle(frame)
             with code.only_if(frame.job("room") > 0), code.loop(self.motion.width) as lane:
-                self.output.record(frame, frame.lane(lane), kicks)
+                retracts = crossings is not None and crossings.retraction is not None
+                self.output.record(frame, frame.lane(lane), kicks, "unretracted" if retracts else "y")
             after, rest = self.step.end_time(frame)
             if not self.notes:
                 self.output.write_due(

@@ -2,6 +2,7 @@
 
 A step y(t + h) = Σ yₖ hᵏ is a composition of maps of the state y₀ and the parameters p:
 
+    Retraction        y₀, p ↦ y₀ on the borders that the motion slides along (`_retraction`)
     ZerothOrder       y₀, p ↦ the acceleration, and what the recursion reads of the zeroth order
     CauchyProducts    rows of the orders before ↦ Σ' aⱼ bₖ₋ⱼ
     OrderRecursion    yₖ, values and sums ↦ the rows of order k, and yₖ₊₁
@@ -9,7 +10,7 @@ A step y(t + h) = Σ yₖ hᵏ is a composition of maps of the state y₀ and th
     ProjectedEnd      the end of the series ↦ that on the constraints
     Saltation         a state at a border ↦ that on the piece beyond it (`_saltation`)
 
-`TaylorSeries.coefficients` computes the first three. Here `push` emits the pushforward of a map, from the tangents of
+`TaylorSeries.coefficients` computes three more. Here `push` emits the pushforward of a map, from the tangents of
 its arguments to those of its results, and `pull` its pullback, which takes cotangents of results and adds to those of
 arguments. What reads a step in one of the two ways (`_tangent`, `_adjoint`) is a loop over the maps; a new kind of map
 brings its two rules, and nothing else knows of it.

@@ -88,8 +88,8 @@ class Output:
 
     # ---- steps, for their transposes ----
 
-    def record(self, frame: Frame, lane: Lane, kicks: bool) -> None:
-        """Time, size and first state of the step, whose it is and which, as long as there is room.
+    def record(self, frame: Frame, lane: Lane, kicks: bool, state: str = "y") -> None:
+        """Time, size and first state of the step, a field, whose it is and which, as long as there is room.
 
         Where anything `kicks` the motion, steps of no length may count as well.
         All threads write rows into one table, in the order in which they come to it.
@@ -103,7 +103,7 @@ class Output:
                 for k, x in enumerate(parts):
                     frame.write("record", row + k, x)
                 for i in motion.form.each(code, motion.states):
-                    frame.write("record", row + len(parts) + i, lane["y", i])
+                    frame.write("record", row + len(parts) + i, lane[state, i])
                 if motion.pieces:
                     self._record_pieces(frame, lane, row + (RECORDED + motion.states))
 

@@ -14,6 +14,7 @@ from lagjax._native._frame import Frame, Lane
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._output import RECORDED
 from lagjax._native._parts import MotionParts
+from lagjax._native._retraction import Retraction
 from lagjax._native._saltation import GuardTable, Saltation
 from lagjax._native._taylor import TaylorSeries, is_large
 
@@ -37,7 +38,8 @@ class Replay:
         number: ir.Type = DOUBLE,
     ):
         self.parts, self._jump = parts, parts.jump_over_steps
-        more = () if self._jump is None else [self._jump.line] * jumps
+        more = [] if self._jump is None else [self._jump.line] * jumps
+        more += [line for line in (parts.borders and parts.borders.retraction,) if line]
         large = is_large(parts.program, parts.projection, times=2, more=more)
         if parts.borders is not None:
             fields = fields | Saltation.fields(parts.borders) | at_borders | {"crossed": 1, "grazes": 1}
@@ -45,6 +47,9 @@ class Replay:
         self.motion = motion = TaylorSeries(
             name, parts, job, fields, large, width, keep_sums=True, number=number
         )  # fmt: skip
+        borders = parts.borders
+        self.retraction = borders and borders.retraction and Retraction(motion, borders, parts.nesting)
+        self._retract = self.retraction and self.retraction.apply(is_run=False)
         self._size = motion.states + RECORDED + motion.recorded_pieces  # of what is recorded of a step
 
     def saltation(self) -> Saltation | None:
@@ -89,7 +94,11 @@ class Replay:
         with self.motion.rounds(frame, rounds):
             with code.loop(self.motion.width) as index:
                 self._recall(frame, frame.lane(index))
+            if self._retract is not None:
+                frame.call(self._retract)
             frame.call(self.motion.coefficients, frame.job("order"))
+            if self.retraction is not None:
+                self.retraction.note_start(frame)
             yield
             with code.loop(self.motion.width) as index, code.only_if(frame.lane(index)["member"] >= 0):
                 leave(frame, frame.lane(index), index)

@@ -41,7 +41,7 @@ class Tangent:
         fields |= {"moved": 2 * parts.series.size} if parts.projection is not None else {}
         self.replay = Replay("tangent", parts, JOB, fields, {}, width, jumps=1)
         self.motion = motion = self.replay.motion
-        self.saltation = self.replay.saltation()
+        self.saltation, self.retraction = self.replay.saltation(), self.replay.retraction
         self.note_border = self.saltation and self.saltation.note_end()
         self.directions = directions = Directions(motion, parts, lanes)
         self.form, self.series_sum = directions.form, SeriesSum(motion)
@@ -147,6 +147,8 @@ class Tangent:
                     lane["dparams", i] = frame.read("params_dot", first + self.motion.place_of_number(code, i))
         if self.saltation is not None:
             self.saltation.push(self.directions, frame)
+        if self.retraction is not None:
+            self.retraction.push(self.directions, frame)
         return frame.finish()
 
     def _series(self, zeroth_order: ZerothOrder) -> Code:

@@ -112,6 +112,8 @@ class Borders(NamedTuple):
     `nested` says whether switching numbers depend on pieces. `tables` (m,) has that of every piece that is one of a
     table; those of a `CLOCK` have no guards. `motion` has the borders of the motion alone, where this is one with
     tangents (`_jump.with_borders_of_tangents`). `kick` is that at borders at which L jumps, None where there are none.
+    `retraction` takes the inputs of the program to the state on the borders that it slides along, None where it may
+    slide along none; `moved` are the coordinates that each moves.
     """
 
     program: Pieced
@@ -125,6 +127,8 @@ class Borders(NamedTuple):
     tables: tuple[Located | None, ...] = ()
     motion: "Borders | None" = None
     kick: Kick | None = None
+    retraction: StraightLine | None = None
+    moved: tuple[frozenset[int], ...] = ()
 
     @property
     def kicking(self) -> tuple[int, ...]:
@@ -541,9 +545,9 @@ class _Rewriting:
             done = with_sliding(line, self.size, program.size, self.switches, slides, linear)
             if done is not None:
                 break
-        sliding = slides if done is not None else []
+        sliding, retraction, moved = slides if done is not None else [], None, ()
         if done is not None:
-            line, places, shares, linear = done
+            line, places, shares, linear, retraction, moved = done
             switches, arguments = [places[i] for i in switches] + shares, [places[i] for i in arguments]
         count, kick = len(switches), None
         if self.mechanics:
@@ -554,7 +558,8 @@ class _Rewriting:
         kinds = (*self.kinds, *[SLIDE] * len(sliding))
         return Borders(
             pieced, tuple(switches), kinds, self._decide(count, sliding), _guards(kinds, sliding), nested,
-            tuple(arguments), tuple(features.values()), (*self.tables, *[None] * len(sliding)), kick=kick,
+            tuple(arguments), tuple(features.values()), (*self.tables, *[None] * len(sliding)), None, kick,
+            retraction, moved,
         )  # fmt: skip
 
     # ---- where L jumps ----

@@ -18,6 +18,7 @@ Source of the first order: Aizerman & Gantmakher, Q. J. Mech. Appl. Math. 11 (19
 Circuits Syst. I 47 (2000) 204, §III.
 """
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -61,6 +62,19 @@ class Nesting(NamedTuple):
     def levels(self) -> list[tuple[int, int]]:
         """The coordinates whose tangents each level has, and the number of directions of these tangents."""
         return [(Nesting(self.base, self.directions[:k]).size, count) for k, count in enumerate(self.directions)]
+
+    @property
+    def disjoint_rows(self) -> list[tuple[int, int, int]]:
+        """Rows, each with two others that are derivatives along some of its directions, and none along both."""
+        counts, found = [1 + count for count in self.directions], []
+        place = functools.partial(np.ravel_multi_index, dims=counts, order="F")
+        for index in itertools.product(*map(range, counts)):
+            among = [range(3) if i else (0,) for i in index]  # in none of both, in the first, in the second
+            for parts in itertools.product(*among):
+                if 1 in parts and 2 in parts and parts.index(1) < parts.index(2):
+                    a, b = (tuple(i * (part == k) for i, part in zip(index, parts, strict=True)) for k in (1, 2))
+                    found.append((int(place(index)), int(place(a)), int(place(b))))
+        return found
 
     def with_tangents(self, directions: int) -> "Nesting":
         """The same with tangents of all of it along this many directions."""
@@ -141,6 +155,10 @@ def with_borders_of_tangents(borders: Borders, size: int, directions: int, membe
     every = [None, *range(directions)]
     of = [(i, row) for row in every for i in range(n)] + [(n + k, None) for k in range(1 + len(followed))]
     tables = [_table_of_row(row * member) for row in range(1, rows)]
+    retraction = borders.retraction
+    if retraction is not None:
+        states = [(half * n + i, row) for half in range(2) for row in every for i in range(n)]
+        retraction = with_tangents(retraction, program.dtypes, places, moving, states, tables)
     line = with_tangents(line, program.dtypes, places, moving, of, tables)
     switches = line.outputs[rows * n + 1 :]
     dtypes = (np.dtype(float),) * (first_piece + pieces)
@@ -150,7 +168,7 @@ def with_borders_of_tangents(borders: Borders, size: int, directions: int, membe
     return borders._replace(
         program=Pieced(line, len(dtypes), dtypes, None, max(program.budget, len(line.nodes))),
         switches=switches[:pieces], arguments=switches[pieces:], decide=_renumber_inputs(borders.decide, decided),
-        motion=borders.motion or borders,
+        motion=borders.motion or borders, retraction=retraction,
     )  # fmt: skip
 
 

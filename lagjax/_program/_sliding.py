@@ -8,15 +8,22 @@ shares together, from one linear system.
 Where pieces act on the right side alone of A z = r, each for itself, they are unknowns of that system: the piece
 p + μ instead of p, with A z − Σ μₖ ∂r/∂pₖ = r, and one row more for each, that of u̇ = 0, or μ = 0 where nothing slides.
 Its series needs no series of an elimination. Else the program is copied for each of them, a few at most.
+
+What such equations leave is rounding, which a body at rest would gather to ½ ε t². So the acceleration of one
+coordinate of each border, its *pivot*, follows from u̇ = 0 itself: it is zero where u is a velocity alone. And a step
+begins on its borders: the *retraction* puts the velocity back on u = 0, along what the border's force moves, and the
+position where u depends on that alone. Its derivative is that of a motion whose start is varied: off the border by δu,
+on either side, the force brings it back at once.
 """
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
 
 from lagjax._program._differentiation import copy_nodes, gradient_in
 from lagjax._program._graph import Graph
+from lagjax._program._passes import live
 from lagjax._program._series import LinearSystem, StraightLine
 
 MOST_SLIDING = 64  # pieces that are unknowns of the linear system: their own elimination takes a third of the cube
@@ -24,6 +31,9 @@ MOST_COPIES, LARGEST_COPIED = 4, 4000  # pieces for each of which a program is c
 # Borders that are not independent share what they hold as if they yielded by so much, relative; what that leaves is
 # mended this many times. The share of what no border holds alone is as exact as rounding, divided by it.
 SOFT, MENDED = 1e-9, 2
+# What moves less off a border, relative to what pushes it there, is held by others: rounding of forces that cancel. It
+# decides on derivatives alone; doubled, nothing that was looked at changes.
+STILL = 1e-9
 FAR = 1e100  # of a rate: a share that is beyond 0 and 1; the search for its roots squares it
 _LARGEST = 10_000_000  # operations: a bound for errors
 
@@ -39,12 +49,18 @@ class Slide(NamedTuple):
 
 
 class Sliding(NamedTuple):
-    """A program with shares; `places` says where the nodes of the one without them are."""
+    """A program with shares; `places` says where the nodes of the one without them are.
+
+    `retraction` takes the same inputs to the state (q, q̇) on the borders that the motion slides along; `moved` are the
+    coordinates that the force of each of these moves.
+    """
 
     line: StraightLine
     places: Sequence[int]
     shares: list[int]
     linear: LinearSystem | None
+    retraction: StraightLine
+    moved: tuple[frozenset[int], ...]
 
 
 def with_sliding(
@@ -93,8 +109,8 @@ class _SlidingForces:
         acts = self._acts()
         if acts is None:
             return None
-        slopes, rates = zip(*map(self._rate, range(len(self.slides))), strict=True)
-        effects = self._effects(acts, slopes)
+        slopes, rates, levels = zip(*map(self._rate, range(len(self.slides))), strict=True)
+        responses, effects = self._effects(acts, slopes)
         pushed = [self.f("lt", row[k], self.zero) for k, row in enumerate(effects)]
         # Borders that are not pushed onto are left, and act on nothing until then.
         acts = [
@@ -102,18 +118,36 @@ class _SlidingForces:
         ]
         normals = [[self.f("select", p, self.zero, d) for d in of] for p, of in zip(pushed, slopes, strict=True)]
         equations = self._equations(effects, pushed, slopes)
+        ends = [self.f("select", p, self.zero, rate) for p, rate in zip(pushed, rates, strict=True)]
         missing = [
-            self.f("sub", self.f("select", p, self.zero, rate), dot(self.graph, d, self.linear.z[: self.n]))
-            for p, d, rate in zip(pushed, normals, rates, strict=True)
+            self.f("sub", end, dot(self.graph, d, self.linear.z[: self.n]))
+            for end, d in zip(ends, normals, strict=True)
         ]
         unknown = self._unknown(equations, missing)
+        pivots = _choose_pivots([_constants(self.graph, self._unmask(d)) for d in slopes])
+        held = _Held(self.graph, self.n, pushed, [self._unmask(d) for d in slopes], responses, pivots)
         z = self._solve(self._push_right_side(self.linear.right, acts, unknown))
+        if len(pivots) < len(acts):  # what has none is held by the rounding of rounding
+            left = [self.f("sub", end, dot(self.graph, d, z[: self.n])) for end, d in zip(ends, normals, strict=True)]
+            more = equations.solve(self.graph, left)
+            rest = self._solve(self._push_right_side([self.zero] * len(z), acts, more))
+            z, unknown = (
+                [self.f("add", *pair) for pair in zip(*both, strict=True)] for both in ((z, rest), (unknown, more))
+            )
+        z = held.hold(z, rates)
         shares = [self._share(k, pushed[k], unknown[k], slopes[k], rates[k], z) for k in range(len(acts))]
-        ends = [self.f("select", p, self.zero, rate) for p, rate in zip(pushed, rates, strict=True)]
-        linear = self._system(z, unknown, acts, normals, ends, equations)
+        linear = self._system(z, unknown, acts, normals, ends, equations, held.pivots())
         outputs = (*z[: self.n], *self.line.outputs[self.n :])
         line = StraightLine(tuple(self.graph.nodes), tuple(self.graph.kinds), outputs)
-        return Sliding(line, range(len(self.line.nodes)), shares, linear)
+        by_position = [k for k, slide in enumerate(self.slides) if slide.order > 1]
+        if by_position:
+            some = [[effects[k][m] for m in by_position] for k in by_position]
+            pushes = [self._pushes_back(k, effects, pushed, slopes, missing) for k in by_position]
+            of_positions = self._equations(some, pushes, [slopes[k] for k in by_position])
+            at = [self.switches[self.slides[k].piece] for k in by_position]
+            held.put_back(0, by_position, at, lambda left: of_positions.solve(self.graph, left), pushes)
+        held.put_back(self.n, range(len(levels)), levels, lambda left: equations.solve(self.graph, left), pushed)
+        return Sliding(line, range(len(self.line.nodes)), shares, linear, *held.finish())
 
     def _solve(self, right: Sequence[int]) -> list[int]:
         """z of A z = r."""
@@ -121,11 +155,16 @@ class _SlidingForces:
         nodes = copy_nodes(self.graph, line, [*self.linear.factors, *right])
         return [nodes[i] for i in line.outputs]
 
-    def _effects(self, acts: Sequence[dict[int, int]], slopes: Sequence[list[int]]) -> list[list[int]]:
-        """The slopes ∂u̇/∂p of the rate of each border by each piece; zeros where nothing slides."""
+    def _effects(self, acts: Sequence[dict[int, int]], slopes: Sequence[list[int]]) -> tuple[list[list[int]], ...]:
+        """The slopes of q̈ by each piece, and ∂u̇/∂p of each border by each piece; zeros where nothing slides."""
         size = len(self.linear.right)
         responses = [self._solve([act.get(i, self.zero) for i in range(size)])[: self.n] for act in acts]
-        return [[dot(self.graph, d, response) for response in responses] for d in slopes]
+        return responses, [[dot(self.graph, d, response) for response in responses] for d in slopes]
+
+    def _unmask(self, numbers: Sequence[int]) -> list[int]:
+        """Numbers that are zero where nothing slides, as they are where something does."""
+        nodes = self.graph.nodes
+        return [nodes[d][1][2] if nodes[d][0] == "select" else d for d in numbers]
 
     def _equations(self, effects: list[list[int]], pushed: Sequence[int], slopes: Sequence[list[int]]) -> "_Equations":
         """The linear equations of μ; μ = 0 where there is nothing to do."""
@@ -145,6 +184,26 @@ class _SlidingForces:
         lower = eliminate(self.graph, rows)
         return _Equations(rows, lower, whole if soft else [])
 
+    def _pushes_back(self, j: int, effects, pushed: Sequence[int], slopes, missing: Sequence[int]) -> int:
+        """True where border j of positions pushes back what lies beside it; other borders may hold that there, too."""
+        f, others = self.f, [k for k in range(len(self.slides)) if k != j]
+        if all(self.slides[k].order > 1 for k in others):
+            return pushed[j]
+        without = [p if k != j else f("and", p, f("not", p)) for k, p in enumerate(pushed)]
+        equations = self._equations(effects, without, slopes)
+        stays = pushed[j]
+        for side in (self.one, self.number(-1.0)):
+            change = f("sub", side, self.pieces[j])
+            beside = [f("sub", x, f("mul", effects[k][j], change)) for k, x in enumerate(missing)]
+            mu = self._unknown(equations, [f("select", p, self.zero, x) for p, x in zip(without, beside, strict=True)])
+            for k in others:
+                held = f("lt", f("abs", f("add", self.pieces[k], mu[k])), self.one)
+                stays = f("and", stays, f("or", f("not", pushed[k]), held))
+            row = [self.zero if k == j else x for k, x in enumerate(effects[j])]
+            moves = f("abs", f("sub", beside[j], dot(self.graph, row, mu)))
+            stays = f("and", stays, f("le", moves, f("mul", self.number(STILL), f("abs", effects[j][j]))))
+        return f("and", pushed[j], f("not", stays))
+
     def _unknown(self, equations: "_Equations", missing: list[int]) -> list[int]:
         """μ; where borders share what they hold, the pieces p + μ are to be small, and not how far they are from p."""
         if not equations.whole:
@@ -155,12 +214,10 @@ class _SlidingForces:
 
     def _are_dependent(self, slopes: Sequence[list[int]]) -> bool:
         """True if the rates of some borders are combinations of others, so that these can share what they hold."""
-        numbers = np.random.default_rng(0).uniform(0.5, 1.5, (len(slopes), self.n))
+        some, numbers = np.random.default_rng(0), np.zeros((len(slopes), self.n))
         for k, of_one in enumerate(slopes):
-            for i, d in enumerate(of_one):
-                branch = self.graph.nodes[d][1][2] if self.graph.nodes[d][0] == "select" else d
-                value = self.graph.value(branch)
-                numbers[k, i] = numbers[k, i] if value is None else value
+            for i, value in _constants(self.graph, self._unmask(of_one)).items():
+                numbers[k, i] = some.uniform(0.5, 1.5) if value is None else value
         return bool(np.linalg.matrix_rank(numbers) < len(slopes))
 
     def _share(self, k: int, pushed: int, mu: int, slopes: list[int], rate: int, z: Sequence[int]) -> int:
@@ -221,20 +278,21 @@ class _SlidingForces:
                 sides[i] = values
         return sides
 
-    def _rate(self, k: int) -> tuple[list[int], int]:
-        """∂w/∂q̇ and −∂w/∂q q̇ − ∂w/∂t of what is to stay zero, u or u̇; zeros where nothing slides."""
+    def _rate(self, k: int) -> tuple[list[int], int, int]:
+        """∂w/∂q̇ and −∂w/∂q q̇ − ∂w/∂t of what is to stay zero, u or u̇; zeros where nothing slides. And w."""
         n, node = self.n, self.switches[self.slides[k].piece]
+        level = node
         for _ in range(self.slides[k].order):
-            slopes = self._slopes(node)
+            level, slopes = node, self._slopes(node)
             velocities = [self.graph.input(n + i, "float") for i in range(n)]
             node = self.f("add", dot(self.graph, slopes[:n], velocities), slopes[2 * n])
-        return [self.masked(k, x) for x in slopes[n : 2 * n]], self.masked(k, self.f("neg", node))
+        return [self.masked(k, x) for x in slopes[n : 2 * n]], self.masked(k, self.f("neg", node)), level
 
     def _slopes(self, node: int) -> list[int]:
         line = StraightLine(tuple(self.graph.nodes), tuple(self.graph.kinds), ())
         return gradient_in(self.graph, line, list(range(len(line.nodes))), node, range(2 * self.n + 1))
 
-    def _system(self, z, unknown, acts, slopes, rates, equations) -> LinearSystem:
+    def _system(self, z, unknown, acts, slopes, rates, equations, pivots) -> LinearSystem:
         system, count = self.linear, len(self.linear.right)
         others = {(i, count + k): self.f("neg", c) for k, act in enumerate(acts) for i, c in act.items()}
         others |= {
@@ -245,6 +303,7 @@ class _SlidingForces:
         }
         # What `solve` needs besides: the entries, and the elimination of the unknowns.
         own = [*others.values(), *(x for table in equations for row in table for x in row)]
+        own += [x for _, _, *numbers in pivots for x in numbers]
         known = {x: self.graph.value(x) for x in own}
         read = list(dict.fromkeys(x for x in own if known[x] is None))
         factors = (*system.factors, *read)
@@ -255,6 +314,7 @@ class _SlidingForces:
             at = {x: inputs[len(system.factors) + i] for i, x in enumerate(read)}
             at |= {x: graph.constant(value, "float") for x, value in known.items() if value is not None}
             right, ends = inputs[len(factors) : len(factors) + count], inputs[len(factors) + count :]
+            left = list(ends)
             inner = system.solve().line
 
             def apply_inverse(right):
@@ -269,7 +329,25 @@ class _SlidingForces:
             for (row, column), c in others.items():
                 if column >= count:
                     right[row] = graph.apply("sub", right[row], graph.apply("mul", at[c], mu[column - count]))
-            outputs = (*apply_inverse(right), *mu)
+            z = apply_inverse(right)
+            if len(pivots) < len(acts):
+                end, rest = list(left), [graph.constant(0.0, "float")] * count
+                for (row, column), d in others.items():
+                    if row >= count:
+                        end[row - count] = graph.apply("sub", end[row - count], graph.apply("mul", at[d], z[column]))
+                more = _Equations(*([[at[x] for x in row] for row in table] for table in equations)).solve(graph, end)
+                for (row, column), c in others.items():
+                    if column >= count:
+                        rest[row] = graph.apply("sub", rest[row], graph.apply("mul", at[c], more[column - count]))
+                z = [graph.apply("add", *pair) for pair in zip(z, apply_inverse(rest), strict=True)]
+                mu = [graph.apply("add", *pair) for pair in zip(mu, more, strict=True)]
+            for k, i, free, inverse in pivots:
+                end = left[k]
+                for (row, j), d in others.items():
+                    if row == count + k and j != i:
+                        end = graph.apply("sub", end, graph.apply("mul", at[d], z[j]))
+                z[i] = graph.apply("add", graph.apply("mul", at[free], z[i]), graph.apply("mul", at[inverse], end))
+            outputs = (*z, *mu)
             return StraightLine(tuple(graph.nodes), tuple(graph.kinds), outputs)
 
         return LinearSystem(
@@ -285,6 +363,94 @@ def _adds_up(op: str, operands: Sequence[int], sides: dict) -> bool:
     if op == "mul":
         return sum(moving) == 1
     return op in ("div", "select") and not moving[1 if op == "div" else 0]
+
+
+# ---- what stays on borders ----
+
+
+class _Held:
+    """Accelerations, and a state, on the borders that hold: those that are `pushed` onto.
+
+    `slopes` are ∂u̇/∂q̈ of each border, `responses` the accelerations by each piece, `pivots` as `_choose_pivots` gives
+    them. The state begins as the inputs of the program.
+    """
+
+    def __init__(self, graph: Graph, n: int, pushed: Sequence[int], slopes, responses, pivots):
+        self.graph, self.n, self.pushed, self.slopes, self.responses = graph, n, pushed, slopes, responses
+        self.zero, self.one = (graph.constant(x, "float") for x in (0.0, 1.0))
+        self.divisors = [(k, i, graph.apply("select", pushed[k], self.one, slopes[k][i])) for k, i in pivots]
+        self.state = {i: graph.input(i, "float") for i in range(2 * n)}
+
+    def pivots(self) -> list[tuple[int, int, int, int]]:
+        """Each border, its pivot, 1 where the pivot is free, and the inverse of its slope where the border holds."""
+        f, zero, one = self.graph.apply, self.zero, self.one
+        return [
+            (k, i, f("select", self.pushed[k], one, zero), f("select", self.pushed[k], zero, f("div", one, divisor)))
+            for k, i, divisor in self.divisors
+        ]
+
+    def hold(self, z: Sequence[int], rates: Sequence[int]) -> list[int]:
+        """Accelerations with those of pivots from Σ ∂u̇/∂q̈ᵢ q̈ᵢ = `rates`."""
+        f, z = self.graph.apply, list(z)
+        for k, i, divisor in self.divisors:
+            others = dot(self.graph, [self.zero if j == i else d for j, d in enumerate(self.slopes[k])], z[: self.n])
+            z[i] = f("select", self.pushed[k], z[i], f("div", f("sub", rates[k], others), divisor))
+        return z
+
+    def put_back(
+        self, first: int, which: Sequence[int], levels: Sequence[int], solve: Callable, pushed: Sequence[int]
+    ) -> None:
+        """Move the state from `first` on to zero `levels` of the borders `which`, all along what their forces move.
+
+        `solve` gives the multiples of `responses` that change the levels by given numbers, where borders are `pushed`
+        onto. Then pivots move alone, by what rounding and one step of Newton's have left.
+        """
+        f, state, n, pushed_of = self.graph.apply, self.state, self.n, dict(zip(which, pushed, strict=True))
+        left = zip(which, self._evaluate(levels), strict=True)
+        multiples = solve([f("select", pushed_of[k], self.zero, level) for k, level in left])
+        for i in range(n):
+            moves = dot(self.graph, [self.responses[k][i] for k in which], multiples)
+            state[first + i] = f("sub", state[first + i], moves)
+        left, moved = dict(zip(which, self._evaluate(levels), strict=True)), [self.zero] * n
+        for k, i, divisor in self.divisors:
+            if k in left:
+                change = f("div", f("add", left[k], dot(self.graph, self.slopes[k], moved)), divisor)
+                before, change = state[first + i], f("neg", change)
+                state[first + i] = f("select", pushed_of[k], before, f("add", before, change))
+                moved[i] = f("add", moved[i], f("select", pushed_of[k], self.zero, change))
+
+    def _evaluate(self, nodes: Sequence[int]) -> list[int]:
+        """Nodes of the program at the state."""
+        graph = self.graph
+        line = StraightLine(*live(graph.nodes, graph.kinds, nodes))
+        given = {node[2]: i for i, node in enumerate(graph.nodes) if node[0] == "input"} | self.state
+        places = copy_nodes(graph, line, [given.get(i, self.zero) for i in range(1 + max(given))])
+        return [places[i] for i in line.outputs]
+
+    def finish(self) -> tuple[StraightLine, tuple[frozenset[int], ...]]:
+        """The line from the inputs of the program to the state, and which coordinates each border moves."""
+        graph = self.graph
+        line = StraightLine(*live(graph.nodes, graph.kinds, [self.state[i] for i in range(2 * self.n)]))
+        return line, tuple(frozenset(_constants(graph, response)) for response in self.responses)
+
+
+def _choose_pivots(rows: Sequence[dict[int, float | None]]) -> list[tuple[int, int]]:
+    """Borders, each with a coordinate that can follow from the others, in an order in which none changes one before.
+
+    `rows` has the slopes ∂u̇/∂q̈ᵢ of each border that are not zero, None for those that are no constants. A pivot is
+    alone in its row, or has the largest constant of it, so that it gathers no rounding. A border may have none.
+    """
+    left, behind = dict(enumerate(rows)), []
+
+    def is_free(k: int, i: int) -> bool:
+        constants = {j: abs(x) for j, x in rows[k].items() if x is not None}
+        leads = len(rows[k]) == 1 or (i in constants and constants[i] == max(constants.values()))
+        return leads and not any(i in row for m, row in left.items() if m != k)
+
+    while (found := next(((k, i) for k, row in left.items() for i in row if is_free(k, i)), None)) is not None:
+        behind.append(found)
+        del left[found[0]]
+    return [(k, i) for k, row in left.items() for i in row if len(row) == 1] + behind[::-1]
 
 
 # ---- with a copy for each of them ------------------------------------------------------------------------------------
@@ -315,13 +481,15 @@ def _copy_for_slides(
         [f("sub", places[i], x) for i, x in zip(line.outputs[:n], a, strict=False)]
         for places in map(copy, range(count))
     ]
-    rates, effects = [], []
+    rates, effects, normals, ends = [], [], [], []
     for j, _ in slides:
         slopes = gradient_in(graph, line, base, switches[j], range(2 * n + 1))
         velocity = [graph.input(n + i, "float") for i in range(n)]
-        rate = dot(graph, [*slopes[:n], *slopes[n : 2 * n]], [*velocity, *a[:n]])
-        rates.append(f("add", rate, slopes[2 * n]))
-        effects.append([dot(graph, slopes[n : 2 * n], of_one) for of_one in more])
+        drift = f("add", dot(graph, slopes[:n], velocity), slopes[2 * n])
+        normals.append(slopes[n : 2 * n])
+        ends.append(f("neg", drift))
+        rates.append(f("add", drift, dot(graph, normals[-1], a[:n])))
+        effects.append([dot(graph, normals[-1], of_one) for of_one in more])
     # Borders that are not pushed onto are left.
     held = [f("and", flags[k], f("lt", effects[k][k], zero)) for k in range(count)]
     rows = [
@@ -333,10 +501,15 @@ def _copy_for_slides(
     for i in range(n):
         for k in range(count):
             a[i] = f("add", a[i], f("select", held[k], zero, f("mul", shares[k], more[k][i])))
+    hold = _Held(graph, n, held, normals, more, _choose_pivots([_constants(graph, d) for d in normals]))
+    a[:n] = hold.hold(a[:n], ends)
     moves = [f("add", rates[k], dot(graph, shares, effects[k])) for k in range(count)]
     left = [f("add", number(0.5), f("mul", number(FAR), x)) for x in moves]
-    ends = [f("select", held[k], f("select", flags[k], zero, left[k]), shares[k]) for k in range(count)]
-    return Sliding(StraightLine(tuple(graph.nodes), tuple(graph.kinds), tuple(a)), base, ends, None)
+    of_sides = [f("select", held[k], f("select", flags[k], zero, left[k]), shares[k]) for k in range(count)]
+    done = StraightLine(tuple(graph.nodes), tuple(graph.kinds), tuple(a))
+    levels = [base[switches[j]] for j, _ in slides]
+    hold.put_back(n, range(count), levels, lambda left: substitute(graph, rows, lower, left), held)
+    return Sliding(done, base, of_sides, None, *hold.finish())
 
 
 # ---- a few linear equations ------------------------------------------------------------------------------------------
@@ -357,6 +530,12 @@ class _Equations(NamedTuple):
             more = substitute(graph, self.upper, self.lower, left)
             x = [graph.apply("add", a, b) for a, b in zip(x, more, strict=True)]
         return x
+
+
+def _constants(graph: Graph, numbers: Sequence[int]) -> dict[int, float | None]:
+    """The numbers that are not zero throughout; None for those that are no constants."""
+    values = {i: graph.value(d) for i, d in enumerate(numbers)}
+    return {i: value for i, value in values.items() if value != 0}
 
 
 def dot(graph: Graph, xs: Sequence[int], ys: Sequence[int]) -> int:

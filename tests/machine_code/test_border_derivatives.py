@@ -202,3 +202,37 @@ def test_a_fit_through_stick_and_slip():
         bend = jax.hessian(lambda params: jnp.mean((places(params) - observed) ** 2))(params)
         params = params - jnp.linalg.solve(bend, slope)
     np.testing.assert_allclose(params, truth, atol=1e-8)
+
+
+# ---- jumps beside functions whose slopes may be infinite -------------------------------------------------------------
+
+JUMPS = {
+    "sign": lambda q, v: jnp.sign(v),
+    "where": lambda q, v: jnp.where(q > 0.3, 1.0, 0.2),
+    "clip": lambda q, v: jnp.clip(3 * q, -0.5, 0.5),
+    "table": lambda q, v: jnp.interp(q, jnp.array([-2.0, 0.1, 0.4, 2.0]), jnp.array([0.0, 0.3, -0.2, 0.5])),
+    "floor": lambda q, v: jnp.floor(2 * q + 0.3),
+}
+STEEP = (
+    lambda x, p: jnp.sqrt(p + x * x), lambda x, p: jnp.cbrt(p + x * x), lambda x, p: (p + x * x) ** 1.3,
+    lambda x, p: p ** (1 + x), lambda x, p: jnp.arctan2(x, p), lambda x, p: jnp.hypot(x, p),
+)  # fmt: skip
+
+
+@pytest.mark.parametrize("jump", [pytest.param(name, marks=[pytest.mark.slow] * (name != "sign")) for name in JUMPS])
+def test_reverse_mode_of_a_jump_beside_roots(jump):
+    """Compiles a motion, its tangents and its transpose."""
+
+    def forces(q, v, params):
+        return -0.3 * JUMPS[jump](q, v) - 0.05 * sum(p * f(0.7 * q + v, p) for f, p in zip(STEEP, params, strict=True))
+
+    scene = lagjax.System(lambda q, v: 0.5 * v * v - 0.5 * q * q, forces=forces)
+
+    def end(params):
+        return lagjax.simulate(scene, 1.0, 0.5, jnp.array([0.0, 2.0]), tuple(params), rtol=1e-11).q[-1]
+
+    params, h = jnp.linspace(0.4, 0.9, len(STEEP)), 1e-5
+    reverse, forward = jax.grad(end)(params), jax.jacfwd(end)(params)
+    np.testing.assert_allclose(reverse, forward, atol=1e-10)
+    differences = [(end(params.at[i].add(h)) - end(params.at[i].add(-h))) / (2 * h) for i in range(len(STEEP))]
+    np.testing.assert_allclose(reverse, differences, atol=1e-7)

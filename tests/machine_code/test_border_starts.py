@@ -1,0 +1,176 @@
+"""Motions that begin on the borders they rest on: their derivatives, and that nothing creeps.
+
+Off a border, on either side, friction brings the motion back at once: derivatives are those of a start on it.
+"""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+
+T = 3.0
+TS = jnp.array([0.0, T])
+# Three bodies of unit mass: one on a belt, one with the sliding mode v = −c q, one whose friction is at its limit.
+SCENE = lagjax.System(
+    lambda q, v: 0.5 * v @ v,
+    forces=lambda q, v, params: -jnp.sign(v - params["belt"] * jnp.array([1.0, 0.0, 0.0]) + params["c"] * q)
+    * jnp.array([1.0, 4.0, 2.0]) + jnp.array([params["load"], 0.0, 2.0]),
+)  # fmt: skip
+X = {"v": jnp.array([0.5, -1.0, 0.0]), "belt": 0.5, "c": jnp.array([0.0, 1.0, 0.0]), "load": 0.25}
+Q = jnp.array([0.0, 1.0, 0.0])
+
+
+def ends(x, ts=TS):
+    run = lagjax.simulate(SCENE, Q.astype(ts.dtype), x["v"], ts, {name: x[name] for name in ("belt", "c", "load")})
+    return run.q[-1], run.qdot[-1]
+
+
+def values(tree):
+    return {name: np.asarray(x) for name, x in tree.items()}
+
+
+@pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
+def test_first_derivatives_are_those_of_a_start_on_the_border(derivative):
+    q, v = derivative(ends)(X)
+    decay = np.exp(-T)
+    for of_q, of_v, exact in (
+        # q = u T; e^(−c T) and −c e^(−c T), whatever the velocity is at the start.
+        (values(q)["belt"][:2], values(v)["belt"][:2], ([T, 0.0], [1.0, 0.0])),
+        (values(q)["c"][1, 1], values(v)["c"][1, 1], (-T * decay, (T - 1.0) * decay)),
+        (values(q)["v"][:2, :2], values(v)["v"][:2, :2], (np.zeros((2, 2)), np.zeros((2, 2)))),
+        (values(q)["load"][:2], values(v)["load"][:2], (np.zeros(2), np.zeros(2))),
+    ):
+        np.testing.assert_allclose(of_q, exact[0], atol=1e-9)
+        np.testing.assert_allclose(of_v, exact[1], atol=1e-9)
+    # At the limit it goes on with what it gets forwards, and stops what it gets backwards.
+    assert np.isnan(values(q)["v"][2, 2]) and values(q)["v"][0, 2] == 0.0
+
+
+def test_in_single_precision():
+    """Compiles one batch of motions and their transpose, for callers in float32."""
+    with jax.enable_x64(False):
+        x = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), X)
+        ts = TS.astype(jnp.float32)
+        many = jax.tree.map(lambda leaf: jnp.stack([leaf] * 3), x)
+        slopes = jax.jit(jax.vmap(jax.grad(lambda x: ends(x, ts)[0][:2].sum())))(many)
+        np.testing.assert_allclose(slopes["belt"], T, rtol=1e-6)
+        np.testing.assert_allclose(slopes["c"][:, 1], -T * np.exp(-T), rtol=1e-5)
+        np.testing.assert_allclose(slopes["v"][:, :2], 0.0, atol=1e-6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("outer", [jax.jacfwd, jax.jacrev])
+@pytest.mark.parametrize("inner", [jax.jacfwd, jax.jacrev])
+def test_second_derivatives_exist_along_the_border_alone(inner, outer):
+    def end(x):  # slope of the sliding mode, stiffness, velocity at the start
+        scene = lagjax.System(
+            lambda q, v: 0.5 * v * v,
+            forces=lambda q, v, params: -3.0 * jnp.sign(v + params[0] * q) - params[1] * q,
+        )
+        return lagjax.simulate(scene, x[3], x[2], TS, x[:2]).q[-1]
+
+    second = outer(inner(end))(jnp.array([1.0, 0.5, -1.0, 1.0]))
+    # The end is q0 e^(−cT): c, the start and its velocity are varied off the border, the stiffness is not.
+    assert np.isnan(second[np.ix_([0, 2, 3], [0, 2, 3])]).all()
+    np.testing.assert_array_equal(second[1], 0.0)
+    np.testing.assert_array_equal(second[:, 1], 0.0)
+
+
+@pytest.mark.slow
+def test_a_second_run_from_the_end_of_the_first():
+    """Start and border move together there: second derivatives exist, and are those of one run."""
+    scene = lagjax.System(
+        lambda q, v: 0.5 * v @ v,
+        forces=lambda q, v, params: -params[0] * jnp.sign(v + params[1] * q) - 0.3 * q[::-1],
+    )
+    q0, v0 = jnp.array([0.5, -0.3]), jnp.array([0.7, 0.1])
+
+    def once(x):
+        return jnp.sum(lagjax.simulate(scene, q0, v0, 2 * TS, x).q[-1] ** 2)
+
+    def twice(x):
+        run = lagjax.simulate(scene, q0, v0, TS, x)
+        return jnp.sum(lagjax.simulate(scene, run.q[-1], run.qdot[-1], TS, x).q[-1] ** 2)
+
+    x = jnp.array([2.0, 0.6])
+    for derivative in (jax.grad, jax.hessian, lambda f: jax.jacfwd(jax.jacfwd(f)), lambda f: jax.jacrev(jax.jacrev(f))):
+        np.testing.assert_allclose(derivative(twice)(x), derivative(once)(x), rtol=1e-6, atol=1e-9)
+
+
+def test_a_mode_that_begins_on_its_border():
+    """A body falls on a belt that takes it along, whatever the velocity that the reset gives it."""
+    fall = lagjax.System(lambda q, v, params: 0.5 * v @ v - q[1])
+    carried = lagjax.System(
+        lambda q, v: 0.5 * v @ v,
+        forces=lambda q, v, params: jnp.array([-params["mu"] * jnp.sign(v[0] - params["belt"]), 0.0]),
+    )
+
+    def land(q, v, params):
+        return q, jnp.array([params["reset"], 0.0])
+
+    def end(x):
+        law = [lagjax.Transition("fall", "carried", lambda q, v: q[1], -1, land)]
+        start = jnp.array([0.0, 0.5]), jnp.zeros(2)
+        return lagjax.simulate_hybrid({"fall": fall, "carried": carried}, law, "fall", *start, TS, x).q[-1, 0]
+
+    x = {"mu": 2.0, "belt": 0.25, "reset": 0.25}
+    assert abs(end(x) - 0.5) < 1e-12  # it falls for a unit of time
+    slopes = jax.grad(end)(x)
+    np.testing.assert_allclose([slopes["belt"], slopes["reset"], slopes["mu"]], [2.0, 0.0, 0.0], atol=1e-9)
+
+
+@pytest.mark.parametrize(("friction", "slopes"), [(0.5, [0.0, 0.0, 1.0, 0.0]), (2.5, [1.0, 0.0, 0.0, 0.0])])
+def test_a_body_in_a_corner_with_friction(friction, slopes):
+    """Pushed by 2: from beside the corner it comes back to it in a time as the root of the way, or stays there."""
+    scene = lagjax.System(
+        lambda q, v: 0.5 * v * v,
+        forces=lambda q, v, params: params[1] - 2.0 * jnp.sign(q - params[0]) - params[2] * jnp.sign(v),
+    )
+
+    def end(x):
+        return lagjax.simulate(scene, x[0], x[1], TS, x[2:]).q[-1]
+
+    x = jnp.array([0.5, 0.0, 0.5, 0.25, friction])
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derivative(end)(x)[:4], slopes, atol=1e-12)
+    if friction > 2.25:
+        np.testing.assert_allclose(end(x.at[0].add(0.1)), 0.6, atol=1e-12)
+
+
+# ---- creep -----------------------------------------------------------------------------------------------------------
+
+
+def stack(q, v, params):
+    """Three blocks on each other, the lowest on a belt; loads that they hold."""
+    friction = params[0] * jnp.array([3.0, 2.0, 1.0]) * jnp.sign(jnp.diff(v, prepend=params[2]))
+    return params[1] * jnp.array([0.5, 1.0, -0.3]) - friction + jnp.append(friction[1:], 0.0)
+
+
+def test_nothing_that_rests_creeps():
+    """Motions at rest, or on a belt, for 1e8 units of time. Compiles one batch of motions."""
+    random = np.random.default_rng(0)
+    scene, count = lagjax.System(lambda q, v: 0.5 * v @ (jnp.array([1.0, 2.0, 0.7]) * v), forces=stack), 200
+    mu = random.uniform(0.5, 5.0, count)
+    speeds = np.where(np.arange(count) < 100, 0.0, random.uniform(-2.0, 2.0, count))
+    params = jnp.asarray(np.stack([mu, 0.9 * mu * random.uniform(-1.0, 1.0, count), speeds], axis=1))
+    q0, v0 = random.uniform(-1.0, 1.0, (count, 3)), np.repeat(speeds[:, None], 3, axis=1)
+    run = lagjax.simulate_batch(scene, q0, v0, jnp.array([0.0, 1e4, 1e8]), params, batch_axes=(0, 0, 0))
+    np.testing.assert_array_equal(run.q[:100, -1], q0[:100])
+    np.testing.assert_allclose(run.q[100:, -1], q0[100:] + 1e8 * v0[100:], rtol=1e-15)
+    np.testing.assert_array_equal(run.qdot[:, -1], v0)
+
+
+def test_what_has_come_to_rest_stays_there():
+    """A block that slides down and stops, and where it does, by the end of the time and long after."""
+    scene = lagjax.System(
+        lambda q, v, params: 0.5 * v * v - params[0] * q, forces=lambda q, v, params: -params[1] * jnp.sign(v)
+    )
+
+    def end(params, t):
+        return lagjax.simulate(scene, 0.0, 1.0, jnp.stack([0.0 * t, t]), params).q[-1]
+
+    params = jnp.array([0.7, 1.1])  # it stops after v²/2 (g + μ)
+    np.testing.assert_allclose(end(params, 1e8), 0.5 / 1.8, rtol=1e-12)
+    np.testing.assert_allclose(jax.grad(end)(params, 1e8), -0.5 / 1.8**2 * np.ones(2), rtol=1e-9)
