@@ -1,6 +1,7 @@
 """Random hybrid scenes that meet corners, and several guards within rounding: is any motion wrong without a word?
 
     python -m benchmarks.hybrid_population --scenes 300
+    python -m benchmarks.hybrid_population --scenes 300 --float32
 
 Two to six guards watch every scene: particles in boxes and polygons, beads on a line that touch, between walls and
 without, balls that land together, a particle that falls in a box, and two modes that take turns at a line between
@@ -26,6 +27,7 @@ import mpmath
 import numpy as np
 
 import lagjax
+from benchmarks._singles import EPS, SINGLE_NOISE, add_option, precision_of, rounded
 
 MOST, MOST_AT_ONCE = 60, 200  # transitions of a motion; reflections at one instant, in exact arithmetic
 # Some sixty transitions, each known to a hundred roundings at speeds of ten, for twenty units of time: 1e-10. A count
@@ -33,6 +35,25 @@ MOST, MOST_AT_ONCE = 60, 200  # transitions of a motion; reflections at one inst
 TOLERANCE, MOMENT = 1e-9, 1e-9
 SIZES = (0.0, 1e-16, 1e-15, 3e-15, 1e-14, 3e-14, 1e-13, 1e-12)
 NEARBY = Fraction(2, 10**13)  # of a start whose motion may be taken for the exact one, where reflections do not commute
+
+
+class Digits(NamedTuple):
+    """How exactly the numbers of all scenes came in, and what is asked of their motions."""
+
+    precision: np.dtype = np.dtype(float)
+    sizes: tuple[float, ...] = SIZES
+    nearby: Fraction = NEARBY
+    tolerance: float = TOLERANCE
+    moment: float = MOMENT
+
+
+# A start counts as on a surface within `SINGLE_NOISE` of coordinates up to 3, of which a guard has two, and each of the
+# faces that it meets at once moves it by that; a result is rounded. Motions end, and are counted, that much beside.
+SINGLE = Digits(
+    np.dtype(np.float32), (0.0, *(k * EPS for k in (0.5, 1, 2, 16, 100, 1000))), Fraction(2 * SINGLE_NOISE),
+    8 * SINGLE_NOISE, 32 * SINGLE_NOISE,
+)  # fmt: skip
+DOUBLE = digits_of = Digits()
 
 
 class Motion(NamedTuple):
@@ -148,13 +169,23 @@ def together(parts: Sequence[Motion | None]) -> list[Motion]:
 def digits(rng, low: int, high: int, count: int | None = None):
     """Numbers of one digit or of two behind the point, as decimals between low and high."""
     scale = int(rng.choice([1, 10, 10, 100]))
-    return rng.integers(low * scale, high * scale + 1, count) / scale
+    return given(rng.integers(low * scale, high * scale + 1, count) / scale)
+
+
+def given(x):
+    """Numbers as they come in."""
+    return rounded(x, digits_of.precision)[()]
+
+
+def chosen(rng, numbers: Sequence[float]) -> float:
+    """One of these numbers, as it comes in."""
+    return float(given(rng.choice(numbers)))
 
 
 def off(rng, x: np.ndarray, low, high) -> np.ndarray:
     """Some coordinates are moved by a little, not beyond low and high."""
-    moved = x + rng.choice(SIZES, x.size) * rng.choice([-1, 1], x.size) * (rng.random(x.size) < 0.5)
-    return np.clip(moved, low, high)
+    moved = x + rng.choice(digits_of.sizes, x.size) * rng.choice([-1, 1], x.size) * (rng.random(x.size) < 0.5)
+    return given(np.clip(moved, low, high))
 
 
 def exact(x) -> list[Fraction]:
@@ -176,7 +207,7 @@ def box(rng) -> Scene:
     size = np.full(d, 1.0) if rng.random() < 0.5 else np.maximum(digits(rng, 0, 3, d), 0.5)
     q, v = off(rng, rng.integers(0, 11, d) / 10 * size, 0 * size, size), digits(rng, -3, 3, d)
     if rng.random() < 0.4:  # towards a corner, or along the diagonal
-        q, v = np.full(d, q[0]), np.full(d, v[0]) * rng.choice([1, 2, 3], d)
+        q, v = np.full(d, q[0]), given(np.full(d, v[0]) * rng.choice([1, 2, 3], d))
         q, size = off(rng, q, 0, size[0]), np.full(d, size[0])
     normals = BOX[[*range(d), *range(3, 3 + d)], :d]
     return billiard(rng, q, v, normals, np.concatenate([0 * size, size]), True)
@@ -189,43 +220,47 @@ def polygon(rng) -> Scene:
     size = float(rng.choice([1.0, 0.5, 2.0, 1.2]))
     while True:
         q = off(rng, rng.integers(-10, 11, 2) / 10 * size, -9, 9)
-        if (normals @ q + offsets(size) >= 0).all():
-            return billiard(rng, q, digits(rng, -3, 3, 2), normals, np.array(offsets(size), float), commute)
+        # In float32 a start may be beyond a face, by rounding.
+        if (normals @ q + offsets(size) >= (0 if digits_of is DOUBLE else -4 * EPS * size)).all():
+            return billiard(rng, q, digits(rng, -3, 3, 2), normals, np.array(offsets(size)), commute)
 
 
 def beads(rng) -> Scene:
-    """Three or five beads of equal mass on a line, some of which touch; between walls or not."""
-    n, walls = int(rng.choice([3, 5])), bool(rng.random() < 0.5)
+    """Three or five beads of equal mass on a line, as wide as this or points; between walls or not; some touch."""
+    n, walls, width = int(rng.choice([3, 5])), bool(rng.random() < 0.5), float(rng.choice([0.0, 0.1, 0.3, 0.7]))
     q = np.sort(rng.integers(0, 11, n) if rng.random() < 0.5 else rng.integers(0, 4, n) * 3) / 10
     v = digits(rng, -2, 2, n) * (rng.random(n) < 0.6)
-    q = np.maximum.accumulate(off(rng, q, 0.0, 1.0))
+    q = given(np.maximum.accumulate(off(rng, q, 0.0, 1.0)) + width * np.arange(n))
     apart = np.eye(n)[1:] - np.eye(n)[:-1]
-    normals, offsets = apart, np.zeros(n - 1)
+    normals, offsets = apart, np.full(n - 1, -width)
     if walls:
-        normals, offsets = np.concatenate([apart, np.eye(n)[:1], -np.eye(n)[-1:]]), np.r_[offsets, 0.0, 1.0]
+        normals = np.concatenate([apart, np.eye(n)[:1], -np.eye(n)[-1:]])
+        offsets = np.r_[offsets, 0.0, 1.0 + width * (n - 1)]
     return billiard(rng, q, v, normals, offsets, True)
 
 
 def billiard(rng, q, v, normals, offsets, commute: bool) -> Scene:
-    """A scene of reflections."""
-    duration = float(rng.choice([0.5, 1.0, 2.0, 5.0, 10.0, 7.3]))
+    """A scene of reflections, whose offsets are hundredths: in float32 these are exact, and a start beside them."""
+    hundredths = np.round(100 * np.asarray(offsets))
+    offsets = hundredths / 100
+    duration = chosen(rng, [0.5, 1.0, 2.0, 5.0, 10.0, 7.3])
     numbers = exact(v), duration, [exact(n) for n in normals], exact(offsets)
     right = [reflected(exact(q), *numbers)]
     if not commute:
-        shifts = itertools.product((0, -NEARBY, NEARBY), repeat=len(q))
+        shifts = itertools.product((0, -digits_of.nearby, digits_of.nearby), repeat=len(q))
         near = [[x + dx for x, dx in zip(exact(q), shift, strict=True)] for shift in shifts]
         right += [reflected(x, *numbers, last=last) for x in near for last in (False, True)]
     if right[0] is None:  # too many: it is drawn again
-        return billiard(rng, q, 0.3 * np.round(v, 1), normals, offsets, commute)
-    params = {"normals": np.asarray(normals, float), "offsets": np.asarray(offsets, float)}
+        return billiard(rng, q, given(0.3 * np.round(v, 1)), normals, offsets, commute)
+    params = {"normals": np.asarray(normals, float), "hundredths": hundredths}
     family = f"{len(normals)} reflections of {len(q)} coordinates"
     return Scene(family, q, v, duration, params, [motion for motion in right if motion])
 
 
 def balls(rng) -> Scene:
     """Two or three balls over a floor, dropped or thrown, often from one height."""
-    d, e = int(rng.choice([2, 3])), float(rng.choice([1.0, 0.9, 0.5]))
-    g, duration = float(rng.choice([10.0, 9.81, 1.0])), float(rng.choice([1.0, 2.0, 0.8]))
+    d, e = int(rng.choice([2, 3])), chosen(rng, [1.0, 0.9, 0.5])
+    g, duration = chosen(rng, [10.0, 9.81, 1.0]), chosen(rng, [1.0, 2.0, 0.8])
     q, v = np.abs(digits(rng, 0, 2, d)) * (rng.random(d) < 0.8), digits(rng, -2, 2, d) * (rng.random(d) < 0.5)
     if rng.random() < 0.7:
         q, v = np.full(d, q[0]), np.full(d, v[0])
@@ -291,7 +326,7 @@ def runs(family: str, d: int, guards: int) -> Callable:
             return reflect
 
         def guard(i):
-            return lambda q, v, params: params["normals"][i] @ q + params["offsets"][i]
+            return lambda q, v, params: params["normals"][i] @ q + params["hundredths"][i] / 100
 
         faces = [face("a", guard(i), reset(i)) for i in range(guards)]
     elif "balls" in family:
@@ -331,7 +366,7 @@ def _beyond(i: int) -> Callable:
 def error_of(motion: Motion, q, v, count: int) -> float:
     """How far an end is from a right one; infinite where the number of transitions is another."""
     error = np.abs(q - motion.q).max() / (1 + np.abs(motion.q).max())
-    if motion.nearest > MOMENT:
+    if motion.nearest > digits_of.moment:
         error = max(error, np.abs(v - motion.v).max() / (1 + np.abs(motion.v).max()))
         error = error if count == motion.count else np.inf
     return float(error) if np.isfinite(error) else np.inf
@@ -342,21 +377,24 @@ def main(arguments: list[str] | None = None) -> collections.Counter:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.hybrid_population", description=__doc__.splitlines()[0])
     parser.add_argument("--scenes", type=int, default=300)
     parser.add_argument("--first", type=int, default=0, help="the seed of the first one")
+    add_option(parser)
+    global digits_of
     options = parser.parse_args(arguments)
-    jax.config.update("jax_enable_x64", True)
+    precision = precision_of(options)
+    digits_of = SINGLE if options.float32 else DOUBLE
     seeds = range(options.first, options.first + options.scenes)
     scenes = {seed: FAMILIES[seed % len(FAMILIES)](np.random.default_rng(seed)) for seed in seeds}
     counts, worst = collections.Counter(), 0.0
     for family in sorted({scene.family for scene in scenes.values()}):
         of_family = {seed: scene for seed, scene in scenes.items() if scene.family == family}
-        given = [(s.q, s.v, s.duration, s.params) for s in of_family.values()]
-        q, v, duration, params = jax.tree.map(lambda *xs: np.stack(xs), *given)
-        done = runs(family, q.shape[1], len(params.get("offsets", [()])[0]))(q, v, duration, params)
+        numbers = [(s.q, s.v, s.duration, s.params) for s in of_family.values()]
+        q, v, duration, params = jax.tree.map(lambda *xs: np.stack(xs).astype(precision), *numbers)
+        done = runs(family, q.shape[1], len(params.get("hundredths", [()])[0]))(q, v, duration, params)
         ends = zip(*(np.asarray(x) for x in (done.ok, done.end.q, done.end.qdot, done.transitions.count)), strict=True)
         for (seed, scene), (ok, q_end, v_end, count) in zip(of_family.items(), ends, strict=True):
             error = min((error_of(motion, q_end, v_end, count) for motion in scene.right), default=np.inf)
             rests = not scene.right
-            name = ("rests" if rests else "named") if not ok else "right" if error <= TOLERANCE else "wrong"
+            name = ("rests" if rests else "named") if not ok else "right" if error <= digits_of.tolerance else "wrong"
             worst = max(worst, error) if name == "right" else worst
             counts[name] += 1
             if name in ("wrong", "named"):

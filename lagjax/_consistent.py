@@ -4,6 +4,7 @@ What a start is measured by, and how far off it may be, stands in `_constraints`
 own arguments, and answered with a sentence. Values that are being traced, as under `jax.jit`, are not looked at.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._constraints import TOLERANCE, sizes
+from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout
 from lagjax._linear import dependent_rows, diagonal_scale, schur_complements
 from lagjax._many_states import Sample
@@ -20,6 +22,7 @@ from lagjax._validate import is_concrete
 PyTree = Any
 
 
+@accepts_singles(("q0", "qdot0"), ("ts", "params"))
 def require_consistent(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree) -> None:
     """Raise `ValueError`, naming the constraint, where the start of a single motion is inconsistent.
 
@@ -115,7 +118,8 @@ def _nothing_to_find(system, q0, qdot0, t, params) -> bool:
     return not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(q))
 
 
-def inconsistent_members(system, ts, values: dict, axes: dict) -> jax.Array | None:
+@accepts_singles(("values",), ("ts",))
+def inconsistent_members(system, layout: Layout, ts, values: dict, axes: dict) -> jax.Array | None:
     """True for each member of a batch that starts off its constraints, shape (N,); None if that cannot be known.
 
     `values` holds q0, qdot0 and params of the batch, `axes` which axis of each counts the members.
@@ -123,20 +127,23 @@ def inconsistent_members(system, ts, values: dict, axes: dict) -> jax.Array | No
     if not has_constraints(system) or not _all_concrete((ts, values, system)):
         return None
 
-    t, span = jnp.asarray(ts[0]), jnp.abs(jnp.asarray(ts[-1]) - ts[0])
-    return jax.vmap(lambda *one: _inconsistent(system, t, span, *one), in_axes=tuple(axes.values()))(*values.values())
+    t, span, tolerance = jnp.asarray(ts[0]), jnp.abs(jnp.asarray(ts[-1]) - ts[0]), TOLERANCE[layout.dtype]
+    given = system, tolerance, t, span
+    numbers, of = zip(*((values[name], axes[name]) for name in ("q0", "qdot0", "params")), strict=True)
+    return jax.vmap(lambda *one: _inconsistent(*given, *one), in_axes=of)(*numbers)
 
 
 @eqx.filter_jit
-def _inconsistent(system, t, span, q0: PyTree, qdot0: PyTree, params: PyTree) -> jax.Array:
+def _inconsistent(system, tolerance: float, t, span, q0: PyTree, qdot0: PyTree, params: PyTree) -> jax.Array:
     layout = Layout.from_state(q0, qdot0)
     state = layout.flatten(q0), layout.flatten(qdot0), t, eqx.filter(params, eqx.is_array_like)
     motion = system.motion(layout, params)
-    return motion.constraints.inconsistent(motion.mass_matrix(*state), *state, span)
+    return motion.constraints.inconsistent(motion.mass_matrix(*state), *state, span, tolerance)
 
 
 def _start(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree) -> _StartConditions:
     """The start of a motion, measured without compiling anything where the scene has programs."""
+    layout = dataclasses.replace(layout, dtype=Layout.from_state(q0, qdot0).dtype)  # in float64 also for float32
     q, qdot = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(x)]) for x in (q0, qdot0))
     q, qdot, t = (np.asarray(x, layout.dtype) for x in (q, qdot, ts[0]))
     sample = Sample.from_scene(system, layout, q[None], qdot[None], t, params)

@@ -110,7 +110,7 @@ def crossings(
     layout = Layout.from_state(q0, qdot0)
     problem = Problem.from_arguments(system, layout, q0, qdot0, ts, params, rtol, atol, max_steps)
     if has_constraints(system):
-        q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
+        q0, qdot0 = as_arrays((q0, qdot0), layout.dtype, "state")
         require_consistent(system, layout, problem.ts, q0, qdot0, problem.params)
     surfaces = surfaces_in(problem, functions, directions, names)
     solution, noted = MachineCode().crossings(problem, surfaces, count)

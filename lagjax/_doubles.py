@@ -116,6 +116,11 @@ def _round_array(array):
     return array if array.dtype not in _NARROW else array.astype(_NARROW[array.dtype])
 
 
+def widen(tree: PyTree) -> PyTree:
+    """The arrays of a pytree in NumPy, floats in double precision."""
+    return jax.tree.map(lambda x: _widen(x) if isinstance(x, jax.Array | np.ndarray | np.generic) else x, tree)
+
+
 def _widen(array) -> np.ndarray:
     """The array in NumPy, floats in double precision."""
     return np.asarray(array, _WIDE.get(array.dtype, array.dtype))

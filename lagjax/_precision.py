@@ -169,7 +169,7 @@ def work_precision(
 
     if solvers is None:
         measured = _default_solvers(_problem(system, q0, qdot0, ts, params, batch_axes))
-    scene = as_arrays((q0, qdot0, jnp.asarray(ts), params), dtype)
+    scene = as_arrays((q0, qdot0, jnp.asarray(ts), params), dtype, "state")
     precise = as_arrays(scene, jnp.result_type(float))
 
     def run(solver, rtol, reference=False) -> Trajectory:

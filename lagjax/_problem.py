@@ -256,7 +256,7 @@ class AbstractEngine(abc.ABC):
         """
         rtol, atol, ts = self.rtol(problem), problem.tolerances[1], problem.ts
         if atol is not None:
-            return rtol, as_arrays(atol, problem.layout.dtype)
+            return rtol, as_arrays(atol, problem.layout.dtype, "atol")
         library: Any = np if all(map(_is_on_host, (y0, ts, rtol))) else jnp
         # Within `jit` an operation on an array of JAX is traced, even where its numbers are known.
         ts, relative = library.asarray(ts), library.asarray(rtol)

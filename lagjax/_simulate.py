@@ -78,10 +78,11 @@ def simulate(
       times for every member: lower it for the gradient of a large batch.
     - `event`: a function of (q, qdot), and of `t`, `params` by name. A real-valued event stops the motion where it
       changes sign. Machine code finds that on its series, without sampling, so that none is missed. A motion that
-      starts on the zero, to rounding, has to leave it first; with a direction only if it leaves the other way, and else
-      it ends at once. A Boolean event stops the motion after the step on which it becomes true. Boolean events, and
-      events with a root finder of their own, are integrated by diffrax; there give a direction if the motion starts on
-      the zero. `diffrax.Event` around such functions sets the direction and the root finder.
+      starts on the zero, to the rounding of the numbers that came in (eight roundings of each, in float32), has to
+      leave it first; with a direction only if it leaves the other way, and else it ends at once. A Boolean event stops
+      the motion after the step on which it becomes true. Boolean events, and events with a root finder of their own,
+      are integrated by diffrax; there give a direction if the motion starts on the zero. `diffrax.Event` around such
+      functions sets the direction and the root finder.
     - `adjoint`: how derivatives are taken. By default machine code goes back over its own steps in reverse mode
       (`jax.grad`, `jax.vjp`), at the cost of a few motions however many parameters there are, and forward over them in
       forward mode, all directions together (`jax.jvp`, `jax.jacfwd`); derivatives of every order exist. A run of
@@ -138,7 +139,7 @@ def simulate(
     given = Problem.from_arguments(system, layout, q0, qdot0, ts, params, rtol, atol, max_steps, event)
     problem = lift_problem(given)
     if has_constraints(system):
-        q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
+        q0, qdot0 = as_arrays((q0, qdot0), layout.dtype, "state")
         require_consistent(problem.system, layout, problem.ts, q0, qdot0, problem.params)
     engine = choose(problem, requested).engine
     solution = engine.solve(problem)
@@ -197,8 +198,8 @@ def simulate_batch(
             "them, and None for what they share. The default is (0, 0, None)."
         )
         raise
-    values = {name: as_arrays(value, batch.member.layout.dtype) for name, value in values.items()}
-    inconsistent = inconsistent_members(system, batch.member.ts, values, axes)
+    values = {name: as_arrays(value, batch.member.layout.dtype, name) for name, value in values.items()}
+    inconsistent = inconsistent_members(system, batch.member.layout, batch.member.ts, values, axes)
     solution = engine.solve_batch(batch)
     trajectory = trajectory_of(given.member, engine, solution, given.y0, values["params"], batch_axes[2])
     return trajectory if inconsistent is None else _mask_inconsistent(trajectory, inconsistent)

@@ -20,6 +20,7 @@ from lagjax._arguments import Function, accept, present
 from lagjax._constraints import Constraints
 from lagjax._derivation import derivation_of, numbers_of
 from lagjax._diffrax import form_of
+from lagjax._doubles import SINGLE, compute_in_doubles
 from lagjax._explain import Explanation, explain
 from lagjax._layout import Layout
 from lagjax._linear import schur_complements
@@ -313,8 +314,16 @@ class System(eqx.Module):
         require_number(t, "t")
         q, qdot, t = as_arrays((q, qdot, 1.0 * t), layout.dtype, "state")
         params = as_arrays(params, layout.dtype)
-        value = self._evaluate_program(quantity, layout, q, qdot, t, params)
-        value = _evaluate(self, quantity, q, qdot, t, params) if value is None else value
+
+        def evaluate_at(self, q, qdot, t, params):
+            value = self._evaluate_program(quantity, Layout.from_state(q, qdot), q, qdot, t, params)
+            return _evaluate(self, quantity, q, qdot, t, params) if value is None else value
+
+        given = self, q, qdot, t, params
+        # A tracer that a function closes over would be lost in doubles.
+        closes = any(f.code.tracers for role in ROLES if isinstance(f := getattr(self, role), Function))
+        is_single = layout.dtype == SINGLE and not closes
+        value = compute_in_doubles(evaluate_at, *given) if is_single else evaluate_at(*given)
         return jax.tree.map(jnp.asarray, layout.restore(value) if restore else value)
 
     def _evaluate_program(self, quantity: Callable, layout: Layout, q, qdot, t, params) -> np.ndarray | None:

@@ -41,7 +41,9 @@ def _flatten(tree: PyTree, name: str) -> tuple[list, Any]:
 
 def _is_plain(leaf, dtype) -> bool:
     """True if nothing can be wrong with a leaf: a Python float, or an array that has the dtype of the state."""
-    return type(leaf) is float or ((type(leaf) is np.ndarray or isinstance(leaf, jax.Array)) and leaf.dtype == dtype)
+    if type(leaf) is float:
+        return dtype != _SINGLE or _TINY <= abs(leaf) <= _HUGE or leaf == 0
+    return (type(leaf) is np.ndarray or isinstance(leaf, jax.Array)) and leaf.dtype == dtype
 
 
 def _leaf_as_array(leaf, label: str, dtype):
@@ -51,10 +53,25 @@ def _leaf_as_array(leaf, label: str, dtype):
     require_numbers(leaf, label)
     if np.ma.is_masked(leaf):
         raise ValueError(f"{label} is masked in places, where it has no number: fill them first.")
+    if dtype == _SINGLE and label.startswith("params"):
+        _require_single(leaf, label)
     try:
         return _as_array(leaf, dtype if jnp.issubdtype(jnp.result_type(leaf), jnp.floating) else None)
     except OverflowError:
         raise ValueError(f"{label} is too large for an integer of 64 bits: write it as a float.") from None
+
+
+def _require_single(leaf, label: str) -> None:
+    """Raise `ValueError` where float32 is too narrow for the largest number of a leaf."""
+    largest = float(np.max(np.abs(np.asarray(leaf, float)), initial=0.0)) if is_concrete(leaf) else 0.0
+    if largest and np.isfinite(largest) and not _TINY <= largest <= _HUGE and getattr(leaf, "dtype", None) != _SINGLE:
+        raise ValueError(
+            f"{label} is {largest:.3g}, and float32 holds {_TINY:.1e} to {_HUGE:.1e}: choose other units, or "
+            "call jax.config.update('jax_enable_x64', True) and pass a state of float64."
+        )
+
+
+_SINGLE, _TINY, _HUGE = np.dtype("float32"), float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
 
 
 def _dtype_of(value):

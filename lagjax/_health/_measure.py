@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._batch_members import Members
-from lagjax._doubles import DOUBLE
+from lagjax._doubles import DOUBLE, widen, with_doubles
 from lagjax._health._laws import Law, Measurements, measurements_at, power_at
 from lagjax._layout import Layout
 from lagjax._many_states import Sample, borders_of, is_lowered, map_in_chunks
@@ -84,13 +84,22 @@ def measure_trajectory(trajectory) -> tuple[dict[str, Any], Names]:
     """The fields of `Health` that are measured along the path, and names for them."""
     steps = trajectory.stats["num_accepted_steps"]
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
-        members = Members(trajectory)
-        laws = _laws(trajectory, members.layout, members.params)
-        if all(is_lowered(law.derivation) for law in laws):
-            return _report_of(members, laws), _names(laws, members.layout)
+        report = _report_in_doubles(Members(trajectory))
+        if report is not None:
+            return report
     axes, tree = jax.tree.flatten(trajectory.params_axes, is_leaf=lambda axis: axis is None)  # hashable
     arrays = dataclasses.replace(trajectory, stats={}, params_axes=None)
     return _measure_traced(arrays, tuple(axes), tree, jnp.asarray(steps))
+
+
+@with_doubles
+def _report_in_doubles(members: Members) -> tuple[dict[str, Any], Names] | None:
+    """The report of all members, whose laws are those of float64; None where a scene has no programs."""
+    layout = dataclasses.replace(members.layout, dtype=DOUBLE)
+    laws = _laws(members.trajectory, layout, widen(members.params))
+    if not all(is_lowered(law.derivation) for law in laws):
+        return None
+    return _report_of(members, laws), _names(laws, layout)
 
 
 def _precision_of(trajectory, q) -> np.dtype:
@@ -161,7 +170,7 @@ def _report_of(members: Members, laws: list[Law]) -> dict[str, Any]:
             if not len(here):
                 continue
             numbers = [x if np.ndim(x) == 0 else x[member[here]] for x in members.numbers]
-            sample = Sample(law.derivation, q[here], qdot[here], t[here], numbers)
+            sample = Sample(law.derivation, *widen((q[here], qdot[here], t[here], numbers)))
             values = function(law, index, member[here], sample)
             if len(here) == len(mode):
                 total = values

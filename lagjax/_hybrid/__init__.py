@@ -137,10 +137,10 @@ def simulate_hybrid(
         raise ValueError("rtol and atol of simulate_hybrid must be numbers: they decide the order of the method.")
     if is_concrete(problem.ts) and np.asarray(problem.ts)[-1] < np.asarray(problem.ts)[0]:
         raise ValueError("simulate_hybrid goes forward in time: a reset cannot be undone; ts must increase.")
-    q0, qdot0 = as_arrays((q0, qdot0), layout.dtype)
+    q0, qdot0 = as_arrays((q0, qdot0), layout.dtype, "state")
     require_consistent(modes[start], layout, problem.ts, q0, qdot0, problem.params)
     rtol, atol = float(MachineCode().rtol(problem.double_precision)), None if atol is None else float(atol)
-    plan = RoundPlan(modes, tuple(transitions), start, max_transitions, rtol, atol, max_steps)
+    plan = RoundPlan(modes, tuple(transitions), start, max_transitions, rtol, atol, max_steps, problem.is_single)
     ending, record = _motion(plan, problem)
     trajectory = _trajectory(modes, problem, ending, record)
     return _raise_unless_ok(modes, trajectory, layout, ending.mode) if throw else trajectory

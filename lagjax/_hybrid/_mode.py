@@ -21,8 +21,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._arguments import Function, accept, present
+from lagjax._constraints import TOLERANCE
 from lagjax._custom import attach_derivative
 from lagjax._derivation import Derivation
+from lagjax._doubles import DOUBLE, SINGLE
 from lagjax._layout import Layout, halves
 from lagjax._machine_code import (
     Guarded,
@@ -48,11 +50,11 @@ class Transition(eqx.Module):
 
     - `guard`: a real function; it may also ask, by name, for `t`, `params` and `multipliers`, the last as the
       constraints of the mode return them.
-    - `direction`: −1 only where the guard falls, +1 only where it rises, 0 for both. A guard that is zero to rounding
-      where a mode begins, and continues in that direction, has been met: the transition happens at once, that of a
-      ball on the floor with a velocity into it. One that goes the other way, or a guard of both directions, has to
-      leave zero first. Where it goes is decided by the first coefficient of its series that is not rounding.
-      Give contacts a direction.
+    - `direction`: −1 only where the guard falls, +1 only where it rises, 0 for both. A guard that is zero where a mode
+      begins, to the rounding of the numbers that came in, and continues in that direction, has been met: the transition
+      happens at once, that of a ball on the floor with a velocity into it. One that goes the other way, or a guard of
+      both directions, has to leave zero first. Where it goes is decided by the first coefficient of its series that is
+      not rounding. Give contacts a direction.
     - `reset(q, qdot)` → (q, qdot): the state after the transition; it may also ask for `t` and `params`. None keeps it.
     - `fires`: what happens where the guard is beyond zero in its direction when the mode begins, at the start or
       behind a transition. "beyond": it happens at once. "crossing": it waits until the guard has come back and crosses.
@@ -124,6 +126,7 @@ class Mode(NamedTuple):
     surfaces: Surfaces | None
     params: PyTree
     vector: jax.Array  # every number in params, (P,)
+    widths: tuple = ()  # of the first (q, q̇, t), and of params: their rounding, where the start came in float32
 
     @classmethod
     def from_problem(cls, name: str, problem: Problem, leaving: tuple[Transition, ...], numbers, targets) -> "Mode":
@@ -138,6 +141,7 @@ class Mode(NamedTuple):
             if refusal := MachineCode().refuses(problem):
                 raise Unlowerable(refusal)
             surfaces = _surfaces(problem.derivation, problem.system, leaving, tuple(code), structure)
+            surfaces = surfaces and surfaces._replace(is_rounded=problem.is_rounded)
             guarded = dataclasses.replace(problem, guards=_watched_guards(surfaces))
             if refusal := MachineCode().refuses(guarded):
                 raise Unlowerable(refusal)
@@ -180,7 +184,9 @@ class Mode(NamedTuple):
 
     def guards_at(self, t, y, latest) -> Guarded:
         """The guards at a state, without derivatives, of a run that ends at `latest`."""
-        return self._surfaces.evaluate_guards(t, y, self.vector, latest)
+        of_state, of_params = self.widths
+        of_numbers = jnp.pad(of_params, (0, self.vector.size - of_params.size))  # what modes differ by is exact
+        return self._surfaces.evaluate_guards(t, y, self.vector, latest, (of_state, of_numbers))
 
     def crossing(self, k: int) -> Callable:
         """`(taken, t, y, numbers)` → (t, y): the state at t, where guard k is zero and stays so as what went in varies.
@@ -198,7 +204,8 @@ class Mode(NamedTuple):
         motion = system.motion(self.layout, self.params)
         t, y, numbers = jax.lax.stop_gradient((t, y, eqx.filter(self.params, eqx.is_array_like)))
         state = *halves(y), t, numbers
-        return motion.constraints.inconsistent(motion.mass_matrix(*state), *state, jnp.inf)
+        tolerance = TOLERANCE[SINGLE if self.problem.is_rounded else DOUBLE]
+        return motion.constraints.inconsistent(motion.mass_matrix(*state), *state, jnp.inf, tolerance)
 
 
 def _watched_guards(surfaces: Surfaces | None) -> Guards | None:

@@ -4,6 +4,7 @@ A round runs every member to the end of its time or to the next zero of a guard 
 the way, and puts it into the next mode. Along a round derivatives are those of machine code; at its end see `_mode`.
 """
 
+import dataclasses
 import functools
 from collections.abc import Sequence
 from typing import Any, NamedTuple
@@ -19,7 +20,8 @@ from lagjax._hybrid._families import SystemFamily, families
 from lagjax._hybrid._mode import Mode, Transition, state_after
 from lagjax._layout import Layout
 from lagjax._lift import Lifted
-from lagjax._machine_code import Guarded
+from lagjax._machine_code import Guarded, vector_of
+from lagjax._native import SINGLE_NOISE
 from lagjax._problem import Problem
 from lagjax._results import RESULTS, SUCCESSFUL, code_of
 from lagjax._system import System
@@ -56,13 +58,14 @@ class RoundPlan(eqx.Module):
     rtol: float = eqx.field(static=True)
     atol: float | None = eqx.field(static=True)
     max_steps: int = eqx.field(static=True)
+    is_single: bool = eqx.field(static=True)  # whether the start came in float32
 
-    def __init__(self, modes: dict[str, System], transitions, start, max_transitions, rtol, atol, max_steps):
+    def __init__(self, modes, transitions, start, max_transitions, rtol, atol, max_steps, is_single):
         self.names, self.systems, self.transitions = tuple(modes), tuple(modes.values()), transitions
-        self.start, self.max_transitions = start, max_transitions
+        self.start, self.max_transitions, self.is_single = start, max_transitions, is_single
         self.rtol, self.atol, self.max_steps = rtol, atol, max_steps
 
-    def groups(self, layout: Layout, params: PyTree) -> list["ModeGroup"]:
+    def groups(self, layout: Layout, params: PyTree, widths: tuple) -> list["ModeGroup"]:
         """The modes with the transitions that leave them; those that differ by numbers alone are one group."""
         numbers = [tuple(k for k, t in enumerate(self.transitions) if t.source == name) for name in self.names]
         leaving = [tuple(self.transitions[k] for k in of_mode) for of_mode in numbers]
@@ -75,9 +78,11 @@ class RoundPlan(eqx.Module):
             table = np.array([numbers[k] for k in family.modes], int).reshape(len(family.modes), -1)
             targets = np.array([[self.names.index(self.transitions[k].target) for k in row] for row in table], int)
             problem = Problem.from_system(family.system, layout, own, **limits)
+            problem = dataclasses.replace(problem, is_rounded=self.is_single)
             mode = Mode.from_problem(
                 self.names[first], problem, family.leaving, table[0], targets.reshape(table.shape)[0]
             )
+            mode = mode._replace(widths=widths)
             groups.append(ModeGroup(family, mode, table, targets.reshape(table.shape)))
         return groups
 
@@ -180,7 +185,9 @@ class Exit(NamedTuple):
 def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree) -> tuple[Ending, TransitionRecord]:
     """The motion from y0 (2n,) at ts[0]: how it ended, and its transitions, with an axis of `max_transitions`."""
     ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
-    rounds, start = _Rounds.from_plan(plan, plan.groups(layout, params), ts), plan.names.index(plan.start)
+    given = jnp.append(y0, ts[0]), vector_of(eqx.filter(params, eqx.is_array_like))
+    widths = tuple(SINGLE_NOISE * jnp.abs(jax.lax.stop_gradient(x)) for x in given)
+    rounds, start = _Rounds.from_plan(plan, plan.groups(layout, params, widths), ts), plan.names.index(plan.start)
     inconsistent = rounds.is_inconsistent(start, ts[0], y0, [start])
     first = Ending(
         t=ts[0], y=y0, mode=jnp.asarray(start), going=~inconsistent,

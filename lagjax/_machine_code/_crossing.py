@@ -82,13 +82,14 @@ def surfaces_of(problem: Problem, functions: tuple, directions: tuple[int, ...],
     """
     code, structure = jax.tree.flatten(eqx.filter(problem.params, eqx.is_array_like, inverse=True))
     try:
-        return _lower_surfaces(problem.derivation, functions, directions, tuple(code), structure, what)
+        given = directions, tuple(code), structure, what, problem.is_rounded
+        return _lower_surfaces(problem.derivation, functions, *given)
     except Unlowerable as reason:
         return str(reason)
 
 
 @functools.lru_cache(maxsize=64)
-def _lower_surfaces(derivation: Derivation, functions, directions, code, structure, what: str) -> Surfaces:
+def _lower_surfaces(derivation: Derivation, functions, directions, code, structure, what, is_rounded) -> Surfaces:
     restore = derivation.layout.restore
 
     def value(function):
@@ -100,7 +101,8 @@ def _lower_surfaces(derivation: Derivation, functions, directions, code, structu
 
         return evaluate_guard
 
-    return Surfaces.from_functions(derivation, [value(function) for function in functions], directions, code, structure)
+    values = [value(function) for function in functions]
+    return Surfaces.from_functions(derivation, values, directions, code, structure, is_rounded)
 
 
 # ---- to the first event ----------------------------------------------------------------------------------------------

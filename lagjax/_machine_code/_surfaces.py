@@ -20,7 +20,7 @@ import numpy as np
 from lagjax._derivation import Derivation
 from lagjax._failures import differentiable_where
 from lagjax._machine_code._lines import outputs
-from lagjax._native import GUARD_NOISE, INSTANT, SMALLEST_STEP, Guards
+from lagjax._native import GUARD_NOISE, INSTANT, SINGLE_NOISE, SMALLEST_STEP, Guards
 from lagjax._program import Program, lower
 
 PyTree = Any
@@ -47,19 +47,20 @@ class Surfaces(NamedTuple):
     """Guards as programs of (q, q̇, t, params), and how each has to change sign: −1, 0, +1.
 
     `values` gives all g. `complete` gives what `_native.Guards` wants: g, then ġ, then the sizes of both, which bound
-    their round-off.
+    their round-off; and for a start that `is_rounded` to float32, unless the motion remembers it, that of the start.
     """
 
     values: Program
     complete: Program
     directions: tuple[int, ...]
+    is_rounded: bool = False
 
     def guards(self, notes: bool = False, remembers: bool = False) -> Guards:
         """The surfaces as guards of machine code: a change ends the motion or, with `notes`, is written down.
 
         A motion that `remembers` is given the side of each surface from which it comes (see `Guards`).
         """
-        return Guards(self.values, self.complete, self.directions, notes, remembers)
+        return Guards(self.values, self.complete, self.directions, notes, remembers, self.is_rounded)
 
     @property
     def have_no_rate(self) -> np.ndarray:
@@ -67,21 +68,35 @@ class Surfaces(NamedTuple):
         count = len(self.directions)
         return np.array([self.complete.constant(count + k) == 0.0 for k in range(count)])
 
-    def evaluate_guards(self, t, y, numbers, latest) -> Guarded:
-        """The guards at a state (2n,), as machine code takes a start there in a run that ends at `latest`."""
+    def evaluate_guards(self, t, y, numbers, latest, widths) -> Guarded:
+        """The guards at a state (2n,), as machine code takes a start there in a run that ends at `latest`.
+
+        Where the start `is_rounded`, what came in, (q, q̇, t) and `numbers`, is known to these `widths`.
+        """
         count, still = len(self.directions), jax.lax.stop_gradient
         t, y, numbers, latest = still((t, y, numbers, latest))
-        out = outputs(self.complete, 4 * count, jnp.append(y, t), numbers)
+        given = jnp.append(y, t), numbers
+        out = outputs(self.complete, 4 * count, *given)
         values, rates, sizes, rate_sizes = out.reshape(4, count)
         errors = outputs(_rate_errors(self.complete, count), count, jnp.append(y, t), numbers)
         errors = jnp.where(jnp.isfinite(errors), errors, 0.0)  # a root at zero has no slope
         instant = INSTANT * SMALLEST_STEP * jnp.maximum(jnp.abs(t), jnp.abs(latest))
-        rate_rounding = GUARD_NOISE * (rate_sizes + errors)
-        return Guarded(values, rates, GUARD_NOISE * sizes, jnp.abs(rates) * instant, rate_rounding)
+        rounding, rate_rounding = GUARD_NOISE * sizes, GUARD_NOISE * (rate_sizes + errors)
+        if self.is_rounded:
+            slopes = jax.jacrev(lambda *given: outputs(self.values, count, *given), (0, 1))(*given)
+            terms = [jnp.where(width > 0, jnp.abs(by) * width, 0.0) for by, width in zip(slopes, widths, strict=True)]
+            rounding += sum(term.sum(1) for term in terms)
+        return Guarded(values, rates, rounding, jnp.abs(rates) * instant, rate_rounding)
 
     @classmethod
     def from_functions(
-        cls, derivation: Derivation, functions: Sequence[Callable], directions: tuple[int, ...], code: tuple, structure
+        cls,
+        derivation: Derivation,
+        functions: Sequence[Callable],
+        directions: tuple[int, ...],
+        code: tuple,
+        structure,
+        is_rounded: bool = False,
     ) -> "Surfaces":
         """The surfaces of functions of y = (q, q̇, t), (2n + 1,), and params; each gives one number.
 
@@ -98,11 +113,17 @@ class Surfaces(NamedTuple):
             rate = jnp.concatenate([y[n:-1], acceleration, jnp.ones(1)])
             by_y = jax.jacfwd(values)(y, numbers)
             terms, moving = by_y * y, by_y * rate
-            return values(y, numbers), moving.sum(1), jnp.abs(terms).sum(1), jnp.abs(moving).sum(1)
+            found = values(y, numbers), moving.sum(1), jnp.abs(terms).sum(1), jnp.abs(moving).sum(1)
+            if not is_rounded:
+                return found
+            floats, others = eqx.partition(numbers, eqx.is_inexact_array)
+            slopes = jax.jacrev(lambda y, floats: values(y, eqx.combine(floats, others)), (0, 1))(y, floats)
+            moved = jax.tree.map(lambda by, x: jnp.abs(by * x).reshape(len(terms), -1).sum(1), slopes, (y, floats))
+            return *found, SINGLE_NOISE * sum(jax.tree.leaves(moved))
 
         y = jax.ShapeDtypeStruct((2 * n + 1,), derivation.layout.dtype)
         numbers = derivation.numbers
-        return cls(lower(values, y, numbers), lower(complete, y, numbers), directions)
+        return cls(lower(values, y, numbers), lower(complete, y, numbers), directions, is_rounded)
 
 
 @functools.lru_cache(maxsize=64)

@@ -200,6 +200,10 @@ BISECTIONS = 60
 # smallest steps, is on the surface: it takes its side from its rate, or from where it is after `LITTLE` of the step.
 # A reset leaves a state on the surface to some ten roundings; doubled, a start next to a surface counts as one on it.
 GUARD_NOISE, INSTANT, LITTLE = 64 * EPS, 16.0, 1e-4
+# The same for numbers that came in as float32, in parts of each: eight roundings. Its own is one, what computed it (a
+# cosine and a radius, steps of a grid) makes some five. Doubled, a start 1e-6 of its size beside a surface counts as
+# one on it; halved, one that is a sum of three products may pass through.
+SINGLE_NOISE = 4 * 2.0**-23
 
 # ---- constraints -----------------------------------------------------------------------------------------------------
 

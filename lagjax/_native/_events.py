@@ -65,8 +65,9 @@ class Events:
         first: int,
         notes: bool,
         remembers: bool,
+        is_rounded: bool,
     ):
-        self.directions, self.remembers = directions, remembers
+        self.directions, self.remembers, self.is_rounded = directions, remembers, is_rounded
         self.motion, self.step, self.output, self.roots = motion, step, output, roots
         self.values, self.complete, self.count, self.first, self.notes = values, complete, len(directions), first, notes
         self.can_jump = any(piecewise)
@@ -84,7 +85,8 @@ class Events:
         where a motion begins, how it changes there, where it changes on the way and how; how often it has been noted,
         when it was last gone through, whether it was zero at the border where the step before ended, and its leading
         term with what is rounding of it. For all of them the step before it was cut, how far they can be seen, as a
-        part of it, the first change, and the event.
+        part of it, the first change, and the event. Where starts are rounded `zero` is the value of a guard that counts
+        as zero.
         """
         each = ("guard", "side", "side_begin", "contact", "met", "root_at", "change", "noted", "noted_begin")
         each = (*each, "passed_at", "waits", "waited", "noise", "lead", "lead_order")
@@ -94,7 +96,7 @@ class Events:
         """A lane has taken a member."""
         with frame.code.loop(self.count) as g:
             lane["passed_at", g] = float("inf")
-            for name in ("noted", "contact", "met", "waits"):
+            for name in ("noted", "contact", "met", "waits", *(["zero"] if self.is_rounded else [])):
                 lane[name, g] = 0.0
 
     # ---- the guards ----
@@ -106,7 +108,7 @@ class Events:
         moved = self.motion.move_state(frame, self.motion.increments(frame, order, s)[0])
         guards = self.motion.evaluate(frame, self.values, moved, s)
         for i in range(self.count):
-            frame["guard", i] = guards[i]
+            frame["guard", i] = guards[i] - frame["zero", i] if self.is_rounded else guards[i]
         return frame.finish()
 
     def _guard_value(self, frame: Frame, order: Value, g: Value, s: Value) -> Value:
@@ -120,7 +122,8 @@ class Events:
         On the surface, to rounding, that is the side from which the motion comes. Where it goes to the other side, and
         does so in the direction of the guard, that is a change at the start, into `met`. Otherwise, and where nobody
         knows from where it comes, it is the side that the motion goes to. Where it goes its rate says or, where that is
-        zero to rounding too, the first term of its series that is not.
+        zero to rounding too, the first term of its series that is not. The rounding of a start is that of the numbers
+        that came in.
 
         A motion that remembers may begin beyond the surface, on the other side than it comes from. Where it goes on
         that is a change at the start, too, and where the side is infinite it is one wherever the motion goes.
@@ -147,12 +150,14 @@ class Events:
                 on_it = code.intrinsic("fabs", value) <= noise + moved * instant
                 if self.remembers:
                     on_it = on_it | (code.intrinsic("fabs", value) <= from_there)
+                elif self.is_rounded:
+                    on_it = on_it | (code.intrinsic("fabs", value) <= out[i + 4 * count])
                 leaves, order_of_zero = moved > rate_noises[i], frame["lead_order", i]
                 sound = order_of_zero > 0.0
                 turn = code.select(sound, frame["lead", i], later - value)
                 bends = code.intrinsic("fabs", turn) > code.select(sound, 0.0, noise)
                 before = self._sign(frame, before)
-                unclear = code.select(code.compare("!=", before, 0.0), 0.0, later)
+                unclear = code.select(code.compare("!=", before, 0.0), 0.0, turn if self.is_rounded else later)
                 going = code.select(leaves, rate * frame["forward"], code.select(bends, turn, unclear))
                 there = on_it | (value * before < 0.0) if self.remembers else on_it
                 goes_on = (going * before < 0.0) | ~(from_there < float("inf"))
@@ -163,6 +168,8 @@ class Events:
                 side = code.select(on_it, code.select(stays, before, going), value)
                 with frame.where(fresh):
                     frame["side", i] = self._sign(frame, side)
+                    if self.is_rounded:
+                        frame["zero", i] = code.select(on_it, value, 0.0)
                 zeros = code.select(leaves, Touch.VALUE, code.select(sound, order_of_zero, Touch.RATE))
                 frame["contact", i] = code.select(fresh & on_it, zeros, Touch.NONE)
         return frame.finish()
@@ -278,9 +285,10 @@ class Events:
         code, roots, h = frame.code, self.roots, frame["h"]
         degree, j = self.motion.followed_degree(code, order), g + self.first
         moving, value = code.compare("!=", h, 0.0) & (frame["met", g] <= 0.0), self.motion.followed_value(frame, j)
-        side = frame["side", g]
+        side, zero = frame["side", g], frame["zero", g] if self.is_rounded else 0.0
+        value = value - zero if self.is_rounded else value
         side = code.select(code.compare("==", side, 0.0), self._sign(frame, value), side)
-        roots.polynomial(frame, j, degree, h, side, 0.0)
+        roots.polynomial(frame, j, degree, h, side, zero)
         clear = self._is_clear(frame, degree)
         with code.only_if(code.any_lane(moving & ~clear)):
             self._look_closely(frame, order, g, degree, side)

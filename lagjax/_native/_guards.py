@@ -15,10 +15,12 @@ class Guards(NamedTuple):
 
     That ends the motion or, with `notes`, is written down. `values` gives all g. With y the state and the time, the
     outputs of `program` are all g; their rates ġ = Σ ∂g/∂yᵢ ẏᵢ; then Σ |∂g/∂yᵢ yᵢ| and Σ |∂g/∂yᵢ ẏᵢ|, of which
-    round-off is a part. A motion that `remembers` has two numbers more for each guard, behind its parameters: how far
-    rounding may have moved them, with the sign of the side from which the motion comes, 0 where that is unknown, and
-    infinite where a motion that is beyond the surface has changed its side wherever it goes; then how far rounding may
-    have moved their rates.
+    round-off is a part; and, if there are five of each guard, how far the rounding of a start in float32 moves it. A
+    motion that `remembers` has two numbers more for each guard, behind its parameters: how far rounding may have moved
+    them, with the sign of the side from which the motion comes, 0 where that is unknown, and infinite where a motion
+    that is beyond the surface has changed its side wherever it goes; then how far rounding may have moved their rates.
+    Of a start that `is_rounded`, more coarsely than the motion, a guard that is zero to rounding is zero: its surface
+    passes through the start.
     """
 
     values: Recurrent
@@ -26,6 +28,7 @@ class Guards(NamedTuple):
     directions: tuple[int, ...]
     notes: bool = False
     remembers: bool = False
+    is_rounded: bool = False
 
     @property
     def inputs(self) -> int:

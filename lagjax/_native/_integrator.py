@@ -73,7 +73,7 @@ class Integrator:
         if projection is not None:
             fields |= Projector.fields(n) | _rank_drops.fields(n, self.guards)
         if guards is not None:
-            fields |= Roots.fields(MAX_ORDER + 2)
+            fields |= Roots.fields(MAX_ORDER + 2) | ({"zero": self.guards} if guards.is_rounded else {})
         if borders is not None:
             fields |= BorderControl.fields(borders)
         jump = parts.jump
@@ -107,7 +107,7 @@ class Integrator:
         first = self.motion.series.followed - self.guards
         return Events(
             self.motion, self.step, self.output, roots, *lines, guards.directions, piecewise, first, self.notes,
-            guards.remembers,
+            guards.remembers, guards.is_rounded,
         )  # fmt: skip
 
     # ---- members ----

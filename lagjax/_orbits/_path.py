@@ -186,7 +186,7 @@ def find_path(
     layout = Layout.from_state(q_start, q_end)
     arcs = Arcs.from_system(system, q_start, q_end, params, RTOL, "Paths")
     ends = [
-        np.asarray(concatenate_leaves(jax.tree.leaves(as_arrays(q, layout.dtype)), np.dtype(float)))
+        np.asarray(concatenate_leaves(jax.tree.leaves(as_arrays(q, layout.dtype, "state")), np.dtype(float)))
         for q in (q_start, q_end)
     ]
     times = np.linspace(float(t_start), float(t_end), _ARCS + 1)

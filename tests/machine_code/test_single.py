@@ -193,6 +193,192 @@ def test_batches_of_gradients_loops_and_branches(off):
     agrees(jax.jit(jax.grad(total))(LENGTH, starts), in_double(jax.grad(total), LENGTH, starts), 16)
 
 
+# ---- starts on surfaces ----------------------------------------------------------------------------------------------
+
+# Levels are k/10 in float64, k a number of float32: the start float32(k/10) is up to half a rounding beside them.
+TENTHS, FREE = np.arange(1, 20, dtype=np.float32), lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2))
+SECOND = np.float32([0.0, 1.0])
+
+
+def wall(guard, i=0, modes=("a", "a")):
+    return lagjax.Transition(*modes, guard, -1, lambda q, v: (q, v.at[i].multiply(-1.0)))
+
+
+def swap(i, guard, modes=("a", "a")):
+    return lagjax.Transition(*modes, guard, -1, lambda q, v: (q, v.at[i].set(v[i + 1]).at[i + 1].set(v[i])))
+
+
+def end_of(transitions, q, v, ts, params, modes=("a",)):
+    run = lagjax.simulate_hybrid(dict.fromkeys(modes, FREE), transitions, "a", q, v, ts, params, max_transitions=8)
+    return run.end.q, run.end.qdot, run.transitions.count
+
+
+def test_a_body_bounces_off_a_wall_on_which_it_starts(off):
+    def bounce(k, start):
+        return end_of([wall(lambda q, v, params: params / 10 - q[0])], start[None], jnp.ones(1), SECOND, k)[0][0]
+
+    starts = np.float32(TENTHS / 10.0)
+    ends, (by_k, by_start) = jax.jit(jax.vmap(lambda *x: (bounce(*x), jax.jacfwd(bounce, (0, 1))(*x))))(TENTHS, starts)
+    np.testing.assert_allclose(ends, TENTHS / 10.0 - 1, atol=2 * EPS)
+    np.testing.assert_allclose(by_start, -1, atol=EPS)  # the wall stands, and the bounce is later or earlier
+    np.testing.assert_allclose(by_k, 0.2, atol=EPS)
+
+
+@pytest.mark.parametrize("modes", [("a", "a"), pytest.param(("a", "b"), marks=pytest.mark.slow)])
+def test_a_blow_goes_through_balls_that_touch(off, modes):
+    """Newton's cradle; with two modes the guard of a contact is one of the mode that begins at the blow before."""
+
+    def gap(i):
+        return lambda q, v, params: q[i + 1] - q[i] - params / 10
+
+    def blow(k, q):
+        contacts = [swap(i, gap(i), modes[:: 1 - 2 * (i % 2)]) for i in range(3)]
+        return end_of(contacts, q.at[0].add(-1.0), jnp.eye(4)[0], 2 * SECOND, k, modes)
+
+    places = np.float32(TENTHS / 10.0)[:, None] * np.arange(4, dtype=np.float32)
+    _, v, count = jax.jit(jax.vmap(blow))(TENTHS, places)
+    np.testing.assert_array_equal(count, 3)
+    np.testing.assert_array_equal(v, np.tile([0, 0, 0, 1], (len(TENTHS), 1)))
+
+
+def test_a_start_on_a_section_has_to_leave_it_first(off):
+    """A throw returns to its level, once; with a direction a motion that goes that way ends where it starts."""
+    throw = lagjax.System(lambda q, v: 0.5 * v**2 - q)
+
+    def section(q, v, params):
+        return params / 10 - q
+
+    def times(k, start, speed):
+        given = throw, section, start, speed, 9 * SECOND, k
+        found = lagjax.crossings(*given, count=4)
+        ends = [
+            lagjax.simulate(*given[:1], *given[2:], event=diffrax.Event(section, direction=way)).end.t
+            for way in (None, False, True)
+        ]
+        return found.count, found.t[0], jnp.stack(ends)
+
+    for speed, expected in ((2.0, [4, 0, 4]), (-2.0, [9, 9, 0])):
+        many, first, ends = jax.jit(jax.vmap(times, (0, 0, None)))(TENTHS, np.float32(TENTHS / 10.0), speed)
+        np.testing.assert_array_equal(many, int(speed > 0))
+        np.testing.assert_allclose(ends, np.tile(expected, (len(TENTHS), 1)), atol=8 * EPS)
+        if speed > 0:
+            np.testing.assert_allclose(first, 4, atol=8 * EPS)
+
+
+def test_a_motion_that_leaves_slowly_has_not_met_the_surface(off):
+    """In steps of 1e-3 that a fast coordinate needs it is within the rounding of its start for hundreds of steps."""
+    fast = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - 0.5 * (1e3 * q[1]) ** 2 - 1e-6 * q[0])
+    starts = np.stack([TENTHS / 10.0, np.ones(19)], 1).astype(np.float32)
+    ts = np.float32([0.0, 0.1])
+
+    def run(k, q):
+        def guard(q, v, params):
+            return params / 10 - q[0]
+
+        met = lagjax.simulate_hybrid({"a": fast}, [wall(guard)], "a", q, 0 * q, ts, k, max_transitions=2)
+        event = lagjax.simulate(fast, q, 0 * q, ts, k, event=guard)
+        return met.transitions.count, event.end.t, lagjax.crossings(fast, guard, q, 0 * q, ts, k, count=2).count
+
+    count, t_end, many = jax.jit(jax.vmap(run))(TENTHS, starts)
+    assert not np.any(count) and not np.any(many) and np.all(t_end == ts[1])
+
+
+def loop_in_a_box(q, v, steps):
+    """A loop of motions of a hundredth, whose state is rounded after each; whether every one was followed."""
+    walls = [wall(lambda q, v, i=i: q[i], i) for i in range(2)]
+    walls += [wall(lambda q, v: 0.7 - q[0], 0), wall(lambda q, v: 0.3 - q[1], 1)]
+
+    def step(state, _):
+        q, v, ok = state
+        run = lagjax.simulate_hybrid({"a": FREE}, walls, "a", q, v, np.float32([0.0, 0.01]), max_transitions=8,
+                                     throw=False)  # fmt: skip
+        return (run.end.q, run.end.qdot, ok & run.ok), None
+
+    return jax.jit(jax.vmap(lambda q, v: jax.lax.scan(step, (q, v, True), length=steps)[0]))(q, v)
+
+
+def folded(q, v, t):
+    """The place in the box of 0.7 × 0.3 after so long."""
+    box = np.array([0.7, 0.3])
+    x = np.mod(q.astype(float) + v.astype(float) * t, 2 * box)
+    return np.minimum(x, 2 * box - x)
+
+
+def test_a_loop_of_motions_stays_in_its_box(off):
+    """Steps end on the walls to rounding: 0.35 to the wall and 0.7 back in whole numbers of steps."""
+    k = np.arange(1, 17)
+    q, v = np.float32(np.tile([0.35, 0.15], (16, 1))), np.float32(np.stack([35.0 / k, 15.0 / k[::-1]], 1))
+    ends, _, ok = loop_in_a_box(q, v, 60)
+    assert np.all(ok) and np.abs(ends - folded(q, v, 0.6)).max() < 60 * EPS
+
+
+@pytest.mark.slow
+def test_no_member_of_many_leaves_its_box(off):
+    rng = np.random.default_rng(0)
+    q, v = np.float32(rng.uniform(0, [0.7, 0.3], (500, 2))), np.float32(rng.uniform(-1, 1, (500, 2)))
+    ends, _, ok = loop_in_a_box(q, v, 2000)
+    # Every step rounds the place by half a unit of 0.7, and its time, 0.01, is off by a ten-millionth.
+    assert np.all(ok) and np.abs(ends - folded(q, v, 20.0)).max() < 2000 * EPS
+
+
+@pytest.mark.parametrize("place", [0.3, 0.7])
+def test_a_motion_that_starts_on_a_border_of_its_force(off, place):
+    """−sign(q − place): from there with v = ½ it comes back after 1, and as far on the other side after 2."""
+    system = lagjax.System(lambda q, v: 0.5 * v**2, forces=lambda q, v: -jnp.sign(q - place))
+    for speed in (0.5, -0.5):
+        run = lagjax.simulate(system, place, speed, np.float32([0.0, 0.5, 1.5, 3.5]))
+        np.testing.assert_allclose(run.q - place, speed * np.array([0, 0.25, -0.25, -0.25]), atol=4 * EPS)
+
+
+# ---- units in which float32 is narrow --------------------------------------------------------------------------------
+
+
+def test_planets_and_atoms_in_si_units(off):
+    """Masses whose product is 1e55, and constants of 1e-46: every quantity is computed in float64."""
+
+    def gravity(q, v, params):
+        of = 0.5 * jnp.array([1.989e30, 5.97e24]) @ jnp.sum(v**2, 1)
+        return of + params * 1.989e30 * 5.97e24 / jnp.sqrt(jnp.sum((q[1] - q[0]) ** 2))
+
+    system, q, v = lagjax.System(gravity), jnp.array([[0.0, 0], [1.496e11, 0]]), jnp.array([[0.0, 0], [0, 29780.0]])
+    pull = 6.674e-11 * 1.989e30 / 1.496e11**2
+    energy = 0.5 * 5.97e24 * 29780**2 - pull * 1.496e11 * 5.97e24
+    for at in (lambda name: getattr(system, name), lambda name: jax.jit(getattr(system, name))):
+        found = at("acceleration")(q, v, 0.0, 6.674e-11)
+        assert found.dtype == np.float32 and found[1, 0] == pytest.approx(-pull, rel=4 * EPS)
+        assert at("energy")(q, v, 0.0, 6.674e-11) == pytest.approx(energy, rel=4 * EPS)
+    assert jax.grad(lambda g: system.acceleration(q, v, 0.0, g)[1, 0])(6.674e-11) == pytest.approx(-pull / 6.674e-11)
+    health = lagjax.simulate(system, q, v, np.linspace(0, 3e7, 5, dtype=np.float32), 6.674e-11).health()
+    assert "nothing suspicious" in str(health)
+    tiny = lagjax.System(lambda q, v: 0.5e-46 * v**2 - 0.5e-46 * q**2)
+    assert tiny.acceleration(1.0, 0.0) == -1 and jax.grad(lambda k: tiny.acceleration(k, 0.0))(1.0) == -1
+    bead = lagjax.System(lambda q, v: 0.5e24 * v @ v - 1e21 * q[0], constraints=lambda q: jnp.sum(q**4) - 1.5e11**4)
+    given = jnp.array([[1.5e11, 0.0], [1.6e11, 0.0]]), jnp.array([[0.0, 1e4], [0.0, 1e4]])
+    np.testing.assert_array_equal(lagjax.simulate_batch(bead, *given, np.float32([0.0, 1e5])).ok, [True, False])
+
+
+def test_params_that_float32_cannot_hold_are_refused(off):
+    system = lagjax.System(lambda q, v, params: 0.5 * params["m"] * v**2 - 0.5 * params["m"] * q**2)
+    for mass in (1e-46, 1e40, np.array(3e-45)):
+        for use in (lambda m: lagjax.simulate(system, 1.0, 0.0, TS, {"m": m}),
+                    lambda m: system.acceleration(1.0, 0.0, params={"m": m})):  # fmt: skip
+            with pytest.raises(ValueError, match=r"params\['m'\] is .*, and float32 holds 1.2e-38 to 3.4e\+38"):
+                use(mass)
+    assert lagjax.simulate(system, 1e-50, 0.0, TS, {"m": 1.0}).ok  # a coordinate that is nothing, beside others
+
+
+def test_a_start_off_its_constraints_is_refused_or_followed(off):
+    """Whatever is taken for consistent is within what the first step brings back; more is told what to do."""
+    rod = lagjax.System(lagrangians.weight, constraints=lambda q: jnp.sum(q**2) - 1.0)
+    for far in (16 * EPS, 1e-5, 1e-3):
+        given = rod, np.float32([0.6, -0.8]) * np.float32(1 + far), np.zeros(2, np.float32), TS[:2]
+        if far < 5e-6 * 0.8:
+            assert abs(np.sum(np.float64(lagjax.simulate(*given).q[-1]) ** 2) - 1) < 4 * EPS
+        else:
+            with pytest.raises(ValueError, match=r"q0 does not satisfy constraints: .* system\.project"):
+                lagjax.simulate(*given)
+
+
 # ---- the rules of the one primitive ----------------------------------------------------------------------------------
 
 
