@@ -37,7 +37,7 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 - `fit`: the likeliest parameters with intervals, as a `Fit`; its methods return a `Profile`, a `Prediction`,
   `Experiments`, a `Comparison`
 - `Record`, `Timings`, `Guess`, `Delayed`, `wrapped`: what was measured, and how
-- `Gaussian`, `StudentT`: the noise
+- `Gaussian`, `StudentT`, `Quantised`, `Clipped`: the noise
 - `positive`, `between`, `angle`, `simplex`, `inertia`: what parameters may be
 
 **Many members, few numbers of each**
@@ -80,9 +80,11 @@ if TYPE_CHECKING:  # each is imported on first use: all of them take as long as 
     from lagjax._crossings import crossings
     from lagjax._diffrax import FineOutput
     from lagjax._fit import (
+        Clipped,
         Delayed,
         Gaussian,
         Guess,
+        Quantised,
         Record,
         StudentT,
         Timings,
@@ -115,12 +117,14 @@ if TYPE_CHECKING:  # each is imported on first use: all of them take as long as 
 __version__ = "0.1.0"
 __all__ = [
     "RESULTS",
+    "Clipped",
     "Delayed",
     "FineOutput",
     "Gaussian",
     "Guess",
     "Hybrid",
     "MachineCode",
+    "Quantised",
     "Record",
     "SimulationError",
     "Statistics",

@@ -7,7 +7,7 @@
 
 Files, from the lowest floor up:
 
-    _noise         Gaussian and Student-t residuals: noise scale, degrees of freedom, likelihood
+    _noise         Gaussian and Student-t residuals, sensors that round or are at their limits: scale, likelihood
     _parameters    the free numbers, their names, and the transforms that keep them in a set
     _records       Record, its sampled inputs, and rows of records in batches
     _timings       Timings, the instants at which a motion crosses sections, with derivatives
@@ -43,7 +43,16 @@ from lagjax._consistent import has_constraints
 from lagjax._doubles import DOUBLE, with_doubles
 from lagjax._fit._descent import Descent
 from lagjax._fit._motions import Manifold, choose_motions
-from lagjax._fit._noise import AbstractNoise, Gaussian, StudentT, log_likelihood
+from lagjax._fit._noise import (
+    AbstractNoise,
+    Clipped,
+    Gaussian,
+    Quantised,
+    Sensor,
+    StudentT,
+    log_likelihood,
+    read_sensor,
+)
 from lagjax._fit._parameters import Parameters, angle, between, inertia, positive, simplex
 from lagjax._fit._prediction import Prediction
 from lagjax._fit._profile import Comparison, Profile
@@ -73,6 +82,7 @@ from lagjax._fit._search import (
     build_reader,
     pad_states,
     run_multistart,
+    search_again,
     search_by_gradient,
     search_records,
     start_by_weak_form,
@@ -88,6 +98,7 @@ from lagjax._fit._verdict import (
     constant_signals,
     find_mistake,
     possible_mistakes,
+    require_measurements,
     verdict,
 )
 from lagjax._hybrid import Hybrid, Scene, first_law, require_scene
@@ -96,6 +107,7 @@ from lagjax._problem import DEFAULT_RTOL
 from lagjax._samples import HOLDS
 
 __all__ = [
+    "Clipped",
     "Comparison",
     "Delayed",
     "Experiments",
@@ -104,6 +116,7 @@ __all__ = [
     "Guess",
     "Prediction",
     "Profile",
+    "Quantised",
     "Record",
     "StudentT",
     "Timings",
@@ -163,7 +176,9 @@ def fit(
       an array of these for the numbers of an array, `np.array([lagjax.positive, None])`; `lagjax.simplex` and
       `lagjax.inertia` for a whole array. A parameter that is known to be positive should say so:
       its search and its interval are then relative.
-    - `noise`: `lagjax.Gaussian()`, the default, or `lagjax.StudentT()` where the data have outliers.
+    - `noise`: `lagjax.Gaussian()`, the default; `lagjax.StudentT()` where the data have outliers;
+      `lagjax.Quantised(step)` and `lagjax.Clipped(low, high)` where sensors round or are at their limits, which the
+      default reads off the data, and says.
     - `hold`: how the `inputs` of records continue between samples: "zero" keeps the last sample, as a D/A converter
       does; "linear", "cubic" and "band" interpolate as `lagjax.samples` does.
       "band" is for inputs below the Nyquist frequency, evenly sampled. Functions of the scene ask for `inputs` by name.
@@ -209,7 +224,9 @@ def fit(
     require_untraced(params0, "params0")
     noise = Gaussian() if noise is None else noise
     if not isinstance(noise, AbstractNoise):
-        raise TypeError(f"noise must be lagjax.Gaussian() or lagjax.StudentT(); got {noise!r}.")
+        raise TypeError(
+            f"noise must be lagjax.Gaussian(), StudentT(), Quantised(step) or Clipped(low, high); got {noise!r}."
+        )
     scenes = _scenes(system, records, params0, observe, hold)
     parameters = Parameters.from_pytree(params0, free, transforms)
     settings = _Settings(system, observe, noise, int(starts), method, int(seed), progress)
@@ -246,7 +263,7 @@ def _mistakes(
     if len(scenes) > 1 or settings.method == "gradient":
         return []
     [scene] = scenes
-    once, about = settings._replace(starts=1, progress=False), _build_residuals(scene, parameters)
+    once, about = settings._replace(starts=1, progress=False), _build_residuals(scene, parameters, settings.noise)
     reading = [reader for reader in _readers(scenes, Residuals([about])) or [] if reader is not None]
     if not about.signals.names:
         return []
@@ -280,7 +297,7 @@ def _fit_checked(
     settings: _Settings, scenes: list["_GivenSystem"], params0: PyTree, parameters: Parameters
 ) -> tuple[Fit, Verdict]:
     """The fit of records that were checked. Raises `Unfollowed` where the first trial cannot be followed."""
-    question = Residuals([_build_residuals(scene, parameters) for scene in scenes])
+    question = Residuals([_build_residuals(scene, parameters, settings.noise) for scene in scenes])
     _require_one_beginning(question, settings.starts, settings.method)
     readers = _readers(scenes, question)
     if settings.progress:
@@ -294,7 +311,8 @@ def _fit_checked(
     search = functools.partial(
         search_records, question, noise=noise, method=settings.method, readers=readers, weak=weak
     )
-    return _build_result(settings, *run_multistart(question, search, first, y0, settings.starts, settings.seed))
+    descent, waterfall = run_multistart(question, search, first, y0, settings.starts, settings.seed)
+    return _build_result(settings, search_again(descent, noise), waterfall)
 
 
 class _GivenSystem(NamedTuple):
@@ -390,13 +408,13 @@ def _layout(system: Scene, records: list[Record], params0, form: Form | None) ->
     return replace(Layout.from_state(q, qdot), dtype=DOUBLE)
 
 
-def _build_residuals(scene: _GivenSystem, parameters: Parameters) -> SystemResiduals:
+def _build_residuals(scene: _GivenSystem, parameters: Parameters, noise: AbstractNoise) -> SystemResiduals:
     """The residuals of whole records of one system."""
     with errors_of_system(scene.name):
-        return _system_residuals(*scene, parameters)
+        return _system_residuals(*scene, parameters, noise)
 
 
-def _system_residuals(name, system, records, observe, form, layout, parameters) -> SystemResiduals:
+def _system_residuals(name, system, records, observe, form, layout, parameters, noise) -> SystemResiduals:
     rtol = DEFAULT_RTOL
     motions = choose_motions(system, layout, parameters, rtol, None, form)
     recordings = [record for record in records if isinstance(record, Record)]
@@ -405,11 +423,15 @@ def _system_residuals(name, system, records, observe, form, layout, parameters) 
     signals = Signals(observe, layout, parameters, recordings[0] if recordings else None, form)
     _require_no_jumps(system, records, observe, signals)
     _require_motion(recordings, signals.names, records)
+    if not isinstance(noise, StudentT):
+        require_measurements(recordings, signals.names, signals.periods)
+    sensor = read_sensor(recordings, noise, signals.names, signals.periods)
     size = _sizes(recordings)
     timings = {k: record for k, record in enumerate(records) if isinstance(record, Timings)}
     clocks = {k: build_clock(system, layout, parameters, record, rtol) for k, record in timings.items()}
     if timings:
         size = np.append(size, max(np.ptp(record.ts) for record in timings.values()))
+        sensor = Sensor(*(np.append(x, np.nan) for x in sensor))
     fitted = np.array([record.start is None or isinstance(record.start, Guess) for record in records])
     manifold = None
     if isinstance(system, Hybrid):
@@ -420,7 +442,7 @@ def _system_residuals(name, system, records, observe, form, layout, parameters) 
         raise ValueError("A start on constraints of a scene with `inputs` cannot be fitted: give start=(q0, qdot0).")
     return SystemResiduals(
         name, system, records, whole_pieces(records), fitted, motions, signals, parameters,
-        np.where(size > 0, size, 1.0), rtol, clocks, manifold,
+        np.where(size > 0, size, 1.0), rtol, clocks, manifold, sensor,
     )  # fmt: skip
 
 
@@ -548,7 +570,7 @@ def _build_result(settings: _Settings, descent: Descent, waterfall: Waterfall | 
     parameters, question.watch = question.parameters, None
     known = information(question, point, widths)
     unseen = unseen_sentences(question, point, widths, known)
-    found = verdict(descent, unseen, known, question)
+    found = verdict(descent, unseen, known, question, settings.noise)
     done = Fit(
         params=parameters.restore(parameters.numbers(point.u)),
         starts=question.group_by_system(
@@ -560,7 +582,7 @@ def _build_result(settings: _Settings, descent: Descent, waterfall: Waterfall | 
         unseen=unseen,
         ok=found.ok,
         message=found.message,
-        log_likelihood=log_likelihood(widths, point.flat(), question.weights),
+        log_likelihood=log_likelihood(widths, point.flat(), question.weights, question.sides),
         trials=descent.trials,
         waterfall=waterfall,
         records=tuple(question.records),

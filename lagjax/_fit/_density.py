@@ -162,7 +162,8 @@ class Density:
         at = self.unknowns(jnp.asarray(x, self.dtype))
         pairs = zip(self.question.batches, self.residuals(at), strict=True)
         weighted = [np.sqrt(batch.weights) * residuals for batch, residuals in pairs]
-        return self.weighted_log_likelihood(weighted, [batch.weights > 0 for batch in self.question.batches], at)
+        batches = self.question.batches
+        return self.weighted_log_likelihood(weighted, [b.weights > 0 for b in batches], [b.sides for b in batches], at)
 
     def residuals(self, at: PosteriorUnknowns) -> list:
         """The outputs of the sensors less the measurements, (N, T, S), of every batch."""
@@ -173,17 +174,21 @@ class Density:
                 found.append(jnp.zeros((*own.shape[:2], signals), own.dtype).at[..., part.signals].set(own))
         return found
 
-    def weighted_log_likelihood(self, weighted: list, counted: list, at: PosteriorUnknowns):
+    def weighted_log_likelihood(self, weighted: list, counted: list, sides: list, at: PosteriorUnknowns):
         """Σ_s shares_s log L_s, up to a constant, of √weight · residual (N, T, S) of every batch, where they count.
 
         For a signal whose noise is Gaussian other numbers with the same sum of squares do as well.
         """
-        total = -jnp.sum(self.shares * (self.question.weights > 0).sum(axis=0) * jnp.log(at.sigma))
+        exact = (self.question.weights > 0) & (True if self.question.sides is None else self.question.sides == 0)
+        total = -jnp.sum(self.shares * exact.sum(axis=0) * jnp.log(at.sigma))
         dof = jnp.where(self._tails, at.dof, 1.0)
         norm = gammaln((dof + 1) / 2) - gammaln(dof / 2) - 0.5 * jnp.log(dof)
-        for rows, counts in zip(weighted, counted, strict=True):
+        for rows, counts, side in zip(weighted, counted, sides, strict=True):
             squares = (rows / at.sigma) ** 2
             each = jnp.where(self._tails, norm - (dof + 1) / 2 * jnp.log1p(squares / dof), -0.5 * squares)
+            if side is not None:
+                at_limit = jax.scipy.special.log_ndtr(jnp.where(side != 0, side * rows / at.sigma, 0.0))
+                each = jnp.where(side != 0, at_limit, each)
             total = total + jnp.sum(jnp.where(counts, each * self.shares, 0.0))
         return total
 
@@ -213,7 +218,9 @@ class Density:
         question, point = self.question, self.point
         robust = np.array([(d + 1) / (d + 3) if np.isfinite(d) else 1.0 for d in self.widths.dof])
         weight = np.sqrt(self.shares * robust) / self.widths.sigma
-        triangles = question.triangles(point, [np.sqrt(batch.weights) * weight for batch in question.batches])
+        triangles = question.triangles(
+            point, [f * weight * self.widths.sigma for f in question.fisher_factors(point, self.widths)]
+        )
         free, size = len(point.u), self.noise_places.start
         precision = np.zeros((len(self) + 1, len(self) + 1))
         for own, triangle in zip(self.start_places, triangles, strict=True):
@@ -347,12 +354,13 @@ class Block(NamedTuple):
     """The expansions of one batch, in units of the weights: `rows` (N, T, S, Q), and which `counts` (N, T, S).
 
     The Q coefficients are of 1, of the d numbers ζ that a piece depends on, and of their products ζᵢζⱼ, i ≤ j. `own`
-    (N, d) are the places of these numbers in z.
+    (N, d) are the places of these numbers in z; `sides` are those of the samples.
     """
 
     rows: np.ndarray
     counts: np.ndarray
     own: np.ndarray
+    sides: np.ndarray | None
 
 
 class Surrogate(NamedTuple):
@@ -367,7 +375,9 @@ class Surrogate(NamedTuple):
         padded = jnp.append(zeta, 0.0)  # where the start of a piece is known its numbers are those of the last place
         weighted = [self._residuals(block, padded) for block in self.blocks]
         density = self.chart.density
-        log_likelihood = density.weighted_log_likelihood(weighted, [b.counts for b in self.blocks], density.unknowns(x))
+        log_likelihood = density.weighted_log_likelihood(
+            weighted, [b.counts for b in self.blocks], [b.sides for b in self.blocks], density.unknowns(x)
+        )
         total = density.posterior(x, log_likelihood) + volume
         return jnp.where(jnp.isfinite(total), total, -jnp.inf)
 
@@ -386,7 +396,7 @@ def expand_residuals(chart: Chart) -> Surrogate | str:
     states = question.states if question.fitted.any() else 0
     unknowns = states + free
     size = sum(batch.weights.size for batch in question.batches) * (1 + unknowns + unknowns * (unknowns + 1) // 2)
-    plain = not np.isfinite(density.widths.dof).any()
+    plain = not np.isfinite(density.widths.dof).any() and question.sides is None
     if size > _LARGEST and not plain:
         return f"The expansion of its residuals to second order would hold {size} numbers, more than {_LARGEST}."
     found = _differentiate_twice(chart, states)
@@ -400,7 +410,7 @@ def expand_residuals(chart: Chart) -> Surrogate | str:
         if plain and rows.shape[1] > rows.shape[3]:
             rows = np.stack([compress_rows(rows[:, :, s]) for s in range(rows.shape[2])], axis=2)
             counts = np.ones(rows.shape[:3], bool)
-        blocks.append(Block(rows, counts, _places(density, states)[batch.rows]))
+        blocks.append(Block(rows, counts, _places(density, states)[batch.rows], batch.sides))
     if (size := sum(block.rows.size for block in blocks)) > _LARGEST:
         return f"The expansion of its residuals to second order holds {size} numbers, more than {_LARGEST}."
     return Surrogate(chart, blocks)

@@ -133,7 +133,7 @@ def minimise(
             return Descent(point, model.widths, False, trials, text, question)
         better, damping, trials = _find_better_trial(question, point, model, anchor, damping, trials, limit)
         if better is not None:
-            falls.append((trials, model.cost - question.cost(better, model.factors) - anchor.cost(better.u)))
+            falls.append((trials, model.cost - question.cost(better, model.factors, model.widths) - anchor.cost(better.u)))
         if better is None and trials < limit:
             text = f"The search stopped where rounding hides what is left, after {trials} trials."
             return Descent(point, model.widths, True, trials, text, question)
@@ -163,7 +163,8 @@ class _Model(NamedTuple):
 def _model(question: Residuals, point: Trial, noise: AbstractNoise, anchor: Anchor) -> _Model:
     widths = question.noise_scale(point, noise)
     factors = question.factors(point, widths)
-    triangles, cost = question.triangles(point, factors), question.cost(point, factors) + anchor.cost(point.u)
+    triangles = question.linearise(point, widths)
+    cost = question.cost(point, factors, widths) + anchor.cost(point.u)
     pull = anchor.weight, anchor.pull(point.u)
     return _Model(widths, factors, triangles, question.states, pull, question.parameters.limits(point.u), cost)
 
@@ -183,7 +184,7 @@ def _find_better_trial(
         trial = question.evaluate(question.parameters.take_step(point.u, step.u), point.starts + step.starts)
         trials += 1
         if not isinstance(trial, LostTrial):
-            fall = model.cost - question.cost(trial, model.factors) - anchor.cost(trial.u)
+            fall = model.cost - question.cost(trial, model.factors, model.widths) - anchor.cost(trial.u)
             if fall > 0.0:
                 return trial, max(_LEAST, damping * max(0.1, 1.0 - (2.0 * fall / step.gain - 1.0) ** 3)), trials
         damping, growth = damping * growth, 2.0 * growth
@@ -290,7 +291,7 @@ def _initial_unknowns(density: Density, question: Residuals, noise: AbstractNois
                 int(batch.rows[int(np.argmax(bad))]), "Its motion could not be followed from the first trial."
             )
     flat = np.concatenate([r.reshape(-1, r.shape[-1]) for r in left])
-    widths = noise.widths(flat, question.weights, question.least)
+    widths = noise.widths(flat, question.weights, question.least, question.sides)
     x = density.first.copy()
     x[density.noise_places] = np.log(widths.sigma)
     return x

@@ -1,4 +1,5 @@
-"""The scatter of measurements about the motion: `Gaussian`, and `StudentT` with outliers.
+"""The scatter of measurements about the motion: `Gaussian`, `StudentT` with outliers, and what sensors do to numbers:
+`Quantised` rounds them, `Clipped` cuts them off.
 
 A residual e of a signal with width σ and weight w has the standardised size z = √w e/σ. The density is
 
@@ -8,14 +9,33 @@ A residual e of a signal with width σ and weight w has the standardised size z 
 with σ, and ν, of each signal by maximum likelihood from the residuals themselves. A Student-t fit is a sequence of
 weighted least squares: with these counts a smaller weighted sum is a larger likelihood.
 Source: Lange, Little & Taylor, *Robust statistical modeling using the t distribution*, JASA 84 (1989) 881.
+
+**A sample at a limit** of its sensor says that the value lies there or beyond: it contributes −log Φ(u), u = ±z. Its
+score is ∓λ, λ = φ(u)/Φ(u), and its curvature λ(λ + u) is between 0 and 1, where a sample of a Gaussian has the score z
+and the curvature 1. So it enters the least squares with the residual score/curvature and the weight curvature, as in
+Fisher scoring, and σ² is the sum of the squares of scores over that of curvatures, times the σ² that these are for.
+Source: Tobin, Econometrica 26 (1958) 24; Amemiya, J. Econometrics 24 (1984) 3.
+
+**Rounding to multiples of h** leaves errors ε(x), functions of the exact value x with the period h. Where within a step
+the motion lies is not known better than that, so over an offset that is equally likely anywhere in a step
+
+    E ε(x) = 0,    E ε(x) ε(y) = Σₖ aₖ cos(2πk (x − y)/h),    aₖ = h²/(2π²k²) exp(−(2πk s/h)²),    Σₖ aₖ ≤ h²/12
+
+with s the noise before rounding. At rest all errors are one and the same; where the motion goes on by a step or more
+from sample to sample, or the noise is as large as half of one, they are independent. `worths` is what samples are
+worth, and `rounding_square` what least squares with any weights make of such errors: its intervals need no more.
+Source: Widrow & Kollár, *Quantization Noise* (2008), ch. 4 and 11.
 """
 
 import abc
 from dataclasses import dataclass
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
+import jax
 import numpy as np
-from scipy.special import gammaln
+from scipy.special import gammaln, log_ndtr
+
+from lagjax._fit._records import Record, real_numbers, spread_over_signals
 
 _WIDEST, _NARROWEST = 200.0, 1.0  # ν: beyond 200 it is a Gaussian to a percent, below 1 there is not even a mean
 _ROUNDS = 30  # of the fixed point for σ, which gains a factor of three or more in each
@@ -28,17 +48,42 @@ class NoiseScale(NamedTuple):
     dof: np.ndarray
 
 
+class Sensor(NamedTuple):
+    """What the sensors of S signals do to numbers: the `step` (S,) that they round to, and the limits `low`, `high`
+    (S,) that they cut off at; NaN for none."""
+
+    step: np.ndarray
+    low: np.ndarray
+    high: np.ndarray
+
+    def sides(self, values: np.ndarray) -> np.ndarray | None:
+        """1 for samples (..., S) at an upper limit, −1 at a lower one, and 0; None where there are no limits."""
+        if np.isnan(self.low).all() and np.isnan(self.high).all():
+            return None
+        return (values >= self.high).astype(float) - (values <= self.low)
+
+
 class AbstractNoise(abc.ABC):
     """A law for the scatter of measurements."""
 
     @abc.abstractmethod
-    def widths(self, residuals: np.ndarray, weights: np.ndarray, least: np.ndarray) -> NoiseScale:
-        """The noise of S signals that makes these residuals (M, S) likeliest; no σ is smaller than `least` (S,)."""
+    def widths(self, residuals: np.ndarray, weights: np.ndarray, least: np.ndarray, sides=None) -> NoiseScale:
+        """The noise of S signals that makes these residuals (M, S) likeliest; no σ is smaller than `least` (S,).
+
+        `sides` (M, S), None for zeros, are 1 where a sample is at the upper limit of its sensor, −1 at the lower one.
+        """
+
+    def sensor(self, records: list[Record]) -> "Sensor | None":
+        """What the sensors of these records do to numbers; None where the records are to tell."""
+        return None
 
 
 @dataclass(frozen=True)
 class Gaussian(AbstractNoise):
     """Normal noise; σ of each signal is estimated from the residuals. It is the default of `fit`.
+
+    Where the records show that a sensor rounds, or is at its limits, the fit takes that into account and says so, as
+    with `lagjax.Quantised` and `lagjax.Clipped`.
 
     ```python
     import lagjax
@@ -47,11 +92,83 @@ class Gaussian(AbstractNoise):
     ```
     """
 
-    def widths(self, residuals, weights, least):
-        """σ² = mean of w e² over the samples that count."""
-        count = np.maximum((weights > 0).sum(axis=0), 1)
-        sigma = np.sqrt((weights * residuals**2).sum(axis=0) / count)
-        return NoiseScale(np.maximum(sigma, least), np.full(len(least), np.inf))
+    def widths(self, residuals, weights, least, sides=None):
+        """σ² = mean of w e² over the samples that count; of those at a limit their scores and curvatures."""
+        counted = (weights > 0) & (True if sides is None else sides == 0)
+        sigma = np.sqrt((weights * residuals**2).sum(axis=0, where=counted) / np.maximum(counted.sum(axis=0), 1))
+        widths = NoiseScale(np.maximum(sigma, least), np.full(len(least), np.inf))
+        for _ in range(_ROUNDS if sides is not None and sides.any() else 0):
+            score, curvature = scores(np.sqrt(weights) * residuals / widths.sigma, sides)
+            share = (score**2).sum(axis=0) / np.maximum(curvature.sum(axis=0, where=weights > 0), 1e-9)
+            widths = widths._replace(sigma=np.maximum(widths.sigma * np.sqrt(share), least))
+        return widths
+
+
+@dataclass(frozen=True)
+class Quantised(Gaussian):
+    r"""Values that a sensor rounds to multiples of `step`, an encoder or a converter of few bits.
+
+    The rounding error is uniform within a step, with the variance step²/12, and noise is estimated beside it. Errors of
+    samples between which the motion hardly moves are the same: a run of equal values counts once, and intervals hold
+    for a step of any size. A sensor that cuts off instead of rounding (`floor`) shows half a step too little: say so
+    in `observe`, `lambda q, qdot: q - step / 2`, or add it to the values.
+
+    `step` is a positive number for all signals, or a prefix of the structure of `values` with one for each, where None
+    stands for a signal that is not rounded.
+
+    **Raises** `TypeError` or `ValueError` for what is no step, and in `fit` where values are no multiples of it.
+
+    Source: Widrow & Kollár, *Quantization Noise* (2008).
+
+    ```python
+    import math, lagjax
+
+    noise = lagjax.Quantised(2 * math.pi / 4096)  # lagjax.fit(..., noise=noise)
+    ```
+    """
+
+    step: Any
+
+    def __post_init__(self):
+        for leaf in jax.tree.leaves(self.step):
+            if not (np.isfinite(step := real_numbers(leaf, "step", "a number")).all() and (step > 0).all()):
+                raise ValueError(f"Quantised(step) needs a positive step; got {leaf!r}.")
+
+    def sensor(self, records):
+        """The steps of the signals."""
+        return Sensor(*(spread_over_signals(x, records[0], "step") for x in (self.step, None, None)))
+
+
+@dataclass(frozen=True)
+class Clipped(Gaussian):
+    r"""Values that a sensor cuts off at its limits `low` and `high`, with normal noise before that.
+
+    A sample at a limit says that the value lies there or beyond, and contributes the probability of that, Φ(±e/σ).
+
+    Both are numbers for all signals, or prefixes of the structure of `values` with one for each; None for no limit.
+
+    **Raises** `TypeError` or `ValueError` for limits that are no numbers in order, and in `fit` where values are beyond.
+
+    Source: Tobin, Econometrica 26 (1958) 24.
+
+    ```python
+    import lagjax
+
+    noise = lagjax.Clipped(-0.8, 0.8)  # lagjax.fit(..., noise=noise)
+    ```
+    """
+
+    low: Any = None
+    high: Any = None
+
+    def __post_init__(self):
+        leaves = jax.tree.leaves((self.low, self.high))
+        if not leaves or any(np.isnan(real_numbers(leaf, "A limit", "a number")).any() for leaf in leaves):
+            raise ValueError(f"Clipped(low, high) needs a limit or two; got {self.low!r} and {self.high!r}.")
+
+    def sensor(self, records):
+        """The limits of the signals."""
+        return Sensor(*(spread_over_signals(x, records[0], "a limit") for x in (None, self.low, self.high)))
 
 
 @dataclass(frozen=True)
@@ -73,7 +190,7 @@ class StudentT(AbstractNoise):
         if self.dof is not None and not (np.ndim(self.dof) == 0 and np.isfinite(self.dof) and self.dof >= _NARROWEST):
             raise ValueError(f"StudentT(dof) needs a number of degrees of freedom of at least 1; got {self.dof!r}.")
 
-    def widths(self, residuals, weights, least):
+    def widths(self, residuals, weights, least, sides=None):
         """σ by its fixed point σ² = mean of c w e² with c = (ν+1)/(ν + z²), ν by search over its logarithm."""
         found = [
             self._fit_signal(np.sqrt(weights[keep, s]) * residuals[keep, s], least[s])
@@ -110,7 +227,7 @@ class KnownNoise(AbstractNoise):
 
     known: NoiseScale
 
-    def widths(self, residuals, weights, least):
+    def widths(self, residuals, weights, least, sides=None):
         """The noise that is known."""
         return self.known
 
@@ -133,19 +250,36 @@ def _cost(scaled: np.ndarray, sigma: float, dof: float) -> float:
     return np.log(sigma) - constant + 0.5 * (dof + 1) * float(np.mean(np.log1p((scaled / sigma) ** 2 / dof)))
 
 
-def counts(widths: NoiseScale, residuals: np.ndarray, weights: np.ndarray) -> np.ndarray:
+def scores(z: np.ndarray, sides: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
+    """The slope and the curvature of −log L by x/σ of samples of standardised size z; `sides` as for `widths`."""
+    if sides is None:
+        return z, np.ones_like(z)
+    u = sides * z
+    mills = np.exp(-0.5 * u**2 - log_ndtr(u)) / np.sqrt(2 * np.pi)
+    # λ + u > 1/(4 + 2|u|), which is above what the difference of large numbers is rounded to.
+    curvature = mills * np.maximum(mills + u, 1.0 / (4.0 + 2.0 * np.abs(u)))
+    return np.where(sides == 0, z, -sides * mills), np.where(sides == 0, 1.0, curvature)
+
+
+def counts(widths: NoiseScale, residuals: np.ndarray, weights: np.ndarray, sides=None) -> np.ndarray:
     """The weight of each sample in the next sum of squares of e/σ, in the shape of the residuals."""
-    z = weights * (residuals / widths.sigma) ** 2
+    z = np.sqrt(weights) * residuals / widths.sigma
     with np.errstate(invalid="ignore"):  # ∞/∞ where the noise is Gaussian
-        robust = np.where(np.isinf(widths.dof), 1.0, (widths.dof + 1) / (widths.dof + z))
-    return weights * robust
+        robust = np.where(np.isinf(widths.dof), 1.0, (widths.dof + 1) / (widths.dof + z**2))
+    return weights * robust * scores(z, sides)[1]
 
 
-def log_likelihood(widths: NoiseScale, residuals: np.ndarray, weights: np.ndarray) -> float:
+def log_likelihood(widths: NoiseScale, residuals: np.ndarray, weights: np.ndarray, sides=None) -> float:
     """The logarithm of the likelihood of residuals (M, S) whose samples are independent."""
     total = 0.0
+    if sides is not None:
+        at_limit = (sides != 0) & (weights > 0)
+        total = float(log_ndtr(sides * np.sqrt(weights) * residuals / widths.sigma).sum(where=at_limit))
+        weights = np.where(at_limit, 0.0, weights)
     for s, (sigma, dof) in enumerate(zip(*widths, strict=True)):
         keep = weights[:, s] > 0
+        if not keep.any():
+            continue
         root = np.sqrt(weights[keep, s])
         z = root * residuals[keep, s]
         if np.isinf(dof):
@@ -154,3 +288,119 @@ def log_likelihood(widths: NoiseScale, residuals: np.ndarray, weights: np.ndarra
             each = -_cost(z, sigma, dof)
         total += len(z) * each + np.log(root).sum()
     return float(total)
+
+
+# ---- rounding --------------------------------------------------------------------------------------------------------
+
+_HARMONICS = 20  # of the errors' covariance: what they leave, 3 % of step²/12, counts as independent
+
+
+def harmonics(step: float, sigma: float) -> tuple[np.ndarray, float, float]:
+    """aₖ (K,) for errors of the standard deviation `sigma` in all; the variance of rounding beside them, which counts
+    as independent, and that of the noise before rounding."""
+    k, before = np.arange(1, _HARMONICS + 1), max(sigma**2 - step**2 / 12, 0.0)
+    a = step**2 / (2 * (np.pi * k) ** 2) * np.exp(-((2 * np.pi * k) ** 2) * before / step**2)
+    return a, step**2 / 12 - float(a.sum()), before
+
+
+def worths(x: np.ndarray, step: float, sigma: float) -> np.ndarray:
+    """How many independent samples each sample of a signal is worth, whose exact values are near x (T,).
+
+    A sample shares its rounding error with its m neighbours up to half a step away, on both sides as far as none is
+    further, and is worth 1/(1 + (m − 1) ρ) with ρ the share of the variance that they have in common.
+    """
+    rho, many = min(float(harmonics(step, sigma)[0].sum()) / sigma**2, 1.0), np.ones(len(x))
+    for way in (1, -1):
+        left, lag = np.arange(len(x)), 0
+        while len(left):
+            lag += way
+            left = left[(left + lag >= 0) & (left + lag < len(x))]
+            left = left[np.abs(x[left + lag] - x[left]) < step / 2]
+            many[left] += 1
+    return 1.0 / (1.0 + (many - 1.0) * rho)
+
+
+def rounding_square(rows: list[np.ndarray], x: list[np.ndarray], step: float, sigma: float) -> np.ndarray:
+    """E (Σ Gᵢ εᵢ)(Σ Gᵢ εᵢ)ᵀ of the common part of rounding errors, over rows (N, T, F) of batches whose values are near
+    x (N, T)."""
+    total = np.zeros((rows[0].shape[-1],) * 2)
+    for k, a in enumerate(harmonics(step, sigma)[0], start=1):
+        sums = sum(np.einsum("ntf,nt->f", g, np.exp(2j * np.pi * k / step * at)) for g, at in zip(rows, x, strict=True))
+        total += a * (sums[:, None] * sums.conj()).real
+    return total
+
+
+_LATTICE = 1e-3  # of a step that a multiple may be off: text of four digits and float32 are within it
+_EQUAL = 0.02  # of neighbours that are equal: with fewer, rounding errors are independent anyhow
+_RUN, _AT_LIMIT = 3, 0.01  # equal values in a row at a limit of a sensor, and the share of all samples in such rows
+
+
+def find_step(column: np.ndarray) -> float:
+    """The step that all values of a signal (T,) are multiples of, up to an offset, where they show it; NaN elsewhere."""
+    kinds = np.unique(column)
+    if len(kinds) < 3 or np.mean(np.diff(column) == 0) < _EQUAL:
+        return np.nan
+    gaps = np.diff(kinds)
+    rough = np.min(gaps[gaps > 1e-6 * np.ptp(kinds)], initial=np.inf)
+    whole = np.round((kinds - kinds[0]) / rough)
+    step = np.ptp(kinds) / whole[-1]
+    rounding = 4 * np.finfo(np.float32).eps * np.abs(kinds).max()
+    on_lattice = np.abs(kinds - kinds[0] - whole * step).max() < _LATTICE * step + min(rounding, 0.1 * step)
+    return float(step) if on_lattice else np.nan
+
+
+def find_limits(column: np.ndarray, step: float) -> list[float]:
+    """The lowest and the highest value of a signal (T,) where its sensor is at a limit there; NaN where it is not.
+
+    A sensor at its limit shows one value for some time, where the values about it change by more: those of noise never
+    repeat, and those of a sensor that rounds come to rest at a turning point before they repeat.
+    """
+    found, edges = [], np.diff(column, 2)
+    for end in (column.min(), column.max()):
+        there = column == end
+        begins = np.flatnonzero(there[1:] & ~there[:-1]) + 1
+        runs = [int(np.argmin(np.append(there[i:], False))) for i in begins]
+        long = [i for i, run in zip(begins, runs, strict=True) if run >= _RUN and i >= 2]
+        enough = sum(runs) >= max(_AT_LIMIT * len(column), 4)
+        if np.isfinite(step):  # the motion stops dead at the limit, faster than it ever turns elsewhere
+            kinks = [abs(edges[i - 1]) for i in long]
+            enough &= len(kinks) > 0 and np.median(kinks) > 3 * step
+        else:
+            others = column[(column > column.min()) & (column < column.max())]
+            enough &= len(others) > 1 and bool(np.mean(np.diff(others) == 0) < _EQUAL)
+        found.append(float(end) if long and enough else np.nan)
+    return found
+
+
+def find_sensor(records: list[Record]) -> Sensor:
+    """What records show of their sensors: rounding that all of them share, and limits that some of them reach."""
+    columns = [np.concatenate([r.matrix[:, s] for r in records]) for s in range(records[0].matrix.shape[1])]
+    columns = [column[np.isfinite(column)] for column in columns]
+    steps = np.array([find_step(column) for column in columns])
+    ends = np.array([find_limits(column, step) for column, step in zip(columns, steps, strict=True)])
+    return Sensor(steps, *ends.T)
+
+
+def read_sensor(records: list[Record], noise: AbstractNoise, names: tuple[str, ...], periods: np.ndarray) -> Sensor:
+    """What the sensors of some records do to numbers: what the law says, and beside that what the records show.
+
+    Wrapped signals turn round at their ends, which are no limits. Raises `ValueError` where values are not what the law
+    says.
+    """
+    if not records:
+        return Sensor(*np.zeros((3, 0)))
+    found, given = find_sensor(records), noise.sensor(records)
+    found = found._replace(**{end: np.where(np.isfinite(periods), np.nan, getattr(found, end)) for end in found._fields[1:]})
+    if given is None:
+        return found
+    for place, record in enumerate(records):
+        for column, name, step, low, high in zip(record.matrix.T, names, *given, strict=True):
+            column = column[np.isfinite(column)]
+            if len(column) and np.isfinite(step):
+                off = (column - column[0]) / step
+                slack = _LATTICE + 8 * np.finfo(np.float32).eps * np.abs(column).max() / step
+                if np.abs(off - np.round(off)).max() > slack:
+                    raise ValueError(f"The values of {name} in records[{place}] do not differ by multiples of {step:g}.")
+            if (column < low).any() or (column > high).any():
+                raise ValueError(f"Some values of {name} in records[{place}] are beyond the limits {low:g} and {high:g}.")
+    return Sensor(*(np.where(np.isnan(own), shown, own) for own, shown in zip(given, found, strict=True)))

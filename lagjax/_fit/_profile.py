@@ -227,7 +227,7 @@ class _ProfileLine:
         if isinstance(done, LostTrial):
             raise ValueError(question.describe_failure(done))
         self.u, point = done.point.u, done.point
-        self.best = log_likelihood(widths, point.flat(), question.weights)
+        self.best = log_likelihood(widths, point.flat(), question.weights, question.sides)
         self.places = [_Place(float(self.u[which]), np.delete(self.u, which), point.starts, 0.0)]
 
     def deviance(self, at: float) -> float:
@@ -241,7 +241,7 @@ class _ProfileLine:
         for others, starts in self._guesses(at):
             done = minimise(question, others, starts, KnownNoise(self.widths), _ENOUGH, _TRIALS)
             if not isinstance(done, LostTrial):
-                lost = self.best - log_likelihood(self.widths, done.point.flat(), question.weights)
+                lost = self.best - log_likelihood(self.widths, done.point.flat(), question.weights, question.sides)
                 self.places.append(_Place(at, done.point.u, done.point.starts, 2.0 * self.scale * lost))
                 return self.places[-1].deviance
         return np.inf
@@ -263,7 +263,7 @@ class _ProfileLine:
         done = minimise(self.question, u, place.starts, KnownNoise(self.widths), _ENOUGH, 2 * _TRIALS)
         if isinstance(done, LostTrial):
             return None
-        lost = self.best - log_likelihood(self.widths, done.point.flat(), self.question.weights)
+        lost = self.best - log_likelihood(self.widths, done.point.flat(), self.question.weights, self.question.sides)
         return float(done.point.u[self.which]), 2.0 * self.scale * lost
 
 

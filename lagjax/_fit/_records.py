@@ -462,6 +462,18 @@ def restore_structure(matrix: np.ndarray, record) -> PyTree:
     return _split_columns(matrix, record.structure)
 
 
+def spread_over_signals(given: PyTree, record: Record, what: str) -> np.ndarray:
+    """The number of each signal (S,) of a record from a prefix of the structure of its values; NaN for None."""
+    leaves, tree = jax.tree.flatten(record.values)
+    given = jax.tree.map(lambda x: np.nan if x is None else x, given, is_leaf=lambda x: x is None)
+    try:
+        spread = tree.flatten_up_to(jax.tree.broadcast(given, record.values))
+        each = [np.broadcast_to(one, leaf.shape[1:]).ravel() for one, leaf in zip(spread, leaves, strict=True)]
+    except ValueError:
+        raise ValueError(f"{what} must be one number, or a prefix of the structure and shapes of values.") from None
+    return np.concatenate(each).astype(float)
+
+
 def inputs_between(record: Record, ts: np.ndarray) -> PyTree:
     """The inputs of a record at other times, on lines between the samples; None where it has none."""
     if record.input_structure is None:
@@ -500,6 +512,7 @@ class Samples(NamedTuple):
     - `ts` (N, T): times, and after the last one of a piece times so close to it that following them costs nothing.
     - `values` (N, T, S), `weights` (N, T, S): signals and how much they count, zero where there is none.
     - `inputs` (N, T, I), I = 0 where there are none: the inputs at these times. `table`: between them.
+    - `sides` (N, T, S): 1 where a sample is at the upper limit of its sensor, −1 at the lower one; None for zeros.
     """
 
     rows: np.ndarray
@@ -508,6 +521,7 @@ class Samples(NamedTuple):
     weights: np.ndarray
     inputs: np.ndarray
     table: SampleTable | None
+    sides: np.ndarray | None = None
 
 
 def batches(records: list[Any], pieces: list[Piece], eps: float = 2.3e-16, hold: str = "zero") -> list[Samples]:

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._fit._motions import AbstractMotions, Manifold, Origins, ProjectedStarts, RecordMotion
-from lagjax._fit._noise import AbstractNoise, NoiseScale, counts
+from lagjax._fit._noise import AbstractNoise, NoiseScale, Sensor, counts, log_ndtr, scores, worths
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import (
     Driven,
@@ -109,6 +109,7 @@ class SystemResiduals:
         rtol: float,
         clocks: dict[int, Clock] | None = None,
         manifold: Manifold | None = None,
+        sensor: Sensor | None = None,
     ):
         self.name, self.scene = name, scene
         self.records, self.pieces, self.fitted = records, pieces, fitted
@@ -116,6 +117,7 @@ class SystemResiduals:
         timed = any(piece.record in self.clocks for piece in pieces)
         self.names = (*signals.names, *(("times",) if timed else ()))
         self.periods = np.append(signals.periods, [np.inf] * timed)
+        self.sensor = Sensor(*np.full((3, len(self.names)), np.nan)) if sensor is None else sensor
         self.size, self.rtol, self.least = size[: len(self.names)], rtol, rtol * size[: len(self.names)]
         self.motions, self.signals, self.parameters = motions, signals, parameters
         self.layout: Layout = signals.layout
@@ -134,7 +136,7 @@ class SystemResiduals:
         """The residuals of other pieces of the records."""
         return SystemResiduals(
             self.name, self.scene, self.records, pieces, fitted, self.motions, self.signals, self.parameters,
-            self.size, self.rtol, self.clocks, self.manifold,
+            self.size, self.rtol, self.clocks, self.manifold, self.sensor,
         )  # fmt: skip
 
     def with_records(
@@ -145,7 +147,7 @@ class SystemResiduals:
         parameters = self.parameters if parameters is None else parameters
         return SystemResiduals(
             self.name, self.scene, records, whole_pieces(records), fitted, self.motions, self.signals, parameters,
-            self.size, self.rtol, None, manifold,
+            self.size, self.rtol, None, manifold, self.sensor,
         )  # fmt: skip
 
     def columns(self, record: int) -> slice:
@@ -177,7 +179,7 @@ class SystemResiduals:
         values[..., columns], weights[..., columns] = batch.values, batch.weights
         if self.signals.delays is not None and columns.start == 0:
             weights[batch.ts < batch.ts[:, :1] + self.signals.delays.longest] = 0.0
-        return batch._replace(values=values, weights=weights)
+        return batch._replace(values=values, weights=weights, sides=self.sensor.sides(values))
 
     # ---- the trials of a search ----
 
@@ -466,6 +468,13 @@ class Residuals:
         self.least = np.concatenate([part.system.least for part in self.parts])
         self.batches = [self._embed_batch(part, batch) for part in self.parts for batch in part.system.batches]
         self.weights = np.concatenate([b.weights.reshape(-1, len(self.names)) for b in self.batches])
+        self.sensor = Sensor(*(np.concatenate(x) for x in zip(*(part.system.sensor for part in self.parts), strict=True)))
+        self.sides = None
+        if any(b.sides is not None for b in self.batches):
+            self.sides = np.concatenate(
+                [np.reshape(np.zeros_like(b.weights) if b.sides is None else b.sides, (-1, len(self.names)))
+                 for b in self.batches]
+            )  # fmt: skip
         self.measured = int((self.weights > 0).sum())
 
     def _split_by_system(self) -> list[SystemPart]:
@@ -484,7 +493,11 @@ class Residuals:
         """A batch of one system with the rows and signals of all."""
         values, weights = np.zeros((2, *batch.ts.shape, len(self.names)))
         values[..., part.signals], weights[..., part.signals] = batch.values, batch.weights
-        return batch._replace(rows=part.rows[batch.rows], values=values, weights=weights)
+        sides = batch.sides
+        if sides is not None:
+            sides = np.zeros_like(values)
+            sides[..., part.signals] = batch.sides
+        return batch._replace(rows=part.rows[batch.rows], values=values, weights=weights, sides=sides)
 
     def with_pieces(self, pieces: list[Piece], fitted: np.ndarray) -> "Residuals":
         """The residuals of other pieces of the records; the signals are those of systems with a piece."""
@@ -550,18 +563,47 @@ class Residuals:
 
     def noise_scale(self, point: Trial, noise: AbstractNoise) -> NoiseScale:
         """The noise of the signals that makes the residuals of a trial likeliest."""
-        return noise.widths(point.flat(), self.weights, self.least)
+        return noise.widths(point.flat(), self.weights, self.least, self.sides)
 
     def factors(self, point: Trial, widths: NoiseScale) -> list[np.ndarray]:
         """√count/σ of every sample, by which its residual enters the sum of squares."""
         return [
-            np.sqrt(counts(widths, r, batch.weights)) / widths.sigma
+            np.sqrt(counts(widths, r, batch.weights, batch.sides)) / widths.sigma
             for r, batch in zip(point.residuals, self.batches, strict=True)
         ]
 
-    def cost(self, point: Trial, factors: list[np.ndarray]) -> float:
-        """Half the weighted sum of squares."""
-        return 0.5 * sum(float(np.sum((f * r) ** 2)) for f, r in zip(factors, point.residuals, strict=True))
+    def fisher_factors(self, point: Trial, widths: NoiseScale) -> list[np.ndarray]:
+        """√weight/σ of every sample, times the root of the curvature of what is at the limit of a sensor."""
+        return self.factors(point, widths._replace(dof=np.full(len(widths.dof), np.inf)))
+
+    def working_trial(self, point: Trial, widths: NoiseScale) -> Trial:
+        """The trial with residuals of which those at the limit of a sensor have the slope of their likelihood."""
+        return point if self.sides is None else point._replace(
+            residuals=[self._working(batch, r, widths) for batch, r in zip(self.batches, point.residuals, strict=True)]
+        )  # fmt: skip
+
+    @staticmethod
+    def _working(batch: Samples, residuals: np.ndarray, widths: NoiseScale) -> np.ndarray:
+        unit = widths.sigma / np.sqrt(np.where(batch.weights > 0, batch.weights, 1.0))
+        score, curvature = scores(residuals / unit, batch.sides)
+        safe = np.maximum(curvature, np.finfo(float).tiny)
+        return np.where(curvature > np.finfo(float).tiny, unit * score / safe, 0.0)
+
+    def cost(self, point: Trial, factors: list[np.ndarray], widths: NoiseScale) -> float:
+        """Half the weighted sum of squares, and −log of the probability of samples at the limit of a sensor."""
+        total = 0.0
+        for f, r, batch in zip(factors, point.residuals, self.batches, strict=True):
+            if batch.sides is None:
+                total += 0.5 * float(np.sum((f * r) ** 2))
+            else:
+                at_limit = (batch.sides != 0) & (batch.weights > 0)
+                u = batch.sides * np.sqrt(batch.weights) * r / widths.sigma
+                total += float(np.sum(np.where(at_limit, -log_ndtr(u), 0.5 * (f * r) ** 2)))
+        return total
+
+    def linearise(self, point: Trial, widths: NoiseScale) -> np.ndarray:
+        """The triangles of the least squares about a trial."""
+        return self.triangles(self.working_trial(point, widths), self.factors(point, widths))
 
     def triangles(self, point: Trial, factors: list[np.ndarray]) -> np.ndarray:
         """The weighted rows of each piece, compressed: (N, D + 1, D + 1), the residual as last column."""
@@ -577,6 +619,34 @@ class Residuals:
                 rows = np.concatenate([rows, more], axis=1)
             found[batch.rows] = compress_rows(rows)
         return found
+
+    # ---- what rounding makes of samples ----
+
+    def exact_values(self, point: Trial, signal: int) -> list[np.ndarray]:
+        """What the sensor of one signal would show without rounding, (N, T) of every batch."""
+        pairs = zip(self.batches, point.residuals, strict=True)
+        return [batch.values[..., signal] + r[..., signal] for batch, r in pairs]
+
+    def worths(self, point: Trial, widths: NoiseScale, signal: int) -> list[np.ndarray]:
+        """How many independent samples each is worth, (N, T) of every batch, for a signal whose sensor rounds."""
+        found = []
+        for batch, exact in zip(self.batches, self.exact_values(point, signal), strict=True):
+            found.append(np.zeros(exact.shape))
+            for own, x, there in zip(found[-1], exact, batch.weights[..., signal] > 0, strict=True):
+                own[there] = worths(x[there], self.sensor.step[signal], widths.sigma[signal])
+        return found
+
+    def count_runs_once(self, point: Trial, widths: NoiseScale) -> "Residuals":
+        """The same residuals, where samples that share a rounding error have together the weight of one."""
+        other, weights = copy.copy(self), [batch.weights.copy() for batch in self.batches]
+        for s in np.flatnonzero(np.isfinite(self.sensor.step)):
+            each = self.worths(point, widths, s)
+            mean = sum(float(w.sum()) for w in each) / max((self.weights[:, s] > 0).sum(), 1)
+            for w, worth in zip(weights, each, strict=True):
+                w[..., s] *= worth / mean
+        other.batches = [batch._replace(weights=w) for batch, w in zip(self.batches, weights, strict=True)]
+        other.weights = np.concatenate([w.reshape(-1, len(self.names)) for w in weights])
+        return other
 
     # ---- pieces, records and systems ----
 

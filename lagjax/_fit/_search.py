@@ -477,7 +477,7 @@ def _evaluate_starts(question: Residuals, u: np.ndarray, starts: np.ndarray) -> 
             if not isinstance(trial, LostTrial):
                 noise = question.noise_scale(trial, Gaussian())
                 found.starts[k], found.misfits[k] = trial.starts, misfit(noise, question)
-                found.triangles[k] = question.triangles(trial, question.factors(trial, noise))
+                found.triangles[k] = question.linearise(trial, noise)
     return found
 
 
@@ -532,7 +532,7 @@ def run_multistart(question: Residuals, search, u, y0, starts: int, seed: int) -
 
 
 def _log_likelihood(done: Descent) -> float:
-    return log_likelihood(done.widths, done.point.flat(), done.question.weights)
+    return log_likelihood(done.widths, done.point.flat(), done.question.weights, done.question.sides)
 
 
 def build_reader(record: Record, about: SystemResiduals, numbers: np.ndarray, probes: int = 256) -> Reader | None:
@@ -622,6 +622,19 @@ def _search_pieces(question: Residuals, level: Descent, joined: NoiseScale | Non
         return done._replace(message=f"{done.message} {text}")
     text += ", though the motion does not forget its start: the scene lacks something that lasts longer."
     return done._replace(message=f"{done.message} {text}", converged=False)
+
+
+def search_again(done: Descent, noise) -> Descent:
+    """The end of a search where samples that share a rounding error count once; of sensors that do not round the same.
+
+    Which samples do is known where the motion is, and does not change with the last digits of the parameters.
+    """
+    question = done.question
+    if np.isnan(question.sensor.step).all():
+        return done
+    question = question.count_runs_once(done.point, done.widths)
+    again = _require_success(question, minimise(question, done.point.u, done.point.starts, noise, _ENOUGH, _TRIALS))
+    return done if not again.converged else again._replace(converged=done.converged, message=done.message)
 
 
 def search_by_gradient(question: Residuals, u, y0, noise, readers: list[Reader | None] | None) -> Descent:

@@ -34,7 +34,7 @@ import numpy as np
 from lagjax._arguments import accept
 from lagjax._fit._motions import RecordMotion
 from lagjax._fit._parameters import Parameters
-from lagjax._fit._records import Form, Record, restore_structure
+from lagjax._fit._records import Form, Record, restore_structure, spread_over_signals
 from lagjax._layout import Layout, halves
 
 PyTree = Any
@@ -191,14 +191,8 @@ class Wrapped:
 
     def periods(self, record: Record) -> np.ndarray:
         """The period of each signal (S,), infinite where it is not wrapped. Raises where there is not one for each."""
-        leaves, tree = jax.tree.flatten(record.values)
-        period = jax.tree.map(lambda x: np.inf if x is None else x, self.period, is_leaf=lambda x: x is None)
-        try:
-            spread = tree.flatten_up_to(jax.tree.broadcast(period, record.values))
-            each = [np.broadcast_to(one, leaf.shape[1:]).ravel() for one, leaf in zip(spread, leaves, strict=True)]
-        except ValueError:
-            raise ValueError("period must be one number, or a prefix of the structure and shapes of values.") from None
-        return np.concatenate(each).astype(float)
+        each = spread_over_signals(self.period, record, "period")
+        return np.where(np.isnan(each), np.inf, each)
 
 
 def sensors(observe) -> tuple[Any, Wrapped | None]:

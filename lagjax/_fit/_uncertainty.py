@@ -56,7 +56,7 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import stdtrit
 
-from lagjax._fit._noise import NoiseScale
+from lagjax._fit._noise import NoiseScale, harmonics, rounding_square, scores
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._residuals import LostTrial, Residuals, Trial, compress_rows
 
@@ -87,10 +87,11 @@ def _autocorrelation(question: Residuals, point: Trial, widths: NoiseScale, sign
     sums, count = np.zeros(1), 0
     for batch, residuals in zip(question.batches, point.residuals, strict=True):
         z = np.sqrt(batch.weights[..., signal]) * residuals[..., signal] / widths.sigma[signal]
+        z, curvature = scores(z, None if batch.sides is None else batch.sides[..., signal])
         if not np.isinf(dof):
             z = z * (dof + 1) / (dof + z**2)  # what enters the likelihood's slope
         counted = batch.weights[..., signal] > 0
-        own, count = lag_products(z, counted), count + int(counted.sum())
+        own, count = lag_products(z / np.sqrt(np.maximum(curvature, 1e-99)), counted), count + round(curvature.sum(where=counted))
         longer = np.zeros(max(len(sums), len(own)))
         longer[: len(sums)] += sums
         longer[: len(own)] += own
@@ -185,7 +186,7 @@ class Information(NamedTuple):
     - `null` (F, K): the K directions of u that nothing depends on, as far as rounding lets one tell; `confirmed` are
       those among them that nothing depends on.
     - `effective` (S,): the number of samples of each signal that independent ones would need to say as much.
-    - `correlation` (S,): the correlation of neighbouring residuals.
+    - `correlation` (S,): the correlation of neighbouring residuals, less what rounding makes of it.
     - `white` (F, F): the covariance if residuals were white, zero where nothing is seen; `lost`: by how much variances
       are larger because unknowns were fitted.
     """
@@ -212,20 +213,32 @@ def require_level(level) -> None:
 
 def information(question: Residuals, point: Trial, widths: NoiseScale) -> Information:
     """The information of the data about the parameters, at the end of a search."""
-    factors = [np.sqrt(b.weights) / widths.sigma for b in question.batches]
+    factors = question.fisher_factors(point, widths)
     triangles = question.triangles(point, factors)
     null, basis = null_space(triangles, question.states)
     if _is_lost(question, point):
         null, basis = np.eye(len(point.u)), np.zeros((len(point.u), 0))
     laws = autocorrelations(question, point, widths)
-    lags = [law.lags for law in laws]
-    effective = np.array([law.count / law.time for law in laws])
+    effective, correlation = (np.array(x) for x in zip(*((a.count / a.time, a.neighbour) for a in laws), strict=True))
     free, unit = len(point.u), _lengths(triangles, question.states)  # of columns: their squares may be no numbers
-    middle = np.zeros((free, free))
+    middle, rows_of = np.zeros((free, free)), []
     for batch, factor, slopes in zip(question.batches, factors, point.slopes, strict=True):
         own = eliminate_starts(triangles[batch.rows], factor[..., None] * slopes, question.states) / unit
-        for s, law in enumerate(lags):
-            middle += correlated_square(close_gaps(own[:, :, s], batch.weights[..., s] > 0), law)
+        rows_of.append(own)
+        for s in np.flatnonzero(np.isnan(question.sensor.step)):
+            middle += correlated_square(close_gaps(own[:, :, s], batch.weights[..., s] > 0), laws[s].lags)
+    for s in np.flatnonzero(np.isfinite(question.sensor.step)):
+        sigma, step = widths.sigma[s], question.sensor.step[s]
+        _, rest, before = harmonics(step, sigma)
+        rows = [np.sqrt(b.weights[..., s, None]) / sigma * own[:, :, s]
+                for b, own in zip(question.batches, rows_of, strict=True)]  # fmt: skip
+        for g, b in zip(rows, question.batches, strict=True):
+            g = close_gaps(g, b.weights[..., s] > 0)
+            middle += before * correlated_square(g, laws[s].lags) + rest * correlated_square(g, np.ones(1))
+        middle += rounding_square(rows, question.exact_values(point, s), step, sigma)
+        share = min(before / sigma**2, 1.0)
+        worth = sum(float(w.sum()) for w in question.worths(point, widths, s))
+        effective[s], correlation[s] = worth / (1 + (laws[s].time - 1) * share), share * correlation[s]
     # Student's t tells (ν+1)/(ν+3) of what a Gaussian of the same σ tells; the dof that were used up are counted.
     used = free - null.shape[1] + question.unknowns
     lost = max(effective.sum() / max(effective.sum() - used, 1.0), 1.0)
@@ -239,9 +252,7 @@ def information(question: Residuals, point: Trial, widths: NoiseScale) -> Inform
     covariance[:, unseen] = np.nan
     covariance[unseen, unseen] = np.inf
     confirmed = null if not null.size else confirmed_null(question, point, null)
-    return Information(
-        covariance, null, confirmed, effective, np.array([law.neighbour for law in laws]), white, float(lost)
-    )
+    return Information(covariance, null, confirmed, effective, correlation, white, float(lost))
 
 
 def null_space(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:

@@ -35,10 +35,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._fit._descent import Descent, column_norms, eliminate
-from lagjax._fit._noise import NoiseScale
+from lagjax._fit._noise import AbstractNoise, NoiseScale, Sensor
 from lagjax._fit._parameters import Between, Parameters, Positive
 from lagjax._fit._records import Record, restore_structure
 from lagjax._fit._residuals import Residuals, Trial, compress_rows
+from lagjax._fit._sensors import wrap_residuals
 from lagjax._fit._uncertainty import Information, correlated_power, eliminate_starts
 
 _WIDE = 3.0  # rad: a signal of a smaller range is not tried as degrees, which would leave it 0.05
@@ -117,6 +118,73 @@ def find_mistake(
     return []
 
 
+_JUMP = 5.0  # times what neighbours differ by (95 % of them): noise alone jumps there and back by 3 at most
+_FAR = 30.0  # times the spread of the others, from which on one sample is no measurement
+_KINDS, _REPEATED = 5, 3  # values that are looked at, and how often they must be there
+
+
+def require_measurements(records: list[Record], names: tuple[str, ...], periods: np.ndarray) -> None:
+    """Raise `ValueError` for samples that stand for missing ones: one value, to which a signal jumps and comes back."""
+    for place, record in enumerate(records):
+        for k, name in enumerate(names):
+            column = _present_samples(record, k)
+            if (found := _find_placeholder(column, periods[k])) is None:
+                continue
+            value, count = found
+            others = column[column != value]
+            repeat = "never repeat" if len(np.unique(others)) == len(others) else "are far from it just before and after"
+            away = abs(value - np.median(others)) / max(np.ptp(others), np.finfo(float).tiny)
+            how = f", {away:.2g} times the spread of the others" if away > _FAR else f", among values that {repeat}"
+            exactly = "" if away > _FAR else "exactly "
+            raise ValueError(
+                f"{count} of {len(column)} samples of {name} in records[{place}] are {exactly}{value:.6g}{how}: are they "
+                "missing? Put NaN there, or take noise=lagjax.StudentT()."
+            )
+
+
+def _find_placeholder(column: np.ndarray, period: float) -> tuple[float, int] | None:
+    """The value that stands for missing samples of a signal (T,), and how many; None where there is no such."""
+    kinds, counts = np.unique(column, return_counts=True)
+    if len(kinds) < _FEWEST:
+        return None
+    middle, spread = np.median(column), np.ptp(np.quantile(column, [0.05, 0.95]))
+    far = np.abs(kinds - middle) > _FAR * spread if spread > 0 else np.zeros(len(kinds), bool)
+    often = np.argsort(-counts, kind="stable")[:_KINDS]
+    for k in dict.fromkeys([*often[counts[often] >= _REPEATED].tolist(), *np.flatnonzero(far)[:_KINDS].tolist()]):
+        there = column == kinds[k]
+        if there.mean() > 0.5:
+            continue
+        others = column[~there]
+        usual = np.quantile(np.abs(wrap_residuals(np.diff(others)[:, None], np.array([period]))), 0.95)
+        before = np.maximum(np.cumsum(~there) - 1, 0)[there]
+        after = np.minimum(before + 1, len(others) - 1)
+        jumps = np.abs(wrap_residuals(kinds[k] - others[np.stack([before, after], axis=1)], np.full(2, period))).min(axis=1)
+        if usual > 0 and np.mean(jumps > _JUMP * usual) >= 0.5:
+            return float(kinds[k]), int(there.sum())
+    return None
+
+
+def describe_sensors(records: list[Record], noise, names: tuple[str, ...], sensor: Sensor, sigma: np.ndarray) -> list[str]:
+    """A sentence for every signal of one system whose sensor rounds, or is at a limit, where the law does not say so."""
+    given = noise.sensor(records) or Sensor(*np.full((3, len(names)), np.nan))
+    found = []
+    for k, name in enumerate(names):
+        step, some = sensor.step[k], np.concatenate([_present_samples(record, k) for record in records])
+        if np.isnan(given.step[k]) and step**2 / 12 > _ROUNDED * sigma[k] ** 2:
+            off = "" if np.abs(some / step - np.round(some / step)).max() < 0.01 else " up to an offset"
+            found.append(
+                f"All values of {name} are multiples of {step:.4g}{off}: they are fitted as with "
+                f"noise=lagjax.Quantised({step:.4g})."
+            )
+        for end, word, limit in (("low", "smallest", sensor.low[k]), ("high", "largest", sensor.high[k])):
+            if np.isfinite(limit) and np.isnan(getattr(given, end)[k]):
+                found.append(
+                    f"{(some == limit).sum()} of {len(some)} samples of {name} are {limit:.4g}, the {word} value, in runs: "
+                    f"they are fitted as with noise=lagjax.Clipped({end}={limit:.4g}), {limit:.4g} or beyond."
+                )
+    return found
+
+
 def constant_signals(records: list[Any], names: tuple[str, ...]) -> list[str]:
     """A sentence for every signal, of these names, that is the same at all samples of a record of one system."""
     return [
@@ -174,6 +242,7 @@ _UNEXPLAINED = 0.3  # of a signal's size, left as motion: sound fits leave 1e-3 
 _DOUBTED = 0.05  # of a signal's size, left as motion, from which a fit of other records is tried
 _FAINT = 0.1  # of a signal's size over all records: what is left of a record that hardly moves is not looked at
 _CORRELATED = 0.5
+_ROUNDED = 0.05  # of the variance of the noise, from which on a sentence tells of rounding
 
 
 class Verdict(NamedTuple):
@@ -184,14 +253,16 @@ class Verdict(NamedTuple):
     left: "Unexplained"
 
 
-def verdict(descent: Descent, unseen: tuple[str, ...], known: Information, question: Residuals) -> Verdict:
+def verdict(
+    descent: Descent, unseen: tuple[str, ...], known: Information, question: Residuals, noise: AbstractNoise
+) -> Verdict:
     """The verdict on a search that ended there."""
     parts = [descent.message]
     if known.confirmed.shape[1]:
         parts.append("Not everything that is free is seen: fix it, or measure more.")
     left = measure_unexplained(question, descent.point, descent.widths)
     parts += left.motion + left.noise
-    triangles = question.triangles(descent.point, question.factors(descent.point, descent.widths))
+    triangles = question.linearise(descent.point, descent.widths)
     at_ends, named = _describe_ends(question.parameters, descent.point, triangles, question.states, known)
     parts += at_ends
     # Half a step of the search is one standard deviation: the interval then spans more than a factor of fifty.
@@ -203,6 +274,10 @@ def verdict(descent: Descent, unseen: tuple[str, ...], known: Information, quest
         question, triangles, known, ~named, _unexplained_motion(question, descent.point, descent.widths)
     )
     parts += apart + pulls
+    for part in question.parts:
+        records, own = [r for r in part.system.records if isinstance(r, Record)], part.sensor_noise(descent.widths)
+        if records:
+            parts += describe_sensors(records, noise, part.system.signals.names, part.system.sensor, own.sigma)
     if np.nanmax(known.correlation) > _CORRELATED:
         parts.append("The residuals are correlated: they hold motion that the scene lacks, and intervals allow for it.")
     ok = descent.converged and not (unseen or left.motion or apart)
@@ -231,7 +306,8 @@ def measure_unexplained(question: Residuals, point: Trial, widths: NoiseScale) -
     left, noisy, shares, doubted, many = [], [], [0.0], False, len(question.records) > 1
     of_records = np.zeros(len(question.records))
     for signal, name in enumerate(question.names):
-        parts = {k: _parts(*rows) for k, rows in _rows_of_signal(question, point, widths, signal).items()}
+        rounding = np.nan_to_num(question.sensor.step[signal]) ** 2 / 12
+        parts = {k: _parts(*rows, rounding) for k, rows in _rows_of_signal(question, point, widths, signal).items()}
         if not parts:
             continue
         samples = sum(part.samples for part in parts.values())
@@ -267,7 +343,7 @@ def _percent(part: float, whole: float) -> str:
 
 class _Parts(NamedTuple):
     """Of one signal in one record: the samples that count, and mean squares of the residuals, of what these hold beyond
-    white noise, and of the signal about its mean."""
+    white noise and rounding, and of the signal about its mean."""
 
     samples: float
     left: float
@@ -275,10 +351,11 @@ class _Parts(NamedTuple):
     own: float
 
 
-def _parts(rows: np.ndarray, values: np.ndarray, counts: np.ndarray) -> _Parts:
+def _parts(rows: np.ndarray, values: np.ndarray, counts: np.ndarray, rounding: float) -> _Parts:
     samples, root = counts.sum(), np.sqrt(counts)
     mean = np.sum(counts * values) / samples
     motion = correlated_power(root * rows, counts > 0) * (counts > 0).sum() / samples
+    motion = max(motion - rounding, 0.0)
     return _Parts(samples, np.sum(counts * rows**2) / samples, motion, np.sum(counts * (values - mean) ** 2) / samples)
 
 
@@ -385,7 +462,7 @@ def _unexplained_motion(question: Residuals, point: Trial, widths: NoiseScale) -
     found: dict[int, float] = {}
     for signal in range(len(question.names)):
         for k, rows in _rows_of_signal(question, point, widths, signal).items():
-            part = _parts(*rows)
+            part = _parts(*rows, np.nan_to_num(question.sensor.step[signal]) ** 2 / 12)
             found[k] = found.get(k, 0.0) + part.samples * part.motion / widths.sigma[signal] ** 2
     return found
 
