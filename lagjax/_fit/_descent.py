@@ -133,7 +133,9 @@ def minimise(
             return Descent(point, model.widths, False, trials, text, question)
         better, damping, trials = _find_better_trial(question, point, model, anchor, damping, trials, limit)
         if better is not None:
-            falls.append((trials, model.cost - question.cost(better, model.factors, model.widths) - anchor.cost(better.u)))
+            falls.append(
+                (trials, model.cost - question.cost(better, model.factors, model.widths) - anchor.cost(better.u))
+            )
         if better is None and trials < limit:
             text = f"The search stopped where rounding hides what is left, after {trials} trials."
             return Descent(point, model.widths, True, trials, text, question)

@@ -63,15 +63,25 @@ class Sensor(NamedTuple):
         return (values >= self.high).astype(float) - (values <= self.low)
 
 
-class AbstractNoise(abc.ABC):
-    """A law for the scatter of measurements."""
+class AbstractNoise(abc.ABC):  # noqa: B024
+    """A law for the scatter of measurements, which is normal where the law says no more."""
 
-    @abc.abstractmethod
     def widths(self, residuals: np.ndarray, weights: np.ndarray, least: np.ndarray, sides=None) -> NoiseScale:
         """The noise of S signals that makes these residuals (M, S) likeliest; no σ is smaller than `least` (S,).
 
         `sides` (M, S), None for zeros, are 1 where a sample is at the upper limit of its sensor, −1 at the lower one.
+        Of normal noise σ² is the mean of w e², and the squared scores over curvatures where some are at a limit.
         """
+        counted = (weights > 0) & (True if sides is None else sides == 0)
+        sigma = np.sqrt((weights * residuals**2).sum(axis=0, where=counted) / np.maximum(counted.sum(axis=0), 1))
+        widths = NoiseScale(np.maximum(sigma, least), np.full(len(least), np.inf))
+        for _ in range(_ROUNDS if sides is not None else 0):
+            score, curvature = scores(np.sqrt(weights) * residuals / widths.sigma, sides)
+            share = (score**2).sum(axis=0, where=weights > 0) / np.maximum(
+                curvature.sum(axis=0, where=weights > 0), 1e-9
+            )
+            widths = widths._replace(sigma=np.maximum(widths.sigma * np.sqrt(share), least))
+        return widths
 
     def sensor(self, records: list[Record]) -> "Sensor | None":
         """What the sensors of these records do to numbers; None where the records are to tell."""
@@ -92,20 +102,9 @@ class Gaussian(AbstractNoise):
     ```
     """
 
-    def widths(self, residuals, weights, least, sides=None):
-        """σ² = mean of w e² over the samples that count; of those at a limit their scores and curvatures."""
-        counted = (weights > 0) & (True if sides is None else sides == 0)
-        sigma = np.sqrt((weights * residuals**2).sum(axis=0, where=counted) / np.maximum(counted.sum(axis=0), 1))
-        widths = NoiseScale(np.maximum(sigma, least), np.full(len(least), np.inf))
-        for _ in range(_ROUNDS if sides is not None and sides.any() else 0):
-            score, curvature = scores(np.sqrt(weights) * residuals / widths.sigma, sides)
-            share = (score**2).sum(axis=0) / np.maximum(curvature.sum(axis=0, where=weights > 0), 1e-9)
-            widths = widths._replace(sigma=np.maximum(widths.sigma * np.sqrt(share), least))
-        return widths
-
 
 @dataclass(frozen=True)
-class Quantised(Gaussian):
+class Quantised(AbstractNoise):
     r"""Values that a sensor rounds to multiples of `step`, an encoder or a converter of few bits.
 
     The rounding error is uniform within a step, with the variance step²/12, and noise is estimated beside it. Errors of
@@ -140,14 +139,14 @@ class Quantised(Gaussian):
 
 
 @dataclass(frozen=True)
-class Clipped(Gaussian):
+class Clipped(AbstractNoise):
     r"""Values that a sensor cuts off at its limits `low` and `high`, with normal noise before that.
 
     A sample at a limit says that the value lies there or beyond, and contributes the probability of that, Φ(±e/σ).
 
     Both are numbers for all signals, or prefixes of the structure of `values` with one for each; None for no limit.
 
-    **Raises** `TypeError` or `ValueError` for limits that are no numbers in order, and in `fit` where values are beyond.
+    **Raises** `TypeError` or `ValueError` for what are no limits, and in `fit` where values are beyond.
 
     Source: Tobin, Econometrica 26 (1958) 24.
 
@@ -292,6 +291,7 @@ def log_likelihood(widths: NoiseScale, residuals: np.ndarray, weights: np.ndarra
 
 # ---- rounding --------------------------------------------------------------------------------------------------------
 
+_LAG = 1.2  # ratio of the lags at which neighbours are compared: how many there are is known to as much
 _HARMONICS = 20  # of the errors' covariance: what they leave, 3 % of step²/12, counts as independent
 
 
@@ -310,13 +310,13 @@ def worths(x: np.ndarray, step: float, sigma: float) -> np.ndarray:
     further, and is worth 1/(1 + (m − 1) ρ) with ρ the share of the variance that they have in common.
     """
     rho, many = min(float(harmonics(step, sigma)[0].sum()) / sigma**2, 1.0), np.ones(len(x))
+    lags = np.unique(np.round(_LAG ** np.arange(np.log(len(x) + 1) / np.log(_LAG))).astype(int))
     for way in (1, -1):
-        left, lag = np.arange(len(x)), 0
-        while len(left):
-            lag += way
-            left = left[(left + lag >= 0) & (left + lag < len(x))]
-            left = left[np.abs(x[left + lag] - x[left]) < step / 2]
-            many[left] += 1
+        left = np.arange(len(x))
+        for lag, more in zip(lags, np.diff(lags, prepend=0), strict=True):
+            to = left + way * lag
+            left = left[(to >= 0) & (to < len(x)) & (np.abs(x[np.clip(to, 0, len(x) - 1)] - x[left]) < step / 2)]
+            many[left] += more
     return 1.0 / (1.0 + (many - 1.0) * rho)
 
 
@@ -325,28 +325,26 @@ def rounding_square(rows: list[np.ndarray], x: list[np.ndarray], step: float, si
     x (N, T)."""
     total = np.zeros((rows[0].shape[-1],) * 2)
     for k, a in enumerate(harmonics(step, sigma)[0], start=1):
-        sums = sum(np.einsum("ntf,nt->f", g, np.exp(2j * np.pi * k / step * at)) for g, at in zip(rows, x, strict=True))
-        total += a * (sums[:, None] * sums.conj()).real
+        each = [np.einsum("ntf,nt->f", g, np.exp(2j * np.pi * k / step * at)) for g, at in zip(rows, x, strict=True)]
+        sums = np.sum(each, axis=0)
+        total += a * np.real(sums[:, None] * sums.conj())
     return total
 
 
-_LATTICE = 1e-3  # of a step that a multiple may be off: text of four digits and float32 are within it
+_LATTICE = 0.02  # of a step that a multiple may be off, in text of few digits or float32; chance is off by 0.25
 _EQUAL = 0.02  # of neighbours that are equal: with fewer, rounding errors are independent anyhow
 _RUN, _AT_LIMIT = 3, 0.01  # equal values in a row at a limit of a sensor, and the share of all samples in such rows
 
 
 def find_step(column: np.ndarray) -> float:
-    """The step that all values of a signal (T,) are multiples of, up to an offset, where they show it; NaN elsewhere."""
-    kinds = np.unique(column)
-    if len(kinds) < 3 or np.mean(np.diff(column) == 0) < _EQUAL:
+    """The step of which all values of a signal (T,) are multiples, up to an offset; NaN where they do not show one."""
+    gaps = np.diff(np.unique(column))
+    if not len(gaps) or np.mean(np.diff(column) == 0) < _EQUAL:
         return np.nan
-    gaps = np.diff(kinds)
-    rough = np.min(gaps[gaps > 1e-6 * np.ptp(kinds)], initial=np.inf)
-    whole = np.round((kinds - kinds[0]) / rough)
-    step = np.ptp(kinds) / whole[-1]
-    rounding = 4 * np.finfo(np.float32).eps * np.abs(kinds).max()
-    on_lattice = np.abs(kinds - kinds[0] - whole * step).max() < _LATTICE * step + min(rounding, 0.1 * step)
-    return float(step) if on_lattice else np.nan
+    whole = np.cumsum(np.round(gaps / np.min(gaps[gaps > 1e-6 * gaps.sum()])))  # of neighbours, few steps apart
+    step, rounding = gaps.sum() / whole[-1], 4 * np.finfo(np.float32).eps * np.abs(column).max()
+    off = np.abs(np.cumsum(gaps) - whole * step).max()
+    return float(step) if off < _LATTICE * step + min(rounding, 0.1 * step) else np.nan
 
 
 def find_limits(column: np.ndarray, step: float) -> list[float]:
@@ -384,13 +382,15 @@ def find_sensor(records: list[Record]) -> Sensor:
 def read_sensor(records: list[Record], noise: AbstractNoise, names: tuple[str, ...], periods: np.ndarray) -> Sensor:
     """What the sensors of some records do to numbers: what the law says, and beside that what the records show.
 
-    Wrapped signals turn round at their ends, which are no limits. Raises `ValueError` where values are not what the law
-    says.
+    Wrapped signals turn round at their ends, which are no limits, and Student's t knows none. Raises `ValueError` where
+    values are not what the law says.
     """
     if not records:
         return Sensor(*np.zeros((3, 0)))
     found, given = find_sensor(records), noise.sensor(records)
-    found = found._replace(**{end: np.where(np.isfinite(periods), np.nan, getattr(found, end)) for end in found._fields[1:]})
+    if isinstance(noise, StudentT):
+        return Sensor(found.step, *np.full((2, len(names)), np.nan))
+    found = Sensor(found.step, *(np.where(np.isfinite(periods), np.nan, end) for end in found[1:]))
     if given is None:
         return found
     for place, record in enumerate(records):
@@ -400,7 +400,11 @@ def read_sensor(records: list[Record], noise: AbstractNoise, names: tuple[str, .
                 off = (column - column[0]) / step
                 slack = _LATTICE + 8 * np.finfo(np.float32).eps * np.abs(column).max() / step
                 if np.abs(off - np.round(off)).max() > slack:
-                    raise ValueError(f"The values of {name} in records[{place}] do not differ by multiples of {step:g}.")
+                    raise ValueError(
+                        f"The values of {name} in records[{place}] do not differ by multiples of {step:g}."
+                    )
             if (column < low).any() or (column > high).any():
-                raise ValueError(f"Some values of {name} in records[{place}] are beyond the limits {low:g} and {high:g}.")
+                raise ValueError(
+                    f"Some values of {name} in records[{place}] are beyond the limits {low:g} and {high:g}."
+                )
     return Sensor(*(np.where(np.isnan(own), shown, own) for own, shown in zip(given, found, strict=True)))

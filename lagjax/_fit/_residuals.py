@@ -468,7 +468,9 @@ class Residuals:
         self.least = np.concatenate([part.system.least for part in self.parts])
         self.batches = [self._embed_batch(part, batch) for part in self.parts for batch in part.system.batches]
         self.weights = np.concatenate([b.weights.reshape(-1, len(self.names)) for b in self.batches])
-        self.sensor = Sensor(*(np.concatenate(x) for x in zip(*(part.system.sensor for part in self.parts), strict=True)))
+        self.sensor = Sensor(
+            *(np.concatenate(x) for x in zip(*(part.system.sensor for part in self.parts), strict=True))
+        )
         self.sides = None
         if any(b.sides is not None for b in self.batches):
             self.sides = np.concatenate(
@@ -639,7 +641,7 @@ class Residuals:
     def count_runs_once(self, point: Trial, widths: NoiseScale) -> "Residuals":
         """The same residuals, where samples that share a rounding error have together the weight of one."""
         other, weights = copy.copy(self), [batch.weights.copy() for batch in self.batches]
-        for s in np.flatnonzero(np.isfinite(self.sensor.step)):
+        for s in np.flatnonzero(np.isfinite(self.sensor.step)).tolist():
             each = self.worths(point, widths, s)
             mean = sum(float(w.sum()) for w in each) / max((self.weights[:, s] > 0).sum(), 1)
             for w, worth in zip(weights, each, strict=True):

@@ -91,7 +91,10 @@ def _autocorrelation(question: Residuals, point: Trial, widths: NoiseScale, sign
         if not np.isinf(dof):
             z = z * (dof + 1) / (dof + z**2)  # what enters the likelihood's slope
         counted = batch.weights[..., signal] > 0
-        own, count = lag_products(z / np.sqrt(np.maximum(curvature, 1e-99)), counted), count + round(curvature.sum(where=counted))
+        own, count = (
+            lag_products(z / np.sqrt(np.maximum(curvature, 1e-99)), counted),
+            count + round(curvature.sum(where=counted)),
+        )
         longer = np.zeros(max(len(sums), len(own)))
         longer[: len(sums)] += sums
         longer[: len(own)] += own
@@ -227,7 +230,7 @@ def information(question: Residuals, point: Trial, widths: NoiseScale) -> Inform
         rows_of.append(own)
         for s in np.flatnonzero(np.isnan(question.sensor.step)):
             middle += correlated_square(close_gaps(own[:, :, s], batch.weights[..., s] > 0), laws[s].lags)
-    for s in np.flatnonzero(np.isfinite(question.sensor.step)):
+    for s in np.flatnonzero(np.isfinite(question.sensor.step)).tolist():
         sigma, step = widths.sigma[s], question.sensor.step[s]
         _, rest, before = harmonics(step, sigma)
         rows = [np.sqrt(b.weights[..., s, None]) / sigma * own[:, :, s]

@@ -35,7 +35,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._fit._descent import Descent, column_norms, eliminate
-from lagjax._fit._noise import AbstractNoise, NoiseScale, Sensor
+from lagjax._fit._noise import AbstractNoise, NoiseScale, Sensor, StudentT, find_sensor
 from lagjax._fit._parameters import Between, Parameters, Positive
 from lagjax._fit._records import Record, restore_structure
 from lagjax._fit._residuals import Residuals, Trial, compress_rows
@@ -118,7 +118,7 @@ def find_mistake(
     return []
 
 
-_JUMP = 5.0  # times what neighbours differ by (95 % of them): noise alone jumps there and back by 3 at most
+_JUMP = 3.0  # times the most that other neighbours differ by: neither motion nor noise jumps so far and back
 _FAR = 30.0  # times the spread of the others, from which on one sample is no measurement
 _KINDS, _REPEATED = 5, 3  # values that are looked at, and how often they must be there
 
@@ -127,18 +127,21 @@ def require_measurements(records: list[Record], names: tuple[str, ...], periods:
     """Raise `ValueError` for samples that stand for missing ones: one value, to which a signal jumps and comes back."""
     for place, record in enumerate(records):
         for k, name in enumerate(names):
-            column = _present_samples(record, k)
+            column = record.matrix[record.weight_matrix[:, k] > 0, k]
             if (found := _find_placeholder(column, periods[k])) is None:
                 continue
             value, count = found
             others = column[column != value]
-            repeat = "never repeat" if len(np.unique(others)) == len(others) else "are far from it just before and after"
+            repeat = (
+                "never repeat" if len(np.unique(others)) == len(others) else "are far from it just before and after"
+            )
             away = abs(value - np.median(others)) / max(np.ptp(others), np.finfo(float).tiny)
-            how = f", {away:.2g} times the spread of the others" if away > _FAR else f", among values that {repeat}"
-            exactly = "" if away > _FAR else "exactly "
+            how = f"exactly {value:.6g}, among values that {repeat}"
+            if away > _FAR:
+                how = f"{value:.6g}, {float(f'{away:.2g}'):.0f} times the spread of the others"
             raise ValueError(
-                f"{count} of {len(column)} samples of {name} in records[{place}] are {exactly}{value:.6g}{how}: are they "
-                "missing? Put NaN there, or take noise=lagjax.StudentT()."
+                f"{count} of {len(column)} samples of {name} in records[{place}] are {how}: missing? Put NaN there, or "
+                "take noise=lagjax.StudentT()."
             )
 
 
@@ -152,20 +155,27 @@ def _find_placeholder(column: np.ndarray, period: float) -> tuple[float, int] | 
     often = np.argsort(-counts, kind="stable")[:_KINDS]
     for k in dict.fromkeys([*often[counts[often] >= _REPEATED].tolist(), *np.flatnonzero(far)[:_KINDS].tolist()]):
         there = column == kinds[k]
-        if there.mean() > 0.5:
+        if there.mean() > 0.5:  # where it rests
             continue
         others = column[~there]
-        usual = np.quantile(np.abs(wrap_residuals(np.diff(others)[:, None], np.array([period]))), 0.95)
+        steps = np.abs(wrap_residuals(np.diff(others)[:, None], np.array([period])))
         before = np.maximum(np.cumsum(~there) - 1, 0)[there]
         after = np.minimum(before + 1, len(others) - 1)
-        jumps = np.abs(wrap_residuals(kinds[k] - others[np.stack([before, after], axis=1)], np.full(2, period))).min(axis=1)
-        if usual > 0 and np.mean(jumps > _JUMP * usual) >= 0.5:
+        jumps = np.abs(wrap_residuals(kinds[k] - others[np.stack([before, after], axis=1)], np.full(2, period))).min(
+            axis=1
+        )
+        if (jumps > _JUMP * steps.max()).sum() >= (1 if far[k] else _REPEATED):
             return float(kinds[k]), int(there.sum())
     return None
 
 
-def describe_sensors(records: list[Record], noise, names: tuple[str, ...], sensor: Sensor, sigma: np.ndarray) -> list[str]:
-    """A sentence for every signal of one system whose sensor rounds, or is at a limit, where the law does not say so."""
+def describe_sensors(
+    records: list[Record], noise, names: tuple[str, ...], sensor: Sensor, sigma: np.ndarray
+) -> list[str]:
+    """A sentence for every signal of a system whose sensor rounds, or is at a limit, and the law does not say so."""
+    is_student = isinstance(noise, StudentT)
+    if is_student:  # it knows no limits
+        sensor = Sensor(sensor.step, *find_sensor(records)[1:])
     given = noise.sensor(records) or Sensor(*np.full((3, len(names)), np.nan))
     found = []
     for k, name in enumerate(names):
@@ -178,9 +188,10 @@ def describe_sensors(records: list[Record], noise, names: tuple[str, ...], senso
             )
         for end, word, limit in (("low", "smallest", sensor.low[k]), ("high", "largest", sensor.high[k])):
             if np.isfinite(limit) and np.isnan(getattr(given, end)[k]):
+                law, count = f"noise=lagjax.Clipped({end}={limit:.4g})", (some == limit).sum()
+                how = f"take {law}." if is_student else f"they are fitted as with {law}, {limit:.4g} or beyond."
                 found.append(
-                    f"{(some == limit).sum()} of {len(some)} samples of {name} are {limit:.4g}, the {word} value, in runs: "
-                    f"they are fitted as with noise=lagjax.Clipped({end}={limit:.4g}), {limit:.4g} or beyond."
+                    f"{count} of {len(some)} samples of {name} are {limit:.4g}, the {word} value, in runs: {how}"
                 )
     return found
 
@@ -281,6 +292,7 @@ def verdict(
     if np.nanmax(known.correlation) > _CORRELATED:
         parts.append("The residuals are correlated: they hold motion that the scene lacks, and intervals allow for it.")
     ok = descent.converged and not (unseen or left.motion or apart)
+    ok &= not (isinstance(noise, StudentT) and any("Clipped" in text for text in parts))
     if not ok or at_ends or labels:
         still = [
             text for part in question.parts for text in constant_signals(part.system.records, part.system.signals.names)
@@ -307,7 +319,7 @@ def measure_unexplained(question: Residuals, point: Trial, widths: NoiseScale) -
     of_records = np.zeros(len(question.records))
     for signal, name in enumerate(question.names):
         rounding = np.nan_to_num(question.sensor.step[signal]) ** 2 / 12
-        parts = {k: _parts(*rows, rounding) for k, rows in _rows_of_signal(question, point, widths, signal).items()}
+        parts = {k: _parts(rows, rounding) for k, rows in _rows_of_signal(question, point, widths, signal).items()}
         if not parts:
             continue
         samples = sum(part.samples for part in parts.values())
@@ -351,7 +363,8 @@ class _Parts(NamedTuple):
     own: float
 
 
-def _parts(rows: np.ndarray, values: np.ndarray, counts: np.ndarray, rounding: float) -> _Parts:
+def _parts(row: tuple[np.ndarray, np.ndarray, np.ndarray], rounding: float) -> _Parts:
+    rows, values, counts = row
     samples, root = counts.sum(), np.sqrt(counts)
     mean = np.sum(counts * values) / samples
     motion = correlated_power(root * rows, counts > 0) * (counts > 0).sum() / samples
@@ -462,7 +475,7 @@ def _unexplained_motion(question: Residuals, point: Trial, widths: NoiseScale) -
     found: dict[int, float] = {}
     for signal in range(len(question.names)):
         for k, rows in _rows_of_signal(question, point, widths, signal).items():
-            part = _parts(*rows, np.nan_to_num(question.sensor.step[signal]) ** 2 / 12)
+            part = _parts(rows, np.nan_to_num(question.sensor.step[signal]) ** 2 / 12)
             found[k] = found.get(k, 0.0) + part.samples * part.motion / widths.sigma[signal] ** 2
     return found
 
