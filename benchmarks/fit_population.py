@@ -1,10 +1,14 @@
 """Random fits with one seeded mistake each: is any answer wrong without a word?
 
-    python -m benchmarks.fit_population --fits 100 --honest 30
+    python -m benchmarks.fit_population --fits 97 --sensors 60 --honest 30
+    python -m benchmarks.fit_population --fits 0 --sensors 60 --honest 10 --float32
+    python -m benchmarks.fit_population --fits 0 --sensors 0 --honest 0 --coverage 100
 
 A pendulum with friction, a double pendulum, a cart with a pole, Duffing's oscillator and two masses on springs, three
 records each, and one mistake in the data: angles modulo 2π, degrees, milliseconds, swapped signals, a constant signal,
-a wrong sign, shifted times, one record mirrored, one record of another machine. An answer is
+a wrong sign, shifted times, one record mirrored, one record of another machine. `--sensors` draws what sensors do:
+samples missing and written as 0.0, −9999 or 1e6, values rounded, rounded to 24 lines of a turn, or cut off at limits;
+`--float32` hands records over in float32 without JAX's switch. An answer is
 
 - *right* where the fit is ok and every parameter is within four standard deviations or 1 % of the truth; of a mistake
   that only changes units, of the truth in these units;
@@ -13,6 +17,10 @@ a wrong sign, shifted times, one record mirrored, one record of another machine.
 - *wrong* where the fit is ok and a parameter is not right; a *crash* is an error that is no sentence.
 
 Honest fits, with no mistake, are the control: one that is not ok is an *alarm*.
+
+`--coverage` counts how often 95 % intervals hold the truth, of fits that are not told what the sensor does: a motor
+with dry friction and an encoder of 2.5 mrad, driven for 3 s of 4 and then at rest; a pendulum whose sensor ends at ±0.8
+of ±1.2; one with an encoder of 24 lines and a swing of 0.4 rad, without and with noise.
 """
 
 import argparse
@@ -154,9 +162,31 @@ def spoil(case: Case, mistake: str | None, rng) -> Spoiled:
         name, words = rng.choice(list(truth)), mine
         other = {**truth, name: truth[name] * rng.choice([0.7, 1.4])}
         values[which] = motion(case, *rng.uniform(-1.2, 1.2, (2, case.size)), other, rng)
+    elif mistake in PLACEHOLDERS:
+        words, share = "missing", rng.uniform(0.02, 0.1)
+        for one in values:
+            one[rng.random(one.shape) < share] = PLACEHOLDERS[mistake]
+    elif mistake == "rounded":
+        values = [_round(one, rng.uniform(0.01, 0.1), offset) for offset in [rng.random()] for one in values]
+    elif mistake == "24 lines":
+        values = [_round(one, 2 * np.pi / 24, offset) for offset in [rng.random()] for one in values]
+    elif mistake == "clipped":
+        ends = rng.uniform(0.5, 0.9) * np.max([np.abs(one).max(axis=0) for one in values], axis=0)
+        values = [np.clip(one, -ends, ends) for one in values]
+    if not jax.config.jax_enable_x64:
+        values = [one.astype(np.float32) for one in values]
     return Spoiled([lagjax.Record(t, one) for t, one in zip(times, values, strict=True)], words, truth)
 
 
+def _round(values: np.ndarray, step: float, offset: float) -> np.ndarray:
+    """The values at a sensor that rounds, whose lines are `offset` of a step from zero."""
+    return step * (np.round(values / step + offset) - offset)
+
+
+PLACEHOLDERS = {"zeros": 0.0, "-9999": -9999.0, "1e6": 1e6}
+SENSORS: dict[str, Callable[[Case], bool]] = {
+    name: lambda case: True for name in (*PLACEHOLDERS, "rounded", "24 lines", "clipped")
+}
 MISTAKES: dict[str, Callable[[Case], bool]] = {
     "wrapped": lambda case: bool(case.angles),
     "degrees": lambda case: bool(case.angles),
@@ -189,24 +219,82 @@ def judge(case: Case, spoiled: Spoiled, rng) -> tuple[str, str]:
     return "right" if right else "wrong", text
 
 
-def schedule(fits: int, honest: int) -> list[tuple[int, str, str | None]]:
+def schedule(fits: int, honest: int, sensors: int = 0) -> list[tuple[int, str, str | None]]:
     """(seed, scene, mistake): every mistake in every scene that can have it, in turn, and honest fits last."""
-    pairs = [(scene, mistake) for mistake, can in MISTAKES.items() for scene, case in CASES.items() if can(case)]
-    order = np.random.default_rng(0).permutation(len(pairs))
-    rows: list[tuple[int, str, str | None]] = [(seed, *pairs[order[seed % len(pairs)]]) for seed in range(fits)]
+    rows: list[tuple[int, str, str | None]] = []
+    for first, count, mistakes in ((0, fits, MISTAKES), (5_000, sensors, SENSORS)):
+        pairs = [(scene, mistake) for mistake, can in mistakes.items() for scene, case in CASES.items() if can(case)]
+        order = np.random.default_rng(0).permutation(len(pairs))
+        rows += [(first + seed, *pairs[order[seed % len(pairs)]]) for seed in range(count)]
     return rows + [(10_000 + seed, list(CASES)[seed % len(CASES)], None) for seed in range(honest)]
+
+
+MOTOR = lagjax.System(
+    lambda q, v: 0.5 * v**2,
+    forces=lambda q, v, params, inputs: params["K"] * inputs - params["B"] * v - params["F"] * jnp.sign(v),
+)
+PENDULUM = lagjax.System(
+    lambda q, v, params: 0.5 * v**2 + params["w2"] * jnp.cos(q),
+    dissipation=lambda q, v, params: 0.5 * params["c"] * v**2,
+)
+
+
+def motor_record(rng) -> lagjax.Record:
+    """A square wave for 3 s of 4, then rest, seen by an encoder."""
+    ts, truth, step = np.linspace(0.0, 4.0, 2000), {"K": 8.0, "B": 1.5, "F": 2.0}, 2.5e-3
+    driven = np.where(ts < 3.0, rng.uniform(1.5, 3.0) * np.sign(np.sin(2 * np.pi * ts / 0.8 + rng.uniform(0, 6))), 0.0)
+    record = lagjax.Record(ts, np.zeros(2000), inputs=driven, start=(0.0, rng.uniform(-1, 1)))
+    kept = lagjax.fit(MOTOR, record, truth, free=False)  # the motion of the truth, with the inputs of the record
+    return lagjax.Record(ts, _round(np.asarray(kept.residuals[0]), step, rng.random()), inputs=driven)
+
+
+def pendulum_record(rng, size: float, sensor: Callable[[np.ndarray], np.ndarray], sigma: float) -> lagjax.Record:
+    """A swing of about this size, seen by a sensor."""
+    ts, size, phase = np.linspace(0.0, 12.0, 601), size * rng.uniform(0.95, 1.05), rng.uniform(0, 2 * np.pi)
+    q = lagjax.simulate(PENDULUM, size * np.cos(phase), 3 * size * np.sin(phase), ts, {"w2": 9.0, "c": 0.1}).q
+    return lagjax.Record(ts, sensor(np.asarray(q) + sigma * rng.normal(size=601)))
+
+
+def coverage(draws: int) -> dict[str, dict[str, float]]:
+    """Of each sensor and parameter the share of 95 % intervals that hold the truth."""
+    lines = 2 * np.pi / 24
+    kinds = {
+        "motor, encoder": (MOTOR, {"K": 8.0, "B": 1.5, "F": 2.0}, motor_record),
+        "clipped": (PENDULUM, {"w2": 9.0, "c": 0.1},
+                    lambda rng: pendulum_record(rng, 1.2, lambda x: np.clip(x, -0.8, 0.8), 5e-3)),
+        "24 lines": (PENDULUM, {"w2": 9.0, "c": 0.1},
+                     lambda rng: pendulum_record(rng, 0.4, lambda x: _round(x, lines, rng.random()), 0.0)),
+        "24 lines, noise": (PENDULUM, {"w2": 9.0, "c": 0.1},
+                            lambda rng: pendulum_record(rng, 0.4, lambda x: _round(x, lines, rng.random()), 0.08)),
+    }  # fmt: skip
+    shares = {}
+    for kind, (system, truth, record) in kinds.items():
+        held = []
+        for seed in range(draws):
+            begin = {k: 1.1 * x for k, x in truth.items()}
+            fit = lagjax.fit(system, record(np.random.default_rng(seed)), begin, transforms=lagjax.positive)
+            low, high = fit.intervals()
+            held.append([low[k] <= x <= high[k] or not fit.ok for k, x in truth.items()])
+        shares[kind] = dict(zip(truth, np.mean(held, axis=0).round(3).tolist(), strict=True))
+        print(f"{kind:<16} of {draws} intervals of 95 % hold the truth: {shares[kind]}", flush=True)
+    return shares
 
 
 def main(argv=None) -> dict[str, Any]:
     """Run the population, print what is wrong, told or an alarm, and return the counts by mistake."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--fits", type=int, default=100, help="fits with a mistake")
+    parser.add_argument("--sensors", type=int, default=0, help="fits with what sensors do to numbers")
+    parser.add_argument("--coverage", type=int, default=0, help="fits of each sensor whose intervals are counted")
+    parser.add_argument("--float32", action="store_true", help="records in float32, without JAX's switch")
     parser.add_argument("--honest", type=int, default=30, help="fits without one")
     parser.add_argument("--only", type=int, nargs="*", help="seeds to run alone, with all that they say")
     options = parser.parse_args(argv)
-    jax.config.update("jax_enable_x64", True)
+    jax.config.update("jax_enable_x64", not options.float32)
+    if options.coverage:
+        coverage(options.coverage)
     counts: dict[str, collections.Counter] = collections.defaultdict(collections.Counter)
-    for seed, scene, mistake in schedule(options.fits, options.honest):
+    for seed, scene, mistake in schedule(options.fits, options.honest, options.sensors):
         if options.only and seed not in options.only:
             continue
         rng, used = np.random.default_rng(seed), time.process_time()
