@@ -50,7 +50,6 @@ from lagjax._fit._noise import (
     Quantised,
     Sensor,
     StudentT,
-    log_likelihood,
     read_sensor,
 )
 from lagjax._fit._parameters import Parameters, angle, between, inertia, positive, simplex
@@ -328,7 +327,6 @@ class _GivenSystem(NamedTuple):
 
 
 def _scenes(system, records, params0, observe, hold: str) -> list[_GivenSystem]:
-    """The systems with their records, checked."""
     scenes = []
     for name, one, own, shown in systems_by_name(system, records, observe):
         with errors_of_system(name):
@@ -409,7 +407,6 @@ def _layout(system: Scene, records: list[Record], params0, form: Form | None) ->
 
 
 def _build_residuals(scene: _GivenSystem, parameters: Parameters, noise: AbstractNoise) -> SystemResiduals:
-    """The residuals of whole records of one system."""
     with errors_of_system(scene.name):
         return _system_residuals(*scene, parameters, noise)
 
@@ -426,7 +423,8 @@ def _system_residuals(name, system, records, observe, form, layout, parameters, 
     if not isinstance(noise, StudentT):
         require_measurements(recordings, signals.names, signals.periods)
     sensor = read_sensor(recordings, noise, signals.names, signals.periods)
-    size = _sizes(recordings)
+    every = np.concatenate([record.matrix for record in recordings]) if recordings else np.zeros((1, 0))
+    size = np.sqrt(np.nanmean(every**2, axis=0))  # root mean squares
     timings = {k: record for k, record in enumerate(records) if isinstance(record, Timings)}
     clocks = {k: build_clock(system, layout, parameters, record, rtol) for k, record in timings.items()}
     if timings:
@@ -478,13 +476,6 @@ def _require_length(recordings: list[Record], longest: float) -> None:
                 f"Record {place} is {length:g} long, shorter than the longest delay of its sensors, {longest:g}: "
                 "nothing is left of it. Leave it out, or bound the delay closer."
             )
-
-
-def _sizes(recordings: list[Record]) -> np.ndarray:
-    """The root mean square of each signal; of none without recordings."""
-    if not recordings:
-        return np.zeros(0)
-    return np.sqrt(np.nanmean(np.concatenate([record.matrix for record in recordings]) ** 2, axis=0))
 
 
 def _readers(scenes: list[_GivenSystem], question: Residuals) -> list[Reader | None] | None:
@@ -565,7 +556,6 @@ class _Printer:
 
 
 def _build_result(settings: _Settings, descent: Descent, waterfall: Waterfall | None) -> tuple[Fit, Verdict]:
-    """The result in the user's structures and in words."""
     point, widths, question = descent.point, descent.widths, descent.question
     parameters, question.watch = question.parameters, None
     known = information(question, point, widths)
@@ -582,7 +572,7 @@ def _build_result(settings: _Settings, descent: Descent, waterfall: Waterfall | 
         unseen=unseen,
         ok=found.ok,
         message=found.message,
-        log_likelihood=log_likelihood(widths, point.flat(), question.weights, question.sides),
+        log_likelihood=question.log_likelihood(point, widths),
         trials=descent.trials,
         waterfall=waterfall,
         records=tuple(question.records),

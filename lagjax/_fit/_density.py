@@ -326,7 +326,8 @@ class Chart(NamedTuple):
     def jacobian(self, zeta: np.ndarray) -> np.ndarray:
         """∂x/∂ζ (D, D)."""
         by_y = np.ones(len(self.centre))
-        by_y[self.bounded] = _slope((self.centre + self.root @ zeta)[self.bounded], self.low, self.high)
+        y = (self.centre + self.root @ zeta)[self.bounded]  # of log[(y − a)/(b − y)], or log(y − a) where b is infinite
+        by_y[self.bounded] = 1.0 / (y - self.low) + 1.0 / (self.high - y)
         return by_y[:, None] * self.root
 
     def room(self, ways: np.ndarray) -> np.ndarray:
@@ -339,11 +340,6 @@ class Chart(NamedTuple):
         moved = np.abs(self.root @ ways)[self.bounded]
         with np.errstate(divide="ignore"):
             return np.min(most / moved, axis=0, initial=1.0)
-
-
-def _slope(y: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """du/dy (B,) of u = log[(y − a)/(b − y)], or log(y − a) where b is infinite."""
-    return 1.0 / (y - low) + 1.0 / (high - y)
 
 
 # Numbers of all expansions together: 32 MiB that every step of a trajectory reads. Many more, and a motion is cheaper.

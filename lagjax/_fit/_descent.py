@@ -88,7 +88,6 @@ class Anchor(NamedTuple):
 
     @classmethod
     def none(cls, u: np.ndarray) -> "Anchor":
-        """No weight at all."""
         return cls(u, np.zeros_like(u))
 
     def pull(self, u: np.ndarray) -> np.ndarray:
@@ -157,7 +156,6 @@ class _Model(NamedTuple):
     cost: float
 
     def step(self, damping: float) -> DescentStep:
-        """The damped step from the trial."""
         scale = column_norms(self.triangles, self.states)
         return eliminate(self.triangles, self.states, scale, damping, self.pull, self.limits)
 

@@ -134,7 +134,6 @@ class Quantised(AbstractNoise):
                 raise ValueError(f"Quantised(step) needs a positive step; got {leaf!r}.")
 
     def sensor(self, records):
-        """The steps of the signals."""
         return Sensor(*(spread_over_signals(x, records[0], "step") for x in (self.step, None, None)))
 
 
@@ -166,7 +165,6 @@ class Clipped(AbstractNoise):
             raise ValueError(f"Clipped(low, high) needs a limit or two; got {self.low!r} and {self.high!r}.")
 
     def sensor(self, records):
-        """The limits of the signals."""
         return Sensor(*(spread_over_signals(x, records[0], "a limit") for x in (None, self.low, self.high)))
 
 
@@ -227,7 +225,6 @@ class KnownNoise(AbstractNoise):
     known: NoiseScale
 
     def widths(self, residuals, weights, least, sides=None):
-        """The noise that is known."""
         return self.known
 
 

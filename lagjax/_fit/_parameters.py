@@ -108,11 +108,9 @@ class AbstractSeparable(AbstractTransform):
 
     @property
     def separable(self) -> bool:
-        """True."""
         return True
 
     def jacobian(self, u):
-        """A diagonal of slopes."""
         return np.diag(self.slope(u))
 
     def ends(self, x, spread):
@@ -129,7 +127,6 @@ class AbstractSeparable(AbstractTransform):
             return np.where(excluded, self.value(u - wide), low), np.where(excluded, self.value(u + wide), high)
 
     def log_volume(self, u, xp: Any = np):
-        """Σ log dx/du."""
         return xp.sum(xp.log(self.slope(u, xp)))
 
 
@@ -141,15 +138,12 @@ class Unbounded(AbstractSeparable):
     room: ClassVar[float] = np.inf
 
     def value(self, u, xp: Any = np):
-        """x(u)."""
         return u
 
     def slope(self, u, xp: Any = np):
-        """dx/du."""
         return xp.ones_like(u)
 
     def inverse(self, x):
-        """u(x)."""
         return x
 
     def draw(self, u, rng):
@@ -157,7 +151,6 @@ class Unbounded(AbstractSeparable):
         return u + np.where(u != 0, np.abs(u), 1.0) * rng.normal(size=len(u))
 
     def refuses(self, x):
-        """None: every number is allowed."""
         return None
 
 
@@ -174,19 +167,15 @@ class Positive(AbstractSeparable):
 
     @property
     def bounds(self):
-        """Zero and infinity."""
         return 0.0, np.inf
 
     def value(self, u, xp: Any = np):
-        """x(u)."""
         return xp.exp(u)
 
     def slope(self, u, xp: Any = np):
-        """dx/du."""
         return xp.exp(u)
 
     def inverse(self, x):
-        """u(x), of positive x."""
         return np.log(x)
 
     def limits(self, u):
@@ -203,7 +192,6 @@ class Positive(AbstractSeparable):
         return u + np.log(10.0) * rng.normal(size=len(u))
 
     def refuses(self, x):
-        """The complaint that values must be positive, where one is not."""
         return None if np.all(x > 0) else "must start above zero, because its transform is lagjax.positive"
 
     def __repr__(self) -> str:
@@ -219,23 +207,18 @@ class Between(AbstractSeparable):
 
     @property
     def bounds(self):
-        """Both."""
         return self.lower, self.upper
 
     def value(self, u, xp: Any = np):
-        """x(u)."""
         return self.lower + (self.upper - self.lower) * _logistic(u, xp)
 
     def slope(self, u, xp: Any = np):
-        """dx/du."""
         return (self.upper - self.lower) * _logistic(u, xp) * _logistic(-u, xp)
 
     def inverse(self, x):
-        """u(x), of x between the bounds."""
         return np.log((x - self.lower) / (self.upper - x))
 
     def limits(self, u):
-        """The steps to where u is `reach` less or more."""
         each = _logistic(u) * _logistic(-u)
         with np.errstate(invalid="ignore", divide="ignore"):  # NaN, no limit, where x is rounded to its bound
             low, high = (
@@ -250,7 +233,6 @@ class Between(AbstractSeparable):
             return u + np.log1p(_logistic(-u) * step) - np.log1p(-_logistic(u) * step)
 
     def draw(self, u, rng):
-        """Uniform between the bounds."""
         share = rng.uniform(size=len(u))
         return np.log(share / (1.0 - share))
 
@@ -282,19 +264,15 @@ class Angle(AbstractSeparable):
     room: ClassVar[float] = np.pi
 
     def value(self, u, xp: Any = np):
-        """x(u)."""
         return u - 2 * np.pi * xp.ceil((u - np.pi) / (2 * np.pi))
 
     def slope(self, u, xp: Any = np):
-        """dx/du."""
         return xp.ones_like(u)
 
     def inverse(self, x):
-        """u(x)."""
         return x
 
     def draw(self, u, rng):
-        """Uniform on the circle."""
         return rng.uniform(-np.pi, np.pi, len(u))
 
     def ends(self, x, spread):
@@ -303,7 +281,6 @@ class Angle(AbstractSeparable):
         return x - half, x + half
 
     def refuses(self, x):
-        """None: every number is an angle."""
         return None
 
     def __repr__(self) -> str:
@@ -329,21 +306,17 @@ class Simplex(AbstractTransform):
     total: float = 1.0
 
     def specialize(self, x, shape):
-        """The simplex with the sum of `x`."""
         return Simplex(float(np.sum(x)))
 
     def count_unknowns(self, count):
-        """n − 1."""
         return count - 1
 
     def refuses(self, x):
-        """The complaint that there must be several numbers, all positive."""
         if len(x) < 2 or not np.all(x > 0):
             return "must start as several numbers above zero in one array, because its transform is lagjax.simplex"
         return None
 
     def value(self, u, xp: Any = np):
-        """x(u)."""
         logs = _helmert(u.shape[0] + 1) @ u
         shares = xp.exp(logs - xp.max(logs))
         return self.total * shares / xp.sum(shares)
@@ -354,11 +327,9 @@ class Simplex(AbstractTransform):
         return self.total * (np.diag(shares) - np.outer(shares, shares)) @ _helmert(len(u) + 1)
 
     def inverse(self, x):
-        """u(x) = Hᵀ log x."""
         return _helmert(len(x)).T @ np.log(x)
 
     def draw(self, u, rng):
-        """Uniform on the simplex."""
         return self.inverse(rng.dirichlet(np.ones(len(u) + 1)))
 
     def ends(self, x, spread):
@@ -366,7 +337,6 @@ class Simplex(AbstractTransform):
         return Between(0.0, self.total).ends(x, spread)
 
     def log_volume(self, u, xp: Any = np):
-        """Σ log x, up to a constant."""
         return xp.sum(xp.log(self.value(u, xp)))
 
     def __repr__(self) -> str:
@@ -397,15 +367,12 @@ class Inertia(AbstractTransform):
     vector: bool = True
 
     def specialize(self, x, shape):
-        """The form for ten numbers, or for a matrix."""
         return Inertia(vector=shape != (4, 4))
 
     def count_unknowns(self, count):
-        """Ten."""
         return 10
 
     def refuses(self, x):
-        """The complaint that the numbers must be those of a body."""
         if len(x) not in (10, 16):
             return "must have the shape (10,) or (4, 4), because its transform is lagjax.inertia"
         matrix = self._pseudo(x) if len(x) == 10 else x.reshape(4, 4)
@@ -445,12 +412,10 @@ class Inertia(AbstractTransform):
         return xp.exp(alpha) * xp.stack([xp.stack(row) for row in rows])
 
     def value(self, u, xp: Any = np):
-        """x(u)."""
         factor = self._factor(u, xp)
         return self._numbers(factor @ factor.T, xp)
 
     def jacobian(self, u):
-        """The derivatives of U Uᵀ, one for each u."""
         factor, size = self._factor(u, np), np.exp(u[0])
         moves = np.zeros((10, 4, 4))
         moves[0] = factor
@@ -462,7 +427,6 @@ class Inertia(AbstractTransform):
         return self._numbers(products + products.swapaxes(1, 2), np).T
 
     def inverse(self, x):
-        """u(x), of the inertia of a body."""
         pseudo = self._pseudo(x) if self.vector else x.reshape(4, 4)
         flipped = np.linalg.cholesky(pseudo[::-1, ::-1])
         factor = flipped[::-1, ::-1] / flipped[0, 0]
@@ -576,7 +540,8 @@ class Parameters:
                         raise ValueError(f"{label} is free as a whole or not at all: its transform is {one!r}.")
                     one = _specialize_transform(label, one, values[some], shape)
                     parts.append(Part(label, shape, count + some, one))
-                names += [name for name, free_too in zip(_names(label, shape), fitted, strict=True) if free_too]
+                ends = [f"[{', '.join(map(str, index))}]" if shape else "" for index in np.ndindex(shape)]
+                names += [label + end for end, free_too in zip(ends, fitted, strict=True) if free_too]
             count += values.size
         if not names and free is None:
             raise ValueError(
@@ -823,7 +788,3 @@ def _specialize_transform(label: str, transform, values: np.ndarray, shape: tupl
     if reason := transform.refuses(values):
         raise ValueError(f"{label} {reason}; got {values if values.size > 1 else values[0]}.")
     return transform.specialize(values, shape)
-
-
-def _names(label: str, shape: tuple[int, ...]) -> list[str]:
-    return [label + (f"[{', '.join(map(str, index))}]" if shape else "") for index in np.ndindex(shape)]

@@ -32,7 +32,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from lagjax._fit._descent import minimise
-from lagjax._fit._noise import KnownNoise, NoiseScale, log_likelihood
+from lagjax._fit._noise import KnownNoise, NoiseScale
 from lagjax._fit._residuals import LostTrial, Residuals
 from lagjax._fit._uncertainty import Information
 
@@ -227,7 +227,7 @@ class _ProfileLine:
         if isinstance(done, LostTrial):
             raise ValueError(question.describe_failure(done))
         self.u, point = done.point.u, done.point
-        self.best = log_likelihood(widths, point.flat(), question.weights, question.sides)
+        self.best = question.log_likelihood(point, widths)
         self.places = [_Place(float(self.u[which]), np.delete(self.u, which), point.starts, 0.0)]
 
     def deviance(self, at: float) -> float:
@@ -241,7 +241,7 @@ class _ProfileLine:
         for others, starts in self._guesses(at):
             done = minimise(question, others, starts, KnownNoise(self.widths), _ENOUGH, _TRIALS)
             if not isinstance(done, LostTrial):
-                lost = self.best - log_likelihood(self.widths, done.point.flat(), question.weights, question.sides)
+                lost = self.best - question.log_likelihood(done.point, self.widths)
                 self.places.append(_Place(at, done.point.u, done.point.starts, 2.0 * self.scale * lost))
                 return self.places[-1].deviance
         return np.inf
@@ -263,12 +263,11 @@ class _ProfileLine:
         done = minimise(self.question, u, place.starts, KnownNoise(self.widths), _ENOUGH, 2 * _TRIALS)
         if isinstance(done, LostTrial):
             return None
-        lost = self.best - log_likelihood(self.widths, done.point.flat(), self.question.weights, self.question.sides)
+        lost = self.best - self.question.log_likelihood(done.point, self.widths)
         return float(done.point.u[self.which]), 2.0 * self.scale * lost
 
 
 def profile(question: Residuals, u, starts, widths: NoiseScale, known: Information, name: str, level: float) -> Profile:
-    """The profile of the free number called `name`."""
     parameters = question.parameters
     line = _ProfileLine(question, u, starts, widths, known, parameters.unknown(name))
     threshold = known.quantile(level) ** 2

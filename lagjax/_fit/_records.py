@@ -92,7 +92,8 @@ class Form(NamedTuple):
     def drive_scene(self, system: System) -> System:
         """The scene whose parameters are `Driven`."""
         present = [name for name in _FUNCTIONS if getattr(system, name) is not None]
-        wrapped = [_wrap_function(getattr(system, name), self) for name in present]
+        parts = [eqx.partition(_FunctionOfInputs(getattr(system, name), self), eqx.is_array) for name in present]
+        wrapped = [Function(arrays, Edition.from_function(code), ("t", "params")) for arrays, code in parts]
         return eqx.tree_at(lambda s: [getattr(s, name) for name in present], system, wrapped)
 
     def bind_samples(self, system: Scene, params: PyTree, ts: np.ndarray, inputs: np.ndarray) -> tuple[Scene, PyTree]:
@@ -122,11 +123,6 @@ class _FunctionOfInputs(eqx.Module):
         if "inputs" in self.function.extras:
             extras["inputs"] = self.form.restore(samples(params.knots, params.values, self.form.hold)(t))
         return self.function(*roles, **extras)
-
-
-def _wrap_function(function: Function, form: Form) -> Function:
-    arrays, code = eqx.partition(_FunctionOfInputs(function, form), eqx.is_array)
-    return Function(arrays, Edition.from_function(code), ("t", "params"))
 
 
 def input_functions(scene: Scene) -> list[str]:

@@ -28,7 +28,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._fit._motions import AbstractMotions, Manifold, Origins, ProjectedStarts, RecordMotion
-from lagjax._fit._noise import AbstractNoise, NoiseScale, Sensor, counts, log_ndtr, scores, worths
+from lagjax._fit._noise import AbstractNoise, NoiseScale, Sensor, counts, log_likelihood, log_ndtr, scores, worths
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import (
     Driven,
@@ -151,7 +151,6 @@ class SystemResiduals:
         )  # fmt: skip
 
     def columns(self, record: int) -> slice:
-        """The signals that a record has."""
         last = len(self.signals.names)
         return slice(last, last + 1) if record in self.clocks else slice(0, last)
 
@@ -574,6 +573,10 @@ class Residuals:
             for r, batch in zip(point.residuals, self.batches, strict=True)
         ]
 
+    def log_likelihood(self, point: Trial, widths: NoiseScale) -> float:
+        """The logarithm of the likelihood of the residuals of a trial, as if all samples were independent."""
+        return log_likelihood(widths, point.flat(), self.weights, self.sides)
+
     def fisher_factors(self, point: Trial, widths: NoiseScale) -> list[np.ndarray]:
         """√weight/σ of every sample, times the root of the curvature of what is at the limit of a sensor."""
         return self.factors(point, widths._replace(dof=np.full(len(widths.dof), np.inf)))
@@ -654,11 +657,9 @@ class Residuals:
 
     @property
     def unknowns(self) -> int:
-        """The number of free numbers of all starts."""
         return sum(part.system.states * int(part.system.fitted.sum()) for part in self.parts)
 
     def columns(self, record: int) -> slice:
-        """The signals that a record has."""
         part = self._owner(record)
         own = part.system.columns(record - part.records.start)
         return slice(part.signals.start + own.start, part.signals.start + own.stop)
@@ -682,7 +683,6 @@ class Residuals:
         return next(part for part in self.parts if part.records.start <= record < part.records.stop)
 
     def describe_failure(self, failure: LostTrial) -> str:
-        """A sentence for a failure, with the record's number."""
         piece = self.pieces[failure.piece]
         begin = self.records[piece.record].ts[piece.places[0]]
         return f"The motion of {self.label(piece.record)} from t = {begin:g} failed. {failure.text}"

@@ -33,7 +33,7 @@ from lagjax._fit._report import (
 from lagjax._fit._residuals import Residuals, SystemPart, Trial
 from lagjax._fit._sample import draw, inference_data
 from lagjax._fit._search import Waterfall
-from lagjax._fit._uncertainty import LEVEL, Experiments, Information, rank_experiments, start_covariances
+from lagjax._fit._uncertainty import LEVEL, Experiments, Information, rank_experiments
 
 PyTree = Any
 
@@ -157,26 +157,6 @@ class Fit:
             numbers[self.parameters.places] = values
             ends.append(self.parameters.restore(numbers))
         return ends[0], ends[1]
-
-    @with_doubles
-    def start_intervals(self, level: float = LEVEL) -> tuple[Any, Any]:
-        """The ends (low, high) of the intervals of the starts, each in the structure of `starts`.
-
-        Each contains its number with probability `level`; the uncertainty of the parameters is included. A start that
-        is known is both ends of its own interval.
-
-        Raises `ValueError` for a level that is not between 0 and 1.
-        """
-        wide = self.information.quantile(level) * np.sqrt(
-            np.diagonal(
-                start_covariances(self.question, self._point, self.widths, self.information).covariance,
-                axis1=1,
-                axis2=2,
-            )
-        )
-        ends = (enumerate((self.states + s * wide)[self.question.firsts]) for s in (-1, 1))
-        low, high = (self.question.group_by_system([self.question.restore_state(k, y) for k, y in end]) for end in ends)
-        return low, high
 
     @with_doubles
     def profile(self, name: str, level: float = LEVEL) -> Profile:

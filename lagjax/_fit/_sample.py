@@ -292,7 +292,6 @@ class Agreement(NamedTuple):
 
 
 def agreement(x: np.ndarray) -> Agreement:
-    """The agreement of draws (C, K, D) of C chains."""
     arviz = _arviz()
     if x.shape[1] < _FEWEST_TO_TELL:
         return Agreement(*np.full((2, x.shape[2]), np.nan))

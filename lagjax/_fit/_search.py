@@ -57,7 +57,7 @@ from scipy.optimize import least_squares
 from lagjax._consistent import has_constraints
 from lagjax._fit._descent import Anchor, Descent, build_descent, column_norms, descend_gradient, eliminate, minimise
 from lagjax._fit._motions import AbstractMotions
-from lagjax._fit._noise import Gaussian, NoiseScale, log_likelihood
+from lagjax._fit._noise import Gaussian, NoiseScale
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import (
     Driven,
@@ -434,7 +434,6 @@ def short_search(question: Residuals, u: np.ndarray, starts: np.ndarray) -> Tria
 
 
 def misfit(widths: NoiseScale, question: Residuals) -> float:
-    """The noise that is left, over the size of the signals."""
     return float(np.exp(np.mean(np.log(widths.sigma / question.size))))
 
 
@@ -482,7 +481,6 @@ def _evaluate_starts(question: Residuals, u: np.ndarray, starts: np.ndarray) -> 
 
 
 def _step(question: Residuals, at: _EvaluatedStarts, k: int, damping: float) -> tuple[np.ndarray, np.ndarray]:
-    """The end of the damped step of one start."""
     triangles, states, none = at.triangles[k], question.states, np.zeros(at.u.shape[1])
     limits = question.parameters.limits(at.u[k])
     step = eliminate(triangles, states, column_norms(triangles, states), damping, (none, none), limits)
@@ -525,14 +523,10 @@ def run_multistart(question: Residuals, search, u, y0, starts: int, seed: int) -
             continue
         if place is not None:
             misfits[place] = misfit(done[-1].widths, question)
-    best = max(done, key=lambda one: (one.question is question, _log_likelihood(one)))
+    best = max(done, key=lambda one: (one.question is question, one.question.log_likelihood(one.point, one.widths)))
     misfits = np.sort(misfits)
     misfits[0] = min(misfits[0], misfit(best.widths, question))
     return best, Waterfall(misfits)
-
-
-def _log_likelihood(done: Descent) -> float:
-    return log_likelihood(done.widths, done.point.flat(), done.question.weights, done.question.sides)
 
 
 def build_reader(record: Record, about: SystemResiduals, numbers: np.ndarray, probes: int = 256) -> Reader | None:
@@ -551,7 +545,6 @@ def build_reader(record: Record, about: SystemResiduals, numbers: np.ndarray, pr
 
 
 def search_records(question: Residuals, u, starts, noise, method: str, readers, weak) -> Descent:
-    """The search of whole records, after that of growing segments where the method asks for it."""
     if method == "segments" and readers is None:
         raise ValueError('method="segments" reads starts off the data: for that values must have the structure of q.')
     if method == "whole" or readers is None:

@@ -33,6 +33,7 @@ import numpy as np
 
 from lagjax._arguments import accept
 from lagjax._fit._motions import RecordMotion
+from lagjax._fit._noise import find_step
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Form, Record, restore_structure, spread_over_signals
 from lagjax._layout import Layout, halves
@@ -252,7 +253,7 @@ def _jump(y: np.ndarray, positions: bool) -> tuple[int, str] | None:
     beside = np.sort(beside, axis=-1)[:, -2]
     low, high = y.min(), y.max()
     sharp = steps > _SHARP * np.maximum(beside, 1e-9 * (high - low))
-    sharp &= ~_isolated_steps(y, steps)
+    sharp &= ~_isolated_steps(y, steps) & ~(steps < 2.5 * find_step(y))  # lines of a coarse encoder
     for period, text in _PERIODS.items():
         fits = sharp & (np.abs(steps - period) <= _NEAR * beside + 1e-6 * period)
         edge = 2 * np.max(beside[fits], initial=0.0)
@@ -417,14 +418,10 @@ def _require_signals(observe_state, layout: Layout, parameters: Parameters, reco
     out = jax.eval_shape(observe_state, *(jax.ShapeDtypeStruct(shape, layout.dtype) for shape in shapes))
     leaves, tree = jax.tree.flatten(out)
     got = tree, tuple(getattr(leaf, "shape", ()) for leaf in leaves)
-    if any(map(_is_complex, leaves)):
+    if any(np.issubdtype(np.result_type(leaf), np.complexfloating) for leaf in leaves):
         raise ValueError("observe returns complex numbers: return their real and imaginary parts.")
     if got != record.structure:
         raise ValueError(
             f"observe returns {got[0]} of shapes {got[1]} at one time, but the values of a record have "
             f"{record.structure[0]} of shapes {record.structure[1]} after their axis of times."
         )
-
-
-def _is_complex(leaf) -> bool:
-    return np.issubdtype(np.result_type(leaf), np.complexfloating)

@@ -320,7 +320,6 @@ def _hybrid_end(run: Trajectory) -> tuple:
 
 
 def _transitions(run: Trajectory) -> Transitions:
-    """The transitions of a hybrid motion."""
     assert run.transitions is not None
     return run.transitions
 
@@ -340,7 +339,6 @@ def _mode_places(scene: Hybrid, transition: Transition) -> tuple[int, int]:
 
 
 def _last_time(timings: Timings) -> float:
-    """Until when crossings are looked for."""
     ends = [timings.ts[1]]
     for k in np.unique(timings.flat.which):
         there = (timings.flat.which == k) & np.isfinite(timings.flat.times)

@@ -1,7 +1,6 @@
-"""Uncertainty: autocorrelation of residuals, covariance of parameters and starts, identifiability, experiment design.
+"""Uncertainty: autocorrelation of residuals, covariance of parameters, identifiability, experiment design.
 
-It holds `Correlation`, `Information`, `StartCovariance`, `unseen_sentences` (parameters that are not identifiable) and
-`Experiments`.
+It holds `Correlation`, `Information`, `unseen_sentences` (parameters that are not identifiable) and `Experiments`.
 
 **Autocorrelation of residuals.** At 1 kHz residuals hold what the scene lacks, and neighbours agree: n samples are
 worth n/τ independent ones, with τ the sum of the correlations over all lags. Source: Geyer, *Practical Markov chain
@@ -24,14 +23,6 @@ Over a chaotic record sensitivities grow until all columns point along the one d
 rounding hides the rest: G seems to have null directions where it has none. Null directions are the same whatever the
 rows are multiplied by, so they are looked for a second time where every row has length one (`confirmed`): what is null
 there is not seen, and what is not was drowned. Where rows grow by more than there are digits, all are.
-
-**Covariance of the starts**, which were eliminated. A piece with rows A of its start and B of the parameters, in units
-of the noise ε, has the start
-
-    δs = A⁺ (ε − B δu),        δu = H⁻¹ Gᵀ ε,        G = B − A A⁺B over all pieces
-
-so its covariance is that of its own rows, that of the parameters through A⁺B, and what both share where residuals are
-correlated. Where A does not see a component of the start its variance is infinite.
 
 **Identifiability.** A null direction v of the parameters says that measurements do not change along v, at one point. In
 logarithms, with the relative changes dxᵢ/xᵢ as coordinates, what is seen is orthogonal to it: if that has small whole
@@ -73,7 +64,6 @@ class Correlation(NamedTuple):
 
 
 def autocorrelations(question: Residuals, point: Trial, widths: NoiseScale) -> list[Correlation]:
-    """The autocorrelation of the residuals of every signal (S,)."""
     return [_autocorrelation(question, point, widths, signal) for signal in range(len(widths.sigma))]
 
 
@@ -104,7 +94,8 @@ def _autocorrelation(question: Residuals, point: Trial, widths: NoiseScale, sign
     cut = int(insignificant[0]) if len(insignificant) else len(law)
     if cut <= 1:
         return Correlation(np.ones(1), 1.0, count, float(law[1]) if len(law) > 1 else 0.0)
-    lags = law[: 3 * cut] * _parzen(np.arange(min(3 * cut, len(law))) / (3 * cut))
+    x = np.arange(min(3 * cut, len(law))) / (3 * cut)
+    lags = law[: 3 * cut] * np.where(x < 0.5, 1 - 6 * x**2 + 6 * x**3, 2 * (1 - x) ** 3)
     return Correlation(lags, float(max(1.0, lags[0] + 2 * lags[1:].sum())), count, float(law[1]))
 
 
@@ -142,10 +133,6 @@ def close_gaps(rows: np.ndarray, counted: np.ndarray) -> np.ndarray:
         return rows
     order = np.argsort(~counted, axis=1, kind="stable")
     return np.take_along_axis(rows, order.reshape(*order.shape, *[1] * (rows.ndim - 2)), axis=1)
-
-
-def _parzen(x: np.ndarray) -> np.ndarray:
-    return np.where(x < 0.5, 1 - 6 * x**2 + 6 * x**3, 2 * (1 - x) ** 3)
 
 
 def correlated_square(rows: np.ndarray, lags: np.ndarray) -> np.ndarray:
@@ -215,7 +202,6 @@ def require_level(level) -> None:
 
 
 def information(question: Residuals, point: Trial, widths: NoiseScale) -> Information:
-    """The information of the data about the parameters, at the end of a search."""
     factors = question.fisher_factors(point, widths)
     triangles = question.triangles(point, factors)
     null, basis = null_space(triangles, question.states)
@@ -347,49 +333,6 @@ def eliminate_starts(triangles: np.ndarray, slopes: np.ndarray, states: int) -> 
     instead = np.matmul(v.swapaxes(1, 2) * inverse[:, None], np.matmul(u.swapaxes(1, 2), of_u))
     shape = (len(slopes), *[1] * (slopes.ndim - 3), *instead.shape[1:])
     return slopes[..., states:] - np.matmul(slopes[..., :states], instead.reshape(shape))
-
-
-class StartCovariance(NamedTuple):
-    """The uncertainty of N starts: `covariance` (N, 2n, 2n), and A⁺B (N, 2n, F), how they follow the parameters."""
-
-    covariance: np.ndarray
-    follows: np.ndarray
-
-
-def start_covariances(question: Residuals, point: Trial, widths: NoiseScale, known: Information) -> StartCovariance:
-    """The uncertainty of the starts of all pieces at the end of a search; zero for those that are not fitted."""
-    states, free, pieces = question.states, len(point.u), len(question.pieces)
-    lags = [law.lags for law in autocorrelations(question, point, widths)]
-    found = StartCovariance(np.zeros((pieces, states, states)), np.zeros((pieces, states, free)))
-    for batch, slopes in zip(question.batches, point.slopes, strict=True):
-        rows = np.sqrt(batch.weights)[..., None] / widths.sigma[:, None] * slopes
-        for row, piece in zip(batch.rows.tolist(), rows, strict=True):
-            if question.fitted[row]:
-                across = np.zeros((states, states)) if point.across is None else point.across[row]
-                found.covariance[row], found.follows[row] = _start_covariance(piece, states, lags, known, across)
-    return found
-
-
-def _start_covariance(rows: np.ndarray, states: int, lags: list[np.ndarray], known: Information, across: np.ndarray):
-    """The covariance (2n, 2n) of one start, and A⁺B, from its weighted rows (T, S, 2n + F).
-
-    What is `across` (2n, 2n) the constraints is not free, and no less known for not being seen.
-    """
-    a, b = rows[..., :states], rows[..., states:]
-    u, values, v = np.linalg.svd(a.reshape(-1, states), full_matrices=False)
-    sees = values > 1e-10 * values.max()
-    into = (u[:, sees] / values[sees]) @ v[sees]  # (A⁺)ᵀ, (T S, 2n)
-    follows = into.T @ b.reshape(-1, b.shape[-1])
-    own = np.concatenate([into.reshape(a.shape), b - a @ follows], axis=-1)
-    square = np.sum([correlated_square(own[None, :, s], lags[s]) for s in range(len(lags))], axis=0)
-    covariance = _identifiable_covariance(known)
-    shared = square[:states, states:] @ known.white @ follows.T
-    found = known.lost * (square[:states, :states] - shared - shared.T) + follows @ covariance @ follows.T
-    not_seen = v[~sees] - v[~sees] @ across.T
-    lost = (np.abs(not_seen) > 1e-6).any(axis=0) | _depends_on_unseen(follows, known)
-    found[lost], found[:, lost] = np.nan, np.nan
-    found[lost, lost] = np.inf
-    return found, follows
 
 
 def covariance_of_one_start(

@@ -64,12 +64,16 @@ def possible_mistakes(
     """The mistakes that may be in the records, the likeliest first, where the data move `slower` times slower than the
     scene does, and `worst` has the places of the records in the order of what is left of them."""
     count, some = len(names), range(min(len(names), _MOST))
-    by_time = [_convert_milliseconds(r) if isinstance(r, Record) else r for r in records]
+    by_time = [
+        replace(r, ts=r.ts / 1e3, input_ts=None if r.input_ts is None else r.input_ts / 1e3)
+        if isinstance(r, Record) else r
+        for r in records
+    ]  # fmt: skip
     milliseconds = [PossibleMistake("with the times in milliseconds", by_time)]
     ranges = [max(np.ptp(_present_samples(r, k)) for r in records if isinstance(r, Record)) for k in range(count)]
     wide = [k for k in range(count) if ranges[k] > _WIDE]
     degrees = [
-        PossibleMistake(f"with {_list_names(names, turned)} in degrees", _scale_signals(records, turned, np.pi / 180))
+        PossibleMistake(f"with {_list_names(names, turned)} in degrees", _change_signals(records, turned, np.radians))
         for turned in ([wide] if wide else []) + [[k] for k in wide[:_MOST] if len(wide) > 1]
     ]
     yield from milliseconds if slower > _SLOW else []
@@ -84,17 +88,12 @@ def possible_mistakes(
         yield PossibleMistake(f"without records[{place}]", [*records[:place], *records[place + 1 :]])
     yield from swaps if len(swaps) > 1 else []
     for k in some:
-        yield PossibleMistake(f"with the other sign of {names[k]}", _scale_signals(records, [k], -1.0))
+        yield PossibleMistake(f"with the other sign of {names[k]}", _change_signals(records, [k], np.negative))
     for turned in [list(some)] + [[k] for k in some if count > 1]:
         text = f"with {_list_names(names, turned)} counted from the opposite direction, π further"
         yield PossibleMistake(text, _change_signals(records, turned, lambda x: x + np.pi))
     yield from degrees if max(ranges) <= _WIDEST else []
     yield from milliseconds if slower <= _SLOW else []
-
-
-def _convert_milliseconds(record: Record) -> Record:
-    """A record whose times were taken for seconds."""
-    return replace(record, ts=record.ts / 1e3, input_ts=None if record.input_ts is None else record.input_ts / 1e3)
 
 
 def find_mistake(
@@ -164,7 +163,11 @@ def _find_placeholder(column: np.ndarray, period: float) -> tuple[float, int] | 
         jumps = np.abs(wrap_residuals(kinds[k] - others[np.stack([before, after], axis=1)], np.full(2, period))).min(
             axis=1
         )
-        if (jumps > _JUMP * steps.max()).sum() >= (1 if far[k] else _REPEATED):
+        # Or a value comes back and back among values that never do: samples of a real signal stay equal, or differ.
+        runs = np.sum(there[1:] & ~there[:-1])
+        alone = runs >= _REPEATED and there.sum() < 2 * runs and len(np.unique(others)) == len(others)
+        inside = alone and others.min() < kinds[k] < others.max()
+        if inside or (jumps > _JUMP * steps.max()).sum() >= (1 if far[k] else _REPEATED):
             return float(kinds[k]), int(there.sum())
     return None
 
@@ -218,12 +221,7 @@ def _list_names(names: tuple[str, ...], which: list[int]) -> str:
     return " and ".join(names[k] for k in which) if len(which) < len(names) or len(names) == 1 else "all signals"
 
 
-def _scale_signals(records: list[Any], columns: list[int], factor: float) -> list[Any]:
-    return _change_signals(records, columns, lambda x: factor * x)
-
-
 def _reorder_signals(records: list[Any], order: np.ndarray) -> list[Any]:
-    """The records with signals in another order, and their weights with them."""
     found = []
     for record in records:
         if isinstance(record, Record):
@@ -234,7 +232,6 @@ def _reorder_signals(records: list[Any], order: np.ndarray) -> list[Any]:
 
 
 def _change_signals(records: list[Any], columns: list[int], change: Callable[[np.ndarray], np.ndarray]) -> list[Any]:
-    """The records with some signals changed."""
     found = []
     for record in records:
         if isinstance(record, Record):
@@ -267,7 +264,6 @@ class Verdict(NamedTuple):
 def verdict(
     descent: Descent, unseen: tuple[str, ...], known: Information, question: Residuals, noise: AbstractNoise
 ) -> Verdict:
-    """The verdict on a search that ended there."""
     parts = [descent.message]
     if known.confirmed.shape[1]:
         parts.append("Not everything that is free is seen: fix it, or measure more.")

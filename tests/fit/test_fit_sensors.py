@@ -50,6 +50,7 @@ def spoiled(places, value, values=EXACT + NOISE):
         (spoiled(PLACES[:1], 1e6), r"1 of 601 samples of q in records\[0\] are 1e\+06"),
         (spoiled(PLACES, 0.0, np.round(EXACT, 3)), "60 of 601 samples .* exactly 0, among values that are far from it"),
         (spoiled(PLACES, 0.0).astype(np.float32), "60 of 601 samples of q"),
+        (spoiled([40, 163, 300, 309], 0.5, 3 * EXACT + 100 * NOISE), "4 of 601 samples of q .* exactly 0.5"),
     ],
 )
 def test_samples_that_stand_for_missing_ones_are_said_before_the_first_trial(values, sentence):

@@ -112,8 +112,7 @@ def test_what_comes_out_has_the_names_of_the_systems(records, joint):
     np.testing.assert_allclose(sigma, [1.0, 2.0, 2.0], rtol=0.25)  # of 91 and of 182 samples: 5 to 7 %
     assert joint.starts["single"][0][0] == pytest.approx(-0.5, abs=5 * SIGMA)
     assert np.shape(joint.starts["double"][0][0]) == (2,) and set(joint.residuals["double"][1]) == {"x", "elbow"}
-    low, high = joint.start_intervals(0.9999)
-    assert (low["double"][0][0] < [0.3, -0.2]).all() and (high["double"][0][0] > [0.3, -0.2]).all()
+    np.testing.assert_allclose(joint.starts["double"][0][0], [0.3, -0.2], atol=5 * SIGMA)
     text = str(joint)
     assert "single: q" in text and "3 records" in text
 
@@ -215,4 +214,3 @@ def test_crossing_times_of_one_system_and_constraints_of_another():
     assert fit.params["g"] == pytest.approx(9.81, rel=1e-6)
     assert list(fit.noise) == ["gates: times", "rod: q[0]", "rod: q[1]"]
     np.testing.assert_allclose(np.concatenate(fit.starts["rod"][0]), [*q0, 0.0, 0.0], atol=1e-6)
-    assert np.isfinite(np.concatenate(fit.start_intervals()[1]["rod"][0])).all()

@@ -219,5 +219,3 @@ def test_a_long_chaotic_record_is_followed_in_pieces():
     assert found.residuals[0].shape == (6001, 2) and len(found.starts) == 1
     assert max(found.rms.values()) == pytest.approx(SIGMA, rel=0.05)
     np.testing.assert_allclose(found.starts[0][0], [2.0, 2.5], atol=3 * SIGMA)
-    low, high = found.start_intervals()
-    assert np.shape(low[0][0]) == (2,) and (low[0][0] < high[0][0]).all()
