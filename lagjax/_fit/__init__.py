@@ -461,7 +461,6 @@ def _require_motion(recordings: list[Record], names: tuple[str, ...], records: l
 
 
 def _require_supported(scene: Hybrid, fitted: np.ndarray, observe) -> None:
-    """Raise `ValueError` for what a fit of hybrid motion cannot do."""
     if fitted.any() and has_constraints(first_law(scene)):
         raise ValueError("A start on constraints of hybrid motion cannot be fitted: give start=(q0, qdot0).")
     if isinstance(observe, Delayed):
@@ -520,7 +519,6 @@ def _starts(question: Residuals, readers: list[Reader | None] | None, params0: P
 
 
 def _start(system: SystemResiduals, readers: list[Reader | None] | None, place: int, params0: PyTree) -> np.ndarray:
-    """The first guess of the start of one record, (2n,)."""
     record = system.records[place]
     state = known_start(record, system.layout, place, params0)
     if state is not None:

@@ -91,11 +91,9 @@ class Anchor(NamedTuple):
         return cls(u, np.zeros_like(u))
 
     def pull(self, u: np.ndarray) -> np.ndarray:
-        """The residuals of the anchor (F,)."""
         return self.weight * (u - self.centre)
 
     def cost(self, u: np.ndarray) -> float:
-        """Half their sum of squares."""
         return 0.5 * float(np.sum(self.pull(u) ** 2))
 
 

@@ -57,7 +57,6 @@ class SampleTable(NamedTuple):
         return np.concatenate(parts, axis=1)
 
     def select(self, rows) -> "SampleTable":
-        """The tables of some of the pieces."""
         return SampleTable(self.knots[rows], self.values[rows])
 
 
@@ -90,7 +89,6 @@ class Form(NamedTuple):
         )
 
     def drive_scene(self, system: System) -> System:
-        """The scene whose parameters are `Driven`."""
         present = [name for name in _FUNCTIONS if getattr(system, name) is not None]
         parts = [eqx.partition(_FunctionOfInputs(getattr(system, name), self), eqx.is_array) for name in present]
         wrapped = [Function(arrays, Edition.from_function(code), ("t", "params")) for arrays, code in parts]
@@ -363,7 +361,6 @@ def real_numbers(array, name: str, what: str) -> np.ndarray:
 
 
 def require_untraced(tree: PyTree, what: str) -> None:
-    """Raise `TypeError` where a number of `what` is being traced."""
     require_concrete(
         tree,
         what,
@@ -497,7 +494,6 @@ class Piece(NamedTuple):
 
 
 def whole_pieces(records: list[Record]) -> list[Piece]:
-    """Every record in one piece."""
     return [Piece(k, np.arange(len(record))) for k, record in enumerate(records)]
 
 
@@ -664,7 +660,6 @@ def systems_by_name(system, records, observe) -> list[tuple[str | None, Any, Any
 
 
 def _require_names(what: str, given, systems: dict) -> None:
-    """Raise where an argument is no dict of the names of the systems."""
     names = ", ".join(map(repr, systems))
     if not isinstance(given, dict):
         raise TypeError(

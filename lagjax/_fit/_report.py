@@ -53,7 +53,6 @@ def draw_record(axes, record: Record, residuals: np.ndarray, names: tuple[str, .
 
 
 def draw_waterfall(ax, misfits: np.ndarray) -> None:
-    """Misfits in order."""
     known = np.isfinite(misfits)
     ax.plot(np.arange(1, len(misfits) + 1)[known], misfits[known], "o-", color=BLUE, markersize=3, linewidth=1)
     ax.set(yscale="log", xlabel="start, in order", ylabel="misfit / signals")
@@ -77,7 +76,6 @@ def draw_correlations(ax, matrix: np.ndarray, names: tuple[str, ...]) -> None:
 
 
 def draw_residuals(ax, residuals: np.ndarray, sigma: np.ndarray, names: tuple[str, ...]) -> None:
-    """The distribution of residuals (M, S) over σ, beside the normal one."""
     bins = np.linspace(-5, 5, 51)
     for s, name in enumerate(names[:6]):
         z = residuals[:, s] / sigma[s]
@@ -130,7 +128,6 @@ def render_page(
 
 
 def _render_picture(size: tuple[float, float], draw: Callable[[Any], None]) -> str:
-    """A figure of a size in inches as PNG in base64."""
     matplotlib = matplotlib_or_refuse("Fit.report")
     figure = matplotlib.figure.Figure(figsize=size, layout="constrained", dpi=110)
     draw(figure)
@@ -150,7 +147,6 @@ class SystemDrawing(NamedTuple):
 
 
 def build_pictures(systems: list[SystemDrawing], covariance, waterfall) -> dict[str, list[str]]:
-    """The pictures of a fit by their headings."""
     figures = {}
     for system in systems:
         of_one = "" if system.name is None else f"{system.name}: "

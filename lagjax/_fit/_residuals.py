@@ -62,7 +62,6 @@ class Trial(NamedTuple):
     across: np.ndarray | None = None
 
     def flat(self) -> np.ndarray:
-        """All residuals, (M, S)."""
         return np.concatenate([r.reshape(-1, r.shape[-1]) for r in self.residuals])
 
 
@@ -133,7 +132,6 @@ class SystemResiduals:
         return other
 
     def with_pieces(self, pieces: list[Piece], fitted: np.ndarray) -> "SystemResiduals":
-        """The residuals of other pieces of the records."""
         return SystemResiduals(
             self.name, self.scene, self.records, pieces, fitted, self.motions, self.signals, self.parameters,
             self.size, self.rtol, self.clocks, self.manifold, self.sensor,
@@ -203,7 +201,6 @@ class SystemResiduals:
         ]
 
     def _begin_trial(self, u: np.ndarray, starts: np.ndarray) -> _PendingTrial | LostTrial:
-        """The trial u (F,), starts (N, 2n), at the starts of its motions."""
         numbers, directions = self.parameters.numbers(u), self.parameters.directions(u)
         starts, moved = self.origins.move(starts, numbers, directions)
         tangents = None
@@ -280,7 +277,6 @@ class SystemResiduals:
         return y0_dot, np.concatenate([np.zeros((states, directions.shape[1])), directions])
 
     def _observe_motion(self, batch: Samples, trial: _PendingTrial, motion: RecordMotion | LostTrial):
-        """The signals of a motion, and their tangents."""
         if isinstance(motion, LostTrial):
             return motion
         return self.signals.evaluate(motion, batch.ts, batch.inputs, trial.numbers, self._directions(batch, trial)[1])
@@ -401,7 +397,6 @@ class SystemResiduals:
         return starts
 
     def require_traceable(self) -> None:
-        """Raise `ValueError` for what `trace_residuals` cannot do."""
         if self.manifold is not None and self.fitted.any():
             raise ValueError("There is no density for starts on constraints that are fitted: give start=(q0, qdot0).")
         if self.signals.delays is not None:
@@ -419,7 +414,6 @@ class SystemPart(NamedTuple):
 
     @property
     def name(self) -> str | None:
-        """The name of the system, None where there is no other."""
         return self.system.name
 
     def sensor_noise(self, widths: NoiseScale) -> NoiseScale:
@@ -542,7 +536,6 @@ class Residuals:
         ]
 
     def _join_trials(self, starts: np.ndarray, points: list[Trial]) -> Trial:
-        """One trial of all systems from those of each."""
         if len(points) == 1 and self.parts[0].system.states == self.states:
             return points[0]
         u, placed, residuals, slopes = points[0].u, starts.copy(), [], []
@@ -563,7 +556,6 @@ class Residuals:
         return Trial(u, placed, residuals, slopes, across if across.any() else None)
 
     def noise_scale(self, point: Trial, noise: AbstractNoise) -> NoiseScale:
-        """The noise of the signals that makes the residuals of a trial likeliest."""
         return noise.widths(point.flat(), self.weights, self.least, self.sides)
 
     def factors(self, point: Trial, widths: NoiseScale) -> list[np.ndarray]:

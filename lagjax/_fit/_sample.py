@@ -202,7 +202,6 @@ class Chains(NamedTuple):
 
     @staticmethod
     def from_state(state, exact: Callable) -> "Chains":
-        """The chains at a state of the sampler, with the exact density there."""
         log_exact, log_expansion = np.asarray(exact(state.position), float), np.asarray(state.logdensity, float)
         ratio = np.subtract(
             log_exact, log_expansion, out=np.full(len(log_exact), -np.inf), where=np.isfinite(log_exact)

@@ -111,7 +111,6 @@ class Reader(NamedTuple):
         return cls(record, windows, scatter, tuple(each.tolist()))
 
     def states(self, places) -> np.ndarray:
-        """(q, q̇) at the samples `places` (M,) of the record, (M, 2n)."""
         read = self.read(places)
         return np.stack([one[k] for k in (0, 1) for one in read], axis=-1)
 
@@ -409,7 +408,6 @@ class Trials(NamedTuple):
 
 
 def random_starts(parameters: Parameters, u: np.ndarray, count: int, seed: int) -> np.ndarray:
-    """u itself and `count` − 1 random ones, (K, F)."""
     rng = np.random.default_rng(seed)
     return np.stack([u, *(parameters.draw(u, rng) for _ in range(count - 1))])
 
@@ -456,7 +454,6 @@ class _EvaluatedStarts(NamedTuple):
 
 
 def _subsample(question: Residuals) -> Residuals:
-    """The residuals of at most `_SHORT_SAMPLES` samples of each record."""
     chosen = lambda count: np.unique(np.linspace(0, count - 1, _SHORT_SAMPLES).astype(int))  # noqa: E731
     pieces = [Piece(piece.record, piece.places[chosen(len(piece.places))]) for piece in question.pieces]
     return question.with_pieces(pieces, question.fitted)

@@ -122,12 +122,10 @@ class Timings(MeasuredSignal):
         return np.where(np.isnan(self.flat.times), 0.0, self.flat.weights)[:, None]
 
     def restore(self, matrix: np.ndarray) -> PyTree:
-        """Numbers for all times, (M, 1), in the form of `times`."""
         keys, functions = _sections(self.section)
         return _restore_keys([matrix[self.flat.which == k, 0] for k in range(len(functions))], keys)
 
     def columns(self, values: PyTree) -> np.ndarray:
-        """Numbers in the form of `times` as (M, 1)."""
         keys, _ = _sections(self.section)
         return np.concatenate(_section_arrays(values, keys, "values"))[:, None]
 
@@ -221,7 +219,6 @@ def build_clock(scene: Scene, layout: Layout, parameters: Parameters, timings: T
 def _build_section_clock(
     system: System, layout: Layout, parameters: Parameters, timings: Timings, rtol: float
 ) -> Clock:
-    """The crossings of the sections, along one motion."""
     flat, span, (keys, functions) = timings.flat, (float(timings.t0), _last_time(timings)), sections_of(timings.section)
     params = parameters.restore(parameters.first)
     problem = Problem.from_system(system, layout, params, ts=span, rtol=_SHARPER * rtol, max_steps=_BUDGET)
