@@ -330,6 +330,7 @@ def rounding_square(rows: list[np.ndarray], x: list[np.ndarray], step: float, si
 
 _LATTICE = 0.02  # of a step that a multiple may be off, in text of few digits or float32; chance is off by 0.25
 _EQUAL = 0.02  # of neighbours that are equal: with fewer, rounding errors are independent anyhow
+_BEFORE, _RISE = 10, 16  # samples before a limit at most, over which a motion that is cut off rises by as many steps
 _RUN, _AT_LIMIT = 3, 0.01  # equal values in a row at a limit of a sensor, and the share of all samples in such rows
 
 
@@ -347,23 +348,21 @@ def find_step(column: np.ndarray) -> float:
 def find_limits(column: np.ndarray, step: float) -> list[float]:
     """The lowest and the highest value of a signal (T,) where its sensor is at a limit there; NaN where it is not.
 
-    A sensor at its limit shows one value for some time, where the values about it change by more: those of noise never
-    repeat, and those of a sensor that rounds come to rest at a turning point before they repeat.
+    A sensor at its limit shows one value for some time. Those of noise never repeat, and a motion that turns, or comes
+    to rest, within a step for r samples rises by eight steps over the r before: one that is cut off, by more.
     """
-    found, edges = [], np.diff(column, 2)
+    found, others = [], column[(column > column.min()) & (column < column.max())]
+    repeats = len(others) < 2 or np.mean(np.diff(others) == 0) >= _EQUAL
     for end in (column.min(), column.max()):
         there = column == end
-        begins = np.flatnonzero(there[1:] & ~there[:-1]) + 1
+        begins = (np.flatnonzero(there[1:] & ~there[:-1]) + 1).tolist()
         runs = [int(np.argmin(np.append(there[i:], False))) for i in begins]
-        long = [i for i, run in zip(begins, runs, strict=True) if run >= _RUN and i >= 2]
-        enough = sum(runs) >= max(_AT_LIMIT * len(column), 4)
-        if np.isfinite(step):  # the motion stops dead at the limit, faster than it ever turns elsewhere
-            kinks = [abs(edges[i - 1]) for i in long]
-            enough &= len(kinks) > 0 and np.median(kinks) > 3 * step
-        else:
-            others = column[(column > column.min()) & (column < column.max())]
-            enough &= len(others) > 1 and bool(np.mean(np.diff(others) == 0) < _EQUAL)
-        found.append(float(end) if long and enough else np.nan)
+        rises = [
+            abs(end - column[max(i - min(run, _BEFORE), 0)]) for i, run in zip(begins, runs, strict=True) if run >= _RUN
+        ]
+        enough = rises and sum(runs) >= max(_AT_LIMIT * len(column), 4)
+        sharp = np.median(rises) > _RISE * step if rises and np.isfinite(step) else not repeats
+        found.append(float(end) if enough and sharp else np.nan)
     return found
 
 

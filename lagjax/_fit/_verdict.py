@@ -185,10 +185,11 @@ def describe_sensors(
         step, some = sensor.step[k], np.concatenate([_present_samples(record, k) for record in records])
         if np.isnan(given.step[k]) and step**2 / 12 > _ROUNDED * sigma[k] ** 2:
             off = "" if np.abs(some / step - np.round(some / step)).max() < 0.01 else " up to an offset"
-            found.append(
-                f"All values of {name} are multiples of {step:.4g}{off}: they are fitted as with "
-                f"noise=lagjax.Quantised({step:.4g})."
-            )
+            law = f"noise=lagjax.Quantised({step:.4g})"
+            how = f"take {law}." if is_student else f"they are fitted as with {law}."
+            found.append(f"All values of {name} are multiples of {step:.4g}{off}: {how}")
+        if np.ptp(some) < _FEW_STEPS * step:
+            found.append(f"{name} moves by less than {_FEW_STEPS:g} steps of its sensor: {_TOO_COARSE}")
         for end, word, limit in (("low", "smallest", sensor.low[k]), ("high", "largest", sensor.high[k])):
             if np.isfinite(limit) and np.isnan(getattr(given, end)[k]):
                 law, count = f"noise=lagjax.Clipped({end}={limit:.4g})", (some == limit).sum()
@@ -250,6 +251,8 @@ _UNEXPLAINED = 0.3  # of a signal's size, left as motion: sound fits leave 1e-3 
 _DOUBTED = 0.05  # of a signal's size, left as motion, from which a fit of other records is tried
 _FAINT = 0.1  # of a signal's size over all records: what is left of a record that hardly moves is not looked at
 _CORRELATED = 0.5
+_FEW_STEPS = 2.5  # of rounding in a signal: below, errors are as large as it, and no small change of a fit
+_TOO_COARSE = "there are no intervals from lines that far apart."
 _ROUNDED = 0.05  # of the variance of the noise, from which on a sentence tells of rounding
 
 
@@ -288,7 +291,7 @@ def verdict(
     if np.nanmax(known.correlation) > _CORRELATED:
         parts.append("The residuals are correlated: they hold motion that the scene lacks, and intervals allow for it.")
     ok = descent.converged and not (unseen or left.motion or apart)
-    ok &= not (isinstance(noise, StudentT) and any("Clipped" in text for text in parts))
+    ok &= not any("take noise=" in text or _TOO_COARSE in text for text in parts)
     if not ok or at_ends or labels:
         still = [
             text for part in question.parts for text in constant_signals(part.system.records, part.system.signals.names)

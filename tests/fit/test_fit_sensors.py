@@ -115,8 +115,10 @@ def test_limits_are_seen_and_said():
 
 
 def test_a_converter_of_few_bits_at_its_limits():
-    found = fit(np.round(np.clip(EXACT, -0.8, 0.8) / 2e-3) * 2e-3)
-    assert is_right(found) and "Quantised(0.002)" in found.message and "Clipped(high=0.8)" in found.message
+    for step in (2e-3, 1e-2):
+        found = fit(np.clip(np.round((EXACT + 0.8 * NOISE) / step) * step, -0.8, 0.8))
+        assert is_right(found) and "Clipped(low=-0.8)" in found.message and "Clipped(high=0.8)" in found.message
+    assert "Quantised(0.01)" in found.message
 
 
 def test_the_density_has_the_limits_and_their_gradient():
@@ -159,6 +161,14 @@ def test_a_coarse_encoder_is_honest(offset):
     swing = np.asarray(lagjax.simulate(SCENE, 0.4, 0.0, TS, TRUTH).q)
     found = fit(np.round(swing / STEP + offset) * STEP - offset * STEP)
     assert is_right(found, 0.95) and "Quantised(0.2618)" in found.message
+
+
+def test_what_no_law_of_rounding_helps_is_not_ok():
+    swing = np.asarray(lagjax.simulate(SCENE, 0.2, 0.0, TS, TRUTH).q)
+    found = fit(np.round(swing / STEP) * STEP)
+    assert not found.ok and "q moves by less than 2.5 steps of its sensor" in found.message
+    student = fit(np.round(EXACT / STEP) * STEP, noise=lagjax.StudentT())
+    assert not student.ok and "take noise=lagjax.Quantised(0.2618)" in student.message
 
 
 def test_rest_counts_once():
