@@ -49,8 +49,8 @@ class NoiseScale(NamedTuple):
 
 
 class Sensor(NamedTuple):
-    """What the sensors of S signals do to numbers: the `step` (S,) that they round to, and the limits `low`, `high`
-    (S,) that they cut off at; NaN for none."""
+    """The sensors of S signals: the `step` (S,) that they round to, and the limits `low`, `high` (S,) that they cut off
+    at; NaN for none."""
 
     step: np.ndarray
     low: np.ndarray
@@ -84,7 +84,7 @@ class AbstractNoise(abc.ABC):  # noqa: B024
         return widths
 
     def sensor(self, records: list[Record]) -> "Sensor | None":
-        """What the sensors of these records do to numbers; None where the records are to tell."""
+        """The sensors of these records; None where the records are to tell."""
         return None
 
 
@@ -301,7 +301,7 @@ def harmonics(step: float, sigma: float) -> tuple[np.ndarray, float, float]:
 
 
 def worths(x: np.ndarray, step: float, sigma: float) -> np.ndarray:
-    """How many independent samples each sample of a signal is worth, whose exact values are near x (T,).
+    """The number of independent samples that each sample of a signal is worth, whose exact values are near x (T,).
 
     A sample shares its rounding error with its m neighbours up to half a step away, on both sides as far as none is
     further, and is worth 1/(1 + (m − 1) ρ) with ρ the share of the variance that they have in common.
@@ -367,7 +367,7 @@ def find_limits(column: np.ndarray, step: float) -> list[float]:
 
 
 def find_sensor(records: list[Record]) -> Sensor:
-    """What records show of their sensors: rounding that all of them share, and limits that some of them reach."""
+    """The sensors as records show them: rounding that all of them share, and limits that some of them reach."""
     columns = [np.concatenate([r.matrix[:, s] for r in records]) for s in range(records[0].matrix.shape[1])]
     columns = [column[np.isfinite(column)] for column in columns]
     steps = np.array([find_step(column) for column in columns])
@@ -376,7 +376,7 @@ def find_sensor(records: list[Record]) -> Sensor:
 
 
 def read_sensor(records: list[Record], noise: AbstractNoise, names: tuple[str, ...], periods: np.ndarray) -> Sensor:
-    """What the sensors of some records do to numbers: what the law says, and beside that what the records show.
+    """The sensors of some records, as the law says, and where it says nothing as the records show.
 
     Wrapped signals turn round at their ends, which are no limits, and Student's t knows none. Raises `ValueError` where
     values are not what the law says.

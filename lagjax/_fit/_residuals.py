@@ -620,12 +620,12 @@ class Residuals:
     # ---- what rounding makes of samples ----
 
     def exact_values(self, point: Trial, signal: int) -> list[np.ndarray]:
-        """What the sensor of one signal would show without rounding, (N, T) of every batch."""
+        """The values that a sensor would show without rounding, (N, T) of every batch."""
         pairs = zip(self.batches, point.residuals, strict=True)
         return [batch.values[..., signal] + r[..., signal] for batch, r in pairs]
 
     def worths(self, point: Trial, widths: NoiseScale, signal: int) -> list[np.ndarray]:
-        """How many independent samples each is worth, (N, T) of every batch, for a signal whose sensor rounds."""
+        """The worth of each sample in independent ones, (N, T) of every batch, where the sensor of a signal rounds."""
         found = []
         for batch, exact in zip(self.batches, self.exact_values(point, signal), strict=True):
             found.append(np.zeros(exact.shape))
