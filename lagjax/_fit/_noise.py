@@ -339,7 +339,7 @@ def find_step(column: np.ndarray) -> float:
     gaps = np.diff(np.unique(column))
     if not len(gaps) or np.mean(np.diff(column) == 0) < _EQUAL:
         return np.nan
-    whole = np.cumsum(np.round(gaps / np.min(gaps[gaps > 1e-6 * gaps.sum()])))  # of neighbours, few steps apart
+    whole = np.cumsum(np.round(gaps / np.min(gaps[gaps > 1e-12 * gaps.sum()])))  # of neighbours, few steps apart
     step, rounding = gaps.sum() / whole[-1], 4 * np.finfo(np.float32).eps * np.abs(column).max()
     off = np.abs(np.cumsum(gaps) - whole * step).max()
     return float(step) if off < _LATTICE * step + min(rounding, 0.1 * step) else np.nan
