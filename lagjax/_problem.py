@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jax.extend import core
 from jaxtyping import Array, Float, Int
 
 from lagjax._arguments import accept
@@ -437,6 +438,72 @@ def _make_event(event, dtype) -> diffrax.Event:
     tolerance = 4 * float(jnp.finfo(dtype).eps)
     root_finder = event.root_finder or _SignChange(rtol=tolerance, atol=tolerance)
     return diffrax.Event(conditions, root_finder, event.direction)
+
+
+# The sign of the difference of two numbers where the one is less, or more, than the other.
+_SIGNS = {"lt": -1, "le": -1, "gt": 1, "ge": 1}
+_PASSING_ON = ("squeeze", "reshape", "broadcast_in_dim", "copy")
+
+
+def evaluate_condition(function: Callable, *arguments) -> tuple[Any, int]:
+    """The value of an event, and 0; of one that holds where a number is more than another their difference, and 1.
+
+    And −1 where it holds if the difference is less than zero.
+    """
+    closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
+    leaves = jax.tree.leaves(arguments)
+    if getattr(shape, "dtype", None) == np.dtype(bool) and shape.shape == ():
+        found = _difference(closed.jaxpr, closed.consts, leaves)
+        if found is not None:
+            return found
+    return function(*arguments), 0
+
+
+def _difference(jaxpr, constants, arguments) -> tuple[Any, int] | None:
+    """The difference of two numbers and its sign, where a jaxpr compares them; None where it does something else."""
+    (out,) = jaxpr.outvars
+    equation = next((e for e in jaxpr.eqns if out in e.outvars), None)
+    if equation is None:
+        return None
+
+    def with_outputs(atoms):
+        return jaxpr.replace(outvars=list(atoms), debug_info=jaxpr.debug_info.with_unknown_names())
+
+    name = equation.primitive.name
+    if name in ("jit", "pjit", "closed_call"):
+        inner, run = equation.params["jaxpr"], core.ClosedJaxpr(with_outputs(equation.invars), constants)
+        return _difference(inner.jaxpr, inner.consts, core.jaxpr_as_fun(run)(*arguments))
+    if name in (*_PASSING_ON, "not"):
+        found = _difference(with_outputs(equation.invars[:1]), constants, arguments)
+        return found and (found[0], -found[1] if name == "not" else found[1])
+    if name not in _SIGNS or not jnp.issubdtype(equation.invars[0].aval.dtype, jnp.floating):
+        return None
+    more, less = core.jaxpr_as_fun(core.ClosedJaxpr(with_outputs(equation.invars), constants))(*arguments)
+    return jnp.reshape(more - less, ()), _SIGNS[name]
+
+
+def signs_of_event(problem: Problem) -> list[int | None]:
+    """For each function of an event the sign of a comparison (`evaluate_condition`), 0 of a number, None of others."""
+    signs: list[int | None] = []
+    for function in jax.tree.leaves(problem.event.cond_fn, is_leaf=callable):
+
+        def evaluate(y, t, numbers, function=function):
+            value, sign = evaluate_condition(flat_condition(function, problem), y, t, numbers)
+            is_bool = not sign and jnp.result_type(value) == np.dtype(bool)
+            signs.append(None if is_bool else sign)
+            return value
+
+        jax.eval_shape(evaluate, problem.y0, problem.ts[0], problem.numbers)
+    return signs
+
+
+def flat_condition(function: Callable, problem: Problem) -> Callable:
+    """An event as a function of the solver's state (2n,), t and the numbers among the parameters."""
+
+    def condition(y, t, numbers):
+        return function(*map(problem.layout.restore, halves(y)), t=t, params=eqx.combine(numbers, problem.params))
+
+    return condition
 
 
 def has_own_root_finder(event: diffrax.Event) -> bool:

@@ -79,10 +79,12 @@ def simulate(
     - `event`: a function of (q, qdot), and of `t`, `params` by name. A real-valued event stops the motion where it
       changes sign. Machine code finds that on its series, without sampling, so that none is missed. A motion that
       starts on the zero, to the rounding of the numbers that came in (eight roundings of each, in float32), has to
-      leave it first; with a direction only if it leaves the other way, and else it ends at once. A Boolean event stops
-      the motion after the step on which it becomes true. Boolean events, and events with a root finder of their own,
-      are integrated by diffrax; there give a direction if the motion starts on the zero. `diffrax.Event` around such
-      functions sets the direction and the root finder.
+      leave it first; with a direction only if it leaves the other way, and else it ends at once. A Boolean event that
+      compares two numbers, as `q < 0` does, stops the motion where it becomes true, and at once where it is true at the
+      start: their difference is the event. Any other one stops it after the step on which it becomes true, and there
+      derivatives of the end are NaN. These, and events with a root finder of their own, are integrated by diffrax;
+      there give a direction if the motion starts on the zero. `diffrax.Event` around such functions sets the direction
+      and the root finder.
     - `adjoint`: how derivatives are taken. By default machine code goes back over its own steps in reverse mode
       (`jax.grad`, `jax.vjp`), at the cost of a few motions however many parameters there are, and forward over them in
       forward mode, all directions together (`jax.jvp`, `jax.jacfwd`); derivatives of every order exist. A run of
@@ -94,19 +96,20 @@ def simulate(
     - `progress`: print how far the integration has come; or any diffrax progress meter.
 
     **Borders.** Forces and potentials may have kinks and jumps (`where`, `abs`, `sign`, `clip`, `floor`, …), also in
-    time. Where L itself or p = ∂L/∂q̇ jumps, the velocities do: p is continuous at an instant, and along a border in
-    space, across which the energy is (where that does not suffice, the motion is reflected); at the very instant they
-    are those behind it. What cannot be decided so is refused before the run, and so is all of it with a solver of
-    diffrax. Machine code ends a step at every border and begins the next one beyond it; where both sides push towards
-    the border, as dry friction at rest does, the motion stays on it. First and second derivatives, in every mode,
-    include the jumps at borders. Where they do not exist they are NaN: where a border is grazed, and by knots of two
-    inputs that coincide (see `samples`). With diffrax, steps shrink at borders and go across, and a derivative over
-    them lacks what a jump of the acceleration adds. So the steps are searched for a jump before a derivative is
-    computed: a motion that crosses one, at a place that moves with the state or with parameters that are
-    differentiated, raises `SimulationError` in `jax.grad`; its derivatives are NaN with `throw=False`. With an event or
-    an `adjoint` they are NaN in either case, but by the time of a switch that is a parameter, where they lack its jump;
-    with `diffrax.BacksolveAdjoint` nothing is searched. Corners, where the acceleration is continuous, and jumps at
-    known times add nothing to first derivatives.
+    time. Angles have their cuts (`arctan2`, `jnp.angle`, `arctan(y / x)`, complex roots, logarithms and powers). Where
+    L itself or p = ∂L/∂q̇ jumps, the velocities do: p is continuous at an instant, and along a border in space, across
+    which the energy is (where that does not suffice, the motion is reflected); at the very instant they are those
+    behind it. What cannot be decided so is refused before the run, and so is all of it with a solver of diffrax.
+    Machine code ends a step at every border and begins the next one beyond it; where both sides push towards the
+    border, as dry friction at rest does, the motion stays on it. First and second derivatives, in every mode, include
+    the jumps at borders. Where they do not exist they are NaN: where a border is grazed, and by knots of two inputs
+    that coincide (see `samples`). With diffrax, steps shrink at borders and go across, and a derivative over them lacks
+    what a jump of the acceleration adds. So the steps are searched for a jump before a derivative is computed: a motion
+    that crosses one, at a place that moves with the state or with parameters that are differentiated, raises
+    `SimulationError` in `jax.grad`; its derivatives are NaN with `throw=False`. With an event or an `adjoint` they are
+    NaN in either case, but by the time of a switch that is a parameter, where they lack its jump; with
+    `diffrax.BacksolveAdjoint` nothing is searched. Corners, where the acceleration is continuous, and jumps at known
+    times add nothing to first derivatives.
 
     **Values that functions read.** What the event and the functions inside `system` read besides their arguments
     (globals, closures, attributes, helpers) is compared at every call: after `K = 1.0` the motion is that of the new

@@ -20,10 +20,20 @@ from lagjax._diffrax._integrate import Jumps, Method, WithJumps, integrate
 from lagjax._diffrax._solvers import FineOutput, Projected
 from lagjax._doubles import DOUBLE, SINGLE
 from lagjax._failures import differentiable_where, lost_unless
-from lagjax._layout import Layout, halves
-from lagjax._problem import AbstractEngine, Batch, Problem, PyTree, Solution, too_tight
+from lagjax._layout import halves
+from lagjax._problem import (
+    AbstractEngine,
+    Batch,
+    Problem,
+    PyTree,
+    Solution,
+    evaluate_condition,
+    flat_condition,
+    signs_of_event,
+    too_tight,
+)
 from lagjax._program import CLOCK, Unlowerable, table_of
-from lagjax._results import ENDED_WELL, RESULTS, SUCCESSFUL, code_of, result_from
+from lagjax._results import ENDED_WELL, EVENT_OCCURRED, RESULTS, SUCCESSFUL, code_of, result_from
 from lagjax._stopped import End, what_stopped
 from lagjax._validate import is_concrete, require_number
 
@@ -156,7 +166,7 @@ def _solve(engine: Diffrax, problem: Problem) -> Solution:
     # A member that cannot start is given no time to integrate over: it costs nothing, and the others do not wait.
     start = _state_result(y0, *form.acceleration(given[0], halves(y0), numbers))
     ts = jnp.where(start == RESULTS.successful, given, given[0])
-    event = None if problem.event is None else _flatten_event(problem.event, problem.layout, problem.params)
+    event, is_located = (None, True) if problem.event is None else _flatten_event(problem, ts, y0, numbers)
     method = engine.method(problem)
     solution = integrate(form, method, engine.adjoint, event, ts, y0, numbers)
     result = _explain_result(solution, form, start, ts, numbers)
@@ -172,9 +182,14 @@ def _solve(engine: Diffrax, problem: Problem) -> Solution:
     # there is, their cotangents must not be lost: they go to all that went in.
     reached = jnp.isfinite(solution.path).all(axis=1) & (ts == given)
     well = jnp.isin(result._value, jnp.asarray(ENDED_WELL))
+    y_end, t_end, inputs = solution.y_end, solution.t_end, (given, y0, *jax.tree.leaves(numbers))
+    if not is_located:  # where a motion ends behind a step that an event ended does not vary with the step
+        well = well & (result._value != EVENT_OCCURRED)
+        t_end = differentiable_where(well, t_end, *inputs)
     return solution._replace(
         path=lost_unless(reached[:, None], solution.path, (given, y0, numbers)),
-        y_end=differentiable_where(well, solution.y_end),
+        y_end=differentiable_where(well, y_end, *inputs) if not is_located else differentiable_where(well, y_end),
+        t_end=t_end,
         result=result._value,
     )
 
@@ -214,17 +229,32 @@ def _explain_result(solution: Solution, form: MotionEquations, start: RESULTS, t
     return RESULTS.where(not_finite, RESULTS.nonfinite_state, result)
 
 
-def _flatten_event(event: diffrax.Event, layout: Layout, params: PyTree) -> diffrax.Event:
-    """The event whose conditions take the solver's state (2n,) instead of the user's pytrees."""
+def _flatten_event(problem: Problem, ts, y0, numbers) -> tuple[diffrax.Event, bool]:
+    """The event whose conditions take the solver's state (2n,), and whether all instants of it are located.
 
-    def flat(function):
+    That of a comparison is where its difference is zero. If it holds at the start, it is the start.
+    """
+    event, signs = problem.event, signs_of_event(problem)
+    assert event is not None
+    forward = jnp.sign(ts[-1] - ts[0])
+    instant = 4 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
+
+    def flat(function, sign):
+        function = flat_condition(function, problem)
+        at_once = sign and (evaluate_condition(function, y0, ts[0], numbers)[0] * sign > 0)
+
         def condition(t, y, args, **_):
-            return function(*map(layout.restore, halves(y)), t=t, params=eqx.combine(args, params))
+            value = evaluate_condition(function, y, t, args)[0]
+            return jnp.where(at_once, sign * ((t - ts[0]) * forward - instant), value) if sign else value
 
         return condition
 
-    conditions = jax.tree.map(flat, event.cond_fn, is_leaf=callable)
-    return diffrax.Event(conditions, event.root_finder, event.direction)
+    functions, structure = jax.tree.flatten(event.cond_fn, is_leaf=callable)
+    ways = jax.tree.leaves(event.direction, is_leaf=lambda leaf: leaf is None)
+    conditions = [flat(function, sign) for function, sign in zip(functions, signs, strict=True)]
+    ways = [sign > 0 if sign else way for sign, way in zip(signs, ways, strict=True)]
+    whole = (structure.unflatten(conditions), event.root_finder, structure.unflatten(ways))
+    return diffrax.Event(*whole), None not in signs
 
 
 # ---- what can be wrong with a solver ---------------------------------------------------------------------------------

@@ -24,7 +24,7 @@ from lagjax._layout import halves
 from lagjax._machine_code import _primitives
 from lagjax._machine_code._flow import Flow, Tolerances
 from lagjax._machine_code._surfaces import Surfaces, crossing_variation, require_one_number
-from lagjax._problem import Problem, Solution, has_own_root_finder
+from lagjax._problem import Problem, Solution, evaluate_condition, has_own_root_finder, signs_of_event
 from lagjax._program import Unlowerable
 from lagjax._results import ENDED_WELL, EVENT_OCCURRED
 
@@ -70,9 +70,13 @@ def _surfaces_of_event(problem: Problem) -> Surfaces | str:
         return "the event holds arrays of its own"
     if len(conditions) > MOST_GUARDS:
         return f"the event has {len(conditions)} functions, more than {MOST_GUARDS}"
+    signs = signs_of_event(problem)
+    if None in signs:
+        return "the event is true or false, and no comparison of two numbers"
     ways = jax.tree.leaves(event.direction, is_leaf=lambda leaf: leaf is None)
-    directions = tuple(0 if way is None else 1 if way else -1 for way in ways)
-    return surfaces_of(problem, tuple(conditions), directions, "An event")
+    directions = tuple(sign or (0 if way is None else 1 if way else -1) for sign, way in zip(signs, ways, strict=True))
+    surfaces = surfaces_of(problem, tuple(conditions), directions, "An event")
+    return surfaces if isinstance(surfaces, str) else surfaces._replace(holds=tuple(map(bool, signs)))
 
 
 def surfaces_of(problem: Problem, functions: tuple, directions: tuple[int, ...], what: str) -> Surfaces | str:
@@ -94,9 +98,10 @@ def _lower_surfaces(derivation: Derivation, functions, directions, code, structu
 
     def value(function):
         def evaluate_guard(y, params):
-            given = function(*map(restore, halves(y[:-1])), t=y[-1], params=params)
-            if what == "An event" and jnp.result_type(given) == np.dtype(bool):
-                raise Unlowerable("the event is true or false")
+            def call(y, params):
+                return function(*map(restore, halves(y[:-1])), t=y[-1], params=params)
+
+            given = evaluate_condition(call, y, params)[0] if what == "An event" else call(y, params)
             return require_one_number(given, what)
 
         return evaluate_guard
@@ -145,7 +150,11 @@ def _event_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
         times = jnp.concatenate([ts[:1], times[1:-1], end[None]])
         solution = _primitives.run(flow, tolerances, times, y0, params)
         first = jnp.argmax(((event >> (2 * each)) & 3) > 0)
-        t_end, y_end = move_to_zero(first, fired, end, solution.y_end, params)
+        moves = fired
+        if any(surfaces.holds):  # what holds at the start ends the motion there
+            at_once = jnp.asarray(surfaces.holds)[first] & (t_stop == ts[0])
+            end, moves = jnp.where(fired & at_once, ts[0], end), fired & ~at_once
+        t_end, y_end = move_to_zero(first, moves, end, solution.y_end, params)
         return solution.path, y_end, t_end
 
     return run_unguarded

@@ -21,7 +21,7 @@ from lagjax._derivation import Derivation
 from lagjax._failures import differentiable_where
 from lagjax._machine_code._lines import outputs
 from lagjax._native import GUARD_NOISE, INSTANT, SINGLE_NOISE, SMALLEST_STEP, Guards
-from lagjax._program import Program, lower
+from lagjax._program import Program, StraightLine, Unlowerable, borders, distances, emit, lower
 
 PyTree = Any
 
@@ -48,19 +48,23 @@ class Surfaces(NamedTuple):
 
     `values` gives all g. `complete` gives what `_native.Guards` wants: g, then ġ, then the sizes of both, which bound
     their round-off; and for a start that `is_rounded` to float32, unless the motion remembers it, that of the start.
+    `borders` gives how far every number by which a guard is pieced together is from its border. What `holds` ends a
+    motion at once that begins beyond it, in its direction.
     """
 
     values: Program
     complete: Program
     directions: tuple[int, ...]
     is_rounded: bool = False
+    borders: StraightLine | None = None
+    holds: tuple[bool, ...] = ()
 
     def guards(self, notes: bool = False, remembers: bool = False) -> Guards:
         """The surfaces as guards of machine code: a change ends the motion or, with `notes`, is written down.
 
         A motion that `remembers` is given the side of each surface from which it comes (see `Guards`).
         """
-        return Guards(self.values, self.complete, self.directions, notes, remembers, self.is_rounded)
+        return Guards(self.values, self.complete, self.directions, notes, remembers, self.is_rounded, self.holds)
 
     @property
     def have_no_rate(self) -> np.ndarray:
@@ -123,13 +127,23 @@ class Surfaces(NamedTuple):
 
         y = jax.ShapeDtypeStruct((2 * n + 1,), derivation.layout.dtype)
         numbers = derivation.numbers
-        return cls(lower(values, y, numbers), lower(complete, y, numbers), directions, is_rounded)
+        lowered = lower(values, y, numbers)
+        return cls(lowered, lower(complete, y, numbers), directions, is_rounded, _borders_of(lowered, n))
 
 
 @functools.lru_cache(maxsize=64)
 def _rate_errors(complete: Program, count: int) -> Program:
     """The running errors of all ġ in units of round-off: what is left of terms that cancel is not seen in its size."""
     return complete.rounding_of(range(count, 2 * count), complete.shapes[0].size)
+
+
+def _borders_of(values: Program, n: int) -> StraightLine | None:
+    """The distances of guards from the borders at which they may jump; None of smooth ones, or without a program."""
+    try:
+        found = borders(values, n, slides=False, watched=len(values.outputs))
+    except Unlowerable:
+        return None
+    return None if found is None or not found.switches else distances(found)
 
 
 def vector_of(numbers: PyTree) -> jax.Array:
@@ -157,7 +171,8 @@ def crossing_variation(surfaces: Surfaces, program: Program) -> Callable:
         s = −ε − ½ (g″/g′) ε²,  ε = δg/g′        and the state by   f s + ½ f′ s²,
 
     up to third order in δg, which is zero itself: first and second derivatives are right. Where it is not `taken`
-    nothing moves. Where g′ is zero, as of a guard that jumps and is flat on both sides, there are no derivatives: NaN.
+    nothing moves. Where the guard jumps through zero, δg is that of the number whose border is there: the one that is
+    nearest in time. Where g′ is zero there are no derivatives: NaN.
     """
     still, count = jax.lax.stop_gradient, len(surfaces.directions)
 
@@ -166,8 +181,23 @@ def crossing_variation(surfaces: Surfaces, program: Program) -> Callable:
             n, at = y.shape[0] // 2, (jnp.append(y, t), numbers)
             return outputs(surfaces.complete, 2 * count, *at)[count + k], jnp.append(y[n:], outputs(program, n, *at))
 
-        value, (rate, slope) = outputs(surfaces.values, count, jnp.append(y, t), numbers)[k], rates(t, y)
-        bend, turn = map(still, jax.jvp(rates, (t, y), (jnp.ones_like(t), slope))[1])
+        def away(t, y, numbers):
+            """The guard, and how far the numbers are from their borders by which it is pieced together."""
+            at, line = jnp.append(y, t), surfaces.borders
+            more = () if line is None else emit(*line, (*at, *numbers))
+            return jnp.stack([outputs(surfaces.values, count, at, numbers)[k], *more])
+
+        def rates_away(t, y):
+            rate, slope = rates(t, y)
+            if surfaces.borders is None:
+                return rate[None], slope
+            return jax.jvp(lambda t, y: away(t, y, numbers), (t, y), (jnp.ones_like(t), slope))[1], slope
+
+        value, (rate, slope) = away(t, y, numbers), rates_away(t, y)
+        bend, turn = map(still, jax.jvp(rates_away, (t, y), (jnp.ones_like(t), slope))[1])
+        times = jnp.abs(still(value / rate))
+        times = jnp.where(jnp.isnan(times), jnp.inf, times).at[1:].multiply(_LATER)
+        value, rate, bend = (x[jnp.argmin(times)] for x in (value, rate, bend))
         crosses = ~taken | (rate != 0)
         rate = jnp.where(taken & crosses, rate, 1.0)
         part = jnp.where(taken, value - still(value), 0.0) / rate
@@ -176,3 +206,8 @@ def crossing_variation(surfaces: Surfaces, program: Program) -> Callable:
         return tuple(differentiable_where(crosses, x, t, y, numbers) for x in there)
 
     return move_to_zero
+
+
+# A guard that jumps at a border is not zero there: of the times to both that to the guard's own zero is by many orders
+# longer, where that to the border is some roundings. With twice as much nothing changes.
+_LATER = 1e4

@@ -66,8 +66,9 @@ class Events:
         notes: bool,
         remembers: bool,
         is_rounded: bool,
+        holds: tuple[bool, ...],
     ):
-        self.directions, self.remembers, self.is_rounded = directions, remembers, is_rounded
+        self.directions, self.remembers, self.is_rounded, self.holds = directions, remembers, is_rounded, holds
         self.motion, self.step, self.output, self.roots = motion, step, output, roots
         self.values, self.complete, self.count, self.first, self.notes = values, complete, len(directions), first, notes
         self.can_jump = any(piecewise)
@@ -162,6 +163,8 @@ class Events:
                 there = on_it | (value * before < 0.0) if self.remembers else on_it
                 goes_on = (going * before < 0.0) | ~(from_there < float("inf"))
                 met = fresh & there & goes_on & (before * float(self.directions[i]) <= 0.0)
+                if any(self.holds[i : i + 1]):
+                    met = met | (fresh & ~on_it & (value * float(self.directions[i]) > 0.0))
                 kind = code.select(before > 0.0, Change.FALLS, Change.RISES)
                 frame["met", i] = code.select(met, kind, 0.0)
                 stays = met | code.compare("==", going, 0.0)

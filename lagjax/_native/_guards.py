@@ -20,7 +20,8 @@ class Guards(NamedTuple):
     them, with the sign of the side from which the motion comes, 0 where that is unknown, and infinite where a motion
     that is beyond the surface has changed its side wherever it goes; then how far rounding may have moved their rates.
     Of a start that `is_rounded`, more coarsely than the motion, a guard that is zero to rounding is zero: its surface
-    passes through the start.
+    passes through the start. A guard that `holds` ends a motion at once that begins
+    beyond it, in its direction.
     """
 
     values: Recurrent
@@ -29,6 +30,7 @@ class Guards(NamedTuple):
     notes: bool = False
     remembers: bool = False
     is_rounded: bool = False
+    holds: tuple[bool, ...] = ()
 
     @property
     def inputs(self) -> int:

@@ -107,7 +107,7 @@ class Integrator:
         first = self.motion.series.followed - self.guards
         return Events(
             self.motion, self.step, self.output, roots, *lines, guards.directions, piecewise, first, self.notes,
-            guards.remembers, guards.is_rounded,
+            guards.remembers, guards.is_rounded, guards.holds,
         )  # fmt: skip
 
     # ---- members ----

@@ -39,7 +39,7 @@ from jax.extend import core
 
 from lagjax._program import _complex, _eigenvalues, _special  # noqa: F401  (they register what they lower)
 from lagjax._program import _scalars as scalars
-from lagjax._program._borders import BELOW, CLOCK, FLOOR, SIGN, TABLE, TRUNC, Borders, borders, is_smooth
+from lagjax._program._borders import BELOW, CLOCK, FLOOR, SIGN, TABLE, TRUNC, Borders, borders, distances, is_smooth
 from lagjax._program._differentiation import Derivatives, copy_nodes, pullback, pushforward, with_tangents
 from lagjax._program._emit import Rows, apply_in_jax, emit, emit_rows, plain_elementary
 from lagjax._program._evaluate import evaluate, round_off, steps_of, vjp
@@ -58,11 +58,11 @@ from lagjax._program._series import LinearSystem, Series, StraightLine, series
 __all__ = [
     "BELOW", "CLOCK", "FLOOR", "OPERATIONS", "SIGN", "TABLE", "TRUNC", "Borders", "Derivatives", "Expansion", "Graph",
     "Program", "Scalars", "Series", "StraightLine", "Tape", "Unlowerable", "apply_function", "apply_in_jax", "borders",
-    "concatenate", "copy_nodes", "emit", "evaluate", "expand_primitive", "has_own_rules", "inputs_of", "is_smooth",
-    "live", "lower", "lower_formula", "lower_scalars", "lower_solution",
-    "machine_memory", "operations_that_fit", "orthogonalize",
-    "pause_collections", "plain_elementary", "pullback", "pushforward", "row_weights", "scalars", "scatter", "series",
-    "solve_orthogonalized", "stack", "steps_of", "table_of", "trace_jaxpr", "with_tangents",
+    "concatenate", "copy_nodes", "distances", "emit", "evaluate", "expand_primitive", "has_own_rules", "inputs_of",
+    "is_smooth", "live", "lower", "lower_formula", "lower_scalars", "lower_solution", "machine_memory",
+    "operations_that_fit", "orthogonalize", "pause_collections", "plain_elementary", "pullback", "pushforward",
+    "row_weights", "scalars", "scatter", "series", "solve_orthogonalized", "stack", "steps_of", "table_of",
+    "trace_jaxpr", "with_tangents",
 ]  # fmt: skip
 
 

@@ -3,6 +3,7 @@
     comparisons, abs, max, min, sign    the sign of a switching number u: −1, 0 or 1
     floor, ceil, round, mod             the whole number below a switching number x
     rem, conversion to integers         the whole number between x and zero
+    atan2(y, x)                         the sign of x, and where that is negative the sign of y: its cut
     look-ups (`locate`)                 the piece of an increasing table that a number x is on
 
 A *piece* is what was decided: one of these numbers, constant along a step. Here a program becomes one that takes its
@@ -34,7 +35,8 @@ from lagjax._program._passes import eliminate_dead_code, live
 from lagjax._program._powers import find_powers
 from lagjax._program._rounding import rounding
 from lagjax._program._series import LinearSystem, Recurrent, StraightLine
-from lagjax._program._sliding import MOST_SLIDING, Slide, dot, with_sliding
+from lagjax._program._simplify import is_nonnegative
+from lagjax._program._sliding import FAR, MOST_SLIDING, Slide, dot, with_sliding
 
 # The kinds of pieces; `CLOCK` is the piece of a table that the time itself is on, whose borders are known.
 SIGN, FLOOR, TRUNC, SLIDE, TABLE, CLOCK = range(6)
@@ -50,7 +52,9 @@ _FEATURES = {
 _EXPONENTIALS = ("exp", "exp2", "expm1", "sinh", "cosh")
 _LARGEST = 10  # operations that one may become: a bound for errors, three are usual
 _COMPARISONS = ("lt", "le", "gt", "ge")
-_PIECEWISE = {*_COMPARISONS, "abs", "max", "min", "sign", "floor", "ceil", "round", "rem", "convert", "locate"}
+_PIECEWISE = {
+    *_COMPARISONS, "abs", "max", "min", "sign", "floor", "ceil", "round", "rem", "convert", "locate", "atan2"
+}  # fmt: skip
 _WITHOUT_ANY = {"input", "constant", "add", "sub", "neg", "sin", "cos"}  # no piece, no feature
 _WITHOUT_SERIES = ("rsqrt", "log", "log1p")  # at zero, or −1; besides the operations that are `steep`
 
@@ -277,7 +281,7 @@ class _Rewriting:
         nodes, singular = self.program.line.nodes, set()
         for i in needed:
             op, operands, _ = nodes[i]
-            if operands and (op in _WITHOUT_SERIES or OPERATIONS[op].steep):
+            if operands and op != "atan2" and (op in _WITHOUT_SERIES or OPERATIONS[op].steep):
                 singular |= {self._base(x) for x in operands}
         if not singular:
             return set()
@@ -384,7 +388,9 @@ class _Rewriting:
             op, of = "mod", [self.places[x] for x in self.moduli[i]]
         elif i in self.quotients:
             op, of = "floor", [self.graph.apply("div", *(self.places[x] for x in self.quotients[i]))]
-        elif not self._decides(i):
+        elif not self._decides(i) or (
+            op == "atan2" and is_nonnegative(self.program.line, self.program.line.nodes[i][1][1])
+        ):
             return None
         decided = self._decided(op, of, attribute)
         if decided is not None:
@@ -407,6 +413,8 @@ class _Rewriting:
             if op == "sign" and sign is not None:
                 self._jumping.add(self._base_of(sign))
             return None if sign is None else sign if op == "sign" else f("mul", sign, of[0])
+        if op == "atan2":
+            return self._angle(*of)
         if op == "locate":
             is_time = self.graph.nodes[of[0]][:1] + self.graph.nodes[of[0]][2:] == ("input", self.moving - 1)
             return self._piece(CLOCK if is_time else TABLE, of[0], attribute)
@@ -425,6 +433,26 @@ class _Rewriting:
             return None if whole is None else f("sub", of[0], f("mul", whole, of[1]))
         whole = self._piece(TRUNC, of[0])
         return None if whole is None else f("convert", whole, attribute=attribute)
+
+    def _angle(self, y: int, x: int) -> int | None:
+        """atan2(y, x) by the side of its cut, y = 0 where x < 0; None where no motion crosses that.
+
+        Only where x < 0 is y the switching number, so that an angle of zero is no border; at x = 0 nothing jumps.
+        """
+        f, number = self.graph.apply, lambda x: self.graph.constant(x, "float")
+        half = self._sign(x)
+        beside = f("lt", x if half is None else half, number(0.0))
+        side = self._sign(f("select", beside, number(FAR), y))
+        jumps = half if side is None else side  # where y stays as it is, it may be zero
+        if jumps is None:
+            return None
+        self._jumping.add(self._base_of(jumps))
+        angle = f("atan2", y, x)
+        # What rounding has put on the other side is brought back, by a whole turn.
+        above = f("select", f("prefers", number(0.0), angle), number(0.0), number(2 * math.pi))
+        below = f("select", f("prefers", angle, number(0.0)), number(0.0), number(-2 * math.pi))
+        back = f("select", f("ge", y if side is None else side, number(0.0)), below, above)
+        return f("add", angle, f("select", beside, number(0.0), back))
 
     def _base_of(self, piece: int) -> int:
         return self.graph.term(piece)[1]
@@ -670,19 +698,13 @@ class _Rewriting:
         ones it leaves.
         """
         graph, first = Graph(2 * self.graph.budget), self.program.size
-        nodes: list[int] = []
-        for (op, operands, attribute), kind in zip(self.graph.nodes, self.graph.kinds, strict=True):
-            if op == "input" and attribute >= first:
-                j = attribute - first
-                raw = _raw(graph, self.kinds[j], nodes[self.switches[j]], self.tables[j])
-                stays = graph.apply("gt", graph.input(first + count + j, "float"), graph.constant(0.5, "float"))
-                nodes.append(graph.apply("select", stays, raw, graph.input(attribute, "float")))
-            elif op == "input":
-                nodes.append(graph.input(attribute, kind))
-            elif op == "constant":
-                nodes.append(graph.constant(attribute, kind))
-            else:
-                nodes.append(graph.apply(op, *(nodes[i] for i in operands), attribute=attribute))
+
+        def decide_or_keep(j: int, piece: int) -> int:
+            stays = graph.apply("gt", graph.input(first + count + j, "float"), graph.constant(0.5, "float"))
+            return graph.apply("select", stays, piece, graph.input(first + j, "float"))
+
+        line = StraightLine(tuple(self.graph.nodes), tuple(self.graph.kinds), ())
+        nodes = _copy_deciding(graph, line, first, self.switches, self.kinds, self.tables, decide_or_keep)
         goes_on, zero, one = [], graph.constant(0.0, "float"), graph.constant(1.0, "float")
         pieces = [nodes[i] for i in self.pieces]
         for k, slide in enumerate(slides):
@@ -843,6 +865,46 @@ def _floor_divisions(line: StraightLine) -> dict[int, tuple[int, int]]:
         if nodes[r][1][0] == x and not_zero and signs:
             found[i] = x, y
     return found
+
+
+def distances(found: Borders) -> StraightLine:
+    """The differences of all switching numbers from the nearest level of their piece; of the inputs but the pieces."""
+    line, first = found.program.line, found.program.size - len(found.switches)
+    graph, results = Graph(_LARGEST * len(line.nodes) + 1000), []
+    places = _copy_deciding(graph, line, first, found.switches, found.kinds, found.tables, lambda j, piece: piece)
+    for switch, kind, located in zip(found.switches, found.kinds, found.tables, strict=True):
+        x, level = places[switch], graph.constant(0.0, "float")
+        if located is not None:
+            index, shift = graph.apply("locate", x, attribute=located), graph.constant(1.0, "float")
+            below, above = (
+                graph.apply("sub", x, graph.apply("take", i, attribute=located.table))
+                for i in (index, graph.apply("add", index, shift))
+            )
+            nearer = graph.apply("prefers", graph.apply("neg", above), below)
+            results.append(graph.apply("select", nearer, above, below))
+            continue
+        if kind != SIGN:
+            level = graph.apply("floor", graph.apply("add", x, graph.constant(0.5, "float")))
+        results.append(graph.apply("sub", x, level))
+    return StraightLine(*eliminate_dead_code(graph, results))
+
+
+def _copy_deciding(
+    graph: Graph, line: StraightLine, first: int, switches, kinds, tables, decide: Callable[[int, int], int]
+) -> list[int]:
+    """The nodes of a line with pieces, its inputs from number `first` on, in a graph; piece j is `decide(j, piece)`."""
+    nodes: list[int] = []
+    for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):
+        if op == "input" and attribute >= first:
+            j = attribute - first
+            nodes.append(decide(j, _raw(graph, kinds[j], nodes[switches[j]], tables[j])))
+        elif op == "input":
+            nodes.append(graph.input(attribute, kind))
+        elif op == "constant":
+            nodes.append(graph.constant(attribute, kind))
+        else:
+            nodes.append(graph.apply(op, *(nodes[i] for i in operands), attribute=attribute))
+    return nodes
 
 
 def gradient(borders: Borders, by: Sequence[int]) -> StraightLine:

@@ -2,7 +2,7 @@
 
 A pair has an id of its own (`Expansion.pair`), so that what only moves numbers moves pairs as well. What computes takes
 them apart: a function of z = x + iy becomes two of x and y. Logarithms, roots and powers have their branch cut on the
-negative real axis, as in JAX; a motion that crosses it meets a jump there, which is no border.
+negative real axis, as in JAX: it is that of atan2, a border.
 
 Fourier transforms are sums: of a length that is even, of two halves (Cooley and Tukey, Math. Comp. 19 (1965) 297).
 """

@@ -257,7 +257,7 @@ _ROWS = (
     ),
     # Roots
     _function("sqrt", np.sqrt, lambda f, c, w, u: f("div", c(0.5), w), _intrinsic("sqrt"), steep=True,
-              recurrence=_recurrences.square_root),
+              simplify=_simplify.root, recurrence=_recurrences.square_root),
     _function("rsqrt", lambda x: 1 / np.sqrt(x), lambda f, c, w, u: f("div", f("mul", c(-0.5), w), u),
               lambda code, a: 1.0 / code.intrinsic("sqrt", a)),
     _function("cbrt", np.cbrt, lambda f, c, w, u: f("div", w, f("mul", c(3.0), u)), simplify=_odd, steep=True),
@@ -275,17 +275,18 @@ _ROWS = (
     _function("sin", np.sin, lambda f, c, w, u: f("cos", u), simplify=_odd),
     _function("cos", np.cos, lambda f, c, w, u: f("neg", f("sin", u)), simplify=_even),
     _function("tan", np.tan, lambda f, c, w, u: _one_plus(f, c, _square(f, w)), simplify=_odd),
-    _function("asin", np.arcsin, lambda f, c, w, u: _inverse_root(f, c, _one_minus_square(f, c, u)), simplify=_odd,
-              steep=True),
+    _function("asin", np.arcsin, lambda f, c, w, u: _inverse_root(f, c, _one_minus_square(f, c, u)),
+              simplify=_simplify.inverse, steep=True),
     _function("acos", np.arccos, lambda f, c, w, u: f("neg", _inverse_root(f, c, _one_minus_square(f, c, u))),
-              steep=True),
+              simplify=_simplify.inverse, steep=True),
     _function("atan", np.arctan, lambda f, c, w, u: _inverse(f, c, _one_plus(f, c, _square(f, u))), simplify=_odd),
     Operation(
-        "atan2", 2, np.arctan2, "atan2", steep=True,
+        "atan2", 2, np.arctan2, "atan2", simplify=_simplify.angle, steep=True,
         slopes=(
             lambda f, c, w, y, x: f("div", x, _radius_squared(f, y, x)),
             lambda f, c, w, y, x: f("neg", f("div", y, _radius_squared(f, y, x))),
         ),
+        side=lambda f, c, w, y, x: f("and", f("lt", x, c(0.0)), f("lt", y, c(0.0))),
     ),
     # Hyperbolic functions
     _function("sinh", np.sinh, lambda f, c, w, u: f("cosh", u), simplify=_odd),

@@ -21,6 +21,7 @@ from jax.extend import core
 from lagjax._program._graph import INPUTS, PAIRS, Graph, Unlowerable
 from lagjax._program._indexing import are_numbers, locate_knots, look_up_windows
 from lagjax._program._operations import OPERATIONS
+from lagjax._program._simplify import arctangent
 
 # Scalars that are looked at for each one that the budget allows, as most of a derivative folds away; and in all, which
 # takes some minutes.
@@ -214,14 +215,16 @@ def find_variables(equation) -> list:
 
 
 def formula_of(equation) -> str | None:
-    """The name of the function of JAX that a call is, if that has a formula here ("det", "slogdet", "expn"); or None.
+    """The name of the function of JAX that a call is, if that has a formula here ("det", "expn", "signbit" …); or None.
 
     JAX has rules of its own for their derivatives, which agree with those of any formula for them.
     """
     name, operands = equation.primitive.name, [variable.aval for variable in equation.invars]
     if name in ("jit", "pjit"):
-        is_integral = equation.params["name"] == "expn" and len(operands) == 2
-        return "expn" if is_integral and jnp.issubdtype(operands[0].dtype, jnp.integer) else None
+        called, floats = equation.params["name"], [jnp.issubdtype(x.dtype, jnp.floating) for x in operands]
+        reads_bits = any(e.primitive.name == "bitcast_convert_type" for e in equation.params["jaxpr"].eqns)
+        found = {"expn": [False, True], "signbit": [True] if reads_bits else None}
+        return called if found.get(called) == floats else None
     if name != "custom_jvp_call" or len(operands) != 1:
         return None
     shape, dtype = operands[0].shape, operands[0].dtype
@@ -378,6 +381,18 @@ def _polynomial(expansion, params, x, *coefficients):
     for c in reversed(coefficients[:-1]):
         total = expansion.map("add", expansion.map("mul", total, x), c)
     return total
+
+
+@lowers("signbit")
+def _signbit(expansion, params, x):
+    return [expansion.map("lt", x, expansion.constants(0.0))]
+
+
+@lowers("atan")
+def _atan(expansion, params, x):
+    expansion.work(x.size)
+    expansion.traced_operations += x.size
+    return _ids([arctangent(expansion.graph, i) for i in x.ravel().tolist()], x.shape)
 
 
 @lowers("integer_pow")

@@ -80,6 +80,12 @@ def divide(graph, op, a, b):
     return graph.node("div", a, b)
 
 
+def root(graph, op, a):
+    """√(x²) is |x|, which has two smooth sides."""
+    of, operands, _ = graph.nodes[a]
+    return graph.apply("abs", operands[0]) if of == "mul" and operands[0] == operands[1] else graph.node(op, a)
+
+
 def raise_to_power(graph, op, a, b):
     """Whole and half exponents up to 16 become products and a root: more exact, and many times as fast as `pow`."""
     exponent = graph.value(b)
@@ -183,3 +189,109 @@ def compare(graph, op, a, b):
             cases = [graph.constant(value, graph.kinds[i]) for value in (0, 1)]
             return select(graph, "select", flag, *(graph.apply(op, *((c, b) if i == a else (a, c))) for c in cases))
     return graph.node(op, a, b)
+
+
+# ---- angles ----------------------------------------------------------------------------------------------------------
+
+_DEEPEST = 40  # operations one in the other, beyond which no sign and no quotient is looked for: a bound of the work
+_NEVER_NEGATIVE = frozenset(("exp", "exp2", "cosh", "logistic", "erfc", "sqrt", "rsqrt", "abs", "acos"))
+
+
+def is_nonnegative(graph, i: int, depth: int = _DEEPEST) -> bool:
+    """True if the form of a number tells that it is not negative."""
+    op, operands, attribute = graph.nodes[i]
+    if op == "constant" or not depth:
+        return op == "constant" and attribute >= 0
+    if op == "integer_pow" and attribute % 2 == 0:
+        return True
+    if op == "mul" and operands[0] == operands[1]:
+        return True
+    each = [is_nonnegative(graph, x, depth - 1) for x in operands] if op in _BY_OPERANDS else []
+    return op in _NEVER_NEGATIVE or (any(each) if op == "max" else bool(each) and all(each[op == "select" :]))
+
+
+_BY_OPERANDS = frozenset(("add", "mul", "div", "max", "min", "select", "integer_pow", "pow"))
+
+
+def angle(graph, op, y, x):
+    """atan2(sin u, cos u) is u less whole turns."""
+    (m, sine), (n, cosine) = graph.term(y), graph.term(x)
+    u, v = graph.operand_of("sin", sine), graph.operand_of("cos", cosine)
+    if u is None or u != v or abs(m) != n:
+        return graph.node(op, y, x)
+    return graph.scale(math.copysign(1.0, m), _rest(graph, u, 2 * math.pi))
+
+
+def arctangent(graph, u: int) -> int:
+    """atan(u). Where u is y/x, and x may change its sign, this is atan2(±y, ±x): it jumps at x = 0, and is no pole."""
+    f, zero, one = graph.apply, graph.constant(0.0, "float"), graph.constant(1.0, "float")
+    if (angle := graph.operand_of("tan", u)) is not None:
+        return _rest(graph, angle, math.pi)
+    y, x = _quotient(graph, u, _DEEPEST)
+    if x is None or graph.value(x) is not None:
+        return f("atan", u)
+    sign = f("select", f("lt", x, zero), one, graph.constant(-1.0, "float"))
+    undefined = f("and", f("eq", x, zero), f("eq", y, zero))
+    angle = f("atan2", f("mul", sign, y), f("abs", x))
+    return f("select", undefined, angle, graph.constant(math.nan, "float"))
+
+
+def inverse(graph, op, x):
+    """arccos(cos u) is |u| less whole turns, arcsin(sin u) is ±u less half ones; the sum of both functions is π/2."""
+    of, operands, _ = graph.nodes[x]
+    if of == "cos":
+        found = graph.apply("abs", _rest(graph, operands[0], 2 * math.pi))
+    elif of == "sin":
+        whole, one = _wholes(graph, operands[0], math.pi), graph.constant(1.0, "float")
+        halves = graph.apply("floor", graph.scale(0.5, whole))
+        parity = graph.apply("sub", whole, graph.scale(2.0, halves))
+        found = graph.apply(
+            "mul", graph.apply("sub", one, graph.scale(2.0, parity)), _rest(graph, operands[0], math.pi)
+        )
+    else:
+        return odd(graph, op, x) if op == "asin" else graph.node(op, x)
+    if (of, op) in (("cos", "acos"), ("sin", "asin")):
+        return found
+    return graph.apply("sub", graph.constant(math.pi / 2, "float"), found)
+
+
+def _rest(graph, u: int, period: float) -> int:
+    """u less whole periods, from −½ period to ½."""
+    return graph.apply("sub", u, graph.scale(period, _wholes(graph, u, period)))
+
+
+def _wholes(graph, u: int, period: float) -> int:
+    """The whole periods in u + ½ period; 2⁻⁵¹ of u is taken off, so that ±½ period as they are rounded have none."""
+    turns = graph.apply("mul", graph.constant((1 - 2.0**-51) / period, "float"), u)
+    return graph.apply("floor", graph.apply("add", turns, graph.constant(0.5, "float")))
+
+
+def _quotient(graph, i: int, depth: int) -> tuple[int, int | None]:
+    """Numerator and denominator of a number with poles where the denominator changes its sign; else itself and None."""
+    op, operands, exponent = graph.nodes[i]
+    f, one = graph.apply, graph.constant(1.0, "float")
+    if op == "tan":
+        return f("sin", *operands), f("cos", *operands)
+    if op == "pow" and (graph.value(operands[1]) or 0.0) % 2 == 1:
+        op, operands, exponent = "integer_pow", operands[:1], int(graph.value(operands[1]))
+    if not depth or op not in ("neg", "add", "sub", "mul", "div", "select", "integer_pow"):
+        return i, None
+    parts = [_quotient(graph, x, depth - 1) for x in operands[op == "select" :]]
+    divides = op == "div" or (op == "integer_pow" and exponent < 0)
+    if all(d is None for _, d in parts) and not (divides and not is_nonnegative(graph, operands[-1])):
+        return i, None
+    (n, d), (m, e) = ((n, one if d is None else d) for n, d in (parts[0], parts[-1]))
+    if op == "neg":
+        return f("neg", n), d
+    if op == "integer_pow":
+        n, d = (graph.power(x, abs(exponent)) for x in ((d, n) if divides else (n, d)))
+        return n, d
+    if op == "div":
+        return f("mul", n, e), f("mul", d, m)
+    if op == "mul":
+        return f("mul", n, m), f("mul", d, e)
+    if op == "select":
+        return f("select", operands[0], n, m), f("select", operands[0], d, e)
+    if d == e:
+        return f(op, n, m), d
+    return f(op, f("mul", n, e), f("mul", m, d)), f("mul", d, e)

@@ -120,6 +120,35 @@ def test_a_section_in_pieces():
         assert found[name].count <= len(ts) + (name == "a saw")  # and at the very end, to rounding
 
 
+def test_angles_as_sections():
+    # On a circle from the angle −1 the cut is at 1 + π, and so on; q = t passes the pole of arctan(1/(q − 0.4)) at 0.4.
+    orbit = lagjax.System(lambda q, v: 0.5 * v @ v + 1 / jnp.linalg.norm(q))
+    sections = {
+        "arctan2": lambda q, v: jnp.arctan2(q[1], q[0]),
+        "wrapped": lambda q, v: jnp.mod(jnp.arctan2(q[1], q[0]) + jnp.pi, 2 * jnp.pi) - jnp.pi,
+        "arctan": lambda q, v: jnp.arctan(q[1] / q[0]) - 1,
+    }
+    start, ts = jnp.array([np.cos(1), -np.sin(1)]), jnp.array([0.0, 8.0])
+    found = lagjax.crossings(orbit, sections, start, jnp.array([np.sin(1), np.cos(1)]), ts)
+    expected = {"arctan2": [1, 1 + np.pi, 1 + 2 * np.pi], "arctan": [2, 1 + np.pi / 2, 2 + np.pi, 1 + 3 * np.pi / 2]}
+    for name, where in (*expected.items(), ("wrapped", expected["arctan2"])):
+        np.testing.assert_allclose(times(found[name])[: len(where)], np.sort(where)[: len(where)], rtol=1e-8)
+
+
+@pytest.mark.parametrize("mode", [jax.jacrev, jax.jacfwd])
+def test_a_jump_varies_as_its_border(mode):
+    # x = t passes √p, where the section jumps through zero whatever its own slopes are: dt/dp = 1/(2 √p).
+    scene = lagjax.System(lambda q, v: 0.5 * v @ v)
+    section = lambda q, v, params: jnp.where(q[0] ** 2 > params, 1.0 + q[1], q[1] - 1.0)
+
+    def first(p):
+        start = jnp.array([0.0, 0.1]), jnp.array([1.0, 0.05])
+        return lagjax.crossings(scene, section, *start, jnp.array([0.0, 3.0]), p).t[0]
+
+    slopes = first(2.0), mode(first)(2.0), jax.grad(mode(first))(2.0)
+    np.testing.assert_allclose(slopes, [np.sqrt(2), 0.5 / np.sqrt(2), -0.25 * 2**-1.5], rtol=1e-9)
+
+
 def test_a_section_on_a_border_of_the_force():
     # V = |q| from rest at 1/2: at the corner after odd seconds, with speeds ±1; and so for another section there.
     corner = lagjax.System(lambda q, v: 0.5 * v**2 - abs(q))

@@ -131,7 +131,7 @@ def test_an_interval_of_a_few_roundings_of_the_time():
 @pytest.mark.parametrize(
     ("event", "reason"),
     [
-        (lambda q, v: q < 0.0, "the event is true or false"),
+        (lambda q, v: (q < 0.0) & (v < 0.0), "the event is true or false"),
         (diffrax.Event(floor, optx.Newton(1e-8, 1e-8)), "a root finder of its own"),
         (jax.tree_util.Partial(lambda w, q, v: q - w, jnp.ones(())), "holds arrays of its own"),
     ],
@@ -139,6 +139,34 @@ def test_an_interval_of_a_few_roundings_of_the_time():
 def test_what_goes_to_diffrax(event, reason):
     with pytest.raises(ValueError, match=reason):
         flight(event)
+
+
+COMPARISONS = {
+    "q < 0": lambda q, v: q < 0.0,
+    "not q >= 0": lambda q, v: jnp.logical_not(jnp.greater_equal(q, 0.0)),
+}
+
+
+@pytest.mark.parametrize("name", COMPARISONS)
+def test_a_comparison_is_located(name):
+    # √(2h/g) after the release, and there d/dg = −t/2g; a motion that begins below ends where it begins.
+    event, (h, g) = COMPARISONS[name], (1.0, 9.81)
+    t, slope = jax.value_and_grad(lambda g: fall(h, g, event=event).end.t)(g)
+    np.testing.assert_allclose([t, slope], [np.sqrt(2 * h / g), -np.sqrt(2 * h / g) / (2 * g)], rtol=1e-12)
+    assert fall(0.0, event=event).end.t == 0.0
+    below = lambda h: fall(h, event=event).end
+    assert (below(-1.0).t, below(-1.0).q, jax.grad(lambda h: below(h).q)(-1.0)) == (0.0, -1.0, 1.0)
+
+
+@pytest.mark.slow
+def test_booleans_of_diffrax():
+    # The instant of a comparison is located there, too; that of another Boolean is the end of a step.
+    def land(g, event):
+        return lagjax.simulate(FALL, 1.0, 0.0, TS, g, event=event, solver=diffrax.Dopri8()).end.t
+
+    t, slope = jax.value_and_grad(land)(9.81, COMPARISONS["q < 0"])
+    np.testing.assert_allclose([t, slope], [np.sqrt(2 / 9.81), -np.sqrt(2 / 9.81) / (2 * 9.81)], rtol=1e-8)
+    assert np.isnan(jax.grad(land)(9.81, lambda q, v: (q < 0.0) & (v < 0.0)))
 
 
 def test_an_event_that_is_no_number():

@@ -236,3 +236,21 @@ def test_reverse_mode_of_a_jump_beside_roots(jump):
     np.testing.assert_allclose(reverse, forward, atol=1e-10)
     differences = [(end(params.at[i].add(h)) - end(params.at[i].add(-h))) / (2 * h) for i in range(len(STEEP))]
     np.testing.assert_allclose(reverse, differences, atol=1e-7)
+
+
+def test_borders_by_roots_and_angles_in_every_mode():
+    # A number by which a force is pieced together may have an infinite slope elsewhere, as a distance has at zero.
+    def force(q, v, params):
+        inside = jnp.where(jnp.linalg.norm(q) > 1.3, 1.0, -1.0) + jnp.where(jnp.arctan2(q[1], q[0]) > 0.5, 0.4, 0.0)
+        return params * inside * jnp.array([-q[1], q[0]]) - 0.1 * v
+
+    scene = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q @ q, forces=force)
+
+    def end(x):
+        run = lagjax.simulate(scene, jnp.array([1.0, 0.3]), x[1:], jnp.array([0.0, 6.0]), x[0])
+        return run.q[-1, 0]
+
+    x, step = jnp.array([0.5, -1.2, 2.3]), 1e-6 * np.eye(3)
+    slopes = [(end(x + d) - end(x - d)) / 2e-6 for d in step]
+    for mode in (jax.grad, jax.jacfwd):
+        np.testing.assert_allclose(mode(end)(x), slopes, rtol=1e-5, atol=1e-5)

@@ -64,3 +64,51 @@ def test_a_whole_number_beyond_its_type_is_no_number():
     )
     run = lagjax.simulate(scene, 100_000.5, 0.0, np.array([0.0, 1.0]), throw=False, solver=lagjax.MachineCode())
     assert run.result == lagjax.RESULTS.nonfinite_state
+
+
+# Angles and signs that jump, in spellings of their own, and the same by `mod` and `where`.
+WRAPPED, BEYOND = (lambda u: jnp.mod(u + jnp.pi, 2 * jnp.pi) - jnp.pi), (lambda u: jnp.where(u < 0, -1.0, 1.0))
+JUMPS = {
+    "arctan2": (lambda u: jnp.arctan2(jnp.sin(u), jnp.cos(u)), WRAPPED),
+    "arctan2 of other lengths": (
+        lambda u: jnp.arctan2((2 + jnp.sin(u)) * jnp.sin(u), (2 + jnp.sin(u)) * jnp.cos(u)), WRAPPED),
+    "the angle of a complex number": (lambda u: jnp.angle(jnp.exp((0.2 + 1j) * u)), WRAPPED),
+    "a complex root": (lambda u: jnp.sqrt(jnp.exp(1j * u)).imag, lambda u: jnp.sin(WRAPPED(u) / 2)),
+    "a complex power": (lambda u: (jnp.exp(1j * u) ** 0.3).imag, lambda u: jnp.sin(0.3 * WRAPPED(u))),
+    "half an angle": (lambda u: 2 * jnp.arctan(jnp.tan(u / 2)), WRAPPED),
+    "arctan of a quotient": (lambda u: 2 * jnp.arctan(jnp.sin(u / 2) / jnp.cos(u / 2)), WRAPPED),
+    "arctan at a pole": (lambda u: jnp.arctan(1 / u), lambda u: BEYOND(u) * jnp.pi / 2 - jnp.arctan(u)),
+    "arctan of a sum with a pole": (
+        lambda u: jnp.arctan(1 + u**-1.0), lambda u: jnp.arctan2(BEYOND(u) * (u + 1), jnp.abs(u))),
+    "arctan2 along an axis": (lambda u: jnp.arctan2(0.0, u), lambda u: jnp.where(u < 0, jnp.pi, 0.0)),
+    "mod of an angle": (
+        lambda u: jnp.mod(jnp.arctan2(jnp.sin(u), jnp.cos(u)) + 1, 4.0), lambda u: jnp.mod(WRAPPED(u) + 1, 4.0)),
+    "copysign": (lambda u: jnp.copysign(1.0, u), BEYOND),
+    "signbit": (lambda u: jnp.where(jnp.signbit(u), -1.0, 1.0), BEYOND),
+    "a direction": (lambda u: u / jnp.sqrt(u**2), BEYOND),
+    "arcsin of a sine": (
+        lambda u: jnp.arcsin(jnp.sin(u)),
+        lambda u: jnp.pi / 2 - jnp.abs(jnp.mod(u + jnp.pi / 2, 2 * jnp.pi) - jnp.pi)),
+    "arccos of a cosine": (lambda u: jnp.arccos(jnp.cos(u)), lambda u: jnp.abs(WRAPPED(u))),
+}  # fmt: skip
+FAST_JUMPS = ("arctan2 of other lengths", "arctan at a pole", "copysign")
+
+
+@pytest.mark.parametrize("name", [pytest.param(x, marks=() if x in FAST_JUMPS else pytest.mark.slow) for x in JUMPS])
+def test_jumps(name):
+    # Both run on their own borders; ends and gradients agree to the tolerance of the runs.
+    ends, ts = [], np.array([0.0, 4.0])
+    for jump in JUMPS[name]:
+        scene = lagjax.System(
+            lambda q, v: 0.5 * v * v - 0.5 * q * q, forces=lambda q, v, params, jump=jump: -params * jump(2 * q + 0.4)
+        )
+        end = lambda k, scene=scene: lagjax.simulate(scene, 2.0, 0.4, ts, k, solver=lagjax.MachineCode()).q[-1]
+        ends.append(jax.value_and_grad(end)(0.3))
+    np.testing.assert_allclose(*ends, rtol=1e-7, atol=1e-7)
+
+
+def test_a_removable_pole_is_named():
+    # 0/0 is no angle: the value is NaN where the user's is.
+    scene = lagjax.System(lambda q, v: 0.5 * v * v, forces=lambda q, v: jnp.arctan(jnp.sin(q) / q))
+    run = lagjax.simulate(scene, 0.0, 1.0, np.array([0.0, 1.0]), throw=False, solver=lagjax.MachineCode())
+    assert run.result == lagjax.RESULTS.nonfinite_state
