@@ -259,7 +259,7 @@ _ROWS = (
     _function("sqrt", np.sqrt, lambda f, c, w, u: f("div", c(0.5), w), _intrinsic("sqrt"), steep=True,
               simplify=_simplify.root, recurrence=_recurrences.square_root),
     _function("rsqrt", lambda x: 1 / np.sqrt(x), lambda f, c, w, u: f("div", f("mul", c(-0.5), w), u),
-              lambda code, a: 1.0 / code.intrinsic("sqrt", a)),
+              lambda code, a: 1.0 / code.intrinsic("sqrt", a), simplify=_simplify.root),
     _function("cbrt", np.cbrt, lambda f, c, w, u: f("div", w, f("mul", c(3.0), u)), simplify=_odd, steep=True),
     # Exponentials
     _function("exp", np.exp, lambda f, c, w, u: w),

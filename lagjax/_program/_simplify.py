@@ -81,9 +81,12 @@ def divide(graph, op, a, b):
 
 
 def root(graph, op, a):
-    """√(x²) is |x|, which has two smooth sides."""
+    """√(x²) is |x|, which has two smooth sides; and 1/√(x²) is 1/|x|."""
     of, operands, _ = graph.nodes[a]
-    return graph.apply("abs", operands[0]) if of == "mul" and operands[0] == operands[1] else graph.node(op, a)
+    if of != "mul" or operands[0] != operands[1]:
+        return graph.node(op, a)
+    size = graph.apply("abs", operands[0])
+    return size if op == "sqrt" else graph.apply("div", graph.constant(1.0, "float"), size)
 
 
 def raise_to_power(graph, op, a, b):
