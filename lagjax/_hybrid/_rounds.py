@@ -323,7 +323,7 @@ class _Rounds(NamedTuple):
         return exit._replace(guards_defined=defined, order_matters=order_matters), memory
 
     def _order_matters(self, group: ModeGroup, mode: Mode, place, t, y, rates, there) -> jax.Array:
-        """Whether blows of guards that are `there`, (K,), lead elsewhere if the list is read from its end.
+        """True if blows of guards that are `there`, (K,), lead elsewhere when the list is read from its end.
 
         Blows lead back into their own mode. They are followed in both orders, each as long as its guard goes on in its
         direction, once before it has been turned.
