@@ -42,7 +42,7 @@ _NOISE, _HIT, _EPS = 1e3, 100.0, float(np.finfo(float).eps)
 
 
 class Mechanics(NamedTuple):
-    """What the corner conditions are made of, as nodes: L, p (n,), M (n, n), G (m, n), the rates G q̇ + d and d (m,)."""
+    """The nodes that the corner conditions are made of: L, p (n,), M (n, n), G (m, n), the rates G q̇ + d and d (m,)."""
 
     lagrangian: int
     momentum: tuple[int, ...]
