@@ -73,7 +73,7 @@ def examine(trajectory, reference=None) -> "Health":
 
 
 def _guards(transitions) -> tuple[Array, Array] | None:
-    """Whether the order of the list of transitions mattered, and whether a guard was let out, of each member."""
+    """Two flags of each member: the order of the list of transitions mattered, and a guard was let out."""
     return transitions and (transitions.order_matters.any(-1), jnp.isfinite(transitions.let_out).any(-1))
 
 

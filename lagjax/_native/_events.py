@@ -203,7 +203,7 @@ class Events:
                 frame["lead_order", g] = code.lanes_of(code.as_number(k))
 
     def _rate_noise(self, frame: Frame, i: int, size: Value) -> Value:
-        """How far rounding moves the rate of surface i whose terms have this size; or what is remembered of that."""
+        """The rounding of the rate of surface i, whose terms have this size; or what is remembered of it."""
         if self.remembers:
             return frame["params", self.motion.parameters - self.count + i]
         return GUARD_NOISE * size

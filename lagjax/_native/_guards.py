@@ -34,7 +34,7 @@ class Guards(NamedTuple):
 
     @property
     def inputs(self) -> int:
-        """How many numbers of a member are remembered."""
+        """The count of numbers of a member that are remembered."""
         return 2 * len(self.directions) if self.remembers else 0
 
 
