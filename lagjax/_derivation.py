@@ -239,7 +239,7 @@ class Derivation:
 
     @_lowered_once
     def _mechanics(self) -> StraightLine | None:
-        """The quantities that decide about velocities where L jumps (`_kick.Mechanics`); None if nothing is piecewise."""
+        """The quantities that decide where L jumps (`_kick.Mechanics`), as one line; None if nothing is piecewise."""
         if is_smooth(self.program("lagrangian", "momentum", "rates").line):
             return None
         names = "lagrangian", "momentum", "mass_matrix", "jacobian", "rates", "driving"

@@ -56,7 +56,8 @@ _PIECEWISE = {
     *_COMPARISONS, "abs", "max", "min", "sign", "floor", "ceil", "round", "rem", "convert", "locate", "atan2"
 }  # fmt: skip
 _WITHOUT_ANY = {"input", "constant", "add", "sub", "neg", "sin", "cos"}  # no piece, no feature
-_WITHOUT_SERIES = ("rsqrt", "log", "log1p")  # at zero, or −1; besides the operations that are `steep`
+# Functions without a series where their first operand is zero, or ±1.
+_SINGULAR_AT_ZERO, _SINGULAR_AT_ONE = ("sqrt", "rsqrt", "cbrt", "log", "pow"), ("log1p", "asin", "acos", "acosh")
 
 
 class Guard(NamedTuple):
@@ -278,20 +279,23 @@ class _Rewriting:
 
     def _find_abrupt(self, needed: set[int]) -> set[int]:
         """The decisions at whose border a root has no series."""
-        nodes, singular = self.program.line.nodes, set()
-        for i in needed:
-            op, operands, _ = nodes[i]
-            if operands and op != "atan2" and (op in _WITHOUT_SERIES or OPERATIONS[op].steep):
-                singular |= {self._base(x) for x in operands}
-        if not singular:
+        nodes = self.program.line.nodes
+
+        def bases_of(operations):
+            return {self._base(nodes[i][1][0]) for i in needed if nodes[i][0] in operations}
+
+        at_zero, at_one = bases_of(_SINGULAR_AT_ZERO), bases_of(_SINGULAR_AT_ONE)
+        if not at_zero | at_one:
             return set()
-        out = {i for i in singular if nodes[i][0] in ("abs", "max", "min")}
-        of_selects = [nodes[i][1][0] for i in singular if nodes[i][0] == "select"]
-        out |= _below(self.program.line, of_selects)
+        of_selects = [nodes[i][1][0] for i in at_zero | at_one if nodes[i][0] == "select"]
+        out = _below(self.program.line, of_selects)
         for i in needed:
             op, operands, _ = nodes[i]
-            if op in (*_COMPARISONS, "abs", "max", "min", "sign") and {self._base(x) for x in operands} & singular:
-                out.add(i)
+            if op in (*_COMPARISONS, "abs", "max", "min", "sign"):
+                level = [nodes[x][2] for x in operands if nodes[x][0] == "constant"] or [0.0] * (len(operands) == 1)
+                singular = (at_one if level[0] else at_zero) if level else set()
+                if not singular.isdisjoint({i, *(self._base(x) for x in operands)}):
+                    out.add(i)
         # What else is decided at the same border is decided beside it: no step may end where the root has no series.
         abrupt = {self._compared(i) for i in out} - {None}
         return out | {i for i in needed if self._compared(i) in abrupt}
