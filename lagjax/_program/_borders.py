@@ -624,22 +624,31 @@ class _Rewriting:
             return not velocities.isdisjoint(line.nodes[i][2] for i in below if line.nodes[i][0] == "input")
 
         is_quadratic = not reads_velocity([*of.mass_matrix, *of.jacobian])
-        reasons = {}
+        below = {
+            j: {line.nodes[i][2] for i in _below(line, [self.switches[j]]) if line.nodes[i][0] == "input"}
+            for j in jumping
+        }
+        # Behind such a border another one may be met at the same instant, and both kicks would have to be one.
+        nested = [j for j in jumping if below[j] & set(range(n)) and any(i >= first for i in below[j])]
+        turning = search.find(nested, [*of.momentum], self._levels) if nested else {}
+        reasons: dict[int, str | None] = {}
         for j, by_constraint in jumping.items():
+            reasons[j] = None
             if by_constraint:
                 reasons[j] = "a constraint prescribes a speed that jumps"
             elif reads_velocity([self.switches[j]]):
                 reasons[j] = (
                     "L or the momentum p = dL/dqdot jumps, and no law says with what velocities the motion goes on"
                 )
-            else:
+            elif not is_quadratic:
                 reasons[j] = (
-                    None
-                    if is_quadratic
-                    else (
-                        "L or the momentum p = dL/dqdot jumps, and L is not quadratic in qdot, so that the velocities "
-                        "behind that are not known in closed form"
-                    )
+                    "L or the momentum p = dL/dqdot jumps, and L is not quadratic in qdot, so that the velocities "
+                    "behind that are not known in closed form"
+                )
+            elif turning.get(j):
+                reasons[j] = (
+                    "the momentum p = dL/dqdot jumps where one condition decides about another (a look-up by "
+                    "searchsorted or digitize; nested jnp.where are followed)"
                 )
         return reasons
 

@@ -254,3 +254,22 @@ def test_borders_by_roots_and_angles_in_every_mode():
     slopes = [(end(x + d) - end(x - d)) / 2e-6 for d in step]
     for mode in (jax.grad, jax.jacfwd):
         np.testing.assert_allclose(mode(end)(x), slopes, rtol=1e-5, atol=1e-5)
+
+
+@pytest.mark.parametrize("slow", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_jump_beside_a_root_that_is_singular_elsewhere(slow):
+    """sqrt(q) has no series at q = 0, and a jump at q = 1.3 is a border all the same."""
+    roots = (jnp.sqrt, jnp.log, lambda q: q**0.3, jnp.cbrt) if slow else (jnp.sqrt,)
+    for root in roots:
+        scene = lagjax.System(
+            lambda q, v: 0.5 * v**2 - 0.5 * (q - 1.5) ** 2,
+            forces=lambda q, v, params, root=root: -params * jnp.where(q > 1.3, 1.0, 0.2) - 0.1 * root(q),
+        )
+
+        def end(x, scene=scene):
+            return lagjax.simulate(scene, 2.0, x[1], jnp.array([0.0, 2.5]), x[0], rtol=1e-11).q[-1]
+
+        x, step = jnp.array([0.4, 0.8]), 1e-5 * np.eye(2)
+        differences = [(end(x + d) - end(x - d)) / 2e-5 for d in step]
+        for mode in (jax.grad, jax.jacfwd):
+            np.testing.assert_allclose(mode(end)(x), differences, rtol=1e-7, atol=1e-7)
