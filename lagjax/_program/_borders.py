@@ -629,7 +629,7 @@ class _Rewriting:
             for j in jumping
         }
         # Behind such a border another one may be met at the same instant, and both kicks would have to be one.
-        nested = [j for j in jumping if below[j] & set(range(n)) and any(i >= first for i in below[j])]
+        nested = [j for j in jumping if self.kinds[j] != CLOCK and any(i >= first for i in below[j])]
         turning = search.find(nested, [*of.momentum], self._levels) if nested else {}
         reasons: dict[int, str | None] = {}
         for j, by_constraint in jumping.items():
