@@ -6,7 +6,6 @@
 What jumps is the potential, the mass or a vector potential; the spellings are those of `benchmarks.jump_population`.
 The reference goes from level to level with DOP853 (SciPy) on equations by hand, with the momentum along a border and
 the energy (or, by time, the whole momentum) as they were before it; where the energy does not suffice, it reflects.
-*Named* are momenta that jump by place in a look-up that is searched, which are refused.
 """
 
 import functools

@@ -617,6 +617,10 @@ class _Rewriting:
             candidates = [j for j in range(len(self.switches)) if first + j in read]
             found = search.find(candidates, nodes, self._levels) if candidates else {}
             jumping |= {j: nodes is of.rates for j, jumps in found.items() if jumps}
+        for j in sorted(jumping, reverse=True):  # beyond a piece that others are decided by, these may be other ones
+            below = (line.nodes[i] for i in _below(line, [self.switches[j]]))
+            decided_by = {a - first for op, _, a in below if op == "input" and a >= first}
+            jumping |= {k: jumping[j] for k in decided_by if k not in jumping}
         velocities = set(range(n, 2 * n))
 
         def reads_velocity(nodes):
@@ -624,13 +628,6 @@ class _Rewriting:
             return not velocities.isdisjoint(line.nodes[i][2] for i in below if line.nodes[i][0] == "input")
 
         is_quadratic = not reads_velocity([*of.mass_matrix, *of.jacobian])
-        below = {
-            j: {line.nodes[i][2] for i in _below(line, [self.switches[j]]) if line.nodes[i][0] == "input"}
-            for j in jumping
-        }
-        # Behind such a border another one may be met at the same instant, and both kicks would have to be one.
-        nested = [j for j in jumping if self.kinds[j] != CLOCK and any(i >= first for i in below[j])]
-        turning = search.find(nested, [*of.momentum], self._levels) if nested else {}
         reasons: dict[int, str | None] = {}
         for j, by_constraint in jumping.items():
             reasons[j] = None
@@ -644,11 +641,6 @@ class _Rewriting:
                 reasons[j] = (
                     "L or the momentum p = dL/dqdot jumps, and L is not quadratic in qdot, so that the velocities "
                     "behind that are not known in closed form"
-                )
-            elif turning.get(j):
-                reasons[j] = (
-                    "the momentum p = dL/dqdot jumps where one condition decides about another (a look-up by "
-                    "searchsorted or digitize; nested jnp.where are followed)"
                 )
         return reasons
 

@@ -166,12 +166,20 @@ def invert(graph, op, a):
 
 
 def select(graph, op, predicate, no, yes):
-    """One branch where the predicate is known or both branches are the same; the predicate where that is the result."""
+    """One branch where the predicate is known or both branches are the same; the predicate where that is the result.
+
+    `where(x == 0, 0, x)` is x: a series that begins at zero would be that of zero for good.
+    """
     known = graph.value(predicate)
     if known is not None or no == yes:
         return yes if known else no
     if (original := graph.operand_of("not", predicate)) is not None:
         return select(graph, op, original, yes, no)
+    compared, operands, _ = graph.nodes[predicate]
+    if compared in ("eq", "ne") and {no, yes} == {*operands}:  # both are the same number where they are equal
+        return no if compared == "eq" else yes
+    if compared == "ne" and operands == (no, no) and math.isnan(graph.value(yes) or 0.0):
+        return no
     if graph.kinds[no] == "bool" and (graph.value(no), graph.value(yes)) == (False, True):
         return predicate
     if graph.kinds[no] == "bool" and (graph.value(no), graph.value(yes)) == (True, False):

@@ -317,17 +317,21 @@ def test_check_sees_every_spelling(spelling):
     assert [f.kind for f in found if "velocities jump there" in f.message] == ["discontinuity"]
 
 
-def test_a_momentum_that_jumps_in_a_look_up_that_is_searched_is_refused_but_for_clocks():
+def test_jumps_that_are_decided_in_several_steps():
+    """A look-up by searchsorted decides at one level about the next one; a level of zero is one like others."""
     levels, values = jnp.array([-0.5, 0.0, 0.2, 0.9, 1.4]), jnp.array([0.0, 0.8, -0.4, 0.6, 0.1, 0.5])
 
     def look_up(u):
         return values[jnp.searchsorted(levels, u)]
 
-    by_place = lagjax.System(lambda q, v: 0.5 * v @ v + look_up(q[0]) * v[1])
-    by_time = lagjax.System(lambda q, v, t: 0.5 * v @ v + look_up(t - 1) * v[1])
-    for scene in (by_place, by_time):
-        with pytest.raises(ValueError, match="one condition decides about another"):
-            lagjax.simulate(scene, jnp.array([-1.0, 0.0]), jnp.array([1.0, 0.0]), jnp.array([0.0, 3.0]))
-    by_clock = lagjax.System(lambda q, v, t: 0.5 * v**2 + look_up(t) * v)
-    run = lagjax.simulate(by_clock, 0.0, 1.0, jnp.array([-1.0, 2.0]))
-    np.testing.assert_allclose(run.qdot[-1], 0.5, rtol=1e-14)
+    by_place = lagjax.System(lambda q, v: 0.5 * v @ v + 0.3 * look_up(q[0]) * v[1])
+    run = lagjax.simulate(by_place, jnp.array([-1.0, 0.0]), jnp.array([1.0, 0.0]), jnp.array([0.0, 3.0]))
+    np.testing.assert_allclose(run.qdot[-1], [np.sqrt(1 - 0.15**2), -0.15], rtol=1e-14)
+    ts = jnp.array([0.0, 0.7, 1.1, 1.5, 2.2, 2.8])
+    by_time = lagjax.System(
+        lambda q, v, t: 0.5 * v @ v + look_up(t - 1) * v[1],
+        forces=lambda q, v, t: look_up(t - 1) * jnp.array([1.0, 0.0]),
+    )
+    run = lagjax.simulate(by_time, jnp.zeros(2), jnp.zeros(2), ts)
+    np.testing.assert_allclose(run.qdot[:, 1], -values[np.searchsorted(levels, ts - 1)], atol=1e-14)
+    np.testing.assert_allclose(run.qdot[:, 0], [0.0, 0.16, 0.36, 0.5, 0.77, 0.99], rtol=1e-14)
