@@ -241,7 +241,7 @@ def main(arguments=None) -> None:
     """The command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=int, default=100)
-    parser.add_argument("--single", type=int, default=None, help="scenes in float32; by default a fifth of all")
+    parser.add_argument("--float32", type=int, default=None, help="scenes in float32; by default a fifth of all")
     parser.add_argument("--loads", type=int, default=2000)
     parser.add_argument("--seed", type=int, default=0)
     given = parser.parse_args(arguments)
@@ -250,7 +250,7 @@ def main(arguments=None) -> None:
     print("After 1e8:", {name: float(f"{x:.2g}") for name, x in creep(given.loads).items()})
     print("float64:", count_kinds(given.scenes, given.seed, np.float64))
     jax.config.update("jax_enable_x64", False)
-    single = given.scenes // 5 if given.single is None else given.single
+    single = given.scenes // 5 if given.float32 is None else given.float32
     print("float32:", count_kinds(single, given.seed, np.float32))
     jax.config.update("jax_enable_x64", before)
 

@@ -1,7 +1,7 @@
 """Random hybrid scenes whose guards may be beyond zero where a mode begins: is any motion wrong without a word?
 
     python -m benchmarks.guard_population --scenes 300
-    python -m benchmarks.guard_population --scenes 300 --single
+    python -m benchmarks.guard_population --scenes 300 --float32
 
 Balls that rest on shaken tables, blocks that stick and slip (by a constraint with a multiplier, statically as much held
 as kinetically or more), blocks under inputs that are held from call to call, freewheels, particles that begin beyond
@@ -11,7 +11,7 @@ zero there to 20 of them is decided by where it is a little later. Scenes in whi
 millionth without going through are drawn again.
 
 A motion is *right* whose end and whose count of transitions are those of the reference, *named* where it ends in an
-error that says so, and else *wrong*. With `--single` the state and the parameters come in float32, without the x64
+error that says so, and else *wrong*. With `--float32` the state and the parameters come in float32, without the x64
 switch; the reference begins with the numbers as rounded.
 """
 
@@ -29,6 +29,7 @@ import numpy as np
 from scipy.integrate import quad
 
 import lagjax
+from benchmarks import _singles
 
 G, MOST, STEPS = 9.81, 60, 12  # gravity; transitions of a motion; calls of a control loop
 # Some sixty transitions, each known to a hundred roundings of numbers up to a hundred: 1e-10. Of float32 the same with
@@ -482,10 +483,10 @@ def main(arguments: list[str] | None = None) -> collections.Counter:
     parser = argparse.ArgumentParser(prog="python -m benchmarks.guard_population", description=__doc__.splitlines()[0])
     parser.add_argument("--scenes", type=int, default=300)
     parser.add_argument("--first", type=int, default=0, help="the seed of the first one")
-    parser.add_argument("--single", action="store_true", help="in float32, without the x64 switch")
+    _singles.add_option(parser)
     options = parser.parse_args(arguments)
-    jax.config.update("jax_enable_x64", not options.single)
-    dtype, tolerance = (np.float32, SINGLE_TOLERANCE) if options.single else (np.float64, TOLERANCE)
+    _singles.precision_of(options)
+    dtype, tolerance = (np.float32, SINGLE_TOLERANCE) if options.float32 else (np.float64, TOLERANCE)
     seeds = range(options.first, options.first + options.scenes)
     scenes = {seed: _drawn(FAMILIES[seed % len(FAMILIES)], np.random.default_rng(seed)) for seed in seeds}
     counts, worst = collections.Counter(), 0.0

@@ -1,13 +1,13 @@
 """Random scenes with jumps in every spelling, as forces, events and sections: is any value or gradient wrong?
 
     python -m benchmarks.jump_population --scenes 200
-    python -m benchmarks.jump_population --scenes 200 --single
+    python -m benchmarks.jump_population --scenes 200 --float32
 
 A *spelling* is a function of one number u that jumps where u passes levels that are known, with a smooth form between
 them: angles by `arctan2`, powers and logarithms of complex numbers, wholes, comparisons, tables. A *kind* says what
 jumps with it: a force by the place, by the time or by the angle of an orbit; an event; a section. The reference goes
 from level to level with DOP853 (SciPy) on the smooth forms, angles as a further coordinate, and its derivatives are
-differences. `--single` is JAX's default, float32.
+differences. `--float32` is JAX's default, float32.
 """
 
 import argparse
@@ -27,6 +27,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import lagjax
+from benchmarks import _singles
 
 PI = np.pi
 # Runs of rtol 1e-9 for ten units of time, whose errors grow tenfold at a border; differences of a reference of 1e-12
@@ -420,9 +421,9 @@ def main(arguments: list[str] | None = None) -> collections.Counter:
     parser.add_argument("--first", type=int, default=0, help="the seed of the first one")
     parser.add_argument("--spellings", nargs="*", default=list(SPELLINGS))
     parser.add_argument("--kinds", nargs="*", default=list(KINDS))
-    parser.add_argument("--single", action="store_true", help="float32, without the x64 switch")
+    _singles.add_option(parser)
     options = parser.parse_args(arguments)
-    jax.config.update("jax_enable_x64", not options.single)
+    _singles.precision_of(options)
     warnings.filterwarnings("ignore", category=RuntimeWarning)
     counts: collections.Counter = collections.Counter()
     for seed in range(options.first, options.first + options.scenes):
@@ -432,7 +433,7 @@ def main(arguments: list[str] | None = None) -> collections.Counter:
             counts["not compared"] += 1
             continue
         scene, right = drawn
-        name, what = compare(scene, right, slopes, options.single)
+        name, what = compare(scene, right, slopes, options.float32)
         counts[name] += 1
         if name != "right":
             print(f"{seed} {name}: {scene.name}, p = {scene.p.tolist()}: {what}", flush=True)

@@ -1,7 +1,7 @@
 """Random scenes in which L jumps, in every spelling, by place and by time: is any value or gradient wrong?
 
     python -m benchmarks.kick_population --scenes 200
-    python -m benchmarks.kick_population --scenes 200 --single
+    python -m benchmarks.kick_population --scenes 200 --float32
 
 What jumps is the potential, the mass or a vector potential; the spellings are those of `benchmarks.jump_population`.
 The reference goes from level to level with DOP853 (SciPy) on equations by hand, with the momentum along a border and

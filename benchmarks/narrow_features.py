@@ -1,6 +1,6 @@
 """Narrow features that are no exponentials, and collisions from far away: is any motion wrong without a word?
 
-    python -m benchmarks.narrow_features --scenes 300              # --single: in float32, without the x64 switch
+    python -m benchmarks.narrow_features --scenes 300              # --float32: in float32, without the x64 switch
 
 A feature f((x − c) / w) of one of ten families, 1e-1 to 1e-7 wide, acts on a unit mass as a force in time, as a
 potential in place, or is a function whose crossings of a level are counted; or the mass, 1e2 to 1e6 lengths away, flies
@@ -18,13 +18,13 @@ import sys
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 import lagjax
+from benchmarks import _singles
 
 RTOL, SLACK, SPAN = 1e-9, 1e4, 10.0
 SINGLE = 2.0**-24  # half a unit in the last place of float32
@@ -227,12 +227,12 @@ def main(arguments: list[str] | None = None) -> collections.Counter:
     )
     parser.add_argument("--scenes", type=int, default=300)
     parser.add_argument("--first", type=int, default=0, help="the seed of the first one")
-    parser.add_argument("--single", action="store_true", help="states in float32, as JAX has them by default")
+    _singles.add_option(parser)
     options = parser.parse_args(arguments)
-    jax.config.update("jax_enable_x64", not options.single)
+    _singles.precision_of(options)
     counts, steps = collections.Counter(), []
     for seed in range(options.first, options.first + options.scenes):
-        name, error, taken, text = compared(seed, options.single)
+        name, error, taken, text = compared(seed, options.float32)
         counts[name] += 1
         steps.append(taken)
         if name != "right":
