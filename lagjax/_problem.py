@@ -450,10 +450,17 @@ def evaluate_condition(function: Callable, *arguments) -> tuple[Any, int]:
 
     And −1 where it holds if the difference is less than zero.
     """
-    closed, shape = jax.make_jaxpr(function, return_shape=True)(*arguments)
-    leaves = jax.tree.leaves(arguments)
+    leaves, structure = jax.tree.flatten(arguments)
+    numbers = [i for i, x in enumerate(leaves) if eqx.is_array_like(x)]  # params may hold words as well
+
+    def call(*given):
+        new = dict(zip(numbers, given, strict=True))
+        return function(*jax.tree.unflatten(structure, [new.get(i, x) for i, x in enumerate(leaves)]))
+
+    leaves_of_call = [leaves[i] for i in numbers]
+    closed, shape = jax.make_jaxpr(call, return_shape=True)(*leaves_of_call)
     if getattr(shape, "dtype", None) == np.dtype(bool) and shape.shape == ():
-        found = _difference(closed.jaxpr, closed.consts, leaves)
+        found = _difference(closed.jaxpr, closed.consts, leaves_of_call)
         if found is not None:
             return found
     return function(*arguments), 0

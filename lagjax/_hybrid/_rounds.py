@@ -331,13 +331,15 @@ class _Rounds(NamedTuple):
         some, ways = group.blows
         if some.size < 2:
             return jnp.asarray(False)
-        t, y, params = _constant_unless(False, (t, y, mode.params))
+        # A loop that closes over numbers that vary cannot be transposed.
+        t, y, params, vector, latest = _constant_unless(False, (t, y, mode.params, mode.vector, self.ts[-1]))
+        mode = mode._replace(vector=vector)
         there = (there & (mode.targets == place))[some]
         resets = [functools.partial(state_after, mode.leaving[k], mode.layout, t, params=params) for k in some]
         orders = jnp.stack([jnp.arange(some.size, 0, -1), jnp.arange(1, some.size + 1)])
 
         def going(y):
-            return there & (mode.guards_at(t, y, self.ts[-1]).clear_rates()[some] * ways > 0)
+            return there & (mode.guards_at(t, y, latest).clear_rates()[some] * ways > 0)
 
         def blow(y, hits, order):
             k = jnp.argmax(jnp.where(hits, order, 0))
@@ -464,7 +466,10 @@ def _constant_unless(varies, tree: PyTree) -> PyTree:
     """The numbers of a pytree, without derivatives unless `varies` holds."""
 
     def constant(x):
-        return jnp.where(varies, x, jax.lax.stop_gradient(x)) if eqx.is_array_like(x) else x
+        if not eqx.is_array_like(x):
+            return x
+        still = jax.lax.stop_gradient(x)
+        return still if varies is False else jnp.where(varies, x, still)
 
     return jax.tree.map(constant, tree)
 

@@ -351,8 +351,6 @@ class _Rewriting:
             self._note_exponent(*of)
         if op == "div" and (quotient := self._direction(*of)) is not None:
             return quotient
-        if op == "mul" and (product := self._multiple_of_direction(*of)) is not None:
-            return product
         return self.graph.node(op, *of, attribute=attribute)
 
     def _direction(self, x: int, size: int) -> int | None:
@@ -368,15 +366,6 @@ class _Rewriting:
             branches = [q or self.graph.apply("div", x, y) for q, y in zip(quotients, operands[1:], strict=True)]
             return self.graph.apply("select", operands[0], *branches)
         return self._sign_of_quotient(x, size)
-
-    def _multiple_of_direction(self, *factors: int) -> int | None:
-        """x (n / |x|) as n times the piece of x; None of other products."""
-        for x, quotient in (factors, factors[::-1]) if self._known else ():
-            c, base = self.graph.term(quotient)
-            op, operands, _ = self.graph.nodes[base]
-            if op == "div" and (direction := self._direction(x, operands[1])) is not None:
-                return self.graph.apply("mul", self.graph.scale(c, operands[0]), direction)
-        return None
 
     def _sign_of_quotient(self, x: int, size: int) -> int | None:
         """x / size, where the size is a multiple of |x|: a multiple of the piece of x."""

@@ -232,7 +232,7 @@ class Jumping:
 
     def _states(self, count: int) -> np.ndarray:
         """States that nothing speaks for; entries of tables that are parameters increase."""
-        ends = [1 + table.positions[-1] for table in self.tables]
+        ends = [1 + max(table.positions) for table in self.tables]
         columns = self.draw.uniform(0.3, 1.2, (max([self.beside, *ends]), count))
         columns[: self.moving] *= self.draw.choice([-1.0, 1.0], (self.moving, count))
         for table in self.tables:

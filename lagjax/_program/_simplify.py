@@ -59,6 +59,10 @@ def multiply(graph, op, a, b):
         return graph.scale(m * n, graph.product(x, y))
     if m < 0 or n < 0:
         return graph.scale(math.copysign(1, m * n), multiply(graph, op, graph.scale(abs(m), x), graph.scale(abs(n), y)))
+    for x, quotient in ((a, b), (b, a)):  # x · (c / |x|)
+        divided, operands, _ = graph.nodes[quotient]
+        if divided == "div" and (sign := direction(graph, x, operands[1])) is not None:
+            return graph.apply("mul", operands[0], sign)
     return graph.product(a, b)
 
 
@@ -77,7 +81,16 @@ def divide(graph, op, a, b):
         return negate(graph, "neg", divide(graph, op, a, positive))
     if (square := graph.operand_of("sqrt", b)) is not None and graph.nodes[a][0] == "div" and graph.nodes[a][1][1] == b:
         return graph.apply("div", graph.nodes[a][1][0], square)
-    return graph.node("div", a, b)
+    return graph.node("div", a, b) if (sign := direction(graph, a, b)) is None else sign
+
+
+def direction(graph, a, b):
+    """x / |x|, or a multiple of it, as the sign of x, which has both sides at zero; None of other quotients."""
+    (m, x), (n, size) = graph.term(a), graph.term(b)
+    if (of := graph.operand_of("abs", size)) is None:
+        return None
+    k, base = graph.term(of)
+    return graph.scale(m / (n * abs(k)), graph.apply("sign", x)) if x == base else None
 
 
 def root(graph, op, a):
