@@ -491,6 +491,7 @@ def _difference(jaxpr, constants, arguments) -> tuple[Any, int] | None:
 
 def signs_of_event(problem: Problem) -> list[int | None]:
     """For each function of an event the sign of a comparison (`evaluate_condition`), 0 of a number, None of others."""
+    assert problem.event is not None
     signs: list[int | None] = []
     for function in jax.tree.leaves(problem.event.cond_fn, is_leaf=callable):
 

@@ -38,7 +38,7 @@ class Guarded(NamedTuple):
     of_time: jax.Array
     rate_rounding: jax.Array
 
-    def clear_rates(self, largest=0.0) -> jax.Array:
+    def clear_rates(self, largest: jax.Array | float = 0.0) -> jax.Array:
         """The rates, 0 where their rounding, or the `largest` one so far, decides them."""
         return jnp.where(jnp.abs(self.rates) > jnp.maximum(self.rate_rounding, largest), self.rates, 0.0)
 
