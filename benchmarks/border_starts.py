@@ -22,8 +22,9 @@ from scipy.integrate import solve_ivp
 
 import lagjax
 
-T, STEP, SIDES = 1.5, 1e-5, 1e-4  # of a difference; by how much both sides may differ, in parts of the gradient
-WRONG = {np.dtype("float64"): 1e-5, np.dtype("float32"): 2e-3}  # in parts of the largest slope; STEP leaves 1e-6
+T, STEP, SIDES = 1.5, 1e-6, 1e-4  # of a difference; by how much both sides may differ, in parts of the gradient
+# In parts of the largest slope. Both sides bend differently, so that a difference over STEP is off by some 3e-6.
+WRONG = {np.dtype("float64"): 1e-5, np.dtype("float32"): 2e-3}
 MOST_MODES = 200
 
 
