@@ -82,7 +82,7 @@ class Surfaces(NamedTuple):
         given = jnp.append(y, t), numbers
         out = outputs(self.complete, 4 * count, *given)
         values, rates, sizes, rate_sizes = out.reshape(4, count)
-        errors = outputs(_rate_errors(self.complete, count), count, jnp.append(y, t), numbers)
+        errors = outputs(_rate_errors(self.complete, count), count, *given)
         errors = jnp.where(jnp.isfinite(errors), errors, 0.0)  # a root at zero has no slope
         instant = INSTANT * SMALLEST_STEP * jnp.maximum(jnp.abs(t), jnp.abs(latest))
         rounding, rate_rounding = GUARD_NOISE * sizes, GUARD_NOISE * (rate_sizes + errors)
