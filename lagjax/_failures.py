@@ -15,7 +15,7 @@ from jax.core import ShapedArray
 from jax.experimental.buffer_callback import buffer_callback
 from jax.interpreters import ad, batching, mlir
 
-from lagjax._custom import VaryingPrimitive, attach_derivative, batch_in_front, cond_alike
+from lagjax._custom import VaryingPrimitive, batch_in_front, cond_alike
 from lagjax._results import ENDED_WELL, RESULTS, SimulationError, advice, code_of, result_from
 
 
@@ -123,42 +123,63 @@ batching.primitive_batchers[check_p] = lambda args, axes, **settings: (
 
 def nan_unless(reached, x):
     """`x` where `reached` holds, else NaN; so are its derivatives, but for the zero cotangent of an unused value."""
-    return nan_unless_p.bind(jnp.broadcast_to(reached, jnp.shape(x)), x)
+    return lost_unless(reached, x, ())
 
 
 def lost_unless(reached, x, inputs):
-    """`nan_unless` for what is a constant where it was not reached: its cotangent goes to all floats of `inputs`.
+    """`x` where `reached` holds, else NaN; and so are its derivatives of every order by it and all floats of `inputs`.
 
-    By way of a function of them whose derivatives of every order are not zero: a sine, and not a sum.
+    Where a derivative is not wanted, it stays zero.
     """
-    floats = [x for x in jax.tree.leaves(inputs) if jnp.issubdtype(jnp.result_type(x), jnp.floating)]
-    anything = jnp.sin(sum(jnp.sum(jnp.where(jnp.isfinite(x), x, 0.0)) for x in floats))
-    return nan_unless(reached, jnp.where(reached, x, anything))
+    return nan_unless_p.bind(jnp.broadcast_to(reached, jnp.shape(x)), x, *_floats(inputs), marks=True, batch=0)
 
 
 def differentiable_where(well, x, *inputs):
     """`x` itself, whose derivatives by it and by `inputs` are NaN unless `well` holds."""
-    return attach_derivative(lambda well, x, *more: (lost_unless(well, x, (x, *more)),), (x,), well, x, *inputs)[0]
+    return nan_unless_p.bind(jnp.broadcast_to(well, jnp.shape(x)), x, *_floats(inputs), marks=False, batch=0)
 
 
-def _nan_unless(reached, x):
-    return jnp.where(reached, x, jnp.nan)
+def _floats(tree) -> list:
+    return [x for x in jax.tree.leaves(tree) if jnp.issubdtype(jnp.result_type(x), jnp.floating)]
 
 
-def _nan_unless_transpose(cotangent, reached, x):
+def _nan_unless(reached, x, *_, marks, batch):
+    return jnp.where(reached, x, jnp.nan) if marks else x
+
+
+def _nan_unless_transpose(cotangent, reached, x, *inputs, marks, batch):
+    """Of what is linear in x and in some of the inputs, with this many axes of a `batch` in front."""
     cotangent = ad.instantiate_zeros(cotangent)
-    return [None, jnp.where(reached | (cotangent == 0), cotangent, jnp.nan)]
+    kept = reached | (cotangent == 0)
+    all_kept = kept.all(tuple(range(batch, kept.ndim)))
+
+    def lose(linear):
+        shape = linear.aval.shape
+        return jnp.broadcast_to(
+            jnp.where(all_kept, 0.0, jnp.nan).reshape(all_kept.shape + (1,) * (len(shape) - batch)), shape
+        ).astype(linear.aval.dtype)
+
+    of_x = jnp.where(kept, cotangent, jnp.nan) if ad.is_undefined_primal(x) else None
+    return [None, of_x, *(lose(x) if ad.is_undefined_primal(x) else None for x in inputs)]
 
 
-def _nan_unless_jvp(primals, tangents):
-    reached, _ = primals
-    return nan_unless_p.bind(*primals), nan_unless_p.bind(reached, ad.instantiate_zeros(tangents[1]))
+def _nan_unless_jvp(primals, tangents, **settings):
+    """Its derivative varies with what varies, and once more with everything."""
+    reached, x, *inputs = primals
+    moving = [t for t in tangents[2:] if not isinstance(t, ad.Zero)]
+    along = ad.instantiate_zeros(tangents[1])
+    values = nan_unless_p.bind(*primals, **settings)
+    return values, nan_unless_p.bind(reached, along, *moving, x, *inputs, **settings | {"marks": True})
+
+
+def _nan_unless_batch(args, axes, *, marks, batch):
+    return nan_unless_p.bind(*batch_in_front(args, axes), marks=marks, batch=batch + 1), 0
 
 
 nan_unless_p = VaryingPrimitive("lagjax_nan_unless")
-nan_unless_p.def_abstract_eval(lambda reached, x: ShapedArray(x.shape, x.dtype))
+nan_unless_p.def_abstract_eval(lambda reached, x, *_, **__: ShapedArray(x.shape, x.dtype))
 nan_unless_p.def_impl(_nan_unless)
 mlir.register_lowering(nan_unless_p, mlir.lower_fun(_nan_unless, multiple_results=False))
 ad.primitive_jvps[nan_unless_p] = _nan_unless_jvp
 ad.primitive_transposes[nan_unless_p] = _nan_unless_transpose
-batching.primitive_batchers[nan_unless_p] = lambda args, axes: (nan_unless_p.bind(*batch_in_front(args, axes)), 0)
+batching.primitive_batchers[nan_unless_p] = _nan_unless_batch

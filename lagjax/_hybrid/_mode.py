@@ -32,7 +32,6 @@ from lagjax._machine_code import (
     MachineCode,
     Surfaces,
     crossing_variation,
-    flow_of,
     require_one_number,
     vector_of,
 )
@@ -188,13 +187,13 @@ class Mode(NamedTuple):
         of_numbers = jnp.pad(of_params, (0, self.vector.size - of_params.size))  # what modes differ by is exact
         return self._surfaces.evaluate_guards(t, y, self.vector, latest, (of_state, of_numbers))
 
-    def crossing(self, k: int) -> Callable:
-        """`(taken, t, y, numbers)` → (t, y): the state at t, where guard k is zero and stays so as what went in varies.
+    def crossing(self, k, taken, t, y, numbers) -> tuple:
+        """(t, y): the state at t, where guard k is zero and stays so as what went in varies, if it is `taken`.
 
         See `_machine_code.crossing_variation`.
         """
-        moved = functools.partial(crossing_variation(self._surfaces, flow_of(self.problem).general_program), k)
-        return lambda taken, t, y, numbers: attach_derivative(moved, (t, y), taken, t, y, numbers)
+        moved = crossing_variation(self._surfaces)
+        return attach_derivative(moved, (t, y), k, taken, t, y, numbers)
 
     def is_inconsistent(self, t, y):
         """True if a state is off the constraints of this mode."""

@@ -14,7 +14,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._custom import vary_alike
 from lagjax._failures import lost_unless
 from lagjax._hybrid._families import SystemFamily, families
 from lagjax._hybrid._mode import Mode, Transition, state_after
@@ -195,11 +194,11 @@ def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree) -> tu
         modes=jnp.full(ts.size, -1), steps=jnp.zeros(2, int), latest=jnp.asarray(-1), memory=rounds.no_memory(0.0, 0.0),
         let_out=jnp.full(len(plan.transitions), jnp.nan),
     )  # fmt: skip
-    leaves, structure = jax.tree.flatten(first)
-    first = jax.tree.unflatten(structure, vary_alike(leaves, like=(ts, y0, rounds.groups[0].first.vector)))
+    first = _vary_with(first, ts, y0, rounds.groups[0].first.vector)
     ending, record = jax.lax.scan(rounds.run_round, first, jnp.arange(plan.max_transitions + 1))
     record = jax.tree.map(lambda x: x[: plan.max_transitions], record)
-    named = jnp.where(_go_in_turn(record), IN_TURN, jnp.where(_pile_up(record.t, ts[-1]), ZENO, TOO_MANY))
+    still = jax.lax.stop_gradient(record)
+    named = jnp.where(_go_in_turn(still), IN_TURN, jnp.where(_pile_up(still.t, ts[-1]), ZENO, TOO_MANY))
     ending = ending._replace(result=jnp.where(ending.result == TOO_MANY, named, ending.result))
     return _lose_unreached(ending, record, (ts, y0, rounds.groups[0].first.vector))
 
@@ -296,31 +295,35 @@ class _Rounds(NamedTuple):
 
         One that the motion was `put` beyond is no crossing: it happens when the mode begins, however that varies.
         """
-        no, none, place = jnp.asarray(False), jnp.asarray(-1), before.mode
-        exit = Exit(t, y, y, place, none, no, no, jnp.asarray(True), no)
+        no, place = jnp.asarray(False), before.mode
         if not mode.leaving:
-            return exit, self.no_memory(known[0].rounding, known[0].rate_rounding)
-        y_here, numbers = _constant_unless((kinds > 0).any(), (y, mode.vector))
+            none = Exit(t, y, y, place, jnp.asarray(-1), no, no, jnp.asarray(True), no)
+            return none, self.no_memory(known[0].rounding, known[0].rate_rounding)
+        happens, k = (kinds > 0).any(), jnp.argmax(kinds > 0)
+        y_here, vector = _constant_unless(happens, (y, mode.vector))
         guarded = mode.guards_at(t, y, self.ts[-1])
         rates = guarded.clear_rates(known[0].rate_rounding[mode.numbers])
-        earlier = jnp.asarray(False)
-        for k, transition in enumerate(mode.leaving):
-            taken = (kinds[k] > 0) & ~earlier
-            earlier = earlier | taken
-            # It changes sign at once, against its rate: the motion that turns it round is lost in rounding.
-            against = jnp.where(kinds[k] == 2, rates[k] < 0, rates[k] > 0) & at_once & ~put[k]
-            crossed = mode.crossing(k)(taken & ~put[k], t, y_here, numbers)
-            t_zero, y_zero = _select(taken & put[k], (before.t, before.y), crossed)
-            y_next = state_after(transition, mode.layout, *_constant_unless(taken, (t_zero, y_zero, mode.params)))
-            target, number = jnp.asarray(mode.targets[k]), jnp.asarray(mode.numbers[k])
-            inconsistent = self.is_inconsistent(target, t_zero, y_next, group.targets[:, k].tolist())
-            this = Exit(t_zero, y_zero, y_next, target, number, against, inconsistent, no, no)
-            exit = _select(taken, this, exit)
+        # It changes sign at once, against its rate: the motion that turns it round is lost in rounding.
+        against = happens & jnp.where(kinds[k] == 2, rates[k] < 0, rates[k] > 0) & at_once & ~put[k]
+        crossed = mode.crossing(k, happens & ~put[k], t, y_here, vector)
+        t_zero, y_zero = _select(happens, _select(put[k], (before.t, before.y), crossed), (t, y))
+        y_next = y_zero
+        for j, transition in enumerate(mode.leaving):
+            if transition.reset is not None:
+                taken = happens & (k == j)
+                moved = state_after(transition, mode.layout, *_constant_unless(taken, (t_zero, y_zero, mode.params)))
+                y_next = jnp.where(taken, moved, y_next)
+        target, number = (
+            jnp.where(happens, jnp.asarray(x)[k], other) for x, other in ((mode.targets, place), (mode.numbers, -1))
+        )
+        inconsistent = happens & self.is_inconsistent(
+            target, t_zero, y_next, [*np.unique(group.targets), *group.family.modes]
+        )
         memory = self._memory(mode, guarded, rates, kinds, *known)
         there = (kinds > 0) | (jnp.abs(guarded.values) <= memory.rounding[mode.numbers] + guarded.of_time)
         order_matters = self._order_matters(group, mode, place, t, y, rates, there & (kinds > 0).any())
         defined = ~jnp.isnan(guarded.values).any()
-        return exit._replace(guards_defined=defined, order_matters=order_matters), memory
+        return Exit(t_zero, y_zero, y_next, target, number, against, inconsistent, defined, order_matters), memory
 
     def _order_matters(self, group: ModeGroup, mode: Mode, place, t, y, rates, there) -> jax.Array:
         """True if blows of guards that are `there`, (K,), lead elsewhere when the list is read from its end.
@@ -456,6 +459,22 @@ class _Rounds(NamedTuple):
         known = before.let_out[mode.numbers]
         now = jnp.where(are_let_out & jnp.isnan(known), jax.lax.stop_gradient(before.t), known)
         return before.let_out.at[mode.numbers].set(now)
+
+
+def _vary_with(first: Ending, *inputs) -> Ending:
+    """The state before the first round as it is, with a derivative, a batch and mesh axes where a later one has them.
+
+    Else JAX writes the rounds down once more for the numbers that get theirs in a round. Of a sine, so do derivatives.
+    """
+    moving = jnp.sin(sum(x.ravel()[0] for x in inputs if x.size))
+    still = jax.lax.stop_gradient(moving)
+
+    def vary(x, like=still):
+        return jnp.where(False, like.astype(jnp.asarray(x).dtype), x)
+
+    return jax.tree.map(vary, first)._replace(
+        t=vary(first.t, moving), y=vary(first.y, moving), path=vary(first.path, moving)
+    )
 
 
 def _select(condition, new: PyTree, old: PyTree) -> PyTree:

@@ -124,9 +124,9 @@ def _register_once() -> None:
     addresses = {_TARGET: _native.handler().address}
     addresses |= {f"lagjax_{kind}": _native.derivative_handler(kind).address for kind in _SWEEPS}
     for target, address in addresses.items():
-        jax.ffi.register_ffi_target(target, _capsule(address), platform="cpu", api_version=1)
+        jax.ffi.register_ffi_target(target, capsule(address), platform="cpu", api_version=1)
 
 
-def _capsule(address: int):
+def capsule(address: int):
     new = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
     return new(("PyCapsule_New", ctypes.pythonapi))(address, None, None)

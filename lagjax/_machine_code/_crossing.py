@@ -140,7 +140,7 @@ def _run_to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tol
 @functools.lru_cache(maxsize=64)
 def _event_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
     """`(ts, y0, params, t_end, result, event)` → path, y_end, t_end, for the sake of their derivatives."""
-    move_to_zero, each = crossing_variation(surfaces, flow.general_program), np.arange(len(surfaces.directions))
+    move_to_zero, each = crossing_variation(surfaces), np.arange(len(surfaces.directions))
 
     @jax.jit
     def run_unguarded(ts, y0, params, t_stop, result, event):
@@ -208,7 +208,7 @@ def _run_with_crossings(
 @functools.lru_cache(maxsize=64)
 def _crossings_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
     """`(ts, y0, params, t)` → t (G, room) and y (G, room, 2n), for the sake of their derivatives."""
-    move_to_zero, each = crossing_variation(surfaces, flow.general_program), np.arange(len(surfaces.directions))
+    move_to_zero, each = crossing_variation(surfaces), np.arange(len(surfaces.directions))
 
     @jax.jit
     def run_unguarded(ts, y0, params, t):

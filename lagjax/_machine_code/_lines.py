@@ -1,4 +1,4 @@
-"""Straight lines as functions of JAX that NumPy evaluates: for programs that XLA would compile for minutes.
+"""Straight lines as functions of JAX that XLA does not compile: machine code of our own evaluates them, or NumPy.
 
 With y = g(x) a line and D its derivative by x, there are three functions,
 
@@ -12,10 +12,12 @@ and their own derivatives are these again, of other lines, so that there are der
     d forward = forward(x, dv) + forward of the line (x, v) ↦ D(x) v, along dx
     d back    = back(x, dw)    + forward of the line (x, w) ↦ D(x)ᵀ w, along dx
 
-A line is differentiated on its graph (`_program._differentiation`), which takes milliseconds.
+A line is differentiated on its graph (`_program._differentiation`), which takes milliseconds. XLA takes that for each
+operation: derivatives of a motion by its duration compiled for 14 s longer with 188 operations, for minutes with 672.
 """
 
 import functools
+import math
 from collections.abc import Callable
 
 import jax
@@ -25,34 +27,36 @@ from jax.core import ShapedArray
 from jax.interpreters import ad, batching, mlir
 
 from lagjax._custom import VaryingPrimitive, batch_in_front
-from lagjax._machine_code._call import call_host
-from lagjax._program import Program, StraightLine, evaluate, pullback, pushforward, steps_of
+from lagjax._machine_code._call import NO_HANDLER, call_host, capsule
+from lagjax._native import LARGEST_LINE, LineCode, line_handler
+from lagjax._program import Program, StraightLine, Unlowerable, emit, evaluate, pullback, pushforward, steps_of
 
-# Operations of a program that XLA compiles; NumPy evaluates a larger one. The second derivative of a motion by its
-# duration took 14 s more of compilation than NumPy takes in all for 188 operations, and minutes for 672. In a compiled
-# loop a small one is faster through XLA. Twice as many would cost several seconds of compilation.
+_TARGET = "lagjax_line"
+# Operations of a line on a GPU that XLA compiles; NumPy on the host evaluates a longer one. Twice as many would cost
+# several seconds of compilation.
 LARGEST_COMPILED = 100
 
 
 def outputs(program: Program, count: int, first, numbers):
-    """The first `count` outputs (…, count) for the first inputs (…, m) and the others (…, P), by XLA or by NumPy."""
-    if not is_large(program):
+    """The first `count` outputs (…, count) for the first inputs (…, m) and the others (…, P)."""
+    if not is_line(program) or jnp.result_type(first) != np.dtype(float):
         return jnp.stack(program.compute_outputs(first, numbers)[:count], axis=-1)
+    return _line_of(program.line, count, program.size)(_side_by_side(first, numbers))
+
+
+def is_line(program: Program) -> bool:
+    """True if the inputs of a program are floats, and none are in tables."""
+    return all(dtype.kind == "f" for dtype in program.dtypes) and not program.looks_up
+
+
+def _side_by_side(first, numbers):
     shape = jnp.broadcast_shapes(first.shape[:-1], numbers.shape[:-1])
-    parts = [jnp.broadcast_to(x, (*shape, x.shape[-1])) for x in (first, numbers)]
-    return _line_of(program, count)(jnp.concatenate(parts, axis=-1))
-
-
-def is_large(program: Program) -> bool:
-    """True if NumPy evaluates it: one of many operations, on floats alone, that looks up no tables."""
-    floats = all(dtype.kind == "f" for dtype in program.dtypes)
-    return floats and program.operations > LARGEST_COMPILED and not program.looks_up
+    return jnp.concatenate([jnp.broadcast_to(x, (*shape, x.shape[-1])) for x in (first, numbers)], axis=-1)
 
 
 @functools.lru_cache(maxsize=64)
-def _line_of(program: Program, count: int) -> "Line":
-    line = StraightLine(program.nodes, program.kinds, program.outputs[:count])
-    return Line(line, program.size, program.size)
+def _line_of(line: StraightLine, count: int, size: int) -> "Line":
+    return Line(line._replace(outputs=line.outputs[:count]), size, size)
 
 
 class Line:
@@ -67,6 +71,16 @@ class Line:
     @property
     def outputs(self) -> int:
         return len(self.line.outputs)
+
+    @functools.cached_property
+    def code(self) -> LineCode | None:
+        """Its machine code; None where it has none, or one that takes long to make."""
+        if NO_HANDLER is not None or len(self.line.nodes) > LARGEST_LINE:
+            return None
+        try:
+            return LineCode(self.line, self.size)
+        except Unlowerable:
+            return None
 
     @functools.cached_property
     def steps(self) -> Callable:
@@ -157,14 +171,44 @@ def _register(primitive, of, width) -> None:
     def call_back(*arrays, line: Line):
         return call_host(functools.partial(host, line=line), [shape(*arrays, line=line)], *arrays)[0]
 
+    def call_code(*arrays, line: Line):
+        x = jnp.concatenate(arrays, axis=-1)
+        result, code = shape(*arrays, line=line), of(line).code
+        assert code is not None
+        rows = jax.ShapeDtypeStruct((math.prod(x.shape[:-1]), of(line).outputs), np.float64)
+        found = jax.ffi.ffi_call(_TARGET, rows)(x.reshape(-1, x.shape[-1]), line=np.int64(code.address))
+        return found.reshape(result.shape)
+
+    def lower_on_cpu(context, *arrays, line: Line):
+        if context.module_context.lowering_parameters.for_export:  # it runs elsewhere
+            return mlir.lower_fun(compile_operations, multiple_results=False)(context, *arrays, line=line)
+        code = of(line).code
+        if code is None:
+            return mlir.lower_fun(call_back, multiple_results=False)(context, *arrays, line=line)
+        _register_handler()
+        # What XLA compiled keeps its callbacks; this one is never called, and keeps the machine code.
+        context.module_context.add_host_callback(functools.partial(id, code))
+        return mlir.lower_fun(call_code, multiple_results=False)(context, *arrays, line=line)
+
+    def compile_operations(*arrays, line: Line):
+        nodes, kinds, results = of(line).line
+        return jnp.stack(emit(nodes, kinds, results, tuple(x[..., i] for x in arrays for i in range(x.shape[-1]))), -1)
+
     def call_from_gpu(*arrays, line: Line):
+        if len(of(line).line.nodes) <= LARGEST_COMPILED:
+            return compile_operations(*arrays, line=line)
         return jax.pure_callback(functools.partial(compute, line=line), shape(*arrays, line=line), *arrays)
 
     primitive.def_abstract_eval(shape)
     primitive.def_impl(evaluate)
-    for platform, form in (("cpu", call_back), ("cuda", call_from_gpu)):
-        mlir.register_lowering(primitive, mlir.lower_fun(form, multiple_results=False), platform=platform)
+    mlir.register_lowering(primitive, lower_on_cpu, platform="cpu")
+    mlir.register_lowering(primitive, mlir.lower_fun(call_from_gpu, multiple_results=False), platform="cuda")
     batching.primitive_batchers[primitive] = _batch_rule(primitive)
+
+
+@functools.cache
+def _register_handler() -> None:
+    jax.ffi.register_ffi_target(_TARGET, capsule(line_handler()), platform="cpu", api_version=1)
 
 
 _register(value_p, lambda line: line, lambda line: line.outputs)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from lagjax._machine_code._flow import Flow
-from lagjax._machine_code._lines import is_large, outputs
+from lagjax._machine_code._lines import outputs
 from lagjax._program import emit
 
 INSTANT = 1e-9  # of the time; what a border is off by while a motion slides along it is rounding
@@ -23,7 +23,7 @@ def rate(flow: Flow, t, y, params):
     n = flow.size
     borders = flow.borders
     slides = borders is not None and any(guard.slide >= 0 for guard in borders.guards)
-    if flow.general_program.looks_up or (is_large(flow.general_program) and not slides):
+    if flow.general_program.looks_up or not slides:
         return _rate_from_rows(flow, t, y, params)
     scalars = (*(y[..., i] for i in range(2 * n)), t, *(params[..., i] for i in range(flow.numbers)))
     scalars = jnp.broadcast_arrays(*scalars)

@@ -48,12 +48,14 @@ class Surfaces(NamedTuple):
 
     `values` gives all g. `complete` gives what `_native.Guards` wants: g, then ġ, then the sizes of both, which bound
     their round-off; and for a start that `is_rounded` to float32, unless the motion remembers it, that of the start.
-    `borders` gives how far every number by which a guard is pieced together is from its border. What `holds` ends a
-    motion at once that begins beyond it, in its direction.
+    `borders` gives how far every number by which a guard is pieced together is from its border, and `followed()` all g
+    and these distances, how fast both change along the motion, and (q̇, q̈). What `holds` ends a motion at once that
+    begins beyond it, in its direction.
     """
 
     values: Program
     complete: Program
+    followed: Callable[[], Program]
     directions: tuple[int, ...]
     is_rounded: bool = False
     borders: StraightLine | None = None
@@ -112,9 +114,12 @@ class Surfaces(NamedTuple):
             params = eqx.combine(numbers, structure.unflatten(code))
             return jnp.stack([function(y, params) for function in functions])
 
-        def complete(y, numbers):
+        def rate_of(y, numbers):
             acceleration = jnp.stack(program.complete.compute_outputs(y, vector_of(numbers))[:n])
-            rate = jnp.concatenate([y[n:-1], acceleration, jnp.ones(1)])
+            return jnp.concatenate([y[n:-1], acceleration, jnp.ones(1)])
+
+        def complete(y, numbers):
+            rate = rate_of(y, numbers)
             by_y = jax.jacfwd(values)(y, numbers)
             terms, moving = by_y * y, by_y * rate
             found = values(y, numbers), moving.sum(1), jnp.abs(terms).sum(1), jnp.abs(moving).sum(1)
@@ -128,7 +133,18 @@ class Surfaces(NamedTuple):
         y = jax.ShapeDtypeStruct((2 * n + 1,), derivation.layout.dtype)
         numbers = derivation.numbers
         lowered = lower(values, y, numbers)
-        return cls(lowered, lower(complete, y, numbers), directions, is_rounded, _borders_of(lowered, n))
+        pieces = _borders_of(lowered, n)
+
+        def followed(y, numbers):
+            def away(y):
+                more = () if pieces is None else emit(*pieces, (*y, *vector_of(numbers)))
+                return jnp.stack([*values(y, numbers), *more])
+
+            rate = rate_of(y, numbers)
+            return *jax.jvp(away, (y,), (rate,)), rate[:-1]
+
+        follow = functools.cache(lambda: lower(followed, y, numbers))
+        return cls(lowered, lower(complete, y, numbers), follow, directions, is_rounded, pieces)
 
 
 @functools.lru_cache(maxsize=64)
@@ -162,10 +178,10 @@ def require_one_number(value, what: str) -> jax.Array:
     return value
 
 
-def crossing_variation(surfaces: Surfaces, program: Program) -> Callable:
+def crossing_variation(surfaces: Surfaces) -> Callable:
     """`(k, taken, t, y, numbers)` → (t, y): the state at t, where guard k is zero, moved to where it is zero then.
 
-    With δg the variation of the guard, f the rate of the state by the `program` of q̈, and ′ the derivative along the
+    With δg the variation of the guard, f the rate of the state, and ′ the derivative along the
     motion, the time moves by
 
         s = −ε − ½ (g″/g′) ε²,  ε = δg/g′        and the state by   f s + ½ f′ s²,
@@ -176,28 +192,25 @@ def crossing_variation(surfaces: Surfaces, program: Program) -> Callable:
     """
     still, count = jax.lax.stop_gradient, len(surfaces.directions)
 
+    def follow(t, y, numbers):
+        program, n = surfaces.followed(), y.shape[0] // 2
+        found = outputs(program, len(program.outputs), jnp.append(y, t), numbers)
+        return jnp.split(found, [len(found) // 2 - n, len(found) - 2 * n])
+
     def move_to_zero(k, taken, t, y, numbers):
-        def rates(t, y):
-            n, at = y.shape[0] // 2, (jnp.append(y, t), numbers)
-            return outputs(surfaces.complete, 2 * count, *at)[count + k], jnp.append(y[n:], outputs(program, n, *at))
-
-        def away(t, y, numbers):
-            """The guard, and how far the numbers are from their borders by which it is pieced together."""
-            at, line = jnp.append(y, t), surfaces.borders
-            more = () if line is None else emit(*line, (*at, *numbers))
-            return jnp.stack([outputs(surfaces.values, count, at, numbers)[k], *more])
-
-        def rates_away(t, y):
-            rate, slope = rates(t, y)
-            if surfaces.borders is None:
-                return rate[None], slope
-            return jax.jvp(lambda t, y: away(t, y, numbers), (t, y), (jnp.ones_like(t), slope))[1], slope
-
-        value, (rate, slope) = away(t, y, numbers), rates_away(t, y)
-        bend, turn = map(still, jax.jvp(rates_away, (t, y), (jnp.ones_like(t), slope))[1])
-        times = jnp.abs(still(value / rate))
-        times = jnp.where(jnp.isnan(times), jnp.inf, times).at[1:].multiply(_LATER)
-        value, rate, bend = (x[jnp.argmin(times)] for x in (value, rate, bend))
+        numbers_there = still(numbers)
+        values, rates, slope = follow(t, y, numbers)
+        _, (_, bends, turn) = jax.jvp(
+            lambda t, y: follow(t, y, numbers_there), still((t, y)), (jnp.ones_like(t), still(slope))
+        )
+        at = k
+        if surfaces.borders is not None:
+            times = jnp.abs(still(values / rates))
+            times = jnp.where(jnp.isnan(times), jnp.inf, times).at[count:].multiply(_LATER)
+            at = jnp.argmin(
+                jnp.where((jnp.arange(times.size) >= count) | (jnp.arange(times.size) == k), times, jnp.inf)
+            )
+        value, rate, bend = values[at], rates[at], bends[at]
         crosses = ~taken | (rate != 0)
         rate = jnp.where(taken & crosses, rate, 1.0)
         part = jnp.where(taken, value - still(value), 0.0) / rate

@@ -28,6 +28,7 @@ one Taylor series, of the order that the tolerance asks for.
     _replay              recorded steps once more;  _tangent, _adjoint: their maps forward and back
     _kernel              motions and derivatives as functions of arrays;  _threads: on several cores, interruptible
     _handler             the motion as a call of XLA;  _derivative_handler: derivatives of short motions
+    _line_handler        any straight line as a call of XLA
     _gpu                 the modules of one lane as programs for NVIDIA GPUs;  _gpu_entry: what a thread of these does
 
 Nothing here knows JAX: arrays are NumPy's, and a program is data (`_program._series.Recurrent`).
@@ -42,6 +43,7 @@ from lagjax._native._constants import (
     EVENT,
     GUARD_NOISE,
     INSTANT,
+    LARGEST_LINE,
     NOT_FINITE,
     OUT_OF_STEPS,
     PROJECTION_FAILED,
@@ -61,6 +63,7 @@ from lagjax._native._kernel import (
     cores,
     floor_of,
 )
+from lagjax._native._line_handler import LineCode, line_handler
 from lagjax._native._parts import Projection, pieces_of, recurrences, require_recurrences
 from lagjax._native._taylor import is_large, order_for
 from lagjax._native._threads import map_in_threads
@@ -74,6 +77,7 @@ __all__ = [
     "EVENT",
     "GUARD_NOISE",
     "INSTANT",
+    "LARGEST_LINE",
     "NOT_FINITE",
     "OUT_OF_STEPS",
     "PROJECTION_FAILED",
@@ -85,6 +89,7 @@ __all__ = [
     "DerivativePlan",
     "Guards",
     "Kernel",
+    "LineCode",
     "Nesting",
     "Outcome",
     "Plan",
@@ -97,6 +102,7 @@ __all__ = [
     "handler",
     "is_large",
     "lanes",
+    "line_handler",
     "map_in_threads",
     "order_for",
     "pieces_of",

@@ -17,7 +17,7 @@ from llvmlite import ir
 from lagjax._native import _adjoint, _integrator, _tangent
 from lagjax._native._constants import DONE
 from lagjax._native._frame import CACHE_LINE
-from lagjax._native._handler import call, handler_function, job_of, load_at
+from lagjax._native._handler import call, handler_function, job_of, load_at, run_call
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value, compile_module, lanes
 from lagjax._native._output import RECORDED
 
@@ -79,7 +79,7 @@ class SweepHandler:
     def __init__(self, kind: str):
         module = ir.Module(kind)
         module.triple = ""
-        handler_function(module, _SweepCode(module, KINDS[kind]).code, len(ARGUMENTS), len(RESULTS))
+        handler_function(module, len(ARGUMENTS), len(RESULTS), run_call(_SweepCode(module, KINDS[kind]).code))
         self._engine, places = compile_module(module, ("handler",))
         self.address = places["handler"]
 

@@ -14,6 +14,7 @@ import ctypes
 import functools
 import re
 import threading
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -154,7 +155,7 @@ class Handler:
     def __init__(self):
         module = ir.Module("handler")
         module.triple = ""
-        handler_function(module, _RunCode(module).code, len(ARGUMENTS), len(RESULTS))
+        handler_function(module, len(ARGUMENTS), len(RESULTS), run_call(_RunCode(module).code))
         self._engine, places = compile_module(module, ("handler", "begin_run"))
         self.address, pointers = places["handler"], 1 + len(ARGUMENTS) + len(RESULTS)
         kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * pointers, *[ctypes.c_int64] * 4)
@@ -178,11 +179,11 @@ def _make_handler() -> Handler:
 # ---- XLA's side ------------------------------------------------------------------------------------------------------
 
 
-def handler_function(module: ir.Module, work: Code, arguments: int, results: int) -> None:
+def handler_function(module: ir.Module, arguments: int, results: int, work: Callable) -> None:
     """`XLA_FFI_Error* handler(XLA_FFI_CallFrame*)`, which reads the frame.
 
-    It calls `work(plan, *arguments, *results, members, times, rows of ts, rows of params)` with their addresses; the
-    first three arguments are `ts`, `y0` and `params`.
+    `work(code, plan, data, dims)` writes down what it does: with the address that is the attribute, with those of the
+    arguments and results, and with those of their sizes.
     """
     code, null = Code(module, "handler", [POINTER], lanes(), result=POINTER, public=True), ir.Constant(POINTER, None)
     (frame,) = code.arguments
@@ -193,10 +194,22 @@ def handler_function(module: ir.Module, work: Code, arguments: int, results: int
     args, rets, attrs = (load_at(frame, offset, POINTER) for offset in (_ARGS, _RETS, _ATTRS))
     plan = load_at(load_at(element(attrs, 0), _SCALAR_VALUE, POINTER), 0, POINTER)
     buffers = [element(args, i) for i in range(arguments)] + [element(rets, i) for i in range(results)]
-    ts, y0, params = (load_at(buffer, _DIMS, POINTER) for buffer in buffers[:3])
-    sizes = load_at(y0, 0, INTEGER), load_at(ts, 8, INTEGER), load_at(ts, 0, INTEGER), load_at(params, 0, INTEGER)
-    code.call(work, plan, *(load_at(buffer, _DATA, POINTER) for buffer in buffers), *sizes)
+    work(code, plan, *([load_at(buffer, offset, POINTER) for buffer in buffers] for offset in (_DATA, _DIMS)))
     code.builder.ret(null)
+
+
+def run_call(run: Code) -> Callable:
+    """`work` of a handler: `run(plan, *data, members, times, rows of ts, rows of params)`.
+
+    The first three arguments are `ts`, `y0` and `params`.
+    """
+
+    def work(code: Code, plan: Value, data: list[Value], dims: list[Value]) -> None:
+        ts, y0, params = dims[:3]
+        sizes = load_at(y0, 0, INTEGER), load_at(ts, 8, INTEGER), load_at(ts, 0, INTEGER), load_at(params, 0, INTEGER)
+        code.call(run, plan, *data, *sizes)
+
+    return work
 
 
 def _tell_version(code: Code, extension: Value) -> None:

@@ -1,0 +1,59 @@
+"""Straight lines as calls of XLA: rows of inputs to rows of outputs, without Python and without a compiler of XLA's.
+
+One handler serves all lines: the attribute of a call is where the machine code of its line is.
+"""
+
+import functools
+import threading
+
+from llvmlite import ir
+
+from lagjax._native._handler import call, handler_function, load_at
+from lagjax._native._ir import INTEGER, POINTER, Code, Value, compile_module
+from lagjax._native._lanes import emit, sincos_function
+from lagjax._program._series import StraightLine
+
+_lock = threading.Lock()
+
+
+class LineCode:
+    """A straight line of `inputs` floats in machine code, for as long as this object lives.
+
+    At its `address` is `evaluate(x, out, rows)`, with x (rows, inputs) and out (rows, outputs). Raises `Unlowerable`.
+    """
+
+    def __init__(self, line: StraightLine, inputs: int):
+        module, outputs = ir.Module("line"), len(line.outputs)
+        module.triple = ""
+        turns = any(op in ("sin", "cos") for op, _, _ in line.nodes)
+        sincos = sincos_function(module, 1) if turns else None
+        code = Code(module, "evaluate", [POINTER, POINTER, INTEGER], 1, public=True)
+        x, out, rows = code.arguments
+        with code.loop(rows) as row:
+            read = functools.cache(lambda i: code.load(code.element(x, row * inputs + i), code.vector))
+            for k, value in enumerate(emit(code, line, read, sincos, None)):
+                number = code.as_number(value) if line.kinds[line.outputs[k]] == "bool" else value
+                code.store(code.lanes_of(number), code.element(out, row * outputs + k))
+        code.finish()
+        self._engine, places = compile_module(module, ("evaluate",))
+        self.address = places["evaluate"]
+
+
+def line_handler() -> int:
+    """The address of the handler of all lines: of one argument (rows, inputs) and one result (rows, outputs), doubles."""
+    with _lock:
+        return _make_handler()[1]
+
+
+@functools.cache
+def _make_handler() -> tuple:
+    module = ir.Module("line_handler")
+    module.triple = ""
+
+    def evaluate(code: Code, line: Value, data: list[Value], dims: list[Value]) -> None:
+        address = Value(code, code.builder.ptrtoint(line.it, INTEGER))
+        call(code, address, ir.VoidType(), *data, load_at(dims[0], 0, INTEGER))
+
+    handler_function(module, 1, 1, evaluate)
+    engine, places = compile_module(module, ("handler",))
+    return engine, places["handler"]
