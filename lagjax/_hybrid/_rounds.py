@@ -250,7 +250,7 @@ class _Rounds(NamedTuple):
         t_start, memory = jax.lax.stop_gradient(before.t), before.memory
         outset = self._outset(group, mode, guarded, before)
         horizon = jnp.where(here, self.ts[-1], t_start)
-        noted = jnp.concatenate([outset.sides, memory.rate_rounding[mode.numbers]])
+        noted = jnp.concatenate([outset.sides, _pick(memory.rate_rounding, self._places_of(mode))])
         located = mode.solve_to_event(jnp.stack([t_start, horizon]), before.y, noted)
         changes = jnp.where(here, located.event, 0)
         t_end = jnp.where(here & (located.result == SUCCESSFUL), self.ts[-1], located.t_end)
@@ -300,13 +300,15 @@ class _Rounds(NamedTuple):
             none = Exit(t, y, y, place, jnp.asarray(-1), no, no, jnp.asarray(True), no)
             return none, self.no_memory(known[0].rounding, known[0].rate_rounding)
         happens, k = (kinds > 0).any(), jnp.argmax(kinds > 0)
+        first, places = np.arange(len(mode.leaving)) == k, self._places_of(mode)
         y_here, vector = _constant_unless(happens, (y, mode.vector))
         guarded = mode.guards_at(t, y, self.ts[-1])
-        rates = guarded.clear_rates(known[0].rate_rounding[mode.numbers])
+        rates = guarded.clear_rates(_pick(known[0].rate_rounding, places))
         # It changes sign at once, against its rate: the motion that turns it round is lost in rounding.
-        against = happens & jnp.where(kinds[k] == 2, rates[k] < 0, rates[k] > 0) & at_once & ~put[k]
-        crossed = mode.crossing(k, happens & ~put[k], t, y_here, vector)
-        t_zero, y_zero = _select(happens, _select(put[k], (before.t, before.y), crossed), (t, y))
+        against = happens & _pick(jnp.where(kinds == 2, rates < 0, rates > 0) & ~put, first) & at_once
+        is_put = _pick(put, first)
+        crossed = mode.crossing(k, happens & ~is_put, t, y_here, vector)
+        t_zero, y_zero = _select(happens, _select(is_put, (before.t, before.y), crossed), (t, y))
         y_next = y_zero
         for j, transition in enumerate(mode.leaving):
             if transition.reset is not None:
@@ -314,13 +316,14 @@ class _Rounds(NamedTuple):
                 moved = state_after(transition, mode.layout, *_constant_unless(taken, (t_zero, y_zero, mode.params)))
                 y_next = jnp.where(taken, moved, y_next)
         target, number = (
-            jnp.where(happens, jnp.asarray(x)[k], other) for x, other in ((mode.targets, place), (mode.numbers, -1))
+            jnp.where(happens, _pick(jnp.asarray(x), first), other)
+            for x, other in ((mode.targets, place), (mode.numbers, -1))
         )
         inconsistent = happens & self.is_inconsistent(
             target, t_zero, y_next, [*np.unique(group.targets), *group.family.modes]
         )
         memory = self._memory(mode, guarded, rates, kinds, *known)
-        there = (kinds > 0) | (jnp.abs(guarded.values) <= memory.rounding[mode.numbers] + guarded.of_time)
+        there = (kinds > 0) | (jnp.abs(guarded.values) <= _pick(memory.rounding, places) + guarded.of_time)
         order_matters = self._order_matters(group, mode, place, t, y, rates, there & (kinds > 0).any())
         defined = ~jnp.isnan(guarded.values).any()
         return Exit(t_zero, y_zero, y_next, target, number, against, inconsistent, defined, order_matters), memory
@@ -380,14 +383,14 @@ class _Rounds(NamedTuple):
         A guard that changes comes from the side that it leaves. Another one that is on its surface comes from where it
         began, if it `stays` there since or has no rate, and else from where its rate does.
         """
-        numbers = mode.numbers
-        rounding = jnp.maximum(before.rounding[numbers], guarded.rounding)
+        places = self._places_of(mode)
+        rounding = jnp.maximum(_pick(before.rounding, places), guarded.rounding)
         since = jnp.where(stays | (rates == 0), jnp.sign(sides), -jnp.sign(rates))
         here = jnp.where(jnp.abs(guarded.values) > rounding + guarded.of_time, jnp.sign(guarded.values), since)
         here = jnp.where(kinds > 0, jnp.where(kinds == 1, 1.0, -1.0), here)
         nothing = self.no_memory(before.rounding, before.rate_rounding)
-        new = guarded.values, here, rounding, jnp.maximum(before.rate_rounding[numbers], guarded.rate_rounding)
-        return GuardMemory(*(x.at[numbers].set(of_mode) for x, of_mode in zip(nothing, new, strict=True)))
+        new = guarded.values, here, rounding, jnp.maximum(_pick(before.rate_rounding, places), guarded.rate_rounding)
+        return GuardMemory(*(_put(x, places, of_mode) for x, of_mode in zip(nothing, new, strict=True)))
 
     def _note_rounding(self, before: Ending, modes: list[Mode], guards: list[Guarded | None]) -> GuardMemory:
         """The memory with the rounding of the guards where a round begins: of its mode, and of other modes.
@@ -398,13 +401,13 @@ class _Rounds(NamedTuple):
         for index, (mode, guarded) in enumerate(zip(modes, guards, strict=True)):
             if guarded is None:
                 continue
-            here, numbers = place == index, mode.numbers
+            here, back = place == index, self._places_of(mode).T
             alike = np.array(["multipliers" not in transition.guard.extras for transition in mode.leaving])
             values = jnp.where((here | alike) & jnp.isfinite(guarded.rounding), guarded.rounding, 0.0)
             rates = jnp.where(here & jnp.isfinite(guarded.rate_rounding), guarded.rate_rounding, 0.0)
             memory = memory._replace(
-                rounding=memory.rounding.at[numbers].max(values),
-                rate_rounding=memory.rate_rounding.at[numbers].max(rates),
+                rounding=jnp.maximum(memory.rounding, _pick(values, back)),
+                rate_rounding=jnp.maximum(memory.rate_rounding, _pick(rates, back)),
             )
         return memory
 
@@ -418,7 +421,7 @@ class _Rounds(NamedTuple):
         memory = before.memory
         if guarded is None or mode.surfaces is None:
             return Outset(*jnp.zeros((2, 0)), *jnp.zeros((2, 0), bool))
-        values, was, rounding, largest = (x[mode.numbers] for x in memory)
+        values, was, rounding, largest = (_pick(x, self._places_of(mode)) for x in memory)
         unmoved, followed = jnp.abs(guarded.values - values) <= rounding, mode.numbers == before.latest
         rates, noise = guarded.clear_rates(largest), rounding + guarded.of_time
         goes, ways = jnp.sign(rates), np.array([float(transition.direction) for transition in mode.leaving])
@@ -456,9 +459,14 @@ class _Rounds(NamedTuple):
 
     def _note_let_out(self, mode: Mode, before: Ending, are_let_out) -> jax.Array:
         """The first times at which guards were let out, (K,), with those of this round."""
-        known = before.let_out[mode.numbers]
+        places = self._places_of(mode)
+        known = _pick(before.let_out, places)
         now = jnp.where(are_let_out & jnp.isnan(known), jax.lax.stop_gradient(before.t), known)
-        return before.let_out.at[mode.numbers].set(now)
+        return _put(before.let_out, places, now)
+
+    def _places_of(self, mode: Mode):
+        """The places of a mode's transitions among all, (K of the mode, K) of bool."""
+        return mode.numbers[:, None] == np.arange(len(self.plan.transitions))
 
 
 def _vary_with(first: Ending, *inputs) -> Ending:
@@ -479,6 +487,20 @@ def _vary_with(first: Ending, *inputs) -> Ending:
 
 def _select(condition, new: PyTree, old: PyTree) -> PyTree:
     return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+
+
+def _pick(x: jax.Array, places) -> jax.Array:
+    """The entry of x (K,) in each row of `places` (…, K), which hold one at most: 0 without any.
+
+    In a batch XLA makes several programs of a look-up, and one of this.
+    """
+    found = jnp.where(places, x, jnp.zeros_like(x))
+    return found.any(-1) if x.dtype == bool else found.sum(-1)
+
+
+def _put(x: jax.Array, places, values: jax.Array) -> jax.Array:
+    """x (K,) with these values (k,) at their places (k, K)."""
+    return jnp.where(places.any(0), _pick(values, places.T), x)
 
 
 def _constant_unless(varies, tree: PyTree) -> PyTree:

@@ -210,7 +210,7 @@ def crossing_variation(surfaces: Surfaces) -> Callable:
             at = jnp.argmin(
                 jnp.where((jnp.arange(times.size) >= count) | (jnp.arange(times.size) == k), times, jnp.inf)
             )
-        value, rate, bend = values[at], rates[at], bends[at]
+        value, rate, bend = (jnp.where(np.arange(len(values)) == at, x, 0.0).sum() for x in (values, rates, bends))
         crosses = ~taken | (rate != 0)
         rate = jnp.where(taken & crosses, rate, 1.0)
         part = jnp.where(taken, value - still(value), 0.0) / rate

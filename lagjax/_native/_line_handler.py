@@ -40,7 +40,7 @@ class LineCode:
 
 
 def line_handler() -> int:
-    """The address of the handler of all lines: of one argument (rows, inputs) and one result (rows, outputs), doubles."""
+    """The address of the handler of all lines: from x (rows, inputs) to a result (rows, outputs), both of doubles."""
     with _lock:
         return _make_handler()[1]
 
