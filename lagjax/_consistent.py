@@ -5,6 +5,7 @@ own arguments, and answered with a sentence. Values that are being traced, as un
 """
 
 import dataclasses
+from collections.abc import Iterator
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,7 +13,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._constraints import TOLERANCE, sizes
+from lagjax._constraints import ROUNDINGS, TOLERANCE, rows_of_terms, sizes
+from lagjax._derivation import derivation_of
 from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout
 from lagjax._linear import dependent_rows, diagonal_scale, schur_complements
@@ -28,7 +30,7 @@ def require_consistent(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, pa
 
     That is: a constraint is not finite, or has no gradient; as many are independent as there are coordinates, so that
     nothing can move; two of them contradict each other; or q0 or qdot0 is farther from one than `TOLERANCE` of its
-    size.
+    size, and the value of the constraint is more than `ROUNDINGS` of its own terms.
     """
     if not has_constraints(system) or not _all_concrete((ts, q0, qdot0, params, system)):
         return
@@ -39,22 +41,37 @@ def require_consistent(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, pa
     if not (start.driven or _reads_time(system)):
         _require_room(names, start, layout.size, len(names) - len(dependent))
     tolerance = TOLERANCE[layout.dtype]
-    for values, size, what, quantity in (
+    if next(_faults(names, start, dependent, tolerance, np.zeros((3, len(names)))), None) is None:
+        return  # as most starts, without a look at rounding
+    derivation, q, qdot, t, numbers, _ = start.sample
+    terms = derivation.term_sizes(q[0], qdot[0], t, numbers, ("residual", "rates", "gamma"))
+    rounding = ROUNDINGS * np.finfo(layout.dtype).eps * rows_of_terms(terms, (3, len(names)))
+    for is_of_q, sentence in _faults(names, start, dependent, tolerance, rounding):
+        if not is_of_q or _nothing_to_find(system, q0, qdot0, ts[0], params):
+            raise ValueError(sentence)
+
+
+def _faults(names, start, dependent, tolerance, rounding) -> Iterator[tuple[bool, str]]:
+    """A sentence for each contradiction and distance, and whether it is a contradiction of positions.
+
+    `rounding` (3, m) is what may be left of values, rates and γ.
+    """
+    of_rows = (
         (start.values, start.size_q, "q0", "it"),
         (start.rates, start.size_qdot, "qdot0", "its rate of change"),
-    ):
-        clash = _contradiction(names, values, what, start.scaled_lengths, dependent, tolerance, size)
-        if clash and (what == "qdot0" or _nothing_to_find(system, q0, qdot0, ts[0], params)):
-            raise ValueError(clash)
+        (start.gamma, 0.0, "the acceleration", None),
+    )
+    for (values, size, what, quantity), left in zip(of_rows, rounding, strict=True):
+        if clash := _contradiction(names, values, what, start.scaled_lengths, dependent, tolerance, size, left):
+            yield what == "q0", clash
         for k, (name, value) in enumerate(zip(names, values, strict=True)):
-            if abs(value) > tolerance * size * start.scaled_lengths[k]:
+            if quantity and abs(value) > max(tolerance * size * start.scaled_lengths[k], left[k]):
                 distance = abs(value) / start.lengths[k]
-                raise ValueError(
+                yield (
+                    False,
                     f"{what} does not satisfy {name}: {quantity} is {value:.3g} there, a distance of {distance:.3g}. "
-                    "Put the state on the constraints first: q0, qdot0 = system.project(q0, qdot0, t, params)."
+                    "Put the state on the constraints first: q0, qdot0 = system.project(q0, qdot0, t, params).",
                 )
-    if clash := _contradiction(names, start.gamma, "the acceleration", start.scaled_lengths, dependent, tolerance, 0.0):
-        raise ValueError(clash)
 
 
 class _StartConditions(NamedTuple):
@@ -69,6 +86,7 @@ class _StartConditions(NamedTuple):
     scaled_lengths: np.ndarray  # the same with coordinates in units of 1/√Mᵢᵢ, (m,)
     size_q: np.ndarray  # the largest coordinate in these units, ()
     size_qdot: np.ndarray  # the largest velocity, ()
+    sample: Sample
 
 
 def _require_gradients(names: list[str], start: _StartConditions) -> None:
@@ -94,16 +112,17 @@ def _require_room(names: list[str], start: _StartConditions, coordinates: int, i
         )
 
 
-def _contradiction(names, values, what, lengths, dependent, tolerance, size) -> str | None:
+def _contradiction(names, values, what, lengths, dependent, tolerance, size, rounding) -> str | None:
     """A sentence where a constraint is a combination of others, but does not ask for the same combination.
 
     `values` (m,) are what the constraints ask for in the quantity called `what`, of which errors count by `size` or
-    by the largest of `values`; `dependent` is from `dependent_rows`.
+    by the largest of `values`, and `rounding` (m,) is what may be left of them; `dependent` is from `dependent_rows`.
     """
     size = max(size, np.max(np.abs(values) / lengths))
     for row, factors in dependent.items():
         weights = np.abs(factors) * lengths
-        if abs(values[row] - factors @ values) > tolerance * size * (lengths[row] + weights.sum()):
+        allowed = tolerance * size * (lengths[row] + weights.sum())
+        if abs(values[row] - factors @ values) > max(allowed, rounding[row] + np.abs(factors) @ rounding):
             others = ", ".join(name for name, weight in zip(names, weights, strict=True) if weight)
             return (
                 f"{names[row]} contradicts {others}: at the initial state it is a combination of them, but asks for "
@@ -127,18 +146,23 @@ def inconsistent_members(system, layout: Layout, ts, values: dict, axes: dict) -
     if not has_constraints(system) or not _all_concrete((ts, values, system)):
         return None
 
-    t, span, tolerance = jnp.asarray(ts[0]), jnp.abs(jnp.asarray(ts[-1]) - ts[0]), TOLERANCE[layout.dtype]
-    given = system, tolerance, t, span
+    given = system, layout.dtype, jnp.asarray(ts[0]), jnp.abs(jnp.asarray(ts[-1]) - ts[0])
     numbers, of = zip(*((values[name], axes[name]) for name in ("q0", "qdot0", "params")), strict=True)
-    return jax.vmap(lambda *one: _inconsistent(*given, *one), in_axes=of)(*numbers)
+
+    def inconsistent(has_terms: bool):
+        return jax.vmap(lambda *one: _inconsistent(has_terms, *given, *one), in_axes=of)(*numbers)
+
+    found = inconsistent(False)
+    return inconsistent(True) if found.any() else found  # what terms there are is compiled where it matters
 
 
 @eqx.filter_jit
-def _inconsistent(system, tolerance: float, t, span, q0: PyTree, qdot0: PyTree, params: PyTree) -> jax.Array:
+def _inconsistent(has_terms: bool, system, dtype, t, span, q0: PyTree, qdot0: PyTree, params: PyTree) -> jax.Array:
     layout = Layout.from_state(q0, qdot0)
     state = layout.flatten(q0), layout.flatten(qdot0), t, eqx.filter(params, eqx.is_array_like)
     motion = system.motion(layout, params)
-    return motion.constraints.inconsistent(motion.mass_matrix(*state), *state, span, tolerance)
+    terms = derivation_of(system, layout, params).term_sizes(*state) if has_terms else 0.0
+    return motion.constraints.inconsistent(motion.mass_matrix(*state), *state, span, dtype, terms)
 
 
 def _start(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree) -> _StartConditions:
@@ -161,6 +185,7 @@ def _start(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree
         scaled_lengths=np.linalg.norm(of["jacobian"] * unit, axis=1),
         size_q=size_q,
         size_qdot=size_qdot,
+        sample=sample,
     )
 
 

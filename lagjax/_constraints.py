@@ -13,6 +13,7 @@ A scene without constraints has m = 0 rows here, not another kind of object. Not
 matrix M, by which distances between states are measured, is an argument.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -85,19 +86,21 @@ class Constraints(eqx.Module):
         return distances(self.residual(*state), self.rates(*state), self.jacobian_and_gamma(*state)[0], positions)
 
     def inconsistent(
-        self, matrix: Float[Array, "n n"], q: Vector, qdot: Vector, t: Time, params: PyTree, span: Time, tolerance
+        self, matrix: Float[Array, "n n"], q: Vector, qdot: Vector, t: Time, params: PyTree, span: Time, dtype, terms
     ) -> Bool[Array, ""]:
-        """True if no motion may start from a state: `tolerance` off a constraint, or one of them has no gradient.
+        """True if no motion may start from a state: off a constraint, or one of them has no gradient.
 
-        Of a motion over this span of time, with the mass matrix M. A state that is not a number is inconsistent.
+        Of a motion over this span of time, with the mass matrix M. Off is what is farther than `TOLERANCE` of the size
+        of the state and has a value of more than `ROUNDINGS` of the `terms` (2m,) of `residual` and of `rates` (see
+        `Derivation.term_sizes`), in a start of this dtype. A state that is not a number is inconsistent.
         """
         state, unit = (q, qdot, t, params), diagonal_scale(matrix)
         jacobian = self.jacobian_and_gamma(*state)[0]
-        measured = self.residual(*state), self.rates(*state), jacobian * unit, self.f(q, t, params).size
-        of_q, of_qdot = distances(*measured)
-        size_q, size_qdot = sizes(unit, q, qdot, span)
-        near = (of_q <= tolerance * size_q) & (of_qdot <= tolerance * size_qdot)
-        return ~jnp.all(near & jacobian.any(axis=1))
+        values, positions = jnp.stack([self.residual(*state), self.rates(*state)]), self.f(q, t, params).size
+        off = jnp.stack(distances(values[0], values[1], jacobian * unit, positions))
+        near = off <= TOLERANCE[dtype] * jnp.stack(sizes(unit, q, qdot, span))[:, None]
+        rounded = jnp.abs(values) <= ROUNDINGS * np.finfo(dtype).eps * rows_of_terms(terms, values.shape)
+        return ~jnp.all((near | rounded) & jacobian.any(axis=1))
 
     # ---- one Newton step back to the constraints ----
 
@@ -121,6 +124,11 @@ class Constraints(eqx.Module):
 # computed or typed with six digits; in float32 one that forty roundings have made. The first projection takes care of
 # it, of up to `_native.START`. It would also take care of more, but by moving the start elsewhere.
 TOLERANCE = {np.dtype("float64"): 1e-6, np.dtype("float32"): 5e-6}
+
+# A constraint holds as well where its value is no more than so many roundings of its own terms, whatever the size of q:
+# coordinates that are deviations from a drawn pose begin at zero, beside links of a metre. They are those that float32
+# is given above. Doubled, a link of a kilometre may be off by 18 nm, where it now may by 9.
+ROUNDINGS = 40
 
 
 def sizes(unit, q, qdot, span):
@@ -147,6 +155,12 @@ def distances(residual, rates, jacobian, positions: int):
     of_positions = xp.where(xp.arange(residual.shape[-1]) < positions, residual, 0)
     of_q, of_qdot = (xp.where(x == 0, 0, xp.abs(x) / xp.where(x == 0, 1, lengths)) for x in (of_positions, rates))
     return of_q, of_qdot
+
+
+def rows_of_terms(terms, shape: tuple[int, ...]):
+    """The sizes of the terms of some quantities of m constraints, (…, m); of a scene without programs they are 0."""
+    xp = np if isinstance(terms, float | np.ndarray) else jnp
+    return xp.reshape(xp.broadcast_to(terms, math.prod(shape)), shape)
 
 
 def velocity_scales(matrix: Float[Array, "n n"], jacobian: Float[Array, "m n"], qdot: Vector) -> Vector:
@@ -206,25 +220,27 @@ _NEWTON_STEPS = 50
 
 
 def nearest_consistent(
-    mass_matrix: Callable, constraints: Constraints, q: Vector, qdot: Vector, t: Time, params: PyTree
+    mass_matrix: Callable, constraints: Constraints, q: Vector, qdot: Vector, t: Time, params: PyTree, terms=0.0
 ) -> tuple[Vector, Vector]:
     """The consistent state nearest to (q, q̇), shape (n,) each; NaN where it is not found.
 
     q̂ minimises (q̂ − q)ᵀM(q̂ − q) with M = M(q, q̇) among all with f = 0, and then the velocities minimise the same form
     with M = M(q̂, q̇) among all that are consistent at q̂. The derivatives are those of that function, to every order:
     q̂ is a root of `_stationary`, and differentiated implicitly. A state that is not found has NaN for derivatives.
+    `terms` (2m,) are the sizes of the terms of `residual` and of `rates`, of which rounding is left.
     """
+    of_f, of_rates = rows_of_terms(terms, (2, len(constraints.residual(q, qdot, t, params))))
     if constraints.on_positions is not None:
-        q = _nearest_positions(mass_matrix, constraints, q, qdot, t, params)
+        q = _nearest_positions(mass_matrix, constraints, q, qdot, t, params, of_f)
     state, given = (q, qdot, t, params), qdot
     matrix = mass_matrix(*state)
     qdot = qdot + constraints.velocity_step(matrix, *state)
     jacobian, _ = constraints.jacobian_and_gamma(q, qdot, t, params)
-    reached = _holds(constraints.rates(q, qdot, t, params), jacobian, diagonal_scale(matrix), qdot, given)
+    reached = _holds(constraints.rates(q, qdot, t, params), jacobian, of_rates, diagonal_scale(matrix), qdot, given)
     return q, qdot * jnp.where(reached, 1.0, jnp.nan)  # a product, so that derivatives are NaN as well
 
 
-def _nearest_positions(mass_matrix, constraints: Constraints, q0, qdot, t, params) -> Vector:
+def _nearest_positions(mass_matrix, constraints: Constraints, q0, qdot, t, params, terms) -> Vector:
     """q with f = 0, nearest to q0 in the metric of M(q0, q̇), by Newton's method for M (q − q0) + Jᵀν = 0, f = 0.
 
     These are the conditions of the constrained minimum (sequential quadratic programming: Nocedal & Wright, *Numerical
@@ -240,9 +256,16 @@ def _nearest_positions(mass_matrix, constraints: Constraints, q0, qdot, t, param
     """
     matrix = mass_matrix(q0, qdot, t, params)
     unit = jax.lax.stop_gradient(diagonal_scale(matrix))
+    jacobian = jax.lax.stop_gradient(jax.jacfwd(constraints.f)(q0, t, params)) * unit
+    terms = terms[: len(jacobian)]
+    # The size of the terms, as a distance: where q is smaller it is their rounding that moves it.
+    least = jnp.max(jnp.where(terms > 0, terms * jax.lax.rsqrt(jnp.sum(jacobian**2, axis=1)), 0.0), initial=0.0)
+
+    def resolution(q):
+        return _AT_REST * jnp.finfo(q.dtype).eps * jnp.maximum(_size(unit, q, q0), least)
 
     def is_at_rest(q, moved):
-        return jnp.max(jnp.abs(moved / unit)) <= _AT_REST * jnp.finfo(q.dtype).eps * _size(unit, q, q0)
+        return jnp.max(jnp.abs(moved / unit)) <= resolution(q)
 
     def stationary(place):
         q, nu = place
@@ -265,9 +288,8 @@ def _nearest_positions(mass_matrix, constraints: Constraints, q0, qdot, t, param
             return jnp.sqrt((q - q0) @ matrix @ (q - q0))
 
         # For a q0 that is consistent both distances are round-off.
-        rounding = _AT_REST * jnp.finfo(q.dtype).eps * _size(unit, q, q0) * q.size
-        farther = distance(q) > 1.001 * distance(nearby[0]) + rounding
-        holds = _holds(constraints.f(q, t, params), jax.jacfwd(constraints.f)(q, t, params), unit, q, q0)
+        farther = distance(q) > 1.001 * distance(nearby[0]) + resolution(q) * q.size
+        holds = _holds(constraints.f(q, t, params), jax.jacfwd(constraints.f)(q, t, params), terms, unit, q, q0)
         return jnp.where(holds & ~farther, q, jnp.nan), nu
 
     start = q0, jnp.zeros_like(constraints.f(q0, t, params))
@@ -299,17 +321,17 @@ def _iterate_to_rest(step: Callable, start: tuple[Vector, Row], is_at_rest: Call
     return jnp.where(is_at_rest(q, moved), q, jnp.nan), nu
 
 
-def _holds(residual: Row, jacobian: Float[Array, "m n"], unit: Vector, *states: Vector) -> Bool[Array, ""]:
+def _holds(residual: Row, jacobian: Float[Array, "m n"], terms: Row, unit: Vector, *states: Vector) -> Bool[Array, ""]:
     """True if constraints hold, in which case the steps did not just become small between some that contradict.
 
     A distance of √eps of the state is allowed: the last step of Newton's method was at the level of rounding, so that
     constraints which can hold do so far better, and those that contradict each other are off by far more. The second
     term is for a gradient that vanishes, where rounding of the others' size is the limit. Coordinates
-    are in their `unit` (n,), and as large as in any of the states (n,).
+    are in their `unit` (n,), and as large as in any of the states (n,). Rounding of `terms` (m,) is allowed as well.
     """
     lengths, eps = jnp.sqrt(jnp.sum((jacobian * unit) ** 2, axis=1)), jnp.finfo(residual.dtype).eps
     allowed = jnp.sqrt(eps) * lengths + 100 * eps * jnp.max(lengths)
-    return jnp.all(jnp.abs(residual) <= allowed * _size(unit, *states))
+    return jnp.all(jnp.abs(residual) <= jnp.maximum(allowed * _size(unit, *states), ROUNDINGS * eps * terms))
 
 
 def _size(unit: Vector, *states: Vector) -> Float[Array, ""]:

@@ -49,6 +49,7 @@ from lagjax._program import (
 from lagjax._quantities import OwnRules, quantities
 from lagjax._recursion import Recursion, RecursiveElimination
 from lagjax._saddle import LARGEST_INDEFINITE, IndefiniteElimination, SaddleElimination, TwoCoordinates
+from lagjax._validate import is_concrete
 
 PyTree = Any
 
@@ -186,6 +187,24 @@ class Derivation:
     def evaluate(self, names: Sequence[str], columns: Sequence) -> dict[str, np.ndarray]:
         """Named quantities at S states, each of shape (S, …), in NumPy; `columns` as `Program.evaluate_many` takes."""
         return self._split_outputs(names, self.program(*names).evaluate_many(columns))
+
+    def term_sizes(self, q, qdot, t, numbers: PyTree, names: tuple[str, ...] = ("residual", "rates")):
+        """The sizes of the terms of quantities at a state of numbers or tracers, (outputs,); 0 without programs.
+
+        The rounding of a quantity is so many times `eps`: its running error, with inputs that are rounded, too. It is
+        0.6 for 0.1 + q0 + 0.2 - q1 - 0.3 at q = 0, where the value, 0 or 6e-17, says nothing.
+        """
+        key, state = ("rounding", *names), [q, qdot, t, *jax.tree.leaves(numbers)]
+        try:
+            if key not in self._programs:
+                program = self.program(*names)
+                self._programs[key] = program.rounding_of(range(len(program.outputs)), program.size)
+            if all(map(is_concrete, state)):
+                return self._programs[key].evaluate_many(np.concatenate([np.ravel(x) for x in state]))[:, 0]
+        except Unlowerable:
+            return 0.0
+        first, *others = map(jnp.ravel, jax.lax.stop_gradient([jnp.concatenate([q, qdot, t[None]]), *state[3:]]))
+        return jnp.stack(self._programs[key].compute_outputs(first, jnp.concatenate(others) if others else ()))
 
     def round_off(self, names: Sequence[str], columns: Sequence) -> dict[str, np.ndarray]:
         """The rounding errors of these quantities at S states, each of shape (S, …)."""

@@ -122,9 +122,9 @@ class Motion(eqx.Module):
         """(q, q̇) after one Newton step of each kind back to the constraints, the shortest in the metric of M."""
         return _constraints.projected(self.mass_matrix, self.constraints, q, qdot, t, params)
 
-    def nearest_consistent(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Vector, Vector]:
+    def nearest_consistent(self, q: Vector, qdot: Vector, t: Time, params: PyTree, terms=0.0) -> tuple[Vector, Vector]:
         """The consistent state that is nearest to (q, q̇) in the metric of M; NaN where it is not found."""
-        return _constraints.nearest_consistent(self.mass_matrix, self.constraints, q, qdot, t, params)
+        return _constraints.nearest_consistent(self.mass_matrix, self.constraints, q, qdot, t, params, terms)
 
     # ---- all of it ----
 

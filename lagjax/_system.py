@@ -316,7 +316,12 @@ class System(eqx.Module):
         params = as_arrays(params, layout.dtype)
 
         def evaluate_at(self, q, qdot, t, params):
-            value = self._evaluate_program(quantity, Layout.from_state(q, qdot), q, qdot, t, params)
+            layout = Layout.from_state(q, qdot)
+            value = self._evaluate_program(quantity, layout, q, qdot, t, params)
+            if value is None and quantity is Motion.nearest_consistent:
+                numbers, flat = eqx.filter(params, eqx.is_array_like), (layout.flatten(q), layout.flatten(qdot), t)
+                terms = derivation_of(self, layout, params).term_sizes(*flat, numbers)
+                return _evaluate(self, quantity, q, qdot, t, params, terms=terms)
             return _evaluate(self, quantity, q, qdot, t, params) if value is None else value
 
         given = self, q, qdot, t, params
@@ -429,14 +434,14 @@ _OF_QUANTITIES: dict[Callable, tuple[tuple[str, ...], Callable]] = {
 
 
 @eqx.filter_jit
-def _evaluate(system: System, quantity: Callable, q, qdot, t, params):
+def _evaluate(system: System, quantity: Callable, q, qdot, t, params, **more):
     """One of `Motion`'s functions, compiled whole: XLA would take seconds to prepare its operations one by one."""
     layout = Layout.from_state(q, qdot)
     numbers, state = eqx.filter(params, eqx.is_array), (layout.flatten(q), layout.flatten(qdot))
     if quantity is Motion.acceleration:  # in the form in which diffrax integrates it
         form = form_of(derivation_of(system, layout, params), "array" if system.path == "array" else "auto")
         return form.acceleration(t, state, numbers)[0]
-    return quantity(system.motion(layout, params), *state, t, numbers)
+    return quantity(system.motion(layout, params), *state, t, numbers, **more)
 
 
 def _require_scalar(value: PyTree, role: str) -> None:

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float
 from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._settle import settle
 from lagjax._analysis._solve import is_root, levenberg_marquardt, polish, shortest_preimage
+from lagjax._constraints import ROUNDINGS
 from lagjax._doubles import accepts_singles
 from lagjax._failures import nan_unless
 from lagjax._linear import least_norm
@@ -82,7 +83,9 @@ def equilibrium(
     require_steady(scene)
     if stable:
         scene = _settled_scene(scene, qdot)
-    place, multipliers, ok = _solve_balance(*scene.arguments)
+    place, multipliers, ok = _solve_balance(False, *scene.arguments)
+    if scene.concrete and not ok:  # again, with the rounding of terms, whose program is compiled where it may matter
+        place, multipliers, ok = _solve_balance(True, *scene.arguments)
     if throw and scene.concrete and not ok:
         raise ValueError(_sentence(scene))
     of_user = None
@@ -123,8 +126,12 @@ _TINY = 1e-6
 
 
 @eqx.filter_jit
-def _solve_balance(*arguments) -> tuple[Vector, Array, Bool[Array, ""]]:
-    """q (n,), λ (m,) and whether they are an equilibrium, of a scene made of `SceneState.arguments`."""
+def _solve_balance(has_terms: bool, *arguments) -> tuple[Vector, Array, Bool[Array, ""]]:
+    """q (n,), λ (m,) and whether they are an equilibrium, of a scene made of `SceneState.arguments`.
+
+    Near q = 0 the forces and constraints can be no more than rounding of their terms, which are looked at if
+    `has_terms`.
+    """
     scene = SceneState.from_arguments(*arguments)
     n = scene.layout.size
 
@@ -144,7 +151,11 @@ def _solve_balance(*arguments) -> tuple[Vector, Array, Bool[Array, ""]]:
 
     z = jax.lax.custom_root(residual, start, find, lambda linear, right: shortest_preimage(linear, right, unit))
     q = z[:n]
-    ok = is_root(residual, jax.lax.stop_gradient(z), least=least, power=0.5)
+    terms: Any = 0.0
+    if has_terms:
+        at = jax.lax.stop_gradient(q), scene.qdot, jnp.zeros((), q.dtype), scene.numbers
+        terms = ROUNDINGS * jnp.finfo(q.dtype).eps ** 0.5 * scene.derivation.term_sizes(*at, ("force", "residual"))
+    ok = is_root(residual, jax.lax.stop_gradient(z), terms, least=least, power=0.5)
     multipliers = least_multipliers(scene, q)
     return nan_unless(ok, q), nan_unless(ok, multipliers), ok
 

@@ -21,7 +21,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._arguments import Function, accept, present
-from lagjax._constraints import TOLERANCE
 from lagjax._custom import attach_derivative
 from lagjax._derivation import Derivation
 from lagjax._doubles import DOUBLE, SINGLE
@@ -202,9 +201,9 @@ class Mode(NamedTuple):
             return jnp.asarray(False)
         motion = system.motion(self.layout, self.params)
         t, y, numbers = jax.lax.stop_gradient((t, y, eqx.filter(self.params, eqx.is_array_like)))
-        state = *halves(y), t, numbers
-        tolerance = TOLERANCE[SINGLE if self.problem.is_rounded else DOUBLE]
-        return motion.constraints.inconsistent(motion.mass_matrix(*state), *state, jnp.inf, tolerance)
+        state, dtype = (*halves(y), t, numbers), SINGLE if self.problem.is_rounded else DOUBLE
+        terms = self.problem.derivation.term_sizes(*state)
+        return motion.constraints.inconsistent(motion.mass_matrix(*state), *state, jnp.inf, dtype, terms)
 
 
 def _watched_guards(surfaces: Surfaces | None) -> Guards | None:

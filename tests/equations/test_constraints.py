@@ -844,6 +844,37 @@ def test_members_that_start_off_their_constraints_are_refused_alone():
     assert np.isnan(run.q[1]).all() and np.isfinite(run.q[::2]).all()
 
 
+LINKS = lagjax.System(  # coordinates that are deviations from a drawn pose begin at zero, beside links of 0.1 to 0.3 m
+    lambda q, v: 0.5 * v @ v - 0.5 * q @ q,
+    constraints=lambda q, params: params[0] + q[0] + params[1] - q[1] - params[2],
+    velocity_constraints=lambda q, v, params: params[0] + v[1] + params[1] - v[2] - params[2],
+)
+METRES = [(metre, np.array([0.1, 0.2, 0.3]) * metre, 1e-12 * metre * np.eye(3)[0]) for metre in (1.0, 1e-10, 1e11)]
+
+
+def test_starts_at_zero_are_off_by_rounding_of_the_terms():
+    rest, ts = np.zeros(3), np.array([0.0, 1.0])
+    for metre, links, off in METRES:
+        assert abs(lagjax.simulate(LINKS, rest, rest, ts, links).q).max() < 1e-15 * metre
+        batch = lagjax.simulate_batch(LINKS, np.stack([rest, off]), np.zeros((2, 3)), ts, links)
+        assert batch.ok.tolist() == [True, False]
+        with pytest.raises(ValueError, match="q0 does not satisfy constraints: it is "):
+            lagjax.simulate(LINKS, off, rest, ts, links)
+        assert "inconsistent_start" not in lagjax.check(LINKS, rest, rest, params=links).kinds
+
+
+@pytest.mark.slow
+def test_what_is_found_at_zero_is_exact_to_rounding_of_the_terms():
+    rest, many = np.zeros(3), jax.jit(jax.vmap(LINKS.project, in_axes=(0, 0, None, None)))
+    for metre, links, off in METRES:
+        starts = np.stack([rest, off, 1e6 * off])
+        q, qdot = many(starts, starts, 0.0, links)
+        np.testing.assert_allclose(q, starts[:, :1] * [0.5, 0.5, 0], atol=3e-16 * metre)
+        np.testing.assert_allclose(qdot, starts[:, :1] * np.ones(3) / 3, atol=3e-16 * metre)
+        np.testing.assert_allclose(LINKS.project(off, off, 0.0, links)[0], q[1], atol=3e-16 * metre)
+        assert abs(lagjax.equilibrium(LINKS, rest, links).q).max() < 1e-15 * metre
+
+
 def test_signatures_and_names_that_are_refused():
     with pytest.raises(TypeError, match=r"constraints must have the form constraints\(q\)"):
         lagjax.System(weight, constraints=lambda: 0.0)
