@@ -13,7 +13,7 @@ import numpy as np
 
 from lagjax._arguments import accept
 from lagjax._consistent import has_constraints, require_consistent
-from lagjax._failures import raise_where_failed, sentence
+from lagjax._failures import marks_absent, raise_where_failed, sentence
 from lagjax._layout import Layout, halves
 from lagjax._machine_code import MOST_GUARDS, MachineCode, Noted, Surfaces, surfaces_of
 from lagjax._platform import is_known
@@ -51,6 +51,7 @@ class Crossings(NamedTuple):
         return f"{count.sum()} crossings{many}{when}, {'all there' if ok.all() else f'not all there in {(~ok).sum()}'}"
 
 
+@marks_absent
 def crossings(
     system: System,
     section: Callable | dict[str, Callable],

@@ -8,6 +8,9 @@ An output that was not reached has no derivative. `where` alone would make it ze
 branch is a constant; `nan_unless` makes it NaN wherever its cotangent is not zero.
 """
 
+import functools
+from collections.abc import Callable
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -119,6 +122,20 @@ batching.primitive_batchers[check_p] = lambda args, axes, **settings: (
 
 
 # ---- outputs that were not reached -----------------------------------------------------------------------------------
+
+
+def marks_absent(function: Callable) -> Callable:
+    """A decorator for what returns NaN where there is nothing: after an event, beyond the last crossing or transition.
+
+    `jax_debug_nans` would take that for a mistake of an operation. A motion that fails has its own result and sentence.
+    """
+
+    @functools.wraps(function)
+    def decorated(*args, **kwargs):
+        with jax.debug_nans(False):
+            return function(*args, **kwargs)
+
+    return decorated
 
 
 def nan_unless(reached, x):

@@ -18,7 +18,7 @@ import numpy as np
 from lagjax._consistent import has_constraints, inconsistent_members, require_consistent
 from lagjax._diffrax import Diffrax
 from lagjax._engine import choose, requested_engine
-from lagjax._failures import raise_where_failed
+from lagjax._failures import marks_absent, raise_where_failed
 from lagjax._layout import Layout, halves
 from lagjax._lift import lift_batch, lift_problem
 from lagjax._machine_code import MachineCode
@@ -31,6 +31,7 @@ from lagjax._validate import as_arrays, is_concrete, require_flag
 PyTree = Any
 
 
+@marks_absent
 def simulate(
     system: System,
     q0: PyTree,
@@ -152,6 +153,7 @@ def simulate(
     return raise_unless_ok(trajectory, layout)
 
 
+@marks_absent
 def simulate_batch(
     system: System,
     q0: PyTree,

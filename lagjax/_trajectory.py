@@ -14,6 +14,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._failures import marks_absent
 from lagjax._layout import Layout
 from lagjax._results import RESULTS
 from lagjax._system import System
@@ -137,6 +138,7 @@ class Trajectory(eqx.Module):
         """f and a at every output time, in the structure of `multipliers`: the drift off the constraints."""
         return self._map_outputs("constraint_residual")
 
+    @marks_absent
     def health(self, reference: "Trajectory | None" = None) -> "Health":
         """The trust that this motion deserves: conservation laws, constraints, the mass matrix, gradients.
 
@@ -243,6 +245,7 @@ class Trajectory(eqx.Module):
         for system in (self.system,) if isinstance(self.system, System) else self.system.values():
             system.require_present()
 
+    @marks_absent
     def _map_outputs(self, name: str) -> PyTree:
         """Map a method (q, qdot, t, params) of the system over the time axis, and over the batch axes before it."""
         self.require_present()

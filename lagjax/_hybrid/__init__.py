@@ -18,6 +18,7 @@ import numpy as np
 
 from lagjax._consistent import require_consistent
 from lagjax._doubles import DOUBLE, compute_in_doubles
+from lagjax._failures import marks_absent
 from lagjax._hybrid._mode import Transition
 from lagjax._hybrid._rounds import IN_ONE_PLACE, Ending, RoundPlan, TransitionRecord, hybrid_motion
 from lagjax._layout import Layout, halves
@@ -68,6 +69,7 @@ class Hybrid:
         _require_modes(self.modes, self.transitions, self.start, self.max_transitions)
 
 
+@marks_absent
 def simulate_hybrid(
     modes: dict[str, System],
     transitions: list[Transition],

@@ -94,3 +94,26 @@ def test_members_that_fail_leave_the_derivatives_of_others_alone():
     found = jax.jit(jax.vmap(jax.grad(f)))(jnp.ones(2), ends)
     np.testing.assert_allclose(found[0], np.cos(1.0), rtol=1e-9)
     assert jnp.isnan(found[1])
+
+
+@pytest.mark.parametrize("derived", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_nan_for_what_is_not_there_is_no_mistake_to_jax_debug_nans(derived):
+    """Rows beyond the last crossing or transition, outputs after an event."""
+    ts, turn = jnp.linspace(0.0, 5.0, 6), lagjax.Transition("a", "a", lambda q, v: v, direction=1)
+
+    def crossed(x):
+        return lagjax.crossings(SPRING, lambda q, v: q, x, 0.0, ts, 1.0, count=4)
+
+    def turned(x):
+        return lagjax.simulate_hybrid({"a": SPRING}, [turn], "a", x, 0.0, ts, 1.0, max_transitions=3)
+
+    with jax.debug_nans(True):
+        run = lagjax.simulate(SPRING, 1.0, 0.0, ts, 1.0, event=lambda q, v: q)
+        assert np.isnan(np.asarray(run.energy())[-1]) and np.isfinite(turned(1.0).energy()).all()
+        assert int(crossed(1.0).count) == 2 and int(turned(1.0).transitions.count) == 1
+        for transform in (jax.grad, jax.jacfwd, lambda f: jax.vmap(jax.grad(f)), jax.jit) if derived else ():
+            x = jnp.ones(2) if transform.__name__ == "<lambda>" else 1.0
+            np.testing.assert_allclose(transform(lambda x: turned(x).q[1])(x), np.cos(1.0), rtol=1e-8)
+            np.testing.assert_allclose(transform(lambda x: x * crossed(x).t[0])(x), np.pi / 2, rtol=1e-8)
+        with pytest.raises(FloatingPointError):
+            jnp.log(jnp.asarray(-1.0))
