@@ -1,6 +1,6 @@
 """Stores that are begun: new ones, those with members of another store, those that continue its motions.
 
-Of a store that is there already, `require_same` checks the description and `repair` the files.
+Of a store that is there already, `require_same` checks the description.
 
 **Members of another store** (`extend`): a member is known where all of its coordinates, bit for bit, are those of a
 member of the other store that is done. In a unit of the new store the known members are those of a product of places
@@ -30,9 +30,9 @@ from lagjax._results import RESULTS, code_of
 from lagjax._sweep import _batch
 from lagjax._sweep._batch import KeptResults, batches_of, label, names_of, quantities_of
 from lagjax._sweep._description import MOTION, Description, FinalStates, difference, pack_description, texts, users_path
-from lagjax._sweep._job import Job, cpu, record_of, require_versions, source_path, states, uses_doubles, versions
+from lagjax._sweep._job import cpu, record_of, require_versions, source_path, states, uses_doubles, versions
 from lagjax._sweep._members import RESERVED, Axis, Grid, describe_axes, points_of
-from lagjax._sweep._store import FORMAT, KNOWN, NOT_DONE, RESULT, Quantity, Store, arrays_as_bytes
+from lagjax._sweep._store import FORMAT, KNOWN, NOT_DONE, RESULT, Quantity, Store, arrays_as_bytes, is_file_name
 from lagjax._trajectory import State
 from lagjax.designs import GROWING, Design
 
@@ -154,7 +154,7 @@ def _require_names(quantities: list[Quantity], axes: tuple[Axis, ...], reduce: d
     for q in quantities:
         if q.name in taken:
             raise ValueError(f"keep returns {q.name!r}, which is a name in over, or `result`: give it another name.")
-        if "/" in q.name or not q.name or q.name.startswith(".") or q.name == "zarr.json":
+        if not is_file_name(q.name) or q.name == "zarr.json":
             raise ValueError(
                 f"keep returns {q.name!r}: names must not be empty, begin with a dot, contain a slash, or be zarr.json."
             )
@@ -193,13 +193,6 @@ def require_same(store: Store, spec: dict, axes: tuple[Axis, ...], description: 
             f"{store.path} was begun with another description, and is left as it is. Take another store, or the "
             "description of this one. What differs:\n" + "\n".join(lines)
         )
-
-
-def repair(job: Job) -> None:
-    """Have units computed again whose chunks are not whole, as after a crash of the disk."""
-    for unit, text in job.store.find_damage(job.spec, job.store.finished_units()).items():
-        warnings.warn(f"{job.store.path}: {text}. It is computed again.", stacklevel=3)
-        job.store.undo(job.spec, unit)
 
 
 # ---- a store that begins with members of another one -----------------------------------------------------------------

@@ -270,6 +270,11 @@ def unpack_description(data: bytes, path: list[str]) -> Description:
     sys.path += [place for place in path if place not in sys.path]
     try:
         return pickle.loads(data)
+    except (pickle.UnpicklingError, EOFError, ValueError, IndexError, KeyError, TypeError) as why:
+        raise ValueError(
+            f"The functions of this sweep, in its .sweep/scene.pkl, cannot be read ({type(why).__name__}: {why}): the "
+            "file is damaged. Call `sweep` as before, without isolate and executor: that does not read it."
+        ) from why
     except (ImportError, AttributeError) as why:
         raise ImportError(
             f"The functions of this sweep cannot be rebuilt here: {why}. They were defined in a module that this "

@@ -46,9 +46,13 @@ class Axis:
         about = {"names": list(self.names), "size": self.size}
         if isinstance(self.source, Design):
             return about | self.source.described()
-        values = hashlib.sha256(b"".join(np.ascontiguousarray(x).tobytes() for x in self.source)).hexdigest()
         ends = [[float(x[0]), float(x[-1])] for x in self.source]
-        return about | {"rule": "values", "ends": ends, "sha256": values}
+        return about | {"rule": "values", "ends": ends, "sha256": hash_columns(self.source)}
+
+
+def hash_columns(columns) -> str:
+    """The hash of the values along an axis, by which they are known."""
+    return hashlib.sha256(b"".join(np.ascontiguousarray(x).tobytes() for x in columns)).hexdigest()
 
 
 def describe_axes(axes: list[dict]) -> str:

@@ -37,7 +37,7 @@ class Status(NamedTuple):
       energy is not conserved, or none is known.
     - `slow`: functions that are called member by member because they are not written in jax.numpy, and why not.
     - `damaged`: finished units whose chunks are not there, or not whole, in words by units. They do not count as done;
-      the sweep, run again, computes them again. Contents are not read: `Sweep.damaged` does that.
+      the sweep, run again, computes them again. Contents are not read: `Sweep.damaged` and the next run do that.
     - `cpus`: the kinds of CPU that computed units; members of several differ as by a change of rounding.
     """
 
@@ -87,6 +87,7 @@ class Status(NamedTuple):
 
 def status(store: Store) -> Status:
     spec = store.spec()
+    store.require_arrays(spec)
     grid, finished = store.grid(spec), store.finished_units()
     damaged = store.find_damage(spec, finished)
     done = sorted(finished - set(damaged))

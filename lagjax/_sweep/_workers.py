@@ -22,6 +22,7 @@ import subprocess
 import sys
 import time
 import traceback
+import warnings
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
 from pathlib import Path
@@ -54,11 +55,21 @@ def require_part(part: Any) -> slice:
 
 
 def units_to_compute(job: Job, part: slice) -> list[int]:
-    """The units of a part that are not done. Raises `OSError` where they could not be written.
+    """The units of a part that are not done, or are damaged. Raises `OSError` where they could not be written.
 
     Nothing is written where all are done: a finished store may lie on a disk that is read-only.
     """
-    left = sorted(set(range(job.grid.units)[part]) - job.store.finished_units())
+    store, chosen = job.store, set(range(job.grid.units)[part])
+    store.require_arrays(job.spec)
+    finished = {unit for unit in store.finished_units() if unit in chosen or unit >= job.grid.units}
+    damaged = store.find_damage(job.spec, finished, whole=True)
+    for unit in damaged:
+        store.undo(job.spec, unit)
+    if damaged:
+        first = "; ".join(list(damaged.values())[:_NAMED])
+        more = f"; and {len(damaged) - _NAMED} units more" if len(damaged) > _NAMED else ""
+        warnings.warn(f"{store.path}: {first}{more}. What is damaged is computed again.", stacklevel=3)
+    left = sorted(chosen - (finished - set(damaged)))
     if left:
         job.store.require_writable()
     return left
@@ -95,6 +106,7 @@ def run_store(store: Store, notify: Notify = lambda: None, most: int | None = No
 
 # ---- executors -------------------------------------------------------------------------------------------------------
 
+_NAMED = 5  # damaged units that a warning names
 _WINDOW = 64  # units that an executor is given at a time: a scheduler holds this many tasks, not a million
 _POLL = 0.2  # seconds between two looks at tasks that are no futures
 

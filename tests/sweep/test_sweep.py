@@ -383,29 +383,87 @@ def test_disks_that_refuse(tmp_path, undisturbed, monkeypatch, number, words):
     assert digests(tmp_path) == undisturbed
 
 
-@pytest.mark.slow
-def test_damaged_chunks_are_found_and_computed_again(tmp_path, undisturbed):
-    swept(tmp_path)
-    chunk = sorted((tmp_path / "store" / "end" / "c").glob("*/*"))[2]
-    data = chunk.read_bytes()
-    chunk.write_bytes(data[:-1] + b"x")  # of the right size: found by its hash
-    run = lagjax.Sweep(tmp_path / "store")
-    assert "is not what was written" in run.damaged()[2]
-    chunk.write_bytes(data[: len(data) // 2])
-    with pytest.warns(UserWarning, match=r"unit 2: its chunk of 'end' has 30 bytes, where it should have 60"):
-        swept(tmp_path)
-    assert digests(tmp_path) == undisturbed and not run.damaged()
-
-
-def test_a_byte_that_has_changed_is_noticed_by_every_reader(tmp_path):
-    run = swept(tmp_path)
-    chunk = sorted((tmp_path / "store" / "end" / "c").glob("*/*"))[2]
-    data = bytearray(chunk.read_bytes())
+def flip(file):
+    data = bytearray(file.read_bytes())
     data[5] ^= 1
-    chunk.write_bytes(data)
-    with pytest.raises(ValueError, match="checksum"):
+    file.write_bytes(data)
+
+
+DAMAGES = {
+    "end/c/0/0": (flip, "its chunk of 'end' is not what was written"),
+    "end/c/1/0": (lambda file: os.truncate(file, 7), "its chunk of 'end' has 7 bytes, where it should have 60"),
+    "fastest/c/2/0": (Path.unlink, "its chunk of 'fastest' is not there"),
+    ".sweep/done/3.json": (lambda file: file.write_text("{}"), "its record cannot be read"),
+    ".sweep/done/4.json": (lambda file: file.write_bytes(b"\xff"), "its record cannot be read"),
+    ".sweep/done/7.json": (lambda file: file.write_text("{}"), "there are but 6 units"),
+}
+
+
+@pytest.mark.parametrize("by_command", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_what_is_damaged_is_told_and_computed_again(tmp_path, undisturbed, by_command):
+    run = swept(tmp_path)
+    for name, (damage, _) in DAMAGES.items():
+        damage(run.store / name)
+    with pytest.raises(ValueError, match="checksum"), pytest.warns(UserWarning, match="computes them again"):
         run.open().end.load()
-    assert list(run.damaged()) == [2] and not run.status().damaged  # which does not read all
+    told, seen = run.damaged(), run.status().damaged
+    assert set(told) == {0, 1, 2, 3, 4, 7} and set(seen) == {1, 2, 3, 4, 7}  # the status reads no contents
+    assert all(words in text for text, (_, words) in zip(told.values(), DAMAGES.values(), strict=True))
+    with pytest.warns(UserWarning, match=r"unit 1: .*computed again"):
+        command_line.main(["sweep", "run", "--quiet", str(run.store)]) if by_command else swept(tmp_path)
+    assert digests(tmp_path) == undisturbed and not run.damaged() and run.status().units_done == 6
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"chunk": [0, 7]}, {"shape": [6, 8]}, {"chunk": [1, 8]}, {"batch": 0}, {"axes": 3}, {"ts": ...},
+        {"kept": [{"name": "end", "shape": [], "dtype": "O"}]},
+        {"kept": [{"name": "../../x", "shape": [], "dtype": "<f8"}]},
+        {"kept": [{"name": "/x", "shape": [], "dtype": "<f8"}]}, b"\xff\xfe", b"[]", b"{",
+    ],
+    ids=str,
+)  # fmt: skip
+def test_a_damaged_description_is_a_sentence(tmp_path, change):
+    file = tmp_path / ".sweep" / "spec.json"
+    file.parent.mkdir()
+    spec = {
+        "format": _store.FORMAT, "axes": [{"names": ["a"], "size": 6}, {"names": ["b"], "size": 7}], "shape": [6, 7],
+        "chunk": [1, 7], "batch": 4, "kept": [], "reduce": {}, **dict.fromkeys(_store._OF_SPEC),
+    }  # fmt: skip
+    file.write_text(json.dumps(spec))
+    assert Store(tmp_path).spec() == spec
+    if isinstance(change, dict):
+        change = json.dumps({name: x for name, x in (spec | change).items() if x is not ...}).encode()
+    file.write_bytes(change)
+    with pytest.raises(ValueError, match=r"spec\.json cannot be read \(.*the store is damaged\. Begin the same sweep"):
+        Store(tmp_path).spec()
+
+
+def test_damaged_metadata_are_a_sentence_whose_advice_helps(tmp_path, undisturbed, capsys):
+    run, other = swept(tmp_path), tmp_path / "other"
+    (other / "store").parent.mkdir()
+    swept(other)
+    broken = {"zarr.json": b"{", "end/zarr.json": b"\xff", "length/c/0": b"\0" * 48, ".sweep/spec.json": b""}
+    for name, content in broken.items():
+        (run.store / name).write_bytes(content)
+        for use in (lambda: swept(tmp_path), run.status, run.open):
+            with pytest.raises(ValueError, match=r"the store is damaged\. Begin the same sweep, with the same `unit`"):
+                use()
+        assert command_line.main(["sweep", "run", str(run.store)]) == 1 and "is damaged" in capsys.readouterr().err
+        shutil.copy(other / "store" / name, run.store / name)
+    swept(tmp_path)
+    moved = run.store / "end" / "c"
+    moved.rename(other / "elsewhere")
+    moved.symlink_to(other / "elsewhere")
+    with pytest.raises(ValueError, match="is a link, or its chunks are"):
+        swept(tmp_path)
+    (run.store / ".sweep" / "scene.pkl").write_bytes(b"x")
+    moved.unlink()
+    assert command_line.main(["sweep", "run", str(run.store)]) == 1 and "scene.pkl, cannot" in capsys.readouterr().err
+    with pytest.warns(UserWarning, match="computed again"):
+        swept(tmp_path)
+    assert digests(tmp_path) == undisturbed
 
 
 def test_units_whose_chunks_are_gone_are_not_done(tmp_path, capsys):
