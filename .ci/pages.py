@@ -131,7 +131,15 @@ def on_config(config):
         {"Method and figures": [f"{name}.md" for name in ("method", "benchmarks", "problems")]},
         {"Reference": [{"By purpose": "reference.md"}, *_reference()]},
         {"Examples": [{path.stem.replace("_", " "): f"{path.stem}.md"} for path in examples()]},
-        {"Project": ["development.md", {"Contributing": "CONTRIBUTING.md"}, {"Changes": "CHANGELOG.md"}, "release.md"]},
+        {
+            "Project": [
+                "development.md",
+                {"Contributing": "CONTRIBUTING.md"},
+                {"Changes": "CHANGELOG.md"},
+                "security.md",
+                "release.md",
+            ]
+        },
     ]
     return config
 

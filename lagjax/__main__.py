@@ -47,7 +47,7 @@ def _parser() -> argparse.ArgumentParser:
     of_sweeps = commands.add_parser("sweep", help="a sweep that lagjax.sweep has begun")
     actions = of_sweeps.add_subparsers(required=True, title="actions")
     for name, command, about in (
-        ("run", _run, "compute the units that are missing, or a part of them"),
+        ("run", _run, "compute the units that are missing or damaged (unpickles: run only stores of your own)"),
         ("status", _status, "tell how far it is"),
         ("check", _check, "read all that is done, and tell what is damaged"),
     ):

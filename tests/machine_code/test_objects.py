@@ -1,10 +1,13 @@
 """Machine code kept on disk: the same code, made once for all processes, whatever happens to the files."""
 
+import contextlib
 import os
 import subprocess
 import sys
+import tempfile
 import threading
 import time
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -104,6 +107,29 @@ def test_what_another_user_has_written_is_not_read(cache, monkeypatch):
     (file,) = cache.iterdir()
     give_to_another_user(monkeypatch, file)
     assert kept() != mine
+
+
+@pytest.mark.filterwarnings("ignore:os.fork")  # the child calls nothing of JAX
+@pytest.mark.skipif(not hasattr(os, "fork") or os.geteuid() != 0, reason="only root can be two users")
+@pytest.mark.parametrize("inside", ["", "lagjax-0"])
+def test_a_neighbour_on_the_machine_plants_nothing(monkeypatch, inside):
+    """Objects of another user in a folder like /tmp, or in the one that would be made there, have the right names."""
+    with tempfile.TemporaryDirectory() as shared:
+        os.chmod(shared, 0o1777)
+        monkeypatch.setenv("LAGJAX_CACHE", shared)
+        place = Path(shared) / inside
+        if (neighbour := os.fork()) == 0:
+            with contextlib.suppress(BaseException):
+                os.setuid(12345)
+                place.mkdir(0o755, exist_ok=True)
+                _objects.private_folder = lambda _: place
+                kept()
+            os._exit(0)
+        os.waitpid(neighbour, 0)
+        (planted,) = place.glob("*.o")
+        with pytest.warns(UserWarning, match="not kept") if inside else contextlib.nullcontext():
+            assert not planted.read_bytes().endswith(kept())
+        assert planted.stat().st_uid == 12345
 
 
 @OWN
