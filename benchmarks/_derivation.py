@@ -62,7 +62,7 @@ def _in_new_process(name: str, links: int, budget: float) -> dict[str, float | N
 def _stages(case: Case) -> tuple[float, float]:
     params = jax.tree.map(jnp.asarray, case.scene.params)
     layout = Layout.from_state(case.tree(case.q0[0]), case.tree(case.qdot0[0]))
-    motion = case.scene.system.motion(layout, params)
+    motion = case.scene.system._motion(layout, params)
     derive, program = seconds(lambda: Derivation(motion, layout, eqx.filter(params, eqx.is_array_like)).acceleration)
     return derive, seconds(lambda: _native.Kernel(program, layout.size))[0]
 

@@ -160,7 +160,7 @@ def inconsistent_members(system, layout: Layout, ts, values: dict, axes: dict) -
 def _inconsistent(has_terms: bool, system, dtype, t, span, q0: PyTree, qdot0: PyTree, params: PyTree) -> jax.Array:
     layout = Layout.from_state(q0, qdot0)
     state = layout.flatten(q0), layout.flatten(qdot0), t, eqx.filter(params, eqx.is_array_like)
-    motion = system.motion(layout, params)
+    motion = system._motion(layout, params)
     terms = derivation_of(system, layout, params).term_sizes(*state) if has_terms else 0.0
     return motion.constraints.inconsistent(motion.mass_matrix(*state), *state, span, dtype, terms)
 

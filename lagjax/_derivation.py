@@ -612,7 +612,7 @@ def derivation_of(system: Any, layout: Layout, params: PyTree) -> Derivation:
     if arrays:
         numbers = eqx.filter(params, eqx.is_array_like)
         return Derivation(
-            system.motion(layout, params), layout, numbers, "the functions of the scene hold arrays of their own"
+            system._motion(layout, params), layout, numbers, "the functions of the scene hold arrays of their own"
         )
     leaves, tree = jax.tree.flatten(params)
     key = _Structure(scene, layout, tree, tuple(map(_structure_of, leaves)))
@@ -627,7 +627,7 @@ def _derived(key: _Structure, unhashable: str | None = None) -> Derivation:
     leaves = [np.zeros(*leaf) if isinstance(leaf, _Number) else leaf for leaf in key.leaves]
     params, system = jax.tree.unflatten(key.params, leaves), jax.tree.unflatten(key.system, [])
     numbers = eqx.filter(params, eqx.is_array_like)
-    return Derivation(system.motion(key.layout, params), key.layout, numbers, unhashable=unhashable)
+    return Derivation(system._motion(key.layout, params), key.layout, numbers, unhashable=unhashable)
 
 
 _derived_once = functools.lru_cache(maxsize=64)(_derived)

@@ -138,7 +138,7 @@ def solve_saddle(of: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 @eqx.filter_jit
 def _evaluate_compiled(names: tuple[str, ...], system: Any, layout: Layout, q, qdot, t, params) -> dict[str, jax.Array]:
-    motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
+    motion, numbers = system._motion(layout, params), eqx.filter(params, eqx.is_array_like)
 
     def quantities_at(q, qdot, t):
         values = motion.quantities(q, qdot, t, numbers)

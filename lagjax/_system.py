@@ -1,7 +1,7 @@
 """`System`: the scene as its author describes it, and the physics one can ask of a single state.
 
 A `System` holds the user's functions, checked for their signatures when it is built and for what they return when they
-first meet a state. `System.motion(layout)` is the same scene in flat coordinates, as an integration takes it.
+first meet a state. `System._motion(layout)` is the same scene in flat coordinates, as an integration takes it.
 """
 
 import math
@@ -119,7 +119,7 @@ class System(eqx.Module):
         shown = [f"{role}={getattr(f, 'name', f)}" for role, f in functions if f is not None]
         return f"System({', '.join(shown)}, path={self.path!r})"
 
-    def require_present(self) -> None:
+    def _require_present(self) -> None:
         """Raise `ValueError` where something that a function of the scene reads has changed since this one was made."""
         for function in (getattr(self, role) for role in ROLES):
             if isinstance(function, Function):
@@ -229,7 +229,7 @@ class System(eqx.Module):
         schur = self._evaluate_quantity(Motion.schur_complement, q, qdot, t, params)
         return facts.with_constraints(names, np.asarray(schur) if is_concrete(schur) else None)
 
-    def motion(self, layout: Layout, params: PyTree = None) -> Motion:
+    def _motion(self, layout: Layout, params: PyTree = None) -> Motion:
         """The scene in the flat coordinates of `layout`, after a look at what its functions return there.
 
         The functions of the result take the numbers in `params` alone, with None in the place of everything else.
@@ -268,13 +268,13 @@ class System(eqx.Module):
     def _evaluate_constraints(self, quantity: Callable, q, qdot, t, params) -> PyTree:
         self._require_constraints()
         self = present_system(self)
-        return self.split_by_constraint(
+        return self._split_by_constraint(
             self._evaluate_quantity(quantity, q, qdot, t, params), Layout.from_state(q, qdot), params
         )
 
-    def split_by_constraint(self, flat: jax.Array, layout: Layout, params: PyTree) -> PyTree:
+    def _split_by_constraint(self, flat: jax.Array, layout: Layout, params: PyTree) -> PyTree:
         """`flat` (m,), a number for each constraint, in the structure of `multipliers`."""
-        structure = self.constraint_structure(layout, params)
+        structure = self._constraint_structure(layout, params)
         ends = np.cumsum([0, *(math.prod(leaf.shape) for leaf in jax.tree.leaves(structure))]).tolist()
         pieces = [
             flat[start:end].reshape(leaf.shape)
@@ -285,7 +285,7 @@ class System(eqx.Module):
             return parts[0]
         return {**parts[0], **parts[1]} if all(isinstance(part, dict) for part in parts) else parts
 
-    def constraint_structure(self, layout: Layout, params: PyTree) -> tuple:
+    def _constraint_structure(self, layout: Layout, params: PyTree) -> tuple:
         """The shapes that the constraint functions return, a tuple of one or two pytrees."""
         numbers, code = eqx.partition(params, eqx.is_array_like)
 
@@ -302,7 +302,7 @@ class System(eqx.Module):
         """A name for each of the m constraints, such as constraints['rod'] or velocity_constraints[1]."""
         roles = [role for role in ("constraints", "velocity_constraints") if getattr(self, role) is not None]
         names = []
-        for role, part in zip(roles, self.constraint_structure(layout, params), strict=True):
+        for role, part in zip(roles, self._constraint_structure(layout, params), strict=True):
             for path, leaf in jax.tree_util.tree_leaves_with_path(part):
                 label = role + jax.tree_util.keystr(path)
                 names += [label + (str(list(index)) if leaf.shape else "") for index in np.ndindex(leaf.shape)]
@@ -370,7 +370,7 @@ class System(eqx.Module):
         if self.forces is not None:
             _require_structure(output_shapes(self.forces, "forces"), layout)
         if self.constraints is not None or self.velocity_constraints is not None:
-            _require_constraints(self.constraint_structure(layout, params))
+            _require_constraints(self._constraint_structure(layout, params))
 
 
 def _structure_of(role: str, state: PyTree) -> str:
@@ -441,7 +441,7 @@ def _evaluate(system: System, quantity: Callable, q, qdot, t, params, **more):
     if quantity is Motion.acceleration:  # in the form in which diffrax integrates it
         form = form_of(derivation_of(system, layout, params), "array" if system.path == "array" else "auto")
         return form.acceleration(t, state, numbers)[0]
-    return quantity(system.motion(layout, params), *state, t, numbers, **more)
+    return quantity(system._motion(layout, params), *state, t, numbers, **more)
 
 
 def _require_scalar(value: PyTree, role: str) -> None:

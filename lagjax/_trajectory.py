@@ -38,7 +38,8 @@ class State(NamedTuple):
 class Transitions(NamedTuple):
     """The changes of mode of a hybrid motion, in order: NaN or −1 beyond the last of `count`.
 
-    `t`, `q`, `qdot` are those just before the reset; `source` and `target` are places in `Trajectory.mode_names`.
+    `t`, `q`, `qdot` are those just before the reset, `q_next` and `qdot_next` just after it; `source` and `target` are
+    places in `Trajectory.mode_names`.
     `order_matters` is true where blows meet at one instant that do not commute: read from its end, the list of
     transitions leads to another state. `let_out`, for each transition of that list: the first time at which its guard
     was beyond zero where a mode began, and came back instead of a blow; NaN where that never was.
@@ -52,6 +53,8 @@ class Transitions(NamedTuple):
     count: jax.Array
     order_matters: jax.Array
     let_out: jax.Array
+    q_next: PyTree
+    qdot_next: PyTree
 
 
 class Trajectory(eqx.Module):
@@ -159,7 +162,7 @@ class Trajectory(eqx.Module):
         """
         from lagjax._health import examine
 
-        self.require_present()
+        self._require_present()
         return examine(self, reference)
 
     def to_xarray(self, units: PyTree = None, time_unit: str | None = None):
@@ -211,8 +214,9 @@ class Trajectory(eqx.Module):
         - `speed`: units of time that pass in a second; `fps`: frames in a second.
 
         Frames are evenly spaced in time, whatever the outputs are. Between outputs the motion is the Hermite cubic
-        through q and q̇, so that closer outputs make a better film. Both axes have the same scale. The first 50 members
-        of a batch are drawn into one picture.
+        through q and q̇, so that closer outputs make a better film; transitions are where and when they were. A line
+        that never moves is drawn without dots. Both axes have the same scale. The first 50 members of a batch are drawn
+        into one picture.
 
         Raises `ImportError` without matplotlib; `ValueError` for points, traces and speeds that cannot be shown.
 
@@ -240,15 +244,15 @@ class Trajectory(eqx.Module):
             mapped = jax.vmap(mapped, in_axes=(0, 0, *axes, 0, *[0] * len(more)))
         return mapped(self.q, self.qdot, (self.ts, self.tolerances), self.params, self.mode, *more)
 
-    def require_present(self) -> None:
+    def _require_present(self) -> None:
         """Raise `ValueError` where the scene reads other values by now than when this motion was followed."""
         for system in (self.system,) if isinstance(self.system, System) else self.system.values():
-            system.require_present()
+            system._require_present()
 
     @marks_absent
     def _map_outputs(self, name: str) -> PyTree:
         """Map a method (q, qdot, t, params) of the system over the time axis, and over the batch axes before it."""
-        self.require_present()
+        self._require_present()
 
         def evaluate_member(q, qdot, times_and_tolerances, params, mode):
             ts, _ = times_and_tolerances
@@ -277,7 +281,7 @@ def _require_like_constraints(modes: dict[str, System], name: str, q, qdot, para
     constrained = [
         which for which, s in modes.items() if s.constraints is not None or s.velocity_constraints is not None
     ]
-    structures = [modes[which].constraint_structure(Layout.from_state(q, qdot), params) for which in constrained]
+    structures = [modes[which]._constraint_structure(Layout.from_state(q, qdot), params) for which in constrained]
     if len(constrained) < len(modes) or any(structure != structures[0] for structure in structures):
         one = constrained[0] if constrained else next(iter(modes))
         raise ValueError(

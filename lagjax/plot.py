@@ -10,6 +10,7 @@ colour maps are perceptually uniform, so that all of them can be told apart with
     ax.set_xlabel("t [s]")
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -23,6 +24,7 @@ from lagjax._check import join_names
 from lagjax._crossings import Crossings
 from lagjax._display import COLORS, course_of, courses_of, require_points, times_of_members
 from lagjax._fit import Fit, Record, draw_record, record_matrix
+from lagjax._health import does_work
 from lagjax._layout import Layout
 from lagjax._platform import is_known
 from lagjax._precision import WorkPrecision
@@ -30,13 +32,24 @@ from lagjax._trajectory import Trajectory
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 GREY = "0.55"
-CURVE = 600  # points of a curve, at least: about as many as dots of a figure that is printed
+
+__all__ = [
+    "compare", "energy_error", "fit", "modes", "path", "phase", "poincare", "profile", "return_map", "space_time",
+    "state_map", "trajectory", "work_precision",
+]  # fmt: skip
+
+
+def __dir__() -> list[str]:
+    """The figures alone."""
+    return [*__all__, *(name for name in globals() if name.startswith("__"))]
 
 
 def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, members: int = 30, ax=None):
     """Coordinates against time, one colour each, the first seven of more; or, with a `projection`, curves in the plane.
 
-    `space_time` shows all coordinates of a chain or a lattice.
+    Between two outputs curves are the cubic that has q and q̇ of both (Hermite); of a hybrid motion they go through the
+    states before and after every transition, and end where a reset moves what is drawn. `space_time` shows all
+    coordinates of a chain or a lattice.
 
     - `projection`: a function of one state (q, qdot) that returns (x, y): `lambda q, qdot: (q, qdot)` for the phase
       portrait of one coordinate, or where a body is in space.
@@ -44,23 +57,17 @@ def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, me
 
     >>> lagjax.plot.trajectory(trajectory); lagjax.plot.trajectory(trajectory, lambda q, qdot: (q[0], qdot[0]))
     """
-    q, qdot = _states(trajectory, members)
-    ax = _axes(ax)
-    count = len(jax.tree.leaves(q)[0])
-    opacity = max(0.15, count**-0.5)
+    layout, curves = _curves(trajectory, members)
+    ax, opacity = _axes(ax), max(0.15, len(curves) ** -0.5)
     if projection is not None:
-        x, y = map(np.asarray, jax.vmap(jax.vmap(_pair(projection)))(q, qdot))
-        ax.plot(x.T, y.T, color=COLORS[0], alpha=opacity, linewidth=1.2)
+        for x, y in _project(layout, curves, projection):
+            ax.plot(x, y, color=COLORS[0], alpha=opacity, linewidth=1.2)
         return ax
-
-    layout = Layout.from_state(*jax.tree.map(lambda leaf: leaf[0, 0], (q, qdot)))
-    paths = np.asarray(jax.vmap(jax.vmap(layout.flatten))(q))
-    ts = times_of_members(trajectory).reshape(-1, paths.shape[1])
-    ts = ts[_some(len(ts), members)]
     shown = _places(layout, ())
     for color, i in zip(COLORS, shown, strict=False):
-        lines = ax.plot(ts.T, paths[:, :, i].T, color=color, alpha=opacity, linewidth=1.5)
-        lines[0].set_label(layout.names[i])
+        for t, q, _ in curves:
+            ax.plot(t, q[:, i], color=color, alpha=opacity, linewidth=1.5)
+        ax.lines[-len(curves)].set_label(layout.names[i])
     ax.set_xlabel("t")
     if layout.size == 1:
         ax.set_ylabel(layout.names[0])
@@ -97,7 +104,7 @@ def space_time(trajectory: Trajectory, *, label: str | None = None, cmap: str = 
 def phase(trajectory: Trajectory, *coordinates: str, members: int = 30, ax=None):
     """The phase portrait: the velocity of each coordinate against it, from the dot on; a colour for each coordinate.
 
-    Between two outputs the curve is the cubic that has q and q̇ of both (Hermite).
+    The curves are those of `trajectory`: they end at a reset, and go on behind it.
 
     - `coordinates`: their names, as messages and tables have them: "q['theta']", "q[0]"; by default all, the first
       seven of more.
@@ -105,17 +112,14 @@ def phase(trajectory: Trajectory, *coordinates: str, members: int = 30, ax=None)
 
     >>> lagjax.plot.phase(trajectory, "q['theta']")
     """
-    _require_numbers(trajectory, "trajectory")
-    chosen = _some(max(1, np.size(trajectory.ok)), _positive(members, "members"))
-    layout, courses = courses_of(trajectory, chosen)
+    layout, curves = _curves(trajectory, members)
     places = _places(layout, coordinates)
-    ax, opacity = _axes(ax), max(0.15, len(courses) ** -0.5)
-    curves = [course.smooth(CURVE) for course in courses]
+    ax, opacity = _axes(ax), max(0.15, len(curves) ** -0.5)
     for color, i in zip(COLORS, places, strict=False):
-        for q, qdot in curves:
+        for _, q, qdot in curves:
             ax.plot(q[:, i], qdot[:, i], color=color, alpha=opacity, linewidth=1.2)
         ax.lines[-len(curves)].set_label(layout.names[i])
-        starts = np.array([(course.q[0, i], course.before[0, i]) for course in courses])
+        starts = np.array([(q[0, i], qdot[0, i]) for _, q, qdot in curves])
         ax.plot(*starts.T, ".", color=color, markersize=5)
     if len(places) == 1:
         name = layout.names[places[0]]
@@ -149,6 +153,7 @@ def compare(one: Trajectory, other, *coordinates: str, figure=None):
     """
     _require_numbers(one, "one")
     layout, course = course_of(one)
+    t, q, _ = course.curve()
     ts, values, style = _other(other, layout)
     places = _places(layout, coordinates, most=4)
     matplotlib = _matplotlib()
@@ -156,10 +161,10 @@ def compare(one: Trajectory, other, *coordinates: str, figure=None):
         figure = matplotlib.pyplot.figure(figsize=(max(6.4, 3.6 * len(places)), 4.6), layout="constrained")
     axes = figure.subplots(2, len(places), squeeze=False, sharex="col", gridspec_kw={"height_ratios": [2, 1]})
     for (above, below), i in zip(axes.T, places, strict=True):
-        _axes(above).plot(course.t, course.q[:, i], color=COLORS[0], linewidth=1.5, label="motion")
+        _axes(above).plot(t, q[:, i], color=COLORS[0], linewidth=1.5, label="motion")
         above.plot(ts, values[:, i], style, color=COLORS[1], markersize=3.0, linewidth=1.2, label="other")
         _axes(below).plot(
-            ts, course.coordinates_at(ts)[:, i] - values[:, i], style[0], color=COLORS[1], markersize=3.0, linewidth=1
+            ts, course.states_at(ts)[0][:, i] - values[:, i], style[0], color=COLORS[1], markersize=3.0, linewidth=1
         )
         above.set_title(layout.names[i], fontsize="medium")
         below.set_xlabel("t")
@@ -175,7 +180,9 @@ def _other(other, layout: Layout) -> tuple[np.ndarray, np.ndarray, str]:
         of_other, course = course_of(other)
         if of_other.names != layout.names:
             raise ValueError("The two motions have other coordinates: there is nothing to compare.")
-        return course.t, course.q, "--"
+        t, q, _ = course.curve()
+        q[1:][np.isnan(q[:-1]).any(axis=1)] = np.nan  # at the instant of a jump the difference is that before it
+        return t, q, "--"
     if isinstance(other, tuple) and len(other) == 2:
         other = Record(*other)
     if not isinstance(other, Record):
@@ -277,13 +284,23 @@ def _swings(ax, points: Function, q, shape, params, largest: float) -> None:
 def path(x, y, *, values=None, label: str | None = None, cmap: str = "viridis", ax=None):
     """A curve in the plane, both axes on one scale.
 
-    - `x`, `y`: arrays of shape (T,).
+    - `x`, `y`: a trajectory and its projection, as in `trajectory`, whose curve it is; or arrays of shape (T,), which
+      straight lines join.
     - `values`: shape (T,); colours the curve, by time for instance, with a colour bar called `label`. Without it the
       curve has one colour, and `label` is its entry in a legend.
 
-    >>> lagjax.plot.path(trajectory.q[:, 0], trajectory.q[:, 1], values=trajectory.ts, label="t [s]")
+    >>> lagjax.plot.path(trajectory, lambda q, qdot: (q[0], q[1]), values=trajectory.ts, label="t [s]")
     """
     matplotlib = _matplotlib()
+    if isinstance(x, Trajectory):
+        _require_numbers(x, "x")
+        layout, course = course_of(x)
+        curve = course.curve()
+        (line,) = _project(layout, [curve], y)
+        if values is not None:
+            order = np.argsort(np.asarray(x.ts))
+            values = np.interp(curve[0], np.asarray(x.ts)[order], np.asarray(values)[order])
+        x, y = line
     ax = _axes(ax)
     ax.set_aspect("equal", adjustable="datalim")
     if values is None:
@@ -362,8 +379,9 @@ def _section_points(crossings: Crossings, projection: Callable) -> tuple[np.ndar
 def energy_error(trajectory: Trajectory, *, scale: float | None = None, ax=None):
     """|h(t) − h(0)| / |h(0)| against time, on a logarithmic axis; of a batch the median, and 5 to 95 % of the members.
 
-    `scale` takes the place of |h(0)|; give it where the energy at the start is zero or close to it. Members that failed
-    are left out.
+    It is an error where h should be constant. Where something does work, a force, friction, a drive, or a reset that
+    takes energy, the axis says that it is a change. `scale` takes the place of |h(0)|; give it where the energy at the
+    start is zero or close to it. Members that failed are left out.
 
     >>> lagjax.plot.energy_error(trajectory, scale=params["m"] * params["g"] * params["l"])
     """
@@ -386,8 +404,24 @@ def energy_error(trajectory: Trajectory, *, scale: float | None = None, ax=None)
     if len(h) > 1:
         ax.fill_between(times, low, high, color=COLORS[0], alpha=0.2, linewidth=0, label="5 to 95 % of the members")
     ax.plot(times, np.where(median > 0, median, np.nan), color=COLORS[0], linewidth=1.5, label="median")
-    ax.set(yscale="log", xlabel="t", ylabel="relative error of the energy")
+    what = "change" if does_work(trajectory) or _loses_at_transitions(trajectory, h) else "error"
+    ax.set(yscale="log", xlabel="t", ylabel=f"relative {what} of the energy")
     return _legend(ax) if len(h) > 1 else ax
+
+
+def _loses_at_transitions(trajectory: Trajectory, h: np.ndarray) -> bool:
+    """True if a transition changes the energy by more than rounding, in parts of the largest one."""
+    changes = trajectory.transitions
+    if changes is None:
+        return False
+    before, after = (
+        dataclasses.replace(trajectory, ts=changes.t, q=q, qdot=qdot, mode=mode).energy()
+        for q, qdot, mode in (
+            (changes.q, changes.qdot, changes.source), (changes.q_next, changes.qdot_next, changes.target),
+        )
+    )  # fmt: skip
+    rounding = np.finfo(h.dtype).eps ** 0.5 * np.nanmax(np.abs(h))
+    return bool(np.nanmax(np.abs(np.asarray(after - before)), initial=0.0) > rounding)
 
 
 def work_precision(result: WorkPrecision, *, ax=None):
@@ -545,12 +579,22 @@ def _positive(count, name: str) -> int:
     return int(count)
 
 
-def _states(trajectory: Trajectory, members: int) -> tuple[Any, Any]:
-    """q and qdot of at most this many members, on a first axis that is there for a single trajectory too."""
+def _curves(trajectory: Trajectory, members: int) -> tuple[Layout, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
+    """The curves (t, q, q̇) of at most this many members, evenly chosen, and the layout of their coordinates."""
     _require_numbers(trajectory, "trajectory")
-    count = _positive(members, "members")
-    states = trajectory.q, trajectory.qdot
-    return jax.tree.map(lambda leaf: _some_members(leaf, trajectory, count), states)
+    count = max(1, np.size(trajectory.ok))
+    chosen = np.linspace(0, count - 1, min(_positive(members, "members"), count)).astype(int)
+    layout, courses = courses_of(trajectory, np.unique(chosen))
+    return layout, [course.curve() for course in courses]
+
+
+def _project(layout: Layout, curves: list, projection: Callable) -> list[tuple[np.ndarray, np.ndarray]]:
+    """The curves in the plane, x and y of each; NaN where a state jumps."""
+    q, qdot = (np.concatenate([curve[part] for curve in curves]).astype(layout.dtype) for part in (1, 2))
+    states = map(layout.restore, map(jnp.asarray, (q, qdot)))
+    known = np.isfinite(q).all(axis=1)
+    xy = np.where(known, np.stack([np.asarray(x) for x in jax.vmap(_pair(projection))(*states)]), np.nan)
+    return [tuple(part) for part in np.split(xy, np.cumsum([len(t) for t, _, _ in curves])[:-1], axis=1)]
 
 
 def _pair(projection: Callable) -> Callable:
@@ -564,15 +608,3 @@ def _pair(projection: Callable) -> Callable:
         return values[0], values[1]
 
     return two_numbers
-
-
-def _some_members(leaf: Any, trajectory: Trajectory, count: int):
-    """Evenly chosen members of a leaf, `count` at most, on a first axis that is there for a single trajectory too."""
-    batch = np.ndim(trajectory.ok)
-    leaf = jnp.reshape(leaf, (-1, *leaf.shape[batch:]))
-    return leaf[_some(len(leaf), count)]
-
-
-def _some(members: int, count: int) -> np.ndarray:
-    """The places of at most `count` members, evenly chosen."""
-    return np.unique(np.linspace(0, members - 1, min(count, members)).astype(int))

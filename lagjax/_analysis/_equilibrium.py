@@ -90,7 +90,7 @@ def equilibrium(
         raise ValueError(_sentence(scene))
     of_user = None
     if scene.constrained:
-        of_user = scene.system.split_by_constraint(multipliers, scene.layout, scene.params)
+        of_user = scene.system._split_by_constraint(multipliers, scene.layout, scene.params)
     return Equilibrium(scene.layout.restore(place), of_user, ok)
 
 

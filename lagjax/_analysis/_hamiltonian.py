@@ -147,7 +147,7 @@ class _FlatScene(NamedTuple):
     @classmethod
     def from_state(cls, system: System, q: PyTree, p: PyTree, params: PyTree) -> "_FlatScene":
         layout = Layout.from_state(q, p)
-        return cls(layout, present_system(system).motion(layout, params), eqx.filter(params, eqx.is_array_like))
+        return cls(layout, present_system(system)._motion(layout, params), eqx.filter(params, eqx.is_array_like))
 
     def velocity(self, q: Vector, p: Vector, t) -> Vector:
         """v with ∂L/∂q̇(q, v, t) = p, by Newton's method from rest."""

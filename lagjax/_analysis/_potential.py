@@ -76,7 +76,7 @@ def absorb_potential_forces(scene: SceneState, scales: Scales, states: FlatState
     system, layout, reference = scene.system, scene.layout, np.asarray(scene.q)
 
     def lagrangian(q, qdot, t, params):
-        motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
+        motion, numbers = system._motion(layout, params), eqx.filter(params, eqx.is_array_like)
         place = layout.flatten(q), layout.flatten(qdot), t, numbers
 
         def force(q):

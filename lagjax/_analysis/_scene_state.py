@@ -51,7 +51,7 @@ class SceneState(NamedTuple):
     @classmethod
     def from_arguments(cls, system: System, layout: Layout, q: Vector, qdot: Vector, params: PyTree) -> "SceneState":
         """A scene at the flat state q, q̇ (n,), with params of arrays, inside of a compiled function."""
-        motion, derivation = system.motion(layout, params), derivation_of(system, layout, params)
+        motion, derivation = system._motion(layout, params), derivation_of(system, layout, params)
         return cls(system, layout, motion, derivation, q, qdot, params, eqx.filter(params, eqx.is_array_like))
 
     @property

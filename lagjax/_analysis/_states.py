@@ -34,7 +34,7 @@ def random_states(scene: SceneState, scales: Scales, count: int, seed: int, piec
 
 @eqx.filter_jit
 def _project(q, qdot, t, system, layout, params):
-    motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
+    motion, numbers = system._motion(layout, params), eqx.filter(params, eqx.is_array_like)
     return jax.vmap(lambda *y: motion.nearest_consistent(*y, numbers))(q, qdot, t)
 
 

@@ -415,7 +415,7 @@ def _charge(scene: SceneState, fields: Fields, weights: np.ndarray, gauge: Calla
 
     @accepts_singles(("q", "qdot"), ("t", "params"))
     def charge(q, qdot, t=0.0, params=None):
-        here = system.motion(layout, params)
+        here = system._motion(layout, params)
         numbers = eqx.filter(params, eqx.is_array_like)
         state = layout.flatten(q), layout.flatten(qdot), jnp.asarray(t, layout.dtype), numbers
         change, of_time = fields.transform(jnp.asarray(weights, layout.dtype), params)(state[0], state[2])

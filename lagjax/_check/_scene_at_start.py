@@ -311,7 +311,7 @@ def _rounding(*terms):
 def _variation(system: System, q, qdot, t, params, acceleration, multipliers):
     """The slopes of M q̈ − Gᵀλ − F and G q̈ − γ by (q, q̇), (n + m, 2n), for constant q̈ and λ: compiled by XLA."""
     layout = Layout.from_state(q, qdot)
-    motion, numbers = system.motion(layout, params), eqx.filter(params, eqx.is_array_like)
+    motion, numbers = system._motion(layout, params), eqx.filter(params, eqx.is_array_like)
 
     def balance(y):
         q, qdot = jnp.split(y, 2)

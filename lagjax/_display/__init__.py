@@ -2,11 +2,13 @@
 
 _summary     the three lines of a trajectory
 _notebook    the HTML of a result: its text, and a small picture
-_animation   a motion as a film; states between outputs
+_course      a motion between its outputs
+_animation   a motion as a film
 _export      a trajectory as an xarray.Dataset or a pandas.DataFrame, intervals as a table
 """
 
-from lagjax._display._animation import Animation, course_of, courses_of, make_animation, require_points
+from lagjax._display._animation import Animation, make_animation, require_points
+from lagjax._display._course import course_of, courses_of
 from lagjax._display._export import dataset, frame, intervals
 from lagjax._display._notebook import COLORS, cell, trajectory_html
 from lagjax._display._summary import summary, times_of_members

@@ -1,17 +1,13 @@
 """`Animation`: a motion that moves, by matplotlib. `Trajectory.animate` makes one.
 
-    Trajectory ─► Course of each member ─► states at the frames ─► positions of points ─► pictures ─► a file
-
-A trajectory is known at its output times alone. Between two of them the state follows the cubic that has q and q̇ of
-both ends (Hermite); across a change of mode of a hybrid motion it ends with the state before it, and continues along
-the parabola that meets the next output, since the velocity after a reset is not recorded.
+Trajectory ─► Course of each member ─► states at the frames ─► positions of points ─► pictures ─► a file
 """
 
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -20,60 +16,19 @@ import numpy as np
 
 from lagjax._arguments import Function, accept
 from lagjax._batch_members import Members
+from lagjax._display._course import course_of_member
 from lagjax._display._notebook import COLORS
-from lagjax._display._summary import times_of_members
-from lagjax._layout import Layout
-from lagjax._platform import is_known, numbers_at
+from lagjax._platform import is_known
 
 PyTree = Any
 MEMBERS = 50  # that are drawn of a batch, the first ones
 FRAMES = 20_000  # of which a film has fewer
 TRAIL = 2.0  # seconds of the film over which a trace fades
+FINER = 8  # pieces of a trace from one frame to the next: half a turn in a frame is round, and half as many has corners
 _VIDEO, _PAGE = (".mp4", ".m4v", ".mov", ".webm"), (".html", ".htm")
 _LARGEST = 2000.0  # megabytes of a page, more than `FRAMES` make
 _SIZE, _DPI = 4.8, 100  # inches of a side, and dots in one
 _INTERVALS = 8  # between numbers along a side of that length; twelve of six characters would touch
-
-
-class Course(NamedTuple):
-    """The places of one member between K knots: times (K,), q (K, n), and q̇ (K, n) just before and after each.
-
-    NaN after a knot: the velocity there is not known.
-    """
-
-    t: np.ndarray
-    q: np.ndarray
-    before: np.ndarray
-    after: np.ndarray
-
-    def coordinates_at(self, times: np.ndarray) -> np.ndarray:
-        """q (F, n) at some times; NaN beyond the ends, but for what a float32 rounds away."""
-        return self.states_at(times)[0]
-
-    def states_at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """q and q̇ (F, n) at some times: the cubic between two knots and its derivative; NaN beyond the ends."""
-        low, high = sorted((self.t[0], self.t[-1]))
-        slack = 1e-6 * (high - low)
-        inside = ((times >= low - slack) & (times <= high + slack))[:, None]
-        sign = np.sign(self.t[-1] - self.t[0])
-        place = np.clip(np.searchsorted(sign * self.t, sign * times, side="left") - 1, 0, len(self.t) - 2)
-        h = (self.t[place + 1] - self.t[place])[:, None]
-        with np.errstate(invalid="ignore", divide="ignore"):
-            x = np.where(h == 0, 0.0, (times[:, None] - self.t[place][:, None]) / h)
-            a, b, rate = self.q[place], self.q[place + 1], self.before[place + 1]
-            begin, end, rise = h * self.after[place], h * rate, b - a
-            begin = np.where(np.isnan(begin), 2 * rise - end, begin)
-            second, third = 3 * rise - 2 * begin - end, begin + end - 2 * rise
-            q = a + x * (begin + x * (second + x * third))
-            qdot = (begin + x * (2 * second + 3 * x * third)) / h
-            q, qdot = np.where(x == 1, b, q), np.where(x == 1, rate, qdot)
-            return np.where(inside, q, np.nan), np.where(inside, qdot, np.nan)
-
-    def smooth(self, points: int) -> tuple[np.ndarray, np.ndarray]:
-        """q and q̇ (F, n) at the knots and evenly between them, at `points` times at least: for curves."""
-        knots = np.arange(len(self.t))
-        finer = max(1, -(-points // max(1, len(knots) - 1)))
-        return self.states_at(np.interp(np.arange(finer * (len(knots) - 1) + 1) / finer, knots, self.t))
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -81,11 +36,14 @@ class Animation:
     """A motion as a film; made by `Trajectory.animate`. `save` writes it to a file, and a notebook shows it.
 
     - `positions(times)`: the positions of the points, a dict of arrays (members, frames, k, 2 or 3) by name.
+    - `paths(times)`: the times (F,) and positions (F, k, 2 or 3) along the path of each member, which are those at
+      `times` and at all of its outputs and transitions; NaN where it jumps.
     - `span`: the first and the last time; `speed`: units of time in a second of the film; `fps`: frames in a second.
     - `traces`: the points that leave a trace, (name, place) each.
     """
 
     positions: Callable[[np.ndarray], dict[str, np.ndarray]]
+    paths: Callable[[np.ndarray], list[tuple[np.ndarray, dict[str, np.ndarray]]]]
     span: tuple[float, float]
     speed: float
     fps: float
@@ -177,14 +135,23 @@ class Animation:
     def _figure(self, fps: float) -> tuple[Any, Callable, int]:
         """The figure, a function that sets it to frame i, and how many frames there are."""
         matplotlib, times = _matplotlib(), self.times(fps)
-        positions = self.positions(times)
-        figure = matplotlib.figure.Figure(figsize=_size(positions), layout="constrained", dpi=_DPI)
+        positions, traces = self.positions(times), self._traces(times)
+        limits = _limits([*positions.values(), *(path for _, _, path in traces)])
+        figure = matplotlib.figure.Figure(figsize=_size(*limits), layout="constrained", dpi=_DPI)
         matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
-        show, moving = _draw_film(figure, positions, times, self.traces, max(1, round(TRAIL * fps)))
+        show, moving = _draw_film(_axes(figure, *limits), positions, times, traces, max(1, round(TRAIL * fps)))
         figure.draw_without_rendering()
         figure.set_layout_engine("none")  # it is laid out: to do so for every frame takes most of the time
         _keep_the_rest(figure, moving)
         return figure, show, len(times)
+
+    def _traces(self, times: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
+        """The traces: of every member and traced point its name, the times (F,) and the places (F, 2 or 3)."""
+        if not self.traces:
+            return []
+        finer = np.interp(np.arange(FINER * (len(times) - 1) + 1) / FINER, np.arange(len(times)), times)
+        paths = self.paths(finer)
+        return [(name, t, path[name][:, place]) for name, place in self.traces for t, path in paths]
 
 
 def make_animation(trajectory, points: Callable, trace, speed: float, fps: float) -> Animation:
@@ -194,7 +161,7 @@ def make_animation(trajectory, points: Callable, trace, speed: float, fps: float
         raise ValueError("animate draws numbers: call it outside of jit, vmap and grad.")
     function = accept(points, "points", ("q",))
     members = Members(trajectory)
-    courses = [_course(trajectory, members, k) for k in range(min(members.count, MEMBERS))]
+    courses = [course_of_member(members, k) for k in range(min(members.count, MEMBERS))]
     reached = [course.t[np.isfinite(course.q).all(axis=1)] for course in courses]
     known = np.concatenate(reached)
     if not len(known):
@@ -211,15 +178,19 @@ def make_animation(trajectory, points: Callable, trace, speed: float, fps: float
         )
 
     def positions(times: np.ndarray) -> dict[str, np.ndarray]:
-        each = [
-            _positions(function, members, k, course.coordinates_at(times), times) for k, course in enumerate(courses)
-        ]
+        each = [_positions(function, members, k, course.states_at(times)[0], times) for k, course in enumerate(courses)]
         return {name: np.stack([one[name] for one in each]) for name in each[0]}
+
+    def paths(times: np.ndarray) -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:
+        curves = [course.curve(times)[:2] for course in courses]
+        longest = np.arange(max(len(t) for t, _ in curves))  # paths of one length are compiled once
+        filled = [tuple(x[np.minimum(longest, len(x) - 1)] for x in curve) for curve in curves]
+        return [(t, _positions(function, members, k, q, t)) for k, (t, q) in enumerate(filled)]
 
     shapes = {name: array.shape[2:] for name, array in positions(np.array([begin])).items()}
     if not shapes:
         raise ValueError("points returns an empty dict: there is nothing to show.")
-    return Animation(positions, (float(begin), end), float(speed), float(fps), _parse_trace(trace, shapes))
+    return Animation(positions, paths, (float(begin), end), float(speed), float(fps), _parse_trace(trace, shapes))
 
 
 def _require_positive(**numbers) -> None:
@@ -231,54 +202,14 @@ def _require_positive(**numbers) -> None:
 # ---- where the points are --------------------------------------------------------------------------------------------
 
 
-def courses_of(trajectory, places) -> tuple[Layout, list[Course]]:
-    """The members in these places of a batch, between their outputs; place 0 of one motion is that motion."""
-    members = Members(trajectory)
-    return members.layout, [_course(trajectory, members, k) for k in places]
-
-
-def course_of(trajectory) -> tuple[Layout, Course]:
-    """One motion between its outputs. Raises `ValueError` for a batch."""
-    members = Members(trajectory)
-    if members.batch:
-        raise ValueError(
-            "Compare one motion, not a batch: jax.tree.map(lambda x: x[k], (batch.q, batch.qdot)) are the states of "
-            "member k; simulate follows it alone."
-        )
-    return members.layout, _course(trajectory, members, 0)
-
-
-def _course(trajectory, members: Members, k: int) -> Course:
-    """The knots of a member: its outputs, and the states just before its transitions."""
-    place = np.unravel_index(k, members.batch) if members.batch else ()
-
-    def flatten_member(tree):
-        leaves = [numbers_at(leaf, place) for leaf in jax.tree.leaves(tree)]
-        return np.concatenate([leaf.reshape(len(leaf), -1) for leaf in leaves], axis=1).astype(float)
-
-    t = times_of_members(trajectory).reshape(members.count, -1)[k].astype(float)
-    q, qdot = flatten_member(trajectory.q), flatten_member(trajectory.qdot)
-    changes = trajectory.transitions
-    if changes is None:
-        return Course(t, q, qdot, qdot)
-    when = np.asarray(changes.t).reshape(members.count, -1)[k]
-    there = np.isfinite(when)
-    before = flatten_member(changes.qdot)[there]
-    order = np.argsort(np.concatenate([t, when[there]]), kind="stable")
-    return Course(
-        np.concatenate([t, when[there]])[order],
-        np.concatenate([q, flatten_member(changes.q)[there]])[order],
-        np.concatenate([qdot, before])[order],
-        np.concatenate([qdot, np.full_like(before, np.nan)])[order],
-    )
-
-
 def _positions(function: Function, members: Members, k: int, q: np.ndarray, times: np.ndarray) -> dict[str, np.ndarray]:
-    """The points (frames, number, 2 or 3) of a member at its states q (frames, n), by name."""
+    """The points (frames, number, 2 or 3) of a member at its states q (frames, n), by name; NaN where q is."""
     states = members.layout.restore(q.astype(members.layout.dtype))
     drawn = _evaluate_points(function, states, times.astype(members.layout.dtype), members.params_of(k))
     named = drawn if isinstance(drawn, dict) else {"": drawn}
-    return {str(name): require_points(name, np.asarray(value), len(q)) for name, value in named.items()}
+    known = np.all(np.isfinite(q), axis=1)[:, None, None]
+    positions = {str(name): require_points(name, np.asarray(value), len(q)) for name, value in named.items()}
+    return {name: np.where(known, value, np.nan) for name, value in positions.items()}
 
 
 @eqx.filter_jit
@@ -327,21 +258,21 @@ def _parse_trace(trace, shapes: dict[str, tuple[int, ...]]) -> tuple[tuple[str, 
 # ---- pictures --------------------------------------------------------------------------------------------------------
 
 
-def _draw_film(
-    figure, positions: dict[str, np.ndarray], times: np.ndarray, traces, trail: int
-) -> tuple[Callable, list]:
+def _draw_film(ax, positions: dict[str, np.ndarray], times: np.ndarray, traces, trail: int) -> tuple[Callable, list]:
     """Set the figure up; a function that sets it to frame i, and the artists to draw for it."""
-    ax, space = _axes(figure, positions), next(iter(positions.values())).shape[-1] == 3
-    count = len(next(iter(positions.values())))
-    opacity = max(0.2, count**-0.5)
-    lines, faded = [], []
-    for color, (name, array) in zip(_cycle_colors(len(positions)), positions.items(), strict=True):
-        style = dict(color=color, alpha=opacity, linewidth=2, marker="o", markersize=5, solid_capstyle="round")
+    space = ax.name == "3d"
+    opacity = max(0.2, len(next(iter(positions.values()))) ** -0.5)
+    lines, faded, forward = [], [], np.sign(times[-1] - times[0])
+    colors = dict(zip(positions, _cycle_colors(len(positions)), strict=True))
+    for name, array in positions.items():
+        stands = array.shape[2] > 1 and not np.ptp(array, axis=(0, 1)).any()  # a floor has no ends
+        style = dict(color=colors[name], alpha=opacity, linewidth=2, marker="" if stands else "o", markersize=5)
         for member in array:
-            lines.append((ax.plot(*([] for _ in range(member.shape[-1])), **style)[0], member))
-        for place in [place for traced, place in traces if traced == name]:
-            for member in array:
-                faded.append((_trace(ax, color, space, opacity), member[:, place], color))
+            line = ax.plot(*([] for _ in range(member.shape[-1])), **style, solid_capstyle="round")[0]
+            lines.append((line, member))
+    for name, t, path in traces:
+        seen = np.searchsorted(forward * t, forward * times, side="right")  # of the path, at every frame
+        faded.append((_trace(ax, colors[name], space, opacity), t, path, seen, colors[name]))
     # Above the scene; at a height of its own, as matplotlib looks for none of a title that is hidden.
     clock = ax.set_title(f"t = {times[-1]:.{_digits(times)}f}", loc="left", y=1.0, fontsize="medium")
 
@@ -351,15 +282,16 @@ def _draw_film(
                 line.set_data_3d(*member[i].T)
             else:
                 line.set_data(*member[i].T)
-        for collection, path, color in faded:
-            recent = path[max(0, i - trail) : i + 1]
-            collection.set_segments(np.stack([recent[:-1], recent[1:]], axis=1))
-            collection.set_color([(*_rgb(color), a * opacity) for a in np.linspace(0, 1, len(recent) - 1)])
+        for collection, t, path, seen, color in faded:
+            begin, recent = times[max(0, i - trail)], slice(max(0, seen[max(0, i - trail)] - 1), seen[i])
+            collection.set_segments(np.stack([path[recent][:-1], path[recent][1:]], axis=1))
+            age = (t[recent][1:] - begin) / (times[i] - begin if i else 1.0)
+            collection.set_color([(*_rgb(color), a * opacity) for a in np.clip(age, 0.0, 1.0)])
         clock.set_text(f"t = {times[i]:.{_digits(times)}f}")
         return ()
 
     above = [] if space else [ax.spines["left"], ax.spines["bottom"]]  # these stand still, and on top
-    return show, [clock, *above, *(line for line, _ in lines), *(collection for collection, *_ in faded)]
+    return show, [clock, *above, *(artist for artist, *_ in lines + faded)]
 
 
 def _keep_the_rest(figure, moving: list) -> None:
@@ -388,9 +320,8 @@ def _keep_the_rest(figure, moving: list) -> None:
     figure.draw = draw
 
 
-def _axes(figure, positions):
+def _axes(figure, low: np.ndarray, high: np.ndarray):
     """Axes of equal scale that hold the whole motion."""
-    low, high = _limits(positions)
     ax = figure.add_subplot(projection="3d" if len(low) == 3 else None)
     limits = {f"{axis}lim": ends for axis, *ends in zip("xyz", low, high, strict=False)}
     ax.set(**limits)
@@ -415,9 +346,9 @@ def _axes(figure, positions):
     return ax
 
 
-def _limits(positions) -> tuple[np.ndarray, np.ndarray]:
-    """The box of all points at all times, a twentieth wider, and no side less than a tenth of the longest."""
-    every = np.concatenate([array.reshape(-1, array.shape[-1]) for array in positions.values()])
+def _limits(points: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The box of all points, a twentieth wider, and no side less than a tenth of the longest."""
+    every = np.concatenate([array.reshape(-1, array.shape[-1]) for array in points])
     every = every[np.isfinite(every).all(axis=1)]
     if not len(every):
         raise ValueError("points returns no finite position at any time: there is nothing to show.")
@@ -426,9 +357,8 @@ def _limits(positions) -> tuple[np.ndarray, np.ndarray]:
     return middle - half, middle + half
 
 
-def _size(positions) -> tuple[float, float]:
+def _size(low: np.ndarray, high: np.ndarray) -> tuple[float, float]:
     """Width and height of the figure in inches, even numbers of dots, as videos need them."""
-    low, high = _limits(positions)
     if len(low) == 3:
         return _SIZE, _SIZE
     width, height = (high - low) / (high - low).max()

@@ -342,7 +342,7 @@ def weak_form_residuals(system: SystemResiduals, readers: Sequence[Reader | None
     def momentum_and_force(y, t, table, numbers):
         params = parameters.restore(numbers)
         params = params if form is None else Driven(params, *table)
-        motion = scene.motion(layout, params)
+        motion = scene._motion(layout, params)
         state = (*halves(y), t, params)
         return jnp.stack([motion.momentum(*state), motion.generalized_force(*state)])
 

@@ -37,13 +37,13 @@ from lagjax._batch_members import Members
 from lagjax._diagnosis import diagnosis, motion_end
 from lagjax._health._border_counts import Met, count_borders, is_piecewise
 from lagjax._health._compare import global_error
-from lagjax._health._measure import SLACK, SMALLEST, VISIBLE, Extreme, measure_trajectory
+from lagjax._health._measure import SLACK, SMALLEST, VISIBLE, Extreme, does_work, measure_trajectory
 from lagjax._layout import Layout
 from lagjax._results import RESULTS, advice, show_str
 from lagjax._system import System
 from lagjax._validate import is_concrete
 
-__all__ = ["Extreme", "Health", "examine"]
+__all__ = ["Extreme", "Health", "does_work", "examine"]
 
 # The part of steps rejected beyond which the motion meets something that the step control does not get over.
 UNSTEADY = 0.5

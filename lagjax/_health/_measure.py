@@ -113,6 +113,12 @@ def _laws(trajectory, layout: Layout, params) -> list[Law]:
     return [Law.from_system(system, layout, params, name if len(modes) > 1 else "") for name, system in modes.items()]
 
 
+def does_work(trajectory) -> bool:
+    """True if anything does work in some mode of a motion, so that its energy is not constant."""
+    members = Members(trajectory)
+    return any(law.works for law in _laws(trajectory, members.layout, members.params))
+
+
 def _names(laws: list[Law], layout: Layout) -> Names:
     momenta = _conserved(laws)
     return Names(

@@ -101,8 +101,9 @@ def simulate_hybrid(
     The other arguments are those of `simulate`, `max_steps` counting for each stretch between transitions. The result
     is a `Trajectory` with two more fields: `mode`, for every output time the place of its mode in `modes` (−1 where it
     was not reached; at the instant of a transition, the mode before it), and `transitions`: `t`, `q`, `qdot` just
-    before the reset, and `source`, `target` as places in `modes`, all of length `max_transitions` with NaN or −1 beyond
-    the last, their `count`, whether the order of the list mattered (`order_matters`), and which guards were `let_out`.
+    before the reset, `q_next`, `qdot_next` just after it, and `source`, `target` as places in `modes`, all of length
+    `max_transitions` with NaN or −1 beyond the last, their `count`, whether the order of the list mattered
+    (`order_matters`), and which guards were `let_out`.
 
     `jax.vmap`, `jax.jit` and `jax.grad` work around it, and every member of a batch switches at its own time. Times and
     states of transitions have first and second derivatives with respect to the initial state and params; third
@@ -159,18 +160,21 @@ def _motion(plan: RoundPlan, problem: Problem) -> tuple[Ending, TransitionRecord
 
 def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, record: TransitionRecord) -> Trajectory:
     """The motion in the pytree of the user."""
-    restore, (accepted, rejected) = problem.layout.restore, ending.steps
-    (q, qdot), (q_end, qdot_end), (q_before, qdot_before) = map(halves, (ending.path, ending.y, record.y))
+    states, (accepted, rejected) = (ending.path, ending.y, record.y, record.y_next), ending.steps
+    (q, qdot), end, (q_before, qdot_before), (q_next, qdot_next) = (
+        map(problem.layout.restore, halves(y)) for y in states
+    )
     transitions = Transitions(
-        t=record.t, q=restore(q_before), qdot=restore(qdot_before), source=record.source, target=record.target,
+        t=record.t, q=q_before, qdot=qdot_before, source=record.source, target=record.target,
         count=jnp.sum(record.source >= 0), order_matters=record.order_matters, let_out=ending.let_out,
+        q_next=q_next, qdot_next=qdot_next,
     )  # fmt: skip
     return Trajectory(
         ts=jnp.asarray(problem.ts),
-        q=restore(q),
-        qdot=restore(qdot),
+        q=q,
+        qdot=qdot,
         result=result_from(ending.result),
-        end=State(ending.t, restore(q_end), restore(qdot_end)),
+        end=State(ending.t, *end),
         stats={
             "num_steps": accepted + rejected,
             "num_accepted_steps": accepted,

@@ -199,7 +199,7 @@ class Mode(NamedTuple):
         system = self.problem.system
         if system.constraints is None and system.velocity_constraints is None:
             return jnp.asarray(False)
-        motion = system.motion(self.layout, self.params)
+        motion = system._motion(self.layout, self.params)
         t, y, numbers = jax.lax.stop_gradient((t, y, eqx.filter(self.params, eqx.is_array_like)))
         state, dtype = (*halves(y), t, numbers), SINGLE if self.problem.is_rounded else DOUBLE
         terms = self.problem.derivation.term_sizes(*state)
@@ -228,7 +228,7 @@ def _surfaces(
         if multipliers is None:
             return {}
         flat = jnp.stack(multipliers.compute_outputs(y, vector_of(eqx.filter(params, eqx.is_array_like))))
-        return {"multipliers": system.split_by_constraint(flat, layout, params)}
+        return {"multipliers": system._split_by_constraint(flat, layout, params)}
 
     def value(guard):
         return lambda y, params: _value(

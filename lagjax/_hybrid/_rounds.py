@@ -154,13 +154,14 @@ class Outset(NamedTuple):
 
 
 class TransitionRecord(NamedTuple):
-    """One transition: its time, the state before the reset, and the modes on both sides; NaN and −1 without any.
+    """One transition: its time, the states around the reset, and the modes on both sides; NaN and −1 without any.
 
     And whether another order of the list leads to another state, where blows meet.
     """
 
     t: jax.Array
     y: jax.Array
+    y_next: jax.Array
     source: jax.Array
     target: jax.Array
     order_matters: jax.Array
@@ -219,9 +220,8 @@ class _Rounds(NamedTuple):
     def run_round(self, before: Ending, count) -> tuple[Ending, TransitionRecord]:
         """One round: every group runs the members that are in its modes; the others are given no time."""
         after, fired = before, jnp.asarray(False)
-        record = TransitionRecord(
-            jnp.asarray(jnp.nan), jnp.full_like(before.y, jnp.nan), jnp.asarray(-1), jnp.asarray(-1), fired
-        )
+        nowhere, none = jnp.full_like(before.y, jnp.nan), jnp.asarray(-1)
+        record = TransitionRecord(jnp.asarray(jnp.nan), nowhere, nowhere, none, none, fired)
         place, row = jnp.asarray(self.places)[before.mode]
         modes = [group.mode(jnp.where(place == index, row, 0)) for index, group in enumerate(self.groups)]
         guards = [mode.guards_at(before.t, before.y, self.ts[-1]) if mode.leaving else None for mode in modes]
@@ -286,7 +286,7 @@ class _Rounds(NamedTuple):
             memory=memory,
             let_out=self._note_let_out(mode, before, here & outset.blows & ~((kinds > 0) & at_once)),
         )
-        return after, event, TransitionRecord(exit.t, exit.y, before.mode, exit.target, exit.order_matters)
+        return after, event, TransitionRecord(exit.t, exit.y, exit.y_next, before.mode, exit.target, exit.order_matters)
 
     def _pass_transition(
         self, group: ModeGroup, mode: Mode, before: Ending, kinds, at_once, put, t, y, known
@@ -547,6 +547,6 @@ def _go_in_turn(record: TransitionRecord) -> jax.Array:
 def _lose_unreached(ending: Ending, record: TransitionRecord, inputs) -> tuple[Ending, TransitionRecord]:
     """The ending and the record with NaN derivatives of outputs that were not reached and of absent transitions."""
     happened = record.source >= 0
-    t, y = (lost_unless(which, x, inputs) for which, x in ((happened, record.t), (happened[:, None], record.y)))
+    t, y, y_next = (lost_unless(happened[:, *[None] * (x.ndim - 1)], x, inputs) for x in record[:3])
     path = lost_unless((ending.modes >= 0)[:, None], ending.path, inputs)
-    return ending._replace(path=path), record._replace(t=t, y=y)
+    return ending._replace(path=path), record._replace(t=t, y=y, y_next=y_next)

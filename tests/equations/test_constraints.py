@@ -524,7 +524,7 @@ def test_accelerations_where_a_parallelogram_is_flat():
     away = np.array([0.0, 1e-12, 1e-9, 1e-7, 1e-6, 1e-5, 1e-4, 1e-2])
     expected = jax.vmap(lambda angle: minimal.acceleration(angle, 3.0))(GROUND[1] + away)
     layout = Layout.from_state(jnp.zeros(3), jnp.zeros(3))
-    motion = lagjax.System(linkage, constraints=closed_linkage).motion(layout)
+    motion = lagjax.System(linkage, constraints=closed_linkage)._motion(layout)
     for path in ("scalar", "array"):
         form = form_of(Derivation(motion, layout, None), path)
 

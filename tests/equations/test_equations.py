@@ -18,7 +18,7 @@ from lagjax._layout import Layout
 def forms(scene, *paths):
     layout = Layout.from_state(scene.q0, scene.qdot0)
     params = jax.tree.map(jnp.asarray, scene.params)
-    motion = scene.system.motion(layout, params)
+    motion = scene.system._motion(layout, params)
     return layout, params, [form_of(Derivation(motion, layout, params), path) for path in paths]
 
 
@@ -81,7 +81,7 @@ def test_both_forms_follow_one_motion_and_one_gradient():
 def test_both_forms_find_a_singular_mass_matrix(lagrangian):
     n = 3
     layout = Layout.from_state(jnp.zeros(n), jnp.zeros(n))
-    motion = lagjax.System(lagrangian).motion(layout)
+    motion = lagjax.System(lagrangian)._motion(layout)
     for path in ("scalar", "array"):
         form = form_of(Derivation(motion, layout, None), path)
         acceleration, singular = form.acceleration(jnp.asarray(0.0), (jnp.zeros(n), jnp.ones(n)), None)

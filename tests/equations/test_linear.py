@@ -188,7 +188,7 @@ def programs():
     free = lagjax.System(weight, dissipation=lambda q, v: 0.1 * jnp.sum(v**2), path="array")
     held = lagjax.System(weight, constraints=redundant, path="array")
     q, v, zero = jnp.array([0.6, -0.8, 0.5]), jnp.zeros(3), jnp.zeros(())
-    motion = held.motion(Layout.from_state(q, v), None)
+    motion = held._motion(Layout.from_state(q, v), None)
     yield "acceleration", free.acceleration
     yield "its second derivatives", lambda q, v: jax.hessian(lambda q: free.acceleration(q, v).sum())(q)
     yield "constrained acceleration", held.acceleration
