@@ -62,12 +62,9 @@ class Function(eqx.Module):
             with self.code.traced():
                 return function(*roles, **{name: extras[name] for name in self.extras})
         except (AttributeError, IndexError, TypeError) as reason:
-            if isinstance(reason, jax.errors.TracerIntegerConversionError):
-                _note(reason, self.name, _NO_COUNT)
-                raise
             if isinstance(reason, _NO_VALUES):
-                _note(reason, self.name, _USE_JAX)
-                raise
+                what = _NO_COUNT if isinstance(reason, jax.errors.TracerIntegerConversionError) else _USE_JAX
+                raise ValueNotKnown(f"{self.name}{_place_of(reason)}: {what}") from None
             asks = "params" in self.extras
             if asks and extras["params"] is None and not isinstance(reason, IndexError):  # None has no index to miss
                 raise TypeError(
@@ -91,11 +88,17 @@ def present(function: Function) -> Function:
     return function if code is fields["code"] else Function(fields["arrays"], code, fields["extras"])
 
 
-# Errors of JAX where a function asks a traced number for its value; they are TypeErrors.
-_NO_VALUES = (jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError)
+class ValueNotKnown(TypeError):
+    """A function of the user asked a number for its value while it was being traced."""
+
+
+# Errors of JAX where that happens; they are TypeErrors, too.
+_NO_VALUES = (
+    jax.errors.ConcretizationTypeError, jax.errors.TracerArrayConversionError, jax.errors.TracerIntegerConversionError,
+)  # fmt: skip
 _USE_JAX = (
-    "its arguments have no values while it is differentiated: write jnp.cos(q) for math.cos(q) or numpy.cos(q), "
-    "jnp.where(q > 0, a, b) for `if q > 0`, and no float(q)."
+    "the arguments of a function of a scene have no values while it is differentiated. Write jnp.cos(q) for "
+    "math.cos(q) or numpy.cos(q), jnp.where(q > 0, a, b) for `if q > 0`, and no float(q)."
 )
 
 _NO_COUNT = (
@@ -120,15 +123,25 @@ def _keys_of(roles: tuple, extras: dict[str, Any]) -> str:
 
 def find_params_expression(reason: Exception) -> str | None:
     """The expression that read `params` where a function of the user failed; None where something else failed."""
-    if reason.__traceback__ is None:
-        return None
+    _, text = _expression(reason)
+    return text if text.startswith(("params", "(params")) else None
+
+
+def _place_of(reason: Exception) -> str:
+    """The line and the expression of the user that failed, as the middle of a sentence."""
+    where, text = _expression(reason)
+    return f", {where}, `{text}`" if text else where and f", {where}"
+
+
+def _expression(reason: Exception) -> tuple[str, str]:
+    """The line of the user that failed, and its expression; empty where these are not known."""
     frames = traceback.extract_tb(reason.__traceback__)
     theirs = [frame for frame in frames if not frame.filename.startswith(_NOT_USERS)]
     if not theirs or theirs[-1].lineno is None:
-        return None
+        return "", ""
     last = theirs[-1]
     text = linecache.getline(last.filename, last.lineno or 0).encode()[last.colno : last.end_colno].decode()
-    return text if text.startswith(("params", "(params")) else None
+    return f"line {last.lineno} of {Path(last.filename).name}", text.strip()
 
 
 def _note(error: Exception, name: str, text: str) -> None:

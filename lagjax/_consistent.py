@@ -96,6 +96,11 @@ def _require_gradients(names: list[str], start: _StartConditions) -> None:
                 f"{name} is not finite at the initial state (value {value}, gradient {length}): start where it is "
                 "finite, or write it so that it is finite there."
             )
+        if length == 0 and name.startswith("velocity_constraints"):
+            raise ValueError(
+                f"{name} does not depend on qdot at the initial state, so that no force can keep it: pass what depends "
+                "on q alone as constraints=…."
+            )
         if length == 0:
             raise ValueError(
                 f"{name} has zero gradient at the initial state, so that it exerts no force there: write it with a "

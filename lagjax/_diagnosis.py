@@ -40,6 +40,9 @@ LONGEST = 4000  # equations of a function up to which they are gone through one 
 RUNAWAY = 1e-8
 RUNAWAY_SINGLE = 3e-6  # of float32, whose steps are given up at 5e-7 of the whole
 SINGULAR = 1e-9  # the part of its first value to which an eigenvalue of M has come down where M is called singular
+# Steps beyond which a budget was spent on crossing borders: one that no step fits over is given up within a hundred
+# after those that led there. Twice as many say the same of most scenes.
+MANY = 1000
 ESCAPED = 1e3  # times its largest coordinate at the start: a motion to infinity
 
 _CODES = {
@@ -81,11 +84,11 @@ class Undefined(NamedTuple):
     by_time: bool  # whether time alone, without the motion, leads there
 
 
-def describe_failure(trajectory: Trajectory, layout: Layout) -> str:
-    """The whole message of a single motion that failed: its result, its last state and the diagnosis."""
+def describe_failure(trajectory: Trajectory, layout: Layout, why: str | None) -> str:
+    """The whole message of a single motion that failed: why it did, its last state and the diagnosis."""
     end, system = trajectory.end, trajectory.system
     y_end = np.concatenate([layout.flatten(end.q), layout.flatten(end.qdot)])
-    message = sentence(trajectory.result._value, end.t, trajectory.ts[-1], y_end, layout.names) or ""
+    message = sentence(trajectory.result._value, end.t, trajectory.ts[-1], y_end, layout.names, why) or ""
     if not isinstance(system, System):
         return message
     if trajectory.result == RESULTS.mass_matrix_singular:
@@ -386,7 +389,8 @@ def _borders(derivation: Derivation, params, ended: Ended) -> str:
 def _budget(ended: Ended) -> str:
     """The time that was reached when the budget of steps was spent."""
     reached, whole = abs(ended.t - ended.t_first), abs(ended.t_last - ended.t_first)
-    if _CODES[ended.code] != "max_steps_reached" or not reached > 0:
+    crossed = _CODES[ended.code] == "acceleration_discontinuous" and ended.steps > MANY
+    if not (crossed or _CODES[ended.code] == "max_steps_reached") or not reached > 0:
         return ""
     needed = ended.steps * whole / reached
     return (

@@ -45,8 +45,11 @@ def first_failed(result) -> tuple[int, ...] | None:
     return tuple(failed[0].tolist()) if len(failed) else None
 
 
-def sentence(result, t_end, t_last, y_end, names: tuple[str, ...]) -> str | None:
-    """The first failure among members with any batch axes, its time and its state; None where all ended well."""
+def sentence(result, t_end, t_last, y_end, names: tuple[str, ...], why: str | None = None) -> str | None:
+    """The first failure among members with any batch axes, its time and its state; None where all ended well.
+
+    `why` stands for the advice on its result, where more is known.
+    """
     result, t_end, t_last, y_end = map(np.asarray, (result, t_end, t_last, y_end))
     member = first_failed(result)
     if member is None:
@@ -64,7 +67,7 @@ def sentence(result, t_end, t_last, y_end, names: tuple[str, ...]) -> str | None
     velocity = ", ".join(f"{value:.6g}" for value in qdot[:8])
     return (
         f"The motion{who} could not be followed beyond t = {float(t_end[member]):.9g} of {float(t_last):.9g}. "
-        f"{advice(result_from(result[member]))}\nThe last state was {state}; velocities {velocity}."
+        f"{why or advice(result_from(result[member]))}\nThe last state was {state}; velocities {velocity}."
     )
 
 

@@ -347,7 +347,10 @@ def axes_per_leaf(values: dict[str, PyTree], batch_axes) -> tuple[dict[str, PyTr
                 f"batch_axes for {name} is {prefix!r}, which does not fit its structure: give one axis for all of it, "
                 f"or one for each of {', '.join(labels[:12])}, None for what all members share."
             ) from None
-        for label, leaf, axis in zip(labels, leaves, tree.flatten_up_to(axes[name]), strict=True):
+        spread = tree.flatten_up_to(axes[name])
+        spread = [axis if eqx.is_array_like(leaf) else None for leaf, axis in zip(leaves, spread, strict=True)]
+        axes[name] = tree.unflatten(spread)  # a function or a string, as networks have them, is no part of a batch
+        for label, leaf, axis in zip(labels, leaves, spread, strict=True):
             if axis is not None:
                 require_numbers(leaf, label)
                 if not -jnp.ndim(leaf) <= axis < jnp.ndim(leaf):

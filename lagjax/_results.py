@@ -8,6 +8,16 @@ import diffrax
 import jax
 import jax.numpy as jnp
 
+_TO_REST = (
+    "let it come to rest in a mode whose constraint holds it. That transition stands in the list before the bounce and "
+    "has its surface: Transition('flight', 'rest', lambda q, v: jnp.where(v > -0.01, q, 1.0), -1, lambda q, v: "
+    "(0 * q, 0 * v))."
+)
+PUSHED = (
+    "The guard is pushed at its surface: the reset leaves the motion there, at rest, and nothing holds it, so that the "
+    f"transition is due again at once. No budget of transitions leads beyond it: {_TO_REST}"
+)
+
 
 class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     """The result codes of diffrax, extended; compare with `trajectory.result == lagjax.RESULTS.successful`."""
@@ -18,11 +28,11 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "negative number, a branch of `where` that is not taken, knots of a look-up that do not increase."
     )
     acceleration_discontinuous = (
-        "The acceleration jumps there, and no step fits over it or the budget of steps was spent on it: a corner "
-        "that the motion rests on, such as abs(q) at zero, or, with a solver of diffrax, dry friction at rest. Make "
-        "its two sides modes of simulate_hybrid, or round it off over a width that the motion can resolve. Machine "
-        "code ends a step at a jump that is merely crossed; diffrax takes some forty steps for it: then raise "
-        "max_steps or loosen rtol."
+        "The acceleration has a jump or a corner there, and the budget of steps was spent on such places, or no step "
+        "fits over it. Where the motion merely crosses them, as one that is switched fast does, raise max_steps: each "
+        "takes a step of machine code, and some forty of diffrax. Where it rests on one, as on abs(q) at zero or, with "
+        "a solver of diffrax, by dry friction, make its two sides modes of simulate_hybrid, or round it off over a "
+        "width that steps resolve."
     )
     derivatives_lost = (
         "The acceleration jumps on the way, where the steps of diffrax go across: a derivative over these steps lacks "
@@ -37,8 +47,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     zeno = (
         "Transitions follow each other at ever shorter times that add up to a finite one (Zeno), as the bounces of a "
         "ball do, or at once, as where it lies on the floor: no budget of transitions leads beyond it. End ts before "
-        "that time, or add a transition to a mode at rest, its guard an energy that a bounce brings below a small one, "
-        "with direction=-1."
+        f"that time, or {_TO_REST}"
     )
     transitions_in_turn = (
         "Transitions follow each other at one instant, and time does not move: behind each of them the guard of the "
@@ -47,7 +56,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "that rests on its switching line, is one System with sign or where, which slides along it."
     )
     inconsistent_start = (
-        "The initial state does not satisfy the constraints. Put it there first: system.project(q0, qdot0, t, params)."
+        "The initial state does not satisfy the constraints, or that behind a transition those of its mode. Put it "
+        "there first: system.project(q0, qdot0, t, params), or give the transition a reset."
     )
     constraint_rank_lost = (
         "The constraints became dependent on each other, and no longer determine how the motion continues: a dead "
@@ -93,8 +103,8 @@ def name_of(code) -> str:
     return _NAMES[int(code)]
 
 
-def advice(result: RESULTS) -> str:
-    """The sentence for one concrete result: what happened, and what to try."""
+def advice(result: RESULTS, is_implicit: bool = False) -> str:
+    """The sentence for one concrete result, of a solver that may be implicit: what happened, and what to try."""
     if result == RESULTS.dt_min_reached:
         return (
             "The step size shrank to nothing. The motion runs into a singularity or a discontinuity there (a "
@@ -102,9 +112,11 @@ def advice(result: RESULTS) -> str:
             "allows. Stop before it with event=..., smooth it, or loosen rtol and atol."
         )
     if result == RESULTS.max_steps_reached:
+        damped = "" if is_implicit else "use an implicit solver such as diffrax.Kvaerno5() for what is damped, and "
         return (
             "The budget of steps was spent. Raise max_steps or loosen rtol; if the steps are far shorter than the "
-            "motion needs, it is stiff: use an implicit solver such as diffrax.Kvaerno5()."
+            f"motion needs, it is stiff: {damped}make a constraint of what swings fast without damping, as a stiff rod "
+            "does."
         )
     return RESULTS[result]
 

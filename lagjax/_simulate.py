@@ -23,7 +23,7 @@ from lagjax._layout import Layout, halves
 from lagjax._lift import lift_batch, lift_problem
 from lagjax._machine_code import MachineCode
 from lagjax._problem import AbstractEngine, Batch, Problem, Solution, axes_per_leaf
-from lagjax._results import ENDED_WELL, RESULTS, SimulationError, result_from
+from lagjax._results import ENDED_WELL, RESULTS, SimulationError, advice, result_from
 from lagjax._system import System, require_system
 from lagjax._trajectory import State, Trajectory
 from lagjax._validate import as_arrays, is_concrete, require_flag
@@ -33,10 +33,10 @@ PyTree = Any
 
 @marks_absent
 def simulate(
-    system: System,
+    system: System | Any,
     q0: PyTree,
     qdot0: PyTree,
-    ts: jax.Array,
+    ts: jax.Array | np.ndarray,
     params: PyTree = None,
     *,
     solver: diffrax.AbstractSolver | MachineCode | None = None,
@@ -55,6 +55,7 @@ def simulate(
 
     **Everyday arguments**
 
+    - `system`: a `System`, or a `Hybrid`, whose motion is that of `simulate_hybrid`.
     - `q0`, `qdot0`: the initial state, pytrees of real floats of one structure. Their dtype (float32, float64) is that
       of times, parameters and results. Machine code computes in float64 in any case and rounds once, at the end.
     - `ts`: output times, shape (T,), T ≥ 2, strictly increasing, or strictly decreasing to go back in time.
@@ -136,6 +137,11 @@ def simulate(
     trajectory.q - jnp.cos(trajectory.ts)
     ```
     """
+    if not isinstance(system, System) and hasattr(system, "follow"):  # a `Hybrid`
+        others = {"solver": solver, "dt": dt, "event": event, "adjoint": adjoint, "progress": progress or None}
+        if given := [name for name, value in others.items() if value is not None]:
+            raise TypeError(f"simulate takes no {', '.join(given)} for a lagjax.Hybrid, which runs in machine code.")
+        return system.follow(q0, qdot0, ts, params, rtol=rtol, atol=atol, max_steps=max_steps, throw=throw)
     system = require_system(system)
     require_flag(throw, "throw")
     layout = Layout.from_state(q0, qdot0)
@@ -150,7 +156,8 @@ def simulate(
     trajectory = trajectory_of(given, engine, solution, given.y0, given.params)
     if not throw or (isinstance(solution.result, np.integer) and solution.result in ENDED_WELL):
         return trajectory
-    return raise_unless_ok(trajectory, layout)
+    implicit = isinstance(engine, Diffrax) and isinstance(engine.solver, diffrax.AbstractImplicitSolver)
+    return raise_unless_ok(trajectory, layout, lambda: advice(trajectory.result, implicit))
 
 
 @marks_absent
@@ -287,8 +294,11 @@ def _mask_inconsistent(trajectory: Trajectory, inconsistent: jax.Array) -> Traje
     return eqx.tree_at(lambda t: (t.q, t.qdot, t.result), trajectory, (q, qdot, result))
 
 
-def raise_unless_ok(trajectory: Trajectory, layout: Layout) -> Trajectory:
-    """Raise `SimulationError` for a trajectory that did not reach its end; at run time when it is being traced."""
+def raise_unless_ok(trajectory: Trajectory, layout: Layout, why: Callable[[], str | None]) -> Trajectory:
+    """Raise `SimulationError` for a trajectory that did not reach its end; at run time when it is being traced.
+
+    `why()` are the words for what stopped it, where they are known better than by the result.
+    """
     end, code = trajectory.end, trajectory.result._value
     if is_concrete(code) and int(code) in ENDED_WELL:
         return trajectory
@@ -300,4 +310,4 @@ def raise_unless_ok(trajectory: Trajectory, layout: Layout) -> Trajectory:
         return eqx.tree_at(lambda t: (t.q, t.qdot, t.end), trajectory, states)
     from lagjax._diagnosis import describe_failure  # a motion that succeeds does not come here
 
-    raise SimulationError(describe_failure(trajectory, layout), trajectory)
+    raise SimulationError(describe_failure(trajectory, layout, why()), trajectory)

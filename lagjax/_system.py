@@ -16,7 +16,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from lagjax._arguments import Function, accept, present
+from lagjax._arguments import Function, ValueNotKnown, accept, present
 from lagjax._constraints import Constraints
 from lagjax._derivation import derivation_of, numbers_of
 from lagjax._diffrax import form_of
@@ -221,6 +221,7 @@ class System(eqx.Module):
         print(scene.system.explain(scene.q0, scene.qdot0, params=scene.params))
         ```
         """
+        require_number(t, "t")
         self, layout = present_system(self), Layout.from_state(q, qdot)
         facts = explain(Problem.from_system(self, layout, params))
         if self.constraints is None and self.velocity_constraints is None:
@@ -360,6 +361,8 @@ class System(eqx.Module):
                 return jax.eval_shape(
                     lambda q, t, p: function(q, q, t=t, params=eqx.combine(p, code)), state, t, numbers
                 )
+            except ValueNotKnown:
+                raise
             except (TypeError, KeyError, IndexError, AttributeError) as error:
                 error.add_note(_structure_of(role, state))
                 raise
@@ -386,7 +389,13 @@ def require_system(system: Any) -> System:
     Raises `TypeError` for anything else in its place, a bare Lagrangian most often.
     """
     if not isinstance(system, System):
-        raise TypeError(f"system must be a lagjax.System, as lagjax.System(lagrangian) is; got {system!r}.")
+        kind = type(system).__name__
+        if kind == "Hybrid":
+            raise TypeError(
+                "This is for one System: a lagjax.Hybrid is taken by simulate, simulate_hybrid, fit and sweep."
+            )
+        name = getattr(system, "__name__", kind) if callable(system) else kind
+        raise TypeError(f"system must be a lagjax.System, as lagjax.System(lagrangian) is; got {name}.")
     return present_system(system)
 
 
@@ -477,5 +486,5 @@ def _require_structure(value: PyTree, layout: Layout) -> None:
             f"forces must return the structure of q, one force per coordinate; q is {layout.tree} with shapes "
             f"{layout.shapes}, forces returned {tree} with shapes {shapes}."
         )
-    if not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
-        raise TypeError("forces must return real floating-point numbers.")
+    if any(jnp.issubdtype(leaf.dtype, jnp.complexfloating) for leaf in leaves):
+        raise TypeError("forces must return real numbers: take jnp.real of what is complex.")

@@ -6,7 +6,6 @@ motion (`_health`, `_display`) stands above it and is imported by the method tha
 """
 
 from collections.abc import Callable
-from functools import partial
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import equinox as eqx
@@ -235,14 +234,19 @@ class Trajectory(eqx.Module):
 
     def map_members(self, function, *more) -> PyTree:
         """Map `function(q, qdot, (ts, tolerances), params, mode, *more)` over the batch axes, those of `more` too."""
-        mapped, rank = function, jnp.ndim(self.result._value)
+        numbers, code = eqx.partition(self.params, eqx.is_array_like)  # JAX maps over no function in params
+        rank = jnp.ndim(self.result._value)
+
+        def mapped(q, qdot, times_and_tolerances, numbers, mode, *more):
+            return function(q, qdot, times_and_tolerances, eqx.combine(numbers, code), mode, *more)
+
         for outer in range(rank):
             # The innermost batch axis of `simulate_batch` shares its times and some parameters; axes that the user's
             # own `jax.vmap(simulate)` added are on everything.
             shared = outer == 0 and self.ts.ndim < 1 + rank
             axes = (None, self.params_axes) if shared else (0, 0)
             mapped = jax.vmap(mapped, in_axes=(0, 0, *axes, 0, *[0] * len(more)))
-        return mapped(self.q, self.qdot, (self.ts, self.tolerances), self.params, self.mode, *more)
+        return mapped(self.q, self.qdot, (self.ts, self.tolerances), numbers, self.mode, *more)
 
     def _require_present(self) -> None:
         """Raise `ValueError` where the scene reads other values by now than when this motion was followed."""
@@ -256,8 +260,11 @@ class Trajectory(eqx.Module):
 
         def evaluate_member(q, qdot, times_and_tolerances, params, mode):
             ts, _ = times_and_tolerances
-            at_one_time = partial(self._evaluate_output, name)
-            return jax.vmap(at_one_time, in_axes=(0, 0, 0, None, 0))(q, qdot, ts, params, mode)
+
+            def evaluate_output(q, qdot, t, mode):
+                return self._evaluate_output(name, q, qdot, t, params, mode)
+
+            return jax.vmap(evaluate_output)(q, qdot, ts, mode)
 
         return self.map_members(evaluate_member)
 

@@ -172,11 +172,18 @@ def require_number(value, name: str) -> None:
     """Raise for anything but one real number."""
     kind = _dtype_of(value) if eqx.is_array_like(value) else None
     if kind is None or kind == jnp.bool_ or jnp.issubdtype(kind, jnp.complexfloating):
-        raise TypeError(f"{name} must be a real number; got {value!r}.")
+        raise TypeError(f"{name} must be a real number; got {value!r}.{_say_params(value)}")
     if isinstance(value, int) and abs(value) >= 2**63:
         raise ValueError(f"{name} is too large for an integer of 64 bits: write it as a float.")
     if jnp.ndim(value) != 0:
         raise ValueError(f"{name} must be one number; got shape {jnp.shape(value)}.")
+
+
+def _say_params(value) -> str:
+    """A sentence about parameters that stand in the place of a number or of times; nothing for anything else."""
+    if not isinstance(value, dict | list | tuple | eqx.Module):
+        return ""
+    return " Parameters come behind it; or name them, params=…."
 
 
 def output_times(ts, dtype) -> jax.Array | np.ndarray:
@@ -188,7 +195,13 @@ def output_times(ts, dtype) -> jax.Array | np.ndarray:
     try:
         kind = dtype_of(ts if isinstance(ts, jax.Array) else np.asarray(ts))
     except (TypeError, ValueError):
-        raise TypeError(f"ts must be an array of output times; got {type(ts).__name__}.") from None
+        got = f"{type(ts).__name__}.{_say_params(ts)}"
+        raise TypeError(f"ts must be an array of output times; got {got}") from None
+    if np.ndim(ts) == 2:
+        raise ValueError(
+            f"ts must be one row of output times, which all members share; got shape {np.shape(ts)}. For times of "
+            "their own: jax.vmap(lambda q0, qdot0, ts: lagjax.simulate(system, q0, qdot0, ts))(q0, qdot0, ts)."
+        )
     if np.ndim(ts) != 1 or np.size(ts) < 2:
         raise ValueError(f"ts must hold at least two output times, ts[0] the start; got shape {np.shape(ts)}.")
     if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):

@@ -14,7 +14,7 @@ from lagjax._layout import Layout
 from lagjax._motion import Motion
 from lagjax._program import Unlowerable
 from lagjax._scales import Scales
-from lagjax._system import System, require_system
+from lagjax._system import ROLES, System, require_system
 from lagjax._validate import as_arrays, is_concrete, require_finite
 
 PyTree = Any
@@ -44,6 +44,7 @@ class SceneState(NamedTuple):
         layout = Layout.from_state(q, rest)
         require_finite(q, "q")
         require_finite(rest, "qdot")
+        _require_no_velocities(system, q, params)
         return cls.from_arguments(
             system, layout, layout.flatten(q), layout.flatten(rest), as_arrays(params, layout.dtype)
         )
@@ -177,3 +178,14 @@ def _evaluate_quantity(name: str, q, qdot, *arguments) -> Array:
 
     one = {"force": scene.force, "momentum": momentum, "mass_matrix": scene.mass_matrix}[name]
     return jax.vmap(one)(jnp.asarray(q), jnp.asarray(qdot))
+
+
+def _require_no_velocities(system: System, q: PyTree, params: PyTree) -> None:
+    """Raise `ValueError` for params that look like velocities in a scene of which no function asks for params."""
+    functions = [getattr(system, role) for role in ROLES]
+    if params is None or any("params" in function.extras for function in functions if function is not None):
+        return
+    if jax.tree.map(jnp.shape, params) == jax.tree.map(jnp.shape, q):
+        raise ValueError(
+            "No function of this system asks for params, and those given are like q: name velocities, qdot=…."
+        )

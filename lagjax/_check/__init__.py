@@ -24,7 +24,7 @@ from lagjax._layout import Layout
 from lagjax._native import ATOL_OVER_MOTION, ATOL_OVER_RTOL
 from lagjax._problem import DEFAULT_RTOL
 from lagjax._system import System, require_system
-from lagjax._validate import is_concrete, not_finite
+from lagjax._validate import is_concrete, not_finite, require_number
 
 __all__ = ["Finding", "Findings", "check", "join_names"]
 
@@ -70,8 +70,7 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
     """
     system = require_system(system)
     layout = Layout.from_state(q, qdot)
-    if jnp.ndim(t) != 0:
-        raise ValueError(f"t must be one number; got shape {jnp.shape(t)}.")
+    require_number(t, "t")
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves((q, qdot, t, params))):
         raise ValueError("check needs numbers, not traced values: call it outside of jit, vmap and grad, on one state.")
     reported = _inputs(layout, q, qdot, t, params)

@@ -28,13 +28,14 @@ from lagjax._engine import choose
 from lagjax._failures import sentence
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Driven, Form, SampleTable, input_functions, start_pair
-from lagjax._hybrid import Hybrid, Scene, first_law, follow
+from lagjax._hybrid import Hybrid, Scene, first_law
 from lagjax._layout import Layout, halves
 from lagjax._machine_code import KEPT, Flow, MachineCode, flow_of, jvp, project_start_tangents, tolerances_of
 from lagjax._native import Projection
 from lagjax._problem import Problem
 from lagjax._program import evaluate
 from lagjax._results import ENDED_WELL
+from lagjax._simulate import simulate
 from lagjax._system import System
 
 PyTree = Any
@@ -152,7 +153,7 @@ class _JaxMotions(AbstractMotions):
         def run(state, ts, table):
             y0, numbers = state
             q, qdot = map(layout.restore, halves(y0))
-            trajectory = follow(scene, q, qdot, ts, scene_params(numbers, table), throw=False, **options)
+            trajectory = simulate(scene, q, qdot, ts, scene_params(numbers, table), throw=False, **options)
             rows = jax.vmap(lambda q, v: jnp.concatenate([layout.flatten(q), layout.flatten(v)]))
             end = jnp.concatenate([layout.flatten(trajectory.end.q), layout.flatten(trajectory.end.qdot)])
             path = rows(trajectory.q, trajectory.qdot)

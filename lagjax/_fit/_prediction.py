@@ -21,7 +21,7 @@ from lagjax._fit._residuals import LostTrial, Residuals, SystemPart, SystemResid
 from lagjax._fit._search import build_reader
 from lagjax._fit._sensors import UNCLEAR, wrap_residuals
 from lagjax._fit._uncertainty import LEVEL, covariance_of_one_start, require_level, signal_deviations
-from lagjax._hybrid import follow
+from lagjax._simulate import simulate
 from lagjax._trajectory import Trajectory
 
 PyTree = Any
@@ -95,7 +95,7 @@ def predict_record(fit, record: Record, system: str | None) -> Prediction:
     form, driven = about.signals.form, (record.sampled_at, record.input_samples)
     scene, params = about.scene, fit.params
     scene, params = (scene, params) if form is None else form.bind_samples(scene, params, *driven)
-    trajectory = follow(scene, q0, qdot0, cast(jax.Array, ts), params)  # NumPy's is as good
+    trajectory = simulate(scene, q0, qdot0, cast(jax.Array, ts), params)  # NumPy's is as good
     values, deviation = _predict_signals(fit, part, record, question, point)
     left = wrap_residuals(values - record.matrix, about.signals.periods)
     left = np.where(record.weight_matrix > 0, left, np.nan)

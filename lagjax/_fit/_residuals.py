@@ -43,8 +43,9 @@ from lagjax._fit._records import (
 )
 from lagjax._fit._sensors import Signals, wrap_residuals
 from lagjax._fit._timings import Clock
-from lagjax._hybrid import Scene, follow
+from lagjax._hybrid import Scene
 from lagjax._layout import Layout, halves
+from lagjax._simulate import simulate
 from lagjax._system import System
 
 
@@ -375,7 +376,7 @@ class SystemResiduals:
         def sense(ts, y0, inputs, table):
             q, qdot = map(layout.restore, halves(y0))
             own = params if form is None else Driven(params, *table)
-            motion = follow(scene, q, qdot, ts, own, rtol=self.rtol, throw=False)
+            motion = simulate(scene, q, qdot, ts, own, rtol=self.rtol, throw=False)
             rows = jax.vmap(lambda q, v: jnp.concatenate([layout.flatten(q), layout.flatten(v)]))(motion.q, motion.qdot)
             return jax.vmap(lambda y, t, i: signals.evaluate_state(y, t, numbers, i))(rows, ts, inputs)
 

@@ -18,10 +18,11 @@ from lagjax._crossings import directions_of, sections_of
 from lagjax._failures import sentence
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Guess, MeasuredSignal, real_numbers, require_start
-from lagjax._hybrid import Hybrid, Scene, Transition, follow
+from lagjax._hybrid import Hybrid, Scene, Transition
 from lagjax._layout import Layout, halves
 from lagjax._machine_code import MachineCode, Noted, surfaces_of
 from lagjax._problem import Problem, Solution
+from lagjax._simulate import simulate
 from lagjax._system import System
 from lagjax._trajectory import Trajectory, Transitions
 
@@ -277,7 +278,7 @@ def _build_transition_clock(
 
     def run(y0, numbers):
         q, qdot = map(layout.restore, halves(y0))
-        return follow(scene, q, qdot, span, parameters.restore(numbers), rtol=rtol, throw=False)
+        return simulate(scene, q, qdot, span, parameters.restore(numbers), rtol=rtol, throw=False)
 
     def times(y0, numbers):
         happened = _transitions(run(y0, numbers))

@@ -9,7 +9,9 @@ Source: Aizerman & Gantmakher, Q. J. Mech. Appl. Math. 11 (1958) 225; Hiskens & 
 """
 
 import dataclasses
+import functools
 import operator
+from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -24,20 +26,23 @@ from lagjax._hybrid._rounds import IN_ONE_PLACE, Ending, RoundPlan, TransitionRe
 from lagjax._layout import Layout, halves
 from lagjax._machine_code import MachineCode
 from lagjax._problem import Problem
-from lagjax._results import RESULTS, SimulationError, result_from
-from lagjax._simulate import raise_unless_ok, simulate
+from lagjax._results import PUSHED, RESULTS, SimulationError, result_from
+from lagjax._simulate import raise_unless_ok
 from lagjax._system import System, present_system, require_system
 from lagjax._trajectory import State, Trajectory, Transitions
 from lagjax._validate import as_arrays, is_concrete, require_budget, require_flag
 
-__all__ = ["Hybrid", "Scene", "Transition", "first_law", "follow", "laws", "require_scene", "simulate_hybrid"]
+__all__ = ["Hybrid", "Scene", "Transition", "first_law", "laws", "require_scene", "simulate_hybrid"]
 
 PyTree = Any
+# The part of a motion below which a time between transitions is none: bounces that pile up come down to the rounding of
+# the time before they are given up, and a reset that leaves a motion on its surface does so behind a longer one.
+SUDDEN = 1e-9
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Hybrid:
-    """A hybrid system as one object, modes and transitions: `fit` and `sweep` take it in place of a `System`.
+    """A hybrid system as one object: `simulate`, `simulate_hybrid`, `fit` and `sweep` take it in place of a `System`.
 
     - `modes`, `transitions`, `start`, `max_transitions`: those of `simulate_hybrid`; every motion begins in the mode
       `start`.
@@ -50,6 +55,7 @@ class Hybrid:
     ball = lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q)
     bounce = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -0.9 * v))
     scene = lagjax.Hybrid({"flight": ball}, [bounce], "flight")
+    lagjax.simulate(scene, 1.0, 0.0, ts=[0.0, 1.0])
     ```
     """
 
@@ -58,7 +64,11 @@ class Hybrid:
     start: str
     max_transitions: int = 32
 
-    def now(self) -> "Hybrid":
+    def follow(self, q0: PyTree, qdot0: PyTree, ts, params: PyTree, **options) -> Trajectory:
+        """The motion from (q0, qdot0), with the options that `simulate` and `simulate_hybrid` share."""
+        return simulate_hybrid(self, q0, qdot0, ts, params, **options)
+
+    def _now(self) -> "Hybrid":
         """The scene with its functions as they are now: this one, where nothing that they read has changed."""
         modes, transitions = _present(self.modes, self.transitions)
         before, now = [*self.modes.values(), *self.transitions], [*modes.values(), *transitions]
@@ -69,7 +79,22 @@ class Hybrid:
         _require_modes(self.modes, self.transitions, self.start, self.max_transitions)
 
 
+def _accepts_hybrid(function: Callable) -> Callable:
+    """A decorator: a `Hybrid` may stand in place of the first three arguments."""
+
+    @functools.wraps(function)
+    def decorated(modes, *args, **options):
+        if not isinstance(modes, Hybrid):
+            return function(modes, *args, **options)
+        options = {"max_transitions": modes.max_transitions, **options}
+        start = options.pop("start", modes.start)
+        return function(modes.modes, modes.transitions, start, *args, **options)
+
+    return decorated
+
+
 @marks_absent
+@_accepts_hybrid
 def simulate_hybrid(
     modes: dict[str, System],
     transitions: list[Transition],
@@ -87,7 +112,8 @@ def simulate_hybrid(
 ) -> Trajectory:
     r"""The motion from (q0, qdot0) in mode `start`, at the times `ts`, through every transition on the way.
 
-    - `modes`: a `System` for each name; all share the structure of `q0` and `params`.
+    - `modes`: a `System` for each name; all share the structure of `q0` and `params`. Or a `Hybrid` in place of the
+      first three arguments: `simulate_hybrid(hybrid, q0, qdot0, ts, params)`.
     - `transitions`: from which mode to which, and where. The earliest transition happens; of several at one instant,
       the first in the list. After it the same law holds as at the start (see `Transition`): guards that are at zero
       to rounding and go on in their direction follow at once, as do blows along a row of balls that touch, and those
@@ -192,14 +218,41 @@ def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, reco
 def _raise_unless_ok(modes: dict[str, System], trajectory: Trajectory, layout: Layout, last) -> Trajectory:
     """The trajectory where it ended well; else `SimulationError`, which names the mode `last` in which it ended."""
     if not is_concrete(trajectory.ok) or trajectory.ok:
-        return raise_unless_ok(trajectory, layout)
+        return raise_unless_ok(trajectory, layout, lambda: None)
     name = trajectory.mode_names[int(last)]
     system = modes[name]
     try:
-        return raise_unless_ok(dataclasses.replace(trajectory, system=system), layout)
+        of_mode = dataclasses.replace(trajectory, system=system)
+        return raise_unless_ok(of_mode, layout, lambda: _why_stopped(trajectory, layout))
     except SimulationError as error:
         text = f"{error}\nIt was in the mode {name!r}.{_last_transitions(trajectory)}"
         raise SimulationError(text, trajectory) from None
+
+
+def _why_stopped(trajectory: Trajectory, layout: Layout) -> str | None:
+    """Words for what its transitions came to; None where the result says it."""
+    changes, names, modes = trajectory.transitions, trajectory.mode_names, trajectory.system
+    assert changes is not None and isinstance(modes, dict)
+    end, count = trajectory.end, int(changes.count)
+    if trajectory.result == RESULTS.zeno:
+        times = np.append(np.asarray(trajectory.ts)[0], np.asarray(changes.t)[:count])
+        gaps, span = np.diff(times)[np.diff(times) > 0], float(end.t) - times[0]
+        at_once = float(end.t) - times[-1] <= SUDDEN * span
+        return PUSHED if at_once and (not gaps.size or gaps[-1] > SUDDEN * span) else None
+    if trajectory.result != RESULTS.inconsistent_start or not count:
+        return None
+    source, target = (names[int(x[count - 1])] for x in (changes.source, changes.target))
+    q, qdot = jax.tree.map(lambda x: x[count - 1], (changes.q_next, changes.qdot_next))
+    try:
+        require_consistent(modes[target], layout, jnp.stack([end.t, trajectory.ts[-1]]), q, qdot, trajectory.params)
+    except ValueError as error:
+        off = str(error).partition(" Put the state")[0].replace("q0 does", "q does").replace("qdot0 does", "qdot does")
+        return (
+            f"Behind the transition {source!r} → {target!r} the state is off the constraints of {target!r}: {off} Give "
+            "the transition a reset that puts q and qdot there, as the pull of a string does that becomes taut: "
+            "reset=lambda q, v: (q, v - (q @ v) / (q @ q) * q)."
+        )
+    return None
 
 
 def _last_transitions(trajectory: Trajectory) -> str:
@@ -258,7 +311,7 @@ def require_scene(scene: Any) -> Scene:
 
     Raises `TypeError` for what is neither a `System` nor a `Hybrid`.
     """
-    return scene.now() if isinstance(scene, Hybrid) else require_system(scene)
+    return scene._now() if isinstance(scene, Hybrid) else require_system(scene)
 
 
 def first_law(scene: Scene) -> System:
@@ -269,13 +322,3 @@ def first_law(scene: Scene) -> System:
 def laws(scene: Scene) -> tuple[System, ...]:
     """The systems that a motion may be in."""
     return tuple(scene.modes.values()) if isinstance(scene, Hybrid) else (scene,)
-
-
-def follow(scene: Scene, q0: PyTree, qdot0: PyTree, ts, params: PyTree, **options) -> Trajectory:
-    """The motion of a scene, with the `options` that `simulate` and `simulate_hybrid` share."""
-    if not isinstance(scene, Hybrid):
-        return simulate(scene, q0, qdot0, ts, params, **options)
-    modes, transitions, start = scene.modes, scene.transitions, scene.start
-    return simulate_hybrid(
-        modes, transitions, start, q0, qdot0, ts, params, max_transitions=scene.max_transitions, **options
-    )

@@ -2,13 +2,14 @@
 
 from typing import Any
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from lagjax._layout import Layout
 from lagjax._problem import concatenate_leaves, rows
-from lagjax._validate import as_arrays, require_concrete, require_finite
+from lagjax._validate import as_arrays, require_concrete, require_finite, require_number
 
 PyTree = Any
 
@@ -20,6 +21,8 @@ def starts(q0: PyTree, qdot0: PyTree, time, name: str) -> tuple[np.ndarray, Layo
     Raises `TypeError` or `ValueError` where that is not so, or a number is not finite or not there yet.
     """
     require_untraced((q0, qdot0, time), "The start")
+    if isinstance(time, dict | eqx.Module):
+        require_number(time, name)
     for label, value in ((name, time), ("q0", q0), ("qdot0", qdot0)):
         require_finite(value, label)
     times = np.asarray(time, float)

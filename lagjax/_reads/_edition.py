@@ -13,6 +13,7 @@ import collections
 import contextlib
 import enum
 import functools
+import pickle
 import threading
 import types
 from collections.abc import Callable, Iterator
@@ -94,7 +95,19 @@ class Edition:
         return repr(self.function)
 
     def __reduce__(self):
-        return _edition_of, (self.function,)
+        """The function by name; one that has none, such as a lambda, by value, as cloudpickle packs it."""
+        try:
+            pickle.dumps(self.function)
+            return _edition_of, (self.function,)
+        except (pickle.PicklingError, AttributeError, TypeError) as reason:
+            try:
+                import cloudpickle
+            except ImportError:
+                raise pickle.PicklingError(
+                    f"{self.function!r} has no name by which another process could find it: define it with def at the "
+                    "top of a module, or pip install cloudpickle."
+                ) from reason
+            return _edition_from, (cloudpickle.dumps(self.function),)
 
     @contextlib.contextmanager
     def traced(self) -> Iterator[None]:
@@ -119,6 +132,10 @@ class Edition:
 def _edition_of(function: Callable) -> Edition:
     """The function that a pickle calls: cloudpickle would take the class with all that it reads for a method of it."""
     return Edition.from_function(function)
+
+
+def _edition_from(packed: bytes) -> Edition:
+    return Edition.from_function(pickle.loads(packed))
 
 
 def _same(one: tuple, other: tuple) -> bool:

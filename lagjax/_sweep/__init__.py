@@ -43,7 +43,7 @@ from lagjax._sweep._workers import (
     work,
     work_in_children,
 )
-from lagjax._validate import require_flag
+from lagjax._validate import output_times, require_flag
 
 __all__ = [
     "Failure", "Progress", "Statistics", "Status", "Store", "Summary", "Sweep", "run_store", "status", "sweep",
@@ -238,9 +238,7 @@ def sweep(
     if isinstance(system, Hybrid):
         _require_no_arguments(event=event, crossings=crossings, solver=solver)
     sections = Sections.from_arguments(crossings, _callable(keep), settings)
-    description = Description(
-        system, np.asarray(ts, float), q0, qdot0, params, keep, _reduce(reduce), settings, sections
-    )
+    description = Description(system, _times(ts), q0, qdot0, params, keep, _reduce(reduce), settings, sections)
     if executor is not None and isolate:
         raise ValueError("isolate is for sweeps of this process: give it, or an executor, whose processes may die too.")
     if executor is not None:
@@ -301,3 +299,13 @@ def _reduce(reduce: Any) -> dict[str, Statistics]:
     if not isinstance(reduce, dict) or not all(isinstance(how, Statistics) for how in reduce.values()):
         raise TypeError("reduce must be a dict of lagjax.Statistics by the names that keep returns.")
     return reduce
+
+
+def _times(ts) -> np.ndarray:
+    """The output times, which all members share. Raises `TypeError` or `ValueError` where they are none."""
+    if callable(ts):
+        raise TypeError(
+            "ts must be an array of output times, which all members share; got a function. For ends of their own take "
+            "the latest of all, and end each one by event=lambda q, qdot, t, params: t - params[...]."
+        )
+    return np.asarray(output_times(ts, float))

@@ -18,11 +18,11 @@ import numpy as np
 
 from lagjax._consistent import has_constraints
 from lagjax._crossings import restore_crossings, sections_of, surfaces_in
-from lagjax._hybrid import Hybrid, Scene, follow
+from lagjax._hybrid import Hybrid, Scene
 from lagjax._machine_code import MachineCode, Noted, flow_of, tolerances_of
 from lagjax._problem import Batch, Solution, axes_per_leaf
 from lagjax._results import RESULTS, SUCCESSFUL, code_of, name_of, result_from
-from lagjax._simulate import simulate_batch, trajectory_of
+from lagjax._simulate import simulate, simulate_batch, trajectory_of
 from lagjax._sweep._description import NOT_TRACEABLE, Description, Sections
 from lagjax._sweep._store import RESULT, Quantity
 from lagjax._trajectory import State, Trajectory, Transitions
@@ -414,10 +414,10 @@ _INCONSISTENT = code_of(RESULTS.inconsistent_start)
 
 @functools.lru_cache(maxsize=8)
 def _hybrid_batch(scene: Hybrid, axes: tuple, **tolerances) -> Callable:
-    """`follow` for all members at once, compiled."""
+    """`simulate` for all members at once, compiled."""
 
     def follow_member(q0, qdot0, ts, params):
-        return follow(scene, q0, qdot0, ts, params, throw=False, **tolerances)
+        return simulate(scene, q0, qdot0, ts, params, throw=False, **tolerances)
 
     of_q0, of_qdot0, of_params = axes
     return jax.jit(jax.vmap(follow_member, in_axes=(of_q0, of_qdot0, None, of_params)))

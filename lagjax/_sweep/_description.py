@@ -63,7 +63,7 @@ class Sections(NamedTuple):
             )
         if not takes_crossings:
             raise ValueError(
-                "crossings are found for keep, which does not ask for them: write keep(trajectory, crossings)."
+                "crossings are found for keep, which does not ask for them by name: write keep(trajectory, crossings)."
             )
         if settings["event"] is not None:
             raise ValueError("An event ends the motion, and crossings do not: give one of the two.")

@@ -89,7 +89,7 @@ REFUSED = {
     "L is complex": (ask(lambda q, v: jnp.sum(v) * 1j), TypeError, "real floating-point number; got complex"),
     "a misspelt parameter": (run(params={"m": 1.0, "K": 4.0}), KeyError, "k"),
     "forces of the wrong shape": (ask(forces=lambda q, v: v[0]), TypeError, "structure of q, one force per coord"),
-    "forces that are integers": (ask(forces=lambda q, v: jnp.array([1, 2])), TypeError, "real floating-point"),
+    "forces that are complex": (ask(forces=lambda q, v: 1j * v), TypeError, "forces must return real numbers: take"),
     "dissipation without its sum": (ask(dissipation=lambda q, v: v**2), TypeError, "dissipation must return one sca"),
     "constraints of the velocity": (ask(constraints=lambda q, v: v), TypeError, "asks for `v`"),
     "constraints that hold nothing": (ask(constraints=lambda q: {}), TypeError, "at least one number"),

@@ -1,7 +1,11 @@
 """What a newcomer's mistakes in a scene's functions say: the error of Python or JAX, and beneath it what to write."""
 
 import math
+import pickle
 
+import diffrax
+import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -42,5 +46,116 @@ def test_a_sweep_over_a_parameter_without_its_batch_axis_is_told_of_batch_axes()
 def test_functions_that_ask_for_values_are_told_what_to_write(height):
     with pytest.raises(TypeError) as error:
         lagjax.simulate(lagjax.System(lambda q, v: 0.5 * v**2 - height(q)), 1.0, 0.0, jnp.arange(3.0))
-    note = error.value.__notes__[0]
-    assert "write jnp.cos(q) for math.cos(q)" in note and "jnp.where(q > 0, a, b) for `if q > 0`" in note
+    text, line = str(error.value), height.__code__.co_firstlineno
+    assert f"<lambda>, line {line} of test_mistakes.py, `" in text and "traced array" not in text
+    assert "Write jnp.cos(q) for math.cos(q)" in text and "jnp.where(q > 0, a, b) for `if q > 0`" in text
+    assert not [note for note in getattr(error.value, "__notes__", []) if "lagrangian" in note]
+
+
+SPRING = lagjax.System(lambda q, v, params: 0.5 * params["m"] * v**2 - 0.5 * q**2)
+MASS, TS = {"m": 1.0}, jnp.linspace(0.0, 1.0, 3)
+PLAIN = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q @ q)
+BALL = lagjax.Hybrid(
+    {"f": lagjax.System(lambda q, v: 0.5 * v**2 - q)},
+    [lagjax.Transition("f", "f", lambda q, v: q, -1, lambda q, v: (q, -0.5 * v))],
+    "f",
+)
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        (lambda: SPRING.explain(1.0, 0.0, MASS), "t must be a real number; .* Parameters come behind it"),
+        (lambda: lagjax.check(SPRING, 1.0, 0.0, MASS), "t must be a real number; .* Parameters come behind it"),
+        (
+            lambda: lagjax.lyapunov_exponent(SPRING, 1.0, 0.0, MASS, 9.0),
+            "duration must be a real .* Parameters",
+        ),
+        (lambda: lagjax.periodic_orbit(SPRING, 1.0, 0.0, MASS), "period must be a real number; .* Parameters"),
+        (lambda: lagjax.simulate(SPRING, 1.0, 0.0, MASS, TS), "ts must be an array .* got dict. Parameters"),
+        (lambda: _sweep(MASS), "ts must be an array of output times; got dict"),
+        (lambda: _sweep(lambda point: TS), "which all members share; got a function. For ends of their own .* event="),
+        (
+            lambda: _sweep(TS, {"section": lambda q, v: q}),
+            r"ask for them by name: write keep\(trajectory",
+        ),
+        (lambda: lagjax.simulate_batch(PLAIN, jnp.ones((3, 2)), jnp.ones((3, 2)), jnp.ones((3, 5))), "jax.vmap"),
+        (lambda: lagjax.normal_modes(PLAIN, jnp.zeros(2), jnp.ones(2)), "asks for params, .* name velocities, qdot="),
+        (lambda: lagjax.crossings(BALL, lambda q, v: q, 1.0, 0.0, TS), "^This is for one System: a lagjax.Hybrid is"),
+        (lambda: lagjax.lyapunov_exponent(BALL, 1.0, 0.0, 1.0), "^This is for one System: a lagjax.Hybrid is taken by"),
+        (lambda: lagjax.periodic_orbit(BALL, 1.0, 0.0, 1.0), "^This is for one System: a lagjax.Hybrid is taken by"),
+        (lambda: lagjax.simulate(BALL, 1.0, 0.0, TS, event=lambda q, v: q), "takes no event for a lagjax.Hybrid"),
+        (
+            lambda: lagjax.simulate(lambda q, v: 0.5 * v**2, 1.0, 0.0, TS),
+            r"lagjax.System\(lagrangian\) is; got <lam",
+        ),
+        (
+            lambda: _follow_held(lambda q, v: q @ q - 1),
+            "does not depend on qdot .* pass what depends on q alone as",
+        ),
+        (lambda: _follow_pulses(1000.0), r"Where the motion merely crosses them, .* raise max_steps[\s\S]*some \d+\.$"),
+    ],
+)
+def test_mistakes_are_told_with_what_to_do(call, said):
+    with pytest.raises((TypeError, ValueError, lagjax.SimulationError), match=said):
+        call()
+
+
+def _sweep(ts, crossings=None):
+    def keep(run, found):
+        return {"q": run.q[-1]}
+
+    more = {"params": MASS, "keep": keep, "store": "not-made", "crossings": crossings}
+    return lagjax.sweep(SPRING, {"a": np.linspace(0.0, 1.0, 3)}, ts, q0=lambda point: point["a"], qdot0=0.0, **more)
+
+
+def _follow_held(constraint):
+    held = lagjax.System(lambda q, v: 0.5 * v @ v, velocity_constraints=constraint)
+    return lagjax.simulate(held, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.0]), TS)
+
+
+def _follow_pulses(rate):
+    switched = lagjax.System(lambda q, v: 0.5 * v**2, forces=lambda q, v, t: jnp.where((rate * t) % 1 < 0.5, 1.0, -1.0))
+    return lagjax.simulate(switched, 0.0, 0.0, jnp.array([0.0, 5.0]), max_steps=1200)
+
+
+@pytest.mark.parametrize("force", [lambda q, v: 1 - 3 * (v > 0.1), lambda q, v: v < 0.1])
+def test_whole_numbers_and_comparisons_are_forces(force):
+    system = lagjax.System(lambda q, v: 0.5 * v**2, forces=force)
+    np.testing.assert_allclose(lagjax.simulate(system, 1.0, 0.0, jnp.array([0.0, 5.0])).q[-1], 1.495, rtol=1e-12)
+
+
+def test_a_hybrid_is_taken_where_a_motion_is_followed():
+    one = lagjax.simulate(BALL, 0.5, 0.0, TS * 1.5, rtol=1e-9)
+    two = lagjax.simulate_hybrid(BALL, 0.5, 0.0, ts=TS * 1.5)
+    three = lagjax.simulate_hybrid(BALL.modes, BALL.transitions, "f", 0.5, 0.0, TS * 1.5)
+    for run in (one, two, three):
+        np.testing.assert_allclose(run.q, [0.5, 0.5 - 0.75**2 / 2, 0.25 - 0.125], atol=1e-14)
+
+
+@pytest.mark.slow
+def test_networks_in_a_batch():
+    keys = jax.random.split(jax.random.key(0), 3)
+    nets = eqx.filter_vmap(lambda key: eqx.nn.MLP(1, "scalar", 4, 1, key=key))(keys)
+    system = lagjax.System(lambda q, v, params: 0.5 * v**2 - params(q[None]))
+    batch = lagjax.simulate_batch(system, jnp.ones(3), jnp.zeros(3), TS, nets, batch_axes=(0, 0, 0))
+    one = jax.tree.map(lambda leaf: leaf[2] if eqx.is_array(leaf) else leaf, nets)
+    run = lagjax.simulate(system, 1.0, 0.0, TS, one)
+    np.testing.assert_allclose(batch.q[2], run.q, rtol=1e-12)
+    np.testing.assert_allclose(batch.energy()[2], run.energy(), rtol=1e-12)
+
+
+def test_motions_of_lambdas_are_pickled():
+    run = lagjax.simulate(PLAIN, jnp.ones(2), jnp.zeros(2), TS)
+    again = pickle.loads(pickle.dumps(run))
+    np.testing.assert_array_equal(again.q, run.q)
+    np.testing.assert_array_equal(again.energy(), run.energy())
+
+
+@pytest.mark.slow
+def test_implicit_solvers_are_not_told_to_be_implicit():
+    scene = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2)
+    for solver in (None, diffrax.Kvaerno5()):
+        with pytest.raises(lagjax.SimulationError, match="The budget of steps was spent") as error:
+            lagjax.simulate(scene, 1.0, 0.0, jnp.array([0.0, 1e4]), solver=solver, max_steps=20)
+        assert ("Kvaerno5" in str(error.value)) == (solver is None) and "make a constraint of" in str(error.value)

@@ -249,9 +249,23 @@ def test_a_spent_budget_is_told_from_bounces_that_pile_up():
     assert run(0.8, 4.0).ok
     found = jax.vmap(lambda e: run(e, 200.0).result._value)(jnp.array([0.5, 0.9, 0.95, 1.0]))
     assert found.tolist() == [zeno._value] * 3 + [spent._value]
-    with pytest.raises(lagjax.SimulationError, match="mode at rest") as caught:
+    with pytest.raises(lagjax.SimulationError, match=r"ever shorter times .* let it come to rest") as caught:
         bouncing(1.0, 0.8, ts=jnp.array([0.0, 5.0]))
     assert caught.value.trajectory.result == zeno
+    # What the sentence says, and one who resets a slow ball to rest, which gravity pushes onto the floor at once.
+    line = str(caught.value).partition("its surface: ")[2].partition(".\n")[0]
+    to_rest = eval(line, {"Transition": lagjax.Transition, "jnp": jnp})
+    modes = {"flight": BALL, "rest": lagjax.System(ball_in_gravity, constraints=lambda q: q)}
+
+    def stopped(q, v, params):
+        return q, jnp.where(jnp.abs(v) < params["stop"], 0.0, -0.8 * v)
+
+    bounce = lagjax.Transition("flight", "flight", lambda q, v: q, -1, stopped)
+    for stop in (0.0, 1.0):
+        run = hybrid(modes, [to_rest, bounce], 1.0, 0.0, (0.0, 5.0), {"g": G, "stop": stop})
+        assert run.mode[-1] == 1 and abs(run.q[-1]) < 1e-12
+    with pytest.raises(lagjax.SimulationError, match=r"^(?!.*ever shorter).*The guard is pushed at its surface"):
+        hybrid({"flight": BALL}, [bounce], 1.0, 0.0, (0.0, 5.0), {"g": G, "stop": 1.0})
     # Two modes that take turns, one above and one below the floor, which is soft: flight and contact alternate.
     soft = lagjax.System(lambda q, v, params: 0.5 * v**2 - params["g"] * q - 0.5 * 1e3 * q**2)
     land = lagjax.Transition("flight", "floor", lambda q, v: q, direction=-1)
@@ -936,6 +950,9 @@ def test_modes_of_a_family_keep_their_targets_and_constraints():
     np.testing.assert_allclose(times(run), down_the_stairs(1.3, (0, 2, 3)), rtol=1e-12)
     assert run.transitions.target[:3].tolist() == [2, 3, 4]
     assert run.result == lagjax.RESULTS.inconsistent_start  # it is not at rest there
+    said = r"Behind the transition '3' → 'line' .* the constraints of 'line': qdot does not .* rate of change is 1.59 "
+    with pytest.raises(lagjax.SimulationError, match=said + ".* reset=lambda q, v: "):
+        hybrid(modes, edges, v0=0.2, ts=(0.0, 1.0, 6.0), params=1.3, rtol=1e-12)
 
 
 @pytest.mark.parametrize(
