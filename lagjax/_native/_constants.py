@@ -119,8 +119,9 @@ FIRST_STEP, GROWTH = 1 / 16, 5.0
 # After a rejected step, for what made it fail is near. Measured on a wedge: doubled, a third more steps are rejected.
 GROWTH_AFTER_REJECTION = 2.0
 # The smallest step, in parts of the largest time: a shorter one no longer moves the time reliably. Doubled, a motion
-# that falls into a singularity stops four steps earlier.
-SMALLEST_STEP = 4 * EPS
+# that falls into a singularity stops four steps earlier. It is never zero, nor less than what a processor may take for
+# zero: where `LEAST` is more than all the time there is, one step goes to its end.
+SMALLEST_STEP, LEAST = 4 * EPS, 2.0**-1022
 
 # ---- derivatives -----------------------------------------------------------------------------------------------------
 
