@@ -35,6 +35,7 @@ from lagjax._native._constants import (
     NEGLIGIBLE,
     NO_TIME,
     PAST,
+    RESOLVED,
     RISE,
     SHORT_OF,
     SWITCH_TOLERANCES,
@@ -225,19 +226,24 @@ class BorderControl:
 
     def _look_along(self, frame: Frame, g: Value, degree: Value, h: Value, undecided: Value, beyond, idle) -> None:
         """The first root of guard g, whose polynomial is in `poly`; `beyond` it is that piece."""
-        code, leads = frame.code, self._leads(frame, degree)
+        code, digits, leads = frame.code, frame.digits, self._leads(frame, degree)
         self._divide(frame, g, degree)
         # A move of less than a part of atol does not count as leaving a border that the motion touches. Where borders
         # hold together what moves by rounding, they are left and met in turn at one instant: then more is rounding.
         turns = 1.0 + code.maximum(frame["idle_crossings"] - float(len(self.guards)), frame.constant(0.0))
         turns = code.select(turns < MOST_TURNS, turns, MOST_TURNS)
         patience = (turns * turns) * (turns * turns) * turns
-        nothing = self.roots.size(frame, degree) <= NEGLIGIBLE * code.lanes_of(absolute_tolerance(frame)) * patience
+        size = self.roots.size(frame, degree)
+        nothing = size <= NEGLIGIBLE * code.lanes_of(absolute_tolerance(frame)) * patience
         touches = frame["touch", g] > Touch.NONE
         if self.slides:  # along u = 0 another border of |u| is there by rounding
             touches = touches | (frame["slides"] > 0.0)
-        idle = idle | (nothing & touches & ~undecided)
-        self._shorten(frame, degree, SWITCH_TOLERANCES * frame.job("rtol"), absolute_tolerance(frame))
+        first = [code.intrinsic("fabs", frame["poly", k]) for k in range(3)]  # the last ones may have become zero
+        idle = idle | (((nothing & touches) | (first[0] + first[1] + first[2] < digits.tiny)) & ~undecided)
+        self._shorten(frame, degree, SWITCH_TOLERANCES * frame.job("rtol"), absolute_tolerance(frame), RESOLVED)
+        small = size < digits.small
+        with code.only_if(code.any_lane(small)):
+            self.roots.stretch(frame, degree, 1.0, code.select(small, 1 / digits.small**2, 1.0))
         frame.call(self.roots.first_root, degree)
         self._look_closer(frame, degree)
         # At rest but for what it gains in so little time: u̇ is of the size of ü t.
@@ -477,12 +483,14 @@ class BorderControl:
             leads.value = code.select(code.compare("!=", c, 0.0), sign, leads.value)
         return leads.value
 
-    def _shorten(self, frame: Frame, degree: Value, rtol: Value, atol: Value) -> None:
-        """Halve the interval until the last terms are below atol + rtol Σ |cₖ|."""
+    def _shorten(self, frame: Frame, degree: Value, rtol: Value, atol: Value, share: float = math.inf) -> None:
+        """Halve the interval until the last terms are below atol, or a `share` of Σ |cₖ|, + rtol Σ |cₖ|."""
 
         def is_long():
-            allowed = self.roots.size(frame, degree) * rtol + frame.code.lanes_of(atol)
-            return self.roots.last_terms(frame, degree) > allowed
+            size, least = self.roots.size(frame, degree), frame.code.lanes_of(atol)
+            if share < math.inf:
+                least = frame.code.select(share * size < least, share * size, least)
+            return self.roots.last_terms(frame, degree) > size * rtol + least
 
         self.roots.shorten(frame, degree, is_long)
 

@@ -23,21 +23,26 @@ class Digits(NamedTuple):
     - `largest_unit`: beyond this `unit`, in parts of what q moves along the step, variations are not due to its moving.
       Measured on a pendulum after half a million turns at rtol = 1e-12, below what its angle resolves: without, 274
       steps and 328 rejected; with it 180 and 193; `unit` doubled the same, `largest_unit` doubled 105 and 89.
+    - `small`: the square of what is less may be zero. Where it matters all is taken 1/`small`² times as large.
+    - `tiny`: what is less has terms that are zero, or have lost their digits, and counts as zero.
     """
 
     eps: float
     round_off: float
     unit: float
     largest_unit: float
+    small: float
+    tiny: float
 
     @classmethod
-    def from_rounding(cls, eps: float, largest_unit: float) -> "Digits":
+    def from_rounding(cls, eps: float, largest_unit: float, small: float, tiny: float) -> "Digits":
         """The rounding of numbers whose unit in the last place is `eps`."""
-        return cls(eps, 256 * eps, 16 * eps, largest_unit)
+        return cls(eps, 256 * eps, 16 * eps, largest_unit, small, tiny)
 
 
 # In single precision q may move by a ten-thousandth of itself in a step and still be what varies an acceleration.
-DIGITS, SINGLE_DIGITS = Digits.from_rounding(EPS, 1e-6), Digits.from_rounding(2.0**-23, 2e-2)
+DIGITS = Digits.from_rounding(EPS, 1e-6, 2.0**-400, 2.0**-960)
+SINGLE_DIGITS = Digits.from_rounding(2.0**-23, 2e-2, 2.0**-50, 2.0**-110)
 
 # ---- how a member ended ----------------------------------------------------------------------------------------------
 
@@ -157,6 +162,9 @@ NO_TIME = 0.25
 # They are less than one in a step that suits the state, unless the number is another one than that: there the step is
 # halved.
 SWITCH_TOLERANCES, MOST_HALVINGS = 16.0, 64
+# Below atol they are at most this part of its size, so that what approaches zero for ever, as exp(−s), keeps its sign:
+# its series has it up to s = 3 at the order of the default tolerance. Doubled, that of order 20 loses it.
+RESOLVED = 2.0**-17
 # exp(u) below u = −`FAINT` is 2e-35: nothing, whatever it is multiplied with. Above it, u may rise in one step by
 # `RISE` parts of the order p: then exp(u) is the sum of terms Rᵏ/k! that fall from the last one on, as step control
 # expects.

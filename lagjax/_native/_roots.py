@@ -92,11 +92,11 @@ class Roots:
                 again.value = 1
                 self.stretch(frame, degree, code.select(long, 0.5, 1.0))
 
-    def stretch(self, frame: Frame, degree: Value, part: Value) -> None:
-        """The polynomial over a part of its interval."""
+    def stretch(self, frame: Frame, degree: Value, part: "Value | float", times: "Value | float" = 1.0) -> None:
+        """The polynomial over a part of its interval, `times` as large."""
         code = frame.code
         frame["part"] = frame["part"] * part
-        power = code.variable(frame.constant(1.0))
+        power = code.variable(code.lanes_of(times))
         with code.loop(degree + 1) as k:
             frame["poly", k] = frame["poly", k] * power.value
             power.value = power.value * part

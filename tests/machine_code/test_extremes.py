@@ -3,6 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 import lagjax
 
@@ -19,3 +20,44 @@ def test_times_next_to_each_other_end():
     np.testing.assert_array_equal(alone[1:-1], 1.0)
     together = jax.jit(jax.vmap(lambda ts: lagjax.simulate(PENDULUM, 1.0, 0.5, ts).q[-1]))(spans)
     np.testing.assert_allclose(together, alone, rtol=1e-13)
+
+
+# ---- motions that die out --------------------------------------------------------------------------------------------
+
+
+def test_motions_that_die_out_towards_a_corner():
+    def drag(q, v, params):
+        a, b, width = params
+        air = -a * v[0] - b * jnp.abs(v[0]) * v[0]
+        dead_zone = -jnp.where(jnp.abs(q[1]) < 0.5, 0.0, q[1] - 0.5 * jnp.sign(q[1])) - 3 * v[1]
+        return jnp.array([air, dead_zone, -v[2] / (jnp.abs(v[2]) + width), -5 * v[3] - 0.1 * jnp.abs(v[3]) * v[3]])
+
+    def end(params, duration):
+        return lagjax.simulate(system, *start, jnp.array([0.0, duration]), params)
+
+    def rest(params):
+        a, b, width = params
+        return jnp.array([jnp.log1p(b / a) / b, 0.5, 0.5 + width, 0.0])
+
+    system = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q[3] ** 2, forces=drag)
+    start, params = (jnp.array([0.0, 1.0, 0.0, 1.0]), jnp.array([1.0, 0.0, 1.0, 0.0])), jnp.array([1.0, 0.7, 0.1])
+    found = end(params, 1000.0)
+    np.testing.assert_allclose(found.q[-1], rest(params), atol=1e-9)
+    assert found.stats["num_steps"] < 4000
+    slopes = jax.jacrev(lambda params: end(params, 250.0).q[-1])(params)
+    np.testing.assert_allclose(slopes, jax.jacobian(rest)(params), atol=1e-8)
+
+
+def test_a_motion_that_died_out_long_ago():
+    system = lagjax.System(lambda q, v: 0.5 * v**2, forces=lambda q, v: -v - jnp.abs(v) * v)
+    found = lagjax.simulate(system, 0.0, 1.0, jnp.array([0.0, 1e6]))
+    np.testing.assert_allclose(found.q[-1], np.log(2.0), atol=1e-9)
+    assert found.stats["num_steps"] < 1000
+
+
+@pytest.mark.parametrize("size", [1e-30, 1e-200])
+def test_a_border_is_crossed_with_any_amplitude(size):
+    system = lagjax.System(lambda q, v: 0.5 * v**2, forces=lambda q, v: -jnp.where(q > 0, 4 * q, q))
+    ts = jnp.array([0.0, 1.0, 10 * (np.pi / 2 + np.pi)])
+    found = lagjax.simulate(system, size, 0.0, ts, atol=1e-13 * size)
+    np.testing.assert_allclose(found.q[1:], size * np.array([2 * np.sin(np.pi / 4 - 1.0), 1.0]), rtol=1e-9)
