@@ -13,70 +13,84 @@ from jax import lax
 
 from lagjax._machine_code._flow import Flow
 from lagjax._machine_code._lines import outputs
-from lagjax._program import emit
+from lagjax._program import Rows, emit_look_up, emit_rows
 
 INSTANT = 1e-9  # of the time; what a border is off by while a motion slides along it is rounding
 
 
 def rate(flow: Flow, t, y, params):
     """(q̇, q̈) at states y (…, 2n), t (…), params (…, P); zero where it is not finite: there the motion has ended."""
-    n = flow.size
-    borders = flow.borders
-    slides = borders is not None and any(guard.slide >= 0 for guard in borders.guards)
-    if flow.general_program.looks_up or not slides:
-        return _rate_from_rows(flow, t, y, params)
-    scalars = (*(y[..., i] for i in range(2 * n)), t, *(params[..., i] for i in range(flow.numbers)))
-    scalars = jnp.broadcast_arrays(*scalars)
-    if slides:
-        acceleration = _evaluate_pieces(borders, scalars, _pieces(borders, scalars, n))[0][:n]
+    n, borders, program = flow.size, flow.borders, flow.general_program
+    shape = jnp.broadcast_shapes(y.shape[:-1], t.shape)
+    rows = Rows(_join(shape, y, t[..., None]), params)
+    if borders is not None and any(guard.slide >= 0 for guard in borders.guards):
+        chosen = params if flow.kernel.chosen is None else params[..., jnp.array(flow.kernel.chosen.positions, int)]
+        shape = jnp.broadcast_shapes(shape, params.shape[:-1])
+        rows = rows._replace(first=_join(shape, rows.first, chosen))
+        acceleration = _evaluate_pieces(borders, rows, _pieces(borders, rows, n))[0][:n]
+    elif program.looks_up:  # whose parameters may be too many to be taken apart
+        acceleration = program.compute_rows(rows.first, params)[:n]
     else:
-        acceleration = flow.general_program(*scalars)[:n]
-    return _stack_rate(flow, y, acceleration)
-
-
-def _stack_rate(flow: Flow, y, acceleration):
-    velocity = (y[..., flow.size + i] for i in range(flow.size))
+        acceleration = jnp.moveaxis(outputs(program, n, rows.first, params), -1, 0)
+    velocity = (y[..., n + i] for i in range(n))
     slope = jnp.stack(jnp.broadcast_arrays(*velocity, *acceleration), axis=-1)
     return jnp.where(jnp.isfinite(slope), slope, 0.0)
 
 
-def _rate_from_rows(flow: Flow, t, y, params):
-    """`rate` of a program that looks up tables, whose parameters are too many to be taken apart, or of a large one."""
-    shape = jnp.broadcast_shapes(y.shape[:-1], t.shape)
-    y, time = jnp.broadcast_to(y, (*shape, 2 * flow.size)), jnp.broadcast_to(t, shape)[..., None]
-    rows = jnp.concatenate([y, time], axis=-1)
-    if flow.general_program.looks_up:
-        return _stack_rate(flow, y, flow.general_program.compute_rows(rows, params)[: flow.size])
-    return _stack_rate(flow, y, jnp.moveaxis(outputs(flow.general_program, flow.size, rows, params), -1, 0))
+def _join(shape: Any, *parts):
+    """The columns of some arrays (…, m), side by side."""
+    return jnp.concatenate([jnp.broadcast_to(x, (*shape, x.shape[-1])) for x in parts], axis=-1)
 
 
-def _evaluate_pieces(borders, scalars, pieces) -> tuple[tuple, tuple]:
+def _evaluate_pieces(borders, rows: Rows, pieces) -> tuple[tuple, tuple]:
     """The outputs of the program on these pieces, and the switching numbers."""
     line = borders.program.line
-    outputs = (*line.outputs, *borders.switches)
-    values = emit(line.nodes, line.kinds, outputs, (*scalars, *pieces))
-    return values[: len(line.outputs)], values[len(line.outputs) :]
+    count = len(line.outputs)
+    values = emit_rows(line._replace(outputs=(*line.outputs, *borders.switches)), rows._replace(pieces=pieces))
+    return values[:count], values[count:]
 
 
-def _pieces(borders, scalars, n: int) -> list[Any]:
+def _pieces(borders, rows: Rows, n: int) -> list[Any]:
     """The pieces at a state; 1 for those that say that the motion slides."""
-    count, zero, decide = len(borders.switches), jnp.zeros_like(scalars[0]), borders.decide
-    pieces = list(emit(decide.nodes, decide.kinds, decide.outputs, (*scalars, *[zero] * (2 * count))))
+    count, zero = len(borders.switches), jnp.zeros_like(rows.first[..., 0])
+    pieces = list(emit_rows(borders.decide, rows._replace(pieces=[zero] * (2 * count))))
     # Along a border in position a motion slides at rest, which `decide` knows.
-    sliding = {guard.piece: guard.slide for guard in borders.guards if guard.slide >= 0 and guard.order < 2}
+    guards = [guard for guard in borders.guards if guard.slide >= 0 and guard.on < 0 and guard.order < 2]
+    switches = _evaluate_pieces(borders, rows, pieces)[1]
+    sides: dict[int, tuple] = {}
+    for guard in guards:  # of the borders of a piece the nearest one counts
+        j, piece = guard.piece, pieces[guard.piece]
+        beyond = guard.k * piece + guard.l
+        below, above = (zero - 1, zero + 1) if guard.k < 0 else (jnp.minimum(piece, beyond), jnp.maximum(piece, beyond))
+        found = jnp.abs(switches[j] - _level(borders, guard, rows, piece)), below, above
+        known = sides.get(guard.slide, (j, *found))[1:]
+        sides[guard.slide] = (j, *(jnp.where(found[0] < known[0], x, y) for x, y in zip(found, known, strict=True)))
 
-    def rates(side: float):
+    def rates(side: int):
         """The rates of the switching numbers, where all pieces that may slide are on one side of their border."""
-        there = [jnp.full_like(zero, side) if j in sliding else piece for j, piece in enumerate(pieces)]
-        there = [zero if j in sliding.values() else piece for j, piece in enumerate(there)]
-        out, _ = _evaluate_pieces(borders, scalars, there)
-        moving = [*scalars[n : 2 * n], *out[:n], jnp.ones_like(zero)]
-        moving += [jnp.zeros_like(zero)] * (len(scalars) - 2 * n - 1)
-        return jax.jvp(lambda *at: _evaluate_pieces(borders, at, there)[1], tuple(scalars), tuple(moving))
+        there = list(pieces)
+        for slide, (j, _, *of_sides) in sides.items():
+            there[slide], there[j] = zero, lax.stop_gradient(of_sides[side])
+        out = _evaluate_pieces(borders, rows, there)[0]
+        still = [zero] * (rows.first.shape[-1] - 2 * n - 1)
+        moving = jnp.stack([*(rows[n + i] for i in range(n)), *out[:n], jnp.ones_like(zero), *still], axis=-1)
+        pieced = lambda first: _evaluate_pieces(borders, rows._replace(first=first), there)[1]  # noqa: E731
+        return jax.jvp(pieced, (rows.first,), (moving.astype(rows.first.dtype),))[1]
 
-    (switches, below), (_, above) = rates(-1.0), rates(1.0)
-    for j, slide in sliding.items():
+    below, above = rates(0), rates(1)
+    for slide, (j, offset, lower, _) in sides.items():
         fast = jnp.maximum(jnp.abs(below[j]), jnp.abs(above[j]))
-        near = jnp.abs(switches[j]) <= INSTANT * jnp.abs(scalars[2 * n]) * fast
-        pieces[slide] = jnp.where(near & (below[j] > 0.0) & (above[j] < 0.0), 1.0, zero)
+        slides = (offset <= INSTANT * jnp.abs(rows[2 * n]) * fast) & (below[j] > 0.0) & (above[j] < 0.0)
+        pieces[slide] = jnp.where(slides, 1.0, zero)
+        pieces[j] = jnp.where(slides, lower, pieces[j])
     return [lax.stop_gradient(piece) for piece in pieces]
+
+
+def _level(borders, guard, rows: Rows, piece):
+    """The level of a guard of this piece."""
+    index = guard.d * piece + guard.e
+    if guard.of_table:
+        table = borders.tables[guard.piece].table
+        entry = emit_look_up("take", table, rows.entries, piece.dtype, index)
+        return jnp.where((index >= 0) & (index < table.count), entry, jnp.inf)
+    return index + jnp.where(piece <= 0, guard.below, 0.0) + jnp.where(piece >= 0, guard.above, 0.0)

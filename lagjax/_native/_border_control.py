@@ -24,6 +24,7 @@ from lagjax._native._constants import (
     FAINT,
     FAR,
     GROWTH,
+    JUMP_NOISE,
     LARGEST_FALL,
     LEAST_ORDER,
     MAX_ORDER,
@@ -116,6 +117,7 @@ class BorderControl:
             "approach",
             "next_approach",
             "slides",
+            "stops",
         )
         fields = {"touch": len(borders.guards), "stays": len(borders.switches), **dict.fromkeys(numbers, 1)}
         fields["level"] = len(borders.guards) if _borders.TABLE in borders.kinds else 0
@@ -161,7 +163,7 @@ class BorderControl:
                     frame["stays", j] = 0.0
             with code.loop(len(self.guards)) as g:
                 slide = self.table.place(code, g, "slide")
-                with code.only_if(slide >= 0):
+                with code.only_if((slide >= 0) & code.compare("==", g, self.table.place(code, g, "rest"))):
                     slides = undecided & (self._piece(frame, slide) > 0.0)
                     with frame.where(slides):
                         frame["touch", g] = Touch.SLIDING
@@ -222,10 +224,15 @@ class BorderControl:
         idle = (frame["touch", g] >= Touch.SLIDING) | (undecided & is_share)
         with code.only_if(code.any_lane(~idle)):
             self.roots.polynomial(frame, j, degree, h, code.select(undecided, 1.0, side), level)
-            self._look_along(frame, g, degree, h, undecided, beyond, idle)
+            at_limit = (code.intrinsic("fabs", frame["poly", 0]) <= JUMP_NOISE) & (frame["steps"] > 0.0)
+            comes = ~undecided & (~is_share | at_limit) & (frame["touch", g] <= Touch.NONE)
+            self._look_along(frame, g, degree, h, undecided, beyond, idle, comes)
 
-    def _look_along(self, frame: Frame, g: Value, degree: Value, h: Value, undecided: Value, beyond, idle) -> None:
-        """The first root of guard g, whose polynomial is in `poly`; `beyond` it is that piece."""
+    def _look_along(self, frame: Frame, g: Value, degree: Value, h: Value, undecided, beyond, idle, comes) -> None:
+        """The first root of guard g, whose polynomial is in `poly`; `beyond` it is that piece.
+
+        A border that it `comes` to where another one has been met is met in a step of its own: each shifts tangents.
+        """
         code, digits, leads = frame.code, frame.digits, self._leads(frame, degree)
         self._divide(frame, g, degree)
         # A move of less than a part of atol does not count as leaving a border that the motion touches. Where borders
@@ -252,6 +259,8 @@ class BorderControl:
         # A number that is zero leaves zero as its first coefficient says, or stays.
         leaves = undecided & code.compare("!=", leads, 0.0)
         root = code.select(undecided, code.select(leaves, 0.0, 2.0), self._place(frame))
+        instant = NO_TIME * frame["smallest"] / code.intrinsic("fabs", h)
+        root = code.select(comes & (root < instant) & (instant < 1.0), instant, root)
         is_root = leaves | (~undecided & (frame["is_root"] > 0.0) & (frame["root"] < 1.0))
         # Of two at one instant that of the piece on which the other one depends, which comes first, is crossed.
         apart = code.select(frame["crossed"] > 0.0, 1.0 - AT_ONCE, 1.0) if self.borders.nested else 1.0
@@ -329,7 +338,7 @@ class BorderControl:
     @property
     def slides(self) -> bool:
         """True if the motion may slide along a border that other switching numbers depend on."""
-        return self.borders.nested and _borders.SLIDE in self.borders.kinds
+        return _borders.SLIDE in self.borders.kinds
 
     def _note_slides(self, frame: Frame) -> None:
         """Set `slides` to 1 in the lanes whose motion slides along any border."""
@@ -352,18 +361,36 @@ class BorderControl:
         self._go_beyond(frame, crossed)
         if self.borders.clocks:
             self._pass_knots(frame, going)
+        self._decide_others(frame, crossed)
         after = self.motion.evaluate_now(frame, line) if shaken else []
         for k, j in enumerate(shaken):
             jump = code.intrinsic("fabs", after[k] - before[k].value)
             least = code.intrinsic("fabs", after[k]) * frame.digits.round_off + code.lanes_of(absolute_tolerance(frame))
             jumps = going & (jump > least)
             with frame.where(jumps):
-                frame["stays", j] = 0.0
                 for g, guard in enumerate(self.guards):
                     if guard.piece == j:
                         frame["touch", g] = Touch.NONE
                         if guard.slide >= 0:
                             frame["params", self.motion.parameters + guard.slide] = 0.0
+        if shaken:
+            self._decide_others(frame, crossed)
+
+    def _decide_others(self, frame: Frame, crossed: Value) -> None:
+        """Where a border is crossed on which others depend, decide anew the pieces that touch none."""
+        code = frame.code
+        if not self.borders.nested:
+            return
+        with code.loop(self.pieces) as j:
+            frame["stays", j] = 0.0
+        for j in self.borders.clocks:
+            frame["stays", j] = 1.0
+        with code.loop(len(self.guards)) as g:
+            with frame.where(frame["touch", g] > Touch.NONE):
+                frame["stays", self.table.place(code, g, "piece")] = 1
+        with frame.where(crossed > 0.0):
+            frame["undecided"] = 1
+        frame.call(self.decide)
 
     def _pass_knots(self, frame: Frame, going: Value) -> None:
         """The pieces of tables whose next entry the time has come to: all that are there at one instant."""
@@ -373,7 +400,6 @@ class BorderControl:
             with frame.where(passes):
                 place = self.motion.parameters + j
                 frame["params", place] = frame["params", place] + frame["forward"]
-            frame["stays", j] = 1.0
 
     def _rows_of_features(self) -> Iterator[tuple[Feature, int, int]]:
         """Every kind of feature, and the numbers of the first one of a row of these and of the next one after it.
@@ -538,13 +564,13 @@ class BorderControl:
             frame["counts"] = stepped | (frame["last"] > 0.0)
         at_knot = (frame["stepped"] > 0.0) & (frame["crossed"] > float(len(self.guards)))
         frame["at_knots"] = frame["at_knots"] + code.flag(at_knot)
-        for name in ("is_hit", "grazes"):
+        for name in ("is_hit", "grazes", "stops"):
             with frame.where(stepped):
                 frame[name] = 0.0
         frame.call(self.graze)
 
     def _graze(self, base: int) -> Code:
-        """`()`: set `grazes` where the step ends at a border that it only grazes.
+        """`()`: set `grazes` where the step ends at a border that it only grazes, and `stops` where to rounding.
 
         With the rate u̇ of its switching number a motion that is moved by the tolerance, u by ε, does not cross it, or
         has before, where u̇² ≤ 2 |ü| ε.
@@ -558,17 +584,20 @@ class BorderControl:
             state = motion.move_state(frame, motion.increments(frame, order, frame["h"])[0])
             inputs = state, [frame["t"] + frame["h"]], frame.vectors("params", motion.numbers)
             slopes = motion.form.run(frame, line, *inputs, frame.vectors("hit", self.pieces))
-            error, rtol, atol = code.variable(frame.constant(0.0)), frame.job("rtol"), absolute_tolerance(frame)
+            rtol, atol = frame.job("rtol"), absolute_tolerance(frame)
+            error, rounding = (code.variable(frame.constant(0.0)) for _ in range(2))
             for part in range(2):
                 for i in motion.form.each(code, base):
-                    size = rtol * code.intrinsic("fabs", state[i + part * n]) + code.lanes_of(atol)
-                    moved = code.intrinsic("fabs", slopes[i + part * base]) * size
-                    error.value += moved
+                    slope = code.intrinsic("fabs", slopes[i + part * base])
+                    size = slope * code.intrinsic("fabs", state[i + part * n])
+                    rounding.value += size * EPS
+                    error.value += rtol * size + slope * code.lanes_of(atol)
             rate, bend = self._rates(frame, order)
-            near = rate * rate <= 2.0 * (code.intrinsic("fabs", bend) * error.value)
-            near = near & ends & (frame["is_hit"] > 0.0)
-            with frame.where(near):
-                frame["grazes"] = 1
+            is_hit = ends & (frame["is_hit"] > 0.0)
+            for name, by in (("grazes", error.value), ("stops", rounding.value)):
+                near = is_hit & (rate * rate <= 2.0 * (code.intrinsic("fabs", bend) * by))
+                with frame.where(near):
+                    frame[name] = 1
         return frame.finish()
 
     def _rates(self, frame: Frame, order: Value) -> tuple[Value, Value]:
@@ -614,10 +643,6 @@ class BorderControl:
             with frame.where(crosses):
                 if self.returns:
                     frame["h_before"] = 0.0
-                if self.borders.nested:
-                    frame["undecided"] = 1
-            if self.borders.nested:
-                frame.call(self.decide)
             if self.kick is not None:
                 self._kick_or_reflect(frame, self.kick, crossed, crosses)
             if self.jump is not None:
@@ -635,11 +660,12 @@ class BorderControl:
         """The pieces beyond the borders, which touch them; a piece that touches one is not decided anew.
 
         A motion that would go back over the border at once is pushed onto it from both sides: it slides. So does one
-        that has come back in no measurable time: it bounces off the border, less and less, and comes to rest.
+        that has come back in no measurable time, or not to rounding: it bounces off the border, less and less, and
+        comes to rest.
         """
         code, again = frame.code, frame["stepped"] <= 0.0
         no_time = ~again & (code.intrinsic("fabs", frame["cut"]) <= NO_TIME * frame["smallest"])
-        no_time = no_time & (frame["at_rest"] > 0.0)
+        no_time = (no_time | (~again & (frame["stops"] > 0.0))) & (frame["at_rest"] > 0.0)
         with code.loop(len(self.guards)) as g:
             hit = code.compare("==", crossed, code.lanes_of(code.as_double(g + 1)))
             j, back, slide = (self.table.place(code, g, name) for name in ("piece", "back", "slide"))
@@ -653,17 +679,16 @@ class BorderControl:
             # A share jumps to where it is: it need not touch the border that it had crossed before.
             is_share = code.lanes_of(code.flag(self.table.place(code, g, "on") >= 0)) > 0.0
             with frame.where(hit):
-                frame["touch", back] = code.select(
-                    is_share, Touch.NONE, code.select(slides, Touch.SLIDING, Touch.VALUE)
-                )
+                frame["touch", back] = code.select(is_share, Touch.NONE, Touch.VALUE)
             with code.only_if(slide >= 0):
+                below = code.select(self._piece(frame, j) < frame["beyond"], self._piece(frame, j), frame["beyond"])
+                is_sign = code.lanes_of(self.table.number(code, g, "k")) < 0.0
                 with frame.where(slides):
+                    frame["params", place] = code.select(is_sign, -1.0, below)
                     frame["params", slide + self.motion.parameters] = 1
+                    frame["touch", g] = frame["touch", back] = Touch.NONE
+                    frame["touch", self.table.place(code, g, "rest")] = Touch.SLIDING
             self._leave(frame, g, hit, again)
-        with code.loop(len(self.guards)) as g:
-            j = self.table.place(code, g, "piece")
-            with frame.where(frame["touch", g] > Touch.NONE):
-                frame["stays", j] = 1
 
     # ---- where L jumps ----
 
@@ -803,5 +828,6 @@ class BorderControl:
             place = self.table.place(code, on, "piece") + self.motion.parameters
             order = code.lanes_of(code.as_double(self.table.place(code, on, "order")))
             with frame.where(hit):
-                frame["params", place] = self.table.number(code, g, "goes_on")
+                frame["params", place] = frame["params", place] + self.table.number(code, g, "gains")
+                frame["touch", self.table.place(code, g, "rest")] = Touch.NONE
                 frame["touch", on] = code.select(again, order, order + Touch.VALUE)

@@ -28,7 +28,7 @@ from lagjax._native._integrator import Integrator
 from lagjax._native._ir import DOUBLE, FLOAT, compile_module, lanes
 from lagjax._native._output import RECORDED
 from lagjax._native._packs import forget_stages
-from lagjax._native._parts import MotionParts, Projection, choose_parameters
+from lagjax._native._parts import Chosen, MotionParts, Projection, choose_parameters
 from lagjax._native._schedule import forget_joined
 from lagjax._native._single_member import fills_lanes
 from lagjax._native._table_reads import SET_NUMBERS
@@ -150,6 +150,11 @@ class Kernel:
     def borders(self) -> Borders | None:
         """The borders between the pieces of the motion."""
         return self._parts.borders
+
+    @property
+    def chosen(self) -> Chosen | None:
+        """The numbers of a member that its programs compute with; None where these are all."""
+        return self._parts.chosen
 
     def _integrator(self, number: ir.Type = DOUBLE, for_gpus: bool = False) -> Integrator:
         with pause_collections():

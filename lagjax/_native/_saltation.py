@@ -22,8 +22,8 @@ from lagjax._program._borders import Borders
 from lagjax._program._jump import Jump
 from lagjax._program._look_ups import Table
 
-NUMBERS = ("a", "b", "d", "e", "below", "above", "k", "l", "goes_on")
-PLACES = ("piece", "back", "slide", "on", "order", "of_table")
+NUMBERS = ("a", "b", "d", "e", "below", "above", "k", "l", "gains")
+PLACES = ("piece", "back", "slide", "on", "order", "rest", "of_table")
 
 
 class Hit(IntEnum):

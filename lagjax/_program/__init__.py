@@ -41,7 +41,7 @@ from lagjax._program import _complex, _eigenvalues, _special  # noqa: F401  (the
 from lagjax._program import _scalars as scalars
 from lagjax._program._borders import BELOW, CLOCK, FLOOR, SIGN, TABLE, TRUNC, Borders, borders, distances, is_smooth
 from lagjax._program._differentiation import Derivatives, copy_nodes, pullback, pushforward, with_tangents
-from lagjax._program._emit import Rows, apply_in_jax, emit, emit_rows, plain_elementary
+from lagjax._program._emit import Rows, apply_in_jax, emit, emit_look_up, emit_rows, plain_elementary
 from lagjax._program._evaluate import evaluate, round_off, steps_of, vjp
 from lagjax._program._graph import MANY, Graph, Node, Tape, Unlowerable
 from lagjax._program._groups import Groups, groups_of
@@ -58,7 +58,8 @@ from lagjax._program._series import LinearSystem, Series, StraightLine, series
 __all__ = [
     "BELOW", "CLOCK", "FLOOR", "OPERATIONS", "SIGN", "TABLE", "TRUNC", "Borders", "Derivatives", "Expansion", "Graph",
     "Program", "Scalars", "Series", "StraightLine", "Tape", "Unlowerable", "apply_function", "apply_in_jax", "borders",
-    "concatenate", "copy_nodes", "distances", "emit", "evaluate", "expand_primitive", "has_own_rules", "inputs_of",
+    "concatenate", "copy_nodes", "distances", "emit", "emit_look_up", "evaluate", "expand_primitive", "has_own_rules",
+    "inputs_of",
     "is_smooth", "live", "lower", "lower_formula", "lower_scalars", "lower_solution", "machine_memory",
     "operations_that_fit", "orthogonalize", "pause_collections", "plain_elementary", "pullback", "pushforward",
     "row_weights", "scalars", "scatter", "series", "solve_orthogonalized", "stack", "steps_of", "table_of",

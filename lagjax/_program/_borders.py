@@ -67,10 +67,10 @@ class Guard(NamedTuple):
     k p + l, whose border on this side is guard `back`.
 
     Where both sides push onto the border of `piece`, piece number `slide` becomes 1: the motion slides along it, with
-    α of the acceleration on the upper side and 1 − α of that on the lower one. α is the switching number of `slide`;
-    beyond its guards the motion continues with the guard `on` at the piece `goes_on`. These are −1 where there is none.
-    `order` is that of the rate of u that is zero there (`_sliding.Slide`). Where `of_table` is 1 the level is
-    the entry of that number of the table of the piece.
+    α of the acceleration on the upper side and 1 − α of that on the lower one; its piece is the one below, and guard
+    `rest` the border. α is the switching number of `slide`; beyond its guards the motion continues with the guard `on`
+    at a piece that is larger by `gains`. These are −1 where there is none. `order` is that of the rate of u that is
+    zero there (`_sliding.Slide`). Where `of_table` is 1 the level is the entry of that number of the piece's table.
     """
 
     piece: int
@@ -86,7 +86,8 @@ class Guard(NamedTuple):
     slide: int = -1
     on: int = -1
     order: int = 0
-    goes_on: float = 0.0
+    rest: int = -1
+    gains: float = 0.0
     of_table: int = 0
 
 
@@ -245,6 +246,7 @@ class _Rewriting:
         self.features: dict[tuple[int, int], Feature] = {}  # by the argument, and the kind
         self.abrupt: set[int] = set()
         self.moduli, self.quotients = _moduli(program.line), _floor_divisions(program.line)
+        self.truncated = _truncations(program.line)
         self.decisive = self._decisive()
         comparisons = [i for i in self.decisive if program.line.nodes[i][0] not in ("eq", "ne")]
         self.borders_of_decisions = {self._compared(i) for i in comparisons} - {None}
@@ -254,6 +256,7 @@ class _Rewriting:
         if self.powers or any(
             i in self.moduli
             or i in self.quotients
+            or i in self.truncated
             or self._decides(i)
             or program.line.nodes[i][0] in (*_FEATURES, "pow")
             for i in relevant
@@ -269,7 +272,7 @@ class _Rewriting:
         """The nodes that q̈ depends on, without those of the elimination of a linear system."""
         linear, line = self.program.linear, self.program.line
         roots = line.outputs[: self.size] if linear is None else [*linear.right, *linear.entries.values()]
-        instead = self.moduli | self.quotients
+        instead = self.moduli | self.quotients | self.truncated
         needed = _below(line, roots, instead)
         self._of_guards = _below(line, self.watched, instead)
         if self.watched:  # which may read the solution of a linear system, but not decide on its elimination
@@ -392,6 +395,8 @@ class _Rewriting:
             op, of = "mod", [self.places[x] for x in self.moduli[i]]
         elif i in self.quotients:
             op, of = "floor", [self.graph.apply("div", *(self.places[x] for x in self.quotients[i]))]
+        elif i in self.truncated:
+            op, of = "trunc", [self.places[x] for x in self.truncated[i]]
         elif not self._decides(i) or (
             op == "atan2" and is_nonnegative(self.program.line, self.program.line.nodes[i][1][1])
         ):
@@ -436,7 +441,7 @@ class _Rewriting:
             whole = self._piece(TRUNC, f("div", *of))
             return None if whole is None else f("sub", of[0], f("mul", whole, of[1]))
         whole = self._piece(TRUNC, of[0])
-        return None if whole is None else f("convert", whole, attribute=attribute)
+        return whole if whole is None or op == "trunc" else f("convert", whole, attribute=attribute)
 
     def _angle(self, y: int, x: int) -> int | None:
         """atan2(y, x) by the side of its cut, y = 0 where x < 0; None where no motion crosses that.
@@ -671,22 +676,48 @@ class _Rewriting:
         )
 
     def _sliding(self, line: StraightLine, kicking: Container[int] = ()) -> list[Slide]:
-        """The borders that a motion may slide along: those of signs that something jumps with, but not L.
+        """The borders that a motion may slide along: those that something jumps with, but not L.
 
         Those that depend on velocities come first, and are all there or none.
         """
-        acting = self._jumping & _below(line, line.outputs[: self.size])
-        by_velocity, by_position = [], []
+        n, acting, orders = self.size, _below(line, line.outputs[: self.size]), {}
         for j, kind in enumerate(self.kinds if self.slides else ()):
-            if kind == SIGN and self.pieces[j] in acting and j not in kicking:
-                below = _below(line, [self.switches[j]])
-                read = {line.nodes[i][2] for i in below if line.nodes[i][0] == "input"}
-                if not read.isdisjoint(range(self.size, 2 * self.size)):
-                    by_velocity.append(Slide(j, 1))
-                elif not read.isdisjoint(range(self.size)):
-                    by_position.append(Slide(j, 2))
-        both = by_velocity + by_position
+            if kind == CLOCK or self.pieces[j] not in acting or j in kicking:
+                continue
+            if kind == SIGN and self.pieces[j] not in self._jumping:
+                continue
+            read = {line.nodes[i][2] for i in _below(line, [self.switches[j]]) if line.nodes[i][0] == "input"}
+            if not read.isdisjoint(range(2 * n)):
+                orders[j] = 2 if read.isdisjoint(range(n, 2 * n)) else 1
+        others = [j for j in orders if self.kinds[j] != SIGN]
+        shaking = {j: [m for m in self.switches if self.pieces[j] in _below(line, [m])] for j in orders}
+        if others or any(shaking.values()):
+            search = Jumping(line, self._decide(len(self.switches), ()), self.switches, n, self.program.size)
+            # An interpolation has a corner at its entries, and no jump.
+            jumps = search.find(others, line.outputs[:n], self._levels) if others else {}
+            # Where other switching numbers jump, the pieces on the other side are not known.
+            lost = [j for j, nodes in shaking.items() if nodes and search.find([j], nodes, self._levels)[j]]
+            orders = {j: order for j, order in orders.items() if jumps.get(j, True) is not False and j not in lost}
+        both = [
+            Slide(j, order, 2.0 if self.kinds[j] == SIGN else 1.0, self._level_between(j))
+            for j, order in sorted(orders.items(), key=lambda item: item[1])
+        ]
+        by_velocity = [slide for slide in both if slide.order == 1]
         return both if len(both) <= MOST_SLIDING else by_velocity if len(by_velocity) <= MOST_SLIDING else []
+
+    def _level_between(self, j: int) -> Callable[[Graph, int], int]:
+        """The level between a piece and the next one, of its switching number."""
+        kind, located = self.kinds[j], self.tables[j]
+
+        def level(graph: Graph, piece: int) -> int:
+            zero, above = graph.constant(0.0, "float"), graph.apply("add", piece, graph.constant(1.0, "float"))
+            if kind == SIGN:
+                return zero
+            if located is not None:
+                return graph.apply("take", above, attribute=located.table)
+            return above if kind == FLOOR else graph.apply("select", graph.apply("lt", piece, zero), above, piece)
+
+        return level
 
     def _rate(self, graph: Graph, nodes: list[int], slide: Slide) -> int:
         """u̇ of a border, in a graph in which those of the program are `nodes`."""
@@ -713,12 +744,24 @@ class _Rewriting:
         goes_on, zero, one = [], graph.constant(0.0, "float"), graph.constant(1.0, "float")
         pieces = [nodes[i] for i in self.pieces]
         for k, slide in enumerate(slides):
-            begins = graph.apply("eq", nodes[self.pieces[slide.piece]], zero)
+            flag = graph.input(first + len(self.pieces) + k, "float")
+            piece, below = nodes[self.pieces[slide.piece]], graph.constant(-1.0, "float")
+            begins = graph.apply("eq", piece, zero)
+            if self.kinds[slide.piece] != SIGN:
+                if slide.order == 1:  # it begins on one side, and meets the other one at once
+                    goes_on.append(flag)
+                    continue
+                x, lower = nodes[self.switches[slide.piece]], graph.apply("sub", piece, one)
+                begins, is_lower = (graph.apply("eq", x, slide.level(graph, i)) for i in (lower, piece))
+                begins, below = graph.apply("or", begins, is_lower), graph.apply("select", is_lower, lower, piece)
+                stays = graph.apply(
+                    "gt", graph.input(first + count + slide.piece, "float"), graph.constant(0.5, "float")
+                )
+                begins = graph.apply("and", begins, graph.apply("not", stays))
             if slide.order > 1:
                 begins = graph.apply("and", begins, graph.apply("eq", self._rate(graph, nodes, slide), zero))
-            flag = graph.input(first + len(self.pieces) + k, "float")
             goes_on.append(graph.apply("select", begins, flag, one))
-            pieces[slide.piece] = graph.apply("select", begins, pieces[slide.piece], one)  # shares count from a side
+            pieces[slide.piece] = graph.apply("select", begins, pieces[slide.piece], below)
         return StraightLine(*eliminate_dead_code(graph, pieces + goes_on))
 
 
@@ -747,20 +790,28 @@ def _guards(kinds: Sequence[int], slides: Sequence[Slide]) -> tuple[Guard, ...]:
         k = len(guards)
         if kind == CLOCK:
             continue
-        if kind == SIGN and j in sliding:
-            slide = first + sliding.index(j)
-            order = slides[sliding.index(j)].order
-            guards.append(Guard(j, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, k, slide, order=order))
-            guards.append(Guard(slide, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, k + 1, on=k, goes_on=-1.0))
-            guards.append(Guard(slide, -1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, k + 2, on=k, goes_on=1.0))
-        elif kind == SIGN:
-            guards.append(Guard(j, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, k))
+        if kind == SIGN:
+            of_piece = [Guard(j, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, k)]
         else:
             floors = kind in (FLOOR, TABLE)  # between numbers p and p + 1, or the entries with these indices
             below, above = (0.0, 0.0) if floors else (-1.0, 1.0)
             of = int(kind == TABLE)
-            guards.append(Guard(j, 0.0, 1.0, 1.0, 0.0, below, 0.0, 1.0, -1.0, k + 1, of_table=of))
-            guards.append(Guard(j, 0.0, -1.0, 1.0, 1.0 if floors else 0.0, 0.0, above, 1.0, 1.0, k, of_table=of))
+            of_piece = [
+                Guard(j, 0.0, 1.0, 1.0, 0.0, below, 0.0, 1.0, -1.0, k + 1, of_table=of),
+                Guard(j, 0.0, -1.0, 1.0, 1.0 if floors else 0.0, 0.0, above, 1.0, 1.0, k, of_table=of),
+            ]
+        if j in sliding:
+            lower, upper = (
+                k,
+                k + len(of_piece) - 1,
+            )  # the borders of a piece; the upper one of the piece below is slid on
+            slide, (_, order, width, _) = first + sliding.index(j), slides[sliding.index(j)]
+            of_piece = [guard._replace(slide=slide, order=order, rest=upper) for guard in of_piece]
+            of_piece += [
+                Guard(slide, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, upper + 1, on=upper, rest=upper),
+                Guard(slide, -1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, upper + 2, on=lower, rest=upper, gains=width),
+            ]
+        guards += of_piece
     return tuple(guards)
 
 
@@ -869,6 +920,24 @@ def _floor_divisions(line: StraightLine) -> dict[int, tuple[int, int]]:
         signs = any(nodes[p][0] == "ne" and any(nodes[z] == ("sign", (r,), None) for z in nodes[p][1]) for p in parts)
         if nodes[r][1][0] == x and not_zero and signs:
             found[i] = x, y
+    return found
+
+
+def _truncations(line: StraightLine) -> dict[int, tuple[int]]:
+    """The nodes that are the whole number between x and zero, and x: written as floor(x), or ceil(x) where x < 0."""
+    nodes, found = line.nodes, {}
+    for i, (op, operands, _) in enumerate(nodes):
+        if op != "select" or nodes[operands[0]][0] not in _COMPARISONS:
+            continue
+        of_two = {nodes[x][0]: nodes[x][1] for x in operands[1:]}
+        x, level = nodes[operands[0]][1]
+        negative = operands[2 if nodes[operands[0]][0] in ("lt", "le") else 1]
+        if (
+            nodes[level] == ("constant", (), 0.0)
+            and of_two == {"floor": (x,), "ceil": (x,)}
+            and nodes[negative][0] == "ceil"
+        ):
+            found[i] = (x,)
     return found
 
 

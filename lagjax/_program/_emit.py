@@ -3,7 +3,7 @@
 import contextlib
 import functools
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -15,7 +15,7 @@ from jax.experimental.xla_metadata import set_xla_metadata
 from lagjax import _elementary
 from lagjax._platform import default_platform
 from lagjax._program._graph import Node
-from lagjax._program._look_ups import Table, table_of
+from lagjax._program._look_ups import BESIDE, Table, table_of
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._series import StraightLine
 
@@ -64,7 +64,7 @@ def _emit_outputs(nodes, kinds, outputs, scalars, shape: tuple[Any, ...], entrie
         elif op == "convert":
             values[i] = lax.convert_element_type(values[operands[0]], dtypes[i])
         elif op in LOOK_UPS:
-            values[i] = _emit_look_up(op, attribute, entries, precision, values[operands[0]])
+            values[i] = emit_look_up(op, attribute, entries, precision, values[operands[0]])
         elif op in ("sin", "cos") and operands[0] in paired:
             if operands[0] not in pairs:
                 pairs[operands[0]] = _fast_function("sincos")(values[operands[0]])
@@ -76,18 +76,22 @@ def _emit_outputs(nodes, kinds, outputs, scalars, shape: tuple[Any, ...], entrie
 
 
 class Rows(NamedTuple):
-    """The inputs of a program as arrays: `first` (…, m) of those that come first, then `numbers` (…, P)."""
+    """The inputs of a program as arrays: `first` (…, m) of those that come first, then `numbers` (…, P).
+
+    Where there are `pieces`, these come after the first ones, and numbers are only looked up (`_look_ups.BESIDE`).
+    """
 
     first: Any
     numbers: Any
+    pieces: Sequence = ()
 
     def __getitem__(self, i: int):
         m = self.first.shape[-1]
-        return self.first[..., i] if i < m else self.numbers[..., i - m]
+        return self.first[..., i] if i < m else self.pieces[i - m] if self.pieces else self.numbers[..., i - m]
 
     def entries(self, table: Table):
         """The entries of a table of them, (…, count)."""
-        first = table.first - self.first.shape[-1]
+        first = table.first - (BESIDE if table.first >= BESIDE else self.first.shape[-1])
         return self.numbers[..., first : first + table.stride * (table.count - 1) + 1 : table.stride]
 
 
@@ -97,7 +101,7 @@ def emit_rows(line: StraightLine, rows: Rows) -> tuple:
     return _emit_outputs(line.nodes, line.kinds, line.outputs, rows, shape, rows.entries)
 
 
-def _emit_look_up(op: str, attribute, entries: Callable, precision, x) -> jax.Array:
+def emit_look_up(op: str, attribute, entries: Callable, precision, x) -> jax.Array:
     """An entry of a table, or the piece of one that x is on; `entries(table)` has shape (…, count)."""
     table = table_of(attribute)
     known = table.numbers is not None

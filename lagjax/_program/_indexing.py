@@ -18,6 +18,7 @@ from lagjax._program._operations import OPERATIONS
 # Entries among which one is chosen by comparisons. With 256 knots and values that are computed a first motion takes
 # 0.9 s of a core, half a second more than with those of `params`, and a step takes 90 µs; both grow with their number.
 LARGEST_CHOICE = 256
+_MOST_COMPARED = 32  # knots, each a border of its own: with more of them, halving takes fewer
 _MOST_BASES = 4  # numbers that entries may be combinations of, as a and b in a x + b: more is no table times a number
 Ids = np.ndarray
 _WHOLE = ("locate", "floor", "ceil", "round")  # operations whose result is a whole number
@@ -38,6 +39,23 @@ def locate_knots(expansion: Any, knots: Ids, x: Ids, closed: bool) -> Ids | None
     attribute = Located(table, closed)
     found = [expansion.graph.apply("locate", i, attribute=attribute) for i in expansion.real(x).ravel().tolist()]
     return expansion.map("convert", np.array(found, dtype=np.int64).reshape(x.shape), attribute="int32")
+
+
+def count_knots(expansion: Any, knots: Ids, x: Ids, side: str) -> Ids | None:
+    """How many of the increasing `knots` are below x, from the left side, or at most x, from the right; as integers.
+
+    None where the knots are no table, and too many to be compared.
+    """
+    f, one = expansion.map, expansion.constants(np.int32(1))
+    if side == "right":
+        found = locate_knots(expansion, knots, x, closed=False)
+        return None if found is None else f("add", found, one)
+    if (found := locate_knots(expansion, f("neg", knots[::-1]), f("neg", x), closed=False)) is not None:
+        return f("sub", expansion.constants(np.int32(len(knots) - 1)), found)
+    if len(knots) > _MOST_COMPARED:
+        return None
+    below = f("lt", knots.reshape(-1, *[1] * x.ndim), np.broadcast_to(x, (len(knots), *x.shape)))
+    return expansion.fold("add", f("convert", below, attribute="int32"))
 
 
 def look_up_windows(expansion: Any, x: Ids, indices: Ids, axes: Any, sizes: Any, missing: float | None) -> Ids:

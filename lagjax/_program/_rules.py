@@ -11,6 +11,7 @@ id arrays, and returns an id array (or a list of them). Each needs a row in `tes
 import functools
 import math
 from collections.abc import Callable
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -19,7 +20,7 @@ from jax.core import Tracer
 from jax.extend import core
 
 from lagjax._program._graph import INPUTS, PAIRS, Graph, Unlowerable
-from lagjax._program._indexing import are_numbers, locate_knots, look_up_windows
+from lagjax._program._indexing import are_numbers, count_knots, locate_knots, look_up_windows
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._simplify import arctangent
 
@@ -687,9 +688,9 @@ LOWER.update({name: _scatter(op) for name, op in {**SCATTERS, "scatter-min": "mi
 @lowers(*_CALLS)
 def _call(expansion, params, *arguments):
     body = next(params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in params)
-    if params.get("name") == "searchsorted" and _searches_from_the_right(body, arguments):
-        if (found := locate_knots(expansion, *arguments, closed=False)) is not None:
-            return [expansion.map("add", found, expansion.constants(np.int32(1)))]
+    if params.get("name") == "searchsorted" and (side := _side_of_search(body, arguments)) is not None:
+        if (found := count_knots(expansion, *arguments, side=side)) is not None:
+            return [found]
     if isinstance(body, core.ClosedJaxpr):
         return expansion.run_closed(body, arguments)
     return expansion.run(body, (), arguments)
@@ -709,28 +710,27 @@ def expand_primitive(primitive) -> core.ClosedJaxpr:
     return jax.make_jaxpr(call_expansion)(*primitive.in_avals_flat)
 
 
-def _searches_from_the_right(body, arguments) -> bool:
-    """True if a function that is named so is `jnp.searchsorted(knots, x, side="right")`, for which `jnp.interp` asks.
+def _side_of_search(body, arguments) -> Literal["right", "left"] | None:
+    """The side of `jnp.searchsorted(knots, x, side)`, if a function that is named so is that; None of others.
 
     It is tried with numbers: knots 0, 1, …, and a number below them, between two of them, at one, and beyond them.
     """
     if len(arguments) != 2 or arguments[0].ndim != 1 or not len(arguments[0]) or len(body.out_avals) != 1:
-        return False
+        return None
     shapes, count = [variable.aval for variable in body.jaxpr.invars], len(arguments[0])
     if (
         not all(jnp.issubdtype(shape.dtype, jnp.floating) for shape in shapes)
         or body.out_avals[0].shape != shapes[1].shape
     ):
-        return False
+        return None
+    sides: list[Literal["right", "left"]] = ["right", "left"]
     trial = Expansion(Graph(10_000))
     for x in (-1.0, 0.5, float(count // 2), count + 1.0):
         given = [trial.constants(np.arange(count, dtype=float)), trial.constants(np.full(shapes[1].shape, x))]
         (found,) = trial.run_closed(body, given)
-        if not (
-            trial.require_numbers(trial.real(found), "it") == np.searchsorted(np.arange(count), x, side="right")
-        ).all():
-            return False
-    return True
+        found = trial.require_numbers(trial.real(found), "it")
+        sides = [s for s in sides if (found == np.searchsorted(np.arange(count), x, side=s)).all()]
+    return next(iter(sides), None)
 
 
 @lowers("scan")

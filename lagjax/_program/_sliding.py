@@ -39,13 +39,16 @@ _LARGEST = 10_000_000  # operations: a bound for errors
 
 
 class Slide(NamedTuple):
-    """A border to slide along: that of piece number `piece`. Of its switching number u the rate of this order is zero.
+    """Borders to slide along: those of piece number `piece`. Of its switching number u the rate of this order is zero.
 
-    Order 1 is that of a border that depends on velocities, 2 that of one that does not.
+    Order 1 is that of a border that depends on velocities, 2 that of one that does not. While the motion slides the
+    piece is the one below, and the one above is larger by `width`. `level(graph, piece)` is that of u between them.
     """
 
     piece: int
     order: int
+    width: float
+    level: Callable[[Graph, int], int]
 
 
 class Sliding(NamedTuple):
@@ -93,9 +96,12 @@ class _SlidingForces:
         self.graph = Graph.from_line(line, _LARGEST)
         self.f, self.zero, self.one = self.graph.apply, self.number(0.0), self.number(1.0)
         self.pieces = [self.graph.input(first + slide.piece, "float") for slide in slides]
+        self.offsets = [
+            self.f("sub", switches[slide.piece], slide.level(self.graph, piece))
+            for slide, piece in zip(slides, self.pieces, strict=True)
+        ]
         flags = [self.graph.input(first + len(switches) + k, "float") for k in range(len(slides))]
         self.flags = [self.f("gt", flag, self.number(0.5)) for flag in flags]
-        self.switches = switches
 
     def number(self, x: float) -> int:
         return self.graph.constant(x, "float")
@@ -144,7 +150,7 @@ class _SlidingForces:
             some = [[effects[k][m] for m in by_position] for k in by_position]
             pushes = [self._pushes_back(k, effects, pushed, slopes, missing) for k in by_position]
             of_positions = self._equations(some, pushes, [slopes[k] for k in by_position])
-            at = [self.switches[self.slides[k].piece] for k in by_position]
+            at = [self.offsets[k] for k in by_position]
             held.put_back(0, by_position, at, lambda left: of_positions.solve(self.graph, left), pushes)
         held.put_back(self.n, range(len(levels)), levels, lambda left: equations.solve(self.graph, left), pushed)
         return Sliding(line, range(len(self.line.nodes)), shares, linear, *held.finish())
@@ -192,12 +198,11 @@ class _SlidingForces:
         without = [p if k != j else f("and", p, f("not", p)) for k, p in enumerate(pushed)]
         equations = self._equations(effects, without, slopes)
         stays = pushed[j]
-        for side in (self.one, self.number(-1.0)):
-            change = f("sub", side, self.pieces[j])
+        for change in (self.number(2.0), self.zero):
             beside = [f("sub", x, f("mul", effects[k][j], change)) for k, x in enumerate(missing)]
             mu = self._unknown(equations, [f("select", p, self.zero, x) for p, x in zip(without, beside, strict=True)])
             for k in others:
-                held = f("lt", f("abs", f("add", self.pieces[k], mu[k])), self.one)
+                held = f("lt", f("abs", f("sub", mu[k], self.one)), self.one)
                 stays = f("and", stays, f("or", f("not", pushed[k]), held))
             row = [self.zero if k == j else x for k, x in enumerate(effects[j])]
             moves = f("abs", f("sub", beside[j], dot(self.graph, row, mu)))
@@ -205,12 +210,13 @@ class _SlidingForces:
         return f("and", pushed[j], f("not", stays))
 
     def _unknown(self, equations: "_Equations", missing: list[int]) -> list[int]:
-        """μ; where borders share what they hold, the pieces p + μ are to be small, and not how far they are from p."""
+        """μ; where borders share what they hold, μ − 1 is to be small: the distance from the middle of both sides."""
         if not equations.whole:
             return equations.solve(self.graph, missing)
         f, rows = self.f, equations.whole
-        there = [f("add", x, dot(self.graph, row, self.pieces)) for x, row in zip(missing, rows, strict=True)]
-        return [f("sub", x, p) for x, p in zip(equations.solve(self.graph, there), self.pieces, strict=True)]
+        below = [self.number(-1.0)] * len(rows)
+        there = [f("add", x, dot(self.graph, row, below)) for x, row in zip(missing, rows, strict=True)]
+        return [f("add", x, self.one) for x in equations.solve(self.graph, there)]
 
     def _are_dependent(self, slopes: Sequence[list[int]]) -> bool:
         """True if the rates of some borders are combinations of others, so that these can share what they hold."""
@@ -221,11 +227,10 @@ class _SlidingForces:
         return bool(np.linalg.matrix_rank(numbers) < len(slopes))
 
     def _share(self, k: int, pushed: int, mu: int, slopes: list[int], rate: int, z: Sequence[int]) -> int:
-        """The share of the upper side: (1 + p + μ)/2, and far beyond 0 or 1 where both sides do not push."""
+        """The share of the upper side: μ/2, and far beyond 0 or 1 where both sides do not push."""
         f, half = self.f, self.number(0.5)
-        own = f("mul", half, f("add", self.one, f("add", self.pieces[k], mu)))
         moves = f("sub", dot(self.graph, slopes, z[: self.n]), rate)
-        return f("select", pushed, f("add", half, f("mul", self.number(FAR), moves)), own)
+        return f("select", pushed, f("add", half, f("mul", self.number(FAR), moves)), f("mul", half, mu))
 
     def _push_right_side(
         self, right: Sequence[int], acts: Sequence[dict[int, int]], unknown: Sequence[int]
@@ -259,16 +264,12 @@ class _SlidingForces:
         if not pieces.keys().isdisjoint(graph.find_ancestors([*system.entries.values(), *system.factors])):
             return None
         sides: dict[int, dict[int, tuple[int, int]]] = {}
-        both = self.number(-1.0), self.one
         for i in graph.find_ancestors(system.right):
             if i in pieces:
-                sides[i] = {pieces[i]: both}
+                sides[i] = {pieces[i]: self._both_pieces(pieces[i])}
                 continue
             op, operands, attribute = graph.nodes[i]
-            moving = [x for x in operands if x in sides]
-            among = sorted({k for x in moving for k in sides[x]})
-            if len(among) > 1 and not _adds_up(op, operands, sides):
-                return None
+            among = sorted({k for x in operands for k in sides.get(x, ())})
             values = {}
             for k in among:
                 given = ([sides.get(x, {}).get(k, (x, x))[side] for x in operands] for side in (0, 1))
@@ -278,9 +279,15 @@ class _SlidingForces:
                 sides[i] = values
         return sides
 
+    def _both_pieces(self, k: int) -> tuple[int, int]:
+        """The pieces below and above border k."""
+        if self.slides[k].width > 1:  # of a sign
+            return self.number(-1.0), self.one
+        return self.pieces[k], self.f("add", self.pieces[k], self.one)
+
     def _rate(self, k: int) -> tuple[list[int], int, int]:
         """∂w/∂q̇ and −∂w/∂q q̇ − ∂w/∂t of what is to stay zero, u or u̇; zeros where nothing slides. And w."""
-        n, node = self.n, self.switches[self.slides[k].piece]
+        n, node = self.n, self.offsets[k]
         level = node
         for _ in range(self.slides[k].order):
             level, slopes = node, self._slopes(node)
@@ -353,16 +360,6 @@ class _SlidingForces:
         return LinearSystem(
             (*z, *unknown), system.entries, (*system.right, *rates), factors, solve, others
         )  # fmt: skip
-
-
-def _adds_up(op: str, operands: Sequence[int], sides: dict) -> bool:
-    """True if what several pieces do to a result of this operation is the sum of what each of them does."""
-    moving = [x in sides for x in operands]
-    if op in ("add", "sub", "neg", "convert"):
-        return True
-    if op == "mul":
-        return sum(moving) == 1
-    return op in ("div", "select") and not moving[1 if op == "div" else 0]
 
 
 # ---- what stays on borders ----
@@ -469,9 +466,10 @@ def _copy_for_slides(
 
     def copy(upper: int | None) -> list[int]:
         given = dict(inputs)
-        for k, (j, _) in enumerate(slides):
-            side = one if k == upper else number(-1.0)
-            given[first + j] = f("select", flags[k], graph.input(first + j, "float"), side)
+        if upper is not None:
+            piece = graph.input(first + slides[upper].piece, "float")
+            above = f("add", piece, number(slides[upper].width))
+            given[first + slides[upper].piece] = f("select", flags[upper], piece, above)
         size = max(given) + 1
         return copy_nodes(graph, line, [given.get(i, zero) for i in range(size)])
 
@@ -482,8 +480,8 @@ def _copy_for_slides(
         for places in map(copy, range(count))
     ]
     rates, effects, normals, ends = [], [], [], []
-    for j, _ in slides:
-        slopes = gradient_in(graph, line, base, switches[j], range(2 * n + 1))
+    for slide in slides:
+        slopes = gradient_in(graph, line, base, switches[slide.piece], range(2 * n + 1))
         velocity = [graph.input(n + i, "float") for i in range(n)]
         drift = f("add", dot(graph, slopes[:n], velocity), slopes[2 * n])
         normals.append(slopes[n : 2 * n])
@@ -507,7 +505,10 @@ def _copy_for_slides(
     left = [f("add", number(0.5), f("mul", number(FAR), x)) for x in moves]
     of_sides = [f("select", held[k], f("select", flags[k], zero, left[k]), shares[k]) for k in range(count)]
     done = StraightLine(tuple(graph.nodes), tuple(graph.kinds), tuple(a))
-    levels = [base[switches[j]] for j, _ in slides]
+    levels = [
+        f("sub", base[switches[slide.piece]], slide.level(graph, graph.input(first + slide.piece, "float")))
+        for slide in slides
+    ]
     hold.put_back(n, range(count), levels, lambda left: substitute(graph, rows, lower, left), held)
     return Sliding(done, base, of_sides, None, *hold.finish())
 

@@ -233,3 +233,103 @@ def test_an_oscillator_of_a_broken_power(power):
         run = lagjax.simulate_batch(scene, q0, jnp.zeros(10), ts, solver=lagjax.MachineCode())
         energy = 0.5 * run.qdot[:, -1] ** 2 + jnp.abs(run.q[:, -1]) ** (power + 1) / (power + 1)
         np.testing.assert_allclose(energy, q0 ** (power + 1) / (power + 1), atol=1e-8)
+
+
+# ---- borders of every kind -------------------------------------------------------------------------------------------
+
+LEVELS, HEIGHTS = jnp.array([-1.3, -0.4, 0.7, 1.1]), jnp.array([-2.0, -0.7, 0.2, 0.9, 2.5])
+# A step function, one of its levels, and its values below and above that.
+STEPS = {
+    "floor": (jnp.floor, 1.0, 0.0, 1.0),
+    "trunc": (jnp.trunc, -1.0, -1.0, 0.0),
+    "whole parts": (lambda u: u // 0.5, 0.5, 0.0, 1.0),
+    "parity": (lambda u: 1.0 * (jnp.ceil(2 * u) % 2 == 0), 0.5, 0.0, 1.0),
+    "branches": (lambda u: jax.lax.switch(jnp.int32(u // 1) + 2, [lambda x=x: x for x in HEIGHTS]), 0.0, -0.7, 0.2),
+    "bins, left": (lambda u: HEIGHTS[jnp.searchsorted(LEVELS, u)], 0.7, 0.2, 0.9),
+    "sign of another": (lambda u: jnp.copysign(0.5, u), 0.0, -0.5, 0.5),
+}  # fmt: skip
+FUNCTIONS, AT, BELOW, ABOVE = zip(*STEPS.values(), strict=True)
+STEPPED = lagjax.System(
+    lambda q, v: 0.5 * v @ v,
+    forces=lambda q, v, t, params: (
+        params[0] + params[1] * t - 4 * jnp.stack([f(v[i]) for i, f in enumerate(FUNCTIONS)])
+    ),
+)
+
+
+def held_and_left(x, level, below, above, end):
+    """v and q at the end, from x = (q, v, load, rate): it speeds up to the level, is held there, and goes on beyond."""
+    q, v, load, rate = x
+    a = load - 4 * below
+    t1 = (jnp.sqrt(a * a + 2 * rate * (level - v)) - a) / rate
+    t2 = (4 * above - load) / rate
+    q = q + v * t1 + a * t1**2 / 2 + rate * t1**3 / 6
+    return q + level * (end - t1) + rate * (end - t2) ** 3 / 6, level + rate * (end - t2) ** 2 / 2
+
+
+def last(x):
+    """The end of `STEPPED` from x = (q, v, load, rate)."""
+    run = lagjax.simulate(STEPPED, x[0], x[1], jnp.array([0.0, 2.0]), x[2:])
+    return jnp.stack([run.q[-1], run.qdot[-1]])
+
+
+def exact(x):
+    """The same in closed form."""
+    return jnp.stack(jax.vmap(held_and_left, in_axes=(1, 0, 0, 0, None))(x, *map(jnp.array, (AT, BELOW, ABOVE)), 2.0))
+
+
+def start():
+    """All come to their levels one after the other, and leave them at one instant."""
+    level, above, rates = jnp.array(AT), jnp.array(ABOVE), 0.8 + 0.05 * jnp.arange(len(STEPS))
+    return jnp.stack([0.1 + 0 * level, level - 0.3, 4 * above - 1.3 * rates, rates])
+
+
+def test_a_motion_slides_along_borders_of_every_kind():
+    """All kinds in one scene."""
+    np.testing.assert_allclose(last(start()), exact(start()), atol=1e-10)
+
+
+@pytest.mark.slow
+def test_derivatives_along_borders_of_every_kind():
+    x, weights = start(), jnp.sin(jnp.arange(2.0 * len(STEPS))).reshape(2, -1)
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(derivative(last)(x), jax.jacfwd(exact)(x), atol=1e-8)
+    moved = x[None] + jnp.array([0.0, 0.02])[:, None, None]
+    np.testing.assert_allclose(jax.vmap(last)(moved), jax.vmap(exact)(moved), atol=1e-10)
+    along = lambda f: jax.jvp(jax.grad(lambda x: jnp.sum(weights * f(x) ** 2)), (x,), (jnp.cos(x),))[1]
+    np.testing.assert_allclose(along(last), along(exact), atol=1e-7)
+
+
+@pytest.mark.parametrize("count", [2, pytest.param(10, marks=pytest.mark.slow)])
+def test_borders_that_are_come_to_at_one_instant_each_shift_their_own_tangents(count):
+    scene = lagjax.System(lambda q, v: 0.5 * v @ v, forces=lambda q, v, params: 0.3 - params * jnp.ceil(v))
+
+    def ends(v0):
+        return lagjax.simulate(scene, jnp.zeros(count), v0, jnp.array([0.0, 2.0]), 1.5).q[-1]
+
+    # Down to v = 0 with 1.2, to rest there: q = v0² / 2.4.
+    np.testing.assert_allclose(ends(jnp.full(count, 0.9)), 0.81 / 2.4, atol=1e-10)
+    np.testing.assert_allclose(jax.jacrev(ends)(jnp.full(count, 0.9)), np.eye(count) * 0.9 / 1.2, atol=1e-10)
+
+
+def test_a_corner_away_from_zero_is_rested_in():
+    """Bounces end where rounding of the place hides them; at rest from the start, too."""
+    scene = lagjax.System(
+        lambda q, v: 0.5 * v * v, forces=lambda q, v, params: 3.0 - 4 * jnp.ceil(q - params) - 0.5 * jnp.sign(v)
+    )
+    for level in (0.7, 100.0):
+        for q0, v0 in ((level + 0.2, 0.3), (level, 0.0)):
+            run = lagjax.simulate(scene, q0, v0, jnp.array([0.0, 50.0]), level)
+            np.testing.assert_allclose([run.q[-1] - level, run.qdot[-1]], 0.0, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_an_output_moves_along_the_border_that_is_slid_on():
+    """The rate at an output, where the program looks up tables: v = 1 − q/2 along the border, so that v̇ = −v/2."""
+    pushes = lagjax.samples(np.linspace(0.0, 4.0, 9), np.linspace(1.5, 1.8, 9), hold="linear")
+    scene = lagjax.System(
+        lambda q, v: 0.5 * v * v, forces=lambda q, v, t: pushes(t) - 3 * HEIGHTS[jnp.digitize(v + 0.5 * q, LEVELS)]
+    )
+    end = lambda t: lagjax.simulate(scene, 0.0, 0.65, jnp.array([0.0, t]))
+    rate, v = jax.grad(lambda t: end(t).qdot[-1])(2.0), end(2.0).qdot[-1]
+    np.testing.assert_allclose(rate, -0.5 * v, atol=1e-9)
