@@ -42,7 +42,7 @@ def locate_knots(expansion: Any, knots: Ids, x: Ids, closed: bool) -> Ids | None
 
 
 def count_knots(expansion: Any, knots: Ids, x: Ids, side: str) -> Ids | None:
-    """How many of the increasing `knots` are below x, from the left side, or at most x, from the right; as integers.
+    """The number of increasing `knots` below x, from the left side, or of those at most x, from the right; as integers.
 
     None where the knots are no table, and too many to be compared.
     """

@@ -143,7 +143,7 @@ def test_a_bouncing_ball_comes_to_rest_as_the_sentence_advises():
     law, ts = [bounce, T("f", "rest", small, -1, lambda q, v: (0 * q, 0 * v))], jnp.array([0.0, 3.0])
     run = lagjax.simulate_hybrid({"f": BALL, "rest": rest}, law, "f", 1.0, 0.0, ts, {"g": G})
     assert run.mode.tolist() == [0, 1] and run.q[-1] == 0.0
-    with pytest.raises(lagjax.SimulationError, match=r"(?s)an energy that a bounce brings below.*'f' → 'f'"):
+    with pytest.raises(lagjax.SimulationError, match=r"(?s)add up to a finite one.*'f' → 'f'"):
         lagjax.simulate_hybrid({"f": BALL}, [bounce], "f", 1.0, 0.0, ts, {"g": G}, max_transitions=64)
 
 
