@@ -258,27 +258,13 @@ def _device_arrays(arrays: tuple) -> tuple:
     """NumPy arrays as arrays of JAX.
 
     `jax.device_put` takes as long as a short motion, a compiled function of arrays of these shapes a tenth of that: it
-    is compiled for one motion, and for a batch that comes again and again. In a process that was forked nothing can be
-    compiled: XLA's threads did not come along.
+    is compiled for one motion. In a process that was forked nothing can be compiled: XLA's threads did not come along.
     """
-    if os.getpid() != _PROCESS or (np.ndim(arrays[-1]) > 0 and not _comes_often(arrays)):
+    if os.getpid() != _PROCESS or np.ndim(arrays[-1]) > 0:
         return jax.device_put(arrays)
     return _as_they_are(*arrays)
 
 
-def _comes_often(arrays: tuple) -> bool:
-    """True if arrays of these shapes have been sent so often that a compilation pays, which takes as long as 200."""
-    if sum(x.nbytes for x in jax.tree.leaves(arrays)) > _LARGEST_OFTEN:
-        return False
-    shapes = tuple(x.shape for x in jax.tree.leaves(arrays))
-    if len(_sent_before) > 1000:
-        _sent_before.clear()
-    _sent_before[shapes] = _sent_before.get(shapes, 0) + 1
-    return _sent_before[shapes] > _OFTEN
-
-
-_OFTEN, _LARGEST_OFTEN = 50, 2**16  # calls; bytes, beyond which the arrays themselves take longer than to send them
-_sent_before: dict[tuple, int] = {}
 _PROCESS = os.getpid()
 _as_they_are = jax.jit(lambda *arrays: arrays)
 

@@ -132,8 +132,8 @@ class _MachineCodeMotions(AbstractMotions):
 
     def rate(self, t, y, numbers, table=None):
         flow, params = self._flow(numbers, table)
-        values = flow.general_program.evaluate(*y.T, t, *params.T)[: flow.size]
-        return np.stack([np.broadcast_to(value, t.shape) for value in values], axis=-1)
+        own = params.T if len(params) > 1 else params[0]
+        return flow.general_program.evaluate_many([*y.T, t, *own])[: flow.size].T
 
 
 class _JaxMotions(AbstractMotions):

@@ -234,8 +234,8 @@ class Flow:
         times, numbers = (x[some] if len(x) > 1 else x for x in (ts, params))
 
         def acceleration(t, y):
-            values = self.general_program.evaluate(*y.T, t, *numbers.T)[: self.size]
-            return np.stack([np.broadcast_to(value, t.shape) for value in values], axis=-1)
+            own = numbers.T if len(numbers) > 1 else numbers[0]
+            return self.general_program.evaluate_many([*y.T, t, *own])[: self.size].T
 
         y_end, t_end, _, accepted, rejected = (x[some] for x in solution[1:6])
         end = End(t_end, y_end, times[:, 0], times[:, -1], accepted, rejected)

@@ -187,9 +187,8 @@ class Arcs:
 
     def rate(self, t, y: np.ndarray) -> np.ndarray:
         """ẏ = (q̇, q̈), (R, 2n), at states (R, 2n) and times () or (R,)."""
-        values = self.flow.general_program.evaluate(*y.T, np.asarray(t), *self.numbers)[: self.size]
-        qddot = np.stack([np.broadcast_to(value, (len(y),)) for value in values], axis=-1)
-        return np.concatenate([y[:, self.size :], qddot], axis=1)
+        values = self.flow.general_program.evaluate_many([*y.T, t, *self.numbers])
+        return np.concatenate([y[:, self.size :], values[: self.size].T], axis=1)
 
     def quantities(self, names: tuple[str, ...], t, y: np.ndarray) -> dict[str, np.ndarray]:
         """The quantities of `Motion.quantities` with these names at states (R, 2n), each (R, …)."""

@@ -45,7 +45,7 @@ from lagjax._program._emit import Rows, apply_in_jax, emit, emit_look_up, emit_r
 from lagjax._program._evaluate import evaluate, round_off, steps_of, vjp
 from lagjax._program._graph import MANY, Graph, Node, Tape, Unlowerable
 from lagjax._program._groups import Groups, groups_of
-from lagjax._program._look_ups import look_up, table_of
+from lagjax._program._look_ups import table_of
 from lagjax._program._matrices import orthogonalize, row_weights, solve_orthogonalized
 from lagjax._program._memory import machine_memory, operations_that_fit, pause_collections
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
@@ -283,22 +283,9 @@ class Program:
     def _dtypes(self) -> tuple[np.dtype, ...]:
         return tuple(dtype for shape in self.shapes for dtype in [shape.dtype] * math.prod(shape.shape))
 
-    def evaluate(self, *numbers) -> tuple:
-        """The outputs at these numbers, or arrays of numbers, operation by operation in NumPy: nothing is compiled."""
-        values: list = []
-        with np.errstate(all="ignore"):
-            for (op, operands, attribute), kind in zip(self.nodes, self.kinds, strict=True):
-                if op == "input":
-                    value = numbers[attribute]
-                elif op == "constant":
-                    value = attribute
-                elif op in LOOK_UPS:
-                    value = look_up(op, attribute, numbers, values[operands[0]])
-                else:
-                    extra = () if attribute is None else (attribute,)
-                    value = OPERATIONS[op].value(*(values[i] for i in operands), *extra)
-                values.append(np.dtype("float64" if kind == "float" else kind).type(value))
-        return tuple(values[i] for i in self.outputs)
+    def evaluate(self, *numbers) -> np.ndarray:
+        """The outputs (outputs,) at these numbers, operation by operation in NumPy: nothing is compiled."""
+        return self.evaluate_many(numbers)[:, 0]
 
     def evaluate_many(self, columns) -> np.ndarray:
         """The outputs at S states, shape (outputs, S), in NumPy without compiling anything.

@@ -17,10 +17,10 @@ from lagjax._layout import Layout
 from lagjax._native import _parts
 from lagjax._program import (
     OPERATIONS,
-    Program,
     StraightLine,
     Unlowerable,
     emit,
+    evaluate,
     lower,
     lower_solution,
     pullback,
@@ -54,14 +54,14 @@ def coefficients(function, order, q, v, t, *params):
 def coefficients_of(program, found, order, numbers):
     """The series of q, from q, q̇, t and parameters: a run of the zeroth order, and one of the recursion per order."""
     n, (q, v) = found.size, np.split(np.array(numbers[: 2 * found.size]), 2)
-    out = Program.evaluate(found.zeroth_order, *numbers)
+    out = evaluate(found.zeroth_order, numbers)[:, 0]
     values = out[len(program.outputs) :]
     np.testing.assert_array_equal(out[:n], program.evaluate(*numbers)[:n])
     y, rows = np.zeros((2 * n, order + 1)), np.zeros((found.rows, order + 1))
     y[:, 0], y[:n, 1], y[n:, 1] = [*q, *v], v, out[:n]
     for k in range(1, order):
         sums = [sum(rows[a, j] * rows[b, k - j] for j in range(1, k)) for a, b in found.cauchy_products]
-        out = Program.evaluate(found.order_recursion, *y[:, k], float(k == 1), float(k), 1.0 / k, *values, *sums)
+        out = evaluate(found.order_recursion, [*y[:, k], float(k == 1), float(k), 1.0 / k, *values, *sums])[:, 0]
         rows[:, k] = out[n:]
         y[:n, k + 1], y[n:, k + 1] = y[n:, k] / (k + 1), np.array(out[:n]) / (k + 1)
     return y[:n]
@@ -415,11 +415,11 @@ def test_the_state_may_be_of_first_order():
     # ẏ = f(t, y), with time first, as the inputs come: e^{t²/2} by y' = t y
     program = lower(lambda t, y, p: p * t * y, 0.0, 1.0, 1.0)
     found = series(program, 1, 2)
-    start = Program.evaluate(found.zeroth_order, 0.0, 1.0, 1.0)
+    start = evaluate(found.zeroth_order, [0.0, 1.0, 1.0])[:, 0]
     values, y, rows = start[1:], [1.0, start[0]], np.zeros((found.rows, 12))
     for k in range(1, 12):
         sums = [sum(rows[a, j] * rows[b, k - j] for j in range(1, k)) for a, b in found.cauchy_products]
-        out = Program.evaluate(found.order_recursion, float(k == 1), y[k], float(k), 1.0 / k, *values, *sums)
+        out = evaluate(found.order_recursion, [float(k == 1), y[k], float(k), 1.0 / k, *values, *sums])[:, 0]
         rows[:, k] = out[1:]
         y.append(out[0] / (k + 1))
     expected = [0.5 ** (k // 2) / float(mpmath.factorial(k // 2)) if k % 2 == 0 else 0.0 for k in range(13)]
