@@ -23,6 +23,7 @@ import numpy as np
 
 from lagjax._blame import pieces_of_motion
 from lagjax._constraints import velocity_scales
+from lagjax._doubles import DOUBLE
 from lagjax._layout import Layout, dtype_of
 from lagjax._linear import solve_many
 from lagjax._motion import Motion
@@ -56,6 +57,11 @@ PyTree = Any
 # While it is lowered, an operation takes about a kilobyte, and two where it is written anew.
 OPERATION_BUDGET = operations_that_fit(2000)
 
+
+# Operations of all quantities beyond which JAX differentiates arrays. Derivatives of programs take 100 µs for each;
+# those of arrays 2 s for what is vectorised, as 60 bodies are (39 000: 4 s), and 13 s for an arm that is written joint
+# by joint (7600: 1 s). Doubled, the first kind loses 3 s more; halved, arms of 12 joints compile for half a minute.
+LARGEST_DIFFERENTIATED = 30_000
 
 # The order of coordinates of states far away, where a force between bodies is weak: its square is then a millionth.
 _FAR = 1e3
@@ -123,6 +129,7 @@ class Derivation:
         self._shapes: dict[str, tuple[int, ...]] = {}
         self._sampled: dict[float, list[tuple[np.ndarray, np.ndarray]]] = {}
         self._recursion: Recursion | None = None  # known once the quantities are
+        self._own_rules = False
         # Compiled functions are traced once for each of their derivatives, and all quantities share these.
         self._traced_once: Motion = jax.tree.map(jax.jit, motion)
 
@@ -149,6 +156,7 @@ class Derivation:
         try:
             return lower_scalars(trace_scalars, trace_arrays, tuple(leaves), OPERATION_BUDGET)
         except OwnRules:
+            self._own_rules = True
             return lower(trace_arrays, *leaves, budget=OPERATION_BUDGET)
 
     @property
@@ -369,6 +377,16 @@ class Derivation:
             f"{reason}, at a border of {of}: round it off over a width w that the motion resolves, "
             "0.5 * (1 + jnp.tanh(x / w)) for x > 0, or take samples(..., hold='cubic') where it is sampled"
         )
+
+    @property
+    def differentiates(self) -> bool:
+        """True if derivatives are those of programs: no function has rules of its own or looks up a table, and the
+        programs are not large."""
+        try:
+            usual = not (self._whole.looks_up or self._own_rules)
+            return usual and self.layout.dtype == DOUBLE and self._whole.operations <= LARGEST_DIFFERENTIATED
+        except Unlowerable:
+            return False
 
     @property
     def traced_operations(self) -> int:

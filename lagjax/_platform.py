@@ -1,8 +1,12 @@
 """The device: its kind, as far as a traced program can know it, and the numbers of the arrays that it holds."""
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
+import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 
@@ -23,6 +27,26 @@ def has_nvidia_gpu() -> bool:
         return bool(jax.devices("cuda"))
     except RuntimeError:
         return False
+
+
+# Compilation of the algebra around a few matrices takes a quarter of the time so, and runs as fast to a millisecond.
+_AS_WRITTEN = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+
+
+def compile_for_one_call(function: Callable) -> Callable:
+    """A function that XLA compiles without optimisation where it is called with numbers: what runs once, or seldom.
+
+    Within what is traced already, which may run often, it is optimised as all else there.
+    """
+    optimised = eqx.filter_jit(function)
+    as_written = eqx.filter_jit(function, compiler_options=_AS_WRITTEN)  # pyright: ignore[reportCallIssue]
+
+    @functools.wraps(function)
+    def call(*arguments):
+        leaves = jnp.zeros(()), *jax.tree.leaves(arguments)  # what is made while something is traced is a tracer
+        return (optimised if any(isinstance(x, Tracer) for x in leaves) else as_written)(*arguments)
+
+    return call
 
 
 def is_known(x: Any) -> bool:

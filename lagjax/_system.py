@@ -19,11 +19,11 @@ from jaxtyping import Array, Float
 from lagjax._arguments import Function, ValueNotKnown, accept, present
 from lagjax._constraints import Constraints
 from lagjax._derivation import derivation_of, numbers_of
-from lagjax._diffrax import form_of
 from lagjax._doubles import SINGLE, compute_in_doubles
 from lagjax._explain import Explanation, explain
 from lagjax._layout import Layout
 from lagjax._linear import schur_complements
+from lagjax._machine_code import lowered_motion
 from lagjax._many_states import SADDLE, Sample, solve_saddle
 from lagjax._motion import Motion
 from lagjax._problem import Problem
@@ -446,11 +446,9 @@ _OF_QUANTITIES: dict[Callable, tuple[tuple[str, ...], Callable]] = {
 def _evaluate(system: System, quantity: Callable, q, qdot, t, params, **more):
     """One of `Motion`'s functions, compiled whole: XLA would take seconds to prepare its operations one by one."""
     layout = Layout.from_state(q, qdot)
-    numbers, state = eqx.filter(params, eqx.is_array), (layout.flatten(q), layout.flatten(qdot))
-    if quantity is Motion.acceleration:  # in the form in which diffrax integrates it
-        form = form_of(derivation_of(system, layout, params), "array" if system.path == "array" else "auto")
-        return form.acceleration(t, state, numbers)[0]
-    return quantity(system._motion(layout, params), *state, t, numbers, **more)
+    numbers, derivation = eqx.filter(params, eqx.is_array), derivation_of(system, layout, params)
+    motion = derivation.motion if system.path == "array" else lowered_motion(derivation)
+    return quantity(motion, layout.flatten(q), layout.flatten(qdot), t, numbers, **more)
 
 
 def _require_scalar(value: PyTree, role: str) -> None:

@@ -2,7 +2,6 @@
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -15,6 +14,7 @@ from lagjax._constraints import ROUNDINGS
 from lagjax._doubles import accepts_singles
 from lagjax._failures import nan_unless
 from lagjax._linear import least_norm
+from lagjax._platform import compile_for_one_call
 from lagjax._system import System
 from lagjax._validate import require_flag
 
@@ -125,7 +125,7 @@ def require_steady(scene: SceneState) -> None:
 _TINY = 1e-6
 
 
-@eqx.filter_jit
+@compile_for_one_call
 def _solve_balance(has_terms: bool, *arguments) -> tuple[Vector, Array, Bool[Array, ""]]:
     """q (n,), λ (m,) and whether they are an equilibrium, of a scene made of `SceneState.arguments`.
 

@@ -2,7 +2,6 @@
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
@@ -12,6 +11,7 @@ from lagjax._analysis._smooth import is_smooth, require_smooth
 from lagjax._doubles import accepts_singles
 from lagjax._failures import nan_unless
 from lagjax._linear import diagonal_scale, factorize, least_norm, saddle
+from lagjax._platform import compile_for_one_call
 from lagjax._system import System
 
 PyTree = Any
@@ -69,45 +69,36 @@ def linearize(system: System, q: PyTree, qdot: PyTree = None, params: PyTree = N
     return Linearization(*_linearize(*scene.arguments), names=scene.layout.names)
 
 
-@eqx.filter_jit
+@compile_for_one_call
 def _linearize(*arguments) -> tuple:
     scene = SceneState.from_arguments(*arguments)
-    n, q, qdot = scene.layout.size, scene.q, scene.qdot
-    motion, t, numbers = scene.motion, jnp.zeros((), q.dtype), scene.numbers
-    zero, one = jnp.zeros((n, n), q.dtype), jnp.eye(n, dtype=q.dtype)
-    by_q, by_qdot = jax.jacfwd(motion.acceleration, argnums=(0, 1))(q, qdot, t, numbers)
-    mass, rates, stiffness, jacobian = matrices(scene, q)
-    gamma = jnp.zeros(len(jacobian), q.dtype)
+    n, state = scene.layout.size, (scene.q, scene.qdot, jnp.zeros((), scene.q.dtype), scene.numbers)
+    zero, one = jnp.zeros((n, n), scene.q.dtype), jnp.eye(n, dtype=scene.q.dtype)
+    mass, force = scene.motion.mass_matrix_and_force(*state)
+    jacobian, gamma = scene.motion.constraints.jacobian_and_gamma(*state)
     if scene.constrained:
-        response = jax.vmap(lambda b: saddle(mass, b, jacobian, gamma)[0], in_axes=1, out_axes=1)(one)
+        solve = jax.vmap(lambda b, c: saddle(mass, b, jacobian, c)[0], in_axes=1, out_axes=1)
+        acceleration, multipliers, _ = saddle(mass, force, jacobian, gamma)
     else:
-        response = factorize(mass).solve_columns(one)
-    smooth = is_smooth(scene)
-    by_q, by_qdot, rates, stiffness = (nan_unless(smooth, x) for x in (by_q, by_qdot, rates, stiffness))
-    a, b = jnp.block([[zero, one], [by_q, by_qdot]]), jnp.concatenate([zero, response])
-    return a, b, mass, 0.5 * (rates + rates.T), 0.5 * (rates - rates.T), stiffness, jacobian
+        inverse = factorize(mass)
+        acceleration, multipliers = inverse.solve(force), gamma
 
-
-def matrices(scene: SceneState, q: Vector) -> tuple[Matrix, Matrix, Matrix, Array]:
-    """M, C + G, K of small deviations from the motion through (q, q̇), (n, n) each, and the constraint Jacobian (m, n).
-
-    They are minus the derivatives of F + Gᵀλ − M q̈ at fixed q̈ and λ.
-    """
-    qdot, t = scene.qdot, jnp.zeros((), q.dtype)
-    mass, force = scene.motion.mass_matrix_and_force(q, qdot, t, scene.numbers)
-    jacobian, gamma = scene.motion.constraints.jacobian_and_gamma(q, qdot, t, scene.numbers)
-    acceleration, multipliers, _ = (
-        saddle(mass, force, jacobian, gamma)
-        if scene.constrained
-        else (factorize(mass).solve(force), jnp.zeros(0, q.dtype), None)
-    )
+        def solve(b, c):
+            return inverse.solve_columns(b)
 
     def balance(q, qdot):
-        of_constraints = scene.jacobian(q, qdot).T @ multipliers
-        return scene.force(q, qdot) + of_constraints - scene.mass_matrix(q, qdot) @ acceleration
+        """F + Gᵀλ − M q̈ and γ − G q̈ at fixed q̈ and λ."""
+        mass, force = scene.motion.mass_matrix_and_force(q, qdot, *state[2:])
+        jacobian, gamma = scene.motion.constraints.jacobian_and_gamma(q, qdot, *state[2:])
+        return force + jacobian.T @ multipliers - mass @ acceleration, gamma - jacobian @ acceleration
 
-    stiffness, rates = jax.jacfwd(balance, argnums=(0, 1))(q, qdot)
-    return mass, -rates, -stiffness, jacobian
+    smooth = is_smooth(scene)
+    of_balance, of_rows = jax.jacfwd(balance, argnums=(0, 1))(*state[:2])
+    by_q, by_qdot = (nan_unless(smooth, x) for x in of_balance)
+    response = solve(one, jnp.zeros((len(gamma), n), one.dtype))
+    a = jnp.block([[zero, one], [solve(by_q, of_rows[0]), solve(by_qdot, of_rows[1])]])
+    b, rates = jnp.concatenate([zero, response]), -by_qdot
+    return a, b, mass, 0.5 * (rates + rates.T), 0.5 * (rates - rates.T), -by_q, jacobian
 
 
 def steady_matrices(scene: SceneState, q: Vector) -> tuple[Matrix, Matrix, Matrix, Array, Vector]:

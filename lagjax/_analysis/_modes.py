@@ -25,6 +25,7 @@ from lagjax._doubles import accepts_singles
 from lagjax._failures import nan_unless
 from lagjax._linear import dependent_rows, diagonal_scale, factorize, least_norm, schur_complement
 from lagjax._linear import rank as rank_of
+from lagjax._platform import compile_for_one_call
 from lagjax._results import show_str
 from lagjax._system import System
 from lagjax._validate import is_concrete
@@ -128,24 +129,19 @@ def normal_modes(system: System, q: PyTree, params: PyTree = None, *, qdot: PyTr
     require_smooth(scene, "A normal mode")
     cyclic, rank = scene.conserved, _rank(scene)
     reversible = scene.reversible and qdot is None
-    exponents, shapes, residual = _modes(cyclic, rank, reversible, *scene.arguments)
+    modes, residual = _modes(cyclic, rank, reversible, *scene.arguments)
     if scene.concrete and not residual <= _BALANCED:
         made = f" that a deviation of {float(residual):.2g} of q's size would make" if np.isfinite(residual) else ""
         raise ValueError(
             f"q is not an equilibrium: forces are left{made}. Find one first: "
             "q = lagjax.equilibrium(system, q, params).q."
         )
-    if scene.concrete and not np.isfinite(np.asarray(exponents)).all():
+    if scene.concrete and not np.isfinite(np.asarray(modes.exponents)).all():
         raise ValueError(
             "There are no modes: the mass matrix is singular or not positive definite at q, so that small motions are "
             "no oscillations there. lagjax.check(system, q, qdot) tells which velocity has no kinetic energy."
         )
-    size = jnp.max(jnp.abs(exponents), initial=0)
-    stable = jnp.all(exponents.real <= _grows_beyond(size)) & jnp.all(jnp.isfinite(exponents))
-    first = exponents[:, 0]
-    length = jnp.abs(jnp.where(first == 0, 1, first))
-    ratios = jnp.where(first.real == 0, 0, -first.real / length)
-    return Modes(first.imag, scene.layout.restore(shapes), stable, exponents, ratios)
+    return modes
 
 
 # How far from an equilibrium modes are still those of it, in units of the size of q. Linear in that are their errors.
@@ -169,9 +165,9 @@ def _rank(scene: SceneState) -> int:
     return len(jacobian) - len(dependent_rows(np.asarray(schur)))
 
 
-@eqx.filter_jit
+@compile_for_one_call
 def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> tuple:
-    """Exponents (k, 2) and shapes (k, n) of the k degrees of freedom, and how far q is from an equilibrium."""
+    """The modes of the k degrees of freedom, and how far q is from an equilibrium."""
     scene = SceneState.from_arguments(*arguments)
     q = scene.q
     matrices = steady_matrices(scene, q)
@@ -198,7 +194,13 @@ def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> 
     shapes = _normalise(shapes[order], mass) * unit
     balanced = (residual <= _BALANCED) & is_smooth(scene)
     exponents = jax.lax.complex(*(nan_unless(balanced, x) for x in (exponents.real, exponents.imag)))[order]
-    return exponents, jnp.where(balanced, shapes, jnp.nan), residual
+    shapes = scene.layout.restore(jnp.where(balanced, shapes, jnp.nan))
+    size = jnp.max(jnp.abs(exponents), initial=0)
+    stable = jnp.all(exponents.real <= _grows_beyond(size)) & jnp.all(jnp.isfinite(exponents))
+    first = exponents[:, 0]
+    length = jnp.abs(jnp.where(first == 0, 1, first))
+    ratios = jnp.where(first.real == 0, 0, -first.real / length)
+    return Modes(first.imag, shapes, stable, exponents, ratios), residual
 
 
 def _rank_is(jacobian: Float[Array, "m n"], rank: int) -> Bool[Array, ""]:

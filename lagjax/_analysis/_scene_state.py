@@ -11,6 +11,7 @@ from jaxtyping import Array, Float
 from lagjax._consistent import has_constraints
 from lagjax._derivation import Derivation, columns_of, derivation_of, numbers_of
 from lagjax._layout import Layout
+from lagjax._machine_code import lowered_motion
 from lagjax._motion import Motion
 from lagjax._program import Unlowerable
 from lagjax._scales import Scales
@@ -52,7 +53,8 @@ class SceneState(NamedTuple):
     @classmethod
     def from_arguments(cls, system: System, layout: Layout, q: Vector, qdot: Vector, params: PyTree) -> "SceneState":
         """A scene at the flat state q, q̇ (n,), with params of arrays, inside of a compiled function."""
-        motion, derivation = system._motion(layout, params), derivation_of(system, layout, params)
+        derivation = derivation_of(system, layout, params)
+        motion = derivation.motion if system.path == "array" else lowered_motion(derivation)
         return cls(system, layout, motion, derivation, q, qdot, params, eqx.filter(params, eqx.is_array_like))
 
     @property

@@ -28,6 +28,7 @@ from lagjax._machine_code._crossing import (
 from lagjax._machine_code._derivatives import jvp, portions, project_start_tangents, vjp
 from lagjax._machine_code._flow import Flow, Tolerances, unfit
 from lagjax._machine_code._gpu_launch import adapt_tolerances
+from lagjax._machine_code._lowered_motion import lowered_motion
 from lagjax._machine_code._steps import KEPT, StepStore
 from lagjax._machine_code._surfaces import Guarded, Surfaces, crossing_variation, require_one_number, vector_of
 from lagjax._native import Guards, Nesting, append_guards, pieces_of
@@ -38,8 +39,8 @@ from lagjax._validate import is_concrete
 
 __all__ = [
     "KEPT", "MOST_GUARDS", "Flow", "Guarded", "Guards", "MachineCode", "Noted", "StepStore", "Surfaces", "Tolerances",
-    "crossing_variation", "flow_of", "jvp", "portions", "project_start_tangents", "require_one_number", "surfaces_of",
-    "tolerances_of", "vector_of", "vjp",
+    "crossing_variation", "flow_of", "jvp", "lowered_motion", "portions", "project_start_tangents",
+    "require_one_number", "surfaces_of", "tolerances_of", "vector_of", "vjp",
 ]  # fmt: skip
 
 

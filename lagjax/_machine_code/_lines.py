@@ -29,19 +29,35 @@ from jax.interpreters import ad, batching, mlir
 from lagjax._custom import VaryingPrimitive, batch_in_front
 from lagjax._machine_code._call import NO_HANDLER, call_host, capsule
 from lagjax._native import LARGEST_LINE, LineCode, line_handler
-from lagjax._program import Program, StraightLine, Unlowerable, emit, evaluate, pullback, pushforward, steps_of
+from lagjax._program import (
+    Graph,
+    Groups,
+    Program,
+    StraightLine,
+    Unlowerable,
+    copy_nodes,
+    emit,
+    evaluate,
+    groups_of,
+    pullback,
+    pushforward,
+    steps_of,
+)
 
 _TARGET = "lagjax_line"
 # Operations of a line on a GPU that XLA compiles; NumPy on the host evaluates a longer one. Twice as many would cost
 # several seconds of compilation.
 LARGEST_COMPILED = 100
+# Machine code takes some 70 µs a node to make, and NumPy 1 to 2 µs a node for a call: that of a line which XLA does not
+# wait for is made after as many calls as take that long, so that one call is not slow, and a thousand are not.
+_NODES_PER_CALL = 40
 
 
 def outputs(program: Program, count: int, first, numbers):
     """The first `count` outputs (…, count) for the first inputs (…, m) and the others (…, P)."""
     if not is_line(program) or jnp.result_type(first) != np.dtype(float):
         return jnp.stack(program.compute_outputs(first, numbers)[:count], axis=-1)
-    return _line_of(program.line, count, program.size)(_side_by_side(first, numbers))
+    return line_of(program, count)(_side_by_side(first, numbers))
 
 
 def is_line(program: Program) -> bool:
@@ -54,9 +70,22 @@ def _side_by_side(first, numbers):
     return jnp.concatenate([jnp.broadcast_to(x, (*shape, x.shape[-1])) for x in (first, numbers)], axis=-1)
 
 
+def line_of(program: Program, count: int | None = None) -> "Line":
+    """The first `count` outputs of a program, by default all; other inputs than floats are given as floats."""
+    return _line_of(program.line, count, program.dtypes)
+
+
 @functools.lru_cache(maxsize=64)
-def _line_of(line: StraightLine, count: int, size: int) -> "Line":
-    return Line(line._replace(outputs=line.outputs[:count]), size, size)
+def _line_of(line: StraightLine, count: int | None, dtypes: tuple[np.dtype, ...]) -> "Line":
+    line = line._replace(outputs=line.outputs[:count])
+    if any(dtype.kind != "f" for dtype in dtypes):
+        graph, ids = Graph(3 * len(line.nodes) + len(dtypes)), []
+        for i, dtype in enumerate(dtypes):
+            x = graph.input(i, "float")
+            ids.append(x if dtype.kind == "f" else graph.apply("convert", x, attribute=dtype.name))
+        nodes = copy_nodes(graph, line, ids)
+        line = StraightLine(tuple(graph.nodes), tuple(graph.kinds), tuple(nodes[i] for i in line.outputs))
+    return Line(line, len(dtypes), len(dtypes))
 
 
 class Line:
@@ -66,7 +95,7 @@ class Line:
     """
 
     def __init__(self, line: StraightLine, size: int, count: int):
-        self.line, self.size, self.count = line, size, count
+        self.line, self.size, self.count, self._calls = line, size, count, 0
 
     @property
     def outputs(self) -> int:
@@ -74,18 +103,34 @@ class Line:
 
     @functools.cached_property
     def code(self) -> LineCode | None:
-        """Its machine code; None where it has none, or one that takes long to make."""
-        if NO_HANDLER is not None or len(self.line.nodes) > LARGEST_LINE:
-            return None
+        """Its machine code; None where it has none."""
         try:
-            return LineCode(self.line, self.size)
+            return None if NO_HANDLER is not None else LineCode(self.line, self.size)
         except Unlowerable:
             return None
 
     @functools.cached_property
-    def steps(self) -> Callable:
+    def _steps(self) -> Callable:
         """The calls of NumPy, one after the other, for a precision; they take longer to write down than to do."""
         return functools.cache(functools.partial(steps_of, self.line))
+
+    @functools.cached_property
+    def _groups(self) -> Groups | None:
+        """Its alike operations side by side, if there are many."""
+        return groups_of(self.line)
+
+    def evaluate(self, *parts: np.ndarray) -> np.ndarray:
+        """The outputs (…, outputs) at inputs that are given in parts (…, some): by NumPy at first.
+
+        When that has taken about as long as machine code takes to make, it is made.
+        """
+        rows = np.concatenate([part.reshape(-1, part.shape[-1]) for part in parts], axis=1)
+        self._calls += 1
+        if self._calls * _NODES_PER_CALL >= len(self.line.nodes) and self.code is not None:
+            found = self.code(rows)
+        else:
+            found = evaluate(self.line, list(rows.T), self._steps, self._groups).T
+        return found.reshape(*parts[0].shape[:-1], self.outputs)
 
     @functools.cached_property
     def forward(self) -> "Line":
@@ -109,15 +154,6 @@ class Line:
     def __call__(self, x):
         """g(x) of rows x (…, inputs), under every transformation of JAX."""
         return value_p.bind(x, line=self)
-
-
-# ---- on the host: NumPy arrays with any batch axes in front ----------------------------------------------------------
-
-
-def _rows(line: Line, *parts) -> np.ndarray:
-    batch = parts[0].shape[:-1]
-    columns = [column for part in parts for column in part.reshape(-1, part.shape[-1]).T]
-    return evaluate(line.line, columns, line.steps).T.reshape(*batch, line.outputs)
 
 
 # ---- primitives ------------------------------------------------------------------------------------------------------
@@ -156,7 +192,7 @@ def _register(primitive, of, width) -> None:
     """A primitive, the line `of(line)` in NumPy, `width(line)` numbers a row: at once, or in a callback of XLA's."""
 
     def host(*arrays, line: Line):
-        return [_rows(of(line), *arrays)]
+        return [of(line).evaluate(*arrays)]
 
     def shape(x, *_, line: Line):
         return ShapedArray((*x.shape[:-1], width(line)), np.dtype(float))
@@ -182,7 +218,7 @@ def _register(primitive, of, width) -> None:
     def lower_on_cpu(context, *arrays, line: Line):
         if context.module_context.lowering_parameters.for_export:  # it runs elsewhere
             return mlir.lower_fun(compile_operations, multiple_results=False)(context, *arrays, line=line)
-        code = of(line).code
+        code = of(line).code if len(of(line).line.nodes) <= LARGEST_LINE else None
         if code is None:
             return mlir.lower_fun(call_back, multiple_results=False)(context, *arrays, line=line)
         _register_handler()

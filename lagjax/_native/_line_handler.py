@@ -3,9 +3,11 @@
 One handler serves all lines: the attribute of a call is where the machine code of its line is.
 """
 
+import ctypes
 import functools
 import threading
 
+import numpy as np
 from llvmlite import ir
 
 from lagjax._native._handler import call, handler_function, load_at
@@ -36,7 +38,14 @@ class LineCode:
                 code.store(code.lanes_of(number), code.element(out, row * outputs + k))
         code.finish()
         self._engine, places = compile_module(module, ("evaluate",))
-        self.address = places["evaluate"]
+        self.address, self._outputs = places["evaluate"], outputs
+        self._evaluate = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(self.address)
+
+    def __call__(self, rows: np.ndarray) -> np.ndarray:
+        """The outputs (R, outputs) at rows (R, inputs)."""
+        rows, found = np.ascontiguousarray(rows, float), np.empty((len(rows), self._outputs))
+        self._evaluate(rows.ctypes.data, found.ctypes.data, len(rows))
+        return found
 
 
 def line_handler() -> int:

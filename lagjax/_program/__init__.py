@@ -57,13 +57,12 @@ from lagjax._program._series import LinearSystem, Series, StraightLine, series
 
 __all__ = [
     "BELOW", "CLOCK", "FLOOR", "OPERATIONS", "SIGN", "TABLE", "TRUNC", "Borders", "Derivatives", "Expansion", "Graph",
-    "Program", "Scalars", "Series", "StraightLine", "Tape", "Unlowerable", "apply_function", "apply_in_jax", "borders",
-    "concatenate", "copy_nodes", "distances", "emit", "emit_look_up", "evaluate", "expand_primitive", "has_own_rules",
-    "inputs_of",
-    "is_smooth", "live", "lower", "lower_formula", "lower_scalars", "lower_solution", "machine_memory",
-    "operations_that_fit", "orthogonalize", "pause_collections", "plain_elementary", "pullback", "pushforward",
-    "row_weights", "scalars", "scatter", "series", "solve_orthogonalized", "stack", "steps_of", "table_of",
-    "trace_jaxpr", "with_tangents",
+    "Groups", "Program", "Scalars", "Series", "StraightLine", "Tape", "Unlowerable", "apply_function", "apply_in_jax",
+    "borders", "concatenate", "copy_nodes", "distances", "emit", "emit_look_up", "evaluate", "expand_primitive",
+    "groups_of", "has_own_rules", "inputs_of", "is_smooth", "live", "lower", "lower_formula", "lower_scalars",
+    "lower_solution", "machine_memory", "operations_that_fit", "orthogonalize", "pause_collections", "plain_elementary",
+    "pullback", "pushforward", "row_weights", "scalars", "scatter", "series", "solve_orthogonalized", "stack",
+    "steps_of", "table_of", "trace_jaxpr", "with_tangents",
 ]  # fmt: skip
 
 

@@ -8,8 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from lagrangians import free_particle, free_particles
+from sweeps import sweep
 
 import lagjax
+from lagjax._layout import Layout
 
 
 class Polar(NamedTuple):
@@ -124,6 +126,65 @@ def test_transformations_of_the_derivation():
         np.testing.assert_allclose(
             jax.vmap(derivative, (None, 0))(3.0, states[0].rho), -1 / (2.0 * states[0].rho ** 2), rtol=1e-14
         )
+
+
+def hinges(q, v, t, params):
+    """A driven pendulum of two hinges with a spring: quotients, roots and an integer parameter."""
+    x = jnp.cumsum(params["l"] * jnp.sin(q)) + 0.1 * jnp.cos(3.0 * t)
+    u = jnp.cumsum(params["l"] * jnp.cos(q) * v)
+    w = jnp.cumsum(params["l"] * jnp.sin(q) * v)
+    return 0.5 * (u @ u + w @ w) + jnp.sum(jnp.cos(q)) / (2.0 + x[1] ** 2) - params["k"] * jnp.sqrt(1.0 + q[0] ** 2)
+
+
+HINGES = lagjax.System(hinges, forces=lambda q, v: -0.1 * v * jnp.abs(v), dissipation=lambda q, v: 0.05 * v @ v)
+AT = jnp.array([0.3, 0.9]), jnp.array([0.2, -0.4]), jnp.array(0.7)
+NUMBERS = {"l": jnp.array([0.7, 1.1]), "k": 3}
+
+
+def plain_acceleration(q, v, t, params):
+    return HINGES._motion(Layout.from_state(q, v), params).acceleration(q, v, t, params)
+
+
+DERIVATIVES = {
+    "forward": lambda f: jax.jacfwd(f, (0, 1, 2))(*AT, NUMBERS),
+    "reverse": lambda f: jax.jacrev(lambda q, lengths: f(q, *AT[1:], {"l": lengths, "k": 3}), (0, 1))(
+        AT[0], NUMBERS["l"]
+    ),
+    "second": lambda f: jax.hessian(lambda q: f(q, *AT[1:], NUMBERS)[0])(AT[0]),
+    "third": lambda f: jax.jacfwd(jax.jacrev(jax.jacfwd(lambda q: f(q, *AT[1:], NUMBERS)[1])))(AT[0]),
+    "batched": lambda f: jax.vmap(lambda q: jax.jacfwd(f)(q, *AT[1:], NUMBERS))(jnp.stack([AT[0], AT[1]])),
+}
+
+
+@pytest.mark.parametrize("name", sweep(DERIVATIVES, kept=("forward", "reverse")))
+def test_derivatives_of_accelerations_are_those_of_the_derivation_in_jax(name):
+    found, expected = (jax.jit(lambda f=f: DERIVATIVES[name](f))() for f in (HINGES.acceleration, plain_acceleration))
+    # Both are exact but for the rounding of some hundred operations on numbers of order one.
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-13), found, expected)
+
+
+def test_derivatives_of_accelerations_trace_no_lagrangian():
+    # XLA gets a call of the scene's program, and not L differentiated three times.
+    def count(function):
+        text = str(jax.make_jaxpr(jax.jacfwd(function))(*AT, NUMBERS))
+        return text.count("lagjax_line"), sum(text.count(f" {name} ") for name in ("sin", "cos", "sqrt"))
+
+    calls, operations = count(HINGES.acceleration)
+    assert calls and operations == 0 and count(plain_acceleration)[1] > 20
+
+
+def test_rules_and_tables_of_the_user_are_followed_in_derivatives():
+    @jax.custom_jvp
+    def square(x):
+        return x**2
+
+    square.defjvp(lambda x, dx: (square(*x), 7.0 * dx[0]))
+    ruled = lagjax.System(lambda q, v: 0.5 * v**2, forces=lambda q, v: square(q))
+    assert jax.jacfwd(ruled.acceleration)(0.5, 0.0) == 7.0
+    table = lagjax.samples(jnp.linspace(0.0, 1.0, 3), jnp.array([0.0, 1.0, 0.0]), hold="linear")
+    pushed = lagjax.System(lambda q, v: 0.5 * v**2, forces=lambda q, v, t: table(t) * q)
+    slopes = jax.jacfwd(pushed.acceleration, (0, 2))(0.5, 0.0, 0.3)
+    np.testing.assert_allclose(slopes, [0.6, 1.0], rtol=1e-14)
 
 
 def test_float32_stays_float32():
