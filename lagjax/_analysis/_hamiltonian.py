@@ -2,25 +2,25 @@
 
     p = ∂L/∂q̇(q, q̇, t)   ⇄   q̇ = v(q, p, t)        H = p·v − L        q̇ = v,   ṗ = ∂L/∂q(q, v) + Q
 
-A canonical motion is integrated as it stands: z = (q, p) with ż = X(z, t) is, differentiated once, z̈ = (∂X/∂z) ż +
-∂X/∂t, the equation of a scene with the kinetic energy ½ ż² and that force. Its momenta are never those of L.
+A canonical motion is that of Lagrange's equations from q̇ = v(q, p, t), with p = ∂L/∂q̇ along it.
 """
 
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from lagjax._analysis._coordinates import restrict_signature
+from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._solve import is_root, newton, shortest_preimage
 from lagjax._consistent import has_constraints
 from lagjax._failures import nan_unless
 from lagjax._layout import Layout
+from lagjax._platform import compile_for_one_call
 from lagjax._simulate import simulate
 from lagjax._system import System, present_system, require_system
+from lagjax._validate import as_arrays
 
 PyTree = Any
 Vector = Float[Array, " n"]
@@ -44,7 +44,7 @@ class Hamiltonian(NamedTuple):
       The velocity is found by Newton's method; it is NaN where p determines none (a singular mass matrix).
     - `equations(q, p, t, params)`: (q̇, ṗ).
     - `simulate(q0, p0, ts, params, **options)`: the canonical motion, a `CanonicalTrajectory`; options as of
-      `lagjax.simulate`.
+      `lagjax.simulate`, an event of (q, qdot).
     """
 
     system: System
@@ -69,7 +69,7 @@ def hamiltonian(system: System) -> Hamiltonian:
         H(q, p, t) = p·q̇ − L,   q̇ = ∂H/∂p,   ṗ = −∂H/∂q + Q
 
     L need not be quadratic in the velocities. All functions are differentiable and work under `jit` and `vmap`.
-    Canonical motions are integrated in (q, p), independently of `lagjax.simulate`.
+    Canonical motions are those of `lagjax.simulate` from v(q, p, t), where M is regular along them.
 
     **Raises** `TypeError` for what is no `System`, `ValueError` for a system with constraints.
 
@@ -90,75 +90,40 @@ def hamiltonian(system: System) -> Hamiltonian:
         return system.momentum(q, qdot, t, params)
 
     def velocity(q, p, t=0.0, params=None):
-        flat = _FlatScene.from_state(system, q, p, params)
-        return flat.layout.restore(flat.velocity(flat.layout.flatten(q), flat.layout.flatten(p), _time(t, flat)))
+        return _transform(system, q, p, t, params)[0]
 
     def energy(q, p, t=0.0, params=None):
-        flat = _FlatScene.from_state(system, q, p, params)
-        x, y, t = flat.layout.flatten(q), flat.layout.flatten(p), _time(t, flat)
-        v = flat.velocity(x, y, t)
-        return y @ v - flat.motion.lagrangian(x, v, t, flat.numbers)
+        return _transform(system, q, p, t, params)[2]
 
-    def equations(q, p, t: Any = 0.0, params=None):
-        flat = _FlatScene.from_state(system, q, p, params)
-        rate, force = flat.rates(flat.layout.flatten(q), flat.layout.flatten(p), _time(t, flat))
-        return flat.layout.restore(rate), flat.layout.restore(force)
-
-    canonical = _phase_space(equations, system)
+    def equations(q, p, t=0.0, params=None):
+        return _transform(system, q, p, t, params)[:2]
 
     def run(q0, p0, ts, params=None, **options):
-        z0 = {"p": p0, "q": q0}
-        q_rate, p_rate = equations(q0, p0, jnp.asarray(ts)[0], params)
-        done = simulate(canonical, z0, {"p": p_rate, "q": q_rate}, ts, params, **options)
-        return CanonicalTrajectory(done.ts, done.q["q"], done.q["p"], done.ok)
+        done = simulate(system, q0, velocity(q0, p0, jnp.asarray(ts)[0], params), ts, params, **options)
+        p = jax.vmap(lambda q, qdot, t: momentum(q, qdot, t, params))(done.q, done.qdot, done.ts)
+        return CanonicalTrajectory(done.ts, done.q, p, done.ok)
 
     return Hamiltonian(system, energy, momentum, velocity, equations, run)
 
 
-def _time(t, flat: "_FlatScene") -> Array:
-    return jnp.asarray(t, flat.layout.dtype)
+def _transform(system: System, q: PyTree, p: PyTree, t, params: PyTree) -> tuple[PyTree, PyTree, Array]:
+    """q̇ and ṗ, in the structure of q, and H."""
+    system, layout = present_system(system), Layout.from_state(q, p)
+    flat = layout.flatten(q), layout.flatten(p), as_arrays(params, layout.dtype)
+    v, force, energy = _transform_flat(jnp.asarray(t, layout.dtype), system, layout, *flat)
+    return layout.restore(v), layout.restore(force), energy
 
 
-def _phase_space(equations: Callable, system: System) -> System:
-    """The scene whose coordinates are z = (q, p): ½ ż², and the force that ż = X(z, t) makes."""
+@compile_for_one_call
+def _transform_flat(t, *arguments) -> tuple[Vector, Vector, Array]:
+    """q̇ = v with ∂L/∂q̇(q, v, t) = p, by Newton's method from rest, ṗ and H; p is in the place of q̇."""
+    scene = SceneState.from_arguments(*arguments)
+    motion, q, p = scene.motion, scene.q, scene.qdot
 
-    def kinetic(z, zdot):
-        return 0.5 * sum(jnp.sum(x**2) for x in jax.tree.leaves(zdot))
+    def residual(v):
+        return motion.momentum(q, v, t, scene.numbers) - p
 
-    def force(z, zdot, t, params):
-        def rates(z, t):
-            q_rate, p_rate = equations(z["q"], z["p"], t, params)
-            return {"p": p_rate, "q": q_rate}
-
-        t = jnp.asarray(t, float)
-        return jax.jvp(rates, (z, t), (zdot, jnp.ones_like(t)))[1]
-
-    functions = [f for f in (system.lagrangian, system.forces, system.dissipation) if f is not None]
-    return System(kinetic, forces=restrict_signature(force, {extra for f in functions for extra in f.extras}))
-
-
-class _FlatScene(NamedTuple):
-    """The functions of a scene on vectors (n,), for q and p of this layout, and the numbers of its parameters."""
-
-    layout: Layout
-    motion: Any
-    numbers: PyTree
-
-    @classmethod
-    def from_state(cls, system: System, q: PyTree, p: PyTree, params: PyTree) -> "_FlatScene":
-        layout = Layout.from_state(q, p)
-        return cls(layout, present_system(system)._motion(layout, params), eqx.filter(params, eqx.is_array_like))
-
-    def velocity(self, q: Vector, p: Vector, t) -> Vector:
-        """v with ∂L/∂q̇(q, v, t) = p, by Newton's method from rest."""
-
-        def residual(v):
-            return self.motion.momentum(q, v, t, self.numbers) - p
-
-        v = jax.lax.custom_root(residual, jnp.zeros_like(p), newton, shortest_preimage)
-        return nan_unless(jax.lax.stop_gradient(is_root(residual, v, p)), v)
-
-    def rates(self, q: Vector, p: Vector, t) -> tuple[Vector, Vector]:
-        """(q̇, ṗ)."""
-        v = self.velocity(q, p, t)
-        return v, self.motion.generalized_force(q, v, t, self.numbers)
+    v = jax.lax.custom_root(residual, jnp.zeros_like(p), newton, shortest_preimage)
+    v = nan_unless(jax.lax.stop_gradient(is_root(residual, v, p)), v)
+    at = q, v, t, scene.numbers
+    return v, motion.generalized_force(*at), motion.energy(*at) - residual(v) @ v

@@ -65,6 +65,11 @@ class _LoweredMotion(Motion):
         """M and F of M q̈ = F + Gᵀλ."""
         return tuple(_evaluate(self.derivation, q, qdot, t, params, "mass_matrix", "force"))
 
+    def energy(self, q, qdot, t, params):
+        """h = p·q̇ − L."""
+        momentum, value = _evaluate(self.derivation, q, qdot, t, params, "momentum", "lagrangian")
+        return momentum @ qdot - value
+
     def solved_acceleration(self, q, qdot, t, params):
         """q̈, NaN where its matrix is singular, and whether that is so."""
         try:
