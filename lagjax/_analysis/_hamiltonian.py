@@ -86,10 +86,10 @@ def hamiltonian(system: System) -> Hamiltonian:
     if has_constraints(system):
         raise ValueError("hamiltonian takes systems without constraints: give L in coordinates that satisfy them.")
 
-    def momentum(q, qdot, t=0.0, params=None):
+    def momentum(q, qdot, t: Any = 0.0, params=None):
         return system.momentum(q, qdot, t, params)
 
-    def velocity(q, p, t=0.0, params=None):
+    def velocity(q, p, t: Any = 0.0, params=None):
         return _transform(system, q, p, t, params)[0]
 
     def energy(q, p, t=0.0, params=None):

@@ -333,7 +333,7 @@ _CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpo
           "custom_vjp_call", "custom_vjp_call_jaxpr")  # fmt: skip
 _WITH_BODIES = frozenset((*_CALLS, "scan", "while", "cond"))
 # What passes arrays on, or looks up entries in them: these may have ids without nodes.
-_PASSING_ON = frozenset(("gather", "dynamic_slice", "lagjax_locate", "convert_element_type", *_CALLS))
+_PASSING_ON = frozenset(("gather", "dynamic_slice", "lagjax_locate", "convert_element_type", *_WITH_BODIES))
 
 
 def lowers(*names):

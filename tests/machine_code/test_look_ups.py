@@ -228,3 +228,18 @@ def test_a_field_on_a_grid():
         along = jnp.asarray(RNG.normal(size=params[name].shape))
         ahead, behind = (end(params | {name: params[name] + s * along}) for s in (1e-5, -1e-5))
         np.testing.assert_allclose(jnp.vdot(slopes[name], along), (ahead - behind) / 2e-5, atol=1e-8)
+
+
+@pytest.mark.parametrize("where", ["a closure", "params"])
+def test_a_table_of_any_length_is_looked_up(where):
+    # A tenth of a second with 200 000 knots: none of them is an operation. A straight line needs one piece, so that the
+    # motion q̈ = t is exact.
+    knots = jnp.linspace(0.0, 2.0, 200_001)
+    table = {"t": knots, "u": knots}
+    if where == "params":
+        force, params = lambda q, qdot, t, params: jnp.interp(t, params["t"], params["u"]), table
+    else:
+        force, params = lambda q, qdot, t: jnp.interp(t, table["t"], table["u"]), None
+    scene = lagjax.System(free_particle, forces=force)
+    run = lagjax.simulate(scene, 0.0, 0.0, END, params, solver=MACHINE)
+    np.testing.assert_allclose(run.q[-1], 1.2**3 / 6, rtol=1e-12)
