@@ -41,6 +41,7 @@ from lagjax._machine_code._rates import rate
 from lagjax._machine_code._steps import KEPT
 from lagjax._machine_code._variational import from_rows, to_rows
 from lagjax._native import Begun, Projection
+from lagjax._platform import default_platform
 from lagjax._problem import Solution
 from lagjax._program import Program
 from lagjax._results import SUCCESSFUL
@@ -51,13 +52,19 @@ def run(flow: Flow, tolerances: Tolerances, ts, y0, params) -> Solution:
 
     A flow with guards has no derivatives: they would have to say how its end moves.
     """
-    return _compile_run(flow, tolerances)(ts, y0, params)
+    if default_platform() == "cpu":  # outside of `jit` the host computes, and nothing is compiled for a new scene
+        return _run(ts, y0, params, flow=flow, tolerances=tolerances, keep=False)
+    return compile_once(_run_flow, flow, tolerances)(ts, y0, params)
 
 
-@functools.lru_cache(maxsize=256)
-def _compile_run(flow: Flow, tolerances: Tolerances):
-    """`run` as one program of XLA: a derivative outside of `jit` then compiles as one, not operation by operation."""
-    return jax.jit(lambda *given: _run(*given, flow=flow, tolerances=tolerances, keep=False))
+@functools.lru_cache(maxsize=64)
+def compile_once(function, flow: Flow, *more):
+    """A function of a flow and of arrays, as one program of XLA: for what no machine code computes outside of `jit`."""
+    return jax.jit(functools.partial(function, flow, *more))
+
+
+def _run_flow(flow: Flow, tolerances: Tolerances, *given) -> Solution:
+    return _run(*given, flow=flow, tolerances=tolerances, keep=False)
 
 
 # ---- on the host: NumPy arrays with any batch axes in front ----------------------------------------------------------
@@ -163,6 +170,10 @@ def _curvature_composed(ts, y0, params, path_ct, end_ct, dy0, dparams, *, flow, 
     return [state_ct * length, numbers_ct * length]
 
 
+def _curvature_of_flow(flow: Flow, tolerances: Tolerances, *args):
+    return _curvature_composed(*args, flow=flow, tolerances=tolerances)
+
+
 def _jvp_composed(ts, y0, params, dy0, dparams, *, flow, tolerances):
     """`jvp` along one direction, (…, 2n) and (…, P), by the run of the tangent flow: for its own derivatives."""
     given, length = _tangent_inputs(flow, ts, y0, params, dy0, dparams)
@@ -175,7 +186,7 @@ def _jvp_composed(ts, y0, params, dy0, dparams, *, flow, tolerances):
 def _tangent_inputs(flow: Flow, ts, y0, params, dy0, dparams):
     """The start of the tangent flow, for a direction of length one; and the length."""
     if flow.projection is not None:
-        dy0 = _project_direction(flow, flow.projection, ts[..., 0], y0, params, dy0, dparams)
+        dy0 = compile_once(_project_direction, flow)(ts[..., 0], y0, params, dy0, dparams)
     length = jnp.max(jnp.abs(dy0), axis=-1, keepdims=True)
     if flow.numbers:
         length = jnp.maximum(*jnp.broadcast_arrays(length, jnp.max(jnp.abs(dparams), axis=-1, keepdims=True)))
@@ -185,16 +196,21 @@ def _tangent_inputs(flow: Flow, ts, y0, params, dy0, dparams):
     return (ts, start, numbers), length
 
 
-def _project_direction(flow: Flow, projection: Projection, t, y0, params, dy0, dparams):
+def _project_direction(flow: Flow, t, y0, params, dy0, dparams):
     """The tangent of the projection of a start, at which a motion with constraints begins (see `_derivatives`)."""
 
     def differentiate_start(t, y, p, dy, dp):
         def start(y, p):
-            return outputs(cast(Program, projection.state), flow.states, jnp.append(y, t), p)
+            return outputs(cast(Program, cast(Projection, flow.projection).state), flow.states, jnp.append(y, t), p)
 
         return jax.jvp(start, (y, p), (dy, dp))[1]
 
     return jnp.vectorize(differentiate_start, signature="(),(s),(p),(s),(p)->(s)")(t, y0, params, dy0, dparams)
+
+
+def _rate(flow: Flow, *state):
+    """`rate` at a state (t, y, params), compiled as one."""
+    return compile_once(rate, flow)(*state)
 
 
 def _residuals(solution: Solution):
@@ -224,14 +240,14 @@ def _derivative_of_run(primals, tangents, *, flow, tolerances, keep):
     solution = Solution(*outs)
     dy0, dparams = _value(dy0), _value(dparams)
     if not _zero(dts):
-        dy0 = dy0 - rate(flow, ts[..., 0], y0, params) * dts[..., :1]
+        dy0 = dy0 - _rate(flow, ts[..., 0], y0, params) * dts[..., :1]
     direction = [x[..., None, :] for x in (dy0, dparams)]
     d_path, d_end = jvp_p.bind(*primals, *_residuals(solution), *direction, flow=flow, tolerances=tolerances)
     d_path, d_end, d_t_end = d_path[..., 0, :, :], d_end[..., 0, :], jnp.zeros_like(solution.t_end)
     if not _zero(dts):
         reached, done = jnp.isfinite(solution.path), solution.result == SUCCESSFUL
         places = jnp.where(reached, solution.path, y0[..., None, :])
-        rates = rate(flow, ts, places, params[..., None, :]) * dts[..., None]
+        rates = _rate(flow, ts, places, params[..., None, :]) * dts[..., None]
         d_path = d_path + jnp.where(reached, rates, 0.0)
         d_end = d_end + jnp.where(done[..., None], rates[..., -1, :], 0.0)
         d_t_end = jnp.where(done, dts[..., -1], 0.0)
@@ -285,7 +301,7 @@ def _vjp_variation(primals, tangents, outs, settings):
     dy0, dparams = _value(dy0), _value(dparams)
     if not _zero(dts):
         total = _vjp_variation_in_time(primals, dts, outs, settings)
-        dy0 = dy0 - rate(settings["flow"], ts[..., 0], y0, params) * dts[..., :1]
+        dy0 = dy0 - _rate(settings["flow"], ts[..., 0], y0, params) * dts[..., :1]
     given = [x[..., None, :] for x in (ts, y0, params)]
     direction = [x[..., None, :] for x in (dy0, dparams)]
     more = curvature_p.bind(*given, *cts, *direction, **settings)
@@ -305,10 +321,10 @@ def _vjp_variation_in_time(primals, dts, outs, settings):
     weights = weights.at[..., -1, :].add(jnp.where(done[..., None, None], end_ct, 0.0))
 
     def rates(places, numbers):
-        return rate(flow, ts[..., None, :], places, numbers[..., None, :]) * dts[..., None, :, None]
+        return _rate(flow, ts[..., None, :], places, numbers[..., None, :]) * dts[..., None, :, None]
 
     def first_rate(y, numbers):
-        return -rate(flow, ts[..., None, 0], y, numbers) * dts[..., None, :1]
+        return -_rate(flow, ts[..., None, 0], y, numbers) * dts[..., None, :1]
 
     def transpose_rate(function, place, cotangent, numbers_shape):
         place = jnp.broadcast_to(place, cotangent.shape)
@@ -602,7 +618,7 @@ for _primitive, _compiled_form in ((run_p, _run_compiled), (jvp_p, _jvp_compiled
     mlir.register_lowering(_primitive, _lowering_rule(_compiled_form), platform="cpu")
 curvature_p.multiple_results = True
 curvature_p.def_abstract_eval(_curvature_shapes)
-curvature_p.def_impl(_curvature_composed)
+curvature_p.def_impl(lambda *args, flow, tolerances: compile_once(_curvature_of_flow, flow, tolerances)(*args))
 for _platform in ("cpu", "cuda"):
     _rule = mlir.lower_fun(_curvature_composed, multiple_results=True)
     mlir.register_lowering(curvature_p, _rule, platform=_platform)

@@ -412,7 +412,7 @@ def is_file_name(name: Any) -> bool:
 
 
 def _fault_of(spec: dict) -> str | None:
-    """What cannot be right in a description, in words; None where all may be."""
+    """A reason, in words, why a description is not what was written; None where it may be."""
     try:
         shape, chunk = spec["shape"], spec["chunk"]
         sizes = [*shape, *chunk, spec["batch"], *(size + 1 for x in spec["kept"] for size in x["shape"])]

@@ -106,7 +106,7 @@ def eagerly(function, monkeypatch):
     """What a derivative is on the host, over steps that were kept."""
     with monkeypatch.context() as patch:
         patch.setattr(_call, "NO_HANDLER", "this test says so")
-        _primitives._compile_run.cache_clear()
+        _primitives.compile_once.cache_clear()
         return function()
 
 
@@ -350,7 +350,7 @@ def in_many_programs():
 
     _machine_code._make_flow.cache_clear()
     _derivation._derived_once.cache_clear()
-    _primitives._compile_run.cache_clear()
+    _primitives.compile_once.cache_clear()
     import gc
 
     gc.collect()

@@ -34,7 +34,7 @@ translated = functools.lru_cache(maxsize=64)(PtxOnCpu)
 
 def transforms_are_new():
     """What was lowered by other rules is forgotten."""
-    _primitives._compile_run.cache_clear()
+    _primitives.compile_once.cache_clear()
     jax.clear_caches()
 
 
