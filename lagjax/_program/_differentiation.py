@@ -245,8 +245,11 @@ def pullback_and_entries(
     of: Sequence[int],
     known=(),
     varies: Callable[[Table], bool] = lambda table: True,
+    is_linear: bool = False,
 ) -> tuple[StraightLine, tuple[Table, ...]]:
     """`pullback`, and the cotangents of the entries of tables that are not among the inputs `by`.
+
+    `is_linear` says that the line is in these: it is one of tangents.
 
     For each of the tables two outputs come behind those of the inputs: the index of an entry, and its cotangent. Only
     entries of tables for which `varies` is true have cotangents.
@@ -256,7 +259,7 @@ def pullback_and_entries(
         cotangents: dict[int, int] = {}
         for k, output in enumerate(of):
             placed._add(cotangents, line.outputs[output], placed.graph.input(len(dtypes) + k, "float"))
-        results = placed.cotangents(cotangents, by, tables, varies)
+        results = placed.cotangents(cotangents, by, tables, varies, is_linear)
         results += [i for _, *entry in tables for i in entry]
         done = placed.finish_line(results, known, len(dtypes) + len(of))
     return done, tuple(table for table, *_ in tables)
@@ -370,14 +373,19 @@ class _PlacedLine(Derivatives):
         by: Sequence[int],
         tables: list | None = None,
         varies: Callable[[Table], bool] = lambda table: False,
+        is_linear: bool = False,
     ) -> list[int]:
         """The cotangents of the inputs `by`, from those of some nodes.
+
+        A root whose slope is infinite has a cotangent that is infinite, too; past a slope of zero, as that of
+        max(q, 0) on its flat side, it is zero.
 
         Those of entries of a table that `varies` are added to `tables`: the table, the index, and the cotangent; or,
         where the table consists of inputs `by`, to each of these.
         """
         line, nodes, inputs, results = self.line, self.nodes, frozenset(by), {}
-        varied = self._find_varying_nodes(inputs, varies)
+        varied, flat = self._find_varying_nodes(inputs, varies), ("mul",) if is_linear else ("max", "min")
+        beneath = self._find_beneath_roots(varied, is_linear)
         for k in range(len(line.nodes) - 1, -1, -1):
             (op, operands, attribute), g = line.nodes[k], cotangents.get(k)
             if g is None or not varied[k]:
@@ -395,7 +403,11 @@ class _PlacedLine(Derivatives):
                 rules = self.rules(nodes[k], op, [nodes[j] for j in operands])
                 for i, rule in zip(operands, rules, strict=False):  # a step has no derivative at all
                     if rule is not None and varied[i]:
-                        self._add(cotangents, i, self._zero_where_zero(k, g, rule(g)))
+                        part = self._zero_where_zero(k, g, rule(g))
+                        if op in flat and k in beneath:
+                            slope = rule(self._number(1.0))
+                            part = self._select_unless_zero(slope, self._select_unless_zero(g, part))
+                        self._add(cotangents, i, part)
         return [results[i] if i in results else self._number(0.0) for i in by]
 
     def _find_varying_nodes(self, inputs: frozenset[int], varies: Callable[[Table], bool]) -> list[bool]:
@@ -418,8 +430,25 @@ class _PlacedLine(Derivatives):
         by_root = op == "div" and (of := nodes[operands[1]][0]) not in ("input", "constant") and OPERATIONS[of].steep
         if not (OPERATIONS[op].steep or by_root):
             return part
+        return self._select_unless_zero(g, part)
+
+    def _select_unless_zero(self, number: int, part: int) -> int:
         zero = self._number(0.0)
-        return self.graph.apply("select", self.graph.apply("eq", g, zero), part, zero)
+        return self.graph.apply("select", self.graph.apply("eq", number, zero), part, zero)
+
+    def _find_beneath_roots(self, varied: list[bool], is_linear: bool) -> set[int]:
+        """The nodes that vary and that operations of steep slopes depend on; in a line of tangents, their tangents.
+
+        There a tangent beneath a root is one that is asked whether it is zero (`_zero_where_zero`).
+        """
+        nodes, beneath = self.line.nodes, set()
+        for k in range(len(nodes) - 1, -1, -1):
+            op, operands, _ = nodes[k]
+            if is_linear and op == "select" and nodes[operands[0]][0] == "eq":
+                beneath.update(i for i in (*nodes[operands[0]][1], *operands[1:]) if varied[i])
+            elif k in beneath or (not is_linear and operands and varied[k] and OPERATIONS[op].steep):
+                beneath.update(i for i in operands if varied[i])
+        return beneath
 
 
 def _tangents_of(table: Table, places: dict[int, int], beside: "TangentTable | None") -> Table | None:

@@ -125,14 +125,16 @@ class Jump(NamedTuple):
         ]
         of = range((rows - 1) * 2 * n, (2 * rows - 1) * 2 * n)
         dtypes = [np.dtype(float)] * (first + upper)
-        line, tables = pullback_and_entries(self.line, dtypes, by, of, varies=lambda table: table.tangents)
+        line, tables = pullback_and_entries(
+            self.line, dtypes, by, of, varies=lambda table: table.tangents, is_linear=True
+        )
         nodes, of_upper = [], []
         for op, operands, attribute in line.nodes:
             of_upper.append(first <= attribute < first + upper if op == "input" else any(of_upper[i] for i in operands))
             if op == "input" and attribute >= first + upper:
                 attribute -= upper
             elif op == "eq" and of_upper[-1]:  # all that is read of them is whether a tangent is zero: it is not
-                op, operands, attribute = "constant", (), False
+                op, operands, attribute, of_upper[-1] = "constant", (), False, False
             nodes.append((op, operands, attribute))
         line = StraightLine(*live(tuple(nodes), line.kinds, line.outputs))
         return line, tables

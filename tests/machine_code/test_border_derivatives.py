@@ -206,36 +206,54 @@ def test_a_fit_through_stick_and_slip():
 
 # ---- jumps beside functions whose slopes may be infinite -------------------------------------------------------------
 
+ENTRIES = jnp.array([0.3, -0.2, 0.1, 0.4])
 JUMPS = {
-    "sign": lambda q, v: jnp.sign(v),
-    "where": lambda q, v: jnp.where(q > 0.3, 1.0, 0.2),
-    "clip": lambda q, v: jnp.clip(3 * q, -0.5, 0.5),
-    "table": lambda q, v: jnp.interp(q, jnp.array([-2.0, 0.1, 0.4, 2.0]), jnp.array([0.0, 0.3, -0.2, 0.5])),
-    "floor": lambda q, v: jnp.floor(2 * q + 0.3),
+    "sign": lambda q, v: 0.3 * jnp.sign(v),
+    "where": lambda q, v: jnp.where(q > 0.3, 0.4, 0.0),
+    "clip": lambda q, v: jnp.clip(3 * q, -0.5, 0.7),
+    "floor": lambda q, v: 0.2 * jnp.floor(2 * q + 0.3),
+    "table": lambda q, v: ENTRIES[jnp.clip(jnp.floor(2 * q + 2.1), 0, 3).astype(int)],
+    "knots": lambda q, v: jnp.interp(q, jnp.array([-2.0, 0.1, 0.4, 2.0]), jnp.array([0.0, 0.3, -0.2, 0.5])),
+    "mod": lambda q, v: 0.3 * jnp.mod(2 * q + 0.2, 1.0),
+    "switch": lambda q, v: jax.lax.switch((q > 0.1).astype(int) + (q > 0.4), [lambda x=x: x for x in (0.1, -0.3, 0.2)]),
 }
-STEEP = (
-    lambda x, p: jnp.sqrt(p + x * x), lambda x, p: jnp.cbrt(p + x * x), lambda x, p: (p + x * x) ** 1.3,
-    lambda x, p: p ** (1 + x), lambda x, p: jnp.arctan2(x, p), lambda x, p: jnp.hypot(x, p),
+OPERATIONS = (
+    lambda q, v, p: jnp.sqrt(p) * v, lambda q, v, p: jnp.sqrt(q * q + p), lambda q, v, p: jnp.cbrt(p) * q,
+    lambda q, v, p: jnp.cbrt(2 + q + p), lambda q, v, p: (2 + q) ** 1.3 * p**0.7, lambda q, v, p: 2.0**p * q,
+    lambda q, v, p: (3 + q) ** p, lambda q, v, p: jnp.arctan2(q, p), lambda q, v, p: jnp.hypot(q, p),
+    lambda q, v, p: jnp.hypot(v, p), lambda q, v, p: jnp.arcsin(0.3 * q * p), lambda q, v, p: jnp.arccosh(3 + p * q),
+    lambda q, v, p: jnp.exp(-p * q), lambda q, v, p: jnp.log(3 + q * p), lambda q, v, p: jax.lax.rsqrt(1 + q * q * p),
+    # On the flat side of these the slope of the root is infinite, and that of the function zero.
+    lambda q, v, p: p * jnp.maximum(q, 0.0) ** 2.5, lambda q, v, p: p * jnp.sqrt(jnp.maximum(q - 5.0, 0.0)),
+    lambda q, v, p: p * jnp.cbrt(jnp.maximum(q, 0.0)) * q * q,
 )  # fmt: skip
 
 
-@pytest.mark.parametrize("jump", [pytest.param(name, marks=[pytest.mark.slow] * (name != "sign")) for name in JUMPS])
-def test_reverse_mode_of_a_jump_beside_roots(jump):
-    """Compiles a motion, its tangents and its transpose."""
+@pytest.mark.parametrize(
+    ("jump", "operations"),
+    [("sign", OPERATIONS[-3:]), *(pytest.param(name, OPERATIONS, marks=pytest.mark.slow) for name in JUMPS)],
+)
+def test_derivatives_of_a_jump_beside_every_operation(jump, operations):
+    """Every coordinate is a pair of a jump and an operation, none of which knows of another."""
+    count = len(operations)
 
     def forces(q, v, params):
-        return -0.3 * JUMPS[jump](q, v) - 0.05 * sum(p * f(0.7 * q + v, p) for f, p in zip(STEEP, params, strict=True))
+        smooth = jnp.stack([f(q[k], v[k], params[k]) for k, f in enumerate(operations)])
+        return -2 * q - jnp.stack([JUMPS[jump](q[k], v[k]) for k in range(count)]) - 0.3 * smooth
 
-    scene = lagjax.System(lambda q, v: 0.5 * v * v - 0.5 * q * q, forces=forces)
+    scene = lagjax.System(lambda q, v: 0.5 * v @ v, forces=forces)
 
-    def end(params):
-        return lagjax.simulate(scene, 1.0, 0.5, jnp.array([0.0, 2.0]), tuple(params), rtol=1e-11).q[-1]
+    def end(q, params):
+        return lagjax.simulate(scene, q, jnp.zeros(count), jnp.array([0.0, 4.0]), params, rtol=1e-11).q[-1]
 
-    params, h = jnp.linspace(0.4, 0.9, len(STEEP)), 1e-5
-    reverse, forward = jax.grad(end)(params), jax.jacfwd(end)(params)
-    np.testing.assert_allclose(reverse, forward, atol=1e-10)
-    differences = [(end(params.at[i].add(h)) - end(params.at[i].add(-h))) / (2 * h) for i in range(len(STEEP))]
-    np.testing.assert_allclose(reverse, differences, atol=1e-7)
+    x, h = (jnp.linspace(0.713, 0.883, count), jnp.linspace(0.41, 0.59, count)), 1e-5
+    reverse = jax.grad(lambda x: end(*x).sum())(x)
+    for k in range(2):
+        moved = tuple(jnp.full(count, float(i == k)) for i in range(2))
+        forward = jax.jvp(end, x, moved)[1]
+        ahead, back = (end(*(a + d * step for a, d in zip(x, moved, strict=True))) for step in (h, -h))
+        np.testing.assert_allclose(forward, (ahead - back) / (2 * h), atol=1e-7)
+        np.testing.assert_allclose(reverse[k], forward, atol=1e-7)
 
 
 def test_borders_by_roots_and_angles_in_every_mode():
