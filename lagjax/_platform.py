@@ -29,8 +29,18 @@ def has_nvidia_gpu() -> bool:
         return False
 
 
-# Compilation of the algebra around a few matrices takes a quarter of the time so, and runs as fast to a millisecond.
-_AS_WRITTEN = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+@functools.cache
+def _as_written() -> dict[str, Any]:
+    """The options of XLA without optimisation, as far as this version of it has them.
+
+    Compilation of the algebra around a few matrices takes half of the time so, and runs as fast to a millisecond.
+    """
+    options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
+    try:
+        jax.jit(lambda: 0.0, compiler_options=options).lower().compile()
+    except jax.errors.JaxRuntimeError:
+        options.pop("xla_cpu_use_fusion_emitters")
+    return options
 
 
 def compile_for_one_call(function: Callable) -> Callable:
@@ -39,12 +49,15 @@ def compile_for_one_call(function: Callable) -> Callable:
     Within what is traced already, which may run often, it is optimised as all else there.
     """
     optimised = eqx.filter_jit(function)
-    as_written = eqx.filter_jit(function, compiler_options=_AS_WRITTEN)  # pyright: ignore[reportCallIssue]
+
+    @functools.cache
+    def as_written() -> Callable:
+        return eqx.filter_jit(function, compiler_options=_as_written())  # pyright: ignore[reportCallIssue]
 
     @functools.wraps(function)
     def call(*arguments):
         leaves = jnp.zeros(()), *jax.tree.leaves(arguments)  # what is made while something is traced is a tracer
-        return (optimised if any(isinstance(x, Tracer) for x in leaves) else as_written)(*arguments)
+        return (optimised if any(isinstance(x, Tracer) for x in leaves) else as_written())(*arguments)
 
     return call
 
