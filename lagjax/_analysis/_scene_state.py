@@ -9,9 +9,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lagjax._consistent import has_constraints
-from lagjax._derivation import Derivation, columns_of, derivation_of, numbers_of
+from lagjax._derivation import Derivation, columns_of, derivation_of
 from lagjax._layout import Layout
 from lagjax._machine_code import lowered_motion
+from lagjax._many_states import Sample
 from lagjax._motion import Motion
 from lagjax._program import Unlowerable
 from lagjax._scales import Scales
@@ -139,15 +140,9 @@ class SceneState(NamedTuple):
     @property
     def scales(self) -> Scales:
         """The sizes of coordinates, velocities and the time, of a scene of numbers."""
-        numbers = numbers_of(self.numbers)
 
         def evaluated(name, q, qdot):
-            if (derivation := self.lowered) is not None:
-                try:
-                    return derivation.evaluate((name,), columns_of(q, qdot, 0.0, numbers))[name]
-                except Unlowerable:
-                    pass
-            return np.asarray(_evaluate_quantity(name, q, qdot, *self.arguments))
+            return Sample.from_scene(self.system, self.layout, q, qdot, 0.0, self.params).quantities(name)[name]
 
         return Scales.from_quantities(evaluated, np.asarray(self.q), np.asarray(self.qdot))
 
@@ -168,18 +163,6 @@ class SceneState(NamedTuple):
     def holds(self, q: Vector) -> Float[Array, " k"]:
         """f, the constraints on positions, (k,)."""
         return self.motion.constraints.f(q, jnp.zeros((), q.dtype), self.numbers)
-
-
-@eqx.filter_jit
-def _evaluate_quantity(name: str, q, qdot, *arguments) -> Array:
-    """Forces, momenta or mass matrices at states (S, n), of a scene without scalar programs."""
-    scene = SceneState.from_arguments(*arguments)
-
-    def momentum(q, qdot):
-        return scene.motion.momentum(q, qdot, jnp.zeros((), q.dtype), scene.numbers)
-
-    one = {"force": scene.force, "momentum": momentum, "mass_matrix": scene.mass_matrix}[name]
-    return jax.vmap(one)(jnp.asarray(q), jnp.asarray(qdot))
 
 
 def _require_no_velocities(system: System, q: PyTree, params: PyTree) -> None:
