@@ -8,7 +8,6 @@ integration misses, `is_right` finds.
 from collections.abc import Callable
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -19,6 +18,7 @@ from lagjax._analysis._potential import line_integral
 from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._transformations import Fields
 from lagjax._doubles import accepts_singles
+from lagjax._platform import compile_for_one_call
 
 # Parts of the terms of Λ that count as zero, and what the gradient of G may be off.
 _ZERO, _RIGHT = 1e-10, 1e-9
@@ -113,7 +113,7 @@ def _function(scene: SceneState, fields: Fields, weights: np.ndarray, constant: 
     return gauge
 
 
-@eqx.filter_jit
+@compile_for_one_call
 def _changes(weights: Array, fields: Fields, states: FlatState, *arguments) -> tuple:
     """The fields of `Changes`."""
     scene = SceneState.from_arguments(*arguments)

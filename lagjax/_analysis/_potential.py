@@ -15,6 +15,7 @@ from jaxtyping import Array
 
 from lagjax._analysis._noether import FlatState
 from lagjax._analysis._scene_state import SceneState
+from lagjax._platform import compile_for_one_call
 from lagjax._scales import Scales
 from lagjax._system import System
 
@@ -110,7 +111,7 @@ def _have_potential(scene: SceneState, scales: Scales, states: FlatState) -> boo
     return off <= _CURL * size
 
 
-@eqx.filter_jit
+@compile_for_one_call
 def _derivatives(states: FlatState, *arguments) -> tuple[Array, Array, Array]:
     """Q (S, n), ∂Q/∂q and ∂Q/∂q̇ (S, n, n)."""
     scene = SceneState.from_arguments(*arguments)

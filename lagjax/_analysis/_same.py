@@ -2,7 +2,6 @@
 
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,6 +12,7 @@ from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._states import perturb_last_digits, random_states
 from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout
+from lagjax._platform import compile_for_one_call
 from lagjax._results import show_str
 from lagjax._system import System, require_system
 
@@ -127,7 +127,7 @@ def _compare_equations(scenes, states: FlatState) -> tuple[float, np.ndarray, np
     return factor, left / np.where(terms > 0, terms, 1.0), well
 
 
-@eqx.filter_jit
+@compile_for_one_call
 def _equations(states: FlatState, *arguments) -> tuple[Array, Array]:
     """E (S, n) and the size of its terms (S, n)."""
     scene = SceneState.from_arguments(*arguments)

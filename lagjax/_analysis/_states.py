@@ -7,6 +7,7 @@ import numpy as np
 
 from lagjax._analysis._noether import FlatState
 from lagjax._analysis._scene_state import SceneState
+from lagjax._platform import compile_for_one_call
 from lagjax._scales import Scales
 
 # How far states are drawn from that of the scene, in its scales: so that they do not come near an origin that is one
@@ -32,7 +33,7 @@ def random_states(scene: SceneState, scales: Scales, count: int, seed: int, piec
     return FlatState(*(jnp.asarray(x, dtype) for x in (q, qdot, scales.qdot / scales.t * draws[2], t)))
 
 
-@eqx.filter_jit
+@compile_for_one_call
 def _project(q, qdot, t, system, layout, params):
     motion, numbers = system._motion(layout, params), eqx.filter(params, eqx.is_array_like)
     return jax.vmap(lambda *y: motion.nearest_consistent(*y, numbers))(q, qdot, t)

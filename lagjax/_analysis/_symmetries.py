@@ -26,6 +26,7 @@ from lagjax._analysis._transformations import Fields, fields_of, textbook_symmet
 from lagjax._arguments import accept
 from lagjax._doubles import accepts_singles
 from lagjax._layout import Layout
+from lagjax._platform import compile_for_one_call
 from lagjax._results import show_str
 from lagjax._system import System
 from lagjax._trajectory import Trajectory
@@ -239,7 +240,7 @@ def _flatten_generators(generators, layout: Layout) -> dict[str, Callable]:
 # ---- the columns -----------------------------------------------------------------------------------------------------
 
 
-@eqx.filter_jit
+@compile_for_one_call
 def _columns(fields: Fields, states: FlatState, *arguments) -> tuple[Array, Array]:
     """The change under each of K transformations at S states: of L (S, n, K), of forces and constraints (S, r, K).
 
