@@ -121,6 +121,16 @@ def dtype_of(x):
     return jnp.result_type(x)
 
 
+def describe_numbers(tree: PyTree, name: str, most: int = 8) -> str:
+    """The numbers of a pytree by name, "q['x'] = 1, q['y'] = 2": the first of them, at `most`."""
+    found = [
+        f"{label}{list(place) if place else ''} = {value:.6g}"
+        for label, leaf in zip(*labelled_leaves(tree, name)[:2], strict=True)
+        for place, value in np.ndenumerate(np.asarray(leaf))
+    ]
+    return ", ".join(found[:most]) + (f", … ({len(found) - most} more)" if len(found) > most else "")
+
+
 def labelled_leaves(tree: PyTree, name: str, is_leaf=None) -> tuple[tuple[str, ...], list, Any]:
     """The leaves of a pytree with their names, such as `params['m']`, and its structure."""
     try:

@@ -15,7 +15,8 @@ import numpy as np
 
 from lagjax._failures import marks_absent
 from lagjax._layout import Layout
-from lagjax._results import RESULTS
+from lagjax._platform import is_known
+from lagjax._results import RESULTS, show_str
 from lagjax._system import System
 
 if TYPE_CHECKING:
@@ -54,6 +55,20 @@ class Transitions(NamedTuple):
     let_out: jax.Array
     q_next: PyTree
     qdot_next: PyTree
+
+    _repr_pretty_ = show_str
+
+    def __str__(self) -> str:
+        """Their times and modes, of one motion the first ten."""
+        if not all(map(is_known, (self.t, self.count))):
+            return repr(self)
+        count = np.asarray(self.count)
+        if count.ndim:
+            return f"{count.sum()} transitions of {' × '.join(map(str, count.shape))} motions"
+        rows = list(zip(*(np.asarray(x)[: min(count, 10)] for x in (self.source, self.target, self.t)), strict=True))
+        listed = ", ".join(f"{source} → {target} at t = {t:.6g}" for source, target, t in rows)
+        more = f", … ({count - 10} more)" if count > 10 else ""
+        return f"{count} transitions between places in mode_names: {listed}{more}" if count else "no transitions"
 
 
 class Trajectory(eqx.Module):

@@ -13,8 +13,10 @@ from lagjax._analysis._solve import is_root, levenberg_marquardt, polish, shorte
 from lagjax._constraints import ROUNDINGS
 from lagjax._doubles import accepts_singles
 from lagjax._failures import nan_unless
+from lagjax._layout import describe_numbers
 from lagjax._linear import least_norm
-from lagjax._platform import compile_for_one_call
+from lagjax._platform import compile_for_one_call, is_known
+from lagjax._results import show_str
 from lagjax._system import System
 from lagjax._validate import require_flag
 
@@ -34,6 +36,17 @@ class Equilibrium(NamedTuple):
     q: PyTree
     multipliers: PyTree
     ok: Bool[Array, ""]
+
+    _repr_pretty_ = show_str
+
+    def __str__(self) -> str:
+        if not all(map(is_known, jax.tree.leaves(self))):
+            return repr(self)
+        ok = np.asarray(self.ok)
+        if ok.ndim:
+            return f"{ok.sum()} of {ok.size} equilibria were found"
+        forces = "" if self.multipliers is None else f"; {describe_numbers(self.multipliers, 'multipliers')}"
+        return f"Equilibrium at {describe_numbers(self.q, 'q')}{forces}" if ok else "No equilibrium was found"
 
 
 @accepts_singles(("q", "qdot"), ("params",))

@@ -4,6 +4,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from lagjax._analysis._scene_state import SceneState
@@ -11,12 +12,14 @@ from lagjax._analysis._smooth import is_smooth, require_smooth
 from lagjax._doubles import accepts_singles
 from lagjax._failures import nan_unless
 from lagjax._linear import diagonal_scale, factorize, least_norm, saddle
-from lagjax._platform import compile_for_one_call
+from lagjax._platform import compile_for_one_call, is_known
+from lagjax._results import show_str
 from lagjax._system import System
 
 PyTree = Any
 Vector = Float[Array, " n"]
 Matrix = Float[Array, "n n"]
+_SHOWN = 8  # equations that are printed
 
 
 class Linearization(NamedTuple):
@@ -37,6 +40,20 @@ class Linearization(NamedTuple):
     stiffness: Matrix
     constraint_jacobian: Float[Array, "m n"]
     names: tuple[str, ...]
+
+    _repr_pretty_ = show_str
+
+    def __str__(self) -> str:
+        """An equation for each of the first coordinates; the shapes of many states."""
+        if not is_known(self.A) or np.ndim(self.A) != 2:
+            return f"Linearization: A {np.shape(self.A)}, B {np.shape(self.B)}"
+        n, more = len(self.names), len(self.names) - _SHOWN
+        of = [*(f"δ{name}" for name in self.names), *(f"δ{name}'" for name in self.names)]
+        of += [f"u{name.removeprefix('q')}" for name in self.names]
+        rows = np.hstack([self.A, self.B])[n : n + _SHOWN]
+        shown = [" ".join(f"{c:+.6g} {name}" for c, name in zip(row, of, strict=True) if c) or "0" for row in rows]
+        lines = [f"δ{name}'' = {line.removeprefix('+')}" for name, line in zip(self.names, shown, strict=False)]
+        return "\n".join([*lines, *([f"… ({more} more)"] if more > 0 else [])])
 
 
 @accepts_singles(("q", "qdot"), ("params",))

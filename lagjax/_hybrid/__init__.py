@@ -75,6 +75,9 @@ class Hybrid:
         same = all(map(operator.is_, before, now))
         return self if same else Hybrid(modes, transitions, self.start, self.max_transitions)
 
+    def __repr__(self) -> str:
+        return f"Hybrid of {', '.join(map(repr, self.modes))}, begins in {self.start!r}: {self.transitions}"
+
     def __post_init__(self):
         _require_modes(self.modes, self.transitions, self.start, self.max_transitions)
 

@@ -101,6 +101,12 @@ class Transition(eqx.Module):
         self.guard = accept(guard, "guard", extras=("t", "params", "multipliers"))
         self.reset = None if reset is None else accept(reset, "reset")
 
+    def __repr__(self) -> str:
+        way = {-1: "falls through", 0: "passes", 1: "rises through"}[self.direction]
+        more = "" if self.reset is None else f", with the reset {self.reset.name}"
+        more += "" if self.fires is None else f", fires={self.fires!r}"
+        return f"Transition({self.source!r} → {self.target!r} where {self.guard.name} {way} zero{more})"
+
     def now(self) -> "Transition":
         """The transition with its functions as they are now."""
         functions = self.guard, self.reset

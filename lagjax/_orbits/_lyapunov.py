@@ -21,7 +21,7 @@ from lagjax._failures import sentence
 from lagjax._layout import halves
 from lagjax._orbits._arcs import Arcs
 from lagjax._orbits._starts import starts
-from lagjax._results import SUCCESSFUL, SimulationError
+from lagjax._results import SUCCESSFUL, SimulationError, show_str
 from lagjax._system import System
 from lagjax._validate import require_flag
 
@@ -46,6 +46,15 @@ class LyapunovExponent(NamedTuple):
     value: jax.Array
     error: jax.Array
     ok: jax.Array
+
+    _repr_pretty_ = show_str
+
+    def __str__(self) -> str:
+        value, error, ok = map(np.asarray, self)
+        if not value.ndim:
+            return f"Lyapunov exponent {value:.6g} ± {error:.1g} per unit of time"
+        span = f" from {np.nanmin(value):.6g} to {np.nanmax(value):.6g}" if ok.any() else ""
+        return f"{ok.sum()} of {ok.size} Lyapunov exponents{span} per unit of time"
 
 
 @accepts_singles(("q0", "qdot0"), ("duration", "params"))

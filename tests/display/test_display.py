@@ -62,6 +62,11 @@ def test_a_hybrid_motion():
     run = lagjax.simulate_hybrid({"flight": ball}, [bounce], "flight", 1.0, 0.0, TS, throw=False)
     first, second, third = lines(run)
     assert first.endswith("; modes flight") and second.endswith("32 transitions") and third.endswith(": zeno")
+    assert str(run.transitions).startswith("32 transitions between places in mode_names: 0 → 0 at t = 0.451524, 0 → 0")
+    assert repr(bounce) == "Transition('flight' → 'flight' where <lambda> falls through zero, with the reset <lambda>)"
+    assert repr(lagjax.Hybrid({"flight": ball}, [bounce], "flight")).startswith(
+        "Hybrid of 'flight', begins in 'flight'"
+    )
 
 
 def test_what_has_no_numbers(fallen):
@@ -162,6 +167,11 @@ def test_results_of_the_analysis_read_as_sentences():
     other = lagjax.same_motion(pendulum, lagjax.System(lambda q, v: 0.5 * v**2), 0.5, 0.1)
     assert str(other).startswith("Other motions: with the best factor") and "the equation of q at q" in str(other)
     assert repr(list(lagjax.conserved_quantities(pendulum, 0.5, 0.1))) == "[Conserved('energy')]"
+    assert str(lagjax.equilibrium(pendulum, 0.1)) == "Equilibrium at q = 0"
+    found = lagjax.results.Equilibrium({"x": jnp.array([0.0, -1.0])}, {"rod": jnp.array(0.5)}, jnp.array(True))
+    assert str(found) == "Equilibrium at q['x'][0] = 0, q['x'][1] = -1; multipliers['rod'] = 0.5"
+    assert str(lagjax.linearize(pendulum, 0.0)) == "δq'' = -1 δq +1 u"
+    assert str(lagjax.lyapunov_exponent(pendulum, 0.5, 0.0, 5.0)).startswith("Lyapunov exponent -0.0")
     path = lagjax.find_path(pendulum, 0.0, 0.5, 0.0, 1.0)
     assert repr(path).startswith("Path: action 1.08090018, a minimum among nearby paths, 0 conjugate times")
     along = lagjax.family(pendulum, lagjax.periodic_orbit(pendulum, 0.5, 0.0, 6.3), count=3)
@@ -172,7 +182,7 @@ def test_an_integer_of_params_and_an_unknown_dataclass_are_explained():
     counted = lagjax.System(lambda q, v, params: 0.5 * v**2 - sum(q**2 for _ in range(params["n"])))
     with pytest.raises(TypeError) as error:
         lagjax.simulate(counted, 1.0, 0.0, jnp.array([0.0, 1.0]), {"n": 3})
-    assert "let the function close over that integer" in "".join(error.value.__notes__)
+    assert "let the function close over that integer" in str(error.value)
 
     @dataclasses.dataclass
     class Place:
