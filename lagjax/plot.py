@@ -22,7 +22,7 @@ from lagjax._analysis import Modes
 from lagjax._arguments import Function, accept
 from lagjax._check import join_names
 from lagjax._crossings import Crossings
-from lagjax._display import COLORS, course_of, courses_of, require_points, times_of_members
+from lagjax._display import COLORS, course_of, courses_of, join_curve, require_points, times_of_members
 from lagjax._fit import Fit, Record, draw_record, record_matrix
 from lagjax._health import does_work
 from lagjax._layout import Layout
@@ -61,12 +61,12 @@ def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, me
     ax, opacity = _axes(ax), max(0.15, len(curves) ** -0.5)
     if projection is not None:
         for x, y in _project(layout, curves, projection):
-            ax.plot(x, y, color=COLORS[0], alpha=opacity, linewidth=1.2)
+            ax.plot(*join_curve(x, y), color=COLORS[0], alpha=opacity, linewidth=1.2)
         return ax
     shown = _places(layout, ())
     for color, i in zip(COLORS, shown, strict=False):
         for t, q, _ in curves:
-            ax.plot(t, q[:, i], color=color, alpha=opacity, linewidth=1.5)
+            ax.plot(*join_curve(t, q[:, i]), color=color, alpha=opacity, linewidth=1.5)
         ax.lines[-len(curves)].set_label(layout.names[i])
     ax.set_xlabel("t")
     if layout.size == 1:

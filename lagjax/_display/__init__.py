@@ -8,12 +8,12 @@ _export      a trajectory as an xarray.Dataset or a pandas.DataFrame, intervals 
 """
 
 from lagjax._display._animation import Animation, make_animation, require_points
-from lagjax._display._course import course_of, courses_of
+from lagjax._display._course import course_of, courses_of, join_curve
 from lagjax._display._export import dataset, frame, intervals
 from lagjax._display._notebook import COLORS, cell, trajectory_html
 from lagjax._display._summary import summary, times_of_members
 
 __all__ = [
-    "COLORS", "Animation", "cell", "course_of", "courses_of", "dataset", "frame", "intervals", "make_animation",
-    "require_points", "summary", "times_of_members", "trajectory_html",
+    "COLORS", "Animation", "cell", "course_of", "courses_of", "dataset", "frame", "intervals", "join_curve",
+    "make_animation", "require_points", "summary", "times_of_members", "trajectory_html",
 ]  # fmt: skip

@@ -62,6 +62,13 @@ class Course(NamedTuple):
         return np.insert(t, jumps, t[jumps]), q, qdot
 
 
+def join_curve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A curve (2, F) in a plane, without the gaps across which both of these go on."""
+    xy = np.stack([x, y])
+    gaps = 1 + np.flatnonzero(np.isnan(y[1:-1]))
+    return np.delete(xy, gaps[(xy[:, gaps - 1] == xy[:, gaps + 1]).all(axis=0)], axis=1)
+
+
 def courses_of(trajectory, places) -> tuple[Layout, list[Course]]:
     """The members in these places of a batch, between their outputs; place 0 of one motion is that motion."""
     members = Members(trajectory)

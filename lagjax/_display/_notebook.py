@@ -8,15 +8,14 @@ notebook must never fail because of its last line.
 import base64
 import html
 import io
-import math
 from collections.abc import Callable
 from typing import Any
 
 import jax
 import numpy as np
 
-from lagjax._display._summary import times_of_members
-from lagjax._platform import is_known, numbers_at
+from lagjax._display._course import Course, courses_of, join_curve
+from lagjax._platform import is_known
 from lagjax._results import ENDED_WELL
 
 MEMBERS, OUTPUTS, COORDINATES = 30, 400, 6  # that are drawn
@@ -51,23 +50,16 @@ def trajectory_html(trajectory) -> str | None:
 
 def _draw(figure, trajectory) -> None:
     codes = np.asarray(trajectory.result._value).ravel()
-    members, outputs = _some(codes.size, MEMBERS), _some(trajectory.ts.shape[-1], OUTPUTS)
-    ax, rank, drawn = figure.subplots(), np.ndim(trajectory.result._value), 0
-    ts = times_of_members(trajectory)
-    ts = ts[np.unravel_index(members, ts.shape[:-1])][:, outputs] if ts.ndim > 1 else ts[None, outputs]
+    members, ax = _some(codes.size, MEMBERS), figure.subplots()
+    layout, courses = courses_of(trajectory, members)
     opacity = max(0.15, len(members) ** -0.5)
-    for path, leaf in jax.tree_util.tree_leaves_with_path(trajectory.q):
-        inside = leaf.shape[rank + 1 :]
-        for place in np.ndindex(inside):
-            if drawn == COORDINATES:
-                break
-            values = _member_values(leaf, rank, members, outputs, place)
-            lines = ax.plot(ts.T, values.T, color=COLORS[drawn], alpha=opacity, linewidth=1.2)
-            lines[0].set_label("q" + jax.tree_util.keystr(path) + (str(list(place)) if inside else ""))
-            drawn += 1
-    every = sum(math.prod(leaf.shape[rank + 1 :]) for leaf in jax.tree.leaves(trajectory.q))
-    if every > drawn:
-        ax.plot([], [], " ", label=f"… ({every - drawn} more)")
+    curves = [_shorten(course) for course in courses]
+    for name, color, i in zip(layout.names, COLORS, range(COORDINATES), strict=False):
+        for t, q in curves:
+            ax.plot(*join_curve(t, q[:, i]), color=color, alpha=opacity, linewidth=1.2)
+        ax.lines[-len(curves)].set_label(name)
+    if layout.size > COORDINATES:
+        ax.plot([], [], " ", label=f"… ({layout.size - COORDINATES} more)")
     for member in members[~np.isin(codes[members], ENDED_WELL)]:
         ax.axvline(np.ravel(trajectory.end.t)[member], color="0.4", linewidth=0.8, linestyle=":")
     plain(ax)
@@ -78,10 +70,12 @@ def _draw(figure, trajectory) -> None:
         handle.set_alpha(1.0)
 
 
-def _member_values(leaf, rank: int, members: np.ndarray, outputs: np.ndarray, place: tuple[int, ...]) -> np.ndarray:
-    """One scalar coordinate (M, T) of M members at T outputs, without a copy of other members."""
-    for_members = np.unravel_index(members[:, None], leaf.shape[:rank]) if rank else ()
-    return np.atleast_2d(numbers_at(leaf, (*for_members, outputs[None, :] if rank else outputs, *place)))
+def _shorten(course: Course) -> tuple[np.ndarray, np.ndarray]:
+    """The times (F,) and coordinates (F, n) of a curve; of many outputs those at some even times."""
+    if len(course.t) <= OUTPUTS:
+        return course.curve()[:2]
+    times = np.linspace(course.t[0], course.t[-1], OUTPUTS)
+    return times, course.states_at(times)[0]
 
 
 def plain(ax) -> None:

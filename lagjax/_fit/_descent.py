@@ -319,7 +319,10 @@ def build_descent(
         return point
     text = f"The descent by gradients came to rest within {steps} steps."
     if not rest:
-        text = f"The descent by gradients was stopped after {steps} steps, and the likelihood still grew."
+        text = (
+            f"The descent by gradients was stopped after {steps} steps, and the likelihood still grew: go on from "
+            "there, with fit.params in the place of params0."
+        )
     return Descent(point, question.noise_scale(point, noise), rest, steps, text, question)
 
 
