@@ -377,7 +377,7 @@ class BorderControl:
             self._decide_others(frame, crossed)
 
     def _decide_others(self, frame: Frame, crossed: Value) -> None:
-        """Where a border is crossed on which others depend, decide anew the pieces that touch none."""
+        """Decide anew the pieces that touch no border, where one is crossed on which others depend."""
         code = frame.code
         if not self.borders.nested:
             return
