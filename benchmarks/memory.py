@@ -85,14 +85,13 @@ def main(arguments: list[str] | None = None) -> list[dict]:
     """Each kind in a process of its own; the rows."""
     parser = argparse.ArgumentParser(prog="python -m benchmarks.memory", description=__doc__.splitlines()[0])
     parser.add_argument("--only", choices=KINDS, nargs="+", default=list(KINDS))
-    parser.add_argument("--scenes", type=int, help="of each kind (default: 1000, 100, 50)")
+    parser.add_argument("--scenes", type=int, nargs="+", help="of each kind (default: 1000, 100, 50)")
     parser.add_argument("--clear", type=int, default=0, help="clear the caches of JAX after so many scenes")
     parser.add_argument("--params", action="store_true", help="the number in params, in place of the code")
     parser.add_argument("--here", action="store_true", help="in this process")
     parser.add_argument("--store", action="store_true", help=f"keep the result in {STORE}")
     options, rows = parser.parse_args(arguments), []
-    for kind in options.only:
-        scenes = options.scenes or SCENES[kind]
+    for kind, scenes in zip(options.only, options.scenes or map(SCENES.get, options.only), strict=True):
         if options.here:
             row = soak(kind, scenes, options.clear, options.params)
             print(json.dumps(row))
