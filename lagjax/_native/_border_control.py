@@ -18,6 +18,7 @@ from lagjax._native._constants import (
     ABRUPT,
     ARGUMENT,
     AT_ONCE,
+    BEYOND,
     DISCONTINUOUS,
     EARLY,
     EPS,
@@ -39,6 +40,7 @@ from lagjax._native._constants import (
     RESOLVED,
     RISE,
     SHORT_OF,
+    STEEP,
     SWITCH_TOLERANCES,
 )
 from lagjax._native._frame import Frame, Lane
@@ -233,24 +235,20 @@ class BorderControl:
 
         A border that it `comes` to where another one has been met is met in a step of its own: each shifts tangents.
         """
-        code, digits, leads = frame.code, frame.digits, self._leads(frame, degree)
+        code, leads = frame.code, self._leads(frame, degree)
         self._divide(frame, g, degree)
         # A move of less than a part of atol does not count as leaving a border that the motion touches. Where borders
         # hold together what moves by rounding, they are left and met in turn at one instant: then more is rounding.
         turns = 1.0 + code.maximum(frame["idle_crossings"] - float(len(self.guards)), frame.constant(0.0))
         turns = code.select(turns < MOST_TURNS, turns, MOST_TURNS)
         patience = (turns * turns) * (turns * turns) * turns
-        size = self.roots.size(frame, degree)
-        nothing = size <= NEGLIGIBLE * code.lanes_of(absolute_tolerance(frame)) * patience
+        nothing = self.roots.size(frame, degree) <= NEGLIGIBLE * code.lanes_of(absolute_tolerance(frame)) * patience
         touches = frame["touch", g] > Touch.NONE
         if self.slides:  # along u = 0 another border of |u| is there by rounding
             touches = touches | (frame["slides"] > 0.0)
         first = [code.intrinsic("fabs", frame["poly", k]) for k in range(3)]  # the last ones may have become zero
-        idle = idle | (((nothing & touches) | (first[0] + first[1] + first[2] < digits.tiny)) & ~undecided)
+        idle = idle | (((nothing & touches) | (first[0] + first[1] + first[2] < frame.digits.tiny)) & ~undecided)
         self._shorten(frame, degree, SWITCH_TOLERANCES * frame.job("rtol"), absolute_tolerance(frame), RESOLVED)
-        small = size < digits.small
-        with code.only_if(code.any_lane(small)):
-            self.roots.stretch(frame, degree, 1.0, code.select(small, 1 / digits.small**2, 1.0))
         frame.call(self.roots.first_root, degree)
         self._look_closer(frame, degree)
         # At rest but for what it gains in so little time: u̇ is of the size of ü t.
@@ -470,8 +468,15 @@ class BorderControl:
             level = code.maximum(rise - slope * u, -FAINT)
             matters = level < (float("inf") if feature.kind == BELOW else 0.0)
             start = level + slope * u
+            if feature.kind == BELOW:  # from above it comes to where there is a series again, and then is told in parts
+                above, falls = u * scale - BEYOND, self.motion.followed_coefficient(frame, j, 1) * h < 0.0
+                high = (above > 0.0) | ((u * scale > STEEP) & falls)
+                slope = code.select(high, scale, slope)
+                start = code.select(high, code.maximum(above, rise), start)
         if feature.kind <= SQUARED:
-            start = code.select(start > FAR, (1.0 - LARGEST_FALL) * start, start)
+            far = start > FAR
+            start = code.select(far, (1.0 - LARGEST_FALL) * start, start)
+            of_size = code.select(far, ARGUMENT * LARGEST_FALL, of_size)
         self.roots.polynomial(frame, j, degree, h, slope, u - start / slope)
         if feature.kind == FALLS:  # one that rises is told by fewer terms
             self.roots.sum_up(frame, degree)

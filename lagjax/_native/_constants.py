@@ -23,7 +23,7 @@ class Digits(NamedTuple):
     - `largest_unit`: beyond this `unit`, in parts of what q moves along the step, variations are not due to its moving.
       Measured on a pendulum after half a million turns at rtol = 1e-12, below what its angle resolves: without, 274
       steps and 328 rejected; with it 180 and 193; `unit` doubled the same, `largest_unit` doubled 105 and 89.
-    - `small`: the square of what is less may be zero. Where it matters all is taken 1/`small`² times as large.
+    - `small`: the square of what is less may be zero, and that of more than 1/`small` infinite.
     - `tiny`: what is less has terms that are zero, or have lost their digits, and counts as zero.
     """
 
@@ -169,6 +169,9 @@ RESOLVED = 2.0**-17
 # `RISE` parts of the order p: then exp(u) is the sum of terms Rᵏ/k! that fall from the last one on, as step control
 # expects.
 FAINT, RISE = 80.0, 0.5
+# exp(u) is infinite above u = 709.8: steps from above end below that, and fall by no more than they may rise as long as
+# its coefficients may be infinite, e²⁰⁰ times the twentieth power of a rate. Doubled, only rates up to 1e6 are told.
+BEYOND, STEEP = 700.0, 200.0
 # From an argument as large as this on it is not known to a tenth: then the way to the feature is gone in parts.
 FAR = 2.0**40
 # The last terms of the argument of a feature, at most; of a base, in parts of what it falls or rises to.

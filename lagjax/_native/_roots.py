@@ -106,9 +106,18 @@ class Roots:
     def _first_root(self) -> Code:
         frame = self.motion.function("first_root", INTEGER)
         frame["begin"], frame["doubt"], frame["instant"] = 0.0, 0.0, EPS
+        code, small = frame.code, frame.digits.small
         self.sum_up(frame, *frame.arguments)
-        size = frame.code.intrinsic("fabs", frame["poly", 0]) + frame["falls"] + frame["rises"]
-        frame["unsure"] = (ROOT_NOISE * EPS) * size
+
+        def size():
+            return code.intrinsic("fabs", frame["poly", 0]) + frame["falls"] + frame["rises"]
+
+        least, largest = size() < small, size() > 1 / small
+        with code.only_if(code.any_lane(least | largest)):
+            times = code.select(least, 1 / small**2, code.select(largest, small**2, 1.0))
+            self.stretch(frame, frame.arguments[0], 1.0, times)
+            self.sum_up(frame, *frame.arguments)
+        frame["unsure"] = (ROOT_NOISE * EPS) * size()
         frame.call(self.next_root, *frame.arguments)
         return frame.finish()
 

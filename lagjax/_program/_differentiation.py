@@ -21,7 +21,7 @@ import numpy as np
 
 from lagjax._program._graph import INPUTS, Graph, Node, Tape
 from lagjax._program._look_ups import Table, move_look_up
-from lagjax._program._operations import LOOK_UPS, OPERATIONS
+from lagjax._program._operations import LOOK_UPS, OPERATIONS, is_function
 from lagjax._program._passes import eliminate_dead_code, factor, replace_by_inputs, sink_negations
 from lagjax._program._series import StraightLine
 
@@ -151,7 +151,8 @@ class Derivatives:
             assert of_u is not None
             return self._apply("div", of_u, v)
         part = self._apply("mul", w, of_v)
-        return self._apply("div", self._apply("neg", part) if of_u is None else self._apply("sub", of_u, part), v)
+        change = self._apply("neg", part) if of_u is None else self._apply("sub", of_u, part)
+        return self._mask_quotient(self._apply("div", change, v), w, v)
 
     # ---- rules ----
 
@@ -159,9 +160,34 @@ class Derivatives:
         """The rules that take a cotangent, or a tangent, of each operand past w = op(operands); None: there is none."""
 
         def bind_rule(rule):
-            return None if rule is None else lambda g: rule(self._apply, self._number, g, w, *operands)
+            return None if rule is None else lambda g: apply_rule(rule, g)
+
+        def apply_rule(rule, g):
+            result = rule(self._apply, self._number, g, w, *operands)
+            if not self.graph.hides_growth or not any(map(self.graph.grows, (w, *operands))):
+                return result
+            if op == "div":
+                return self._mask_quotient(result, w, operands[1])
+            slope = rule(self._apply, self._number, self._number(1.0), w, *operands)
+            if len(operands) == 1 and is_function(op):
+                result = self._zero_where(self.graph.is_flat_by(operands[0], slope), result)
+            return self._mask_product(result, g, slope)
 
         return [bind_rule(rule) for rule in OPERATIONS[op].transpose()] if operands else []
+
+    def _mask_quotient(self, tangent: int, w: int, v: int) -> int:
+        """A tangent, or a cotangent, of w = u/v: 0 where w is flat, as what has overflown gives no number."""
+        return self._zero_where(self.graph.is_flat_quotient(w, v), tangent) if self.graph.grows(v) else tangent
+
+    def _mask_product(self, product: int, g: int, slope: int) -> int:
+        """A product of g and a slope, 0 where g is and the slope is huge."""
+        if not self.graph.hides_growth or not self.graph.grows(slope):
+            return product
+        is_zero = self._apply("eq", g, self._number(0.0))
+        return self._zero_where(self._apply("and", is_zero, self.graph.is_huge(slope)), product)
+
+    def _zero_where(self, where: int, x: int) -> int:
+        return self._apply("select", where, x, self._number(0.0))
 
     def _rules(self, w: int, op: str, operands: Sequence[int], attribute: Any = None) -> Sequence[_Rule | None]:
         """`rules`, where a power is one operation."""
@@ -180,7 +206,8 @@ class Derivatives:
     def _power_derivative(self, base: int, exponent: float, g: int) -> int:
         """p uᵖ⁻¹ g, which is finite at u = 0 where the products and roots that make up uᵖ have no derivative."""
         lower = base if exponent == 2 else self._apply("pow", base, self._number(exponent - 1))
-        return self._apply("mul", g, self._apply("mul", self._number(exponent), lower))
+        slope = self._apply("mul", self._number(exponent), lower)
+        return self._mask_product(self._apply("mul", g, slope), g, slope)
 
     # ---- the graph ----
 

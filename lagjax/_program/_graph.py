@@ -26,7 +26,7 @@ from typing import Any
 import numpy as np
 
 from lagjax._program._look_ups import look_up, table_of
-from lagjax._program._operations import LOOK_UPS, OPERATIONS
+from lagjax._program._operations import BOUNDED, GROWING, LOOK_UPS, OPERATIONS, is_function
 from lagjax._program._simplify import whole_power
 
 
@@ -70,6 +70,8 @@ class Graph:
         self.powers: dict[int, tuple[int, float]] = {}  # what is a power of another node, and which
         self._arrays: list[bytes] = []  # long arrays of numbers, and where their ids begin and end
         self._ends = [NUMBERS]
+        self._growing: list[bool] = []
+        self._hides_growth = False
 
     @classmethod
     def from_line(cls, line, budget: int) -> "Graph":
@@ -105,6 +107,54 @@ class Graph:
             i = marks.rfind(1, 0, i)
         order.reverse()
         return order
+
+    # ---- what overflows where it no longer matters, as cosh u in 1/cosh u ----
+
+    def grows(self, i: int) -> bool:
+        """True if a node may come near the largest double where nothing else does: what is made of exponentials."""
+        growing = self._growing
+        for op, operands, _ in self.nodes[len(growing) : i + 1]:
+            by_operand = any(growing[j] for j in operands)
+            self._hides_growth |= by_operand and (growing[operands[-1]] if op == "div" else is_function(op))
+            growing.append(op in GROWING or (by_operand and op not in BOUNDED and self.kinds[len(growing)] == "float"))
+        return growing[i]
+
+    @property
+    def hides_growth(self) -> bool:
+        """True if anything is divided by what grows, or is another function of it."""
+        self.grows(len(self.nodes) - 1)
+        return self._hides_growth
+
+    def is_huge(self, v: int) -> int:
+        """True where v is so large that its coefficients may be infinite: the square of 1/v is zero; or no number."""
+        first = len(self.nodes)
+        found = self._vanishes(self.apply("div", self.constant(1.0, "float"), v))
+        return self._bound(first, found)
+
+    def finite_part(self, v: int) -> int:
+        """v, and 0 where it is huge."""
+        huge, first = self.is_huge(v), len(self.nodes)
+        return self._bound(first, self.apply("select", huge, v, self.constant(0.0, "float")))
+
+    def is_flat_quotient(self, w: int, v: int) -> int:
+        """True where w = u/v is zero to every digit, as v is huge."""
+        return self.apply("and", self.is_huge(v), self._vanishes(w))
+
+    def is_flat_by(self, u: int, slope: int) -> int:
+        """True where a function with this slope is flat to every digit, as u is so large."""
+        return self._vanishes(self.apply("mul", slope, u))
+
+    def _vanishes(self, x: int) -> int:
+        """True where the square of x is zero, or x is no number."""
+        return self.apply("not", self.apply("prefers", self.apply("mul", x, x), self.constant(0.0, "float")))
+
+    def _bound(self, first: int, result: int) -> int:
+        """The result, where nodes from the `first` one on do not grow."""
+        self.grows(first - 1)
+        self._growing += [False] * (len(self.nodes) - first)
+        return result
+
+    # ---- operations ----
 
     def apply(self, op: str, *operands: int, attribute=None) -> int:
         """The scalar `op(*operands)`, as simple as the rules below make it."""

@@ -359,6 +359,16 @@ _ROWS = (
     Operation("not", 1, np.invert, lambda code, a: ~a, lax="bitwise_not", simplify=_simplify.invert, is_step=True),
 )  # fmt: skip
 
+# What may come near the largest double where nothing else does, and what does not whatever its operand is.
+GROWING = frozenset(("exp", "exp2", "expm1", "sinh", "cosh"))
+BOUNDED = frozenset(("sin", "cos", "tanh", "logistic", "erf", "erfc", "atan", "atan2", "log", "log1p", "asinh"))
+
+
+def is_function(op: str) -> bool:
+    """True for an operation that is told by its slopes, and not by a recurrence of its own."""
+    return bool(OPERATIONS[op].slopes) and OPERATIONS[op].recurrence is None
+
+
 # Look-ups in tables (`_look_ups`): their operand is a number, and a whole array stands in their attribute.
 LOOK_UPS = {
     name: Operation(name, 1, _refuse_look_up, None, is_step=True, exact=True) for name in ("take", "locate")

@@ -80,10 +80,10 @@ def select(r, i, operands, of):
         if number is not None and math.isnan(number):  # a guard: NaN shows at order zero
             return of[1:][branch == yes]
     zero = r.order_recursion.constant(0.0, "float")
-    return _choose(r, predicate, *(zero if c is None else c for c in of[1:]))
+    return choose(r, predicate, *(zero if c is None else c for c in of[1:]))
 
 
-def _choose(r, predicate: int, no: int, yes: int) -> int:
+def choose(r, predicate: int, no: int, yes: int) -> int:
     """`yes` where the predicate, a node of the program, holds at order zero, else `no`."""
     flag = r.zeroth_order.apply("select", predicate, r.number(0.0), r.number(1.0))
     holds = r.order_recursion.apply("gt", r.value(flag), r.order_recursion.constant(0.5, "float"))
@@ -93,7 +93,7 @@ def _choose(r, predicate: int, no: int, yes: int) -> int:
 def absolute(r, i, operands, of):
     """wₖ = ±uₖ, with the sign of u₀."""
     below = r.zeroth_order.apply("lt", operands[0], r.number(0.0))
-    return _choose(r, below, of[0], r.order_recursion.apply("neg", of[0]))
+    return choose(r, below, of[0], r.order_recursion.apply("neg", of[0]))
 
 
 def extremum(comparison: str) -> Callable:
@@ -102,6 +102,6 @@ def extremum(comparison: str) -> Callable:
     def rule(r, i, operands, of):
         zero = r.order_recursion.constant(0.0, "float")
         a, b = (zero if c is None else c for c in of)
-        return _choose(r, r.zeroth_order.apply(comparison, *operands), b, a)
+        return choose(r, r.zeroth_order.apply(comparison, *operands), b, a)
 
     return rule

@@ -35,7 +35,7 @@ import numpy as np
 from lagjax._program._graph import Graph, Node, Unlowerable
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, sink_negations
-from lagjax._program._recurrences import finite
+from lagjax._program._recurrences import choose, finite
 
 
 class StraightLine(NamedTuple):
@@ -122,6 +122,8 @@ class _Recurrences:
         self.size, self.moving, self.followed = size, moving, followed
         self.zeroth_order = Graph.from_line(program.line, 10 * program.budget)
         self.order_recursion = Graph(20 * program.budget)
+        # What overflows where it no longer matters has no coefficients there: infinite ones would be no numbers.
+        self.hides_growth = self.zeroth_order.hides_growth
         self.outputs = list(program.line.outputs)
         self.order_k = [self.order_recursion.input(i, "float") for i in range(self.moving)]
         self.k, self.inverse_k = (self.order_recursion.input(self.moving + i, "float") for i in range(2))
@@ -161,7 +163,11 @@ class _Recurrences:
     def value(self, node: int) -> int:
         """The value of a node at order zero."""
         number = self.zeroth_order.value(node)
-        return self._input("value", node) if number is None else self.order_recursion.constant(number, "float")
+        if number is not None:
+            return self.order_recursion.constant(number, "float")
+        if self.hides_growth and self.zeroth_order.grows(node):
+            node = self.zeroth_order.finite_part(node)
+        return self._input("value", node)
 
     def cauchy_product(self, a: int, b: "int | _Component", by_order: bool = False) -> int:
         """Σ' aⱼ bₖ₋ⱼ, or Σ' j aⱼ bₖ₋ⱼ."""
@@ -193,7 +199,10 @@ class _Recurrences:
                 missing.add(i)
                 stack.extend(self.zeroth_order.nodes[i][1])
         for i in sorted(missing):
-            self._coefficients[i] = self._coefficient(i)
+            c = self._coefficient(i)
+            if self.hides_growth and isinstance(c, int) and self.zeroth_order.grows(i):
+                c = choose(self, self.zeroth_order.is_huge(i), c, self.order_recursion.constant(0.0, "float"))
+            self._coefficients[i] = c
 
     def _coefficient(self, i: int) -> "int | _Unknown | None":
         op, operands, attribute = self.zeroth_order.nodes[i]

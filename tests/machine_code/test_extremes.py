@@ -61,3 +61,27 @@ def test_a_border_is_crossed_with_any_amplitude(size):
     ts = jnp.array([0.0, 1.0, 10 * (np.pi / 2 + np.pi)])
     found = lagjax.simulate(system, size, 0.0, ts, atol=1e-13 * size)
     np.testing.assert_allclose(found.q[1:], size * np.array([2 * np.sin(np.pi / 4 - 1.0), 1.0]), rtol=1e-9)
+
+
+# ---- what overflows where it no longer matters -----------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("width", [1e-3, 1e-6])
+def test_narrow_pulses_are_met_from_where_cosh_is_infinite(width):
+    def pulses(q, v, params):
+        soliton, logistic = 1 / jnp.cosh(q[0] / width) ** 2, 1 / (1 + jnp.exp(q[1] / width))
+        return params * jnp.array([soliton, logistic, jnp.exp(-q[2] / width - jnp.exp(-q[2] / width))])
+
+    def end(params):
+        return lagjax.simulate(system, jnp.full(3, -1.0), jnp.ones(3), jnp.array([0.0, 2.5]), params)
+
+    system, strength = lagjax.System(lambda q, v: 0.5 * v @ v, forces=pulses), 1.0
+    found = end(strength)
+    assert found.stats["num_steps"] < 1000
+    # The energies that these forces give: 2 a width, a and a width.
+    speeds = np.sqrt(1.0 + 2 * strength * np.array([2 * width, 1.0, width]))
+    np.testing.assert_allclose(found.qdot[-1], speeds, rtol=2e-9 / width * 1e-3 + 1e-9)
+    slopes = jax.jacfwd(lambda a: end(a).qdot[-1])(strength)
+    np.testing.assert_allclose(slopes, np.array([2 * width, 1.0, width]) / speeds, rtol=1e-5)
+    first = jax.grad(lambda a: end(a).qdot[-1][1])(strength)
+    np.testing.assert_allclose(first, 1.0 / speeds[1], rtol=1e-6)
