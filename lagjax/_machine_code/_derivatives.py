@@ -349,7 +349,8 @@ def _divide_steps(flow: Flow, steps: Steps, member: int, params, tolerances: Tol
     times = np.append((t[:, None] + h[:, None] * np.arange(parts) / parts).ravel(), t[-1] + h[-1])
     path = flow.follow(times[None], first_state[:, : flow.states], params[None], tolerances).path[0]
     more = np.repeat(rows[:, 4 + flow.states :], parts, axis=0)  # of a piecewise program
-    more[:, -1:] = np.where(np.arange(1, len(more) + 1)[:, None] % parts == 0, more[:, -1:], 0.0)
+    last = np.arange(1, len(more) + 1)[:, None] % parts == 0
+    more[:, -2:] = np.where(last, more[:, -2:], 0.0)  # which border it ends at, and whether that is grazed
     begins = np.stack([times[:-1], np.diff(times), *np.zeros((2, len(path) - 1))]).T
     table = np.concatenate([begins, path[:-1], more], axis=1)
     count = np.array([len(table)])

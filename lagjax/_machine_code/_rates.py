@@ -54,8 +54,8 @@ def _pieces(borders, rows: Rows, n: int) -> list[Any]:
     """The pieces at a state; 1 for those that say that the motion slides."""
     count, zero = len(borders.switches), jnp.zeros_like(rows.first[..., 0])
     pieces = list(emit_rows(borders.decide, rows._replace(pieces=[zero] * (2 * count))))
-    # Along a border in position a motion slides at rest, which `decide` knows.
-    guards = [guard for guard in borders.guards if guard.slide >= 0 and guard.on < 0 and guard.order < 2]
+    # Along a border in position a motion slides at rest, which `decide` knows, and so it rests on a cone.
+    guards = [guard for guard in borders.guards if guard.slide >= 0 and guard.k != 0.0 and guard.order < 2]
     switches = _evaluate_pieces(borders, rows, pieces)[1]
     sides: dict[int, tuple] = {}
     for guard in guards:  # of the borders of a piece the nearest one counts

@@ -18,6 +18,7 @@ from lagjax._native._constants import (
     ABRUPT,
     ARGUMENT,
     AT_ONCE,
+    AT_REST,
     BEYOND,
     DISCONTINUOUS,
     EARLY,
@@ -25,8 +26,10 @@ from lagjax._native._constants import (
     FAINT,
     FAR,
     GROWTH,
+    GROWTH_OF_LENGTH,
     JUMP_NOISE,
     LARGEST_FALL,
+    LAST_STEPS,
     LEAST_ORDER,
     MAX_ORDER,
     MOST_CROSSINGS,
@@ -39,6 +42,7 @@ from lagjax._native._constants import (
     PAST,
     RESOLVED,
     RISE,
+    SETS_OUT,
     SHORT_OF,
     STEEP,
     SWITCH_TOLERANCES,
@@ -122,7 +126,7 @@ class BorderControl:
             "stops",
         )
         fields = {"touch": len(borders.guards), "stays": len(borders.switches), **dict.fromkeys(numbers, 1)}
-        fields["level"] = len(borders.guards) if _borders.TABLE in borders.kinds else 0
+        fields["level"] = len(borders.guards) if any(guard.of_table for guard in borders.guards) else 0
         if borders.kicking:
             fields |= {"kick_before": len(borders.switches), "kick_hit": len(borders.switches), "kicks": 1, "counts": 1}
         return fields | Roots.fields(MAX_ORDER + 2) | Saltation.fields(borders)
@@ -216,7 +220,7 @@ class BorderControl:
         piece = self._piece(frame, j)
         level = piece * d + e + code.select(piece <= 0.0, code.lanes_of(below), 0.0)
         level = level + code.select(piece >= 0.0, code.lanes_of(above), 0.0)
-        if _borders.TABLE in self.borders.kinds:
+        if any(guard.of_table for guard in self.guards):
             is_table = code.lanes_of(code.as_double(self.table.place(code, g, "of_table"))) > 0.0
             level = code.select(is_table, frame["level", g], level)
         side, beyond = piece * a + b, piece * k + l
@@ -227,8 +231,24 @@ class BorderControl:
         with code.only_if(code.any_lane(~idle)):
             self.roots.polynomial(frame, j, degree, h, code.select(undecided, 1.0, side), level)
             at_limit = (code.intrinsic("fabs", frame["poly", 0]) <= JUMP_NOISE) & (frame["steps"] > 0.0)
+            if self.borders.releases:
+                self._limit_growth(frame, g, level)
             comes = ~undecided & (~is_share | at_limit) & (frame["touch", g] <= Touch.NONE)
             self._look_along(frame, g, degree, h, undecided, beyond, idle, comes)
+
+    def _limit_growth(self, frame: Frame, g: Value, level: Value) -> None:
+        """The step ends where the length of a cone's vector, whose polynomial is in `poly`, has grown by a part of it.
+
+        Tangents across it change at a rate that falls as it grows: from rest on without a bound.
+        """
+        code = frame.code
+        is_cone = self._is_cone(frame, g) & (code.lanes_of(code.as_double(self.table.place(code, g, "on"))) < 0.0)
+        length, rate = frame["poly", 0] + level, frame["poly", 1]
+        part = GROWTH_OF_LENGTH * length / rate
+        sooner = is_cone & (rate > 0.0) & (length > level) & (part < frame["nearest"])
+        with frame.where(sooner):
+            frame["nearest"] = part
+            frame["crossed"] = 0.0
 
     def _look_along(self, frame: Frame, g: Value, degree: Value, h: Value, undecided, beyond, idle, comes) -> None:
         """The first root of guard g, whose polynomial is in `poly`; `beyond` it is that piece.
@@ -325,9 +345,17 @@ class BorderControl:
         return frame.code.maximum(frame.code.intrinsic("fabs", frame["t"]), frame["smallest"]) * (4.0 * EPS)
 
     def _note_levels(self, frame: Frame) -> None:
-        """The entries on both sides of the pieces of tables, which are the levels of their guards."""
+        """The levels of guards that change: entries on both sides of the pieces of tables, and the speeds of cones."""
         code = frame.code
         for g, guard in enumerate(self.guards):
+            if self.borders.kinds[guard.piece] == _borders.CONE:
+                rate = self.motion.followed_coefficient(frame, integer(code, guard.piece), integer(code, 1))
+                fall = (0.0 - rate) * frame["forward"]
+                last = fall * (LAST_STEPS * frame["smallest"])  # what is gone in the shortest steps
+                unit = code.lanes_of(absolute_tolerance(frame))
+                far = self.motion.followed_value(frame, integer(code, guard.piece)) > AT_REST * unit
+                least = unit * code.select(far, AT_REST, SETS_OUT)
+                frame["level", g] = code.select(last > least, last, least)
             if self.borders.kinds[guard.piece] == _borders.TABLE:
                 index = self._piece(frame, integer(code, guard.piece)) + guard.e
                 knot, inside = self._knot(frame, guard.piece, index)
@@ -375,7 +403,7 @@ class BorderControl:
             self._decide_others(frame, crossed)
 
     def _decide_others(self, frame: Frame, crossed: Value) -> None:
-        """Decide anew the pieces that touch no border, where one is crossed on which others depend."""
+        """Decide the pieces anew that touch no border, where one is crossed on which others depend."""
         code = frame.code
         if not self.borders.nested:
             return
@@ -642,6 +670,8 @@ class BorderControl:
                 frame["h"] = frame["planned_h"]
             if self.note is not None:
                 frame.call(self.note)
+            if self.borders.release.outputs:
+                self._release(frame, crossed)
             if self.kick is not None:
                 self._note_kick(frame, crossed)
             self._go_on(frame, crossed, crosses)
@@ -678,6 +708,8 @@ class BorderControl:
             by_position = code.lanes_of(code.flag(self.table.place(code, g, "order") > 1)) > 0.0
             bounces = no_time & by_position
             slides = hit & (bounces | (again & (frame["touch", g] > Touch.NONE)))
+            if self.borders.releases:
+                slides = slides | (hit & self._is_cone(frame, g))
             slides = slides & (code.lanes_of(code.as_double(slide)) >= 0.0)
             with frame.where(hit & ~slides):
                 frame["params", place] = frame["beyond"]
@@ -687,7 +719,7 @@ class BorderControl:
                 frame["touch", back] = code.select(is_share, Touch.NONE, Touch.VALUE)
             with code.only_if(slide >= 0):
                 below = code.select(self._piece(frame, j) < frame["beyond"], self._piece(frame, j), frame["beyond"])
-                is_sign = code.lanes_of(self.table.number(code, g, "k")) < 0.0
+                is_sign = code.lanes_of(self.table.number(code, g, "k")) <= 0.0
                 with frame.where(slides):
                     frame["params", place] = code.select(is_sign, -1.0, below)
                     frame["params", slide + self.motion.parameters] = 1
@@ -836,3 +868,29 @@ class BorderControl:
                 frame["params", place] = frame["params", place] + self.table.number(code, g, "gains")
                 frame["touch", self.table.place(code, g, "rest")] = Touch.NONE
                 frame["touch", on] = code.select(again, order, order + Touch.VALUE)
+            if self.borders.releases:  # the vector of a cone has been given a length beyond its level
+                of_cone = hit & self._is_cone(frame, on)
+                with frame.where(of_cone):
+                    frame["touch", on] = Touch.NONE
+
+    def _is_cone(self, frame: Frame, g: Value) -> Value:
+        """True in all lanes if guard g is that of a cone, or a share."""
+        code = frame.code
+        return code.lanes_of(code.flag(code.compare("==", self.table.number(code, g, "k"), 0.0))) > 0.0
+
+    def _release(self, frame: Frame, crossed: Value) -> None:
+        """Let the vectors of cones that hold no longer set out, with a speed that is twice what counts as none."""
+        code, motion, n = frame.code, self.motion, len(self.borders.release.outputs)
+        shares = self.borders.releases
+        base, leaves = n // (2 * len(shares)), frame.constant(0.0) > 0.0
+        for g in shares:
+            leaves = leaves | code.compare("==", crossed, float(g + 1))
+        with code.only_if(code.any_lane(leaves)):
+            out, speed = motion.evaluate_now(frame, self.borders.release), 2.0 * SETS_OUT * absolute_tolerance(frame)
+            for k, g in enumerate(shares):
+                hit = code.compare("==", crossed, float(g + 1))
+                for i in range(base):
+                    change = code.lanes_of(speed) * out[2 * k * base + i] - out[(2 * k + 1) * base + i]
+                    with frame.where(hit):
+                        frame["y", i + motion.n, 0] = frame["y", i + motion.n, 0] + change
+                        frame["low", i + motion.n] = 0.0

@@ -155,6 +155,16 @@ NEGLIGIBLE = 1e-3
 # their number: rounding grows with the forces, whose size is not known here. A million times as much is 1e-9 by the
 # default tolerances; blocks held by forces of 1000 need some ten turns.
 MOST_TURNS = 16.0
+# Of atol: the length of a vector of velocities at which dry friction has stopped it, and half of that with which it
+# sets out again. What is left of the way is the square of the first, 1e-9 at the default tolerances: doubled, first
+# derivatives are off by so much more; with a hundredth of it the coefficients of their series overflow. The second one
+# is an error of velocities.
+AT_REST, SETS_OUT = 1e3, 16.0
+# Smallest steps before its end in which a length is not followed: it counts as none. Doubled, it ends so much earlier.
+LAST_STEPS = 16.0
+# By which part of itself that length may grow in a step: tangents across it have a series of this ratio. Doubled, steps
+# from rest are half as many, some 50, and what is left out of a series of order 20 is 1e-6 of a tangent.
+GROWTH_OF_LENGTH = 0.25
 # A border that is reached within this part of the smallest step from another one is bounced off without end: the
 # motion rests on it. What is left of its velocity is as small as that.
 NO_TIME = 0.25

@@ -166,12 +166,27 @@ class Saltation:
 
     # ---- what jumps ----
 
-    def _jumps(self, code: Code, before: Numbers, behind: Numbers) -> Callable[[Index], Value]:
-        """`(i)`: true if acceleration i jumps by more than rounding."""
+    def _sets_out(self, frame: Frame, hit: Vectors, behind: Numbers) -> Value | None:
+        """True if a cone is left at the border that is `hit`; None where there are none.
+
+        From there tangents across it follow its direction at a rate without a bound: they are not known.
+        """
+        leaves = None
+        for share in self.table.borders.releases:
+            guard = self.table.borders.guards[share]
+            cone = self.table.borders.guards[guard.on].piece
+            here = [frame.code.compare("!=", hit[j], 0.0) for j in (guard.piece, cone)]
+            here = (here[0] | here[1]) & (behind[cone] > 0.0)
+            leaves = here if leaves is None else leaves | here
+        return leaves
+
+    def _jumps(self, code: Code, before: Numbers, behind: Numbers, lost: Value | None) -> Callable[[Index], Value]:
+        """`(i)`: true if acceleration i jumps by more than rounding, or its tangents are `lost`."""
 
         def jumps(i):
             larger = code.maximum(code.intrinsic("fabs", before[i]), code.intrinsic("fabs", behind[i]))
-            return code.intrinsic("fabs", before[i] - behind[i]) > JUMP_NOISE * larger
+            differs = code.intrinsic("fabs", before[i] - behind[i]) > JUMP_NOISE * larger
+            return differs if lost is None else differs | lost
 
         return jumps
 
@@ -183,12 +198,16 @@ class Saltation:
             kicks = here if kicks is None else kicks | here
         return kicks
 
-    def _tangent_jumps(self, frame: Frame, out: Numbers, hit: Value, grazes: Value, kicks: Value | None) -> Callable:
+    def _tangent_jumps(
+        self, frame: Frame, out: Numbers, hit: Value, grazes: Value, kicks: Value | None, lost: Value | None
+    ) -> Callable:
         """`(row, i, part)`: the number that is added to coordinate i of a row (part 0), or to its velocity (part 1)."""
         code, n = frame.code, self.base
         first = (len(self.jump.orders) - 1) * 2 * n
-        jumps = self._jumps(code, *(_some(out, first + k * n, n) for k in range(2)))
-        is_hit, jump_or_nan = hit > 0.0, self._jump_or_nan(code, hit, grazes > 0.0)
+        before, behind = (_some(out, first + k * n, n) for k in range(2))
+        jumps = self._jumps(code, before, behind, lost)
+        is_hit, nowhere = hit > 0.0, grazes > 0.0 if lost is None else (grazes > 0.0) | lost
+        jump_or_nan = self._jump_or_nan(code, hit, nowhere)
 
         def added(row: int, i: Index, part: int) -> Value:
             step, moves = jump_or_nan(out[i + ((row - 1) * 2 + part) * n]), is_hit
@@ -241,8 +260,9 @@ class Saltation:
                 _field(frame, "params", motion.parameters - numbers, numbers),
             ]  # fmt: skip
             out = motion.form.run(frame, self.jump.line, *parts)
-            kicks = self._kicks(frame, frame.vectors("hit", self.pieces))
-            added = self._tangent_jumps(frame, out, frame["is_hit"], frame["grazes"], kicks)
+            hit = frame.vectors("hit", self.pieces)
+            lost = self._sets_out(frame, hit, parts[5])
+            added = self._tangent_jumps(frame, out, frame["is_hit"], frame["grazes"], self._kicks(frame, hit), lost)
             for row in range(1, len(self.jump.orders)):
                 for part in range(2):
                     for i in motion.form.each(code, base):
@@ -305,10 +325,13 @@ class Saltation:
             return directions.numbers_of(frame, name, count, lambda i: (i + first,), in_place=True)
 
         tangents = [frame.vectors("dy", n, lambda i: (i, 0)), frame.vectors("dy", n, lambda i: (i + n, 0))]
-        inputs = self._edge_inputs(numbers, numbers("params", self.motion.pieces, behind))
+        pieces = numbers("params", self.motion.pieces, behind)
+        inputs = self._edge_inputs(numbers, pieces)
         out = form.run(frame, jump.line, *inputs, *tangents, frame.vectors("dparams", directions.numbers))
         is_hit, grazes = (directions.number_of(frame, name) for name in ("is_hit", "grazes"))
-        added = self._tangent_jumps(frame, out, is_hit, grazes, self._kicks(frame, numbers("hit", self.pieces)))
+        hit = numbers("hit", self.pieces)
+        lost = self._sets_out(frame, hit, pieces)
+        added = self._tangent_jumps(frame, out, is_hit, grazes, self._kicks(frame, hit), lost)
         for row in range(jump.lower):
             for part in range(2):
                 for i in form.each(frame.code, self.base):
@@ -349,8 +372,9 @@ class Saltation:
         n, rows, motion, code = self.base, self.jump.lower, self.motion, frame.code
         inputs = self._edge_inputs(lambda name, count: frame.vectors(name, count), behind)
         out = motion.form.run(frame, self.jump.accelerations(n), *inputs)
-        jumps = self._jumps(code, _some(out, 0, n), _some(out, n, n))
-        kicks = self._kicks(frame, frame.vectors("hit", self.pieces))
+        hit = frame.vectors("hit", self.pieces)
+        lost, kicks = self._sets_out(frame, hit, behind), self._kicks(frame, hit)
+        jumps = self._jumps(code, _some(out, 0, n), _some(out, n, n), lost)
         cotangents, sum = motion.form.room(frame, rows * 2 * n), code.variable(frame.constant(0.0))
         for row in range(rows):
             for part in range(2):
@@ -365,7 +389,8 @@ class Saltation:
         line, tables = self.jump.transposed(n, self.parameters)
         gains = motion.form.run(frame, line, *inputs, cotangents)
         moves = (frame["is_hit"] > 0.0) & ~(sum.value <= 0.0)
-        jump_or_nan = self._jump_or_nan(code, frame["is_hit"], frame["grazes"] > 0.0)
+        nowhere = frame["grazes"] > 0.0 if lost is None else (frame["grazes"] > 0.0) | lost
+        jump_or_nan = self._jump_or_nan(code, frame["is_hit"], nowhere)
 
         def gain_at(place: Index) -> Value:
             return code.select(moves, jump_or_nan(gains[place]), 0.0)

@@ -5,6 +5,7 @@
     rem, conversion to integers         the whole number between x and zero
     atan2(y, x)                         the sign of x, and where that is negative the sign of y: its cut
     look-ups (`locate`)                 the piece of an increasing table that a number x is on
+    u / |u| of velocities               whether the vector u moves, 1, or rests, −1: dry friction in the plane
 
 A *piece* is what was decided: one of these numbers, constant along a step. Here a program becomes one that takes its
 pieces as further inputs, so that along every step it is smooth; beside it stand the switching numbers, and the program
@@ -39,7 +40,7 @@ from lagjax._program._simplify import is_nonnegative
 from lagjax._program._sliding import FAR, MOST_SLIDING, Slide, dot, with_sliding
 
 # The kinds of pieces; `CLOCK` is the piece of a table that the time itself is on, whose borders are known.
-SIGN, FLOOR, TRUNC, SLIDE, TABLE, CLOCK = range(6)
+SIGN, FLOOR, TRUNC, SLIDE, TABLE, CLOCK, CONE = range(7)
 LARGEST_WITH_ROUNDING = 500  # operations of numbers that are watched, and whose rounding is: three times as many
 # What a function is flat like: exp(u) below, exp(−|u|) on both sides, exp(−u²), or zero up to a border; and in which
 # units of its argument. Of powers these are exponents: |u| to the minus `scale` grows as |u| falls, u to the `scale` as
@@ -50,6 +51,8 @@ _FEATURES = {
     "tanh": (BESIDE, 2.0), "sinh": (BESIDE, 2.0), "cosh": (BESIDE, 2.0), "erf": (SQUARED, 1.0), "erfc": (SQUARED, 1.0),
 }  # fmt: skip
 _EXPONENTIALS = ("exp", "exp2", "expm1", "sinh", "cosh")
+# The length of a vector at rest, whose square is there, and the longest one that a guard against zero may put there.
+_NOTHING, _NO_LENGTH = 2.0**-500, 1e-12
 _LARGEST = 10  # operations that one may become: a bound for errors, three are usual
 _COMPARISONS = ("lt", "le", "gt", "ge")
 _PIECEWISE = {
@@ -119,7 +122,7 @@ class Borders(NamedTuple):
     table; those of a `CLOCK` have no guards. `motion` has the borders of the motion alone, where this is one with
     tangents (`_jump.with_borders_of_tangents`). `kick` is that at borders at which L jumps, None where there are none.
     `retraction` takes the inputs of the program to the state on the borders that it slides along, None where it may
-    slide along none; `moved` are the coordinates that each moves.
+    slide along none; `moved` are the coordinates that each moves. `release` is that of the cones (`_sliding.Sliding`).
     """
 
     program: Pieced
@@ -135,11 +138,21 @@ class Borders(NamedTuple):
     kick: Kick | None = None
     retraction: StraightLine | None = None
     moved: tuple[frozenset[int], ...] = ()
+    release: StraightLine = StraightLine((), (), ())
 
     @property
     def kicking(self) -> tuple[int, ...]:
         """The pieces with which L jumps."""
         return () if self.kick is None else self.kick.pieces
+
+    @property
+    def releases(self) -> list[int]:
+        """The guards beyond which a cone holds no longer."""
+        return [
+            g
+            for g, guard in enumerate(self.guards)
+            if guard.on >= 0 and self.kinds[self.guards[guard.on].piece] == CONE
+        ]
 
     @property
     def clocks(self) -> tuple[int, ...]:
@@ -247,6 +260,8 @@ class _Rewriting:
         self.abrupt: set[int] = set()
         self.moduli, self.quotients = _moduli(program.line), _floor_divisions(program.line)
         self.truncated = _truncations(program.line)
+        self.cones = _find_cones(program.line, size, program.linear) if slides else {}
+        self.parts: dict[int, tuple[int, ...]] = {}  # of the vector of a cone, by its piece
         self.decisive = self._decisive()
         comparisons = [i for i in self.decisive if program.line.nodes[i][0] not in ("eq", "ne")]
         self.borders_of_decisions = {self._compared(i) for i in comparisons} - {None}
@@ -255,6 +270,7 @@ class _Rewriting:
         self.powers = find_powers(program.line, relevant, self._of_guards, size)
         if self.powers or any(
             i in self.moduli
+            or i in self.cones
             or i in self.quotients
             or i in self.truncated
             or self._decides(i)
@@ -301,7 +317,7 @@ class _Rewriting:
                     out.add(i)
         # What else is decided at the same border is decided beside it: no step may end where the root has no series.
         abrupt = {self._compared(i) for i in out} - {None}
-        return out | {i for i in needed if self._compared(i) in abrupt}
+        return {i for i in needed if i in out or self._compared(i) in abrupt} - self.cones.keys()
 
     def _compared(self, i: int) -> frozenset[int] | None:
         """The numbers that are equal at the border of a node, but for factors and zero; None of other nodes."""
@@ -342,6 +358,8 @@ class _Rewriting:
         if op == "constant":
             return self.graph.constant(attribute, kind)
         of = [self.places[x] for x in operands]
+        if i in self.cones and i in self.decisive:
+            return self._place_on_cone(i, op, of)
         if i in self.decisive and (decided := self._replace_by_piece(i, op, of, attribute)) is not None:
             return decided
         if op in ("eq", "ne") and (sign := self._known_sign(i, *of)) is not None:
@@ -355,6 +373,23 @@ class _Rewriting:
         if op == "div" and (quotient := self._direction(*of)) is not None:
             return quotient
         return self.graph.node(op, *of, attribute=attribute)
+
+    def _place_on_cone(self, i: int, op: str, of: list[int]) -> int:
+        """A root of a sum of squares, or what is decided about it: 1 at rest, where the sum is zero."""
+        f, number, square = self.graph.apply, lambda x: self.graph.constant(x, "float"), self.places[self.cones[i]]
+        length = f("sqrt", f("add", square, number(_NOTHING**2)))
+        piece = self._piece(CONE, length)
+        assert piece is not None
+        self.parts[piece] = tuple(self.places[x] for x in _squares(self.program.line, self.cones[i]) or ())
+        moves = f("gt", piece, number(0.0))
+        if op in ("sqrt", "rsqrt", "max"):
+            x = of[0] if op != "max" or self.graph.value(of[0]) is None else of[1]
+            if op != "max":
+                return f(op, f("select", moves, self._one, f("add", x, number(_NOTHING**2))))
+            return f("select", moves, self._one, x)
+        is_first = self.graph.value(of[0]) is None
+        says_moving = op == "ne" or op in (("gt", "ge") if is_first else ("lt", "le"))
+        return moves if says_moving else f("not", moves)
 
     def _direction(self, x: int, size: int) -> int | None:
         """x / |x| as the piece of x, which has both sides at x = 0, too; None of other quotients.
@@ -582,9 +617,9 @@ class _Rewriting:
             done = with_sliding(line, self.size, program.size, self.switches, slides, linear)
             if done is not None:
                 break
-        sliding, retraction, moved = slides if done is not None else [], None, ()
+        sliding, retraction, moved, release = slides if done is not None else [], None, (), StraightLine((), (), ())
         if done is not None:
-            line, places, shares, linear, retraction, moved = done
+            line, places, shares, linear, retraction, moved, release = done
             switches, arguments = [places[i] for i in switches] + shares, [places[i] for i in arguments]
         count, kick = len(switches), None
         if self.mechanics:
@@ -596,7 +631,7 @@ class _Rewriting:
         return Borders(
             pieced, tuple(switches), kinds, self._decide(count, sliding), _guards(kinds, sliding), nested,
             tuple(arguments), tuple(features.values()), (*self.tables, *[None] * len(sliding)), None, kick,
-            retraction, moved,
+            retraction, moved, release,
         )  # fmt: skip
 
     # ---- where L jumps ----
@@ -689,7 +724,7 @@ class _Rewriting:
             read = {line.nodes[i][2] for i in _below(line, [self.switches[j]]) if line.nodes[i][0] == "input"}
             if not read.isdisjoint(range(2 * n)):
                 orders[j] = 2 if read.isdisjoint(range(n, 2 * n)) else 1
-        others = [j for j in orders if self.kinds[j] != SIGN]
+        others = [j for j in orders if self.kinds[j] not in (SIGN, CONE)]
         shaking = {j: [m for m in self.switches if self.pieces[j] in _below(line, [m])] for j in orders}
         if others or any(shaking.values()):
             search = Jumping(line, self._decide(len(self.switches), ()), self.switches, n, self.program.size)
@@ -699,7 +734,13 @@ class _Rewriting:
             lost = [j for j, nodes in shaking.items() if nodes and search.find([j], nodes, self._levels)[j]]
             orders = {j: order for j, order in orders.items() if jumps.get(j, True) is not False and j not in lost}
         both = [
-            Slide(j, order, 2.0 if self.kinds[j] == SIGN else 1.0, self._level_between(j))
+            Slide(
+                j,
+                order,
+                2.0 if self.kinds[j] in (SIGN, CONE) else 1.0,
+                self._level_between(j),
+                self.parts.get(self.pieces[j], ()),
+            )
             for j, order in sorted(orders.items(), key=lambda item: item[1])
         ]
         by_velocity = [slide for slide in both if slide.order == 1]
@@ -746,8 +787,8 @@ class _Rewriting:
         for k, slide in enumerate(slides):
             flag = graph.input(first + len(self.pieces) + k, "float")
             piece, below = nodes[self.pieces[slide.piece]], graph.constant(-1.0, "float")
-            begins = graph.apply("eq", piece, zero)
-            if self.kinds[slide.piece] != SIGN:
+            begins = graph.apply("le" if slide.parts else "eq", piece, zero)
+            if self.kinds[slide.piece] not in (SIGN, CONE):
                 if slide.order == 1:  # it begins on one side, and meets the other one at once
                     goes_on.append(flag)
                     continue
@@ -762,6 +803,9 @@ class _Rewriting:
                 begins = graph.apply("and", begins, graph.apply("eq", self._rate(graph, nodes, slide), zero))
             goes_on.append(graph.apply("select", begins, flag, one))
             pieces[slide.piece] = graph.apply("select", begins, pieces[slide.piece], below)
+        for j, kind in enumerate(self.kinds):  # what cannot rest moves
+            if kind == CONE and all(slide.piece != j for slide in slides):
+                pieces[j] = one
         return StraightLine(*eliminate_dead_code(graph, pieces + goes_on))
 
 
@@ -771,6 +815,9 @@ def _raw(graph: Graph, kind: int, x: int, table: Located | None) -> int:
         return graph.apply("locate", x, attribute=table)
     if kind == SIGN:
         return graph.apply("sign", x)
+    if kind == CONE:
+        moves = graph.apply("gt", x, graph.constant(2 * _NOTHING, "float"))
+        return graph.apply("select", moves, *(graph.constant(p, "float") for p in (-1.0, 1.0)))
     below = graph.apply("floor", x)
     if kind == FLOOR:
         return below
@@ -788,9 +835,11 @@ def _guards(kinds: Sequence[int], slides: Sequence[Slide]) -> tuple[Guard, ...]:
     first = len(kinds) - len(sliding)
     for j, kind in enumerate(kinds[:first]):
         k = len(guards)
-        if kind == CLOCK:
+        if kind == CLOCK or (kind == CONE and j not in sliding):
             continue
-        if kind == SIGN:
+        if kind == CONE:  # whose level is a speed that counts as none
+            of_piece = [Guard(j, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, k, of_table=1)]
+        elif kind == SIGN:
             of_piece = [Guard(j, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, k)]
         else:
             floors = kind in (FLOOR, TABLE)  # between numbers p and p + 1, or the entries with these indices
@@ -805,12 +854,14 @@ def _guards(kinds: Sequence[int], slides: Sequence[Slide]) -> tuple[Guard, ...]:
                 k,
                 k + len(of_piece) - 1,
             )  # the borders of a piece; the upper one of the piece below is slid on
-            slide, (_, order, width, _) = first + sliding.index(j), slides[sliding.index(j)]
+            slide, (_, order, width, *_) = first + sliding.index(j), slides[sliding.index(j)]
             of_piece = [guard._replace(slide=slide, order=order, rest=upper) for guard in of_piece]
             of_piece += [
                 Guard(slide, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, upper + 1, on=upper, rest=upper),
                 Guard(slide, -1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, upper + 2, on=lower, rest=upper, gains=width),
             ]
+            if kind == CONE:  # which is left on one side alone
+                of_piece[-2:] = [of_piece[-2]._replace(gains=width)]
         guards += of_piece
     return tuple(guards)
 
@@ -939,6 +990,50 @@ def _truncations(line: StraightLine) -> dict[int, tuple[int]]:
         ):
             found[i] = (x,)
     return found
+
+
+def _squares(line: StraightLine, i: int) -> list[int] | None:
+    """The nodes whose squares, times positive constants, node i is the sum of; None where it is no such sum."""
+    op, operands, _ = line.nodes[i]
+    if op == "add":
+        some = [_squares(line, x) for x in operands]
+        return None if None in some else [u for of in some for u in of or ()]
+    if op == "mul" and operands[0] == operands[1]:
+        return [operands[0]]
+    factors = [line.nodes[x][2] for x in operands if line.nodes[x][0] == "constant"] if op == "mul" else []
+    others = [x for x in operands if line.nodes[x][0] != "constant"]
+    return _squares(line, others[0]) if len(others) == len(factors) == 1 and factors[0] > 0 else None
+
+
+def _find_cones(line: StraightLine, size: int, linear: Any) -> dict[int, int]:
+    """The nodes by which lengths |u| of velocities that something is divided by are known, each with the node of |u|².
+
+    These are roots, also of what `where` or `maximum` puts in the place of |u| = 0, and the comparisons of such guards.
+    """
+    nodes, cones = line.nodes, {}
+
+    def guarded(i: int) -> list[int]:
+        """A node, or those that a guard chooses from."""
+        op, operands, _ = nodes[i]
+        some = operands[1:] if op == "select" else operands if op == "max" else ()
+        return [i, *(x for k in some for x in guarded(k))] if some else [i]
+
+    roots = {x for op, of, _ in nodes if op == "div" for x in guarded(of[1]) if nodes[x][0] == "sqrt"}
+    roots |= {i for i, (op, _, _) in enumerate(nodes) if op == "rsqrt"}
+    squares = {}
+    for root in roots if linear is not None else ():
+        for x in guarded(nodes[root][1][0]):
+            parts = _squares(line, x)
+            reads = [{nodes[i][2] for i in _below(line, [u]) if nodes[i][0] == "input"} for u in parts or ()]
+            if parts and not any(read.isdisjoint(range(size, 2 * size)) for read in reads):
+                squares[x] = cones[root] = x
+    squares |= {i: x for i, x in cones.items() if nodes[i][0] == "sqrt"}
+    for i, (op, operands, _) in enumerate(nodes):
+        if op in (*_COMPARISONS, "eq", "ne", "max") and not squares.keys().isdisjoint(operands):
+            others = [x for x in operands if x not in squares]
+            if len(others) == 1 and nodes[others[0]][0] == "constant" and 0 <= nodes[others[0]][2] <= _NO_LENGTH:
+                cones[i] = next(squares[x] for x in operands if x in squares)
+    return cones
 
 
 def distances(found: Borders) -> StraightLine:

@@ -170,7 +170,7 @@ def with_borders_of_tangents(borders: Borders, size: int, directions: int, membe
     return borders._replace(
         program=Pieced(line, len(dtypes), dtypes, None, max(program.budget, len(line.nodes))),
         switches=switches[:pieces], arguments=switches[pieces:], decide=_renumber_inputs(borders.decide, decided),
-        motion=borders.motion or borders, retraction=retraction,
+        motion=borders.motion or borders, retraction=retraction, release=_renumber_inputs(borders.release, decided),
     )  # fmt: skip
 
 

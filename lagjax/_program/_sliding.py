@@ -16,6 +16,7 @@ position where u depends on that alone. Its derivative is that of a motion whose
 on either side, the force brings it back at once.
 """
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -36,6 +37,9 @@ SOFT, MENDED = 1e-9, 2
 STILL = 1e-9
 FAR = 1e100  # of a rate: a share that is beyond 0 and 1; the search for its roots squares it
 _LARGEST = 10_000_000  # operations: a bound for errors
+# The length of the vector of a cone that is as good as none: forces change by so little beside it, and its square is
+# there. What friction does along each of its parts is read off there.
+_TINY = 2.0**-300
 
 
 class Slide(NamedTuple):
@@ -43,19 +47,31 @@ class Slide(NamedTuple):
 
     Order 1 is that of a border that depends on velocities, 2 that of one that does not. While the motion slides the
     piece is the one below, and the one above is larger by `width`. `level(graph, piece)` is that of u between them.
+
+    Of a cone u is the length of a vector of `parts`, all of which stay zero: dry friction in the plane.
     """
 
     piece: int
     order: int
     width: float
     level: Callable[[Graph, int], int]
+    parts: tuple[int, ...] = ()
+
+
+class _Row(NamedTuple):
+    """A number that stays zero: of border number `slide`, from the middle of both sides by `below` on the lower one."""
+
+    slide: int
+    offset: int
+    below: float
 
 
 class Sliding(NamedTuple):
     """A program with shares; `places` says where the nodes of the one without them are.
 
     `retraction` takes the same inputs to the state (q, q̇) on the borders that the motion slides along; `moved` are the
-    coordinates that the force of each of these moves.
+    coordinates that the force of each of these moves. `release` gives for each cone changes of q̇ (n,): one by which its
+    vector becomes a unit along what it does not hold, and what takes the vector away.
     """
 
     line: StraightLine
@@ -64,6 +80,7 @@ class Sliding(NamedTuple):
     linear: LinearSystem | None
     retraction: StraightLine
     moved: tuple[frozenset[int], ...]
+    release: StraightLine = StraightLine((), (), ())
 
 
 def with_sliding(
@@ -80,7 +97,9 @@ def with_sliding(
         done = _SlidingForces(line, n, first, switches, slides, linear).build()
         if done is not None:
             return done
-    if len(slides) > MOST_COPIES or len(line.nodes) > LARGEST_COPIED or any(slide.order > 1 for slide in slides):
+    if len(slides) > MOST_COPIES or len(line.nodes) > LARGEST_COPIED:
+        return None
+    if any(slide.order > 1 or slide.parts for slide in slides):
         return None
     return _copy_for_slides(line, n, first, switches, slides)
 
@@ -96,10 +115,12 @@ class _SlidingForces:
         self.graph = Graph.from_line(line, _LARGEST)
         self.f, self.zero, self.one = self.graph.apply, self.number(0.0), self.number(1.0)
         self.pieces = [self.graph.input(first + slide.piece, "float") for slide in slides]
-        self.offsets = [
-            self.f("sub", switches[slide.piece], slide.level(self.graph, piece))
-            for slide, piece in zip(slides, self.pieces, strict=True)
-        ]
+        self.rows = []
+        for k, (slide, piece) in enumerate(zip(slides, self.pieces, strict=True)):
+            if slide.parts:
+                self.rows += [_Row(k, u, 0.0) for u in slide.parts]
+            else:
+                self.rows.append(_Row(k, self.f("sub", switches[slide.piece], slide.level(self.graph, piece)), -1.0))
         flags = [self.graph.input(first + len(switches) + k, "float") for k in range(len(slides))]
         self.flags = [self.f("gt", flag, self.number(0.5)) for flag in flags]
 
@@ -107,17 +128,19 @@ class _SlidingForces:
         return self.graph.constant(x, "float")
 
     def masked(self, k: int, x: int) -> int:
-        """Zero where nothing slides along border k."""
-        return self.f("select", self.flags[k], self.zero, x)
+        """Zero where nothing slides along the border of row k."""
+        return self.f("select", self.flags[self.rows[k].slide], self.zero, x)
 
     def build(self) -> Sliding | None:
         """The program; None where pieces act on more than the right side, or not each for itself."""
         acts = self._acts()
         if acts is None:
             return None
-        slopes, rates, levels = zip(*map(self._rate, range(len(self.slides))), strict=True)
+        slopes, rates, levels = zip(*map(self._rate, range(len(self.rows))), strict=True)
         responses, effects = self._effects(acts, slopes)
         pushed = [self.f("lt", row[k], self.zero) for k, row in enumerate(effects)]
+        all_pushed = [functools.reduce(lambda a, b: self.f("and", a, b), of) for of in self._group_rows(pushed)]
+        pushed = [all_pushed[row.slide] for row in self.rows]
         # Borders that are not pushed onto are left, and act on nothing until then.
         acts = [
             {i: self.f("select", p, self.zero, c) for i, c in act.items()} for p, act in zip(pushed, acts, strict=True)
@@ -141,19 +164,47 @@ class _SlidingForces:
                 [self.f("add", *pair) for pair in zip(*both, strict=True)] for both in ((z, rest), (unknown, more))
             )
         z = held.hold(z, rates)
-        shares = [self._share(k, pushed[k], unknown[k], slopes[k], rates[k], z) for k in range(len(acts))]
+        shares = [self._share(k, unknown, slopes, rates, all_pushed[k], z) for k in range(len(self.slides))]
+        directions = [
+            self.f("select", p, self.f("neg", x), y) for p, x, y in zip(pushed, missing, unknown, strict=True)
+        ]
+        release = self._release(directions, [self._unmask(d) for d in slopes])
         linear = self._system(z, unknown, acts, normals, ends, equations, held.pivots())
         outputs = (*z[: self.n], *self.line.outputs[self.n :])
         line = StraightLine(tuple(self.graph.nodes), tuple(self.graph.kinds), outputs)
-        by_position = [k for k, slide in enumerate(self.slides) if slide.order > 1]
+        by_position = [k for k, row in enumerate(self.rows) if self.slides[row.slide].order > 1]
         if by_position:
             some = [[effects[k][m] for m in by_position] for k in by_position]
             pushes = [self._pushes_back(k, effects, pushed, slopes, missing) for k in by_position]
             of_positions = self._equations(some, pushes, [slopes[k] for k in by_position])
-            at = [self.offsets[k] for k in by_position]
+            at = [self.rows[k].offset for k in by_position]
             held.put_back(0, by_position, at, lambda left: of_positions.solve(self.graph, left), pushes)
         held.put_back(self.n, range(len(levels)), levels, lambda left: equations.solve(self.graph, left), pushed)
-        return Sliding(line, range(len(self.line.nodes)), shares, linear, *held.finish())
+        retraction, moved = held.finish()
+        of_slides = tuple(frozenset().union(*some) for some in self._group_rows(moved))
+        release = StraightLine(*live(self.graph.nodes, self.graph.kinds, release))
+        return Sliding(line, range(len(self.line.nodes)), shares, linear, retraction, of_slides, release)
+
+    def _group_rows(self, of_rows: Sequence) -> list[list]:
+        """The items of rows, border by border."""
+        return [
+            [x for row, x in zip(self.rows, of_rows, strict=True) if row.slide == k] for k in range(len(self.slides))
+        ]
+
+    def _release(self, directions: Sequence[int], slopes: Sequence[list[int]]) -> list[int]:
+        """The outputs of `Sliding.release`."""
+        f, results = self.f, []
+        for k, slide in enumerate(self.slides):
+            if not slide.parts:
+                continue
+            rows = [m for m, row in enumerate(self.rows) if row.slide == k]
+            length = f("sqrt", dot(self.graph, [directions[m] for m in rows], [directions[m] for m in rows]))
+            length = f("select", f("gt", length, self.zero), self.one, length)
+            sizes = [dot(self.graph, slopes[m], slopes[m]) for m in rows]
+            for numbers in ([f("div", directions[m], length) for m in rows], [self.rows[m].offset for m in rows]):
+                parts = [f("div", x, size) for x, size in zip(numbers, sizes, strict=True)]
+                results += [dot(self.graph, [slopes[m][i] for m in rows], parts) for i in range(self.n)]
+        return results
 
     def _solve(self, right: Sequence[int]) -> list[int]:
         """z of A z = r."""
@@ -192,8 +243,8 @@ class _SlidingForces:
 
     def _pushes_back(self, j: int, effects, pushed: Sequence[int], slopes, missing: Sequence[int]) -> int:
         """True where border j of positions pushes back what lies beside it; other borders may hold that there, too."""
-        f, others = self.f, [k for k in range(len(self.slides)) if k != j]
-        if all(self.slides[k].order > 1 for k in others):
+        f, others = self.f, [k for k in range(len(self.rows)) if k != j]
+        if all(self.slides[self.rows[k].slide].order > 1 for k in others):
             return pushed[j]
         without = [p if k != j else f("and", p, f("not", p)) for k, p in enumerate(pushed)]
         equations = self._equations(effects, without, slopes)
@@ -202,7 +253,7 @@ class _SlidingForces:
             beside = [f("sub", x, f("mul", effects[k][j], change)) for k, x in enumerate(missing)]
             mu = self._unknown(equations, [f("select", p, self.zero, x) for p, x in zip(without, beside, strict=True)])
             for k in others:
-                held = f("lt", f("abs", f("sub", mu[k], self.one)), self.one)
+                held = f("lt", f("abs", f("add", mu[k], self.number(self.rows[k].below))), self.one)
                 stays = f("and", stays, f("or", f("not", pushed[k]), held))
             row = [self.zero if k == j else x for k, x in enumerate(effects[j])]
             moves = f("abs", f("sub", beside[j], dot(self.graph, row, mu)))
@@ -214,9 +265,9 @@ class _SlidingForces:
         if not equations.whole:
             return equations.solve(self.graph, missing)
         f, rows = self.f, equations.whole
-        below = [self.number(-1.0)] * len(rows)
+        below = [self.number(row.below) for row in self.rows]
         there = [f("add", x, dot(self.graph, row, below)) for x, row in zip(missing, rows, strict=True)]
-        return [f("add", x, self.one) for x in equations.solve(self.graph, there)]
+        return [f("sub", x, p) for x, p in zip(equations.solve(self.graph, there), below, strict=True)]
 
     def _are_dependent(self, slopes: Sequence[list[int]]) -> bool:
         """True if the rates of some borders are combinations of others, so that these can share what they hold."""
@@ -226,11 +277,19 @@ class _SlidingForces:
                 numbers[k, i] = some.uniform(0.5, 1.5) if value is None else value
         return bool(np.linalg.matrix_rank(numbers) < len(slopes))
 
-    def _share(self, k: int, pushed: int, mu: int, slopes: list[int], rate: int, z: Sequence[int]) -> int:
-        """The share of the upper side: μ/2, and far beyond 0 or 1 where both sides do not push."""
+    def _share(self, k: int, unknown: Sequence[int], slopes: Sequence, rates: Sequence, pushed: int, z) -> int:
+        """The share of the upper side: μ/2, and far beyond 0 or 1 where both sides do not push.
+
+        Of a cone, which holds up to a length of 1, it is what is left of the square of that, of 1/4: never 1.
+        """
         f, half = self.f, self.number(0.5)
-        moves = f("sub", dot(self.graph, slopes, z[: self.n]), rate)
-        return f("select", pushed, f("add", half, f("mul", self.number(FAR), moves)), f("mul", half, mu))
+        rows = [m for m, row in enumerate(self.rows) if row.slide == k]
+        mu = [unknown[m] for m in rows]
+        if self.slides[k].parts:
+            left = f("sub", self.one, dot(self.graph, mu, mu))
+            return f("select", pushed, self.number(-FAR), f("mul", self.number(0.25), left))
+        moves = f("sub", dot(self.graph, slopes[rows[0]], z[: self.n]), rates[rows[0]])
+        return f("select", pushed, f("add", half, f("mul", self.number(FAR), moves)), f("mul", half, mu[0]))
 
     def _push_right_side(
         self, right: Sequence[int], acts: Sequence[dict[int, int]], unknown: Sequence[int]
@@ -243,19 +302,39 @@ class _SlidingForces:
         return pushed
 
     def _acts(self) -> list[dict[int, int]] | None:
-        """∂r/∂pₖ, entry by entry: half of the difference of both sides."""
+        """∂r/∂pₖ, entry by entry: half of the difference of both sides; of a cone, what a unit of its vector does."""
         of_sides = self._values_on_both_sides()
         if of_sides is None:
             return None
-        half, acts = self.number(0.5), []
-        for k in range(len(self.slides)):
+        acts = []
+        for m, (k, *_) in enumerate(self.rows):
+            if self.slides[k].parts:
+                below, above, factor = (
+                    self._evaluate_cone(k, None),
+                    self._evaluate_cone(k, self.rows[m].offset),
+                    self.one,
+                )
+            else:
+                below, above = ({x: of[k][side] for x, of in of_sides.items() if k in of} for side in range(2))
+                factor = self.number(0.5)
             act = {}
-            for i, node in enumerate(self.linear.right):
-                if k in of_sides.get(node, {}):
-                    below, above = of_sides[node][k]
-                    act[i] = self.masked(k, self.f("mul", half, self.f("sub", above, below)))
+            for i, x in enumerate(self.linear.right):
+                change = self.f("sub", above[x], below[x]) if x in below and x in above else self.zero
+                if self.graph.value(change) != 0:
+                    act[i] = self.masked(m, self.f("mul", factor, change))
             acts.append(act)
         return acts
+
+    def _evaluate_cone(self, k: int, along: int | None) -> dict[int, int]:
+        """The nodes where the vector of cone k is tiny and has one part alone, or where it is zero and at rest."""
+        graph, parts = self.graph, self.slides[k].parts
+        known = {u: self.number(_TINY if u == along else 0.0) for u in parts}
+        known[self.pieces[k]] = self.number(-1.0 if along is None else 1.0)
+        for i in graph.find_ancestors(self.linear.right):
+            op, operands, attribute = graph.nodes[i]
+            if i not in known and any(x in known for x in operands):
+                known[i] = graph.apply(op, *(known.get(x, x) for x in operands), attribute=attribute)
+        return known
 
     def _values_on_both_sides(self) -> dict[int, dict[int, tuple[int, int]]] | None:
         """The nodes that depend on pieces, and for each piece their values below and above, the others as they are."""
@@ -265,6 +344,8 @@ class _SlidingForces:
             return None
         sides: dict[int, dict[int, tuple[int, int]]] = {}
         for i in graph.find_ancestors(system.right):
+            if i in pieces and self.slides[pieces[i]].parts:
+                continue
             if i in pieces:
                 sides[i] = {pieces[i]: self._both_pieces(pieces[i])}
                 continue
@@ -287,9 +368,9 @@ class _SlidingForces:
 
     def _rate(self, k: int) -> tuple[list[int], int, int]:
         """∂w/∂q̇ and −∂w/∂q q̇ − ∂w/∂t of what is to stay zero, u or u̇; zeros where nothing slides. And w."""
-        n, node = self.n, self.offsets[k]
+        n, node = self.n, self.rows[k].offset
         level = node
-        for _ in range(self.slides[k].order):
+        for _ in range(self.slides[self.rows[k].slide].order):
             level, slopes = node, self._slopes(node)
             velocities = [self.graph.input(n + i, "float") for i in range(n)]
             node = self.f("add", dot(self.graph, slopes[:n], velocities), slopes[2 * n])

@@ -333,3 +333,81 @@ def test_an_output_moves_along_the_border_that_is_slid_on():
     end = lambda t: lagjax.simulate(scene, 0.0, 0.65, jnp.array([0.0, t]))
     rate, v = jax.grad(lambda t: end(t).qdot[-1])(2.0), end(2.0).qdot[-1]
     np.testing.assert_allclose(rate, -0.5 * v, atol=1e-9)
+
+
+# ---- dry friction in the plane ---------------------------------------------------------------------------------------
+
+
+def guarded(v):
+    """v / |v| by the double `where` that keeps gradients at rest finite."""
+    square = v @ v
+    return jnp.where(square > 0, v / jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+
+
+DIRECTIONS = [
+    lambda v: v / jnp.linalg.norm(v),
+    lambda v: v / jnp.maximum(jnp.sqrt(v @ v), 1e-12),
+    lambda v: v / jnp.where(v @ v == 0, 1.0, jnp.linalg.norm(v)),
+    guarded,
+]
+PUCK = lagjax.System(
+    lambda q, v: 0.5 * v @ v,
+    forces=lambda q, v, t, params: params[0:2] + t * params[2:4] - params[4] * v / jnp.linalg.norm(v),
+)
+
+
+def puck(v0, params, *ts):
+    return lagjax.simulate(PUCK, jnp.zeros(2), jnp.array(v0), jnp.array([0.0, *ts]), jnp.array(params))
+
+
+def test_discs_stop_and_rest_in_every_spelling():
+    """Each disc stops after v/μ at v²/2μ, and stays there."""
+    scene = lagjax.System(
+        lambda q, v: 0.5 * jnp.sum(v * v),
+        forces=lambda q, v: -2.0 * jnp.stack([f(v[i]) for i, f in enumerate(DIRECTIONS)] + [0.0 * v[-1]]),
+        dissipation=lambda q, v: 2.0 * jnp.linalg.norm(v[-1]),
+    )
+    v0 = jnp.array([[0.3, 0.4], [-0.6, 0.2], [0.1, 0.7], [0.5, -0.5], [0.2, 0.3]])
+    run = lagjax.simulate(scene, jnp.zeros((5, 2)), v0, jnp.array([0.0, 1.0, 1e6]))
+    exact = v0 * jnp.linalg.norm(v0, axis=1, keepdims=True) / 4
+    np.testing.assert_allclose(run.q[1:], np.stack([exact, exact]), atol=1e-12)
+    np.testing.assert_array_equal(run.qdot[1:], 0.0)
+
+
+def test_a_puck_rests_until_its_load_is_larger_than_friction():
+    held = puck([0.0, 0.0], [1.2, 1.59, 0.0, 0.0, 2.0], 1e6)  # 1.992 of 2
+    np.testing.assert_array_equal(held.q[-1], 0.0)
+    slips = puck([0.0, 0.0], [1.8, 2.4, 0.0, 0.0, 2.0], 2.0)  # 3 of 2
+    np.testing.assert_allclose(slips.q[-1], [1.2, 1.6], atol=1e-9)
+    ramp = puck([0.0, 0.0], [0.0, 0.0, 0.6, 0.8, 2.0], 1.99, 5.0)  # from t = 2 on
+    np.testing.assert_allclose(ramp.q[1:], [[0.0, 0.0], [2.7, 3.6]], atol=1e-9)
+
+
+def test_derivatives_of_a_puck_through_its_stop():
+    """Down a slope that friction holds. Compiles a motion, its tangents and its transpose."""
+    params = jnp.array([1.0, 0.0, 0.0, 0.0, 2.0])
+
+    def place(x):
+        run = lagjax.simulate(PUCK, jnp.zeros(2), x[:2], jnp.array([0.0, 2.0]), params.at[4].set(x[2]))
+        return run.q[-1]
+
+    x, step = jnp.array([0.3, 0.4, 2.0]), 1e-4
+    slopes = jnp.stack([(place(x + step * e) - place(x - step * e)) / (2 * step) for e in jnp.eye(3)], axis=1)
+    for derivative in (jax.jacrev, jax.jacfwd):
+        np.testing.assert_allclose(derivative(place)(x), slopes, atol=1e-6)
+    sets_out = lambda limit: puck([0.0, 0.0], [0.0, 0.0, 0.6, 0.8, limit], 5.0).q[-1, 0]
+    assert jnp.isnan(jax.grad(sets_out)(2.0))  # of directions behind a release nothing is known
+
+
+def test_a_turning_table_carries_a_body_along():
+    turn = 0.8
+    scene = lagjax.System(
+        lambda q, v: 0.5 * v @ v,
+        forces=lambda q, v: -2.0 * (lambda u: u / jnp.linalg.norm(u))(v - turn * jnp.stack([-q[1], q[0]])),
+    )
+    q0, v0, ts = jnp.array([[1.0, 0.0], [4.0, 0.0]]), jnp.array([[0.5, 0.2], [0.0, 3.2]]), jnp.array([0.0, 5.0, 50.0])
+    run = lagjax.simulate_batch(scene, q0, v0, ts)
+    u = run.qdot - turn * jnp.stack([-run.q[..., 1], run.q[..., 0]], axis=-1)
+    np.testing.assert_allclose(u[0, 1:], 0.0, atol=1e-12)
+    np.testing.assert_allclose(jnp.linalg.norm(run.q[0, 2]), jnp.linalg.norm(run.q[0, 1]), rtol=1e-9)
+    assert jnp.linalg.norm(run.q[1, 2]) > 10.0  # where ω² r is more than friction, it flies off
