@@ -372,33 +372,22 @@ class Store:
                 except FileNotFoundError:  # another one removes it
                     pass
 
-    def explain_errors(self, what: str) -> "_ExplainedErrors":
+    @contextmanager
+    def explain_errors(self, what: str) -> Iterator[None]:
         """A context in which an error of the disk is raised again as a sentence; `what` it cost."""
-        return _ExplainedErrors(self, what)
-
-
-class _ExplainedErrors:
-    """Raises an error of the disk again, as a sentence."""
-
-    def __init__(self, store: Store, what: str):
-        self.store, self.what = store, what
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, kind, error, trace):
-        if not isinstance(error, OSError):
-            return
-        if error.errno in _FULL:
-            text = "the disk is full. Make room and run the sweep again"
-        elif error.errno in _REFUSED:
-            text = f"the store is read-only for this process ({os.strerror(error.errno)})"
-        else:
-            return
-        raise OSError(
-            error.errno,
-            f"{self.store.path}: {self.what}: {text}; all units that are done are kept, and nothing is lost",
-        ) from error
+        try:
+            yield
+        except OSError as error:
+            if error.errno in _FULL:
+                text = "the disk is full. Make room and run the sweep again"
+            elif error.errno in _REFUSED:
+                text = f"the store is read-only for this process ({os.strerror(error.errno)})"
+            else:
+                raise
+            raise OSError(
+                error.errno,
+                f"{self.path}: {what}: {text}; all units that are done are kept, and nothing is lost",
+            ) from error
 
 
 def _chunk_bytes(grid: Grid, q: Quantity) -> int:
