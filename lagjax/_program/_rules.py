@@ -9,6 +9,7 @@ id arrays, and returns an id array (or a list of them). Each needs a row in `tes
 """
 
 import functools
+import itertools
 import math
 from collections.abc import Callable
 from typing import Literal
@@ -216,7 +217,7 @@ def find_variables(equation) -> list:
 
 
 def formula_of(equation) -> str | None:
-    """The name of the function of JAX that a call is, if that has a formula here ("det", "expn", "signbit" …); or None.
+    """The name of the function of JAX that a call is, if that has a formula here ("det", "expn", "hypot" …); or None.
 
     JAX has rules of its own for their derivatives, which agree with those of any formula for them.
     """
@@ -224,8 +225,11 @@ def formula_of(equation) -> str | None:
     if name in ("jit", "pjit"):
         called, floats = equation.params["name"], [jnp.issubdtype(x.dtype, jnp.floating) for x in operands]
         reads_bits = any(e.primitive.name == "bitcast_convert_type" for e in equation.params["jaxpr"].eqns)
-        found = {"expn": [False, True], "signbit": [True] if reads_bits else None}
-        return called if found.get(called) == floats else None
+        found = {"expn": [False, True], "signbit": [True] if reads_bits else None, "hypot": [True, True]}
+        if found.get(called) != floats:
+            return None
+        own = called != "hypot" or str(equation.params["jaxpr"]) == _hypot(*((x.shape, x.dtype) for x in operands))
+        return called if own else None
     if name != "custom_jvp_call" or len(operands) != 1:
         return None
     shape, dtype = operands[0].shape, operands[0].dtype
@@ -261,6 +265,13 @@ def _inner_jaxprs(equation) -> list:
     leaves = jax.tree.leaves(list(params.values()), is_leaf=lambda x: isinstance(x, core.Jaxpr | core.ClosedJaxpr))
     closed = (x.jaxpr if isinstance(x, core.ClosedJaxpr) else x for x in leaves)
     return [x for x in closed if isinstance(x, core.Jaxpr)]
+
+
+@functools.cache
+def _hypot(*operands) -> str:
+    """The body of JAX's hypot of operands of these shapes and types, as a text."""
+    (equation,) = jax.make_jaxpr(jnp.hypot)(*itertools.starmap(jax.ShapeDtypeStruct, operands)).eqns
+    return str(equation.params["jaxpr"])
 
 
 @functools.cache
@@ -387,6 +398,12 @@ def _polynomial(expansion, params, x, *coefficients):
 @lowers("signbit")
 def _signbit(expansion, params, x):
     return [expansion.map("lt", x, expansion.constants(0.0))]
+
+
+@lowers("hypot")
+def _hypotenuse(expansion, params, x, y):
+    """√(x² + y²), which is smooth but for zero; JAX divides by the larger one, and has corners where both are alike."""
+    return [expansion.map("sqrt", expansion.map("add", *(expansion.map("mul", z, z) for z in (x, y))))]
 
 
 @lowers("atan")
