@@ -38,7 +38,7 @@ class Tolerances(NamedTuple):
 
     An atol of 0 stands for none given: it follows the size of the motion. Derivatives need not suit the steps of a
     motion better than those of an rtol that is `slack` times as large. Results that are rounded to float32 in the
-    end `allow_singles`, on a device that is much slower in float64.
+    end `allow_singles`, on a device that is much slower in float64. An order of 0 is that which suits rtol.
     """
 
     rtol: float
@@ -48,6 +48,7 @@ class Tolerances(NamedTuple):
     notes: int = 0
     allow_singles: bool = False
     slack: float = 1.0
+    order: int = 0
 
     @property
     def largest_excess(self) -> float:
@@ -202,21 +203,22 @@ class Flow:
 
     def follow(self, ts, y0, params, tolerances, store=None, room=None, begun=None) -> Solution:
         """`run` without a look at what stopped a member: for another try, and for derivatives."""
-        rtol, atol, max_steps, notes = *tolerances[:3], tolerances.notes
+        rtol, atol, max_steps, notes, order = *tolerances[:3], tolerances.notes, tolerances.order
         if store is not None and room is None:
             room = min(max_steps * len(y0), LARGEST_KEPT // (self.states + 4))
-        done = self.kernel.select_kernel(len(y0))(ts, y0, params, rtol, atol, max_steps, room or 0, begun, notes)
+        done = self.kernel.select_kernel(len(y0))(ts, y0, params, rtol, atol, max_steps, room or 0, begun, notes, order)
         result, event = RESULT_OF_CODE[np.minimum(done.code, _native.EVENT)], np.maximum(done.code - _native.EVENT, 0)
         ticket = np.full(len(y0), -1)
         if store is not None:
             assert done.complete is not None and done.table is not None
             counts = np.where(done.complete, done.steps, 0)
             first = np.cumsum(counts) - counts
-            ticket = store.keep(Steps(self.kernel, _native.order_for(rtol), done.table, first, counts, done.complete))
+            order = order or _native.order_for(rtol)
+            ticket = store.keep(Steps(self.kernel, order, done.table, first, counts, done.complete))
         solution = Solution(*done[:3], result, done.steps, done.rejected, event, ticket, done.idle)
         if (result == SUCCESSFUL).all():
             return solution
-        again, flow, tolerances = self._second_chance(result, tolerances)
+        again, flow, tolerances = self._second_chance(result, done.steps, tolerances)
         if not again.any():
             return solution
         some_ts, some_y0, some_params = members(again, ts, y0, params)
@@ -244,14 +246,19 @@ class Flow:
         solution.result[some[not_finite]] = _NOT_FINITE
         return solution
 
-    def _second_chance(self, result, tolerances: Tolerances) -> "tuple[np.ndarray, Flow, Tolerances]":
+    def _second_chance(self, result, steps, tolerances: Tolerances) -> "tuple[np.ndarray, Flow, Tolerances]":
         """The members to run once more, by which flow and with which tolerances.
 
         A program that assumes a regular mass matrix gives way to one that does not, which is long where a recursion in
         L made it short: without constraints, only if that matrix seems singular. And where constraints become
         dependent, as at a dead centre, a step must not end: rounding of q would decide on q̇, or allow no step from
         there. The kernel takes such steps again; where that does not help, steps of other sizes all along may.
+        The coefficients of a fast motion grow by its rate ω from order to order: where ωᵖ overflows, a lower order may
+        do.
         """
+        overflows = (result == _NOT_FINITE) & (steps == 0)
+        if overflows.any() and not tolerances.order:
+            return overflows, self, tolerances._replace(order=_native.LEAST_ORDER)
         given_up = np.isin(result, _GIVEN_UP if self.projection is not None else _SINGULAR)
         if given_up.any() and (general := self.general()) is not None:
             return given_up, general, tolerances

@@ -211,11 +211,13 @@ class Kernel:
         room: int = 0,
         begun: Begun | None = None,
         room_of_notes: int = 0,
+        order: int = 0,
     ) -> Outcome:
         """The motions from the states `y0` (N, 2n), all arrays of float64.
 
         `ts` (N, T) are the output times and `params` (N, P) the constant numbers; or one row for all. As many
-        steps as there is `room` for are written down, for derivatives. What a handler has `begun` is continued.
+        steps as there is `room` for are written down, for derivatives. What a handler has `begun` is continued. The
+        series are of this `order`; by default of that which suits rtol.
         Where guards are noted, with this much room for each, `path` holds the notes for one guard after the other: a
         time, and the state then, (N, guards (room + 1), 1 + 2n); behind them how many there would have been.
         """
@@ -223,7 +225,7 @@ class Kernel:
         members, times = len(y0), ts.shape[1]
         if begun is not None:
             begun = Begun(*(np.array(x, np.float64) for x in begun))
-        elif room == 0 and self.threads(members) == 1 and not self._notes:
+        elif room == 0 and self.threads(members) == 1 and not self._notes and not order:
             begun = self._begin_run(ts, y0, params, self.plan(rtol, atol, max_steps))
         if begun is None:
             shape = (times, self.states)
@@ -245,8 +247,8 @@ class Kernel:
             next_row=rows,
         )  # fmt: skip
         numbers = dict(
-            **self._strides(ts, params), members=members, times=times, order=order_for(rtol), max_steps=max_steps,
-            room=room, room_of_notes=room_of_notes, rtol=rtol, atol=atol,
+            **self._strides(ts, params), members=members, times=times, order=order or order_for(rtol),
+            max_steps=max_steps, room=room, room_of_notes=room_of_notes, rtol=rtol, atol=atol,
         )  # fmt: skip
         idle = self._forward(arrays, numbers, self.threads(members) if rest is None else 1, rest)
         table = None if table is None else table[: rows[0]]

@@ -85,3 +85,22 @@ def test_narrow_pulses_are_met_from_where_cosh_is_infinite(width):
     np.testing.assert_allclose(slopes, np.array([2 * width, 1.0, width]) / speeds, rtol=1e-5)
     first = jax.grad(lambda a: end(a).qdot[-1][1])(strength)
     np.testing.assert_allclose(first, 1.0 / speeds[1], rtol=1e-6)
+
+
+# ---- fast motions ----------------------------------------------------------------------------------------------------
+
+
+def test_rates_whose_powers_overflow():
+    """ω²⁰ is beyond all doubles: of series of lower order it is not asked for."""
+    clock = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params**2 * q**2)
+
+    def end(q, rate, rtol=1e-12):
+        return lagjax.simulate(clock, q, 0.0, jnp.array([0.0, 3.0]) / jax.lax.stop_gradient(rate), rate, rtol=rtol)
+
+    for rate, rtol in ((1e16, 1e-14), (1e20, 1e-12), (1e30, 1e-9)):
+        np.testing.assert_allclose(end(1.0, rate, rtol).q[-1], np.cos(3.0), atol=100 * rtol)
+    rates = jnp.array([1.0, 1e20])
+    for slope in (jax.grad, jax.jacfwd):
+        by_q, by_rate = jax.vmap(slope(lambda *x: end(*x).q[-1], (0, 1)), (None, 0))(1.0, rates)
+        np.testing.assert_allclose(by_q, np.cos(3.0), atol=1e-10)
+        np.testing.assert_allclose(by_rate * rates, -3.0 * np.sin(3.0), atol=1e-10)
