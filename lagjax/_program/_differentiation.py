@@ -55,10 +55,13 @@ def copy_nodes(graph: Graph, line, inputs: Sequence[int], places: Sequence[int] 
 
 
 class Derivatives:
-    """Derivatives of nodes of a graph; `operations` counts what they consist of before anything is simplified."""
+    """Derivatives of nodes of a graph; `operations` counts what they consist of before anything is simplified.
+
+    What has overflown `hides` its derivatives, but for those of a line of tangents, which are linear in these.
+    """
 
     def __init__(self, graph: Graph):
-        self.graph, self.operations = graph, 0
+        self.graph, self.operations, self.hides = graph, 0, True
 
     # ---- reverse mode ----
 
@@ -164,7 +167,8 @@ class Derivatives:
 
         def apply_rule(rule, g):
             result = rule(self._apply, self._number, g, w, *operands)
-            if not self.graph.hides_growth or not any(map(self.graph.grows, (w, *operands))):
+            grows = self.hides and self.graph.hides_growth and any(map(self.graph.grows, (w, *operands)))
+            if not grows:
                 return result
             if op == "div":
                 return self._mask_quotient(result, w, operands[1])
@@ -181,7 +185,7 @@ class Derivatives:
 
     def _mask_product(self, product: int, g: int, slope: int) -> int:
         """A product of g and a slope, 0 where g is and the slope is huge."""
-        if not self.graph.hides_growth or not self.graph.grows(slope):
+        if not (self.hides and self.graph.hides_growth and self.graph.grows(slope)):
             return product
         is_zero = self._apply("eq", g, self._number(0.0))
         return self._zero_where(self._apply("and", is_zero, self.graph.is_huge(slope)), product)
@@ -282,6 +286,7 @@ def pullback_and_entries(
     entries of tables for which `varies` is true have cotangents.
     """
     placed, tables = _PlacedLine.from_line(line, dtypes), []
+    placed.hides = not is_linear
     with np.errstate(all="ignore"):
         cotangents: dict[int, int] = {}
         for k, output in enumerate(of):

@@ -21,13 +21,16 @@ from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from lagjax._program._differentiation import copy_nodes, gradient_in
 from lagjax._program._graph import Graph
 from lagjax._program._passes import live
 from lagjax._program._series import LinearSystem, StraightLine
 
-MOST_SLIDING = 64  # pieces that are unknowns of the linear system: their own elimination takes a third of the cube
+# Borders that act on each other, whose elimination takes a third of the cube; and borders in all, of which each solves
+# the linear system once more.
+MOST_COUPLED, MOST_SLIDING = 64, 512
 MOST_COPIES, LARGEST_COPIED = 4, 4000  # pieces for each of which a program is copied, and its operations
 # Borders that are not independent share what they hold as if they yielded by so much, relative; what that leaves is
 # mended this many times. The share of what no border holds alone is as exact as rounding, divided by it.
@@ -138,6 +141,8 @@ class _SlidingForces:
             return None
         slopes, rates, levels = zip(*map(self._rate, range(len(self.rows))), strict=True)
         responses, effects = self._effects(acts, slopes)
+        if self._largest_coupled(effects) > MOST_COUPLED:
+            return None
         pushed = [self.f("lt", row[k], self.zero) for k, row in enumerate(effects)]
         all_pushed = [functools.reduce(lambda a, b: self.f("and", a, b), of) for of in self._group_rows(pushed)]
         pushed = [all_pushed[row.slide] for row in self.rows]
@@ -216,7 +221,17 @@ class _SlidingForces:
         """The slopes of q̈ by each piece, and ∂u̇/∂p of each border by each piece; zeros where nothing slides."""
         size = len(self.linear.right)
         responses = [self._solve([act.get(i, self.zero) for i in range(size)])[: self.n] for act in acts]
-        return responses, [[dot(self.graph, d, response) for response in responses] for d in slopes]
+        effects = []
+        for d in slopes:
+            some = [i for i, x in enumerate(d) if x != self.zero]
+            effects.append([dot(self.graph, [d[i] for i in some], [of[i] for i in some]) for of in responses])
+        return responses, effects
+
+    def _largest_coupled(self, effects: list[list[int]]) -> int:
+        """The number of borders in the largest group of those that act on each other."""
+        acts_on = np.array(effects).reshape(len(effects), -1) != self.zero
+        _, groups = connected_components(acts_on, directed=False)
+        return int(np.bincount(groups).max())
 
     def _unmask(self, numbers: Sequence[int]) -> list[int]:
         """Numbers that are zero where nothing slides, as they are where something does."""
@@ -622,33 +637,37 @@ def _constants(graph: Graph, numbers: Sequence[int]) -> dict[int, float | None]:
 
 def dot(graph: Graph, xs: Sequence[int], ys: Sequence[int]) -> int:
     """Σ xᵢ yᵢ."""
-    total = graph.constant(0.0, "float")
+    total = zero = graph.constant(0.0, "float")
     for x, y in zip(xs, ys, strict=True):
-        total = graph.apply("add", total, graph.apply("mul", x, y))
+        if zero not in (x, y):  # as nearly all are where many borders know nothing of each other
+            total = graph.apply("add", total, graph.apply("mul", x, y))
     return total
 
 
 def eliminate(graph: Graph, rows: list[list[int]]) -> list[list[int]]:
     """Eliminate in place, so that `rows` become upper triangular; returns the factors, those of row i to 0 … i − 1."""
-    f, n, lower = graph.apply, len(rows), [[] for _ in rows]
+    f, n, lower, zero = graph.apply, len(rows), [[] for _ in rows], graph.constant(0.0, "float")
     for k in range(n):
         for i in range(k + 1, n):
-            factor = f("div", rows[i][k], rows[k][k])
+            factor = zero if rows[i][k] == zero else f("div", rows[i][k], rows[k][k])
             lower[i].append(factor)
-            rows[i][k] = graph.constant(0.0, "float")
-            for j in range(k + 1, n):
-                rows[i][j] = f("sub", rows[i][j], f("mul", factor, rows[k][j]))
+            rows[i][k] = zero
+            for j in range(k + 1, n) if factor != zero else ():
+                if rows[k][j] != zero:
+                    rows[i][j] = f("sub", rows[i][j], f("mul", factor, rows[k][j]))
     return lower
 
 
 def substitute(graph: Graph, rows: Sequence, lower: Sequence, right: Sequence[int]) -> list[int]:
     """The solution of linear equations that have been eliminated."""
-    f, x, n = graph.apply, list(right), len(rows)
+    f, x, n, zero = graph.apply, list(right), len(rows), graph.constant(0.0, "float")
     for i in range(n):
         for k in range(i):
-            x[i] = f("sub", x[i], f("mul", lower[i][k], x[k]))
+            if lower[i][k] != zero:
+                x[i] = f("sub", x[i], f("mul", lower[i][k], x[k]))
     for k in range(n - 1, -1, -1):
         for j in range(k + 1, n):
-            x[k] = f("sub", x[k], f("mul", rows[k][j], x[j]))
+            if rows[k][j] != zero:
+                x[k] = f("sub", x[k], f("mul", rows[k][j], x[j]))
         x[k] = f("div", x[k], rows[k][k])
     return x
