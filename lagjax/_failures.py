@@ -172,15 +172,18 @@ def _nan_unless_transpose(cotangent, reached, x, *inputs, marks, batch):
     cotangent = ad.instantiate_zeros(cotangent)
     kept = reached | (cotangent == 0)
     all_kept = kept.all(tuple(range(batch, kept.ndim)))
+    known = [y for y in inputs if not ad.is_undefined_primal(y)]
 
-    def lose(linear):
+    def lose(where, value):
+        return nan_unless_p.bind(where, value, *known, marks=True, batch=batch)
+
+    def lose_zero(linear):
         shape = linear.aval.shape
-        return jnp.broadcast_to(
-            jnp.where(all_kept, 0.0, jnp.nan).reshape(all_kept.shape + (1,) * (len(shape) - batch)), shape
-        ).astype(linear.aval.dtype)
+        where = all_kept.reshape(all_kept.shape + (1,) * (len(shape) - batch))
+        return lose(jnp.broadcast_to(where, shape), jnp.zeros(shape, linear.aval.dtype))
 
-    of_x = jnp.where(kept, cotangent, jnp.nan) if ad.is_undefined_primal(x) else None
-    return [None, of_x, *(lose(x) if ad.is_undefined_primal(x) else None for x in inputs)]
+    of_x = lose(kept, cotangent) if ad.is_undefined_primal(x) else None
+    return [None, of_x, *(lose_zero(y) if ad.is_undefined_primal(y) else None for y in inputs)]
 
 
 def _nan_unless_jvp(primals, tangents, **settings):
