@@ -132,8 +132,7 @@ class _MachineCodeMotions(AbstractMotions):
 
     def rate(self, t, y, numbers, table=None):
         flow, params = self._flow(numbers, table)
-        own = params.T if len(params) > 1 else params[0]
-        return flow.general_program.evaluate_many([*y.T, t, *own])[: flow.size].T
+        return flow.general_program.evaluate_many([*y.T, t, *params.T])[: flow.size].T
 
 
 class _JaxMotions(AbstractMotions):

@@ -319,9 +319,7 @@ class _Rounds(NamedTuple):
             jnp.where(happens, _pick(jnp.asarray(x), first), other)
             for x, other in ((mode.targets, place), (mode.numbers, -1))
         )
-        inconsistent = happens & self.is_inconsistent(
-            target, t_zero, y_next, [*np.unique(group.targets), *group.family.modes]
-        )
+        inconsistent = happens & self.is_inconsistent(target, t_zero, y_next, np.unique(group.targets).tolist())
         memory = self._memory(mode, guarded, rates, kinds, *known)
         there = (kinds > 0) | (jnp.abs(guarded.values) <= _pick(memory.rounding, places) + guarded.of_time)
         order_matters = self._order_matters(group, mode, place, t, y, rates, there & (kinds > 0).any())
@@ -421,7 +419,8 @@ class _Rounds(NamedTuple):
         memory = before.memory
         if guarded is None or mode.surfaces is None:
             return Outset(*jnp.zeros((2, 0)), *jnp.zeros((2, 0), bool))
-        values, was, rounding, largest = (_pick(x, self._places_of(mode)) for x in memory)
+        places = self._places_of(mode)
+        values, was, rounding, largest = (_pick(x, places) for x in memory)
         unmoved, followed = jnp.abs(guarded.values - values) <= rounding, mode.numbers == before.latest
         rates, noise = guarded.clear_rates(largest), rounding + guarded.of_time
         goes, ways = jnp.sign(rates), np.array([float(transition.direction) for transition in mode.leaving])
@@ -470,9 +469,10 @@ class _Rounds(NamedTuple):
 
 
 def _vary_with(first: Ending, *inputs) -> Ending:
-    """The state before the first round as it is, with a derivative, a batch and mesh axes where a later one has them.
+    """The state before the first round as it is, with derivatives, a batch and mesh axes where later ones have them.
 
-    Else JAX writes the rounds down once more for the numbers that get theirs in a round. Of a sine, so do derivatives.
+    Else JAX writes the rounds down once more for numbers that get these in a round. The derivatives of a sine vary with
+    the inputs, too, in every order.
     """
     moving = jnp.sin(sum(x.ravel()[0] for x in inputs if x.size))
     still = jax.lax.stop_gradient(moving)

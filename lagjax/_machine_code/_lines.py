@@ -55,19 +55,16 @@ _NODES_PER_CALL = 40
 
 def outputs(program: Program, count: int, first, numbers):
     """The first `count` outputs (…, count) for the first inputs (…, m) and the others (…, P)."""
-    if not is_line(program) or jnp.result_type(first) != np.dtype(float):
+    floats = all(dtype.kind == "f" for dtype in program.dtypes) and jnp.result_type(first) == np.dtype(float)
+    if program.looks_up or not floats:
         return jnp.stack(program.compute_outputs(first, numbers)[:count], axis=-1)
-    return line_of(program, count)(_side_by_side(first, numbers))
+    return line_of(program, count)(join_columns(first, numbers))
 
 
-def is_line(program: Program) -> bool:
-    """True if the inputs of a program are floats, and none are in tables."""
-    return all(dtype.kind == "f" for dtype in program.dtypes) and not program.looks_up
-
-
-def _side_by_side(first, numbers):
-    shape = jnp.broadcast_shapes(first.shape[:-1], numbers.shape[:-1])
-    return jnp.concatenate([jnp.broadcast_to(x, (*shape, x.shape[-1])) for x in (first, numbers)], axis=-1)
+def join_columns(*parts):
+    """The columns of arrays (…, m), side by side; what lies in front is broadcast."""
+    shape = jnp.broadcast_shapes(*(x.shape[:-1] for x in parts))
+    return jnp.concatenate([jnp.broadcast_to(x, (*shape, x.shape[-1])) for x in parts], axis=-1)
 
 
 def line_of(program: Program, count: int | None = None) -> "Line":

@@ -54,17 +54,13 @@ def run(flow: Flow, tolerances: Tolerances, ts, y0, params) -> Solution:
     """
     if default_platform() == "cpu":  # outside of `jit` the host computes, and nothing is compiled for a new scene
         return _run(ts, y0, params, flow=flow, tolerances=tolerances, keep=False)
-    return compile_once(_run_flow, flow, tolerances)(ts, y0, params)
+    return compile_once(_run, flow=flow, tolerances=tolerances, keep=False)(ts, y0, params)
 
 
 @functools.lru_cache(maxsize=64)
-def compile_once(function, flow: Flow, *more):
-    """A function of a flow and of arrays, as one program of XLA: for what no machine code computes outside of `jit`."""
-    return jax.jit(functools.partial(function, flow, *more))
-
-
-def _run_flow(flow: Flow, tolerances: Tolerances, *given) -> Solution:
-    return _run(*given, flow=flow, tolerances=tolerances, keep=False)
+def compile_once(function, *first, **settings):
+    """A function of arrays, behind a flow or with one, as one program of XLA: what the host does not compute alone."""
+    return jax.jit(functools.partial(function, *first, **settings))
 
 
 # ---- on the host: NumPy arrays with any batch axes in front ----------------------------------------------------------
@@ -168,10 +164,6 @@ def _curvature_composed(ts, y0, params, path_ct, end_ct, dy0, dparams, *, flow, 
     state_ct, numbers_ct = vjp_p.bind(*given, *_residuals(solution), *cts, flow=larger, tolerances=tolerances)
     state_ct, numbers_ct = to_rows(state_ct[..., 0, :], flow.size)[..., 0, :], numbers_ct[..., 0, : flow.numbers]
     return [state_ct * length, numbers_ct * length]
-
-
-def _curvature_of_flow(flow: Flow, tolerances: Tolerances, *args):
-    return _curvature_composed(*args, flow=flow, tolerances=tolerances)
 
 
 def _jvp_composed(ts, y0, params, dy0, dparams, *, flow, tolerances):
@@ -618,7 +610,7 @@ for _primitive, _compiled_form in ((run_p, _run_compiled), (jvp_p, _jvp_compiled
     mlir.register_lowering(_primitive, _lowering_rule(_compiled_form), platform="cpu")
 curvature_p.multiple_results = True
 curvature_p.def_abstract_eval(_curvature_shapes)
-curvature_p.def_impl(lambda *args, flow, tolerances: compile_once(_curvature_of_flow, flow, tolerances)(*args))
+curvature_p.def_impl(lambda *args, **settings: compile_once(_curvature_composed, **settings)(*args))
 for _platform in ("cpu", "cuda"):
     _rule = mlir.lower_fun(_curvature_composed, multiple_results=True)
     mlir.register_lowering(curvature_p, _rule, platform=_platform)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jax import lax
 
 from lagjax._machine_code._flow import Flow
-from lagjax._machine_code._lines import outputs
+from lagjax._machine_code._lines import join_columns, outputs
 from lagjax._program import Rows, emit_look_up, emit_rows
 
 INSTANT = 1e-9  # of the time; what a border is off by while a motion slides along it is rounding
@@ -21,12 +21,10 @@ INSTANT = 1e-9  # of the time; what a border is off by while a motion slides alo
 def rate(flow: Flow, t, y, params):
     """(q̇, q̈) at states y (…, 2n), t (…), params (…, P); zero where it is not finite: there the motion has ended."""
     n, borders, program = flow.size, flow.borders, flow.general_program
-    shape = jnp.broadcast_shapes(y.shape[:-1], t.shape)
-    rows = Rows(_join(shape, y, t[..., None]), params)
+    rows = Rows(join_columns(y, t[..., None]), params)
     if borders is not None and any(guard.slide >= 0 for guard in borders.guards):
         chosen = params if flow.kernel.chosen is None else params[..., jnp.array(flow.kernel.chosen.positions, int)]
-        shape = jnp.broadcast_shapes(shape, params.shape[:-1])
-        rows = rows._replace(first=_join(shape, rows.first, chosen))
+        rows = rows._replace(first=join_columns(rows.first, chosen))
         acceleration = _evaluate_pieces(borders, rows, _pieces(borders, rows, n))[0][:n]
     elif program.looks_up:  # whose parameters may be too many to be taken apart
         acceleration = program.compute_rows(rows.first, params)[:n]
@@ -35,11 +33,6 @@ def rate(flow: Flow, t, y, params):
     velocity = (y[..., n + i] for i in range(n))
     slope = jnp.stack(jnp.broadcast_arrays(*velocity, *acceleration), axis=-1)
     return jnp.where(jnp.isfinite(slope), slope, 0.0)
-
-
-def _join(shape: Any, *parts):
-    """The columns of some arrays (…, m), side by side."""
-    return jnp.concatenate([jnp.broadcast_to(x, (*shape, x.shape[-1])) for x in parts], axis=-1)
 
 
 def _evaluate_pieces(borders, rows: Rows, pieces) -> tuple[tuple, tuple]:

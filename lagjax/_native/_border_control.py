@@ -57,7 +57,6 @@ from lagjax._native._taylor import TaylorSeries, integer
 from lagjax._program import _borders
 from lagjax._program._borders import BELOW, FALLS, GROWS, SQUARED, UP_TO, Feature
 from lagjax._program._jump import Jump, Nesting
-from lagjax._program._series import StraightLine
 
 NOWHERE = 1e300  # a level that no switching number comes to
 _AT_END = 16.0  # roundings of the time by which the end of a motion may miss an instant and is still taken to be there
@@ -892,15 +891,9 @@ class BorderControl:
                 hit = code.compare("==", crossed, float(g + 1))
                 for i in range(base):
                     places = 2 * k * base + i, (2 * k + 1) * base + i
-                    if all(self._is_zero(self.borders.release, j) for j in places):
+                    if all(self.borders.release.constant(place) == 0.0 for place in places):
                         continue
                     change = code.lanes_of(speed) * out[places[0]] - out[places[1]]
                     with frame.where(hit):
                         frame["y", i + motion.n, 0] = frame["y", i + motion.n, 0] + change
                         frame["low", i + motion.n] = 0.0
-
-    @staticmethod
-    def _is_zero(line: StraightLine, output: int) -> bool:
-        """True if an output is zero throughout."""
-        op, _, value = line.nodes[line.outputs[output]]
-        return op == "constant" and value == 0.0

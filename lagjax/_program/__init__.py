@@ -356,8 +356,7 @@ class Program:
 
     def constant(self, output: int) -> float | None:
         """The value of an output that does not depend on the inputs, else None."""
-        op, _, attribute = self.nodes[self.outputs[output]]
-        return attribute if op == "constant" else None
+        return self.line.constant(output)
 
     def find_inputs(self, outputs: Sequence[int]) -> frozenset[int]:
         """The positions of the inputs that any of some outputs depends on."""

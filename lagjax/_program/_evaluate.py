@@ -23,8 +23,8 @@ def evaluate(line, columns: Sequence, steps: Callable | None = None, groups: Gro
 
     `steps` gives those of `steps_of` for a precision, where they are kept; of large lines `groups` are evaluated.
 
-    `columns` holds one entry for each input: a number, or one number for each of S states, shape (S,). Floats have the
-    precision of the float columns. Values are dropped as soon as nothing needs them.
+    `columns` holds one entry for each input: a number, () or (1,), or one number for each of S states, shape (S,).
+    Floats have the precision of the float columns. Values are dropped as soon as nothing needs them.
     """
     columns, precision, count = _prepare_columns(line, columns, groups)
     results = np.empty((len(line.outputs), count), precision)
@@ -38,7 +38,7 @@ def evaluate(line, columns: Sequence, steps: Callable | None = None, groups: Gro
     sequence = steps_of(line, precision) if steps is None else steps(precision)
     with np.errstate(all="ignore"):
         for start in range(0, count, CHUNK):
-            part = columns if count <= CHUNK else [x if np.ndim(x) == 0 else x[start : start + CHUNK] for x in columns]
+            part = columns if count <= CHUNK else [_cut(x, slice(start, start + CHUNK)) for x in columns]
             values = _values(sequence, part)
             for row, i in enumerate(line.outputs):
                 results[row, start : start + CHUNK] = values[i]

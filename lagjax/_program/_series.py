@@ -45,6 +45,11 @@ class StraightLine(NamedTuple):
     kinds: tuple[str, ...]
     outputs: tuple[int, ...]
 
+    def constant(self, output: int) -> float | None:
+        """The value of an output that does not depend on the inputs, else None."""
+        op, _, attribute = self.nodes[self.outputs[output]]
+        return attribute if op == "constant" else None
+
 
 class LinearSystem(NamedTuple):
     """A z = r, of which the outputs of a program are the solution: nodes of that program.
