@@ -218,7 +218,7 @@ class Flow:
         solution = Solution(*done[:3], result, done.steps, done.rejected, event, ticket, done.idle)
         if (result == SUCCESSFUL).all():
             return solution
-        again, flow, tolerances = self._second_chance(result, done.steps, tolerances)
+        again, flow, tolerances = self._second_chance(solution, ts, params, tolerances)
         if not again.any():
             return solution
         some_ts, some_y0, some_params = members(again, ts, y0, params)
@@ -234,11 +234,7 @@ class Flow:
         if not some.size:
             return solution
         times, numbers = (x[some] if len(x) > 1 else x for x in (ts, params))
-
-        def acceleration(t, y):
-            own = numbers.T if len(numbers) > 1 else numbers[0]
-            return self.general_program.evaluate_many([*y.T, t, *own])[: self.size].T
-
+        acceleration = functools.partial(self._accelerations, numbers)
         y_end, t_end, _, accepted, rejected = (x[some] for x in solution[1:6])
         end = End(t_end, y_end, times[:, 0], times[:, -1], accepted, rejected)
         not_finite, jumps = what_stopped(acceleration, end, shrank[some], spent[some])
@@ -246,18 +242,25 @@ class Flow:
         solution.result[some[not_finite]] = _NOT_FINITE
         return solution
 
-    def _second_chance(self, result, steps, tolerances: Tolerances) -> "tuple[np.ndarray, Flow, Tolerances]":
+    def _accelerations(self, params, t, y) -> np.ndarray:
+        """q̈ (N, n) at N states."""
+        return self.general_program.evaluate_many([*y.T, t, *params.T])[: self.size].T
+
+    def _second_chance(self, solution, ts, params, tolerances: Tolerances) -> "tuple[np.ndarray, Flow, Tolerances]":
         """The members to run once more, by which flow and with which tolerances.
 
         A program that assumes a regular mass matrix gives way to one that does not, which is long where a recursion in
         L made it short: without constraints, only if that matrix seems singular. And where constraints become
         dependent, as at a dead centre, a step must not end: rounding of q would decide on q̇, or allow no step from
         there. The kernel takes such steps again; where that does not help, steps of other sizes all along may.
-        The coefficients of a fast motion grow by its rate ω from order to order: where ωᵖ overflows, a lower order may
-        do.
+        Where q̈ is finite and its series is not, that may overflow: the coefficients of what changes at a rate ω grow by
+        ω from order to order, and a lower order may do.
         """
-        overflows = (result == _NOT_FINITE) & (steps == 0)
+        result = solution.result
+        overflows = result == _NOT_FINITE
         if overflows.any() and not tolerances.order:
+            accelerations = self._accelerations(params, solution.t_end, solution.y_end)
+            overflows &= np.isfinite(accelerations).all(axis=1)
             return overflows, self, tolerances._replace(order=_native.LEAST_ORDER)
         given_up = np.isin(result, _GIVEN_UP if self.projection is not None else _SINGULAR)
         if given_up.any() and (general := self.general()) is not None:

@@ -104,3 +104,14 @@ def test_rates_whose_powers_overflow():
         by_q, by_rate = jax.vmap(slope(lambda *x: end(*x).q[-1], (0, 1)), (None, 0))(1.0, rates)
         np.testing.assert_allclose(by_q, np.cos(3.0), atol=1e-10)
         np.testing.assert_allclose(by_rate * rates, -3.0 * np.sin(3.0), atol=1e-10)
+
+
+def test_rates_whose_powers_overflow_on_the_way():
+    """A pulse 1e-15 m wide at the speed of atoms, 1.5e18 per second, is met after a flight that knows no rate."""
+
+    def end(length, time):
+        pulse = lambda q, v: -0.3 * length / time**2 * 1e3 / jnp.cosh((q / length - 0.2) * 1e5) ** 2
+        system = lagjax.System(lambda q, v: 0.5 * v**2, forces=pulse)
+        return lagjax.simulate(system, 0.0, 1.5 * length / time, jnp.array([0.0, 10 * time])).q[-1] / length
+
+    np.testing.assert_allclose(end(1e-10, 1e-13), end(1.0, 1.0), rtol=1e-8)
