@@ -23,13 +23,13 @@ from benchmarks import _contenders
 from benchmarks._cases import CASES, Case, double_pendulum
 from benchmarks._contenders import Contender, autodiff_acceleration, named
 from benchmarks._measure import Comparison, compare, seconds
-from lagjax._derivation import derivation_of
-from lagjax._diffrax._equations import MotionEquations, form_of
-from lagjax._layout import Layout
-from lagjax._machine_code import MachineCode
+from lagjax._engine._problem import Problem
+from lagjax._engine.diffrax._equations import MotionEquations, form_of
+from lagjax._engine.taylor import MachineCode
+from lagjax._equations._derivation import derivation_of
+from lagjax._interface._layout import Layout
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, compile_module, lanes
 from lagjax._native._lanes import emit, sincos_function
-from lagjax._problem import Problem
 from lagjax._program import StraightLine, lower
 
 TOLERANCE = 1e-9

@@ -20,8 +20,8 @@ from benchmarks._cases import Case, chain
 from benchmarks._contenders import Contender, named
 from benchmarks._measure import seconds
 from lagjax import _native
-from lagjax._derivation import Derivation
-from lagjax._layout import Layout
+from lagjax._equations._derivation import Derivation
+from lagjax._interface._layout import Layout
 
 LINKS = (2, 4, 8, 16)
 PROGRAMS = ("lagjax", "lagjax, diffrax", "diffrax, by hand", "diffrax, autodiff", "heyoka, SIMD", "SciPy + SymPy")

@@ -17,9 +17,9 @@ import lagjax
 from benchmarks._cases import Case, double_pendulum
 from benchmarks._contenders import SINGLE, installed
 from benchmarks._measure import seconds
-from lagjax._layout import Layout
-from lagjax._machine_code import MachineCode, flow_of
-from lagjax._problem import Problem
+from lagjax._engine._problem import Problem
+from lagjax._engine.taylor import MachineCode, flow_of
+from lagjax._interface._layout import Layout
 
 TOLERANCE, CALLS, INSIDE = 1e-9, 20, 100
 

@@ -36,7 +36,7 @@ import lagjax
 from benchmarks import _report, basin
 from benchmarks._ptx import PtxOnCpu, outputs_of
 from lagjax import scenes
-from lagjax._machine_code import _gpu_launch, _primitives
+from lagjax._engine.taylor import _gpu_launch, _primitives
 from lagjax._native import gpu
 
 STORE = Path(__file__).parent / "results" / "gpu_estimate.json"

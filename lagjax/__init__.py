@@ -60,7 +60,8 @@ import importlib.util
 import warnings
 from typing import TYPE_CHECKING, Any
 
-from lagjax._system import System
+from lagjax._interface import PLACES
+from lagjax._scene import System
 
 if TYPE_CHECKING:  # each is imported on first use: all of them take as long as JAX itself
     from lagjax import designs, plot, results, scenes
@@ -76,9 +77,17 @@ if TYPE_CHECKING:  # each is imported on first use: all of them take as long as 
         routhian,
         same_motion,
     )
-    from lagjax._check import check
-    from lagjax._crossings import crossings
-    from lagjax._diffrax import FineOutput
+    from lagjax._analysis.orbits import (
+        action,
+        branch_off,
+        family,
+        find_path,
+        lyapunov_exponent,
+        lyapunov_spectrum,
+        periodic_orbit,
+    )
+    from lagjax._engine.diffrax import FineOutput
+    from lagjax._engine.taylor import MachineCode
     from lagjax._fit import (
         Clipped,
         Delayed,
@@ -96,22 +105,13 @@ if TYPE_CHECKING:  # each is imported on first use: all of them take as long as 
         simplex,
         wrapped,
     )
-    from lagjax._hybrid import Hybrid, Transition, simulate_hybrid
-    from lagjax._machine_code import MachineCode
-    from lagjax._orbits import (
-        action,
-        branch_off,
-        family,
-        find_path,
-        lyapunov_exponent,
-        lyapunov_spectrum,
-        periodic_orbit,
-    )
-    from lagjax._precision import work_precision
-    from lagjax._results import RESULTS, SimulationError
-    from lagjax._samples import samples
-    from lagjax._simulate import simulate, simulate_batch
+    from lagjax._interface import RESULTS, SimulationError
+    from lagjax._run import crossings, simulate, simulate_batch
+    from lagjax._run.hybrid import Hybrid, Transition, simulate_hybrid
+    from lagjax._scene import samples
     from lagjax._sweep import Statistics, Sweep, sweep
+    from lagjax._trust import work_precision
+    from lagjax._trust.checks import check
     from lagjax.results import *  # noqa: F403
 
 __version__ = "0.1.0"
@@ -171,6 +171,10 @@ __all__ = [
     "wrapped",
 ]
 
+
+# What judges and shows a motion stands above it, and is imported when a method of `Trajectory` calls it.
+PLACES.update(dict.fromkeys(("dataset", "frame", "make_animation", "summary", "trajectory_html"), "lagjax._show"))
+PLACES.update(describe_failure="lagjax._trust", examine="lagjax._trust.health")
 
 _MOVED = {name: f"lagjax.designs.{name}" for name in ("latin_hypercube", "random", "sobol")}
 

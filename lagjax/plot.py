@@ -19,16 +19,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._analysis import Modes
-from lagjax._arguments import Function, accept
-from lagjax._check import join_names
-from lagjax._crossings import Crossings
-from lagjax._display import COLORS, course_of, courses_of, join_curve, require_points, times_of_members
 from lagjax._fit import Fit, Record, draw_record, record_matrix
-from lagjax._health import does_work
-from lagjax._layout import Layout
-from lagjax._platform import is_known
-from lagjax._precision import WorkPrecision
-from lagjax._trajectory import Trajectory
+from lagjax._interface import Function, Layout, accept, is_known
+from lagjax._run import Crossings, Trajectory
+from lagjax._show import COLORS, course_of, courses_of, join_curve, require_points, times_of_members
+from lagjax._trust import WorkPrecision
+from lagjax._trust.checks import join_names
+from lagjax._trust.health import does_work
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")
 GREY = "0.55"

@@ -59,16 +59,15 @@ from lagjax._analysis import (
     Routhian,
     SameMotion,
 )
-from lagjax._check import Finding, Findings
-from lagjax._crossings import Crossings
-from lagjax._display import Animation
-from lagjax._explain import Explanation
+from lagjax._analysis.orbits import Family, LyapunovExponent, Orbit, Path
 from lagjax._fit import Comparison, Experiments, Fit, Prediction, Profile
-from lagjax._health import Health
-from lagjax._orbits import Family, LyapunovExponent, Orbit, Path
-from lagjax._precision import WorkPrecision, WorkPrecisionRow
+from lagjax._run import Crossings, State, Trajectory, Transitions
+from lagjax._scene import Explanation
+from lagjax._show import Animation
 from lagjax._sweep import Status, Summary
-from lagjax._trajectory import State, Trajectory, Transitions
+from lagjax._trust import WorkPrecision, WorkPrecisionRow
+from lagjax._trust.checks import Finding, Findings
+from lagjax._trust.health import Health
 
 __all__ = [
     "Animation",

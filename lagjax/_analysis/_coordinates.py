@@ -11,10 +11,9 @@ import jax
 import jax.numpy as jnp
 
 from lagjax._analysis._solve import is_root, newton, shortest_preimage, shortest_solution
-from lagjax._arguments import Function, accept, present
-from lagjax._failures import nan_unless
-from lagjax._layout import Layout
-from lagjax._system import System, require_system
+from lagjax._interface import Function, Layout, accept, present
+from lagjax._primitives import nan_unless
+from lagjax._scene import System, require_system
 
 PyTree = Any
 

@@ -8,17 +8,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from lagjax._analysis._scene_state import SceneState
-from lagjax._analysis._settle import settle
 from lagjax._analysis._solve import is_root, levenberg_marquardt, polish, shortest_preimage
-from lagjax._constraints import ROUNDINGS
-from lagjax._doubles import accepts_singles
-from lagjax._failures import nan_unless
-from lagjax._layout import describe_numbers
-from lagjax._linear import least_norm
-from lagjax._platform import compile_for_one_call, is_known
-from lagjax._results import show_str
-from lagjax._system import System
-from lagjax._validate import require_flag
+from lagjax._analysis._state_of_rest import settle
+from lagjax._equations import ROUNDINGS, least_norm
+from lagjax._interface import compile_for_one_call, describe_numbers, is_known, require_flag, show_str
+from lagjax._primitives import accepts_singles, nan_unless
+from lagjax._scene import System
 
 PyTree = Any
 Vector = Float[Array, " n"]

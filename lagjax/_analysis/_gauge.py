@@ -17,8 +17,8 @@ from lagjax._analysis._noether import FlatState, variation
 from lagjax._analysis._potential import line_integral
 from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._transformations import Fields
-from lagjax._doubles import accepts_singles
-from lagjax._platform import compile_for_one_call
+from lagjax._interface import compile_for_one_call
+from lagjax._primitives import accepts_singles
 
 # Parts of the terms of Λ that count as zero, and what the gradient of G may be off.
 _ZERO, _RIGHT = 1e-10, 1e-9

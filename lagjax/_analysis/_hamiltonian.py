@@ -14,13 +14,11 @@ from jaxtyping import Array, Bool, Float
 
 from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._solve import is_root, newton, shortest_preimage
-from lagjax._consistent import has_constraints
-from lagjax._failures import nan_unless
-from lagjax._layout import Layout
-from lagjax._platform import compile_for_one_call
-from lagjax._simulate import simulate
-from lagjax._system import System, present_system, require_system
-from lagjax._validate import as_arrays
+from lagjax._equations import has_constraints
+from lagjax._interface import Layout, as_arrays, compile_for_one_call
+from lagjax._primitives import nan_unless
+from lagjax._run import simulate
+from lagjax._scene import System, present_system, require_system
 
 PyTree = Any
 Vector = Float[Array, " n"]

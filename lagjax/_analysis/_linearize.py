@@ -8,13 +8,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lagjax._analysis._scene_state import SceneState
-from lagjax._analysis._smooth import is_smooth, require_smooth
-from lagjax._doubles import accepts_singles
-from lagjax._failures import nan_unless
-from lagjax._linear import diagonal_scale, factorize, least_norm, saddle
-from lagjax._platform import compile_for_one_call, is_known
-from lagjax._results import show_str
-from lagjax._system import System
+from lagjax._analysis._smoothness import is_smooth, require_smooth
+from lagjax._equations import diagonal_scale, factorize, least_norm, saddle
+from lagjax._interface import compile_for_one_call, is_known, show_str
+from lagjax._primitives import accepts_singles, nan_unless
+from lagjax._scene import System
 
 PyTree = Any
 Vector = Float[Array, " n"]

@@ -19,16 +19,13 @@ from lagjax._analysis._eigen import exponents_and_modes, null_space, symmetric_m
 from lagjax._analysis._equilibrium import require_steady
 from lagjax._analysis._linearize import steady_matrices
 from lagjax._analysis._scene_state import SceneState
-from lagjax._analysis._smooth import is_smooth, require_smooth
+from lagjax._analysis._smoothness import is_smooth, require_smooth
 from lagjax._analysis._solve import shortest_solution
-from lagjax._doubles import accepts_singles
-from lagjax._failures import nan_unless
-from lagjax._linear import dependent_rows, diagonal_scale, factorize, least_norm, schur_complement
-from lagjax._linear import rank as rank_of
-from lagjax._platform import compile_for_one_call
-from lagjax._results import show_str
-from lagjax._system import System
-from lagjax._validate import is_concrete
+from lagjax._equations import dependent_rows, diagonal_scale, factorize, least_norm, schur_complement
+from lagjax._equations import rank as rank_of
+from lagjax._interface import compile_for_one_call, is_concrete, show_str
+from lagjax._primitives import accepts_singles, nan_unless
+from lagjax._scene import System
 
 PyTree = Any
 Vector = Float[Array, " n"]

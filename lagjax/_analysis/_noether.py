@@ -16,10 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lagjax._analysis._scene_state import SceneState
-from lagjax._arguments import Function, accept, present
-from lagjax._layout import Layout
+from lagjax._interface import Function, Layout, accept, present
 from lagjax._program import Unlowerable
-from lagjax._system import System, present_system, require_system
+from lagjax._scene import System, present_system, require_system
 
 PyTree = Any
 Vector = Float[Array, " n"]

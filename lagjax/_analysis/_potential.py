@@ -15,9 +15,9 @@ from jaxtyping import Array
 
 from lagjax._analysis._noether import FlatState
 from lagjax._analysis._scene_state import SceneState
-from lagjax._platform import compile_for_one_call
-from lagjax._scales import Scales
-from lagjax._system import System
+from lagjax._equations import Scales
+from lagjax._interface import compile_for_one_call
+from lagjax._scene import System
 
 # Nodes of Gauss's rule: exact for polynomials of degree 63.
 _NODES = 32

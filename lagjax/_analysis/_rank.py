@@ -8,8 +8,8 @@ along a symmetry. Which part that is, is a decision about singular values σ: ze
 caller states.
 
 This is NumPy, of any number of matrices at once. What is compiled and differentiated by JAX decides by pivots instead,
-in `_solve` and `lagjax._linear`: a singular value decomposition would be a kernel of LAPACK inside of XLA, without a
-derivative where singular values meet.
+in `_solve` and `lagjax._equations._linear`: a singular value decomposition would be a kernel of LAPACK inside of XLA,
+without a derivative where singular values meet.
 """
 
 from typing import NamedTuple

@@ -15,12 +15,10 @@ from jaxtyping import Array
 
 from lagjax._analysis._coordinates import restrict_signature
 from lagjax._analysis._scene_state import SceneState
-from lagjax._arguments import present
-from lagjax._layout import Layout
-from lagjax._linear import factorize
-from lagjax._simulate import simulate
-from lagjax._system import System, present_system
-from lagjax._trajectory import State, Trajectory
+from lagjax._equations import factorize
+from lagjax._interface import Layout, present
+from lagjax._run import State, Trajectory, simulate
+from lagjax._scene import System, present_system
 
 PyTree = Any
 

@@ -8,16 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax._consistent import has_constraints
-from lagjax._derivation import Derivation, columns_of, derivation_of
-from lagjax._layout import Layout
-from lagjax._machine_code import lowered_motion
-from lagjax._many_states import Sample
-from lagjax._motion import Motion
+from lagjax._engine.taylor import lowered_motion
+from lagjax._equations import Derivation, Motion, Sample, Scales, columns_of, derivation_of, has_constraints
+from lagjax._interface import Layout, as_arrays, is_concrete, require_finite
 from lagjax._program import Unlowerable
-from lagjax._scales import Scales
-from lagjax._system import ROLES, System, require_system
-from lagjax._validate import as_arrays, is_concrete, require_finite
+from lagjax._scene import ROLES, System, require_system
 
 PyTree = Any
 Vector = Float[Array, " n"]

@@ -2,8 +2,8 @@
 
 `newton` begins near a root, `levenberg_marquardt` far from one, and `polish` ends at rounding what that has found. All
 steps are those of `shortest_solution`, but damped ones, whose matrix is regular. No kernel of LAPACK runs in XLA. The
-iteration of orbits and paths, `lagjax._orbits._shooting`, is in NumPy: a trial there is a run of machine code, of as
-many members as still gain.
+iteration of orbits and paths, `lagjax._analysis.orbits._shooting`, is in NumPy: a trial there is a run of machine code,
+of as many members as still gain.
 """
 
 from collections.abc import Callable
@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from lagjax._linear import factorize, invert, least_norm, singular_threshold
+from lagjax._equations import factorize, invert, least_norm, singular_threshold
 
 Matrix = Float[Array, "n n"]
 Vector = Float[Array, " n"]

@@ -19,17 +19,14 @@ from jaxtyping import Array, Float
 from lagjax._analysis._gauge import changes_of, gauge_of, is_right
 from lagjax._analysis._noether import FlatState, euler_lagrange, flat_generator, variation
 from lagjax._analysis._potential import absorb_potential_forces
+from lagjax._analysis._random_states import perturb_last_digits, random_states
 from lagjax._analysis._rank import decide
 from lagjax._analysis._scene_state import SceneState
-from lagjax._analysis._states import perturb_last_digits, random_states
 from lagjax._analysis._transformations import Fields, fields_of, textbook_symmetries
-from lagjax._arguments import accept
-from lagjax._doubles import accepts_singles
-from lagjax._layout import Layout
-from lagjax._platform import compile_for_one_call
-from lagjax._results import show_str
-from lagjax._system import System
-from lagjax._trajectory import Trajectory
+from lagjax._interface import Layout, accept, compile_for_one_call, show_str
+from lagjax._primitives import accepts_singles
+from lagjax._run import Trajectory
+from lagjax._scene import System
 
 PyTree = Any
 

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._layout import Layout
+from lagjax._interface import Layout
 
 # Up to this many coordinates every linear map is tried, 144 of them.
 _ALL_MAPS = 12

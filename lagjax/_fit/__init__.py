@@ -38,9 +38,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._arguments import find_params_expression
-from lagjax._consistent import has_constraints
-from lagjax._doubles import DOUBLE, with_doubles
+from lagjax._engine import DEFAULT_RTOL
+from lagjax._equations import has_constraints
 from lagjax._fit._descent import Descent
 from lagjax._fit._motions import Manifold, choose_motions
 from lagjax._fit._noise import (
@@ -100,10 +99,10 @@ from lagjax._fit._verdict import (
     require_measurements,
     verdict,
 )
-from lagjax._hybrid import Hybrid, Scene, first_law, require_scene
-from lagjax._layout import Layout
-from lagjax._problem import DEFAULT_RTOL
-from lagjax._samples import HOLDS
+from lagjax._interface import Layout, find_params_expression
+from lagjax._primitives import DOUBLE, with_doubles
+from lagjax._run.hybrid import Hybrid, Scene, first_law, require_scene
+from lagjax._scene import HOLDS
 
 __all__ = [
     "Clipped",

@@ -58,10 +58,10 @@ import numpy as np
 from jax.scipy.special import gammaln
 from scipy.special import polygamma
 
-from lagjax._doubles import accepts_singles
 from lagjax._fit._noise import AbstractNoise, NoiseScale, StudentT
 from lagjax._fit._parameters import AbstractSeparable
 from lagjax._fit._residuals import LostTrial, Residuals, Trial, compress_rows
+from lagjax._primitives import accepts_singles
 
 _LEAST_DOF, _MOST_DOF = 1.0, 200.0  # ν is between these, with a flat density of its logarithm
 

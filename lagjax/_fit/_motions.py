@@ -24,19 +24,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._engine import choose
-from lagjax._failures import sentence
+from lagjax._engine import Problem, choose
+from lagjax._engine.taylor import KEPT, Flow, MachineCode, flow_of, jvp, project_start_tangents, tolerances_of
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Driven, Form, SampleTable, input_functions, start_pair
-from lagjax._hybrid import Hybrid, Scene, first_law
-from lagjax._layout import Layout, halves
-from lagjax._machine_code import KEPT, Flow, MachineCode, flow_of, jvp, project_start_tangents, tolerances_of
+from lagjax._interface import ENDED_WELL, Layout, halves
 from lagjax._native import Projection
-from lagjax._problem import Problem
+from lagjax._primitives import sentence
 from lagjax._program import evaluate
-from lagjax._results import ENDED_WELL
-from lagjax._simulate import simulate
-from lagjax._system import System
+from lagjax._run import simulate
+from lagjax._run.hybrid import Hybrid, Scene, first_law
+from lagjax._scene import System
 
 PyTree = Any
 

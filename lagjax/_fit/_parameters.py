@@ -27,8 +27,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from lagjax._layout import labelled_leaves
-from lagjax._validate import as_arrays, require_finite
+from lagjax._interface import as_arrays, labelled_leaves, require_finite
 
 PyTree = Any
 

@@ -21,8 +21,7 @@ from lagjax._fit._residuals import LostTrial, Residuals, SystemPart, SystemResid
 from lagjax._fit._search import build_reader
 from lagjax._fit._sensors import UNCLEAR, wrap_residuals
 from lagjax._fit._uncertainty import LEVEL, covariance_of_one_start, require_level, signal_deviations
-from lagjax._simulate import simulate
-from lagjax._trajectory import Trajectory
+from lagjax._run import Trajectory, simulate
 
 PyTree = Any
 

@@ -20,13 +20,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._arguments import Function
-from lagjax._hybrid import Scene, laws
-from lagjax._layout import Layout, labelled_leaves
-from lagjax._reads import Edition
-from lagjax._samples import MARGINS, continued, samples, unevenly_spaced
-from lagjax._system import System
-from lagjax._validate import require_concrete
+from lagjax._interface import Function, Layout, labelled_leaves, require_concrete
+from lagjax._interface.reads import Edition
+from lagjax._run.hybrid import Scene, laws
+from lagjax._scene import MARGINS, System, continued, samples, unevenly_spaced
 
 PyTree = Any
 
@@ -69,7 +66,7 @@ class Driven(NamedTuple):
 
 
 class Form(NamedTuple):
-    """The structure of an input at one time, and its interpolation between samples, one of `lagjax._samples.HOLDS`."""
+    """The structure of an input at one time, and its interpolation between samples, one of `_samples.HOLDS`."""
 
     tree: Any
     shapes: tuple[tuple[int, ...], ...]

@@ -43,10 +43,10 @@ from lagjax._fit._records import (
 )
 from lagjax._fit._sensors import Signals, wrap_residuals
 from lagjax._fit._timings import Clock
-from lagjax._hybrid import Scene
-from lagjax._layout import Layout, halves
-from lagjax._simulate import simulate
-from lagjax._system import System
+from lagjax._interface import Layout, halves
+from lagjax._run import simulate
+from lagjax._run.hybrid import Scene
+from lagjax._scene import System
 
 
 class Trial(NamedTuple):

@@ -11,8 +11,6 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lagjax._display import cell, intervals
-from lagjax._doubles import with_doubles
 from lagjax._fit._density import Density
 from lagjax._fit._noise import AbstractNoise, NoiseScale
 from lagjax._fit._parameters import Parameters
@@ -34,6 +32,8 @@ from lagjax._fit._residuals import Residuals, SystemPart, Trial
 from lagjax._fit._sample import draw, inference_data
 from lagjax._fit._search import Waterfall
 from lagjax._fit._uncertainty import LEVEL, Experiments, Information, rank_experiments
+from lagjax._primitives import with_doubles
+from lagjax._show import cell, intervals
 
 PyTree = Any
 

@@ -54,7 +54,7 @@ import numpy as np
 from scipy.linalg import block_diag
 from scipy.optimize import least_squares
 
-from lagjax._consistent import has_constraints
+from lagjax._equations import has_constraints
 from lagjax._fit._descent import Anchor, Descent, build_descent, column_norms, descend_gradient, eliminate, minimise
 from lagjax._fit._motions import AbstractMotions
 from lagjax._fit._noise import Gaussian, NoiseScale
@@ -71,9 +71,9 @@ from lagjax._fit._records import (
 from lagjax._fit._residuals import LostTrial, Residuals, SystemResiduals
 from lagjax._fit._sensors import unwrap_record
 from lagjax._fit._verdict import measure_unexplained
-from lagjax._hybrid import Hybrid
-from lagjax._layout import halves
-from lagjax._system import System
+from lagjax._interface import halves
+from lagjax._run.hybrid import Hybrid
+from lagjax._scene import System
 
 _DEGREE = 3  # of local polynomials: velocities without the bias that curvature gives to lines
 _WINDOWS = (7, 13, 25, 49, 97, 193)  # samples in one of them

@@ -31,12 +31,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._arguments import accept
 from lagjax._fit._motions import RecordMotion
 from lagjax._fit._noise import find_step
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Form, Record, restore_structure, spread_over_signals
-from lagjax._layout import Layout, halves
+from lagjax._interface import Layout, accept, halves
 
 PyTree = Any
 

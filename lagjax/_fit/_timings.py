@@ -14,17 +14,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._crossings import directions_of, sections_of
-from lagjax._failures import sentence
+from lagjax._engine import Problem, Solution
+from lagjax._engine.taylor import MachineCode, Noted, surfaces_of
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._records import Guess, MeasuredSignal, real_numbers, require_start
-from lagjax._hybrid import Hybrid, Scene, Transition
-from lagjax._layout import Layout, halves
-from lagjax._machine_code import MachineCode, Noted, surfaces_of
-from lagjax._problem import Problem, Solution
-from lagjax._simulate import simulate
-from lagjax._system import System
-from lagjax._trajectory import Trajectory, Transitions
+from lagjax._interface import Layout, halves
+from lagjax._primitives import sentence
+from lagjax._run import Trajectory, Transitions, directions_of, sections_of, simulate
+from lagjax._run.hybrid import Hybrid, Scene, Transition
+from lagjax._scene import System
 
 PyTree = Any
 _BUDGET = 10_000_000  # steps: observations last for thousands of periods

@@ -13,19 +13,20 @@ one Taylor series, of the order that the tolerance asks for.
     _table_reads         entries of tables, read from where the numbers of a member lie
     _constants           every numerical choice, with its reason
     _frame               the memory of a thread, the lanes and the job, as a function of a kernel sees them
-    _parts               the programs that a kernel is made from, and their series
+    _motion_parts        the programs that a kernel is made from, and their series
     _taylor              the coefficients of a motion, and what is read off them along a step
     _projection          the way back to the constraints;  _rank_drops: where these become dependent
     _step                step control
     _border_control      the borders of a piecewise program: a step ends at the first one
     _guards              functions of the state that are watched;  _events: where they change sign
     _roots               the zeros of a polynomial: borders and guards have series
-    _output              the outputs, and the record of steps
+    _run_records         the outputs, and the record of steps
     _integrator          all of these, round by round
     _maps                what a step is composed of, each map with its pushforward and its pullback
     _saltation           one more such map: the jump of derivatives at a border, and at a knot of samples
-    _directions          the memory of tangents;  _cotangents: that of cotangents
-    _replay              recorded steps once more;  _tangent, _adjoint: their maps forward and back
+    _retraction          one more: onto a border
+    _tangent_memory      the memory of tangents;  _cotangents: that of cotangents
+    _recorded_steps      recorded steps once more;  _tangent, _adjoint: their maps forward and back
     _kernel              motions and derivatives as functions of arrays;  _threads: on several cores, interruptible
     _handler             the motion as a call of XLA;  _derivative_handler: derivatives of short motions
     _line_handler        any straight line as a call of XLA
@@ -65,7 +66,7 @@ from lagjax._native._kernel import (
     floor_of,
 )
 from lagjax._native._line_handler import LineCode, line_handler
-from lagjax._native._parts import Projection, pieces_of, recurrences, require_recurrences
+from lagjax._native._motion_parts import Projection, pieces_of, recurrences, require_recurrences
 from lagjax._native._taylor import is_large, order_for
 from lagjax._native._threads import map_in_threads
 from lagjax._program._jump import Nesting

@@ -21,8 +21,8 @@ from lagjax._native._cotangents import Cotangents
 from lagjax._native._frame import Frame, Lane, job
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._maps import CauchyProducts, OrderRecursion, ProjectedEnd, SeriesSum, ZerothOrder
-from lagjax._native._parts import MotionParts
-from lagjax._native._replay import Replay
+from lagjax._native._motion_parts import MotionParts
+from lagjax._native._recorded_steps import Replay
 
 # `y_ct` is the cotangent of the end, and becomes that of the start.
 JOB = job(

@@ -47,7 +47,7 @@ SINGLE_DIGITS = Digits.from_rounding(2.0**-23, 2e-2, 2.0**-50, 2.0**-110)
 # ---- how a member ended ----------------------------------------------------------------------------------------------
 
 DONE, OUT_OF_STEPS, STEP_TOO_SMALL, NOT_FINITE, SINGULAR, PROJECTION_FAILED, DISCONTINUOUS, EVENT = range(8)
-# The kernel itself does not give `DISCONTINUOUS`: `_stopped` finds it about the state where it stopped.
+# The kernel itself does not give `DISCONTINUOUS`: `_stop_reason` finds it about the state where it stopped.
 # EVENT + Σ 4ᵏ (1 where guard k falls, 2 where it rises), over those that do so at that instant.
 RUNNING = -1
 

@@ -19,7 +19,7 @@ from lagjax._native._constants import DONE
 from lagjax._native._frame import CACHE_LINE
 from lagjax._native._handler import call, handler_function, job_of, load_at, run_call
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value, compile_module, lanes
-from lagjax._native._output import RECORDED
+from lagjax._native._run_records import RECORDED
 
 _COUNTERS = 4  # next member of both sweeps, next row, idle lanes
 _POINTERS = ("begin", "run", "begin_sweep", "run_sweep")

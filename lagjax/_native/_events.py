@@ -31,8 +31,8 @@ from lagjax._native._constants import (
 )
 from lagjax._native._frame import Frame, Lane, integers
 from lagjax._native._ir import INTEGER, Code, Value, Variable
-from lagjax._native._output import Output
 from lagjax._native._roots import Roots, Touch
+from lagjax._native._run_records import Output
 from lagjax._native._step import StepControl
 from lagjax._native._taylor import TaylorSeries, double
 from lagjax._program._series import StraightLine

@@ -18,7 +18,7 @@ from lagjax._native import _adjoint, _integrator
 from lagjax._native._frame import CACHE_LINE, LANE
 from lagjax._native._handler import job_of
 from lagjax._native._ir import BIT, DOUBLE, FLOAT, INTEGER, POINTER, Code, Value
-from lagjax._native._output import RECORDED
+from lagjax._native._run_records import RECORDED
 from lagjax._native._taylor import TaylorSeries
 
 _ROUNDS = 2**63 - 1  # `max_steps` ends every member, and so the kernel

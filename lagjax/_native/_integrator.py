@@ -8,7 +8,7 @@ Every lane of a vector carries one member. A round takes one step in each lane:
     check          the series must satisfy the equations of motion along the step, and end near its constraints
                    (`_projection`), or the step is halved
     stop           where a guard changes sign the step ends (`_events`)
-    advance        outputs inside the step (`_output`), then the state at its end, summed with its rounding errors
+    advance        outputs inside the step (`_run_records`), then the state at its end, summed with its rounding errors
                    carried along
     finish         a lane whose member has ended takes the next one of the batch
 
@@ -24,10 +24,10 @@ from lagjax._native._events import Events
 from lagjax._native._frame import Frame, Lane, job
 from lagjax._native._guards import Guards
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value
-from lagjax._native._output import Output
-from lagjax._native._parts import MotionParts
+from lagjax._native._motion_parts import MotionParts
 from lagjax._native._projection import Projector
 from lagjax._native._roots import Roots
+from lagjax._native._run_records import Output
 from lagjax._native._single_member import SingleMember, fills_lanes
 from lagjax._native._step import PARTS, StepControl
 from lagjax._native._taylor import TaylorSeries, double, integer, is_large

@@ -26,9 +26,9 @@ from lagjax._native._guards import Guards
 from lagjax._native._handler import Plan, Rest, allocate_aligned, handler
 from lagjax._native._integrator import Integrator
 from lagjax._native._ir import DOUBLE, FLOAT, compile_module, lanes
-from lagjax._native._output import RECORDED
+from lagjax._native._motion_parts import Chosen, MotionParts, Projection, choose_parameters
 from lagjax._native._packs import forget_stages
-from lagjax._native._parts import Chosen, MotionParts, Projection, choose_parameters
+from lagjax._native._run_records import RECORDED
 from lagjax._native._schedule import forget_joined
 from lagjax._native._single_member import fills_lanes
 from lagjax._native._table_reads import SET_NUMBERS

@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterator, Sequence
 import numpy as np
 from llvmlite import ir
 
-from lagjax._digits import COS, PI_2, PI_2_ROUNDED, SIN
 from lagjax._native._constants import LARGEST_ANGLE
 from lagjax._native._frame import Frame, Numbers, Vectors
 from lagjax._native._ir import BIT, DOUBLE, FLOAT, POINTER, Code, Value, element_of
+from lagjax._program._digits import COS, PI_2, PI_2_ROUNDED, SIN
 from lagjax._program._graph import Unlowerable
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._series import StraightLine

@@ -23,11 +23,11 @@ from llvmlite import ir
 
 from lagjax._native._constants import MAX_ORDER
 from lagjax._native._cotangents import Cotangents, add
-from lagjax._native._directions import Directions
 from lagjax._native._frame import Frame, Lane, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
-from lagjax._native._output import instant_about
-from lagjax._native._parts import MotionParts
+from lagjax._native._motion_parts import MotionParts
+from lagjax._native._run_records import instant_about
+from lagjax._native._tangent_memory import Directions
 from lagjax._native._taylor import TaylorSeries, double
 from lagjax._program._differentiation import pullback, pullback_and_entries, pushforward
 

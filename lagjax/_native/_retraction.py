@@ -15,9 +15,9 @@ from collections.abc import Callable, Sequence
 
 from lagjax._native._constants import JUMP_NOISE
 from lagjax._native._cotangents import Cotangents
-from lagjax._native._directions import Directions
 from lagjax._native._frame import Frame, Index, Vectors
 from lagjax._native._ir import Code, Value
+from lagjax._native._tangent_memory import Directions
 from lagjax._native._taylor import TaylorSeries, integer
 from lagjax._program._borders import SLIDE, Borders
 from lagjax._program._differentiation import pullback_and_entries, pushforward

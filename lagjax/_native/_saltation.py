@@ -14,9 +14,9 @@ import numpy as np
 
 from lagjax._native._constants import JUMP_NOISE
 from lagjax._native._cotangents import Cotangents, add
-from lagjax._native._directions import Directions
 from lagjax._native._frame import Frame, Index, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
+from lagjax._native._tangent_memory import Directions
 from lagjax._native._taylor import TaylorSeries
 from lagjax._program._borders import Borders
 from lagjax._program._jump import Jump

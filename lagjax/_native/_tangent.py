@@ -10,13 +10,13 @@ A step that suits the motion may be too long for its tangents: about an equilibr
 of a tangent does not. So the last two terms of their series are measured, and `excess` says how large they became.
 """
 
-from lagjax._native._directions import Directions
 from lagjax._native._frame import Frame, Lane, job
 from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._maps import CauchyProducts, OrderRecursion, ProjectedEnd, SeriesSum, ZerothOrder
-from lagjax._native._output import instant_about
-from lagjax._native._parts import MotionParts
-from lagjax._native._replay import Replay
+from lagjax._native._motion_parts import MotionParts
+from lagjax._native._recorded_steps import Replay
+from lagjax._native._run_records import instant_about
+from lagjax._native._tangent_memory import Directions
 from lagjax._native._taylor import double
 
 # `y_dot` is the tangent of the start, and becomes that of the end.

@@ -18,7 +18,7 @@ from lagjax._native._constants import LARGEST_LINE, LEAST_ORDER, MAX_ORDER, OPER
 from lagjax._native._frame import Frame, Index, Lane, Memory, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._lanes import Lines, sincos_function
-from lagjax._native._parts import MotionParts
+from lagjax._native._motion_parts import MotionParts
 from lagjax._native._table_reads import LookUps
 from lagjax._native._tables import Tables
 from lagjax._program._series import Recurrent, Series, StraightLine

@@ -23,6 +23,13 @@ inputs broadcast, and every output, constants too, has the shape they broadcast 
 
 Derivatives of a program are those of the function it came from, custom rules included: they are traced from that
 function and lowered in turn, on first use.
+
+`_operations` has a row for each operation: its value, its derivatives, its series. `_graph` shares and, by `_simplify`,
+folds; `_scalars` writes formulas on it, `_passes` finish it; `_differentiation` differentiates it. Series: `_series`,
+with `_recurrences` for operations that have one of their own. Pieces: `_borders` (where they meet), `_sliding` (along
+them), `_jump` and `_kick` (over them), `_powers` (where no series helps), `_look_ups` (tables). Values: `_emit` for
+JAX, `_evaluate` and `_groups` for NumPy, `_rounding` for their error; `_elementary` and `_digits` are sine and cosine
+for CPUs. `_memory` bounds what a graph may take. `lowering/` turns JAX's operations into scalars.
 """
 
 import functools
@@ -37,7 +44,6 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jax.extend import core
 
-from lagjax._program import _complex, _eigenvalues, _special  # noqa: F401  (they register what they lower)
 from lagjax._program import _scalars as scalars
 from lagjax._program._borders import BELOW, CLOCK, FLOOR, SIGN, TABLE, TRUNC, Borders, borders, distances, is_smooth
 from lagjax._program._differentiation import Derivatives, copy_nodes, pullback, pushforward, with_tangents
@@ -46,14 +52,15 @@ from lagjax._program._evaluate import evaluate, round_off, steps_of, vjp
 from lagjax._program._graph import MANY, Graph, Node, Tape, Unlowerable
 from lagjax._program._groups import Groups, groups_of
 from lagjax._program._look_ups import table_of
-from lagjax._program._matrices import orthogonalize, row_weights, solve_orthogonalized
 from lagjax._program._memory import machine_memory, operations_that_fit, pause_collections
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, live, sink_negations
 from lagjax._program._rounding import rounding
-from lagjax._program._rules import LARGEST_UNFOLDED, Expansion, expand_primitive, has_own_rules, inputs_of
 from lagjax._program._scalars import Scalars, apply_function, concatenate, scatter, stack
 from lagjax._program._series import LinearSystem, Series, StraightLine, series
+from lagjax._program.lowering import _complex, _eigenvalues, _special  # noqa: F401  they register their rules
+from lagjax._program.lowering._matrices import orthogonalize, row_weights, solve_orthogonalized
+from lagjax._program.lowering._rules import LARGEST_UNFOLDED, Expansion, expand_primitive, has_own_rules, inputs_of
 
 __all__ = [
     "BELOW", "CLOCK", "FLOOR", "OPERATIONS", "SIGN", "TABLE", "TRUNC", "Borders", "Derivatives", "Expansion", "Graph",

@@ -12,8 +12,8 @@ import numpy as np
 from jax import lax
 from jax.experimental.xla_metadata import set_xla_metadata
 
-from lagjax import _elementary
-from lagjax._platform import default_platform
+from lagjax._interface import default_platform
+from lagjax._program import _elementary
 from lagjax._program._graph import Node
 from lagjax._program._look_ups import BESIDE, Table, table_of
 from lagjax._program._operations import LOOK_UPS, OPERATIONS

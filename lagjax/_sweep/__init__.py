@@ -24,7 +24,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from lagjax._hybrid import Hybrid, Scene, require_scene
+from lagjax._interface import output_times, require_flag
+from lagjax._run.hybrid import Hybrid, Scene, require_scene
 from lagjax._sweep._begin import begin, continues, final_states_of, first_look, require_same
 from lagjax._sweep._description import Description, Sections
 from lagjax._sweep._job import Job, precision, uses_doubles
@@ -43,7 +44,6 @@ from lagjax._sweep._workers import (
     work,
     work_in_children,
 )
-from lagjax._validate import output_times, require_flag
 
 __all__ = [
     "Failure", "Progress", "Statistics", "Status", "Store", "Summary", "Sweep", "run_store", "status", "sweep",

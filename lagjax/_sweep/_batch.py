@@ -16,17 +16,24 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._consistent import has_constraints
-from lagjax._crossings import restore_crossings, sections_of, surfaces_in
-from lagjax._hybrid import Hybrid, Scene
-from lagjax._machine_code import MachineCode, Noted, flow_of, tolerances_of
-from lagjax._problem import Batch, Solution, axes_per_leaf
-from lagjax._results import RESULTS, SUCCESSFUL, code_of, name_of, result_from
-from lagjax._simulate import simulate, simulate_batch, trajectory_of
+from lagjax._engine import Batch, Solution, axes_per_leaf
+from lagjax._engine.taylor import MachineCode, Noted, flow_of, tolerances_of
+from lagjax._equations import has_constraints
+from lagjax._interface import RESULTS, SUCCESSFUL, as_arrays, code_of, name_of, result_from
+from lagjax._run import (
+    State,
+    Trajectory,
+    Transitions,
+    restore_crossings,
+    sections_of,
+    simulate,
+    simulate_batch,
+    surfaces_in,
+    trajectory_of,
+)
+from lagjax._run.hybrid import Hybrid, Scene
 from lagjax._sweep._description import NOT_TRACEABLE, Description, Sections
 from lagjax._sweep._store import RESULT, Quantity
-from lagjax._trajectory import State, Trajectory, Transitions
-from lagjax._validate import as_arrays
 
 PyTree = Any
 CRASHED, KEEP_FAILED = 1000, 1001  # result codes of the sweep's own, far from those of `lagjax.RESULTS`

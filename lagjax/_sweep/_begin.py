@@ -24,16 +24,15 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._hybrid import Hybrid
-from lagjax._layout import Layout
-from lagjax._results import RESULTS, code_of
+from lagjax._interface import RESULTS, Layout, code_of
+from lagjax._run import State
+from lagjax._run.hybrid import Hybrid
 from lagjax._sweep import _batch
 from lagjax._sweep._batch import KeptResults, batches_of, label, names_of, quantities_of
 from lagjax._sweep._description import MOTION, Description, FinalStates, difference, pack_description, texts, users_path
 from lagjax._sweep._job import cpu, record_of, require_versions, source_path, states, uses_doubles, versions
 from lagjax._sweep._members import RESERVED, Axis, Grid, describe_axes, points_of
 from lagjax._sweep._store import FORMAT, KNOWN, NOT_DONE, RESULT, Quantity, Store, arrays_as_bytes, is_file_name
-from lagjax._trajectory import State
 from lagjax.designs import GROWING, Design
 
 SECONDS = 20.0  # of a unit, by default: what a worker that dies loses

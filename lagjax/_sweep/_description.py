@@ -3,7 +3,7 @@
 A worker in another shell gets the functions by cloudpickle: those of the user's script by value, those of modules by
 name, found along the same `sys.path`. Their programs decide whether they still are what the store was begun with, as
 JAX traces them, with every constant: a change of a global number changes those, though not the text of a function. Of
-what JAX does not trace here, `keep` above all, `_reads.identity` decides it: the code, and all that it uses.
+what JAX does not trace here, `keep` above all, `reads.identity` decides it: the code, and all that it uses.
 """
 
 import difflib
@@ -19,13 +19,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._arguments import accept
-from lagjax._crossings import directions_of, sections_of
-from lagjax._hybrid import Hybrid, Scene
-from lagjax._machine_code import MachineCode
-from lagjax._reads import array_text, hash_of, identity, source, strip_addresses
+from lagjax._engine.taylor import MachineCode
+from lagjax._interface import accept, require_budget
+from lagjax._interface.reads import array_text, hash_of, identity, source, strip_addresses
+from lagjax._run import directions_of, sections_of
+from lagjax._run.hybrid import Hybrid, Scene
 from lagjax._sweep._statistics import Statistics
-from lagjax._validate import require_budget
 
 PyTree = Any
 ROLES = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")

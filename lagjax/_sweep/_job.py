@@ -25,7 +25,7 @@ import jax
 import numpy as np
 from llvmlite import binding as llvm
 
-from lagjax._results import ENDED_WELL, SUCCESSFUL
+from lagjax._interface import ENDED_WELL, SUCCESSFUL
 from lagjax._sweep._batch import CRASHED, KEEP_FAILED, Batches, KeptResults, batches_of, label
 from lagjax._sweep._description import Description, FinalStates, difference, texts, unpack_description
 from lagjax._sweep._members import Grid, points_of

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._results import show_str
+from lagjax._interface import show_str
 from lagjax._sweep._members import text_of
 from lagjax._sweep._store import Store
 

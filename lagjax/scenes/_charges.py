@@ -9,7 +9,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._system import System
+from lagjax._scene import System
 from lagjax.scenes._scene import Scene
 
 

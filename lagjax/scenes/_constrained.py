@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from lagjax._system import System
+from lagjax._scene import System
 from lagjax.scenes._coordinate_systems import Cartesian, angular_momentum_z
 from lagjax.scenes._mechanisms import _pendulum_exact
 from lagjax.scenes._scene import Scene

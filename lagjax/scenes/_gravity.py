@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._system import System
+from lagjax._scene import System
 from lagjax.scenes import _de421 as de421
 from lagjax.scenes._scene import Scene
 

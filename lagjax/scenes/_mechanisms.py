@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from lagjax._system import System
+from lagjax._scene import System
 from lagjax.scenes._elliptic import jacobi_elliptic
 from lagjax.scenes._scene import Scene
 

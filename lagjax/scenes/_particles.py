@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._system import System
+from lagjax._scene import System
 from lagjax.scenes._coordinate_systems import Cartesian, Polar, angular_momentum_z, convert
 from lagjax.scenes._scene import Scene
 

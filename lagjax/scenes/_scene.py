@@ -5,7 +5,7 @@ from typing import Any, final
 
 import equinox as eqx
 
-from lagjax._system import System
+from lagjax._scene import System
 
 
 @final

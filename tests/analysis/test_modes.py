@@ -9,8 +9,8 @@ from scipy.special import roots_laguerre
 from sweeps import sweep
 
 import lagjax
-from lagjax._derivation import derivation_of
-from lagjax._layout import Layout
+from lagjax._equations._derivation import derivation_of
+from lagjax._interface._layout import Layout
 
 G = 9.81
 

@@ -8,7 +8,7 @@ import pytest
 from lagrangians import radial_fall
 
 import lagjax
-from lagjax._display import _animation, course_of
+from lagjax._show import _animation, course_of
 
 SPRING = lagjax.System(lambda q, v, params: 0.5 * v["x"] ** 2 - 0.5 * params * q["x"] ** 2)
 TS = jnp.linspace(0.0, 6.0, 31)

@@ -116,7 +116,7 @@ def test_names_that_are_html_are_shown_as_they_are():
 
 
 def test_a_picture_of_a_large_batch_is_of_a_few_members(fallen, monkeypatch):
-    from lagjax._display import _notebook
+    from lagjax._show import _notebook
 
     places = []
     course = _notebook.courses_of(fallen, [0])

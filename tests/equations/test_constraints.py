@@ -16,10 +16,10 @@ from sweeps import sweep
 
 import lagjax
 from lagjax import scenes
-from lagjax._derivation import Derivation, derivation_of
-from lagjax._diffrax._equations import form_of
-from lagjax._layout import Layout
-from lagjax._linear import rank_tolerance
+from lagjax._engine.diffrax._equations import form_of
+from lagjax._equations._derivation import Derivation, derivation_of
+from lagjax._equations._linear import rank_tolerance
+from lagjax._interface._layout import Layout
 
 WAYS = pytest.mark.parametrize(
     "path", [pytest.param("auto", id="machine code"), pytest.param("array", id="diffrax", marks=pytest.mark.slow)]

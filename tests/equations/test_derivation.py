@@ -10,14 +10,17 @@ import pytest
 from jax import lax
 
 import lagjax
-from lagjax import _derivation, _diffrax, _machine_code, _program, scenes
-from lagjax import _many_states as many_states
-from lagjax._check import _scene_at_start as of_check
-from lagjax._derivation import Derivation, columns_of, derivation_of, numbers_of
-from lagjax._health import _measure as of_health
-from lagjax._layout import Layout
+from lagjax import _program, scenes
+from lagjax._engine import diffrax as _diffrax
+from lagjax._engine import taylor as _machine_code
+from lagjax._equations import _derivation
+from lagjax._equations import _many_states as many_states
+from lagjax._equations._derivation import Derivation, columns_of, derivation_of, numbers_of
+from lagjax._interface._layout import Layout
 from lagjax._program import OPERATIONS, Unlowerable, evaluate, lower, pullback
 from lagjax._program._evaluate import CHUNK
+from lagjax._trust.checks import _scene_at_start as of_check
+from lagjax._trust.health import _measurements as of_health
 
 # ---- evaluation in NumPy ---------------------------------------------------------------------------------------------
 

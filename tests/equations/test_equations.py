@@ -10,9 +10,9 @@ from sweeps import KINDS, sweep
 
 import lagjax
 from lagjax import scenes
-from lagjax._derivation import Derivation
-from lagjax._diffrax._equations import ArrayEquations, ScalarEquations, form_of
-from lagjax._layout import Layout
+from lagjax._engine.diffrax._equations import ArrayEquations, ScalarEquations, form_of
+from lagjax._equations._derivation import Derivation
+from lagjax._interface._layout import Layout
 
 
 def forms(scene, *paths):

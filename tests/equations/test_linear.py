@@ -11,8 +11,8 @@ from lagrangians import weight
 from sweeps import sweep
 
 import lagjax
-from lagjax import _constraints, _linear
-from lagjax._layout import Layout
+from lagjax._equations import _constraints, _linear
+from lagjax._interface._layout import Layout
 
 
 def symmetric(n, eigenvalues, seed=0):

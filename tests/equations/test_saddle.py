@@ -4,7 +4,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lagjax._saddle import SaddleElimination, elimination_order
+from lagjax._equations._saddle import SaddleElimination, elimination_order
 
 
 def chain(links, rng):

@@ -11,7 +11,7 @@ from lagrangians import free_particle, free_particles
 from sweeps import sweep
 
 import lagjax
-from lagjax._layout import Layout
+from lagjax._interface._layout import Layout
 
 
 class Polar(NamedTuple):

@@ -23,7 +23,7 @@ from lagjax._fit._motions import _JaxMotions, choose_motions
 from lagjax._fit._parameters import Parameters
 from lagjax._fit._search import Reader
 from lagjax._fit._verdict import shifts_without
-from lagjax._layout import Layout
+from lagjax._interface._layout import Layout
 
 SIGMA = 5e-3
 EXAMPLES = Path(__file__).parents[2] / "examples"

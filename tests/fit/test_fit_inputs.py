@@ -12,7 +12,7 @@ from scipy.signal import lsim
 import lagjax
 from lagjax._fit import _motions, _records
 from lagjax._fit._parameters import Parameters
-from lagjax._layout import Layout
+from lagjax._interface._layout import Layout
 
 TRUTH = {"k": 4.0, "c": 0.3, "gain": 1.5}
 TS = 0.02 * np.arange(200)

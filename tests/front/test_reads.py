@@ -20,8 +20,8 @@ import numpy as np
 import pytest
 
 import lagjax
-from lagjax import _derivation
-from lagjax._reads import Edition
+from lagjax._equations import _derivation
+from lagjax._interface.reads import Edition
 
 TS = np.linspace(0.0, 1.0, 3)
 

@@ -9,7 +9,7 @@ from lagrangians import ball_in_gravity, mass_on_a_spring, spring_k
 from sweeps import sweep
 
 import lagjax
-from lagjax import _problem
+from lagjax._engine import _problem
 
 SCENE = lagjax.System(mass_on_a_spring)
 PARAMS = {"m": 2.0, "k": 8.0}  # ω = 2

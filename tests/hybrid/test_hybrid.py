@@ -10,8 +10,8 @@ from lagrangians import ball_in_gravity, free_particle, oscillator
 from sweeps import sweep
 
 import lagjax
-from lagjax._hybrid._families import families
-from lagjax._layout import Layout
+from lagjax._interface._layout import Layout
+from lagjax._run.hybrid._mode_families import families
 
 G = 9.81
 BALL = lagjax.System(ball_in_gravity)

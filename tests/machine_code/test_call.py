@@ -20,7 +20,7 @@ import pytest
 
 import lagjax
 from lagjax import _native
-from lagjax._machine_code import _call, _primitives
+from lagjax._engine.taylor import _call, _primitives
 
 SCENE = lagjax.scenes.double_pendulum()
 TS = np.linspace(0.0, 1.0, 4)
@@ -346,7 +346,8 @@ def in_many_programs():
     kept = jax.jit(lambda q: run(q)[0]).lower(Q[0]).compile()
     expected = np.asarray(run(Q[0])[0])
     jax.clear_caches()
-    from lagjax import _derivation, _machine_code
+    from lagjax._engine import taylor as _machine_code
+    from lagjax._equations import _derivation
 
     _machine_code._make_flow.cache_clear()
     _derivation._derived_once.cache_clear()

@@ -7,11 +7,11 @@ import pytest
 from lagrangians import spring_k
 
 import lagjax
-from lagjax._layout import Layout
-from lagjax._machine_code import _derivatives, _flow, flow_of
-from lagjax._machine_code._flow import Flow, Tolerances
-from lagjax._machine_code._steps import KEPT, StepStore
-from lagjax._problem import Problem
+from lagjax._engine._problem import Problem
+from lagjax._engine.taylor import _derivatives, _flow, flow_of
+from lagjax._engine.taylor._flow import Flow, Tolerances
+from lagjax._engine.taylor._kept_steps import KEPT, StepStore
+from lagjax._interface._layout import Layout
 
 TOLERANCES = Tolerances(1e-11, 1e-11, 4096)
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sweeps import sweep
 
-from lagjax._machine_code._lines import Line
+from lagjax._engine.taylor._line_functions import Line
 from lagjax._program import lower
 
 

@@ -10,7 +10,7 @@ import pytest
 from lagrangians import oscillator
 
 import lagjax
-import lagjax._machine_code as machine_code
+import lagjax._engine.taylor as machine_code
 
 OSCILLATOR = lagjax.System(oscillator)
 BY_ARRAYS = lagjax.System(oscillator, path="array")

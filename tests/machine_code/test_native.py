@@ -16,10 +16,10 @@ from sweeps import sweep
 
 import lagjax
 from lagjax import _native, scenes
-from lagjax._layout import Layout
-from lagjax._machine_code import flow_of
+from lagjax._engine._problem import Problem
+from lagjax._engine.taylor import flow_of
+from lagjax._interface._layout import Layout
 from lagjax._native import _ir, _kernel, _lanes
-from lagjax._problem import Problem
 from lagjax._program import OPERATIONS, Unlowerable, lower, lower_formula
 from lagjax._program import _scalars as xp
 

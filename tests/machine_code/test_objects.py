@@ -14,10 +14,10 @@ import pytest
 
 import lagjax
 from lagjax import _native
-from lagjax._layout import Layout
-from lagjax._machine_code import flow_of
+from lagjax._engine._problem import Problem
+from lagjax._engine.taylor import flow_of
+from lagjax._interface._layout import Layout
 from lagjax._native import _ir, _objects
-from lagjax._problem import Problem
 
 SCENE = lagjax.scenes.spherical_pendulum()
 TS = np.linspace(0.0, 1.0, 5)

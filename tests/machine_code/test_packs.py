@@ -171,7 +171,7 @@ def test_a_scene_in_which_everything_waits_for_what_comes_before_keeps_members_i
 
 def test_the_code_does_not_grow_with_the_scene(monkeypatch):
     from lagjax._native._integrator import Integrator
-    from lagjax._native._parts import MotionParts
+    from lagjax._native._motion_parts import MotionParts
 
     def instructions(count):
         module = Integrator(MotionParts.from_program(cluster(count), 2 * count), width=1).motion.module

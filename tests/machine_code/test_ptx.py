@@ -24,8 +24,8 @@ from jax.sharding import PartitionSpec as P
 import lagjax
 from benchmarks._ptx import PtxOnCpu, outputs_of
 from lagjax import scenes
-from lagjax._machine_code import _gpu_launch, _primitives
-from lagjax._machine_code._call import call_host
+from lagjax._engine.taylor import _gpu_launch, _primitives
+from lagjax._engine.taylor._call import call_host
 from lagjax._native._gpu import MOTION, TRANSPOSE, GpuForm, OneLane, form_for, grid, libdevice
 
 TS, MACHINE_CODE = np.linspace(0.0, 1.0, 5), lagjax.MachineCode()

@@ -7,11 +7,11 @@ import pytest
 
 import lagjax
 from lagjax import _native
-from lagjax._derivation import derivation_of, numbers_of
-from lagjax._layout import Layout
+from lagjax._equations._derivation import derivation_of, numbers_of
+from lagjax._interface._layout import Layout
 from lagjax._native import _packs, _schedule, _taylor
 from lagjax._native._integrator import Integrator
-from lagjax._native._parts import MotionParts
+from lagjax._native._motion_parts import MotionParts
 from lagjax._program import OPERATIONS, Unlowerable, lower
 
 MEMBERS, RTOL, ROOM = 3, 1e-9, 300

@@ -7,11 +7,11 @@ import pytest
 
 import lagjax
 from lagjax import _native
-from lagjax._layout import Layout
-from lagjax._machine_code import _derivatives, _flow, flow_of
-from lagjax._machine_code._flow import Tolerances
+from lagjax._engine._problem import Problem
+from lagjax._engine.taylor import _derivatives, _flow, flow_of
+from lagjax._engine.taylor._flow import Tolerances
+from lagjax._interface._layout import Layout
 from lagjax._native import _kernel
-from lagjax._problem import Problem
 
 TOLERANCES = Tolerances(1e-10, 1e-13, 4096)
 TS = np.array([[0.0, 0.4, 0.5, 1.3, 2.0]])

@@ -8,7 +8,7 @@ from lagrangians import pendulum, pendulum_in_gravity
 from scipy.special import ellipk
 
 import lagjax
-from lagjax._orbits import _floquet, _orbit
+from lagjax._analysis.orbits import _floquet, _orbit
 
 PENDULUM = lagjax.System(pendulum)
 

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 from sweeps import sweep
 
-from lagjax import _digits
-from lagjax import _elementary as el
+from lagjax._program import _digits
+from lagjax._program import _elementary as el
 
 OWN, NUMPY, EXACT = ({name: getattr(of, name) for name in ("sin", "cos")} for of in (jnp, np, mpmath))
 COUNT = 700
@@ -143,6 +143,6 @@ def test_compiled_code_calls_no_scalar_routine():
 
 
 def test_import_leaves_global_state_alone():
-    code = "import jax; import lagjax._elementary; import jax.numpy as n; assert n.ones(1).dtype == n.float32"
+    code = "import jax; import lagjax._program._elementary; import jax.numpy as n; assert n.ones(1).dtype == n.float32"
     environment = {"JAX_ENABLE_X64": "0", "JAX_PLATFORMS": "cpu", "PATH": ""}
     subprocess.run([sys.executable, "-c", code], check=True, env=environment)

@@ -11,7 +11,7 @@ from jax import lax
 from scipy import special
 
 from lagjax import _native
-from lagjax._blame import borders
+from lagjax._equations._blame import borders
 from lagjax._program import OPERATIONS, Unlowerable, lower
 from lagjax._program._emit import WRITTEN
 from lagjax._program._operations import Operation

@@ -12,8 +12,8 @@ from jax import lax
 from sweeps import sweep
 
 import lagjax
-from lagjax._derivation import derivation_of
-from lagjax._layout import Layout
+from lagjax._equations._derivation import derivation_of
+from lagjax._interface._layout import Layout
 from lagjax._program import Unlowerable, lower
 from lagjax._program._evaluate import evaluate, vjp
 from lagjax._program._groups import groups_of

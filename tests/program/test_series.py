@@ -12,9 +12,9 @@ import pytest
 from jax import lax
 
 from lagjax import scenes
-from lagjax._derivation import derivation_of
-from lagjax._layout import Layout
-from lagjax._native import _parts
+from lagjax._equations._derivation import derivation_of
+from lagjax._interface._layout import Layout
+from lagjax._native import _motion_parts as _parts
 from lagjax._program import (
     OPERATIONS,
     StraightLine,

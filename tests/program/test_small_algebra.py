@@ -13,7 +13,7 @@ from jax import lax
 
 import lagjax
 from lagjax._program import OPERATIONS, apply_in_jax, lower
-from lagjax._program._matrices import determinant, solution
+from lagjax._program.lowering._matrices import determinant, solution
 
 
 @pytest.fixture(autouse=True)

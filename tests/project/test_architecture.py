@@ -16,7 +16,6 @@ DEVELOPMENT = (Path(__file__).parents[2] / "docs" / "development.md").read_text(
 # From the top of the street to its end, as the table there lists it. A new module must take a place in it.
 TABLE = DEVELOPMENT.split("## The street")[1].split("\n## ")[0]
 STREET = re.findall(r"^\| `(\w+)(?:\.py|/)` \|", TABLE, flags=re.MULTILINE)
-METHODS = {"_trajectory": {"_display", "_health"}}  # what a noun imports from below it, in methods that are called
 LEAVES = {"scenes", "plot", "results"}  # for users, tests, benchmarks and examples; imported by nothing on the street
 
 
@@ -51,17 +50,16 @@ def test_imports_point_up_the_street():
                 assert here in LEAVES and there in lagjax.__all__, f"{path} imports {there}"
                 continue
             assert there not in LEAVES, f"{path} imports the leaf {there}"
-            if there in METHODS.get(here, ()):
-                continue
             assert STREET.index(there) < STREET.index(here), f"{path} imports {there} from below"
 
 
 def test_a_trajectory_carries_no_judgement():
-    # What judges and shows a motion stands above it: it is imported by the method that calls it.
+    # What judges and shows a motion stands above it: `lagjax/__init__` says where, and the method that calls it imports
+    # it.
     code = """
 import sys, jax.numpy as jnp, lagjax
-verbs = {f"lagjax._{name}" for name in ("check", "diagnosis", "health", "display")}
-import lagjax._trajectory
+verbs = {f"lagjax.{name}" for name in ("_trust", "_show")}
+import lagjax._run
 assert not verbs & set(sys.modules), verbs & set(sys.modules)
 scene = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2)
 run = lagjax.simulate(scene, 1.0, 0.0, jnp.linspace(0.0, 1.0, 3))
@@ -73,19 +71,28 @@ print(run, run.health())
 
 
 def test_packages_have_doors():
-    # What another package uses stands in `__init__`, and an underscore name does not cross. `_native` reads the files
-    # of `_program` one by one, since it runs without JAX.
-    packages = {path.parent.name for path in PACKAGE.glob("_*/__init__.py")}
+    # What a room uses of another stands in the `__init__` of a package there, and an underscore name does not cross.
+    # `_native` reads the files of `_program` one by one, since it runs without JAX.
     for path in PACKAGE.rglob("*.py"):
         for node in ast.walk(ast.parse(path.read_text())):
             if not isinstance(node, ast.ImportFrom) or not (node.module or "").startswith("lagjax."):
                 continue
-            there, *inside = node.module.split(".")[1:]
+            there = node.module.split(".")[1]
             if there == place(path) or (place(path), there) == ("_native", "_program"):
                 continue
             private = [alias.name for alias in node.names if alias.name.startswith("_")]
-            assert not (there in packages and inside), f"{path} imports {node.module} past its door"
+            is_file = (PACKAGE.parent / (node.module.replace(".", "/") + ".py")).exists()
+            assert not (is_file and there.startswith("_")), f"{path} imports {node.module} past its door"
             assert not private, f"{path} imports {private} from {node.module}"
+
+
+def test_the_head_of_a_room_names_its_files():
+    for door in PACKAGE.glob("_*/**/__init__.py"):
+        head = ast.get_docstring(ast.parse(door.read_text())) or ""
+        files = {path.stem for path in door.parent.glob("_*.py")} - {"__init__"}
+        files |= {path.parent.name + "/" for path in door.parent.glob("*/__init__.py")}
+        missing = [name for name in sorted(files) if not re.search(rf"(?<!\w){name}(?!\w)", head)]
+        assert not missing, f"the head of {door.relative_to(PACKAGE)} does not name {missing}"
 
 
 JAX = {"jax", "jaxlib", "equinox", "diffrax", "optimistix", "lineax"}
@@ -159,7 +166,7 @@ def test_importing_changes_nothing():
 
 def test_a_name_is_imported_when_it_is_used():
     code = (
-        "import lagjax, sys; assert 'lagjax._simulate' not in sys.modules, 'it has not been used';"
+        "import lagjax, sys; assert 'lagjax._run._simulate' not in sys.modules, 'it has not been used';"
         "assert set(lagjax.__all__) <= set(dir(lagjax)) and not {'Orbit', 'sobol'} & set(dir(lagjax));"
         "assert not hasattr(lagjax, 'System2') and lagjax.simulate is lagjax.simulate;"
         "early = {'scipy.optimize', 'scipy.special', 'lagjax._fit', 'lagjax._sweep'} & set(sys.modules);"

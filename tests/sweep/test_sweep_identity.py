@@ -19,7 +19,7 @@ from scipy.interpolate import CubicSpline
 from scipy.signal import find_peaks
 
 import lagjax
-from lagjax._reads import identity
+from lagjax._interface.reads import identity
 
 
 class Scale:
@@ -159,7 +159,7 @@ def test_texts_are_the_same_in_another_process(tmp_path):
     functions = {kind: make(1.0) for kind, make in kinds.items() if make not in (of_module, of_import)}
     texts = {kind: identity(function) for kind, function in functions.items()}
     code = (
-        "import pickle, sys; from lagjax._reads import identity\n"
+        "import pickle, sys; from lagjax._interface.reads import identity\n"
         "functions, texts = pickle.load(open(sys.argv[1], 'rb'))\n"
         "other = {kind: (identity(f), texts[kind]) for kind, f in functions.items() if identity(f) != texts[kind]}\n"
         "assert not other, other"

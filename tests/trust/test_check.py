@@ -10,7 +10,7 @@ import pytest
 from sweeps import KINDS, sweep
 
 import lagjax
-from lagjax._check._differences import Slopes, differ, ladder, slopes
+from lagjax._trust.checks._differences import Slopes, differ, ladder, slopes
 
 
 class Polar(NamedTuple):

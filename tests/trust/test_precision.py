@@ -7,7 +7,7 @@ import pytest
 from lagrangians import oscillator, radial_fall
 
 import lagjax
-from lagjax import _precision
+from lagjax._trust import _precision
 
 OSCILLATOR = lagjax.System(oscillator)
 TS = jnp.linspace(0.0, 10.0, 21)

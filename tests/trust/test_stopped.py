@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import lagjax
-from lagjax._stopped import End, what_stopped
+from lagjax._engine._stop_reason import End, what_stopped
 
 TS = jnp.linspace(0.0, 2.0, 5)
 BUDGET = {"max_steps": 2000}
@@ -195,7 +195,7 @@ def test_what_stopped(name):
 
 def test_every_result_has_its_text():
     for name in lagjax.RESULTS._name_to_item:
-        assert name == "successful" or len(lagjax._results.advice(getattr(lagjax.RESULTS, name))) > 20, name
+        assert name == "successful" or len(lagjax._interface._results.advice(getattr(lagjax.RESULTS, name))) > 20, name
 
 
 def fourier(q, v, t):  # no scalar program, and it takes arrays of JAX only

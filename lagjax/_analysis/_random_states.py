@@ -1,0 +1,48 @@
+"""Random states about that of a scene, at which identities are tested that hold everywhere or nowhere."""
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._analysis._noether import FlatState
+from lagjax._analysis._scene_state import SceneState
+from lagjax._equations import Scales
+from lagjax._interface import compile_for_one_call
+
+# How far states are drawn from that of the scene, in its scales: so that they do not come near an origin that is one
+# scale away, and terms of different powers differ by more than rounding. Halved or doubled, the same symmetries are
+# found in the ready scenes.
+_NEAR = 0.5
+# How much farther those of a piecewise scene are drawn: one piece may have what the next one has not.
+_FAR = 5.0
+# Every so manieth state is drawn as far off as it takes for the forces not to be linear.
+_THIRD = 3
+
+
+def random_states(scene: SceneState, scales: Scales, count: int, seed: int, piecewise: bool) -> FlatState:
+    """Random states about that of the scene, (count, …) each, on the constraints if there are any."""
+    size, random = scene.layout.size, np.random.default_rng(seed)
+    draws, t = random.uniform(-1, 1, (3, count, size)), random.uniform(-1, 1, count)
+    beyond = np.where(np.arange(count) % _THIRD, 1.0, scales.reach ** random.uniform(0, 1, count))[:, None]
+    q = np.asarray(scene.q) + (_FAR if piecewise else 1.0) * _NEAR * beyond * scales.q * draws[0]
+    qdot, t = np.asarray(scene.qdot) + _NEAR * scales.qdot * draws[1], scales.t * t
+    if scene.constrained:
+        q, qdot = _project(q, qdot, t, scene.system, scene.layout, scene.params)
+    dtype = scene.layout.dtype
+    return FlatState(*(jnp.asarray(x, dtype) for x in (q, qdot, scales.qdot / scales.t * draws[2], t)))
+
+
+@compile_for_one_call
+def _project(q, qdot, t, system, layout, params):
+    motion, numbers = system._motion(layout, params), eqx.filter(params, eqx.is_array_like)
+    return jax.vmap(lambda *y: motion.nearest_consistent(*y, numbers))(q, qdot, t)
+
+
+def perturb_last_digits(states: FlatState) -> FlatState:
+    """The states with every number moved by a few units in its last place, up or down at random."""
+    random = np.random.default_rng(0)
+    return FlatState(*(x * (1 + _LAST * np.finfo(float).eps * random.choice([-1.0, 1.0], x.shape)) for x in states))
+
+
+_LAST = 4  # units in the last place, which change what rounding leaves and nothing else

@@ -1,0 +1,108 @@
+"""The smoothness of the forces of a scene at a state: without it nothing is linear next to it.
+
+At a jump of the force (dry friction at rest) or a kink (a spring that only pushes, where it begins) the two sides of a
+state have different derivatives, or none. Such places are borders of piecewise functions (`_blame.borders`); whether
+the force is smooth there all the same, as max(q, 0)**2 is, its values on both sides tell.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool
+
+from lagjax._analysis._scene_state import SceneState
+from lagjax._equations import borders_of_motion, pieces_of_motion
+
+# Where forces are compared, in sizes of a coordinate. A border within the first distance is at the state: equilibria
+# are known to the square root of rounding at worst, to 1e-12 as a rule. Friction that is rounded off over ten times as
+# much is smooth, and what has another slope within a tenth of the last distance counts as a kink.
+_AT, _BESIDE = 1e-9, 1e-4
+# From one distance to another, ten or sixteen times as large, what is smooth grows as much and a jump stays: half lies
+# far from either.
+_STAYS = 0.5
+_SLIGHT = 1e-6  # a change of the slope, in units of it, that is a kink and not the rounding of forces, which is 1e-11
+_ROUNDING = 1e4  # units of rounding of the force one size away; below it a jump is rounding of terms that cancel
+
+
+class _Rough(NamedTuple):
+    """Jumps and kinks of the force along every coordinate, then velocity, and the sides that change there."""
+
+    jumps: Bool[Array, " 2n"]
+    kinks: Bool[Array, " 2n"]
+    changed: Bool[Array, "2n sides"]
+
+
+def is_smooth(scene: SceneState) -> Bool[Array, ""]:
+    """True if the forces have derivatives at the state of a scene."""
+    if not _pieces(scene):
+        return jnp.asarray(True)
+    rough = _rough(scene)
+    return ~jnp.any(rough.jumps | rough.kinks)
+
+
+def require_smooth(scene: SceneState, what: str) -> None:
+    """Raise `ValueError` where the force jumps or has a kink at the state, naming the coordinate and the line."""
+    if not scene.concrete or not (pieces := _pieces(scene)):
+        return
+    rough = jax.tree.map(np.asarray, _rough(scene))
+    names = (*scene.layout.names, *(f"d{name}" for name in scene.layout.names))
+    for k in np.flatnonzero(rough.jumps | rough.kinks).tolist():
+        labels = [f"{name}{place}" for name, place, size in pieces for _ in range(size)]
+        operation = labels[int(np.argmax(rough.changed[k]))]
+        how = "the force jumps there" if rough.jumps[k] else "the force has another slope on either side"
+        rest = " Dry friction holds a scene at rest: nothing small oscillates." if k >= len(names) // 2 else ""
+        raise ValueError(
+            f"{what} does not exist at this state, which is on a border along {names[k]}: {how}, at {operation}.{rest} "
+            "Ask for it beside the border, leave the piecewise term out, or round it off (tanh(v / w) for sign(v)). "
+            "Motions across the border are right: simulate follows them."
+        )
+
+
+def _pieces(scene: SceneState) -> list[tuple[str, str, int]]:
+    """The borders of the functions of a scene: name, place, and how many numbers each compares."""
+    return pieces_of_motion(scene.motion, *_state(scene))
+
+
+def _state(scene: SceneState) -> tuple:
+    return scene.q, scene.qdot, jnp.zeros((), scene.q.dtype), scene.numbers
+
+
+def _rough(scene: SceneState) -> _Rough:
+    q, v, t, numbers = jax.lax.stop_gradient(_state(scene))
+    n, eps = len(q), jnp.finfo(q.dtype).eps
+
+    def sides(y):
+        found = [x for _, _, x in borders_of_motion(scene.motion, y[:n], y[n:], t, numbers)]
+        return jnp.concatenate([jnp.ravel(x) for x in found])
+
+    def force(y):
+        return scene.force(y[:n], y[n:])
+
+    def sizes(x):
+        largest = jnp.max(jnp.abs(x))
+        return jnp.maximum(jnp.abs(x), jnp.where(largest > 0, 1e-3 * largest, 1.0))
+
+    y, units = jnp.concatenate([q, v]), jnp.diag(jnp.concatenate([sizes(q), sizes(v)]))
+
+    def evaluate_displaced(function, distance):
+        return [jax.vmap(lambda unit, s=s: function(y + s * distance * unit))(units) for s in (1, -1)]
+
+    at = max(_AT, 16 * float(eps))
+    ahead, behind = evaluate_displaced(sides, at)
+    changed, here = ahead != behind, force(y)
+
+    def steps(distance):
+        ahead, behind = (moved - here for moved in evaluate_displaced(force, distance))
+        return ahead, behind, jnp.maximum(jnp.abs(ahead), jnp.abs(behind)).max(axis=1)
+
+    def bends(distance):
+        ahead, behind, step = steps(distance)
+        return jnp.abs(ahead + behind).max(axis=1) / jnp.where(step > 0, step, 1.0)
+
+    is_border, nearest, near = changed.any(axis=1), steps(at)[2], steps(10 * at)[2]
+    jump = is_border & (nearest > _STAYS * near) & (nearest > _ROUNDING * eps * steps(1.0)[2].max())
+    bend, nearer = bends(_BESIDE), bends(_BESIDE / 16)
+    kink = is_border & ~jump & (nearer > _STAYS * bend) & (nearer > jnp.maximum(_SLIGHT, jnp.sqrt(eps)))
+    return _Rough(jump, kink, changed)

@@ -1,0 +1,28 @@
+"""Orbits: where motions return, how they depend on energy and parameters, how fast they part, which path is taken.
+
+`_arc_motions` follows motions with their derivatives, on rows (`_flat_starts`); `_shooting` closes or joins chains of
+arcs by way of `_condensation`, `_floquet` says what their multipliers are, `_orbit` is `periodic_orbit`.
+`_continuation` goes along a family, `_family` is `family`, `_branch` goes from one to another. `_lyapunov` is about
+motions that never return, `_path` and `_conjugate` about those from one place to another. `decide` of
+`lagjax._analysis` decides about singular values.
+"""
+
+from lagjax._analysis.orbits._branch import branch_off
+from lagjax._analysis.orbits._family import Family, family
+from lagjax._analysis.orbits._lyapunov import LyapunovExponent, lyapunov_exponent, lyapunov_spectrum
+from lagjax._analysis.orbits._orbit import Orbit, periodic_orbit
+from lagjax._analysis.orbits._path import Path, action, find_path
+
+__all__ = [
+    "Family",
+    "LyapunovExponent",
+    "Orbit",
+    "Path",
+    "action",
+    "branch_off",
+    "family",
+    "find_path",
+    "lyapunov_exponent",
+    "lyapunov_spectrum",
+    "periodic_orbit",
+]

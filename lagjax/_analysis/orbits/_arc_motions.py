@@ -1,0 +1,233 @@
+"""`Arcs`: motions of many starts over times of their own, with their derivatives, on rows of NumPy.
+
+What shooting asks of machine code: rows of starts (R, 2n), each with a first and a last time, give the last states
+(R, 2n) and how these depend on the starts (R, 2n, 2n) and on directions of the parameters (R, 2n, F). Machine code
+follows all directions over the steps of the motion, without a program of XLA, so that another number of rows compiles
+nothing, and no kernel of LAPACK runs inside of one.
+"""
+
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lagjax._analysis.orbits._flat_starts import require_untraced
+from lagjax._engine import Problem
+from lagjax._engine.taylor import KEPT, MachineCode, flow_of, jvp, tolerances_of
+from lagjax._equations import Scales, columns_of, has_constraints
+from lagjax._interface import SUCCESSFUL, Layout, halves
+from lagjax._primitives import sentence
+from lagjax._scene import System, require_system
+
+PyTree = Any
+
+
+class Arc(NamedTuple):
+    """R arcs: `end` (R, 2n), `by_start` (R, 2n, 2n), `by_params` (R, 2n, F), and how each ended.
+
+    `steps` (R,) counts what was taken; `result` (R,) and `t_end` (R,) are those of a `Solution`. Rows that failed are
+    NaN.
+    """
+
+    end: np.ndarray
+    by_start: np.ndarray
+    by_params: np.ndarray
+    result: np.ndarray
+    t_end: np.ndarray
+    steps: np.ndarray
+
+    @property
+    def ok(self) -> np.ndarray:
+        """True for each row that came to its last time, with finite derivatives, (R,)."""
+        return (self.result == SUCCESSFUL) & np.isfinite(self.by_start).all(axis=(1, 2))
+
+
+class Units(NamedTuple):
+    """The sizes of states, `state` (R, 2n), and of times, `time` (R,): q and q̇ of all units become comparable by them.
+
+    That of coordinate i is l/√Mᵢᵢ, `length` (R,) being l, which is alike for coordinates of any units, and that of its
+    velocity is as much in a unit of time.
+    """
+
+    state: np.ndarray
+    time: np.ndarray
+    length: np.ndarray
+
+    def repeat(self, count: int) -> "Units":
+        """The units with each row `count` times, (R count, 2n)."""
+        return Units(*(np.repeat(x, count, axis=0) for x in self))
+
+    def growth(self, growth: np.ndarray) -> np.ndarray:
+        """Derivatives of states by states, (R, …, 2n, 2n), in these units."""
+        state = self.state.reshape(len(self.state), *[1] * (growth.ndim - 3), -1)
+        return growth * state[..., None, :] / state[..., :, None]
+
+
+def _or_one(x: np.ndarray) -> np.ndarray:
+    return np.where((x > 0) & np.isfinite(x), x, 1.0)
+
+
+class Arcs:
+    """The follower of motions of one scene with one set of parameters, `numbers` (P,)."""
+
+    def __init__(self, problem: Problem, numbers: np.ndarray):
+        self.problem, self.numbers = problem, numbers
+        self.flow, self.tolerances = flow_of(problem), tolerances_of(problem)
+        self.derivation, self.layout = problem.derivation, problem.layout
+        self.size = problem.layout.size
+        named = {i for name in ("lagrangian", "mass_matrix", "force") for i in self.derivation.reads(name)}
+        self.driven = 2 * self.size in named  # by an explicit time
+        self.conserves = not self.derivation.works
+
+    @classmethod
+    def from_system(cls, system: System, q0, qdot0, params: PyTree, rtol: float, what: str) -> "Arcs":
+        """The arcs of a scene whose state has the structure of (q0, qdot0).
+
+        Raises `ValueError`, a sentence about `what` they are for, where the scene has constraints or no machine code.
+        """
+        system = require_system(system)
+        require_untraced((system, params), "A parameter")
+        layout = Layout.from_state(q0, qdot0)
+        if has_constraints(system):
+            raise ValueError(
+                f"{what} cannot be found with constraints yet: give the scene coordinates that need none, angles of "
+                "links instead of positions of their ends."
+            )
+        problem = Problem.from_system(system, layout, params, rtol=rtol, max_steps=_BUDGET)
+        if refusal := MachineCode().refuses(problem):
+            raise ValueError(f"{what} are found with machine code, and there is none for this scene: {refusal}.")
+        return cls(problem, np.asarray(problem.vector))
+
+    def with_numbers(self, numbers: np.ndarray) -> "Arcs":
+        """The arcs of the scene with other parameters (P,)."""
+        other = object.__new__(Arcs)
+        other.__dict__.update(self.__dict__)
+        other.numbers = numbers
+        return other
+
+    def ends(self, times: np.ndarray, y0: np.ndarray):
+        """The motions alone: their `Solution`, `times` (R, T) or (1, T) and `y0` (R, 2n)."""
+        return self.flow.run(times, y0, self.numbers[None], self.tolerances)
+
+    def equal_shares(self, span: np.ndarray, y0: np.ndarray, count: int) -> np.ndarray:
+        """Parts (R, count + 1) of spans of time (R,) from 0 to 1, in which motions take about equally many steps.
+
+        Each begins at the calmest moment near there, where steps are longest: a state in the midst of an encounter is
+        large and changes fast, and Newton's method would have to creep.
+        """
+        even = np.arange(count + 1) / count
+        shares = np.tile(even, (len(y0), 1))
+        times = np.stack([np.zeros_like(span), span], axis=1)
+        run = self.flow.run(times, y0, self.numbers[None], self.tolerances, KEPT)
+        for steps, rows, members in KEPT.runs(run.ticket):
+            for row, member in zip(rows.tolist(), members.tolist(), strict=True):
+                first, size = int(steps.first[member]), int(steps.counts[member])
+                if run.result[row] == SUCCESSFUL and size >= 4 * count:
+                    begins, lengths = steps.table[first : first + size, :2].T / span[row]
+                    near = np.array_split(np.arange(size), 2 * count)[1:-1]  # halves of shares about their borders
+                    around = [np.append(a, b) for a, b in zip(near[::2], near[1::2], strict=True)]
+                    shares[row, 1:-1] = [begins[some[np.argmax(lengths[some])]] for some in around]
+        shares[:, 0], shares[:, -1] = 0.0, 1.0
+        return shares
+
+    def follow(self, times: np.ndarray, y0: np.ndarray, directions: np.ndarray | None = None) -> Arc:
+        """The arcs between `times` (R, 2) from `y0` (R, 2n), along `directions` (F, P) of the parameters too."""
+        rows, states = y0.shape
+        directions = np.zeros((0, len(self.numbers))) if directions is None else directions
+        params = self.numbers[None]
+        run = self.flow.run(times, y0, params, self.tolerances, KEPT)
+        dy0 = np.zeros((rows, states + len(directions), states))
+        dy0[:, :states] = np.eye(states)
+        dparams = np.zeros((rows, states + len(directions), len(self.numbers)))
+        dparams[:, states:] = directions
+        well = run.result == SUCCESSFUL
+        moved = np.full(dy0.shape, np.nan)
+        if well.any():
+            times, start, dy0, dparams, *steps = (
+                x[well] for x in (times, y0, dy0, dparams, run.path, run.result, run.accepted, run.ticket)
+            )
+            moved[well] = jvp(self.flow, times, start, params, steps, dy0, dparams, self.tolerances)[1]
+        end = np.where(well[:, None], run.y_end, np.nan)
+        moved = np.swapaxes(moved, 1, 2)
+        return Arc(end, moved[..., :states], moved[..., states:], run.result, run.t_end, run.accepted)
+
+    def units(self, y0: np.ndarray, time: np.ndarray | None = None) -> "Units":
+        """The units of states (R, 2n), from the largest coordinate and velocity there, in the metric of M.
+
+        `time` (R,) is that of a change; by default it is read off the velocities and accelerations.
+        """
+        n = self.size
+        mass = np.abs(self.quantities(("mass_matrix",), 0.0, y0)["mass_matrix"][:, np.arange(n), np.arange(n)])
+        root = np.sqrt(np.where(mass > 0, mass, mass.max(axis=1, initial=0.0)[:, None]))
+        root = np.where((root > 0) & np.isfinite(root), root, 1.0)
+        far, fast, bend = (np.abs(x * root).max(axis=1) for x in (*halves(y0), halves(self.rate(0.0, y0))[1]))
+        with np.errstate(all="ignore"):
+            if time is None:
+                length = np.where(far > 0, far, fast**2 / bend)
+                rate = np.maximum(fast / length, np.sqrt(bend / length))
+                for row in np.flatnonzero(~((length > 0) & (rate > 0) & np.isfinite(length * rate))):
+                    scales = self._scales(y0[row])
+                    length[row], rate[row] = np.abs(scales.q * root[row]).max(), 1 / scales.t
+                rate = _or_one(rate)
+            else:
+                rate = 2 * np.pi / time
+                length = np.maximum(far, fast / rate)
+        of_q = (length := _or_one(length))[:, None] / root
+        return Units(np.concatenate([of_q, rate[:, None] * of_q], axis=1), 1 / rate, length)
+
+    def _scales(self, y: np.ndarray) -> Scales:
+        """The scales at one state (2n,), which need some hundred forces."""
+
+        def evaluated(name, q, qdot):
+            return self.quantities((name,), 0.0, np.concatenate([q, qdot], axis=1))[name]
+
+        return Scales.from_quantities(evaluated, *halves(y))
+
+    def rate(self, t, y: np.ndarray) -> np.ndarray:
+        """ẏ = (q̇, q̈), (R, 2n), at states (R, 2n) and times () or (R,)."""
+        values = self.flow.general_program.evaluate_many([*y.T, t, *self.numbers])
+        return np.concatenate([y[:, self.size :], values[: self.size].T], axis=1)
+
+    def quantities(self, names: tuple[str, ...], t, y: np.ndarray) -> dict[str, np.ndarray]:
+        """The quantities of `Motion.quantities` with these names at states (R, 2n), each (R, …)."""
+        q, qdot = halves(y)
+        t = np.broadcast_to(np.asarray(t, float), (len(y),))
+        return self.derivation.evaluate(names, columns_of(q, qdot, t, list(self.numbers)))
+
+    def energy(self, t, y: np.ndarray) -> np.ndarray:
+        """h = p·q̇ − L (R,)."""
+        of = self.quantities(("lagrangian", "momentum"), t, y)
+        return np.sum(of["momentum"] * halves(y)[1], axis=1) - of["lagrangian"].reshape(len(y))
+
+    def energy_slope(self, t, y: np.ndarray) -> np.ndarray:
+        """∂h/∂y (R, 2n)."""
+        of = self.quantities(("energy_by_q", "mass_matrix"), t, y)
+        return np.concatenate([of["energy_by_q"], np.einsum("rij,rj->ri", of["mass_matrix"], halves(y)[1])], axis=1)
+
+    def canonical(self, t, y: np.ndarray, units: Units) -> np.ndarray:
+        """∂(q, p)/∂(q, q̇) (R, 2n, 2n), q and q̇ in units (R, 2n), and p in those that l² and the time belong to.
+
+        The product of the units of qᵢ and pᵢ is then the same for all i, so that the symplectic form is the usual one.
+        """
+        n = self.size
+        by_q = np.moveaxis(np.array(self._momentum_by_q(t, y)).reshape(n, n, len(y)), 2, 0)
+        chart = np.zeros((len(y), 2 * n, 2 * n))
+        chart[:, :n, :n], chart[:, n:, :n] = np.eye(n), by_q
+        chart[:, n:, n:] = self.quantities(("mass_matrix",), t, y)["mass_matrix"]
+        of_q = units.state[:, :n]
+        of_p = (units.length**2 / units.time)[:, None] / of_q
+        return chart * units.state[:, None, :] / np.concatenate([of_q, of_p], axis=1)[:, :, None]
+
+    def _momentum_by_q(self, t, y: np.ndarray) -> list:
+        program = self.derivation.momenta_by_q(tuple(range(self.size)))
+        t = np.broadcast_to(np.asarray(t, float), (len(y),))
+        values = program.evaluate_many(columns_of(*halves(y), t, list(self.numbers)))
+        return [np.broadcast_to(value, (len(y),)) for value in values]
+
+    def why_not(self, row: int, arc: Arc, y0: np.ndarray, t_last: float) -> str:
+        """The failure of an arc, in a sentence."""
+        if arc.result[row] == SUCCESSFUL:
+            return "Its derivatives are not finite."
+        return sentence(arc.result[row], arc.t_end[row], t_last, y0[row], self.layout.names) or ""
+
+
+_BUDGET = 2**16  # steps of an arc: a thousand times what it should take

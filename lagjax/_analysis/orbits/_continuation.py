@@ -1,0 +1,296 @@
+"""The continuation of a family of periodic orbits: what is free along it, its tangent, steps of which none is a jump.
+
+    predict   along the null vector of the closing equations that is no symmetry
+    correct   by Newton's method within the plane across it, at the same length of arc
+
+The rank of the closing equations is decided at closed orbits, where degenerate directions are so to rounding, and is
+that of the trials between them. Decided anew at every trial it would have to leave out all that the trial's defect
+may hide, which of an orbit with a multiplier of a thousand is everything but that one direction. Nor are these
+corrections damped, as those of `_shooting` are: how they contract is what judges a step.
+
+A step stands if Newton's method contracts, if its first correction is short beside the step, and if the chord lies
+midway between tangents that turned little. An orbit of another family that happens to be near fails one of these, or
+is as near as the family bends; how close each came to its bound says how long the next step may be.
+
+Source: Allgower & Georg, *Numerical Continuation Methods* (1990), §6.1 (steps by contraction, distance and angle), §8
+(branch points).
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax._analysis import decide
+from lagjax._analysis.orbits import _shooting
+from lagjax._analysis.orbits._arc_motions import Arcs
+from lagjax._analysis.orbits._condensation import Condensed, condense
+from lagjax._analysis.orbits._orbit import CLOSED
+from lagjax._analysis.orbits._shooting import Chain, Closing
+
+_TRIALS = 8  # of Newton's method: beyond, the step along the family was too long
+# A step is repeated at half its length beyond these: the ratio of the second correction to the first, the first one in
+# parts of the step, the turn of the tangent, and how far the chord is from midway between the tangents.
+_CONTRACTION, _DISTANCE, _TURN, _ASKEW = 0.5, 0.4, 0.6, 0.1
+# The next step is chosen for this share of them.
+_USUAL = 0.4
+_LONGEST = 0.3  # of the largest number of a state: orbits of a family along a straight line are some way apart, no more
+# Singular values of closed orbits beyond this share of the largest are no rounding, whatever the rank was before: about
+# branch points they pass through zero.
+_ROUNDING = 1e-11
+# Of an error along one arc: more arcs where it is larger, so that all digits are left to close.
+_LONGEST_GROWTH = 1e3
+
+
+class FamilyPoint(NamedTuple):
+    """An orbit of a family: its chain (of one member), the numbers of the scene, and the closing equations there.
+
+    `matrix` (2n, 2n + F) are those of the first state and of what else is free, `right` (2n,) their right-hand side.
+    """
+
+    chain: Chain
+    numbers: np.ndarray
+    matrix: np.ndarray
+    condensed: Condensed
+    right: np.ndarray
+
+    @property
+    def free(self) -> np.ndarray:
+        """The first state and the period, (2n + 1,)."""
+        return np.append(self.chain.y[0, 0], self.chain.period)
+
+    def closed(self, share: float) -> bool:
+        """True if all arcs could be followed and close to this share of the size of the state."""
+        return bool(self.chain.ok[0] and self.chain.closure()[0] <= share * self.chain.size()[0])
+
+
+class FamilyTangent(NamedTuple):
+    """The direction in which a family continues: the unit `vector` (2n + F,), the rank of the closing equations at a
+    closed orbit, and its symmetries (2n + F, k), an orthonormal basis."""
+
+    vector: np.ndarray
+    rank: int
+    symmetries: np.ndarray
+
+
+class FamilyUnknowns(NamedTuple):
+    """All numbers of a point, or a change of them: `y` (1, K, 2n), `period` (1,), `numbers` (P,) of the scene."""
+
+    y: np.ndarray
+    period: np.ndarray
+    numbers: np.ndarray
+
+    @classmethod
+    def from_point(cls, point: FamilyPoint) -> "FamilyUnknowns":
+        return cls(point.chain.y, point.chain.period, point.numbers)
+
+    def plus(self, other: "FamilyUnknowns", by: float = 1.0) -> "FamilyUnknowns":
+        return FamilyUnknowns(*(mine + by * one for mine, one in zip(self, other, strict=True)))
+
+    def times(self, by: float) -> "FamilyUnknowns":
+        return FamilyUnknowns(*(by * mine for mine in self))
+
+
+class Follower:
+    """The unknowns along a family: the first state; the period, unless it stays; a parameter, if it has a place.
+
+    All three are in the units of the first orbit, (1, 2n) and (1,), and the parameter in that of its first value.
+    `until` is the value where the family is to end.
+    """
+
+    def __init__(self, arcs: Arcs, place: int | None, y0: np.ndarray, period: np.ndarray, until: float | None = None):
+        self.arcs, self.place, self.until = arcs, place, until
+        self.units = arcs.units(y0, period)
+        self.of_parameter = 1.0 if place is None else abs(float(arcs.numbers[place])) or 1.0
+        self.of_value = 1.0
+        self.period_is_free = not arcs.driven and (place is None or not arcs.conserves)
+
+    def closing(self, numbers: np.ndarray) -> Closing:
+        return Closing.plain(self.arcs.with_numbers(numbers))
+
+    def point(self, y, period, parts, numbers) -> FamilyPoint:
+        """The chain through these states, (1, K, 2n), and its equations."""
+        closing = self.closing(numbers)
+        chain = _shooting.follow(closing, y, period, parts, self.units)
+        columns = [chain.rate[..., None] * np.diff(chain.parts)[..., None, None]] if self.period_is_free else []
+        if self.place is not None:
+            columns.append(self._parameter_derivatives(closing, y, period, parts, self.place))
+        if not chain.ok[0]:
+            nothing = np.zeros((0, 0))
+            return FamilyPoint(chain, numbers, nothing, Condensed(nothing, nothing, nothing, ()), nothing)
+        condensed = condense(chain.growth, np.concatenate([*columns, chain.defect[..., None]], axis=3))
+        matrix = np.concatenate([condensed.first + condensed.last, condensed.more[..., :-1]], axis=2)[0]
+        return FamilyPoint(chain, numbers, matrix, condensed, condensed.more[0, :, -1])
+
+    def _parameter_derivatives(self, closing: Closing, y, period, parts, place: int) -> np.ndarray:
+        """The derivatives (1, K, 2n, 1) of the ends of the arcs by the parameter at this place."""
+        direction = np.eye(len(closing.arcs.numbers))[place][None]
+        whole, state = period[0] * self.units.time[0], self.units.state[0]
+        spans = whole * parts[0] if self.arcs.driven else np.zeros(len(parts[0]))
+        times = np.stack([spans[:-1], spans[1:]], axis=1)
+        if not self.arcs.driven:
+            times[:, 1] = whole * np.diff(parts[0])
+        by_params = closing.arcs.follow(times, y[0] * state, direction).by_params
+        return by_params[None] * self.of_parameter / state[:, None]
+
+    def complete_change(self, point: FamilyPoint, first: np.ndarray, right: float) -> "FamilyUnknowns":
+        """The change of all numbers that the linear equations make of a change `first` (2n + F,) of the free."""
+        states = point.chain.y.shape[2]
+        z = np.append(first[states:], right)[None, :, None]
+        dy = point.condensed.inner(first[None, :states, None], first[None, :states, None], z)[..., 0]
+        by = np.zeros(len(point.numbers))
+        if self.place is not None:
+            by[self.place] = self.of_parameter * first[-1]
+        return FamilyUnknowns(dy, first[states : states + 1] if self.period_is_free else np.zeros(1), by)
+
+    def move(self, point: FamilyPoint, first: np.ndarray, right: float) -> FamilyPoint:
+        """The point after a change (2n + F,) of its free numbers; the states of its inner arcs follow."""
+        return self.rebuild(point, FamilyUnknowns.from_point(point).plus(self.complete_change(point, first, right)))
+
+    def rebuild(self, point: FamilyPoint, whole: "FamilyUnknowns") -> FamilyPoint:
+        """The point with the numbers `whole`, its arcs at the same parts of the period as those of `point`."""
+        return self.point(whole.y, whole.period, point.chain.parts, whole.numbers)
+
+    def refine_arcs(self, point: FamilyPoint) -> FamilyPoint:
+        """The point with its orbit in more arcs where errors grow much along one arc; else the point itself."""
+        count = point.chain.y.shape[1]
+        growth = np.log(max(np.linalg.norm(one, 2) for one in point.chain.growth[0])) / np.log(_LONGEST_GROWTH)
+        more = int(2 ** np.ceil(np.log2(max(growth, 1.0))))
+        if more == 1 or count * more > _MOST_ARCS:
+            return point
+        return self.divide_orbit(point.chain.states(), point.chain.periods(), count * more, point.numbers)
+
+    def divide_orbit(self, y0: np.ndarray, period: np.ndarray, count: int, numbers: np.ndarray) -> FamilyPoint:
+        """The orbit from a state (1, 2n) with a period (1,), both in the user's units, divided into `count` arcs."""
+        parts, y = _shooting.guesses(self.closing(numbers), y0, period, count)
+        return self.point(y / self.units.state[:, None], period / self.units.time, parts, numbers)
+
+    def slope(self, point: FamilyPoint) -> np.ndarray:
+        """The direction (2n + F,), a unit vector, in which the value rises."""
+        slope = np.zeros(point.matrix.shape[1])
+        if self.place is not None:
+            slope[-1] = 1.0
+        else:
+            by_state = self.arcs.energy_slope(0.0, point.chain.states())[0] * self.units.state[0]
+            slope[: len(by_state)] = by_state / (np.linalg.norm(by_state) or 1.0)
+        return slope
+
+    def value(self, point: FamilyPoint) -> float:
+        """The energy, or the parameter."""
+        if self.place is not None:
+            return float(point.numbers[self.place])
+        return float(self.arcs.energy(0.0, point.chain.states())[0])
+
+    def energy(self, point: FamilyPoint) -> float:
+        """h = p·q̇ − L."""
+        return float(self.arcs.with_numbers(point.numbers).energy(0.0, point.chain.states())[0])
+
+
+_MOST_ARCS = 128
+
+
+def tangent_at(
+    follower: Follower, point: FamilyPoint, before: FamilyTangent | None, left_out: int = 0
+) -> FamilyTangent | None:
+    """The direction of the family at a closed orbit: on from `before`, or at first that of a rising value.
+
+    None where there is none: the orbit is alone. At a branch point, where the smallest `left_out` singular values are
+    zero, it is what is nearest to `before` of all directions.
+    """
+    states = point.matrix.shape[0]
+    whole, still = decide(point.matrix, _shooting.RANK), decide(point.matrix[:, :states], _shooting.RANK)
+    slope, count, rank = follower.slope(point), states - int(still.rank), int(whole.rank)
+    if before is not None:  # a rank that falls short of itself in passing a branch point
+        at_least = whole.values[before.rank - 1] > _ROUNDING * whole.values[0]
+        rank = max(rank, before.rank) if at_least else rank
+        count = min(count, before.symmetries.shape[1]) if at_least else count
+    symmetries = np.zeros((point.matrix.shape[1], count))
+    symmetries[:states] = still.right[:, states - count :]
+    if before is None:
+        symmetries = _remove_direction(symmetries, slope)
+    null = whole.right[:, rank - left_out :]
+    left, sizes, _ = np.linalg.svd(null - symmetries @ (symmetries.T @ null), full_matrices=False)
+    left = left[:, sizes > 0.5]
+    vector = left @ (left.T @ (slope if before is None else before.vector))
+    length = np.linalg.norm(vector)
+    if not length > 1e-6 * (np.linalg.norm(slope) if before is None else 1.0):
+        return None
+    return FamilyTangent(vector / length, rank, symmetries)
+
+
+def _remove_direction(basis: np.ndarray, vector: np.ndarray) -> np.ndarray:
+    """An orthonormal basis of what is orthogonal to `vector` in the span of the orthonormal `basis` (m, k)."""
+    along = basis.T @ vector
+    if not np.linalg.norm(along) > 1e-6 * np.linalg.norm(vector):
+        return basis
+    return basis @ np.linalg.svd(along[None], full_matrices=True)[2][1:].T
+
+
+class FamilyStep(NamedTuple):
+    """A corrected orbit with its tangent, and which share of its bounds the step took, 1 at most."""
+
+    point: FamilyPoint
+    tangent: FamilyTangent
+    share: float
+
+
+def correct(
+    follower: Follower, point: FamilyPoint, across: FamilyTangent, left_out: int = 0
+) -> tuple[FamilyPoint, np.ndarray] | None:
+    """The orbit in the plane across a tangent, and the sizes of Newton's corrections; None where there is none.
+
+    The smallest `left_out` singular values of the equations are left out, as at a branch point, where one is zero.
+    """
+    sizes, before = [], np.inf
+    for _ in range(_TRIALS):
+        if not point.chain.ok[0] or not point.chain.period[0] > 0:
+            return None
+        closure = point.chain.closure()[0]
+        if point.closed(1e-2 * CLOSED) or (closure > 0.5 * before and point.closed(CLOSED)):
+            return point, np.array(sizes)
+        before = closure
+        matrix, right = np.concatenate([point.matrix, across.vector[None]]), np.append(point.right, 0.0)
+        change = -decide(matrix)._replace(rank=np.array(across.rank + 1 - left_out)).least_norm(right)
+        sizes.append(np.linalg.norm(change))
+        point = follower.move(point, change, 1.0)
+    return (point, np.array(sizes)) if point.closed(CLOSED) else None
+
+
+def step_along(follower: Follower, last: FamilyPoint, tangent: FamilyTangent, step: float) -> FamilyStep | None:
+    """The orbit one step on; None where the step was too long for the family."""
+    there = correct(follower, follower.move(last, step * tangent.vector, 0.0), tangent)
+    if there is None:
+        return None
+    point, sizes = there
+    following = tangent_at(follower, point, tangent)
+    if following is None:
+        return None
+    sizes = np.append(sizes, [0.0, 0.0])
+    contraction = sizes[1] / sizes[0] if sizes[1] > 1e-8 * step else 0.0
+    cosine = np.clip(tangent.vector @ following.vector, -1.0, 1.0)
+    askew = _chord(follower, last, point, step) - (tangent.vector + following.vector) / 2
+    for one in (tangent, following):
+        askew -= one.symmetries @ (one.symmetries.T @ askew)
+    share = max(
+        np.sqrt(contraction / _CONTRACTION),
+        np.sqrt(sizes[0] / step / _DISTANCE),
+        np.arccos(cosine) / _TURN,
+        np.sqrt(np.linalg.norm(askew) / _ASKEW),
+    )
+    return FamilyStep(point, following, float(share)) if share <= 1 else None
+
+
+def _chord(follower: Follower, last: FamilyPoint, point: FamilyPoint, step: float) -> np.ndarray:
+    """The change of what is free, (2n + F,), in units of the step."""
+    change = point.free - last.free
+    if not follower.period_is_free:
+        change = change[:-1]
+    if follower.place is not None:
+        by = point.numbers[follower.place] - last.numbers[follower.place]
+        change = np.append(change, by / follower.of_parameter)
+    return change / step
+
+
+def next_step(step: float, there: FamilyStep) -> float:
+    """The length of the next step: half to twice this one, so that it takes the usual share of its bounds."""
+    longer = step * float(np.clip(_USUAL / max(there.share, 1e-300), 0.5, 2.0))
+    return min(longer, _LONGEST * there.point.chain.size()[0])

@@ -1,0 +1,320 @@
+"""`family`: periodic orbits that belong together, one after the other, by energy or by a parameter.
+
+A family goes on through folds, where its energy or parameter turns back, because it is followed by its own length of
+arc. Orbits of a conservative scene form families by energy at fixed parameters, and by a parameter at a fixed period;
+limit cycles and driven orbits form them by a parameter alone.
+
+Source: Keller, *Lectures on Numerical Methods in Bifurcation Problems* (1987), §4; Doedel et al., *Computation of
+periodic solutions of conservative systems*, Int. J. Bifurcation and Chaos 13 (2003) 1353; Muñoz-Almaraz et al., Physica
+D 181 (2003) 1.
+"""
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._analysis.orbits import _shooting
+from lagjax._analysis.orbits._arc_motions import Arcs
+from lagjax._analysis.orbits._continuation import (
+    FamilyPoint,
+    FamilyTangent,
+    FamilyUnknowns,
+    Follower,
+    correct,
+    next_step,
+    step_along,
+    tangent_at,
+)
+from lagjax._analysis.orbits._flat_starts import starts
+from lagjax._analysis.orbits._floquet import passage_determinant, reduce
+from lagjax._analysis.orbits._orbit import RTOL, FlatOrbits, Orbit, arc_counts, assess_orbits
+from lagjax._interface import halves, labelled_leaves, require_budget, require_tolerance
+from lagjax._primitives import accepts_singles
+from lagjax._scene import System
+
+PyTree = Any
+
+_SHORTEST = 1e-6  # of the first step: a family that asks for shorter ones ends
+
+
+class Family(NamedTuple):
+    """N periodic orbits along a family; the first is the orbit at which the family was begun.
+
+    - `q0`, `qdot0`, `period`, `multipliers`, `closure`, `stable`: those of each orbit (see `Orbit`), with the orbits as
+      first axis.
+    - `value` (N,): the energy, or the parameter by which the family was followed; `energy` (N,): h = p·q̇ − L.
+    - `fold` (N,): whether `value` turns back at this orbit.
+    - `branch` (N,): whether two multipliers pass through 1 there without a fold, so that another family crosses this
+      one; `doubling` (N,): whether two pass through −1, where a family of twice the period begins.
+    - `message`: a sentence that says why it ends there.
+    """
+
+    q0: PyTree
+    qdot0: PyTree
+    period: jax.Array
+    value: jax.Array
+    energy: jax.Array
+    multipliers: jax.Array
+    closure: jax.Array
+    stable: jax.Array
+    fold: jax.Array
+    branch: jax.Array
+    doubling: jax.Array
+    message: str
+
+    def __repr__(self) -> str:
+        """Three lines: how many orbits and between which values, what happens on the way, and why it ends."""
+        count, periods = len(self.value), np.asarray(self.period)
+        first = f"Family of {count} orbits, {int(np.sum(self.stable))} of them stable"
+        span = f"from {float(self.value[0]):.9g} to {float(self.value[-1]):.9g}" if count else "empty"
+        span += f", periods from {periods.min():.6g} to {periods.max():.6g}" if count else ""
+        events = (("fold", self.fold), ("branch point", self.branch), ("doubling", self.doubling))
+        places = [f"{name} at orbit {', '.join(map(str, np.flatnonzero(x)))}" for name, x in events if np.any(x)]
+        return "\n".join([first, f"{span}; {'; '.join(places)}" if places else span, self.message])
+
+
+@accepts_singles(("orbit",), ("params",))
+def family(
+    system: System,
+    orbit: Orbit,
+    params: PyTree = None,
+    *,
+    by: str = "energy",
+    until: float | None = None,
+    step: float = 0.05,
+    count: int = 100,
+) -> Family:
+    """The family of periodic orbits that begins at `orbit`: at most `count` of them.
+
+    - `by`: "energy"; or the name of a parameter, such as "g" for `params["g"]`, one number.
+    - `until`: the energy or the parameter at which the family ends; it also fixes the direction of the first step.
+      Without it the family begins towards larger values and ends after `count` orbits.
+    - `step`: the arc length of the first step, in parts of the size of `orbit` (of its coordinates, its velocities, its
+      period over 2π and the parameter); it and later steps adapt to how fast Newton's method contracts, how far it
+      moves an orbit, and how much the family turns.
+
+    Folds, branch points and doublings between two orbits are located on the arc between them, as well as multipliers
+    and slopes are known there, and are orbits of the family as others are. `branch_off` goes on from there.
+
+    A nonlinear normal mode is the family by energy that begins at a linear mode: begin with the periodic orbit near
+    q + a·shape at rest, whose period is 2π/frequency, for a small amplitude a (`lagjax.normal_modes`).
+
+    **Raises** `TypeError` or `ValueError` for arguments that cannot be right: an orbit that is not `ok`, a name that no
+    parameter has, a scene with constraints or without machine code.
+
+    ```python
+    import jax, jax.numpy as jnp, lagjax
+    jax.config.update("jax_enable_x64", True)
+
+    pendulum = lagjax.System(lambda q, qdot: 0.5 * qdot**2 + jnp.cos(q))
+    swings = lagjax.family(pendulum, lagjax.periodic_orbit(pendulum, 0.3, 0.0, 6.3), count=10)
+    ```
+    """
+    require_budget(count, "count")
+    require_tolerance(step, "step")
+    if jnp.ndim(orbit.period) or not bool(orbit.ok):
+        raise ValueError("orbit must be one periodic orbit that is ok: of a batch take one member, and see why not.")
+    period, layout, y0 = starts(orbit.q0, orbit.qdot0, orbit.period, "period")
+    q, qdot = map(layout.restore, halves(y0[0]))
+    arcs = Arcs.from_system(system, q, qdot, params, RTOL, "Families")
+    place = None if by == "energy" else parameter_index(params, by)
+    follower = Follower(arcs, place, y0, period.ravel(), until)
+    if by == "energy" and not arcs.conserves:
+        raise ValueError(
+            "The energy of this scene is not conserved, so that there is no family by energy: name a parameter."
+        )
+    return _build_family(follower, *_follow_family(follower, y0, period.ravel(), float(step), count))
+
+
+def parameter_index(params: PyTree, name: str) -> int:
+    """The place of the parameter among all numbers."""
+    labels, leaves, _ = labelled_leaves(params, "params")
+    begin = 0
+    for label, leaf in zip(labels, leaves, strict=True):
+        if name in (label, label.removeprefix("params").strip("[]'."), label.rsplit(".", 1)[-1]):
+            if np.size(leaf) != 1:
+                raise ValueError(f"{label} has {np.size(leaf)} numbers: a family needs a parameter that is one.")
+            return begin
+        begin += np.size(leaf)
+    raise ValueError(
+        f"by must be 'energy' or one of {', '.join(labels) or 'no parameters, for there are none'}; got {name!r}."
+    )
+
+
+class _Member(NamedTuple):
+    """An orbit of a family, and what it tells: `found` (of one orbit), its multipliers, and what happens there.
+
+    `symmetries` counts those of the orbit; `tests` (4,) change sign at a fold, at a branch point or fold, at a
+    doubling, and at the value where the family is to end.
+    """
+
+    point: FamilyPoint
+    tangent: FamilyTangent
+    symmetries: int
+    found: FlatOrbits
+    tests: np.ndarray
+    events: tuple[bool, bool, bool] = (False, False, False)
+
+
+def _member(follower: Follower, point: FamilyPoint, tangent: FamilyTangent, most: int | None) -> _Member:
+    """An orbit with its multipliers; at most `most` directions count as symmetries."""
+    (symmetries,) = _shooting.symmetries(point.chain, most)
+    count = symmetries.null.shape[2]
+    found = assess_orbits(follower.closing(point.numbers), point.chain, count)
+    reduced = reduce(point.chain.growth[0], *symmetries)
+    through = [passage_determinant(reduced, sign) if not found.message[0] else np.nan for sign in (1, -1)]
+    beyond = np.nan if follower.until is None else (follower.value(point) - follower.until) / follower.of_value
+    return _Member(point, tangent, count, found, np.array([follower.slope(point) @ tangent.vector, *through, beyond]))
+
+
+def _follow_family(follower: Follower, y0, period, step: float, count: int) -> tuple[list[_Member], str]:
+    """The orbits of a family, and why it ends."""
+    point, shortest, until = first_point(follower, y0, period, follower.arcs.numbers), _SHORTEST * step, follower.until
+    if until is not None:
+        follower.of_value = abs(until - follower.value(point)) or 1.0
+    tangent = tangent_at(follower, point, None)
+    if tangent is None:
+        alone = FamilyTangent(np.zeros(point.matrix.shape[1]), 0, np.zeros((point.matrix.shape[1], 0)))
+        message = "The orbit is alone: it closes at no other energy, or parameter, near its own."
+        return [_member(follower, point, alone, None)], message
+    wanted = until is None or until > follower.value(point)
+    tangent = tangent if wanted else tangent._replace(vector=-tangent.vector)
+    members = [_member(follower, point, tangent, None)]
+    while len(members) < count:
+        last = members[-1]
+        there = step_along(follower, last.point, last.tangent, step)
+        if there is None or _shooting.is_equilibrium(there.point.chain)[0]:
+            step /= 2
+            if step < shortest:
+                return members, _end(follower, last.point, there is not None)
+            continue
+        following = _member(follower, there.point, there.tangent, last.symmetries)
+        members += _locate_events(follower, last, following, step)
+        if until is not None and (follower.value(there.point) > until) == wanted:
+            return members[:count], f"The family was followed until {until:.6g}."
+        members.append(_refine_member(follower, following))
+        step = next_step(step, there)
+    return members[:count], f"{count} orbits were found; the family goes on: raise count to follow it further."
+
+
+def first_point(follower: Follower, y0: np.ndarray, period: np.ndarray, numbers: np.ndarray) -> FamilyPoint:
+    """The orbit at which a family begins, in as many arcs as its steps and its growth need."""
+    count = int(arc_counts(follower.arcs.with_numbers(numbers), y0, period)[0])
+    return follower.refine_arcs(follower.divide_orbit(y0, period, count, numbers))
+
+
+def _refine_member(follower: Follower, member: _Member) -> _Member:
+    """The member with its orbit in more arcs where errors grow much along one arc; else the member itself."""
+    point = follower.refine_arcs(member.point)
+    if point is member.point:
+        return member
+    there = correct(follower, point, member.tangent)
+    return member if there is None else member._replace(point=there[0])
+
+
+def _end(follower: Follower, last: FamilyPoint, stopped: bool) -> str:
+    where = f"{follower.value(last):.9g}, with a period of {last.chain.periods()[0]:.6g}"
+    if stopped:
+        return f"The family ends at an equilibrium, near {where}."
+    return (
+        f"The family could not be followed beyond {where}. It ends there, as at a collision or at an orbit that takes "
+        "for ever, or begins to depend on its value so steeply that no step is short enough."
+    )
+
+
+# ---- what happens between two orbits ---------------------------------------------------------------------------------
+
+_SAME = 1e-3  # of a step: within, a fold and a branch point are one, where both tests change sign
+_NOISE = 1e-9  # of tests, which are of order one: what is all degenerate, as an isotropic oscillator, passes nothing
+# How far from a branch point orbits are computed, in parts of the bracket, and the bracket that ends that, in parts of
+# the step: the inverse polynomial through four orbits is then right to its fourth power.
+_BESIDE, _BRACKET = 0.02, 1e-3
+
+
+def _locate_events(follower: Follower, last: _Member, following: _Member, step: float) -> list[_Member]:
+    """The folds, branch points and doublings between two orbits, in their order, up to where the family is to end."""
+    turned = (last.tests * following.tests < 0) & (np.maximum(abs(last.tests), abs(following.tests)) > _NOISE)
+    located = {k: _locate_event(follower, last, following, step, k) for k in np.flatnonzero(turned).tolist()}
+    if 0 in located and 1 in located and abs(located[0][0] - located[1][0]) < _SAME * step:
+        del located[1]
+    ordered = sorted(located.items(), key=lambda item: item[1][0])
+    ends = [place for place, (k, _) in enumerate(ordered, 1) if k == 3]
+    ordered = ordered[: ends[0]] if ends else ordered
+    return [member._replace(events=tuple(k == j for j in range(3))) for k, (_, member) in ordered]
+
+
+def _locate_event(follower: Follower, last: _Member, following: _Member, step: float, k: int) -> tuple[float, _Member]:
+    """The zero of test k on the arc between two orbits, and the orbit there.
+
+    At a branch point the equations are singular, and about it Newton's method finds orbits of either family. So orbits
+    are computed beside it, nearer and nearer, from cubic guesses that are much nearer than the other family; the one
+    at the zero is then interpolated, and corrected in all directions but the singular one.
+    """
+    across, found = last.tangent, {0.0: last, step: following}
+    a, b = 0.0, step
+    while b - a > _BRACKET * step:
+        zero, width = _zero(found, a, b, k), b - a
+        for s in (max(zero, a + 2 * _BESIDE * width) - _BESIDE * width, zero + _BESIDE * width):
+            if not a < s < b:
+                continue
+            member = _orbit_between(follower, found, a, b, s, across, 0, last.symmetries)
+            if member is None or not np.isfinite(member.tests[k]):
+                return a, found[a]
+            found[s] = member
+            a, b = (s, b) if member.tests[k] * found[a].tests[k] > 0 else (a, s)
+        if b - a > 0.9 * width:
+            break
+    zero = _zero(found, a, b, k)
+    member = _orbit_between(follower, found, a, b, zero, across, int(k == 1), last.symmetries)
+    return zero, found[a] if member is None else member
+
+
+def _zero(found: dict[float, _Member], a: float, b: float, k: int) -> float:
+    """The zero of the inverse polynomial through the four orbits nearest to a bracket; within it in any case."""
+    near = sorted(found, key=lambda s: abs(s - (a + b) / 2))[:4]
+    values = [found[s].tests[k] for s in near]
+    shares = [np.prod([w / (w - v) for w in values[:j] + values[j + 1 :]]) for j, v in enumerate(values)]
+    zero = float(np.dot(near, shares))
+    if a < zero < b:
+        return zero
+    return (a * found[b].tests[k] - b * found[a].tests[k]) / (found[b].tests[k] - found[a].tests[k])
+
+
+def _orbit_between(
+    follower: Follower, found: dict[float, _Member], a: float, b: float, s: float, across: FamilyTangent, left_out: int,
+    most: int,
+) -> _Member | None:  # fmt: skip
+    """The orbit at arc length s between members of `found` at a and b; None where it belongs to another family."""
+    ends = [FamilyUnknowns.from_point(found[x].point) for x in (a, b)]
+    slopes = [_rate(follower, found[x], across) for x in (a, b)]
+    u, width = (s - a) / (b - a), b - a
+    guess = ends[0].times((1 + 2 * u) * (1 - u) ** 2).plus(ends[1], u**2 * (3 - 2 * u))
+    guess = guess.plus(slopes[0], width * u * (1 - u) ** 2).plus(slopes[1], width * u**2 * (u - 1))
+    there = correct(follower, follower.rebuild(found[a].point, guess), across, left_out)
+    tangent = None if there is None else tangent_at(follower, there[0], found[a].tangent, left_out)
+    if there is None or tangent is None or tangent.vector @ across.vector < _ALONG:
+        return None
+    return _member(follower, there[0], tangent, most)
+
+
+_ALONG = 0.7  # the cosine of the turn of a tangent between two neighbours, more than which they have by `step_along`
+
+
+def _rate(follower: Follower, member: _Member, across: FamilyTangent) -> FamilyUnknowns:
+    """The change of all numbers along the family by the arc across a tangent."""
+    vector = member.tangent.vector / (member.tangent.vector @ across.vector)
+    return follower.complete_change(member.point, vector, 0.0)
+
+
+def _build_family(follower: Follower, members: list[_Member], message: str) -> Family:
+    """The family in the user's structure."""
+    arrays = zip(*(member.found[:6] for member in members), strict=True)
+    found = FlatOrbits._make([*map(np.concatenate, arrays), ()])
+    points, layout = [member.point for member in members], follower.arcs.layout
+    value, energy = (np.array([of(point) for point in points]) for of in (follower.value, follower.energy))
+    q, qdot = map(layout.restore, halves(found.y))
+    events = np.array([member.events for member in members]).T
+    columns = q, qdot, found.period, value, energy, found.multipliers, found.closure, found.stable, *events
+    return Family._make([*jax.tree.map(jnp.asarray, columns), message])

@@ -1,0 +1,277 @@
+"""`action` and `find_path`: the path between two configurations, what its action is, and whether that is least.
+
+A path of Hamilton's principle joins q_start at one time to q_end at another. It is found by the multiple shooting
+of `_shooting`: states at equal parts of the time, joined by motions, with q given at both ends. Whether its action is
+a minimum is told by conjugate points, where neighbouring paths from the same start meet again: as many as there are on
+the way, as many independent variations lower the action (Morse).
+
+Source: Gelfand & Fomin, *Calculus of Variations*, §26–29; Milnor, *Morse Theory*, §15; Stoer & Bulirsch, §7.3.5.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._analysis.orbits._arc_motions import Arcs, Units
+from lagjax._analysis.orbits._conjugate import conjugate_times
+from lagjax._analysis.orbits._shooting import Chain, Closing, close, equations
+from lagjax._engine import concatenate_leaves
+from lagjax._interface import Layout, SimulationError, as_arrays, halves, require_finite, require_flag, require_number
+from lagjax._primitives import accepts_singles
+from lagjax._run import Trajectory, simulate
+from lagjax._scene import System, require_system
+
+PyTree = Any
+
+RTOL = 1e-14
+_ARCS = 8
+_CLOSED = 1e-10  # the largest defect of a path, of the size of its states
+_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(10)  # of each of as many panels as there are outputs, or `_PANELS`
+_PANELS, _RESOLVED = 64, 1e-9
+
+
+class Path(NamedTuple):
+    """A motion from `q_start` to `q_end`.
+
+    - `qdot_start`, `qdot_end`: the velocities there, in the user's structure; `trajectory`: the motion, at 129 times.
+    - `action` (): ∫ L dt.
+    - `conjugate_times` (k,): when neighbouring paths from the start meet this one again, repeated by multiplicity.
+    - `index`: how many independent variations with fixed ends lower the action: the conjugate times before the end.
+    - `minimum`: whether the action is least among nearby paths (`index` 0, and the end not conjugate); otherwise it is
+      a saddle.
+    - `closure` (): the largest defect, in parts of the size of the ends and of the velocities that join them; `ok`, and
+      `message`, a sentence that says why not.
+    """
+
+    qdot_start: PyTree
+    qdot_end: PyTree
+    trajectory: Trajectory | None
+    action: jax.Array
+    conjugate_times: jax.Array
+    index: int
+    minimum: bool
+    closure: jax.Array
+    ok: bool
+    message: str
+
+    def __repr__(self) -> str:
+        """Two lines: its action and what kind of extremum that is, and how well it joins; or why there is none."""
+        if not self.ok:
+            return f"Path: none was found. {self.message}"
+        kind = "a minimum" if self.minimum else f"a saddle of index {self.index}"
+        met = len(self.conjugate_times)
+        return (
+            f"Path: action {float(self.action):.9g}, {kind} among nearby paths, {met} conjugate times\n"
+            f"joined to {float(self.closure):.2g} of its size"
+        )
+
+
+def action(system: System, path: Trajectory | Callable, t_start=None, t_end=None, params: PyTree = None) -> jax.Array:
+    """∫ L(q, q̇, t) dt along a `path`, a scalar.
+
+    - `path`: a `Trajectory` of this system, whose motion is followed once more between its first and last time; or a
+      function of the time that returns q, between `t_start` and `t_end`, whether it is a motion or not. Its velocity
+      is its derivative by JAX.
+
+    The integral is a ten-point Gauss rule between neighbouring outputs of the trajectory, or on 64 equal parts.
+
+    **Raises** `ValueError` where twice as many parts give a different value: the path is not resolved, or not smooth.
+
+    ```python
+    import jax.numpy as jnp, lagjax
+
+    oscillator = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2)
+    lagjax.action(oscillator, jnp.cos, 0.0, 1.0)  # −sin(2)/4
+    ```
+    """
+    system = require_system(system)
+    if isinstance(path, Trajectory):
+        params = path.params if params is None else params
+        ts, states = _motion_states(system, path, params)
+    else:
+        ts, states = _function_states(path, t_start, t_end)
+    coarse, fine = (_integral(system, states, edges, params) for edges in (ts, _halve_panels(ts)))
+    if not abs(float(coarse[0] - fine[0])) <= _RESOLVED * abs(float(fine[1])):
+        raise ValueError(
+            f"The action is not resolved: {float(coarse[0]):.9g} and, on parts half as long, {float(fine[0]):.9g}. The "
+            "path has features narrower than that, or corners: give a trajectory with more output times, or take the "
+            "parts between corners one by one."
+        )
+    return fine[0]
+
+
+def _motion_states(system: System, path: Trajectory, params) -> tuple[np.ndarray, Callable]:
+    """The times of outputs, and what gives (q, q̇) of a motion at times between."""
+    q, qdot = jax.tree.map(lambda x: x[0], (path.q, path.qdot))
+
+    def states(times):
+        run = simulate(system, q, qdot, jnp.concatenate([path.ts[:1], times]), params, rtol=RTOL)
+        return jax.tree.map(lambda x: x[1:], (run.q, run.qdot))
+
+    return np.asarray(path.ts), states
+
+
+def _function_states(path, t_start, t_end) -> tuple[np.ndarray, Callable]:
+    """The edges of equal parts of the time, and what gives (q, q̇) of a function of the time."""
+    if not callable(path):
+        raise TypeError(f"path must be a Trajectory, or a function of the time; got {type(path).__name__}.")
+    for value, name in ((t_start, "t_start"), (t_end, "t_end")):
+        require_number(value, name)
+
+    def states(times):
+        return jax.vmap(lambda t: jax.jvp(path, (t,), (jnp.ones_like(t),)))(times)
+
+    return np.linspace(float(t_start), float(t_end), _PANELS + 1), states
+
+
+def _halve_panels(ts: np.ndarray) -> np.ndarray:
+    return np.sort(np.concatenate([ts, (ts[1:] + ts[:-1]) / 2]))[:: 1 if ts[-1] > ts[0] else -1]
+
+
+def _integral(system: System, states: Callable, edges: np.ndarray, params) -> tuple[jax.Array, jax.Array]:
+    """∫ L dt and ∫ |L| dt over panels between these edges."""
+    half = np.diff(edges) / 2
+    times = (edges[:-1] + half)[:, None] + half[:, None] * _NODES
+    q, qdot = states(jnp.asarray(times.ravel()))
+
+    def lagrangian(q, qdot, t):
+        return system.lagrangian(q, qdot, t=t, params=params)
+
+    values = jax.vmap(lagrangian)(q, qdot, jnp.asarray(times.ravel())).reshape(times.shape) * half[:, None]
+    return jnp.sum(values @ _WEIGHTS), jnp.sum(jnp.abs(values) @ _WEIGHTS)
+
+
+@accepts_singles(("q_start", "q_end"), ("params",))
+def find_path(
+    system: System,
+    q_start: PyTree,
+    q_end: PyTree,
+    t_start: float,
+    t_end: float,
+    params: PyTree = None,
+    *,
+    guess: Callable | None = None,
+    throw: bool = True,
+) -> Path:
+    """The motion of `system` that is at `q_start` at `t_start` and at `q_end` at `t_end`.
+
+    There may be several such motions, or none. Which one is found depends on `guess`, a function of the time that
+    returns q; by default a straight line. The search is multiple shooting: Newton's method on the states at the ends of
+    eight equal parts of the time.
+
+    **Raises** `TypeError` or `ValueError` for arguments that cannot be right, for a scene with constraints or without
+    machine code; `SimulationError` where no path is found, unless `throw` is False.
+
+    ```python
+    import jax, jax.numpy as jnp, lagjax
+    jax.config.update("jax_enable_x64", True)
+
+    ball = lagjax.System(lambda q, qdot: 0.5 * qdot @ qdot - 9.81 * q[1])
+    path = lagjax.find_path(ball, jnp.zeros(2), jnp.array([10.0, 0.0]), 0.0, 2.0)  # thrown with 9.81 upwards
+    ```
+    """
+    require_flag(throw, "throw")
+    for name, value in (("q_start", q_start), ("q_end", q_end), ("t_start", t_start), ("t_end", t_end)):
+        require_finite(value, name)
+    for name, value in (("t_start", t_start), ("t_end", t_end)):
+        require_number(value, name)
+    if not t_end > t_start:
+        raise ValueError(f"t_end must be later than t_start; got {t_end} and {t_start}.")
+    layout = Layout.from_state(q_start, q_end)
+    arcs = Arcs.from_system(system, q_start, q_end, params, RTOL, "Paths")
+    ends = [
+        np.asarray(concatenate_leaves(jax.tree.leaves(as_arrays(q, layout.dtype, "state")), np.dtype(float)))
+        for q in (q_start, q_end)
+    ]
+    times = np.linspace(float(t_start), float(t_end), _ARCS + 1)
+    first = _guess_states(layout, guess, ends, times)
+    closing = Closing.plain(arcs)._replace(t_first=times[0], q_end=ends[1])
+    parts = np.linspace(0.0, 1.0, _ARCS + 1)[None]
+    chain = close(closing, first[None], times[-1:] - times[:1], parts, _units(arcs, first, ends, times))
+    message = _why_not(closing, chain, times)
+    if message:
+        if throw:
+            raise SimulationError(message, None)
+        return _nothing(chain, message)
+    return _build_path(system, arcs, chain, ends[0], times, params)
+
+
+def _units(arcs: Arcs, y, ends, times) -> Units:
+    """The units of the first state, (1, 2n), with the farther one of both ends as the size of q."""
+    n, duration = arcs.size, times[-1:] - times[:1]
+    farther = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
+    velocity = np.maximum(np.abs(y[0, n:]), np.abs(ends[1] - ends[0]) / duration)
+    here = arcs.units(y[:1], duration)
+    root = here.length[:, None] / here.state[:, :n]
+    length = np.maximum((farther * root).max(axis=1), (velocity * root).max(axis=1) * duration) or 1.0
+    return Units(np.concatenate([length / root, length / root / duration], axis=1), duration, np.ravel(length))
+
+
+def _guess_states(layout: Layout, guess, ends, times) -> np.ndarray:
+    """States (K, 2n) at the first times of the arcs."""
+    q_start, q_end = ends
+    if guess is None:
+        slope = (q_end - q_start) / (times[-1] - times[0])
+        return np.stack([np.concatenate([q_start + slope * (t - times[0]), slope]) for t in times[:-1]])
+
+    def state(t):
+        q, qdot = jax.jvp(guess, (t,), (jnp.ones_like(t),))
+        return jnp.concatenate([layout.flatten(q), layout.flatten(qdot)])
+
+    y = np.stack([np.asarray(state(jnp.asarray(t))) for t in times[:-1]])
+    y[0, : len(q_start)] = q_start
+    return y
+
+
+def _why_not(closing: Closing, chain: Chain, times) -> str:
+    """Why no path was found; "" where one was."""
+    between = f"between t = {times[0]:.6g} and {times[-1]:.6g}"
+    if not chain.ok[0]:
+        return (
+            f"No path was found {between}: from the guess the motion cannot be followed. Give another guess=..., a "
+            f"function of the time. {chain.why[0]}"
+        )
+    missed = float(chain.closure()[0])
+    if missed <= _CLOSED:
+        return ""
+    singular = equations(closing, chain).decided.rank[0] < chain.y.shape[2]
+    end = " The ends are conjugate to each other: neighbouring paths all meet there, or none does." if singular else ""
+    return (
+        f"No path was found {between}: the motions that were tried miss each other by {missed:.2g} of their "
+        f"size. There may be none, or it may be far from the guess: give another guess=..., a function of time.{end}"
+    )
+
+
+def _nothing(chain: Chain, message: str) -> Path:
+    lost = jnp.asarray(np.nan)
+    return Path(None, None, None, lost, jnp.zeros(0), -1, False, jnp.asarray(chain.closure()[0]), False, message)
+
+
+def _build_path(system: System, arcs: Arcs, chain: Chain, q_start: np.ndarray, times, params) -> Path:
+    """The path in the user's structure, with its action and its second variation."""
+    restore, states = arcs.layout.restore, chain.y[0] * chain.of_state
+    states[0, : arcs.size] = q_start  # exactly, not by way of the units
+    conjugate, at_end = conjugate_times(arcs, states, times, chain.units)
+    (q, qdot), end = map(restore, halves(states[0])), arcs.ends(times[-2:][None], states[-1:]).path[0, -1]
+    qdot, qdot_end = jax.tree.map(jnp.asarray, (qdot, restore(end[arcs.size :])))
+    ts = np.linspace(times[0], times[-1], 16 * _ARCS + 1)
+    trajectory = simulate(system, q, qdot, ts, params, rtol=RTOL, throw=False)
+    total = sum(_arc_action(arcs, y, t0, t1) for y, t0, t1 in zip(states, times[:-1], times[1:], strict=True))
+    index = len(conjugate)
+    return Path(
+        qdot, qdot_end, trajectory, jnp.asarray(total), jnp.asarray(conjugate), index, index == 0 and not at_end,
+        jnp.asarray(chain.closure()[0]), True, "",
+    )  # fmt: skip
+
+
+def _arc_action(arcs: Arcs, y, t_first, t_last) -> float:
+    """∫ L dt along one arc, on eight panels."""
+    edges = np.linspace(t_first, t_last, 9)
+    half = np.diff(edges) / 2
+    times = ((edges[:-1] + half)[:, None] + half[:, None] * _NODES).ravel()
+    path = arcs.ends(np.append(t_first, times)[None], y[None]).path[0, 1:]
+    values = arcs.quantities(("lagrangian",), times, path)["lagrangian"].reshape(len(half), -1)
+    return float(half @ values @ _WEIGHTS)

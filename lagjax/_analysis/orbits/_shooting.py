@@ -1,0 +1,325 @@
+"""Multiple shooting for orbits and paths: damped Newton on states along the motion and the period, for many at once.
+
+    φ(y_k; a_k T, a_(k+1) T) − y_(k+1) = 0,  k = 0 … K−1,  y_K = S y_0,  or q_0 and q_K given
+
+S is the identity, or a symmetry of the scene up to which the motion returns; the parts 0 = a_0 < … < a_K = 1 of the
+period are those in which the guess takes equally many steps, so that violent moments make short arcs. Of a path both
+positions are given and T is its duration. The two differ in how the first and the last state depend on the numbers that
+are free, and in what a deficient rank says: an orbit has neighbours, of which the nearest one is taken; ends of a path
+are then conjugate, and no step is.
+
+Short arcs keep what one error becomes small, so that orbits close whose errors grow a millionfold in a period. Arcs of
+all orbits are rows of one run. Of the alternatives, single shooting loses as many digits as an error grows, and
+collocation needs as many unknowns as there are steps. The first states come from both sides: forward from the start for
+half the period and backward for the other half, so that errors of the guess grow only half as long.
+
+Source: Stoer & Bulirsch, *Introduction to Numerical Analysis*, §7.3.5; Deuflhard, *Newton Methods for Nonlinear
+Problems* (2004), §3.3 and §7.1, for the damping and the rank.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax._analysis import Decided, decide
+from lagjax._analysis.orbits._arc_motions import Arc, Arcs, Units
+from lagjax._analysis.orbits._condensation import Condensed, condense
+from lagjax._equations import singular_threshold
+
+# Relative to the largest singular value: below, a direction counts as degenerate. Measured on the 695 planar orbits,
+# true ones are above 1e-6 and degenerate ones of a closed orbit below 1e-11. Twice as much changes no rank there.
+RANK = 1e-8
+_PER_DEFECT, _LARGEST_RANK = 30.0, 1e-3  # before it is closed, an orbit's degenerate directions are so by its defect
+_TRIALS = 60
+# The shares of a step that are tried. Of 64 random paths quarters miss one that halves find.
+_SHARES, _SHARES_OF_PATH = 0.25 ** np.arange(8), 0.5 ** np.arange(10)
+_ENOUGH = 8e-15  # of the size of the state: round-off, below which trials cannot be told from each other
+
+
+class Closing(NamedTuple):
+    """The conditions on the ends: those of an orbit are S y = `matrix` y + `shift`, and an energy if given.
+
+    Those of a path are the given positions: `q_end` (n,), and the one it begins with, at the time `t_first`.
+    """
+
+    arcs: Arcs
+    matrix: np.ndarray
+    shift: np.ndarray
+    energy: float | None = None
+    t_first: float = 0.0
+    q_end: np.ndarray | None = None
+
+    @classmethod
+    def plain(cls, arcs: Arcs, energy: float | None = None) -> "Closing":
+        """Orbits that return to where they began."""
+        return cls(arcs, np.eye(2 * arcs.size), np.zeros(2 * arcs.size), energy)
+
+    @property
+    def lasts(self) -> bool:
+        """True if the duration is given: that of a path, and the period of what is driven."""
+        return self.arcs.driven or self.q_end is not None
+
+    def free(self) -> tuple[np.ndarray, np.ndarray]:
+        """E and F (2n, 2n): the first state changes by E u and the last by F u, u (2n,) being free."""
+        whole, n = np.eye(2 * self.arcs.size), self.arcs.size
+        if self.q_end is None:
+            return whole, whole
+        return np.roll(whole, n, axis=0) * (np.arange(2 * n) < n), whole * (np.arange(2 * n) >= n)
+
+    def target(self, y: np.ndarray, end: np.ndarray, of_state: np.ndarray) -> np.ndarray:
+        """The states (B, K, 2n) where arcs from `y` that end at `end` should end, all in units `of_state` (B, 2n)."""
+        target, n = np.roll(y, -1, axis=1), self.arcs.size
+        if self.q_end is not None:
+            target[:, -1] = np.concatenate([self.q_end / of_state[:, :n], end[:, -1, n:]], axis=1)
+        return target
+
+    def images(self, y: np.ndarray) -> np.ndarray:
+        """S y for rows (R, 2n)."""
+        return y @ self.matrix.T + self.shift
+
+    def map_back(self, y: np.ndarray) -> np.ndarray:
+        """S⁻¹ y for rows (R, 2n)."""
+        return np.linalg.solve(self.matrix, (y - self.shift).T).T
+
+    def conditions(self, y0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The error of the energy of first states (B, 2n), (B, m), and its slopes (B, m, 2n); m is 0 or 1."""
+        if self.energy is None:
+            return np.zeros((len(y0), 0)), np.zeros((len(y0), 0, y0.shape[1]))
+        off = self.arcs.energy(0.0, y0) - self.energy
+        return off[:, None], self.arcs.energy_slope(0.0, y0)[:, None]
+
+
+class Chain(NamedTuple):
+    """B closed chains of K arcs: states `y` (B, K, 2n) at `parts` (B, K + 1) of the periods `period` (B,).
+
+    All is in the `units` of each chain, in which metres and seconds do not matter.
+    `defect` (B, K, 2n) is end of an arc minus the next state, `growth` (B, K, 2n, 2n) the derivatives of the arcs,
+    `rate` (B, K, 2n) that of the ends in time; those of the last arc are taken back by S. `off` (B, m) and `slope`
+    (B, m, 2n) are conditions on the first state. `ok` (B,) tells whether all arcs could be followed.
+    """
+
+    y: np.ndarray
+    period: np.ndarray
+    parts: np.ndarray
+    of_state: np.ndarray
+    of_time: np.ndarray
+    of_length: np.ndarray
+    defect: np.ndarray
+    growth: np.ndarray
+    rate: np.ndarray
+    off: np.ndarray
+    slope: np.ndarray
+    ok: np.ndarray
+    why: tuple[str, ...]
+
+    @property
+    def units(self) -> Units:
+        return Units(self.of_state, self.of_time, self.of_length)
+
+    def states(self) -> np.ndarray:
+        """The first states (B, 2n) in the units of the user."""
+        return self.y[:, 0] * self.of_state
+
+    def periods(self) -> np.ndarray:
+        """The periods (B,) in the unit of the user."""
+        return self.period * self.of_time
+
+    def size(self) -> np.ndarray:
+        """The largest number of a state, (B,)."""
+        return np.abs(self.y).max(axis=(1, 2))
+
+    def closure(self) -> np.ndarray:
+        """The largest defect of each chain, (B,)."""
+        return np.where(self.ok, np.abs(self.defect).max(axis=(1, 2)), np.inf)
+
+    def merit(self) -> np.ndarray:
+        """The closure together with how far the first state is from its conditions, (B,)."""
+        steep = np.maximum(np.abs(self.slope).max(axis=2, initial=0.0), 1e-300)
+        return np.maximum(self.closure(), np.max(np.abs(self.off) / steep, axis=1, initial=0.0))
+
+    def select(self, chosen: np.ndarray) -> "Chain":
+        """The chains at `chosen`: indices, or a mask (B,)."""
+        places = np.flatnonzero(chosen) if chosen.dtype == bool else chosen
+        return Chain._make([*(x[places] for x in self[:_ARRAYS]), tuple(self.why[k] for k in places.tolist())])
+
+    def replace_members(self, places: np.ndarray, others: "Chain") -> "Chain":
+        arrays = [np.array(x) for x in self[:_ARRAYS]]
+        for mine, new in zip(arrays, others[:_ARRAYS], strict=True):
+            mine[places] = new
+        why = list(self.why)
+        for place, text in zip(places.tolist(), others.why, strict=True):
+            why[place] = text
+        return Chain._make([*arrays, tuple(why)])
+
+
+_ARRAYS = 12  # of the fields of a chain
+
+
+def guesses(closing: Closing, y0: np.ndarray, period: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Parts (B, K + 1) of the period and states (B, K, 2n) there, from starts (B, 2n): from both sides to the middle.
+
+    K is a power of two. A driven motion that does not close has no past: it is followed forward only.
+    """
+    arcs = closing.arcs
+    if count == 1:
+        return np.broadcast_to([0.0, 1.0], (len(y0), 2)), y0[:, None].copy()
+    if arcs.driven:
+        parts = arcs.equal_shares(period, y0, count)
+        return parts, arcs.ends(period[:, None] * parts, y0).path[:, :count]
+    half, images = count // 2, closing.images(y0)
+    ahead, back = arcs.equal_shares(period / 2, y0, half), arcs.equal_shares(-period / 2, images, half)
+    first = arcs.ends(period[:, None] / 2 * ahead, y0).path
+    second = arcs.ends(-period[:, None] / 2 * back, images).path
+    parts = np.concatenate([ahead / 2, 1 - back[:, -2::-1] / 2], axis=1)
+    return parts, np.concatenate([first, second[:, -2:0:-1]], axis=1)
+
+
+def follow(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray, units: Units) -> Chain:
+    """The chains through these states, (B, K, 2n), all in these units."""
+    arcs, (chains, count, states) = closing.arcs, y.shape
+    of_state, spans = units.state[:, None], (period * units.time)[:, None]
+    times = closing.t_first + np.stack([spans * parts[:, :-1], spans * parts[:, 1:]], axis=2).reshape(-1, 2)
+    rows = (y * of_state).reshape(-1, states)
+    if not closing.lasts:  # each begins at zero, where times have the most digits
+        times = (spans * np.diff(parts)).reshape(-1, 1) * np.array([0.0, 1.0])
+    arc = arcs.follow(times, rows)
+    rate = arcs.rate(times[:, 1], arc.end).reshape(y.shape)
+    ok = np.asarray(arc.ok.reshape(chains, count).all(axis=1))
+    end, growth = arc.end.reshape(y.shape), arc.by_start.reshape(*y.shape, states)
+    inverse = np.linalg.inv(closing.matrix)
+    end[:, -1], rate[:, -1] = closing.map_back(end[:, -1]), rate[:, -1] @ inverse.T
+    growth[:, -1] = inverse @ growth[:, -1]
+    end = end / of_state
+    defect = end - closing.target(y, end, units.state)
+    off, slope = closing.conditions(y[:, 0] * units.state)
+    rate, slope = rate * units.time[:, None, None] / of_state, slope * of_state
+    why = _why(arcs, arc, rows, times, ok)
+    return Chain(y, period, parts, *units, defect, units.growth(growth), rate, off, slope, ok, why)
+
+
+def _why(arcs: Arcs, arc: Arc, rows, times, ok) -> tuple[str, ...]:
+    """The reason why each chain stopped, "" where none did."""
+    count = len(arc.ok) // len(ok)
+    texts = [""] * len(ok)
+    for k in np.flatnonzero(~ok).tolist():
+        row = k * count + int(np.argmin(arc.ok[k * count : (k + 1) * count]))
+        texts[k] = arcs.why_not(row, arc, rows, times[row, 1])
+    return tuple(texts)
+
+
+class NewtonEquations(NamedTuple):
+    """The equations of Newton's method for B chains: condensed to both ends, with the rank decided.
+
+    The unknowns are u (2n,) of `Closing.free`, and the period where it is free; `right` (B, 2n + m).
+    """
+
+    condensed: Condensed
+    decided: Decided
+    right: np.ndarray
+
+
+def equations(closing: Closing, chain: Chain) -> NewtonEquations:
+    """The equations at these chains."""
+    condensed = condense(chain.growth, np.stack([chain.rate * np.diff(chain.parts)[..., None], chain.defect], axis=3))
+    of_first, of_last = closing.free()
+    regular, of_period = condensed.first @ of_first + condensed.last @ of_last, condensed.more[..., :1]
+    # A condition in units of the state, as the defects are.
+    unit = 1 / np.maximum(np.abs(chain.slope).max(axis=2), 1e-300)
+    matrix = np.concatenate([regular, unit[:, :, None] * chain.slope], axis=1)
+    right = np.concatenate([condensed.more[..., 1], unit * chain.off], axis=1)
+    if not closing.lasts:
+        none = np.zeros((len(matrix), chain.off.shape[1], 1))
+        matrix = np.concatenate([matrix, np.concatenate([of_period, none], axis=1)], axis=2)
+    if closing.q_end is None:
+        threshold = np.clip(_PER_DEFECT * chain.merit() / np.maximum(chain.size(), 1e-300), RANK, _LARGEST_RANK)
+    else:
+        threshold = singular_threshold(chain.y[0].size, float)
+    return NewtonEquations(condensed, decide(matrix, threshold), right)
+
+
+def correction(closing: Closing, chain: Chain) -> tuple[np.ndarray, np.ndarray]:
+    """The step of Newton's method, shortest in the first state and the period: dy (B, K, 2n) and dT (B,).
+
+    Zero for a path with conjugate ends.
+    """
+    condensed, decided, right = equations(closing, chain)
+    step, states = -decided.least_norm(right), chain.y.shape[2]
+    period = np.zeros(len(step)) if closing.lasts else step[:, -1]
+    first, last = (step[:, :states] @ of.T for of in closing.free())
+    z = np.stack([period, np.ones(len(step))], axis=1)[:, :, None]
+    dy = condensed.inner(first[..., None], last[..., None], z)[..., 0]
+    if closing.q_end is not None:
+        dy[decided.rank < states] = 0.0
+    return dy, period
+
+
+def close(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray, units: Units) -> Chain:
+    """The closed chains, or joined paths, near these states, as far as they are found: look at `Chain.closure`."""
+    chain = follow(closing, y / units.state[:, None], period / units.time, parts, units)
+    active = chain.ok.copy()
+    for _ in range(_TRIALS):
+        active &= chain.merit() > _ENOUGH * chain.size()
+        if not active.any():
+            break
+        places = np.flatnonzero(active)
+        better = _improve(closing, chain.select(places))
+        gained = better.merit() < 0.9 * chain.merit()[places]
+        lower = better.merit() < chain.merit()[places]
+        chain = chain.replace_members(places[lower], better.select(lower))
+        active[places[~gained]] = False
+    return chain
+
+
+def _improve(closing: Closing, chain: Chain) -> Chain:
+    """Each chain after the largest share of one step by which its defect falls."""
+    dy, dperiod = correction(closing, chain)
+    longest = np.minimum(1.0, 0.25 * chain.period / np.maximum(np.abs(dperiod), 1e-300))
+    best, waiting = chain, np.arange(len(chain.period))
+    for share in _SHARES if closing.q_end is None else _SHARES_OF_PATH:
+        here, scale = chain.select(waiting), share * longest[waiting]
+        y, period = here.y + scale[:, None, None] * dy[waiting], here.period + scale * dperiod[waiting]
+        trial = follow(closing, y, period, here.parts, here.units)
+        lower = trial.merit() < (1 - 0.25 * scale) * here.merit()
+        near = here.merit() < 1e3 * _ENOUGH * here.size()  # where rounding decides
+        best = best.replace_members(waiting[lower], trial.select(lower))
+        waiting = waiting[~lower & ~near]
+        if not len(waiting):
+            break
+    return best
+
+
+class Symmetries(NamedTuple):
+    """The null spaces of monodromy − 1 of a closed chain and of its transpose: (K, 2n, k) at every state."""
+
+    null: np.ndarray
+    of_transpose: np.ndarray
+
+
+def symmetries(chain: Chain, most: int | None = None) -> list[Symmetries]:
+    """The rank decision about closed chains: which directions are symmetries, at most this many.
+
+    At a branch point monodromy − 1 sends more to zero, by chance: those of the smallest singular values are chosen.
+    """
+    forward, null = _null(chain.growth)
+    # ℓ_k = G_kᵀ ℓ_(k+1): the same chain, walked back from the end.
+    back, of_transpose = _null(np.swapaxes(chain.growth[:, ::-1], 2, 3))
+    found = []
+    for k in range(len(chain.period)):
+        count = chain.y.shape[2] - max(forward.rank[k], back.rank[k])
+        count = count if most is None else min(count, most)
+        right, left = null[k][..., null.shape[3] - count :], of_transpose[k][..., null.shape[3] - count :]
+        found.append(Symmetries(right, np.roll(left[::-1], 1, axis=0)))
+    return found
+
+
+def _null(growth: np.ndarray) -> tuple[Decided, np.ndarray]:
+    """The decision about A + B of chains that are closed, and the right vectors at all states, (B, K, 2n, 2n)."""
+    chains, count, states, _ = growth.shape
+    condensed = condense(growth, np.zeros((chains, count, states, 0)))
+    rank = decide(condensed.first + condensed.last, RANK)
+    return rank, condensed.inner(rank.right, rank.right, np.zeros((chains, 0, states)))
+
+
+def is_equilibrium(chain: Chain) -> np.ndarray:
+    """True if nothing moves along a chain, beside its states and the guess: an equilibrium closes after any time."""
+    return np.abs(chain.rate).max(axis=(1, 2)) * chain.period <= 1e-6 * np.maximum(chain.size(), 1.0)

@@ -1,0 +1,35 @@
+"""Engines, which integrate: a flat `Problem` becomes a flat `Solution`.
+
+`_problem` holds `Problem`, `Batch`, `Solution` and what an engine is; `_choice` decides which engine integrates a
+problem, and why. `taylor/` is Taylor series in machine code, `diffrax/` any solver of diffrax on any device.
+`_stop_reason` says what a motion ran into, from the accelerations about its last state.
+"""
+
+from lagjax._engine._choice import choose, requested_engine
+from lagjax._engine._problem import (
+    DEFAULT_RTOL,
+    LEAST_RTOL,
+    AbstractEngine,
+    Batch,
+    Problem,
+    Solution,
+    axes_per_leaf,
+    concatenate_leaves,
+    rows,
+)
+from lagjax._engine._stop_reason import AHEAD
+
+__all__ = [
+    "AHEAD",
+    "DEFAULT_RTOL",
+    "LEAST_RTOL",
+    "AbstractEngine",
+    "Batch",
+    "Problem",
+    "Solution",
+    "axes_per_leaf",
+    "choose",
+    "concatenate_leaves",
+    "requested_engine",
+    "rows",
+]

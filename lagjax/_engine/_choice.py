@@ -1,0 +1,66 @@
+"""`choose`: which engine integrates a problem. The one place where that is decided; `explain` prints its answer.
+
+Without a choice by the user it is machine code where the scene has it, else diffrax with its default solver. A solver,
+fixed steps, an adjoint or a progress meter ask for diffrax; `solver=lagjax.MachineCode()` insists on machine code.
+"""
+
+from typing import Any, NamedTuple
+
+from lagjax._engine._problem import AbstractEngine, Problem
+from lagjax._engine.diffrax import Diffrax
+from lagjax._engine.taylor import MachineCode
+
+
+class Choice(NamedTuple):
+    """The engine that integrates, and why that is not machine code: the end of a sentence, None where it is."""
+
+    engine: AbstractEngine
+    refusal: str | None
+
+
+def requested_engine(
+    solver=None, dt=None, adjoint=None, progress: Any = False, rtol=None, atol=None
+) -> AbstractEngine | None:
+    """The engine that these arguments of `simulate` determine; None where they leave it open.
+
+    Raises `TypeError` or `ValueError` where they cannot be right, or contradict each other.
+    """
+    if dt is not None and not (rtol is None and atol is None):
+        raise ValueError("dt asks for fixed steps and rtol/atol for adaptive ones: give one or the other.")
+    others = {
+        "fixed steps": dt is not None,
+        "an adjoint": adjoint is not None,
+        "a progress meter": progress is not False,
+    }
+    if isinstance(solver, MachineCode):
+        for what, given in others.items():
+            if given:
+                raise ValueError(_refusal(f"{what} was asked for".replace("steps was", "steps were")))
+        return solver
+    return Diffrax.from_arguments(solver, dt, adjoint, progress) if solver is not None or any(others.values()) else None
+
+
+_MACHINE_CODE = MachineCode()
+
+
+def choose(problem: Problem, requested: AbstractEngine | None = None) -> Choice:
+    """The engine for a problem. Raises `ValueError` where the `requested` one, or without it every one, refuses it."""
+    if isinstance(requested, Diffrax):
+        choice = Choice(requested, "diffrax was asked for")
+    else:
+        refusal = _MACHINE_CODE.declines(problem) if requested is None else _MACHINE_CODE.lacks(problem)
+        if refusal is None:
+            return Choice(_MACHINE_CODE, None)
+        if requested is not None:
+            raise ValueError(_refusal(refusal))
+        choice = Choice(Diffrax(), refusal)
+    if refusal := choice.engine.refuses(problem):
+        raise ValueError(f"{refusal}.")
+    return choice
+
+
+def _refusal(reason: str) -> str:
+    return (
+        f"solver=lagjax.MachineCode() cannot integrate this: {reason}. Leave solver at None, and diffrax integrates "
+        "what machine code cannot."
+    )

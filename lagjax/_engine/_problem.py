@@ -1,0 +1,545 @@
+"""`Problem → engine → Solution`: a question that every engine understands, and its answer, both flat.
+
+    Problem   a scene, its parameters, an initial state (2n,), output times (T,), tolerances, a budget, an event
+    Solution  the states (T, 2n) at the output times, the last state, how the motion ended, counts of steps
+
+An engine is a value. It says which problems it refuses, and solves the others, one or a batch, under every
+transformation of JAX. Pytrees of the user exist on both sides of this module, but not behind it: the state is one
+vector (q, q̇), and the programs of a scene take the parameters as one vector too (`Problem.vector`).
+"""
+
+import abc
+import functools
+import types
+from collections.abc import Callable, Hashable, Mapping
+from dataclasses import dataclass, field, replace
+from typing import Any, ClassVar, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+from jax.extend import core
+from jaxtyping import Array, Float, Int
+
+from lagjax._equations import Derivation, derivation_of
+from lagjax._interface import (
+    Layout,
+    accept,
+    all_finite,
+    as_arrays,
+    dtype_of,
+    flatten_numbers,
+    halves,
+    is_concrete,
+    labelled_leaves,
+    output_times,
+    require_budget,
+    require_finite,
+    require_numbers,
+    require_tolerance,
+)
+from lagjax._interface.reads import Edition
+from lagjax._native import ATOL_OVER_MOTION, ATOL_OVER_RTOL
+from lagjax._primitives import DOUBLE, SINGLE
+
+PyTree = Any
+Numbers = Array | np.ndarray
+
+# The default, also for a state in float32, for which machine code computes in float64: 1e-7 would leave roundings alone
+# of the last digit there, and saves a quarter of the time; 1e-9 gives the digits of the run in float64. The absolute
+# tolerance is far below the relative one, and smaller still in a motion that is as small itself: it is there for
+# components that pass through zero.
+DEFAULT_RTOL = 1e-9
+# The smallest rtol, in units of round-off. Machine code sums with the rounding errors carried along: below one unit its
+# truncation, which has a sign, does not add up to more than the round-off of a long run, which has none.
+LEAST_RTOL = 0.25
+
+
+@jax.tree_util.register_dataclass
+@dataclass(frozen=True, eq=False)
+class Problem:
+    """The motion of a scene from one state, as a question to an engine.
+
+    - `system`, `layout`, `params`: the scene, the structure of its coordinates, and its parameters as the user gave
+      them, every number an array.
+    - `ts` (T,): the output times, of which the first is that of the initial state `y0` (2n,), q and then q̇.
+    - `tolerances`: rtol and atol of a step as they were given, None where those of the engine hold by default
+      (`AbstractEngine.tolerances`).
+    - `max_steps`: the budget of steps, rejected ones included.
+    - `event`: functions of the user's state that end the motion.
+    - `guards`: the same as a program for machine code (`_native.Guards`), whose signs end the motion; of hybrid motion.
+    - `is_rounded`: whether the solution, in float64, is rounded to float32 in the end.
+    """
+
+    system: Any
+    layout: Layout
+    params: PyTree
+    ts: Float[Numbers, " T"]
+    y0: Float[Numbers, " states"]
+    tolerances: tuple[Float[Numbers, ""] | None, Float[Numbers, ""] | None]
+    max_steps: int = field(metadata={"static": True})
+    event: diffrax.Event | None = None
+    guards: Hashable = field(metadata={"static": True}, default=None)
+    is_rounded: bool = field(metadata={"static": True}, default=False)
+
+    @classmethod
+    def from_arguments(
+        cls, system, layout: Layout, q0, qdot0, ts, params=None, rtol=None, atol=None, max_steps=65_536, event=None
+    ) -> "Problem":
+        """The problem of the arguments of `simulate`, after checks of all that does not depend on an engine.
+
+        Raises `TypeError` or `ValueError` with the name of the argument that cannot be right.
+        """
+        dtype, given = layout.dtype, _check_fields(layout.dtype, params, ts, rtol, atol, max_steps, event)
+        y0 = concatenate_leaves(jax.tree.leaves(as_arrays((q0, qdot0), dtype, "state")), dtype)
+        problem = cls(system=system, layout=layout, y0=y0, **given)
+        vectors = y0, problem.vector
+        if not all(isinstance(x, np.ndarray) and all_finite(x) for x in vectors):  # leaf by leaf, with their names
+            for name, value in (("q0", q0), ("qdot0", qdot0), ("params", problem.params)):
+                require_finite(value, name)
+        return problem
+
+    @classmethod
+    def from_system(
+        cls, system, layout: Layout, params, ts=(0.0, 1.0), rtol=None, atol=None, max_steps=65_536, event=None
+    ) -> "Problem":
+        """A problem of this scene that starts at q = q̇ = 0: enough to choose an engine and to make its program."""
+        given = _check_fields(layout.dtype, params, ts, rtol, atol, max_steps, event)
+        return cls(system=system, layout=layout, y0=np.zeros(2 * layout.size, layout.dtype), **given)
+
+    # What follows from the fields is looked up once: an engine is chosen and then solves the same problem.
+
+    @functools.cached_property
+    def derivation(self) -> Derivation:
+        """The derivation of the scene: made once for all problems whose scene and structure are equal."""
+        return derivation_of(self.system, self.layout, self.params)
+
+    @functools.cached_property
+    def made(self) -> dict:
+        """The parts that engines have made of it, by name, and use more than once."""
+        return {}
+
+    @property
+    def numbers(self) -> PyTree:
+        """The numbers among the parameters: what can be traced. The rest is part of the program."""
+        return eqx.filter(self.params, eqx.is_array_like)
+
+    @functools.cached_property
+    def vector(self) -> Float[Numbers, " P"]:
+        """Every number in the parameters, shape (P,), in the dtype of the state."""
+        return concatenate_leaves(list(filter(eqx.is_array_like, jax.tree.leaves(self.params))), self.layout.dtype)
+
+    @property
+    def is_known(self) -> bool:
+        """True if nothing in it is being traced, so that it can be solved at once."""
+        return all(map(is_concrete, (self.ts, self.y0, self.vector)))
+
+    @property
+    def is_single(self) -> bool:
+        """True if its state is in float32."""
+        return self.layout.dtype == SINGLE
+
+    @functools.cached_property
+    def double_precision(self) -> "Problem":
+        """The problem in float64; numbers that are being traced become zeros."""
+
+        def wide(leaf):
+            if not eqx.is_array_like(leaf) or dtype_of(leaf) != SINGLE:
+                return leaf
+            return np.asarray(leaf, DOUBLE) if is_concrete(leaf) else _zeros(np.shape(leaf), DOUBLE)
+
+        params, ts, y0 = jax.tree.map(wide, (self.params, self.ts, self.y0))
+        layout = replace(self.layout, dtype=DOUBLE)
+        return replace(self, layout=layout, params=params, ts=ts, y0=y0, is_rounded=True)
+
+
+class Batch(eqx.Module):
+    """Many problems of one scene, which differ in their initial states and in numbers of their parameters.
+
+    `member` is a problem of the structure of all; `y0` (N, 2n) holds the initial states, and `params` the parameters,
+    with the members as first axis of every leaf whose entry in `axes` is 0. The others, whose entry is None, are for
+    all members.
+    """
+
+    member: Problem
+    y0: Float[Numbers, "N states"]
+    params: PyTree
+    axes: tuple[int | None, ...] = eqx.field(static=True)
+
+    @classmethod
+    def from_values(
+        cls, system, values: dict, axes: dict, size: int, ts, rtol=None, atol=None, max_steps=65_536, event=None
+    ) -> "Batch":
+        """The batch of `values` by name, q0, qdot0, params, with the axis of members of every leaf (`axes_per_leaf`).
+
+        Raises `TypeError` or `ValueError` as `Problem.from_arguments`; a number of one member alone may be NaN.
+        """
+        member = {name: jax.tree.map(_shape_of_one, value, axes[name]) for name, value in values.items()}
+        layout = Layout.from_state(member["q0"], member["qdot0"])
+        one = Problem.from_system(system, layout, member["params"], ts, rtol, atol, max_steps, event)
+        arrays = {name: as_arrays(value, layout.dtype, name) for name, value in values.items()}
+        for name, value in arrays.items():
+            require_finite(jax.tree.map(lambda leaf, axis: leaf if axis is None else None, value, axes[name]), name)
+        state = jax.tree.leaves((arrays["q0"], arrays["qdot0"]))
+        params, structure = jax.tree.flatten(arrays["params"])
+        of_params = structure.flatten_up_to(axes["params"])
+        in_front = [x if axis is None else _move_axis_first(x, axis) for x, axis in zip(params, of_params, strict=True)]
+        of_state = [
+            axis for name in ("q0", "qdot0") for axis in jax.tree.structure(values[name]).flatten_up_to(axes[name])
+        ]
+        y0 = rows(state, of_state, size, layout.dtype)
+        spread = tuple(None if axis is None else 0 for axis in of_params)
+        return cls(one, y0, structure.unflatten(in_front), spread)
+
+    def __len__(self) -> int:
+        return len(self.y0)
+
+    def map_members(self, solve: Callable[[Problem], "Solution"]) -> "Solution":
+        """`solve` under `jax.vmap` over the members."""
+        axes = jax.tree.unflatten(jax.tree.structure(self.params), self.axes)
+        return jax.vmap(lambda y0, params: solve(replace(self.member, y0=y0, params=params)), in_axes=(0, axes))(
+            self.y0, self.params
+        )
+
+    @property
+    def is_known(self) -> bool:
+        """True if nothing in it is being traced."""
+        numbers = eqx.filter(self.params, eqx.is_array_like)
+        return all(is_concrete(leaf) for leaf in jax.tree.leaves((self.member.ts, self.y0, numbers)))
+
+    @property
+    def vectors(self) -> Float[Numbers, "members P"]:
+        """The numbers in the parameters of each member, shape (N, P), or (1, P) where all share them."""
+        leaves = jax.tree.leaves(self.params)
+        numbers = [(leaf, axis) for leaf, axis in zip(leaves, self.axes, strict=True) if eqx.is_array_like(leaf)]
+        if all(axis is None for _, axis in numbers):
+            return concatenate_leaves([leaf for leaf, _ in numbers], self.member.layout.dtype)[None]
+        return rows([leaf for leaf, _ in numbers], [axis for _, axis in numbers], len(self), self.member.layout.dtype)
+
+
+class Solution(NamedTuple):
+    """The motion that answers a problem; of a batch, with the members as first axis of everything.
+
+    - `path` (T, 2n): the states at the output times, NaN where not reached; or what was noted on the way.
+    - `y_end` (2n,), `t_end` (): the state and the time at which the motion ended.
+    - `result` (): how it ended, as the integer of a `lagjax.RESULTS`.
+    - `accepted`, `rejected` (): counts of steps.
+    - `event` (): which guards changed sign at the end, Σ 4ᵏ (1 where guard k falls, 2 where it rises); 0 without any.
+    - `ticket` (): names the steps that are kept for the transpose of this motion, −1 where they are not.
+    - `idle`: of a batch as a whole, the steps for which a lane was idle; None for one motion.
+    """
+
+    path: Float[Any, "*N T states"]
+    y_end: Float[Any, "*N states"]
+    t_end: Float[Any, "*N"]
+    result: Int[Any, "*N"]
+    accepted: Int[Any, "*N"]
+    rejected: Int[Any, "*N"]
+    event: Int[Any, "*N"] = None
+    ticket: Int[Any, "*N"] = None
+    idle: Int[Any, ""] = None
+
+
+class AbstractEngine(abc.ABC):
+    """The integrator: `MachineCode` or `Diffrax`. `default_rtol` is its tolerance where none is given."""
+
+    default_rtol: ClassVar[Mapping[np.dtype, float]] = {DOUBLE: DEFAULT_RTOL, SINGLE: DEFAULT_RTOL}
+
+    def rtol(self, problem: Problem) -> Float[Numbers, ""]:
+        """rtol of a step: that of the problem, or by default that of this engine."""
+        rtol, dtype = problem.tolerances[0], problem.layout.dtype
+        return _read_only(self.default_rtol[dtype], dtype) if rtol is None else as_arrays(rtol, dtype)
+
+    def tolerances(self, problem: Problem, y0: Float[Numbers, "*N states"]) -> tuple:
+        """rtol, and atol where it was given; by default at most a sixteenth of rtol times the size of motions.
+
+        Their size is, in these first states, the largest coordinate, or where they begin at zero how far the largest
+        velocity would lead; or the largest velocity, if that is smaller and not zero.
+        """
+        rtol, atol, ts = self.rtol(problem), problem.tolerances[1], problem.ts
+        if atol is not None:
+            return rtol, as_arrays(atol, problem.layout.dtype, "atol")
+        library: Any = np if all(map(_is_on_host, (y0, ts, rtol))) else jnp
+        # Within `jit` an operation on an array of JAX is traced, even where its numbers are known.
+        ts, relative = library.asarray(ts), library.asarray(rtol)
+        far, fast = (library.abs(half).max(axis=-1) for half in halves(library.asarray(y0)))
+        far = library.where(far > 0, far, fast * abs(ts[-1] - ts[0]))
+        size = library.minimum(*(library.where(x > 0, x, library.inf) for x in (far, fast))).min(initial=library.inf)
+        return rtol, relative * library.minimum(ATOL_OVER_RTOL, ATOL_OVER_MOTION * size)
+
+    @abc.abstractmethod
+    def refuses(self, problem: Problem) -> str | None:
+        """Why this engine cannot solve the problem, as the end of a sentence; None where it can."""
+
+    @abc.abstractmethod
+    def solve(self, problem: Problem) -> Solution:
+        """The motion of one member, under `jax.jit`, `jax.vmap` and derivatives."""
+
+    @abc.abstractmethod
+    def solve_batch(self, batch: Batch) -> Solution:
+        """The motions of all members."""
+
+
+# ---- vectors ---------------------------------------------------------------------------------------------------------
+
+
+def _is_on_host(leaf) -> bool:
+    """True if NumPy can read an array without moving it between devices, or gathering it from several."""
+    if not isinstance(leaf, jax.Array):
+        return True
+    return is_concrete(leaf) and [device.platform for device in leaf.devices()] == ["cpu"]
+
+
+def concatenate_leaves(leaves: list, dtype) -> Float[Numbers, " count"]:
+    """All numbers of the leaves as one vector; by NumPy where it can read them, at a tenth of the cost of JAX.
+
+    Of a complex number, which has no place in machine code, that is the real part.
+    """
+    if not all(map(_is_on_host, leaves)):
+        return flatten_numbers(leaves, dtype)
+    arrays = (leaf.real if np.iscomplexobj(leaf) else leaf for leaf in leaves)
+    return np.concatenate([np.zeros(0, dtype), *(np.asarray(leaf, dtype).ravel() for leaf in arrays)])
+
+
+def rows(leaves, axes, size: int, dtype) -> Float[Numbers, "size numbers"]:
+    """The numbers of every member end to end, shape (size, numbers); `axes` are those of the members, leaf by leaf."""
+    library: Any = np if all(map(_is_on_host, leaves)) else jnp
+    columns = [library.zeros((size, 0), dtype)]
+    for leaf, axis in zip(leaves, axes, strict=True):
+        array = library.asarray(leaf, dtype)
+        if axis is None:
+            columns.append(library.broadcast_to(array.reshape(1, -1), (size, array.size)))
+        else:
+            columns.append(library.moveaxis(array, axis, 0).reshape(size, array.size // size))
+    return library.concatenate(columns, axis=1)
+
+
+def _move_axis_first(leaf, axis: int):
+    """A leaf with this axis in front; by NumPy where it can read the leaf."""
+    library: Any = np if _is_on_host(leaf) else jnp
+    return library.moveaxis(library.asarray(leaf), axis, 0)
+
+
+def _shape_of_one(leaf, axis):
+    """A leaf of one member: zeros of its shape, which cost nothing, or what all members share."""
+    if axis is None:
+        return leaf
+    shape = np.shape(leaf)
+    return _zeros((*shape[:axis], *shape[axis:][1:]), np.dtype(dtype_of(leaf)))
+
+
+@functools.lru_cache(maxsize=256)
+def _zeros(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
+    """One zero, seen as an array of this shape."""
+    return np.broadcast_to(np.zeros((), dtype), shape)
+
+
+def axes_per_leaf(values: dict[str, PyTree], batch_axes) -> tuple[dict[str, PyTree], int]:
+    """`batch_axes` spread over every leaf, and the size of the batch, which must be the same everywhere."""
+    if not isinstance(batch_axes, tuple) or len(batch_axes) != 3:
+        raise ValueError(f"batch_axes must be a tuple of three, for (q0, qdot0, params); got {batch_axes!r}.")
+    axes, sizes = {}, {}
+    for (name, value), prefix in zip(values.items(), batch_axes, strict=True):
+        labels, leaves, tree = labelled_leaves(value, name)
+        try:
+            axes[name] = jax.tree.broadcast(prefix, value, is_leaf=lambda axis: axis is None)
+        except ValueError:
+            raise ValueError(
+                f"batch_axes for {name} is {prefix!r}, which does not fit its structure: give one axis for all of it, "
+                f"or one for each of {', '.join(labels[:12])}, None for what all members share."
+            ) from None
+        spread = tree.flatten_up_to(axes[name])
+        spread = [axis if eqx.is_array_like(leaf) else None for leaf, axis in zip(leaves, spread, strict=True)]
+        axes[name] = tree.unflatten(spread)  # a function or a string, as networks have them, is no part of a batch
+        for label, leaf, axis in zip(labels, leaves, spread, strict=True):
+            if axis is not None:
+                require_numbers(leaf, label)
+                if not -jnp.ndim(leaf) <= axis < jnp.ndim(leaf):
+                    raise ValueError(
+                        f"{label} has shape {jnp.shape(leaf)}: it has no axis {axis} for the batch. Where all members "
+                        "share it, let batch_axes have None in its place."
+                    )
+                sizes[label] = jnp.shape(leaf)[axis]
+    if not sizes:
+        raise ValueError("batch_axes maps over nothing: name the axis of the members in q0, qdot0 or params.")
+    if len(set(sizes.values())) > 1:
+        listed = ", ".join(f"{label} has {size}" for label, size in sizes.items())
+        raise ValueError(f"All batched arguments must have the same number of members; {listed}.")
+    if 0 in sizes.values():
+        listed = ", ".join(label for label, size in sizes.items() if size == 0)
+        raise ValueError(f"The batch is empty: {listed} has no member along its batch axis.")
+    return axes, next(iter(sizes.values()))
+
+
+# ---- what can be wrong -----------------------------------------------------------------------------------------------
+
+
+def _check_fields(dtype, params, ts, rtol, atol, max_steps, event) -> dict[str, Any]:
+    """The fields of a problem that depend neither on its scene nor on its state. Raises where they cannot be right."""
+    ts = output_times(ts, dtype)
+    require_budget(max_steps, "max_steps")
+    tolerances = _tolerances(dtype, rtol, atol)
+    event = _event(event, dtype)
+    return dict(params=as_arrays(params, dtype), ts=ts, tolerances=tolerances, max_steps=max_steps, event=event)
+
+
+def _tolerances(dtype, rtol, atol) -> tuple[Float[Numbers, ""] | None, Float[Numbers, ""] | None]:
+    """rtol and atol as arrays, where they are given. Raises where no engine meets them."""
+    if rtol is not None and (reason := too_tight(require_tolerance(rtol, "rtol"), DOUBLE, LEAST_RTOL)):
+        raise ValueError(f"{reason}.")
+    if atol is not None:
+        require_tolerance(atol, "atol")
+
+    def array(x):
+        return np.asarray(x, DOUBLE) if x is not None and is_concrete(x) else as_arrays(x, dtype)
+
+    return array(rtol), array(atol)
+
+
+@functools.lru_cache(maxsize=16)
+def _read_only(number: float, dtype) -> np.ndarray:
+    array = np.array(number, dtype)
+    array.flags.writeable = False
+    return array
+
+
+def too_tight(rtol, dtype, least: float) -> str | None:
+    """Why rtol is too small, where it is below `least` units of round-off."""
+    eps = float(jnp.finfo(dtype).eps)
+    if not is_concrete(rtol) or float(rtol) >= least * eps:
+        return None
+    more = "; call jax.config.update('jax_enable_x64', True) and pass float64 states" if dtype == np.float32 else ""
+    return (
+        f"{dtype.name} cannot meet rtol={float(rtol):.3g}: its round-off is {eps:.1e}, so rtol must be at least "
+        f"{least * eps:.1e}{more}"
+    )
+
+
+def _event(event, dtype) -> diffrax.Event | None:
+    """The event with its functions' signatures checked, and with a root finder that uses the dtype's digits."""
+    if event is None:
+        return None
+    return (
+        _known_event(Edition.from_function(event), dtype)
+        if isinstance(event, types.FunctionType)
+        else _make_event(event, dtype)
+    )
+
+
+@functools.lru_cache(maxsize=64)  # a signature takes as long to read as a short motion
+def _known_event(event: Edition, dtype) -> diffrax.Event:
+    return _make_event(event.function, dtype)
+
+
+def _make_event(event, dtype) -> diffrax.Event:
+    condition = event.cond_fn if isinstance(event, diffrax.Event) else event
+    _, functions, _ = labelled_leaves(condition, "event", is_leaf=lambda leaf: leaf is None or callable(leaf))
+    if not functions or not all(map(callable, functions)):
+        raise TypeError(f"event must be a function event(q, qdot), or a pytree of such; got {condition!r}.")
+    if not isinstance(event, diffrax.Event):
+        event = diffrax.Event(event)
+    conditions = jax.tree.map(lambda function: accept(function, "event"), event.cond_fn, is_leaf=callable)
+    tolerance = 4 * float(jnp.finfo(dtype).eps)
+    root_finder = event.root_finder or _SignChange(rtol=tolerance, atol=tolerance)
+    return diffrax.Event(conditions, root_finder, event.direction)
+
+
+# The sign of the difference of two numbers where the one is less, or more, than the other.
+_SIGNS = {"lt": -1, "le": -1, "gt": 1, "ge": 1}
+_PASSING_ON = ("squeeze", "reshape", "broadcast_in_dim", "copy")
+
+
+def evaluate_condition(function: Callable, *arguments) -> tuple[Any, int]:
+    """The value of an event, and 0; of one that holds where a number is more than another their difference, and 1.
+
+    And −1 where it holds if the difference is less than zero.
+    """
+    leaves, structure = jax.tree.flatten(arguments)
+    numbers = [i for i, x in enumerate(leaves) if eqx.is_array_like(x)]  # params may hold words as well
+
+    def call(*given):
+        new = dict(zip(numbers, given, strict=True))
+        return function(*jax.tree.unflatten(structure, [new.get(i, x) for i, x in enumerate(leaves)]))
+
+    leaves_of_call = [leaves[i] for i in numbers]
+    closed, shape = jax.make_jaxpr(call, return_shape=True)(*leaves_of_call)
+    if getattr(shape, "dtype", None) == np.dtype(bool) and shape.shape == ():
+        found = _difference(closed.jaxpr, closed.consts, leaves_of_call)
+        if found is not None:
+            return found
+    return function(*arguments), 0
+
+
+def _difference(jaxpr, constants, arguments) -> tuple[Any, int] | None:
+    """The difference of two numbers and its sign, where a jaxpr compares them; None where it does something else."""
+    (out,) = jaxpr.outvars
+    equation = next((e for e in jaxpr.eqns if out in e.outvars), None)
+    if equation is None:
+        return None
+
+    def with_outputs(atoms):
+        return jaxpr.replace(outvars=list(atoms), debug_info=jaxpr.debug_info.with_unknown_names())
+
+    name = equation.primitive.name
+    if name in ("jit", "pjit", "closed_call"):
+        inner, run = equation.params["jaxpr"], core.ClosedJaxpr(with_outputs(equation.invars), constants)
+        return _difference(inner.jaxpr, inner.consts, core.jaxpr_as_fun(run)(*arguments))
+    if name in (*_PASSING_ON, "not"):
+        found = _difference(with_outputs(equation.invars[:1]), constants, arguments)
+        return found and (found[0], -found[1] if name == "not" else found[1])
+    if name not in _SIGNS or not jnp.issubdtype(equation.invars[0].aval.dtype, jnp.floating):
+        return None
+    more, less = core.jaxpr_as_fun(core.ClosedJaxpr(with_outputs(equation.invars), constants))(*arguments)
+    return jnp.reshape(more - less, ()), _SIGNS[name]
+
+
+def signs_of_event(problem: Problem) -> list[int | None]:
+    """For each function of an event the sign of a comparison (`evaluate_condition`), 0 of a number, None of others."""
+    assert problem.event is not None
+    signs: list[int | None] = []
+    for function in jax.tree.leaves(problem.event.cond_fn, is_leaf=callable):
+
+        def evaluate(y, t, numbers, function=function):
+            value, sign = evaluate_condition(flat_condition(function, problem), y, t, numbers)
+            is_bool = not sign and jnp.result_type(value) == np.dtype(bool)
+            signs.append(None if is_bool else sign)
+            return value
+
+        jax.eval_shape(evaluate, problem.y0, problem.ts[0], problem.numbers)
+    return signs
+
+
+def flat_condition(function: Callable, problem: Problem) -> Callable:
+    """An event as a function of the solver's state (2n,), t and the numbers among the parameters."""
+
+    def condition(y, t, numbers):
+        return function(*map(problem.layout.restore, halves(y)), t=t, params=eqx.combine(numbers, problem.params))
+
+    return condition
+
+
+def has_own_root_finder(event: diffrax.Event) -> bool:
+    """True if the user has chosen how the instant of an event is found."""
+    return not isinstance(event.root_finder, _SignChange)
+
+
+class _SignChange(optx.Bisection):
+    """Bisection that stops when the interval is as small as the dtype resolves, whatever the size of the function.
+
+    The sign change that fired an event brackets its root, so that this always arrives. It also does where there is
+    nothing to find, as in the members of a batch that had no event, or in a Boolean one: there diffrax asks for the end
+    of the step.
+    """
+
+    def init(self, fn, y, args, options, f_struct, aux_struct, tags):
+        lower, upper = (jnp.asarray(options[end], f_struct.dtype) for end in ("lower", "upper"))
+        state = optx.Bisection(self.rtol, self.atol, flip=True).init(fn, y, args, options, f_struct, aux_struct, tags)
+        return eqx.tree_at(lambda s: s.flip, state, fn(lower, args)[0] > fn(upper, args)[0])
+
+    def terminate(self, fn, y, args, options, state, tags):
+        scale = jnp.maximum(jnp.abs(state.lower), jnp.abs(state.upper))
+        small = jnp.abs(state.upper - state.lower) <= self.rtol * scale
+        return small & jnp.isfinite(state.error), optx.RESULTS.successful

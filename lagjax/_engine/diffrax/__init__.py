@@ -1,0 +1,298 @@
+"""`Diffrax`: the engine of everything that machine code is not for, any solver of diffrax, on any device.
+
+What diffrax reports of a motion that stopped ("the step became too small") is completed with what it ran into: a mass
+matrix that is singular, a force that is not finite or jumps, constraints that became dependent.
+
+`_equations` is the first-order system that a solver sees, `_integrate` one integration and its reverse-mode derivative,
+`_jumps` finds jumps of the acceleration on the way, `_solvers` wraps solvers for dense output and for constraints.
+"""
+
+from typing import ClassVar
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+import optimistix as optx
+
+from lagjax._engine._problem import (
+    AbstractEngine,
+    Batch,
+    Problem,
+    PyTree,
+    Solution,
+    evaluate_condition,
+    flat_condition,
+    signs_of_event,
+    too_tight,
+)
+from lagjax._engine._stop_reason import End, what_stopped
+from lagjax._engine.diffrax._equations import ArrayEquations as ArrayEquations
+from lagjax._engine.diffrax._equations import MotionEquations, form_of
+from lagjax._engine.diffrax._integrate import Jumps, Method, WithJumps, integrate
+from lagjax._engine.diffrax._solvers import FineOutput, Projected
+from lagjax._equations import rank_lost
+from lagjax._interface import (
+    ENDED_WELL,
+    EVENT_OCCURRED,
+    RESULTS,
+    SUCCESSFUL,
+    code_of,
+    halves,
+    is_concrete,
+    require_number,
+    result_from,
+)
+from lagjax._primitives import DOUBLE, SINGLE, differentiable_where, lost_unless
+from lagjax._program import CLOCK, Unlowerable, table_of
+
+# Solvers reject steps for the round-off of their error estimate where rtol is below some ten units of it.
+LEAST_RTOL = 10
+
+
+class Diffrax(AbstractEngine, eqx.Module):
+    """A solver of diffrax, with adaptive steps or with fixed ones of size `dt`.
+
+    `solver` None is Dopri8, with better states between its steps where they are wanted; `adjoint` None goes back over
+    the recorded steps in reverse mode.
+    """
+
+    default_rtol: ClassVar = {DOUBLE: 1e-9, SINGLE: 1e-5}  # in the arithmetic of the state
+
+    solver: diffrax.AbstractSolver | None = None
+    dt: jax.Array | np.ndarray | None = None
+    adjoint: diffrax.AbstractAdjoint | None = None
+    progress: diffrax.AbstractProgressMeter = diffrax.NoProgressMeter()
+
+    @classmethod
+    def from_arguments(cls, solver=None, dt=None, adjoint=None, progress: bool | diffrax.AbstractProgressMeter = False):
+        """The engine that these arguments of `simulate` ask for. Raises where one of them cannot be right."""
+        if solver is not None:
+            _require_solver(solver, adaptive=dt is None)
+        if isinstance(progress, bool):
+            progress = diffrax.TextProgressMeter() if progress else diffrax.NoProgressMeter()
+        _require_instance(progress, "progress", diffrax.AbstractProgressMeter, "True or False")
+        if adjoint is not None:
+            _require_instance(adjoint, "adjoint", diffrax.AbstractAdjoint, "None")
+        if dt is not None:
+            require_number(dt, "dt")
+            if is_concrete(dt) and not (np.isfinite(dt) and dt > 0):
+                raise ValueError(f"dt must be a positive step size, also backward in time; got {dt}.")
+            dt = dt if isinstance(dt, jax.Array) else np.asarray(dt, float)
+        return cls(solver, dt, adjoint, progress)
+
+    def refuses(self, problem: Problem) -> str | None:
+        """Why a scene is not for it, or the tolerance, or the number of fixed steps, as the end of a sentence."""
+        if problem.derivation.kicks:
+            return problem.derivation.kick_refusal or (
+                "L, or its momentum p = dL/dqdot, jumps at a border: the velocities jump there, and steps of diffrax "
+                "go across. Machine code ends a step there and has that: leave solver at None, on a CPU "
+                "(`System.explain` says why a scene is not for it). Or round the jump off over a width that steps "
+                "resolve, 0.5 * (1 + jnp.tanh(x / w)) for x > 0, hold='cubic' for samples"
+            )
+        if self.dt is None:
+            return too_tight(self.rtol(problem), problem.layout.dtype, LEAST_RTOL)
+        if not (is_concrete(self.dt) and is_concrete(problem.ts)):
+            return None
+        ts = np.asarray(problem.ts)
+        needed = float(abs(ts[-1] - ts[0])) / float(self.dt)
+        if needed <= problem.max_steps + 0.5:
+            return None
+        return f"dt={self.dt} needs {needed:.0f} steps, more than max_steps={problem.max_steps}: raise one of them"
+
+    def solve(self, problem: Problem) -> Solution:
+        """The motion of one member, compiled once for all problems of its structure."""
+        return _solve(self, problem)
+
+    def solve_batch(self, batch: Batch) -> Solution:
+        """The motions of all members, which step together until the slowest has arrived."""
+        solution = _solve_batch(self, batch)
+        steps = solution.accepted + solution.rejected
+        return solution._replace(idle=steps.size * jnp.max(steps) - jnp.sum(steps))
+
+    def method(self, problem: Problem) -> Method:
+        """The steps over this problem."""
+        dtype, ts, solver = problem.layout.dtype, jnp.asarray(problem.ts), self.solver
+        if solver is None:
+            # States between steps are wanted for outputs inside and to locate an event.
+            between = ts.size > 2 or problem.event is not None
+            solver = FineOutput(diffrax.Dopri8()) if between else diffrax.Dopri8()
+        if self.dt is not None:
+            dt0 = jnp.asarray(self.dt, dtype) * jnp.sign(ts[-1] - ts[0])
+            return Method(solver, diffrax.ConstantStepSize(), dt0, problem.max_steps, self.progress)
+        rtol, atol = self.tolerances(problem, problem.y0)
+        # Below this a step no longer moves the time reliably.
+        smallest = 4 * jnp.finfo(dtype).eps * jnp.maximum(abs(ts[0]), abs(ts[-1]))
+        controller = diffrax.PIDController(rtol, atol, norm=_norm_or_inf, dtmin=smallest, force_dtmin=False)
+        if (jumps := _jumps(problem)) is not None:
+            controller = WithJumps(controller, jumps)
+        return Method(solver, controller, None, problem.max_steps, self.progress, jumps)
+
+
+_AT_END = 256  # diffrax lets a step that ends up to 100 roundings before the end of the motion end there
+
+
+def _jumps(problem: Problem) -> Jumps | None:
+    """The times inside the motion at which its program looks up another entry of a table; None without any.
+
+    One at an end of the motion is moved inside by some roundings, so that only one tiny step sees it.
+    """
+    try:
+        borders = problem.derivation.borders
+    except Unlowerable:
+        return None
+    if borders is None or CLOCK not in borders.kinds:
+        return None
+    numbers, first = jnp.asarray(problem.vector), 2 * problem.layout.size + 1
+    located = (table for kind, table in zip(borders.kinds, borders.tables, strict=True) if kind == CLOCK)
+    knots = jnp.concatenate([
+        jnp.asarray(table.entries, numbers.dtype) if table.numbers is not None
+        else numbers[table.first - first :: table.stride][: table.count]
+        for table in dict.fromkeys(table_of(of) for of in located if of is not None)
+    ])  # fmt: skip
+    ends = jnp.asarray(problem.ts)[jnp.array([0, -1])]
+    low, high, shift = ends.min(), ends.max(), _AT_END * jnp.finfo(knots.dtype).eps * jnp.abs(knots)
+    inside = (knots >= low) & (knots <= high)
+    return Jumps.from_times(jnp.where(inside, jnp.clip(knots, low + shift, high - shift), jnp.inf))
+
+
+def _norm_or_inf(error: PyTree) -> jax.Array:
+    """Root mean square, with NaN as infinity: an undefined step is then rejected and shortened like any bad one."""
+    norm = optx.rms_norm(error)
+    return jnp.where(jnp.isnan(norm), jnp.inf, norm)
+
+
+@eqx.filter_jit
+def _solve_batch(engine: Diffrax, batch: Batch) -> Solution:
+    return batch.map_members(lambda problem: _solve(engine, problem))
+
+
+@eqx.filter_jit
+def _solve(engine: Diffrax, problem: Problem) -> Solution:
+    derivation, numbers, given = problem.derivation, problem.numbers, jnp.asarray(problem.ts)
+    form, y0 = form_of(derivation, problem.system.path), jnp.asarray(problem.y0)
+
+    # A member that cannot start is given no time to integrate over: it costs nothing, and the others do not wait.
+    start = _state_result(y0, *form.acceleration(given[0], halves(y0), numbers))
+    ts = jnp.where(start == RESULTS.successful, given, given[0])
+    event, is_located = (None, True) if problem.event is None else _flatten_event(problem, ts, y0, numbers)
+    method = engine.method(problem)
+    solution = integrate(form, method, engine.adjoint, event, ts, y0, numbers)
+    result = _explain_result(solution, form, start, ts, numbers)
+    if derivation.motion.constrained:
+        end = halves(solution.y_end)
+        schur = derivation.motion.schur_complement
+        lost = rank_lost(schur, (*halves(y0), given[0], numbers), (*end, solution.t_end, numbers))
+        failed = (result != RESULTS.successful) & (result != RESULTS.event_occurred)
+        result = RESULTS.where(failed & lost, RESULTS.constraint_rank_lost, result)
+        not_projected = solution.result == code_of(RESULTS.promote(Projected.FAILED))
+        result = RESULTS.where(not_projected, RESULTS.projection_failed, result)
+    # diffrax leaves outputs it did not reach at inf, and those of a member without time at its start. Whatever adjoint
+    # there is, their cotangents must not be lost: they go to all that went in.
+    reached = jnp.isfinite(solution.path).all(axis=1) & (ts == given)
+    well = jnp.isin(result._value, jnp.asarray(ENDED_WELL))
+    y_end, t_end, inputs = solution.y_end, solution.t_end, (given, y0, *jax.tree.leaves(numbers))
+    if not is_located:  # where a motion ends behind a step that an event ended does not vary with the step
+        well = well & (result._value != EVENT_OCCURRED)
+        t_end = differentiable_where(well, t_end, *inputs)
+    return solution._replace(
+        path=lost_unless(reached[:, None], solution.path, (given, y0, numbers)),
+        y_end=differentiable_where(well, y_end, *inputs) if not is_located else differentiable_where(well, y_end),
+        t_end=t_end,
+        result=result._value,
+    )
+
+
+# ---- what stopped a motion -------------------------------------------------------------------------------------------
+
+
+def _state_result(y, acceleration, singular) -> RESULTS:
+    """The result code of a motion from a state with this acceleration: successful if it can go on."""
+    finite = jax.tree.reduce(lambda all_, leaf: all_ & jnp.isfinite(leaf).all(), (y, acceleration), jnp.array(True))
+    failed = jnp.where(singular, code_of(RESULTS.mass_matrix_singular), code_of(RESULTS.nonfinite_state))
+    return result_from(jnp.where(finite, SUCCESSFUL, failed))
+
+
+def _explain_result(solution: Solution, form: MotionEquations, start: RESULTS, ts, numbers) -> RESULTS:
+    """The most telling of what diffrax reports, of the first and the last state, and of what the motion ran into."""
+    last = halves(solution.y_end)
+    end = _state_result(last, *form.acceleration(solution.t_end, last, numbers))
+    result = result_from(solution.result)
+    stopped = (result != RESULTS.successful) & (result != RESULTS.event_occurred)
+    unhealthy = (end != RESULTS.successful) & (stopped | (end == RESULTS.nonfinite_state))
+    result = RESULTS.where(unhealthy, end, result)
+    result = RESULTS.where(start == RESULTS.successful, result, start)
+
+    field = eqx.filter_closure_convert(form.acceleration, ts[0], last, numbers)
+    # A name has no derivative, and the search for it is a loop that reverse mode could not go back through.
+    frozen = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, (field, ts, solution, numbers))
+    field, ts, solution, numbers = frozen
+
+    def acceleration(t, y):
+        return field(t, halves(y), numbers)[0]
+
+    at = End(solution.t_end, solution.y_end, ts[0], ts[-1], solution.accepted, solution.rejected)
+    stopped = (result == RESULTS.dt_min_reached, result == RESULTS.max_steps_reached)
+    not_finite, jumps = what_stopped(acceleration, at, *stopped)
+    result = RESULTS.where(jumps, RESULTS.acceleration_discontinuous, result)
+    return RESULTS.where(not_finite, RESULTS.nonfinite_state, result)
+
+
+def _flatten_event(problem: Problem, ts, y0, numbers) -> tuple[diffrax.Event, bool]:
+    """The event whose conditions take the solver's state (2n,), and whether all instants of it are located.
+
+    That of a comparison is where its difference is zero. If it holds at the start, it is the start.
+    """
+    event, signs = problem.event, signs_of_event(problem)
+    assert event is not None
+    forward = jnp.sign(ts[-1] - ts[0])
+    instant = 4 * jnp.finfo(ts.dtype).eps * jnp.maximum(jnp.abs(ts[0]), jnp.abs(ts[-1]))
+
+    def flat(function, sign):
+        function = flat_condition(function, problem)
+        at_once = sign and (evaluate_condition(function, y0, ts[0], numbers)[0] * sign > 0)
+
+        def condition(t, y, args, **_):
+            value = evaluate_condition(function, y, t, args)[0]
+            return jnp.where(at_once, sign * ((t - ts[0]) * forward - instant), value) if sign else value
+
+        return condition
+
+    functions, structure = jax.tree.flatten(event.cond_fn, is_leaf=callable)
+    ways = jax.tree.leaves(event.direction, is_leaf=lambda leaf: leaf is None)
+    conditions = [flat(function, sign) for function, sign in zip(functions, signs, strict=True)]
+    ways = [sign > 0 if sign else way for sign, way in zip(signs, ways, strict=True)]
+    whole = (structure.unflatten(conditions), event.root_finder, structure.unflatten(ways))
+    return diffrax.Event(*whole), None not in signs
+
+
+# ---- what can be wrong with a solver ---------------------------------------------------------------------------------
+
+
+def _require_instance(value, name: str, kind: type, example: str) -> None:
+    if not isinstance(value, kind):
+        raise TypeError(f"{name} must be an instance of diffrax.{kind.__name__}, or {example}; got {value!r}.")
+
+
+def _require_solver(solver, adaptive: bool) -> None:
+    name = type(solver).__name__
+    if not isinstance(solver, diffrax.AbstractSolver):
+        raise TypeError(f"solver must be an instance of a diffrax solver, such as diffrax.Tsit5(); got {solver!r}.")
+    structure = solver.term_structure
+    if not (isinstance(structure, type) and issubclass(diffrax.ODETerm, structure)):
+        raise ValueError(
+            f"{name} splits the equations into several terms, which those of a general Lagrangian do not allow; "
+            "use a solver of ordinary differential equations, such as diffrax.Dopri8() or diffrax.Kvaerno5()."
+        )
+    if adaptive and not isinstance(solver, diffrax.AbstractAdaptiveSolver):
+        raise ValueError(f"{name} has no error estimate to adapt its steps to: give a fixed step with dt=...")
+    # Left to their default, they are those of adaptive steps.
+    if not adaptive and isinstance(solver, diffrax.AbstractImplicitSolver):
+        finder = solver.root_finder
+        if not all(eqx.is_array_like(getattr(finder, tolerance, 0.0)) for tolerance in ("rtol", "atol")):
+            raise ValueError(
+                f"{name} solves an equation in every step, and with a fixed step nothing says how well: give it "
+                f"tolerances, as in diffrax.{name}(root_finder=diffrax.VeryChord(rtol=1e-10, atol=1e-10)), or leave "
+                "dt out."
+            )

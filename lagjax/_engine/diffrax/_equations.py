@@ -1,0 +1,140 @@
+"""The first-order system ẏ = f(t, y) that a solver sees, in the form that suits the scene.
+
+A small scene becomes a *scalar program*: the mass matrix is eliminated by formulas written out for exactly its pattern
+of zeros, and nothing is left that this scene does not need. Any other scene keeps the derivatives as JAX arrays. Both
+forms give the same motion to round-off, and are tested against each other.
+"""
+
+import abc
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.experimental.xla_metadata import set_xla_metadata
+from jaxtyping import Array, Bool, Float
+
+from lagjax._equations import Derivation, Motion
+from lagjax._interface import default_platform
+from lagjax._program import Program, Unlowerable
+
+PyTree = Any
+Vector = Float[Array, " n"]
+State = tuple[Vector, Vector]  # q and q̇
+
+# Operations of a program beyond which XLA takes longer to compile it than it saves, and batched elimination on arrays
+# overtakes written-out elimination: measured on chains of pendulums, where it lies at 12 links.
+LARGEST_XLA_PROGRAM = 2_000
+
+
+class MotionEquations(eqx.Module):
+    """ẏ = f(t, y, params) with y = (q, q̇), two vectors of shape (n,); params holds numbers alone."""
+
+    @abc.abstractmethod
+    def acceleration(self, t: Float[Array, ""], y: State, params: PyTree) -> tuple[Vector, Bool[Array, ""]]:
+        """q̈ (n,), and whether the matrix that it was solved with is singular: then q̈ is NaN."""
+
+    def vector_field(self, t: Float[Array, ""], y: State, params: PyTree) -> State:
+        """ẏ = (q̇, q̈)."""
+        return y[1], self.acceleration(t, y, params)[0]
+
+    @property
+    @abc.abstractmethod
+    def constrained(self) -> bool:
+        """True if the scene has constraints to project to."""
+
+    @abc.abstractmethod
+    def projected(self, t: Float[Array, ""], y: State, params: PyTree) -> State:
+        """y after one Newton step of positions and of velocities back to the constraints."""
+
+
+class ArrayEquations(MotionEquations):
+    """The equations with M, F, G and γ as JAX arrays; `reason` says why the scene has no scalar program in use."""
+
+    motion: Motion = eqx.field(static=True)
+    accelerate: Any = eqx.field(static=True)
+    reason: str = eqx.field(static=True)
+
+    def __init__(self, motion: Motion, reason: str):
+        self.motion, self.reason = motion, reason
+        self.accelerate = jax.jit(motion.solved_acceleration)  # traced once, however often it is called
+
+    @property
+    def constrained(self) -> bool:
+        return self.motion.constrained
+
+    def projected(self, t, y, params):
+        """y after `Motion.projected`."""
+        return self.motion.projected(*y, t, params)
+
+    def acceleration(self, t, y, params):
+        """q̈ and whether it is singular, from `Motion.solved_acceleration`."""
+        return _compiled_once(self.accelerate, *y, t, params)
+
+
+class ScalarEquations(MotionEquations):
+    """The equations as scalar programs, whose inputs are q, q̇, t and every number in params.
+
+    `program` gives q̈ and whether its matrix is singular, `projection` (q, q̇) after a step back to the constraints.
+    """
+
+    program: Program = eqx.field(static=True)
+    projection: Program | None = eqx.field(static=True)
+    accelerate: Any = eqx.field(static=True)
+    project: Any = eqx.field(static=True)
+
+    def __init__(self, program: Program, projection: Program | None = None):
+        self.program, self.projection, self.accelerate = program, projection, jax.jit(program.__call__)
+        self.project = None if projection is None else jax.jit(projection.__call__)
+
+    @property
+    def constrained(self) -> bool:
+        return self.projection is not None
+
+    def projected(self, t, y, params):
+        """y after the program `projection`."""
+        state = _compiled_once(self.project, *y[0], *y[1], t, *_scalars(params))
+        return jnp.stack(state[: len(state) // 2]), jnp.stack(state[len(state) // 2 :])
+
+    def acceleration(self, t, y, params):
+        """q̈ and whether it is singular, from `program`."""
+        *acceleration, singular = _compiled_once(self.accelerate, *y[0], *y[1], t, *_scalars(params))
+        return jnp.stack(acceleration), singular
+
+
+def form_of(derivation: Derivation, path: str = "auto") -> "ScalarEquations | ArrayEquations":
+    """The form of its equations that suits a scene; `path` "scalar" or "array" insists on one.
+
+    Raises `ValueError` where "scalar" is given and impossible, with the reason.
+    """
+    motion = derivation.motion
+    if path == "array":
+        return ArrayEquations(motion, "asked for")
+    try:
+        program = derivation.acceleration.complete
+    except Unlowerable as reason:
+        if path == "scalar":
+            raise ValueError(f"This scene has no scalar program: {reason}. Leave `path` at 'auto'.") from None
+        return ArrayEquations(motion, str(reason))
+    if path == "auto" and program.looks_up:  # whose inputs would be the entries of tables, one by one
+        return ArrayEquations(motion, "it looks up entries of tables")
+    if path == "auto" and program.operations > LARGEST_XLA_PROGRAM:
+        reason = f"{program.operations} operations are more than the {LARGEST_XLA_PROGRAM} that XLA compiles quickly"
+        return ArrayEquations(motion, reason)
+    return ScalarEquations(program, derivation.projected)
+
+
+def _scalars(params: PyTree) -> list[jax.Array]:
+    """Every number in the parameters, as a list of scalars."""
+    return [x for leaf in jax.tree.leaves(params) for x in ([leaf] if jnp.ndim(leaf) == 0 else jnp.ravel(leaf))]
+
+
+def _compiled_once(function, *arguments):
+    """Call a jitted function without XLA inlining it on CPUs: it is compiled once, however many places call it.
+
+    On a GPU a call of its own costs as much as the arithmetic of a step, and compiling ten of them is quick.
+    """
+    if default_platform() != "cpu":
+        return function(*arguments)
+    with set_xla_metadata(inlineable="false"):
+        return function(*arguments)

@@ -1,0 +1,292 @@
+"""One integration by diffrax, and its reverse-mode derivative.
+
+The motion is integrated with adaptive steps in a plain loop that keeps nothing. Its derivative is that of the same
+method taken over the *same steps*: for a gradient the times of the accepted steps are recorded, and the
+backward pass differentiates a second integration with those times. It makes no decisions, so that recomputing
+a part of it (checkpointing) cannot decide otherwise, and it has no rejected steps. The sizes of the steps are not
+differentiated, as everywhere in diffrax.
+
+Differentiating the adaptive loop itself by recomputation is not safe: recomputed steps are compiled apart from the
+first ones, differ from them in the last digit, and then accept or reject otherwise, which gives wrong gradients without
+a word. This is the only module that calls diffrax's integrator.
+"""
+
+from typing import Any
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+
+from lagjax._engine._problem import Solution
+from lagjax._engine.diffrax._equations import MotionEquations
+from lagjax._engine.diffrax._jumps import AdaptiveWrapper, Noting, may_jump, note_jumps
+from lagjax._engine.diffrax._solvers import Projected
+from lagjax._interface import ENDED_WELL, RESULTS, SUCCESSFUL, code_of, halves
+from lagjax._primitives import differentiable_where
+
+PyTree = Any
+
+
+class Method(eqx.Module):
+    """The stepping of diffrax: its solver, its controller, the fixed size of steps (None where adaptive), their budget.
+
+    `jumps` are where adaptive steps end and begin anew, None without any.
+    """
+
+    solver: diffrax.AbstractSolver
+    controller: diffrax.AbstractStepSizeController
+    dt0: jax.Array | None
+    max_steps: int = eqx.field(static=True)
+    progress: diffrax.AbstractProgressMeter
+    jumps: "Jumps | None" = None
+
+
+def integrate(
+    form: MotionEquations,
+    method: Method,
+    adjoint: diffrax.AbstractAdjoint | None,
+    event: diffrax.Event | None,
+    ts: jax.Array,
+    y0: jax.Array,
+    params: PyTree,
+) -> Solution:
+    """ẏ = f(t, y) from y0 = (q, q̇), (2n,), at ts[0] to ts[-1], or to the event. Outputs not reached are infinite.
+
+    The state is one array: two of them take a solver twice as many operations of half the size.
+
+    With `adjoint` None, and without an event, reverse mode goes over the recorded steps; otherwise derivatives are
+    those of the diffrax adjoint.
+    """
+    # What f closes over (a parameter from outside, the weights of a neural Lagrangian) becomes an argument.
+    field = eqx.filter_closure_convert(_flatten_function(form.vector_field), ts[0], y0, params)
+    project = (
+        eqx.filter_closure_convert(_flatten_function(form.projected), ts[0], y0, params) if form.constrained else None
+    )
+    solution = _differentiable((field, project, ts, y0, params), method, adjoint, event)
+    if project is not None:
+        solution = solution._replace(path=jax.vmap(project, in_axes=(0, 0, None))(ts, solution.path, params))
+    return solution
+
+
+def _flatten_function(function):
+    """The function (t, y, params) of states y (2n,) to (2n,) that `function` is of pairs (q, q̇) to such pairs."""
+    return lambda t, y, params: jnp.concatenate(function(t, halves(y), params))
+
+
+def _differentiable(moving, method: Method, adjoint, event) -> Solution:
+    if adjoint is not None or event is not None:
+        adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
+        if isinstance(adjoint, diffrax.BacksolveAdjoint) or not may_jump(*_initial_arguments(moving)):
+            return _solve(moving, method, adjoint, event)
+        # It is not known here by what this will be differentiated: parameters count as fixed.
+        solution, _, crossed = _call(moving, _note_jumps(moving, method, None), adjoint, event)
+        y_end, path = (differentiable_where(~crossed, x) for x in (solution.y_end, solution.path))
+        return solution._replace(path=path, y_end=y_end)
+    # Tolerances and the smallest step follow from ts and the dtype; like all that sizes a step, they are data here.
+    frozen = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, method)
+    return _solve_and_record(moving, frozen)
+
+
+def _initial_arguments(moving) -> tuple:
+    """The field, and its arguments (t, y, params) at the start of the motion."""
+    field, _, ts, y0, params = moving
+    return field, ts[0], y0, params
+
+
+def _note_jumps(moving, method: Method, varied) -> Method:
+    """The method whose controller notes steps across a jump of the field that moves with the state or with `varied`."""
+    field, _, _, _, params = moving
+    varied = jax.tree.map(lambda _: False, (field, params)) if varied is None else varied
+    return eqx.tree_at(lambda m: m.controller, method, note_jumps(method.controller, field, varied))
+
+
+def _solve(moving, method: Method, adjoint, event=None) -> Solution:
+    """One integration by diffrax; `moving` is all that can be differentiated."""
+    return _call(moving, method, adjoint, event)[0]
+
+
+def _call(moving, method: Method, adjoint, event=None, *more: diffrax.SubSaveAt) -> tuple[Solution, Any, Any]:
+    """Call diffrax: the solution, what else it is to save, and where that is noted whether a step crossed a jump."""
+    field, project, ts, y0, params = moving
+    solver = method.solver if project is None else Projected(method.solver, project)
+    saved = [diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True), *more]
+    notes = isinstance(method.controller, Noting)
+    done: Any = diffrax.diffeqsolve(
+        diffrax.ODETerm(field),
+        _set_stage_loop(solver, adjoint),
+        t0=ts[0],
+        t1=ts[-1],
+        dt0=method.dt0,
+        y0=y0,
+        args=params,
+        saveat=diffrax.SaveAt(subs=saved, controller_state=notes),
+        stepsize_controller=method.controller,
+        adjoint=adjoint,
+        event=event,
+        max_steps=method.max_steps,
+        throw=False,
+        progress_meter=method.progress,
+    )
+    accepted, rejected = (done.stats[f"num_{kind}_steps"] for kind in ("accepted", "rejected"))
+    result = RESULTS.promote(done.result)._value
+    crossed = done.controller_state[1] if notes else None
+    return Solution(done.ys[0], done.ys[1][0], done.ts[1][0], result, accepted, rejected), done.ys[2:], crossed
+
+
+def _set_stage_loop(solver, adjoint):
+    """The solver with a stage loop that the adjoint can differentiate, which diffrax sees to unless it is wrapped."""
+    if isinstance(solver, diffrax.AbstractRungeKutta):
+        return solver
+    kinds = {diffrax.ForwardMode: "lax", diffrax.RecursiveCheckpointAdjoint: "checkpointed"}
+    kind = kinds.get(type(adjoint), "bounded")
+
+    def set_scan_kind(part):
+        if not isinstance(part, diffrax.AbstractRungeKutta) or part.scan_kind is not None:
+            return part
+        return eqx.tree_at(lambda s: s.scan_kind, part, kind, is_leaf=lambda leaf: leaf is None)
+
+    return jax.tree.map(set_scan_kind, solver, is_leaf=lambda part: isinstance(part, diffrax.AbstractRungeKutta))
+
+
+@eqx.filter_custom_vjp
+def _solve_and_record(moving, method):
+    """The solution by the plain loop, `diffrax.ForwardMode`, which keeps nothing; reverse mode replays its steps."""
+    return _solve(moving, method, diffrax.ForwardMode())
+
+
+@_solve_and_record.def_fwd
+def _forward(perturbed, moving, method):
+    record = diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: t)
+    of_field, _, _, of_start, of_params = perturbed
+    varied = of_field, of_params
+    moves = any(jax.tree.leaves((varied, of_start)))
+    if moves and may_jump(*_initial_arguments(moving)):
+        method = _note_jumps(moving, method, varied)
+    solution, (times,), crossed = _call(moving, method, diffrax.ForwardMode(), None, record)
+    if crossed is None:
+        crossed = jnp.array(False)
+    residuals = times, solution.t_end, solution.result, crossed
+    well = jnp.isin(solution.result, jnp.asarray(ENDED_WELL, solution.result.dtype))
+    lost = jnp.asarray(code_of(RESULTS.derivatives_lost), solution.result.dtype)
+    return solution._replace(result=jnp.where(crossed & well, lost, solution.result)), residuals
+
+
+@_solve_and_record.def_bwd
+def _backward(residuals, cotangents, perturbed, moving, method):
+    del perturbed
+    times, t_end, result, crossed = residuals
+
+    def replay(moving):
+        field, project, ts, y0, params = moving
+        # A member that stopped early is replayed as far as it came; nothing flows back from beyond.
+        ahead = ts[-1] > ts[0]
+        reached = jnp.where(ahead, jnp.minimum(ts, t_end), jnp.maximum(ts, t_end))
+        ts = jnp.where(result == SUCCESSFUL, ts, reached)
+        # The last step ends at ts[-1] itself, which may be differentiated, not at its recorded value.
+        controller = _RecordedSteps(jnp.where(times == t_end, jnp.inf, times), method.jumps)
+        again = Method(method.solver, controller, None, method.max_steps, diffrax.NoProgressMeter())
+        solution = _solve((field, project, ts, y0, params), again, diffrax.RecursiveCheckpointAdjoint())
+        return solution[:3]
+
+    replayed, pull_back = eqx.filter_vjp(replay, moving)
+    filled = jax.tree.map(lambda x, c: jnp.zeros_like(x) if c is None else c, replayed, tuple(cotangents[:3]))
+    filled = jax.tree.map(lambda c: jnp.where(crossed & (c != 0), jnp.nan, c), filled)
+    return pull_back(filled)[0]
+
+
+class _RecordedSteps(diffrax.AbstractStepSizeController):
+    """Steps that end at given times, padded with inf (after which the end of the integration is the next)."""
+
+    times: jax.Array
+    jumps: "Jumps | None"
+
+    def wrap(self, direction):
+        """The controller of steps in a time that is multiplied by `direction`, 1 or −1: that of backward motion."""
+        times = jnp.where(jnp.isinf(self.times), jnp.inf, self.times * direction)
+        if self.jumps is None:
+            return _RecordedSteps(times, None)
+        jumps = self.jumps.reversed(direction)
+        return _RecordedSteps(jumps.ends(times), jumps)  # what is recorded of a step is where the next one begins
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        """The first time; the state counts the steps."""
+        return jnp.minimum(self.times[0], t1), jnp.array(1)
+
+    def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
+        """Accept, and go on to the next time."""
+        next_ = self.times.at[controller_state].get(mode="fill", fill_value=jnp.inf)
+        begin, jumps = (t1, False) if self.jumps is None else self.jumps.next_start(t1)
+        return True, begin, next_, jumps, controller_state + 1, diffrax.RESULTS.successful
+
+
+# ---- where the field jumps at known times ----------------------------------------------------------------------------
+
+
+class Jumps(eqx.Module):
+    """Times at which the field jumps, (K,) in increasing order: a step ends at `before`, the next begins at `behind`.
+
+    That is a few roundings off, because a stage at the end of a step, t₀ + h, may be rounded onto the jump; to leave
+    out so little of the time changes less than rounding does. Infinite times are none.
+    """
+
+    before: jax.Array
+    behind: jax.Array
+
+    @classmethod
+    def from_times(cls, times: jax.Array) -> "Jumps":
+        """The jumps at times (K,), in any order."""
+        times = jnp.sort(times)
+        gap = 4 * jnp.finfo(times.dtype).eps * jnp.where(jnp.isfinite(times), jnp.abs(times), 0.0)
+        return cls(times - gap, times + gap)
+
+    def reversed(self, direction) -> "Jumps":
+        """The jumps in a time that is multiplied by `direction`, 1 or −1; those at infinity stay at +∞."""
+        one, other = self.before * direction, self.behind * direction
+        low, high = jnp.minimum(one, other), jnp.maximum(one, other)
+        return Jumps(*(jnp.sort(jnp.where(jnp.isfinite(x), x, jnp.inf)) for x in (low, high)))
+
+    def next_start(self, t):
+        """The time at which the step after one that ended at t begins, and whether that is behind a jump."""
+        begin = _exchange(t, self.before, self.behind)
+        return begin, begin != t
+
+    def ends(self, times):
+        """The ends of the steps behind which others begin at these times."""
+        return _exchange(times, self.behind, self.before)
+
+    def first(self, begin, end):
+        """`end`, or the first jump on the way from `begin` to it."""
+        ahead = jnp.searchsorted(self.before, begin, side="right")
+        return jnp.minimum(end, self.before.at[ahead].get(mode="fill", fill_value=jnp.inf))
+
+
+def _exchange(t, old, new):
+    """The times t, where those that occur in `old`, in increasing order, are replaced by their partners in `new`."""
+    place = jnp.minimum(jnp.searchsorted(old, t), len(old) - 1)
+    return jnp.where(jnp.isfinite(t) & (old[place] == t), new[place], t)
+
+
+class WithJumps(AdaptiveWrapper):
+    """The steps of a controller, which end before every jump and go on behind it."""
+
+    controller: Any  # an adaptive one: `wrap` of diffrax does not say so of what it returns
+    jumps: Jumps
+
+    def __init__(self, controller: Any, jumps: Jumps):
+        self.controller, self.jumps = controller, jumps
+
+    def wrap(self, direction):
+        """The controller of steps in a time that is multiplied by `direction`, 1 or −1: that of backward motion."""
+        return WithJumps(self.controller.wrap(direction), self.jumps.reversed(direction))
+
+    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
+        """The end of the first step, and the state of the controller."""
+        end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+        return self.jumps.first(t0, end), state
+
+    def adapt_step_size(self, *arguments):
+        """The controller's decision on a step; the next one ends at the first jump."""
+        keep, begin, end, made_jump, state, result = self.controller.adapt_step_size(*arguments)
+        behind, jumps = self.jumps.next_start(begin)
+        return keep, behind, self.jumps.first(behind, end + (behind - begin)), made_jump | jumps, state, result

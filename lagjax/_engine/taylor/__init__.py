@@ -1,0 +1,300 @@
+"""`MachineCode`: the engine on CPUs (`_gpu_launch`: on GPUs), Taylor series in machine code made for the scene.
+
+Its way: `Problem` ─► `Flow` (rows of NumPy) at once, where nothing is traced; ─► `_primitives`, the flow as primitives
+of JAX, where something is. All of that is in float64; a problem in float32 goes through the door of `_doubles` first.
+
+On rows of NumPy: `_flow` (the flow map), `_derivatives` (its jvp and vjp), `_variational` (its variational equations),
+`_kept_steps` (steps kept for transposes), `_state_rates` (how an output moves with its time). As JAX: `_primitives`,
+which `_call` (CPU) and `_gpu_launch` run; `_line_functions` and `_lowered_motion` for the scene's own quantities. Where
+a motion meets a surface: `_surfaces`, `_crossing`.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._engine._problem import AbstractEngine, Batch, Problem, Solution
+from lagjax._engine.taylor import _primitives
+from lagjax._engine.taylor._crossing import (
+    MOST_GUARDS,
+    Noted,
+    crossing_tangents,
+    motion_to_event,
+    motion_with_crossings,
+    surfaces_of,
+    surfaces_of_event,
+)
+from lagjax._engine.taylor._derivatives import jvp, portions, project_start_tangents, vjp
+from lagjax._engine.taylor._flow import Flow, Tolerances, unfit
+from lagjax._engine.taylor._gpu_launch import adapt_tolerances
+from lagjax._engine.taylor._kept_steps import KEPT, StepStore
+from lagjax._engine.taylor._lowered_motion import lowered_motion
+from lagjax._engine.taylor._surfaces import Guarded, Surfaces, crossing_variation, require_one_number, vector_of
+from lagjax._equations import Derivation
+from lagjax._interface import default_platform, has_nvidia_gpu, is_concrete
+from lagjax._native import Guards, Nesting, append_guards, pieces_of
+from lagjax._primitives import compute_in_doubles
+from lagjax._program import Program, Unlowerable
+
+__all__ = [
+    "KEPT", "MOST_GUARDS", "Flow", "Guarded", "Guards", "MachineCode", "Noted", "StepStore", "Surfaces", "Tolerances",
+    "crossing_variation", "flow_of", "jvp", "lowered_motion", "portions", "project_start_tangents",
+    "require_one_number", "surfaces_of", "tolerances_of", "vector_of", "vjp",
+]  # fmt: skip
+
+
+# Not an equinox.Module: its methods are pytrees of their own, and to make one takes as long as ten steps.
+@jax.tree_util.register_static
+@dataclass(frozen=True)
+class MachineCode(AbstractEngine):
+    r"""Taylor series in machine code made for the scene: `simulate(..., solver=lagjax.MachineCode())`.
+
+    With the default `solver=None` a run goes to machine code where it can and to diffrax where it cannot.
+    `MachineCode()` insists: a run that machine code cannot integrate is a `ValueError` that says why, instead of a
+    slower run. `simulate`, `simulate_batch` and `work_precision` take it, the last one to compare it with solvers of
+    diffrax.
+
+    Each coordinate becomes a power series about the present time, of an order p that suits the tolerance,
+
+        q(t + h) = Σ qₖ hᵏ, 0 ≤ k ≤ p,    (k+1)(k+2) qₖ₊₂ = (q̈)ₖ
+
+    with the coefficients (q̈)ₖ by recurrences through the scalar operations of the acceleration. Four or eight members
+    of a batch stand side by side in the vector registers of every core.
+
+    It computes in float64, also for a state in float32, whose results it rounds once; but see below for GPUs.
+
+    On an NVIDIA GPU one thread follows a member; `MachineCode()` is lowered for CUDA as for CPUs, by `jax.export` too.
+    On an H100 it is 30 times as fast as diffrax for a double pendulum, whose series stay in registers, 1.2 times for a
+    chain of four links and 4 times for one of eight, with smaller errors (`python -m benchmarks.gpu`); the 16 cores
+    beside it are as fast for that chain. Where a GPU is at hand whose float64 is slow (all but those of data centres;
+    none of these has been tried), the series of a state in float32 are in float32 too, the time and the control of
+    steps in float64, with an rtol of 1e-6 at least; a run with borders or events computes in float64 there as well. On
+    a GPU members that fail are not tried once more by another variant of the equations, and an angle beyond 2²⁰ ends a
+    motion. A first derivative in forward mode takes a motion with its tangents for every direction; one in reverse mode
+    goes back over the steps, as on a CPU, and takes such tangents for every number with constraints alone, or where a
+    member's steps are too many or do not suit its derivatives. Higher ones are composed of these. Crossings and hybrid
+    motion require a CPU.
+
+    Machine code requires a CPU or such a GPU, a scene whose acceleration is a scalar program of smooth or piecewise
+    smooth operations and whose kernel fits into half of the machine's memory, adaptive steps, and real-valued events;
+    on a CPU derivatives are by its own adjoint. `System.explain` says whether a scene has machine code.
+
+    **Raises** nothing itself; a run without machine code raises `ValueError` before anything is integrated.
+
+    Source: Jorba & Zou, *A software package for the numerical integration of ODEs by means of high-order Taylor
+    methods*, Exp. Math. 14 (2005) 99–117, §2.1, §3.2.
+
+    ```python
+    import jax, jax.numpy as jnp, lagjax
+    jax.config.update("jax_enable_x64", True)
+
+    scene = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2)
+    trajectory = lagjax.simulate(scene, 1.0, 0.0, jnp.linspace(0, 10, 101), solver=lagjax.MachineCode())
+    ```
+    """
+
+    def refuses(self, problem: Problem) -> str | None:
+        """Why it cannot solve the problem on a CPU, as the end of a sentence; None where it can."""
+        lacks = self.lacks(problem)
+        if lacks is None and (platform := default_platform()) != "cpu":
+            return f"the default device is a {platform}, and `jax.default_device(jax.devices('cpu')[0])` chooses a CPU"
+        return lacks
+
+    def lacks(self, problem: Problem) -> str | None:
+        """Why there is no machine code for the problem, as the end of a sentence; None where there is.
+
+        Whether a GPU can run it is seen when it is lowered for one.
+        """
+        if problem.is_single:
+            with jax.enable_x64(True):
+                return self.lacks(problem.double_precision)
+        if not all(map(is_concrete, problem.tolerances)):
+            return "the tolerances are being traced"
+        if problem.event is not None and isinstance(surfaces := surfaces_of_event(problem), str):
+            return surfaces
+        flow = _flow_of(problem)
+        return flow if isinstance(flow, str) else None
+
+    def declines(self, problem: Problem) -> str | None:
+        """Why it is not the default for the problem, as the end of a sentence; None where it is.
+
+        An NVIDIA GPU is no reason where its threads can remember a motion.
+        """
+        refusal = self.refuses(problem)
+        if refusal is None or not has_nvidia_gpu() or self.lacks(problem) is not None:
+            return refusal
+        with jax.enable_x64(True):
+            flow = flow_of(problem.double_precision if problem.is_single else problem)
+            tolerances = adapt_tolerances(flow, tolerances_of(problem))
+            try:
+                flow.kernel.for_gpus(tolerances.allow_singles).motion(tolerances.rtol)
+            except Unlowerable as reason:
+                return str(reason)
+        return None
+
+    def solve(self, problem: Problem) -> Solution:
+        """The motion of one member, under every transformation of JAX. The problem is one that is not refused."""
+        if problem.is_single:
+            return _solve_in_doubles(self.solve, problem)
+        flow, tolerances = flow_of(problem), tolerances_of(problem)
+        if problem.is_known and default_platform() == "cpu":
+            _require_increasing(flow.program, problem.vector)
+            ts, y0, params = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
+            return Solution._make([*(x[0] for x in flow.run(ts, y0, params, tolerances)[:-1]), None])
+        ts, y0, params = map(jnp.asarray, (problem.ts, problem.y0, problem.vector))
+        if problem.event is None:
+            return _primitives.run(flow, tolerances, ts, y0, params)
+        return motion_to_event(flow, _unguarded_flow(problem), _surfaces_of(problem), tolerances)(ts, y0, params)
+
+    def solve_to_event(self, problem: Problem, sides) -> Solution:
+        """The motion of one member to the first change of its guards; it remembers `sides` (see `Guards`).
+
+        It has no derivatives.
+        """
+        ts, y0, numbers = map(jax.lax.stop_gradient, (problem.ts, problem.y0, problem.vector))
+        numbers = jnp.concatenate([numbers, jnp.asarray(sides, float)])
+        return _primitives.run(flow_of(problem), tolerances_of(problem), ts, y0, numbers)
+
+    def refuses_crossings(self, problem: Problem, surfaces: Surfaces) -> str | None:
+        """Why it cannot find the crossings of these surfaces, as the end of a sentence; None where it can."""
+        return self.refuses(dataclasses.replace(problem, event=None, guards=surfaces.guards(notes=True)))
+
+    def crossings(self, problem: Problem, surfaces: Surfaces, room: int, slack: float = 1.0) -> tuple[Solution, Noted]:
+        """The motion of one member, and the crossings of its surfaces, `room` for each, on the way.
+
+        Derivatives are those of a tolerance that is `slack` times as large.
+        """
+        if problem.is_single:
+            return _solve_in_doubles(lambda problem: self.crossings(problem, surfaces, room, slack), problem)
+        noting, flow, surfaces, tolerances = _flows_to_crossings(problem, surfaces, room, slack)
+        if problem.is_known:
+            ts, y0, params = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
+            solution = noting.run(ts, y0, params, tolerances)
+            solution = Solution._make([*(x[0] for x in solution[:-1]), None])
+            return solution, Noted.read(solution.path, len(surfaces.directions))
+        ts, y0, params = map(jnp.asarray, (problem.ts, problem.y0, problem.vector))
+        return motion_with_crossings(noting, flow, surfaces, tolerances)(ts, y0, params)
+
+    def crossing_tangents(self, problem: Problem, surfaces: Surfaces, room: int, slack: float, dy0, dparams):
+        """The times of the crossings (G, room), and their tangents (D, G, room), of a problem in float64.
+
+        They are along the directions `dy0` (D, 2n) of the start and `dparams` (D, P) of the parameters.
+        """
+        tangents = crossing_tangents(*_flows_to_crossings(problem, surfaces, room, slack))
+        return tangents(problem.ts, problem.y0, problem.vector, dy0, dparams)
+
+    def solve_batch(self, batch: Batch) -> Solution:
+        """The motions of all members, in the lanes of vectors and on all cores."""
+        if not batch.is_known or default_platform() != "cpu":
+            return batch.map_members(self.solve)
+        member = batch.member
+        given = np.asarray(member.ts)[None], np.asarray(batch.y0), np.asarray(batch.vectors)
+        if member.is_single:
+            return compute_in_doubles(lambda *given: _run(member.double_precision, given), *given)
+        return _run(member, given)
+
+
+def _run(problem: Problem, given: tuple) -> Solution:
+    ts, y0, params = given
+    return flow_of(problem).run(ts, y0, params, tolerances_of(problem))
+
+
+def _solve_in_doubles(solve: Callable, problem: Problem):
+    """The solution by `solve` in float64, in the precision of the problem."""
+
+    def solve_numbers(ts, y0, params):
+        return solve(dataclasses.replace(problem.double_precision, ts=ts, y0=y0, params=params))
+
+    return compute_in_doubles(solve_numbers, problem.ts, problem.y0, problem.params)
+
+
+def flow_of(problem: Problem) -> Flow:
+    """The flow of a problem's scene. Raises `ValueError` where it has none, saying why."""
+    if problem.is_single:
+        with jax.enable_x64(True):
+            return flow_of(problem.double_precision)
+    flow = _flow_of(problem)
+    if isinstance(flow, str):
+        raise ValueError(f"There is no machine code for this scene: {flow}.")
+    return flow
+
+
+def _flows_to_crossings(
+    problem: Problem, surfaces: Surfaces, room: int, slack: float
+) -> tuple[Flow, Flow, Surfaces, Tolerances]:
+    """The flow that notes the crossings of surfaces, that without any, the surfaces, and the tolerances of both."""
+    noting = dataclasses.replace(problem, event=None, guards=surfaces.guards(notes=True))
+    tolerances = tolerances_of(problem)._replace(notes=room, slack=slack)
+    return flow_of(noting), _unguarded_flow(problem), surfaces, tolerances
+
+
+def _unguarded_flow(problem: Problem) -> Flow:
+    return flow_of(dataclasses.replace(problem, event=None, guards=None))
+
+
+def _surfaces_of(problem: Problem) -> Surfaces:
+    surfaces = surfaces_of_event(problem)
+    assert not isinstance(surfaces, str), surfaces
+    return surfaces
+
+
+def _flow_of(problem: Problem) -> Flow | str:
+    guards = problem.guards if problem.event is None else _surfaces_of(problem).guards()
+    return _make_flow(problem.derivation, problem.system.path, guards)
+
+
+@functools.lru_cache(maxsize=64)
+def _make_flow(derivation: Derivation, path: str, guards: Guards | None) -> Flow | str:
+    """The flow of a scene, or a sentence that says why it has none. Made once."""
+    if path == "array":
+        return "the array path was asked for"
+    if derivation.unhashable is not None:
+        return f"the scene cannot be remembered: {derivation.unhashable}"
+    try:
+        program, projection = derivation.acceleration, derivation.projection
+    except Unlowerable as reason:
+        return str(reason)
+    n = derivation.layout.size
+    if guards is not None and guards.remembers:
+        program = program.append_inputs(guards.inputs)
+    if reason := unfit(program, n):
+        return reason
+    if reason := derivation.kick_refusal:
+        return reason
+    found = pieces_of(program, Nesting(n)) if derivation.kicks else None
+    try:
+        if guards is not None:
+            found = append_guards(program, n, guards.values, True).borders
+    except Unlowerable as reason:
+        return f"of a guard, {reason}"
+    if derivation.kicks and found is None:
+        return "L, or its momentum p = dL/dqdot, jumps at a border that no series leads to"
+    return Flow.from_program(program, n, projection, guards)
+
+
+def _require_increasing(program: Program, vector) -> None:
+    """Raise `ValueError` where the knots of a look-up, among the parameters, do not increase."""
+    for op, _, attribute in program.nodes if program.looks_up else ():
+        if op == "locate" and attribute.table.numbers is None:
+            knots = np.asarray(vector)[np.array(attribute.table.positions) - (program.size - len(vector))]
+            wrong = np.flatnonzero(~(np.diff(knots) > 0))
+            if wrong.size:
+                i = int(wrong[0])
+                raise ValueError(
+                    f"The knots of a look-up (samples, jnp.interp, searchsorted) must increase, but in params one that "
+                    f"is {knots[i + 1]:g} comes after one that is {knots[i]:g}. Sort them, and keep one of those that "
+                    "are equal."
+                )
+
+
+def tolerances_of(problem: Problem) -> Tolerances:
+    """The numbers that say how exactly, and how long, a problem is integrated."""
+    rtol, atol = MachineCode().rtol(problem), problem.tolerances[1]
+    return Tolerances(
+        float(rtol), 0.0 if atol is None else float(atol), problem.max_steps, allow_singles=problem.is_rounded
+    )  # fmt: skip

@@ -1,0 +1,132 @@
+"""A run of machine code as XLA calls it: by a handler in machine code, and by Python for all that is rare.
+
+    members that one thread works on ─► handler ─► all ended well? ─► yes: results, without Python
+                                                        └─ no: `Flow.run` continues in a callback
+    more members                     ─► `Flow.run` in a callback
+    derivatives of a short run       ─► handlers, which run it once more; of others ─► `_derivatives` in a callback
+
+Long runs, second chances, failures and what stopped them are Python's, as are threads and Ctrl-C. The handler is for
+the version of XLA's interface that it knows; where `NO_HANDLER` says why that is another one, every run is a callback.
+"""
+
+import ctypes
+import functools
+import threading
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.experimental.buffer_callback import buffer_callback
+
+from lagjax import _native
+from lagjax._engine.taylor._flow import Flow, Tolerances
+from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL
+from lagjax._primitives import cond_alike, vary_alike
+
+NO_HANDLER = _native.unavailable(jax.ffi.include_dir())
+_TARGET = "lagjax_integrate"
+_SWEEPS = ("jvp", "vjp")
+_lock = threading.Lock()
+
+
+def call_host(host: Callable, shapes, *arrays) -> tuple:
+    """Call `host` on NumPy arrays, in a callback of what XLA compiles; `shapes` are those of its results."""
+
+    # Not `jax.pure_callback`: it puts its arguments on the device once more and waits for that, on the threads that
+    # the callbacks themselves may occupy.
+    def callback(_, places, *arrays):
+        with jax.enable_x64(True):  # another thread; a program may be made here
+            results = host(*map(np.asarray, arrays))
+        for place, values in zip(places, results, strict=True):
+            np.asarray(place)[...] = values
+
+    return tuple(buffer_callback(callback, tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in shapes))(*arrays))
+
+
+def has_handler(flow: Flow, members: int) -> bool:
+    """True if a run of this many members begins in the handler."""
+    notes = flow.guards is not None and flow.guards.notes
+    return NO_HANDLER is None and not notes and flow.kernel.select_kernel(members).threads(members) == 1
+
+
+def has_sweep(flow: Flow, members: int) -> bool:
+    """True if derivatives of this many members begin in a handler, with their motion run once more."""
+    return has_handler(flow, members) and flow.projection is None and flow.kernel.rounds_of_sweep > 0
+
+
+def run_by_handler(
+    flow: Flow, tolerances: Tolerances, host: Callable, shapes, ts, y0, params, rounds: int | None = None
+) -> tuple:
+    """The run of N members, `ts` (1 or N, T), `y0` (N, 2n), `params` (1 or N, P), N not too many for one thread.
+
+    The handler goes this many `rounds`, by default those of a slice of time.
+    `host(ts, y0, params, *begun)` continues what the handler leaves undone (`_native.Begun`); its results, of these
+    `shapes`, are those of the whole.
+    """
+    _register()
+    members, states = y0.shape
+    kernel = flow.kernel.select_kernel(members)
+    plan = kernel.plan(tolerances.rtol, tolerances.atol, tolerances.max_steps)
+    plan.rounds = plan.rounds if rounds is None else rounds
+    rows, size = (members,), (kernel.rest_size,)
+    of_handler = [(members, ts.shape[1], states), (members, states), *[rows] * 4, size]
+    call = jax.ffi.ffi_call(_TARGET, [jax.ShapeDtypeStruct(shape, np.float64) for shape in of_handler])
+    begun = call(ts, y0, params, plan=np.int64(ctypes.addressof(plan)))
+    begun = _native.Begun(*vary_alike(begun, like=(ts, y0, params)))
+
+    def convert_results(ts, y0, params, path, y_end, t_end, code, steps, rejected, rest):
+        happened = code >= _native.EVENT
+        result = jnp.where(happened, EVENT_OCCURRED, SUCCESSFUL)
+        event = jnp.where(happened, code - _native.EVENT, 0.0)
+        counts = result, steps, rejected, event, jnp.full(rows, -1)
+        return path, y_end, t_end, *(x.astype(int) for x in counts)
+
+    def continue_on_host(*arrays):
+        # The callback lives as long as the compiled program, and with it what the handler needs.
+        return call_host(functools.partial(host, needed=(plan, kernel)), shapes, *arrays)
+
+    well = _has_ended_well(begun)
+    return tuple(cond_alike(well, convert_results, continue_on_host, ts, y0, params, *begun))
+
+
+def sweep_by_handler(kind: str, flow: Flow, tolerances: Tolerances, ts, y0, params, argument, start) -> tuple:
+    """The results of a sweep over the motions of N members, not too many for one thread (`_native.SweepHandler`).
+
+    Then `excess` (N,); whether it is done, () of bool; and what must live as long as the compiled program.
+    """
+    _register()
+    (members, states), times = y0.shape, ts.shape[1]
+    directions = start.shape[1] if kind == "jvp" else 1
+    plan = flow.kernel.sweep_plan(kind, members, times, directions, *tolerances[:3])
+    second = (members, directions, times, states) if kind == "jvp" else (members, flow.numbers)
+    shapes = start.shape, second, (members,), (1,), (plan.scratch(members, times),)
+    call = jax.ffi.ffi_call(f"lagjax_{kind}", [jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes])
+    given = ts, y0, params, argument, start
+    *results, done, _ = vary_alike(call(*given, plan=np.int64(ctypes.addressof(plan))), like=given)
+    return *results, done[0] > 0, (plan, flow.kernel)
+
+
+def _has_ended_well(begun: _native.Begun):
+    """True if nothing is left to do, and no member failed."""
+    more = jax.lax.bitcast_convert_type(begun.rest[-1], np.int64)
+    codes = (begun.code == _native.DONE) | (begun.code >= _native.EVENT)
+    return (more == 0) & jnp.all(codes) & jnp.all(jnp.isfinite(begun.y_end))
+
+
+def _register() -> None:
+    with _lock:
+        _register_once()
+
+
+@functools.cache
+def _register_once() -> None:
+    addresses = {_TARGET: _native.handler().address}
+    addresses |= {f"lagjax_{kind}": _native.derivative_handler(kind).address for kind in _SWEEPS}
+    for target, address in addresses.items():
+        jax.ffi.register_ffi_target(target, capsule(address), platform="cpu", api_version=1)
+
+
+def capsule(address: int):
+    new = ctypes.PYFUNCTYPE(ctypes.py_object, ctypes.c_void_p, ctypes.c_char_p, ctypes.c_void_p)
+    return new(("PyCapsule_New", ctypes.pythonapi))(address, None, None)

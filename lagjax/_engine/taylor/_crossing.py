@@ -1,0 +1,232 @@
+"""Events and crossings of one member under every transformation of JAX: where they are, and how they vary.
+
+    located   by machine code that watches guards along the steps, without derivatives
+    varied    by one more run, without guards, whose outputs are at the times that were located: the states there vary
+              as at any output time, and with them the times (`_surfaces.crossing_variation`)
+
+The second run is only for derivatives. Its outputs lie some roundings before the crossings: where a force jumps on the
+surface itself, the state, its rate and its derivatives are then all those before the jump, and agree.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._engine._problem import Problem, Solution, evaluate_condition, has_own_root_finder, signs_of_event
+from lagjax._engine.taylor import _primitives
+from lagjax._engine.taylor._flow import Flow, Tolerances
+from lagjax._engine.taylor._surfaces import Surfaces, crossing_variation, require_one_number
+from lagjax._equations import Derivation
+from lagjax._interface import ENDED_WELL, EVENT_OCCURRED, halves
+from lagjax._primitives import attach_derivative, differentiable_where, lost_unless
+from lagjax._program import Unlowerable
+
+_BEFORE = 64 * np.finfo(np.float64).eps  # of the largest time: more than the rounding of a time, and of a border's
+MOST_GUARDS = 24  # two bits each in the code of an event, which the kernel keeps in a double of 53
+
+
+class Noted(NamedTuple):
+    """The crossings of each of G surfaces, `room` at most, NaN beyond the last one.
+
+    `t` (G, room) and `y` (G, room, 2n): when, and the state then; `count` (G,): how many there were.
+    """
+
+    t: Any
+    y: Any
+    count: Any
+
+    @classmethod
+    def read(cls, path, surfaces: int) -> "Noted":
+        """The crossings in the `path` of a motion that notes them, (G (room + 1), 2n + 1)."""
+        rows = path.reshape(surfaces, -1, path.shape[-1])
+        count = rows[:, -1, 0]
+        return cls(rows[:, :-1, 0], rows[:, :-1, 1:], count)
+
+
+# ---- an event as a surface -------------------------------------------------------------------------------------------
+
+
+def surfaces_of_event(problem: Problem) -> Surfaces | str:
+    """The functions of an event as surfaces, or why they are not for machine code, as the end of a sentence."""
+    if "surfaces" not in problem.made:
+        problem.made["surfaces"] = _surfaces_of_event(problem)
+    return problem.made["surfaces"]
+
+
+def _surfaces_of_event(problem: Problem) -> Surfaces | str:
+    event = problem.event
+    assert event is not None
+    if has_own_root_finder(event):
+        return "the event has a root finder of its own"
+    conditions = jax.tree.leaves(event.cond_fn, is_leaf=lambda leaf: callable(leaf))
+    if any(eqx.is_array(leaf) for leaf in jax.tree.leaves(conditions)):
+        return "the event holds arrays of its own"
+    if len(conditions) > MOST_GUARDS:
+        return f"the event has {len(conditions)} functions, more than {MOST_GUARDS}"
+    signs = signs_of_event(problem)
+    if None in signs:
+        return "the event is true or false, and no comparison of two numbers"
+    ways = jax.tree.leaves(event.direction, is_leaf=lambda leaf: leaf is None)
+    directions = tuple(sign or (0 if way is None else 1 if way else -1) for sign, way in zip(signs, ways, strict=True))
+    surfaces = surfaces_of(problem, tuple(conditions), directions, "An event")
+    return surfaces if isinstance(surfaces, str) else surfaces._replace(holds=tuple(map(bool, signs)))
+
+
+def surfaces_of(problem: Problem, functions: tuple, directions: tuple[int, ...], what: str) -> Surfaces | str:
+    """Functions of (q, qdot), and of t and params, as surfaces; or why they are not for machine code.
+
+    Raises `TypeError` where one of them is not one real number; `what` it is.
+    """
+    code, structure = jax.tree.flatten(eqx.filter(problem.params, eqx.is_array_like, inverse=True))
+    try:
+        given = directions, tuple(code), structure, what, problem.is_rounded
+        return _lower_surfaces(problem.derivation, functions, *given)
+    except Unlowerable as reason:
+        return str(reason)
+
+
+@functools.lru_cache(maxsize=64)
+def _lower_surfaces(derivation: Derivation, functions, directions, code, structure, what, is_rounded) -> Surfaces:
+    restore = derivation.layout.restore
+
+    def value(function):
+        def evaluate_guard(y, params):
+            def call(y, params):
+                return function(*map(restore, halves(y[:-1])), t=y[-1], params=params)
+
+            given = evaluate_condition(call, y, params)[0] if what == "An event" else call(y, params)
+            return require_one_number(given, what)
+
+        return evaluate_guard
+
+    values = [value(function) for function in functions]
+    return Surfaces.from_functions(derivation, values, directions, code, structure, is_rounded)
+
+
+# ---- to the first event ----------------------------------------------------------------------------------------------
+
+
+@functools.lru_cache(maxsize=64)
+def motion_to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances) -> Callable[..., Solution]:
+    """`(ts, y0, params)` → the motion to its event, or to the last of `ts` (T,), with first and second derivatives.
+
+    As one program of XLA: a derivative outside of `jit` then compiles as one, not operation by operation.
+    """
+    return jax.jit(functools.partial(_run_to_event, guarded, flow, surfaces, tolerances))
+
+
+def _run_to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances, ts, y0, params) -> Solution:
+    still = jax.lax.stop_gradient
+    solution = jax.tree.map(still, _primitives.run(guarded, tolerances, still(ts), still(y0), still(params)))
+    reached = jnp.isfinite(solution.path).all(axis=1)
+    values, where = (solution.path, solution.y_end, solution.t_end), (solution.result, solution.event)
+    run_again = _event_variation(flow, surfaces, tolerances)
+    path, y_end, t_end = attach_derivative(run_again, values, ts, y0, params, solution.t_end, *where)
+    well = jnp.isin(solution.result, jnp.asarray(ENDED_WELL))
+    return solution._replace(
+        path=lost_unless(reached[:, None], path, (ts, y0, params)),
+        y_end=differentiable_where(well, y_end),
+        t_end=differentiable_where(well, t_end),
+    )
+
+
+@functools.lru_cache(maxsize=64)
+def _event_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
+    """`(ts, y0, params, t_end, result, event)` → path, y_end, t_end, for the sake of their derivatives."""
+    move_to_zero, each = crossing_variation(surfaces), np.arange(len(surfaces.directions))
+
+    @jax.jit
+    def run_unguarded(ts, y0, params, t_stop, result, event):
+        fired, stop = result == EVENT_OCCURRED, _shortly_before(ts, t_stop)
+        end = jnp.where(fired, stop, ts[-1])
+        times = jnp.where((end - ts) * (ts[-1] - ts[0]) >= 0, ts, end)
+        times = jnp.concatenate([ts[:1], times[1:-1], end[None]])
+        solution = _primitives.run(flow, tolerances, times, y0, params)
+        first = jnp.argmax(((event >> (2 * each)) & 3) > 0)
+        moves = fired
+        if any(surfaces.holds):  # what holds at the start ends the motion there
+            at_once = jnp.asarray(surfaces.holds)[first] & (t_stop == ts[0])
+            end, moves = jnp.where(fired & at_once, ts[0], end), fired & ~at_once
+        t_end, y_end = move_to_zero(first, moves, end, solution.y_end, params)
+        return solution.path, y_end, t_end
+
+    return run_unguarded
+
+
+# ---- all crossings ---------------------------------------------------------------------------------------------------
+
+
+@functools.lru_cache(maxsize=64)
+def motion_with_crossings(
+    noting: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances
+) -> Callable[..., tuple[Solution, Noted]]:
+    """`(ts, y0, params)` → the motion to the last of `ts`, and its crossings, with first and second derivatives."""
+    return jax.jit(functools.partial(_run_with_crossings, noting, flow, surfaces, tolerances))
+
+
+@functools.lru_cache(maxsize=64)
+def crossing_tangents(noting: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances) -> Callable:
+    """`(ts, y0, params, dy0, dparams)` → the times of crossings, (G, room), and their tangents, (D, G, room).
+
+    These are along D directions of the start, `dy0` (D, 2n), and of the parameters, `dparams` (D, P).
+    """
+
+    @jax.jit
+    def tangents(ts, y0, params, dy0, dparams):
+        def times(y0, params):
+            return _run_with_crossings(noting, flow, surfaces, tolerances, ts, y0, params)[1].t
+
+        def differentiate_times(*direction):
+            return jax.jvp(times, (y0, params), direction)
+
+        return jax.vmap(differentiate_times, out_axes=(None, 0))(dy0, dparams)
+
+    return tangents
+
+
+def _run_with_crossings(
+    noting: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances, ts, y0, params
+) -> tuple[Solution, Noted]:
+    still = jax.lax.stop_gradient
+    solution = jax.tree.map(still, _primitives.run(noting, tolerances, still(ts), still(y0), still(params)))
+    noted = Noted.read(solution.path, len(surfaces.directions))
+    run_again = _crossings_variation(flow, surfaces, tolerances._replace(notes=0))
+    t, y = attach_derivative(run_again, (noted.t, noted.y), ts, y0, params, noted.t)
+    there, inputs = jnp.isfinite(noted.t), (ts, y0, params)
+    return solution, Noted(
+        lost_unless(there, t, inputs), lost_unless(there[..., None], y, inputs), noted.count
+    )  # fmt: skip
+
+
+@functools.lru_cache(maxsize=64)
+def _crossings_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
+    """`(ts, y0, params, t)` → t (G, room) and y (G, room, 2n), for the sake of their derivatives."""
+    move_to_zero, each = crossing_variation(surfaces), np.arange(len(surfaces.directions))
+
+    @jax.jit
+    def run_unguarded(ts, y0, params, t):
+        there = jnp.isfinite(t)
+        times = jnp.where(there, _shortly_before(ts, t), jax.lax.stop_gradient(ts[-1])).ravel()
+        order = jnp.argsort(times * jnp.sign(ts[-1] - ts[0]))
+        solution = _primitives.run(
+            flow, tolerances, jnp.concatenate([ts[:1], times[order], ts[-1:]]), y0, params
+        )  # fmt: skip
+        path = jnp.zeros_like(solution.path[1:-1]).at[order].set(solution.path[1:-1])
+        y, times = path.reshape(*t.shape, -1), times.reshape(t.shape)
+        of_section = jax.vmap(move_to_zero, (None, 0, 0, 0, None))
+        return jax.vmap(of_section, (0, 0, 0, 0, None))(each, there, times, y, params)
+
+    return run_unguarded
+
+
+def _shortly_before(ts, t):
+    """A few roundings earlier than t, but not before the first time."""
+    first, last = jax.lax.stop_gradient((ts[0], ts[-1]))
+    step = _BEFORE * jnp.maximum(abs(first), abs(last))
+    earlier = t - jnp.sign(last - first) * step
+    return jnp.where((earlier - first) * (last - first) > 0, earlier, first)

@@ -1,0 +1,295 @@
+"""`Flow`: the flow map of a scalar program in machine code, (output times, initial state, params) → states.
+
+Everything here works on NumPy arrays with one row a member; `_derivatives` has its derivatives, `_primitives` makes
+functions of both that JAX can transform.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax import _native
+from lagjax._engine._problem import Solution
+from lagjax._engine._stop_reason import End, what_stopped
+from lagjax._engine.taylor._kept_steps import LARGEST_KEPT, Steps, StepStore
+from lagjax._engine.taylor._variational import tangent_programs
+from lagjax._interface import RESULTS, SUCCESSFUL, code_of
+from lagjax._program import Program, Unlowerable, machine_memory, operations_that_fit
+
+# Operations of an acceleration: making its kernel takes some 4 KB for each, with the derivatives some 10 KB.
+LARGEST_PROGRAM = operations_that_fit(10_000)
+# The last terms that the series of a tangent may have, relative to the tangent, in tolerances. What the series leaves
+# out is smaller by e² at least. Measured on all scenes: a motion that has its own scale takes steps with at most 300.
+EXCESS = 1000.0
+# The codes of the kernel, in their order, as results. Beyond `EVENT` they say which guards changed sign.
+RESULT_OF_CODE = np.array([code_of(result) for result in (
+    RESULTS.successful, RESULTS.max_steps_reached, RESULTS.dt_min_reached, RESULTS.nonfinite_state,
+    RESULTS.mass_matrix_singular, RESULTS.projection_failed, RESULTS.acceleration_discontinuous, RESULTS.event_occurred,
+)])  # fmt: skip
+_SPENT, _SHRANK, _NOT_FINITE, _SINGULAR, _NOT_PROJECTED, _JUMPS = RESULT_OF_CODE[1:7].tolist()
+NOT_FINITE_RESULT = _NOT_FINITE
+_GIVEN_UP = (_SINGULAR, _NOT_FINITE, _SHRANK, _NOT_PROJECTED)  # what another variant of the program may still follow
+
+
+class Tolerances(NamedTuple):
+    """The local error of a step, what a run may cost, and how often each guard may be noted on the way.
+
+    An atol of 0 stands for none given: it follows the size of the motion. Derivatives need not suit the steps of a
+    motion better than those of an rtol that is `slack` times as large. Results that are rounded to float32 in the
+    end `allow_singles`, on a device that is much slower in float64. An order of 0 is that which suits rtol.
+    """
+
+    rtol: float
+    atol: float
+    max_steps: int
+    tries: int = 4
+    notes: int = 0
+    allow_singles: bool = False
+    slack: float = 1.0
+    order: int = 0
+
+    @property
+    def largest_excess(self) -> float:
+        """The last terms that the series of a tangent may have along a step, relative to the tangent."""
+        return EXCESS * self.slack * self.rtol
+
+    @property
+    def tighter(self) -> "Tolerances":
+        """Slightly tighter tolerances for another try, whose steps end at other places."""
+        return self._replace(rtol=0.7 * self.rtol, atol=0.7 * self.atol, tries=self.tries - 1)
+
+    @property
+    def floor(self) -> float:
+        """atol in units of rtol."""
+        return _native.floor_of(self.rtol, self.atol)
+
+    @property
+    def with_larger_budget(self) -> "Tolerances":
+        """The tolerances for a motion with its tangents, which takes more steps."""
+        return self._replace(max_steps=4 * self.max_steps)
+
+
+def unfit(program: Program, size: int) -> str | None:
+    """Why there is no machine code for a scene, as the end of a sentence; None where there is."""
+    if program.operations > LARGEST_PROGRAM:
+        return (
+            f"its acceleration takes {program.operations} operations, more than the {LARGEST_PROGRAM} whose kernel and "
+            f"derivatives fit into half of this machine's {machine_memory() / 1e9:.0f} GB of memory"
+        )  # fmt: skip
+    try:
+        _native.require_recurrences(program, size)
+    except Unlowerable as reason:
+        return str(reason)
+    return None
+
+
+# ---- flows -----------------------------------------------------------------------------------------------------------
+
+
+class Flow:
+    """The flow of a program for q̈ with n coordinates.
+
+    `parts` gives the program, which takes q, q̇, t and then the P parameters and gives q̈ and whether the mass matrix is
+    singular, and the projection that keeps the motion on its constraints, or None. It is called when machine code is
+    first needed. `guards` end a motion early. `groups` (n,) numbers the coordinates whose errors are measured together;
+    these may be those of a motion with its tangents (`nesting`). `motion` gives the program of the motion alone, where
+    the flow's has tangents too; `general` the flow of the variant for any mass matrix: members that the regular variant
+    cannot follow start again with it.
+    """
+
+    def __init__(
+        self,
+        parts: Callable[[], tuple[Program, _native.Projection | None]],
+        size: int,
+        numbers: int,
+        guards: _native.Guards | None = None,
+        groups: tuple[int, ...] | None = None,
+        nesting: _native.Nesting | None = None,
+        general: "Callable[[], Flow | None]" = lambda: None,
+        motion: "Callable[[], Program] | None" = None,
+    ):
+        self._motion_program: Callable = (lambda: self.program) if motion is None else motion
+        self._parts, self.size, self.numbers, self.guards = functools.cache(parts), size, numbers, guards
+        self.groups = tuple(range(size)) if groups is None else groups
+        self.nesting = nesting or _native.Nesting(size)
+        self.general = functools.cache(general)
+        self.tangent = functools.lru_cache(maxsize=8)(self._tangent)
+
+    @classmethod
+    def from_program(cls, program: Program, size: int, projection=None, guards=None) -> "Flow":
+        """The flow of a scene's program, with that of its general variant behind it."""
+
+        def general():
+            try:
+                other = program.complete
+            except Unlowerable:
+                return None
+            fits = other is not program and other.operations <= LARGEST_PROGRAM
+            return cls.from_program(other, size, projection, guards) if fits else None
+
+        return cls(lambda: (program, projection), size, program.size - 2 * size - 1, guards, general=general)
+
+    @property
+    def program(self) -> Program:
+        """q̈ and whether the mass matrix is singular."""
+        return self._parts()[0]
+
+    @property
+    def projection(self) -> _native.Projection | None:
+        """The way back to the constraints, where there are some."""
+        return self._parts()[1]
+
+    @functools.cached_property
+    def general_program(self) -> Program:
+        """The program that holds for any mass matrix, if there is one, else the flow's own.
+
+        That is enough where there are no constraints: all pivots are positive if and only if the mass matrix is.
+        """
+        if self.projection is None:
+            return self.program
+        try:
+            return self.program.complete
+        except Unlowerable:
+            return self.program
+
+    @property
+    def states(self) -> int:
+        """Numbers in a state: q, then q̇."""
+        return 2 * self.size
+
+    def path_shape(self, times: int, notes: int) -> tuple[int, ...]:
+        """The shape of the `path` of a member: of states at this many output times, or of what is noted."""
+        if self.guards is None or not self.guards.notes:
+            return times, self.states
+        return len(self.guards.directions) * (notes + 1), self.states + 1
+
+    @functools.cached_property
+    def kernel(self) -> _native.Kernel:
+        parts = self.program, self.size, self.projection, self.guards, self.groups, self.nesting
+        return _native.Kernel(*parts, motion=self._motion_program())
+
+    @property
+    def borders(self):
+        """The borders of its program, where steps end; None without."""
+        return self.kernel.borders
+
+    # ---- forward ----
+
+    def run(
+        self,
+        ts,
+        y0,
+        params,
+        tolerances: Tolerances,
+        store: StepStore | None = None,
+        room: int | None = None,
+        begun: _native.Begun | None = None,
+    ) -> Solution:
+        """`ts` (N, T) or (1, T), `y0` (N, 2n), `params` (N, P) or (1, P) → the motions of N members.
+
+        With a `store` the steps are kept there, up to `room` of all members: by default as many as may be kept. Results
+        say what stopped a member, and not only that its steps became too small, or too many. A run that a handler has
+        `begun` is continued.
+        """
+        solution = self.follow(ts, y0, params, tolerances, store, room, begun)
+        if (solution.result != SUCCESSFUL).any():
+            solution = self._explain_stops(solution, ts, params)
+        finite = np.isfinite(solution.y_end)
+        if not finite.all():  # even where it came to the last time
+            solution.result[~finite.all(axis=1)] = _NOT_FINITE
+        return solution
+
+    def follow(self, ts, y0, params, tolerances, store=None, room=None, begun=None) -> Solution:
+        """`run` without a look at what stopped a member: for another try, and for derivatives."""
+        rtol, atol, max_steps, notes, order = *tolerances[:3], tolerances.notes, tolerances.order
+        if store is not None and room is None:
+            room = min(max_steps * len(y0), LARGEST_KEPT // (self.states + 4))
+        done = self.kernel.select_kernel(len(y0))(ts, y0, params, rtol, atol, max_steps, room or 0, begun, notes, order)
+        result, event = RESULT_OF_CODE[np.minimum(done.code, _native.EVENT)], np.maximum(done.code - _native.EVENT, 0)
+        ticket = np.full(len(y0), -1)
+        if store is not None:
+            assert done.complete is not None and done.table is not None
+            counts = np.where(done.complete, done.steps, 0)
+            first = np.cumsum(counts) - counts
+            order = order or _native.order_for(rtol)
+            ticket = store.keep(Steps(self.kernel, order, done.table, first, counts, done.complete))
+        solution = Solution(*done[:3], result, done.steps, done.rejected, event, ticket, done.idle)
+        if (result == SUCCESSFUL).all():
+            return solution
+        again, flow, tolerances = self._second_chance(solution, ts, params, tolerances)
+        if not again.any():
+            return solution
+        some_ts, some_y0, some_params = members(again, ts, y0, params)
+        better = flow.follow(some_ts, some_y0, some_params, tolerances, store, room)
+        for values, new in zip(solution[:-1], better[:-1], strict=True):
+            values[again] = new
+        return solution._replace(idle=done.idle + better.idle)
+
+    def _explain_stops(self, solution: Solution, ts, params) -> Solution:
+        """The solution with what stopped the members whose steps became too small, or too many."""
+        shrank, spent = solution.result == _SHRANK, solution.result == _SPENT
+        some = np.flatnonzero(shrank | spent)
+        if not some.size:
+            return solution
+        times, numbers = (x[some] if len(x) > 1 else x for x in (ts, params))
+        acceleration = functools.partial(self._accelerations, numbers)
+        y_end, t_end, _, accepted, rejected = (x[some] for x in solution[1:6])
+        end = End(t_end, y_end, times[:, 0], times[:, -1], accepted, rejected)
+        not_finite, jumps = what_stopped(acceleration, end, shrank[some], spent[some])
+        solution.result[some[jumps]] = _JUMPS
+        solution.result[some[not_finite]] = _NOT_FINITE
+        return solution
+
+    def _accelerations(self, params, t, y) -> np.ndarray:
+        """q̈ (N, n) at N states."""
+        return self.general_program.evaluate_many([*y.T, t, *params.T])[: self.size].T
+
+    def _second_chance(self, solution, ts, params, tolerances: Tolerances) -> "tuple[np.ndarray, Flow, Tolerances]":
+        """The members to run once more, by which flow and with which tolerances.
+
+        A program that assumes a regular mass matrix gives way to one that does not, which is long where a recursion in
+        L made it short: without constraints, only if that matrix seems singular. And where constraints become
+        dependent, as at a dead centre, a step must not end: rounding of q would decide on q̇, or allow no step from
+        there. The kernel takes such steps again; where that does not help, steps of other sizes all along may.
+        Where q̈ is finite and its series is not, that may overflow: the coefficients of what changes at a rate ω grow by
+        ω from order to order, and a lower order may do.
+        """
+        result = solution.result
+        overflows = result == _NOT_FINITE
+        if overflows.any() and not tolerances.order:
+            accelerations = self._accelerations(params, solution.t_end, solution.y_end)
+            overflows &= np.isfinite(accelerations).all(axis=1)
+            return overflows, self, tolerances._replace(order=_native.LEAST_ORDER)
+        given_up = np.isin(result, _GIVEN_UP if self.projection is not None else _SINGULAR)
+        if given_up.any() and (general := self.general()) is not None:
+            return given_up, general, tolerances
+        stuck = result == _NOT_PROJECTED
+        if self.projection is not None:
+            stuck |= result == _SHRANK
+        return stuck & (tolerances.tries > 1), self, tolerances.tighter
+
+    def _tangent(self, directions: int) -> "Flow":
+        """The flow of q and of its derivatives along this many directions, whose δparams are numbers of it.
+
+        It has (1 + D) n coordinates and (1 + D) P parameters. A tangent that is zero by symmetry is as exact as the
+        other coordinates in its direction, not exact relative to itself: each direction is one group.
+        """
+        n, rows = self.size, 1 + directions
+        groups = self.groups + tuple(n + row for row in range(directions) for _ in range(n))
+
+        def general():
+            other = self.general()
+            return None if other is None else other.tangent(directions)
+
+        def parts():
+            return tangent_programs(self.program, self.projection, n, directions)
+
+        nesting = self.nesting.with_tangents(directions)
+        return Flow(parts, rows * n, rows * self.numbers, None, groups, nesting, general, self._motion_program)
+
+
+def members(chosen: np.ndarray, *arrays: np.ndarray) -> list[np.ndarray]:
+    """The rows that are `chosen`, Booleans (N,), of each array; an array of one row is shared by all."""
+    return [x[chosen] if len(x) == len(chosen) else x for x in arrays]

@@ -1,0 +1,121 @@
+"""A run of machine code on an NVIDIA GPU: XLA launches it itself, by the custom call that takes PTX.
+
+There is no handler, no callback and no address in the program, so that it may be exported and kept. What Python does
+after a run on a CPU - a second try of members that failed, a look at what stopped them - is not done here: a member
+that another variant of the program could follow ends with the code of the first.
+"""
+
+import math
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax import _native
+from lagjax._engine.taylor._flow import NOT_FINITE_RESULT, RESULT_OF_CODE, Flow, Tolerances
+from lagjax._native import gpu
+from lagjax._program import Unlowerable
+
+_TARGET = "__gpu$xla.gpu.ptx"
+# Compute capabilities of NVIDIA's processors whose float64 runs at half the rate of float32: P100, V100, A100, H100 and
+# B200. That of all others runs at 1/32 or 1/64.
+_FAST_DOUBLES = frozenset(("6.0", "7.0", "8.0", "9.0", "10.0"))
+# The local error of a step in single precision, at least: eight units in the last place. With half of that a chain of
+# eight links has half of its steps refused for what rounding leaves of an acceleration; the results are as exact.
+_LEAST_RTOL = 2.0**-20
+
+
+def adapt_tolerances(flow: Flow, tolerances: Tolerances) -> Tolerances:
+    """The tolerances on the GPU at hand: they allow single precision where it computes in that.
+
+    That is where the caller's numbers are of float32, float64 is slow, and single precision decides about nothing
+    (`Kernel.allows_singles`).
+    """
+    if not (tolerances.allow_singles and has_slow_doubles() and flow.kernel.allows_singles):
+        return tolerances._replace(allow_singles=False)
+    return tolerances._replace(rtol=max(tolerances.rtol, _LEAST_RTOL))
+
+
+def has_slow_doubles() -> bool:
+    """True if there is a GPU, and its float64 runs at 1/32 of the rate of float32 or less."""
+    try:
+        devices = jax.devices("cuda")
+    except RuntimeError:
+        return False
+    return getattr(devices[0], "compute_capability", None) not in _FAST_DOUBLES
+
+
+def run_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params) -> tuple:
+    """The motions of N members, `ts` (1 or N, T), `y0` (N, 2n), `params` (1 or N, P): a `Solution` without `idle`.
+
+    The tolerances are those for the device (`adapt_tolerances`).
+
+    Raises `ValueError` where the scene cannot go to a GPU, saying why.
+    """
+    notes = tolerances.notes
+    try:
+        program = flow.kernel.for_gpus(tolerances.allow_singles).motion(tolerances.rtol)
+    except Unlowerable as reason:
+        raise ValueError(f"solver=lagjax.MachineCode() cannot integrate this scene on a GPU: {reason}.") from None
+    members, path = len(y0), jnp.full((len(y0), *flow.path_shape(ts.shape[1], notes)), jnp.nan)
+    arrays = _inputs(gpu.MOTION, ts, y0, params, flow, tolerances, room_of_notes=notes) | {"path": path}
+    shapes = [path.shape, y0.shape, *[(members,)] * 4]
+    return _solution(*launch(gpu.MOTION, program, members, arrays, shapes), states=not notes)
+
+
+def transpose_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params, path_ct, end_ct) -> tuple | None:
+    """The cotangents of `y0` (N, 2n) and of the parameters (N, P), from those of outputs and ends.
+
+    `path_ct` is (N, T, 2n), of which the first and the last output are not looked at, `end_ct` (N, 2n). Then `excess`
+    (N,), as of `Kernel.vjp`, and which are done (N,): all but those with more steps than a thread can write down. None
+    where a GPU cannot go back over the steps of this scene.
+    """
+    try:
+        program, row = flow.kernel.for_gpus(tolerances.allow_singles).transpose(tolerances.rtol)
+    except Unlowerable:
+        return None
+    members, threads = len(y0), math.prod(gpu.grid(gpu.TRANSPOSE, len(y0)))
+    room = min(tolerances.max_steps, gpu.LARGEST_RECORD // (threads * row))
+    arrays = _inputs(gpu.TRANSPOSE, ts, y0, params, flow, tolerances, room=room)
+    arrays |= {"path_ct": path_ct, "end_ct": end_ct}
+    shapes = [y0.shape, (members, max(1, flow.numbers)), (members,), (members,), (threads * room * row,)]
+    y_ct, params_ct, excess, done, _ = launch(gpu.TRANSPOSE, program, members, arrays, shapes)
+    return y_ct, params_ct[:, : flow.numbers], excess, done > 0
+
+
+def _inputs(entry: gpu.Entry, ts, y0, params, flow: Flow, tolerances: Tolerances, **more: int) -> dict[str, Any]:
+    """The arrays that all entries have."""
+    rtol, atol, max_steps, *_ = tolerances
+    numbers = entry.words(
+        members=len(y0), times=ts.shape[1], ts_stride=ts.shape[1] if len(ts) > 1 else 0,
+        params_stride=flow.numbers if len(params) > 1 else 0, max_steps=max_steps, rtol=rtol, atol=atol, **more,
+    )  # fmt: skip
+    if not flow.numbers:
+        params = jnp.zeros((1, 1))  # an array that has an address
+    words, counter = jnp.asarray(np.array(numbers, np.int64)), jnp.zeros(1, np.int64)
+    return dict(ts=ts, y0=y0, params=params, numbers=words, next_member=counter)
+
+
+def launch(entry: gpu.Entry, program: str, members: int, arrays: dict[str, Any], shapes: list[tuple]) -> list:
+    """Launch a program for this many members on the `arrays` of its entry; its results have these shapes."""
+    blocks, threads = gpu.grid(entry, members)
+    sizes = dict(grid_x=blocks, grid_y=1, grid_z=1, block_x=threads, block_y=1, block_z=1, shared_mem_bytes=0)
+    attributes = {name: np.int32(size) for name, size in sizes.items()}
+    results = [jax.ShapeDtypeStruct((1,), np.int64), *(jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes)]
+    # Nothing clears what a kernel writes to: what must be clear is given, and written to where it is.
+    call = jax.ffi.ffi_call(_TARGET, results, input_output_aliases=entry.aliases)
+    given = (arrays[name] for name in entry.arguments)
+    return list(call(*given, name="integrate", kernel_type="ptx", kernel_data=program, **attributes))[1:]
+
+
+def _solution(path, y_end, t_end, code, steps, rejected, states: bool) -> tuple:
+    """The results of the kernel as the fields of a `Solution`; NaN in the path where a member did not come."""
+    code, steps, rejected = (x.astype(int) for x in (code, steps, rejected))
+    result = jnp.asarray(RESULT_OF_CODE)[jnp.minimum(code, _native.EVENT)]
+    result = jnp.where(jnp.isfinite(y_end).all(axis=1), result, NOT_FINITE_RESULT)
+    if states:
+        reached = (code == _native.DONE)[:, None, None] | jnp.isfinite(path).all(axis=2, keepdims=True)
+        path = jnp.where(reached, path, jnp.nan)
+    event = jnp.maximum(code - _native.EVENT, 0)
+    return path, y_end, t_end, result, steps, rejected, event, jnp.full(code.shape, -1)

@@ -1,0 +1,226 @@
+"""Surfaces that a motion meets: guards as programs, and how the time and the state of a crossing vary.
+
+Where a guard vanishes is found by machine code, without derivatives (`_native._events`). Those of the crossing come
+from the implicit function: with g the guard and ġ its rate along the motion,
+
+    dt* = −dg / ġ        dy* = dy + ẏ dt*
+
+and the same to second order (`crossing_variation`).
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._engine.taylor._line_functions import outputs
+from lagjax._equations import Derivation
+from lagjax._native import GUARD_NOISE, INSTANT, SINGLE_NOISE, SMALLEST_STEP, Guards
+from lagjax._primitives import differentiable_where
+from lagjax._program import Program, StraightLine, Unlowerable, borders, distances, emit, lower
+
+PyTree = Any
+
+
+class Guarded(NamedTuple):
+    """The guards at a state, all (G,): their `values`, and their `rates` along the motion.
+
+    And how far a value is moved by its own `rounding`, and by that of the time (`of_time`), and a rate by its own.
+    """
+
+    values: jax.Array
+    rates: jax.Array
+    rounding: jax.Array
+    of_time: jax.Array
+    rate_rounding: jax.Array
+
+    def clear_rates(self, largest: jax.Array | float = 0.0) -> jax.Array:
+        """The rates, 0 where their rounding, or the `largest` one so far, decides them."""
+        return jnp.where(jnp.abs(self.rates) > jnp.maximum(self.rate_rounding, largest), self.rates, 0.0)
+
+
+class Surfaces(NamedTuple):
+    """Guards as programs of (q, q̇, t, params), and how each has to change sign: −1, 0, +1.
+
+    `values` gives all g. `complete` gives what `_native.Guards` wants: g, then ġ, then the sizes of both, which bound
+    their round-off; and for a start that `is_rounded` to float32, unless the motion remembers it, that of the start.
+    `borders` gives how far every number by which a guard is pieced together is from its border, and `followed()` all g
+    and these distances, how fast both change along the motion, and (q̇, q̈). What `holds` ends a motion at once that
+    begins beyond it, in its direction.
+    """
+
+    values: Program
+    complete: Program
+    followed: Callable[[], Program]
+    directions: tuple[int, ...]
+    is_rounded: bool = False
+    borders: StraightLine | None = None
+    holds: tuple[bool, ...] = ()
+
+    def guards(self, notes: bool = False, remembers: bool = False) -> Guards:
+        """The surfaces as guards of machine code: a change ends the motion or, with `notes`, is written down.
+
+        A motion that `remembers` is given the side of each surface from which it comes (see `Guards`).
+        """
+        return Guards(self.values, self.complete, self.directions, notes, remembers, self.is_rounded, self.holds)
+
+    @property
+    def have_no_rate(self) -> np.ndarray:
+        """True for every guard, (G,), that has no rate anywhere: it changes its sign by jumps."""
+        count = len(self.directions)
+        return np.array([self.complete.constant(count + k) == 0.0 for k in range(count)])
+
+    def evaluate_guards(self, t, y, numbers, latest, widths) -> Guarded:
+        """The guards at a state (2n,), as machine code takes a start there in a run that ends at `latest`.
+
+        Where the start `is_rounded`, what came in, (q, q̇, t) and `numbers`, is known to these `widths`.
+        """
+        count, still = len(self.directions), jax.lax.stop_gradient
+        t, y, numbers, latest = still((t, y, numbers, latest))
+        given = jnp.append(y, t), numbers
+        out = outputs(self.complete, 4 * count, *given)
+        values, rates, sizes, rate_sizes = out.reshape(4, count)
+        errors = outputs(_rate_errors(self.complete, count), count, *given)
+        errors = jnp.where(jnp.isfinite(errors), errors, 0.0)  # a root at zero has no slope
+        instant = INSTANT * SMALLEST_STEP * jnp.maximum(jnp.abs(t), jnp.abs(latest))
+        rounding, rate_rounding = GUARD_NOISE * sizes, GUARD_NOISE * (rate_sizes + errors)
+        if self.is_rounded:
+            slopes = jax.jacrev(lambda *given: outputs(self.values, count, *given), (0, 1))(*given)
+            terms = [jnp.where(width > 0, jnp.abs(by) * width, 0.0) for by, width in zip(slopes, widths, strict=True)]
+            rounding += sum(term.sum(1) for term in terms)
+        return Guarded(values, rates, rounding, jnp.abs(rates) * instant, rate_rounding)
+
+    @classmethod
+    def from_functions(
+        cls,
+        derivation: Derivation,
+        functions: Sequence[Callable],
+        directions: tuple[int, ...],
+        code: tuple,
+        structure,
+        is_rounded: bool = False,
+    ) -> "Surfaces":
+        """The surfaces of functions of y = (q, q̇, t), (2n + 1,), and params; each gives one number.
+
+        `code` and `structure` are what params hold that is not a number. Raises `Unlowerable`.
+        """
+        n, program = derivation.layout.size, derivation.acceleration
+
+        def values(y, numbers):
+            params = eqx.combine(numbers, structure.unflatten(code))
+            return jnp.stack([function(y, params) for function in functions])
+
+        def rate_of(y, numbers):
+            acceleration = jnp.stack(program.complete.compute_outputs(y, vector_of(numbers))[:n])
+            return jnp.concatenate([y[n:-1], acceleration, jnp.ones(1)])
+
+        def complete(y, numbers):
+            rate = rate_of(y, numbers)
+            by_y = jax.jacfwd(values)(y, numbers)
+            terms, moving = by_y * y, by_y * rate
+            found = values(y, numbers), moving.sum(1), jnp.abs(terms).sum(1), jnp.abs(moving).sum(1)
+            if not is_rounded:
+                return found
+            floats, others = eqx.partition(numbers, eqx.is_inexact_array)
+            slopes = jax.jacrev(lambda y, floats: values(y, eqx.combine(floats, others)), (0, 1))(y, floats)
+            moved = jax.tree.map(lambda by, x: jnp.abs(by * x).reshape(len(terms), -1).sum(1), slopes, (y, floats))
+            return *found, SINGLE_NOISE * sum(jax.tree.leaves(moved))
+
+        y = jax.ShapeDtypeStruct((2 * n + 1,), derivation.layout.dtype)
+        numbers = derivation.numbers
+        lowered = lower(values, y, numbers)
+        pieces = _borders_of(lowered, n)
+
+        def followed(y, numbers):
+            def away(y):
+                more = () if pieces is None else emit(*pieces, (*y, *vector_of(numbers)))
+                return jnp.stack([*values(y, numbers), *more])
+
+            rate = rate_of(y, numbers)
+            return *jax.jvp(away, (y,), (rate,)), rate[:-1]
+
+        follow = functools.cache(lambda: lower(followed, y, numbers))
+        return cls(lowered, lower(complete, y, numbers), follow, directions, is_rounded, pieces)
+
+
+@functools.lru_cache(maxsize=64)
+def _rate_errors(complete: Program, count: int) -> Program:
+    """The running errors of all ġ in units of round-off: what is left of terms that cancel is not seen in its size."""
+    return complete.rounding_of(range(count, 2 * count), complete.shapes[0].size)
+
+
+def _borders_of(values: Program, n: int) -> StraightLine | None:
+    """The distances of guards from the borders at which they may jump; None of smooth ones, or without a program."""
+    try:
+        found = borders(values, n, slides=False, watched=len(values.outputs))
+    except Unlowerable:
+        return None
+    return None if found is None or not found.switches else distances(found)
+
+
+def vector_of(numbers: PyTree) -> jax.Array:
+    """Every number of a pytree, (P,)."""
+    leaves = [jnp.ravel(leaf) for leaf in jax.tree.leaves(numbers)]
+    return jnp.concatenate(leaves) if leaves else jnp.zeros(0)
+
+
+def require_one_number(value, what: str) -> jax.Array:
+    """The value of a guard as an array. Raises `TypeError` where it is not one real number."""
+    if len(jax.tree.leaves(value)) != 1 or value is not jax.tree.leaves(value)[0]:
+        raise TypeError(f"{what} must return one real number; got {type(value).__name__}.")
+    value = jnp.asarray(value)
+    if value.shape != () or not jnp.issubdtype(value.dtype, jnp.floating):
+        raise TypeError(f"{what} must return one real number; got shape {value.shape} of {value.dtype}.")
+    return value
+
+
+def crossing_variation(surfaces: Surfaces) -> Callable:
+    """`(k, taken, t, y, numbers)` → (t, y): the state at t, where guard k is zero, moved to where it is zero then.
+
+    With δg the variation of the guard, f the rate of the state, and ′ the derivative along the
+    motion, the time moves by
+
+        s = −ε − ½ (g″/g′) ε²,  ε = δg/g′        and the state by   f s + ½ f′ s²,
+
+    up to third order in δg, which is zero itself: first and second derivatives are right. Where it is not `taken`
+    nothing moves. Where the guard jumps through zero, δg is that of the number whose border is there: the one that is
+    nearest in time. Where g′ is zero there are no derivatives: NaN.
+    """
+    still, count = jax.lax.stop_gradient, len(surfaces.directions)
+
+    def follow(t, y, numbers):
+        program, n = surfaces.followed(), y.shape[0] // 2
+        found = outputs(program, len(program.outputs), jnp.append(y, t), numbers)
+        return jnp.split(found, [len(found) // 2 - n, len(found) - 2 * n])
+
+    def move_to_zero(k, taken, t, y, numbers):
+        numbers_there = still(numbers)
+        values, rates, slope = follow(t, y, numbers)
+        _, (_, bends, turn) = jax.jvp(
+            lambda t, y: follow(t, y, numbers_there), still((t, y)), (jnp.ones_like(t), still(slope))
+        )
+        at = k
+        if surfaces.borders is not None:
+            times = jnp.abs(still(values / rates))
+            times = jnp.where(jnp.isnan(times), jnp.inf, times).at[count:].multiply(_LATER)
+            at = jnp.argmin(
+                jnp.where((jnp.arange(times.size) >= count) | (jnp.arange(times.size) == k), times, jnp.inf)
+            )
+        value, rate, bend = (jnp.where(np.arange(len(values)) == at, x, 0.0).sum() for x in (values, rates, bends))
+        crosses = ~taken | (rate != 0)
+        rate = jnp.where(taken & crosses, rate, 1.0)
+        part = jnp.where(taken, value - still(value), 0.0) / rate
+        later = -part - 0.5 * still(bend / rate) * part**2
+        there = t + later, y + slope * later + 0.5 * turn * later**2
+        return tuple(differentiable_where(crosses, x, t, y, numbers) for x in there)
+
+    return move_to_zero
+
+
+# A guard that jumps at a border is not zero there: of the times to both that to the guard's own zero is by many orders
+# longer, where that to the border is some roundings. With twice as much nothing changes.
+_LATER = 1e4

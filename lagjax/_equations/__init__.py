@@ -1,0 +1,74 @@
+"""The equations of motion of a Lagrangian: M, F, q̈ and λ, on arrays and on scalars.
+
+`_motion` derives momentum, mass matrix, force, acceleration, energy and multipliers on arrays, `_quantities` the same
+on scalars, operation by operation. `_constraints` holds constraint Jacobian, right-hand side, distances and projection;
+`_consistency` tests a start against them. `_linear` solves symmetric systems and saddle points as arrays; `_saddle` is
+the same elimination on scalars, which keeps the zeros of a scene, and `_recursion` the one for chains in O(n).
+`_derivation` keeps everything derived from a scene as scalar programs, each lowered once; `_many_states` evaluates them
+at many states. `_scales` says how large coordinates, velocities and time are at a state; `_blame` which operations of a
+user's function are not finite or make it piecewise, and in which line.
+"""
+
+from lagjax._equations._blame import Offender, borders_of_motion, offenders, pieces_of, pieces_of_motion, poles
+from lagjax._equations._consistency import has_constraints, inconsistent_members, require_consistent
+from lagjax._equations._constraints import ROUNDINGS, Constraints, distances, rank_lost
+from lagjax._equations._derivation import Derivation, columns_of, derivation_of, numbers_of
+from lagjax._equations._linear import (
+    augment,
+    dependent_rows,
+    diagonal_scale,
+    eigen,
+    factorize,
+    invert,
+    least_norm,
+    null_directions,
+    rank,
+    saddle,
+    schur_complement,
+    schur_complements,
+    singular_threshold,
+)
+from lagjax._equations._many_states import SADDLE, Sample, borders_of, is_lowered, map_in_chunks, solve_saddle
+from lagjax._equations._motion import Motion
+from lagjax._equations._scales import Scales
+
+__all__ = [
+    "ROUNDINGS",
+    "SADDLE",
+    "Constraints",
+    "Derivation",
+    "Motion",
+    "Offender",
+    "Sample",
+    "Scales",
+    "augment",
+    "borders_of",
+    "borders_of_motion",
+    "columns_of",
+    "dependent_rows",
+    "derivation_of",
+    "diagonal_scale",
+    "distances",
+    "eigen",
+    "factorize",
+    "has_constraints",
+    "inconsistent_members",
+    "invert",
+    "is_lowered",
+    "least_norm",
+    "map_in_chunks",
+    "null_directions",
+    "numbers_of",
+    "offenders",
+    "pieces_of",
+    "pieces_of_motion",
+    "poles",
+    "rank",
+    "rank_lost",
+    "require_consistent",
+    "saddle",
+    "schur_complement",
+    "schur_complements",
+    "singular_threshold",
+    "solve_saddle",
+]

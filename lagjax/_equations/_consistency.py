@@ -1,0 +1,211 @@
+"""The test that the start of a motion satisfies its constraints, before any work is done.
+
+What a start is measured by, and how far off it may be, stands in `_constraints`. Here it is evaluated with the user's
+own arguments, and answered with a sentence. Values that are being traced, as under `jax.jit`, are not looked at.
+"""
+
+import dataclasses
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._equations._constraints import ROUNDINGS, TOLERANCE, rows_of_terms, sizes
+from lagjax._equations._derivation import derivation_of
+from lagjax._equations._linear import dependent_rows, diagonal_scale, schur_complements
+from lagjax._equations._many_states import Sample
+from lagjax._interface import Layout, is_concrete
+from lagjax._primitives import accepts_singles
+
+PyTree = Any
+
+
+@accepts_singles(("q0", "qdot0"), ("ts", "params"))
+def require_consistent(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree) -> None:
+    """Raise `ValueError`, naming the constraint, where the start of a single motion is inconsistent.
+
+    That is: a constraint is not finite, or has no gradient; as many are independent as there are coordinates, so that
+    nothing can move; two of them contradict each other; or q0 or qdot0 is farther from one than `TOLERANCE` of its
+    size, and the value of the constraint is more than `ROUNDINGS` of its own terms.
+    """
+    if not has_constraints(system) or not _all_concrete((ts, q0, qdot0, params, system)):
+        return
+    names = system.constraint_names(layout, params)
+    start = _start(system, layout, ts, q0, qdot0, params)
+    _require_gradients(names, start)
+    dependent = dependent_rows(start.schur)
+    if not (start.driven or _reads_time(system)):
+        _require_room(names, start, layout.size, len(names) - len(dependent))
+    tolerance = TOLERANCE[layout.dtype]
+    if next(_faults(names, start, dependent, tolerance, np.zeros((3, len(names)))), None) is None:
+        return  # as most starts, without a look at rounding
+    derivation, q, qdot, t, numbers, _ = start.sample
+    terms = derivation.term_sizes(q[0], qdot[0], t, numbers, ("residual", "rates", "gamma"))
+    rounding = ROUNDINGS * np.finfo(layout.dtype).eps * rows_of_terms(terms, (3, len(names)))
+    for is_of_q, sentence in _faults(names, start, dependent, tolerance, rounding):
+        if not is_of_q or _nothing_to_find(system, q0, qdot0, ts[0], params):
+            raise ValueError(sentence)
+
+
+def _faults(names, start, dependent, tolerance, rounding) -> Iterator[tuple[bool, str]]:
+    """A sentence for each contradiction and distance, and whether it is a contradiction of positions.
+
+    `rounding` (3, m) is what may be left of values, rates and γ.
+    """
+    of_rows = (
+        (start.values, start.size_q, "q0", "it"),
+        (start.rates, start.size_qdot, "qdot0", "its rate of change"),
+        (start.gamma, 0.0, "the acceleration", None),
+    )
+    for (values, size, what, quantity), left in zip(of_rows, rounding, strict=True):
+        if clash := _contradiction(names, values, what, start.scaled_lengths, dependent, tolerance, size, left):
+            yield what == "q0", clash
+        for k, (name, value) in enumerate(zip(names, values, strict=True)):
+            if quantity and abs(value) > max(tolerance * size * start.scaled_lengths[k], left[k]):
+                distance = abs(value) / start.lengths[k]
+                yield (
+                    False,
+                    f"{what} does not satisfy {name}: {quantity} is {value:.3g} there, a distance of {distance:.3g}. "
+                    "Put the state on the constraints first: q0, qdot0 = system.project(q0, qdot0, t, params).",
+                )
+
+
+class _StartConditions(NamedTuple):
+    """The conditions of m constraints on the first state of a motion of n coordinates, in NumPy."""
+
+    values: np.ndarray  # f, and zero for constraints on velocities, (m,)
+    rates: np.ndarray  # J q̇ + ∂f/∂t, then a, (m,)
+    gamma: np.ndarray  # γ of G q̈ = γ, (m,)
+    lengths: np.ndarray  # of the rows of G, (m,)
+    schur: np.ndarray  # the Schur complement, (m, m)
+    driven: np.ndarray  # whether the constraints move what is at rest, ()
+    scaled_lengths: np.ndarray  # the same with coordinates in units of 1/√Mᵢᵢ, (m,)
+    size_q: np.ndarray  # the largest coordinate in these units, ()
+    size_qdot: np.ndarray  # the largest velocity, ()
+    sample: Sample
+
+
+def _require_gradients(names: list[str], start: _StartConditions) -> None:
+    for name, value, rate, gamma, length in zip(names, *start[:4], strict=True):
+        if not np.isfinite([value, rate, gamma, length]).all():
+            raise ValueError(
+                f"{name} is not finite at the initial state (value {value}, gradient {length}): start where it is "
+                "finite, or write it so that it is finite there."
+            )
+        if length == 0 and name.startswith("velocity_constraints"):
+            raise ValueError(
+                f"{name} does not depend on qdot at the initial state, so that no force can keep it: pass what depends "
+                "on q alone as constraints=…."
+            )
+        if length == 0:
+            raise ValueError(
+                f"{name} has zero gradient at the initial state, so that it exerts no force there: write it with a "
+                "gradient that does not vanish where it is zero, f instead of f², say."
+            )
+
+
+def _require_room(names: list[str], start: _StartConditions, coordinates: int, independent: int) -> None:
+    """Raise where independent constraints, more than there are coordinates, leave nothing to move."""
+    if len(names) > coordinates <= independent and np.isfinite(start.schur).all():
+        raise ValueError(
+            f"There are {len(names)} constraints ({', '.join(names)}) for {coordinates} coordinates, and {independent} "
+            "of them are independent at the initial state: nothing can move. Drop those that are not meant."
+        )
+
+
+def _contradiction(names, values, what, lengths, dependent, tolerance, size, rounding) -> str | None:
+    """A sentence where a constraint is a combination of others, but does not ask for the same combination.
+
+    `values` (m,) are what the constraints ask for in the quantity called `what`, of which errors count by `size` or
+    by the largest of `values`, and `rounding` (m,) is what may be left of them; `dependent` is from `dependent_rows`.
+    """
+    size = max(size, np.max(np.abs(values) / lengths))
+    for row, factors in dependent.items():
+        weights = np.abs(factors) * lengths
+        allowed = tolerance * size * (lengths[row] + weights.sum())
+        if abs(values[row] - factors @ values) > max(allowed, rounding[row] + np.abs(factors) @ rounding):
+            others = ", ".join(name for name, weight in zip(names, weights, strict=True) if weight)
+            return (
+                f"{names[row]} contradicts {others}: at the initial state it is a combination of them, but asks for "
+                f"another value of {what}. They cannot all hold: drop or correct one."
+            )
+    return None
+
+
+def _nothing_to_find(system, q0, qdot0, t, params) -> bool:
+    """True if `project` finds no consistent q: constraints that ask for different steps may still meet somewhere."""
+    q, _ = eqx.filter_jit(system.project)(q0, qdot0, t, params)
+    return not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(q))
+
+
+@accepts_singles(("values",), ("ts",))
+def inconsistent_members(system, layout: Layout, ts, values: dict, axes: dict) -> jax.Array | None:
+    """True for each member of a batch that starts off its constraints, shape (N,); None if that cannot be known.
+
+    `values` holds q0, qdot0 and params of the batch, `axes` which axis of each counts the members.
+    """
+    if not has_constraints(system) or not _all_concrete((ts, values, system)):
+        return None
+
+    given = system, layout.dtype, jnp.asarray(ts[0]), jnp.abs(jnp.asarray(ts[-1]) - ts[0])
+    numbers, of = zip(*((values[name], axes[name]) for name in ("q0", "qdot0", "params")), strict=True)
+
+    def inconsistent(has_terms: bool):
+        return jax.vmap(lambda *one: _inconsistent(has_terms, *given, *one), in_axes=of)(*numbers)
+
+    found = inconsistent(False)
+    return inconsistent(True) if found.any() else found  # what terms there are is compiled where it matters
+
+
+@eqx.filter_jit
+def _inconsistent(has_terms: bool, system, dtype, t, span, q0: PyTree, qdot0: PyTree, params: PyTree) -> jax.Array:
+    layout = Layout.from_state(q0, qdot0)
+    state = layout.flatten(q0), layout.flatten(qdot0), t, eqx.filter(params, eqx.is_array_like)
+    motion = system._motion(layout, params)
+    terms = derivation_of(system, layout, params).term_sizes(*state) if has_terms else 0.0
+    return motion.constraints.inconsistent(motion.mass_matrix(*state), *state, span, dtype, terms)
+
+
+def _start(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree) -> _StartConditions:
+    """The start of a motion, measured without compiling anything where the scene has programs."""
+    layout = dataclasses.replace(layout, dtype=Layout.from_state(q0, qdot0).dtype)  # in float64 also for float32
+    q, qdot = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(x)]) for x in (q0, qdot0))
+    q, qdot, t = (np.asarray(x, layout.dtype) for x in (q, qdot, ts[0]))
+    sample = Sample.from_scene(system, layout, q[None], qdot[None], t, params)
+    of = {name: value[0] for name, value in sample.quantities(*_ASKED).items()}
+    on_positions = np.arange(len(of["residual"])) < sample.derivation.position_count
+    unit = diagonal_scale(of["mass_matrix"])
+    size_q, size_qdot = sizes(unit, q, qdot, abs(float(ts[-1]) - float(t)) or np.inf)
+    return _StartConditions(
+        values=np.where(on_positions, of["residual"], 0),
+        rates=of["rates"],
+        gamma=of["gamma"],
+        lengths=np.linalg.norm(of["jacobian"], axis=1),
+        schur=schur_complements(of["mass_matrix"][None], of["jacobian"][None])[0],
+        driven=(of["driving"] != 0).any(),
+        scaled_lengths=np.linalg.norm(of["jacobian"] * unit, axis=1),
+        size_q=size_q,
+        size_qdot=size_qdot,
+        sample=sample,
+    )
+
+
+_ASKED = ("mass_matrix", "jacobian", "gamma", "residual", "rates", "driving")
+
+
+def has_constraints(system) -> bool:
+    """True if a motion of the scene can start off its constraints."""
+    return system.constraints is not None or system.velocity_constraints is not None
+
+
+def _reads_time(system) -> bool:
+    """True if a constraint asks for the time: it may prescribe a motion."""
+    functions = system.constraints, system.velocity_constraints
+    return any("t" in function.extras for function in functions if function is not None)
+
+
+def _all_concrete(tree: PyTree) -> bool:
+    return all(is_concrete(leaf) for leaf in jax.tree.leaves(tree))

@@ -1,0 +1,345 @@
+"""Constraints in flat coordinates: their equations, the distance of a state from them, and the way back to them.
+
+A scene has k constraints on positions and m − k on velocities, of n coordinates:
+
+    f(q, t) = 0,  shape (k,)        a(q, q̇, t) = 0,  shape (m − k,)
+
+Both are differentiated by the time until the acceleration appears linearly, f twice and a once:
+
+    J q̇ + ∂f/∂t = 0,  J = ∂f/∂q                      the rate of f
+    G q̈ = γ,          G = (J; ∂a/∂q̇), shape (m, n)   the constraint Jacobian and the acceleration-level right-hand side
+
+A scene without constraints has m = 0 rows here, not another kind of object. Nothing here knows a Lagrangian: the mass
+matrix M, by which distances between states are measured, is an argument.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float
+
+from lagjax._equations import _linear
+from lagjax._equations._linear import diagonal_scale
+
+PyTree = Any
+Vector = Float[Array, " n"]  # one number for each coordinate
+Row = Float[Array, " m"]  # one number for each constraint
+Time = Float[Array, ""]
+
+
+class Constraints(eqx.Module):
+    """The constraint functions of a scene: f(q, t, params) → (k,) and a(q, qdot, t, params) → (m − k,), or None.
+
+    q and qdot have shape (n,). Every result lists the constraints on positions first.
+    """
+
+    on_positions: Callable | None = None
+    on_velocities: Callable | None = None
+
+    @property
+    def exist(self) -> bool:
+        return self.on_positions is not None or self.on_velocities is not None
+
+    def f(self, q: Vector, t: Time, params: PyTree) -> Float[Array, " k"]:
+        """The values of the constraints on positions."""
+        return jnp.zeros(0, q.dtype) if self.on_positions is None else self.on_positions(q, t, params)
+
+    def a(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Float[Array, " m-k"]:
+        """The values of the constraints on velocities."""
+        return jnp.zeros(0, q.dtype) if self.on_velocities is None else self.on_velocities(q, qdot, t, params)
+
+    def residual(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Row:
+        """f, then a: zero where the constraints hold."""
+        return jnp.concatenate([self.f(q, t, params), self.a(q, qdot, t, params)])
+
+    def rates(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Row:
+        """J q̇ + ∂f/∂t, then a: zero where the velocities are consistent."""
+        rate = jax.jvp(lambda q, t: self.f(q, t, params), (q, t), (qdot, jnp.ones_like(t)))[1]
+        return jnp.concatenate([rate, self.a(q, qdot, t, params)])
+
+    def driving(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Row:
+        """∂f/∂t, then a(q, 0, t): a constraint does no work where its driving is zero."""
+        by_t = jax.jvp(lambda t: self.f(q, t, params), (t,), (jnp.ones_like(t),))[1]
+        return jnp.concatenate([by_t, self.a(q, jnp.zeros_like(qdot), t, params)])
+
+    def jacobian_and_gamma(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Float[Array, "m n"], Row]:
+        """G and γ of G q̈ = γ. γ is minus all that the time derivatives of f and a contain besides G q̈."""
+        forward = qdot, jnp.ones_like(t)
+
+        def rate(q, t):
+            return jax.jvp(lambda q, t: self.f(q, t, params), (q, t), forward)[1]
+
+        jacobian = [jax.jacfwd(self.f)(q, t, params), jax.jacfwd(self.a, argnums=1)(q, qdot, t, params)]
+        second_rate = jax.jvp(rate, (q, t), forward)[1]
+        rate_of_a = jax.jvp(lambda q, t: self.a(q, qdot, t, params), (q, t), forward)[1]
+        return jnp.concatenate(jacobian), -jnp.concatenate([second_rate, rate_of_a])
+
+    def distances(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Row, Row]:
+        """The `distances` of one state."""
+        state = q, qdot, t, params
+        positions = self.f(q, t, params).size
+        return distances(self.residual(*state), self.rates(*state), self.jacobian_and_gamma(*state)[0], positions)
+
+    def inconsistent(
+        self, matrix: Float[Array, "n n"], q: Vector, qdot: Vector, t: Time, params: PyTree, span: Time, dtype, terms
+    ) -> Bool[Array, ""]:
+        """True if no motion may start from a state: off a constraint, or one of them has no gradient.
+
+        Of a motion over this span of time, with the mass matrix M. Off is what is farther than `TOLERANCE` of the size
+        of the state and has a value of more than `ROUNDINGS` of the `terms` (2m,) of `residual` and of `rates` (see
+        `Derivation.term_sizes`), in a start of this dtype. A state that is not a number is inconsistent.
+        """
+        state, unit = (q, qdot, t, params), diagonal_scale(matrix)
+        jacobian = self.jacobian_and_gamma(*state)[0]
+        values, positions = jnp.stack([self.residual(*state), self.rates(*state)]), self.f(q, t, params).size
+        off = jnp.stack(distances(values[0], values[1], jacobian * unit, positions))
+        near = off <= TOLERANCE[dtype] * jnp.stack(sizes(unit, q, qdot, span))[:, None]
+        rounded = jnp.abs(values) <= ROUNDINGS * np.finfo(dtype).eps * rows_of_terms(terms, values.shape)
+        return ~jnp.all((near | rounded) & jacobian.any(axis=1))
+
+    # ---- one Newton step back to the constraints ----
+
+    def position_step(self, matrix: Float[Array, "n n"], q: Vector, t: Time, params: PyTree) -> Vector:
+        """δq of one Newton step to f = 0, the shortest in the metric of M: M δq = Jᵀμ, J δq = −f."""
+        jacobian = jax.jacfwd(self.f)(q, t, params)
+        return _linear.saddle(matrix, jnp.zeros_like(q), jacobian, -self.f(q, t, params))[0]
+
+    def velocity_step(self, matrix: Float[Array, "n n"], q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
+        """δq̇ to velocities that are consistent, the shortest in the metric of M: M δq̇ = Gᵀμ, G δq̇ = −rates.
+
+        One step arrives, as the rates are affine in q̇ for every f, and for every a that d'Alembert's principle is for.
+        """
+        jacobian, _ = self.jacobian_and_gamma(q, qdot, t, params)
+        return _linear.saddle(matrix, jnp.zeros_like(q), jacobian, -self.rates(q, qdot, t, params))[0]
+
+
+# ---- how far a state is from its constraints -------------------------------------------------------------------------
+
+# The distance from a constraint, over the size of q or q̇, up to which a motion may start: an initial state that was
+# computed or typed with six digits; in float32 one that forty roundings have made. The first projection takes care of
+# it, of up to `_native.START`. It would also take care of more, but by moving the start elsewhere.
+TOLERANCE = {np.dtype("float64"): 1e-6, np.dtype("float32"): 5e-6}
+
+# A constraint holds as well where its value is no more than so many roundings of its own terms, whatever the size of q:
+# coordinates that are deviations from a drawn pose begin at zero, beside links of a metre. They are those that float32
+# is given above. Doubled, a link of a kilometre may be off by 18 nm, where it now may by 9.
+ROUNDINGS = 40
+
+
+def sizes(unit, q, qdot, span):
+    """The sizes of q and of q̇, (…) each, with coordinates in their `unit` (…, n), 1/√Mᵢᵢ: the same for all of them.
+
+    Velocities that would not move q by more than its size in the whole span of time are as large as those that would.
+    Takes q and qdot (…, n) of NumPy or JAX.
+    """
+    xp = unit.__array_namespace__()
+    of_q, of_qdot = (xp.max(xp.abs(x / unit), axis=-1) for x in (q, qdot))
+    return of_q, xp.maximum(of_qdot, of_q / span)
+
+
+def distances(residual, rates, jacobian, positions: int):
+    """The errors of positions and velocities in each constraint, two arrays (..., m).
+
+    |fₖ|/|∂fₖ/∂q| has the units of a coordinate, which fₖ has not: it is, to first order, how far q has to move. The
+    rates divided by the lengths of the same rows are, likewise, velocities. Constraints on velocities ask nothing of q.
+    Takes `residual` and `rates` (..., m) and `jacobian` (..., m, n), of NumPy or JAX; the first `positions` of the m
+    are f. A constraint that holds is at distance zero, also where it has no gradient; otherwise that is infinitely far.
+    """
+    xp = jacobian.__array_namespace__()
+    lengths = xp.sqrt(xp.sum(jacobian**2, axis=-1))
+    of_positions = xp.where(xp.arange(residual.shape[-1]) < positions, residual, 0)
+    of_q, of_qdot = (xp.where(x == 0, 0, xp.abs(x) / xp.where(x == 0, 1, lengths)) for x in (of_positions, rates))
+    return of_q, of_qdot
+
+
+def rows_of_terms(terms, shape: tuple[int, ...]):
+    """The sizes of the terms of some quantities of m constraints, (…, m); of a scene without programs they are 0."""
+    xp = np if isinstance(terms, float | np.ndarray) else jnp
+    return xp.reshape(xp.broadcast_to(terms, math.prod(shape)), shape)
+
+
+def velocity_scales(matrix: Float[Array, "n n"], jacobian: Float[Array, "m n"], qdot: Vector) -> Vector:
+    """The velocity scale of every coordinate for an error norm: how fast the others make it move through G.
+
+    In constraint k, coordinate j contributes Gₖⱼ q̇ⱼ, which is as large as the velocity |Gₖⱼ q̇ⱼ / Gₖᵢ| of coordinate i;
+    the largest over j is the scale that k gives to i, and the smallest over k counts. So a coupler that does not turn
+    is as exact as the cranks that carry it, and not relative to its own velocity, which is rounding. Where Gₖᵢ happens
+    to pass through zero that grows without bound; it is therefore limited by maxⱼ √(Mⱼⱼ/Mᵢᵢ) |q̇ⱼ|, the velocity of
+    equal kinetic energy. Zero for coordinates in no constraint.
+    """
+    by_constraints = jnp.min(_largest_term(jacobian * qdot, jacobian), axis=0)
+    root = jnp.sqrt(jnp.abs(jnp.diagonal(matrix)))[None]
+    by_energy = _largest_term(root * qdot, root)[0]
+    return jnp.where(by_constraints < jnp.inf, jnp.minimum(by_constraints, by_energy), 0.0)
+
+
+def _largest_term(terms, weights):
+    """max over j of |termsₖⱼ| divided by |weightsₖᵢ|, shape (m, n); infinite where a weight is zero."""
+    nonzero = weights != 0
+    largest = jnp.max(jnp.abs(terms), axis=1, keepdims=True)
+    return jnp.where(nonzero, largest / jnp.abs(jnp.where(nonzero, weights, 1.0)), jnp.inf)
+
+
+def rank_lost(schur_complement: Callable, start: tuple, end: tuple) -> Bool[Array, ""]:
+    """True if fewer constraints are independent at `end` than at `start`, both (q, q̇, t, params).
+
+    Counted are the independent rows of S = `schur_complement`(state), with every row of G in units of its length at the
+    start: a gradient that fades away on the way is lost as well.
+    """
+    first, last = (schur_complement(*jax.lax.stop_gradient(state)) for state in (start, end))
+    diagonal = jnp.diagonal(first)
+    scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
+    before, after = (_linear.rank(scale[:, None] * schur * scale) for schur in (first, last))
+    return jnp.isfinite(last).all() & (after < before)
+
+
+# ---- the way back ----------------------------------------------------------------------------------------------------
+
+
+def projected(
+    mass_matrix: Callable, constraints: Constraints, q: Vector, qdot: Vector, t: Time, params: PyTree
+) -> tuple[Vector, Vector]:
+    """(q, q̇) after one Newton step for the positions and one for the velocities, shape (n,) each.
+
+    That is enough after a step of an integration: close to the constraints Newton's method squares the distance.
+    `mass_matrix` takes (q, qdot, t, params).
+    """
+    if constraints.on_positions is not None:
+        q = q + constraints.position_step(mass_matrix(q, qdot, t, params), q, t, params)
+    return q, qdot + constraints.velocity_step(mass_matrix(q, qdot, t, params), q, qdot, t, params)
+
+
+# Newton's method doubles its digits from where it converges, and needs 4 to 8 steps from anywhere near; 300 times the
+# size of a circle away it takes 16. Doubled, this changes nothing but the time that is lost where there is no solution.
+_NEWTON_STEPS = 50
+
+
+def nearest_consistent(
+    mass_matrix: Callable, constraints: Constraints, q: Vector, qdot: Vector, t: Time, params: PyTree, terms=0.0
+) -> tuple[Vector, Vector]:
+    """The consistent state nearest to (q, q̇), shape (n,) each; NaN where it is not found.
+
+    q̂ minimises (q̂ − q)ᵀM(q̂ − q) with M = M(q, q̇) among all with f = 0, and then the velocities minimise the same form
+    with M = M(q̂, q̇) among all that are consistent at q̂. The derivatives are those of that function, to every order:
+    q̂ is a root of `_stationary`, and differentiated implicitly. A state that is not found has NaN for derivatives.
+    `terms` (2m,) are the sizes of the terms of `residual` and of `rates`, of which rounding is left.
+    """
+    of_f, of_rates = rows_of_terms(terms, (2, len(constraints.residual(q, qdot, t, params))))
+    if constraints.on_positions is not None:
+        q = _nearest_positions(mass_matrix, constraints, q, qdot, t, params, of_f)
+    state, given = (q, qdot, t, params), qdot
+    matrix = mass_matrix(*state)
+    qdot = qdot + constraints.velocity_step(matrix, *state)
+    jacobian, _ = constraints.jacobian_and_gamma(q, qdot, t, params)
+    reached = _holds(constraints.rates(q, qdot, t, params), jacobian, of_rates, diagonal_scale(matrix), qdot, given)
+    return q, qdot * jnp.where(reached, 1.0, jnp.nan)  # a product, so that derivatives are NaN as well
+
+
+def _nearest_positions(mass_matrix, constraints: Constraints, q0, qdot, t, params, terms) -> Vector:
+    """q with f = 0, nearest to q0 in the metric of M(q0, q̇), by Newton's method for M (q − q0) + Jᵀν = 0, f = 0.
+
+    These are the conditions of the constrained minimum (sequential quadratic programming: Nocedal & Wright, *Numerical
+    Optimization*, §18.1). The method starts where shortest steps to f = 0 alone arrive, for far away its own steps lead
+    anywhere. NaN where either does not arrive, or where the second arrives farther away: at another stationary point.
+
+    The loop is written here and its derivative is `jax.lax.custom_root`'s. `optimistix.root_find` with its `Newton`, an
+    own solver for `lineax` (theirs call LAPACK, see `_linear`) and `ImplicitAdjoint` was measured instead. Its
+    derivatives are right to every order, but it loses three things. A member of a batch that has no nearest state makes
+    the derivative of the whole batch raise, from a call back to the host: lineax solves for tangents with
+    `throw=True`. Its test of convergence compares f and M (q − q0) with the tolerance for q: masses of 1e6 do not
+    converge. And from some 44 radii beside a circle it does not arrive, without the first loop.
+    """
+    matrix = mass_matrix(q0, qdot, t, params)
+    unit = jax.lax.stop_gradient(diagonal_scale(matrix))
+    jacobian = jax.lax.stop_gradient(jax.jacfwd(constraints.f)(q0, t, params)) * unit
+    terms = terms[: len(jacobian)]
+    # The size of the terms, as a distance: where q is smaller it is their rounding that moves it.
+    least = jnp.max(jnp.where(terms > 0, terms * jax.lax.rsqrt(jnp.sum(jacobian**2, axis=1)), 0.0), initial=0.0)
+
+    def resolution(q):
+        return _AT_REST * jnp.finfo(q.dtype).eps * jnp.maximum(_size(unit, q, q0), least)
+
+    def is_at_rest(q, moved):
+        return jnp.max(jnp.abs(moved / unit)) <= resolution(q)
+
+    def stationary(place):
+        q, nu = place
+        f, pull_back = jax.vjp(lambda q: constraints.f(q, t, params), q)
+        return matrix @ (q - q0) + pull_back(nu)[0], f
+
+    def shortest_step(place):
+        q, nu = place
+        return q + constraints.position_step(mass_matrix(q, qdot, t, params), q, t, params), nu
+
+    def newton_step(place):
+        value, linear = jax.linearize(stationary, place)
+        return jax.tree.map(jnp.subtract, place, _solve_symmetric_saddle(linear, value))
+
+    def find(_, start):
+        nearby = _iterate_to_rest(shortest_step, start, is_at_rest)
+        q, nu = _iterate_to_rest(newton_step, (nearby[0], start[1]), is_at_rest)
+
+        def distance(q):
+            return jnp.sqrt((q - q0) @ matrix @ (q - q0))
+
+        # For a q0 that is consistent both distances are round-off.
+        farther = distance(q) > 1.001 * distance(nearby[0]) + resolution(q) * q.size
+        holds = _holds(constraints.f(q, t, params), jax.jacfwd(constraints.f)(q, t, params), terms, unit, q, q0)
+        return jnp.where(holds & ~farther, q, jnp.nan), nu
+
+    start = q0, jnp.zeros_like(constraints.f(q0, t, params))
+    return jax.lax.custom_root(stationary, start, find, _solve_symmetric_saddle)[0]
+
+
+def _solve_symmetric_saddle(linear: Callable, right: tuple[Vector, Row]) -> tuple[Vector, Row]:
+    """(x, ν) with H x + Jᵀν = b, J x = c, where `linear` maps (x, ν) to the left-hand sides and `right` is (b, c)."""
+    b, c = right
+    columns = jax.vmap(lambda x: linear((x, jnp.zeros_like(c))), out_axes=1)
+    matrix, jacobian = columns(jnp.eye(b.size, dtype=b.dtype))
+    x, multipliers, _ = _linear.saddle(matrix, b, jacobian, c)
+    return x, -multipliers
+
+
+def _iterate_to_rest(step: Callable, start: tuple[Vector, Row], is_at_rest: Callable) -> tuple[Vector, Row]:
+    """(q, ν) after as many steps as it takes until q moves no more than rounding; NaN if it always does."""
+
+    def moves(carry):
+        (q, _), moved, count = carry
+        return ~is_at_rest(q, moved) & (count < _NEWTON_STEPS)
+
+    def once(carry):
+        place, _, count = carry
+        new = step(place)
+        return new, new[0] - place[0], count + 1
+
+    (q, nu), moved, _ = jax.lax.while_loop(moves, once, (start, jnp.full_like(start[0], jnp.inf), 0))
+    return jnp.where(is_at_rest(q, moved), q, jnp.nan), nu
+
+
+def _holds(residual: Row, jacobian: Float[Array, "m n"], terms: Row, unit: Vector, *states: Vector) -> Bool[Array, ""]:
+    """True if constraints hold, in which case the steps did not just become small between some that contradict.
+
+    A distance of √eps of the state is allowed: the last step of Newton's method was at the level of rounding, so that
+    constraints which can hold do so far better, and those that contradict each other are off by far more. The second
+    term is for a gradient that vanishes, where rounding of the others' size is the limit. Coordinates
+    are in their `unit` (n,), and as large as in any of the states (n,). Rounding of `terms` (m,) is allowed as well.
+    """
+    lengths, eps = jnp.sqrt(jnp.sum((jacobian * unit) ** 2, axis=1)), jnp.finfo(residual.dtype).eps
+    allowed = jnp.sqrt(eps) * lengths + 100 * eps * jnp.max(lengths)
+    return jnp.all(jnp.abs(residual) <= jnp.maximum(allowed * _size(unit, *states), ROUNDINGS * eps * terms))
+
+
+def _size(unit: Vector, *states: Vector) -> Float[Array, ""]:
+    """The largest coordinate of some states (n,), in the `unit` (n,) of each."""
+    return jnp.max(jnp.abs(jnp.stack(states) / unit))
+
+
+# Steps of q at which Newton's method is at rest, in units of round-off of the largest coordinate. Those of a converged
+# method are some eps times the condition of the scaled saddle point; below 16 an occasional one would not come to rest
+# and count as not found, and twice that still leaves all but one digit.
+_AT_REST = 16

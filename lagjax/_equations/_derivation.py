@@ -1,0 +1,650 @@
+"""`Derivation`: everything that is derived from a scene, lowered to scalar programs on first use and kept.
+
+    (system, layout, structure of params) ─► derivation_of ─► Derivation ─► programs and facts
+
+One lowering gives all quantities of a state together: L, p, M, the forces, G, γ, … (`Motion.quantities`); a program for
+some of them is cut out of that one. What is solved for (accelerations, multipliers, the steps back to the constraints)
+is written down as formulas in JAX on scalars, which call these programs, and lowered once more: an elimination that is
+written in `jnp` costs nothing to test, and its derivatives are JAX's.
+
+All programs take the same inputs: q, q̇, t and then every number of params, one scalar each.
+"""
+
+import functools
+import threading
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._equations._blame import pieces_of_motion
+from lagjax._equations._constraints import velocity_scales
+from lagjax._equations._linear import solve_many
+from lagjax._equations._motion import Motion
+from lagjax._equations._quantities import OwnRules, quantities
+from lagjax._equations._recursion import Recursion, RecursiveElimination
+from lagjax._equations._saddle import LARGEST_INDEFINITE, IndefiniteElimination, SaddleElimination, TwoCoordinates
+from lagjax._interface import Layout, dtype_of, is_concrete
+from lagjax._native import Projection
+from lagjax._primitives import DOUBLE
+from lagjax._program import (
+    Borders,
+    Graph,
+    Program,
+    StraightLine,
+    Unlowerable,
+    apply_function,
+    borders,
+    concatenate,
+    is_smooth,
+    lower,
+    lower_formula,
+    lower_scalars,
+    lower_solution,
+    operations_that_fit,
+    pause_collections,
+    scatter,
+    stack,
+)
+
+PyTree = Any
+
+# While it is lowered, an operation takes about a kilobyte, and two where it is written anew.
+OPERATION_BUDGET = operations_that_fit(2000)
+
+
+# Operations of all quantities beyond which JAX differentiates arrays. Derivatives of programs take 100 µs for each;
+# those of arrays 2 s for what is vectorised, as 60 bodies are (39 000: 4 s), and 13 s for an arm that is written joint
+# by joint (7600: 1 s). Doubled, the first kind loses 3 s more; halved, arms of 12 joints compile for half a minute.
+LARGEST_DIFFERENTIATED = 30_000
+
+# The order of coordinates of states far away, where a force between bodies is weak: its square is then a millionth.
+_FAR = 1e3
+
+
+class _Saddle(NamedTuple):
+    """A linear system M x − Gᵀλ = b, G x = c by the names of b (None: zero) and c, and the sign c is taken with.
+
+    `velocities` tells whether constraints on velocities belong to it.
+    """
+
+    b: str | None
+    c: str
+    sign: int
+    velocities: bool = True
+
+
+_ACCELERATION = _Saddle("force", "gamma", 1)
+_VELOCITY_STEP = _Saddle(None, "rates", -1)
+_POSITION_STEP = _Saddle(None, "residual", -1, velocities=False)
+
+
+def _lowered_once(make: Callable) -> property:
+    """A property that is made once; what could not be lowered raises the same `Unlowerable` again, without the work."""
+    name = make.__name__
+
+    @functools.wraps(make)
+    def get(self):
+        if name not in self._made:
+            with self._lock:  # programs of a large scene share one graph
+                if name not in self._made:
+                    try:
+                        with pause_collections():
+                            self._made[name] = make(self)
+                    except Unlowerable as reason:
+                        self._made[name] = reason
+        made = self._made[name]
+        if isinstance(made, Unlowerable):
+            raise Unlowerable(str(made)) from None
+        return made
+
+    return property(get)
+
+
+class Derivation:
+    """The derivation of a scene: its programs, and the facts that can be read off them.
+
+    Every program is lowered on first use. Each raises `Unlowerable`, with the end of a sentence, where
+    the scene has none: it is too large, or takes operations that have no scalar form.
+    """
+
+    def __init__(
+        self, motion: Motion, layout: Layout, params: PyTree, refusal: str | None = None, unhashable: str | None = None
+    ):
+        """`params` holds numbers or shapes of numbers; `refusal` says why a scene must not be lowered at all.
+
+        `unhashable` says why this derivation cannot be kept for the next time.
+        """
+        self.motion, self.layout, self.refusal, self.unhashable = motion, layout, refusal, unhashable
+        self.numbers = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), params)
+        self._made: dict[str, Any] = {}
+        self._lock = threading.RLock()
+        self._programs: dict[tuple[str, ...], Program] = {}
+        self._by_q: dict[tuple[int, ...], Program] = {}
+        self._shapes: dict[str, tuple[int, ...]] = {}
+        self._sampled: dict[float, list[tuple[np.ndarray, np.ndarray]]] = {}
+        self._recursion: Recursion | None = None  # known once the quantities are
+        self._own_rules = False
+        # Compiled functions are traced once for each of their derivatives, and all quantities share these.
+        self._traced_once: Motion = jax.tree.map(jax.jit, motion)
+
+    # ---- quantities of a state ----
+
+    @_lowered_once
+    def _whole(self) -> Program:
+        """All of `Motion.quantities` in the order of their names."""
+        if self.refusal is not None:
+            raise Unlowerable(self.refusal)
+
+        def order_values(values):
+            self._shapes = {name: values[name].shape for name in sorted(values)}
+            return [values[name] for name in self._shapes]
+
+        def trace_arrays(*leaves):
+            return order_values(self._traced_once.quantities(*jax.tree.unflatten(structure, leaves)))
+
+        def trace_scalars(expansion, leaves):
+            values, self._recursion = quantities(self.motion, expansion, self.state_shapes, leaves)
+            return order_values(values)
+
+        leaves, structure = jax.tree.flatten(self.state_shapes)
+        try:
+            return lower_scalars(trace_scalars, trace_arrays, tuple(leaves), OPERATION_BUDGET)
+        except OwnRules:
+            self._own_rules = True
+            return lower(trace_arrays, *leaves, budget=OPERATION_BUDGET)
+
+    @property
+    def _graph(self) -> Graph | None:
+        """The graph of all quantities, to which other programs are added, where it is too large to be copied."""
+        origin = self._whole.origin
+        return None if origin is None else origin.graph
+
+    def program(self, *names: str) -> Program:
+        """The program for these of `Motion.quantities`, end to end, each in C order."""
+        if names not in self._programs:
+            positions = [k for name in names for k in self._positions(name)]
+            structure = jax.tree.structure(tuple(self.state_shapes))
+
+            def chosen(*leaves):
+                values = self._traced_once.quantities(*jax.tree.unflatten(structure, leaves))
+                return [values[name] for name in names]
+
+            self._programs[names] = self._whole.select_outputs(positions, chosen)
+        return self._programs[names]
+
+    @functools.cached_property
+    def _starts(self) -> dict[str, int]:
+        ends = np.cumsum([0, *(self.count(name) for name in self._shapes)]).tolist()
+        return dict(zip(self._shapes, ends, strict=False))
+
+    def shape(self, name: str) -> tuple[int, ...]:
+        """The shape of one of `Motion.quantities`."""
+        self._whole  # noqa: B018  (its trace says what the shapes are)
+        return self._shapes[name]
+
+    def count(self, name: str) -> int:
+        """The count of numbers in one of `Motion.quantities`."""
+        return int(np.prod(self.shape(name), dtype=int))
+
+    def evaluate(self, names: Sequence[str], columns: Sequence) -> dict[str, np.ndarray]:
+        """Named quantities at S states, each of shape (S, …), in NumPy; `columns` as `Program.evaluate_many` takes."""
+        return self._split_outputs(names, self.program(*names).evaluate_many(columns))
+
+    def term_sizes(self, q, qdot, t, numbers: PyTree, names: tuple[str, ...] = ("residual", "rates")):
+        """The sizes of the terms of quantities at a state of numbers or tracers, (outputs,); 0 without programs.
+
+        The rounding of a quantity is so many times `eps`: its running error, with inputs that are rounded, too. It is
+        0.6 for 0.1 + q0 + 0.2 - q1 - 0.3 at q = 0, where the value, 0 or 6e-17, says nothing.
+        """
+        key, state = ("rounding", *names), [q, qdot, t, *jax.tree.leaves(numbers)]
+        try:
+            if key not in self._programs:
+                program = self.program(*names)
+                self._programs[key] = program.rounding_of(range(len(program.outputs)), program.size)
+            if all(map(is_concrete, state)):
+                return self._programs[key].evaluate_many(np.concatenate([np.ravel(x) for x in state]))[:, 0]
+        except Unlowerable:
+            return 0.0
+        first, *others = map(jnp.ravel, jax.lax.stop_gradient([jnp.concatenate([q, qdot, t[None]]), *state[3:]]))
+        return jnp.stack(self._programs[key].compute_outputs(first, jnp.concatenate(others) if others else ()))
+
+    def round_off(self, names: Sequence[str], columns: Sequence) -> dict[str, np.ndarray]:
+        """The rounding errors of these quantities at S states, each of shape (S, …)."""
+        return self._split_outputs(names, self.program(*names).round_off_many(columns))
+
+    def _split_outputs(self, names: Sequence[str], outputs: np.ndarray) -> dict[str, np.ndarray]:
+        rows, values, start = outputs.T, {}, 0
+        for name in names:
+            end = start + self.count(name)
+            values[name] = rows[:, start:end].reshape(len(rows), *self.shape(name))
+            start = end
+        return values
+
+    def momenta_by_q(self, momenta: tuple[int, ...]) -> Program:
+        """∂pᵢ/∂q for the coordinates i in `momenta`, shape (len(momenta), n)."""
+        if momenta not in self._by_q:
+
+            def chosen(*state):
+                return self._traced_once.momentum(*state)[jnp.asarray(momenta, int)]
+
+            self._by_q[momenta] = lower(jax.jacrev(chosen), *self.state_shapes, budget=OPERATION_BUDGET)
+        return self._by_q[momenta]
+
+    # ---- what is solved for ----
+
+    @_lowered_once
+    def acceleration(self) -> Program:
+        """q̈, then whether M, or its saddle point with the constraints, is singular.
+
+        Where L builds velocities by recursion, and that is shorter, they are eliminated, not M (see `_recursion`): the
+        last output tells where that does not hold.
+
+        With constraints M may be singular (a parameter may make it so) as long as the saddle point is not. To allow for
+        that costs three times the arithmetic. Where M is regular in general the program is therefore the regular-M
+        variant, and its last output tells where that would cost digits; there `otherwise()` is the general variant.
+        Machine code changes over where that comes about, with the numbers of the run at hand; XLA, which has to write
+        the program down before it knows them, takes the one that always holds (`Program.complete`).
+        """
+        mechanics = self._mechanics
+        if (variant := self._recursive_acceleration()) is not None:
+            return replace(variant, otherwise=lambda: self._general_acceleration, mechanics=mechanics)
+        if not self.motion.constrained or self._constant_mass or not self._regular(_ACCELERATION):
+            return self._general_acceleration
+        variant = self._solution(_ACCELERATION, regular_only=True)
+        return replace(variant, otherwise=lambda: self._general_acceleration, mechanics=mechanics)
+
+    @_lowered_once
+    def _general_acceleration(self) -> Program:
+        program, mechanics = self._solution(_ACCELERATION), self._mechanics
+        return program if mechanics is None else replace(program, mechanics=mechanics)
+
+    @_lowered_once
+    def _mechanics(self) -> StraightLine | None:
+        """The quantities that decide where L jumps (`_kick.Mechanics`), as one line; None if nothing is piecewise."""
+        if is_smooth(self.program("lagrangian", "momentum", "rates").line):
+            return None
+        names = "lagrangian", "momentum", "mass_matrix", "jacobian", "rates", "driving"
+        return self.program(*names).line
+
+    @_lowered_once
+    def multipliers(self) -> Program | None:
+        """λ, those of `constraints` first; redundant ones are zero. None without constraints."""
+        if not self.motion.constrained:
+            return None
+        system, solve = self._system(_ACCELERATION)
+
+        def multipliers(*scalars):
+            _, _, right, factors, _ = system(*scalars)
+            return -solve(factors, right)[self.layout.size :]
+
+        return lower_formula(multipliers, *self.scalar_shapes, budget=OPERATION_BUDGET, graph=self._graph)
+
+    @_lowered_once
+    def projected(self) -> Program | None:
+        """(q, q̇) after one Newton step of each kind back to the constraints, as `Motion.projected`; or None."""
+        if not self.motion.constrained:
+            return None
+        n = self.layout.size
+        velocity = self._solution(_VELOCITY_STEP)
+        position = None if self.motion.constraints.on_positions is None else self._solution(_POSITION_STEP)
+
+        def projected(*scalars):
+            q, v, rest = stack(scalars[:n]), stack(scalars[n : 2 * n]), scalars[n:]
+            if position is not None:
+                q = q + position.vector(*scalars)[:n]
+            return concatenate([q, v + velocity.vector(*(q[i] for i in range(n)), *rest)[:n]])
+
+        return lower_formula(projected, *self.scalar_shapes, budget=OPERATION_BUDGET, graph=self._graph)
+
+    @_lowered_once
+    def velocity_scales(self) -> Program | None:
+        """The `velocity_scales` of a state, (n,); None without constraints."""
+        if not self.motion.constrained:
+            return None
+        n, parts = self.layout.size, self.program("mass_matrix", "jacobian")
+
+        def scales_from_arrays(values, qdot):
+            return velocity_scales(values[: n * n].reshape(n, n), values[n * n :].reshape(-1, n), qdot)
+
+        def scales(*scalars):
+            return apply_function(scales_from_arrays, parts.vector(*scalars), stack(scalars[n : 2 * n]))
+
+        return lower_formula(scales, *self.scalar_shapes, budget=OPERATION_BUDGET, graph=self._graph)
+
+    @_lowered_once
+    def projection(self) -> Projection | None:
+        """The programs by which machine code keeps a motion on its constraints; None without any."""
+        return None if self.projected is None else Projection(self.projected, self.velocity_scales)
+
+    # ---- facts ----
+
+    def reads(self, name: str) -> frozenset[int]:
+        """The positions of the inputs that any number of this quantity depends on."""
+        return self._whole.find_inputs(self._positions(name))
+
+    def absent(self, name: str) -> np.ndarray:
+        """True for each number of this quantity that is zero whatever the state, in its shape."""
+        zeros = [self._whole.constant(k) == 0 for k in self._positions(name)]
+        return np.array(zeros, bool).reshape(self.shape(name))
+
+    def _positions(self, name: str) -> range:
+        """The outputs of the program of all quantities that are this one."""
+        count = self.count(name)  # first of all: it is the trace that says where quantities start
+        return range(self._starts[name], self._starts[name] + count)
+
+    @_lowered_once
+    def works(self) -> bool:
+        """True if anything does work: an explicit time, a force, a constraint that drives the motion."""
+        return not all(self.absent(name).all() for name in ("lagrangian_by_t", "nonconservative_force", "driving"))
+
+    @_lowered_once
+    def conserved(self) -> tuple[int, ...]:
+        """The coordinates whose momenta are constant: neither L, nor a force, nor a constraint acts on them."""
+        untouched = self.absent("generalized_force") & self.absent("jacobian").all(axis=0)
+        return tuple(np.flatnonzero(untouched).tolist())
+
+    @_lowered_once
+    def borders(self) -> Borders | None:
+        """The decisions of the accelerations along a motion, and their narrow features; None where there are none."""
+        return borders(self.acceleration, self.layout.size)
+
+    @functools.cached_property
+    def kicks(self) -> bool:
+        """True if velocities jump at borders of the motion, as L or a speed that a constraint prescribes does."""
+        if not self.motion.constrained and not pieces_of_motion(self.motion, *self.state_shapes):
+            return False  # most scenes, and the largest ones, at no cost
+        try:
+            return self.borders is not None and bool(self.borders.kicking)
+        except Unlowerable:
+            return False
+
+    @property
+    def kick_refusal(self) -> str | None:
+        """Why velocities behind a border are not known, as the end of a sentence; None where they are."""
+        if not self.kicks or (borders := self.borders) is None or borders.kick is None or not borders.kick.refused:
+            return None
+        piece, reason = borders.kick.refused[0]
+        n, read = self.layout.size, borders.read_by(borders.switches[piece])
+        inputs = (*self.layout.names, *(f"d{name}/dt" for name in self.layout.names), "t")
+        of = ", ".join(inputs[i] for i in sorted(read) if i < 2 * n + 1)
+        return (
+            f"{reason}, at a border of {of}: round it off over a width w that the motion resolves, "
+            "0.5 * (1 + jnp.tanh(x / w)) for x > 0, or take samples(..., hold='cubic') where it is sampled"
+        )
+
+    @property
+    def differentiates(self) -> bool:
+        """True if derivatives are those of programs: no function has rules of its own or looks up a table, and the
+        programs are not large."""
+        try:
+            usual = not (self._whole.looks_up or self._own_rules)
+            return usual and self.layout.dtype == DOUBLE and self._whole.operations <= LARGEST_DIFFERENTIATED
+        except Unlowerable:
+            return False
+
+    @property
+    def traced_operations(self) -> int:
+        """The scalar operations of all quantities as derived, before reduction."""
+        return self._whole.traced_operations
+
+    # ---- inputs ----
+
+    @property
+    def state_shapes(self) -> tuple:
+        """Shapes of (q, q̇, t, params), as the functions of the motion take them."""
+        q, t = jax.ShapeDtypeStruct((self.layout.size,), self.layout.dtype), jax.ShapeDtypeStruct((), self.layout.dtype)
+        return q, q, t, self.numbers
+
+    @functools.cached_property
+    def scalar_shapes(self) -> list[jax.ShapeDtypeStruct]:
+        """The shapes of the inputs of every program: q, q̇, t and every number in params, one by one."""
+        leaves = jax.tree.leaves(self.numbers)
+        numbers = [dtype for leaf in leaves for dtype in [leaf.dtype] * leaf.size]
+        dtypes = [self.layout.dtype] * (2 * self.layout.size + 1) + numbers
+        of = {dtype: jax.ShapeDtypeStruct((), dtype) for dtype in set(dtypes)}  # one for all: there may be many
+        return [of[dtype] for dtype in dtypes]
+
+    # ---- linear systems ----
+
+    def _solution(self, saddle: _Saddle, regular_only: bool = False) -> Program:
+        """x of a linear system, and then whether it is singular."""
+        system, solve = self._system(saddle, regular_only)
+        return lower_solution(
+            system, solve, self.layout.size, *self.scalar_shapes, budget=OPERATION_BUDGET, graph=self._graph
+        )
+
+    def _system(self, saddle: _Saddle, regular_only: bool = False) -> tuple[Callable, Callable]:
+        """A z = r with z = (x, −λ), as two functions of scalars.
+
+        The first gives the entries of A, r, factors of A and whether it is singular; the second z, from the factors and
+        r. With constraints M is augmented by GᵀW G, unless it is constant and regular, or `regular_only` is set:
+        that says where M is not regular enough.
+        """
+        n, m, regular = self.layout.size, self._rows(saddle), self._regular(saddle)
+        if regular is None and (self.motion.constrained or n > LARGEST_INDEFINITE):
+            raise Unlowerable("its mass matrix is not positive definite and needs pivoting")
+        zeros = self.absent("mass_matrix"), self.absent("jacobian")[:m]
+        augmented = self.motion.constrained and not (regular_only or (self._constant_mass and regular))
+        if n == 2 and not self.motion.constrained:
+            elimination = TwoCoordinates(zeros[0], self.layout.dtype)
+        elif regular is None:
+            elimination = IndefiniteElimination(zeros[0], self.layout.dtype)
+        else:
+            elimination = SaddleElimination(zeros, self.layout.dtype, augmented, regular_only)
+        if elimination.operations > OPERATION_BUDGET:
+            raise Unlowerable(
+                f"to solve for the accelerations takes some {elimination.operations} operations, more than the "
+                f"{OPERATION_BUDGET} that are expected to fit in memory"
+            )
+        parts = self._parts(saddle, elimination.entries, m)
+        count, places = len(elimination.entries), elimination.entries
+
+        def system(*scalars):
+            values = parts(*scalars)
+            entries, c, b = values[:count], values[count : count + m], values[count + m :]
+            factors, singular = elimination.factors(entries)
+            c = c if saddle.sign > 0 else -c
+            b = scatter(c[:0], np.zeros(0, int), n) if saddle.b is None else b
+            return places, entries, concatenate([b, c]), factors, singular
+
+        return system, elimination.solve
+
+    def _recursive_acceleration(self) -> Program | None:
+        """q̈ by the recursion in L; None where there is none, or where it does not hold at a sampled state."""
+        self._whole  # noqa: B018  (its trace finds the recursion)
+        if self._recursion is None or self._regular(_ACCELERATION) is None:
+            return None
+        elimination, n = RecursiveElimination(self._recursion, self.layout.dtype), self.layout.size
+        places, count = elimination.entries, len(elimination.entries)
+        positions = [*self._positions("recursion"), *self._positions("force")]
+        # The operations of the program alone are used, not its function.
+        cut = functools.cache(lambda: self._whole.select_outputs(positions, solve_dense))
+
+        def system(*scalars):
+            whole = self._whole.own_outputs(*scalars)
+            values = cut().vector(*scalars) if whole is None else whole[positions]
+            right = scatter(values[count:], np.arange(n), n + 2 * elimination.velocities)
+            return places, values[:count], right, *elimination.factors(values[:count])
+
+        def solve_dense(*scalars):  # the same function of the state, with arrays: M is eliminated
+            dense, solve = self._system(_ACCELERATION)
+            _, _, right, factors, singular = dense(*scalars)
+            return [*solve(factors, right), jnp.asarray(singular)]
+
+        program = lower_solution(
+            system,
+            elimination.solve,
+            n,
+            *self.scalar_shapes,
+            budget=OPERATION_BUDGET,
+            graph=self._graph,
+            in_jax=solve_dense,
+        )
+        return program if self._agrees(program) else None
+
+    def _agrees(self, program: Program) -> bool:
+        """True if a program for q̈ gives that of M q̈ = F at the sampled states."""
+        columns = self._columns()
+        of = self.evaluate(["mass_matrix", "force"], columns)
+        exact = solve_many(of["mass_matrix"], of["force"][:, :, None])[:, :, 0]
+        *found, singular = program.evaluate_many(columns)
+        usable = np.isfinite(exact).all(axis=1)
+        error = np.abs(np.array(found).T - exact)[usable]
+        return not singular[usable].any() and bool((error <= 1e-6 * np.abs(exact[usable]).max(initial=0)).all())
+
+    def _parts(self, saddle: _Saddle, entries: np.ndarray, constraints: int) -> Callable:
+        """A formula for these entries of M and G, the `constraints` numbers of c, and b, end to end."""
+        n, starts = self.layout.size, self._starts
+        row, column = entries.T
+        of_mass = starts["mass_matrix"] + n * row + column
+        positions = np.where(row < n, of_mass, starts["jacobian"] + n * (row - n) + column).tolist()
+        positions += range(starts[saddle.c], starts[saddle.c] + constraints)
+        if saddle.b is not None:
+            positions += range(starts[saddle.b], starts[saddle.b] + n)
+        structure = jax.tree.structure(tuple(self.state_shapes))
+
+        def chosen(*leaves):
+            values = self._traced_once.quantities(*jax.tree.unflatten(structure, leaves))
+            table = jnp.concatenate([values["mass_matrix"], values["jacobian"]])
+            right = [] if saddle.b is None else [values[saddle.b]]
+            return [table[row, column], values[saddle.c][:constraints], *right]
+
+        cut = functools.cache(lambda: self._whole.select_outputs(positions, chosen))
+
+        def parts(*scalars):
+            whole = self._whole.own_outputs(*scalars)
+            return cut().vector(*scalars) if whole is None else whole[positions]
+
+        return parts
+
+    def _rows(self, saddle: _Saddle) -> int:
+        """The number of constraints of this system; those on positions come first."""
+        return self.shape("jacobian")[0] if saddle.velocities else self.position_count
+
+    @functools.cached_property
+    def position_count(self) -> int:
+        """The number of constraints on positions, which come first."""
+        q, _, t, numbers = self.state_shapes
+        return jax.eval_shape(self._traced_once.constraints.f, q, t, numbers).size
+
+    @_lowered_once
+    def _constant_mass(self) -> bool:
+        return not self.reads("mass_matrix")
+
+    def _samples(self, reach: float) -> list[tuple[np.ndarray, np.ndarray]]:
+        """M and G at a few states that nothing speaks for, where they are finite."""
+        if reach not in self._sampled:
+            n, parts = self.layout.size, self.program("mass_matrix", "jacobian")
+            rows = parts.evaluate_many(self._columns(reach)).T
+            self._sampled[reach] = [
+                (x[: n * n].reshape(n, n), x[n * n :].reshape(-1, n)) for x in rows if np.isfinite(x).all()
+            ]
+        return self._sampled[reach]
+
+    def _columns(self, reach: float = 1.0) -> list[np.ndarray]:
+        """The inputs at these states, one array (states,) for each: of order one, but q of this order."""
+        n, columns = self.layout.size, np.random.default_rng(0).uniform(0.3, 1.2, (3, len(self.scalar_shapes))).T
+        return [reach * x for x in columns[:n]] + list(columns[n:])
+
+    def _regular(self, saddle: _Saddle) -> bool | None:
+        """True if M is regular in general: at all of the sampled states; None where it need not be positive definite.
+
+        Elimination without pivoting is for positive definite M. With constraints M may be singular, and is then
+        augmented by GᵀG. The choice is between right answers: a wrong guess is caught by the test on the pivots. A mass
+        matrix that is a series in something small, as 1/(c² r) in relativity, is positive definite where that is small:
+        a scene counts as positive definite that is so at all states near, or at all far away.
+        """
+        for reach in (1.0, _FAR):
+            if (regular := self._definite(saddle, self._samples(reach))) is not None:
+                return regular
+        return None
+
+    def _definite(self, saddle: _Saddle, samples: list[tuple[np.ndarray, np.ndarray]]) -> bool | None:
+        """True if M is regular at these samples; None where what is eliminated is not positive definite."""
+        n, m, regular = self.layout.size, self._rows(saddle), True
+        for matrix, jacobian in samples:
+            lowest, size, rows = _lowest_eigenvalue(matrix), np.abs(matrix).max(), jacobian[:m]
+            regular = regular and lowest > 1e-10 * size
+            augmented = _lowest_eigenvalue(matrix + rows.T @ rows) if m else lowest
+            if (n > 2 or m) and augmented < -1e-12 * size:
+                return None
+        return bool(regular)
+
+
+def _lowest_eigenvalue(matrix: np.ndarray) -> float:
+    diagonal = np.diagonal(matrix)
+    return float(diagonal.min() if np.array_equal(matrix, np.diag(diagonal)) else np.linalg.eigvalsh(matrix)[0])
+
+
+def columns_of(q, qdot, t, numbers: Sequence) -> list:
+    """The inputs of a program at S states: `q`, `qdot` (S, n), `t` () or (S,), and `numbers` each () or (S,)."""
+    return [*np.asarray(q).T, *np.asarray(qdot).T, np.asarray(t), *numbers]
+
+
+def numbers_of(params: PyTree) -> list:
+    """Every number in the parameters, one by one."""
+    return [x for leaf in jax.tree.leaves(params) for x in np.ravel(np.asarray(leaf))]
+
+
+# ---- made once ---------------------------------------------------------------------------------------------------
+
+
+class _Number(NamedTuple):
+    """The key of a number, or of an array of them, among the parameters."""
+
+    shape: tuple[int, ...]
+    dtype: np.dtype
+
+
+class _Structure(NamedTuple):
+    """All that decides how a scene is derived, which is structure alone, as its layout is.
+
+    `leaves` are those of the parameters: a `_Number`, or what is part of the program.
+    """
+
+    system: Any
+    layout: Layout
+    params: Any
+    leaves: tuple
+
+
+def _structure_of(leaf):
+    if type(leaf) is np.ndarray or eqx.is_array_like(leaf):
+        return _Number(np.shape(leaf), np.dtype(dtype_of(leaf)))
+    return leaf
+
+
+def derivation_of(system: Any, layout: Layout, params: PyTree) -> Derivation:
+    """The derivation of a scene with parameters of this structure, whatever their values.
+
+    It is made once for scenes, layouts and structures that are equal. Scenes whose functions hold arrays of their own
+    have no programs, as these arrays could change; those whose code cannot be hashed are derived anew each time.
+    """
+    arrays, scene = jax.tree.flatten(system)
+    if arrays:
+        numbers = eqx.filter(params, eqx.is_array_like)
+        return Derivation(
+            system._motion(layout, params), layout, numbers, "the functions of the scene hold arrays of their own"
+        )
+    leaves, tree = jax.tree.flatten(params)
+    key = _Structure(scene, layout, tree, tuple(map(_structure_of, leaves)))
+    try:
+        hash(key)
+    except TypeError as reason:
+        return _derived(key, str(reason))
+    return _derived_once(key)
+
+
+def _derived(key: _Structure, unhashable: str | None = None) -> Derivation:
+    leaves = [np.zeros(*leaf) if isinstance(leaf, _Number) else leaf for leaf in key.leaves]
+    params, system = jax.tree.unflatten(key.params, leaves), jax.tree.unflatten(key.system, [])
+    numbers = eqx.filter(params, eqx.is_array_like)
+    return Derivation(system._motion(key.layout, params), key.layout, numbers, unhashable=unhashable)
+
+
+_derived_once = functools.lru_cache(maxsize=64)(_derived)

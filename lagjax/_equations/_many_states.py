@@ -1,0 +1,160 @@
+"""`Sample`: the quantities of a scene at many states, in NumPy, for what judges a scene or a motion.
+
+They come from the programs of the scene, which compile nothing. Where a scene has none (arrays in its functions,
+operations without a scalar form, far too many of them) a `Sample` that holds the scene itself has XLA compile them;
+another one raises `Unlowerable`.
+"""
+
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._equations._derivation import Derivation, columns_of, derivation_of, numbers_of
+from lagjax._equations._linear import saddle_many
+from lagjax._interface import Layout, halves
+from lagjax._program import Program, Unlowerable, evaluate
+
+PyTree = Any
+
+SADDLE = ("mass_matrix", "force", "jacobian", "gamma")  # of M q̈ − Gᵀλ = F, G q̈ = γ
+_AT_ONCE = 2**20  # entries of mass matrices that XLA computes side by side, 8 MB: memory grows like their number
+
+
+class Sample(NamedTuple):
+    """A scene at S states: `q`, `qdot` (S, n), `t` () or (S,), and `numbers` of its parameters, () or (S,) each."""
+
+    derivation: Derivation
+    q: np.ndarray
+    qdot: np.ndarray
+    t: Any
+    numbers: Sequence
+    scene: tuple[Any, PyTree] | None = None  # the system and its parameters, where XLA may evaluate them
+
+    @classmethod
+    def from_scene(cls, system: Any, layout: Layout, q, qdot, t, params: PyTree) -> "Sample":
+        """States q, q̇ (S, n) of a scene with one set of parameters; XLA evaluates them if the scene has no programs."""
+        derivation, numbers = derivation_of(system, layout, params), numbers_of(eqx.filter(params, eqx.is_array_like))
+        return cls(derivation, q, qdot, t, numbers, (system, params))
+
+    @classmethod
+    def from_states(cls, derivation: Derivation, y: np.ndarray, t, numbers: Sequence | np.ndarray) -> "Sample":
+        """States y = (q, q̇), (S, 2n), of a scene that has programs."""
+        return cls(derivation, *halves(y), t, list(numbers))
+
+    @property
+    def columns(self) -> list:
+        """The inputs of a program."""
+        return columns_of(self.q, self.qdot, self.t, self.numbers)
+
+    def quantities(self, *names: str) -> dict[str, np.ndarray]:
+        """The quantities of `Motion.quantities` with these names, (S, …) each. Raises `Unlowerable`."""
+        try:
+            return self.derivation.evaluate(names, self.columns)
+        except Unlowerable:
+            if self.scene is None:
+                raise
+        (system, params), layout = self.scene, self.derivation.layout
+        q, qdot, t = (jnp.asarray(x, layout.dtype) for x in (self.q, self.qdot, self.t))
+        return jax.tree.map(np.asarray, _evaluate_compiled(names, system, layout, q, qdot, t, params))
+
+    def flat(self, *names: str) -> np.ndarray:
+        """The `quantities` with these names, flattened and concatenated, (S, outputs)."""
+        values = self.quantities(*names)
+        return np.concatenate([values[name].reshape(len(self.q), -1) for name in names], axis=1)
+
+    def round_off(self, *names: str) -> dict[str, np.ndarray]:
+        """The rounding errors of quantities, (S, …) each. Raises `Unlowerable`."""
+        return self.derivation.round_off(names, self.columns)
+
+    def evaluate(self, program: Program) -> np.ndarray:
+        """The outputs (S, outputs) of a program of the scene."""
+        outputs = program.evaluate_many(self.columns)
+        return np.broadcast_to(outputs, (len(outputs), len(self.q))).T
+
+    def acceleration(self) -> np.ndarray:
+        """q̈ (S, n) by the program with which a motion is followed. Raises `Unlowerable`."""
+        return self.evaluate(self.derivation.acceleration)[:, : self.derivation.layout.size]
+
+    def momenta_by_q(self, momenta: tuple[int, ...]) -> np.ndarray:
+        """∂pᵢ/∂q of the coordinates i in `momenta`, (S, len(momenta), n)."""
+        shape = len(self.q), len(momenta), self.derivation.layout.size
+        if not momenta:
+            return np.zeros(shape, self.q.dtype)
+        return self.evaluate(self.derivation.momenta_by_q(momenta)).reshape(shape)
+
+    def evaluate_in_parts(self, function: Callable, size: int, *more):
+        """`function(sample, *more)` on at most `size` states at a time; `more` are arrays (S,), or numbers for all."""
+
+        def cut(x, start):
+            return x if np.ndim(x) == 0 else x[start : start + size]
+
+        parts = []
+        for start in range(0, len(self.q), size):
+            q, qdot, t, *others = (cut(x, start) for x in (self.q, self.qdot, self.t, *more))
+            part = self._replace(q=q, qdot=qdot, t=t, numbers=[cut(x, start) for x in self.numbers])
+            parts.append(function(part, *others))
+        return parts[0] if len(parts) == 1 else jax.tree.map(lambda *some: np.concatenate(some), *parts)
+
+    def solve_acceleration(self) -> np.ndarray:
+        """q̈ (S, n) from the quantities `SADDLE`. Raises `Unlowerable`."""
+        with np.errstate(all="ignore"):
+            return solve_saddle(self.quantities(*SADDLE))[0]
+
+    def pieces(self) -> np.ndarray:
+        """A number (S,) that is another one where the accelerations decide on other pieces."""
+        borders = borders_of(self.derivation)
+        if borders is None:
+            return np.zeros(len(self.q))
+        flags = np.zeros(2 * len(borders.switches))
+        found = evaluate(borders.decide, [*self.columns, *flags])
+        return np.sqrt(np.arange(2, 2 + len(found))) @ np.where(np.isfinite(found), found, 0.5)
+
+
+def is_lowered(derivation: Derivation) -> bool:
+    """True if a scene has programs."""
+    try:
+        return bool(derivation.program("mass_matrix").shapes)
+    except Unlowerable:
+        return False
+
+
+def borders_of(derivation: Derivation):
+    """The borders of the accelerations; None where nothing is decided, or the scene has no programs."""
+    try:
+        borders = derivation.borders
+    except Unlowerable:
+        return None
+    return borders if borders is not None and borders.switches else None
+
+
+def solve_saddle(of: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """q̈ (S, n) and λ (S, m) from the quantities `SADDLE`."""
+    return saddle_many(of["mass_matrix"], of["force"], of["jacobian"], of["gamma"])
+
+
+@eqx.filter_jit
+def _evaluate_compiled(names: tuple[str, ...], system: Any, layout: Layout, q, qdot, t, params) -> dict[str, jax.Array]:
+    motion, numbers = system._motion(layout, params), eqx.filter(params, eqx.is_array_like)
+
+    def quantities_at(q, qdot, t):
+        values = motion.quantities(q, qdot, t, numbers)
+        return {name: values[name] for name in names}
+
+    if len(q) == 1:
+        return jax.tree.map(lambda x: x[None], quantities_at(q[0], qdot[0], jnp.ravel(t)[0]))
+    return map_in_chunks(quantities_at, (q, qdot, jnp.broadcast_to(t, len(q))), _AT_ONCE // layout.size**2)
+
+
+def map_in_chunks(function, arrays, size: int):
+    """`function` of each of the states in `arrays`, at most `size` of them at a time."""
+    count = len(arrays[0])
+    size = max(1, min(size, count))
+    missing = -count % size
+    padded = [jnp.concatenate([x, jnp.broadcast_to(x[-1:], (missing, *x.shape[1:]))]) for x in arrays]
+    chunks = [x.reshape(-1, size, *x.shape[1:]) for x in padded]
+    values = jax.lax.map(lambda chunk: jax.vmap(function)(*chunk), chunks)
+    return jax.tree.map(lambda x: x.reshape(x.shape[0] * size, *x.shape[2:])[:count], values)

@@ -1,0 +1,170 @@
+"""The equations of motion of a scene, derived from its Lagrangian by automatic differentiation.
+
+    p = ∂L/∂q̇        M = ∂²L/∂q̇²        M q̈ = F + Gᵀλ,  F = ∂L/∂q − (∂p/∂q) q̇ − ∂p/∂t + Q        h = p·q̇ − L
+
+Q are the generalised forces that no potential gives, and minus the velocity gradient of the Rayleigh dissipation
+function; Gᵀλ are the forces of the constraints. L may be any smooth function: nothing here assumes T − U. Everything is
+flat: q and q̇ are vectors of n coordinates. Only this module, on arrays, and `_quantities`, on scalars, differentiate a
+Lagrangian.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from lagjax._equations import _constraints, _linear
+from lagjax._equations._constraints import Constraints, Row, Time, Vector
+
+PyTree = Any
+Matrix = Float[Array, "n n"]
+Scalar = Float[Array, ""]
+
+
+class Motion(eqx.Module):
+    """A scene in flat coordinates; every function takes (q, qdot, t, params), q and qdot of shape (n,)."""
+
+    lagrangian: Callable
+    forces: Callable | None
+    dissipation: Callable | None
+    constraints: Constraints = Constraints()
+
+    # ---- without constraints ----
+
+    def momentum(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
+        """p = ∂L/∂q̇."""
+        return jax.grad(self.lagrangian, argnums=1)(q, qdot, t, params)
+
+    def mass_matrix(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Matrix:
+        """M = ∂²L/∂q̇²."""
+        return jax.hessian(self.lagrangian, argnums=1)(q, qdot, t, params)
+
+    def nonconservative_force(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
+        """Q = forces − ∂D/∂q̇."""
+        force = jnp.zeros_like(q)
+        if self.forces is not None:
+            force += self.forces(q, qdot, t, params)
+        if self.dissipation is not None:
+            force -= jax.grad(self.dissipation, argnums=1)(q, qdot, t, params)
+        return force
+
+    def generalized_force(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
+        """∂L/∂q + Q, which is dp/dt along the motion of a scene without constraints."""
+        return jax.grad(self.lagrangian)(q, qdot, t, params) + self.nonconservative_force(q, qdot, t, params)
+
+    def mass_matrix_and_force(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Matrix, Vector]:
+        """M and F = ∂L/∂q − (∂p/∂q) q̇ − ∂p/∂t + Q."""
+
+        def momentum_at_velocity(q, t):
+            return self.momentum(q, qdot, t, params)
+
+        # (∂p/∂q) q̇ + ∂p/∂t is how p changes while q moves and q̇ does not: one directional derivative.
+        _, drift = jax.jvp(momentum_at_velocity, (q, t), (qdot, jnp.ones_like(t)))
+        return self.mass_matrix(q, qdot, t, params), self.generalized_force(q, qdot, t, params) - drift
+
+    def energy(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Scalar:
+        """h = p·q̇ − L, with dh/dt = −∂L/∂t + Q·q̇ along the motion."""
+        return self.momentum(q, qdot, t, params) @ qdot - self.lagrangian(q, qdot, t, params)
+
+    def energy_and_momenta(
+        self, coordinates: tuple[int, ...], q: Vector, qdot: Vector, t: Time, params: PyTree
+    ) -> Float[Array, " 1+c"]:
+        """h, then pᵢ for the c `coordinates` i, shape (1 + c,): what may be conserved."""
+        momentum = self.momentum(q, qdot, t, params)
+        energy = momentum @ qdot - self.lagrangian(q, qdot, t, params)
+        return jnp.concatenate([energy[None], momentum[jnp.asarray(coordinates, int)]])
+
+    # ---- with constraints ----
+
+    @property
+    def constrained(self) -> bool:
+        return self.constraints.exist
+
+    def acceleration(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
+        """q̈ of M q̈ = F + Gᵀλ, G q̈ = γ; NaN where their matrix is singular."""
+        return self.solved_acceleration(q, qdot, t, params)[0]
+
+    def solved_acceleration(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Vector, Bool[Array, ""]]:
+        """q̈, and whether the matrix that it was solved with is singular (q̈ is NaN where it is)."""
+        if self.constrained:
+            acceleration, _, singular = self._solved(q, qdot, t, params)
+            return acceleration, singular
+        matrix, force = self.mass_matrix_and_force(q, qdot, t, params)
+        mass = _linear.factorize(matrix)
+        return mass.solve(force), mass.singular
+
+    def multipliers(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Row:
+        """λ, those of constraints on positions first. Of least norm where G is redundant."""
+        return self._solved(q, qdot, t, params)[1]
+
+    def constraint_force(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
+        """Gᵀλ, the generalised force that the constraints exert."""
+        return self.constraints.jacobian_and_gamma(q, qdot, t, params)[0].T @ self.multipliers(q, qdot, t, params)
+
+    def _solved(self, q, qdot, t, params) -> tuple[Vector, Row, Bool[Array, ""]]:
+        """q̈, λ and whether the saddle point of M and G is singular."""
+        matrix, force = self.mass_matrix_and_force(q, qdot, t, params)
+        return _linear.saddle(matrix, force, *self.constraints.jacobian_and_gamma(q, qdot, t, params))
+
+    def schur_complement(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Float[Array, "m m"]:
+        """G M⁻¹ Gᵀ, or G K⁻¹ Gᵀ of the same rank (see `_linear`): its rank is the number of independent constraints."""
+        jacobian, _ = self.constraints.jacobian_and_gamma(q, qdot, t, params)
+        return _linear.schur_complement(self.mass_matrix(q, qdot, t, params), jacobian)
+
+    def residual(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Row:
+        """The values of the constraints: f, then a."""
+        return self.constraints.residual(q, qdot, t, params)
+
+    def projected(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Vector, Vector]:
+        """(q, q̇) after one Newton step of each kind back to the constraints, the shortest in the metric of M."""
+        return _constraints.projected(self.mass_matrix, self.constraints, q, qdot, t, params)
+
+    def nearest_consistent(self, q: Vector, qdot: Vector, t: Time, params: PyTree, terms=0.0) -> tuple[Vector, Vector]:
+        """The consistent state that is nearest to (q, q̇) in the metric of M; NaN where it is not found."""
+        return _constraints.nearest_consistent(self.mass_matrix, self.constraints, q, qdot, t, params, terms)
+
+    # ---- all of it ----
+
+    def quantities(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> dict[str, Array]:
+        """All quantities of a single state, by name, from one round of differentiation.
+
+        - `lagrangian` (), `momentum` (n,), `mass_matrix` (n, n), `lagrangian_by_q` (n,), `lagrangian_by_t` (),
+          `energy_by_q` (n,).
+        - `force` (n,): F of M q̈ = F + Gᵀλ.
+        - `given_force` (n,): the user's forces; `dissipation` (1,) or (0,), `dissipation_by_qdot` (n,);
+          `nonconservative_force` (n,) = forces − ∂D/∂q̇; `generalized_force` (n,) = ∂L/∂q + forces − ∂D/∂q̇.
+        - `jacobian` G (m, n) and `gamma` γ (m,) of G q̈ = γ; `residual` (m,): f, a; `rates` (m,): J q̇ + ∂f/∂t, a;
+          `driving` (m,): ∂f/∂t, a(q, 0, t), by which constraints do work. m is zero without constraints.
+        """
+        state, n = (q, qdot, t, params), q.size
+        value, (by_q, momentum, by_t) = jax.value_and_grad(self.lagrangian, argnums=(0, 1, 2))(*state)
+        # One linearisation of (∂L/∂q, p) gives M, column by column, the drift (∂p/∂q) q̇ + ∂p/∂t, and (∂p/∂q)ᵀ q̇.
+        _, jvp = jax.linearize(lambda *y: jax.grad(self.lagrangian, argnums=(0, 1))(*y, params), q, qdot, t)
+        no_change, no_time = jnp.zeros_like(q), jnp.zeros_like(t)
+        matrix = jax.vmap(lambda e: jvp(no_change, e, no_time)[1], out_axes=1)(jnp.eye(n, dtype=q.dtype))
+        drift = jvp(qdot, no_change, jnp.ones_like(t))[1]
+        damping = Motion(self.lagrangian, None, self.dissipation)
+        nonconservative = self.nonconservative_force(*state)
+        jacobian, gamma = self.constraints.jacobian_and_gamma(*state)
+        return {
+            "lagrangian": value,
+            "momentum": momentum,
+            "mass_matrix": matrix,
+            "lagrangian_by_q": by_q,
+            "lagrangian_by_t": by_t,
+            "energy_by_q": jvp(no_change, qdot, no_time)[0] - by_q,
+            "force": by_q + nonconservative - drift,
+            "given_force": jnp.zeros_like(q) if self.forces is None else self.forces(*state),
+            "dissipation": jnp.zeros(0, q.dtype) if self.dissipation is None else self.dissipation(*state)[None],
+            "dissipation_by_qdot": -damping.nonconservative_force(*state),
+            "nonconservative_force": nonconservative,
+            "generalized_force": by_q + nonconservative,
+            "jacobian": jacobian,
+            "gamma": gamma,
+            "residual": self.constraints.residual(*state),
+            "rates": self.constraints.rates(*state),
+            "driving": self.constraints.driving(*state),
+        }

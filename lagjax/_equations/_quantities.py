@@ -1,0 +1,256 @@
+"""`Motion.quantities` on scalars: every function of a scene is traced as it is, and differentiated scalar by scalar.
+
+JAX differentiates whole arrays: ∂²L/∂q̇² takes as many passes over L as there are coordinates, each full of zeros that
+are folded away afterwards, and JAX takes long to trace them. On scalars only what is there is differentiated. What it
+gives is the same; `tests/equations/test_derivation.py` compares them.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+
+from lagjax._equations._constraints import Constraints
+from lagjax._equations._motion import Motion
+from lagjax._equations._recursion import Recursion, RecursiveElimination, recursion_of
+from lagjax._equations._saddle import SaddleElimination
+from lagjax._program import Derivatives, Expansion, Tape, copy_nodes, has_own_rules, inputs_of, trace_jaxpr
+
+PyTree = Any
+Ids = np.ndarray  # scalars of a graph, in the shape of the array that they stand for
+
+
+class OwnRules(Exception):
+    """A function of a scene has rules of its own for its derivatives, which only JAX can apply."""
+
+
+class _Taped(NamedTuple):
+    """A value as it is written: a tape, what its scalars are in the graph, which is the value, where inputs are."""
+
+    tape: Tape
+    nodes: list[int]
+    output: int
+    positions: dict[int, int]
+
+    @property
+    def value(self) -> Ids:
+        """The value in the graph, ()."""
+        return np.array(self.nodes[self.output], dtype=np.int64)
+
+
+class _ScalarState:
+    """A state on scalars: q (n,), q̇ (n,), t () and params as ids, by name, and the shapes that functions expect."""
+
+    def __init__(self, expansion: Expansion, shapes: tuple, leaves: list[Ids]):
+        names = ("q", "qdot", "t", "params")
+        state = jax.tree.unflatten(jax.tree.structure(shapes), leaves)
+        self.expansion, self.derivatives = expansion, Derivatives(expansion.graph)
+        self.shapes: dict[str, Any] = dict(zip(names, shapes, strict=True))
+        self.ids: dict[str, Any] = dict(zip(names, state, strict=True))
+        # Coordinates are differentiated by, one by one: those of a long array are nodes as well.
+        self.ids |= {name: expansion.real(self.ids[name]) for name in ("q", "qdot", "t")}
+
+    def evaluate(self, function: Callable, *arguments: str, at_rest: bool = False) -> Ids:
+        """The value of a function of some of q, qdot, t, params; `at_rest` with qdot = 0."""
+        values = self.ids | ({"qdot": self.zeros(self.ids["qdot"].shape)} if at_rest else {})
+        leaves = jax.tree.leaves([values[name] for name in arguments])
+        (value,) = self.expansion.run_closed(self._traced(function, *arguments), leaves)
+        return value
+
+    def taped(self, function: Callable) -> "_Taped":
+        """A function of (q, q̇, t, params) with one value, as it is written."""
+        tape = Tape(self.expansion.graph.budget)
+        written = Expansion(tape)
+        inputs = [i for leaf in jax.tree.leaves(list(self.ids.values())) for i in leaf.ravel().tolist()]
+        arguments = inputs_of(tape, jax.tree.leaves(list(self.shapes.values())))
+        (output,) = written.run_closed(self._traced(function, *self.ids), arguments)
+        self.expansion.traced_operations += written.traced_operations
+        nodes = copy_nodes(self.expansion.graph, tape, inputs)
+        return _Taped(tape, nodes, int(output), {i: k for k, i in enumerate(inputs)})
+
+    def gradient(self, of: "_Taped", *by: str, together: bool = True) -> list[Ids]:
+        """The derivatives of what is on a tape by each of some of q, qdot and t."""
+        inputs = [self.ids[name] for name in by]
+        positions = [of.positions[i] for ids in inputs for i in ids.ravel().tolist()]
+        again = [of.positions[i] for i in self.ids["qdot"].ravel().tolist()]
+        gradient = self.derivatives.gradient(of.tape, of.nodes, of.output, positions, together, again)
+        flat = np.array(gradient, dtype=np.int64)
+        ends = np.cumsum([ids.size for ids in inputs])[:-1]
+        return [part.reshape(ids.shape) for part, ids in zip(np.split(flat, ends), inputs, strict=True)]
+
+    def _traced(self, function: Callable, *arguments: str):
+        jaxpr = trace_jaxpr(function, *(self.shapes[name] for name in arguments))
+        if has_own_rules(jaxpr.jaxpr):
+            raise OwnRules
+        return jaxpr
+
+    def zeros(self, shape) -> Ids:
+        return np.full(shape, self.expansion.graph.constant(0.0, "float"))
+
+    def jacobian(self, values: Ids, by: str) -> Ids:
+        """∂valueᵢ/∂xⱼ for x = q or qdot, shape (values, n)."""
+        one = self.expansion.graph.constant(1.0, "float")
+        directions = [{i: one} for i in self.ids[by].tolist()]
+        rows, result = (
+            self.derivatives.directional_derivatives(values.tolist(), directions),
+            self.zeros((values.size, len(directions))),
+        )
+        for i, row in enumerate(rows):
+            for j, derivative in row.items():
+                result[i, j] = derivative
+        return result
+
+    def rate(self, values: Ids, q: Ids | None = None, qdot: Ids | None = None, t: bool = False) -> Ids:
+        """The rates of change of `values` while q, q̇ and t change at the rates `q`, `qdot` and 1, where given."""
+        rates: dict[int, int] = {}
+        for name, rate in (("q", q), ("qdot", qdot)):
+            if rate is not None:
+                rates |= zip(self.ids[name].tolist(), rate.tolist(), strict=True)
+        if t:
+            rates[int(self.ids["t"])] = self.expansion.graph.constant(1.0, "float")
+        return np.array(self.derivatives.directional_derivative(values.tolist(), rates), dtype=np.int64)
+
+    def zero(self, values: Ids) -> np.ndarray:
+        """True for each number that is zero whatever the state."""
+        graph = self.expansion.graph
+        return np.array([graph.value(i) == 0 for i in values.ravel().tolist()], bool).reshape(values.shape)
+
+    def varying(self, values: Ids) -> np.ndarray:
+        """True for each number that depends on q, q̇ or t."""
+        graph = self.expansion.graph
+        moving = {i for name in ("q", "qdot", "t") for i in self.ids[name].ravel().tolist()}
+        for i in self.derivatives.find_ancestors(values.ravel().tolist()):
+            if not moving.isdisjoint(graph.nodes[i][1]):
+                moving.add(i)
+        return np.array([i in moving for i in values.ravel().tolist()], bool).reshape(values.shape)
+
+    def map(self, op: str, *arrays: Ids) -> Ids:
+        """An operation, elementwise."""
+        return self.expansion.map(op, *arrays)
+
+
+def quantities(
+    motion: Motion, expansion: Expansion, shapes: tuple, leaves: list[Ids]
+) -> tuple[dict[str, Ids], Recursion | None]:
+    """`Motion.quantities`, as ids; `shapes` are those of (q, q̇, t, params) and `leaves` the ids of all their leaves.
+
+    Where accelerations take fewer operations by the recursion in L, that comes with them, and its `entries` are one
+    quantity more: `recursion` (k,). Raises `OwnRules`.
+    """
+    state, everything = _ScalarState(expansion, shapes, leaves), ("q", "qdot", "t", "params")
+    rates = {"q": state.ids["qdot"], "t": True}
+    lagrangian = state.taped(motion.lagrangian)
+    by_q, momentum, by_t, matrix, inertial = _derivatives(state, lagrangian, rates)
+    zero = state.zeros(by_q.shape)
+    forces = zero if motion.forces is None else state.evaluate(motion.forces, *everything)
+    dissipation, damping = state.zeros(0), zero
+    if motion.dissipation is not None:
+        taped = state.taped(motion.dissipation)
+        dissipation, (damping,) = taped.value, state.gradient(taped, "qdot")
+    nonconservative = state.map("sub", forces, damping)
+    generalized = state.map("add", by_q, nonconservative)
+    result = {
+        "lagrangian": lagrangian.value,
+        "momentum": momentum,
+        "mass_matrix": matrix,
+        "lagrangian_by_q": by_q,
+        "lagrangian_by_t": by_t,
+        "energy_by_q": state.map("sub", state.rate(by_q, qdot=state.ids["qdot"]), by_q),
+        "force": state.map("add", inertial, nonconservative),
+        "given_force": forces,
+        "dissipation": dissipation.reshape(-1),
+        "dissipation_by_qdot": damping,
+        "nonconservative_force": nonconservative,
+        "generalized_force": generalized,
+        **_constraint_quantities(motion.constraints, state, rates),
+    }
+    # Last of all, so that programs of scenes without one are not touched by the search.
+    recursion = _shorter_recursion(motion, state, lagrangian, matrix)
+    if recursion is not None:
+        result["recursion"] = _entries(state, recursion)
+    expansion.traced_operations += state.derivatives.operations
+    return result, recursion
+
+
+# What a Taylor series costs: a step takes about this many orders, and a sum over all lower orders half as many
+# products.
+_ORDERS = 20
+
+
+def _shorter_recursion(motion: Motion, state: _ScalarState, lagrangian: _Taped, matrix: Ids) -> Recursion | None:
+    """The recursion in L, where that takes fewer operations than to eliminate M; two coordinates have Cramer's rule."""
+    if motion.constraints.exist or len(matrix) < 3 or not state.varying(matrix).any():
+        return None
+    recursion = recursion_of(state.derivatives, int(lagrangian.value), state.ids["qdot"].tolist())
+    if recursion is None:
+        return None
+    sparse = RecursiveElimination(recursion, float)
+    dense = SaddleElimination((state.zero(matrix), np.zeros((0, len(matrix)), bool)), float, False, False)
+    if not sparse.complete:
+        return None
+    nodes, entries = matrix[tuple(dense.entries.T)].tolist(), _entries(state, recursion).tolist()
+    graph = state.expansion.graph
+    costs = (
+        _cost(state, entries, sparse.entries, *sparse.operations([graph.value(i) for i in entries])),
+        _cost(state, nodes, dense.entries, dense.operations, dense.solution_operations),
+    )
+    return recursion if all(a < b for a, b in zip(*costs, strict=True)) else None
+
+
+def _cost(
+    state: _ScalarState, nodes: list[int], places: np.ndarray, operations: int, solution: int
+) -> tuple[int, float]:
+    """The operations of an elimination with its matrix, whose `nodes` stand at these places, and those of a step."""
+    operations += state.derivatives.size(nodes)
+    sums = np.where(places[:, 0] == places[:, 1], 1, 2)[state.varying(np.array(nodes))].sum()
+    return operations, operations + _ORDERS * (solution + (2 + _ORDERS / 2) * float(sums))
+
+
+def _entries(state: _ScalarState, recursion: Recursion) -> Ids:
+    minus = state.expansion.graph.constant(-1.0, "float")
+    return np.array([minus if i is None else i for i in recursion.entries.values()])
+
+
+# Scalars of a tape beyond which cotangents of equal scalars are always taken together: what they would hide is that
+# terms of sums cancel, and sums of many terms are not compared.
+_APART = 5000
+# The part of its operations that one form must save to be preferred: less is within what later passes may change.
+_SHORTER = 0.97
+
+
+def _derivatives(state: _ScalarState, lagrangian: _Taped, rates: dict) -> tuple[Ids, Ids, Ids, Ids, Ids]:
+    """∂L/∂q, p, ∂L/∂t, M, and ∂L/∂q − (∂p/∂q) q̇ − ∂p/∂t, in the form that takes fewer operations.
+
+    In a kinetic energy of rotations the terms of ∂L/∂q cancel with those of (∂p/∂q) q̇. Where the cotangents of equal
+    scalars are added up at once, that is not seen: where cos q is in the kinetic and in the potential energy, one term
+    cancels and the other does not. For forces between many bodies to add them up at once is a quarter shorter.
+    """
+    forms = []
+    for together in (True, False) if len(lagrangian.tape.nodes) <= _APART else (True,):
+        by_q, momentum, by_t = state.gradient(lagrangian, "q", "qdot", "t", together=together)
+        matrix = state.jacobian(momentum, "qdot")
+        matrix = np.where(np.tri(len(matrix), dtype=bool), matrix, matrix.T)
+        inertial = state.map("sub", by_q, state.rate(momentum, **rates))
+        forms.append((by_q, momentum, by_t, matrix, inertial))
+    if len(forms) == 1:
+        return forms[0]
+    sizes = [state.derivatives.size([*matrix.ravel().tolist(), *inertial.tolist()]) for *_, matrix, inertial in forms]
+    return forms[0] if sizes[0] < _SHORTER * sizes[-1] else forms[-1]
+
+
+def _constraint_quantities(constraints: Constraints, state: _ScalarState, rates: dict) -> dict[str, Ids]:
+    f = a = at_rest = state.zeros(0)
+    if constraints.on_positions is not None:
+        f = state.evaluate(constraints.on_positions, "q", "t", "params")
+    if constraints.on_velocities is not None:
+        a = state.evaluate(constraints.on_velocities, "q", "qdot", "t", "params")
+        at_rest = state.evaluate(constraints.on_velocities, "q", "qdot", "t", "params", at_rest=True)
+    rate = state.rate(f, **rates)
+    return {
+        "jacobian": np.concatenate([state.jacobian(f, "q"), state.jacobian(a, "qdot")]),
+        "gamma": state.map("neg", np.concatenate([state.rate(rate, **rates), state.rate(a, **rates)])),
+        "residual": np.concatenate([f, a]),
+        "rates": np.concatenate([rate, a]),
+        "driving": np.concatenate([state.rate(f, t=True), at_rest]),
+    }

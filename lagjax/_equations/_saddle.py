@@ -1,0 +1,323 @@
+"""The linear system behind every acceleration on scalars: one elimination that keeps the zeros of its matrix.
+
+    M x = b                     without constraints
+    M x − Gᵀλ = b,   G x = c    with constraints: for z = (x, −λ),   A z = (b, c),   A = (M Gᵀ; G 0)
+
+A mechanism couples a part to few others, but M⁻¹ and the Schur complement G M⁻¹ Gᵀ have hardly a zero left: to
+eliminate all of M and then all constraints takes operations that grow with the cube of the number of links. Here a
+constraint is eliminated after the last of its own coordinates, and all of them in an order that fills few zeros
+(minimum degree: Tinney & Walker, Proc. IEEE 55 (1967) 1801, scheme 2). A chain of n links then costs n times a link,
+a diagonal M one division for each coordinate, and blocks of M do not meet.
+
+M positive definite needs no pivoting. What is left of M, once coordinates E and constraints C that touch only E are
+eliminated, is the mass matrix of the other coordinates where those of E move freely under C. It lies between that
+without C, which is M's own Schur complement, and that with E at rest, a block of M. The pivots of coordinates are
+therefore positive, those of constraints negative or, where a constraint depends on those before it, zero; no entry
+grows. The rank so found is that of the rows of G that came before: all their coordinates did, too.
+
+The formulas are for vectors of `Scalars` as well as for arrays of JAX: a pivot, its column of L, and what it takes off
+all that is left, at once.
+"""
+
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from lagjax._equations._linear import rank_tolerance, singular_threshold
+from lagjax._program import orthogonalize, row_weights, solve_orthogonalized
+from lagjax._program import scalars as xp
+
+# The part of a pivot that elimination has to leave for a matrix to count as regular in the regular-M variant: four
+# digits of an acceleration may be lost, and twelve remain. Twice as large, a few more states take the general variant,
+# three times as expensive; much smaller, the error of an acceleration would exceed the tolerances.
+REGULAR = 1e-4
+
+
+# Coordinates of the largest M that is solved without being positive definite: 12 000 operations, 2 CPU s of LLVM. With
+# twice as many they would be eight times as many, and diffrax begins as soon.
+LARGEST_INDEFINITE = 16
+
+
+class _Pivot(NamedTuple):
+    """One step of an elimination: the index of the pivot, those it is eliminated from, and places in vectors.
+
+    `column` has the places of Lᵢⱼ in L, and of Aᵢⱼ in A; `first`, `second` and `updated` are, for every pair of rows
+    below the pivot, their positions in the column and the place of what is taken off.
+    """
+
+    index: int
+    rows: np.ndarray
+    column: np.ndarray
+    first: np.ndarray
+    second: np.ndarray
+    updated: np.ndarray
+
+
+class SaddleElimination:
+    """A z = (b, c) as straight-line arithmetic, for one pattern of zeros: M positive (semi)definite.
+
+    `zeros` marks what is zero in M (n, n) and in G (m, n) whatever the state; m may be zero. M is `augmented` by GᵀW G,
+    W diagonal, unless it is known to be regular: GᵀW G x = GᵀW c changes neither x nor λ. Redundant rows are left out
+    of λ: the motion is the same, the multipliers are a solution but not the shortest. With `regular_only` the saddle
+    point is called singular as soon as it loses digits: where M, or what the constraints make of it, is within
+    `REGULAR` of singular. That is the regular-M variant, which takes a third of the arithmetic and leaves the rest of
+    the states to the general one.
+
+    `entries` lists the row and column of what may not be zero in M, on and below its diagonal, and then in G, whose
+    rows are numbered from n: the vectors that `factors` takes are in that order.
+    """
+
+    def __init__(self, zeros: tuple[np.ndarray, np.ndarray], dtype, augmented: bool, regular_only: bool):
+        mass_zeros, row_zeros = zeros
+        self.dtype, self.augmented, self.regular_only = dtype, augmented, regular_only
+        self.constraints, self.size = row_zeros.shape
+        touched = ~row_zeros
+        self.rows = [np.flatnonzero(row) for row in touched]
+        self.entries = np.concatenate(
+            [np.argwhere(np.tril(~mass_zeros | ~mass_zeros.T)), np.argwhere(touched) + [self.size, 0]]
+        )
+        mass = ~mass_zeros
+        if augmented:
+            mass = mass | ((touched.T.astype(float) @ touched.astype(float)) > 0)
+        self.order, filled = elimination_order(mass, touched)
+        self.massless = ~np.diagonal(mass)
+        self._place_all(filled)
+
+    def _place_all(self, filled: np.ndarray) -> None:
+        """The places in a vector of the entries of A on and below its diagonal: the diagonal, then L by columns."""
+        total, place = len(self.order), np.argsort(self.order)
+        self.slots = np.full((total, total), -1)
+        self.slots[range(total), range(total)] = range(total)
+        self.below, self.count = {}, total
+        for j in self.order:
+            rows = np.flatnonzero(filled[j] & (place > place[j]))
+            self.below[j] = rows = rows[np.argsort(place[rows])]
+            self.slots[rows, j] = self.slots[j, rows] = np.arange(self.count, self.count + len(rows))
+            self.count += len(rows)
+
+    def _pivots(self) -> Iterator[_Pivot]:
+        """The steps of the elimination, in order."""
+        for j in self.order:
+            rows = self.below[j]
+            first, second = np.tril_indices(len(rows), -1)
+            yield _Pivot(j, rows, self.slots[rows, j], first, second, self.slots[rows[first], rows[second]])
+
+    @property
+    def operations(self) -> int:
+        """About how many operations the elimination and one solution take."""
+        return sum(len(rows) * (len(rows) + 6) + 3 for rows in self.below.values())
+
+    @property
+    def solution_operations(self) -> int:
+        """About how many of them one solution takes."""
+        return sum(4 * len(rows) + 1 for rows in self.below.values())
+
+    # ---- factors ----
+
+    def factors(self, values) -> tuple[Any, Any]:
+        """The factors of M and G that `solve` needs, a tree of vectors, and whether the saddle point is singular.
+
+        `values` holds what stands at `entries`.
+        """
+        a, weighted, singular = xp.scatter(values, self.slots[tuple(self.entries.T)], self.count), None, None
+        if self.augmented:
+            a, weighted = self._weight_entries(a)
+        if self.regular_only:
+            # The constraints would have to hold a light coordinate against forces on heavy ones.
+            diagonal = a[: self.size]
+            singular = xp.fold("min", diagonal) <= REGULAR * xp.fold("max", diagonal)
+        lower, inverse, lost = self._eliminate(a)
+        return (weighted, lower, inverse), lost if singular is None else singular | lost
+
+    def _eliminate(self, a) -> tuple[Any, Any, Any]:
+        """L in the order of the pivots, D⁻¹, and whether a pivot was lost to round-off."""
+        n, total = self.size, len(self.order)
+        # What coordinates take off the diagonal, and what constraints do: in a constraint the two must stay separate.
+        taken: list[list] = [[[], []] for _ in range(total)]
+        inverse: list[Any] = [None] * total
+        columns, losses = [], []
+        for j, rows, column, first, second, updated in self._pivots():
+            lost, inverse[j] = self._pivot(j, a[j], *taken[j])
+            if lost is not None:
+                losses.append(lost)
+            if not len(rows):
+                continue
+            scaled = a[column]  # L D
+            lower = scaled * inverse[j]
+            columns.append(lower)
+            squares = lower * scaled
+            for k, i in enumerate(rows.tolist()):
+                taken[i][j >= n].append(squares[k])
+            if len(updated):
+                a = xp.replace_entries(a, updated, a[updated] - lower[first] * scaled[second])
+        lost = xp.fold("or", xp.stack(losses)) if losses else False
+        return xp.concatenate(columns) if columns else a[:0], xp.stack(inverse), lost
+
+    def _pivot(self, j: int, diagonal, of_coordinates: list, of_constraints: list) -> tuple[Any, Any]:
+        """A flag that a pivot was lost, None where that does not count, and its inverse."""
+        if j < self.size:
+            return self._mass_pivot(j, diagonal, of_coordinates + of_constraints)
+        lost, inverse = self._constraint_pivot(of_coordinates, of_constraints)
+        return (lost if self.regular_only else None), inverse
+
+    def _mass_pivot(self, j: int, diagonal, terms: list) -> tuple[Any, Any]:
+        """A flag that the rest of Mⱼⱼ is round-off, and its inverse; NaN where it is."""
+        if not terms and not self.massless[j]:
+            return diagonal == 0.0, 1.0 / diagonal
+        pivot = diagonal
+        for term in terms:
+            pivot = pivot - term
+        lost = pivot <= (REGULAR if self.regular_only else singular_threshold(self.size, self.dtype)) * diagonal
+        return lost, 1.0 / xp.where(lost, np.nan, pivot)
+
+    def _constraint_pivot(self, of_coordinates: list, of_constraints: list) -> tuple[Any, Any]:
+        """A flag that a constraint depends on those before it, and D⁻¹: it is left out then, or NaN if `regular_only`.
+
+        The pivot is −G M⁻¹ Gᵀ of this constraint, and what those before it take off that. A row that is left out
+        changes nothing where the constraints are consistent.
+        """
+        own: Any = 0.0
+        for term in of_coordinates:
+            own = own + term
+        left = own
+        for term in of_constraints:
+            left = left + term
+        lost = left <= (REGULAR if self.regular_only else rank_tolerance(self.dtype)) * own
+        if self.regular_only:
+            return lost, -1.0 / xp.where(lost, np.nan, left)
+        return lost, xp.where(lost, 0.0, -1.0 / xp.where(lost, 1.0, left))
+
+    def _weight_entries(self, a) -> tuple[Any, Any]:
+        """The entries of M + GᵀW G and of G, and the entries of W G in the order of the rows of G.
+
+        The weights are the trace of M over |Gₖ|², within a factor n of those of `augment`. They are differentiated here
+        like everything else, and a trace is smooth where a maximum is not.
+        """
+        trace, weighted, added = xp.fold("add", a[: self.size]), [], xp.scatter(a[:0], np.zeros(0, int), self.count)
+        for k, touching in enumerate(self.rows):
+            if not len(touching):
+                continue
+            row = a[self.slots[self.size + k, touching]]
+            size = xp.fold("add", row * row)
+            weighted.append(trace / xp.where(size > 0.0, size, 1.0) * row)
+            first, second = np.tril_indices(len(touching))
+            places = self.slots[touching[first], touching[second]]
+            added = xp.replace_entries(added, places, added[places] + weighted[-1][first] * row[second])
+        return a + added, xp.concatenate(weighted) if weighted else a[:0]
+
+    # ---- solution ----
+
+    def solve(self, factors: tuple[Any, Any, Any], right):
+        """x and then −λ, n + m numbers, linear in `right`: b and then c."""
+        weighted, lower, inverse = factors
+        z, n = right, self.size
+        start = 0
+        for k, touching in enumerate(self.rows if self.augmented else ()):
+            row = weighted[start : start + len(touching)]
+            z = xp.replace_entries(z, touching, z[touching] + row * z[n + k]) if len(touching) else z
+            start += len(touching)
+        start = 0
+        for j in self.order:
+            rows = self.below[j]
+            if len(rows):
+                z = xp.replace_entries(z, rows, z[rows] - lower[start : start + len(rows)] * z[j])
+            start += len(rows)
+        z = z * inverse
+        for i, (columns, places) in reversed(list(zip(self.order, self._rows_of_lower(), strict=True))):
+            if len(columns):
+                z = xp.replace_entries(z, columns, z[columns] - lower[places] * z[i])
+        return z
+
+    def _rows_of_lower(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """The columns in which L has an entry in each row, in the order of elimination, and the entries' places."""
+        total, columns = len(self.order), {i: [] for i in self.order}
+        for j in self.order:
+            for i in self.below[j].tolist():
+                columns[i].append(j)
+        for i in self.order:
+            yield (before := np.array(columns[i], int)), self.slots[i, before] - total
+
+
+class TwoCoordinates:
+    """M x = b for two coordinates, by Cramer's rule: it needs no pivoting, and takes the fewest operations.
+
+    `zeros` (2, 2) marks what is zero in M whatever the state; the rest is as in `SaddleElimination`. A determinant that
+    cancels to round-off is singularity; it is replaced by NaN.
+    """
+
+    def __init__(self, zeros: np.ndarray, dtype):
+        self.threshold, self.diagonal, self.operations = singular_threshold(2, dtype), bool(zeros[1, 0]), 16
+        self.entries = np.array([[0, 0], [1, 1]] if self.diagonal else [[0, 0], [1, 0], [1, 1]])
+
+    def factors(self, values) -> tuple[Any, Any]:
+        """The entries and the inverse determinant, or the diagonal, and whether M is singular."""
+        if self.diagonal:
+            return values, (values[0] == 0.0) | (values[1] == 0.0)
+        a, c, d = (values[k] for k in range(3))
+        product, square = a * d, c * c
+        determinant = product - square
+        singular = xp.absolute(determinant) <= self.threshold * xp.maximum(xp.absolute(product), square)
+        return xp.stack([a, c, d, 1.0 / xp.where(singular, np.nan, determinant)]), singular
+
+    def solve(self, factors, right):
+        """x, two numbers, linear in `right`."""
+        if self.diagonal:
+            return right / factors
+        a, c, d, inverse = (factors[k] for k in range(4))
+        return xp.stack([(d * right[0] - c * right[1]) * inverse, (a * right[1] - c * right[0]) * inverse])
+
+
+class IndefiniteElimination:
+    """M x = b for an M that need not be positive definite, with no more coordinates than `LARGEST_INDEFINITE`.
+
+    Its columns are made orthogonal (`_program._matrices`), where other matrices are eliminated with pivots. `zeros`
+    (n, n) marks what is zero in M whatever the state; the rest is as in `SaddleElimination`.
+    """
+
+    def __init__(self, zeros: np.ndarray, dtype):
+        self.size, self.entries = len(zeros), np.argwhere(np.tril(~zeros | ~zeros.T))
+        self.threshold = singular_threshold(self.size, dtype) ** 2
+        self.operations = 3 * self.size**3
+
+    def factors(self, values) -> tuple[Any, Any]:
+        """Q and R, and whether M is singular: what is left of a column, squared, is round-off."""
+        n, (row, column) = self.size, self.entries.T
+        places = np.full((n, n), len(self.entries))
+        places[row, column] = places[column, row] = np.arange(len(self.entries))
+        matrix = xp.concatenate([values, np.zeros(1)])[places]
+        factors, weights = orthogonalize(matrix), row_weights(matrix)
+        sizes = [xp.fold("add", weights * matrix[:, j] * matrix[:, j]) for j in range(n)]
+        lost = factors.squares <= self.threshold * xp.stack(sizes)
+        duals = xp.where(lost[:, None], np.nan, factors.duals)
+        return factors._replace(duals=duals), xp.fold("or", lost)
+
+    def solve(self, factors, right):
+        """x, linear in `right`."""
+        return solve_orthogonalized(factors, right)
+
+
+def elimination_order(mass: np.ndarray, rows: np.ndarray) -> tuple[list[int], np.ndarray]:
+    """The order in which coordinates 0 … n−1 and constraints n … n+m−1 are eliminated, and what is filled by then.
+
+    `mass` (n, n) and `rows` (m, n) mark what need not be zero; `filled` (n + m, n + m) marks that of L and Lᵀ. A
+    constraint comes after all of its coordinates, without which its pivot might be zero though it is not redundant.
+    """
+    m, n = rows.shape
+    filled = np.block([[mass | mass.T, rows.T], [rows, np.zeros((m, m), bool)]])
+    np.fill_diagonal(filled, False)
+    left, order = np.ones(n + m, bool), []
+    degree, waiting = filled.sum(axis=1), rows.sum(axis=1)
+    while left.any():
+        free = left.copy()
+        free[n:] &= waiting == 0
+        j = int(np.argmin(np.where(free, degree, n + m)))
+        order.append(j)
+        left[j] = False
+        others = np.flatnonzero(filled[j] & left)
+        filled[np.ix_(others, others)] = True
+        filled[others, others] = False
+        degree[others] = (filled[others] & left).sum(axis=1)
+        if j < n:
+            waiting -= rows[:, j]
+    return order, filled

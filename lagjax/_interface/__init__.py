@@ -1,0 +1,84 @@
+"""The border to the user's world: functions as they are called and read, numbers as they come and go, results.
+
+`_arguments` calls functions of the user: roles by position, `t` and `params` by name; `reads/` says what such a
+function reads, and whether that is still the same. `_layout` turns a pytree into a flat vector and back, and names
+coordinates. `_validate` holds what can be wrong with numbers, and the sentences for it; `_results` the result codes,
+what to try, and the exception; `_platform` the kind of device that JAX computes on, and the numbers of arrays on it.
+`_registered` is how a room calls a function of a room above.
+"""
+
+from lagjax._interface._arguments import Function, ValueNotKnown, accept, find_params_expression, present
+from lagjax._interface._layout import Layout, describe_numbers, dtype_of, flatten_numbers, halves, labelled_leaves
+from lagjax._interface._platform import compile_for_one_call, default_platform, has_nvidia_gpu, is_known, numbers_at
+from lagjax._interface._registered import PLACES, import_registered
+from lagjax._interface._results import (
+    ENDED_WELL,
+    EVENT_OCCURRED,
+    PUSHED,
+    RESULTS,
+    SUCCESSFUL,
+    SimulationError,
+    advice,
+    code_of,
+    name_of,
+    result_from,
+    show_str,
+)
+from lagjax._interface._validate import (
+    all_finite,
+    as_arrays,
+    is_concrete,
+    not_finite,
+    output_times,
+    require_budget,
+    require_concrete,
+    require_finite,
+    require_flag,
+    require_number,
+    require_numbers,
+    require_tolerance,
+)
+
+__all__ = [
+    "ENDED_WELL",
+    "EVENT_OCCURRED",
+    "PLACES",
+    "PUSHED",
+    "RESULTS",
+    "SUCCESSFUL",
+    "Function",
+    "Layout",
+    "SimulationError",
+    "ValueNotKnown",
+    "accept",
+    "advice",
+    "all_finite",
+    "as_arrays",
+    "code_of",
+    "compile_for_one_call",
+    "default_platform",
+    "describe_numbers",
+    "dtype_of",
+    "find_params_expression",
+    "flatten_numbers",
+    "halves",
+    "has_nvidia_gpu",
+    "import_registered",
+    "is_concrete",
+    "is_known",
+    "labelled_leaves",
+    "name_of",
+    "not_finite",
+    "numbers_at",
+    "output_times",
+    "present",
+    "require_budget",
+    "require_concrete",
+    "require_finite",
+    "require_flag",
+    "require_number",
+    "require_numbers",
+    "require_tolerance",
+    "result_from",
+    "show_str",
+]

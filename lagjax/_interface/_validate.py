@@ -1,0 +1,239 @@
+"""The checks of a user's numbers, before any work is done, with a sentence for each mistake.
+
+Numbers become arrays, so that a new value is never a new program. Values that are being traced (inside the user's own
+`jit`) have no number yet: for them only shapes and dtypes are checked.
+"""
+
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+
+from lagjax._interface._layout import dtype_of, labelled_leaves
+
+PyTree = Any
+
+
+def as_arrays(tree: PyTree, dtype, name: str = "params") -> PyTree:
+    """Every number as an array, so that a new value is no new program; floats in the dtype of the state.
+
+    Raises `TypeError` or `ValueError`, with the name of the leaf, for what is neither a number nor can be a part of the
+    program.
+    """
+    leaves, structure = _flatten(tree, name)
+    if not all(_is_plain(leaf, dtype) for leaf in leaves):
+        labels, leaves, structure = labelled_leaves(tree, name)
+        return structure.unflatten(_leaf_as_array(*of, dtype) for of in zip(leaves, labels, strict=True))
+    return structure.unflatten([np.asarray(leaf, dtype) if type(leaf) is float else leaf for leaf in leaves])
+
+
+def _flatten(tree: PyTree, name: str) -> tuple[list, Any]:
+    """The leaves of a pytree, whose names cost more than all else, and its structure."""
+    try:
+        return jax.tree.flatten(tree)
+    except ValueError:
+        _, leaves, structure = labelled_leaves(tree, name)  # which raises a sentence
+        return leaves, structure
+
+
+def _is_plain(leaf, dtype) -> bool:
+    """True if nothing can be wrong with a leaf: a Python float, or an array that has the dtype of the state."""
+    if type(leaf) is float:
+        return dtype != _SINGLE or _TINY <= abs(leaf) <= _HUGE or leaf == 0
+    return (type(leaf) is np.ndarray or isinstance(leaf, jax.Array)) and leaf.dtype == dtype
+
+
+def _leaf_as_array(leaf, label: str, dtype):
+    if not eqx.is_array_like(leaf):  # a function, a string: part of the program
+        _require_hashable(leaf, label)
+        return leaf
+    require_numbers(leaf, label)
+    if np.ma.is_masked(leaf):
+        raise ValueError(f"{label} is masked in places, where it has no number: fill them first.")
+    if dtype == _SINGLE and label.startswith("params"):
+        _require_single(leaf, label)
+    try:
+        return _as_array(leaf, dtype if jnp.issubdtype(jnp.result_type(leaf), jnp.floating) else None)
+    except OverflowError:
+        raise ValueError(f"{label} is too large for an integer of 64 bits: write it as a float.") from None
+
+
+def _require_single(leaf, label: str) -> None:
+    """Raise `ValueError` where float32 is too narrow for the largest number of a leaf."""
+    largest = float(np.max(np.abs(np.asarray(leaf, float)), initial=0.0)) if is_concrete(leaf) else 0.0
+    if largest and np.isfinite(largest) and not _TINY <= largest <= _HUGE and getattr(leaf, "dtype", None) != _SINGLE:
+        raise ValueError(
+            f"{label} is {largest:.3g}, and float32 holds {_TINY:.1e} to {_HUGE:.1e}: choose other units, or "
+            "call jax.config.update('jax_enable_x64', True) and pass a state of float64."
+        )
+
+
+_SINGLE, _TINY, _HUGE = np.dtype("float32"), float(np.finfo(np.float32).tiny), float(np.finfo(np.float32).max)
+
+
+def _dtype_of(value):
+    """The dtype of a number or an array of numbers; None for all else, of which NumPy has many kinds."""
+    try:
+        kind = dtype_of(value)
+    except (TypeError, ValueError):
+        return None
+    return kind if jnp.issubdtype(kind, jnp.number) or jnp.issubdtype(kind, jnp.bool_) else None
+
+
+def require_numbers(leaf, label: str) -> None:
+    """Raise `TypeError` for a leaf that is not a number or an array of numbers, of a kind that JAX knows."""
+    if _dtype_of(leaf) is None:
+        kind = getattr(leaf, "dtype", None)
+        got = type(leaf).__name__ if kind is None else f"an array of {kind}"
+        raise TypeError(f"{label} must hold numbers that JAX knows; got {got}.")
+
+
+def _require_hashable(leaf, label: str) -> None:
+    try:
+        hash(leaf)
+    except TypeError:
+        raise TypeError(
+            f"{label} is a {type(leaf).__name__}, neither a number nor hashable: it can be no part of a program."
+        ) from None
+
+
+def _as_array(x, dtype=None):
+    """An array of JAX if it is one already, else one of NumPy, which costs nothing and stays a number inside `jit`."""
+    if isinstance(x, jax.Array):
+        return x if dtype is None or x.dtype == dtype else x.astype(dtype)
+    return np.asarray(x, jnp.result_type(x) if dtype is None else dtype)
+
+
+def is_concrete(value) -> bool:
+    return not isinstance(value, Tracer)
+
+
+def require_concrete(tree: PyTree, what: str, instead: str) -> None:
+    """Raise `TypeError` where a number of `what` is being traced; `instead` is a sentence about what to do."""
+    if not all(map(is_concrete, jax.tree.leaves(tree))):
+        raise TypeError(f"{what} is being traced by jax.jit, jax.vmap or jax.grad. {instead}")
+
+
+def not_finite(tree: PyTree, name: str) -> list[tuple[str, Any]]:
+    """Every number that is NaN or infinite, with its name; values that are being traced have none yet."""
+    found = []
+    if all(_is_finite(leaf) for leaf in jax.tree.leaves(tree)):  # the names of leaves cost more than all else
+        return found
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        if eqx.is_array_like(leaf) and is_concrete(leaf) and _dtype_of(leaf) is not None:
+            values = np.asarray(leaf)
+            finite = np.isfinite(values)
+            if finite.all():
+                continue
+            label = name + jax.tree_util.keystr(path)
+            for index in np.argwhere(~finite):
+                found.append((label + (str(index.tolist()) if values.ndim else ""), values[tuple(index)]))
+    return found
+
+
+def _is_finite(leaf) -> bool:
+    """True if a leaf is an array of floats without NaN and infinity; false where that takes a closer look."""
+    return isinstance(leaf, np.ndarray | jax.Array) and is_concrete(leaf) and leaf.dtype in _FLOATS and all_finite(leaf)
+
+
+_FLOATS = (np.dtype("float64"), np.dtype("float32"))
+
+
+def all_finite(array) -> bool:
+    """True if no number of a concrete array is NaN or infinite."""
+    return bool(np.isfinite(np.asarray(array)).all())
+
+
+def require_budget(value, name: str) -> None:
+    """Raise for what is no positive integer of 32 bits, in which steps and transitions are counted."""
+    if isinstance(value, bool) or not isinstance(value, int) or value < 1:
+        raise ValueError(f"{name} must be a positive integer, so that every run ends; got {value!r}.")
+    if value >= 2**31:
+        raise ValueError(f"{name} must be less than 2**31, more than any run could use up.")
+
+
+def require_flag(value, name: str) -> None:
+    """Raise `TypeError` for what is neither true nor false."""
+    if not isinstance(value, bool | np.bool_):
+        raise TypeError(f"{name} must be True or False; got {value!r}.")
+
+
+def require_finite(tree: PyTree, name: str) -> None:
+    """Raise where a number is NaN or infinite, naming it."""
+    if bad := not_finite(tree, name):
+        where, value = bad[0]
+        raise ValueError(f"{where} is {value}: every number given must be finite.")
+
+
+def require_number(value, name: str) -> None:
+    """Raise for anything but one real number."""
+    kind = _dtype_of(value) if eqx.is_array_like(value) else None
+    if kind is None or kind == jnp.bool_ or jnp.issubdtype(kind, jnp.complexfloating):
+        raise TypeError(f"{name} must be a real number; got {value!r}.{_say_params(value)}")
+    if isinstance(value, int) and abs(value) >= 2**63:
+        raise ValueError(f"{name} is too large for an integer of 64 bits: write it as a float.")
+    if jnp.ndim(value) != 0:
+        raise ValueError(f"{name} must be one number; got shape {jnp.shape(value)}.")
+
+
+def _say_params(value) -> str:
+    """A sentence about parameters that stand in the place of a number or of times; nothing for anything else."""
+    if not isinstance(value, dict | list | tuple | eqx.Module):
+        return ""
+    return " Parameters come behind it; or name them, params=…."
+
+
+def output_times(ts, dtype) -> jax.Array | np.ndarray:
+    """The output times as an array (T,) of this dtype. Raises for what is not strictly monotonic, or not two times."""
+    if isinstance(ts, np.ndarray | jax.Array) and _is_plain(ts, dtype) and is_concrete(ts) and ts.ndim == 1:
+        values = np.asarray(ts)  # most often there is nothing to say
+        if len(values) > 1 and _is_monotonic(values) and all_finite(values):
+            return ts
+    try:
+        kind = dtype_of(ts if isinstance(ts, jax.Array) else np.asarray(ts))
+    except (TypeError, ValueError):
+        got = f"{type(ts).__name__}.{_say_params(ts)}"
+        raise TypeError(f"ts must be an array of output times; got {got}") from None
+    if np.ndim(ts) == 2:
+        raise ValueError(
+            f"ts must be one row of output times, which all members share; got shape {np.shape(ts)}. For times of "
+            "their own: jax.vmap(lambda q0, qdot0, ts: lagjax.simulate(system, q0, qdot0, ts))(q0, qdot0, ts)."
+        )
+    if np.ndim(ts) != 1 or np.size(ts) < 2:
+        raise ValueError(f"ts must hold at least two output times, ts[0] the start; got shape {np.shape(ts)}.")
+    if not (jnp.issubdtype(kind, jnp.floating) or jnp.issubdtype(kind, jnp.integer)):
+        raise TypeError(f"ts must hold real numbers; got {kind}.")
+    whole = ts if isinstance(ts, jax.Array) else np.asanyarray(ts)
+    times = whole if _is_plain(whole, dtype) else _as_array(_leaf_as_array(whole, "ts", dtype), dtype)
+    require_finite(times, "ts")
+    if is_concrete(times):
+        values = np.asarray(times)
+        if not _is_monotonic(values):
+            raise ValueError(
+                f"ts must be strictly increasing or strictly decreasing, in {np.dtype(dtype).name}; it is not between "
+                f"ts[{_first_bad_gap(np.diff(values))}] and the next."
+            )
+    return times
+
+
+def _is_monotonic(values: np.ndarray) -> bool:
+    """True if numbers increase or decrease strictly."""
+    later, earlier = values[1:], values[:-1]
+    return bool((later > earlier).all() or (later < earlier).all())
+
+
+def _first_bad_gap(gaps: np.ndarray) -> int:
+    return int(np.argmax(np.sign(gaps) != np.sign(gaps[0]))) if gaps[0] != 0 else 0
+
+
+def require_tolerance(value, name: str):
+    """The value of `rtol` or `atol`. Raises where it is not one positive number, or an rtol that is 1 or more."""
+    require_number(value, name)
+    if is_concrete(value) and not (np.isfinite(value) and value > 0):
+        raise ValueError(f"{name} must be positive; got {value}.")
+    if name == "rtol" and is_concrete(value) and value >= 1:
+        raise ValueError(f"rtol must be less than 1, which would leave no digit of the motion; got {value}.")
+    return value

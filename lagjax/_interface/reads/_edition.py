@@ -1,0 +1,335 @@
+"""`Edition`: a user's function as it is now, with what it reads.
+
+What is derived from a function is kept under its edition. On the next call `Edition.now` looks whether all that was
+read is still there; if not, the walk is gone again, and another text is another edition, under which everything is
+derived anew. Going back to former values goes back to what was derived from them. Two functions of one text, as a
+lambda in a loop gives them, are one edition.
+
+JAX keeps the traces of helpers that a function hands to it, as the branches of `jax.lax.cond` or what is under
+`jax.jit`, and finds them by the helper alone. A trace under another context is another one: see `Edition.traced`.
+"""
+
+import collections
+import contextlib
+import enum
+import functools
+import pickle
+import threading
+import types
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import jax
+import numpy as np
+from jax.core import Tracer
+
+from lagjax._interface.reads._identity import CHANGING, Walk, array_text
+from lagjax._interface.reads._marks import LARGEST_ARRAY, LARGEST_CONTAINER, SIZE, Marks
+from lagjax._interface.reads._names_in_code import ReadNames
+
+_MOST_THINGS = 2000  # functions, classes and objects of one walk, some 50 ms; what is beyond is known by its identity
+_MOST_EDITIONS = 256  # texts of one function that are known again
+_CONSTRUCTING = frozenset(
+    "__init__ __new__ __post_init__ __init_subclass__ __class_getitem__ __repr__ __str__ __del__".split()
+)
+# Part of the key under which JAX keeps traces. JAX wants it to be made before anything is traced: here.
+_context = jax.make_user_context(None)
+_inside = threading.local()  # whether a function of the user is being traced
+
+
+class Edition:
+    """A user's function together with all that it read when this edition was made; equal where both are the same."""
+
+    __slots__ = ("__weakref__", "_hash", "_held", "_watch", "function", "helped", "text", "tracers")
+
+    def __init__(self, watch: "_Watch | _Still", text: str, held: list, tracers: list, helped: bool):
+        self.function, self._watch = watch.function, watch
+        self.text, self._held, self.tracers = text, tuple(held), tuple(tracers)
+        self.helped = helped  # by other functions, whose traces JAX may keep
+        self._hash = hash(text)
+
+    @classmethod
+    def from_function(cls, function: Callable) -> "Edition":
+        is_plain = isinstance(function, types.FunctionType)
+        return (_watch_of(function) if is_plain else _Watch(function)).edition()
+
+    def trace_edition(self, function: Callable, how: str) -> "Edition":
+        """The edition of `function`, a trace of this one whose tracers are arguments; `how` says which is which.
+
+        It is one and the same edition whatever is being traced.
+        """
+        still = _Still(function)
+        still.latest = Edition(still, f"{how}: {self.text}", list(self._held), [], False)
+        return still.latest
+
+    def now(self) -> "Edition":
+        """The present edition of the same function: this one, where nothing that it reads has changed."""
+        return self._watch.edition()
+
+    def require_present(self) -> None:
+        """Raise `ValueError` where this is not the present edition."""
+        now = self.now()
+        if now is not self and now != self:
+            raise ValueError(
+                f"{_difference(self, now)} Derive the result again with the new value, or set the former one back; "
+                "values that change often belong into `params`."
+            )
+
+    def __hash__(self) -> int:
+        return self._hash
+
+    def __eq__(self, other: Any) -> bool:
+        if self is other:
+            return True
+        return isinstance(other, Edition) and self.text == other.text and _same(self._identities, other._identities)
+
+    @property
+    def _identities(self) -> tuple:
+        return (*self._held, *self.tracers)
+
+    @property
+    def __wrapped__(self) -> Callable:
+        return self.function  # with which a walk continues
+
+    def __repr__(self) -> str:
+        return repr(self.function)
+
+    def __reduce__(self):
+        """The function by name; one that has none, such as a lambda, by value, as cloudpickle packs it."""
+        try:
+            pickle.dumps(self.function)
+            return _edition_of, (self.function,)
+        except (pickle.PicklingError, AttributeError, TypeError) as reason:
+            try:
+                import cloudpickle
+            except ImportError:
+                raise pickle.PicklingError(
+                    f"{self.function!r} has no name by which another process could find it: define it with def at the "
+                    "top of a module, or pip install cloudpickle."
+                ) from reason
+            return _edition_from, (cloudpickle.dumps(self.function),)
+
+    @contextlib.contextmanager
+    def traced(self) -> Iterator[None]:
+        """While the function runs. Raises `ValueError` where it is another edition by now.
+
+        What the function itself changes while it runs (it counts its calls, it remembers results) is found out here,
+        and is not watched any more.
+        """
+        if getattr(_inside, "is_traced", False):  # what it calls is part of what was read
+            yield
+            return
+        self.require_present()
+        _inside.is_traced = True
+        try:
+            with _context(self) if self.helped else contextlib.nullcontext():
+                yield
+        finally:
+            _inside.is_traced = False
+            self._watch.settle()
+
+
+def _edition_of(function: Callable) -> Edition:
+    """The function that a pickle calls: cloudpickle would take the class with all that it reads for a method of it."""
+    return Edition.from_function(function)
+
+
+def _edition_from(packed: bytes) -> Edition:
+    return Edition.from_function(pickle.loads(packed))
+
+
+def _same(one: tuple, other: tuple) -> bool:
+    return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))
+
+
+class _Still:
+    """A function that reads nothing that could change, as a trace does."""
+
+    latest: Edition
+
+    def __init__(self, function: Callable):
+        self.function = function
+
+    def edition(self) -> Edition:
+        return self.latest
+
+    def settle(self) -> None:
+        pass
+
+
+# Places that functions change while they are traced, held under what finds them: counters, lists of calls, memories.
+# What is changed by one function, another one may read. Beyond this many the first are forgotten, and found again.
+_own: dict[tuple[int, str | None], Any] = {}
+_MOST_OWN = 1000
+
+
+class _Watch:
+    """A function, its latest edition, and where all that it read was found."""
+
+    def __init__(self, function: Callable):
+        self.function = function
+        self._lock = threading.RLock()
+        self._latest: tuple[Marks, Edition] | None = None
+        self._known: dict[tuple[str, tuple[int, ...]], Edition] = {}
+
+    def edition(self) -> Edition:
+        latest = self._latest
+        if latest is not None and latest[0].hold():
+            return latest[1]
+        with self._lock:
+            walk, text = self._walk()
+            same_as = None
+            if latest is not None and all(map(_own.__contains__, _new_places(latest[0], walk))):
+                same_as = latest[1]
+            edition = self._edition_of(walk, text, same_as)
+            self._latest = walk.marks, edition
+            return edition
+
+    def _walk(self) -> "tuple[_LiveWalk, str]":
+        names: set[str] | None = set()
+        while True:  # ends, as names only become more
+            walk = _LiveWalk(names)
+            text = walk.text(self.function)
+            if walk.names == names:
+                return walk, text
+            names = walk.names
+
+    def _edition_of(self, walk: "_LiveWalk", text: str, same_as: Edition | None) -> Edition:
+        key = text, tuple(map(id, (*walk.held, *walk.tracers)))
+        if len(self._known) >= _MOST_EDITIONS:
+            self._known.clear()
+        if same_as is not None:
+            self._known[key] = same_as
+        if key not in self._known:
+            self._known[key] = Edition(self, text, walk.held, walk.tracers, len(walk.things) > 1)
+        return self._known[key]
+
+    def settle(self) -> None:
+        """Look what has changed while the function ran: what it writes to is not watched from now on."""
+        with self._lock:
+            if self._latest is None or self._latest[0].hold():
+                return
+            walk, _ = self._walk()
+            _own.update({
+                key: place for key, place in _new_places(self._latest[0], walk).items() if walk.is_own(place, key[1])
+            })  # fmt: skip
+            for key in list(_own)[:-_MOST_OWN]:
+                _own.pop(key, None)
+        self.edition()
+
+
+def _new_places(before: Marks, now: "_LiveWalk") -> dict[tuple[int, str | None], Any]:
+    """The place that has another value now than before."""
+    known = before.keys
+    new = {key: place for key, place in now.marks.keys.items() if key not in known}
+    return new | {(id(place), key): place for place, key in before.changed() if key is not SIZE}
+
+
+# Holds the functions and what they close over; a signature and a walk take as long as a short motion.
+_watch_of = functools.lru_cache(maxsize=64)(_Watch)
+
+
+class _LiveWalk(Walk):
+    """A walk in this process: it marks where everything is, and skips attributes that no code names."""
+
+    # A mapping of another class is an object: what it gives may be made anew each time.
+    containers = (dict, types.MappingProxyType, list, tuple, set, frozenset, collections.deque)
+
+    def __init__(self, wanted: set[str] | None):
+        super().__init__()
+        self.marks = Marks()
+        self.held: list[Any] = []  # what is known by its identity
+        self.tracers: list[Any] = []
+        self.names = None if wanted is None else set(wanted)  # None: all of them
+        self._wanted = wanted
+        self._stored: set[str] = set()
+        self._of_libraries: set[int] = set()  # whose objects may remember what they like
+
+    def is_own(self, place: Any, key: str | None) -> bool:
+        """True if code that was met may have changed what is there."""
+        if key is None or self.names is None:
+            return place is not None
+        return key in self._stored or id(place) in self._of_libraries
+
+    # ---- what a walk asks for ----
+
+    def read(self, place: Any, key: Any, value: Any) -> Any:
+        if (id(place), key) in _own:
+            return CHANGING
+        self.marks.mark(place, key, value)
+        return value
+
+    def misses(self, place: dict, key: str) -> None:
+        self.marks.miss(place, key)
+
+    def counts(self, attributes: dict[str, Any], users: bool) -> None:
+        self.marks.count(attributes)
+        if not users:
+            self._of_libraries.add(id(attributes))
+
+    def meets(self, names: ReadNames) -> None:
+        self._stored |= names.stored
+        if self.names is not None:
+            self.names = None if names.reflects else self.names | names.globals | names.attributes
+
+    def wants(self, name: str, value: Any, owner: Any) -> bool:
+        if isinstance(value, functools.cached_property):
+            self._stored.add(name)
+        if self._wanted is None or name in self._wanted or isinstance(owner, enum.EnumType):
+            return True
+        if isinstance(owner, type) and name in _CONSTRUCTING:
+            return owner.__name__ in self._wanted
+        return isinstance(owner, type) and name.startswith("__")
+
+    def opaque(self, thing: Any) -> list[tuple[str, Any]]:
+        try:
+            shown = repr(thing)
+        except Exception:
+            return [("is", self._identity(thing))]
+        return [("is", self._identity(thing))] if " at 0x" in shown.lower() else [("shown", shown)]
+
+    def numbered(self, value: Any) -> str:
+        if id(value) not in self._numbers and len(self.things) >= _MOST_THINGS:
+            return self._identity(value)
+        return super().numbered(value)
+
+    def container(self, value: Any, deep: int) -> str:
+        if len(value) <= LARGEST_CONTAINER:
+            return super().container(value, deep)
+        count = len(value)
+        return CHANGING if self.read(value, None, value) is CHANGING else f"{count} in {self._identity(value)}"
+
+    def describe_array(self, array: Any) -> str:
+        if isinstance(array, Tracer):
+            return f"tracer {place_in(self.tracers, array)}: {array.shape} {array.dtype} {array.weak_type}"
+        if isinstance(array, np.ndarray):
+            if self.read(array, None, array) is CHANGING:
+                return CHANGING
+            if array.dtype == object and array.size <= LARGEST_CONTAINER:
+                return f"{array.shape} {[self.name(x) for x in array.flat]}"
+        if array.nbytes > LARGEST_ARRAY:
+            return f"{array.dtype}{array.shape} {self._identity(array)}"
+        try:
+            return array_text(array)
+        except Exception:  # an array that is not in this process, or was given away
+            return self._identity(array)
+
+    def _identity(self, thing: Any) -> str:
+        return f"{type(thing).__qualname__} {place_in(self.held, thing)}"
+
+
+def place_in(things: list, thing: Any) -> int:
+    """The place of this very thing in a list, to whose end it goes if it is not there."""
+    for k, other in enumerate(things):
+        if other is thing:
+            return k
+    things.append(thing)
+    return len(things) - 1
+
+
+def _difference(old: Edition, now: Edition) -> str:
+    """The value that a function read once, and the one that it reads now."""
+    name = getattr(old.function, "__name__", type(old.function).__name__)
+    pairs = zip(old.text.split("\n"), now.text.split("\n"), strict=False)
+    was, is_now = next(((a.strip(), b.strip()) for a, b in pairs if a != b), ("another value", "this one"))
+    return f"{name} read {was} when this was derived from it, and reads {is_now} now."

@@ -1,0 +1,354 @@
+"""A function or a value in words: its code, and all that it uses from outside, however far away that is.
+
+Two values with one text compute the same; so a store can tell whether `keep` is still the function it was begun with.
+The text of a value that went to another process by cloudpickle is the same there: no address, no order of a set, and
+nothing of what libraries keep for themselves enters. What is of an installed package is named, not read.
+"""
+
+import array
+import collections
+import dataclasses
+import enum
+import functools
+import hashlib
+import importlib.util
+import inspect
+import re
+import sys
+import types
+from collections.abc import Callable, Iterator, Mapping
+from pathlib import PurePath
+from typing import Any
+
+import jax
+import numpy as np
+
+from lagjax._interface.reads._names_in_code import ReadNames, names_of
+
+_LONG = 400  # characters of a value that is shown; of a longer one its hash
+_DEEP = 50  # containers within containers: one that is deeper contains itself
+_ATOMS = (type(None), bool, int, float, complex, str, bytes, type(Ellipsis), slice, range)
+CHANGING = "what the function itself changes"  # in the place of such a value
+_NOT_FILLED = object()  # in the place of the content of a cell whose name is assigned later
+
+
+def identity(value: Any) -> str:
+    """The text of a function or a value: a line for each function, class and object that is met."""
+    return Walk().text(value)
+
+
+class Walk:
+    """Functions, classes and objects in the order in which they are met; each of them is described once.
+
+    A subclass may look on while the walk goes from one to another (`read`), leave out attributes that no code names
+    (`wants`), and describe what has no text (`opaque`).
+    """
+
+    containers: tuple[type, ...] = (Mapping, list, tuple, set, frozenset, collections.deque)
+
+    def __init__(self):
+        self.things: list[Any] = []  # held, so that no address is used twice
+        self._numbers: dict[int, int] = {}
+
+    # ---- what a subclass may change ----
+
+    def read(self, place: Any, key: Any, value: Any) -> Any:
+        """A value that is found in a dict or an object by a key, or in a cell; with the key None the place itself.
+
+        The result is the value, or `CHANGING` in its place.
+        """
+        return value
+
+    def misses(self, place: dict, key: str) -> None:
+        """A key has no entry."""
+
+    def counts(self, attributes: dict[str, Any], users: bool) -> None:
+        """The attributes of an object, of which some are read, and others may be added; `users`: of a user's class."""
+
+    def wants(self, name: str, value: Any, owner: Any) -> bool:
+        """True if an attribute of an object, a class or a function of the user is one of the things it reads."""
+        return True
+
+    def meets(self, names: ReadNames) -> None:
+        """Code that is among what is read names these."""
+
+    def opaque(self, thing: Any) -> list[tuple[str, Any]]:
+        """The words for an object whose inside cannot be seen."""
+        return [("shown", strip_addresses(repr(thing)))]
+
+    def describe_array(self, value: Any) -> str:
+        return array_text(value)
+
+    # ---- the walk ----
+
+    def text(self, value: Any) -> str:
+        """A value in words, and under it a line for everything that has a number there."""
+        lines = [self.name(value)]
+        for k, thing in enumerate(self.things):  # which grows meanwhile
+            lines.append(f"#{k} {self.line(thing)}")
+        return "\n".join(lines)
+
+    def name(self, value: Any, deep: int = 0) -> str:
+        """A value in words; of functions, classes and objects a number, by which their line is found."""
+        kind = type(value)
+        if kind in _ATOMS:
+            return shorten(repr(value))
+        if isinstance(value, np.ndarray | np.generic | jax.Array):
+            return self.describe_array(value)
+        if isinstance(value, enum.Enum):
+            return f"{self.name(kind)}.{value.name} = {self.name(value.value, deep + 1)}"
+        if isinstance(value, _ATOMS):  # of a class of its own
+            base: Any = next(base for base in _ATOMS if isinstance(value, base))
+            return f"{self.name(kind)} {shorten(base.__repr__(value))}"
+        if isinstance(value, bytearray | array.array):
+            return self.name(type(value)) + self.describe_array(self.read(value, None, np.array(value)))
+        if isinstance(value, self.containers) and deep < _DEEP:
+            return shorten(self.container(value, deep + 1))
+        if isinstance(value, types.ModuleType):
+            return value.__name__
+        if (name := _library_name(value)) is not None:
+            return name
+        return self.numbered(value)
+
+    def numbered(self, value: Any) -> str:
+        """The number of a function, a class or an object, whose line comes later."""
+        if id(value) not in self._numbers:
+            self._numbers[id(value)] = len(self.things)
+            self.things.append(value)
+        return f"#{self._numbers[id(value)]}"
+
+    def container(self, value: Any, deep: int) -> str:
+        """A container with all that is in it, which may be containers: `deep` of them are around it."""
+        if (value := self.read(value, None, value)) is CHANGING:
+            return CHANGING
+        kind = "" if type(value) in (dict, list, tuple, set, frozenset) else self.name(type(value))
+        if isinstance(value, Mapping):
+            return kind + "{" + ", ".join(f"{_key(k)}: {self.name(x, deep)}" for k, x in list(value.items())) + "}"
+        if isinstance(value, set | frozenset):
+            return kind + "{" + ", ".join(sorted(self.name(x, deep) for x in list(value))) + "}"
+        return kind + "[" + ", ".join(self.name(x, deep) for x in list(value)) + "]"
+
+    def line(self, thing: Any) -> str:
+        """The parts of a function, a class or an object."""
+        if isinstance(thing, types.FunctionType):
+            return self._parts("function", self._function_parts(thing))
+        if isinstance(thing, type):
+            return self._parts(f"class {thing.__name__}", self._class_parts(thing))
+        if isinstance(thing, types.MethodType):
+            return self._parts("method", [("of", thing.__self__), ("function", thing.__func__)])
+        if isinstance(thing, functools.partial):
+            return self._parts("partial", [("of", thing.func), ("args", thing.args), ("keywords", thing.keywords)])
+        if isinstance(thing, property):
+            return self._parts("property", [("get", thing.fget)])
+        if (inner := _unwrap(thing)) is not None:
+            return self._parts("wrapped", [("function", inner), *self._function_attributes(thing)])
+        return self._parts(self.name(type(thing)), self._state(thing))
+
+    def _parts(self, kind: str, parts) -> str:
+        return "\n".join([kind, *(f"    {name} = {self.name(value)}" for name, value in parts)])
+
+    def _function_parts(self, function: types.FunctionType) -> Iterator[tuple[str, Any]]:
+        """The byte code, the defaults and the outer values of a function; of a library's function its closure alone."""
+        cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
+        inside = {name: value for name, cell in cells if (value := self._read_cell(cell, name)) is not _NOT_FILLED}
+        if not _is_users(function.__module__):
+            yield "name", f"{function.__module__}.{function.__qualname__}"
+            yield "code", code_text(function.__code__)  # functions made by one function have one name
+            yield from inside.items()
+            return
+        names, outer = names_of(function.__code__), function.__globals__
+        self.meets(names)
+        for name in names.globals.difference(outer):
+            self.misses(outer, name)
+        outside = {name: self.read(outer, name, outer[name]) for name in sorted(names.globals) if name in outer}
+        imported = {
+            ".".join((".",) * level) + name: _import_module(outer, level, name) for level, name, _ in names.imports
+        }
+        used = inside | outside | {name: module for name, module in imported.items() if module is not None}
+        yield "code", code_text(function.__code__)
+        yield "defaults", [function.__defaults__, function.__kwdefaults__]
+        yield from sorted(self._add_module_attributes(used, names.attributes | names.globals).items())
+        yield from self._function_attributes(function)
+
+    def _read_cell(self, cell: types.CellType, name: str) -> Any:
+        """The value in a closure cell; `_NOT_FILLED` where it is empty."""
+        try:
+            return self.read(cell, name, cell.cell_contents)
+        except ValueError:  # of a name that is assigned later
+            return _NOT_FILLED
+
+    def _function_attributes(self, function: Any) -> list[tuple[str, Any]]:
+        held, is_plain = getattr(function, "__dict__", {}), isinstance(function, types.FunctionType)
+        return [
+            (f".{name}", self.read(held, name, x))
+            for name, x in sorted(held.items())
+            if name != "__wrapped__" and (is_plain or not name.startswith("_")) and self.wants(name, x, function)
+        ]
+
+    def _add_module_attributes(self, used: dict[str, Any], names: frozenset[str]) -> dict[str, Any]:
+        """The values `used` by name, and the attributes `names` of the user's modules among them, as of `helpers.f`."""
+        found, waiting, modules = dict(used), list(used.items()), set()
+        for path, value in waiting:  # which grows meanwhile
+            if isinstance(value, types.ModuleType) and _is_users(value.__name__) and value.__name__ not in modules:
+                modules.add(value.__name__)
+                held = vars(value)
+                more = {f"{path}.{name}": self.read(held, name, held[name]) for name in sorted(names) if name in held}
+                found |= more
+                waiting += more.items()
+        return found
+
+    def _class_parts(self, kind: type) -> Iterator[tuple[str, Any]]:
+        """All that a class of the user holds, and the classes that it extends."""
+        yield "bases", [*kind.__bases__, *([] if type(kind) is type else [type(kind)])]
+        held = kind.__dict__
+        for name, value in sorted(held.items()):
+            if isinstance(value, staticmethod | classmethod):
+                inner: Any = value.__func__
+            else:
+                inner = getattr(value, "method", value)  # equinox wraps those of its modules
+            if _is_said_by_class(name, inner) and self.wants(name, inner, kind):
+                yield name, CHANGING if self.read(kind, name, value) is CHANGING else inner
+
+    def _state(self, thing: Any) -> list[tuple[str, Any]]:
+        """The attributes of an object by name; of what converts to an array, its values."""
+        try:
+            if hasattr(type(thing), "__array__") and not _is_users(type(thing).__module__):
+                return [("values", self.read(thing, None, np.asarray(thing)))]
+        except Exception:  # an object of its own kind, such as a set of tables
+            pass
+        return self._attributes(thing)
+
+    def _attributes(self, thing: Any) -> list[tuple[str, Any]]:
+        inside, users = getattr(thing, "__dict__", {}), _is_users(type(thing).__module__)
+        if not isinstance(inside, dict):
+            inside = {}
+        slots = [name for kind in type(thing).__mro__ for name in _slot_names(kind)]
+        if dataclasses.is_dataclass(thing):
+            fields = [x.name for x in dataclasses.fields(thing)]
+            held = {name: inside[name] if name in inside else getattr(thing, name, None) for name in fields}
+        else:
+            held = {name: getattr(thing, name) for name in slots if hasattr(thing, name)} | inside
+            if users:
+                held = {name: x for name, x in held.items() if self.wants(name, x, thing)}
+            else:  # not its caches, unless there is nothing else, as in what delegates to another object
+                held = {name: x for name, x in held.items() if not name.startswith("_") or _is_plain(x)} or held
+        held = {name: self.read(inside if name in inside else thing, name, x) for name, x in held.items()}
+        if held or users:
+            self.counts(inside, users)
+            return sorted(held.items())
+        return self.opaque(thing)
+
+
+def _key(key: Any) -> str:
+    return strip_addresses(repr(key))
+
+
+# Attributes of every class, which say nothing that its code does not: methods of that kind enter, values do not.
+def _is_said_by_class(name: str, value: Any) -> bool:
+    is_dunder = name.startswith("__") and name.endswith("__")
+    if is_dunder:
+        return isinstance(value, types.FunctionType | property)
+    return not isinstance(value, types.MemberDescriptorType | types.GetSetDescriptorType) and name != "_abc_impl"
+
+
+def _is_plain(value: Any) -> bool:
+    return isinstance(value, int | float | complex | str | np.ndarray | jax.Array)
+
+
+def _slot_names(kind: type) -> tuple[str, ...]:
+    """The names in the `__slots__` of a class itself, without those of its bases."""
+    slots = kind.__dict__.get("__slots__", ())
+    return (slots,) if isinstance(slots, str) else tuple(slots)
+
+
+def _import_module(names: dict[str, Any], level: int, name: str) -> types.ModuleType | None:
+    """A module that a function with these globals imports when it is called; None where there is no such module."""
+    try:
+        full = name if not level else importlib.util.resolve_name("." * level + name, names.get("__package__"))
+        return importlib.import_module(full) if _is_users(full) else sys.modules.get(full)
+    except Exception:  # whatever the user's module raises, it will raise again where the function is called
+        return None
+
+
+def _unwrap(thing: Any) -> Any:
+    """The function within one that `functools.wraps` or `jax.jit` made; None of others.
+
+    What jax.jit returns has no `__wrapped__` any more once it came from another process.
+    """
+    state = thing.__getstate__() if type(thing).__name__ == "PjitFunction" else {}
+    return getattr(thing, "__wrapped__", state.get("fun"))
+
+
+def _library_name(value: Any) -> str | None:
+    """The name of a function or a class of a library, or of one that is written in C; None of others."""
+    module, name = getattr(value, "__module__", None), getattr(value, "__qualname__", None)
+    if not isinstance(module, str) or not isinstance(name, str):
+        return None
+    if isinstance(value, types.FunctionType) and (value.__closure__ or "<" in name):
+        return None
+    compiled = not isinstance(value, type | types.FunctionType | types.MethodType) and _unwrap(value) is None
+    return f"{module}.{name}" if compiled or not _is_users(module) else None
+
+
+@functools.lru_cache(maxsize=1024)
+def _is_users(module: str | None) -> bool:
+    """True if a module is the user's: not of Python, and not of an installed package."""
+    root = (module or "__main__").split(".")[0]
+    if root == "__main__":  # whatever started it
+        return True
+    if root in sys.stdlib_module_names or root == "lagjax":
+        return False
+    places = getattr(sys.modules.get(root), "__file__", None) or ""
+    return not {"site-packages", "dist-packages"} & set(PurePath(places).parts)
+
+
+# ---- words -----------------------------------------------------------------------------------------------------------
+
+
+def source(function: Callable) -> str:
+    """The lines of a function, or its name where there are none to be read."""
+    while isinstance(function, functools.partial):
+        function = function.func
+    try:
+        return inspect.cleandoc("\n" + inspect.getsource(function))
+    except Exception:  # written in C, or at a prompt; of an object with __call__ its class is read
+        name = getattr(function, "__qualname__", type(function).__qualname__)
+        return f"<{name}, whose text cannot be read>"
+
+
+def array_text(value: Any) -> str:
+    """An array in words, a large one by its hash."""
+    try:
+        array = np.asarray(value)
+    except TypeError:  # keys of jax.random
+        array = np.asarray(jax.random.key_data(value))
+    if array.dtype == object:
+        return strip_addresses(shorten(repr(array.tolist())))
+    return f"{array.dtype} {array.tolist()}" if array.size <= 16 else f"{array.dtype}{array.shape} {hash_of(array)}"
+
+
+def hash_of(array: np.ndarray) -> str:
+    """Sixteen digits of the SHA-256 of an array's bytes."""
+    return hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()[:16]
+
+
+def strip_addresses(text: str) -> str:
+    """A text without the places of objects in memory."""
+    return re.sub(r"0x[0-9a-f]+", "0x", text)
+
+
+def shorten(text: str) -> str:
+    """A text, of a long one its beginning and its hash."""
+    return text if len(text) <= _LONG else f"{text[:40]}… {hashlib.sha256(text.encode()).hexdigest()[:16]}"
+
+
+@functools.lru_cache(maxsize=4096)
+def code_text(code: types.CodeType) -> str:
+    """A hash of what a function does, its numbers and names included; not of where it stands."""
+    inner = [code_text(x) if isinstance(x, types.CodeType) else _constant(x) for x in code.co_consts]
+    text = "\n".join([code.co_code.hex(), repr(code.co_names), repr(code.co_varnames), *inner])
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _constant(x: Any) -> str:
+    return repr(sorted(map(repr, x))) if isinstance(x, frozenset) else repr(x)

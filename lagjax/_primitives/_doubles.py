@@ -1,0 +1,273 @@
+"""Functions that compute in float64 for callers whose numbers are float32: rounded once, when all is done.
+
+While `jax_enable_x64` is off JAX has no float64. `jax.enable_x64(True)` around a part of a program turns it on for as
+long as that part is traced; it is differentiated, batched and compiled later, with the switch off, and JAX's own rules
+then mix precisions. So such a part is one primitive whose parameter is a function g of arrays, and the rules of the
+primitive turn the switch on around all that happens to g. Its derivative is a function again,
+
+    (x, v) ↦ Dg(x) v      linear in v, transposed: (x, w) ↦ Dg(x)ᵀ w
+
+and so are the derivatives of that: there are all orders in all modes. A derivative computes g(x) once more.
+"""
+
+import contextlib
+import functools
+import inspect
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray
+from jax.interpreters import ad, batching, mlir
+
+from lagjax._interface import dtype_of, is_concrete
+from lagjax._primitives._custom import VaryingPrimitive
+
+PyTree = Any
+
+SINGLE, DOUBLE = np.dtype("float32"), np.dtype("float64")
+_NARROW = {DOUBLE: SINGLE, np.dtype("complex128"): np.dtype("complex64")}
+_WIDE = {narrow: wide for wide, narrow in _NARROW.items()}
+
+
+def compute_in_doubles(function: Callable, *arguments: PyTree) -> PyTree:
+    """`function(*arguments)` in float64: of arrays that are rounded to float32 first, with arrays of float32.
+
+    Integers of the result are those that JAX has at present. What is not an array stays what it is. It works under
+    every transformation of JAX; where nothing is traced, the function is called with NumPy arrays.
+    """
+    leaves, tree = jax.tree.flatten(arguments)
+    places = [i for i, leaf in enumerate(leaves) if isinstance(leaf, jax.Array | np.ndarray | np.generic)]
+    arrays, is_on, made = [_round_array(leaves[i]) for i in places], has_doubles(), {}
+
+    def call_with_arrays(*arrays):
+        filled = list(leaves)
+        for i, array in zip(places, arrays, strict=True):
+            filled[i] = array
+        found, made["tree"] = jax.tree.flatten(function(*tree.unflatten(filled)))
+        made["others"] = [None if isinstance(x, jax.Array | np.ndarray | np.generic) else x for x in found]
+        return [x for x, other in zip(found, made["others"], strict=True) if other is None]
+
+    if all(map(is_concrete, arrays)):
+        with jax.enable_x64(True):
+            results = call_with_arrays(*map(_widen, arrays))
+            results = [_narrow_array(x, is_on) for x in results]
+    else:
+        results = computed_p.bind(*map(jnp.asarray, arrays), of=_Map(call_with_arrays), keeps_integers=is_on)
+    found = iter(results)
+    return made["tree"].unflatten([next(found) if other is None else other for other in made["others"]])
+
+
+def accepts_singles(state: tuple[str, ...], others: tuple[str, ...] = ()) -> Callable:
+    """A decorator: `compute_in_doubles` calls the function in float64 where the arguments named in `state` are float32.
+
+    The arguments named in `others`, which are numbers too, are converted with them.
+    """
+
+    def decorate(function: Callable) -> Callable:
+        signature = inspect.signature(function)
+
+        @functools.wraps(function)
+        def decorated(*args, **kwargs):
+            given = signature.bind(*args, **kwargs).arguments
+            if not _are_single([given[name] for name in state if name in given]):
+                return function(*args, **kwargs)
+            numbers = {name: given[name] for name in (*state, *others) if name in given}
+            numbers = jax.tree.map(lambda leaf: SINGLE.type(leaf) if type(leaf) is float else leaf, numbers)
+            return compute_in_doubles(lambda numbers: function(**{**given, **numbers}), numbers)
+
+        return decorated
+
+    return decorate
+
+
+def with_doubles(function: Callable) -> Callable:
+    """A decorator: the function is called with float64 on; arrays that it returns are in JAX's own precision."""
+
+    @functools.wraps(function)
+    def decorated(*args, **kwargs):
+        if has_doubles():
+            return function(*args, **kwargs)
+        return compute_in_doubles(lambda: function(*args, **kwargs))
+
+    return decorated
+
+
+def _are_single(numbers: PyTree) -> bool:
+    """True if JAX would compute with these numbers in float32. What is wrong with them is for others to say."""
+    kinds = set()
+    for leaf in jax.tree.leaves(numbers):
+        with contextlib.suppress(TypeError, ValueError):
+            kinds.add(dtype_of(leaf))
+    return SINGLE in kinds and DOUBLE not in kinds
+
+
+def has_doubles() -> bool:
+    """True if JAX has float64 at present."""
+    return jax.dtypes.canonicalize_dtype(DOUBLE) == DOUBLE
+
+
+def _round_array(array):
+    """The array in single precision, if it is of floats."""
+    return array if array.dtype not in _NARROW else array.astype(_NARROW[array.dtype])
+
+
+def widen(tree: PyTree) -> PyTree:
+    """The arrays of a pytree in NumPy, floats in double precision."""
+    return jax.tree.map(lambda x: _widen(x) if isinstance(x, jax.Array | np.ndarray | np.generic) else x, tree)
+
+
+def _widen(array) -> np.ndarray:
+    """The array in NumPy, floats in double precision."""
+    return np.asarray(array, _WIDE.get(array.dtype, array.dtype))
+
+
+def _narrow_array(array, keeps_integers: bool):
+    """The array as float32, by NumPy, which compiles nothing; what NumPy holds stays there."""
+    narrow = np.asarray(array).astype(_narrow(array.dtype, keeps_integers), copy=False)
+    return narrow if not isinstance(array, jax.Array) else jax.device_put(narrow)
+
+
+def _narrow(dtype, keeps_integers: bool) -> np.dtype:
+    dtype = np.dtype(dtype)
+    if dtype.kind in "iu" and not keeps_integers:
+        return np.dtype(f"{dtype.kind}{min(dtype.itemsize, 4)}")
+    return _NARROW.get(dtype, dtype)
+
+
+# ---- the primitive ---------------------------------------------------------------------------------------------------
+
+
+@dataclass(frozen=True, eq=False)
+class _Map:
+    """A function of arrays (*x, *v) that returns a list of arrays, and is linear in the last `linear` arguments, v.
+
+    `transposed(*x, *w)` gives the cotangents of v from those of the results. `results` are the shapes and types of
+    these, where they are known without tracing the function.
+    """
+
+    function: Callable
+    linear: int = 0
+    transposed: Callable | None = None
+    results: tuple[ShapedArray, ...] | None = None
+
+    def derivative(self, size: int, moving: tuple[int, ...], results: dict[int, ShapedArray]) -> "_Map":
+        """(*its `size` arguments, *tangents of those that are `moving`) ↦ the tangents of these `results`."""
+
+        def restrict_to_moving(arguments):
+            def function(*some):
+                given = dict(zip(moving, some, strict=True))
+                found = self.function(*(given.get(i, x) for i, x in enumerate(arguments)))
+                return [found[i] for i in results]
+
+            return function, tuple(jnp.asarray(arguments[i]) for i in moving)
+
+        def forward(*given):
+            function, at = restrict_to_moving(given[:size])
+            return jax.jvp(function, at, tuple(map(jnp.asarray, given[size:])))[1]
+
+        def back(*given):
+            function, at = restrict_to_moving(given[:size])
+            return list(jax.vjp(function, *at)[1](list(map(jnp.asarray, given[size:]))))
+
+        return _Map(forward, len(moving), back, tuple(results.values()))
+
+    def batched(self, axes: tuple, size: int) -> "_Map":
+        """The map for batches of this size along these axes of its arguments, and along the first of its results."""
+        first, back = len(axes) - self.linear, self.transposed
+
+        def transposed(*given):
+            assert back is not None
+            return jax.vmap(back, in_axes=(*axes[:first], *[0] * (len(given) - first)))(*given)
+
+        results = self.results and tuple(ShapedArray((size, *x.shape), x.dtype) for x in self.results)
+        return _Map(jax.vmap(self.function, in_axes=axes), self.linear, transposed, results)
+
+    def transpose(self, count: int, results: tuple[ShapedArray, ...]) -> "_Map":
+        """(*x, *w) ↦ the cotangents of v, which are the `results`, linear in the `count` cotangents w."""
+        assert self.transposed is not None
+        return _Map(self.transposed, count, self.function, results)
+
+
+computed_p = VaryingPrimitive("lagjax_in_doubles")
+computed_p.multiple_results = True
+
+
+@computed_p.def_abstract_eval
+def _shapes(*arrays, of: _Map, keeps_integers: bool):
+    if of.results is not None:
+        return list(of.results)
+    with jax.enable_x64(True):
+        wide = [jax.ShapeDtypeStruct(x.shape, _WIDE.get(x.dtype, x.dtype)) for x in arrays]
+        results = jax.eval_shape(of.function, *wide)
+    return [ShapedArray(x.shape, _narrow(x.dtype, keeps_integers)) for x in results]
+
+
+@computed_p.def_impl
+def _evaluate(*arrays, of: _Map, keeps_integers: bool):
+    with jax.enable_x64(True):
+        results = of.function(*map(_widen, arrays))
+        return [jax.device_put(_narrow_array(x, keeps_integers)) for x in results]
+
+
+def _lower(ctx, *arrays, of: _Map, keeps_integers: bool):
+    def rounded(*arrays):
+        results = of.function(*(x.astype(_WIDE.get(x.dtype, x.dtype)) for x in arrays))
+        return [jnp.asarray(x).astype(_narrow(x.dtype, keeps_integers)) for x in results]
+
+    with jax.enable_x64(True):
+        return mlir.lower_fun(rounded, multiple_results=True)(ctx, *arrays)
+
+
+def _jvp(primals, tangents, *, of: _Map, **settings):
+    first = len(primals) - of.linear
+    bind = functools.partial(computed_p.bind, **settings)
+    results = bind(*primals, of=of)
+    floats = {i: _shape_of(x) for i, x in enumerate(results) if jnp.issubdtype(x.dtype, jnp.inexact)}
+    parts = []
+    if not all(isinstance(x, ad.Zero) for x in tangents[first:]):
+        parts.append(bind(*primals[:first], *map(ad.instantiate_zeros, tangents[first:]), of=of))
+    moving = tuple(i for i, x in enumerate(tangents[:first]) if not isinstance(x, ad.Zero))
+    if moving:
+        derivative = of.derivative(len(primals), moving, floats)
+        parts.append(bind(*primals, *(tangents[i] for i in moving), of=derivative))
+    along: list = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in results]
+    for i, *terms in zip(floats, *parts, strict=True) if parts else ():
+        along[i] = sum(terms[1:], terms[0])
+    return results, along
+
+
+def _shape_of(x) -> ShapedArray:
+    aval = x.aval if ad.is_undefined_primal(x) else jax.typeof(x)
+    return ShapedArray(aval.shape, aval.dtype)
+
+
+def _transpose(cotangents, *arguments, of: _Map, **settings):
+    first = len(arguments) - of.linear
+    known = [ad.instantiate_zeros(x) for x in cotangents]
+    of = of.transpose(len(known), tuple(map(_shape_of, arguments[first:])))
+    found = computed_p.bind(*arguments[:first], *known, of=of, **settings)
+    linear = zip(arguments[first:], found, strict=True)
+    return [None] * first + [new if ad.is_undefined_primal(x) else None for x, new in linear]
+
+
+def _batch(arrays, axes, *, of: _Map, **settings):
+    first = len(arrays) - of.linear
+    size = next(x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not None)
+    # What it is linear in has one row a member, so that a cotangent of it has, too.
+    arrays = [
+        jnp.broadcast_to(x, (size, *x.shape)) if i >= first and axis is None else x
+        for i, (x, axis) in enumerate(zip(arrays, axes, strict=True))
+    ]
+    axes = tuple(0 if i >= first and axis is None else axis for i, axis in enumerate(axes))
+    results = computed_p.bind(*arrays, of=of.batched(axes, size), **settings)
+    return results, [0] * len(results)
+
+
+mlir.register_lowering(computed_p, _lower)
+ad.primitive_jvps[computed_p] = _jvp
+ad.primitive_transposes[computed_p] = _transpose
+batching.primitive_batchers[computed_p] = _batch

@@ -1,0 +1,208 @@
+"""Motions that did not reach their end, in a program of JAX: it raises, or is NaN in values and derivatives.
+
+A failure is known when the numbers are: at once in plain Python and under `jax.vmap` or `jax.grad` alone, at run time
+inside `jax.jit`. `raise_where_failed` is one primitive for all of them. What it returns is passed through it, so that
+the check cannot be dropped as dead code where only a derivative is used: the derivative passes through it as well.
+
+An output that was not reached has no derivative. `where` alone would make it zero in reverse mode, since its other
+branch is a constant; `nan_unless` makes it NaN wherever its cotangent is not zero.
+"""
+
+import functools
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray
+from jax.experimental.buffer_callback import buffer_callback
+from jax.interpreters import ad, batching, mlir
+
+from lagjax._interface import ENDED_WELL, RESULTS, SimulationError, advice, code_of, result_from
+from lagjax._primitives._custom import VaryingPrimitive, batch_in_front, cond_alike
+
+
+def raise_where_failed(tree, result, end, t_last, names: tuple[str, ...]):
+    """`tree` again, where its motion ended well; else `SimulationError`, naming what failed, when and in which member.
+
+    `result` holds a result code, `end` = (t, y) the time and the state (2n,) at which the motion ended, `t_last` the
+    time it was to reach, and `names` (n,) those of the coordinates. Inside `jax.jit` the error is JAX's own, and its
+    text ends with this one.
+    """
+    passed = check_p.bind(*map(jnp.asarray, (result, end[0], t_last, end[1])), names=names)
+
+    def checked(leaf):
+        if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
+            return leaf
+        return jnp.where(passed == 0, leaf, jnp.nan)
+
+    return jax.tree.map(checked, tree)
+
+
+def first_failed(result) -> tuple[int, ...] | None:
+    """The place of the first member that failed among results with any batch axes; None where all ended well."""
+    failed = np.argwhere(~np.isin(np.asarray(result), ENDED_WELL))
+    return tuple(failed[0].tolist()) if len(failed) else None
+
+
+def sentence(result, t_end, t_last, y_end, names: tuple[str, ...], why: str | None = None) -> str | None:
+    """The first failure among members with any batch axes, its time and its state; None where all ended well.
+
+    `why` stands for the advice on its result, where more is known.
+    """
+    result, t_end, t_last, y_end = map(np.asarray, (result, t_end, t_last, y_end))
+    member = first_failed(result)
+    if member is None:
+        return None
+    who = ""
+    if member:
+        label, failed = member[0] if len(member) == 1 else member, int(np.sum(~np.isin(result, ENDED_WELL)))
+        others = f", the first of {failed} that failed" if failed > 1 else ""
+        who = f" of member {label}{others} among {result.size},"
+    if result[member] == code_of(RESULTS.derivatives_lost):
+        return f"The motion{who} has no derivatives here. {advice(result_from(result[member]))}"
+    t_last, y = np.broadcast_to(t_last, result.shape)[member], y_end[member]
+    q, qdot = y[: len(names)], y[len(names) :]
+    state = ", ".join(f"{name} = {value:.6g}" for name, value in zip(names[:8], q[:8], strict=True))
+    velocity = ", ".join(f"{value:.6g}" for value in qdot[:8])
+    return (
+        f"The motion{who} could not be followed beyond t = {float(t_end[member]):.9g} of {float(t_last):.9g}. "
+        f"{why or advice(result_from(result[member]))}\nThe last state was {state}; velocities {velocity}."
+    )
+
+
+def _raise(result, t_end, t_last, y_end, *, names) -> None:
+    if text := sentence(result, t_end, t_last, y_end, names):
+        raise SimulationError(text, None)
+
+
+check_p = VaryingPrimitive("lagjax_check")
+check_p.def_abstract_eval(lambda result, t_end, *_, **__: ShapedArray(result.shape, t_end.dtype))
+
+
+@check_p.def_impl
+def _check_eagerly(result, *values, **settings):
+    _raise(*map(np.asarray, (result, *values)), **settings)
+    return jnp.zeros(jnp.shape(result), values[0].dtype)
+
+
+def _lower_with(on_host):
+    """One comparison where all is well; the host is called only where something failed."""
+
+    def check(result, *values, **settings):
+        def host(*arrays):
+            _raise(*map(np.asarray, arrays), **settings)
+
+        shape = jax.ShapeDtypeStruct(result.shape, values[0].dtype)
+        well = jnp.isin(result, jnp.asarray(ENDED_WELL, result.dtype)).all()
+        return cond_alike(well, lambda *_: jnp.zeros(shape.shape, shape.dtype), on_host(host, shape), result, *values)
+
+    return mlir.lower_fun(check, multiple_results=False)
+
+
+def _call_on_buffers(host, shape):
+    return buffer_callback(lambda _, place, *arrays: host(*arrays), shape)
+
+
+def _call_on_copies(host, shape):
+    return lambda *arrays: jax.pure_callback(lambda *x: host(*x), shape, *arrays)
+
+
+mlir.register_lowering(check_p, _lower_with(_call_on_copies))
+mlir.register_lowering(check_p, _lower_with(_call_on_buffers), platform="cpu")
+
+
+def _zero_derivative(primals, tangents, **settings):
+    passed = check_p.bind(*primals, **settings)
+    return passed, ad.Zero(jax.typeof(passed).to_tangent_aval())
+
+
+ad.primitive_jvps[check_p] = _zero_derivative
+batching.primitive_batchers[check_p] = lambda args, axes, **settings: (
+    check_p.bind(*batch_in_front(args, axes), **settings),
+    0,
+)
+
+
+# ---- outputs that were not reached -----------------------------------------------------------------------------------
+
+
+def marks_absent(function: Callable) -> Callable:
+    """A decorator for what returns NaN where there is nothing: after an event, beyond the last crossing or transition.
+
+    `jax_debug_nans` would take that for a mistake of an operation. A motion that fails has its own result and sentence.
+    """
+
+    @functools.wraps(function)
+    def decorated(*args, **kwargs):
+        with jax.debug_nans(False):
+            return function(*args, **kwargs)
+
+    return decorated
+
+
+def nan_unless(reached, x):
+    """`x` where `reached` holds, else NaN; so are its derivatives, but for the zero cotangent of an unused value."""
+    return lost_unless(reached, x, ())
+
+
+def lost_unless(reached, x, inputs):
+    """`x` where `reached` holds, else NaN; and so are its derivatives of every order by it and all floats of `inputs`.
+
+    Where a derivative is not wanted, it stays zero.
+    """
+    return nan_unless_p.bind(jnp.broadcast_to(reached, jnp.shape(x)), x, *_floats(inputs), marks=True, batch=0)
+
+
+def differentiable_where(well, x, *inputs):
+    """`x` itself, whose derivatives by it and by `inputs` are NaN unless `well` holds."""
+    return nan_unless_p.bind(jnp.broadcast_to(well, jnp.shape(x)), x, *_floats(inputs), marks=False, batch=0)
+
+
+def _floats(tree) -> list:
+    return [x for x in jax.tree.leaves(tree) if jnp.issubdtype(jnp.result_type(x), jnp.floating)]
+
+
+def _nan_unless(reached, x, *_, marks, batch):
+    return jnp.where(reached, x, jnp.nan) if marks else x
+
+
+def _nan_unless_transpose(cotangent, reached, x, *inputs, marks, batch):
+    """Of what is linear in x and in some of the inputs, with this many axes of a `batch` in front."""
+    cotangent = ad.instantiate_zeros(cotangent)
+    kept = reached | (cotangent == 0)
+    all_kept = kept.all(tuple(range(batch, kept.ndim)))
+    known = [y for y in inputs if not ad.is_undefined_primal(y)]
+
+    def lose(where, value):
+        return nan_unless_p.bind(where, value, *known, marks=True, batch=batch)
+
+    def lose_zero(linear):
+        shape = linear.aval.shape
+        where = all_kept.reshape(all_kept.shape + (1,) * (len(shape) - batch))
+        return lose(jnp.broadcast_to(where, shape), jnp.zeros(shape, linear.aval.dtype))
+
+    of_x = lose(kept, cotangent) if ad.is_undefined_primal(x) else None
+    return [None, of_x, *(lose_zero(y) if ad.is_undefined_primal(y) else None for y in inputs)]
+
+
+def _nan_unless_jvp(primals, tangents, **settings):
+    """Its derivative varies with what varies, and once more with everything."""
+    reached, x, *inputs = primals
+    moving = [t for t in tangents[2:] if not isinstance(t, ad.Zero)]
+    along = ad.instantiate_zeros(tangents[1])
+    values = nan_unless_p.bind(*primals, **settings)
+    return values, nan_unless_p.bind(reached, along, *moving, x, *inputs, **settings | {"marks": True})
+
+
+def _nan_unless_batch(args, axes, *, marks, batch):
+    return nan_unless_p.bind(*batch_in_front(args, axes), marks=marks, batch=batch + 1), 0
+
+
+nan_unless_p = VaryingPrimitive("lagjax_nan_unless")
+nan_unless_p.def_abstract_eval(lambda reached, x, *_, **__: ShapedArray(x.shape, x.dtype))
+nan_unless_p.def_impl(_nan_unless)
+mlir.register_lowering(nan_unless_p, mlir.lower_fun(_nan_unless, multiple_results=False))
+ad.primitive_jvps[nan_unless_p] = _nan_unless_jvp
+ad.primitive_transposes[nan_unless_p] = _nan_unless_transpose
+batching.primitive_batchers[nan_unless_p] = _nan_unless_batch

@@ -1,0 +1,389 @@
+"""Complex numbers on scalars: each is a pair of real ones, its real and its imaginary part.
+
+A pair has an id of its own (`Expansion.pair`), so that what only moves numbers moves pairs as well. What computes takes
+them apart: a function of z = x + iy becomes two of x and y. Logarithms, roots and powers have their branch cut on the
+negative real axis, as in JAX: it is that of atan2, a border.
+
+Fourier transforms are sums: of a length that is even, of two halves (Cooley and Tukey, Math. Comp. 19 (1965) 297).
+"""
+
+import functools
+import math
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax._program._scalars import Scalars
+from lagjax._program.lowering._rules import COMPLEX, Expansion
+
+
+class Pair(NamedTuple):
+    """Complex numbers by their parts, arrays of scalars."""
+
+    re: Scalars
+    im: Scalars
+
+    def __add__(self, other):  # type: ignore[override]
+        return Pair(self.re + other.re, self.im + other.im)
+
+    def __sub__(self, other):
+        return Pair(self.re - other.re, self.im - other.im)
+
+    def __neg__(self):
+        return Pair(-self.re, -self.im)
+
+    def __mul__(self, other):  # type: ignore[override]
+        return Pair(self.re * other.re - self.im * other.im, self.re * other.im + self.im * other.re)
+
+    @property
+    def is_real(self) -> bool:
+        """True if the imaginary part is zero whatever the numbers."""
+        graph = self.im.expansion.graph
+        return all(graph.value(i) == 0 for i in self.im.ids.ravel().tolist())
+
+    @property
+    def square(self) -> Scalars:
+        """|z|²."""
+        return self.re * self.re if self.is_real else self.re * self.re + self.im * self.im
+
+    @property
+    def angle(self) -> Scalars:
+        """The argument of z, between −π and π."""
+        return self.im.map("atan2", self.im, self.re)
+
+    @property
+    def conjugate(self) -> "Pair":
+        """x − iy."""
+        return Pair(self.re, -self.im)
+
+    @property
+    def multiply_by_i(self) -> "Pair":
+        """The product i z."""
+        return Pair(-self.im, self.re)
+
+    @property
+    def divide_by_i(self) -> "Pair":
+        """The quotient z / i = −i z."""
+        return Pair(self.im, -self.re)
+
+    def scale(self, factor) -> "Pair":
+        """The product with a real number."""
+        return Pair(self.re * factor, self.im * factor)
+
+    def shift(self, number: float) -> "Pair":
+        """The sum with a real number."""
+        return Pair(self.re + number, self.im)
+
+
+def _f(op: str, x: Scalars, *others) -> Scalars:
+    return x.map(op, x, *others)
+
+
+def _polar(size: Scalars, angle: Scalars) -> Pair:
+    return Pair(size * _f("cos", angle), size * _f("sin", angle))
+
+
+# ---- functions ------------------------------------------------------------------------------------------------------
+
+
+def _quotient(a: Pair, b: Pair) -> Pair:
+    if b.is_real:
+        return Pair(a.re / b.re, a.im / b.re)
+    product, size = a * b.conjugate, b.square
+    return Pair(product.re / size, product.im / size)
+
+
+def _inverse(z: Pair) -> Pair:
+    size = z.square
+    return Pair(z.re / size, -z.im / size)
+
+
+def _absolute(z: Pair) -> Scalars:
+    if z.is_real:
+        return _f("abs", z.re)
+    square = z.square
+    size = _f("sqrt", square)
+    z.re.expansion.moduli |= zip(size.ids.ravel().tolist(), square.ids.ravel().tolist(), strict=True)
+    return size
+
+
+def _sign(z: Pair) -> Pair:
+    """z/|z|, and 0 at 0."""
+    square = z.square
+    is_zero = _f("eq", square, 0.0)
+    size = _f("sqrt", is_zero.map("select", is_zero, square, 1.0))
+    return Pair(z.re / size, z.im / size)
+
+
+def _exponential(z: Pair) -> Pair:
+    return _polar(_f("exp", z.re), z.im)
+
+
+def _logarithm(z: Pair) -> Pair:
+    return Pair(0.5 * _f("log", z.square), z.angle)
+
+
+def _log1p(z: Pair) -> Pair:
+    return Pair(0.5 * _f("log1p", z.re * (2.0 + z.re) + z.im * z.im), z.shift(1.0).angle)
+
+
+def _expm1(z: Pair) -> Pair:
+    """eˣ cos y − 1 = (eˣ − 1) cos y − 2 sin²(y/2), which loses no digits at small z."""
+    half = _f("sin", 0.5 * z.im)
+    return Pair(_f("expm1", z.re) * _f("cos", z.im) - 2.0 * half * half, _f("exp", z.re) * _f("sin", z.im))
+
+
+def _square_root(z: Pair) -> Pair:
+    return _polar(_f("sqrt", _f("sqrt", z.square)), 0.5 * z.angle)
+
+
+def _whole_power(z: Pair, exponent: int) -> Pair:
+    """A whole power by repeated squaring; of a negative exponent the inverse."""
+    result, base, left = None, z, abs(exponent)
+    while left:
+        if left & 1:
+            result = base if result is None else result * base
+        left >>= 1
+        base = base * base if left else base
+    if result is None:
+        return Pair(1.0 + 0.0 * z.re, 0.0 * z.im)
+    return result if exponent > 0 else _inverse(result)
+
+
+def _power(z: Pair, exponent: Pair) -> Pair:
+    """|z|ᶜ e^(−d θ), turned by c θ + d log |z|, for an exponent c + id and z with the argument θ."""
+    graph = z.re.expansion.graph
+    values = {graph.value(i) for i in exponent.re.ids.ravel().tolist()} if exponent.is_real else {None}
+    value = values.pop() if len(values) == 1 else None
+    if value is not None and value == round(value) and abs(value) <= 16:
+        return _whole_power(z, int(value))
+    size = _f("pow", z.square, 0.5 * exponent.re)
+    if exponent.is_real:
+        return _polar(size, z.angle * exponent.re)
+    logarithm = _logarithm(z)
+    size = size * _f("exp", -(exponent.im * logarithm.im))
+    return _polar(size, exponent.re * logarithm.im + exponent.im * logarithm.re)
+
+
+def _sine(z: Pair) -> Pair:
+    return Pair(_f("sin", z.re) * _f("cosh", z.im), _f("cos", z.re) * _f("sinh", z.im))
+
+
+def _cosine(z: Pair) -> Pair:
+    return Pair(_f("cos", z.re) * _f("cosh", z.im), -(_f("sin", z.re) * _f("sinh", z.im)))
+
+
+def _tangent(z: Pair) -> Pair:
+    """tan x sech² y/(1 + tan² x tanh² y) and tanh y sec² x/(1 + …), written so that nothing overflows."""
+    sine, cosine, ratio = _f("sin", z.re), _f("cos", z.re), _f("tanh", z.im)
+    size = cosine * cosine + sine * sine * ratio * ratio
+    return Pair(sine * cosine * (1.0 - ratio * ratio) / size, ratio / size)
+
+
+def _arcsine(z: Pair) -> Pair:
+    """The arcsine by roots of 1 ± z, without loss (Kahan, *Branch cuts for complex elementary functions* (1987))."""
+    less, more = _square_root((-z).shift(1.0)), _square_root(z.shift(1.0))
+    product = less * more
+    return Pair(_f("atan2", z.re, product.re), _f("asinh", (less.conjugate * more).im))
+
+
+def _arccosine(z: Pair) -> Pair:
+    less, more = _square_root((-z).shift(1.0)), _square_root(z.shift(1.0))
+    return Pair(2.0 * _f("atan2", less.re, more.re), _f("asinh", (more.conjugate * less).im))
+
+
+def _inverse_hyperbolic_cosine(z: Pair) -> Pair:
+    less, more = _square_root(z.shift(-1.0)), _square_root(z.shift(1.0))
+    return Pair(_f("asinh", (less.conjugate * more).re), 2.0 * _f("atan2", less.im, more.re))
+
+
+def _inverse_hyperbolic_tangent(z: Pair) -> Pair:
+    """½ (log(1 + z) − log(1 − z))."""
+    return (_log1p(z) - _log1p(-z)).scale(0.5)
+
+
+def _derive_circular(function: Callable) -> Callable:
+    """The circular function of a hyperbolic one, or the other way about: f(z) = −i F(i z)."""
+    return lambda z: function(z.multiply_by_i).divide_by_i
+
+
+_FUNCTIONS: dict[str, Callable] = {
+    "real": lambda z: z.re,
+    "imag": lambda z: z.im,
+    "conj": lambda z: z.conjugate,
+    "neg": lambda z: -z,
+    "abs": _absolute,
+    "sign": _sign,
+    "mul": lambda a, b: a * b,
+    "div": _quotient,
+    "square": lambda z: z * z,
+    "pow": _power,
+    "sqrt": _square_root,
+    "rsqrt": lambda z: _inverse(_square_root(z)),
+    "exp": _exponential,
+    "exp2": lambda z: _exponential(z.scale(math.log(2.0))),
+    "expm1": _expm1,
+    "log": _logarithm,
+    "log1p": _log1p,
+    "logistic": lambda z: _inverse(_exponential(-z).shift(1.0)),
+    "sin": _sine,
+    "cos": _cosine,
+    "tan": _tangent,
+    "asin": _arcsine,
+    "acos": _arccosine,
+    "atan": _derive_circular(_inverse_hyperbolic_tangent),
+    "sinh": _derive_circular(_sine),
+    "cosh": lambda z: _cosine(z.multiply_by_i),
+    "tanh": _derive_circular(_tangent),
+    "asinh": _derive_circular(_arcsine),
+    "acosh": _inverse_hyperbolic_cosine,
+    "atanh": _inverse_hyperbolic_tangent,
+    "eq": lambda a, b: _f("and", _f("eq", a.re, b.re), _f("eq", a.im, b.im)),
+    "ne": lambda a, b: _f("or", _f("ne", a.re, b.re), _f("ne", a.im, b.im)),
+}
+# What is linear, or moves numbers by others: done with each part.
+_PARTWISE = (
+    "add", "sub", "add_any", "select_n", "reduce_sum", "cumsum", "gather", "dynamic_slice", "dynamic_update_slice",
+    "scatter", "scatter-add", "scatter-sub",
+)  # fmt: skip
+
+
+# ---- primitives -----------------------------------------------------------------------------------------------------
+
+
+def _pair_of(expansion: Expansion, ids: np.ndarray) -> Pair:
+    return Pair(*(Scalars(expansion, part) for part in expansion.parts(ids)))
+
+
+def _ids_of(expansion: Expansion, value: "Pair | Scalars") -> np.ndarray:
+    return value.ids if isinstance(value, Scalars) else expansion.pair(value.re.ids, value.im.ids)
+
+
+def _elementwise(name: str, function: Callable) -> Callable:
+    def rule(expansion, params, *arguments):
+        return _ids_of(expansion, function(*(_pair_of(expansion, x) for x in arguments)))
+
+    return rule
+
+
+def _partwise(name: str) -> Callable:
+    def rule(expansion, params, *arguments):
+        parts = [expansion.parts(x) if expansion.has_pairs(x) else (x, x) for x in arguments]
+        return expansion.pair(*(expansion.lower_primitive(name, params, xs) for xs in zip(*parts, strict=True)))
+
+    return rule
+
+
+COMPLEX.update({name: _elementwise(name, function) for name, function in _FUNCTIONS.items()})
+COMPLEX.update({name: _partwise(name) for name in _PARTWISE})
+
+
+def _lowers(name: str) -> Callable:
+    def register(rule):
+        COMPLEX[name] = rule
+        return rule
+
+    return register
+
+
+@_lowers("complex")
+def _complex(expansion, params, re, im):
+    return expansion.pair(*np.broadcast_arrays(re, im))
+
+
+@_lowers("convert_element_type")
+def _convert_element_type(expansion, params, x):
+    if np.issubdtype(params["new_dtype"], np.complexfloating):
+        return (
+            x
+            if expansion.has_pairs(x)
+            else expansion.pair(*expansion.parts(expansion.map("convert", x, attribute="float")))
+        )
+    return expansion.lower_primitive("convert_element_type", params, [expansion.parts(x)[0]])
+
+
+@_lowers("integer_pow")
+def _integer_pow(expansion, params, x):
+    return _ids_of(expansion, _whole_power(_pair_of(expansion, x), params["y"]))
+
+
+@_lowers("reduce_prod")
+def _product(expansion, params, x):
+    rows = np.moveaxis(x, params["axes"], range(len(params["axes"])))
+    rows = rows.reshape(-1, *rows.shape[len(params["axes"]) :])
+    if not len(rows):
+        return np.broadcast_to(expansion.constants(1.0 + 0.0j), rows.shape[1:])
+    return _ids_of(expansion, functools.reduce(lambda a, b: a * b, (_pair_of(expansion, row) for row in rows)))
+
+
+@_lowers("dot_general")
+def _dot_general(expansion, params, x, y):
+    params = {**params, "preferred_element_type": None}
+    a, b = expansion.parts(x), expansion.parts(y)
+    products = {(i, j): expansion.lower_primitive("dot_general", params, [a[i], b[j]]) for i in (0, 1) for j in (0, 1)}
+    return expansion.pair(
+        expansion.map("sub", products[0, 0], products[1, 1]), expansion.map("add", products[0, 1], products[1, 0])
+    )
+
+
+# ---- Fourier transforms ---------------------------------------------------------------------------------------------
+
+
+@_lowers("fft")
+def _fourier(expansion, params, x):
+    """Sums Σ xⱼ e^(∓2πi jk/n) along the last axes, of which that of a real transform is the last one."""
+    kind, lengths = params["fft_type"].name, params["fft_lengths"]
+    axes, turn = [x.ndim - len(lengths) + k for k in range(len(lengths))], 1 if kind.startswith("I") else -1
+    if kind == "RFFT":
+        x = _map_rows(expansion, x, axes[-1], lambda rows: _transform_rows(rows, turn)[: lengths[-1] // 2 + 1])
+        axes = axes[:-1]
+    for axis in axes[:-1] if kind == "IRFFT" else axes:
+        x = _map_rows(expansion, x, axis, lambda rows: _transform_rows(rows, turn))
+    if kind == "IRFFT":
+        x = expansion.parts(
+            _map_rows(expansion, x, axes[-1], lambda rows: _transform_rows(_complete_spectrum(rows, lengths[-1]), turn))
+        )[0]
+    if turn < 0:
+        return x
+    number = expansion.constants(1.0 / math.prod(lengths))
+    parts = [expansion.map("mul", number, part) for part in expansion.parts(x)]
+    return parts[0] if kind == "IRFFT" else expansion.pair(*parts)
+
+
+def _map_rows(expansion: Expansion, x: np.ndarray, axis: int, transform: Callable) -> np.ndarray:
+    rows = transform([_pair_of(expansion, row) for row in np.moveaxis(x, axis, 0)])
+    return np.stack([_ids_of(expansion, row) for row in rows], axis)
+
+
+def _complete_spectrum(rows: list[Pair], n: int) -> list[Pair]:
+    """All n coefficients of a real function, from those of frequencies that are not negative."""
+    first = Pair(rows[0].re, 0.0 * rows[0].im)
+    half = [first, *rows[1:]]
+    if n % 2 == 0 and n > 1:
+        half[-1] = Pair(rows[-1].re, 0.0 * rows[-1].im)
+    return half + [half[n - k].conjugate for k in range(len(half), n)]
+
+
+def _transform_rows(rows: list[Pair], turn: int) -> list[Pair]:
+    """Σⱼ rowsⱼ e^(turn 2πi jk/n) for every k."""
+    n = len(rows)
+    if n % 2 or n == 0:
+        return [
+            functools.reduce(lambda a, b: a + b, (_rotate(x, turn, j * k, n) for j, x in enumerate(rows)))
+            for k in range(n)
+        ]
+    even, odd = _transform_rows(rows[::2], turn), _transform_rows(rows[1::2], turn)
+    odd = [_rotate(x, turn, k, n) for k, x in enumerate(odd)]
+    return [a + b for a, b in zip(even, odd, strict=True)] + [a - b for a, b in zip(even, odd, strict=True)]
+
+
+def _rotate(z: Pair, turn: int, k: int, n: int) -> Pair:
+    """z e^(turn 2πi k/n)."""
+    k %= n
+    if 4 * k % n == 0:
+        quarter = turn * (4 * k // n) % 4
+        return (z, z.multiply_by_i, -z, z.divide_by_i)[quarter]
+    angle = 2 * math.pi * k / n
+    cosine, sine = math.cos(angle), turn * math.sin(angle)
+    return Pair(z.re * cosine - z.im * sine, z.re * sine + z.im * cosine)

@@ -1,0 +1,794 @@
+"""From a jaxpr to a graph: what every JAX primitive does to arrays of node ids.
+
+An array in the traced function becomes a NumPy array of ids here. An elementwise primitive maps `Graph.apply` over the
+ids; a primitive that only moves data is NumPy's own function of the ids; a loop or a call runs its body again.
+
+To support another primitive: an elementwise one needs a row in `_operations`, one that moves data a line in `MOVES`,
+anything else a function marked `@lowers("its_name")`, which gets the expansion, the parameters of the equation and the
+id arrays, and returns an id array (or a list of them). Each needs a row in `tests/program/test_program.py`.
+"""
+
+import functools
+import itertools
+import math
+from collections.abc import Callable
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
+from jax.extend import core
+
+from lagjax._program._graph import INPUTS, PAIRS, Graph, Unlowerable
+from lagjax._program._operations import OPERATIONS
+from lagjax._program._simplify import arctangent
+from lagjax._program.lowering._indexing import are_numbers, count_knots, locate_knots, look_up_windows
+
+# Scalars that are looked at for each one that the budget allows, as most of a derivative folds away; and in all, which
+# takes some minutes.
+WORK_PER_OPERATION = 50
+# Numbers of an array beyond which they become nodes one by one only when something computes with them; and numbers in
+# all. Both only decide what a lowering costs.
+LARGEST_UNFOLDED, MOST_NUMBERS = 256, 2000
+LARGEST_WORK = 20_000_000
+
+
+class Expansion:
+    """A jaxpr being turned into a graph, and what that has cost so far."""
+
+    def __init__(self, graph: Graph):
+        self.graph = graph
+        self.traced_operations = 0
+        self.moduli: dict[int, int] = {}  # |z| of complex numbers, and |z|², which is smooth at zero
+        self._pairs: list[tuple[int, int]] = []
+        self._work = 0
+
+    def run(self, jaxpr, constants, arguments) -> list[np.ndarray]:
+        """The outputs of a jaxpr as id arrays; equations nothing depends on are skipped."""
+        scope = dict(zip(jaxpr.constvars, constants, strict=True)) | dict(zip(jaxpr.invars, arguments, strict=True))
+
+        def read(atom):
+            return self.constants(atom.val) if isinstance(atom, core.Literal) else scope[atom]
+
+        for equation in live_equations(jaxpr):
+            scope |= zip(
+                equation.outvars,
+                self._equation(equation, [read(atom) for atom in find_variables(equation)]),
+                strict=True,
+            )
+        return [read(atom) for atom in jaxpr.outvars]
+
+    def run_closed(self, jaxpr, arguments) -> list[np.ndarray]:
+        return self.run(jaxpr.jaxpr, [self.constants(value) for value in jaxpr.consts], arguments)
+
+    def real(self, array: np.ndarray) -> np.ndarray:
+        """The array with a node for every scalar of it: what computes with an entry of a table makes it one."""
+        if not array.size or array.max() < INPUTS:
+            return array
+        self.work(array.size)
+        return _ids([i if i >= PAIRS else self.graph.real(i) for i in array.ravel().tolist()], array.shape)
+
+    def constants(self, value) -> np.ndarray:
+        if isinstance(value, Tracer):
+            raise Unlowerable("the function closes over a traced value; pass it as an argument")
+        dtype = value.dtype if hasattr(value, "dtype") else np.asarray(value).dtype
+        if is_complex(dtype):
+            return self.pair(self.constants(np.real(value)), self.constants(np.imag(value)))
+        kind, value = kind_of(dtype), np.asarray(value)
+        if kind == "float" and value.size > LARGEST_UNFOLDED:
+            return self.graph.array(value)
+        self.work(value.size)
+        return _ids([self.graph.constant(x, kind) for x in value.ravel().tolist()], value.shape)
+
+    def pair(self, re: np.ndarray, im: np.ndarray) -> np.ndarray:
+        """The complex numbers with these parts."""
+        first = PAIRS + len(self._pairs)
+        self._pairs += zip(self.real(re).ravel().tolist(), self.real(im).ravel().tolist(), strict=True)
+        self.work(re.size)
+        return np.arange(first, first + re.size, dtype=np.int64).reshape(re.shape)
+
+    def parts(self, array: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The real and the imaginary parts of numbers that may be complex."""
+        zero = self.graph.constant(0.0, "float")
+        ids = self.real(array).ravel().tolist()
+        pairs = [self._pairs[i - PAIRS] if i >= PAIRS else (i, zero) for i in ids]
+        return _ids([re for re, _ in pairs], array.shape), _ids([im for _, im in pairs], array.shape)
+
+    @staticmethod
+    def has_pairs(array: np.ndarray) -> bool:
+        return bool(array.size) and array.max() >= PAIRS
+
+    def map(self, op: str, *arrays: np.ndarray, attribute=None) -> np.ndarray:
+        """`op` elementwise."""
+        arrays = np.broadcast_arrays(*map(self.real, arrays))
+        shape, size = arrays[0].shape, arrays[0].size
+        self.work(size)
+        self.traced_operations += size
+        columns = (array.ravel().tolist() for array in arrays)
+        return _ids(self.graph.apply_all(op, *columns, attribute=attribute), shape)
+
+    def fold(self, op: str, array: np.ndarray) -> np.ndarray:
+        """`op` along the first axis, from the left."""
+        total = array[0]
+        for row in array[1:]:
+            total = self.map(op, total, row)
+        return total
+
+    def require_numbers(self, array: np.ndarray, what: str) -> np.ndarray:
+        """The numbers behind an array of constants."""
+        values = [self.graph.value(i) for i in array.ravel().tolist()]
+        if None in values:
+            raise Unlowerable(f"{what} depends on the values of the inputs")
+        return np.array(values, dtype=np.int64).reshape(array.shape)
+
+    def work(self, count: int) -> None:
+        """Give up before the work is done, not after."""
+        self._work += count
+        if self._work > min(WORK_PER_OPERATION * self.graph.budget, LARGEST_WORK):
+            raise Unlowerable(
+                f"expanded to scalars, the function takes far more than the {self.graph.budget} operations allowed by "
+                "`budget`"
+            )
+
+    def _equation(self, equation, arguments) -> list[np.ndarray]:
+        name = formula_of(equation) or equation.primitive.name
+        for variable in equation.outvars:
+            self.work(variable.aval.size)
+        if name == "mul" and equation.invars[0] is equation.invars[1]:
+            name, arguments = "square", arguments[:1]
+        if (
+            name not in MOVES
+            and name not in _WITH_BODIES
+            and any(is_complex(atom.aval.dtype) for atom in [*equation.invars, *equation.outvars])
+        ):
+            if name not in COMPLEX:
+                raise Unlowerable(f"the primitive `{name}` of complex numbers has no scalar form here")
+            result = COMPLEX[name](self, equation.params, *arguments)
+        else:
+            result = self.lower_primitive(name, equation.params, arguments)
+        return list(result) if equation.primitive.multiple_results else [result]
+
+    def lower_primitive(self, name: str, params, arguments):
+        """The result of a primitive of real numbers, or of one that has other functions in it or only moves numbers."""
+        if name not in MOVES and name not in _PASSING_ON:
+            arguments = [self.real(x) for x in arguments]
+        if name in MOVES:
+            return MOVES[name](params, *arguments)
+        if name in LOWER:
+            return LOWER[name](self, params, *arguments)
+        if name in OPERATIONS:
+            return self.map(name, *arguments)
+        raise Unlowerable(f"the primitive `{name}` has no scalar form here")
+
+
+def is_complex(dtype) -> bool:
+    return jnp.issubdtype(dtype, jnp.complexfloating)
+
+
+def kind_of(dtype) -> str:
+    """The kind of a scalar of this type: floats share one, as the program takes the precision of its inputs."""
+    if jnp.issubdtype(dtype, jnp.floating):
+        return "float"
+    if dtype == np.bool_ or jnp.issubdtype(dtype, jnp.integer):
+        return np.dtype(dtype).name
+    raise Unlowerable(f"values of type {dtype} have no scalar form here")
+
+
+def inputs_of(graph: Graph, shapes) -> list[np.ndarray]:
+    """The inputs of a graph for arrays of these shapes, as ids; those of long arrays are no nodes yet."""
+    arguments, count, many, kinds = [], 0, len(shapes) > MOST_NUMBERS, {}
+    for shape in shapes:
+        if (kind := kinds.get(shape.dtype)) is None:
+            kind = kinds[shape.dtype] = kind_of(shape.dtype)
+        if many and kind == "float" and not shape.shape:
+            arguments.append(np.array(count + INPUTS))
+            count += 1
+            continue
+        places = range(count, count + shape.size)
+        if kind == "float" and (many or shape.size > LARGEST_UNFOLDED):
+            arguments.append((np.array(places, dtype=np.int64) + INPUTS).reshape(shape.shape))
+        else:
+            arguments.append(_ids([graph.input(k, kind) for k in places], shape.shape))
+        count += shape.size
+    return arguments
+
+
+def _ids(ids: list[int], shape) -> np.ndarray:
+    return np.array(ids, dtype=np.int64).reshape(shape)
+
+
+def live_equations(jaxpr) -> list:
+    """The equations of a jaxpr that something depends on, in order."""
+    needed, equations = {v for v in jaxpr.outvars if isinstance(v, core.Var)}, []
+    for equation in reversed(jaxpr.eqns):
+        if needed.intersection(equation.outvars):
+            equations.append(equation)
+            needed.update(v for v in find_variables(equation) if isinstance(v, core.Var))
+    return equations[::-1]
+
+
+def find_variables(equation) -> list:
+    """The operands of a lowered equation: of a linear system the matrix and the right-hand side, not JAX's factors."""
+    if equation.primitive.name != "custom_linear_solve":
+        return equation.invars
+    lengths = equation.params["const_lengths"]
+    return equation.invars[: lengths.matvec] + equation.invars[sum(lengths) :]
+
+
+def formula_of(equation) -> str | None:
+    """The name of the function of JAX that a call is, if that has a formula here ("det", "expn", "hypot" …); or None.
+
+    JAX has rules of its own for their derivatives, which agree with those of any formula for them.
+    """
+    name, operands = equation.primitive.name, [variable.aval for variable in equation.invars]
+    if name in ("jit", "pjit"):
+        called, floats = equation.params["name"], [jnp.issubdtype(x.dtype, jnp.floating) for x in operands]
+        reads_bits = any(e.primitive.name == "bitcast_convert_type" for e in equation.params["jaxpr"].eqns)
+        found = {"expn": [False, True], "signbit": [True] if reads_bits else None, "hypot": [True, True]}
+        if found.get(called) != floats:
+            return None
+        own = called != "hypot" or str(equation.params["jaxpr"]) == _hypot(*((x.shape, x.dtype) for x in operands))
+        return called if own else None
+    if name != "custom_jvp_call" or len(operands) != 1:
+        return None
+    shape, dtype = operands[0].shape, operands[0].dtype
+    if len(shape) < 2 or shape[-2] != shape[-1] or not jnp.issubdtype(dtype, jnp.floating):
+        return None
+    text = str(equation.params["call_jaxpr"])
+    return next((name for name in ("det", "slogdet") if text in _determinant(name, shape, dtype)), None)
+
+
+def is_formula(equation) -> bool:
+    """True for a call of such a function, and for one that does nothing but call it."""
+    body = equation.params.get("call_jaxpr")
+    inner = body.eqns if equation.primitive.name == "custom_jvp_call" else ()
+    return formula_of(equation) is not None or (len(inner) == 1 and formula_of(inner[0]) is not None)
+
+
+_OWN_RULES = frozenset(("stop_gradient", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"))
+
+
+def has_own_rules(jaxpr) -> bool:
+    """True if a jaxpr, or one that it calls, asks for other derivatives than those of its operations."""
+    return any(
+        not is_formula(equation)
+        and (equation.primitive.name in _OWN_RULES or any(has_own_rules(inner) for inner in _inner_jaxprs(equation)))
+        for equation in live_equations(jaxpr)
+    )
+
+
+def _inner_jaxprs(equation) -> list:
+    params = equation.params
+    if equation.primitive.name == "custom_linear_solve":  # how JAX solves it is not what is lowered
+        params = {"matvec": params["jaxprs"].matvec}
+    leaves = jax.tree.leaves(list(params.values()), is_leaf=lambda x: isinstance(x, core.Jaxpr | core.ClosedJaxpr))
+    closed = (x.jaxpr if isinstance(x, core.ClosedJaxpr) else x for x in leaves)
+    return [x for x in closed if isinstance(x, core.Jaxpr)]
+
+
+@functools.cache
+def _hypot(*operands) -> str:
+    """The body of JAX's hypot of operands of these shapes and types, as a text."""
+    (equation,) = jax.make_jaxpr(jnp.hypot)(*itertools.starmap(jax.ShapeDtypeStruct, operands)).eqns
+    return str(equation.params["jaxpr"])
+
+
+@functools.cache
+def _determinant(name: str, shape: tuple[int, ...], dtype) -> tuple[str, ...]:
+    """The calls with rules of their own in one of JAX's determinants, also under `vmap`, as texts of their bodies."""
+    function, texts = getattr(jnp.linalg, name), []
+    for _ in range(len(shape) - 1):
+        (equation,) = jax.make_jaxpr(function)(jax.ShapeDtypeStruct(shape, dtype)).eqns
+        bodies = [e.params.get("call_jaxpr") for e in equation.params["jaxpr"].eqns]
+        texts += [str(body) for body in bodies if body is not None]
+        function = jax.vmap(function)
+    return tuple(texts)
+
+
+# ---- primitives that only move data ---------------------------------------------------------------------------------
+
+
+def _slice(params, x):
+    strides = params["strides"] or (1,) * x.ndim
+    return x[tuple(map(slice, params["start_indices"], params["limit_indices"], strides))]
+
+
+def _broadcast_in_dim(params, x):
+    shape = [1] * len(params["shape"])
+    for axis, size in zip(params["broadcast_dimensions"], x.shape, strict=True):
+        shape[axis] = size
+    return np.broadcast_to(x.reshape(shape), params["shape"])
+
+
+def _pad(params, x, value):
+    """Each axis is (before, after, between); a negative margin cuts off."""
+    shape, source, target = [], [], []
+    for size, (before, after, between) in zip(x.shape, params["padding_config"], strict=True):
+        length = before + after + size + max(size - 1, 0) * between
+        places = before + np.arange(size) * (between + 1)
+        kept = (0 <= places) & (places < length)
+        shape.append(max(length, 0))
+        source.append(np.flatnonzero(kept))
+        target.append(places[kept])
+    result = np.full(shape, value)
+    result[np.ix_(*target)] = x[np.ix_(*source)]
+    return result
+
+
+MOVES: dict[str, Callable] = {
+    **dict.fromkeys(
+        ("copy", "copy_p", "stop_gradient", "reduce_precision", "sharding_constraint"), lambda params, x: x
+    ),
+    "optimization_barrier": lambda params, *xs: xs,
+    "slice": _slice,
+    "broadcast_in_dim": _broadcast_in_dim,
+    "pad": _pad,
+    "reshape": lambda params, x: x.reshape(params["new_sizes"]),
+    "squeeze": lambda params, x: np.squeeze(x, params["dimensions"]),
+    "expand_dims": lambda params, x: np.expand_dims(x, params["dimensions"]),
+    "transpose": lambda params, x: np.transpose(x, params["permutation"]),
+    "rev": lambda params, x: np.flip(x, params["dimensions"]),
+    "tile": lambda params, x: np.tile(x, params["reps"]),
+    "concatenate": lambda params, *xs: np.concatenate(xs, params["dimension"]),
+    "stack": lambda params, *xs: np.stack(xs, params["axis"]),
+    "unstack": lambda params, x: list(np.moveaxis(x, params["axis"], 0)),
+    "split": lambda params, x: np.split(x, np.cumsum(params["sizes"])[:-1], params["axis"]),
+}
+
+# ---- primitives that compute ----------------------------------------------------------------------------------------
+
+LOWER: dict[str, Callable] = {}
+COMPLEX: dict[str, Callable] = {}  # the same for complex operands or results (`_complex`)
+_CALLS = ("jit", "pjit", "closed_call", "core_call", "remat", "remat2", "checkpoint", "custom_jvp_call",
+          "custom_vjp_call", "custom_vjp_call_jaxpr")  # fmt: skip
+_WITH_BODIES = frozenset((*_CALLS, "scan", "while", "cond"))
+# What passes arrays on, or looks up entries in them: these may have ids without nodes.
+_PASSING_ON = frozenset(("gather", "dynamic_slice", "lagjax_locate", "convert_element_type", *_WITH_BODIES))
+
+
+def lowers(*names):
+    """The decorator of the function that lowers these primitives."""
+
+    def register(rule):
+        LOWER.update(dict.fromkeys(names, rule))
+        return rule
+
+    return register
+
+
+@lowers("add_any")
+def _add_any(expansion, params, x, y):
+    return expansion.map("add", x, y)
+
+
+@lowers("lt_to")
+def _is_less_in_total_order(expansion, params, x, y):
+    return expansion.map("lt", x, y)
+
+
+@lowers("le_to")
+def _is_not_more_in_total_order(expansion, params, x, y):
+    return expansion.map("le", x, y)
+
+
+@lowers("square")
+def _square(expansion, params, x):
+    moduli = expansion.moduli
+    if not moduli or moduli.keys().isdisjoint(ids := x.ravel().tolist()):
+        return expansion.map("mul", x, x)
+    return _ids([moduli[i] if i in moduli else expansion.graph.apply("mul", i, i) for i in ids], x.shape)
+
+
+@lowers("one_minus_square")
+def _one_minus_square(expansion, params, x):
+    one = expansion.constants(1.0)
+    return expansion.map("mul", expansion.map("add", one, x), expansion.map("sub", one, x))
+
+
+@lowers("polynomial")
+def _polynomial(expansion, params, x, *coefficients):
+    """Σ cₖ xᵏ, by Horner's rule."""
+    total = coefficients[-1]
+    for c in reversed(coefficients[:-1]):
+        total = expansion.map("add", expansion.map("mul", total, x), c)
+    return total
+
+
+@lowers("signbit")
+def _signbit(expansion, params, x):
+    return [expansion.map("lt", x, expansion.constants(0.0))]
+
+
+@lowers("hypot")
+def _hypotenuse(expansion, params, x, y):
+    """√(x² + y²), which is smooth but for zero; JAX divides by the larger one, and has corners where both are alike."""
+    return [expansion.map("sqrt", expansion.map("add", *(expansion.map("mul", z, z) for z in (x, y))))]
+
+
+@lowers("atan")
+def _atan(expansion, params, x):
+    expansion.work(x.size)
+    expansion.traced_operations += x.size
+    return _ids([arctangent(expansion.graph, i) for i in x.ravel().tolist()], x.shape)
+
+
+@lowers("integer_pow")
+def _integer_pow(expansion, params, x):
+    exponent, graph, moduli = params["y"], expansion.graph, expansion.moduli
+    expansion.work(x.size)
+    expansion.traced_operations += x.size
+    half = exponent // 2
+    return _ids(
+        [
+            graph.power(moduli[i], half) if exponent == 2 * half and i in moduli else graph.power(i, exponent)
+            for i in x.ravel().tolist()
+        ],
+        x.shape,
+    )
+
+
+@lowers("pow")
+def _pow(expansion, params, x, y):
+    return expansion.map("pow", x, expansion.map("convert", y, attribute="float"))
+
+
+@lowers("round")
+def _round(expansion, params, x):
+    return expansion.map("round", x, attribute=int(params["rounding_method"]))
+
+
+@lowers("convert_element_type")
+def _convert_element_type(expansion, params, x):
+    kind = kind_of(params["new_dtype"])
+    if kind == "float" and x.size and x.min() >= INPUTS:  # of floats without nodes
+        return x
+    x = expansion.real(x)
+    if kind == "bool":
+        zeros = [expansion.graph.constant(0, expansion.graph.kinds[i]) for i in x.ravel().tolist()]
+        return expansion.map("ne", x, _ids(zeros, x.shape))
+    return expansion.map("convert", x, attribute=kind)
+
+
+@lowers("clamp")
+def _clamp(expansion, params, low, x, high):
+    # Not min and max, whose derivatives at the bounds are a half where JAX has none.
+    above = expansion.map("select", expansion.map("le", x, low), x, low)
+    return expansion.map("select", expansion.map("ge", x, high), above, high)
+
+
+@lowers("select_n")
+def _select_n(expansion, params, which, *cases):
+    if len(cases) == 1:
+        return cases[0]
+    if all(expansion.graph.kinds[i] == "bool" for i in which.ravel().tolist()):
+        return expansion.map("select", which, *cases)
+    return _choose(expansion, which, cases)
+
+
+def _choose(expansion, which, cases):
+    """The case an integer counts to; below the first is the first, beyond the last the last."""
+    if any(map(expansion.has_pairs, cases)):
+        parts = zip(*map(expansion.parts, cases), strict=True)
+        return expansion.pair(*(_choose(expansion, which, list(of)) for of in parts))
+    result = cases[0]
+    for k, case in enumerate(cases[1:], 1):
+        bound = [expansion.graph.constant(k, expansion.graph.kinds[i]) for i in which.ravel().tolist()]
+        result = expansion.map("select", expansion.map("ge", which, _ids(bound, which.shape)), result, case)
+    return result
+
+
+@lowers("iota")
+def _iota(expansion, params):
+    shape = [1] * len(params["shape"])
+    shape[params["dimension"]] = -1
+    numbers = np.arange(params["shape"][params["dimension"]]).astype(params["dtype"])
+    return np.broadcast_to(expansion.constants(numbers).reshape(shape), params["shape"])
+
+
+@lowers("platform_index")
+def _platform_index(expansion, params):
+    # Which of the equivalent branches: that for CPUs, or the default. A program has no platform of its own.
+    cases = params["platforms"]
+    fits = [i for i, platforms in enumerate(cases) if platforms is not None and "cpu" in platforms]
+    return expansion.constants(np.int32((fits + [i for i, platforms in enumerate(cases) if platforms is None])[0]))
+
+
+@lowers("dot_general")
+def _dot_general(expansion, params, x, y):
+    if (dtype := params["preferred_element_type"]) is not None:  # JAX multiplies matrices of two dtypes
+        kind, kinds = kind_of(dtype), expansion.graph.kinds
+        x, y = (
+            z if all(kinds[i] == kind for i in z.ravel().tolist()) else expansion.map("convert", z, attribute=kind)
+            for z in (x, y)
+        )
+    (contract_x, contract_y), (batch_x, batch_y) = params["dimension_numbers"]
+    free_x = [i for i in range(x.ndim) if i not in (*contract_x, *batch_x)]
+    free_y = [i for i in range(y.ndim) if i not in (*contract_y, *batch_y)]
+    shape = [x.shape[i] for i in (*batch_x, *free_x)] + [y.shape[i] for i in free_y]
+    length = math.prod(x.shape[i] for i in contract_x)
+    expansion.work(math.prod(shape) * length)
+    left = np.transpose(x, (*contract_x, *batch_x, *free_x)).reshape(
+        length, *(x.shape[i] for i in (*batch_x, *free_x)), *(1 for _ in free_y)
+    )
+    right = np.transpose(y, (*contract_y, *batch_y, *free_y)).reshape(
+        length, *(y.shape[i] for i in batch_y), *(1 for _ in free_x), *(y.shape[i] for i in free_y)
+    )
+    if not length:
+        return np.broadcast_to(expansion.constants(0.0), shape)
+    return expansion.fold("add", expansion.map("mul", left, right))
+
+
+REDUCTIONS = {
+    "reduce_sum": ("add", 0.0), "reduce_prod": ("mul", 1.0), "reduce_max": ("max", -np.inf),
+    "reduce_min": ("min", np.inf), "reduce_and": ("and", True), "reduce_or": ("or", False),
+    "reduce_xor": ("xor", False),
+}  # fmt: skip
+CUMULATIONS = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
+
+
+def _reduction(op, empty):
+    def rule(expansion, params, x):
+        rows = np.moveaxis(x, params["axes"], range(len(params["axes"])))
+        shape = rows.shape[len(params["axes"]) :]
+        rows = rows.reshape(math.prod(rows.shape[: len(params["axes"])]), *shape)
+        return expansion.fold(op, rows) if len(rows) else np.broadcast_to(expansion.constants(empty), shape)
+
+    return rule
+
+
+def _cumulation(op):
+    def rule(expansion, params, x):
+        rows = list(np.moveaxis(x, params["axis"], 0))[:: -1 if params["reverse"] else 1]
+        for k in range(1, len(rows)):
+            rows[k] = expansion.map(op, rows[k - 1], rows[k])
+        rows = rows[:: -1 if params["reverse"] else 1]
+        return np.stack(rows, params["axis"]) if rows else x
+
+    return rule
+
+
+LOWER.update({name: _reduction(*meaning) for name, meaning in REDUCTIONS.items()})
+LOWER.update({name: _cumulation(op) for name, op in CUMULATIONS.items()})
+
+
+def _first_extreme(better):
+    """The index of the largest or smallest element along an axis, the first of equal ones."""
+
+    def rule(expansion, params, x):
+        (axis,), kind = params["axes"], kind_of(params["index_dtype"])
+        rows = np.moveaxis(x, axis, 0)
+        best, place = rows[0], np.full(rows.shape[1:], expansion.graph.constant(0, kind))
+        for k, row in enumerate(rows[1:], 1):
+            is_better = expansion.map(better, row, best)
+            here = np.full(row.shape, expansion.graph.constant(k, kind))
+            best = expansion.map("select", is_better, best, row)
+            place = expansion.map("select", is_better, place, here)
+        return place
+
+    return rule
+
+
+LOWER.update({"argmax": _first_extreme("gt"), "argmin": _first_extreme("lt")})
+
+
+@lowers("sort")
+def _sort(expansion, params, *operands):
+    """Neighbours are exchanged until all are in order: n (n − 1) / 2 comparisons, for a few numbers."""
+    if params["num_keys"] != 1:
+        raise Unlowerable("the primitive `sort` by several keys has no scalar form here")
+    rows = [list(np.moveaxis(x, params["dimension"], 0)) for x in operands]
+    for end in range(len(rows[0]) - 1, 0, -1):
+        for k in range(end):
+            if len(operands) == 1:
+                (key,) = rows
+                key[k], key[k + 1] = (expansion.map(op, key[k], key[k + 1]) for op in ("min", "max"))
+                continue
+            wrong = expansion.map("lt", rows[0][k + 1], rows[0][k])
+            for row in rows:
+                pair = row[k], row[k + 1]
+                row[k], row[k + 1] = (expansion.map("select", wrong, *of) for of in (pair, pair[::-1]))
+    return [np.stack(row, params["dimension"]) if row else x for row, x in zip(rows, operands, strict=True)]
+
+
+# ---- indexing with arrays: the indices must fold to numbers ---------------------------------------------------------
+
+
+@lowers("dynamic_slice")
+def _dynamic_slice(expansion, params, x, *starts):
+    sizes, starts = params["slice_sizes"], expansion.real(np.array(starts[: x.ndim]))
+    if not are_numbers(expansion, starts):
+        return look_up_windows(expansion, x, starts, range(x.ndim), sizes, None)
+    starts = expansion.require_numbers(starts, "the start of a slice")
+    starts = [min(max(start, 0), n - size) for start, n, size in zip(starts, x.shape, sizes, strict=True)]
+    return x[tuple(slice(start, start + size) for start, size in zip(starts, sizes, strict=True))]
+
+
+@lowers("dynamic_update_slice")
+def _dynamic_update_slice(expansion, params, x, update, *starts):
+    starts = expansion.require_numbers(np.array(starts), "the start of a slice")
+    starts = [min(max(start, 0), n - size) for start, n, size in zip(starts, x.shape, update.shape, strict=True)]
+    result = x.copy()
+    result[tuple(slice(start, start + size) for start, size in zip(starts, update.shape, strict=True))] = update
+    return result
+
+
+def _places(indices, shape, offset_dims, collapsed, index_map, operand_batch, indices_batch, sizes, clip):
+    """The place of each element of a gather's result in the flattened operand; -1 for a window that sticks out.
+
+    The same for a scatter, with the updates in place of the result.
+    """
+    batch_shape = indices.shape[:-1]
+    starts = np.zeros((*batch_shape, len(shape)), dtype=np.int64)
+    starts[..., list(index_map)] = indices
+    for axis, batch_axis in zip(operand_batch, indices_batch, strict=True):
+        starts[..., axis] = np.indices(batch_shape)[batch_axis]
+    room = np.array(shape, dtype=np.int64) - np.array(sizes, dtype=np.int64)
+    inside = ((0 <= starts) & (starts <= room)).all(-1)
+    if clip:
+        starts, inside = np.clip(starts, 0, room), np.ones_like(inside)
+    strides = [math.prod(shape[axis + 1 :]) for axis in range(len(shape))]
+    first = (starts * np.array(strides, dtype=np.int64)).sum(-1)
+    window = sum((np.indices(sizes)[axis] * stride for axis, stride in enumerate(strides)), np.zeros(sizes, np.int64))
+    window = window.squeeze((*collapsed, *operand_batch))
+    shape_of_starts = batch_shape + (1,) * window.ndim
+    places = first.reshape(shape_of_starts) + window
+    places = np.where(inside.reshape(shape_of_starts), places, -1)
+    return np.moveaxis(places, range(len(batch_shape), places.ndim), offset_dims)
+
+
+def _clips(mode) -> bool:
+    return jax.lax.GatherScatterMode.from_any(mode) == jax.lax.GatherScatterMode.CLIP
+
+
+@lowers("lagjax_locate")
+def _locate(expansion, params, knots, x):
+    if (found := locate_knots(expansion, knots, x, params["closed"])) is not None:
+        return found
+    at_most = expansion.map("le", knots.reshape(-1, *[1] * x.ndim), np.broadcast_to(x, (len(knots), *x.shape)))
+    counted = expansion.fold("add", expansion.map("convert", at_most, attribute="int32"))
+    found = expansion.map("sub", counted, expansion.constants(np.int32(1)))
+    if not params["closed"]:
+        return found
+    at_end = expansion.map("eq", x, expansion.real(knots[-1]))
+    return expansion.map("select", at_end, found, expansion.constants(np.int32(len(knots) - 2)))
+
+
+@lowers("gather")
+def _gather(expansion, params, x, indices):
+    d, indices = params["dimension_numbers"], expansion.real(indices)
+    if not are_numbers(expansion, indices) and not d.operand_batching_dims:
+        missing = np.nan if params["fill_value"] is None else params["fill_value"]
+        found = look_up_windows(
+            expansion, x, indices, d.start_index_map, params["slice_sizes"], None if _clips(params["mode"]) else missing
+        )
+        found = np.squeeze(found, tuple(indices.ndim - 1 + axis for axis in d.collapsed_slice_dims))
+        return np.moveaxis(found, range(indices.ndim - 1, found.ndim), d.offset_dims)
+    indices = expansion.require_numbers(indices, "an index")
+    places = _places(
+        indices, x.shape, d.offset_dims, d.collapsed_slice_dims, d.start_index_map, d.operand_batching_dims,
+        d.start_indices_batching_dims, params["slice_sizes"], _clips(params["mode"]),
+    )  # fmt: skip
+    if (places >= 0).all():
+        return x.ravel()[places]
+    if x.size and expansion.graph.kinds[x.flat[0]] != "float":
+        raise Unlowerable("an index into an array that is not of floats is out of bounds")
+    missing = np.nan if params["fill_value"] is None else params["fill_value"]
+    return np.append(x.ravel(), expansion.constants(float(missing)))[places]
+
+
+def _scatter(op):
+    def rule(expansion, params, x, indices, updates):
+        indices, d = expansion.require_numbers(indices, "an index"), params["dimension_numbers"]
+        window = iter(updates.shape[axis] for axis in d.update_window_dims)
+        fixed = (*d.inserted_window_dims, *d.operand_batching_dims)
+        sizes = [1 if axis in fixed else next(window) for axis in range(x.ndim)]
+        places = _places(
+            indices, x.shape, d.update_window_dims, d.inserted_window_dims, d.scatter_dims_to_operand_dims,
+            d.operand_batching_dims, d.scatter_indices_batching_dims, sizes, _clips(params["mode"]),
+        )  # fmt: skip
+        result = x.ravel().copy()
+        for place, update in zip(places.ravel().tolist(), updates.ravel().tolist(), strict=True):
+            if place >= 0:
+                result[place] = update if op is None else expansion.map(op, result[place], np.array(update))
+        return result.reshape(x.shape)
+
+    return rule
+
+
+SCATTERS = {"scatter": None, "scatter-add": "add", "scatter-sub": "sub", "scatter-mul": "mul"}
+LOWER.update({name: _scatter(op) for name, op in {**SCATTERS, "scatter-min": "min", "scatter-max": "max"}.items()})
+
+# ---- calls, loops and branches --------------------------------------------------------------------------------------
+
+
+@lowers(*_CALLS)
+def _call(expansion, params, *arguments):
+    body = next(params[key] for key in ("jaxpr", "call_jaxpr", "fun_jaxpr") if key in params)
+    if params.get("name") == "searchsorted" and (side := _side_of_search(body, arguments)) is not None:
+        if (found := count_knots(expansion, *arguments, side=side)) is not None:
+            return [found]
+    if isinstance(body, core.ClosedJaxpr):
+        return expansion.run_closed(body, arguments)
+    return expansion.run(body, (), arguments)
+
+
+@lowers("call_hi_primitive")
+def _expand_primitive(expansion, params, *arguments):
+    return expansion.run_closed(expand_primitive(params["_prim"]), arguments)
+
+
+def expand_primitive(primitive) -> core.ClosedJaxpr:
+    """An operation that JAX itself writes in others, such as `searchsorted` since 0.12, in these."""
+
+    def call_expansion(*flat):
+        return jax.tree.leaves(primitive.expand(*jax.tree.unflatten(primitive.in_tree, flat)))
+
+    return jax.make_jaxpr(call_expansion)(*primitive.in_avals_flat)
+
+
+def _side_of_search(body, arguments) -> Literal["right", "left"] | None:
+    """The side of `jnp.searchsorted(knots, x, side)`, if a function that is named so is that; None of others.
+
+    It is tried with numbers: knots 0, 1, …, and a number below them, between two of them, at one, and beyond them.
+    """
+    if len(arguments) != 2 or arguments[0].ndim != 1 or not len(arguments[0]) or len(body.out_avals) != 1:
+        return None
+    shapes, count = [variable.aval for variable in body.jaxpr.invars], len(arguments[0])
+    if (
+        not all(jnp.issubdtype(shape.dtype, jnp.floating) for shape in shapes)
+        or body.out_avals[0].shape != shapes[1].shape
+    ):
+        return None
+    sides: list[Literal["right", "left"]] = ["right", "left"]
+    trial = Expansion(Graph(10_000))
+    for x in (-1.0, 0.5, float(count // 2), count + 1.0):
+        given = [trial.constants(np.arange(count, dtype=float)), trial.constants(np.full(shapes[1].shape, x))]
+        (found,) = trial.run_closed(body, given)
+        found = trial.require_numbers(trial.real(found), "it")
+        sides = [s for s in sides if (found == np.searchsorted(np.arange(count), x, side=s)).all()]
+    return next(iter(sides), None)
+
+
+@lowers("scan")
+def _scan(expansion, params, *arguments):
+    consts, carry = _parts_of_scan(params)
+    constants, state, columns = arguments[:consts], arguments[consts : consts + carry], arguments[consts + carry :]
+    order = range(params["length"])[:: -1 if params["reverse"] else 1]
+    rows = {}
+    for k in order:
+        expansion.work(1)
+        results = expansion.run_closed(params["jaxpr"], [*constants, *state, *(column[k] for column in columns)])
+        state, rows[k] = results[:carry], results[carry:]
+    outputs = params["jaxpr"].out_avals[carry:]
+    empty = [np.zeros((0, *aval.shape), dtype=np.int64) for aval in outputs]
+    return [*state, *(map(np.stack, zip(*(rows[k] for k in sorted(rows)), strict=True)) if rows else empty)]
+
+
+def _parts_of_scan(params) -> tuple[int, int]:
+    """The numbers of a scan's constants, and of the arrays that it carries."""
+    if "num_carry" in params:
+        return params["num_consts"], params["num_carry"]
+    consts, carry, _ = params["ft_in"].unpack()  # since JAX 0.11
+    return len(consts), len(carry)
+
+
+@lowers("while")
+def _while(expansion, params, *arguments):
+    split = params["cond_nconsts"], params["cond_nconsts"] + params["body_nconsts"]
+    condition, body, state = arguments[: split[0]], arguments[split[0] : split[1]], arguments[split[1] :]
+    while True:
+        expansion.work(1)
+        (go_on,) = expansion.run_closed(params["cond_jaxpr"], [*condition, *state])
+        if not expansion.require_numbers(go_on, "when a `while` loop ends"):
+            return state
+        state = expansion.run_closed(params["body_jaxpr"], [*body, *state])
+
+
+@lowers("cond")
+def _cond(expansion, params, which, *operands):
+    branches = params["branches"]
+    if (value := expansion.graph.value(int(which))) is not None:
+        return expansion.run_closed(branches[min(max(int(value), 0), len(branches) - 1)], operands)
+    results = [expansion.run_closed(branch, operands) for branch in branches]
+    return [_choose(expansion, np.broadcast_to(which, cases[0].shape), cases) for cases in zip(*results, strict=True)]

@@ -1,0 +1,219 @@
+"""Functions of one number that are series: log Γ and its derivatives, the modified Bessel functions I₀ and I₁, the
+exponential integrals and the incomplete Γ functions.
+
+log Γ obeys no differential equation from which a Taylor series would follow, and the others would need the powers of
+their argument anyway. So all are written out in operations that are there already, to rounding:
+
+    log Γ(x), x > 0    Stirling's series at y = x + 10, less log x(x + 1) … (x + 9)
+    Iₙ(x)              the power series up to |x| = 25, whose terms have one sign, and the asymptotic series beyond
+    Eₙ(x), x > 0       the power series up to x = 1.5, and a continued fraction beyond
+    P(a, x), x ≥ 0     a series whose terms have one sign up to x = a + 1, and 1 − Q with a continued fraction beyond
+
+Where one of two such forms takes over they agree to rounding, and that is no border. Of Eₙ and P the number n or a has
+to be known: it says how many terms are needed.
+
+Abramowitz & Stegun, *Handbook of Mathematical Functions* (1964), 5.1.12, 5.1.22, 6.1.40, 6.1.17, 6.4.6, 6.4.7, 6.4.11,
+6.5.29, 6.5.31, 9.6.10 and 9.7.1; the fractions in their even forms: Press et al., *Numerical Recipes* (1992), §6.2–3.
+"""
+
+import math
+from collections.abc import Callable, Sequence
+from fractions import Fraction
+from typing import Any
+
+import numpy as np
+
+from lagjax._program import _scalars as xp
+from lagjax._program._graph import Unlowerable
+from lagjax._program._scalars import Scalars
+from lagjax._program.lowering._rules import lowers
+
+# Steps by which log Γ is shifted, and Bernoulli's numbers B₂ₖ: at y = 10 the next term of the series is 2e-18. With
+# twice the shift four of them would do, and the product would be twice as long.
+_SHIFT = 10
+_BERNOULLI = [Fraction(1, 6), Fraction(-1, 30), Fraction(1, 42), Fraction(-1, 30), Fraction(5, 66),
+              Fraction(-691, 2730), Fraction(7, 6), Fraction(-3617, 510)]  # fmt: skip
+_MOST_DERIVATIVES = 10  # of ψ: further ones are of no use in mechanics, and long
+# Where Bessel's series change over, and their terms: those left out are below 1e-17 of the sum there. Further out the
+# power series would need more terms, further in the asymptotic one would never be as exact.
+_CHANGE, _POWERS, _ASYMPTOTIC = 25.0, 50, 26
+
+
+def _polynomial(coefficients: Sequence[float], x: Any) -> Any:
+    """Σ cₖ xᵏ, by Horner's rule."""
+    total = x * 0.0 + coefficients[-1]
+    for c in reversed(coefficients[:-1]):
+        total = total * x + c
+    return total
+
+
+def _reflect(x: Scalars) -> tuple[Any, Any, Any]:
+    """A flag that x is negative, the positive one of x and 1 − x, and x where it is negative, else ½."""
+    negative = x.map("lt", x, 0.0)
+    return negative, xp.where(negative, 1.0 - x, x), xp.where(negative, x, 0.5)
+
+
+def log_gamma(x: Scalars) -> Any:
+    """log |Γ(x)|, to 1e-14 of its largest term; for x < 0 by Γ(x) Γ(1 − x) = π / sin πx."""
+    negative, z, reflected = _reflect(x)
+    y = z + float(_SHIFT)
+    inverse = 1.0 / y
+    series = _polynomial([float(b / (2 * k * (2 * k - 1))) for k, b in enumerate(_BERNOULLI, 1)], inverse * inverse)
+    product = z * inverse  # of (z + i) / y, which cannot overflow
+    for i in range(1, _SHIFT):
+        product = product * ((z + float(i)) * inverse)
+    value = (z - 0.5) * xp.logarithm(y) - y + 0.5 * math.log(2 * math.pi) + series * inverse - xp.logarithm(product)
+    sine = reflected.map("sin", math.pi * reflected)
+    return xp.where(negative, math.log(math.pi) - 0.5 * xp.logarithm(sine * sine) - value, value)
+
+
+def polygamma(order: int, x: Scalars) -> Any:
+    """ψ⁽ⁿ⁾(x), the derivative n of ψ = (log Γ)'; for x < 0 as (−1)ⁿ ψ⁽ⁿ⁾(1 − x) − π dⁿ/dxⁿ cot πx.
+
+    With y = x + s it is (−1)ⁿ⁺¹ (n! Σ (x + i)⁻ⁿ⁻¹ + (n − 1)! y⁻ⁿ + n! y⁻ⁿ⁻¹ / 2 + Σ B₂ₖ (2k + n − 1)! / (2k)! y⁻²ᵏ⁻ⁿ),
+    i below s, where −log y stands in the place of the second term for n = 0. With n the shift s grows, so that the
+    first term left out stays below 1e-17.
+    """
+    n, factorial, shift = order, float(math.factorial(order)), _SHIFT + 5 * order
+    negative, z, reflected = _reflect(x)
+    y = z + float(shift)
+    inverse = 1.0 / y
+    series = [float(b * math.factorial(2 * k + n - 1) / math.factorial(2 * k)) for k, b in enumerate(_BERNOULLI, 1)]
+    tail = inverse * (0.5 * factorial + inverse * _polynomial(series, inverse * inverse))
+    value = tail - xp.logarithm(y) if n == 0 else (tail + float(math.factorial(n - 1))) * _power(inverse, n)
+    for i in range(shift):
+        value = value + factorial * _power(1.0 / (z + float(i)), n + 1)
+    sign = (-1.0) ** (n + 1)
+    cotangent = 1.0 / reflected.map("tan", math.pi * reflected)
+    more = math.pi ** (n + 1) * _polynomial(_derivative_of_cotangent(n), cotangent)
+    return xp.where(negative, -value - more, sign * value)
+
+
+def _power(x: Any, n: int) -> Any:
+    """xⁿ, n ≥ 1."""
+    return math.prod([x] * (n - 1), start=x)
+
+
+def _derivative_of_cotangent(n: int) -> list[float]:
+    """The coefficients of dⁿ/dxⁿ cot x, a polynomial of c = cot x, by c' = −(1 + c²)."""
+    found = np.polynomial.Polynomial([0.0, 1.0])
+    for _ in range(n):
+        found = found.deriv() * np.polynomial.Polynomial([-1.0, 0.0, -1.0])
+    return found.coef.tolist()
+
+
+def scaled_bessel(order: int, x: Scalars) -> Any:
+    """e^(−|x|) Iₙ(x) for n = 0 or 1."""
+    size = xp.absolute(x)
+    is_small = xp.prefers(_CHANGE, size)
+    near, far = xp.where(is_small, x, 0.0), xp.where(is_small, _CHANGE, size)
+    powers = [1.0 / (math.factorial(k) * math.factorial(k + order)) for k in range(_POWERS)]
+    small = _polynomial(powers, 0.25 * near * near) * xp.exponential(-xp.absolute(near))
+    asymptotic = [1.0]
+    for k in range(1, _ASYMPTOTIC):
+        asymptotic.append(-asymptotic[-1] * (4 * order**2 - (2 * k - 1) ** 2) / (8 * k))
+    large = _polynomial(asymptotic, 1.0 / far) / xp.root(2 * math.pi * far)
+    if order:
+        small, large = 0.5 * near * small, x.map("sign", x) * large
+    return xp.where(is_small, small, large)
+
+
+# Where the series of Eₙ gives way to the fraction: of E₁, the smallest, two digits cancel there. That of P(a, x) does
+# so at a + 1, where both take about as many terms; for small a the fraction would be long there.
+_CHANGE_OF_INTEGRAL, _LEAST_CHANGE_OF_GAMMA = 2.0, 2.0
+_LARGEST_ORDER, _LARGEST_SHAPE = 20, 100.0  # n of Eₙ, a of P(a, x): their formulas have up to a hundred terms
+
+
+def exponential_integral(n: int, x: Scalars) -> Any:
+    """Eₙ(x) = ∫₁^∞ e^(−x t) t⁻ⁿ dt for x > 0 and n ≥ 0, to 1e-14; for x < 0 it is NaN."""
+    if n == 0:
+        return xp.where(xp.prefers(0.0, x), float("nan"), xp.exponential(-x) / x)
+    is_small = xp.prefers(_CHANGE_OF_INTEGRAL, x)
+    near, far = xp.where(is_small, x, 1.0), xp.where(is_small, _CHANGE_OF_INTEGRAL, x)
+    psi = -float(np.euler_gamma) + sum(1.0 / k for k in range(1, n))
+    powers = [0.0 if k == n - 1 else -((-1.0) ** k) / ((k - n + 1) * math.factorial(k)) for k in range(26 + n)]
+    small = psi - xp.logarithm(xp.where(xp.equal(near, 0.0), 1.0, near) if n > 1 else near)
+    if n > 1:
+        small = (-1.0) ** (n - 1) / math.factorial(n - 1) * _power(near, n - 1) * small
+    large = xp.exponential(-far) * _fraction(far, float(n), lambda k: float(k * (n - 1 + k)), _CHANGE_OF_INTEGRAL)
+    return xp.where(is_small, small + _polynomial(powers, near), large)
+
+
+def incomplete_gamma(a: float, x: Scalars) -> tuple[Any, Any]:
+    """P(a, x) = ∫₀ˣ tᵃ⁻¹ e⁻ᵗ dt / Γ(a) for a > 0 and x ≥ 0, and Q = 1 − P, to 1e-14; for x < 0 they are NaN."""
+    change = max(a + 1.0, _LEAST_CHANGE_OF_GAMMA)
+    is_small = xp.prefers(change, x)
+    near: Any = xp.where(is_small, x, 1.0)
+    far = xp.where(is_small, change, x)
+    terms = [1.0]
+    while terms[-1] * change ** (len(terms) - 1) > 2.0**-56:
+        terms.append(terms[-1] / (a + len(terms)))
+    power = near.map("pow", near, a) * math.exp(-math.lgamma(a + 1.0))
+    small = power * xp.exponential(-near) * _polynomial(terms, near)
+    size = xp.exponential(a * xp.logarithm(far) - far - math.lgamma(a))
+    large = size * _fraction(far, 1.0 - a, lambda k: k * (k - a), change)
+    small = xp.where(xp.prefers(0.0, x), float("nan"), small)
+    return xp.where(is_small, small, 1.0 - large), xp.where(is_small, 1.0 - small, large)
+
+
+def _fraction(x: Any, shift: float, numerator: Callable[[int], float], least: float) -> Any:
+    """1 / (b − c₁ / (b + 2 − c₂ / (b + 4 − …))) with b = x + s, as long as it takes at the least x."""
+
+    def cut(x, length):
+        total = (x + shift) + 2.0 * length
+        for k in reversed(range(length)):
+            total = (x + shift) + 2.0 * k - numerator(k + 1) / total
+        return 1.0 / total
+
+    length = next(n for n in range(1, 200) if abs(cut(least, n) / cut(least, 2 * n + 50) - 1.0) < 2.0**-52)
+    return cut(x, length)
+
+
+def _register(name: str, formula) -> None:
+    @lowers(name)
+    def rule(expansion, params, x: np.ndarray) -> np.ndarray:
+        return formula(Scalars(expansion, x)).ids
+
+
+_register("lgamma", log_gamma)
+_register("digamma", lambda x: polygamma(0, x))
+_register("bessel_i0e", lambda x: scaled_bessel(0, x))
+_register("bessel_i1e", lambda x: scaled_bessel(1, x))
+
+
+@lowers("polygamma")
+def _polygamma(expansion, params, order: np.ndarray, x: np.ndarray) -> np.ndarray:
+    orders = set(expansion.require_numbers(order, "the order of a polygamma function").ravel().tolist())
+    if len(orders) != 1 or not 0 <= (n := orders.pop()) <= _MOST_DERIVATIVES:
+        raise Unlowerable(
+            f"polygamma functions of several orders, or of one beyond {_MOST_DERIVATIVES}, are not written out"
+        )
+    return polygamma(n, Scalars(expansion, x)).ids
+
+
+@lowers("expn")
+def _exponential_integral(expansion, params, order: np.ndarray, x: np.ndarray) -> list[np.ndarray]:
+    orders = set(expansion.require_numbers(order, "the order of an exponential integral").ravel().tolist())
+    if len(orders) != 1 or not 0 <= (n := orders.pop()) <= _LARGEST_ORDER:
+        raise Unlowerable(
+            f"exponential integrals of several orders, or of one beyond {_LARGEST_ORDER}, are not written out"
+        )
+    return [exponential_integral(n, Scalars(expansion, x)).ids]
+
+
+def _incomplete(upper: bool) -> Callable:
+    def rule(expansion, params, shape: np.ndarray, x: np.ndarray) -> np.ndarray:
+        values = {expansion.graph.value(i) for i in shape.ravel().tolist()}
+        a = values.pop() if len(values) == 1 else None
+        if a is None or not 0 < a <= _LARGEST_SHAPE:
+            raise Unlowerable(
+                f"incomplete Γ functions are written out for one known a, 0 < a ≤ {_LARGEST_SHAPE:g}: it says how many "
+                "terms are needed"
+            )
+        return incomplete_gamma(float(a), Scalars(expansion, x))[upper].ids
+
+    return rule
+
+
+lowers("igamma")(_incomplete(False))
+lowers("igammac")(_incomplete(True))

@@ -1,0 +1,303 @@
+"""`Trajectory`: what comes out, in the user's own pytree.
+
+Time is the first axis of `q` and `qdot`; the members of a batch are an axis before it. Quantities derived from the
+states are methods: they cost nothing until they are called, and they are differentiable. What judges and shows a
+motion (`_trust`, `_show`) stands above it: its methods import it when they are called (`_interface._registered`).
+"""
+
+from collections.abc import Callable
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._interface import RESULTS, Layout, import_registered, is_known, show_str
+from lagjax._primitives import marks_absent
+from lagjax._scene import System
+
+if TYPE_CHECKING:
+    import lagjax
+
+PyTree = Any
+Number = jax.Array | np.ndarray
+
+
+class State(NamedTuple):
+    """A time and the state at it."""
+
+    t: jax.Array
+    q: PyTree
+    qdot: PyTree
+
+
+class Transitions(NamedTuple):
+    """The changes of mode of a hybrid motion, in order: NaN or −1 beyond the last of `count`.
+
+    `t`, `q`, `qdot` are those just before the reset, `q_next` and `qdot_next` just after it; `source` and `target` are
+    places in `Trajectory.mode_names`.
+    `order_matters` is true where blows meet at one instant that do not commute: read from its end, the list of
+    transitions leads to another state. `let_out`, for each transition of that list: the first time at which its guard
+    was beyond zero where a mode began, and came back instead of a blow; NaN where that never was.
+    """
+
+    t: jax.Array
+    q: PyTree
+    qdot: PyTree
+    source: jax.Array
+    target: jax.Array
+    count: jax.Array
+    order_matters: jax.Array
+    let_out: jax.Array
+    q_next: PyTree
+    qdot_next: PyTree
+
+    _repr_pretty_ = show_str
+
+    def __str__(self) -> str:
+        """Their times and modes, of one motion the first ten."""
+        if not all(map(is_known, (self.t, self.count))):
+            return repr(self)
+        count = np.asarray(self.count)
+        if count.ndim:
+            return f"{count.sum()} transitions of {' × '.join(map(str, count.shape))} motions"
+        rows = list(zip(*(np.asarray(x)[: min(count, 10)] for x in (self.source, self.target, self.t)), strict=True))
+        listed = ", ".join(f"{source} → {target} at t = {t:.6g}" for source, target, t in rows)
+        more = f", … ({count - 10} more)" if count > 10 else ""
+        return f"{count} transitions between places in mode_names: {listed}{more}" if count else "no transitions"
+
+
+class Trajectory(eqx.Module):
+    """The motion of a system at the times `ts`, one trajectory or a batch of them.
+
+    - `ts`: the output times, shape (T,).
+    - `q`, `qdot`: the structure of the initial state, with the time axis in front of every leaf, and the batch axis,
+      if there is one, in front of that. NaN at times that were not reached.
+    - `result`: how each member ended, one of `lagjax.RESULTS`; `ok`: whether it ended well, at the last time or at an
+      event.
+    - `end`: where each member ended, a `State` of `t`, `q`, `qdot`: at `ts[-1]`, at the event, or at the last accepted
+      step before it failed.
+    - `stats`: counts of steps, per member: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
+    - `tolerances`: rtol and atol of a step; None where it had a fixed size.
+    - `engine`: the engine that integrated it, "MachineCode" or "Diffrax"; "" for a hybrid motion.
+    - `mode`, `transitions`: for a hybrid motion (`simulate_hybrid`) the mode at every output time and its
+      `Transitions`; otherwise None. `system` is then the dict of modes, and quantities are those of the mode at every
+      time, NaN where the mode is −1. A mode is a place in `mode_names`, because the dict loses its order in `jax.jit`.
+    """
+
+    ts: jax.Array
+    q: PyTree
+    qdot: PyTree
+    result: RESULTS
+    end: State
+    stats: dict[str, jax.Array]
+    system: System | dict[str, System]
+    params: PyTree
+    params_axes: PyTree = eqx.field(static=True, default=None)  # how `simulate_batch` mapped over params
+    mode: jax.Array | None = None
+    transitions: "Transitions | None" = None
+    mode_names: tuple[str, ...] = eqx.field(static=True, default=())
+    tolerances: tuple[Number, Number] | None = None
+    engine: str = eqx.field(static=True, default="")
+
+    @classmethod
+    def from_fields(cls, **fields) -> "Trajectory":
+        """A trajectory with all of these fields, made as equinox makes one from its leaves.
+
+        The constructor checks every field for mistakes, which takes a tenth of the time of a short motion.
+        """
+        trajectory = object.__new__(cls)
+        for name in cls.__dataclass_fields__:
+            object.__setattr__(trajectory, name, fields.pop(name))
+        assert not fields, f"a Trajectory has no {', '.join(fields)}"
+        return trajectory
+
+    def __repr__(self) -> str:
+        """Three lines; `equinox.tree_pprint` prints the fields."""
+        return import_registered("summary")(self)
+
+    def _repr_html_(self) -> str | None:
+        """The three lines and a small figure, for notebooks; None, and they show the lines, where there is none."""
+        return import_registered("trajectory_html")(self)
+
+    @property
+    def ok(self) -> jax.Array:
+        """True where a member reached the last time or its event."""
+        code = self.result._value
+        return (code == RESULTS.successful._value) | (code == RESULTS.event_occurred._value)
+
+    def energy(self) -> jax.Array:
+        """h = p·q̇ − L at every output time, shape (T,) or (batch, T)."""
+        return self._map_outputs("energy")
+
+    def momentum(self) -> PyTree:
+        """p = ∂L/∂q̇ at every output time, in the structure of `q`."""
+        return self._map_outputs("momentum")
+
+    @property
+    def multipliers(self) -> PyTree:
+        """λ at every output time, in the structure that the constraint functions return."""
+        return self._map_outputs("multipliers")
+
+    def constraint_force(self) -> PyTree:
+        """(∂f/∂q)ᵀλ + (∂a/∂q̇)ᵀμ at every output time, in the structure of `q`."""
+        return self._map_outputs("constraint_force")
+
+    def constraint_residual(self) -> PyTree:
+        """f and a at every output time, in the structure of `multipliers`: the drift off the constraints."""
+        return self._map_outputs("constraint_residual")
+
+    @marks_absent
+    def health(self, reference: "Trajectory | None" = None) -> "lagjax.results.Health":
+        """The trust that this motion deserves: conservation laws, constraints, the mass matrix, gradients.
+
+        Print the result for a report with a verdict, or read its fields, which have the batch axes of the trajectory
+        (`lagjax.Health`). `reference` is a trajectory of the same system from the same start at the same times, with a
+        tolerance tighter by ten or more; with it the error of the whole motion is estimated. The drift of conserved
+        quantities does not bound that error, which may grow along the motion.
+
+        Raises `ValueError` for a reference that cannot be compared or is not tighter.
+
+        ```python
+        import jax.numpy as jnp, lagjax
+
+        pendulum = lagjax.System(lambda q, qdot: 0.5 * qdot**2 + 9.81 * jnp.cos(q))
+        run = lagjax.simulate(pendulum, 1.0, 0.0, jnp.linspace(0.0, 10.0, 101), rtol=1e-4)
+        print(run.health(reference=lagjax.simulate(pendulum, 1.0, 0.0, run.ts, rtol=1e-6)))
+        ```
+        """
+        self._require_present()
+        return import_registered("examine")(self, reference)
+
+    def to_xarray(self, units: PyTree = None, time_unit: str | None = None):
+        """An `xarray.Dataset` with a variable per leaf of `q` and `qdot` and the dimensions (member,) time, ...
+
+        - `units`: a pytree prefix of `q` of texts or None: "m" for all coordinates, {"x": "m", "theta": "rad"} for
+          each. They are stored in the `attrs` of the variables; the units of velocities are these per `time_unit`.
+        - `time_unit`: the unit of the times, such as "s" or "year".
+
+        Nested batches have the dimensions member_0, member_1, …. Where members have times of their own, as under
+        `jax.vmap`, the times are a coordinate `t`.
+
+        Raises `ImportError` when xarray is not installed.
+        """
+        return import_registered("dataset")(self, units, time_unit)
+
+    def to_pandas(self, units: PyTree = None, time_unit: str | None = None):
+        """A `pandas.DataFrame` with a row per output and a column per number: q['x'], q[1], …, qdot['x'], ….
+
+        The columns have the names that messages use. The index is `t`, or (member, t) for a batch. Hybrid motions have
+        a column `mode` of names, missing where there is none. `units` and `time_unit` are those of `to_xarray`; the
+        units are in `frame.attrs["units"]`, by column.
+
+        Raises `ImportError` when pandas is not installed.
+
+        ```python
+        import jax.numpy as jnp, lagjax
+
+        spring = lagjax.System(lambda q, qdot: 0.5 * qdot["x"] ** 2 - 0.5 * q["x"] ** 2)
+        run = lagjax.simulate(spring, {"x": 1.0}, {"x": 0.0}, jnp.linspace(0.0, 10.0, 101))
+        table = run.to_pandas(units="m", time_unit="s")
+        print(table["q['x']"].max(), table.attrs["units"])
+        ```
+        """
+        return import_registered("frame")(self, units, time_unit)
+
+    def animate(
+        self, points: Callable, trace: Any = None, *, speed: float = 1.0, fps: float = 30.0
+    ) -> "lagjax.results.Animation":
+        """A film of this motion: an `Animation`, which `save` writes to a GIF, an MP4 or a page of HTML.
+
+        - `points`: a function of q, and of `t` and `params` by name, that says where things are: an array (2,) or (3,)
+          for a point, (k, 2) or (k, 3) for a line through k points, or a dict of such arrays by name. All in the plane,
+          or all in space.
+        - `trace`: which points leave a trace that fades: a place among the points, a name in the dict (the last point
+          of that line), a pair (name, place), or a list of these.
+        - `speed`: units of time that pass in a second; `fps`: frames in a second.
+
+        Frames are evenly spaced in time, whatever the outputs are. Between outputs the motion is the Hermite cubic
+        through q and q̇, so that closer outputs make a better film; transitions are where and when they were. A line
+        that never moves is drawn without dots. Both axes have the same scale. The first 50 members of a batch are drawn
+        into one picture.
+
+        Raises `ImportError` without matplotlib; `ValueError` for points, traces and speeds that cannot be shown.
+
+        ```python
+        import jax.numpy as jnp, lagjax
+
+        pendulum = lagjax.System(lambda q, qdot: 0.5 * qdot**2 + 9.81 * jnp.cos(q))
+        run = lagjax.simulate(pendulum, 2.0, 0.0, jnp.linspace(0.0, 2.0, 41))
+        film = run.animate(lambda q: jnp.array([[0.0, 0.0], [jnp.sin(q), -jnp.cos(q)]]), trace=1)
+        film.save("pendulum.gif")
+        ```
+        """
+        return import_registered("make_animation")(self, points, trace, speed, fps)
+
+    def map_members(self, function, *more) -> PyTree:
+        """Map `function(q, qdot, (ts, tolerances), params, mode, *more)` over the batch axes, those of `more` too."""
+        numbers, code = eqx.partition(self.params, eqx.is_array_like)  # JAX maps over no function in params
+        rank = jnp.ndim(self.result._value)
+
+        def mapped(q, qdot, times_and_tolerances, numbers, mode, *more):
+            return function(q, qdot, times_and_tolerances, eqx.combine(numbers, code), mode, *more)
+
+        for outer in range(rank):
+            # The innermost batch axis of `simulate_batch` shares its times and some parameters; axes that the user's
+            # own `jax.vmap(simulate)` added are on everything.
+            shared = outer == 0 and self.ts.ndim < 1 + rank
+            axes = (None, self.params_axes) if shared else (0, 0)
+            mapped = jax.vmap(mapped, in_axes=(0, 0, *axes, 0, *[0] * len(more)))
+        return mapped(self.q, self.qdot, (self.ts, self.tolerances), numbers, self.mode, *more)
+
+    def _require_present(self) -> None:
+        """Raise `ValueError` where the scene reads other values by now than when this motion was followed."""
+        for system in (self.system,) if isinstance(self.system, System) else self.system.values():
+            system._require_present()
+
+    @marks_absent
+    def _map_outputs(self, name: str) -> PyTree:
+        """Map a method (q, qdot, t, params) of the system over the time axis, and over the batch axes before it."""
+        self._require_present()
+
+        def evaluate_member(q, qdot, times_and_tolerances, params, mode):
+            ts, _ = times_and_tolerances
+
+            def evaluate_output(q, qdot, t, mode):
+                return self._evaluate_output(name, q, qdot, t, params, mode)
+
+            return jax.vmap(evaluate_output)(q, qdot, ts, mode)
+
+        return self.map_members(evaluate_member)
+
+    def _evaluate_output(self, name: str, q, qdot, t, params, mode) -> PyTree:
+        if isinstance(self.system, System):
+            return getattr(self.system, name)(q, qdot, t, params)
+        if name not in ("energy", "momentum"):  # which every mode has
+            _require_like_constraints(self.system, name, q, qdot, params)
+        total = None
+        for index, which in enumerate(self.mode_names):
+            # Laws of another mode may be singular here: their NaN must not reach a derivative.
+            state = jax.tree.map(lambda x, here=mode == index: _varied_where(here, x), (q, qdot, t, params))
+            value = getattr(self.system[which], name)(*state)
+            total = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), value) if total is None else total
+            total = jax.tree.map(lambda new, old, here=mode == index: jnp.where(here, new, old), value, total)
+        return total
+
+
+def _require_like_constraints(modes: dict[str, System], name: str, q, qdot, params) -> None:
+    """Raise where modes do not have the same constraints, so that there is no one structure to return."""
+    constrained = [
+        which for which, s in modes.items() if s.constraints is not None or s.velocity_constraints is not None
+    ]
+    structures = [modes[which]._constraint_structure(Layout.from_state(q, qdot), params) for which in constrained]
+    if len(constrained) < len(modes) or any(structure != structures[0] for structure in structures):
+        one = constrained[0] if constrained else next(iter(modes))
+        raise ValueError(
+            f"The modes differ in their constraints, so there is no {name} of the whole motion: take the times of one "
+            f"mode and jax.vmap(trajectory.system[{one!r}].{name}, (0, 0, 0, None))(q, qdot, t, params)."
+        )
+
+
+def _varied_where(here, x):
+    return jnp.where(here, x, jax.lax.stop_gradient(x)) if eqx.is_array_like(x) else x

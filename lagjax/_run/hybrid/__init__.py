@@ -1,0 +1,335 @@
+"""Motion that changes its laws: modes, each a `System` of its own, and transitions between them.
+
+    Transition, modes ─► Plan ─► _transition_rounds: a scan, round after round ─► Ending, Record ─► Trajectory
+                          ├─ _mode_families: modes that differ by numbers alone are one program
+                          └─ _mode: the problem of one mode, its guards, the crossing of a guard, the reset
+
+Source: Aizerman & Gantmakher, Q. J. Mech. Appl. Math. 11 (1958) 225; Hiskens & Pai, IEEE Trans. Circuits Syst. I 47
+(2000) 204, §III.
+"""
+
+import dataclasses
+import functools
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._engine import Problem
+from lagjax._engine.taylor import MachineCode
+from lagjax._equations import require_consistent
+from lagjax._interface import (
+    PUSHED,
+    RESULTS,
+    Layout,
+    SimulationError,
+    as_arrays,
+    halves,
+    is_concrete,
+    require_budget,
+    require_flag,
+    result_from,
+)
+from lagjax._primitives import DOUBLE, compute_in_doubles, marks_absent
+from lagjax._run._simulate import raise_unless_ok
+from lagjax._run._trajectory import State, Trajectory, Transitions
+from lagjax._run.hybrid._mode import Transition
+from lagjax._run.hybrid._transition_rounds import IN_ONE_PLACE, Ending, RoundPlan, TransitionRecord, hybrid_motion
+from lagjax._scene import System, present_system, require_system
+
+__all__ = ["Hybrid", "Scene", "Transition", "first_law", "laws", "require_scene", "simulate_hybrid"]
+
+PyTree = Any
+# The part of a motion below which a time between transitions is none: bounces that pile up come down to the rounding of
+# the time before they are given up, and a reset that leaves a motion on its surface does so behind a longer one.
+SUDDEN = 1e-9
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class Hybrid:
+    """A hybrid system as one object: `simulate`, `simulate_hybrid`, `fit` and `sweep` take it in place of a `System`.
+
+    - `modes`, `transitions`, `start`, `max_transitions`: those of `simulate_hybrid`; every motion begins in the mode
+      `start`.
+
+    **Raises** `TypeError` or `ValueError` as `simulate_hybrid` does.
+
+    ```python
+    import lagjax
+
+    ball = lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q)
+    bounce = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -0.9 * v))
+    scene = lagjax.Hybrid({"flight": ball}, [bounce], "flight")
+    lagjax.simulate(scene, 1.0, 0.0, ts=[0.0, 1.0])
+    ```
+    """
+
+    modes: dict[str, System]
+    transitions: list[Transition]
+    start: str
+    max_transitions: int = 32
+
+    def follow(self, q0: PyTree, qdot0: PyTree, ts, params: PyTree, **options) -> Trajectory:
+        """The motion from (q0, qdot0), with the options that `simulate` and `simulate_hybrid` share."""
+        return simulate_hybrid(self, q0, qdot0, ts, params, **options)
+
+    def _now(self) -> "Hybrid":
+        """The scene with its functions as they are now: this one, where nothing that they read has changed."""
+        modes, transitions = _present(self.modes, self.transitions)
+        before, now = [*self.modes.values(), *self.transitions], [*modes.values(), *transitions]
+        same = all(map(operator.is_, before, now))
+        return self if same else Hybrid(modes, transitions, self.start, self.max_transitions)
+
+    def __repr__(self) -> str:
+        return f"Hybrid of {', '.join(map(repr, self.modes))}, begins in {self.start!r}: {self.transitions}"
+
+    def __post_init__(self):
+        _require_modes(self.modes, self.transitions, self.start, self.max_transitions)
+
+
+def _accepts_hybrid(function: Callable) -> Callable:
+    """A decorator: a `Hybrid` may stand in place of the first three arguments."""
+
+    @functools.wraps(function)
+    def decorated(modes, *args, **options):
+        if not isinstance(modes, Hybrid):
+            return function(modes, *args, **options)
+        options = {"max_transitions": modes.max_transitions, **options}
+        start = options.pop("start", modes.start)
+        return function(modes.modes, modes.transitions, start, *args, **options)
+
+    return decorated
+
+
+@marks_absent
+@_accepts_hybrid
+def simulate_hybrid(
+    modes: dict[str, System],
+    transitions: list[Transition],
+    start: str,
+    q0: PyTree,
+    qdot0: PyTree,
+    ts: jax.Array,
+    params: PyTree = None,
+    *,
+    max_transitions: int = 32,
+    rtol: float | None = None,
+    atol: float | None = None,
+    max_steps: int = 65_536,
+    throw: bool = True,
+) -> Trajectory:
+    r"""The motion from (q0, qdot0) in mode `start`, at the times `ts`, through every transition on the way.
+
+    - `modes`: a `System` for each name; all share the structure of `q0` and `params`. Or a `Hybrid` in place of the
+      first three arguments: `simulate_hybrid(hybrid, q0, qdot0, ts, params)`.
+    - `transitions`: from which mode to which, and where. The earliest transition happens; of several at one instant,
+      the first in the list. After it the same law holds as at the start (see `Transition`): guards that are at zero
+      to rounding and go on in their direction follow at once, as do blows along a row of balls that touch, and those
+      that are beyond it. What a stretch knows the next one remembers: from which side a guard comes that the reset has
+      not moved, and that one without a reset has been crossed.
+    - `max_transitions`: the budget of transitions. A motion that needs more ends there, with the result
+      `max_transitions_reached`; or with `zeno` where no budget is enough because the times accumulate, as the bounces
+      of a ball do. Intervals that shrink steadily to a sum before `ts[-1]`, or below the rounding of the time, count as
+      accumulating. Transitions that go back and forth at one instant end with `transitions_in_turn`.
+
+    The other arguments are those of `simulate`, `max_steps` counting for each stretch between transitions. The result
+    is a `Trajectory` with two more fields: `mode`, for every output time the place of its mode in `modes` (−1 where it
+    was not reached; at the instant of a transition, the mode before it), and `transitions`: `t`, `q`, `qdot` just
+    before the reset, `q_next`, `qdot_next` just after it, and `source`, `target` as places in `modes`, all of length
+    `max_transitions` with NaN or −1 beyond the last, their `count`, whether the order of the list mattered
+    (`order_matters`), and which guards were `let_out`.
+
+    `jax.vmap`, `jax.jit` and `jax.grad` work around it, and every member of a batch switches at its own time. Times and
+    states of transitions have first and second derivatives with respect to the initial state and params; third
+    derivatives are not right. Of several transitions at one instant they are those in the order in which these
+    happened: where resets do not commute, or the start touches a guard, derivatives from the other side are others. The
+    time at which a guard jumps through zero is not varied, nor is that of a transition whose guard is beyond zero where
+    its mode begins, against that beginning.
+
+    Modes whose functions differ by numbers alone, as those of a loop do, share one program where these stand in sums,
+    products, comparisons and results: a ladder of many is compiled as fast as one of few.
+
+    A guard is examined along the whole of every step, and a step is shortened until the guard is smooth there: a guard
+    that touches zero, or crosses it and comes back between two steps, is resolved. A reset to a state off the
+    constraints of the new mode ends the motion with the result `inconsistent_start`.
+
+    **Raises** `TypeError`, `ValueError` for arguments that cannot be right, `SimulationError` as `simulate` does. It
+    needs scenes that have machine code (see `System.explain`), on the CPU.
+
+    ```python
+    import jax.numpy as jnp, lagjax
+
+    ball = lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q)
+    bounce = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -0.9 * v))
+    run = lagjax.simulate_hybrid({"flight": ball}, [bounce], "flight", 1.0, 0.0, jnp.linspace(0.0, 2.0, 9))
+    run.transitions.t[: int(run.transitions.count)]
+    ```
+    """
+    require_flag(throw, "throw")
+    layout = Layout.from_state(q0, qdot0)
+    _require_modes(modes, transitions, start, max_transitions)
+    modes, transitions = _present(modes, transitions)
+    problem = Problem.from_arguments(modes[start], layout, q0, qdot0, ts, params, rtol, atol, max_steps)
+    if not all(map(is_concrete, problem.tolerances)):
+        raise ValueError("rtol and atol of simulate_hybrid must be numbers: they decide the order of the method.")
+    if is_concrete(problem.ts) and np.asarray(problem.ts)[-1] < np.asarray(problem.ts)[0]:
+        raise ValueError("simulate_hybrid goes forward in time: a reset cannot be undone; ts must increase.")
+    q0, qdot0 = as_arrays((q0, qdot0), layout.dtype, "state")
+    require_consistent(modes[start], layout, problem.ts, q0, qdot0, problem.params)
+    rtol, atol = float(MachineCode().rtol(problem.double_precision)), None if atol is None else float(atol)
+    plan = RoundPlan(modes, tuple(transitions), start, max_transitions, rtol, atol, max_steps, problem.is_single)
+    ending, record = _motion(plan, problem)
+    trajectory = _trajectory(modes, problem, ending, record)
+    return _raise_unless_ok(modes, trajectory, layout, ending.mode) if throw else trajectory
+
+
+def _motion(plan: RoundPlan, problem: Problem) -> tuple[Ending, TransitionRecord]:
+    """The rounds of a problem, in float64, in its own precision."""
+    given = problem.ts, problem.y0, problem.params
+    if not problem.is_single:
+        return hybrid_motion(plan, problem.layout, *given)
+    layout = dataclasses.replace(problem.layout, dtype=DOUBLE)
+    return compute_in_doubles(lambda *given: hybrid_motion(plan, layout, *given), *given)
+
+
+def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, record: TransitionRecord) -> Trajectory:
+    """The motion in the pytree of the user."""
+    states, (accepted, rejected) = (ending.path, ending.y, record.y, record.y_next), ending.steps
+    (q, qdot), end, (q_before, qdot_before), (q_next, qdot_next) = (
+        map(problem.layout.restore, halves(y)) for y in states
+    )
+    transitions = Transitions(
+        t=record.t, q=q_before, qdot=qdot_before, source=record.source, target=record.target,
+        count=jnp.sum(record.source >= 0), order_matters=record.order_matters, let_out=ending.let_out,
+        q_next=q_next, qdot_next=qdot_next,
+    )  # fmt: skip
+    return Trajectory(
+        ts=jnp.asarray(problem.ts),
+        q=q,
+        qdot=qdot,
+        result=result_from(ending.result),
+        end=State(ending.t, *end),
+        stats={
+            "num_steps": accepted + rejected,
+            "num_accepted_steps": accepted,
+            "num_rejected_steps": rejected,
+        },
+        system=dict(modes),
+        params=problem.params,
+        mode=ending.modes,
+        transitions=transitions,
+        mode_names=tuple(modes),
+        tolerances=MachineCode().tolerances(problem, problem.y0),
+    )
+
+
+def _raise_unless_ok(modes: dict[str, System], trajectory: Trajectory, layout: Layout, last) -> Trajectory:
+    """The trajectory where it ended well; else `SimulationError`, which names the mode `last` in which it ended."""
+    if not is_concrete(trajectory.ok) or trajectory.ok:
+        return raise_unless_ok(trajectory, layout, lambda: None)
+    name = trajectory.mode_names[int(last)]
+    system = modes[name]
+    try:
+        of_mode = dataclasses.replace(trajectory, system=system)
+        return raise_unless_ok(of_mode, layout, lambda: _why_stopped(trajectory, layout))
+    except SimulationError as error:
+        text = f"{error}\nIt was in the mode {name!r}.{_last_transitions(trajectory)}"
+        raise SimulationError(text, trajectory) from None
+
+
+def _why_stopped(trajectory: Trajectory, layout: Layout) -> str | None:
+    """Words for what its transitions came to; None where the result says it."""
+    changes, names, modes = trajectory.transitions, trajectory.mode_names, trajectory.system
+    assert changes is not None and isinstance(modes, dict)
+    end, count = trajectory.end, int(changes.count)
+    if trajectory.result == RESULTS.zeno:
+        times = np.append(np.asarray(trajectory.ts)[0], np.asarray(changes.t)[:count])
+        gaps, span = np.diff(times)[np.diff(times) > 0], float(end.t) - times[0]
+        at_once = float(end.t) - times[-1] <= SUDDEN * span
+        return PUSHED if at_once and (not gaps.size or gaps[-1] > SUDDEN * span) else None
+    if trajectory.result != RESULTS.inconsistent_start or not count:
+        return None
+    source, target = (names[int(x[count - 1])] for x in (changes.source, changes.target))
+    q, qdot = jax.tree.map(lambda x: x[count - 1], (changes.q_next, changes.qdot_next))
+    try:
+        require_consistent(modes[target], layout, jnp.stack([end.t, trajectory.ts[-1]]), q, qdot, trajectory.params)
+    except ValueError as error:
+        off = str(error).partition(" Put the state")[0].replace("q0 does", "q does").replace("qdot0 does", "qdot does")
+        return (
+            f"Behind the transition {source!r} → {target!r} the state is off the constraints of {target!r}: {off} Give "
+            "the transition a reset that puts q and qdot there, as the pull of a string does that becomes taut: "
+            "reset=lambda q, v: (q, v - (q @ v) / (q @ q) * q)."
+        )
+    return None
+
+
+def _last_transitions(trajectory: Trajectory) -> str:
+    """A sentence that names the transitions that go on for ever, where they do."""
+    changes, names = trajectory.transitions, trajectory.mode_names
+    assert changes is not None
+    if trajectory.result not in (RESULTS.zeno, RESULTS.transitions_in_turn) or not int(changes.count):
+        return ""
+    last = [np.asarray(x)[int(changes.count) - 1 :: -1][:IN_ONE_PLACE] for x in (changes.source, changes.target)]
+    pairs = dict.fromkeys(f"{names[i]!r} → {names[j]!r}" for i, j in zip(*last, strict=True))
+    return f" The last transitions were {' and '.join(pairs)}."
+
+
+def _present(modes: dict[str, System], transitions) -> tuple[dict[str, System], list[Transition]]:
+    """Modes and transitions with their functions as they are now."""
+    systems = {name: present_system(mode) for name, mode in modes.items()}
+    return systems, [transition.now() for transition in transitions]
+
+
+def _require_modes(modes, transitions, start, max_transitions) -> None:
+    if not isinstance(modes, dict) or not modes or not all(isinstance(m, System) for m in modes.values()):
+        raise TypeError("modes must be a dict of lagjax.System by name.")
+    if not isinstance(transitions, list | tuple):
+        raise TypeError(f"transitions must be a list of lagjax.Transition; got {type(transitions).__name__}.")
+    known = ", ".join(map(repr, modes))
+    if not isinstance(start, str) or start not in modes:
+        raise ValueError(f"start is {start!r}, which is no mode: the modes are {known}.")
+    for transition in transitions:
+        if not isinstance(transition, Transition):
+            raise TypeError(f"transitions must be lagjax.Transition; got {transition!r}.")
+        for role in ("source", "target"):
+            if getattr(transition, role) not in modes:
+                name = getattr(transition, role)
+                raise ValueError(f"A transition has the {role} {name!r}, which is no mode: the modes are {known}.")
+    if jax.tree.leaves((modes, transitions)):
+        raise ValueError("A function of a mode or a transition holds arrays of its own: pass these in `params`.")
+    reached, growing = {start}, True
+    while growing:
+        more = {t.target for t in transitions if t.source in reached} - reached
+        reached, growing = reached | more, bool(more)
+    if lost := [name for name in modes if name not in reached]:
+        raise ValueError(
+            f"No transition leads from {start!r} to {', '.join(map(repr, lost))}: unreachable. Add a transition to "
+            "each of these modes, or leave them out."
+        )
+    require_budget(max_transitions, "max_transitions")
+
+
+# ---- a scene of one law or of several --------------------------------------------------------------------------------
+
+Scene = System | Hybrid
+
+
+def require_scene(scene: Any) -> Scene:
+    """The scene with its functions as they are now.
+
+    Raises `TypeError` for what is neither a `System` nor a `Hybrid`.
+    """
+    return scene._now() if isinstance(scene, Hybrid) else require_system(scene)
+
+
+def first_law(scene: Scene) -> System:
+    """The system that a motion begins in."""
+    return scene.modes[scene.start] if isinstance(scene, Hybrid) else scene
+
+
+def laws(scene: Scene) -> tuple[System, ...]:
+    """The systems that a motion may be in."""
+    return tuple(scene.modes.values()) if isinstance(scene, Hybrid) else (scene,)

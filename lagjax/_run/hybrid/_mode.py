@@ -1,0 +1,268 @@
+"""One mode of a hybrid motion: its problem, its guards as programs, and the way through a transition.
+
+Where a guard vanishes is found by machine code, without derivatives. Those of the crossing come from the implicit
+function: with g the guard and ġ its rate along the motion,
+
+    dt* = −dg / ġ        dy* = dy + ẏ dt*
+
+and the same to second order (`Mode.crossing`), after which the reset is differentiated like any function. Together
+these are the jump of a sensitivity at an event ("saltation matrix").
+"""
+
+import dataclasses
+import functools
+import operator
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._engine import Problem, Solution
+from lagjax._engine.taylor import (
+    Guarded,
+    Guards,
+    MachineCode,
+    Surfaces,
+    crossing_variation,
+    require_one_number,
+    vector_of,
+)
+from lagjax._equations import Derivation
+from lagjax._interface import Function, Layout, accept, halves, present
+from lagjax._primitives import DOUBLE, SINGLE, attach_derivative
+from lagjax._program import Unlowerable
+from lagjax._scene import System
+
+PyTree = Any
+
+MOST_GUARDS = 24  # two bits each in the code of an event, which the kernel keeps in a double of 53
+
+
+class Transition(eqx.Module):
+    """A switch from mode `source` to mode `target` where `guard(q, qdot)` changes sign, or has done so.
+
+    - `guard`: a real function; it may also ask, by name, for `t`, `params` and `multipliers`, the last as the
+      constraints of the mode return them.
+    - `direction`: −1 only where the guard falls, +1 only where it rises, 0 for both. A guard that is zero where a mode
+      begins, to the rounding of the numbers that came in, and continues in that direction, has been met: the transition
+      happens at once, that of a ball on the floor with a velocity into it. One that goes the other way, or a guard of
+      both directions, has to leave zero first. Where it goes is decided by the first coefficient of its series that is
+      not rounding. Give contacts a direction.
+    - `reset(q, qdot)` → (q, qdot): the state after the transition; it may also ask for `t` and `params`. None keeps it.
+    - `fires`: what happens where the guard is beyond zero in its direction when the mode begins, at the start or
+      behind a transition. "beyond": it happens at once. "crossing": it waits until the guard has come back and crosses.
+      None decides by the target. To another mode, beyond zero is where `source` ends: at once, whatever the rate. Back
+      into its own mode it is a blow if its reset turns the guard round, or puts it back: at once where the guard goes
+      on; where it comes back it is let out, which `Transitions.let_out` and `health` say. A section, or a kick that
+      leaves the guard to go on, waits.
+
+    Raises `TypeError` or `ValueError` for names, guards and directions that are invalid.
+
+    ```python
+    import lagjax
+
+    floor = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -0.8 * v))
+    ```
+    """
+
+    source: str = eqx.field(static=True)
+    target: str = eqx.field(static=True)
+    guard: Function
+    direction: int = eqx.field(static=True)
+    reset: Function | None
+    fires: str | None = eqx.field(static=True)
+
+    def __init__(
+        self,
+        source: str,
+        target: str,
+        guard: Callable,
+        direction: int = 0,
+        reset: Callable | None = None,
+        fires: str | None = None,
+    ):
+        for role, name in (("source", source), ("target", target)):
+            if not isinstance(name, str):
+                raise TypeError(f"{role} must be the name of a mode; got {name!r}.")
+        if isinstance(direction, bool) or not isinstance(direction, int | np.integer) or abs(direction) > 1:
+            raise ValueError(f"direction must be -1 (falling), +1 (rising) or 0 (both); got {direction!r}.")
+        if guard is None:
+            raise TypeError(f"The transition from {source!r} to {target!r} has no guard: say where it happens.")
+        if fires not in (None, "beyond", "crossing"):
+            raise ValueError(f'fires must be "beyond", "crossing" or None; got {fires!r}.')
+        if fires == "beyond" and not direction:
+            raise ValueError('fires="beyond" needs a direction, -1 or +1: zero is left on both sides.')
+        self.source, self.target, self.direction, self.fires = source, target, int(direction), fires
+        self.guard = accept(guard, "guard", extras=("t", "params", "multipliers"))
+        self.reset = None if reset is None else accept(reset, "reset")
+
+    def __repr__(self) -> str:
+        way = {-1: "falls through", 0: "passes", 1: "rises through"}[self.direction]
+        more = "" if self.reset is None else f", with the reset {self.reset.name}"
+        more += "" if self.fires is None else f", fires={self.fires!r}"
+        return f"Transition({self.source!r} → {self.target!r} where {self.guard.name} {way} zero{more})"
+
+    def now(self) -> "Transition":
+        """The transition with its functions as they are now."""
+        functions = self.guard, self.reset
+        now = present(self.guard), None if self.reset is None else present(self.reset)
+        if all(map(operator.is_, functions, now)):
+            return self
+        return eqx.tree_at(lambda t: (t.guard, t.reset), self, now, is_leaf=lambda x: x is None)
+
+
+class Mode(NamedTuple):
+    """One mode, or one of a family: a problem that lacks a state and times, and the transitions that leave it.
+
+    Their `numbers` (K,) are their places among all transitions, their `targets` (K,) those of the modes that they lead
+    to. `surfaces` is None where none leaves.
+    """
+
+    problem: Problem
+    leaving: tuple[Transition, ...]
+    numbers: Any
+    targets: Any
+    surfaces: Surfaces | None
+    params: PyTree
+    vector: jax.Array  # every number in params, (P,)
+    widths: tuple = ()  # of the first (q, q̇, t), and of params: their rounding, where the start came in float32
+
+    @classmethod
+    def from_problem(cls, name: str, problem: Problem, leaving: tuple[Transition, ...], numbers, targets) -> "Mode":
+        """A mode that is ready to run. Raises `ValueError` where it has no machine code."""
+        if len(leaving) > MOST_GUARDS:
+            raise ValueError(
+                f"{len(leaving)} transitions leave the mode {name!r}, and {MOST_GUARDS} are possible: join the guards "
+                "of those that lead to the same mode, with jnp.minimum for instance."
+            )
+        code, structure = jax.tree.flatten(eqx.filter(problem.params, eqx.is_array_like, inverse=True))
+        try:
+            if refusal := MachineCode().refuses(problem):
+                raise Unlowerable(refusal)
+            surfaces = _surfaces(problem.derivation, problem.system, leaving, tuple(code), structure)
+            surfaces = surfaces and surfaces._replace(is_rounded=problem.is_rounded)
+            guarded = dataclasses.replace(problem, guards=_watched_guards(surfaces))
+            if refusal := MachineCode().refuses(guarded):
+                raise Unlowerable(refusal)
+        except Unlowerable as why:
+            raise ValueError(f"The mode {name!r} has no machine code: {why}.") from None
+        return cls(problem, leaving, numbers, targets, surfaces, problem.params, jnp.asarray(problem.vector))
+
+    def with_params(self, params: PyTree, numbers, targets) -> "Mode":
+        """The mode of the same family that has these parameters, transition numbers and targets."""
+        problem = dataclasses.replace(self.problem, params=params)
+        return self._replace(
+            problem=problem, numbers=numbers, targets=targets, params=params, vector=jnp.asarray(problem.vector)
+        )
+
+    @property
+    def layout(self) -> Layout:
+        """The structure of the coordinates."""
+        return self.problem.layout
+
+    @property
+    def _surfaces(self) -> Surfaces:
+        assert self.surfaces is not None, "no transition leaves this mode"
+        return self.surfaces
+
+    # ---- along the mode ----
+
+    def solve(self, ts, y0) -> Solution:
+        """The motion over the times `ts`, with its derivatives."""
+        return MachineCode().solve(dataclasses.replace(self.problem, ts=ts, y0=y0))
+
+    def solve_to_event(self, ts, y0, sides) -> Solution:
+        """The motion to the last of the times `ts`, or to the first zero of a guard; it has no derivatives.
+
+        Where it begins on a surface it comes from that one of the `sides` (see `_native.Guards`).
+        """
+        guarded = dataclasses.replace(self.problem, ts=ts, y0=y0, guards=_watched_guards(self.surfaces))
+        return MachineCode().solve_to_event(guarded, sides)
+
+    # ---- through a transition ----
+
+    def guards_at(self, t, y, latest) -> Guarded:
+        """The guards at a state, without derivatives, of a run that ends at `latest`."""
+        of_state, of_params = self.widths
+        of_numbers = jnp.pad(of_params, (0, self.vector.size - of_params.size))  # what modes differ by is exact
+        return self._surfaces.evaluate_guards(t, y, self.vector, latest, (of_state, of_numbers))
+
+    def crossing(self, k, taken, t, y, numbers) -> tuple:
+        """(t, y): the state at t, where guard k is zero and stays so as what went in varies, if it is `taken`.
+
+        See `taylor.crossing_variation`.
+        """
+        moved = crossing_variation(self._surfaces)
+        return attach_derivative(moved, (t, y), k, taken, t, y, numbers)
+
+    def is_inconsistent(self, t, y):
+        """True if a state is off the constraints of this mode."""
+        system = self.problem.system
+        if system.constraints is None and system.velocity_constraints is None:
+            return jnp.asarray(False)
+        motion = system._motion(self.layout, self.params)
+        t, y, numbers = jax.lax.stop_gradient((t, y, eqx.filter(self.params, eqx.is_array_like)))
+        state, dtype = (*halves(y), t, numbers), SINGLE if self.problem.is_rounded else DOUBLE
+        terms = self.problem.derivation.term_sizes(*state)
+        return motion.constraints.inconsistent(motion.mass_matrix(*state), *state, jnp.inf, dtype, terms)
+
+
+def _watched_guards(surfaces: Surfaces | None) -> Guards | None:
+    """Surfaces as machine code watches them along a mode."""
+    return None if surfaces is None else surfaces.guards(remembers=True)
+
+
+@functools.lru_cache(maxsize=64)
+def _surfaces(
+    derivation: Derivation, system: System, leaving: tuple[Transition, ...], code: tuple, structure
+) -> Surfaces | None:
+    """The guards of the transitions that leave a mode, lowered once; None where none leaves.
+
+    `code` and `structure` are what params hold that is not a number. Raises `Unlowerable`.
+    """
+    if not leaving:
+        return None
+    layout, multipliers = derivation.layout, derivation.multipliers
+    n = layout.size
+
+    def extras(y, params):
+        if multipliers is None:
+            return {}
+        flat = jnp.stack(multipliers.compute_outputs(y, vector_of(eqx.filter(params, eqx.is_array_like))))
+        return {"multipliers": system._split_by_constraint(flat, layout, params)}
+
+    def value(guard):
+        return lambda y, params: _value(
+            guard, layout.restore(y[:n]), layout.restore(y[n:-1]), {"t": y[-1], "params": params} | extras(y, params)
+        )
+
+    functions = [value(transition.guard) for transition in leaving]
+    directions = tuple(transition.direction for transition in leaving)
+    return Surfaces.from_functions(derivation, functions, directions, code, structure)
+
+
+def _value(guard: Function, q, qdot, extras) -> jax.Array:
+    """The value of a guard, after checking that it is one real number."""
+    if "multipliers" in guard.extras and "multipliers" not in extras:
+        raise ValueError("A guard asks for `multipliers`, but its mode has no constraints.")
+    return require_one_number(guard(q, qdot, **extras), "A guard")
+
+
+def state_after(transition: Transition, layout: Layout, t, y, params) -> jax.Array:
+    """The state (2n,) after the reset of a transition. Raises `TypeError` where that is no state of this layout."""
+    if transition.reset is None:
+        return y
+    result = transition.reset(*map(layout.restore, halves(y)), t=t, params=params)
+    where = f"The reset from {transition.source!r} to {transition.target!r}"
+    if not isinstance(result, tuple) or len(result) != 2:
+        raise TypeError(f"{where} must return the pair (q, qdot); got {type(result).__name__}.")
+    try:
+        same = Layout.from_state(*result) == layout
+    except (TypeError, ValueError) as why:
+        raise TypeError(f"{where} must return (q, qdot) like the initial state: {why}") from None
+    if not same:
+        raise TypeError(f"{where} must return q and qdot in the structure and the shapes of the initial state.")
+    return jnp.concatenate([layout.flatten(part) for part in result])

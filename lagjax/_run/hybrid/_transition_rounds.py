@@ -1,0 +1,550 @@
+"""The rounds of a hybrid motion: a `jax.lax.scan` in which every round ends with a transition, or ends the motion.
+
+A round runs every member to the end of its time or to the next zero of a guard of its mode, writes down the outputs on
+the way, and puts it into the next mode. Along a round derivatives are those of machine code; at its end see `_mode`.
+"""
+
+import dataclasses
+import functools
+from collections.abc import Sequence
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._engine import Problem
+from lagjax._engine.taylor import Guarded, vector_of
+from lagjax._interface import RESULTS, SUCCESSFUL, Layout, code_of
+from lagjax._native import SINGLE_NOISE
+from lagjax._primitives import lost_unless
+from lagjax._run.hybrid._mode import Mode, Transition, state_after
+from lagjax._run.hybrid._mode_families import SystemFamily, families
+from lagjax._scene import Lifted, System
+
+PyTree = Any
+
+TOO_MANY, INCONSISTENT, ZENO, IN_TURN, NOT_FINITE = map(
+    code_of,
+    (RESULTS.max_transitions_reached, RESULTS.inconsistent_start, RESULTS.zeno, RESULTS.transitions_in_turn,
+     RESULTS.nonfinite_state),
+)  # fmt: skip
+# How far the logarithms of two ratios of a geometric sequence may differ, as a part of them. Times of a Zeno motion
+# approach a geometric sequence; twice this would take a slowly changing rhythm for one.
+STEADY = 0.05
+_LEAST = 1e-300  # a side of a guard that is exactly zero still has a sign
+# Transitions at one instant that are said to go back and forth: a chain of as many is longer than any that passes on a
+# blow among a few balls. And how long before it the last other one was, in parts of the time: bounces that pile up come
+# as near to their end as rounding lets them.
+IN_ONE_PLACE, APART = 8, 1e-9
+# Blows at one instant that are followed in both orders of the list, and by how much of its largest value a number of
+# the state may differ behind them: far more than rounding of some thirty blows. Twice as many blows settle more of
+# those of restitution below one, whose last ones are small.
+MOST_BLOWS, SAME = 32, 1e-9
+
+
+class RoundPlan(eqx.Module):
+    """The constants of all rounds: the modes by name, their transitions, and what a run may cost."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    systems: tuple[System, ...]
+    transitions: tuple[Transition, ...]
+    start: str = eqx.field(static=True)
+    max_transitions: int = eqx.field(static=True)
+    rtol: float = eqx.field(static=True)
+    atol: float | None = eqx.field(static=True)
+    max_steps: int = eqx.field(static=True)
+    is_single: bool = eqx.field(static=True)  # whether the start came in float32
+
+    def __init__(self, modes, transitions, start, max_transitions, rtol, atol, max_steps, is_single):
+        self.names, self.systems, self.transitions = tuple(modes), tuple(modes.values()), transitions
+        self.start, self.max_transitions, self.is_single = start, max_transitions, is_single
+        self.rtol, self.atol, self.max_steps = rtol, atol, max_steps
+
+    def groups(self, layout: Layout, params: PyTree, widths: tuple) -> list["ModeGroup"]:
+        """The modes with the transitions that leave them; those that differ by numbers alone are one group."""
+        numbers = [tuple(k for k, t in enumerate(self.transitions) if t.source == name) for name in self.names]
+        leaving = [tuple(self.transitions[k] for k in of_mode) for of_mode in numbers]
+        limits = {"rtol": self.rtol, "atol": self.atol, "max_steps": self.max_steps}
+        groups = []
+        for family in families(self.systems, leaving, layout, params):
+            first, own = family.modes[0], params
+            if len(family.modes) > 1:
+                own = Lifted(params, tuple(row[0] for row in family.rows))
+            table = np.array([numbers[k] for k in family.modes], int).reshape(len(family.modes), -1)
+            targets = np.array([[self.names.index(self.transitions[k].target) for k in row] for row in table], int)
+            problem = Problem.from_system(family.system, layout, own, **limits)
+            problem = dataclasses.replace(problem, is_rounded=self.is_single)
+            mode = Mode.from_problem(
+                self.names[first], problem, family.leaving, table[0], targets.reshape(table.shape)[0]
+            )
+            mode = mode._replace(widths=widths)
+            groups.append(ModeGroup(family, mode, table, targets.reshape(table.shape)))
+        return groups
+
+
+class ModeGroup(NamedTuple):
+    """The modes of a family: the first of them, and for each the places (modes, K) of its transitions and targets."""
+
+    family: SystemFamily
+    first: Mode
+    numbers: np.ndarray
+    targets: np.ndarray
+
+    @property
+    def blows(self) -> tuple[np.ndarray, np.ndarray]:
+        """The places of transitions that may lead back into their own mode, with a direction and a reset; and these."""
+        own = (self.targets == np.array(self.family.modes)[:, None]).any(0)
+        some = [k for k, x in enumerate(self.first.leaving) if own[k] and x.reset and x.direction]
+        return np.array(some, int), np.array([self.first.leaving[k].direction for k in some])
+
+    def mode(self, row) -> Mode:
+        """One of its modes."""
+        if len(self.family.modes) == 1:
+            return self.first
+        tables = self.family.rows, self.numbers, self.targets
+        values, numbers, targets = jax.tree.map(lambda table: jnp.asarray(table)[row], tables)
+        return self.first.with_params(Lifted(self.first.params.params, values), numbers, targets)
+
+
+class Ending(NamedTuple):
+    """The state of a motion between rounds: after the last round, how it ended."""
+
+    t: jax.Array
+    y: jax.Array  # (2n,)
+    mode: jax.Array  # its place in `RoundPlan.names`
+    going: jax.Array  # true while it continues
+    result: jax.Array  # the integer of a `lagjax.RESULTS`
+    path: jax.Array  # (T, 2n), NaN where not reached
+    modes: jax.Array  # (T,), −1 where not reached
+    steps: jax.Array  # accepted, rejected
+    latest: jax.Array  # the number of the transition before, −1 at the beginning
+    memory: "GuardMemory"
+    let_out: jax.Array  # (K,), see `Transitions`
+
+
+class GuardMemory(NamedTuple):
+    """The sides of every guard just before the last reset, (K,): its value, and the side of its surface.
+
+    Of a guard of another mode the value is NaN. `rounding` and `rate_rounding` are those of the largest terms that a
+    guard and its rate have had.
+    """
+
+    values: jax.Array
+    sides: jax.Array  # −1, +1, or 0 where it is unknown
+    rounding: jax.Array
+    rate_rounding: jax.Array
+
+
+class Outset(NamedTuple):
+    """The guards of a mode where a motion begins in it, each (K,).
+
+    The `sides` are those from which it comes, as large as what rounding does, and infinite where the transition happens
+    at once. `lasting` is until when those on their surface stay there. Those `beyond` zero in their direction are no
+    crossings; of these the blows that come back are let out.
+    """
+
+    sides: jax.Array
+    lasting: jax.Array
+    beyond: jax.Array
+    blows: jax.Array
+
+
+class TransitionRecord(NamedTuple):
+    """One transition: its time, the states around the reset, and the modes on both sides; NaN and −1 without any.
+
+    And whether another order of the list leads to another state, where blows meet.
+    """
+
+    t: jax.Array
+    y: jax.Array
+    y_next: jax.Array
+    source: jax.Array
+    target: jax.Array
+    order_matters: jax.Array
+
+
+class Exit(NamedTuple):
+    """The end of a round: when and where it was, the state after the reset, and what becomes of the motion."""
+
+    t: jax.Array
+    y: jax.Array
+    y_next: jax.Array
+    target: jax.Array
+    number: jax.Array  # of the transition
+    piled_up: jax.Array  # whether time does not move any more
+    inconsistent: jax.Array  # whether the state after the reset is off the constraints of its mode
+    guards_defined: jax.Array
+    order_matters: jax.Array
+
+
+@eqx.filter_jit
+def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree) -> tuple[Ending, TransitionRecord]:
+    """The motion from y0 (2n,) at ts[0]: how it ended, and its transitions, with an axis of `max_transitions`."""
+    ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
+    given = jnp.append(y0, ts[0]), vector_of(eqx.filter(params, eqx.is_array_like))
+    widths = tuple(SINGLE_NOISE * jnp.abs(jax.lax.stop_gradient(x)) for x in given)
+    rounds, start = _Rounds.from_plan(plan, plan.groups(layout, params, widths), ts), plan.names.index(plan.start)
+    inconsistent = rounds.is_inconsistent(start, ts[0], y0, [start])
+    first = Ending(
+        t=ts[0], y=y0, mode=jnp.asarray(start), going=~inconsistent,
+        result=jnp.where(inconsistent, INCONSISTENT, SUCCESSFUL), path=jnp.full((ts.size, y0.size), jnp.nan),
+        modes=jnp.full(ts.size, -1), steps=jnp.zeros(2, int), latest=jnp.asarray(-1), memory=rounds.no_memory(0.0, 0.0),
+        let_out=jnp.full(len(plan.transitions), jnp.nan),
+    )  # fmt: skip
+    first = _vary_with(first, ts, y0, rounds.groups[0].first.vector)
+    ending, record = jax.lax.scan(rounds.run_round, first, jnp.arange(plan.max_transitions + 1))
+    record = jax.tree.map(lambda x: x[: plan.max_transitions], record)
+    still = jax.lax.stop_gradient(record)
+    named = jnp.where(_go_in_turn(still), IN_TURN, jnp.where(_pile_up(still.t, ts[-1]), ZENO, TOO_MANY))
+    ending = ending._replace(result=jnp.where(ending.result == TOO_MANY, named, ending.result))
+    return _lose_unreached(ending, record, (ts, y0, rounds.groups[0].first.vector))
+
+
+class _Rounds(NamedTuple):
+    plan: RoundPlan
+    groups: list[ModeGroup]
+    places: np.ndarray  # (modes, 2): of each mode its group, and which of that group it is
+    ts: jax.Array
+
+    @classmethod
+    def from_plan(cls, plan: RoundPlan, groups: list[ModeGroup], ts) -> "_Rounds":
+        places = np.zeros((len(plan.names), 2), int)
+        for index, group in enumerate(groups):
+            places[list(group.family.modes)] = [(index, row) for row in range(len(group.family.modes))]
+        return cls(plan, groups, places, ts)
+
+    def run_round(self, before: Ending, count) -> tuple[Ending, TransitionRecord]:
+        """One round: every group runs the members that are in its modes; the others are given no time."""
+        after, fired = before, jnp.asarray(False)
+        nowhere, none = jnp.full_like(before.y, jnp.nan), jnp.asarray(-1)
+        record = TransitionRecord(jnp.asarray(jnp.nan), nowhere, nowhere, none, none, fired)
+        place, row = jnp.asarray(self.places)[before.mode]
+        modes = [group.mode(jnp.where(place == index, row, 0)) for index, group in enumerate(self.groups)]
+        guards = [mode.guards_at(before.t, before.y, self.ts[-1]) if mode.leaving else None for mode in modes]
+        before = before._replace(memory=self._note_rounding(before, modes, guards))
+        for index, group in enumerate(self.groups):
+            here = before.going & (place == index)
+            ending, event, recorded = self._run_mode(group, modes[index], guards[index], before, here)
+            after, record = _select(here, ending, after), _select(here & event, recorded, record)
+            fired = fired | (here & event)
+        spent = fired & (count == self.plan.max_transitions)
+        after = after._replace(going=after.going & ~spent, result=jnp.where(spent, TOO_MANY, after.result))
+        return after, record
+
+    def is_inconsistent(self, mode, t, y, among: Sequence[int]) -> jax.Array:
+        """True if a state is off the constraints of a mode, which is one `among` these."""
+        (place, row), off = jnp.asarray(self.places)[mode], jnp.asarray(False)
+        for index in np.unique(self.places[list(among), 0]).tolist():
+            this = place == index
+            off = off | (this & self.groups[index].mode(jnp.where(this, row, 0)).is_inconsistent(t, y))
+        return off
+
+    def _run_mode(
+        self, group: ModeGroup, mode: Mode, guarded: Guarded | None, before: Ending, here
+    ) -> tuple[Ending, jax.Array, TransitionRecord]:
+        """One round in this mode of a group for members that are `here`, and whether it ended with a transition."""
+        t_start, memory = jax.lax.stop_gradient(before.t), before.memory
+        outset = self._outset(group, mode, guarded, before)
+        horizon = jnp.where(here, self.ts[-1], t_start)
+        noted = jnp.concatenate([outset.sides, _pick(memory.rate_rounding, self._places_of(mode))])
+        located = mode.solve_to_event(jnp.stack([t_start, horizon]), before.y, noted)
+        changes = jnp.where(here, located.event, 0)
+        t_end = jnp.where(here & (located.result == SUCCESSFUL), self.ts[-1], located.t_end)
+
+        # The same stretch once more, with derivatives and outputs; where it ends is known better already.
+        covered = here & ((self.ts > t_start) | (self.ts == jnp.where(t_start == self.ts[0], t_start, jnp.nan)))
+        covered = covered & (self.ts <= t_end)
+        inside = jnp.where(covered, self.ts, jax.lax.stop_gradient(jnp.clip(self.ts, t_start, t_end)))
+        moved = mode.solve(jnp.concatenate([before.t[None], inside, t_end[None]]), before.y)
+        y_end = located.y_end + jnp.where(here, moved.y_end - jax.lax.stop_gradient(moved.y_end), 0.0)
+
+        at_once = here & (t_end == t_start)
+        kinds = (changes >> jnp.arange(0, 2 * len(mode.leaving), 2)) & 3
+        put = outset.beyond & at_once
+        known = before.memory, outset.sides, t_end <= outset.lasting
+        exit, memory = self._pass_transition(group, mode, before, kinds, at_once, put, t_end, y_end, known)
+        event = (changes > 0) & ~exit.piled_up
+        result = jnp.where(exit.piled_up, ZENO, jnp.where(here & ~event, located.result, before.result))
+        # A reset may give NaN, and a guard that is NaN never fires.
+        sound = jnp.isfinite(jnp.where(event, exit.y_next, y_end)).all() & exit.guards_defined
+        broken = here & ~sound & (event | (result == SUCCESSFUL))
+        result = jnp.where(broken, NOT_FINITE, jnp.where(event & exit.inconsistent, INCONSISTENT, result))
+        after = Ending(
+            t=jnp.where(event, exit.t, t_end),
+            y=jnp.where(event, exit.y_next, y_end),
+            mode=jnp.where(event, exit.target, before.mode),
+            going=event & ~exit.inconsistent & ~broken,
+            result=result,
+            path=jnp.where(covered[:, None], moved.path[1:-1], before.path),
+            modes=jnp.where(covered, before.mode, before.modes),
+            steps=before.steps + jnp.stack([located.accepted, located.rejected]),
+            latest=exit.number,
+            memory=memory,
+            let_out=self._note_let_out(mode, before, here & outset.blows & ~((kinds > 0) & at_once)),
+        )
+        return after, event, TransitionRecord(exit.t, exit.y, exit.y_next, before.mode, exit.target, exit.order_matters)
+
+    def _pass_transition(
+        self, group: ModeGroup, mode: Mode, before: Ending, kinds, at_once, put, t, y, known
+    ) -> tuple[Exit, GuardMemory]:
+        """The state behind the first transition of those whose guard falls (1) or rises (2), as `kinds` (K,) say.
+
+        One that the motion was `put` beyond is no crossing: it happens when the mode begins, however that varies.
+        """
+        no, place = jnp.asarray(False), before.mode
+        if not mode.leaving:
+            none = Exit(t, y, y, place, jnp.asarray(-1), no, no, jnp.asarray(True), no)
+            return none, self.no_memory(known[0].rounding, known[0].rate_rounding)
+        happens, k = (kinds > 0).any(), jnp.argmax(kinds > 0)
+        first, places = np.arange(len(mode.leaving)) == k, self._places_of(mode)
+        y_here, vector = _constant_unless(happens, (y, mode.vector))
+        guarded = mode.guards_at(t, y, self.ts[-1])
+        rates = guarded.clear_rates(_pick(known[0].rate_rounding, places))
+        # It changes sign at once, against its rate: the motion that turns it round is lost in rounding.
+        against = happens & _pick(jnp.where(kinds == 2, rates < 0, rates > 0) & ~put, first) & at_once
+        is_put = _pick(put, first)
+        crossed = mode.crossing(k, happens & ~is_put, t, y_here, vector)
+        t_zero, y_zero = _select(happens, _select(is_put, (before.t, before.y), crossed), (t, y))
+        y_next = y_zero
+        for j, transition in enumerate(mode.leaving):
+            if transition.reset is not None:
+                taken = happens & (k == j)
+                moved = state_after(transition, mode.layout, *_constant_unless(taken, (t_zero, y_zero, mode.params)))
+                y_next = jnp.where(taken, moved, y_next)
+        target, number = (
+            jnp.where(happens, _pick(jnp.asarray(x), first), other)
+            for x, other in ((mode.targets, place), (mode.numbers, -1))
+        )
+        inconsistent = happens & self.is_inconsistent(target, t_zero, y_next, np.unique(group.targets).tolist())
+        memory = self._memory(mode, guarded, rates, kinds, *known)
+        there = (kinds > 0) | (jnp.abs(guarded.values) <= _pick(memory.rounding, places) + guarded.of_time)
+        order_matters = self._order_matters(group, mode, place, t, y, rates, there & (kinds > 0).any())
+        defined = ~jnp.isnan(guarded.values).any()
+        return Exit(t_zero, y_zero, y_next, target, number, against, inconsistent, defined, order_matters), memory
+
+    def _order_matters(self, group: ModeGroup, mode: Mode, place, t, y, rates, there) -> jax.Array:
+        """True if blows of guards that are `there`, (K,), lead elsewhere when the list is read from its end.
+
+        Blows lead back into their own mode. They are followed in both orders, each as long as its guard goes on in its
+        direction, once before it has been turned.
+        """
+        some, ways = group.blows
+        if some.size < 2:
+            return jnp.asarray(False)
+        # A loop that closes over numbers that vary cannot be transposed.
+        t, y, params, vector, latest = _constant_unless(False, (t, y, mode.params, mode.vector, self.ts[-1]))
+        mode = mode._replace(vector=vector)
+        there = (there & (mode.targets == place))[some]
+        resets = [functools.partial(state_after, mode.leaving[k], mode.layout, t, params=params) for k in some]
+        orders = jnp.stack([jnp.arange(some.size, 0, -1), jnp.arange(1, some.size + 1)])
+
+        def going(y):
+            return there & (mode.guards_at(t, y, latest).clear_rates()[some] * ways > 0)
+
+        def blow(y, hits, order):
+            k = jnp.argmax(jnp.where(hits, order, 0))
+            return jnp.where(hits.any(), jnp.stack([reset(y) for reset in resets])[k], y), k
+
+        def follow(carry):
+            states, armed, goes, largest, count = carry
+            hits = armed & goes
+            states, k = jax.vmap(blow)(states, hits, orders)
+            goes = jax.vmap(going)(states)
+            armed = (armed & ~(hits & (jnp.arange(some.size) == k[:, None]))) | ~goes
+            return states, armed, goes, jnp.maximum(largest, jnp.abs(states).max(0)), count + 1
+
+        def is_moving(carry):
+            _, armed, goes, _, count = carry
+            return (armed & goes).any() & (count < MOST_BLOWS) & (jnp.sum(there) > 1)
+
+        goes = there & (rates[some] * ways > 0)
+        states, goes = jnp.stack([y, y]), jnp.stack([goes, goes])
+        first = states, goes | ~goes, goes, jnp.abs(y), jnp.asarray(0)
+        (one, other), _, _, largest, _ = jax.lax.while_loop(is_moving, follow, first)
+        return (jnp.abs(one - other) > SAME * largest).any()
+
+    # ---- on which side of its surface every guard is ----
+
+    def no_memory(self, rounding, rate_rounding) -> GuardMemory:
+        """Nothing is known of any guard but its rounding."""
+        count = len(self.plan.transitions)
+        of_all = (jnp.broadcast_to(x, (count,)) for x in (rounding, rate_rounding))
+        return GuardMemory(jnp.full(count, jnp.nan), jnp.zeros(count), *of_all)
+
+    def _memory(self, mode: Mode, guarded: Guarded, rates, kinds, before: GuardMemory, sides, stays) -> GuardMemory:
+        """The sides before a reset of the guards of this mode, which began on these `sides`.
+
+        A guard that changes comes from the side that it leaves. Another one that is on its surface comes from where it
+        began, if it `stays` there since or has no rate, and else from where its rate does.
+        """
+        places = self._places_of(mode)
+        rounding = jnp.maximum(_pick(before.rounding, places), guarded.rounding)
+        since = jnp.where(stays | (rates == 0), jnp.sign(sides), -jnp.sign(rates))
+        here = jnp.where(jnp.abs(guarded.values) > rounding + guarded.of_time, jnp.sign(guarded.values), since)
+        here = jnp.where(kinds > 0, jnp.where(kinds == 1, 1.0, -1.0), here)
+        nothing = self.no_memory(before.rounding, before.rate_rounding)
+        new = guarded.values, here, rounding, jnp.maximum(_pick(before.rate_rounding, places), guarded.rate_rounding)
+        return GuardMemory(*(_put(x, places, of_mode) for x, of_mode in zip(nothing, new, strict=True)))
+
+    def _note_rounding(self, before: Ending, modes: list[Mode], guards: list[Guarded | None]) -> GuardMemory:
+        """The memory with the rounding of the guards where a round begins: of its mode, and of other modes.
+
+        A guard of another mode may be the same function. What is computed with that mode's equations says nothing here.
+        """
+        memory, place = before.memory, jnp.asarray(self.places)[before.mode][0]
+        for index, (mode, guarded) in enumerate(zip(modes, guards, strict=True)):
+            if guarded is None:
+                continue
+            here, back = place == index, self._places_of(mode).T
+            alike = np.array(["multipliers" not in transition.guard.extras for transition in mode.leaving])
+            values = jnp.where((here | alike) & jnp.isfinite(guarded.rounding), guarded.rounding, 0.0)
+            rates = jnp.where(here & jnp.isfinite(guarded.rate_rounding), guarded.rate_rounding, 0.0)
+            memory = memory._replace(
+                rounding=jnp.maximum(memory.rounding, _pick(values, back)),
+                rate_rounding=jnp.maximum(memory.rate_rounding, _pick(rates, back)),
+            )
+        return memory
+
+    def _outset(self, group: ModeGroup, mode: Mode, guarded: Guarded | None, before: Ending) -> Outset:
+        """The guards of a mode where a motion begins in it.
+
+        A guard is on the side where it was, if the reset has not moved it. One that has been followed is on the side
+        where it goes, or else where it was; without a reset it has been crossed, and so has a jump. Of others on their
+        surface it is known that they can change in their direction, if in one. For those beyond it see `Transition`.
+        """
+        memory = before.memory
+        if guarded is None or mode.surfaces is None:
+            return Outset(*jnp.zeros((2, 0)), *jnp.zeros((2, 0), bool))
+        places = self._places_of(mode)
+        values, was, rounding, largest = (_pick(x, places) for x in memory)
+        unmoved, followed = jnp.abs(guarded.values - values) <= rounding, mode.numbers == before.latest
+        rates, noise = guarded.clear_rates(largest), rounding + guarded.of_time
+        goes, ways = jnp.sign(rates), np.array([float(transition.direction) for transition in mode.leaving])
+        crossed = np.array([transition.reset is None for transition in mode.leaving]) | mode.surfaces.have_no_rate
+        ahead = jnp.where(goes != 0, goes, jnp.where(crossed, -was, was))
+        sides = jnp.where(jnp.abs(guarded.values) > noise, jnp.sign(guarded.values), -ways)
+        sides = jnp.where(unmoved & (was != 0), jnp.where(followed, ahead, was), sides)
+        size = jnp.maximum(noise, _LEAST)
+        stays = jnp.where(goes == 0, before.t, before.t + 2.0 * noise / jnp.abs(rates))
+
+        own = mode.targets == before.mode
+        chosen = np.array([(transition.fires == "beyond", transition.fires is None) for transition in mode.leaving])
+        far = guarded.values * ways > noise
+        leaves = far & (chosen[:, 0] | (chosen[:, 1] & ~own))
+        blows = far & chosen[:, 1] & own & self._are_blows(group, mode, guarded, rates, before)
+        sides = jnp.where(leaves, np.copysign(np.inf, -ways), jnp.where(blows, -ways, sides) * size)
+        return Outset(sides, jax.lax.stop_gradient(stays), leaves | blows, blows)
+
+    def _are_blows(self, group: ModeGroup, mode: Mode, guarded: Guarded, rates, before: Ending) -> jax.Array:
+        """True for every guard, (K,), whose reset keeps it off its surface: turns it round, or puts it back.
+
+        A kick that leaves it to go on does not, nor does a section without a reset.
+        """
+        some, ways = group.blows
+        are_blows = jnp.zeros(len(mode.leaving), bool)
+        if not some.size:
+            return are_blows
+        t, y, params = _constant_unless(False, (before.t, before.y, mode.params))
+        states = jnp.stack([state_after(mode.leaving[k], mode.layout, t, y, params) for k in some])
+        after = jax.vmap(mode.guards_at, (None, 0, None))(t, states, self.ts[-1])
+        after = jax.tree.map(lambda x: x[np.arange(some.size), some], after)
+        later, moved = after.clear_rates() * ways, (guarded.values[some] - after.values) * ways
+        turned = jnp.where(rates[some] * ways < 0, later >= 0, later <= 0)
+        return are_blows.at[some].set(turned | (moved > after.rounding))
+
+    def _note_let_out(self, mode: Mode, before: Ending, are_let_out) -> jax.Array:
+        """The first times at which guards were let out, (K,), with those of this round."""
+        places = self._places_of(mode)
+        known = _pick(before.let_out, places)
+        now = jnp.where(are_let_out & jnp.isnan(known), jax.lax.stop_gradient(before.t), known)
+        return _put(before.let_out, places, now)
+
+    def _places_of(self, mode: Mode):
+        """The places of a mode's transitions among all, (K of the mode, K) of bool."""
+        return mode.numbers[:, None] == np.arange(len(self.plan.transitions))
+
+
+def _vary_with(first: Ending, *inputs) -> Ending:
+    """The state before the first round as it is, with derivatives, a batch and mesh axes where later ones have them.
+
+    Else JAX writes the rounds down once more for numbers that get these in a round. The derivatives of a sine vary with
+    the inputs, too, in every order.
+    """
+    moving = jnp.sin(sum(x.ravel()[0] for x in inputs if x.size))
+    still = jax.lax.stop_gradient(moving)
+
+    def vary(x, like=still):
+        return jnp.where(False, like.astype(jnp.asarray(x).dtype), x)
+
+    return jax.tree.map(vary, first)._replace(
+        t=vary(first.t, moving), y=vary(first.y, moving), path=vary(first.path, moving)
+    )
+
+
+def _select(condition, new: PyTree, old: PyTree) -> PyTree:
+    return jax.tree.map(lambda a, b: jnp.where(condition, a, b), new, old)
+
+
+def _pick(x: jax.Array, places) -> jax.Array:
+    """The entry of x (K,) in each row of `places` (…, K), which hold one at most: 0 without any.
+
+    In a batch XLA makes several programs of a look-up, and one of this.
+    """
+    found = jnp.where(places, x, jnp.zeros_like(x))
+    return found.any(-1) if x.dtype == bool else found.sum(-1)
+
+
+def _put(x: jax.Array, places, values: jax.Array) -> jax.Array:
+    """x (K,) with these values (k,) at their places (k, K)."""
+    return jnp.where(places.any(0), _pick(values, places.T), x)
+
+
+def _constant_unless(varies, tree: PyTree) -> PyTree:
+    """The numbers of a pytree, without derivatives unless `varies` holds."""
+
+    def constant(x):
+        if not eqx.is_array_like(x):
+            return x
+        still = jax.lax.stop_gradient(x)
+        return still if varies is False else jnp.where(varies, x, still)
+
+    return jax.tree.map(constant, tree)
+
+
+def _pile_up(times, end) -> jax.Array:
+    """True if the times of a spent budget of transitions run geometrically to a limit before `end`.
+
+    Aitken's extrapolation of the last times, taken far enough apart that a pattern of two, three or six transitions (a
+    flight and a contact, say) repeats in between: three intervals whose two ratios agree, and are below one. Or the
+    time does not move any more.
+    """
+    apart = next((k for k in (6, 2, 1) if 3 * k < times.size), None)
+    if apart is None:
+        return jnp.asarray(False)  # too few to tell
+    first, second, third = jnp.diff(times[-1 - 3 * apart :: apart])
+    before, ratio = second / first, third / second
+    steady = jnp.abs(jnp.log(ratio) - jnp.log(before)) <= STEADY * jnp.abs(jnp.log(before))
+    rounding = 4 * float(jnp.finfo(times.dtype).eps) * jnp.abs(times[-1])
+    lost = (third <= rounding) & (apart > 1)  # one alone may be two transitions at the same instant
+    return lost | ((ratio < 1) & steady & (times[-1] + third * ratio / (1 - ratio) < end))
+
+
+def _go_in_turn(record: TransitionRecord) -> jax.Array:
+    """True if the last transitions of a spent budget, of several kinds, are at one instant to which none pile up."""
+    if record.t.size < IN_ONE_PLACE:
+        return jnp.asarray(False)
+    last, kinds = record.t[-1], record.source * record.t.size + record.target
+    same = jnp.abs(record.t - last) <= 4 * float(jnp.finfo(record.t.dtype).eps) * jnp.abs(last)
+    before = jnp.max(jnp.where(same, -jnp.inf, record.t))
+    both = (kinds[-IN_ONE_PLACE:] != kinds[-1]).any()
+    return same[-IN_ONE_PLACE:].all() & both & (last - before > APART * jnp.abs(last))
+
+
+def _lose_unreached(ending: Ending, record: TransitionRecord, inputs) -> tuple[Ending, TransitionRecord]:
+    """The ending and the record with NaN derivatives of outputs that were not reached and of absent transitions."""
+    happened = record.source >= 0
+    t, y, y_next = (lost_unless(happened[:, *[None] * (x.ndim - 1)], x, inputs) for x in record[:3])
+    path = lost_unless((ending.modes >= 0)[:, None], ending.path, inputs)
+    return ending._replace(path=path), record._replace(t=t, y=y, y_next=y_next)

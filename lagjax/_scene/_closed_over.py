@@ -1,0 +1,144 @@
+"""`lift_problem`: a problem whose functions close over numbers that are being traced, with these as parameters.
+
+`jax.grad(lambda k: simulate(System(lambda q, v: … k …), …))` gives a Lagrangian that reads a tracer. No program can be
+made of that, nor kept. So each function is traced once, as `jax.closure_convert` does, what it took from outside goes
+beside the user's parameters (`Lifted`), and the program serves every other value, and every function with that code.
+"""
+
+import dataclasses
+from dataclasses import dataclass
+from typing import Any, NamedTuple
+
+import diffrax
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+from jax.core import Tracer
+from jax.extend import core
+
+from lagjax._engine import Batch, Problem
+from lagjax._interface import Function
+from lagjax._interface.reads import Edition, place_in
+from lagjax._scene._system import ROLES, replace_functions
+
+PyTree = Any
+
+
+class Lifted(NamedTuple):
+    """The parameters of the user, and numbers that functions closed over, or by which modes differ."""
+
+    params: PyTree
+    values: tuple
+
+
+@dataclass(frozen=True, eq=False)
+class _Trace:
+    """A function of the user as it was traced, for parameters that are `Lifted`."""
+
+    name: str
+    jaxpr: Any  # whose first arguments are the constants
+    constants: tuple[Any, ...]  # what it took from outside; None for tracers
+    places: tuple[int | None, ...]  # those of tracers among the values
+    structure: Any  # of what it returns
+
+    @property
+    def __name__(self) -> str:
+        return self.name
+
+    def __call__(self, *roles: Any, params: Lifted, t: Any = 0.0) -> PyTree:
+        pairs = zip(self.constants, self.places, strict=True)
+        constants = [c if k is None else params.values[k] for c, k in pairs]
+        values = *constants, *jax.tree.leaves((roles, t, eqx.filter(params.params, eqx.is_array_like)))
+        values = [jnp.asarray(x, v.aval.dtype) for x, v in zip(values, self.jaxpr.invars, strict=True)]
+        return jax.tree.unflatten(self.structure, core.jaxpr_as_fun(core.ClosedJaxpr(self.jaxpr, []))(*values))
+
+
+@dataclass(frozen=True, eq=False)
+class Unchanged:
+    """A function of the user that reads no tracer, for parameters that are `Lifted`."""
+
+    function: Function
+
+    @property
+    def __name__(self) -> str:
+        return self.function.name
+
+    def __call__(self, *roles: Any, params: Lifted, t: Any = 0.0) -> PyTree:
+        return self.function(*roles, t=t, params=params.params)
+
+
+def lift_problem(problem: Problem) -> Problem:
+    """The problem with the tracers that its functions close over as parameters; itself where they close over none."""
+    fields = object.__getattribute__(problem.system, "__dict__")  # an attribute of an equinox.Module takes 2 µs
+    present = [f for role in ROLES if isinstance(f := fields[role], Function)]
+    if problem.event is not None:
+        present += filter(_is_function, jax.tree.leaves(problem.event.cond_fn, is_leaf=_is_function))
+    if not any(object.__getattribute__(f, "code").tracers for f in present):
+        return problem
+    if jax.tree.leaves((problem.system, present)):  # what holds arrays of its own has no program anyway
+        return problem
+    functions = {role: fields[role] for role in ROLES}
+    values: list[Tracer] = []
+
+    def lift(function: Any, roles: int = 2) -> Any:
+        return _lift_function(function, roles, problem, values) if isinstance(function, Function) else function
+
+    system = replace_functions(
+        problem.system, {name: lift(f, 1 + (name != "constraints")) for name, f in functions.items()}
+    )
+    event = problem.event
+    if event is not None:
+        conditions = jax.tree.map(lift, event.cond_fn, is_leaf=_is_function)
+        event = diffrax.Event(conditions, event.root_finder, event.direction)
+    return dataclasses.replace(problem, system=system, event=event, params=Lifted(problem.params, tuple(values)))
+
+
+def lift_batch(batch: Batch) -> Batch:
+    """A batch with the tracers that its functions close over as parameters of all members."""
+    member = lift_problem(batch.member)
+    if member is batch.member:
+        return batch
+    values = member.params.values
+    return Batch(member, batch.y0, Lifted(batch.params, values), (*batch.axes, *[None] * len(values)))
+
+
+def _is_function(x: Any) -> bool:
+    return isinstance(x, Function)
+
+
+def _lift_function(function: Function, roles: int, problem: Problem, values: list) -> Function:
+    extras = tuple(dict.fromkeys((*function.extras, "params")))
+    if not function.code.tracers or "inputs" in function.extras:
+        unchanged = Unchanged(function)
+        return Function(None, Edition.from_function(unchanged), extras)
+    numbers, rest = eqx.partition(problem.params, eqx.is_array_like)
+    layout = problem.layout
+    state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
+
+    def call_with_numbers(states, t, numbers):
+        return function(*states, t=t, params=eqx.combine(numbers, rest))
+
+    closed, shapes = jax.make_jaxpr(call_with_numbers, return_shape=True)((state,) * roles, t, numbers)
+    places = tuple(place_in(values, c) if isinstance(c, Tracer) else None for c in closed.consts)
+    constants = tuple(None if isinstance(c, Tracer) else c for c in closed.consts)
+    structure = jax.tree.structure(shapes)
+    return function_from_trace(
+        function, open_jaxpr(closed), constants, places, structure, f"{places} {closed.in_avals}"
+    )
+
+
+def open_jaxpr(closed: core.ClosedJaxpr, more=(), **changes) -> core.Jaxpr:
+    """A trace whose first arguments are what it took from outside and `more` variables; and with other `changes`."""
+    jaxpr = closed.jaxpr
+    return jaxpr.replace(constvars=[], invars=[*jaxpr.constvars, *more, *jaxpr.invars], **changes)
+
+
+def function_from_trace(function: Function, jaxpr, constants: tuple, places: tuple, structure, how: str) -> Function:
+    """A function as its trace, for parameters that are `Lifted`: the constants that have `places` are values there.
+
+    The first arguments of the jaxpr are these constants. `how` says where the values stand in it, so that equal
+    functions with equal places are one edition.
+    """
+    trace = _Trace(function.name, jaxpr, constants, places, structure)
+    extras = tuple(dict.fromkeys((*function.extras, "params")))
+    return Function(None, function.code.trace_edition(trace, how), extras)

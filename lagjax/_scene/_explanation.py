@@ -1,0 +1,206 @@
+"""The contents of a scene, and what was left out of its equations: facts read off the scalar programs.
+
+Nothing here looks at numbers: a coordinate is cyclic when no operation of the reduced Lagrangian reads it, the energy
+is conserved when none reads the time, no force is given, and the constraints do no work: f does not read the time, and
+a(q, q̇) is zero at rest. Only the dependence of constraints on each other is decided at one state.
+"""
+
+from dataclasses import dataclass, field, replace
+from typing import Any
+
+import numpy as np
+
+from lagjax._engine import Problem, choose
+from lagjax._engine.diffrax import ArrayEquations, form_of
+from lagjax._equations import dependent_rows, pieces_of_motion
+from lagjax._interface import show_str
+from lagjax._native import Nesting, is_large, pieces_of
+from lagjax._program import CLOCK, FLOOR, SIGN, TABLE, TRUNC, Program, Unlowerable
+
+_PIECES = {
+    SIGN: "the sign of", FLOOR: "the whole part of", TRUNC: "the whole part of", CLOCK: "samples by",
+    TABLE: "a table by",
+}  # fmt: skip
+
+
+@dataclass(frozen=True)
+class Explanation:
+    """The facts about a scene; `print` shows them as a table. A fact that could not be determined is None.
+
+    - `coordinates`: the name of every scalar coordinate; `cyclic`: those that L does not depend on, whose momenta are
+      conserved where no force and no constraint force acts.
+    - `mass_matrix`: "constant" or "varying", then "diagonal", "block-diagonal" or "dense"; `mass_matrix_depends_on`:
+      the coordinates, velocities (`d` before the name) and `t` that it reads.
+    - `velocity_terms`: whether forces depend on the velocities; `explicit_time`: whether anything depends on `t`.
+    - `energy_conserved`: whether h = p·q̇ − L is constant along every motion.
+    - `borders`: where the accelerations are piecewise: the operation (a sign, a whole part) and what it reads; on the
+      array path the operation and its line. `borders_located`: whether steps end exactly there; otherwise they go
+      across, and there are no derivatives of a motion that crosses a jump. `narrow`: functions that are flat until
+      their argument comes near (exp, tanh, …), and powers that rise from nothing as their base falls or grows, whose
+      arguments and bases machine code watches along every step.
+    - `operations`: scalar operations of one acceleration (with constraints in machine code, where M is regular);
+      `traced_operations`: of its derivatives before reduction.
+    - `constraints`: the name of every number that is to be zero; `dependent_constraints`: those that, at the state in
+      question, are combinations of earlier ones, and of which (to eps^(2/3) of the squared gradient). They change
+      nothing but the multipliers.
+    - `projection_operations`: scalar operations of one projection onto the constraints, which follows every step.
+    - `path`: "scalar" or "array"; `reason`: why not "scalar".
+    - `solver`: the default engine, and why not machine code where it is not; for machine code also whether operations
+      are written one by one or stand in tables.
+    """
+
+    coordinates: tuple[str, ...]
+    path: str
+    reason: str
+    solver: str
+    cyclic: tuple[str, ...] | None = None
+    mass_matrix: str | None = None
+    mass_matrix_depends_on: tuple[str, ...] | None = None
+    velocity_terms: bool | None = None
+    explicit_time: bool | None = None
+    energy_conserved: bool | None = None
+    borders: tuple[str, ...] | None = None
+    borders_located: bool | None = None
+    narrow: tuple[str, ...] | None = None
+    operations: int | None = None
+    traced_operations: int | None = None
+    constraints: tuple[str, ...] = ()
+    dependent_constraints: dict[str, tuple[str, ...]] | None = field(default_factory=dict)
+    projection_operations: int | None = None
+
+    def with_constraints(self, names: list[str], schur_complement: np.ndarray | None) -> "Explanation":
+        """The explanation with the names of constraints; where G M⁻¹ Gᵀ is known, with the dependent ones."""
+        dependent = None
+        if schur_complement is not None:
+            dependent = {
+                names[row]: tuple(name for name, factor in zip(names, factors, strict=True) if factor)
+                for row, factors in dependent_rows(schur_complement).items()
+            }
+        return replace(self, constraints=tuple(names), dependent_constraints=dependent)
+
+    _repr_pretty_ = show_str
+
+    def __str__(self) -> str:
+        rows = [("coordinates", f"{len(self.coordinates)}: {_join_names(self.coordinates)}")]
+        if self.cyclic is not None:
+            reads = _join_names(self.mass_matrix_depends_on or ())
+            rows += [
+                ("cyclic", _join_names(self.cyclic)),
+                ("mass matrix", f"{self.mass_matrix}; depends on {reads}"),
+                ("velocity terms", "yes" if self.velocity_terms else "no"),
+                ("explicit time", "yes" if self.explicit_time else "no"),
+                ("energy conserved", "yes" if self.energy_conserved else "no"),
+            ]
+        if self.borders:
+            how = "steps end there" if self.borders_located else "not located: steps of diffrax go across"
+            rows.append(("borders", f"{_count_names(self.borders)}; {how}"))
+        if self.narrow:
+            rows.append(("narrow features", _count_names(self.narrow)))
+        if self.constraints:
+            rows.append(("constraints", f"{len(self.constraints)}: {_join_names(self.constraints)}"))
+        for name, others in (self.dependent_constraints or {}).items():
+            rows.append(("dependent", f"{name} on {_join_names(others)}"))
+        if self.operations is not None:
+            rows.append(("operations", f"{self.operations} per acceleration, {self.traced_operations} as derived"))
+        if self.projection_operations is not None:
+            rows.append(("", f"{self.projection_operations} per projection to the constraints"))
+        rows.append(("path", self.path + (f", because {self.reason}" if self.reason else "")))
+        rows.append(("solver", self.solver))
+        return "\n".join(f"{name:17s} {value}" for name, value in rows)
+
+
+def explain(problem: Problem) -> Explanation:
+    """The facts about the scene of a problem, and which engine is chosen for it."""
+    derivation = problem.derivation
+    names, n, motion = derivation.layout.names, derivation.layout.size, derivation.motion
+    known = {"coordinates": names, **_engine(problem)}
+    try:
+        matrix, force = derivation.program("mass_matrix"), derivation.reads("force")
+    except Unlowerable:
+        return Explanation(**known, **_borders_in_lines(problem))
+
+    inputs = (*names, *(f"d{name}" for name in names), "t")
+
+    def named(*quantities: str) -> set[str]:
+        return {inputs[i] for quantity in quantities for i in derivation.reads(quantity) if i < len(inputs)}
+
+    mass, lagrangian = named("mass_matrix"), named("lagrangian")
+    return Explanation(
+        **known,
+        **_borders(problem, inputs),
+        cyclic=tuple(name for name in names if name not in lagrangian),
+        mass_matrix=f"{'varying' if mass else 'constant'}, {_pattern(matrix, n)}",
+        mass_matrix_depends_on=tuple(name for name in inputs if name in mass),
+        velocity_terms=any(i in force for i in range(n, 2 * n)),
+        explicit_time="t" in named("lagrangian", "mass_matrix", "force", "residual"),
+        energy_conserved=not derivation.works and motion.forces is None and motion.dissipation is None,
+        traced_operations=derivation.traced_operations,
+    )
+
+
+def _engine(problem: Problem) -> dict[str, Any]:
+    """The default solver of a motion, the form in which it evaluates the equations, and the cost of that."""
+    derivation, refusal = problem.derivation, choose(problem).refusal
+    if refusal is None:
+        solver, reason = "Taylor series in machine code", ""
+        if is_large(derivation.acceleration, derivation.projection):
+            solver += ", whose operations stand in tables: for code operation by operation they are too many"
+        programs = derivation.acceleration, derivation.projected
+    else:
+        solver, form = f"diffrax.Dopri8, because {refusal}", form_of(derivation, problem.system.path)
+        if isinstance(form, ArrayEquations):
+            return {"solver": solver, "path": "array", "reason": form.reason}
+        reason, programs = "", (form.program, form.projection)
+    operations, of_projection = (None if program is None else program.operations for program in programs)
+    costs = {"operations": operations, "projection_operations": of_projection}
+    return {"solver": solver, "path": "scalar", "reason": reason, **costs}
+
+
+def _borders(problem: Problem, inputs: tuple[str, ...]) -> dict[str, Any]:
+    """The borders and the narrow features of the accelerations, each by what it is and which inputs it reads."""
+    derivation, n = problem.derivation, problem.derivation.layout.size
+    try:
+        borders = derivation.borders
+    except Unlowerable:
+        return _borders_in_lines(problem)
+    if borders is None:
+        return {"borders": (), "narrow": (), "borders_located": True}
+
+    def read_by(node: int) -> str:
+        return _join_names(tuple(inputs[i] for i in sorted(borders.read_by(node)) if i < len(inputs)))
+
+    kinds = zip(borders.switches, borders.kinds, strict=True)
+    in_machine_code = choose(problem).refusal is None and pieces_of(derivation.acceleration, Nesting(n)) is not None
+    return {
+        "borders": tuple(f"{_PIECES[kind]} {read_by(node)}" for node, kind in kinds if kind in _PIECES),
+        "narrow": tuple(f"a function of {read_by(node)}" for node in borders.arguments),
+        "borders_located": in_machine_code or set(borders.kinds) <= {CLOCK},  # known times are diffrax's as well
+    }
+
+
+def _borders_in_lines(problem: Problem) -> dict[str, Any]:
+    """The piecewise operations of the user's functions, by their lines."""
+    n = problem.derivation.layout.size
+    state = problem.y0[:n], problem.y0[n:], problem.ts[0], problem.numbers
+    pieces = pieces_of_motion(problem.derivation.motion, *state)
+    names = tuple(f"{name}{place}" for name, place, size in pieces for _ in range(size))
+    return {"borders": names, "borders_located": not names}
+
+
+def _count_names(names: tuple[str, ...]) -> str:
+    """The count of names, and each of them once."""
+    return f"{len(names)}: {_join_names(tuple(dict.fromkeys(names)))}"
+
+
+def _pattern(parts: Program, n: int) -> str:
+    """Diagonal, block-diagonal or dense: the connected parts of the graph of entries that are not zero."""
+    filled = np.array([[parts.constant(n * i + j) != 0 for j in range(n)] for i in range(n)])
+    if not (filled & ~np.eye(n, dtype=bool)).any():
+        return "diagonal"
+    connected = np.linalg.matrix_power((filled | np.eye(n, dtype=bool)).astype(float), n) > 0
+    return "dense" if connected.all() else "block-diagonal"
+
+
+def _join_names(names: tuple[str, ...], longest: int = 12) -> str:
+    shown = ", ".join(names[:longest]) or "none"
+    return shown + (f", … ({len(names) - longest} more)" if len(names) > longest else "")

@@ -1,0 +1,491 @@
+"""`System`: the scene as its author describes it, and the physics one can ask of a single state.
+
+A `System` holds the user's functions, checked for their signatures when it is built and for what they return when they
+first meet a state. `System._motion(layout)` is the same scene in flat coordinates, as an integration takes it.
+"""
+
+import math
+import operator
+from collections.abc import Callable
+from typing import Any, Literal
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from lagjax._engine import Problem
+from lagjax._engine.taylor import lowered_motion
+from lagjax._equations import (
+    SADDLE,
+    Constraints,
+    Motion,
+    Sample,
+    derivation_of,
+    numbers_of,
+    schur_complements,
+    solve_saddle,
+)
+from lagjax._interface import Function, Layout, ValueNotKnown, accept, as_arrays, is_concrete, present, require_number
+from lagjax._primitives import SINGLE, compute_in_doubles
+from lagjax._program import Unlowerable
+from lagjax._scene._explanation import Explanation, explain
+
+PyTree = Any
+ROLES = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
+Time = Float[ArrayLike, ""]  # a number, or an array of shape ()
+
+
+class System(eqx.Module):
+    r"""A mechanical system, described by its Lagrangian.
+
+    The equations of motion are those of Lagrange, with generalised forces Q and a Rayleigh dissipation function D,
+
+        d/dt ∂L/∂q̇ = ∂L/∂q + Q − ∂D/∂q̇ + (∂f/∂q)ᵀλ + (∂a/∂q̇)ᵀμ.
+
+    The multipliers λ, μ are those for which f and a stay zero. Their sign is that of L̄ = L + Σ λ f, so that (∂f/∂q)ᵀλ
+    is the force that the constraint exerts. Constraints on velocities follow the principle of d'Alembert and Lagrange:
+    their force does no work on the velocities they allow, and they are not added to L. M may be singular where
+    constraints determine the accelerations that L leaves open. Redundant constraints change nothing but the
+    multipliers, which are then those of least norm.
+
+    **Arguments**
+
+    - `lagrangian(q, qdot)`: a plain JAX function that returns the scalar L. `q` is any pytree of real floats (a number,
+      an array, a dict, a NamedTuple); `qdot` has the same structure. L need not be T − U.
+    - `forces(q, qdot)`: the generalised forces Q that have no potential, in the structure of `q`.
+    - `dissipation(q, qdot)`: the scalar D, half the power that is dissipated when D is quadratic in `qdot`.
+    - `constraints(q)`: what must stay zero, f(q, t) = 0: a number, an array, or a dict of named ones.
+    - `velocity_constraints(q, qdot)`: a(q, q̇, t) = 0 that cannot be integrated to such an f: rolling, skates.
+
+    Each may also take, by name, the time `t` and the parameters `params` (any pytree), and in a scene that is fitted to
+    records their sampled `inputs` (`lagjax.Record`).
+
+    - `path`: how the equations are evaluated. A small scene is reduced to a scalar program that holds only the
+      arithmetic it needs, a large one keeps arrays; "auto" chooses, "scalar" and "array" insist. The motion is the
+      same.
+
+    **Units.** Any consistent ones; coordinates of different units may be mixed. The momentum of q has units
+    mass·length²·time⁻¹/{q}, its force mass·length²·time⁻²/{q}, so that p q̇, F q and L are energies. A change of units
+    changes nothing but numbers.
+
+    **Raises** `TypeError` when a function has another signature, when coordinates are not real floats or when a
+    function does not return what its role asks for; `ValueError` when `q` and `qdot` differ in structure or shape.
+
+    Source: Landau & Lifshitz, *Mechanics*, §2 (Lagrange's equations), §6 (energy), §25 (dissipation).
+
+    ```python
+    import jax.numpy as jnp, lagjax
+
+    def pendulum(q, qdot, params):
+        return 0.5 * params["m"] * params["l"]**2 * qdot**2 + params["m"] * 9.81 * params["l"] * jnp.cos(q)
+
+    scene = lagjax.System(pendulum)
+    scene.acceleration(0.1, 0.0, params={"m": 1.0, "l": 0.5})
+    ```
+    """
+
+    lagrangian: Function
+    forces: Function | None
+    dissipation: Function | None
+    constraints: Function | None
+    velocity_constraints: Function | None
+    path: str = eqx.field(static=True)
+
+    def __init__(
+        self,
+        lagrangian: Callable,
+        *,
+        forces: Callable | None = None,
+        dissipation: Callable | None = None,
+        constraints: Callable | None = None,
+        velocity_constraints: Callable | None = None,
+        path: Literal["auto", "scalar", "array"] = "auto",
+    ):
+        if not isinstance(path, str) or path not in ("auto", "scalar", "array"):
+            raise ValueError(f"path must be 'auto', 'scalar' or 'array'; got {path!r}.")
+        self.path = path
+        self.lagrangian = _accept(lagrangian, "lagrangian")
+        self.forces = None if forces is None else _accept(forces, "forces")
+        self.dissipation = None if dissipation is None else _accept(dissipation, "dissipation")
+        self.constraints = None if constraints is None else _accept(constraints, "constraints", ("q",))
+        self.velocity_constraints = (
+            None if velocity_constraints is None else _accept(velocity_constraints, "velocity_constraints")
+        )
+
+    def __repr__(self) -> str:
+        """One line: the functions of the scene and what each asks for. `equinox.tree_pprint` prints the fields."""
+        functions = [(role, getattr(self, role)) for role in ROLES]
+        # Mapped to another pytree (axes, filters), a scene is no longer made of functions.
+        shown = [f"{role}={getattr(f, 'name', f)}" for role, f in functions if f is not None]
+        return f"System({', '.join(shown)}, path={self.path!r})"
+
+    def _require_present(self) -> None:
+        """Raise `ValueError` where something that a function of the scene reads has changed since this one was made."""
+        for function in (getattr(self, role) for role in ROLES):
+            if isinstance(function, Function):
+                function.code.require_present()
+
+    # ---- the physics of one state: q and qdot in the user's pytree, the time t, the parameters params ----
+
+    def acceleration(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> PyTree:
+        """q̈ from Lagrange's equations, in the structure of `q`; NaN where no acceleration is determined.
+
+        That is so where M is singular, or, with constraints, where M and the constraints together leave some
+        acceleration free.
+        """
+        return self._evaluate_quantity(Motion.acceleration, q, qdot, t, params, restore=True)
+
+    def mass_matrix(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> Float[Array, "n n"]:
+        """M = ∂²L/∂q̇², in the order in which the leaves of `q` lie end to end.
+
+        The entry of two coordinates a and b has units energy·time²/({a}{b}).
+        """
+        return self._evaluate_quantity(Motion.mass_matrix, q, qdot, t, params)
+
+    def momentum(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> PyTree:
+        """The conjugate momentum p = ∂L/∂q̇, in the structure of `q`, in units energy·time/{q}."""
+        return self._evaluate_quantity(Motion.momentum, q, qdot, t, params, restore=True)
+
+    def generalized_force(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> PyTree:
+        """∂L/∂q + Q − ∂D/∂q̇, in the structure of `q`, in units energy/{q}.
+
+        Along a motion dp/dt equals this force plus, with constraints, `constraint_force`.
+        """
+        return self._evaluate_quantity(Motion.generalized_force, q, qdot, t, params, restore=True)
+
+    def energy(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> Float[Array, ""]:
+        """h = p·q̇ − L, a scalar. It changes by dh/dt = −∂L/∂t + (Q − ∂D/∂q̇)·q̇, and need not equal T + U.
+
+        Constraints that depend on the time do work as well: −λ ∂f/∂t.
+        """
+        return self._evaluate_quantity(Motion.energy, q, qdot, t, params)
+
+    def multipliers(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> PyTree:
+        """λ, in the structure that the constraint functions return: a dict by name if they return dicts.
+
+        With both kinds of constraints: one dict if both return dicts, else the pair (λ, μ). Where constraints are
+        redundant, their forces are shared by the multipliers of least norm. λ has units energy/{f}.
+
+        **Raises** `ValueError` for a system without constraints.
+        """
+        return self._evaluate_constraints(Motion.multipliers, q, qdot, t, params)
+
+    def constraint_residual(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> PyTree:
+        """f and a, in the structure of `multipliers`: zero where the constraints hold.
+
+        **Raises** `ValueError` for a system without constraints.
+        """
+        return self._evaluate_constraints(Motion.residual, q, qdot, t, params)
+
+    def constraint_force(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> PyTree:
+        """(∂f/∂q)ᵀλ + (∂a/∂q̇)ᵀμ, in the structure of `q`, in units energy/{q}.
+
+        **Raises** `ValueError` for a system without constraints.
+        """
+        self._require_constraints()
+        return self._evaluate_quantity(Motion.constraint_force, q, qdot, t, params, restore=True)
+
+    def project(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> tuple[PyTree, PyTree]:
+        """The consistent state (q̂, v̂) nearest to (q, q̇), in the structure of `q`.
+
+            q̂ minimises (q̂ − q)ᵀ M(q, q̇) (q̂ − q)    among all with f(q̂, t) = 0
+            v̂ minimises (v̂ − q̇)ᵀ M(q̂, q̇) (v̂ − q̇)   among all with J v̂ + ∂f/∂t = 0 and a(q̂, v̂, t) = 0
+
+        The projection has derivatives of every order with respect to the state, the time and the parameters. Values and
+        derivatives are NaN where Newton's method does not converge, as for constraints that contradict each other.
+
+        **Raises** `ValueError` for a system without constraints.
+
+        ```python
+        import jax.numpy as jnp, lagjax
+
+        circle = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q: q @ q - 1.0)
+        q0, qdot0 = circle.project(jnp.array([3.0, 4.0]), jnp.array([0.0, 1.0]))  # (0.6, 0.8), (-0.48, 0.36)
+        ```
+        """
+        self._require_constraints()
+        layout = Layout.from_state(q, qdot)
+        q, qdot = self._evaluate_quantity(Motion.nearest_consistent, q, qdot, t, params)
+        return layout.restore(q), layout.restore(qdot)
+
+    def explain(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> Explanation:
+        """The contents of this scene, and what was left out of its equations; print it, or read its fields.
+
+        It is read from the scene's programs, so that all of it holds for every state and time, except which constraints
+        depend on which. Raises the errors of `System` for invalid coordinates and functions.
+
+        ```python
+        import lagjax
+
+        scene = lagjax.scenes.wedge()
+        print(scene.system.explain(scene.q0, scene.qdot0, params=scene.params))
+        ```
+        """
+        require_number(t, "t")
+        self, layout = present_system(self), Layout.from_state(q, qdot)
+        facts = explain(Problem.from_system(self, layout, params))
+        if self.constraints is None and self.velocity_constraints is None:
+            return facts
+        names = self.constraint_names(layout, params)
+        schur = self._evaluate_quantity(Motion.schur_complement, q, qdot, t, params)
+        return facts.with_constraints(names, np.asarray(schur) if is_concrete(schur) else None)
+
+    def _motion(self, layout: Layout, params: PyTree = None) -> Motion:
+        """The scene in the flat coordinates of `layout`, after a look at what its functions return there.
+
+        The functions of the result take the numbers in `params` alone, with None in the place of everything else.
+        """
+        self._check_outputs(layout, params)
+
+        code = eqx.filter(params, eqx.is_array_like, inverse=True)  # functions and strings: no part of the data
+
+        def flatten_function(function: Function, to_array: Callable) -> Callable:
+            """The user's function in flat coordinates, the last of which are (t, params); `to_array` flattens it."""
+
+            def flat(*arguments):
+                *vectors, t, numbers = arguments
+                trees = map(layout.restore, vectors)
+                return to_array(function(*trees, t=t, params=eqx.combine(numbers, code)))
+
+            return flat
+
+        def optional(function: Function | None, to_array: Callable) -> Callable | None:
+            return None if function is None else flatten_function(function, to_array)
+
+        return Motion(
+            lagrangian=flatten_function(self.lagrangian, lambda value: value),
+            forces=optional(self.forces, layout.flatten),
+            dissipation=optional(self.dissipation, lambda value: value),
+            constraints=Constraints(
+                optional(self.constraints, _concatenate),
+                optional(self.velocity_constraints, _concatenate),
+            ),
+        )
+
+    def _require_constraints(self) -> None:
+        if self.constraints is None and self.velocity_constraints is None:
+            raise ValueError("This system has no constraints: give constraints=... or velocity_constraints=... to it.")
+
+    def _evaluate_constraints(self, quantity: Callable, q, qdot, t, params) -> PyTree:
+        self._require_constraints()
+        self = present_system(self)
+        return self._split_by_constraint(
+            self._evaluate_quantity(quantity, q, qdot, t, params), Layout.from_state(q, qdot), params
+        )
+
+    def _split_by_constraint(self, flat: jax.Array, layout: Layout, params: PyTree) -> PyTree:
+        """`flat` (m,), a number for each constraint, in the structure of `multipliers`."""
+        structure = self._constraint_structure(layout, params)
+        ends = np.cumsum([0, *(math.prod(leaf.shape) for leaf in jax.tree.leaves(structure))]).tolist()
+        pieces = [
+            flat[start:end].reshape(leaf.shape)
+            for start, end, leaf in zip(ends[:-1], ends[1:], jax.tree.leaves(structure), strict=True)
+        ]
+        parts = jax.tree.unflatten(jax.tree.structure(structure), pieces)
+        if len(parts) == 1:
+            return parts[0]
+        return {**parts[0], **parts[1]} if all(isinstance(part, dict) for part in parts) else parts
+
+    def _constraint_structure(self, layout: Layout, params: PyTree) -> tuple:
+        """The shapes that the constraint functions return, a tuple of one or two pytrees."""
+        numbers, code = eqx.partition(params, eqx.is_array_like)
+
+        def output_shapes(q, t, p):
+            extras = {"t": t, "params": eqx.combine(p, code)}
+            positions = () if self.constraints is None else (self.constraints(q, **extras),)
+            velocities = () if self.velocity_constraints is None else (self.velocity_constraints(q, q, **extras),)
+            return positions + velocities
+
+        state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
+        return jax.eval_shape(output_shapes, state, t, numbers)
+
+    def constraint_names(self, layout: Layout, params: PyTree) -> list[str]:
+        """A name for each of the m constraints, such as constraints['rod'] or velocity_constraints[1]."""
+        roles = [role for role in ("constraints", "velocity_constraints") if getattr(self, role) is not None]
+        names = []
+        for role, part in zip(roles, self._constraint_structure(layout, params), strict=True):
+            for path, leaf in jax.tree_util.tree_leaves_with_path(part):
+                label = role + jax.tree_util.keystr(path)
+                names += [label + (str(list(index)) if leaf.shape else "") for index in np.ndindex(leaf.shape)]
+        return names
+
+    def _evaluate_quantity(self, quantity: Callable, q, qdot, t, params, restore: bool = False):
+        """One of `Motion`'s functions at a state in the user's pytree, back in that pytree where `restore` says so."""
+        self, layout = present_system(self), Layout.from_state(q, qdot)
+        require_number(t, "t")
+        q, qdot, t = as_arrays((q, qdot, 1.0 * t), layout.dtype, "state")
+        params = as_arrays(params, layout.dtype)
+
+        def evaluate_at(self, q, qdot, t, params):
+            layout = Layout.from_state(q, qdot)
+            value = self._evaluate_program(quantity, layout, q, qdot, t, params)
+            if value is None and quantity is Motion.nearest_consistent:
+                numbers, flat = eqx.filter(params, eqx.is_array_like), (layout.flatten(q), layout.flatten(qdot), t)
+                terms = derivation_of(self, layout, params).term_sizes(*flat, numbers)
+                return _evaluate(self, quantity, q, qdot, t, params, terms=terms)
+            return _evaluate(self, quantity, q, qdot, t, params) if value is None else value
+
+        given = self, q, qdot, t, params
+        # A tracer that a function closes over would be lost in doubles.
+        closes = any(f.code.tracers for role in ROLES if isinstance(f := getattr(self, role), Function))
+        is_single = layout.dtype == SINGLE and not closes
+        value = compute_in_doubles(evaluate_at, *given) if is_single else evaluate_at(*given)
+        return jax.tree.map(jnp.asarray, layout.restore(value) if restore else value)
+
+    def _evaluate_program(self, quantity: Callable, layout: Layout, q, qdot, t, params) -> np.ndarray | None:
+        """A quantity at a state of numbers, from the scene's programs in NumPy: nothing is compiled.
+
+        None where something is being traced, or the scene has no programs.
+        """
+        concrete = all(is_concrete(leaf) for leaf in jax.tree.leaves((self, q, qdot, t, params)))
+        if self.path == "array" or quantity not in _OF_QUANTITIES or not concrete:
+            return None
+        names, function = _OF_QUANTITIES[quantity]
+        q, qdot = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(x)])[None] for x in (q, qdot))
+        q, qdot, t = (np.asarray(x, layout.dtype) for x in (q, qdot, t))
+        numbers = numbers_of(eqx.filter(params, eqx.is_array_like))
+        try:
+            values = Sample(derivation_of(self, layout, params), q, qdot, t, numbers).quantities(*names)
+        except Unlowerable:
+            return None
+        with np.errstate(all="ignore"):
+            return function(values, qdot)[0]
+
+    def _check_outputs(self, layout: Layout, params: PyTree) -> None:
+        """Trace each function once, on shapes alone, and say what is wrong with what it returns."""
+
+        def output_shapes(function, role):
+            state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
+            numbers, code = eqx.partition(params, eqx.is_array_like)
+            try:
+                return jax.eval_shape(
+                    lambda q, t, p: function(q, q, t=t, params=eqx.combine(p, code)), state, t, numbers
+                )
+            except ValueNotKnown:
+                raise
+            except (TypeError, KeyError, IndexError, AttributeError) as error:
+                error.add_note(_structure_of(role, state))
+                raise
+
+        for function, role in ((self.lagrangian, "lagrangian"), (self.dissipation, "dissipation")):
+            if function is not None:
+                _require_scalar(output_shapes(function, role), role)
+        if self.forces is not None:
+            _require_structure(output_shapes(self.forces, "forces"), layout)
+        if self.constraints is not None or self.velocity_constraints is not None:
+            _require_constraints(self._constraint_structure(layout, params))
+
+
+def _structure_of(role: str, state: PyTree) -> str:
+    """The arguments of a function that fails: a dict, where it expects a number, speaks of neither."""
+    leaves = jax.tree_util.tree_leaves_with_path(state)
+    shown = ", ".join(f"q{jax.tree_util.keystr(path)} of shape {leaf.shape}" for path, leaf in leaves[:8])
+    return f"{role} was called with {shown}. Give q, qdot and params the structure that it reads."
+
+
+def require_system(system: Any) -> System:
+    """The scene with its functions as they are now (`Function.now`): what every public function begins with.
+
+    Raises `TypeError` for anything else in its place, a bare Lagrangian most often.
+    """
+    if not isinstance(system, System):
+        kind = type(system).__name__
+        if kind == "Hybrid":
+            raise TypeError(
+                "This is for one System: a lagjax.Hybrid is taken by simulate, simulate_hybrid, fit and sweep."
+            )
+        name = getattr(system, "__name__", kind) if callable(system) else kind
+        raise TypeError(f"system must be a lagjax.System, as lagjax.System(lagrangian) is; got {name}.")
+    return present_system(system)
+
+
+def present_system(system: System) -> System:
+    """The scene with its functions as they are now: this one, where nothing that they read has changed."""
+    fields = object.__getattribute__(system, "__dict__")  # an attribute of an equinox.Module takes 2 µs
+    functions = [fields[role] for role in ROLES]
+    now = [present(f) if isinstance(f, Function) else f for f in functions]
+    if all(map(operator.is_, functions, now)):
+        return system
+    return replace_functions(system, dict(zip(ROLES, now, strict=True)))
+
+
+def replace_functions(system: System, functions: dict[str, Function | None]) -> System:
+    """The scene with other functions, by their roles, without the constructor: to read signatures takes long."""
+    other = object.__new__(type(system))
+    for name, value in (functions | {"path": system.path}).items():
+        object.__setattr__(other, name, value)
+    return other
+
+
+def _accept(function: Callable, role: str, roles: tuple[str, ...] = ("q", "qdot")) -> Function:
+    """A function of a scene, which may ask for inputs, too."""
+    return accept(function, role, roles, ("t", "params", "inputs"))
+
+
+# The functions of `Motion` in terms of `Motion.quantities` and q̇ (S, n) at S states: which of them, and the formula.
+_OF_QUANTITIES: dict[Callable, tuple[tuple[str, ...], Callable]] = {
+    Motion.acceleration: (SADDLE, lambda of, v: solve_saddle(of)[0]),
+    Motion.multipliers: (SADDLE, lambda of, v: solve_saddle(of)[1]),
+    Motion.constraint_force: (SADDLE, lambda of, v: np.einsum("skn,sk->sn", of["jacobian"], solve_saddle(of)[1])),
+    Motion.schur_complement: (
+        ("mass_matrix", "jacobian"),
+        lambda of, v: schur_complements(of["mass_matrix"], of["jacobian"]),
+    ),
+    Motion.mass_matrix: (("mass_matrix",), lambda of, v: of["mass_matrix"]),
+    Motion.momentum: (("momentum",), lambda of, v: of["momentum"]),
+    Motion.generalized_force: (("generalized_force",), lambda of, v: of["generalized_force"]),
+    Motion.residual: (("residual",), lambda of, v: of["residual"]),
+    Motion.energy: (
+        ("lagrangian", "momentum"),
+        lambda of, v: np.einsum("si,si->s", of["momentum"], v) - of["lagrangian"],
+    ),
+}
+
+
+@eqx.filter_jit
+def _evaluate(system: System, quantity: Callable, q, qdot, t, params, **more):
+    """One of `Motion`'s functions, compiled whole: XLA would take seconds to prepare its operations one by one."""
+    layout = Layout.from_state(q, qdot)
+    numbers, derivation = eqx.filter(params, eqx.is_array), derivation_of(system, layout, params)
+    motion = derivation.motion if system.path == "array" else lowered_motion(derivation)
+    return quantity(motion, layout.flatten(q), layout.flatten(qdot), t, numbers, **more)
+
+
+def _require_scalar(value: PyTree, role: str) -> None:
+    if not isinstance(value, jax.ShapeDtypeStruct):
+        raise TypeError(f"{role} must return one scalar; got {value}.")
+    if value.shape != ():
+        raise TypeError(f"{role} must return one scalar; got an array of shape {value.shape} (a missing sum?).")
+    if not jnp.issubdtype(value.dtype, jnp.floating):
+        raise TypeError(f"{role} must return a real floating-point number; got {value.dtype}.")
+
+
+def _concatenate(tree: PyTree) -> jax.Array:
+    return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(tree)])
+
+
+def _require_constraints(structure: tuple) -> None:
+    leaves = jax.tree.leaves(structure)
+    if not leaves or not sum(math.prod(leaf.shape) for leaf in leaves):
+        raise TypeError("constraints must return at least one number that is to be zero.")
+    if not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
+        raise TypeError("constraints must return real floating-point numbers.")
+    names = [set(part) for part in structure if isinstance(part, dict)]
+    if len(names) == 2 and names[0] & names[1]:
+        shared = ", ".join(sorted(names[0] & names[1]))
+        raise ValueError(f"A constraint and a velocity constraint have the same name: {shared}.")
+
+
+def _require_structure(value: PyTree, layout: Layout) -> None:
+    leaves, tree = jax.tree.flatten(value)
+    shapes = tuple(leaf.shape for leaf in leaves)
+    if tree != layout.tree or shapes != layout.shapes:
+        raise TypeError(
+            f"forces must return the structure of q, one force per coordinate; q is {layout.tree} with shapes "
+            f"{layout.shapes}, forces returned {tree} with shapes {shapes}."
+        )
+    if any(jnp.issubdtype(leaf.dtype, jnp.complexfloating) for leaf in leaves):
+        raise TypeError("forces must return real numbers: take jnp.real of what is complex.")

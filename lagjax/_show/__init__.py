@@ -1,0 +1,19 @@
+"""The look of a result: as text, in a notebook, as a film, as labelled arrays; `lagjax.plot` draws the figures.
+
+_summary     the three lines of a trajectory
+_notebook    the HTML of a result: its text, and a small picture
+_course      a motion between its outputs
+_animation   a motion as a film
+_export      a trajectory as an xarray.Dataset or a pandas.DataFrame, intervals as a table
+"""
+
+from lagjax._show._animation import Animation, make_animation, require_points
+from lagjax._show._course import course_of, courses_of, join_curve
+from lagjax._show._export import dataset, frame, intervals
+from lagjax._show._notebook import COLORS, cell, trajectory_html
+from lagjax._show._summary import summary, times_of_members
+
+__all__ = [
+    "COLORS", "Animation", "cell", "course_of", "courses_of", "dataset", "frame", "intervals", "join_curve",
+    "make_animation", "require_points", "summary", "times_of_members", "trajectory_html",
+]  # fmt: skip

@@ -1,0 +1,411 @@
+"""`Animation`: a motion that moves, by matplotlib. `Trajectory.animate` makes one.
+
+Trajectory ─► Course of each member ─► states at the frames ─► positions of points ─► pictures ─► a file
+"""
+
+import shutil
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._interface import Function, accept, is_known
+from lagjax._run import Members
+from lagjax._show._course import course_of_member
+from lagjax._show._notebook import COLORS
+
+PyTree = Any
+MEMBERS = 50  # that are drawn of a batch, the first ones
+FRAMES = 20_000  # of which a film has fewer
+TRAIL = 2.0  # seconds of the film over which a trace fades
+FINER = 8  # pieces of a trace from one frame to the next: half a turn in a frame is round, and half as many has corners
+_VIDEO, _PAGE = (".mp4", ".m4v", ".mov", ".webm"), (".html", ".htm")
+_LARGEST = 2000.0  # megabytes of a page, more than `FRAMES` make
+_SIZE, _DPI = 4.8, 100  # inches of a side, and dots in one
+_INTERVALS = 8  # between numbers along a side of that length; twelve of six characters would touch
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class Animation:
+    """A motion as a film; made by `Trajectory.animate`. `save` writes it to a file, and a notebook shows it.
+
+    - `positions(times)`: the positions of the points, a dict of arrays (members, frames, k, 2 or 3) by name.
+    - `paths(times)`: the times (F,) and positions (F, k, 2 or 3) along the path of each member, which are those at
+      `times` and at all of its outputs and transitions; NaN where it jumps.
+    - `span`: the first and the last time; `speed`: units of time in a second of the film; `fps`: frames in a second.
+    - `traces`: the points that leave a trace, (name, place) each.
+    """
+
+    positions: Callable[[np.ndarray], dict[str, np.ndarray]]
+    paths: Callable[[np.ndarray], list[tuple[np.ndarray, dict[str, np.ndarray]]]]
+    span: tuple[float, float]
+    speed: float
+    fps: float
+    traces: tuple[tuple[str, int], ...]
+
+    def __repr__(self) -> str:
+        begin, end = self.span
+        seconds = f"{abs(end - begin) / self.speed:.3g} s at {self.fps:g} frames a second"
+        return f"Animation from t = {begin:.6g} to {end:.6g}, {seconds}: save it to .gif, .mp4 or .html"
+
+    def _repr_html_(self) -> str | None:
+        """The film itself, for notebooks; None where it cannot be made."""
+        try:
+            return self._page()
+        except Exception:  # a display must not fail
+            return None
+
+    def times(self, fps: float | None = None) -> np.ndarray:
+        """The times of the frames, evenly spaced from the first to the last."""
+        begin, end = self.span
+        count = int(np.ceil(abs(end - begin) / self.speed * (fps or self.fps))) + 1
+        times = begin + np.arange(count) * np.sign(end - begin) * self.speed / (fps or self.fps)
+        return np.clip(times, min(self.span), max(self.span))
+
+    def save(self, path) -> None:
+        """Write the film: to a GIF, to MP4 (or .webm, .mov), or to a page of HTML, by the suffix of `path`.
+
+        MP4 needs the program ffmpeg, or the package imageio-ffmpeg. A GIF has times in hundredths of a second: its
+        frame rate is as close to `fps` as that allows, and its speed is right.
+
+        Raises `ImportError` without matplotlib, `ValueError` for another suffix, `RuntimeError` without ffmpeg.
+        """
+        suffix = Path(path).suffix.lower()
+        if suffix == ".gif":
+            self._gif(path)
+        elif suffix in _VIDEO:
+            self._video(path)
+        elif suffix in _PAGE:
+            head = '<!doctype html><meta charset="utf-8"><title>A motion</title>'
+            Path(path).write_text(head + self._page(), encoding="utf-8")
+        else:
+            raise ValueError(
+                f"The suffix of {str(path)!r} names no film: write .gif, {', '.join(_VIDEO)}, .html; got {suffix!r}."
+            )
+
+    def _gif(self, path) -> None:
+        """Write the pictures one after another, so that no more than one of them is in memory in its full colours."""
+        from PIL import Image  # comes with matplotlib
+
+        hundredths = max(2, round(100 / self.fps))  # browsers show frames of a hundredth for ten of them
+        figure, show, count = self._figure(100 / hundredths)
+
+        def picture(i: int):
+            show(i)
+            figure.canvas.draw()
+            return Image.fromarray(np.asarray(figure.canvas.buffer_rgba())).convert("RGB")
+
+        rest = map(picture, range(1, count))
+        picture(0).save(path, format="GIF", save_all=True, append_images=rest, duration=10 * hundredths, loop=0)
+
+    def _video(self, path) -> None:
+        matplotlib, program = _matplotlib(), _ffmpeg()
+        if program is None:
+            raise RuntimeError(
+                "To write a video takes the program ffmpeg, which is not there: install it, or pip install "
+                "imageio-ffmpeg. A .gif and an .html need none."
+            )
+        with matplotlib.rc_context({"animation.ffmpeg_path": program}):
+            self._film(self.fps).save(path, writer=matplotlib.animation.FFMpegWriter(fps=self.fps), dpi=_DPI)
+
+    def _page(self) -> str:
+        """The film as HTML: a video where ffmpeg is there, else pictures and a few lines of JavaScript."""
+        matplotlib, program = _matplotlib(), _ffmpeg()
+        film = self._film(self.fps)
+        # Beyond its limit matplotlib leaves frames out, or the whole video.
+        with matplotlib.rc_context({"animation.embed_limit": _LARGEST, "savefig.dpi": _DPI}):
+            if program is None:
+                return film.to_jshtml(fps=self.fps)
+            with matplotlib.rc_context({"animation.ffmpeg_path": program}):
+                return film.to_html5_video()
+
+    def _film(self, fps: float):
+        """matplotlib's own animation, on a figure of its own."""
+        figure, show, count = self._figure(fps)
+        return _matplotlib().animation.FuncAnimation(
+            figure, show, frames=count, init_func=lambda: (), interval=1000 / fps, cache_frame_data=False
+        )
+
+    def _figure(self, fps: float) -> tuple[Any, Callable, int]:
+        """The figure, a function that sets it to frame i, and how many frames there are."""
+        matplotlib, times = _matplotlib(), self.times(fps)
+        positions, traces = self.positions(times), self._traces(times)
+        limits = _limits([*positions.values(), *(path for _, _, path in traces)])
+        figure = matplotlib.figure.Figure(figsize=_size(*limits), layout="constrained", dpi=_DPI)
+        matplotlib.backends.backend_agg.FigureCanvasAgg(figure)
+        show, moving = _draw_film(_axes(figure, *limits), positions, times, traces, max(1, round(TRAIL * fps)))
+        figure.draw_without_rendering()
+        figure.set_layout_engine("none")  # it is laid out: to do so for every frame takes most of the time
+        _keep_the_rest(figure, moving)
+        return figure, show, len(times)
+
+    def _traces(self, times: np.ndarray) -> list[tuple[str, np.ndarray, np.ndarray]]:
+        """The traces: of every member and traced point its name, the times (F,) and the places (F, 2 or 3)."""
+        if not self.traces:
+            return []
+        finer = np.interp(np.arange(FINER * (len(times) - 1) + 1) / FINER, np.arange(len(times)), times)
+        paths = self.paths(finer)
+        return [(name, t, path[name][:, place]) for name, place in self.traces for t, path in paths]
+
+
+def make_animation(trajectory, points: Callable, trace, speed: float, fps: float) -> Animation:
+    """The `Animation` of a trajectory; see `Trajectory.animate`."""
+    _require_positive(speed=speed, fps=fps)
+    if not all(map(is_known, jax.tree.leaves((trajectory.ts, trajectory.q, trajectory.qdot)))):
+        raise ValueError("animate draws numbers: call it outside of jit, vmap and grad.")
+    function = accept(points, "points", ("q",))
+    members = Members(trajectory)
+    courses = [course_of_member(members, k) for k in range(min(members.count, MEMBERS))]
+    reached = [course.t[np.isfinite(course.q).all(axis=1)] for course in courses]
+    known = np.concatenate(reached)
+    if not len(known):
+        raise ValueError("None of the members was followed to any output: there is nothing to show.")
+    begin = courses[0].t[0]
+    end = float(known[np.argmax(np.abs(known - begin))])
+    if end == begin:
+        raise ValueError("The motion ended before its second output: there is nothing to show. Give closer ts.")
+    seconds = abs(end - begin) / speed
+    if not 2 <= seconds * fps + 1 <= FRAMES:
+        raise ValueError(
+            f"The motion takes {abs(end - begin):.6g}, which makes {seconds * fps + 1:.3g} frames at speed={speed:g} "
+            f"and fps={fps:g}. speed={abs(end - begin) / 10:.2g} shows it in ten seconds."
+        )
+
+    def positions(times: np.ndarray) -> dict[str, np.ndarray]:
+        each = [_positions(function, members, k, course.states_at(times)[0], times) for k, course in enumerate(courses)]
+        return {name: np.stack([one[name] for one in each]) for name in each[0]}
+
+    def paths(times: np.ndarray) -> list[tuple[np.ndarray, dict[str, np.ndarray]]]:
+        curves = [course.curve(times)[:2] for course in courses]
+        longest = np.arange(max(len(t) for t, _ in curves))  # paths of one length are compiled once
+        filled = [tuple(x[np.minimum(longest, len(x) - 1)] for x in curve) for curve in curves]
+        return [(t, _positions(function, members, k, q, t)) for k, (t, q) in enumerate(filled)]
+
+    shapes = {name: array.shape[2:] for name, array in positions(np.array([begin])).items()}
+    if not shapes:
+        raise ValueError("points returns an empty dict: there is nothing to show.")
+    return Animation(positions, paths, (float(begin), end), float(speed), float(fps), _parse_trace(trace, shapes))
+
+
+def _require_positive(**numbers) -> None:
+    for name, value in numbers.items():
+        if isinstance(value, bool) or np.ndim(value) or not np.isreal(value) or not 0 < value < np.inf:
+            raise ValueError(f"{name} must be a positive number; got {value!r}.")
+
+
+# ---- where the points are --------------------------------------------------------------------------------------------
+
+
+def _positions(function: Function, members: Members, k: int, q: np.ndarray, times: np.ndarray) -> dict[str, np.ndarray]:
+    """The points (frames, number, 2 or 3) of a member at its states q (frames, n), by name; NaN where q is."""
+    states = members.layout.restore(q.astype(members.layout.dtype))
+    drawn = _evaluate_points(function, states, times.astype(members.layout.dtype), members.params_of(k))
+    named = drawn if isinstance(drawn, dict) else {"": drawn}
+    known = np.all(np.isfinite(q), axis=1)[:, None, None]
+    positions = {str(name): require_points(name, np.asarray(value), len(q)) for name, value in named.items()}
+    return {name: np.where(known, value, np.nan) for name, value in positions.items()}
+
+
+@eqx.filter_jit
+def _evaluate_points(function: Function, states, times, params):
+    def drawn(q, t):
+        points = function(q, t=t, params=params)
+        if isinstance(points, dict):
+            return {name: jnp.asarray(value) for name, value in points.items()}
+        return jnp.asarray(points)
+
+    return jax.vmap(drawn)(states, times)
+
+
+def require_points(name, value: np.ndarray, frames: int) -> np.ndarray:
+    """The positions of one point or line at F frames, (F, k, 2 or 3). Raises `ValueError` for another shape."""
+    if value.ndim == 2:  # one point
+        value = value[:, None, :]
+    if value.ndim != 3 or value.shape[-1] not in (2, 3):
+        what = f"points[{name!r}]" if name != "" else "points"
+        raise ValueError(
+            f"{what} must be one point, shape (2,) or (3,), or a line through k points, shape (k, 2) or (k, 3); got "
+            f"shape {value.shape[1:]}. Return a dict of such arrays to draw several."
+        )
+    return value
+
+
+def _parse_trace(trace, shapes: dict[str, tuple[int, ...]]) -> tuple[tuple[str, int], ...]:
+    """The points that leave a trace, (name, place) each, from the argument `trace`: a name is its line's last point."""
+    if len({shape[-1] for shape in shapes.values()}) > 1:
+        raise ValueError("points has some in the plane and some in space: give all of them two numbers, or three.")
+    if trace is None:
+        return ()
+    listed = trace if isinstance(trace, list) else [trace]
+    first = next(iter(shapes))
+    pairs = [one if isinstance(one, tuple) else (one, -1) if isinstance(one, str) else (first, one) for one in listed]
+    for name, place in pairs:
+        known = isinstance(place, int | np.integer) and name in shapes and -shapes[name][0] <= place < shapes[name][0]
+        if not known:
+            lines = ", ".join(f"{name or 'points'!r} of {shape[0]} points" for name, shape in shapes.items())
+            raise ValueError(
+                f"trace={trace!r} names no point: there are {lines}. Give a name, a place, or (name, place)."
+            )
+    return tuple((name, int(place)) for name, place in pairs)
+
+
+# ---- pictures --------------------------------------------------------------------------------------------------------
+
+
+def _draw_film(ax, positions: dict[str, np.ndarray], times: np.ndarray, traces, trail: int) -> tuple[Callable, list]:
+    """Set the figure up; a function that sets it to frame i, and the artists to draw for it."""
+    space = ax.name == "3d"
+    opacity = max(0.2, len(next(iter(positions.values()))) ** -0.5)
+    lines, faded, forward = [], [], np.sign(times[-1] - times[0])
+    colors = dict(zip(positions, _cycle_colors(len(positions)), strict=True))
+    for name, array in positions.items():
+        stands = array.shape[2] > 1 and not np.ptp(array, axis=(0, 1)).any()  # a floor has no ends
+        style = dict(color=colors[name], alpha=opacity, linewidth=2, marker="" if stands else "o", markersize=5)
+        for member in array:
+            line = ax.plot(*([] for _ in range(member.shape[-1])), **style, solid_capstyle="round")[0]
+            lines.append((line, member))
+    for name, t, path in traces:
+        seen = np.searchsorted(forward * t, forward * times, side="right")  # of the path, at every frame
+        faded.append((_trace(ax, colors[name], space, opacity), t, path, seen, colors[name]))
+    # Above the scene; at a height of its own, as matplotlib looks for none of a title that is hidden.
+    clock = ax.set_title(f"t = {times[-1]:.{_digits(times)}f}", loc="left", y=1.0, fontsize="medium")
+
+    def show(i: int):
+        for line, member in lines:
+            if space:
+                line.set_data_3d(*member[i].T)
+            else:
+                line.set_data(*member[i].T)
+        for collection, t, path, seen, color in faded:
+            begin, recent = times[max(0, i - trail)], slice(max(0, seen[max(0, i - trail)] - 1), seen[i])
+            collection.set_segments(np.stack([path[recent][:-1], path[recent][1:]], axis=1))
+            age = (t[recent][1:] - begin) / (times[i] - begin if i else 1.0)
+            collection.set_color([(*_rgb(color), a * opacity) for a in np.clip(age, 0.0, 1.0)])
+        clock.set_text(f"t = {times[i]:.{_digits(times)}f}")
+        return ()
+
+    above = [] if space else [ax.spines["left"], ax.spines["bottom"]]  # these stand still, and on top
+    return show, [clock, *above, *(artist for artist, *_ in lines + faded)]
+
+
+def _keep_the_rest(figure, moving: list) -> None:
+    """Draw all but the `moving` artists once and for all: axes with their numbers take ten times as long as these.
+
+    matplotlib draws a figure up to three times a frame; its own way to draw less, `blit`, is for windows, not files.
+    """
+    draw_all, kept = figure.draw, []
+    order = figure.axes[0].get_children()
+    moving = sorted(sorted(moving, key=order.index), key=lambda artist: artist.get_zorder())
+    deep = [artist for artist in moving if hasattr(artist, "do_3d_projection")]  # which axes in space draw last
+    flat = [artist for artist in moving if artist not in deep]
+
+    def draw(renderer):
+        if not kept:
+            for artist in moving:
+                artist.set_visible(False)
+            draw_all(renderer)
+            kept.append(renderer.copy_from_bbox(figure.bbox))
+            for artist in moving:
+                artist.set_visible(True)
+        renderer.restore_region(kept[0])
+        for artist in flat + sorted(deep, key=lambda artist: -artist.do_3d_projection()):
+            artist.draw(renderer)
+
+    figure.draw = draw
+
+
+def _axes(figure, low: np.ndarray, high: np.ndarray):
+    """Axes of equal scale that hold the whole motion."""
+    ax = figure.add_subplot(projection="3d" if len(low) == 3 else None)
+    limits = {f"{axis}lim": ends for axis, *ends in zip("xyz", low, high, strict=False)}
+    ax.set(**limits)
+    if len(low) == 3:
+        ax.set_box_aspect(high - low)
+        ax.set(xlabel="x", ylabel="y", zlabel="z")
+        ax.locator_params(nbins=5)  # more would run into each other
+        return ax
+    ax.set_aspect("equal")
+    for axis, share, middle in zip(
+        (ax.xaxis, ax.yaxis), (high - low) / (high - low).max(), (low + high) / 2, strict=True
+    ):
+        if _INTERVALS * share < 2:  # a side of a motion along a line: there is room for one number
+            axis.set_ticks([middle], [f"{middle:.3g}"])
+        else:
+            axis.get_major_locator().set_params(nbins=round(_INTERVALS * share))
+    ax.grid(color="0.9", linewidth=0.8)
+    ax.set_axisbelow(True)
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.spines[["left", "bottom"]].set_color("0.55")
+    ax.tick_params(color="0.55")
+    return ax
+
+
+def _limits(points: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """The box of all points, a twentieth wider, and no side less than a tenth of the longest."""
+    every = np.concatenate([array.reshape(-1, array.shape[-1]) for array in points])
+    every = every[np.isfinite(every).all(axis=1)]
+    if not len(every):
+        raise ValueError("points returns no finite position at any time: there is nothing to show.")
+    middle, half = (every.max(0) + every.min(0)) / 2, (every.max(0) - every.min(0)) / 2
+    half = np.maximum(1.05 * half, 0.1 * (half.max() or 1.0))
+    return middle - half, middle + half
+
+
+def _size(low: np.ndarray, high: np.ndarray) -> tuple[float, float]:
+    """Width and height of the figure in inches, even numbers of dots, as videos need them."""
+    if len(low) == 3:
+        return _SIZE, _SIZE
+    width, height = (high - low) / (high - low).max()
+    return _SIZE * max(width, 0.5), round(_SIZE * max(height, 0.4) * _DPI / 2) * 2 / _DPI
+
+
+def _trace(ax, color: str, space: bool, opacity: float):
+    """An empty line whose pieces have colours of their own."""
+    matplotlib = _matplotlib()
+    if space:
+        from mpl_toolkits.mplot3d.art3d import Line3DCollection
+
+        return ax.add_collection3d(Line3DCollection([np.zeros((2, 3))], linewidths=1.2), autolim=False)
+    return ax.add_collection(matplotlib.collections.LineCollection([], linewidths=1.2), autolim=False)
+
+
+def _cycle_colors(count: int) -> list[str]:
+    return [COLORS[k % len(COLORS)] for k in range(count)]
+
+
+def _rgb(color: str) -> tuple[float, ...]:
+    return tuple(int(color[k : k + 2], 16) / 255 for k in (1, 3, 5))
+
+
+def _digits(times: np.ndarray) -> int:
+    """Decimal places that tell frames apart, up to 6."""
+    step = abs(times[1] - times[0]) if len(times) > 1 else 1.0
+    return int(np.clip(np.ceil(-np.log10(10 * step)), 0, 6))
+
+
+def _ffmpeg() -> str | None:
+    """The program that writes videos, of the system or of the package imageio-ffmpeg."""
+    if program := shutil.which("ffmpeg"):
+        return program
+    try:
+        from imageio_ffmpeg import get_ffmpeg_exe  # pyright: ignore[reportMissingImports]
+
+        return get_ffmpeg_exe()
+    except Exception:  # neither is there
+        return None
+
+
+def _matplotlib() -> Any:
+    try:
+        import matplotlib.animation
+        import matplotlib.backends.backend_agg
+        import matplotlib.collections
+        import matplotlib.figure
+    except ImportError:
+        raise ImportError("animate needs the package matplotlib: pip install lagjax[examples].") from None
+    return matplotlib

@@ -1,0 +1,111 @@
+"""`Course`: a motion between its outputs, for every picture of one.
+
+A trajectory is known at its outputs, just before and just after its transitions, and at the event that ended it: these
+are the knots. Between two of them the state follows the cubic that has q and q̇ of both ends (Hermite). Where a
+transition resets the state, two knots have one time, and nothing joins them.
+"""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from lagjax._interface import RESULTS, Layout, numbers_at
+from lagjax._run import Members
+from lagjax._show._summary import times_of_members
+
+# Points of a curve, at least: four times as many as dots of a figure that is printed, because a planet passes its
+# perihelion in a fraction of them. Half as many show corners there.
+POINTS = 2400
+
+
+class Course(NamedTuple):
+    """The knots of one member in their order: times (K,), q (K, n) and q̇ (K, n)."""
+
+    t: np.ndarray
+    q: np.ndarray
+    qdot: np.ndarray
+
+    def states_at(self, times: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """q and q̇ (F, n) at some times, before a jump at that instant; NaN beyond the ends, but for rounding."""
+        low, high = sorted((self.t[0], self.t[-1]))
+        slack, sign = 1e-6 * (high - low), np.sign(self.t[-1] - self.t[0])
+        place = np.clip(np.searchsorted(sign * self.t, sign * times, side="left") - 1, 0, len(self.t) - 2)
+        h = (self.t[place + 1] - self.t[place])[:, None]
+        inside = ((times >= low - slack) & (times <= high + slack))[:, None]
+        a, b, begin, end = self.q[place], self.q[place + 1], self.qdot[place], self.qdot[place + 1]
+        with np.errstate(invalid="ignore", divide="ignore"):
+            x = np.where(h == 0, 0.0, (times - self.t[place])[:, None] / h)
+            second, third = 3 * (b - a) - h * (2 * begin + end), h * (begin + end) - 2 * (b - a)
+            q = a + x * (h * begin + x * (second + x * third))
+            qdot = begin + x * (2 * second + 3 * x * third) / h
+        q = np.where(x == 1, b, np.where(x == 0, a, q))
+        qdot = np.where(x == 1, end, np.where(x == 0, begin, qdot))
+        return np.where(inside, q, np.nan), np.where(inside, qdot, np.nan)
+
+    def curve(self, times: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """t (F,), q and q̇ (F, n) at all knots and at these times, in order; a row of NaN where the state jumps.
+
+        Without `times` they are evenly between the knots, so that the curve has `POINTS` at least.
+        """
+        if times is None:
+            count = len(self.t) - 1
+            parts = np.arange(1, max(2, -(-POINTS // count))) / max(2, -(-POINTS // count))
+            times = np.interp((np.arange(count)[:, None] + parts).ravel(), np.arange(count + 1), self.t)
+        t = np.concatenate([times, self.t])  # a time at which the state jumps is before the jump
+        order = np.argsort(np.sign(self.t[-1] - self.t[0]) * t, kind="stable")
+        t, states = t[order], np.vstack([np.hstack(self.states_at(times)), np.hstack([self.q, self.qdot])])[order]
+        jumps = np.flatnonzero((t[1:] == t[:-1]) & (states[1:] != states[:-1]).any(axis=1)) + 1
+        q, qdot = np.hsplit(np.insert(states, jumps, np.nan, axis=0), 2)
+        return np.insert(t, jumps, t[jumps]), q, qdot
+
+
+def join_curve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
+    """A curve (2, F) in a plane, without the gaps across which both of these go on."""
+    xy = np.stack([x, y])
+    gaps = 1 + np.flatnonzero(np.isnan(y[1:-1]))
+    return np.delete(xy, gaps[(xy[:, gaps - 1] == xy[:, gaps + 1]).all(axis=0)], axis=1)
+
+
+def courses_of(trajectory, places) -> tuple[Layout, list[Course]]:
+    """The members in these places of a batch, between their outputs; place 0 of one motion is that motion."""
+    members = Members(trajectory)
+    return members.layout, [course_of_member(members, k) for k in places]
+
+
+def course_of(trajectory) -> tuple[Layout, Course]:
+    """One motion between its outputs. Raises `ValueError` for a batch."""
+    members = Members(trajectory)
+    if members.batch:
+        raise ValueError(
+            "Compare one motion, not a batch: jax.tree.map(lambda x: x[k], (batch.q, batch.qdot)) are the states of "
+            "member k; simulate follows it alone."
+        )
+    return members.layout, course_of_member(members, 0)
+
+
+def course_of_member(members: Members, k: int) -> Course:
+    """Member k between its outputs."""
+    trajectory, place = members.trajectory, np.unravel_index(k, members.batch) if members.batch else ()
+    changes, end = trajectory.transitions, trajectory.end
+
+    def flatten_member(tree, rows: int) -> np.ndarray:
+        leaves = [numbers_at(leaf, place).reshape(rows, -1) for leaf in jax.tree.leaves(tree)]
+        return np.concatenate(leaves, axis=1).astype(float)
+
+    t = times_of_members(trajectory).reshape(members.count, -1)[k].astype(float)
+    knots = [(t, *(flatten_member(tree, len(t)) for tree in (trajectory.q, trajectory.qdot)))]
+    if changes is not None:
+        when = numbers_at(changes.t, place).astype(float)
+        pairs = [
+            np.stack([flatten_member(tree, len(when)) for tree in both], axis=1).reshape(2 * len(when), -1)
+            for both in ((changes.q, changes.q_next), (changes.qdot, changes.qdot_next))
+        ]
+        knots.append((np.repeat(when, 2), *pairs))
+    if numbers_at(trajectory.result._value, place) == RESULTS.event_occurred._value:
+        knots.append((numbers_at(end.t, place).reshape(1), flatten_member(end.q, 1), flatten_member(end.qdot, 1)))
+    t, q, qdot = (np.concatenate(parts) for parts in zip(*knots, strict=True))
+    ahead = t[0] <= knots[0][0][-1]
+    order = np.argsort(t if ahead else -t, kind="stable")[: np.isfinite(t).sum()]  # NaN comes last
+    order = np.resize(order, max(2, len(order)))
+    return Course(t[order], q[order], qdot[order])

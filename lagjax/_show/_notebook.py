@@ -1,0 +1,91 @@
+"""The picture of a result in a notebook: its text, and beside it a small picture where matplotlib is installed.
+
+A picture is of a few members and a few hundred outputs, however many there are, so that it takes no longer for a large
+batch. Where there is none to be had, nothing has a value yet or matplotlib is missing, the text is shown alone; a
+notebook must never fail because of its last line.
+"""
+
+import base64
+import html
+import io
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+
+from lagjax._interface import ENDED_WELL, is_known
+from lagjax._show._course import Course, courses_of, join_curve
+
+MEMBERS, OUTPUTS, COORDINATES = 30, 400, 6  # that are drawn
+COLORS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")  # of Okabe & Ito (2008)
+_SIZE, _DPI = (5.2, 1.9), 144  # inches, and the dots of a fine screen
+
+
+def cell(text: str, draw: Callable[[Any], None], size: tuple[float, float] = _SIZE) -> str | None:
+    """HTML of a text with the picture that `draw(figure)` makes beneath it; None where there is no picture."""
+    try:
+        from matplotlib.figure import Figure
+
+        figure, file = Figure(figsize=size, dpi=_DPI, layout="constrained"), io.BytesIO()
+        draw(figure)
+        figure.savefig(file, format="png")
+    except Exception:  # no matplotlib, values that are no numbers, a font that is missing: the text says it all
+        return None
+    image = base64.b64encode(file.getvalue()).decode()
+    return (
+        f'<div><pre style="margin:0;white-space:pre-wrap">{html.escape(text)}</pre><img alt="a small figure" '
+        f'style="width:{96 * size[0]:.0f}px;max-width:100%" src="data:image/png;base64,{image}"></div>'
+    )
+
+
+def trajectory_html(trajectory) -> str | None:
+    """HTML of a trajectory: its three lines, and coordinates against time; None where nothing can be drawn."""
+    leaves = [*jax.tree.leaves(trajectory.q), trajectory.ts, trajectory.result._value, trajectory.end.t]
+    if not all(map(is_known, leaves)) or not leaves[0].size:
+        return None
+    return cell(repr(trajectory), lambda figure: _draw(figure, trajectory))
+
+
+def _draw(figure, trajectory) -> None:
+    codes = np.asarray(trajectory.result._value).ravel()
+    members, ax = _some(codes.size, MEMBERS), figure.subplots()
+    layout, courses = courses_of(trajectory, members)
+    opacity = max(0.15, len(members) ** -0.5)
+    curves = [_shorten(course) for course in courses]
+    for name, color, i in zip(layout.names, COLORS, range(COORDINATES), strict=False):
+        for t, q in curves:
+            ax.plot(*join_curve(t, q[:, i]), color=color, alpha=opacity, linewidth=1.2)
+        ax.lines[-len(curves)].set_label(name)
+    if layout.size > COORDINATES:
+        ax.plot([], [], " ", label=f"… ({layout.size - COORDINATES} more)")
+    for member in members[~np.isin(codes[members], ENDED_WELL)]:
+        ax.axvline(np.ravel(trajectory.end.t)[member], color="0.4", linewidth=0.8, linestyle=":")
+    plain(ax)
+    ax.set_xlabel("t", fontsize="small")
+    for handle in ax.legend(
+        frameon=False, fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5)
+    ).legend_handles:
+        handle.set_alpha(1.0)
+
+
+def _shorten(course: Course) -> tuple[np.ndarray, np.ndarray]:
+    """The times (F,) and coordinates (F, n) of a curve; of many outputs those at some even times."""
+    if len(course.t) <= OUTPUTS:
+        return course.curve()[:2]
+    times = np.linspace(course.t[0], course.t[-1], OUTPUTS)
+    return times, course.states_at(times)[0]
+
+
+def plain(ax) -> None:
+    """A light grid behind the data, no box around it, small figures."""
+    ax.grid(color="0.9", linewidth=0.6)
+    ax.set_axisbelow(True)
+    ax.spines[["top", "right"]].set_visible(False)
+    ax.spines[["left", "bottom"]].set_color("0.55")
+    ax.tick_params(color="0.55", labelsize="small")
+
+
+def _some(count: int, most: int) -> np.ndarray:
+    """Places among 0 … count − 1, evenly chosen, `most` of them at most."""
+    return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))

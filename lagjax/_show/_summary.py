@@ -1,0 +1,106 @@
+"""A trajectory in three lines: what it holds, over what time and in how many steps, and how it ended.
+
+    Trajectory of 1000 members, float64: q['theta'] (1000, 101), q['x'] (1000, 101), and qdot
+    t from 0 to 10 at 101 outputs, 241 steps in the median, at most 388 (12 rejected)
+    998 of 1000 reached the end, 2 nonfinite_state: the first that failed is member 17, at t = 0.5
+
+Numbers that have no value yet, inside `jax.jit` or `jax.vmap`, are left out. The fields themselves are printed by
+`equinox.tree_pprint(trajectory)`.
+"""
+
+import equinox as eqx
+import jax
+import numpy as np
+
+from lagjax._interface import ENDED_WELL, is_known, name_of
+
+COUNTS = ("num_steps", "num_rejected_steps")
+LEAVES_SHOWN = 6  # of q, which may have any number of leaves
+
+
+def summary(trajectory) -> str:
+    """The three lines for a `Trajectory`, batched or not, of values, tracers or shapes alone.
+
+    For a trajectory that has been mapped to a pytree without arrays in it (axes, filters), its fields.
+    """
+    counts = [trajectory.stats[name] for name in COUNTS]
+    essential = trajectory.ts, trajectory.q, trajectory.qdot, trajectory.result, trajectory.end, counts
+    leaves = jax.tree.leaves(essential, is_leaf=lambda leaf: leaf is None)
+    if not all(hasattr(leaf, "shape") and hasattr(leaf, "dtype") for leaf in leaves):
+        return eqx.tree_pformat(trajectory)
+    return "\n".join([_contents(trajectory), _span(trajectory), _verdict(trajectory)])
+
+
+def times_of_members(trajectory) -> np.ndarray:
+    """The output times of every member, (…, T) with the axes of the batch, whether they share them or not."""
+    ts, batch = np.asarray(trajectory.ts), np.shape(trajectory.result._value)
+    inner = (1,) * (len(batch) + 1 - ts.ndim)  # `simulate_batch` shares its times within each batch
+    return np.broadcast_to(ts.reshape(*ts.shape[:-1], *inner, ts.shape[-1]), (*batch, ts.shape[-1]))
+
+
+def _contents(trajectory) -> str:
+    batch = trajectory.result._value.shape
+    named = [
+        f"q{jax.tree_util.keystr(path)} {tuple(leaf.shape)}"
+        for path, leaf in jax.tree_util.tree_leaves_with_path(trajectory.q)
+    ]  # fmt: skip
+    if len(named) > LEAVES_SHOWN:
+        named[LEAVES_SHOWN - 1 :] = [f"… ({len(named) - LEAVES_SHOWN + 1} more)"]
+    members = f" of {' × '.join(map(str, batch))} members" if batch else ""
+    modes = f"; modes {', '.join(trajectory.mode_names)}" if trajectory.mode_names else ""
+    off = trajectory.ts.dtype == np.float32 and not jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
+    dtype = "float32, as jax_enable_x64 is off" if off else trajectory.ts.dtype
+    return f"Trajectory{members}, {dtype}: {', '.join(named)}, and qdot{modes}"
+
+
+def _span(trajectory) -> str:
+    ts, counts = trajectory.ts, [trajectory.stats[name] for name in COUNTS]
+    text = f"{ts.shape[-1]} outputs"
+    if is_known(ts):
+        # Under `jax.vmap` members may have times of their own.
+        start, end = (_range(np.asarray(ts)[..., place]) for place in (0, -1))
+        text = f"t from {start} to {end} at {text}"
+    if not all(map(is_known, counts)):
+        return f"{text}; the steps are being traced"
+    steps, rejected = map(np.asarray, counts)
+    if steps.size == 0:
+        return text
+    if steps.ndim:
+        counted = f"{np.median(steps):.0f} steps in the median, at most {steps.max()} ({rejected.max()} rejected)"
+    else:
+        counted = f"{steps} steps ({rejected} rejected)"
+    changes = trajectory.transitions
+    if changes is not None and is_known(changes.count):
+        counted += f", {'at most ' if steps.ndim else ''}{np.max(np.asarray(changes.count))} transitions"
+    return f"{text}, {counted}"
+
+
+def _verdict(trajectory) -> str:
+    code, t_end = trajectory.result._value, trajectory.end.t
+    if not (is_known(code) and is_known(t_end) and is_known(trajectory.ts)):
+        return "the result is being traced"
+    codes, times = np.asarray(code), np.asarray(t_end)
+    if codes.ndim == 0:
+        name = name_of(codes)
+        return "reached the end" if name == "successful" else f"ended at t = {times:.6g}: {name}"
+    if codes.size == 0:
+        return "no members"
+    values, counts = np.unique(codes, return_counts=True)
+    parts = [
+        f"{count} of {codes.size} reached the end" if name_of(value) == "successful" else f"{count} {name_of(value)}"
+        for value, count in zip(values, counts, strict=True)
+    ]
+    failed = np.argwhere(~np.isin(codes, ENDED_WELL))
+    if not len(failed):
+        return ", ".join(parts)
+    first = tuple(int(i) for i in failed[0])
+    shown = first[0] if len(first) == 1 else first
+    return f"{', '.join(parts)}: the first that failed is member {shown}, at t = {times[first]:.6g}"
+
+
+def _range(values: np.ndarray) -> str:
+    """One number, or the least and the largest of several."""
+    if values.size == 0:
+        return "?"
+    least, largest = f"{values.min():.6g}", f"{values.max():.6g}"
+    return least if least == largest else f"{least} … {largest}"

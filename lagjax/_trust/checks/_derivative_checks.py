@@ -1,0 +1,227 @@
+"""Values and derivatives: finite, and what finite differences say; where not, which operation is to blame."""
+
+import numpy as np
+
+from lagjax._equations import Offender, offenders, pieces_of
+from lagjax._trust.checks._differences import Slopes, differ, ladder, slopes
+from lagjax._trust.checks._findings import Finding, join_names
+from lagjax._trust.checks._jumps_nearby import OF_FORCE
+from lagjax._trust.checks._scene_at_start import CheckedScene, Sides
+
+_SHOWN = 3  # findings of one kind about one function
+# Coordinates beyond which derivatives are first compared along `_RANDOM` directions of q, as many of q̇, and along the
+# motion: to go along every coordinate costs their number times all operations. A derivative that is wrong by less than
+# a hundred thousandth of the slope along such a direction is not seen then.
+_ALL_AT_ONCE = 64
+_RANDOM = 8
+
+
+def findings(scene: CheckedScene) -> list[Finding]:
+    """All there is to say about L, the forces and D, one after the other."""
+    reported = _values(scene)
+    if reported:
+        return reported
+    reported = _not_finite(scene)
+    if reported:
+        return reported
+    if scene.layout.size > _ALL_AT_ONCE and scene.is_lowered and _agree(scene):
+        return []
+    sides = scene.sides()
+    return [
+        finding for block in _blocks(scene, sides.round_off) for finding in _compare_derivatives(scene, sides, *block)
+    ]
+
+
+# ---- finite ----------------------------------------------------------------------------------------------------------
+
+
+def _values(scene: CheckedScene) -> list[Finding]:
+    m, reported = scene.measured, []
+    for role, name, value in (("lagrangian", "L", scene.lagrangian), ("forces", "The force", m.extra),
+                              ("dissipation", "D", scene.dissipation)):  # fmt: skip
+        if not np.isfinite(value).all():
+            where = () if value.ndim == 0 else _select_names(scene.layout.names, ~np.isfinite(value))
+            message = f"{name}{' of ' + join_names(where) if where else ''} is {_first_bad(value)} at this state"
+            reported.append(Finding("value_not_finite", "error", where, message + _blame(scene, role, "value")))
+    return reported
+
+
+def _first_bad(value: np.ndarray) -> str:
+    return str(value[~np.isfinite(value)].ravel()[0])
+
+
+def _not_finite(scene: CheckedScene) -> list[Finding]:
+    m, n, names = scene.measured, scene.layout.size, scene.names
+    first = ~np.isfinite(np.concatenate([m.by_q, m.momentum[0]]))
+    drag = ~np.isfinite(m.by_v_of_dissipation)
+    second = ~np.isfinite(m.mass[0]).all(axis=0) | ~np.isfinite(scene.drift) & ~drag
+    reported = []
+    if first.any():
+        reported.append(
+            _no_derivative(scene, "lagrangian", "The derivative of L by", _select_names(names[:-1], first), "first")
+        )
+    elif second.any():
+        where = _select_names(names[n:-1], second)
+        reported.append(_no_derivative(scene, "lagrangian", "The second derivative of L by", where, "second"))
+    if drag.any():
+        where = _select_names(names[n:-1], drag)
+        reported.append(_no_derivative(scene, "dissipation", "The derivative of D by", where, "first"))
+    return reported
+
+
+def _no_derivative(scene: CheckedScene, role: str, what: str, where: tuple[str, ...], order: str) -> Finding:
+    message = f"{what} {join_names(where)} is not finite at this state, although the function is"
+    return Finding("derivative_not_finite", "error", where, message + _blame(scene, role, order))
+
+
+def _select_names(names, chosen) -> tuple[str, ...]:
+    return tuple(name for name, yes in zip(names, chosen, strict=True) if yes)
+
+
+# ---- the operation to blame ------------------------------------------------------------------------------------------
+
+_REMEDIES = {
+    "sqrt": "A norm at zero, most often: where its square is wanted write jnp.sum(v**2) and not jnp.linalg.norm(v)**2.",
+    "pow": "Powers that are no whole numbers have no derivative of every order at zero: write a polynomial there.",
+    "atan2": "An angle has no derivative at the origin: take Cartesian coordinates, or start elsewhere.",
+    "div": "Divide by something that is not zero where the motion goes, or cancel the fraction by hand.",
+    "log": "Its argument must stay positive.",
+}
+_REMEDIES |= {"rsqrt": _REMEDIES["sqrt"], "cbrt": _REMEDIES["pow"], "integer_pow": _REMEDIES["div"]}
+_BRANCH = (
+    "L itself does not see it, as it is a branch that `where` does not take; its derivative does, as zero times NaN is "
+    "NaN. Keep the argument good in both: where(ok, f(where(ok, x, 1.0)), other)."
+)
+
+
+def _blame(scene: CheckedScene, role: str, order: str) -> str:
+    """The end of a sentence: which operation, with which operands, in which line, and what to write instead."""
+    wanted = {"value": ("value",), "first": ("value", "first derivative")}.get(order)
+    offending = [o for o in offenders(getattr(scene.motion, role), *scene.state) if not wanted or o.fault in wanted]
+    if not offending:
+        return ". No single operation is to blame: large numbers may overflow together; look at the units."
+    first = offending[0]
+    hidden = first.fault == "value" and order != "value"
+    return f": {first}. {_BRANCH if hidden else _remedy(first)}".rstrip()
+
+
+def _remedy(offender: Offender) -> str:
+    return _REMEDIES.get(offender.name, "Write it so that it is smooth there, or start elsewhere.")
+
+
+def _blame_for_kink(scene: CheckedScene, role: str) -> str:
+    function = getattr(scene.motion, role)
+    places = list(dict.fromkeys(f"{name}{place}" for name, place, _ in pieces_of(function, *scene.state)))
+    return f" (the function is pieced together by {join_names(places, 3)})" if places else ""
+
+
+# ---- against finite differences --------------------------------------------------------------------------------------
+
+
+def _blocks(scene: CheckedScene, round_off):
+    """The derivatives that are compared, in blocks: a name, the role of the function, its derivatives, their names.
+
+    The derivatives have the shape (directions, outputs); the last two entries are these directions, of the 2n + 1, and
+    these outputs, of `Measured.here`.
+    """
+    m, n = scene.measured, scene.layout.size
+    first, dissipates = 1 + n, scene.motion.dissipation is not None
+    constraint = first + dissipates
+    # Derivatives by automatic differentiation have the rounding of their terms, which may cancel.
+    of_q, of_v, of_mass, of_drift, of_drag, of_rows = round_off
+    by_y = Slopes(*(np.concatenate(parts)[:, None] for parts in ((m.by_q, m.momentum[0]), (of_q, of_v))))
+    of_momentum = Slopes(np.concatenate([m.mass[0], scene.drift[None]]), np.concatenate([of_mass, of_drift[None]]))
+    blocks = [
+        ("L", "lagrangian", by_y, range(2 * n), range(1)),
+        ("p = dL/dqdot", "lagrangian", of_momentum, range(n, 2 * n + 1), range(1, first)),
+    ]
+    if dissipates:
+        by_v = Slopes(m.by_v_of_dissipation[:, None], of_drag[:, None])
+        blocks.append(("D", "dissipation", by_v, range(n, 2 * n), range(first, constraint)))
+    count = len(scene.residual)
+    if np.isfinite(scene.residual).all() and np.isfinite(m.jacobian[0]).all():
+        positions = position_count(scene)
+        by_q, by_v = (Slopes(m.jacobian[0, k].T, of_rows[k].T) for k in (slice(positions), slice(positions, None)))
+        blocks += [
+            ("a constraint", "constraints", by_q, range(n), range(constraint, constraint + positions)),
+            ("a velocity constraint", "velocity_constraints", by_v, range(n, 2 * n),
+             range(constraint + positions, constraint + count)),
+        ]  # fmt: skip
+    return [block for block in blocks if len(block[-1])]
+
+
+def position_count(scene: CheckedScene) -> int:
+    return scene.derivation.position_count
+
+
+def _agree(scene: CheckedScene) -> bool:
+    """True if derivatives are the slopes along random directions, from both sides and from each."""
+    n, dtype, m = scene.layout.size, scene.layout.dtype, scene.measured
+    directions = np.zeros((2 * _RANDOM + 1, 2 * n + 1))
+    random = np.random.default_rng(0).standard_normal((2, _RANDOM, n)) * scene.sizes[:-1].reshape(2, 1, n)
+    directions[:_RANDOM, :n], directions[_RANDOM:-1, n:-1] = random
+    directions[-1, -1] = 1.0
+    steps = ladder(np.append(np.ones(2 * _RANDOM), scene.sizes[-1]), dtype)
+    minus, plus = scene.displaced_outputs(directions, steps)
+    place = np.abs(directions) @ (_places(scene) / scene.sizes**2)
+    exact = tuple(np.zeros_like(x) for x in (m.by_q, m.momentum[0], m.mass[0], m.by_q, m.by_q, m.jacobian[0]))
+    for _, _, derivative, axes, outputs in _blocks(scene, exact):
+        outside = np.delete(directions, list(axes), axis=1)
+        rows = np.flatnonzero(~outside.any(axis=1))
+        chosen = np.ix_(rows, np.arange(len(steps)), np.asarray(outputs))
+        both, ahead, behind = slopes(
+            minus[chosen], m.here[list(outputs)], plus[chosen], steps[:, rows], place[rows], float(np.finfo(dtype).eps)
+        )
+        value = directions[rows][:, list(axes)] @ derivative.value
+        if differ(ahead, behind, dtype).any() or differ(Slopes(value, np.zeros_like(value)), both, dtype).any():
+            return False
+    return True
+
+
+def _compare_derivatives(
+    scene: CheckedScene, sides: Sides, name, role, derivative, directions, outputs
+) -> list[Finding]:
+    m, dtype, names = scene.measured, scene.layout.dtype, scene.names
+    chosen = np.ix_(directions, range(sides.plus.shape[1]), outputs)
+    place = _places(scene)[list(directions)]
+    both, ahead, behind = slopes(
+        sides.minus[chosen], m.here[list(outputs)], sides.plus[chosen], scene.steps[:, list(directions)], place,
+        float(np.finfo(dtype).eps), sides.noise[list(outputs)],
+    )  # fmt: skip
+    kinks, n = differ(ahead, behind, dtype), scene.layout.size
+    derivative, wrong = derivative.value, differ(derivative, both, dtype) & ~kinks
+    names, reported = [names[i] for i in directions], []
+    for i, k in list(zip(*np.nonzero(kinks), strict=True))[:_SHOWN]:
+        slope = (
+            f"The slope of {name} along {names[i]} is {behind.value[i, k]:.6g} below this state and "
+            f"{ahead.value[i, k]:.6g} above it"
+            f"{_blame_for_kink(scene, role) if role in ('lagrangian', 'dissipation') else ''}"
+        )
+        of_force = role == "dissipation" or (role == "lagrangian" and not (name == "L" and directions[i] >= n))
+        if of_force:
+            rest = (
+                ": the acceleration jumps here. At this very state `acceleration` and derivatives are those of one "
+                f"side, or between them, by the slope {derivative[i, k]:.6g}. {OF_FORCE}"
+            )
+        else:
+            rest = (
+                f": a kink, where automatic differentiation says {derivative[i, k]:.6g}. No force shows the kick that "
+                "it gives to velocities. Smooth it (sqrt(x**2 + w**2) for abs(x)), or make two modes of it with a "
+                "Transition for lagjax.simulate_hybrid."
+            )
+        reported.append(Finding("kink", "advice" if of_force else "error", (names[i],), slope + rest))
+    for i, k in list(zip(*np.nonzero(wrong), strict=True))[:_SHOWN]:
+        message = (
+            f"The derivative of {name} along {names[i]} is {derivative[i, k]:.6g} by automatic differentiation, and "
+            f"{both.value[i, k]:.6g} ± {both.error[i, k]:.0e} by finite differences: a custom derivative is wrong, or "
+            "stop_gradient, a round or a cast to integers hides a dependence."
+        )
+        reported.append(Finding("wrong_derivative", "error", (names[i],), message))
+    return reported
+
+
+def _places(scene: CheckedScene) -> np.ndarray:
+    """|q|, |q̇| and the time, (2n + 1,): the numbers of the state whose rounding moves what is computed from them."""
+    q, v, t = (np.abs(np.asarray(x, float)) for x in scene.state[:3])
+    speed = v.max()
+    return np.concatenate([q, v, [max(t, q.max() / speed if speed > 0 else 0)]])

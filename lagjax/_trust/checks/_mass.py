@@ -1,0 +1,228 @@
+"""The mass matrix: velocities that carry no kinetic energy, and why; its signs and its condition.
+
+With constraints it may be singular where they hold what L does not. Then the augmented matrix K = M + GᵀW G is
+examined, which is regular when the saddle point is (`_linear`). States nearby tell what a direction u with K u = 0 is:
+
+    the row of M is zero everywhere, and p too             a velocity that L does not contain
+    the row of M is zero everywhere, p is not              L is linear in it
+    K is regular where q is another                        the chart is singular here: r = 0, a pole
+    K is regular where q̇ is another                        kinetic energy of a higher order than the second
+    K is singular everywhere, u the same                   a combination of velocities is missing
+    K is singular everywhere, u another                    a gauge: some motion is left undetermined, as the
+                                                           parametrisation of a path where L is of degree one in q̇
+"""
+
+import numpy as np
+
+from lagjax._engine import DEFAULT_RTOL
+from lagjax._equations import diagonal_scale, eigen, null_directions, singular_threshold
+from lagjax._trust.checks._findings import Finding, join_names
+from lagjax._trust.checks._scene_at_start import CheckedScene
+
+
+def findings(scene: CheckedScene) -> list[Finding]:
+    """All that there is to say about the mass matrix."""
+    m, names = scene.measured, scene.layout.names
+    augmented = scene.augmented
+    usable = [k for k in range(1, len(augmented)) if np.isfinite(augmented[k]).all()]
+    if not np.isfinite(augmented[0]).all():
+        return []  # a derivative is not finite, which was said already
+    if len(null_velocities(augmented[0])):
+        return _singular(scene, augmented, usable)
+    others = [augmented[k] for k in usable]
+    condition = _condition(augmented[0], names, DEFAULT_RTOL)
+    return [*_nearly_singular(augmented[0], others, names), *_signs(m.mass[0], m.jacobian[0], names), *condition]
+
+
+def null_velocities(matrix: np.ndarray) -> np.ndarray:
+    """Unit vectors (k, n), one a row, along which a symmetric matrix (n, n) is zero up to the rounding of its entries.
+
+    The entries are derivatives with some units of round-off each: more is allowed for here than in `_linear`, where a
+    matrix is solved with that is taken to be exact.
+    """
+    return null_directions(matrix, _rounding(matrix))
+
+
+def _rounding(matrix: np.ndarray) -> float:
+    """The part of the largest eigenvalue that rounding may make of a zero: 32 units for each row."""
+    return 32 * singular_threshold(len(matrix), matrix.dtype)
+
+
+# ---- singular --------------------------------------------------------------------------------------------------------
+
+
+def _singular(scene: CheckedScene, augmented: np.ndarray, usable: list[int]) -> list[Finding]:
+    """Findings for K (states, n, n) that is singular at the state; `usable` are the states nearby where K is finite."""
+    names, constrained = scene.layout.names, scene.motion.constrained
+    empty = [i for i in range(len(names)) if all(not augmented[k][i].any() for k in [0, *usable])]
+    empty_rows = [_empty(i, scene.measured.momentum[[0, *usable], i], names[i], constrained) for i in empty]
+    rest = [i for i in range(len(names)) if i not in empty]
+
+    def among_rest(k):
+        return null_velocities(augmented[k][np.ix_(rest, rest)])
+
+    if not rest or not len(here := among_rest(0)):
+        return empty_rows
+    where = tuple(names[rest[i]] for i in np.flatnonzero(np.abs(here).max(axis=0) > 1e-6))
+    combinations = "; ".join(_combination(u, [names[i] for i in rest]) for u in here)
+    what = "The saddle point of M and the constraints" if constrained else "The mass matrix d2L/dqdot2"
+    kind, why = _classify(scene, here, {k: among_rest(k) for k in usable})
+    return [*empty_rows, Finding(kind, "error", where, f"{what} is singular along {combinations}, {why}")]
+
+
+def _empty(i: int, momenta: np.ndarray, name: str, constrained: bool) -> Finding:
+    linear = bool(np.any(momenta != 0))
+    kind = "linear_in_velocity" if linear else "velocity_unused"
+    what = f"L is linear in d{name}" if linear else f"L does not contain the velocity d{name}"
+    nor = ", and no constraint holds it" if constrained else ""
+    message = (
+        f"{what}{nor}: the mass matrix has a zero row, and nothing determines the acceleration of {name}. Add its "
+        f"kinetic energy, or take {name} out of q"
+        + (": an equation of first order is not one of motion." if linear else " and give it as a parameter.")
+    )
+    return Finding(kind, "error", (name,), message)
+
+
+def _classify(scene: CheckedScene, here: np.ndarray, nearby: dict[int, np.ndarray]) -> tuple[str, str]:
+    """The kind of a singularity with these null directions, and the rest of the sentence about it."""
+    m = scene.measured
+    if any(not len(directions) for k, directions in nearby.items() if not (m.velocity[k] != m.velocity[0]).any()):
+        return "coordinate_singularity", (
+            "but regular at positions nearby: these coordinates are singular here (polar ones at r = 0, spherical ones "
+            "and Euler angles at a pole, a slack variable s² at s = 0). Use others that are regular where the motion "
+            "goes, such as Cartesian ones with a constraint, or start elsewhere."
+        )
+    if any(not len(directions) for directions in nearby.values()):
+        return "singular_at_velocity", (
+            "but regular at other velocities: L has no second order in them here. Start with another velocity, or "
+            "write a kinetic energy that is quadratic in small velocities."
+        )
+    if scene.motion.constrained:
+        return "singular_saddle_point", (
+            "here and nearby: neither L nor a constraint determines the acceleration there. Add the kinetic energy of "
+            "these velocities or a constraint on them, or take a coordinate out."
+        )
+    if _homogeneous(scene, [0, *nearby]):
+        return "gauge", (
+            "the velocity itself: L is of degree one in the velocities, and every parametrisation of the path is as "
+            "good as another. Take one of the coordinates as t, or, where L is a length alone, integrate its square."
+        )
+    if nearby and all(_same_space(here, directions) for directions in nearby.values()):
+        return "velocity_combination", (
+            "here and nearby: L has no kinetic energy along this combination of velocities. Add it (a missing mass?), "
+            "or use fewer coordinates."
+        )
+    return "gauge", (
+        "and nearby along directions that change with the state: a part of the motion is left free. Fix it by a "
+        "constraint, or use fewer coordinates."
+    )
+
+
+def _homogeneous(scene: CheckedScene, states: list[int]) -> bool:
+    """True if M q̇ = 0 at all of these states: L is of degree one in the velocities."""
+    m = scene.measured
+
+    def annihilates(mass, v):
+        return np.abs(mass @ v).max() <= np.sqrt(np.finfo(mass.dtype).eps) * np.abs(mass).max() * np.abs(v).max()
+
+    in_motion = [k for k in states if m.velocity[k].any()]
+    return bool(in_motion) and all(annihilates(m.mass[k], m.velocity[k]) for k in in_motion)
+
+
+def _same_space(one: np.ndarray, other: np.ndarray) -> bool:
+    """True if the rows of two arrays (k, n) span the same space, up to √eps."""
+    if one.shape != other.shape:
+        return False
+    basis = np.linalg.qr(other.T)[0]
+    return bool(np.abs(one - one @ basis @ basis.T).max() < np.sqrt(np.finfo(one.dtype).eps))
+
+
+def _combination(direction: np.ndarray, names: list[str]) -> str:
+    """A direction as +1 dq[0] -0.3 dq[1]."""
+    direction = direction / direction[np.argmax(np.abs(direction))]
+    terms = [f"{c:+.3g} d{name}" for c, name in zip(direction, names, strict=True) if abs(c) > 1e-6]
+    return " ".join(terms[:8]) + (" …" if len(terms) > 8 else "")
+
+
+# ---- regular ---------------------------------------------------------------------------------------------------------
+
+# The smallest eigenvalue of K over that at states nearby, below which the state is called next to a singularity. The
+# states are a tenth of a size away, and eigenvalues vanish like r²: 1e-6 is a ten-thousandth of a size from the pole.
+_NEARLY = 1e-6
+
+
+def _nearly_singular(here: np.ndarray, others: list[np.ndarray], names) -> list[Finding]:
+    """A warning next to a pole, where K is regular in its own scale but nearly singular in that of states nearby."""
+    if not others:
+        return []
+    usual = 1 / np.sqrt(np.maximum(np.median([np.abs(np.diagonal(k)) for k in others], axis=0), 1e-300))
+
+    def smallest(matrix):
+        values, vectors = eigen(usual[:, None] * matrix * usual)
+        place = np.argmin(np.abs(values))
+        return np.abs(values[place]) / np.abs(values).max(), vectors[:, place]
+
+    lowest, direction = smallest(here)
+    if all(np.array_equal(k, here) for k in others) or lowest >= _NEARLY * np.median([smallest(k)[0] for k in others]):
+        return []
+    where = tuple(name for name, c in zip(names, direction, strict=True) if abs(c) > 0.1)
+    message = (
+        f"The mass matrix is {lowest:.1g} of its usual size along {join_names([f'd{name}' for name in where])}: the "
+        "state is next to a singularity of the coordinates (r = 0, a pole, a gimbal), where accelerations and steps "
+        "become extreme (or a length is in units far too large for it). Use coordinates that are regular there, such "
+        "as Cartesian ones with a constraint."
+    )
+    return [Finding("near_coordinate_singularity", "warning", where, message)]
+
+
+def _signs(mass: np.ndarray, rows: np.ndarray, names) -> list[Finding]:
+    """Negative kinetic energy along velocities that the constraints allow."""
+    scale = diagonal_scale(mass)
+    free = kernel(rows * scale)
+    if not free.shape[1]:
+        return []
+    values, vectors = eigen(free.T @ (scale[:, None] * mass * scale) @ free)
+    negative = values < -_rounding(mass) * np.abs(values).max()
+    if not negative.any():
+        return []
+    direction = scale * (free @ vectors[:, 0])
+    combination = _combination(direction, list(names))
+    where = tuple(name for name, c in zip(names, direction, strict=True) if abs(c) > 1e-6 * np.abs(direction).max())
+    whole = "negative definite" if negative.all() else "indefinite"
+    return [Finding(
+        "indefinite_mass_matrix", "warning", where,
+        f"The mass matrix is {whole}: d2L is negative along {combination}. The motion is that of L all the same, but "
+        "if L is meant to be T - U, a sign is wrong, or a mass is negative.",
+    )]  # fmt: skip
+
+
+def kernel(rows: np.ndarray) -> np.ndarray:
+    """The columns (n, n − rank) that span the kernel of some rows (m, n): the velocities that they leave free."""
+    if not len(rows):
+        return np.eye(rows.shape[1], dtype=rows.dtype)
+    _, values, vectors = np.linalg.svd(rows)
+    rank = int(np.sum(values > 1e-10 * max(values.max(), 1e-300)))
+    return vectors[rank:].T
+
+
+def _spread(matrix: np.ndarray) -> float:
+    """The largest |eigenvalue| of a symmetric matrix over the smallest."""
+    sizes = np.abs(eigen(matrix)[0])
+    with np.errstate(divide="ignore"):
+        return float(sizes.max() / sizes.min())
+
+
+def _condition(matrix: np.ndarray, names, default_rtol: float) -> list[Finding]:
+    scale = diagonal_scale(matrix)
+    condition, raw = _spread(scale[:, None] * matrix * scale), _spread(matrix)
+    lost = condition * np.finfo(matrix.dtype).eps
+    if lost <= default_rtol:
+        return []
+    _, vectors = eigen(scale[:, None] * matrix * scale)
+    where = tuple(name for name, c in zip(names, vectors[:, 0], strict=True) if abs(c) > 0.1)
+    message = (
+        f"The mass matrix has the condition {condition:.1e} after scaling each coordinate ({raw:.1e} before): "
+        f"accelerations are good to {lost:.0e} only, through {join_names(where)}. Use coordinates that are less "
+        "coupled (absolute angles instead of joint angles), masses less far apart, or do not ask for a tighter rtol."
+    )
+    return [Finding("ill_conditioned", "advice", where, message)]

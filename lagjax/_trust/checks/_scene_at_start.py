@@ -1,0 +1,318 @@
+"""Everything that `check` computes: the values and derivatives of a scene at a state and at states around it.
+
+A `Sample` evaluates the scene: by its programs in NumPy, which compiles nothing, or else compiled by XLA.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._equations import Derivation, Motion, Sample, Scales, augment, is_lowered, numbers_of
+from lagjax._interface import Layout, as_arrays
+from lagjax._program import Unlowerable
+from lagjax._scene import System
+from lagjax._trust.checks._differences import ladder
+
+PyTree = Any
+
+_NEARBY = 4  # states with other positions, and as many with other velocities
+
+
+class CheckedScene(NamedTuple):
+    """A scene at a state, and what was measured there. Everything is flat; n coordinates, m constraints."""
+
+    system: System
+    layout: Layout
+    arguments: tuple  # q, qdot, t, params in the user's pytrees
+    state: tuple  # q, q̇, t and the numbers in params
+    sample: Sample  # the state, alone
+    sizes: np.ndarray  # of q, then of q̇, and of the time along the motion
+    steps: np.ndarray  # of the differences, (rungs, 2n + 1), along the same directions
+    measured: "Measured"
+
+    @classmethod
+    def from_state(cls, system: System, layout: Layout, q, qdot, t, params) -> "CheckedScene":
+        """The scene of `system` at a state, with its measurements there."""
+        q, qdot, t, params = as_arrays((q, qdot, 1.0 * t, params), layout.dtype)
+        state = layout.flatten(q), layout.flatten(qdot), jnp.asarray(t), eqx.filter(params, eqx.is_array_like)
+        flat = [np.asarray(x) for x in state[:3]]
+        here = Sample.from_scene(system, layout, flat[0][None], flat[1][None], flat[2], params)
+        scales = _scales(here)
+        sizes = _sizes(q, qdot, scales)
+        steps, offsets = ladder(sizes, layout.dtype), _offsets(sizes, scales, layout.dtype)
+        return cls(system, layout, (q, qdot, t, params), state, here, sizes, steps, _measure(here, offsets))
+
+    @property
+    def derivation(self) -> Derivation:
+        return self.sample.derivation
+
+    @property
+    def motion(self) -> Motion:
+        """The functions of the scene, in flat coordinates."""
+        return self.derivation.motion
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of the 2n + 1 directions of differences: coordinates, velocities, and along the motion."""
+        names = self.layout.names
+        return (*names, *(f"d{name}" for name in names), "the motion")
+
+    def sides(self) -> "Sides":
+        """The outputs on both sides of the state, along every coordinate and velocity and along the motion."""
+        minus, plus = self.displaced_outputs(np.eye(2 * self.layout.size + 1), self.steps)
+        one, here = self.sample, self.measured
+        drift = {
+            "lagrangian_by_q": here.by_q, "given_force": here.extra,
+            "dissipation_by_qdot": here.by_v_of_dissipation, "force": here.force,
+        }  # fmt: skip
+        if not self.is_lowered:
+            by_v = here.by_v_of_dissipation
+            of_terms = (here.by_q,), (here.momentum[0],), (here.mass[0],), drift.values(), (by_v,), (here.jacobian[0],)
+            return Sides(minus, plus, np.zeros_like(here.here), tuple(_rounding(*terms) for terms in of_terms))
+        noise = self.derivation.program(*_COMPARED).round_off_many(one.columns)[:, 0]
+        lost = {name: value[0] for name, value in one.round_off(*_DERIVED).items()}
+        of_drift = sum(lost[name] + np.finfo(self.layout.dtype).eps * abs(value) for name, value in drift.items())
+        round_off = (
+            lost["lagrangian_by_q"], lost["momentum"], lost["mass_matrix"], of_drift, lost["dissipation_by_qdot"],
+            lost["jacobian"],
+        )  # fmt: skip
+        return Sides(minus, plus, noise, round_off)
+
+    def displaced_outputs(self, directions: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The outputs of `Measured.here` at steps back and ahead, each (directions, rungs, outputs).
+
+        `directions` (D, 2n + 1) are combinations of the coordinates, the velocities and the motion; `steps` (rungs, D).
+        """
+        (q, v, t), n = (np.asarray(x) for x in self.state[:3]), self.layout.size
+        axes = np.eye(2 * n + 1, dtype=q.dtype)
+        axes[-1, :n] = v
+        moves = np.stack([-steps, steps]).transpose(2, 0, 1)[..., None] * (directions @ axes)[:, None, None]
+        along = (np.concatenate([q, v, t[None]]) + moves).reshape(-1, 2 * n + 1).astype(q.dtype)
+        sides = self.sample_at(along[:, :n], along[:, n:-1], along[:, -1]).flat(*_COMPARED)
+        sides = sides.reshape(len(directions), 2, len(steps), -1)
+        return sides[:, 0], sides[:, 1]
+
+    def sample_at(self, q: np.ndarray, qdot: np.ndarray, t: np.ndarray) -> Sample:
+        """The scene at S other states: q, q̇ (S, n) and t (S,)."""
+        return self.sample._replace(q=q, qdot=qdot, t=t)
+
+    @property
+    def is_lowered(self) -> bool:
+        return is_lowered(self.derivation)
+
+    @property
+    def lagrangian(self) -> np.ndarray:
+        return self.measured.here[0]
+
+    @property
+    def dissipation(self) -> np.ndarray:
+        """D at the state, zero where there is none."""
+        return self.measured.here[1 + self.layout.size] if self.motion.dissipation is not None else np.zeros(())
+
+    @property
+    def residual(self) -> np.ndarray:
+        """f, then a, at the state, (m,)."""
+        count = self.measured.jacobian.shape[1]
+        return self.measured.here[len(self.measured.here) - count :]
+
+    @property
+    def drift(self) -> np.ndarray:
+        """(∂p/∂q) q̇ + ∂p/∂t at the state, (n,)."""
+        m = self.measured
+        return m.by_q + m.extra - m.by_v_of_dissipation - m.force
+
+    @property
+    def augmented(self) -> np.ndarray:
+        """The augmented matrix K = M + GᵀW G (see `_linear`) of every state, (states, n, n); M without constraints."""
+        return augment(self.measured.mass, self.measured.jacobian)[0]
+
+    def solve_saddle(self) -> tuple[np.ndarray, np.ndarray]:
+        """q̈ (n,) and λ (m,) at the state."""
+        m, n = self.measured, self.layout.size
+        x = self._solve(np.concatenate([m.force, m.gamma])[:, None])[:, 0]
+        return x[:n], x[n:]
+
+    def jacobian(self) -> np.ndarray:
+        """∂q̈/∂(q, q̇) at the state, (n, 2n), by the implicit function theorem."""
+        acceleration, multipliers = self.solve_saddle()
+        try:
+            varied = _program_variation(self.derivation, self.state, acceleration, multipliers)
+        except Unlowerable:
+            q, qdot, t, params = self.arguments
+            varied = np.asarray(_variation(self.system, q, qdot, t, params, acceleration, multipliers))
+        return self._solve(-varied)[: self.layout.size]
+
+    def _solve(self, b: np.ndarray) -> np.ndarray:
+        """(q̈, λ) of the saddle point M q̈ − Gᵀλ = b₁, G q̈ = b₂ for columns b (n + m, k), by least squares.
+
+        The matrix is scaled to K with a unit diagonal and rows of unit length. Where constraints are redundant λ is one
+        of many.
+        """
+        mass, rows = self.measured.mass[0], self.measured.jacobian[0]
+        diagonal = np.sqrt(np.abs(np.diagonal(self.augmented[0])))
+        units = np.concatenate([1 / np.where(diagonal > 0, diagonal, 1), np.ones(len(rows))])
+        units[len(mass) :] = 1 / np.maximum(np.linalg.norm(rows * units[: len(mass)], axis=1), 1e-300)
+        matrix = np.block([[mass, -rows.T], [rows, np.zeros((len(rows), len(rows)))]])
+        scaled = units[:, None] * matrix * units
+        if not (np.isfinite(scaled).all() and np.isfinite(b).all()):
+            return np.full_like(b, np.nan)
+        if not len(rows):
+            return units[:, None] * np.linalg.solve(scaled, units[:, None] * b)
+        tolerance = float(np.finfo(matrix.dtype).eps) ** (2 / 3)
+        return units[:, None] * np.linalg.lstsq(scaled, units[:, None] * b, rcond=tolerance)[0]
+
+
+class Measured(NamedTuple):
+    """The measurements. A first axis of states stands for the state itself, then others in q, then others in q̇."""
+
+    by_q: Any  # ∂L/∂q, (n,)
+    momentum: Any  # (states, n)
+    mass: Any  # (states, n, n)
+    force: Any  # F = M q̈ − Gᵀλ, (n,)
+    extra: Any  # the user's forces, (n,)
+    by_v_of_dissipation: Any  # ∂D/∂q̇, (n,)
+    jacobian: Any  # G, (states, m, n)
+    gamma: Any  # γ of G q̈ = γ, (m,)
+    velocity: Any  # (states, n)
+    power: Any  # Σ q̇ᵢ ∂D/∂q̇ᵢ, which D takes out of the motion, and Σ |q̇ᵢ ∂D/∂q̇ᵢ|, (states, 2)
+    here: Any  # the outputs L, p, D (if there is one), f and a at the state, (outputs,)
+
+
+class Sides(NamedTuple):
+    """The references of derivatives: the outputs of `Measured.here` at states on both sides, and rounding."""
+
+    minus: Any  # at steps back, (directions, rungs, outputs)
+    plus: Any  # at steps ahead, (directions, rungs, outputs)
+    noise: Any  # how far rounding may move `here`, (outputs,)
+    round_off: Any  # how far it may move by_q, momentum, mass, drift, by_v_of_dissipation and the rows of G, each alike
+
+
+def _scales(here: Sample) -> Scales:
+    """The sizes of coordinates, velocities and the time at a state; one, where the scene does not tell."""
+    q, v, t = (np.asarray(x, np.float64) for x in (here.q[0], here.qdot[0], here.t))
+
+    def evaluated(name, q, v):
+        return here._replace(q=q, qdot=v, t=t, scene=None).quantities(name)[name]
+
+    try:
+        scales = Scales.from_quantities(evaluated, q, v)
+    except Unlowerable:
+        scales = Scales(np.abs(q), np.abs(v), 1.0)
+    return scales._replace(**{name: np.where(np.isfinite(x) & (x > 0), x, 1.0) for name, x in scales._asdict().items()})
+
+
+def _sizes(q: PyTree, qdot: PyTree, scales: Scales) -> np.ndarray:
+    """The size of every coordinate, of every velocity, and of the time along the motion, (2n + 1,).
+
+    A coordinate has its absolute value as its size; where that is zero, the largest in its array, or its scale. One
+    that is tiny beside the others (an angle that was projected to 1e-20) counts as a thousandth of that scale. The size
+    of the time is what the fastest coordinate takes to move by its size, or its scale if that is shorter.
+    """
+
+    def sizes_of(tree, scale):
+        leaves = [np.abs(np.ravel(np.asarray(leaf, np.float64))) for leaf in jax.tree.leaves(tree)]
+        largest = np.concatenate([np.full(x.size, x.max(initial=0.0)) for x in leaves])
+        own = np.concatenate(leaves)
+        return np.maximum(np.where(own > 0, own, np.where(largest > 0, largest, scale)), 1e-3 * scale)
+
+    of_q, of_v = sizes_of(q, scales.q), sizes_of(qdot, scales.qdot)
+    speed = np.abs(np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(qdot)]))
+    time = np.min(of_q / np.where(speed > 0, speed, np.inf), where=speed > 0, initial=float(scales.t))
+    return np.concatenate([of_q, of_v, [time]])
+
+
+def _offsets(sizes: np.ndarray, scales: Scales, dtype) -> np.ndarray:
+    """Offsets (1 + 2 · _NEARBY, 2n) from the state: zero, then random ones of q alone, then of q̇ alone.
+
+    Their deviation is a tenth of the sizes. A coordinate that is small beside the others moves by a tenth of its scale:
+    it may be next to where the chart is singular, and has to leave that.
+    """
+    n = len(scales.q)
+    sizes = np.concatenate([np.maximum(sizes[:n], scales.q), sizes[n:-1]])
+    moved = 0.1 * np.random.default_rng(0).standard_normal((2 * _NEARBY, 2 * n)) * sizes
+    moved[:_NEARBY, n:] = 0
+    moved[_NEARBY:, :n] = 0
+    return np.concatenate([np.zeros((1, 2 * n)), moved]).astype(dtype)
+
+
+_COMPARED = ("lagrangian", "momentum", "dissipation", "residual")
+_NEARBY_QUANTITIES = (
+    "momentum", "mass_matrix", "jacobian", "lagrangian_by_q", "force", "given_force", "gamma", "dissipation_by_qdot",
+)  # fmt: skip
+_DERIVED = ("lagrangian_by_q", "momentum", "mass_matrix", "given_force", "dissipation_by_qdot", "force", "jacobian")
+
+
+def _measure(here: Sample, offsets: np.ndarray) -> Measured:
+    """The measurements at the state and at `offsets` (states, 2n) from it."""
+    n = here.derivation.layout.size
+    velocity = here.qdot + offsets[:, n:]
+    near = here._replace(q=here.q + offsets[:, :n], qdot=velocity)
+    of, power = near.quantities(*_NEARBY_QUANTITIES), np.zeros((len(offsets), 2))
+    if here.derivation.motion.dissipation is not None:
+        damping = near._replace(q=here.q + 0 * offsets[:, :n]).quantities("dissipation_by_qdot")
+        terms = damping["dissipation_by_qdot"] * velocity
+        power = np.stack([terms.sum(axis=1), np.abs(terms).sum(axis=1)], axis=1)
+    return Measured(
+        by_q=of["lagrangian_by_q"][0],
+        momentum=of["momentum"],
+        mass=of["mass_matrix"],
+        force=of["force"][0],
+        extra=of["given_force"][0],
+        by_v_of_dissipation=of["dissipation_by_qdot"][0],
+        jacobian=of["jacobian"],
+        gamma=of["gamma"][0],
+        velocity=velocity,
+        power=power,
+        here=here.flat(*_COMPARED)[0],
+    )
+
+
+def _program_variation(derivation: Derivation, state, acceleration, multipliers) -> np.ndarray:
+    """The slopes of M q̈ − Gᵀλ − F and G q̈ − γ by (q, q̇), (n + m, 2n), for constant q̈ and λ: by the programs.
+
+    It is one transposed derivative of the program of M, F, G and γ, for all n + m equations side by side.
+    """
+    q, v, t, numbers = *map(np.asarray, state[:3]), numbers_of(state[3])
+    n, m = len(q), len(multipliers)
+    unit = np.eye(n + m, dtype=q.dtype)
+    program = derivation.program("mass_matrix", "jacobian", "force", "gamma")
+    # Numbers that do not vary, most of a large mass matrix, have no use for a cotangent of n + m numbers.
+    varies = iter([program.constant(k) is None for k in range(n * n + m * n)])
+    cotangents: list = [unit[i] * acceleration[j] if next(varies) else None for i in range(n) for j in range(n)]
+    cotangents += [
+        unit[n + k] * acceleration[i] - unit[i] * multipliers[k] if next(varies) else None
+        for k in range(m)
+        for i in range(n)
+    ]
+    cotangents += [-unit[i] for i in range(n + m)]
+    derivatives = program.vjp_many([*q, *v, t, *numbers], cotangents)[: 2 * n]
+    return np.stack([np.zeros(n + m) if bar is None else np.broadcast_to(bar, n + m) for bar in derivatives], axis=1)
+
+
+def _rounding(*terms):
+    """The rounding of derivatives whose terms are not known one by one, in the shape of the first of `terms`.
+
+    Four units of round-off of the sum of the largest terms.
+    """
+    first, *_ = terms
+    size = sum(np.max(np.abs(term), initial=0.0) for term in terms)
+    return np.full(first.shape, 4 * np.finfo(first.dtype).eps * size)
+
+
+@eqx.filter_jit
+def _variation(system: System, q, qdot, t, params, acceleration, multipliers):
+    """The slopes of M q̈ − Gᵀλ − F and G q̈ − γ by (q, q̇), (n + m, 2n), for constant q̈ and λ: compiled by XLA."""
+    layout = Layout.from_state(q, qdot)
+    motion, numbers = system._motion(layout, params), eqx.filter(params, eqx.is_array_like)
+
+    def balance(y):
+        q, qdot = jnp.split(y, 2)
+        matrix, force = motion.mass_matrix_and_force(q, qdot, t, numbers)
+        jacobian, gamma = motion.constraints.jacobian_and_gamma(q, qdot, t, numbers)
+        left = matrix @ acceleration - jacobian.T @ multipliers - force
+        return jnp.concatenate([left, jacobian @ acceleration - gamma])
+
+    return jax.jacfwd(balance)(jnp.concatenate([layout.flatten(q), layout.flatten(qdot)]))

@@ -1,0 +1,110 @@
+"""The borders that a motion met (`_program._borders`), from its steps taken once more.
+
+What a step ends at is written down for derivatives, and for them alone. So the motion is followed again as for one,
+over the time that it took. That costs as much as the motion did; scenes without borders pay nothing.
+"""
+
+from typing import Generic, NamedTuple, TypeVar
+
+import jax
+import numpy as np
+
+from lagjax._engine import Problem
+from lagjax._engine.taylor import Flow, StepStore, Tolerances, flow_of, portions
+from lagjax._equations import derivation_of, pieces_of_motion
+from lagjax._interface import Layout
+from lagjax._program import Unlowerable
+from lagjax._run import Members
+from lagjax._scene import System
+from lagjax._trust.health._measurements import path_of
+
+LARGEST_PORTION = 2**22  # numbers of steps that are written down at once
+
+Numbers = TypeVar("Numbers", np.ndarray, jax.Array)
+
+
+class Met(NamedTuple, Generic[Numbers]):
+    """The number of times that each of N members crossed a border, began to slide along one, and grazed one; (N,) each.
+
+    `t` is when it first grazed one, NaN where it did not.
+    """
+
+    crossed: Numbers
+    slid: Numbers
+    grazed: Numbers
+    t: Numbers
+
+
+def count_borders(members: Members) -> tuple[bool, Met[np.ndarray] | None]:
+    """A flag that steps ended at the borders of the scene; and how the motion met them; None where not known."""
+    trajectory = members.trajectory
+    if not isinstance(trajectory.system, System):  # modes have transitions for that
+        return True, None
+    crossed, slid, grazed = (np.zeros(members.count, int) for _ in range(3))
+    nothing = Met(crossed, slid, grazed, np.full(members.count, np.nan))
+    if not is_piecewise(trajectory.system, members.layout, members.params):
+        return True, nothing
+    if trajectory.engine != "MachineCode" or trajectory.tolerances is None:
+        return False, None
+    path = path_of(members)
+    start = np.concatenate([path.q[:, 0], path.qdot[:, 0]], axis=1)
+    ts = np.stack([path.ts[:, 0], members.shared(trajectory.end.t, 0)], axis=1)
+    accepted, rejected = (members.shared(trajectory.stats[f"num_{kind}_steps"], 0) for kind in ("accepted", "rejected"))
+    steps = accepted + rejected
+    rtol, atol = (float(np.max(x)) for x in trajectory.tolerances)
+    flow = flow_of(
+        Problem.from_system(trajectory.system, members.layout, members.params, ts=ts[0], rtol=rtol, atol=atol)
+    )
+    if flow.borders is None:  # one without a series
+        return False, None
+    columns = [np.broadcast_to(x, members.count) for x in members.numbers]
+    params = np.stack(columns, axis=1) if columns else np.zeros((members.count, 0))
+    moved = np.flatnonzero(np.isfinite(start).all(axis=1) & (ts[:, 1] != ts[:, 0]) & (steps > 0))
+    for some in portions(moved, steps * (flow.states + 5 + len(flow.borders.switches)), LARGEST_PORTION):
+        tolerances = Tolerances(rtol, atol, 2 * int(steps[some].max()) + 100)
+        _count(flow, (ts[some], start[some], params[some]), tolerances, steps[some], some, nothing)
+    return True, nothing
+
+
+def is_piecewise(system: System, layout: Layout, params) -> bool:
+    """True if the accelerations of a scene decide on something along a motion."""
+    derivation = derivation_of(system, layout, params)
+    try:
+        return derivation.borders is not None and bool(derivation.borders.switches)
+    except Unlowerable:  # arrays; as `_explanation` asks
+        rest = np.zeros(layout.size, layout.dtype)
+        return bool(pieces_of_motion(derivation.motion, rest, rest, rest.sum(), params))
+
+
+def _count(
+    flow: Flow,
+    motions: tuple[np.ndarray, np.ndarray, np.ndarray],
+    tolerances: Tolerances,
+    steps: np.ndarray,
+    places: np.ndarray,
+    into: Met[np.ndarray],
+) -> None:
+    """Follow some motions, and add what they met `into` the counts at their places."""
+    store, borders = StepStore(), flow.borders
+    assert borders is not None  # without a series there are none, and none are counted
+    again = flow.follow(*motions, tolerances, store, 2 * int(steps.sum()) + len(places))
+    guards, pieces = borders.guards, len(borders.switches)
+    # Numbers beyond those of guards are entries of tables that the time comes to, which are no borders.
+    enters, leaves = (np.array([getattr(guard, name) >= 0 for guard in guards] + [False]) for name in ("slide", "on"))
+    slides = sorted({guard.slide for guard in guards if guard.slide >= 0})
+    for run, rows, members in store.runs(again.ticket):
+        for row, member in zip(rows, members, strict=True):
+            table = run.table[run.first[member] : run.first[member] + run.counts[member]]
+            place, crossed, grazes = places[row], table[:, -2], table[:, -1] > 0
+            along = table[:, flow.states + 4 : flow.states + 4 + pieces][:, slides] > 0.5
+            begins = along & ~np.vstack([np.zeros((1, len(slides)), bool), along[:-1]])
+            number = np.clip(crossed.astype(int) - 1, 0, len(guards))
+            at_border = (crossed > 0) & (number < len(guards)) & ~leaves[number]
+            # A border that the motion slides along from there on has not been crossed.
+            to_slide = np.append(np.any(begins, axis=1)[1:], False) & enters[number]
+            into.slid[place] += int(begins.sum())
+            into.crossed[place] += int((at_border & ~to_slide).sum())
+            into.grazed[place] += int(grazes.sum())
+            if grazes.any():
+                first = table[np.argmax(grazes)]
+                into.t[place] = first[0] + first[1]

@@ -1,0 +1,534 @@
+"""From the states of a trajectory to the arrays of a report.
+
+The arrays have the axes (…, state, component). In NumPy the programs of the scene evaluate all members of a batch
+together; where values are being traced, or the scene has no programs, the functions of one member are evaluated in JAX,
+under `jit` and `vmap`. What follows from the measured states is written once, for arrays of either library.
+"""
+
+import dataclasses
+import math
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._equations import Sample, borders_of, is_lowered, map_in_chunks
+from lagjax._interface import Layout, is_concrete
+from lagjax._primitives import DOUBLE, widen, with_doubles
+from lagjax._run import Members
+from lagjax._trust.health._laws import Law, Measurements, measurements_at, power_at
+
+PyTree = Any
+
+# The factor on the bound of what N steps may add up to, since the error of a step is estimated; √(2n) comes on top, for
+# solvers that measure a root mean square. Twice as large, drifts of 10 to 20 times the bound would go unreported.
+SLACK = 10.0
+# The drift of a conserved quantity, in parts of its size, that is reported however loose the tolerances were.
+VISIBLE = 1e-2
+# Units of round-off that are allowed for one evaluation of a conserved quantity.
+ROUND_OFF = 100.0
+# Units of atol: in a motion that is smaller, the errors that atol allows add up to `VISIBLE` within a hundred steps.
+SMALLEST = 1e4
+# Numbers of mass matrices that are evaluated together: intermediate results then stay in the caches.
+_CHUNK = 2**18
+
+
+class Extreme(NamedTuple):
+    """The most extreme value along each path and the time of its output, (…) each; NaN where nothing was reached."""
+
+    value: jax.Array | np.ndarray
+    t: jax.Array | np.ndarray
+
+
+class Names(eqx.Module):
+    """The text of a report, which a compiled function returns as static data."""
+
+    works: bool = eqx.field(static=True)
+    momenta: tuple[str, ...] | None = eqx.field(static=True)
+    constraints: tuple[str, ...] = eqx.field(static=True)
+
+
+class SampledPath(NamedTuple):
+    """The S states of one member, or of N members with a first axis (N, …) in NumPy, and the tolerances of the run.
+
+    The T outputs come first, then the states just before each transition.
+    """
+
+    q: Any  # (…, S, n)
+    qdot: Any  # (…, S, n)
+    t: Any  # (…, S)
+    mode: Any  # (…, S)
+    ts: Any  # (…, T)
+    ends: Any  # (…, T − 1): where the law of each output ends, at the next output or at a transition before it
+    steps: Any  # (…)
+    tolerances: Any  # rtol, or the round-off of the states, and atol, (…) each; None for fixed steps
+    precision: np.dtype  # in which the accelerations were computed
+
+    @property
+    def library(self):
+        """NumPy or `jax.numpy`."""
+        return np if isinstance(self.q, np.ndarray) else jnp
+
+    @property
+    def time(self) -> int:
+        """The axis of the states."""
+        return self.q.ndim - 2
+
+
+def measure_trajectory(trajectory) -> tuple[dict[str, Any], Names]:
+    """The fields of `Health` that are measured along the path, and names for them."""
+    steps = trajectory.stats["num_accepted_steps"]
+    if all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
+        report = _report_in_doubles(Members(trajectory))
+        if report is not None:
+            return report
+    axes, tree = jax.tree.flatten(trajectory.params_axes, is_leaf=lambda axis: axis is None)  # hashable
+    arrays = dataclasses.replace(trajectory, stats={}, params_axes=None)
+    return _measure_traced(arrays, tuple(axes), tree, jnp.asarray(steps))
+
+
+@with_doubles
+def _report_in_doubles(members: Members) -> tuple[dict[str, Any], Names] | None:
+    """The report of all members, whose laws are those of float64; None where a scene has no programs."""
+    layout = dataclasses.replace(members.layout, dtype=DOUBLE)
+    laws = _laws(members.trajectory, layout, widen(members.params))
+    if not all(is_lowered(law.derivation) for law in laws):
+        return None
+    return _report_of(members, laws), _names(laws, layout)
+
+
+def _precision_of(trajectory, q) -> np.dtype:
+    return q.dtype if trajectory.engine == "Diffrax" else DOUBLE
+
+
+def _laws(trajectory, layout: Layout, params) -> list[Law]:
+    modes = {"": trajectory.system}
+    if isinstance(trajectory.system, dict):
+        modes = {name: trajectory.system[name] for name in trajectory.mode_names}
+    return [Law.from_system(system, layout, params, name if len(modes) > 1 else "") for name, system in modes.items()]
+
+
+def does_work(trajectory) -> bool:
+    """True if anything does work in some mode of a motion, so that its energy is not constant."""
+    members = Members(trajectory)
+    return any(law.works for law in _laws(trajectory, members.layout, members.params))
+
+
+def _names(laws: list[Law], layout: Layout) -> Names:
+    momenta = _conserved(laws)
+    return Names(
+        any(law.works for law in laws),
+        None if momenta is None else tuple(layout.names[i] for i in momenta),
+        tuple(name for law in laws for name in law.names),
+    )
+
+
+def _conserved(laws: list[Law]) -> tuple[int, ...] | None:
+    """The coordinates whose momenta are conserved in some mode."""
+    if any(law.conserved is None for law in laws):
+        return None
+    return tuple(sorted({i for law in laws for i in law.conserved or ()}))
+
+
+# ---- in NumPy, all members at once -----------------------------------------------------------------------------------
+
+
+def path_of(members: Members) -> SampledPath:
+    """The states of all members."""
+    run, count = members.trajectory, members.count
+    ts = members.shared(run.ts, 1)
+    q, qdot = members.flat(run.q), members.flat(run.qdot)
+    mode = np.zeros(ts.shape, int) if run.mode is None else np.asarray(run.mode).reshape(ts.shape)
+    t, ends = ts, np.broadcast_to(np.arange(1, ts.shape[1]), (count, ts.shape[1] - 1))
+    if run.transitions is not None:
+        transitions = run.transitions
+        times = np.asarray(transitions.t).reshape(count, -1)
+        source = np.asarray(transitions.source).reshape(times.shape)
+        ends = _ends(np, ts, times)
+        more = (members.flat(transitions.q), members.flat(transitions.qdot), times, source)
+        q, qdot, t, mode = (np.concatenate(pair, axis=1) for pair in zip((q, qdot, t, mode), more, strict=True))
+    tolerances = run.tolerances
+    if tolerances is not None:
+        rtol, atol = (members.shared(x, 0).astype(q.dtype) for x in tolerances)
+        tolerances = np.maximum(rtol, np.finfo(q.dtype).eps), atol
+    steps = np.asarray(run.stats["num_accepted_steps"], q.dtype).reshape(count)
+    return SampledPath(q, qdot, t, mode, ts, ends, steps, tolerances, _precision_of(run, q))
+
+
+def _report_of(members: Members, laws: list[Law]) -> dict[str, Any]:
+    """The fields of `Health` that are measured, with the batch axes of the trajectory."""
+    path, momenta = path_of(members), _conserved(laws) or ()
+    starts = np.cumsum([0, *(len(law.names) for law in laws)])
+
+    def evaluate_by_mode(function: Callable, q, qdot, t, mode):
+        """`function(law, index, member, sample)` on the states of each mode, in the order of all states, (N, S, …)."""
+        shape, total = t.shape, None
+        q, qdot = (np.ascontiguousarray(x.reshape(-1, x.shape[-1])) for x in (q, qdot))
+        t, mode = t.reshape(-1), mode.reshape(-1)
+        member = np.repeat(np.arange(members.count), shape[1])
+        for index, law in enumerate(laws):
+            here = np.flatnonzero(mode == index)
+            if not len(here):
+                continue
+            numbers = [x if np.ndim(x) == 0 else x[member[here]] for x in members.numbers]
+            sample = Sample(law.derivation, *widen((q[here], qdot[here], t[here], numbers)))
+            values = function(law, index, member[here], sample)
+            if len(here) == len(mode):
+                total = values
+                break
+            if total is None:
+                total = jax.tree.map(lambda x: np.zeros((len(mode), *x.shape[1:]), x.dtype), values)
+            for all_states, part in zip(jax.tree.leaves(total), jax.tree.leaves(values), strict=True):
+                all_states[here] = part
+        return jax.tree.map(lambda x: x.reshape(*shape, *x.shape[1:]), total)
+
+    def measure_sample(law, index, member, sample) -> Measurements:
+        tolerances = (0.0, 0.0) if path.tolerances is None else (x[member] for x in path.tolerances)
+        found = law.measurements(momenta, tuple(tolerances), sample)
+        before, after = int(starts[index]), int(starts[-1] - starts[index + 1])
+        distances, rates = (np.pad(x, ((0, 0), (before, after))) for x in (found.distances, found.rates))
+        return found._replace(distances=distances, rates=rates)
+
+    def evaluate_law(function: Callable) -> Callable:
+        return partial(evaluate_by_mode, lambda law, index, member, sample: function(law, sample))
+
+    with np.errstate(all="ignore"):
+        decides = any(borders_of(law.derivation) is not None for law in laws)
+        decided = evaluate_law(lambda law, sample: sample.pieces()) if decides else None
+        between = Rates(evaluate_law(Law.powers), evaluate_law(Law.accelerations), decided)
+        fields = _report(path, laws, momenta, partial(evaluate_by_mode, measure_sample), between)
+    return jax.tree.map(lambda x: jnp.asarray(np.reshape(x, members.batch + np.shape(x)[1:])), fields)
+
+
+# ---- in JAX, one member ----------------------------------------------------------------------------------------------
+
+
+@eqx.filter_jit
+def _measure_traced(trajectory, axes, tree, steps):
+    trajectory = dataclasses.replace(trajectory, params_axes=jax.tree.unflatten(tree, axes))
+    names, members = {}, max(1, jnp.size(trajectory.result._value))
+
+    def one(q, qdot, times_and_tolerances, params, mode, steps, transitions):
+        layout = Layout.from_state(*jax.tree.map(lambda leaf: leaf[0], (q, qdot)))
+        laws = _laws(trajectory, layout, params)
+        names["all"] = _names(laws, layout)
+        path = _path_of_one(layout, q, qdot, times_and_tolerances, mode, steps, transitions)
+        path = path._replace(precision=_precision_of(trajectory, path.q))
+        momenta, numbers = _conserved(laws) or (), eqx.filter(params, eqx.is_array)
+        tolerances = (0.0, 0.0) if path.tolerances is None else path.tolerances
+        size = _CHUNK // (members * layout.size**2)
+
+        def evaluate_in_chunks(function):
+            return lambda *states: map_in_chunks(partial(_evaluate_mode, laws, function), states, size)
+
+        sample = evaluate_in_chunks(lambda law, q, v, t: measurements_at(law, momenta, tolerances, q, v, t, numbers))
+        between = Rates(
+            evaluate_in_chunks(lambda law, q, v, t: power_at(law, q, v, t, numbers)),
+            evaluate_in_chunks(lambda law, q, v, t: law.motion.acceleration(q, v, t, numbers)),
+        )
+        return _report(path, laws, momenta, sample, between)
+
+    fields = trajectory.map_members(one, steps, trajectory.transitions)
+    return fields, names["all"]
+
+
+def _path_of_one(layout: Layout, q, qdot, times_and_tolerances, mode, steps, transitions) -> SampledPath:
+    def flat(tree):
+        return jax.vmap(layout.flatten)(tree)
+
+    ts, tolerances = times_and_tolerances
+    mode = jnp.zeros(ts.size, int) if mode is None else mode
+    q, v, t, ends = flat(q), flat(qdot), ts, jnp.arange(1, ts.size)
+    if transitions is not None:
+        q, v = jnp.concatenate([q, flat(transitions.q)]), jnp.concatenate([v, flat(transitions.qdot)])
+        t, mode = jnp.concatenate([t, transitions.t]), jnp.concatenate([mode, transitions.source])
+        ends = _ends(jnp, ts, transitions.t)
+    if tolerances is not None:
+        rtol, atol = (jnp.asarray(x, layout.dtype) for x in tolerances)
+        tolerances = jnp.maximum(rtol, jnp.finfo(layout.dtype).eps), atol
+    return SampledPath(q, v, t, mode, ts, ends, steps.astype(layout.dtype), tolerances, layout.dtype)
+
+
+def _evaluate_mode(laws: list[Law], function: Callable, q, qdot, t, mode):
+    """`function(law, q, qdot, t)` by the law of the state's mode; distances from other modes' constraints are zero."""
+    starts = np.cumsum([0, *(len(law.names) for law in laws)])
+    total = None
+    for index, law in enumerate(laws):
+        value = function(law, q, qdot, t)
+        if isinstance(value, Measurements):
+            distances, rates = (
+                jnp.zeros(starts[-1], q.dtype).at[starts[index] : starts[index + 1]].set(of_law)
+                for of_law in (value.distances, value.rates)
+            )
+            value = value._replace(distances=distances, rates=rates)
+        total = value if total is None else _select(mode == index, value, total)
+    return total
+
+
+def _select(which, new, old):
+    return jax.tree.map(lambda a, b: jnp.where(which, a, b), new, old)
+
+
+# ---- what the path shows: arrays of either library -------------------------------------------------------------------
+
+
+def _report(path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample: Callable, between: "Rates") -> dict:
+    """All measured fields; `sample(q, qdot, t, mode)` gives the `Measurements` at states."""
+    xp, axis, T, dtype = path.library, path.time, path.ts.shape[-1], path.q.dtype
+    q, qdot, t, mode = path[:4]
+    reached = xp.isfinite(q).all(axis=-1) & xp.isfinite(qdot).all(axis=-1) & (mode >= 0)
+    # States that were not reached are evaluated as if they were the start, and then not counted.
+    q, qdot = (xp.where(reached[..., None], x, x[..., :1, :]) for x in (q, qdot))
+    path = path._replace(q=q, qdot=qdot, t=xp.where(reached, t, t[..., :1]))
+    samples = sample(q, qdot, path.t, xp.maximum(mode, 0))
+    drifts, work_error = _drifts(path, laws, momenta, samples, reached, between)
+    here = jax.tree.map(lambda leaf: leaf[(slice(None),) * axis + (slice(T),)], samples)
+    on_path, extreme = reached[..., :T], partial(_extreme, xp, axis, path.ts)
+    limits, size = _limits(path, here, on_path)
+    owner = np.repeat(np.arange(len(laws)), [len(law.names) for law in laws])
+    in_force = on_path[..., None] & (mode[..., :T, None] == owner)
+    far, fast = (xp.max(xp.where(on_path[..., None], xp.abs(x[..., :T, :]), 0.0), axis=(-2, -1)) for x in (q, qdot))
+    # A velocity that moves nothing by its own size in the whole time is rounding beside one that does.
+    spans = [far, xp.maximum(fast, far / xp.abs(path.ts[..., -1] - path.ts[..., 0]))]
+    eps = float(np.finfo(dtype).eps)
+    fixed = path.tolerances is None
+    near = math.sqrt(eps) if fixed else xp.maximum(path.tolerances[0], ROUND_OFF * eps)[..., None]
+    may_be_singular = any(law.motion.constrained for law in laws)  # the constraints may hold what M does not
+    finest = max(math.sqrt(eps), SLACK * eps) if fixed else SLACK * path.tolerances[0]
+    fine, none = here.finite | ~on_path, xp.zeros(path.ts.shape[:-1], dtype)
+    all_fine, first = xp.all(fine, axis=axis), xp.argmin(fine, axis=axis)
+    energy = extreme(drifts[..., 0], on_path)
+    return {
+        "energy": energy,
+        "energy_allowed": limits[..., 0],
+        "work_error": work_error,
+        "outputs_needed": _outputs_needed(xp, T, energy.value, work_error, size[..., 0]),
+        "amplitude": _amplitude(xp, q[..., :T, :], on_path),
+        "amplitude_needed": none if fixed else SMALLEST * path.tolerances[1] + none,
+        "momentum": extreme(drifts[..., 1:], on_path),
+        "momentum_allowed": limits[..., 1:],
+        "constraint_distance": extreme(here.distances, in_force),
+        "constraint_rate": extreme(here.rates, in_force),
+        "constraint_allowed": near * xp.stack(spans, axis=-1),
+        "smallest_eigenvalue": extreme(here.mass[..., 0], on_path, largest=False),
+        "condition": extreme(here.mass[..., 1], on_path),
+        "scaled_condition": extreme(here.mass[..., 2], on_path),
+        "scaled_condition_allowed": none + (math.inf if may_be_singular else finest / np.finfo(path.precision).eps),
+        "gradients_finite": all_fine,
+        "gradients_time": xp.where(all_fine, math.nan, _pick(xp, path.ts, first)),
+    }
+
+
+def _pick(xp, ts, place):
+    """The entry of ts (…, T) at the index `place` (…)."""
+    return xp.take_along_axis(ts, place[..., None], axis=-1)[..., 0]
+
+
+def _ends(xp, ts, transitions):
+    """The index (…, T − 1) of the state where the law of each output ends: the next output or a transition before."""
+    T = ts.shape[-1]
+    times = xp.where(xp.isnan(transitions), math.inf, transitions)
+    before = xp.sum(times[..., None, :] < ts[..., :-1, None], axis=-1)
+    first = xp.minimum(before, times.shape[-1] - 1)
+    when = xp.take_along_axis(times, first, axis=-1)
+    between = (when >= ts[..., :-1]) & (when < ts[..., 1:])
+    return xp.where(between, T + first, xp.arange(1, T))
+
+
+def _drifts(path: SampledPath, laws, momenta, samples: Measurements, reached, between: "Rates") -> tuple[Any, Any]:
+    """|h − h₀ − W| and |pᵢ − pᵢ₀| at every output, a column each, and how far W may be off, (…).
+
+    A piece of the path, from an output to its entry in `ends`, counts for a quantity that its mode conserves; whatever
+    changes the quantity between there and the next output, such as a transition, is left out.
+    """
+    xp, axis, ends = path.library, path.time, path.ends
+    T = path.ts.shape[-1]
+    until = partial(_take_ends, xp, axis, ends)
+    values = samples.conserved
+    start = values[..., : T - 1, :]
+    measurable = until(reached) & reached[..., : T - 1]
+    work, work_error = xp.zeros_like(start[..., 0]), xp.zeros_like(start[..., 0, 0])
+    if any(law.works for law in laws):
+        work, work_error = _work(path, samples, measurable, between)
+    expected = xp.concatenate([work[..., None], xp.zeros_like(start[..., 1:])], axis=-1)
+    conserves = xp.asarray(np.array([[True, *(i in (law.conserved or ()) for i in momenta)] for law in laws]))
+    counted = conserves[xp.maximum(until(path.mode), 0)] & measurable[..., None]
+    rise = values[..., 1:T, :] - start
+    excused = rise - xp.where(counted, until(values) - start - expected, 0.0)
+    # Where the piece lasts to the next output this is what is expected, without the rounding of three differences.
+    excused = xp.where(counted & (ends < T)[..., None], expected, excused)
+    before = xp.concatenate([xp.zeros_like(values[..., :1, :]), xp.cumsum(excused, axis=axis)], axis=axis)
+    return xp.abs(values[..., :T, :] - values[..., :1, :] - before), work_error
+
+
+def _take_ends(xp, axis: int, ends, x):
+    """x at the end of every piece."""
+    return xp.take_along_axis(x, ends.reshape(ends.shape + (1,) * (x.ndim - ends.ndim)), axis=axis)
+
+
+class Rates(NamedTuple):
+    """Functions of states (q, q̇, t, mode) between outputs: dh/dt, q̈, and what changes where another piece decides."""
+
+    power: Callable
+    acceleration: Callable
+    decided: Callable | None = None
+
+
+def _gauss(count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Points and weights of Gauss and Legendre on (0, 1): exact for polynomials of degree 2 count − 1."""
+    points, weights = np.polynomial.legendre.leggauss(count)
+    return points / 2 + 0.5, weights / 2
+
+
+_POINTS, _WEIGHTS = _gauss(4)
+_MORE_POINTS, _MORE_WEIGHTS = _gauss(8)
+# s³ (1 − s)³ and s⁴ (1 − s)³ as rows of coefficients of s⁰ … s⁷, and the combinations of them whose second derivative
+# is 1 at one and 0 at the other of two points; at these neither of them is near zero, as it would be at 0.3.
+_CHECKED = np.array([0.4, 0.6])
+_VANISHING = np.array([[0, 0, 0, 1, -3, 3, -1, 0], [0, 0, 0, 0, 1, -3, 3, -1]], float)
+_BENDS = np.array([[np.polynomial.Polynomial(row).deriv(2)(x) for row in _VANISHING] for x in _CHECKED])
+_CORRECTIONS = np.linalg.inv(_BENDS).T @ _VANISHING  # (2, 8)
+INSIDE = 1e-9  # how far from its ends a piece of the path is asked what its program decides there
+
+
+def _work(path: SampledPath, samples: Measurements, measurable, between: Rates) -> tuple[Any, Any]:
+    """∫ P dt over every piece, (…, T − 1), and how far the sum of them may be off, (…).
+
+    Between its ends the motion is replaced by a polynomial. The one of degree five that has their q, q̇ and q̈ is off by
+    order six in q, and so is W. At two points the equations of motion say by how much its second derivative is wrong;
+    the polynomial of degree seven that is right there is off by order eight, and W by it is taken, with twice as many
+    points, so that a power that the four of the others do not resolve is seen. Its difference from W by degree five
+    bounds the error, for that is of the lower order. The cubic through q and q̇ is of order four and the trapezoidal
+    rule of order two. Where the power may jump, as the pieces of the program change, the error is as large as the power
+    varies.
+    """
+    xp, axis, T, n = path.library, path.time, path.ts.shape[-1], path.q.shape[-1]
+    until = partial(_take_ends, xp, axis, path.ends)
+    (q, v, t, a, p), last = (path.q, path.qdot, path.t, samples.acceleration, samples.power), T - 1
+    points, weights, more_points, more_weights, checked, corrections = (
+        x.astype(q.dtype) for x in (_POINTS, _WEIGHTS, _MORE_POINTS, _MORE_WEIGHTS, _CHECKED, _CORRECTIONS)
+    )
+    h, zero = until(t) - t[..., :last], xp.zeros((), q.dtype)
+    a0, a1 = a[..., :last, :], until(a)
+    mode = xp.maximum(until(path.mode), 0)
+
+    def combine(coefficients, powers):
+        """Σ cₖ pₖ of coefficients (…, T − 1, n) and powers (S,), (…, T − 1, S, n)."""
+        return sum((c[..., None, :] * x[:, None] for c, x in zip(coefficients, powers, strict=False)), start=zero)
+
+    def evaluate_on_curve(coefficients, function, points):
+        """A function of states over a polynomial in s, with coefficients (…, T − 1, n) of s⁰, s¹, …, at these s."""
+        at = combine(coefficients, [points**k for k in range(len(coefficients))])
+        slope = combine(coefficients, [k * points ** max(k - 1, 0) for k in range(len(coefficients))])
+        shape = at.shape[:-3] + (-1,)
+        times = t[..., :last, None] + h[..., None] * points
+        velocities = slope / h[..., None, None]
+        modes = xp.broadcast_to(mode[..., None], times.shape)
+        states = at.reshape(*shape, n), velocities.reshape(*shape, n), times.reshape(shape), modes.reshape(shape)
+        found = function(*states)
+        return found.reshape(times.shape + found.shape[len(shape) :])
+
+    def integrate(coefficients, points, weights):
+        """∫ P from s = 0 to 1."""
+        return h * xp.sum(evaluate_on_curve(coefficients, between.power, points) * weights, axis=-1)
+
+    q0, q1, v0, v1 = q[..., :last, :], until(q), h[..., None] * v[..., :last, :], h[..., None] * until(v)
+    cubic, quintic = _interpolants((q0, v0, (h**2)[..., None] * a0), (q1, v1, (h**2)[..., None] * a1))
+    bends = combine(quintic, [k * (k - 1) * checked ** max(k - 2, 0) for k in range(6)])
+    defects = (h**2)[..., None, None] * evaluate_on_curve(quintic, between.acceleration, checked) - bends
+    septic = [
+        (quintic[k] if k < 6 else zero) + sum(defects[..., i, :] * corrections[i, k] for i in range(len(corrections)))
+        for k in range(8)
+    ]
+    second = h / 2 * (p[..., :last] + until(p))
+    fourth, sixth = (integrate(of, points, weights) for of in (cubic, quintic))
+    eighth = integrate(septic, more_points, more_weights)
+    found = xp.stack([second, fourth, sixth, eighth])
+    smooth = xp.isfinite(found).all(axis=0)  # elsewhere the error is not known
+    error = _error_of_work(xp, found)
+    if between.decided is not None:
+        inside = np.concatenate([[INSIDE], points, [1 - INSIDE]])
+        pieces = evaluate_on_curve(quintic, between.decided, inside)
+        jumps = (pieces != pieces[..., :1]).any(axis=-1)
+        values = evaluate_on_curve(quintic, between.power, inside)
+        error = xp.where(jumps, h * (values.max(axis=-1) - values.min(axis=-1)), error)
+    error = xp.where(smooth, error, math.inf)
+    return xp.where(smooth, eighth, second), xp.sum(xp.where(measurable, error, 0.0), axis=-1)
+
+
+def _interpolants(begin, end) -> tuple[list, list]:
+    """The polynomials in s with these q, dq/ds and d²q/ds² at s = 0 and 1: the cubic of the first two, the quintic.
+
+    Lists of the coefficients of s⁰, s¹, ….
+    """
+    (q0, v0, a0), (q1, v1, a1) = begin, end
+    a0, rise = a0 / 2, q1 - q0
+    # The three conditions at s = 1 on the coefficients of s³, s⁴ and s⁵.
+    missing, slope, bend = rise - v0 - a0, v1 - v0 - 2 * a0, a1 - 2 * a0
+    last = 10 * missing - 4 * slope + bend / 2, -15 * missing + 7 * slope - bend, 6 * missing - 3 * slope + bend / 2
+    return [q0, v0, 3 * rise - 2 * v0 - v1, v0 + v1 - 2 * rise], [q0, v0, a0, *last]
+
+
+def _error_of_work(xp, found):
+    """The error of the work of every piece, from its values `found` (4, …) by rules of order 2, 4, 6 and 8.
+
+    Once pieces are short enough, errors fall from order to order by the same factor, or a larger one; one of the first
+    two may be small by accident. Where they do not fall eightfold each, the pieces are longer than what they should
+    show, and a small difference proves nothing. Of 240 motions with coarse outputs the work was off by at most 1.5
+    times its error; by ten times where fourfold is enough, and eightfold twice sees as many wrong forces as it can
+    where 256 in all sees a quarter less.
+    """
+    rough, fine, finest = xp.abs(found[1:] - found[:-1])
+    largest = xp.maximum(rough, fine)
+    return xp.where(finest <= largest / 64, finest, xp.maximum(finest, largest))
+
+
+def _outputs_needed(xp, T: int, imbalance, work_error, size):
+    """About how many outputs it takes to tell whether the power is balanced; T where the present ones do.
+
+    They do not where the balance is off by more than `VISIBLE` of the energy and the error of the work may be as large
+    as both.
+    That error is of order six, so that a sixth root gives the number.
+    """
+    visible = VISIBLE * size
+    excess = SLACK * work_error / xp.where(visible > 0, visible, 1.0)
+    undecided = (excess > 1) & (imbalance > visible) & ~(imbalance > 2 * SLACK * work_error)
+    return T * xp.where(undecided, xp.maximum(2.0, xp.ceil(xp.abs(excess) ** (1 / 6))), 1.0)
+
+
+def _amplitude(xp, q, on_path):
+    """The largest change of a coordinate along the path; infinite where nothing moves beyond rounding."""
+    high = xp.max(xp.where(on_path[..., None], q, -math.inf), axis=-2)
+    low = xp.min(xp.where(on_path[..., None], q, math.inf), axis=-2)
+    largest = xp.max(high - low, axis=-1)
+    rounding = ROUND_OFF * float(np.finfo(q.dtype).eps) * xp.max(xp.maximum(xp.abs(high), xp.abs(low)), axis=-1)
+    return xp.where(largest > rounding, largest, math.inf)
+
+
+def _limits(path: SampledPath, here: Measurements, on_path) -> tuple[Any, Any]:
+    """The largest drift of h and the momenta by errors of steps and round-off, and their sizes, (…, k) each.
+
+    Fixed steps have no tolerances: there `VISIBLE` of the size is the limit.
+    """
+    xp, n = path.library, path.q.shape[-1]
+    slope, size = (xp.max(xp.where(on_path[..., None], x, 0.0), axis=-2) for x in (here.slopes, here.sizes))
+    allowed, steps = VISIBLE * size, path.steps[..., None]
+    if path.tolerances is not None:
+        allowed = xp.minimum(allowed, SLACK * math.sqrt(2 * n) * (steps + 1) * slope)
+    return allowed + ROUND_OFF * float(np.finfo(size.dtype).eps) * (1 + xp.sqrt(steps)) * size, size
+
+
+def _extreme(xp, axis: int, ts, values, at, largest: bool = True) -> Extreme:
+    """The extreme of `values` along the axis of time where `at` holds; a NaN there is more extreme than any number."""
+    extra = (1,) * (values.ndim - ts.ndim)
+    at = xp.broadcast_to(at.reshape(at.shape + (1,) * (values.ndim - at.ndim)), values.shape)
+    ranked = xp.where(at, values if largest else -values, -math.inf)
+    place = xp.expand_dims(xp.argmax(ranked, axis=axis), axis)  # the first NaN, if there is one
+    times = xp.broadcast_to(ts.reshape(ts.shape + extra), values.shape)
+    value, when = (xp.squeeze(xp.take_along_axis(x, place, axis=axis), axis) for x in (values, times))
+    any_at = xp.any(at, axis=axis)
+    return Extreme(xp.where(any_at, value, math.nan), xp.where(any_at, when, math.nan))
