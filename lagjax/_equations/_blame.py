@@ -7,6 +7,7 @@ where a function may have a kink or a jump. Both know the line of the user's cod
 
 import os
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +18,7 @@ from jax.extend import core, source_info_util
 from lagjax._equations._motion import Motion
 from lagjax._program import OPERATIONS, apply_in_jax, expand_primitive
 
-_PACKAGE = os.path.dirname(os.path.abspath(__file__))
+_PACKAGE = str(Path(__file__).parents[1])
 
 
 class Offender(NamedTuple):

@@ -108,7 +108,7 @@ _NO_COUNT = (
 
 
 _OF_A_SCENE = "a function of a scene"
-_NOT_USERS = str(Path(__file__).parent), str(Path(jax.__file__).parent)
+_NOT_USERS = str(Path(__file__).parents[1]), str(Path(jax.__file__).parent)
 
 
 def _keys_of(roles: tuple, extras: dict[str, Any]) -> str:
