@@ -1,7 +1,7 @@
 """The behaviour of a scene, from its Lagrangian alone: where it stays, how it oscillates, what it conserves.
 
 At rest and near it: `_equilibrium`, `_linearize`, `_modes`, on `_smoothness` (is there a derivative at all),
-`_state_of_rest` (the way to a minimum), `_solve` (Newton), `_rank` and `_eigen`. Symmetries: `_symmetries` looks for
+`_state_of_rest` (the way to a minimum), `_solve` (Newton), `_eigen`. Symmetries: `_symmetries` looks for
 them among `_transformations`, at `_random_states`; `_gauge`, `_noether` and `_potential` make a conserved quantity of
 one. Other forms of a scene: `_coordinates`, `_hamiltonian`, `_routh`, `_same_motion`. All of them enter by
 `_scene_state`. `orbits/` holds motions that close, chaos, and paths between two ends.
@@ -13,7 +13,6 @@ from lagjax._analysis._hamiltonian import CanonicalTrajectory, Hamiltonian, hami
 from lagjax._analysis._linearize import Linearization, linearize
 from lagjax._analysis._modes import Modes, normal_modes
 from lagjax._analysis._noether import cyclic_coordinates, noether_charge
-from lagjax._analysis._rank import Decided, decide
 from lagjax._analysis._routh import Routhian, routhian
 from lagjax._analysis._same_motion import SameMotion, same_motion
 from lagjax._analysis._symmetries import Conserved, ConservedQuantities, conserved_quantities
@@ -23,7 +22,6 @@ __all__ = [
     "ChangedCoordinates",
     "Conserved",
     "ConservedQuantities",
-    "Decided",
     "Equilibrium",
     "Hamiltonian",
     "Linearization",
@@ -33,7 +31,6 @@ __all__ = [
     "change_coordinates",
     "conserved_quantities",
     "cyclic_coordinates",
-    "decide",
     "equilibrium",
     "hamiltonian",
     "linearize",

@@ -20,9 +20,9 @@ from lagjax._analysis._gauge import changes_of, gauge_of, is_right
 from lagjax._analysis._noether import FlatState, euler_lagrange, flat_generator, variation
 from lagjax._analysis._potential import absorb_potential_forces
 from lagjax._analysis._random_states import perturb_last_digits, random_states
-from lagjax._analysis._rank import decide
 from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._transformations import Fields, fields_of, textbook_symmetries
+from lagjax._equations import decide
 from lagjax._interface import Layout, accept, compile_for_one_call, show_str
 from lagjax._primitives import accepts_singles
 from lagjax._run import Trajectory

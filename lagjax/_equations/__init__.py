@@ -2,11 +2,12 @@
 
 `_motion` derives momentum, mass matrix, force, acceleration, energy and multipliers on arrays, `_quantities` the same
 on scalars, operation by operation. `_constraints` holds constraint Jacobian, right-hand side, distances and projection;
-`_consistency` tests a start against them. `_linear` solves symmetric systems and saddle points as arrays; `_saddle` is
-the same elimination on scalars, which keeps the zeros of a scene, and `_recursion` the one for chains in O(n).
-`_derivation` keeps everything derived from a scene as scalar programs, each lowered once; `_many_states` evaluates them
-at many states. `_scales` says how large coordinates, velocities and time are at a state; `_blame` which operations of a
-user's function are not finite or make it piecewise, and in which line.
+`_consistency` tests a start against them. `_linear` solves symmetric systems and saddle points as arrays, and `_rank`
+decides which singular values count as zero; `_saddle` is the same elimination on scalars, which keeps the zeros of a
+scene, and `_recursion` the one for chains in O(n). `_derivation` keeps everything derived from a scene as scalar
+programs, each lowered once; `_many_states` evaluates them at many states. `_scales` says how large coordinates,
+velocities and time are at a state; `_blame` which operations of a user's function are not finite or make it piecewise,
+and in which line.
 """
 
 from lagjax._equations._blame import Offender, borders_of_motion, offenders, pieces_of, pieces_of_motion, poles
@@ -30,12 +31,14 @@ from lagjax._equations._linear import (
 )
 from lagjax._equations._many_states import SADDLE, Sample, borders_of, is_lowered, map_in_chunks, solve_saddle
 from lagjax._equations._motion import Motion
+from lagjax._equations._rank import Decided, decide, null_space
 from lagjax._equations._scales import Scales
 
 __all__ = [
     "ROUNDINGS",
     "SADDLE",
     "Constraints",
+    "Decided",
     "Derivation",
     "Motion",
     "Offender",
@@ -45,6 +48,7 @@ __all__ = [
     "borders_of",
     "borders_of_motion",
     "columns_of",
+    "decide",
     "dependent_rows",
     "derivation_of",
     "diagonal_scale",
@@ -58,6 +62,7 @@ __all__ = [
     "least_norm",
     "map_in_chunks",
     "null_directions",
+    "null_space",
     "numbers_of",
     "offenders",
     "pieces_of",

@@ -4,7 +4,7 @@
 arcs by way of `_condensation`, `_floquet` says what their multipliers are, `_orbit` is `periodic_orbit`.
 `_continuation` goes along a family, `_family` is `family`, `_branch` goes from one to another. `_lyapunov` is about
 motions that never return, `_path` and `_conjugate` about those from one place to another. `decide` of
-`lagjax._analysis` decides about singular values.
+`lagjax._equations` decides about singular values.
 """
 
 from lagjax._analysis.orbits._branch import branch_off

@@ -12,12 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._analysis import decide
 from lagjax._analysis.orbits._arc_motions import Arcs
 from lagjax._analysis.orbits._continuation import FamilyPoint, FamilyTangent, Follower, correct, tangent_at
 from lagjax._analysis.orbits._family import Family, first_point, parameter_index
 from lagjax._analysis.orbits._flat_starts import starts
 from lagjax._analysis.orbits._orbit import RTOL, Orbit, assess_orbits
+from lagjax._equations import decide
 from lagjax._interface import Layout, halves, require_tolerance
 from lagjax._primitives import accepts_singles
 from lagjax._scene import System

@@ -13,8 +13,8 @@ import itertools
 
 import numpy as np
 
-from lagjax._analysis import decide
 from lagjax._analysis.orbits._arc_motions import Arcs, Units
+from lagjax._equations import decide
 
 _GLANCES = 64  # of each arc: between two of them no phase may turn by half a turn
 _TRIALS = 60  # bisections, which end at the rounding of the time

@@ -20,12 +20,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._analysis import decide
 from lagjax._analysis.orbits import _shooting
 from lagjax._analysis.orbits._arc_motions import Arcs
 from lagjax._analysis.orbits._condensation import Condensed, condense
 from lagjax._analysis.orbits._orbit import CLOSED
 from lagjax._analysis.orbits._shooting import Chain, Closing
+from lagjax._equations import decide
 
 _TRIALS = 8  # of Newton's method: beyond, the step along the family was too long
 # A step is repeated at half its length beyond these: the ratio of the second correction to the first, the first one in

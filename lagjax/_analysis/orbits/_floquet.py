@@ -14,7 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._analysis import decide
+from lagjax._equations import decide
 
 # |multiplier| − 1 above this makes an orbit unstable. Multipliers on the unit circle come out within 1e-9 of it, where
 # two of them meet within the square root of their accuracy, 1e-6.

@@ -7,13 +7,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._analysis import decide
 from lagjax._analysis.orbits import _shooting
 from lagjax._analysis.orbits._arc_motions import Arcs
 from lagjax._analysis.orbits._flat_starts import starts
 from lagjax._analysis.orbits._floquet import UNCERTAIN, UNSTABLE, multipliers_of, pairing_error, reduce
 from lagjax._analysis.orbits._shooting import Chain, Closing
-from lagjax._equations import singular_threshold
+from lagjax._equations import decide, singular_threshold
 from lagjax._interface import SUCCESSFUL, SimulationError, halves, require_finite, require_flag, require_number
 from lagjax._primitives import accepts_singles
 from lagjax._scene import System

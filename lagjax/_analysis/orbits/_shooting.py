@@ -21,10 +21,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._analysis import Decided, decide
 from lagjax._analysis.orbits._arc_motions import Arc, Arcs, Units
 from lagjax._analysis.orbits._condensation import Condensed, condense
-from lagjax._equations import singular_threshold
+from lagjax._equations import Decided, decide, singular_threshold
 
 # Relative to the largest singular value: below, a direction counts as degenerate. Measured on the 695 planar orbits,
 # true ones are above 1e-6 and degenerate ones of a closed orbit below 1e-11. Twice as much changes no rank there.

@@ -15,7 +15,7 @@ examined, which is regular when the saddle point is (`_linear`). States nearby t
 import numpy as np
 
 from lagjax._engine import DEFAULT_RTOL
-from lagjax._equations import diagonal_scale, eigen, null_directions, singular_threshold
+from lagjax._equations import diagonal_scale, eigen, null_directions, null_space, singular_threshold
 from lagjax._trust.checks._findings import Finding, join_names
 from lagjax._trust.checks._scene_at_start import CheckedScene
 
@@ -178,7 +178,7 @@ def _nearly_singular(here: np.ndarray, others: list[np.ndarray], names) -> list[
 def _signs(mass: np.ndarray, rows: np.ndarray, names) -> list[Finding]:
     """Negative kinetic energy along velocities that the constraints allow."""
     scale = diagonal_scale(mass)
-    free = kernel(rows * scale)
+    free = null_space(rows * scale)
     if not free.shape[1]:
         return []
     values, vectors = eigen(free.T @ (scale[:, None] * mass * scale) @ free)
@@ -194,15 +194,6 @@ def _signs(mass: np.ndarray, rows: np.ndarray, names) -> list[Finding]:
         f"The mass matrix is {whole}: d2L is negative along {combination}. The motion is that of L all the same, but "
         "if L is meant to be T - U, a sign is wrong, or a mass is negative.",
     )]  # fmt: skip
-
-
-def kernel(rows: np.ndarray) -> np.ndarray:
-    """The columns (n, n − rank) that span the kernel of some rows (m, n): the velocities that they leave free."""
-    if not len(rows):
-        return np.eye(rows.shape[1], dtype=rows.dtype)
-    _, values, vectors = np.linalg.svd(rows)
-    rank = int(np.sum(values > 1e-10 * max(values.max(), 1e-300)))
-    return vectors[rank:].T
 
 
 def _spread(matrix: np.ndarray) -> float:

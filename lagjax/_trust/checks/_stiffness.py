@@ -2,8 +2,8 @@
 
 import numpy as np
 
+from lagjax._equations import null_space
 from lagjax._trust.checks._findings import Finding
-from lagjax._trust.checks._mass import kernel
 from lagjax._trust.checks._scene_at_start import CheckedScene
 
 # The ratio of the time scales from which an explicit solver spends nearly all of its steps on the fastest.
@@ -14,7 +14,7 @@ def findings(scene: CheckedScene) -> list[Finding]:
     """Advice where one part of the motion is much faster than another."""
     n, m = scene.layout.size, scene.measured
     # Constraints leave the velocities in the kernel of G free.
-    free = kernel(m.jacobian[0].astype(float))
+    free = null_space(m.jacobian[0]).astype(float)
     jacobian = scene.jacobian()
     by_q, by_v = free.T @ jacobian[:, :n] @ free, free.T @ jacobian[:, n:] @ free
     if not (np.isfinite(by_q).all() and np.isfinite(by_v).all()) or not free.shape[1]:

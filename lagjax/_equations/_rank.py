@@ -8,7 +8,7 @@ along a symmetry. Which part that is, is a decision about singular values σ: ze
 caller states.
 
 This is NumPy, of any number of matrices at once. What is compiled and differentiated by JAX decides by pivots instead,
-in `_solve` and `lagjax._equations._linear`: a singular value decomposition would be a kernel of LAPACK inside of XLA,
+in `_linear` and `lagjax._analysis._solve`: a singular value decomposition would be a kernel of LAPACK inside of XLA,
 without a derivative where singular values meet.
 """
 
@@ -48,3 +48,17 @@ def decide(matrices: np.ndarray, relative: np.ndarray | float = 0.0, absolute: f
     left, values, right = np.linalg.svd(matrices, full_matrices=m < k)
     bound = np.maximum(absolute, np.asarray(relative)[..., None] * values[..., :1])
     return Decided(left, values, np.swapaxes(right, -1, -2), np.asarray((values > bound).sum(axis=-1)))
+
+
+def null_space(rows: np.ndarray, threshold: float | None = None) -> np.ndarray:
+    """An orthonormal basis (k, K), a vector a column, of what m rows (m, k) send to zero.
+
+    A multiple of a row says the same, so rows are taken at unit length. Then a singular value counts as zero up to
+    `threshold` of the largest, by default √eps = 1.5e-8: rounding leaves a zero at some n eps, at most √eps where half
+    of the digits cancelled on the way, and what is smaller than √eps has no digit in the Gram matrix of the rows. Twice
+    as large it would be no other in scenes, whose rows meet at angles. Rows that are less accurate than rounding,
+    derivatives of a motion, need a threshold of their accuracy.
+    """
+    threshold = float(np.sqrt(np.finfo(rows.dtype).eps)) if threshold is None else threshold
+    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
+    return decide(rows / np.where(lengths > 0, lengths, 1), threshold).null
