@@ -17,6 +17,7 @@ import pickle
 import threading
 import types
 from collections.abc import Callable, Iterator
+from operator import is_
 from typing import Any
 
 import jax
@@ -28,7 +29,6 @@ from lagjax._interface.reads._marks import LARGEST_ARRAY, LARGEST_CONTAINER, SIZ
 from lagjax._interface.reads._names_in_code import ReadNames
 
 _MOST_THINGS = 2000  # functions, classes and objects of one walk, some 50 ms; what is beyond is known by its identity
-_MOST_EDITIONS = 256  # texts of one function that are known again
 _CONSTRUCTING = frozenset(
     "__init__ __new__ __post_init__ __init_subclass__ __class_getitem__ __repr__ __str__ __del__".split()
 )
@@ -42,8 +42,8 @@ class Edition:
 
     __slots__ = ("__weakref__", "_hash", "_held", "_watch", "function", "helped", "text", "tracers")
 
-    def __init__(self, watch: "_Watch | _Still", text: str, held: list, tracers: list, helped: bool):
-        self.function, self._watch = watch.function, watch
+    def __init__(self, function: Callable, text: str, held=(), tracers=(), helped=False, watch: "_Watch | None" = None):
+        self.function, self._watch = function, watch
         self.text, self._held, self.tracers = text, tuple(held), tuple(tracers)
         self.helped = helped  # by other functions, whose traces JAX may keep
         self._hash = hash(text)
@@ -58,13 +58,11 @@ class Edition:
 
         It is one and the same edition whatever is being traced.
         """
-        still = _Still(function)
-        still.latest = Edition(still, f"{how}: {self.text}", list(self._held), [], False)
-        return still.latest
+        return Edition(function, f"{how}: {self.text}", self._held)
 
     def now(self) -> "Edition":
         """The present edition of the same function: this one, where nothing that it reads has changed."""
-        return self._watch.edition()
+        return self if self._watch is None else self._watch.edition()
 
     def require_present(self) -> None:
         """Raise `ValueError` where this is not the present edition."""
@@ -79,13 +77,10 @@ class Edition:
         return self._hash
 
     def __eq__(self, other: Any) -> bool:
-        if self is other:
-            return True
-        return isinstance(other, Edition) and self.text == other.text and _same(self._identities, other._identities)
-
-    @property
-    def _identities(self) -> tuple:
-        return (*self._held, *self.tracers)
+        if self is other or not isinstance(other, Edition) or self.text != other.text:
+            return self is other
+        ours, theirs = (*self._held, *self.tracers), (*other._held, *other.tracers)
+        return len(ours) == len(theirs) and all(map(is_, ours, theirs))
 
     @property
     def __wrapped__(self) -> Callable:
@@ -126,7 +121,8 @@ class Edition:
                 yield
         finally:
             _inside.is_traced = False
-            self._watch.settle()
+            if self._watch is not None:
+                self._watch.settle()
 
 
 def _edition_of(function: Callable) -> Edition:
@@ -136,25 +132,6 @@ def _edition_of(function: Callable) -> Edition:
 
 def _edition_from(packed: bytes) -> Edition:
     return Edition.from_function(pickle.loads(packed))
-
-
-def _same(one: tuple, other: tuple) -> bool:
-    return len(one) == len(other) and all(a is b for a, b in zip(one, other, strict=True))
-
-
-class _Still:
-    """A function that reads nothing that could change, as a trace does."""
-
-    latest: Edition
-
-    def __init__(self, function: Callable):
-        self.function = function
-
-    def edition(self) -> Edition:
-        return self.latest
-
-    def settle(self) -> None:
-        pass
 
 
 # Places that functions change while they are traced, held under what finds them: counters, lists of calls, memories.
@@ -168,22 +145,19 @@ class _Watch:
 
     def __init__(self, function: Callable):
         self.function = function
-        self._lock = threading.RLock()
         self._latest: tuple[Marks, Edition] | None = None
-        self._known: dict[tuple[str, tuple[int, ...]], Edition] = {}
 
     def edition(self) -> Edition:
         latest = self._latest
         if latest is not None and latest[0].hold():
             return latest[1]
-        with self._lock:
-            walk, text = self._walk()
-            same_as = None
-            if latest is not None and all(map(_own.__contains__, _new_places(latest[0], walk))):
-                same_as = latest[1]
-            edition = self._edition_of(walk, text, same_as)
-            self._latest = walk.marks, edition
-            return edition
+        walk, text = self._walk()
+        if latest is not None and all(map(_own.__contains__, _new_places(latest[0], walk))):
+            edition = latest[1]
+        else:
+            edition = Edition(self.function, text, walk.held, walk.tracers, len(walk.things) > 1, self)
+        self._latest = walk.marks, edition
+        return edition
 
     def _walk(self) -> "tuple[_LiveWalk, str]":
         names: set[str] | None = set()
@@ -194,34 +168,22 @@ class _Watch:
                 return walk, text
             names = walk.names
 
-    def _edition_of(self, walk: "_LiveWalk", text: str, same_as: Edition | None) -> Edition:
-        key = text, tuple(map(id, (*walk.held, *walk.tracers)))
-        if len(self._known) >= _MOST_EDITIONS:
-            self._known.clear()
-        if same_as is not None:
-            self._known[key] = same_as
-        if key not in self._known:
-            self._known[key] = Edition(self, text, walk.held, walk.tracers, len(walk.things) > 1)
-        return self._known[key]
-
     def settle(self) -> None:
         """Look what has changed while the function ran: what it writes to is not watched from now on."""
-        with self._lock:
-            if self._latest is None or self._latest[0].hold():
-                return
-            walk, _ = self._walk()
-            _own.update({
-                key: place for key, place in _new_places(self._latest[0], walk).items() if walk.is_own(place, key[1])
-            })  # fmt: skip
-            for key in list(_own)[:-_MOST_OWN]:
-                _own.pop(key, None)
+        latest = self._latest
+        if latest is None or latest[0].hold():
+            return
+        walk, _ = self._walk()
+        _own.update({key: x for key, x in _new_places(latest[0], walk).items() if walk.is_own(x, key[1])})
+        for key in list(_own)[:-_MOST_OWN]:
+            _own.pop(key, None)
         self.edition()
 
 
 def _new_places(before: Marks, now: "_LiveWalk") -> dict[tuple[int, str | None], Any]:
     """The place that has another value now than before."""
-    known = before.keys
-    new = {key: place for key, place in now.marks.keys.items() if key not in known}
+    keys = before.keys
+    new = {key: place for key, place in now.marks.keys.items() if key not in keys}
     return new | {(id(place), key): place for place, key in before.changed() if key is not SIZE}
 
 
@@ -259,11 +221,8 @@ class _LiveWalk(Walk):
         self.marks.mark(place, key, value)
         return value
 
-    def misses(self, place: dict, key: str) -> None:
-        self.marks.miss(place, key)
-
     def counts(self, attributes: dict[str, Any], users: bool) -> None:
-        self.marks.count(attributes)
+        self.marks.mark(attributes, SIZE, None)
         if not users:
             self._of_libraries.add(id(attributes))
 

@@ -23,13 +23,13 @@ from typing import Any
 import jax
 import numpy as np
 
+from lagjax._interface.reads._marks import ABSENT
 from lagjax._interface.reads._names_in_code import ReadNames, names_of
 
 _LONG = 400  # characters of a value that is shown; of a longer one its hash
 _DEEP = 50  # containers within containers: one that is deeper contains itself
 _ATOMS = (type(None), bool, int, float, complex, str, bytes, type(Ellipsis), slice, range)
 CHANGING = "what the function itself changes"  # in the place of such a value
-_NOT_FILLED = object()  # in the place of the content of a cell whose name is assigned later
 
 
 def identity(value: Any) -> str:
@@ -58,9 +58,6 @@ class Walk:
         The result is the value, or `CHANGING` in its place.
         """
         return value
-
-    def misses(self, place: dict, key: str) -> None:
-        """A key has no entry."""
 
     def counts(self, attributes: dict[str, Any], users: bool) -> None:
         """The attributes of an object, of which some are read, and others may be added; `users`: of a user's class."""
@@ -123,7 +120,12 @@ class Walk:
             return CHANGING
         kind = "" if type(value) in (dict, list, tuple, set, frozenset) else self.name(type(value))
         if isinstance(value, Mapping):
-            return kind + "{" + ", ".join(f"{_key(k)}: {self.name(x, deep)}" for k, x in list(value.items())) + "}"
+            return (
+                kind
+                + "{"
+                + ", ".join(f"{strip_addresses(repr(k))}: {self.name(x, deep)}" for k, x in list(value.items()))
+                + "}"
+            )
         if isinstance(value, set | frozenset):
             return kind + "{" + ", ".join(sorted(self.name(x, deep) for x in list(value))) + "}"
         return kind + "[" + ", ".join(self.name(x, deep) for x in list(value)) + "]"
@@ -150,7 +152,7 @@ class Walk:
     def _function_parts(self, function: types.FunctionType) -> Iterator[tuple[str, Any]]:
         """The byte code, the defaults and the outer values of a function; of a library's function its closure alone."""
         cells = zip(function.__code__.co_freevars, function.__closure__ or (), strict=True)
-        inside = {name: value for name, cell in cells if (value := self._read_cell(cell, name)) is not _NOT_FILLED}
+        inside = {name: self.read(cell, name, cell.cell_contents) for name, cell in cells if _is_filled(cell)}
         if not _is_users(function.__module__):
             yield "name", f"{function.__module__}.{function.__qualname__}"
             yield "code", code_text(function.__code__)  # functions made by one function have one name
@@ -158,9 +160,8 @@ class Walk:
             return
         names, outer = names_of(function.__code__), function.__globals__
         self.meets(names)
-        for name in names.globals.difference(outer):
-            self.misses(outer, name)
-        outside = {name: self.read(outer, name, outer[name]) for name in sorted(names.globals) if name in outer}
+        outside = {name: self.read(outer, name, outer.get(name, ABSENT)) for name in sorted(names.globals)}
+        outside = {name: value for name, value in outside.items() if value is not ABSENT}
         imported = {
             ".".join((".",) * level) + name: _import_module(outer, level, name) for level, name, _ in names.imports
         }
@@ -169,13 +170,6 @@ class Walk:
         yield "defaults", [function.__defaults__, function.__kwdefaults__]
         yield from sorted(self._add_module_attributes(used, names.attributes | names.globals).items())
         yield from self._function_attributes(function)
-
-    def _read_cell(self, cell: types.CellType, name: str) -> Any:
-        """The value in a closure cell; `_NOT_FILLED` where it is empty."""
-        try:
-            return self.read(cell, name, cell.cell_contents)
-        except ValueError:  # of a name that is assigned later
-            return _NOT_FILLED
 
     def _function_attributes(self, function: Any) -> list[tuple[str, Any]]:
         held, is_plain = getattr(function, "__dict__", {}), isinstance(function, types.FunctionType)
@@ -239,8 +233,11 @@ class Walk:
         return self.opaque(thing)
 
 
-def _key(key: Any) -> str:
-    return strip_addresses(repr(key))
+def _is_filled(cell: types.CellType) -> bool:
+    try:
+        return cell.cell_contents is cell.cell_contents
+    except ValueError:  # of a name that is assigned later
+        return False
 
 
 # Attributes of every class, which say nothing that its code does not: methods of that kind enter, values do not.

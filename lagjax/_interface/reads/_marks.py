@@ -6,8 +6,7 @@ gone again, and only another text is another function. An array is compared by i
 
 import collections
 import types
-from collections.abc import Iterator
-from operator import is_
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import numpy as np
@@ -17,65 +16,35 @@ import numpy as np
 LARGEST_ARRAY, SAMPLED = 2**20, 4096
 LARGEST_CONTAINER = 10_000  # entries that are compared one by one, in as long; a larger one by its length
 
-_ABSENT = object()
+ABSENT = object()  # the value under a key that has no entry
 SIZE = "how many attributes there are"
 
 
-def fingerprint(array: np.ndarray) -> bytes:
-    """The bytes of an array, or of some of its numbers."""
-    if array.nbytes <= LARGEST_ARRAY:
-        return array.tobytes()
-    return array.flat[np.linspace(0, array.size - 1, SAMPLED).astype(int)].tobytes()
-
-
 class Marks:
-    """Places and what was found there, sorted by how they are looked at."""
+    """Places and what was found there: values that must be the same objects, and contents that must be equal."""
 
     def __init__(self):
-        self._by_key: list[tuple[Any, str, Any]] = []  # (dict, key, value)
-        self._classes: list[tuple[type, str, Any]] = []
-        self._absent: list[tuple[dict, str]] = []
-        self._attributes: list[tuple[Any, str, Any]] = []
-        self._cells: list[tuple[types.CellType, Any, Any]] = []
-        self._sizes: list[tuple[Any, Any, int]] = []
-        self._tables: list[tuple[Any, tuple, tuple]] = []
-        self._rows: list[tuple[Any, tuple]] = []
-        self._arrays: list[tuple[np.ndarray, tuple, bytes]] = []
-        self._shown: list[tuple[Any, bytes]] = []  # objects that show an array
+        self._values: list[tuple[Callable, Any, str, Any]] = []  # reader, place, key, value
+        self._contents: list[tuple[Callable, Any, str | None, Any, Any]] = []  # reader, place, key, content, parts
 
     def mark(self, place: Any, key: str | None, value: Any) -> None:
-        """Note a value under its key in a dict or an object, the content of a cell, or (key None) a mutable value."""
-        if isinstance(place, types.CellType):
-            self._cells.append((place, key, value))
+        """Note a value (or `ABSENT`) under its key in a dict, an object or a cell; with the key None, the content."""
+        if key is SIZE:
+            self._contents.append((len, place, SIZE, len(place), None))
         elif key is not None:
-            found: Any = self._by_key if isinstance(place, dict) else self._attributes
-            found = self._classes if isinstance(place, type) else found
-            found.append((place, key, value))
-        elif isinstance(place, np.ndarray):
-            self._arrays.append((place, (place.shape, place.dtype), fingerprint(place)))
-        elif isinstance(value, np.ndarray):
-            self._shown.append((place, fingerprint(value)))
-        elif isinstance(place, tuple | frozenset):
-            pass
-        elif len(place) > LARGEST_CONTAINER:
-            self._sizes.append((place, None, len(place)))
-        elif isinstance(place, list | set | collections.deque):
-            self._rows.append((place, tuple(place)))
-        else:
-            self._tables.append((place, tuple(place.keys()), tuple(place.values())))
-
-    def miss(self, place: dict, key: str) -> None:
-        """Note that nothing is under this key."""
-        self._absent.append((place, key))
-
-    def count(self, attributes: dict) -> None:
-        """Note how many attributes an object has."""
-        self._sizes.append((attributes, SIZE, len(attributes)))
+            reader = next((reader for kind, reader in _READERS.items() if isinstance(place, kind)), getattr)
+            self._values.append((reader, place, key, value))
+        elif not isinstance(place, tuple | frozenset):
+            self._contents.append((_content, place, None, _content(place), _parts(place)))
 
     @property
     def keys(self) -> dict[tuple[int, str], Any]:
         """The places with what they are read by, and each of them."""
-        return {(id(place), key): place for place, key, _ in (*self._by_key, *self._classes, *self._attributes)}
+        return {
+            (id(place), key): place
+            for _, place, key, value in self._values
+            if value is not ABSENT and not isinstance(place, types.CellType)
+        }
 
     def hold(self) -> bool:
         """True if all is as it was."""
@@ -84,37 +53,36 @@ class Marks:
     def changed(self) -> Iterator[tuple[Any, str | None]]:
         """The places, with their keys, where something else is now."""
         try:
-            for place, key, value in self._by_key:
-                if place.get(key, _ABSENT) is not value:
+            for reader, place, key, value in self._values:
+                if reader(place, key) is not value:
                     yield place, key
-            for place, key, value in self._classes:
-                if place.__dict__.get(key, _ABSENT) is not value:
+            for reader, place, key, content, _ in self._contents:
+                if reader(place) != content:
                     yield place, key
-            for place, key in self._absent:
-                if key in place:
-                    yield place, key
-            for cell, key, value in self._cells:
-                if cell.cell_contents is not value:
-                    yield cell, key
-            for place, key, value in self._attributes:
-                if getattr(place, key) is not value:
-                    yield place, key
-            for place, key, count in self._sizes:
-                if len(place) != count:
-                    yield place, key
-            for place, values in self._rows:
-                if len(place) != len(values) or not all(map(is_, place, values)):
-                    yield place, None
-            for place, keys, values in self._tables:
-                if len(place) != len(keys) or not (
-                    all(map(is_, place.keys(), keys)) and all(map(is_, place.values(), values))
-                ):
-                    yield place, None
-            for place, kind, content in self._arrays:
-                if (place.shape, place.dtype) != kind or fingerprint(place) != content:
-                    yield place, None
-            for place, content in self._shown:
-                if fingerprint(np.asarray(place)) != content:
-                    yield place, None
         except Exception:  # a cell that was emptied, an attribute that is gone, a dict that another thread adds to
             yield None, None
+
+
+_READERS: dict[type, Callable] = {
+    dict: lambda place, key: place.get(key, ABSENT),
+    type: lambda place, key: place.__dict__.get(key, ABSENT),
+    types.CellType: lambda place, key: place.cell_contents,
+}
+
+
+def _parts(place: Any) -> tuple | None:
+    """All that a container holds; None of a large one, and of what is an array or shows one."""
+    if not isinstance(place, Mapping | list | set | collections.deque) or len(place) > LARGEST_CONTAINER:
+        return None
+    return (*place.keys(), *place.values()) if isinstance(place, Mapping) else tuple(place)
+
+
+def _content(place: Any) -> Any:
+    """The identities of what a container holds, or its length; of an array, or what shows one, its bytes or samples."""
+    if isinstance(place, Mapping | list | set | collections.deque):
+        parts = _parts(place)
+        return len(place) if parts is None else tuple(map(id, parts))
+    array = np.asarray(place)
+    whole = array.nbytes <= LARGEST_ARRAY
+    numbers = array if whole else array.flat[np.linspace(0, array.size - 1, SAMPLED).astype(int)]
+    return array.shape, array.dtype, numbers.tobytes()
