@@ -47,7 +47,7 @@ from lagjax._native._constants import (
     STEEP,
     SWITCH_TOLERANCES,
 )
-from lagjax._native._frame import Frame, Lane
+from lagjax._native._frame import Fields, Frame, Lane
 from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._retraction import Retraction
 from lagjax._native._roots import Roots, Touch
@@ -98,37 +98,36 @@ class BorderControl:
         self.cross = self._cross()
 
     @staticmethod
-    def fields(borders: _borders.Borders) -> dict:
-        """The fields of a thread's memory.
-
-        `touch` is the `Touch` of every guard where the step begins; `stays` is 1 for a piece that is not decided anew;
-        `crossed` is the number of the guard that the step ends at, from 1 on, or 0, and `beyond` the piece there.
-        `planned_h` is the step without borders, `cut` with them, `part` the share of it that a series covers, and
-        `idle_crossings` counts those without a step. `at_rest` is 1 where the motion would be there in no time.
-        `approach` is the length of the step from which on others have ended before a border without a series beyond it,
-        0 where the last one did not.
-        """
-        numbers = (
-            "at_knots",
-            "crossed",
-            "beyond",
-            "at_rest",
-            "planned_h",
-            "cut",
-            "nearest",
-            "undecided",
-            "idle_crossings",
-            "stepped",
-            "part",
-            "approach",
-            "next_approach",
-            "slides",
-            "stops",
-        )
-        fields = {"touch": len(borders.guards), "stays": len(borders.switches), **dict.fromkeys(numbers, 1)}
-        fields["level"] = len(borders.guards) if any(guard.of_table for guard in borders.guards) else 0
+    def fields(borders: _borders.Borders) -> Fields:
+        """The fields of a thread's memory."""
+        guards, pieces = len(borders.guards), len(borders.switches)
+        fields: Fields = {
+            "touch": guards,  # the `Touch` of a guard where the step begins
+            "stays": pieces,  # 1 for a piece that is not decided anew
+            "at_knots": 1,  # the number of steps that ended at entries of tables
+            "crossed": 1,  # the guard that the step ends at, from 1 on, or behind these a clock; 0 without any
+            "beyond": 1,  # the piece beyond it
+            "at_rest": 1,  # 1 if the motion would be at the guard in no time
+            "planned_h": 1,  # the step without borders
+            "cut": 1,  # the step with them
+            "nearest": 1,  # the end of the step, as a part of it
+            "undecided": 1,  # 1 in a lane whose pieces are to be decided
+            "idle_crossings": 1,  # the number of borders since the last step that had a length
+            "stepped": 1,  # 1 if the step has one
+            "part": 1,  # see `Roots.fields`
+            "approach": 1,  # the step from which on others ended before a border without a series; 0 if that is over
+            "next_approach": 1,  # the same behind this step
+            "slides": 1,  # 1 if the motion slides along any border
+            "stops": 1,  # 1 if the step ends at a border that it comes to with no speed, to rounding
+            "level": guards if any(guard.of_table for guard in borders.guards) else 0,  # a level that changes
+        }
         if borders.kicking:
-            fields |= {"kick_before": len(borders.switches), "kick_hit": len(borders.switches), "kicks": 1, "counts": 1}
+            fields |= {
+                "kick_before": pieces,  # the pieces before the border
+                "kick_hit": pieces,  # 1 for the piece whose switching number is zero there
+                "kicks": 1,  # 1 to kick the motion; 2 if it does not pass the border
+                "counts": 1,  # 1 if the step is one that is recorded, be it of no length
+            }
         return fields | Roots.fields(MAX_ORDER + 2) | Saltation.fields(borders)
 
     def begin(self, frame: Frame, lane: Lane) -> None:

@@ -29,7 +29,7 @@ from lagjax._native._constants import (
     SEEN,
     WITHOUT_SERIES,
 )
-from lagjax._native._frame import Frame, Lane, integers
+from lagjax._native._frame import EXACT, Fields, Frame, Lane, integers
 from lagjax._native._ir import INTEGER, Code, Value, Variable
 from lagjax._native._roots import Roots, Touch
 from lagjax._native._run_records import Output
@@ -79,19 +79,30 @@ class Events:
         self.look = self._look()
 
     @staticmethod
-    def fields(guards: int) -> dict:
-        """The fields of a thread's memory.
-
-        For every guard its value, the side before the step and at its end, how many of its first coefficients are zero
-        where a motion begins, how it changes there, where it changes on the way and how; how often it has been noted,
-        when it was last gone through, whether it was zero at the border where the step before ended, and its leading
-        term with what is rounding of it. For all of them the step before it was cut, how far they can be seen, as a
-        part of it, the first change, and the event. Where starts are rounded `zero` is the value of a guard that counts
-        as zero.
-        """
-        each = ("guard", "side", "side_begin", "contact", "met", "root_at", "change", "noted", "noted_begin")
-        each = (*each, "passed_at", "waits", "waited", "noise", "lead", "lead_order")
-        return dict.fromkeys(each, guards) | dict.fromkeys(("planned", "seen", "is_cut", "first_at", "event"), 1)
+    def fields(guards: int) -> Fields:
+        """The fields of a thread's memory, of every guard and of all of them."""
+        return {
+            "guard": guards,  # its value
+            "side": guards,  # its sign at the end of the step
+            "side_begin": guards,  # and at the beginning
+            "contact": guards,  # a `Touch`, where a motion begins
+            "met": guards,  # the `Change` at the start; 0 without any
+            "root_at": guards,  # how far from the beginning of the step it changes
+            "change": guards,  # the `Change` there
+            "noted": guards,  # how often it has been noted
+            "noted_begin": guards,  # how often at the beginning of the step
+            "passed_at": guards,  # when the motion last went through its surface
+            "waits": guards,  # 1 if the next step decides what it does at a border
+            "waited": guards,  # 1 if the step before left that to this one
+            "noise": guards,  # the rounding of its leading term, where a motion begins
+            "lead": guards,  # its first term behind its rate that is more than rounding
+            "lead_order": guards,  # the order of that
+            "planned": 1,  # the step before it was cut
+            "seen": 1,  # up to which part of the step all can be seen
+            "is_cut": 1,  # 1 if the step ends there
+            "first_at": 1,  # how far from the beginning of the step the first change is
+            "event": EXACT,  # the event's code; −1 without any
+        }
 
     def begin(self, frame: Frame, lane: Lane) -> None:
         """A lane has taken a member."""

@@ -20,10 +20,10 @@ thread in memory, words that are not touched cost nothing but their room.
 
 import copy
 import ctypes
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from llvmlite import ir
@@ -36,11 +36,6 @@ Numbers = Any  # vectors by their numbers: a list of values whose indices are kn
 # Integers of a lane: which member it carries (-1: none), which output comes next, and which step.
 LANE = ("member", "output", "step")
 CACHE_LINE = 8  # doubles
-# What is a double, in whatever precision the state is: times, lengths of steps, counts and codes.
-_DOUBLES = frozenset(
-    "t t_low t_end t_before t_low_before h h_before forward smallest longest last due reached is_due "
-    "code event steps steps_before rejected first_number".split()
-)
 _KINDS = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOUBLE}
 
 
@@ -64,26 +59,32 @@ def integers(module: ir.Module, numbers: np.ndarray) -> ir.GlobalVariable:
     return table
 
 
+class Field(NamedTuple):
+    """Vectors of a thread's memory, in rows and columns, whose elements have a `kind`: None is that of a state."""
+
+    rows: int = 1
+    columns: int = 1
+    kind: ir.Type | None = None
+
+
+# The fields of a thread's memory by name: a number of vectors, rows and columns of them, or a `Field`.
+Fields = dict[str, Any]
+# One vector of doubles, in whatever precision the state is: times, lengths of steps, counts and codes.
+EXACT = Field(kind=DOUBLE)
+
+
 class Memory:
-    """The places of the vectors of a thread: `fields` gives each name a number of vectors, or rows and columns of them.
+    """The places of the `fields` of a thread.
 
     `width` is the lanes of a vector, `number` the type of the numbers of a state. A layout `beside` another one has
     vectors of another width in the same memory.
     """
 
-    def __init__(
-        self,
-        width: int,
-        fields: Mapping[str, int | tuple[int, int]],
-        beside: "Memory | None" = None,
-        number: ir.Type = DOUBLE,
-    ):
+    def __init__(self, width: int, fields: Fields, beside: "Memory | None" = None, number: ir.Type = DOUBLE):
         assert number == DOUBLE or width == 1, "lanes of single precision would not lie side by side"
-        self.width, self.number, self._columns, self._offsets = width, number, {}, {}
+        self.width, self.number, self._fields, self._offsets = width, number, {}, {}
         self._doubles = [0] if beside is None else beside._doubles  # of all that share the memory
-        for name, shape in fields.items():
-            rows, columns = shape if isinstance(shape, tuple) else (shape, 1)
-            self.extend(name, rows, columns)
+        self.extend_by(fields)
 
     @property
     def size(self) -> int:
@@ -95,24 +96,20 @@ class Memory:
         """The place of the next field, in doubles."""
         return -(-self._doubles[0] // self.width) * self.width
 
-    def extend(self, name: str, rows: int, columns: int = 1) -> None:
-        """One field more, of this many vectors, behind all others."""
-        begin = self.end
-        self._offsets[name], self._columns[name] = begin, columns
-        self._doubles[0] = begin + rows * columns * self.width
-
-    def extend_by(self, fields: dict[str, int]) -> None:
-        """More fields, by name, of this many vectors each, behind all others."""
-        for name, rows in fields.items():
-            self.extend(name, rows)
+    def extend_by(self, fields: Fields) -> None:
+        """More fields, behind all others."""
+        for name, shape in fields.items():
+            field = Field(shape) if isinstance(shape, int) else Field(*shape)
+            self._fields[name], self._offsets[name] = field, self.end
+            self._doubles[0] = self.end + field.rows * field.columns * self.width
 
     def type_of(self, name: str) -> ir.Type:
-        return DOUBLE if name in _DOUBLES else self.number
+        return self._fields[name].kind or self.number
 
     def place(self, name: str, *indices: Index) -> Any:
         """The first element of a vector, counted in doubles: `name`, `name[i]` or `name[i, k]`."""
         row, column = (*indices, 0, 0)[:2]
-        columns = self._columns[name]
+        columns = self._fields[name].columns
         index = row if columns == 1 else column if isinstance(row, int) and row == 0 else column + row * columns
         return index * self.width + self._offsets[name]
 

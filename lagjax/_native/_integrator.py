@@ -69,11 +69,14 @@ class Integrator:
         self.base_size = nesting.base
         self.guards = 0 if guards is None else len(guards.directions)
         self.notes = guards is not None and guards.notes  # in the place of states at output times
-        fields = StepControl.fields(n) | Output.fields(n) | Events.fields(self.guards) | {"active": 1}
+        fields = StepControl.fields(n) | Output.fields(n) | Events.fields(self.guards)
+        fields["active"] = 1  # 1 in a lane that has a member
         if projection is not None:
             fields |= Projector.fields(n) | _rank_drops.fields(n, self.guards)
         if guards is not None:
-            fields |= Roots.fields(MAX_ORDER + 2) | ({"zero": self.guards} if guards.is_rounded else {})
+            fields |= Roots.fields(MAX_ORDER + 2)
+            if guards.is_rounded:
+                fields["zero"] = self.guards  # the value of a guard that counts as zero
         if borders is not None:
             fields |= BorderControl.fields(borders)
         jump = parts.jump

@@ -6,7 +6,7 @@ then the projection has failed, and the step is halved.
 """
 
 from lagjax._native._constants import PROJECTION_TOLERANCES, START
-from lagjax._native._frame import Frame, Index, Numbers
+from lagjax._native._frame import Fields, Frame, Index, Numbers
 from lagjax._native._ir import Code, Value
 from lagjax._native._taylor import TaylorSeries
 from lagjax._program._series import Recurrent
@@ -24,12 +24,12 @@ class Projector:
         self.project = self._project()
 
     @staticmethod
-    def fields(n: int) -> dict:
-        """The fields of a thread's memory: the projected state at the end of the step, and velocity scales.
-
-        Those of derivatives stay zero.
-        """
-        return {"projected": 2 * n, "velocity_scale": n}
+    def fields(n: int) -> Fields:
+        """The fields of a thread's memory."""
+        return {
+            "projected": 2 * n,  # the state at the end of the step, on the constraints
+            "velocity_scale": n,  # of each coordinate; of derivatives it stays zero
+        }
 
     def scales(self, i: Index) -> bool:
         """True if coordinate i may have a velocity scale; where i is not known, it may."""

@@ -7,15 +7,26 @@ none gets through. The last long one is then taken once more, a little shorter.
 from collections.abc import Iterator
 
 from lagjax._native._constants import MOST_RETURNS, RETAKEN, RUNNING, SHORTER
-from lagjax._native._frame import Frame
+from lagjax._native._frame import EXACT, Fields, Frame
 from lagjax._native._lanes import Lines
 from lagjax._native._tables import Tables
 
 
-def fields(n: int, guards: int) -> dict:
-    """The fields of a thread's memory: the beginning of the last long step, its size, and the returns to it."""
-    before = {"y_before": 2 * n, "low_before": 2 * n, "side_before": guards, "noted_before": guards}
-    return before | dict.fromkeys(("t_before", "t_low_before", "steps_before", "h_before", "returns", "returned"), 1)
+def fields(n: int, guards: int) -> Fields:
+    """The fields of a thread's memory."""
+    return {
+        # Where the last long step began: the fields without `_before`, then.
+        "y_before": 2 * n,
+        "low_before": 2 * n,
+        "side_before": guards,
+        "noted_before": guards,
+        "t_before": EXACT,
+        "t_low_before": EXACT,
+        "steps_before": EXACT,
+        "h_before": EXACT,  # the size of that step; 0 without any
+        "returns": 1,  # the number of returns to it
+        "returned": 1,  # 1 if the motion has just returned
+    }
 
 
 AT_FIRST_ZERO = ("h_before", "returns", "returned")  # for every new member

@@ -27,10 +27,7 @@ Numbers = Callable[[Index], Value]
 
 
 class Retraction:
-    """The map onto the `borders` of a motion whose coordinates are those of a `nesting`.
-
-    Fields are the argument of the map, and where derivatives go over steps whether a member `begins`, and `at_limit`.
-    """
+    """The map onto the `borders` of a motion whose coordinates are those of a `nesting`."""
 
     def __init__(self, motion: TaylorSeries, borders: Borders, nesting: Nesting):
         assert borders.retraction is not None
@@ -38,7 +35,11 @@ class Retraction:
         self.base, self.rows, self.nesting = nesting.base, nesting.size // nesting.base, nesting
         self.shares = [j for j, kind in enumerate(borders.kinds) if kind == SLIDE]
         self.groups = _join(borders.moved)
-        motion.layout.extend_by({"unretracted": motion.states, "begins": 1, "at_limit": self.base})
+        motion.layout.extend_by({
+            "unretracted": motion.states,  # the argument of the map
+            "begins": 1,  # 1 if the step is the first one of its member; of steps that are taken again
+            "at_limit": self.base,  # 1 for a coordinate that a border moves which holds no more than it does; of these
+        })  # fmt: skip
 
     def _slides(self, numbers: Numbers) -> Value:
         """The lanes whose motion slides along any border."""
@@ -131,7 +132,7 @@ class Retraction:
         """`()`: the cotangents of the state, and of the parameters."""
         motion, form = self.motion, self.motion.form
         line, tables = pullback_and_entries(self.line, self.dtypes, cotangents.varied, range(motion.states))
-        motion.layout.extend_by({"lost": motion.states})
+        motion.layout.extend_by({"lost": motion.states})  # 1 for a number whose derivative does not exist
         frame = motion.function("back_retraction")
         code, slides = frame.code, self._slides(lambda i: frame["params", i])
         begins = slides & (frame["begins"] > 0.0)

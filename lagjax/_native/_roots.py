@@ -14,7 +14,7 @@ from collections.abc import Callable
 from enum import IntEnum
 
 from lagjax._native._constants import EPS, MOST_HALVINGS, MOST_MOVES, ROOT_NOISE
-from lagjax._native._frame import Frame
+from lagjax._native._frame import Fields, Frame
 from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._taylor import TaylorSeries, integer
 
@@ -36,13 +36,8 @@ class Touch(IntEnum):
 class Roots:
     """Functions of the polynomial in `poly`, of which `degree + 1` coefficients are there.
 
-    `first_root(degree)` finds the first root, into `root`; 2 without any. P is known to the rounding of its largest
-    value; where P(0) is negative beyond that the root is 0. `is_root` is 0 where only a part of the way was looked at:
-    up to `root`, where there is none.
-
-    `next_root(degree)` begins at `begin`, where P may be zero, with the sums of `sum_up`. P is known to rounding,
-    `unsure`, and `doubt` times the power after its last one; what is closer than `instant` is one place. It leaves the
-    `slope` at the root, and how well P is known there, in `error`.
+    `first_root(degree)` finds the first root. P is known to the rounding of its largest value; where P(0) is negative
+    beyond that the root is 0. `next_root(degree)` begins at `begin`, where P may be zero, with the sums of `sum_up`.
     """
 
     def __init__(self, motion: TaylorSeries):
@@ -51,10 +46,24 @@ class Roots:
         self.first_root = self._first_root()
 
     @staticmethod
-    def fields(columns: int) -> dict:
+    def fields(columns: int) -> Fields:
         """The fields of a thread's memory."""
-        numbers = ("root", "is_root", "slope", "error", "begin", "unsure", "doubt", "instant", "part")
-        return {"poly": columns, **dict.fromkeys((*numbers, "falls", "rises", "down", "up"), 1)}
+        return {
+            "poly": columns,  # the coefficients of P on [0, 1]
+            "root": 1,  # the root, or up to where there is none; 2 without any
+            "is_root": 1,  # 0 where only a part of the way was looked at, up to `root`
+            "slope": 1,  # P′ at the root
+            "error": 1,  # how well P is known there
+            "begin": 1,  # where the search begins
+            "unsure": 1,  # the rounding of P
+            "doubt": 1,  # what P leaves out, as the factor of the power after its last one
+            "instant": 1,  # what is closer is one place
+            "part": 1,  # of the step that [0, 1] is
+            "falls": 1,  # Σ of the negative coefficients but P(0), as a size
+            "rises": 1,  # Σ of the positive ones
+            "down": 1,  # the bound of −P″
+            "up": 1,  # the bound of P″
+        }
 
     # ---- a number along the step as a polynomial ----
 

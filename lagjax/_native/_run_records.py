@@ -1,7 +1,7 @@
 """The records of a run: the states at the output times, the steps for a transpose, and how each member ended."""
 
 from lagjax._native._constants import DONE, EPS
-from lagjax._native._frame import Frame, Index, Lane
+from lagjax._native._frame import EXACT, Fields, Frame, Index, Lane
 from lagjax._native._ir import Code, Value
 from lagjax._native._projection import Projector
 from lagjax._native._taylor import TaylorSeries
@@ -22,12 +22,14 @@ class Output:
         self.motion, self.projector = motion, projector
 
     @staticmethod
-    def fields(n: int) -> dict:
-        """The fields of a thread's memory: the state at an output time, whether a lane has one, and times.
-
-        `due` and `reached` are times in the direction of time: that of the next output, and the end of the step.
-        """
-        return {"between": 2 * n, **dict.fromkeys(("due", "reached", "is_due"), 1)}
+    def fields(n: int) -> Fields:
+        """The fields of a thread's memory; times are in the direction of time."""
+        return {
+            "between": 2 * n,  # the state at an output time
+            "due": EXACT,  # the next output time
+            "reached": EXACT,  # the end of the step, or the instant of a note
+            "is_due": EXACT,  # 1 in a lane that has an output, or a note, to write down
+        }
 
     # ---- states at output times ----
 

@@ -14,7 +14,7 @@ import numpy as np
 
 from lagjax._native._constants import JUMP_NOISE
 from lagjax._native._cotangents import Cotangents, add
-from lagjax._native._frame import Frame, Index, Numbers, Vectors, integers
+from lagjax._native._frame import Fields, Frame, Index, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._tangent_memory import Directions
 from lagjax._native._taylor import TaylorSeries
@@ -154,15 +154,17 @@ class Saltation:
         self.parameters = motion.parameters * self.base // motion.n  # of the motion alone
 
     @staticmethod
-    def fields(borders: Borders) -> dict:
-        """The fields of a thread's memory: the pieces before the border, and which switching number is zero there.
-
-        `entry` numbers the entries of tables that are levels, behind `hit`. `is_hit` is a `Hit`; `grazes` is 1 where
-        the rate of the switching number is zero to the tolerance.
-        """
+    def fields(borders: Borders) -> Fields:
+        """The fields of a thread's memory."""
         pieces = len(borders.switches)
-        entries = {"entry": pieces} if borders.levels_move else {}
-        return {"pieces_before": pieces, "hit": pieces, **entries, "is_hit": 1, "grazes": 1}
+        return {
+            "pieces_before": pieces,  # the pieces before the border
+            "hit": pieces,  # not 0 for the piece whose switching number is zero at the border
+            # The number of the entry that is the level there; follows `hit`.
+            **({"entry": pieces} if borders.levels_move else {}),
+            "is_hit": 1,  # a `Hit`
+            "grazes": 1,  # 1 where the rate of the switching number is zero to the tolerance
+        }
 
     # ---- what jumps ----
 
@@ -274,9 +276,9 @@ class Saltation:
 
     # ---- over steps that have been taken ----
 
-    def fields_along(self) -> dict:
-        """The fields that a thread keeps from one step to the next: the state at the border."""
-        return {"edge": self.motion.states, "edge_t": 1}
+    def fields_along(self) -> Fields:
+        """The fields that a thread keeps from one step to the next."""
+        return {"edge": self.motion.states, "edge_t": 1}  # the state at the border, and the time there
 
     def _note_edge(self, frame: Frame) -> None:
         """The state at the end of a step, and what is to be known of the border there."""

@@ -13,7 +13,7 @@ import numpy as np
 from llvmlite import ir
 
 from lagjax._native._constants import MAX_ORDER
-from lagjax._native._frame import CACHE_LINE, Frame, Index, Memory, Vectors, integers
+from lagjax._native._frame import CACHE_LINE, Fields, Frame, Index, Memory, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value, lanes
 from lagjax._native._lanes import sincos_function
 from lagjax._native._packed import Packed
@@ -31,7 +31,7 @@ def fills_lanes(series: Series) -> bool:
 class SingleMember(TaylorSeries):
     """A `TaylorSeries` of width one, as tables of vectors."""
 
-    def _fields(self) -> dict:
+    def _fields(self) -> Fields:
         rows = -(-(self.series.rows + lanes()) // CACHE_LINE)
         # An odd number of cache lines from one order to the next: else they would meet in a few sets of the cache.
         self._stride = (rows + 1 - rows % 2) * CACHE_LINE
@@ -91,7 +91,7 @@ class SingleMember(TaylorSeries):
                     sums[which[members]] = end + np.arange(run.count)
                     runs.append(run._replace(results=(end,)))
                     end += -(-run.count // lanes()) * lanes()
-        self.layout.extend("sums", end - self.layout.end)
+        self.layout.extend_by({"sums": end - self.layout.end})
         return runs, sums
 
     # ---- the sums ----

@@ -33,7 +33,7 @@ from lagjax._native._constants import (
     SINGULAR,
     STEP_TOO_SMALL,
 )
-from lagjax._native._frame import Frame, Index, Numbers
+from lagjax._native._frame import EXACT, Fields, Frame, Index, Numbers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._projection import Projector, end_of_step
 from lagjax._native._taylor import TaylorSeries, double, integer
@@ -56,15 +56,25 @@ class StepControl:
         self.defect = self._defect()
 
     @staticmethod
-    def fields(n: int) -> dict:
-        """The fields of a thread's memory; `active`, `last` and `singular` are 1 or 0."""
+    def fields(n: int) -> Fields:
+        """The fields of a thread's memory."""
         return {
             "low": 2 * n,  # what rounding took from the state
             "scale": 2 * n,  # 1 / (floor + rtol·size)
             "reach": 2 * PARTS,  # the largest coordinate, and the largest velocity, so far
             "increment": 2 * n,  # P(h) − y
-            **dict.fromkeys(("t_low", "t_end", "forward", "smallest", "longest", "growth", "last"), 1),
-            **dict.fromkeys(("defect", "series_defect", "code", "steps", "rejected"), 1),
+            "t_low": EXACT,  # what rounding took from the time
+            "t_end": EXACT,  # the last output time
+            "forward": EXACT,  # the direction of time, ±1
+            "smallest": EXACT,  # the shortest step that may be taken
+            "longest": EXACT,  # the longest step that may be tried next
+            "growth": 1,  # by which factor the next step may be longer
+            "last": EXACT,  # 1 if the step ends at `t_end`
+            "defect": 1,  # the largest scaled defect of the step, of its series and its projection
+            "series_defect": 1,  # that of the series alone
+            "code": EXACT,  # how the member has ended (`_constants`), or `RUNNING`
+            "steps": EXACT,  # the number of steps taken
+            "rejected": EXACT,  # the number of steps refused
         }
 
     # ---- the size of a step ----

@@ -130,7 +130,7 @@ class Tables:
         """A new field of the memory, of this many vectors."""
         name = f"field{len(self._fields)}"
         self._fields.append(name)
-        self._layout.extend(name, count)
+        self._layout.extend_by({name: count})
         return name
 
     def _constant(self, number: float) -> int:

@@ -15,7 +15,7 @@ import numpy as np
 from llvmlite import ir
 
 from lagjax._native._constants import LARGEST_LINE, LEAST_ORDER, MAX_ORDER, OPERATIONS_PER_COORDINATE
-from lagjax._native._frame import Frame, Index, Lane, Memory, Numbers, Vectors, integers
+from lagjax._native._frame import EXACT, Fields, Frame, Index, Lane, Memory, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._lanes import Lines, sincos_function
 from lagjax._native._motion_parts import MotionParts
@@ -45,7 +45,7 @@ class TaylorSeries:
         name: str,
         parts: MotionParts,
         job: type,
-        fields: dict,
+        fields: Fields,
         large: bool,
         width: int,
         keep_sums: bool = False,
@@ -73,17 +73,19 @@ class TaylorSeries:
         self._sums = self._sums_function()
         self.coefficients = self._coefficients_function()
 
-    def _fields(self) -> dict:
+    def _fields(self) -> Fields:
         series, products = self.series, len(self.series.cauchy_products)
         return {
             "y": (self.states, MAX_ORDER + 1),  # the series of the state, component by component
             "rows": (series.rows, MAX_ORDER),  # the series that the Cauchy products are made of
-            "sums": (MAX_ORDER if self.keep_sums else 1, products),
+            "sums": (MAX_ORDER if self.keep_sums else 1, products),  # the Cauchy products of an order
             "values": series.values,  # what the order recursion reads of the zeroth order
-            "params": self.numbers,
-            "kept": self.kept,
-            # Where the numbers of a member begin; its parameters, and what tables are of.
-            **dict.fromkeys(("t", "h", "singular", "first_number"), 1),
+            "params": self.numbers,  # parameters, and pieces
+            "kept": self.kept,  # outputs of the program that others read
+            "t": EXACT,  # the time
+            "h": EXACT,  # the step
+            "singular": 1,  # 1 if the mass matrix is
+            "first_number": EXACT,  # where the numbers of a member begin: its parameters, and what tables are of
         }
 
     def _form(self) -> Lines | Tables:
