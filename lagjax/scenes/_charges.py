@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._scene import System
-from lagjax.scenes._scene import Scene
+from lagjax.scenes._scene import Scene, components, conservative_scene
 
 
 class _ChargeInFields(eqx.Module):
@@ -41,14 +41,10 @@ def charge_in_fields(phi=no_potential, A=plane_wave, *, q0=None, qdot0=None, par
 
     >>> scene = lagjax.scenes.charge_in_fields(phi=lambda x, t, params: -x[0] * jnp.cos(t))
     """
-    return Scene(
-        system=System(_ChargeInFields(phi, A)),
-        params={"m": 1.0, "e": 1.0, "E": 0.5, "omega": 2.0, "k": 2.0} if params is None else params,
-        q0=np.array([0.0, 0.0, 0.0]) if q0 is None else q0,
-        qdot0=np.array([0.1, 0.2, 0.3]) if qdot0 is None else qdot0,
-        duration=10.0,
-        invariants={},
-    )
+    params = {"m": 1.0, "e": 1.0, "E": 0.5, "omega": 2.0, "k": 2.0} if params is None else params
+    q0 = np.array([0.0, 0.0, 0.0]) if q0 is None else q0
+    qdot0 = np.array([0.1, 0.2, 0.3]) if qdot0 is None else qdot0
+    return Scene(System(_ChargeInFields(phi, A)), params, q0, qdot0, duration=10.0, invariants={})
 
 
 def _uniform_fields_lagrangian(q, qdot, params):
@@ -70,12 +66,9 @@ def _uniform_fields_exact(t, q0, qdot0, params):
     return q, parallel + drift + acceleration * t + turned
 
 
-class _Pseudomomentum(eqx.Module):
-    axis: int = eqx.field(static=True)
-
-    def __call__(self, q, qdot, t, params):
-        m, e, E, B = params["m"], params["e"], params["E"], params["B"]
-        return (m * qdot + e * jnp.cross(B, q) - e * E * t)[self.axis]
+def _pseudomomentum(q, qdot, t, params):
+    m, e, E, B = params["m"], params["e"], params["E"], params["B"]
+    return m * qdot + e * jnp.cross(B, q) - e * E * t
 
 
 def charge_in_uniform_fields(E=(0.3, 0.0, 0.1), B=(0.0, 0.0, 2.0)) -> Scene:
@@ -86,17 +79,12 @@ def charge_in_uniform_fields(E=(0.3, 0.0, 0.1), B=(0.0, 0.0, 2.0)) -> Scene:
 
     >>> scene = lagjax.scenes.charge_in_uniform_fields(E=(1.0, 0.0, 0.0), B=(0.0, 0.0, 5.0))
     """
-    system = System(_uniform_fields_lagrangian)
-    m, e = 1.5, 1.0
-    return Scene(
-        system=system,
-        params={"m": m, "e": e, "E": np.asarray(E, float), "B": np.asarray(B, float)},
-        q0=np.array([1.0, 0.0, -0.5]),
-        qdot0=np.array([0.2, 1.0, 0.3]),
-        duration=2 * np.pi * m / (e * float(np.linalg.norm(B))),
-        invariants={"energy": system.energy} | {f"pseudomomentum_{c}": _Pseudomomentum(i) for i, c in enumerate("xyz")},
-        exact=_uniform_fields_exact,
-    )
+    system, m, e = System(_uniform_fields_lagrangian), 1.5, 1.0
+    params = {"m": m, "e": e, "E": np.asarray(E, float), "B": np.asarray(B, float)}
+    q0, qdot0 = np.array([1.0, 0.0, -0.5]), np.array([0.2, 1.0, 0.3])
+    turn = 2 * np.pi * m / (e * float(np.linalg.norm(B)))
+    more = components("pseudomomentum", _pseudomomentum)
+    return conservative_scene(system, params, q0, qdot0, turn, more, _uniform_fields_exact)
 
 
 def gyration() -> Scene:
@@ -142,15 +130,10 @@ def relativistic_charge_in_electric_field() -> Scene:
 
     >>> scene = lagjax.scenes.relativistic_charge_in_electric_field()
     """
-    system = System(_relativistic_lagrangian)
-    return Scene(
-        system=system,
-        params={"m": 1.0, "e": 1.0, "c": 1.0, "E": np.array([3.0, 0.0, 0.0]), "B": np.zeros(3)},
-        q0=np.zeros(3),
-        qdot0=np.zeros(3),
-        duration=10.0,
-        invariants={"energy": system.energy},
-        exact=_relativistic_electric_exact,
+    params = {"m": 1.0, "e": 1.0, "c": 1.0, "E": np.array([3.0, 0.0, 0.0]), "B": np.zeros(3)}
+    q0, qdot0 = np.zeros(3), np.zeros(3)
+    return conservative_scene(
+        System(_relativistic_lagrangian), params, q0, qdot0, duration=10.0, exact=_relativistic_electric_exact
     )
 
 
@@ -168,12 +151,7 @@ def relativistic_charge_in_magnetic_field() -> Scene:
     >>> scene = lagjax.scenes.relativistic_charge_in_magnetic_field()
     """
     system = System(_relativistic_lagrangian)
-    return Scene(
-        system=system,
-        params={"m": 1.0, "e": 1.0, "c": 1.0, "E": np.zeros(3), "B": np.array([0.0, 0.0, 2.0])},
-        q0=np.array([1.0, 0.0, 0.0]),
-        qdot0=np.array([0.0, 0.9, 0.3]),
-        duration=20.0,
-        invariants={"energy": system.energy, "speed_squared": lambda q, qdot, t, params: qdot @ qdot},
-        exact=_relativistic_magnetic_exact,
-    )
+    params = {"m": 1.0, "e": 1.0, "c": 1.0, "E": np.zeros(3), "B": np.array([0.0, 0.0, 2.0])}
+    q0, qdot0 = np.array([1.0, 0.0, 0.0]), np.array([0.0, 0.9, 0.3])
+    more = {"speed_squared": lambda q, qdot, t, params: qdot @ qdot}
+    return conservative_scene(system, params, q0, qdot0, duration=20.0, exact=_relativistic_magnetic_exact, more=more)

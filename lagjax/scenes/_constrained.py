@@ -16,7 +16,8 @@ from jax.typing import ArrayLike
 from lagjax._scene import System
 from lagjax.scenes._coordinate_systems import Cartesian, angular_momentum_z
 from lagjax.scenes._mechanisms import _pendulum_exact
-from lagjax.scenes._scene import Scene
+from lagjax.scenes._particles import _uniform_gravity_lagrangian
+from lagjax.scenes._scene import Scene, conservative_scene
 
 # ---- rolling off a half-cylinder -------------------------------------------------------------------------------------
 
@@ -76,17 +77,11 @@ def rolling_cylinder() -> Scene:
 
     >>> scene = lagjax.scenes.rolling_cylinder(); scene.exact(1.0, scene.q0, scene.qdot0, scene.params)
     """
-    system = System(_rolling_cylinder_lagrangian, constraints=_rolling_cylinder_constraints)
     R, a, start = 1.0, 0.25, 0.2
-    return Scene(
-        system=system,
-        params={"M": 2.0, "R": R, "a": a, "alpha": 0.5, "g": 9.81},
-        q0=Rolling(R + a, start, (R + a) / a * start),
-        qdot0=Rolling(0.0, 0.0, 0.0),
-        duration=0.9,
-        invariants={"energy": system.energy},
-        exact=_rolling_cylinder_exact,
-    )
+    system = System(_rolling_cylinder_lagrangian, constraints=_rolling_cylinder_constraints)
+    params = {"M": 2.0, "R": R, "a": a, "alpha": 0.5, "g": 9.81}
+    q0, qdot0 = Rolling(R + a, start, (R + a) / a * start), Rolling(0.0, 0.0, 0.0)
+    return conservative_scene(system, params, q0, qdot0, duration=0.9, exact=_rolling_cylinder_exact)
 
 
 # ---- rods ------------------------------------------------------------------------------------------------------------
@@ -137,23 +132,19 @@ def cartesian_pendulum() -> Scene:
 
     >>> scene = lagjax.scenes.cartesian_pendulum(); scene.exact(1.0, scene.q0, scene.qdot0, scene.params)
     """
-    system = System(_masses_lagrangian, constraints=_rod)
-    return Scene(
-        system=system,
-        params={"m": 1.0, "l": 1.0, "g": 9.81},
-        q0=np.array([-1.0, 0.0]),
-        qdot0=np.array([0.0, 0.0]),
-        duration=10.0,
-        invariants={"energy": system.energy},
-        exact=_cartesian_pendulum_exact,
+    params = {"m": 1.0, "l": 1.0, "g": 9.81}
+    q0, qdot0 = np.array([-1.0, 0.0]), np.array([0.0, 0.0])
+    return conservative_scene(
+        System(_masses_lagrangian, constraints=_rod), params, q0, qdot0, duration=10.0, exact=_cartesian_pendulum_exact
     )
 
 
 def _chain_at_rest(theta, params, constraints) -> Scene:
-    system = System(_masses_lagrangian, constraints=constraints)
     length = np.asarray(params["l"])
     q0 = np.cumsum(length * np.array([np.sin(theta), -np.cos(theta)]), axis=1).T
-    return Scene(system, params, q0, np.zeros_like(q0), duration=2.0, invariants={"energy": system.energy})
+    return conservative_scene(
+        System(_masses_lagrangian, constraints=constraints), params, q0, qdot0=np.zeros_like(q0), duration=2.0
+    )
 
 
 def cartesian_double_pendulum() -> Scene:
@@ -214,14 +205,11 @@ def bead_on_wire(shape=parabola, *, params=None, x0=1.0) -> Scene:
 
     >>> scene = bead_on_wire(lambda x, params: jnp.cosh(x), params={"m": 1.0, "g": 9.81})
     """
-    system = System(_masses_lagrangian, constraints=_Wire(shape))
     params = {"m": 1.0, "g": 9.81, "k": 1.5} if params is None else params
     q0 = np.array([x0, float(shape(x0, params))])
-    return Scene(system, params, q0, np.zeros(2), duration=5.0, invariants={"energy": system.energy})
-
-
-def _particle_lagrangian(q, qdot, params):
-    return 0.5 * params["m"] * q.speed_squared(qdot) - params["m"] * params["g"] * q.z
+    return conservative_scene(
+        System(_masses_lagrangian, constraints=_Wire(shape)), params, q0, qdot0=np.zeros(2), duration=5.0
+    )
 
 
 def _sphere(q, params):
@@ -249,20 +237,13 @@ def particle_on_sphere() -> Scene:
 
     >>> scene = particle_on_sphere(); scene.system.multipliers(scene.q0, scene.qdot0, params=scene.params)
     """
-    system = System(_particle_lagrangian, constraints=_sphere)
     R, theta, phi = 1.0, 0.3, 0.7
-    return Scene(
-        system=system,
-        params={"m": 1.0, "R": R, "g": 9.81},
-        q0=Cartesian(R * np.sin(theta) * np.cos(phi), R * np.sin(theta) * np.sin(phi), R * np.cos(theta)),
-        qdot0=Cartesian(0.0, 0.0, 0.0),
-        duration=0.6,
-        invariants={
-            "energy": system.energy,
-            "L_z": lambda q, qdot, t, params: params["m"] * angular_momentum_z(q, qdot),
-        },
-        exact=_particle_on_sphere_exact,
-    )
+    system = System(_uniform_gravity_lagrangian, constraints=_sphere)
+    params = {"m": 1.0, "R": R, "g": 9.81}
+    rho, rest = R * np.sin(theta), Cartesian(0.0, 0.0, 0.0)
+    q0 = Cartesian(rho * np.cos(phi), rho * np.sin(phi), R * np.cos(theta))
+    more = {"L_z": lambda q, qdot, t, params: params["m"] * angular_momentum_z(q, qdot)}
+    return conservative_scene(system, params, q0, rest, duration=0.6, exact=_particle_on_sphere_exact, more=more)
 
 
 # ---- wheels and skates: constraints on velocities --------------------------------------------------------------------
@@ -333,17 +314,12 @@ def rolling_disc(slope=0.3) -> Scene:
 
     >>> scene = rolling_disc(); scene.exact(1.0, scene.q0, scene.qdot0, scene.params)
     """
-    system = System(_rolling_disc_lagrangian, velocity_constraints=_rolling_without_slipping)
     m, R, phi, spin = 1.5, 0.4, 0.5, 2.0
-    return Scene(
-        system=system,
-        params={"m": m, "R": R, "I": 0.5 * m * R**2, "J": 0.25 * m * R**2, "g": 9.81, "slope": slope},
-        q0=Disc(0.0, 0.0, phi, 0.0),
-        qdot0=Disc(R * spin * np.cos(phi), R * spin * np.sin(phi), 1.3, spin),
-        duration=5.0,
-        invariants={"energy": system.energy, "turning rate": _turning_rate},
-        exact=_rolling_disc_exact,
-    )
+    system = System(_rolling_disc_lagrangian, velocity_constraints=_rolling_without_slipping)
+    params = {"m": m, "R": R, "I": 0.5 * m * R**2, "J": 0.25 * m * R**2, "g": 9.81, "slope": slope}
+    q0, qdot0 = Disc(0.0, 0.0, phi, 0.0), Disc(R * spin * np.cos(phi), R * spin * np.sin(phi), 1.3, spin)
+    more = {"turning rate": _turning_rate}
+    return conservative_scene(system, params, q0, qdot0, duration=5.0, exact=_rolling_disc_exact, more=more)
 
 
 def _no_slip_across(q, qdot):
@@ -374,15 +350,10 @@ def knife_edge() -> Scene:
     >>> scene = knife_edge(); scene.exact(1.0, scene.q0, scene.qdot0, scene.params)
     """
     system = System(_knife_edge_lagrangian, velocity_constraints=_no_slip_across)
-    return Scene(
-        system=system,
-        params={"m": 1.0, "J": 0.3, "g": 9.81, "slope": 0.4},
-        q0=Blade(0.0, 0.0, 0.0),
-        qdot0=Blade(0.0, 0.0, 1.5),
-        duration=6.0,
-        invariants={"energy": system.energy, "turning rate": _turning_rate},
-        exact=_knife_edge_exact,
-    )
+    params = {"m": 1.0, "J": 0.3, "g": 9.81, "slope": 0.4}
+    q0, qdot0 = Blade(0.0, 0.0, 0.0), Blade(0.0, 0.0, 1.5)
+    more = {"turning rate": _turning_rate}
+    return conservative_scene(system, params, q0, qdot0, duration=6.0, exact=_knife_edge_exact, more=more)
 
 
 def _sleigh_lagrangian(q, qdot, params):
@@ -424,15 +395,9 @@ def chaplygin_sleigh() -> Scene:
     >>> scene = chaplygin_sleigh(); scene.exact(1.0, scene.q0, scene.qdot0, scene.params)
     """
     system = System(_sleigh_lagrangian, velocity_constraints=_no_slip_across)
-    return Scene(
-        system=system,
-        params={"m": 1.0, "I": 0.1, "a": 0.1},
-        q0=Blade(0.0, 0.0, 0.0),
-        qdot0=Blade(-0.5, 0.0, 2.0),
-        duration=5.0,
-        invariants={"energy": system.energy},
-        exact=_sleigh_exact,
-    )
+    params = {"m": 1.0, "I": 0.1, "a": 0.1}
+    q0, qdot0 = Blade(0.0, 0.0, 0.0), Blade(-0.5, 0.0, 2.0)
+    return conservative_scene(system, params, q0, qdot0, duration=5.0, exact=_sleigh_exact)
 
 
 # ---- linkages --------------------------------------------------------------------------------------------------------
@@ -474,18 +439,14 @@ def slider_crank(l1=1.0, l2=2.0) -> Scene:
 
     >>> scene = slider_crank(); scene.system.multipliers(scene.q0, scene.qdot0, params=scene.params)
     """
-    system = System(_slider_crank_lagrangian, constraints=_slider_crank_constraints)
     crank, rate = 0.5, 4.0
     rod = -np.arcsin(l1 * np.sin(crank) / l2)
     rod_rate = -l1 * np.cos(crank) * rate / (l2 * np.cos(rod))
     slide = -l1 * np.sin(crank) * rate - l2 * np.sin(rod) * rod_rate
-    return Scene(
-        system=system,
-        params={"m": np.array([1.0, 1.0, 2.0]), "l": np.array([l1, l2]), "g": 9.81},
-        q0=SliderCrank(crank, rod, l1 * np.cos(crank) + l2 * np.cos(rod)),
-        qdot0=SliderCrank(rate, rod_rate, slide),
-        duration=3.0,
-        invariants={"energy": system.energy},
+    params = {"m": np.array([1.0, 1.0, 2.0]), "l": np.array([l1, l2]), "g": 9.81}
+    q0, qdot0 = SliderCrank(crank, rod, l1 * np.cos(crank) + l2 * np.cos(rod)), SliderCrank(rate, rod_rate, slide)
+    return conservative_scene(
+        System(_slider_crank_lagrangian, constraints=_slider_crank_constraints), params, q0, qdot0, duration=3.0
     )
 
 
@@ -572,12 +533,8 @@ def andrews_squeezer() -> Scene:
 
     >>> scene = andrews_squeezer(); scene.system.constraint_residual(scene.q0, scene.qdot0, params=scene.params)
     """
-    system = System(_squeezer_lagrangian, constraints=_squeezer_constraints)
-    return Scene(
-        system=system,
-        params=dict(_SQUEEZER),
-        q0=_SQUEEZER_START,
-        qdot0=Squeezer(*[0.0] * 7),
-        duration=0.03,
-        invariants={"energy": system.energy},
+    params = dict(_SQUEEZER)
+    q0, qdot0 = _SQUEEZER_START, Squeezer(*[0.0] * 7)
+    return conservative_scene(
+        System(_squeezer_lagrangian, constraints=_squeezer_constraints), params, q0, qdot0, duration=0.03
     )

@@ -1,13 +1,12 @@
 """Bodies under gravity, from Kepler's ellipse to the post-Newtonian solar system."""
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from lagjax._scene import System
 from lagjax.scenes import _de421 as de421
-from lagjax.scenes._scene import Scene
+from lagjax.scenes._scene import Scene, components, conservative_scene, total_momentum
 
 
 def _kepler_lagrangian(q, qdot, params):
@@ -49,15 +48,10 @@ def _kepler_angular_momentum(q, qdot, t, params):
     return q[0] * qdot[1] - q[1] * qdot[0]
 
 
-class _LaplaceRungeLenz(eqx.Module):
-    """v × L/GM − q/r: points to the pericentre, as long as the orbit is eccentric."""
-
-    axis: int = eqx.field(static=True)
-
-    def __call__(self, q, qdot, t, params):
-        L = _kepler_angular_momentum(q, qdot, t, params)
-        vector = jnp.stack([qdot[1], -qdot[0]]) * L / params["GM"] - q / jnp.sqrt(q @ q)
-        return vector[self.axis]
+def _laplace_runge_lenz(q, qdot, t, params):
+    # v × L/GM − q/r: points to the pericentre, as long as the orbit is eccentric.
+    L = _kepler_angular_momentum(q, qdot, t, params)
+    return jnp.stack([qdot[1], -qdot[0]]) * L / params["GM"] - q / jnp.sqrt(q @ q)
 
 
 def kepler(eccentricity=0.6) -> Scene:
@@ -68,21 +62,11 @@ def kepler(eccentricity=0.6) -> Scene:
 
     >>> scene = lagjax.scenes.kepler(0.9); scene.exact(1.0, scene.q0, scene.qdot0, scene.params)
     """
-    system, e = System(_kepler_lagrangian), eccentricity
-    return Scene(
-        system=system,
-        params={"GM": 1.0},
-        q0=np.array([1 - e, 0.0]),
-        qdot0=np.array([0.0, np.sqrt((1 + e) / (1 - e))]),
-        duration=2 * np.pi,
-        invariants={
-            "energy": system.energy,
-            "angular_momentum": _kepler_angular_momentum,
-            "laplace_runge_lenz_x": _LaplaceRungeLenz(0),
-            "laplace_runge_lenz_y": _LaplaceRungeLenz(1),
-        },
-        exact=_kepler_exact,
-    )
+    system, params, e = System(_kepler_lagrangian), {"GM": 1.0}, eccentricity
+    q0, qdot0 = np.array([1 - e, 0.0]), np.array([0.0, np.sqrt((1 + e) / (1 - e))])
+    more = components("laplace_runge_lenz", _laplace_runge_lenz, "xy")
+    more["angular_momentum"] = _kepler_angular_momentum
+    return conservative_scene(system, params, q0, qdot0, duration=2 * np.pi, exact=_kepler_exact, more=more)
 
 
 def _restricted_three_body_lagrangian(q, qdot, params):
@@ -101,14 +85,10 @@ def restricted_three_body() -> Scene:
 
     >>> scene = lagjax.scenes.restricted_three_body()
     """
-    system = System(_restricted_three_body_lagrangian)
-    return Scene(
-        system=system,
-        params={"mu": 0.012277471},
-        q0=np.array([0.994, 0.0]),
-        qdot0=np.array([0.0, -2.00158510637908252240537862224]),
-        duration=17.0652165601579625588917206249,
-        invariants={"energy": system.energy},
+    params = {"mu": 0.012277471}
+    q0, qdot0 = np.array([0.994, 0.0]), np.array([0.0, -2.00158510637908252240537862224])
+    return conservative_scene(
+        System(_restricted_three_body_lagrangian), params, q0, qdot0, duration=17.0652165601579625588917206249
     )
 
 
@@ -128,13 +108,6 @@ def _newtonian_lagrangian(q, qdot, params):
     return kinetic + 0.5 * GM @ _inverse_distances(q) @ GM
 
 
-class _GravityMomentum(eqx.Module):
-    axis: int = eqx.field(static=True)
-
-    def __call__(self, q, qdot, t, params):
-        return jnp.sum(params["GM"] * qdot[:, self.axis])
-
-
 def _n_body_angular_momentum(q, qdot, t, params):
     return jnp.sum(params["GM"] * (q[:, 0] * qdot[:, 1] - q[:, 1] * qdot[:, 0]))
 
@@ -146,17 +119,10 @@ def n_body(GM, q0, qdot0, duration) -> Scene:
 
     >>> scene = lagjax.scenes.n_body([1.0, 1e-3], [[0.0, 0.0], [1.0, 0.0]], [[0.0, 0.0], [0.0, 1.0]], duration=6.3)
     """
-    system = System(_newtonian_lagrangian)
-    q0 = np.asarray(q0, float)
-    momenta = {f"p_{name}": _GravityMomentum(axis) for axis, name in enumerate("xyz"[: q0.shape[1]])}
-    return Scene(
-        system=system,
-        params={"GM": np.asarray(GM, float)},
-        q0=q0,
-        qdot0=np.asarray(qdot0, float),
-        duration=duration,
-        invariants={"energy": system.energy, "angular_momentum_z": _n_body_angular_momentum, **momenta},
-    )
+    system, (GM, q0, qdot0) = System(_newtonian_lagrangian), (np.asarray(x, float) for x in (GM, q0, qdot0))
+    more = components("p", total_momentum(system), "xyz"[: q0.shape[1]])
+    more["angular_momentum_z"] = _n_body_angular_momentum
+    return conservative_scene(system, {"GM": GM}, q0, qdot0, duration, more)
 
 
 def figure_eight() -> Scene:
@@ -190,14 +156,6 @@ def _einstein_infeld_hoffmann_lagrangian(q, qdot, params):
     return newtonian + (jnp.sum(one_body) - pairs / 4) / c**2
 
 
-class _CanonicalMomentum(eqx.Module):
-    system: System
-    axis: int = eqx.field(static=True)
-
-    def __call__(self, q, qdot, t, params):
-        return jnp.sum(self.system.momentum(q, qdot, t, params)[:, self.axis])
-
-
 def solar_system() -> Scene:
     """Sun, planets, Moon and Pluto by Einstein, Infeld & Hoffmann: general relativity to the order 1/c²,
 
@@ -212,15 +170,8 @@ def solar_system() -> Scene:
     >>> scene = lagjax.scenes.solar_system()
     """
     system = System(_einstein_infeld_hoffmann_lagrangian)
-    return Scene(
-        system=system,
-        params={"GM": de421.GM, "c": de421.C},
-        q0=de421.POSITIONS,
-        qdot0=de421.VELOCITIES,
-        duration=365.25,
-        invariants={"energy": system.energy}
-        | {f"p_{name}": _CanonicalMomentum(system, axis) for axis, name in enumerate("xyz")},
-    )
+    params, more = {"GM": de421.GM, "c": de421.C}, components("p", total_momentum(system))
+    return conservative_scene(system, params, de421.POSITIONS, de421.VELOCITIES, duration=365.25, more=more)
 
 
 def newtonian_solar_system() -> Scene:

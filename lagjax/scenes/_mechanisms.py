@@ -8,7 +8,7 @@ from jax.typing import ArrayLike
 
 from lagjax._scene import System
 from lagjax.scenes._elliptic import jacobi_elliptic
-from lagjax.scenes._scene import Scene
+from lagjax.scenes._scene import Scene, conservative_scene
 
 
 class WedgeAndMass(NamedTuple):
@@ -53,15 +53,10 @@ def wedge() -> Scene:
 
     >>> scene = lagjax.scenes.wedge(); scene.system.acceleration(scene.q0, scene.qdot0, params=scene.params)
     """
-    system = System(_wedge_lagrangian)
-    return Scene(
-        system=system,
-        params={"M": 3.0, "m": 1.0, "g": 9.81, "alpha": 0.6},
-        q0=WedgeAndMass(0.0, 2.0),
-        qdot0=WedgeAndMass(0.0, 0.0),
-        duration=1.0,
-        invariants={"energy": system.energy, "p_X": _wedge_momentum},
-        exact=_wedge_exact,
+    params = {"M": 3.0, "m": 1.0, "g": 9.81, "alpha": 0.6}
+    q0, qdot0 = WedgeAndMass(0.0, 2.0), WedgeAndMass(0.0, 0.0)
+    return conservative_scene(
+        System(_wedge_lagrangian), params, q0, qdot0, duration=1.0, exact=_wedge_exact, more={"p_X": _wedge_momentum}
     )
 
 
@@ -90,15 +85,9 @@ def pendulum() -> Scene:
 
     >>> scene = lagjax.scenes.pendulum(); scene.exact(1.0, scene.q0, scene.qdot0, scene.params)
     """
-    system = System(_pendulum_lagrangian)
-    return Scene(
-        system=system,
-        params={"m": 1.0, "l": 1.0, "g": 9.81},
-        q0=2.0,
-        qdot0=1.0,
-        duration=10.0,
-        invariants={"energy": system.energy},
-        exact=_pendulum_exact,
+    params = {"m": 1.0, "l": 1.0, "g": 9.81}
+    return conservative_scene(
+        System(_pendulum_lagrangian), params, q0=2.0, qdot0=1.0, duration=10.0, exact=_pendulum_exact
     )
 
 
@@ -118,14 +107,9 @@ def double_pendulum() -> Scene:
 
     >>> scene = lagjax.scenes.double_pendulum(); scene.system.mass_matrix(scene.q0, scene.qdot0, params=scene.params)
     """
-    system = System(_double_pendulum_lagrangian)
-    return Scene(
-        system=system,
-        params={"m1": 1.0, "m2": 1.0, "l1": 1.0, "l2": 1.0, "g": 9.81},
-        q0=np.array([1.0, 1.5]),
-        qdot0=np.array([0.0, 0.0]),
-        duration=10.0,
-        invariants={"energy": system.energy},
+    params = {"m1": 1.0, "m2": 1.0, "l1": 1.0, "l2": 1.0, "g": 9.81}
+    return conservative_scene(
+        System(_double_pendulum_lagrangian), params, q0=np.array([1.0, 1.5]), qdot0=np.array([0.0, 0.0]), duration=10.0
     )
 
 
@@ -159,15 +143,8 @@ def chain(n=3) -> Scene:
 
     >>> scene = lagjax.scenes.chain(10); scene.system.energy(scene.q0, scene.qdot0, params=scene.params)
     """
-    system = System(_chain_lagrangian)
-    return Scene(
-        system=system,
-        params={"m": np.full(n, 1 / n), "l": np.full(n, 1 / n), "g": 9.81},
-        q0=np.full(n, 1.0),
-        qdot0=np.zeros(n),
-        duration=2.0,
-        invariants={"energy": system.energy},
-    )
+    params = {"m": np.full(n, 1 / n), "l": np.full(n, 1 / n), "g": 9.81}
+    return conservative_scene(System(_chain_lagrangian), params, q0=np.full(n, 1.0), qdot0=np.zeros(n), duration=2.0)
 
 
 class Direction(NamedTuple):
@@ -193,15 +170,10 @@ def spherical_pendulum() -> Scene:
 
     >>> scene = lagjax.scenes.spherical_pendulum(); scene.system.momentum(scene.q0, scene.qdot0, params=scene.params)
     """
-    system = System(_spherical_pendulum_lagrangian)
-    return Scene(
-        system=system,
-        params={"m": 1.0, "l": 1.0, "g": 9.81},
-        q0=Direction(1.0, 0.0),
-        qdot0=Direction(0.0, 2.0),
-        duration=10.0,
-        invariants={"energy": system.energy, "p_phi": _spherical_pendulum_p_phi},
-    )
+    params = {"m": 1.0, "l": 1.0, "g": 9.81}
+    q0, qdot0 = Direction(1.0, 0.0), Direction(0.0, 2.0)
+    more = {"p_phi": _spherical_pendulum_p_phi}
+    return conservative_scene(System(_spherical_pendulum_lagrangian), params, q0, qdot0, duration=10.0, more=more)
 
 
 def _driven_pendulum_lagrangian(q, qdot, t, params):
@@ -220,14 +192,8 @@ def driven_pendulum() -> Scene:
 
     >>> scene = lagjax.scenes.driven_pendulum(); scene.system.energy(scene.q0, scene.qdot0, 0.1, scene.params)
     """
-    return Scene(
-        system=System(_driven_pendulum_lagrangian),
-        params={"m": 1.0, "l": 1.0, "g": 9.81, "a": 0.1, "Omega": 80.0},
-        q0=3.0,
-        qdot0=0.0,
-        duration=3.0,
-        invariants={},
-    )
+    params = {"m": 1.0, "l": 1.0, "g": 9.81, "a": 0.1, "Omega": 80.0}
+    return Scene(System(_driven_pendulum_lagrangian), params, q0=3.0, qdot0=0.0, duration=3.0, invariants={})
 
 
 def _driven_oscillator_lagrangian(q, qdot, t, params):
@@ -259,15 +225,9 @@ def driven_oscillator(damping=0.0) -> Scene:
 
     >>> scene = lagjax.scenes.driven_oscillator(damping=0.2); scene.exact(1.0, scene.q0, scene.qdot0, scene.params)
     """
-    return Scene(
-        system=System(_driven_oscillator_lagrangian, dissipation=_friction),
-        params={"m": 1.0, "k": 4.0, "c": damping, "f": 1.5, "omega": 1.3},
-        q0=0.5,
-        qdot0=-0.2,
-        duration=20.0,
-        invariants={},
-        exact=_driven_oscillator_exact,
-    )
+    system = System(_driven_oscillator_lagrangian, dissipation=_friction)
+    params = {"m": 1.0, "k": 4.0, "c": damping, "f": 1.5, "omega": 1.3}
+    return Scene(system, params, 0.5, -0.2, duration=20.0, invariants={}, exact=_driven_oscillator_exact)
 
 
 def damped_driven_oscillator() -> Scene:
@@ -304,15 +264,10 @@ def swinging_atwood() -> Scene:
 
     >>> scene = lagjax.scenes.swinging_atwood(); scene.invariants["second"](scene.q0, scene.qdot0, 0.0, scene.params)
     """
-    system = System(_swinging_atwood_lagrangian)
-    return Scene(
-        system=system,
-        params={"mu": 3.0},
-        q0=Swing(1.0, np.pi / 2),
-        qdot0=Swing(0.0, 0.0),
-        duration=10.0,
-        invariants={"energy": system.energy, "second": _swinging_atwood_invariant},
-    )
+    params = {"mu": 3.0}
+    q0, qdot0 = Swing(1.0, np.pi / 2), Swing(0.0, 0.0)
+    more = {"second": _swinging_atwood_invariant}
+    return conservative_scene(System(_swinging_atwood_lagrangian), params, q0, qdot0, duration=10.0, more=more)
 
 
 class SlowAndFast(NamedTuple):
@@ -349,13 +304,7 @@ def fermi_pasta_ulam() -> Scene:
 
     >>> scene = lagjax.scenes.fermi_pasta_ulam(); scene.system.energy(scene.q0, scene.qdot0, params=scene.params)
     """
-    system = System(_fermi_pasta_ulam_lagrangian)
     omega = 50.0
-    return Scene(
-        system=system,
-        params={"omega": omega},
-        q0=SlowAndFast(slow=np.array([1.0, 0.0, 0.0]), fast=np.array([1 / omega, 0.0, 0.0])),
-        qdot0=SlowAndFast(slow=np.array([1.0, 0.0, 0.0]), fast=np.array([1.0, 0.0, 0.0])),
-        duration=20.0,
-        invariants={"energy": system.energy},
-    )
+    first = np.array([1.0, 0.0, 0.0])
+    q0, qdot0 = SlowAndFast(slow=first, fast=first / omega), SlowAndFast(slow=first, fast=first)
+    return conservative_scene(System(_fermi_pasta_ulam_lagrangian), {"omega": omega}, q0, qdot0, duration=20.0)

@@ -13,7 +13,7 @@ import numpy as np
 
 from lagjax._scene import System
 from lagjax.scenes._coordinate_systems import Cartesian, Polar, angular_momentum_z, convert
-from lagjax.scenes._scene import Scene
+from lagjax.scenes._scene import Scene, components, conservative_scene, total_momentum
 
 
 def _free_particle_lagrangian(q, qdot, params):
@@ -31,28 +31,9 @@ def free_particle() -> Scene:
 
     >>> scene = lagjax.scenes.free_particle(); scene.system.momentum(scene.q0, scene.qdot0, params=scene.params)
     """
-    system = System(_free_particle_lagrangian)
-    return Scene(
-        system=system,
-        params={"m": 2.0},
-        q0=Cartesian(1.0, -2.0, 0.5),
-        qdot0=Cartesian(0.3, 0.7, -1.1),
-        duration=10.0,
-        invariants={"energy": system.energy, **_linear_momenta("x", "y", "z")},
-        exact=_free_particle_exact,
-    )
-
-
-def _linear_momenta(*axes):
-    """m ẋ, m ẏ and m ż by name, for `Cartesian` coordinates."""
-    return {f"p_{axis}": _LinearMomentum(axis) for axis in axes}
-
-
-class _LinearMomentum(eqx.Module):
-    axis: str = eqx.field(static=True)
-
-    def __call__(self, q, qdot, t, params):
-        return params["m"] * getattr(qdot, self.axis)
+    system, q0, qdot0 = System(_free_particle_lagrangian), Cartesian(1.0, -2.0, 0.5), Cartesian(0.3, 0.7, -1.1)
+    more = components("p", system.momentum)
+    return conservative_scene(system, {"m": 2.0}, q0, qdot0, duration=10.0, more=more, exact=_free_particle_exact)
 
 
 def _uniform_gravity_lagrangian(q, qdot, params):
@@ -73,16 +54,10 @@ def uniform_gravity() -> Scene:
 
     >>> scene = lagjax.scenes.uniform_gravity(); scene.exact(1.0, scene.q0, scene.qdot0, scene.params)
     """
-    system = System(_uniform_gravity_lagrangian)
-    return Scene(
-        system=system,
-        params={"m": 0.145, "g": 9.81},
-        q0=Cartesian(0.0, 0.0, 1.8),
-        qdot0=Cartesian(20.0, 3.0, 15.0),
-        duration=3.0,
-        invariants={"energy": system.energy, **_linear_momenta("x", "y")},
-        exact=_uniform_gravity_exact,
-    )
+    system, params = System(_uniform_gravity_lagrangian), {"m": 0.145, "g": 9.81}
+    q0, qdot0 = Cartesian(0.0, 0.0, 1.8), Cartesian(20.0, 3.0, 15.0)
+    more = components("p", system.momentum, "xy")
+    return conservative_scene(system, params, q0, qdot0, duration=3.0, more=more, exact=_uniform_gravity_exact)
 
 
 class _OneDimension(eqx.Module):
@@ -104,9 +79,8 @@ def one_dimension(potential=double_well, *, q0=0.1, qdot0=0.0, params=None) -> S
 
     >>> scene = lagjax.scenes.one_dimension(lambda x, params: jnp.cosh(x), params={"m": 1.0})
     """
-    system = System(_OneDimension(potential))
     params = {"m": 1.0, "a": 1.0, "b": 1.0} if params is None else params
-    return Scene(system, params, q0, qdot0, duration=20.0, invariants={"energy": system.energy})
+    return conservative_scene(System(_OneDimension(potential)), params, q0, qdot0, duration=20.0)
 
 
 def morse(x, params):
@@ -132,15 +106,9 @@ def morse_oscillator() -> Scene:
 
     >>> scene = lagjax.scenes.morse_oscillator(); scene.exact(1.0, scene.q0, scene.qdot0, scene.params)
     """
-    system = System(_OneDimension(morse))
-    return Scene(
-        system=system,
-        params={"m": 1.0, "D": 1.0, "a": 1.0},
-        q0=1.2,
-        qdot0=0.3,
-        duration=20.0,
-        invariants={"energy": system.energy},
-        exact=_morse_exact,
+    params = {"m": 1.0, "D": 1.0, "a": 1.0}
+    return conservative_scene(
+        System(_OneDimension(morse)), params, q0=1.2, qdot0=0.3, duration=20.0, exact=_morse_exact
     )
 
 
@@ -177,15 +145,9 @@ def particle_in_potential(potential=anisotropic_well, *, q0=None, qdot0=None, pa
     >>> start = lagjax.scenes.Cylindrical(1.0, 0.0, 0.5)
     >>> scene = lagjax.scenes.particle_in_potential(q0=start, qdot0=lagjax.scenes.Cylindrical(0.0, 1.0, 0.2))
     """
-    system = System(_ParticleInPotential(potential))
-    return Scene(
-        system=system,
-        params={"m": 1.0, "k": np.array([1.0, 2.0, 3.0]), "b": 0.5} if params is None else params,
-        q0=Cartesian(1.0, 0.2, 0.5) if q0 is None else q0,
-        qdot0=Cartesian(-0.2, 0.9, 0.4) if qdot0 is None else qdot0,
-        duration=10.0,
-        invariants={"energy": system.energy},
-    )
+    params = {"m": 1.0, "k": np.array([1.0, 2.0, 3.0]), "b": 0.5} if params is None else params
+    q0, qdot0 = Cartesian(1.0, 0.2, 0.5) if q0 is None else q0, Cartesian(-0.2, 0.9, 0.4) if qdot0 is None else qdot0
+    return conservative_scene(System(_ParticleInPotential(potential)), params, q0, qdot0, duration=10.0)
 
 
 def _harmonic_exact(t, q0, qdot0, params):
@@ -204,18 +166,10 @@ def harmonic_oscillator(coordinates=Cartesian) -> Scene:
 
     >>> scene = lagjax.scenes.harmonic_oscillator(lagjax.scenes.Spherical)
     """
-    system = System(_ParticleInPotential(harmonic_potential))
-    params = {"m": 2.0, "k": 3.0}
+    system, params = System(_ParticleInPotential(harmonic_potential)), {"m": 2.0, "k": 3.0}
     q0, qdot0 = convert(Cartesian(1.0, 0.2, 0.5), Cartesian(-0.2, 0.9, 0.4), coordinates)
-    return Scene(
-        system=system,
-        params=params,
-        q0=q0,
-        qdot0=qdot0,
-        duration=2 * np.pi * np.sqrt(params["m"] / params["k"]),
-        invariants={"energy": system.energy, "angular_momentum": _angular_momentum},
-        exact=_harmonic_exact,
-    )
+    period, more = 2 * np.pi * np.sqrt(params["m"] / params["k"]), {"angular_momentum": _angular_momentum}
+    return conservative_scene(system, params, q0, qdot0, period, more, _harmonic_exact)
 
 
 def _angular_momentum(q, qdot, t, params):
@@ -243,15 +197,10 @@ def central_force(potential=yukawa, coordinates=Polar, *, params=None) -> Scene:
 
     >>> scene = lagjax.scenes.central_force(lambda r, params: -params["k"] / r, params={"m": 1.0, "k": 1.0})
     """
-    system = System(_CentralForce(potential))
     q0, qdot0 = convert(Cartesian(1.0, 0.2, 0.5), Cartesian(-0.2, 0.7, 0.3), coordinates)
-    return Scene(
-        system=system,
-        params={"m": 1.0, "k": 1.0, "a": 5.0} if params is None else params,
-        q0=q0,
-        qdot0=qdot0,
-        duration=20.0,
-        invariants={"energy": system.energy, "angular_momentum": _angular_momentum},
+    params = {"m": 1.0, "k": 1.0, "a": 5.0} if params is None else params
+    return conservative_scene(
+        System(_CentralForce(potential)), params, q0, qdot0, duration=20.0, more={"angular_momentum": _angular_momentum}
     )
 
 
@@ -269,13 +218,6 @@ class _Particles(eqx.Module):
         return lagrangian
 
 
-class _TotalMomentum(eqx.Module):
-    axis: int = eqx.field(static=True)
-
-    def __call__(self, q, qdot, t, params):
-        return jnp.sum(params["m"] * qdot[:, self.axis])
-
-
 def quartic_spring(separation, params):
     """U2 = ½ k d² + ¼ b d⁴, with d² = |separation|²"""
     d_squared = jnp.sum(separation**2)
@@ -291,17 +233,11 @@ def particles(one_body=None, two_body=quartic_spring, *, q0=None, qdot0=None, pa
     >>> scene = lagjax.scenes.particles(one_body=lambda x, params: 9.81 * x[2], two_body=None)
     """
     system = System(_Particles(one_body, two_body))
-    invariants = {"energy": system.energy}
-    if one_body is None:
-        invariants |= {f"p_{name}": _TotalMomentum(axis) for axis, name in enumerate("xyz")}
-    return Scene(
-        system=system,
-        params={"m": np.array([1.0, 2.0, 3.0]), "k": 1.0, "b": 0.5} if params is None else params,
-        q0=np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.2, 1.0]]) if q0 is None else q0,
-        qdot0=np.array([[0.0, 0.5, 0.0], [0.3, 0.0, 0.2], [0.0, -0.1, 0.4]]) if qdot0 is None else qdot0,
-        duration=10.0,
-        invariants=invariants,
-    )
+    params = {"m": np.array([1.0, 2.0, 3.0]), "k": 1.0, "b": 0.5} if params is None else params
+    q0 = np.array([[1.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.2, 1.0]]) if q0 is None else q0
+    qdot0 = np.array([[0.0, 0.5, 0.0], [0.3, 0.0, 0.2], [0.0, -0.1, 0.4]]) if qdot0 is None else qdot0
+    more = components("p", total_momentum(system)) if one_body is None else None
+    return conservative_scene(system, params, q0, qdot0, duration=10.0, more=more)
 
 
 def _rotating_hoop_lagrangian(q, qdot, params):
@@ -317,12 +253,5 @@ def bead_on_rotating_hoop() -> Scene:
 
     >>> scene = lagjax.scenes.bead_on_rotating_hoop(); scene.system.energy(scene.q0, scene.qdot0, params=scene.params)
     """
-    system = System(_rotating_hoop_lagrangian)
-    return Scene(
-        system=system,
-        params={"m": 1.0, "R": 1.0, "g": 9.81, "Omega": 5.0},
-        q0=0.3,
-        qdot0=0.0,
-        duration=10.0,
-        invariants={"energy": system.energy},
-    )
+    params = {"m": 1.0, "R": 1.0, "g": 9.81, "Omega": 5.0}
+    return conservative_scene(System(_rotating_hoop_lagrangian), params, q0=0.3, qdot0=0.0, duration=10.0)

@@ -4,6 +4,7 @@ from collections.abc import Callable
 from typing import Any, final
 
 import equinox as eqx
+import jax.numpy as jnp
 
 from lagjax._scene import System
 
@@ -30,3 +31,20 @@ class Scene(eqx.Module):
     duration: float
     invariants: dict[str, Callable]
     exact: Callable | None = None
+
+
+def conservative_scene(system: System, params, q0, qdot0, duration, more=None, exact=None) -> Scene:
+    """A scene whose energy is constant, and the quantities `more` by name."""
+    return Scene(system, params, q0, qdot0, duration, {"energy": system.energy} | (more or {}), exact)
+
+
+def components(name: str, vector: Callable, axes: str = "xyz") -> dict[str, Callable]:
+    """The components of a `vector`, a function of (q, qdot, t, params), along the axes: `name`_x, …."""
+    return {
+        f"{name}_{axis}": lambda q, qdot, t, params, k=k: vector(q, qdot, t, params)[k] for k, axis in enumerate(axes)
+    }
+
+
+def total_momentum(system: System) -> Callable:
+    """The sum of ∂L/∂q̇ over bodies, of a scene whose q is an array (bodies, axes)."""
+    return lambda *state: jnp.sum(system.momentum(*state), axis=0)
