@@ -5,25 +5,11 @@
     checked   batch        search      squares    null           pytree, in words
                            begins                 directions
 
-Files, from the lowest floor up:
+Three rooms, each of which imports only from those before it:
 
-    _noise         Gaussian and Student-t residuals, sensors that round or are at their limits: scale, likelihood
-    _parameters    the free numbers, their names, and the transforms that keep them in a set
-    _records       Record, its sampled inputs, and rows of records in batches
-    _timings       Timings, the instants at which a motion crosses sections, with derivatives
-    _motions       motions of many starts with their derivatives; starts on constraints
-    _sensors       signals of a motion with their derivatives; delays, wrapped angles
-    _residuals     the residuals of one trial with their derivatives, for one system or several
-    _density       the posterior density, coordinates in which it is round, its expansion
-    _uncertainty   autocorrelation of residuals, covariance, the level of intervals, identifiability, experiment design
-    _descent       Gauss–Newton with eliminated starts; Adam for networks
-    _sample        draws from the posterior
-    _profile       profile likelihood, and comparison of fits by AIC, BIC, cross-validation
-    _verdict       the end of a search in words, influence of records, mistakes in the data
-    _search        multiple shooting over growing segments, weak form, multistart
-    _prediction    records that were not fitted, or are planned
-    _report        a fit in words, figures, pages of HTML
-    _result        Fit, with its intervals
+    model/     records, parameters, sensors, noise, and the residuals of a trial
+    search/    descents, multiple shooting over segments that grow, weak form, multistart
+    result/    Fit: intervals, what is not seen, verdict, profile, draws, predictions, report
 """
 
 import functools
@@ -40,26 +26,15 @@ import numpy as np
 
 from lagjax._engine import DEFAULT_RTOL
 from lagjax._equations import has_constraints
-from lagjax._fit._descent import Descent
-from lagjax._fit._motions import Manifold, choose_motions
-from lagjax._fit._noise import (
-    AbstractNoise,
-    Clipped,
-    Gaussian,
-    Quantised,
-    Sensor,
-    StudentT,
-    read_sensor,
-)
-from lagjax._fit._parameters import Parameters, angle, between, inertia, positive, simplex
-from lagjax._fit._prediction import Prediction
-from lagjax._fit._profile import Comparison, Profile
-from lagjax._fit._records import (
-    Form,
+from lagjax._fit.model._inputs import Form, input_functions
+from lagjax._fit.model._motions import Manifold, choose_motions
+from lagjax._fit.model._noise import AbstractNoise, Clipped, Gaussian, Quantised, Sensor, StudentT, read_sensor
+from lagjax._fit.model._parameters import Parameters
+from lagjax._fit.model._pieces import whole_pieces
+from lagjax._fit.model._records import (
     Guess,
     Record,
     errors_of_system,
-    input_functions,
     known_start,
     require_interpolation,
     require_records,
@@ -67,38 +42,28 @@ from lagjax._fit._records import (
     restore_structure,
     start_pair,
     systems_by_name,
-    whole_pieces,
 )
-from lagjax._fit._report import draw_record, record_matrix
-from lagjax._fit._residuals import LostTrial, Residuals, SystemResiduals
-from lagjax._fit._result import Covariance, Fit, SignalNoise
-from lagjax._fit._search import (
-    Reader,
-    TimeScales,
-    Unfollowed,
-    Waterfall,
-    build_reader,
-    pad_states,
-    run_multistart,
-    search_again,
-    search_by_gradient,
-    search_records,
-    start_by_weak_form,
-    time_scales,
-)
-from lagjax._fit._sensors import UNCLEAR, Delayed, Signals, require_no_jumps, sensors, wrapped
-from lagjax._fit._timings import Timings, build_clock
-from lagjax._fit._uncertainty import Experiments, Information, information, unseen_sentences
-from lagjax._fit._verdict import (
-    SECONDS,
-    Unexplained,
-    Verdict,
-    constant_signals,
-    find_mistake,
-    possible_mistakes,
-    require_measurements,
-    verdict,
-)
+from lagjax._fit.model._residuals import LostTrial, Residuals, SystemResiduals
+from lagjax._fit.model._sensor_faults import constant_signals, require_measurements
+from lagjax._fit.model._sensors import UNCLEAR, Delayed, require_no_jumps, sensors, wrapped
+from lagjax._fit.model._signals import Signals
+from lagjax._fit.model._timings import Timings, build_clock
+from lagjax._fit.model._transforms import angle, between, inertia, positive, simplex
+from lagjax._fit.result._comparison import Comparison
+from lagjax._fit.result._experiments import Experiments
+from lagjax._fit.result._identifiability import unseen_sentences
+from lagjax._fit.result._information import Information, information
+from lagjax._fit.result._mistakes import SECONDS, find_mistake, possible_mistakes
+from lagjax._fit.result._prediction import Prediction
+from lagjax._fit.result._profile import Profile
+from lagjax._fit.result._report import draw_record, record_matrix
+from lagjax._fit.result._result import Covariance, Fit, SignalNoise
+from lagjax._fit.result._verdict import Verdict, verdict
+from lagjax._fit.search._descent import Descent
+from lagjax._fit.search._multistart import Waterfall, run_multistart
+from lagjax._fit.search._reader import Reader, TimeScales, build_reader, pad_states, time_scales
+from lagjax._fit.search._search import Unfollowed, search_again, search_by_gradient, search_records, start_by_weak_form
+from lagjax._fit.search._unexplained import Unexplained
 from lagjax._interface import Layout, find_params_expression
 from lagjax._primitives import DOUBLE, with_doubles
 from lagjax._run.hybrid import Hybrid, Scene, first_law, require_scene

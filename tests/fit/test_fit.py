@@ -18,11 +18,12 @@ from lagrangians import spring
 from scipy.optimize import least_squares
 
 import lagjax
-from lagjax._fit import _descent, _parameters, _residuals, _sensors, _uncertainty
-from lagjax._fit._motions import _JaxMotions, choose_motions
-from lagjax._fit._parameters import Parameters
-from lagjax._fit._search import Reader
-from lagjax._fit._verdict import shifts_without
+from lagjax._fit.model import _autocorrelation, _residuals, _signals, _transforms
+from lagjax._fit.model._motions import _JaxMotions, choose_motions
+from lagjax._fit.model._parameters import Parameters
+from lagjax._fit.result._influence import shifts_without
+from lagjax._fit.search import _descent
+from lagjax._fit.search._reader import Reader
 from lagjax._interface._layout import Layout
 
 SIGMA = 5e-3
@@ -437,7 +438,7 @@ def test_the_real_axis_with_dry_friction(capsys):
 def test_derivatives_of_motions_and_sensors_are_those_of_differences():
     parameters = Parameters.from_pytree(TRUTH, FREE, lagjax.positive)
     observe = lambda q, v, t, params: jnp.stack([jnp.sin(q) * params["l"], v * t])
-    signals = _sensors.Signals(
+    signals = _signals.Signals(
         observe, Layout.from_state(0.0, 0.0), parameters, lagjax.Record(TS, np.zeros((len(TS), 2)), start=(0.0, 0.0))
     )
     motions = choose_motions(SCENE, Layout.from_state(0.0, 0.0), parameters, 1e-12, None)
@@ -498,7 +499,7 @@ def test_elimination_is_the_solution_of_the_whole_problem():
 
 def test_transforms_are_inverses_with_the_slopes_of_differences():
     u = np.array([-3.0, 0.2, 2.0])
-    for transform in (lagjax.positive, lagjax.between(-1.0, 4.0), _parameters.Unbounded()):
+    for transform in (lagjax.positive, lagjax.between(-1.0, 4.0), _transforms.Unbounded()):
         x = transform.value(u)
         np.testing.assert_allclose(transform.inverse(x), u, rtol=1e-12)
         slope = (transform.value(u + 1e-6) - transform.value(u - 1e-6)) / 2e-6
@@ -520,7 +521,7 @@ def test_a_correlated_square_is_that_of_the_whole_matrix():
     law[:3] = lags
     matrix = law[np.abs(np.subtract.outer(np.arange(20), np.arange(20)))]
     expected = np.einsum("ntf,ts,nsg->fg", rows, matrix, rows)
-    np.testing.assert_allclose(_uncertainty.correlated_square(rows, lags), expected, atol=1e-12)
+    np.testing.assert_allclose(_autocorrelation.correlated_square(rows, lags), expected, atol=1e-12)
 
 
 # ---- what is wrong, in a sentence ------------------------------------------------------------------------------------

@@ -10,8 +10,8 @@ from lagrangians import spring
 from scipy.signal import lsim
 
 import lagjax
-from lagjax._fit import _motions, _records
-from lagjax._fit._parameters import Parameters
+from lagjax._fit.model import _inputs, _motions
+from lagjax._fit.model._parameters import Parameters
 from lagjax._interface._layout import Layout
 
 TRUTH = {"k": 4.0, "c": 0.3, "gain": 1.5}
@@ -58,10 +58,10 @@ def test_a_driven_oscillator_is_followed_and_recovered_from_records_of_any_lengt
 
 def test_pieces_of_a_record_have_tables_of_their_own_and_programs_are_made_for_few_lengths():
     u = np.arange(30.0)[:, None]
-    table = _records.build_table([(TS[:30], u), (TS[10:14], u[10:14])], "zero")
+    table = _inputs.build_table([(TS[:30], u), (TS[10:14], u[10:14])], "zero")
     assert table.knots.shape == (2, 64) and table.values.shape == (2, 64, 1)
     assert (np.diff(table.knots) > 0).all() and (table.values[1, 4:] == 13.0).all()
-    assert {_records.table_length(count) for count in range(1, 25_000)} == {16, 64, 256, 1024, 4096, 16384, 65536}
+    assert {_inputs.table_length(count) for count in range(1, 25_000)} == {16, 64, 256, 1024, 4096, 16384, 65536}
 
 
 @pytest.mark.slow
@@ -90,9 +90,9 @@ def test_sensors_see_inputs_and_gain_and_bias_are_parameters():
 def test_machine_code_and_diffrax_agree_and_derivatives_are_those_of_differences():
     hold = "zero"
     layout, parameters = Layout.from_state(0.0, 0.0), Parameters.from_pytree(TRUTH)
-    form = _records.Form(*record_of(TS[:9], hold).input_structure, hold)
+    form = _inputs.Form(*record_of(TS[:9], hold).input_structure, hold)
     pieces = [(TS[:9], inputs_of(TS[:9])[:, None]), (TS[3:8], inputs_of(TS[:5], 1)[:, None])]
-    table, ts = _records.build_table(pieces, hold), np.stack([TS[0:7:3], TS[3:8:2]])
+    table, ts = _inputs.build_table(pieces, hold), np.stack([TS[0:7:3], TS[3:8:2]])
     y0, numbers = np.array([[1.0, 0.0], [0.3, -1.0]]), parameters.first
     y0_dot = np.concatenate([np.broadcast_to(np.eye(2), (2, 2, 2)), np.zeros((2, 3, 2))], axis=1)
     along = y0_dot, np.concatenate([np.zeros((2, 3)), np.eye(3)])
@@ -102,7 +102,7 @@ def test_machine_code_and_diffrax_agree_and_derivatives_are_those_of_differences
     one, other = (motions.follow(ts, y0, numbers, *along, table) for motions in (fast, plain))
     np.testing.assert_allclose(one.path, other.path, atol=1e-8)
     np.testing.assert_allclose(one.tangents, other.tangents, atol=1e-7)
-    at = pieces[0][0], np.repeat(y0[:1], 9, axis=0), numbers, _records.constant_tables(*pieces[0])
+    at = pieces[0][0], np.repeat(y0[:1], 9, axis=0), numbers, _inputs.constant_tables(*pieces[0])
     np.testing.assert_allclose(fast.rate(*at), plain.rate(*at), rtol=1e-12)
     for k, step in enumerate(1e-5 * np.eye(3)):
         after, before = (fast.follow(ts, y0, numbers + way * step, *along, table).path for way in (1, -1))
@@ -219,14 +219,14 @@ def test_smooth_inputs_on_times_of_their_own(hold, count, error):
 @pytest.mark.parametrize("count", [17, 64])
 def test_tables_are_the_inputs_of_records_with_the_ends_they_have(hold, count):
     ts, u = 1.0 + 0.1 * np.arange(count), np.random.default_rng(count).normal(size=(count, 1))
-    table = _records.build_table([(ts, u)], hold)
+    table = _inputs.build_table([(ts, u)], hold)
     at = np.linspace(ts[0], ts[-1], 97)
     expected = lagjax.samples(ts, u, hold)(at)
     np.testing.assert_allclose(lagjax.samples(table.knots[0], table.values[0], hold)(at), expected, atol=1e-10)
-    part = _records.samples_between(ts, 1.31, 1.55, hold)
-    table, at = _records.build_table([(ts[part], u[part])], hold), np.linspace(1.31, min(1.55, ts[-1]), 5)[None]
+    part = _inputs.samples_between(ts, 1.31, 1.55, hold)
+    table, at = _inputs.build_table([(ts[part], u[part])], hold), np.linspace(1.31, min(1.55, ts[-1]), 5)[None]
     expected = lagjax.samples(ts, u, hold)(at[0])
-    np.testing.assert_allclose(_records.inputs_at(table, at, hold)[0][0], expected, atol=1e-10)
+    np.testing.assert_allclose(_inputs.inputs_at(table, at, hold)[0][0], expected, atol=1e-10)
 
 
 @pytest.mark.slow

@@ -10,9 +10,11 @@ import numpy as np
 import pytest
 
 import lagjax
-from lagjax._fit import _parameters, _search
-from lagjax._fit._parameters import Parameters, Unbounded
-from lagjax._fit._search import Reader, time_scales
+from lagjax._fit.model import _transforms
+from lagjax._fit.model._parameters import Parameters
+from lagjax._fit.model._transforms import Unbounded
+from lagjax._fit.search import _search, _weak_form
+from lagjax._fit.search._reader import Reader, time_scales
 
 TS = np.linspace(0.0, 4.0, 101)
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -165,7 +167,7 @@ def test_a_leaf_that_starts_outside_of_its_set_is_refused(start, transform, mess
 
 
 def test_the_sum_of_a_simplex_is_that_of_its_start():
-    own = _parameters.simplex.specialize(np.array([1.0, 2.0, 4.0]), (3,))
+    own = _transforms.simplex.specialize(np.array([1.0, 2.0, 4.0]), (3,))
     assert np.sum(own.value(np.array([0.3, -2.0]))) == pytest.approx(7.0)
 
 
@@ -357,7 +359,7 @@ def test_a_report_is_one_file_with_everything(tmp_path):
 def weak(fit, u):
     readers = [Reader.from_record(record) for record in fit.records]
     scale = min(time_scales(readers, fit.question.systems[0].motions, fit.parameters.numbers(fit.u)))
-    return _search.weak_form_residuals(fit.question.systems[0], readers, scale), _search.fit_weak_form(
+    return _weak_form.weak_form_residuals(fit.question.systems[0], readers, scale), _weak_form.fit_weak_form(
         [(fit.question.systems[0], readers, scale)], u
     )
 
@@ -425,5 +427,5 @@ def test_inputs_drive_the_density_the_weak_form_and_many_starts():
     np.testing.assert_allclose(jax.jit(jax.grad(density))(x), central, rtol=1e-5, atol=1e-4)
     readers = [Reader.from_record(one)]
     scale = min(time_scales(readers, fit.question.systems[0].motions, fit.parameters.numbers(fit.u)))
-    u = _search.fit_weak_form([(fit.question.systems[0], readers, scale)], fit.u + 2.0)
+    u = _weak_form.fit_weak_form([(fit.question.systems[0], readers, scale)], fit.u + 2.0)
     np.testing.assert_allclose(fit.parameters.values(u), [0.3, 4.0], rtol=0.1)

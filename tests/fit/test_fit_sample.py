@@ -9,9 +9,9 @@ import numpy as np
 import pytest
 
 import lagjax
-from lagjax._fit import _density, _sample
-from lagjax._fit._density import Chart
-from lagjax._fit._parameters import Parameters
+from lagjax._fit.model._parameters import Parameters
+from lagjax._fit.result import _expansion, _sample
+from lagjax._fit.result._expansion import Chart
 
 SHORT = np.linspace(0.0, 3.0, 61)
 
@@ -44,7 +44,7 @@ def test_an_expansion_to_second_order_is_exact_where_signals_are_quadratic(noise
     fit = lagjax.fit(scene, records, {"gain": 1.2}, observe=gain, noise=noise)
     density = fit.log_density(prior=lambda params: -params["gain"])
     chart = Chart.from_density(density)
-    surrogate = _density.expand_residuals(chart)
+    surrogate = _expansion.expand_residuals(chart)
     assert not isinstance(surrogate, str)
     assert [block.rows.shape for block in surrogate.blocks] == [(2, terms, 1, 10)]
     z = 3.0 * rng.normal(size=(20, len(density)))
@@ -80,8 +80,8 @@ def quadrature(fit):
 @pytest.mark.parametrize("kept", [1.0, 0.0])
 def test_draws_are_those_of_the_exact_density_whatever_the_expansion_is(bent, kept, monkeypatch):
     # Kept whole, and without what bends: the exact density corrects for both.
-    polynomials = _density._polynomials
-    monkeypatch.setattr(_density, "_polynomials", lambda r, slopes, bends: polynomials(r, slopes, kept * bends))
+    polynomials = _expansion._polynomials
+    monkeypatch.setattr(_expansion, "_polynomials", lambda r, slopes, bends: polynomials(r, slopes, kept * bends))
     drawn = bent.sample(500, seed=3)
     assert drawn.attrs["sampler"].endswith(f"it accepts {float(drawn.sample_stats.acceptance_rate.mean()):.2f}.")
     k, expected = drawn.posterior["params['k']"].values, quadrature(bent)
@@ -104,15 +104,15 @@ def test_where_few_draws_of_the_expansion_are_accepted_the_sampler_follows_the_e
 @pytest.mark.slow
 def test_chains_that_stand_still_along_the_expansion_are_not_kept(bent, monkeypatch):
     # A gradient that is not finite stops every trajectory at its first step.
-    monkeypatch.setattr(_density.Surrogate, "__call__", lambda self, z: jnp.sqrt(0.0 * z[0]))
+    monkeypatch.setattr(_expansion.Surrogate, "__call__", lambda self, z: jnp.sqrt(0.0 * z[0]))
     drawn = bent.sample(20, seed=1, chains=2)
     assert "the chains did not move" in drawn.attrs["sampler"]
     assert len(np.unique(drawn.posterior["params['k']"].values)) > 20
 
 
 def test_an_expansion_that_would_not_fit_says_so(bent, monkeypatch):
-    monkeypatch.setattr(_density, "_LARGEST", 5)
-    assert "more than 5" in str(_density.expand_residuals(Chart.from_density(bent.log_density())))
+    monkeypatch.setattr(_expansion, "_LARGEST", 5)
+    assert "more than 5" in str(_expansion.expand_residuals(Chart.from_density(bent.log_density())))
 
 
 @pytest.mark.slow
@@ -261,8 +261,8 @@ def test_draws_of_numbers_beside_their_bounds_are_those_of_a_normal_density_that
 
 @pytest.mark.slow
 def test_where_the_expansion_is_too_narrow_the_exact_density_is_followed(bent, monkeypatch):
-    residuals = _density.Surrogate._residuals
-    monkeypatch.setattr(_density.Surrogate, "_residuals", staticmethod(lambda *of: 3.0 * residuals(*of)))
+    residuals = _expansion.Surrogate._residuals
+    monkeypatch.setattr(_expansion.Surrogate, "_residuals", staticmethod(lambda *of: 3.0 * residuals(*of)))
     drawn = bent.sample(150, seed=1, chains=8)
     assert drawn.attrs["sampler"].startswith("The No-U-Turn sampler along the exact density")
     shares = [np.mean(drawn.posterior["params['k']"].values < x) for x in quadrature(bent)]

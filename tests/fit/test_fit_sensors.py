@@ -12,8 +12,8 @@ from scipy.optimize import minimize
 from scipy.stats import norm
 
 import lagjax
-from lagjax._fit._noise import find_sensor, rounding_square, worths
-from lagjax._fit._verdict import require_measurements
+from lagjax._fit.model._noise import find_sensor, rounding_square, worths
+from lagjax._fit.model._sensor_faults import require_measurements
 
 TS = np.linspace(0.0, 12.0, 601)
 TRUTH = {"w2": 9.0, "c": 0.1}

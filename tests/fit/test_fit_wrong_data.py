@@ -11,8 +11,8 @@ import pytest
 from lagrangians import damping
 
 import lagjax
-from lagjax._fit._sensors import wrap_residuals
-from lagjax._fit._uncertainty import correlated_power
+from lagjax._fit.model._autocorrelation import correlated_power
+from lagjax._fit.model._sensors import wrap_residuals
 
 SIGMA = 3e-3
 TS = np.linspace(0.0, 8.0, 401)

@@ -11,13 +11,17 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lagjax._fit._density import Density
-from lagjax._fit._noise import AbstractNoise, NoiseScale
-from lagjax._fit._parameters import Parameters
-from lagjax._fit._prediction import Prediction, planned_rows, predict_record
-from lagjax._fit._profile import Comparison, Profile, comparison, profile
-from lagjax._fit._records import Record
-from lagjax._fit._report import (
+from lagjax._fit.model._density import Density
+from lagjax._fit.model._noise import AbstractNoise, NoiseScale
+from lagjax._fit.model._parameters import Parameters
+from lagjax._fit.model._records import Record
+from lagjax._fit.model._residuals import Residuals, SystemPart, Trial
+from lagjax._fit.result._comparison import Comparison, comparison
+from lagjax._fit.result._experiments import Experiments, rank_experiments
+from lagjax._fit.result._information import LEVEL, Information
+from lagjax._fit.result._prediction import Prediction, planned_rows, predict_record
+from lagjax._fit.result._profile import Profile, profile
+from lagjax._fit.result._report import (
     SystemDrawing,
     build_pictures,
     build_title,
@@ -28,10 +32,8 @@ from lagjax._fit._report import (
     record_matrix,
     render_page,
 )
-from lagjax._fit._residuals import Residuals, SystemPart, Trial
-from lagjax._fit._sample import draw, inference_data
-from lagjax._fit._search import Waterfall
-from lagjax._fit._uncertainty import LEVEL, Experiments, Information, rank_experiments
+from lagjax._fit.result._sample import draw, inference_data
+from lagjax._fit.search._multistart import Waterfall
 from lagjax._primitives import with_doubles
 from lagjax._show import cell, intervals
 

@@ -26,23 +26,17 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.special import log_ndtr
 
-from lagjax._fit._motions import AbstractMotions, Manifold, Origins, ProjectedStarts, RecordMotion
-from lagjax._fit._noise import AbstractNoise, NoiseScale, Sensor, counts, log_likelihood, log_ndtr, scores, worths
-from lagjax._fit._parameters import Parameters
-from lagjax._fit._records import (
-    Driven,
-    Piece,
-    Samples,
-    batches,
-    constant_tables,
-    input_functions,
-    inputs_at,
-    start_pair,
-    whole_pieces,
-)
-from lagjax._fit._sensors import Signals, wrap_residuals
-from lagjax._fit._timings import Clock
+from lagjax._fit.model._inputs import Driven, constant_tables, input_functions, inputs_at
+from lagjax._fit.model._motions import AbstractMotions, Manifold, Origins, ProjectedStarts, RecordMotion
+from lagjax._fit.model._noise import AbstractNoise, NoiseScale, Sensor, counts, log_likelihood, scores, worths
+from lagjax._fit.model._parameters import Parameters
+from lagjax._fit.model._pieces import Piece, Samples, batches, whole_pieces
+from lagjax._fit.model._records import start_pair
+from lagjax._fit.model._sensors import wrap_residuals
+from lagjax._fit.model._signals import Signals
+from lagjax._fit.model._timings import Clock
 from lagjax._interface import Layout, halves
 from lagjax._run import simulate
 from lagjax._run.hybrid import Scene

@@ -26,8 +26,9 @@ import numpy as np
 
 from lagjax._engine import Problem, choose
 from lagjax._engine.taylor import KEPT, Flow, MachineCode, flow_of, jvp, project_start_tangents, tolerances_of
-from lagjax._fit._parameters import Parameters
-from lagjax._fit._records import Driven, Form, SampleTable, input_functions, start_pair
+from lagjax._fit.model._inputs import Driven, Form, SampleTable, input_functions
+from lagjax._fit.model._parameters import Parameters
+from lagjax._fit.model._records import start_pair
 from lagjax._interface import ENDED_WELL, Layout, halves
 from lagjax._native import Projection
 from lagjax._primitives import sentence

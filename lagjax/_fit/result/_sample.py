@@ -42,25 +42,39 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._fit._density import Chart, Density, Surrogate, expand_residuals
+from lagjax._fit.model._density import Density
+from lagjax._fit.result._expansion import Chart, Surrogate, expand_residuals
 
 _ACCEPTED = 0.85  # the mean acceptance that steps are tuned for
+
 _ROUNDS = (400, 800, 3200)  # draws of all chains from π*: each round has the metric of the one before
+
 _ROUNDS_OF_MOTIONS = (200, 400, 800)  # of π, where each costs as many motions as draws do later
+
 _FEWEST = 50  # of them of one chain: its step needs this many
+
 _MOST_INNER = 64  # steps of the sampler along π* for one draw: a motion is waited for no longer than that
+
 _PILOT = 64  # draws of π* that are weighed with π before the first draw
+
 _LEAST = 0.2  # of them are accepted, or π* is given up: fewer, and a chain may stay where π* is too small
+
 # π* is too narrow where weights π/π* have a Pareto tail of this shape: means of them do not settle then (Vehtari et
 # al., J. Mach. Learn. Res. 25 (2024) 72). The shape means nothing where nearly all draws are accepted.
 _HEAVY, _NEARLY_ALL = 0.7, 0.9
+
 _WORTH = 0.1  # of the draws along π* must be independent, or π is followed: so do draws of the exact density everywhere
+
 _DOUBLINGS = 6  # of one trajectory: 64 steps. In a metric that fits 3 do; a metric that does not would take thousands
+
 _TRIED = 100  # draws for the start of a chain where the density is not zero
+
 _FEWEST_TO_TELL = 4  # draws of a chain, halves of which are compared
+
 # Quantiles at 2.5 % of 100 independent draws are known to 1.6 %: half as many, and an end of an interval may be the
 # largest draw of all. Chains of 100 good draws have r-hat up to 1.03; ones that sit in different places, 1.1 and more.
 _RELIABLE, _APART = 100, 1.05
+
 _SETTLING = 10  # draws that are thrown away: chains begin at draws of π*, which the exact density has not judged
 
 
@@ -84,9 +98,6 @@ def draw(density: Density, draws: int, chains: int, seed: int) -> Draws:
     chart = Chart.from_density(density)
     drawn = _sample_expansion(chart, draws, chains, seed)
     return _sample_exact(chart, draws, chains, seed, drawn) if isinstance(drawn, str) else drawn
-
-
-# ---- along the expansion, each draw accepted or refused by the exact density -----------------------------------------
 
 
 def _sample_expansion(chart: Chart, draws: int, chains: int, seed: int) -> Draws | str:
@@ -253,9 +264,6 @@ def _correct_draws(
     return Draws(*_unknowns(surrogate.chart, z, log_density), steps, diverged, accepted, words), float(tail)
 
 
-# ---- along the exact density -----------------------------------------------------------------------------------------
-
-
 def _sample_exact(chart: Chart, draws: int, chains: int, seed: int, why: str) -> Draws:
     """Draws by gradients through the motions; `why` says what speaks against the expansion."""
     warming, going = jax.random.split(jax.random.key(seed))
@@ -274,9 +282,6 @@ def _unknowns(chart: Chart, z: np.ndarray, log_density: np.ndarray) -> tuple[np.
     """The unknowns x (C, K, D) at coordinates z (C, K, D), and log p of x where that of z is given (C, K)."""
     x, _, volume = jax.jit(jax.vmap(jax.vmap(chart)))(jnp.asarray(z, chart.density.dtype))
     return np.asarray(x), log_density - np.asarray(volume)
-
-
-# ---- what draws are worth --------------------------------------------------------------------------------------------
 
 
 class Agreement(NamedTuple):

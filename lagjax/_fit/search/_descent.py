@@ -1,8 +1,6 @@
-"""Descents: damped Gauss–Newton for residuals, and Adam for scenes with hundreds of free numbers.
+"""Descent: `minimise`, damped Gauss–Newton for residuals, and `eliminate`, its step.
 
-It holds `minimise`, `eliminate` (its step) and `descend_gradient`.
-
-**`minimise`** is Gauss–Newton with Levenberg's and Marquardt's damping; starts are eliminated one by one. The damped
+It is Gauss–Newton with Levenberg's and Marquardt's damping; starts are eliminated one by one. The damped
 step (δu, δs₁ … δs_N) minimises Σₖ |Aₖ δsₖ + Bₖ δu + rₖ|² + λ |scale · step|². One QR of the small triangle of piece k
 takes out δsₖ: its first 2n rows say what δsₖ follows from δu, the rest says what piece k wants of δu. Below each other
 these rests are a problem of F columns. That is the Schur complement of the normal equations without ever forming them,
@@ -19,39 +17,27 @@ transforms, robust losses are weights (`_noise`), and the tests hold the end poi
 
 Source: Moré, *The Levenberg–Marquardt algorithm: implementation and theory* (1978), for scaling by columns; Madsen,
 Nielsen & Tingleff, *Methods for non-linear least squares problems* (2004), §3.2, for λ; Bock (1987) for elimination.
-
-**`descend_gradient`** takes gradients in reverse mode, for scenes with neural terms. Gauss–Newton follows every free
-number along the motion; a network has hundreds. The gradient comes back over the steps of one batch of motions at the
-cost of a few, however many numbers there are, and Adam goes down it, with a rate that rises and then falls like a
-cosine. It is slower to the last digit than Gauss–Newton, and does not need it: weights of a network have no last digit.
-All numbers move in units of their size, the noise of the signals among them.
-
-Source: Kingma & Ba, *Adam* (2015); Loshchilov & Hutter, *SGDR* (2017), for the cosine.
 """
 
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from lagjax._fit._density import Density
-from lagjax._fit._noise import AbstractNoise, NoiseScale
-from lagjax._fit._residuals import LostTrial, Residuals, Trial, compress_rows, qr_triangle
-from lagjax._fit._uncertainty import independent_share
+from lagjax._fit.model._autocorrelation import independent_share
+from lagjax._fit.model._noise import AbstractNoise, NoiseScale
+from lagjax._fit.model._residuals import LostTrial, Residuals, Trial, compress_rows, qr_triangle
 
 # Damping, relative to the squared norms of the columns. The first step is nearly that of Gauss and Newton; below the
 # least one, damping is below the round-off of derivatives and only keeps columns that nothing depends on from moving.
 _FIRST, _LEAST, _MOST = 1e-4, 1e-14, 1e12
 
-
 _PATIENCE = (
     12  # trials that lowered the sum of squares by less than what ends a search, while derivatives promised more
 )
-_NEAR = 1e-3  # per sample: where it pays to look at how much the residuals are correlated
-_FLAT = 1e-13  # relative: half the sum of squares is itself rounded to so much
 
+_NEAR = 1e-3  # per sample: where it pays to look at how much the residuals are correlated
+
+_FLAT = 1e-13  # relative: half the sum of squares is itself rounded to so much
 
 _KINK = (
     "The search stopped at a kink of the sum of squares after {} trials: derivatives promise to lower half of it by "
@@ -229,106 +215,3 @@ def column_norms(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.nda
     of_starts = np.linalg.norm(triangles[..., :states], axis=1)
     of_u = np.linalg.norm(triangles[..., states:-1], axis=(0, 1))
     return np.where(of_starts > 0, of_starts, 1.0), np.where(of_u > 0, of_u, 1.0)
-
-
-_RATE, _WARM = 1e-2, 0.05  # the largest step, in units of each number; the share of steps over which it rises
-_PORTION = 100  # steps in one call: of them the best is kept
-_STILL = 1.0  # what log L may gain over the last tenth of the steps where the descent has come to its end
-
-
-def descend_gradient(
-    question: Residuals, u: np.ndarray, starts: np.ndarray, noise: AbstractNoise, steps: int,
-    notify: Callable[[str], None] | None = None,
-) -> tuple[np.ndarray, np.ndarray, bool] | LostTrial:  # fmt: skip
-    """u (F,), the starts (N, 2n) after this many steps, and whether log L has come to rest.
-
-    A `LostTrial` where the motion from the first trial cannot be followed; later ones are passed over.
-    """
-    optax = _optax()
-    whole = NoiseScale(question.size, np.full(len(question.size), np.inf))
-    density = Density(question, noise, Trial(u, starts, [], []), whole, np.ones(len(question.size)))
-    first = _initial_unknowns(density, question, noise)
-    if isinstance(first, LostTrial):
-        return first
-    scale = jnp.asarray(_units(density, first), density.dtype)
-    cost = lambda z: -density.log_likelihood(first + scale * z) / question.measured  # noqa: E731
-    rate = optax.warmup_cosine_decay_schedule(0.0, _RATE, int(_WARM * steps) + 1, steps)
-    adam = optax.apply_if_finite(optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate)), steps)
-
-    def step(carry, _):
-        z, state, best = carry
-        value, slope = jax.value_and_grad(cost)(z)
-        best = jax.tree.map(lambda new, old: jnp.where(value < best[0], new, old), (value, z), best)
-        change, state = adam.update(slope, state, z)
-        return (optax.apply_updates(z, change), state, best), None
-
-    go = jax.jit(lambda carry: jax.lax.scan(step, carry, None, length=_PORTION)[0])
-    z = jnp.zeros(len(first), scale.dtype)
-    carry, costs = (z, adam.init(z), (jnp.asarray(jnp.inf, scale.dtype), z)), []
-    for k in range(max(1, -(-steps // _PORTION))):
-        carry = go(carry)
-        costs.append(float(carry[2][0]))
-        if notify is not None:
-            notify(f"step {(k + 1) * _PORTION}: log likelihood {-costs[-1] * question.measured:.6g}")
-    if not np.isfinite(costs[-1]):
-        return LostTrial(0, "The gradient is not finite at any trial.")
-    x = np.asarray(first + scale * carry[2][1], float)
-    rest = costs[-max(1, len(costs) // 10) - 1] if len(costs) > 1 else np.inf
-    at = density.unknowns(jnp.asarray(x, scale.dtype))
-    return x[: len(u)], np.asarray(at.starts, float), bool((rest - costs[-1]) * question.measured < _STILL)
-
-
-def _initial_unknowns(density: Density, question: Residuals, noise: AbstractNoise) -> np.ndarray | LostTrial:
-    """The first x (D,), with the noise that its residuals have."""
-    at = density.unknowns(jnp.asarray(density.first, density.dtype))
-    left = [np.asarray(residuals, float) for residuals in density.residuals(at)]
-    for batch, residuals in zip(question.batches, left, strict=True):
-        bad = ~np.isfinite(residuals).all(axis=(1, 2))
-        if bad.any():
-            return LostTrial(
-                int(batch.rows[int(np.argmax(bad))]), "Its motion could not be followed from the first trial."
-            )
-    flat = np.concatenate([r.reshape(-1, r.shape[-1]) for r in left])
-    widths = noise.widths(flat, question.weights, question.least, question.sides)
-    x = density.first.copy()
-    x[density.noise_places] = np.log(widths.sigma)
-    return x
-
-
-def _units(density: Density, x: np.ndarray) -> np.ndarray:
-    """The units in which x moves: of parameters one, or as large as they are; of starts their size over all records."""
-    question, free = density.question, len(density.question.parameters)
-    scale = np.ones(len(x))
-    unbounded = np.isinf(question.parameters.reach)
-    scale[:free] = np.where(unbounded, np.maximum(1.0, np.abs(x[:free])), 1.0)
-    for part in question.parts:
-        fitted = part.rows[part.system.fitted]
-        if len(fitted):
-            places = density.start_places[fitted, : part.system.states]
-            size = np.sqrt(np.mean(x[places] ** 2, axis=0))
-            scale[places] = np.where(size > 0, size, 1.0)
-    return scale
-
-
-def build_descent(
-    question: Residuals, u: np.ndarray, starts: np.ndarray, noise, steps: int, rest: bool
-) -> Descent | LostTrial:
-    """The result of the descent, with the derivatives that intervals need."""
-    point = question.evaluate(u, starts)
-    if isinstance(point, LostTrial):
-        return point
-    text = f"The descent by gradients came to rest within {steps} steps."
-    if not rest:
-        text = (
-            f"The descent by gradients was stopped after {steps} steps, and the likelihood still grew: go on from "
-            "there, with fit.params in the place of params0."
-        )
-    return Descent(point, question.noise_scale(point, noise), rest, steps, text, question)
-
-
-def _optax() -> Any:
-    try:
-        import optax
-    except ImportError:
-        raise ImportError('method="gradient" needs the package optax: pip install lagjax[neural].') from None
-    return optax

@@ -1,16 +1,6 @@
-"""Records: the measurements as the user gives them, their sampled inputs, and rows of them in batches.
-
-It holds `Form` and `SampleTable` (inputs), `Record` (one recording) and `Samples` (pieces of records side by side).
-
-**Inputs.** A scene whose functions ask for `inputs` becomes one whose functions ask for `t` and `params` alone: its
-parameters are those of the user and, beside them, one table of samples (`Driven`), in which the input at the time t is
-looked up (`lagjax.samples`). So a step of machine code ends at every sample, each member of a batch has a table of its
-own, and derivatives go along the user's parameters only. Tables are filled up to a few lengths (`table_length`): a
-program is made for a length, and serves all records.
-"""
+"""Records: the measurements as the user gives them, checked; and several systems by their names."""
 
 import contextlib
-import functools
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -20,162 +10,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._interface import Function, Layout, labelled_leaves, require_concrete
-from lagjax._interface.reads import Edition
-from lagjax._run.hybrid import Scene, laws
-from lagjax._scene import MARGINS, System, continued, samples, unevenly_spaced
+from lagjax._fit.model._inputs import interpolate_inputs
+from lagjax._interface import Layout, labelled_leaves, require_concrete
+from lagjax._scene import unevenly_spaced
 
 PyTree = Any
-
-
-_LEAST_ROOM, _GROWTH = 16, 4  # of tables: at most four times what is needed, and six programs up to 16 000 samples
-_FUNCTIONS = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
-
-
-class SampleTable(NamedTuple):
-    """The inputs of N pieces of records: I numbers at K instants, `knots` (N, K) and `values` (N, K, I).
-
-    Some samples about a piece are among them where its input asks for them, and behind the last one instants that still
-    increase (`build_table`).
-    """
-
-    knots: np.ndarray
-    values: np.ndarray
-
-    @property
-    def room(self) -> int:
-        """K, for which a program is made."""
-        return self.knots.shape[1]
-
-    def rows(self, numbers: np.ndarray) -> np.ndarray:
-        """The parameters `numbers` (P,) or (N, P) of the user and then the table, (N, P + K + K I)."""
-        count = len(self.knots)
-        parts = np.broadcast_to(numbers, (count, numbers.shape[-1])), self.knots, self.values.reshape(count, -1)
-        return np.concatenate(parts, axis=1)
-
-    def select(self, rows) -> "SampleTable":
-        return SampleTable(self.knots[rows], self.values[rows])
-
-
-class Driven(NamedTuple):
-    """The parameters of a scene with inputs: those of the user, and the table (K,) and (K, I)."""
-
-    params: PyTree
-    knots: Any
-    values: Any
-
-
-class Form(NamedTuple):
-    """The structure of an input at one time, and its interpolation between samples, one of `_samples.HOLDS`."""
-
-    tree: Any
-    shapes: tuple[tuple[int, ...], ...]
-    hold: str
-
-    @property
-    def size(self) -> int:
-        """I, the numbers of an input at one time."""
-        return sum(int(np.prod(shape)) for shape in self.shapes)
-
-    def restore(self, flat) -> PyTree:
-        """The user's structure of the numbers of an input, (…, I)."""
-        sizes = [int(np.prod(shape)) for shape in self.shapes]
-        parts = jnp.split(flat, np.cumsum(sizes)[:-1].tolist(), axis=-1)
-        return jax.tree.unflatten(
-            self.tree, [part.reshape(part.shape[:-1] + shape) for part, shape in zip(parts, self.shapes, strict=True)]
-        )
-
-    def drive_scene(self, system: System) -> System:
-        present = [name for name in _FUNCTIONS if getattr(system, name) is not None]
-        parts = [eqx.partition(_FunctionOfInputs(getattr(system, name), self), eqx.is_array) for name in present]
-        wrapped = [Function(arrays, Edition.from_function(code), ("t", "params")) for arrays, code in parts]
-        return eqx.tree_at(lambda s: [getattr(s, name) for name in present], system, wrapped)
-
-    def bind_samples(self, system: Scene, params: PyTree, ts: np.ndarray, inputs: np.ndarray) -> tuple[Scene, PyTree]:
-        """The scene with inputs (K, I) sampled at `ts` (K,), and its parameters, as `simulate` takes them."""
-        if not input_functions(system) or not isinstance(system, System):
-            return system, params
-        table = build_table([(ts, inputs)], self.hold)
-        return self.drive_scene(system), Driven(params, table.knots[0], table.values[0])
-
-    def params(self, params: PyTree, room: int) -> Driven:
-        """Parameters of the driven scene, with a table of zeros of this many instants: a structure."""
-        return Driven(params, np.arange(float(room)), np.zeros((room, self.size)))
-
-
-class _FunctionOfInputs(eqx.Module):
-    """A function of the user, for parameters that are `Driven`."""
-
-    function: Function
-    form: Form = eqx.field(static=True)
-
-    @property
-    def __name__(self) -> str:
-        return self.function.name
-
-    def __call__(self, *roles, t, params: Driven):
-        extras = {"t": t, "params": params.params}
-        if "inputs" in self.function.extras:
-            extras["inputs"] = self.form.restore(samples(params.knots, params.values, self.form.hold)(t))
-        return self.function(*roles, **extras)
-
-
-def input_functions(scene: Scene) -> list[str]:
-    """The functions of a scene that ask for `inputs`."""
-    functions = ((name, getattr(law, name)) for law in laws(scene) for name in _FUNCTIONS)
-    return [name for name, function in functions if function is not None and "inputs" in function.extras]
-
-
-def table_length(count: int) -> int:
-    """The length of a table that is to hold `count` samples and one more."""
-    room = _LEAST_ROOM
-    while room <= count:
-        room *= _GROWTH
-    return room
-
-
-def build_table(pieces: list[tuple[np.ndarray, np.ndarray]], hold: str) -> SampleTable:
-    """The tables of N pieces, each given by its times (k,) and inputs (k, I), side by side.
-
-    What they are filled up with changes nothing up to the last sample: functions of time are those of (k,) samples.
-    """
-    room, size = table_length(max(len(ts) for ts, _ in pieces) + MARGINS[hold]), pieces[0][1].shape[1]
-    knots, values = np.zeros((len(pieces), room)), np.zeros((len(pieces), room, size))
-    for row, (ts, inputs) in enumerate(pieces):
-        count = len(ts)
-        spacing = (ts[-1] - ts[0]) / (count - 1) if count > 1 else max(1.0, abs(ts[0]))
-        knots[row] = np.concatenate([ts, ts[-1] + spacing * np.arange(1, room - count + 1)])
-        values[row, :count], values[row, count:] = inputs, continued(inputs, room - count, hold)
-    return SampleTable(knots, values)
-
-
-def constant_tables(ts: np.ndarray, inputs: np.ndarray) -> SampleTable:
-    """Tables that hold one input each, `inputs` (M, I), at and after its time `ts` (M,)."""
-    later = np.maximum(1.0, np.abs(ts))
-    return SampleTable(np.stack([ts, ts + later], axis=1), np.stack([inputs, inputs], axis=1))
-
-
-def interpolate_inputs(ts: np.ndarray, inputs: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """The inputs (M, I) at the times `at` (M,), on lines between samples (T, I) at `ts` (T,)."""
-    return np.stack([np.interp(at, ts, column) for column in inputs.T], axis=-1)
-
-
-def samples_between(ts: np.ndarray, begin: float, end: float, hold: str) -> slice:
-    """The samples at `ts` (K,) that determine the input from `begin` to `end`."""
-    margin = MARGINS[hold]
-    first = int(np.searchsorted(ts, begin, side="right")) - 1 - margin
-    last = int(np.searchsorted(ts, end, side="left")) + 1 + margin
-    return slice(max(first, 0), last)
-
-
-@functools.partial(jax.jit, static_argnames="hold")
-def inputs_at(table: SampleTable, ts, hold: str) -> tuple[Any, Any]:
-    """The inputs (N, T, I) at the times `ts` (N, T) of the pieces of a table, and their rates there."""
-
-    def evaluate(knots, values, ts):
-        return jax.jvp(samples(knots, values, hold), (ts,), (jnp.ones_like(ts),))
-
-    return jax.vmap(evaluate)(table.knots, table.values, ts)
 
 
 class Guess(NamedTuple):
@@ -480,80 +319,6 @@ def _split_columns(matrix: np.ndarray, structure: tuple) -> PyTree:
     )  # fmt: skip
 
 
-# ---- pieces of records -----------------------------------------------------------------------------------------------
-
-
-class Piece(NamedTuple):
-    """The samples `places` of the record `record`, followed as a motion of its own from the first of them."""
-
-    record: int
-    places: np.ndarray
-
-
-def whole_pieces(records: list[Record]) -> list[Piece]:
-    return [Piece(k, np.arange(len(record))) for k, record in enumerate(records)]
-
-
-class Samples(NamedTuple):
-    """N pieces of records as rows of one batch, with room for the T samples of the longest.
-
-    - `rows` (N,): the place of each piece among all.
-    - `ts` (N, T): times, and after the last one of a piece times so close to it that following them costs nothing.
-    - `values` (N, T, S), `weights` (N, T, S): signals and how much they count, zero where there is none.
-    - `inputs` (N, T, I), I = 0 where there are none: the inputs at these times. `table`: between them.
-    - `sides` (N, T, S): 1 where a sample is at the upper limit of its sensor, −1 at the lower one; None for zeros.
-    """
-
-    rows: np.ndarray
-    ts: np.ndarray
-    values: np.ndarray
-    weights: np.ndarray
-    inputs: np.ndarray
-    table: SampleTable | None
-    sides: np.ndarray | None = None
-
-
-def batches(records: list[Any], pieces: list[Piece], eps: float = 2.3e-16, hold: str = "zero") -> list[Samples]:
-    """The pieces in batches, none of which is longer than twice its shortest piece: at most half of the room is empty.
-
-    `eps` is the round-off of the numbers that the motion is computed in, `hold` says what inputs are between samples.
-    """
-    lengths = np.array([len(piece.places) for piece in pieces])
-    order, groups = np.argsort(-lengths, kind="stable"), []
-    for row in order.tolist():
-        if not groups or 2 * lengths[row] < lengths[groups[-1][0]]:
-            groups.append([])
-        groups[-1].append(row)
-    return [_stack_pieces(records, pieces, np.sort(rows), eps, hold) for rows in groups]
-
-
-def _stack_pieces(records: list[Record], pieces: list[Piece], rows: np.ndarray, eps: float, hold: str) -> Samples:
-    longest, signals = max(len(pieces[row].places) for row in rows), records[pieces[rows[0]].record].matrix.shape[1]
-    ts = np.zeros((len(rows), longest))
-    values, weights = np.zeros((2, len(rows), longest, signals))
-    matrices = {pieces[row].record: None for row in rows}
-    matrices = {k: (records[k].matrix, records[k].weight_matrix, records[k].input_samples) for k in matrices}
-    driven = matrices[pieces[rows[0]].record][2]
-    inputs, sampled = np.zeros((len(rows), longest, driven.shape[1])), []
-    for i, row in enumerate(rows):
-        record, places = pieces[row]
-        measured, weight = (matrix[places] for matrix in matrices[record][:2])
-        times, count = records[record].ts[places], len(places)
-        # Eight units of round-off apart: times that still increase.
-        gap = 8 * eps * max(abs(times[0]), abs(times[-1]), times[-1] - times[0])
-        ts[i] = np.concatenate([times, times[-1] + gap * np.arange(1, longest - count + 1)])
-        values[i, :count], weights[i, :count] = np.where(weight > 0, measured, 0.0), weight
-        at, samples = records[record].sampled_at, matrices[record][2]
-        between = samples_between(at, times[0], times[-1], hold)
-        sampled.append((at[between], samples[between]))
-        if records[record].input_ts is None:
-            inputs[i, :count], inputs[i, count:] = samples[places], samples[places[-1]]
-    table = build_table(sampled, hold) if driven.shape[1] else None
-    if table is not None and any(records[pieces[row].record].input_ts is not None for row in rows):
-        inputs = np.asarray(inputs_at(table, ts, hold)[0])
-    return Samples(rows, ts, values, weights, inputs, table)
-
-
 def require_records(records) -> list[Any]:
     """The records and timings as a list. Raises where there is none, or where records differ in their signals."""
     if not isinstance(records, MeasuredSignal | Iterable):
@@ -626,9 +391,6 @@ def _convert_to_float(number):
     if not eqx.is_array_like(number) or jnp.issubdtype(kind := jnp.result_type(number), jnp.complexfloating):
         raise TypeError(f"A start must hold real numbers; got {number!r}.")
     return number if jnp.issubdtype(kind, jnp.floating) else jnp.asarray(number, float)
-
-
-# ---- several systems by their names ----------------------------------------------------------------------------------
 
 
 def systems_by_name(system, records, observe) -> list[tuple[str | None, Any, Any, Any]]:

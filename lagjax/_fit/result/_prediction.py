@@ -13,14 +13,21 @@ import jax
 import numpy as np
 from scipy.special import ndtri, stdtrit
 
-from lagjax._fit._descent import minimise
-from lagjax._fit._noise import KnownNoise, NoiseScale
-from lagjax._fit._profile import effective_share
-from lagjax._fit._records import Guess, Record, known_start, require_interpolation, require_records, restore_structure
-from lagjax._fit._residuals import LostTrial, Residuals, SystemPart, SystemResiduals, Trial
-from lagjax._fit._search import build_reader
-from lagjax._fit._sensors import UNCLEAR, wrap_residuals
-from lagjax._fit._uncertainty import LEVEL, covariance_of_one_start, require_level, signal_deviations
+from lagjax._fit.model._noise import KnownNoise, NoiseScale
+from lagjax._fit.model._records import (
+    Guess,
+    Record,
+    known_start,
+    require_interpolation,
+    require_records,
+    restore_structure,
+)
+from lagjax._fit.model._residuals import LostTrial, Residuals, SystemPart, SystemResiduals, Trial
+from lagjax._fit.model._sensors import UNCLEAR, wrap_residuals
+from lagjax._fit.result._comparison import effective_share
+from lagjax._fit.result._information import LEVEL, covariance_of_one_start, require_level, signal_deviations
+from lagjax._fit.search._descent import minimise
+from lagjax._fit.search._reader import build_reader
 from lagjax._run import Trajectory, simulate
 
 PyTree = Any

@@ -1,19 +1,6 @@
-"""Likelihood of restricted fits: one parameter held (profile), records left out, and other models (AIC, BIC).
+"""Profile likelihood of one parameter, all others and the starts fitted anew at every value.
 
-It holds `Comparison`, `effective_share` and `Profile`.
-
-**Comparison.** Information criteria count correlated samples for what they are worth, n of effective samples instead of
-all:
-
-    AIC = 2 k − 2 log L · n/N        BIC = k log n − 2 log L · n/N
-
-with k the free numbers that are seen. They judge by the records that were fitted. Cross-validation asks more: the
-records are dealt into groups, each group is left out in turn, the parameters are fitted to the rest, and the records
-left out are followed with these parameters, only the starts being fitted. A law that fits noise, or one record's
-peculiarities, fails there. Source: Burnham & Anderson, *Model Selection and Multimodel Inference* (2002); Arlot &
-Celisse, *A survey of cross-validation procedures*, Stat. Surv. 4 (2010) 40.
-
-**Profile.** At every value of the parameter all others, and all starts, are fitted anew. The deviance there is
+The deviance at a value is
 
     D = 2 κ (log L(best) − log L(value)),      κ = (variance for white residuals) / (variance that is reported)
 
@@ -26,160 +13,22 @@ for κ; Raue et al., Bioinformatics 25 (2009) 1923, for what profiles say about 
 """
 
 import itertools
-from typing import Any, NamedTuple, cast
+from typing import NamedTuple, cast
 
 import numpy as np
 from scipy.optimize import brentq
 
-from lagjax._fit._descent import minimise
-from lagjax._fit._noise import KnownNoise, NoiseScale
-from lagjax._fit._residuals import LostTrial, Residuals
-from lagjax._fit._uncertainty import Information
-
-_ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT = 1e-2, 40  # a record left out is then known to a hundredth of its noise
-
-
-class Comparison(NamedTuple):
-    """Fits of the same records, in the order of `names`. Print it for a table.
-
-    - `free`: how many free numbers are seen; `log_likelihood`, `aic`, `bic`: of as many samples as are effective.
-    - `left_out`: the root mean square residuals of records that were left out, by signal; None without folds.
-    - `best`: without folds the fit of the smallest BIC. With folds the fit of the fewest free numbers among those that
-      follow records left out as well as any does, within the standard error of the difference over the groups.
-    """
-
-    names: tuple[str, ...]
-    free: tuple[int, ...]
-    log_likelihood: tuple[float, ...]
-    aic: tuple[float, ...]
-    bic: tuple[float, ...]
-    left_out: tuple[dict[str, float], ...] | None
-    best: str
-    text: str
-
-    def __repr__(self) -> str:
-        return self.text
-
-
-def comparison(fits: dict[str, Any], folds: int) -> Comparison:
-    """The comparison of fits by name. Raises `ValueError` where they are not about the same measurements."""
-    first, *others = fits.values()
-    _require_same_records(first, others)
-    records = len(first.records)
-    if not (isinstance(folds, int | np.integer) and (folds == 0 or 2 <= folds <= records)):
-        raise ValueError(f"folds must be 0, or from 2 to the number of records, {records}; got {folds!r}.")
-    share = min(effective_share(fit) for fit in fits.values())
-    count = share * first.question.measured
-    free = tuple(len(fit.u) - fit.information.null.shape[1] for fit in fits.values())
-    logs = tuple(share * fit.log_likelihood for fit in fits.values())
-    aic = tuple(float(2 * k - 2 * log) for k, log in zip(free, logs, strict=True))
-    bic = tuple(float(np.log(count) * k - 2 * log) for k, log in zip(free, logs, strict=True))
-    names, best, left = tuple(fits), int(np.argmin(bic)), None
-    if folds:
-        apart = [cross_validate(fit.question, fit.u, fit.states, fit.law, fit.widths, folds) for fit in fits.values()]
-        left, best = tuple(rms for rms, _ in apart), _choose_simplest(free, np.array([scores for _, scores in apart]))
-    rows = _table(names, free, logs, aic, bic, left)
-    margin = np.partition(np.array(bic), 1)[1] - min(bic)
-    by_bic = names[int(np.argmin(bic))]
-    rows.append(f"The data prefer {_fit_label(by_bic)} fit, by {margin:.1f} in BIC ({count:.0f} effective samples).")
-    if left is not None:
-        simplest = _fit_label(names[best])
-        rows.append(f"Left out in {folds} groups, no record is followed better than by {simplest} fit, but for chance.")
-    return Comparison(names, free, logs, aic, bic, left, names[best], "\n".join(rows))
-
-
-def _choose_simplest(free: tuple[int, ...], scores: np.ndarray) -> int:
-    """The fit with the fewest free numbers whose scores (fits, groups) are no worse than those of the best.
-
-    Source: Hastie, Tibshirani & Friedman, *The Elements of Statistical Learning* (2009), §7.10: one standard error.
-    """
-    means = scores.mean(axis=1)
-    if not np.isfinite(means).any():
-        return 0
-    with np.errstate(invalid="ignore"):
-        behind = scores - scores[np.argmin(means)]
-        error = behind.std(axis=1, ddof=1) / np.sqrt(scores.shape[1])
-        as_good = np.flatnonzero(behind.mean(axis=1) <= error)
-    return int(min(as_good, key=lambda i: (free[i], means[i])))
-
-
-def _fit_label(name: str) -> str:
-    return name if name in ("this", "the other") else f"the {name!r}"
-
-
-def _table(names, free, logs, aic, bic, left) -> list[str]:
-    width = max(len(name) for name in (*names, "fit"))
-    heads = f"{'fit':<{width}}{'free':>6}{'log likelihood':>18}{'AIC':>14}{'BIC':>14}"
-    rows = [heads if left is None else f"{heads}   RMS left out: {', '.join(left[0])}"]
-    for i, name in enumerate(names):
-        row = f"{name:<{width}}{free[i]:>6}{logs[i]:>18.2f}{aic[i]:>14.2f}{bic[i]:>14.2f}"
-        rows.append(row if left is None else f"{row}   {' / '.join(f'{rms:.4g}' for rms in left[i].values())}")
-    return rows
-
-
-def cross_validate(question: Residuals, u: np.ndarray, states: np.ndarray, law, widths: NoiseScale, folds: int):
-    """The root mean square residuals by signal of records that were left out, and for each group their mean logarithm.
-
-    Infinite where one cannot be followed. A signal that only the records left out have is as noisy as `widths` (S,) of
-    all of them say.
-    """
-    failed = dict.fromkeys(question.names, np.inf), np.full(folds, np.inf)
-    scores = np.zeros(folds)
-    groups = np.array([piece.record for piece in question.pieces]) % folds
-    squares, weights = dict.fromkeys(question.names, 0.0), dict.fromkeys(question.names, 0.0)
-    for group in range(folds):
-        rest = _select_pieces(question, groups != group)
-        done = minimise(rest, u, states[groups != group], law, _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
-        if isinstance(done, LostTrial):
-            return failed
-        apart = _select_pieces(question, groups == group).with_parameters(question.parameters.fix(done.point.u))
-        known = _collect_noise(apart.names, (question.names, widths), (rest.names, done.widths))
-        end = minimise(
-            apart, np.zeros(0), states[groups == group], KnownNoise(known), _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT
-        )
-        if isinstance(end, LostTrial):
-            return failed
-        square, weight = (apart.weights * end.point.flat() ** 2).sum(axis=0), apart.weights.sum(axis=0)
-        shown = weight > 0
-        scores[group] = 0.5 * np.mean(np.log(np.maximum(square[shown] / weight[shown], apart.least[shown] ** 2)))
-        for name, some, count in zip(apart.names, square, weight, strict=True):
-            squares[name], weights[name] = squares[name] + some, weights[name] + count
-    rms = {name: float(np.sqrt(squares[name] / weights[name])) for name in question.names if weights[name]}
-    return rms, scores
-
-
-def _collect_noise(names: tuple[str, ...], *known: tuple[tuple[str, ...], NoiseScale]) -> NoiseScale:
-    """The noise of signals by their names, from the last of several that knows it."""
-    found = {name: one for own, widths in known for name, one in zip(own, zip(*widths, strict=True), strict=True)}
-    return NoiseScale(*(np.array(numbers) for numbers in zip(*(found[name] for name in names), strict=True)))
-
-
-def _select_pieces(question: Residuals, keep: np.ndarray) -> Residuals:
-    """The residuals of some of the pieces, without a watch."""
-    part = question.with_pieces([p for p, k in zip(question.pieces, keep, strict=True) if k], question.fitted[keep])
-    part.watch = None
-    return part
-
-
-def _require_same_records(first, others) -> None:
-    for other in others:
-        same = len(first.records) == len(other.records) and all(
-            np.array_equal(a.matrix, b.matrix, equal_nan=True)
-            for a, b in zip(first.records, other.records, strict=True)
-        )
-        if not same:
-            raise ValueError("Only fits of the same records can be compared.")
-
-
-def effective_share(fit) -> float:
-    """The number of independent samples that one sample of a fit is worth."""
-    samples = sum(noise.samples for noise in fit.noise.values())
-    return sum(noise.effective for noise in fit.noise.values()) / samples
-
+from lagjax._fit.model._noise import KnownNoise, NoiseScale
+from lagjax._fit.model._residuals import LostTrial, Residuals
+from lagjax._fit.result._information import Information
+from lagjax._fit.search._descent import minimise
 
 _STEP, _MOST = 0.5, 14  # of the reported half width, doubling where little changes; values on one side
+
 _ENOUGH, _TRIALS = 1e-7, 25  # of the deviance, whose roots are wanted; of a search that begins nearby
+
 _FAR = 3.0  # times |value|, or units of u where that is a logarithm or the like: how far other minima are looked for
+
 _EXACT = 1e-4  # of the half width, to which an end is found
 
 

@@ -15,10 +15,11 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from lagjax._fit._records import Record
-from lagjax._fit._uncertainty import LEVEL
+from lagjax._fit.model._records import Record
+from lagjax._fit.result._information import LEVEL
 
 BLUE, RED, GREY = "#0072B2", "#D55E00", "0.55"
+
 _MOST = 4000  # samples in one curve: more do not show
 
 
@@ -97,6 +98,7 @@ def style_axes(ax) -> None:
 
 
 _RECORDS, _SIGNALS = 6, 6  # that are drawn
+
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
 h1 { font-size: 1.5rem } h2 { font-size: 1.15rem; margin-top: 2.2rem }
@@ -190,8 +192,6 @@ def _record_figures(records, residuals: list[np.ndarray], names, sigma) -> dict[
         ]
     return figures
 
-
-# ---- in words --------------------------------------------------------------------------------------------------------
 
 _LISTED = 8  # numbers of one array that a table lists; of more it says how many there are
 

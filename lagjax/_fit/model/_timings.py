@@ -16,8 +16,8 @@ import numpy as np
 
 from lagjax._engine import Problem, Solution
 from lagjax._engine.taylor import MachineCode, Noted, surfaces_of
-from lagjax._fit._parameters import Parameters
-from lagjax._fit._records import Guess, MeasuredSignal, real_numbers, require_start
+from lagjax._fit.model._parameters import Parameters
+from lagjax._fit.model._records import Guess, MeasuredSignal, real_numbers, require_start
 from lagjax._interface import Layout, halves
 from lagjax._primitives import sentence
 from lagjax._run import Trajectory, Transitions, directions_of, sections_of, simulate
@@ -25,9 +25,12 @@ from lagjax._run.hybrid import Hybrid, Scene, Transition
 from lagjax._scene import System
 
 PyTree = Any
+
 _BUDGET = 10_000_000  # steps: observations last for thousands of periods
+
 # Mean times between crossings that are waited for behind the last measured one: a trial may come later.
 _PATIENCE = 2.0
+
 # Of the tolerance of a fit, for the motion itself: its error grows with the square of the time, and after a thousand
 # periods of seven planets is a thirtieth of what they are measured to. Derivatives then need no shorter steps either.
 _SHARPER = 0.1
@@ -182,9 +185,6 @@ def _require_valid_times(flat: FlatTimings, t0: float) -> None:
         order = np.argsort(flat.numbers[there], kind="stable")
         if (np.diff(flat.numbers[there][order]) == 0).any() or (np.diff(flat.times[there][order]) <= 0).any():
             raise ValueError("Of one section, a later time must have a larger number, and each number one time.")
-
-
-# ---- the times that a scene gives ------------------------------------------------------------------------------------
 
 
 @dataclass(frozen=True, eq=False)

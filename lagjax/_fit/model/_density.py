@@ -1,0 +1,202 @@
+"""The posterior density of a fit's unknowns, a function of one vector for JAX.
+
+    log p(x) = Σ_s (effective_s/samples_s) log L_s + log prior(params) + log |∂params/∂u|
+
+x holds u, which moves the free parameters, the starts that are fitted, and of every signal log σ and, for Student's t,
+a number that moves ν. All records of a system go in one batch of motions, and the gradient comes back over their
+steps: about five motions, however many unknowns there are. Without a `prior` the density is flat in the parameters
+within their sets, in the starts and in log σ and log ν. A motion that cannot be followed has the density zero.
+"""
+
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import gammaln
+from scipy.special import polygamma
+
+from lagjax._fit.model._noise import AbstractNoise, NoiseScale, StudentT
+from lagjax._fit.model._residuals import Residuals, Trial
+from lagjax._primitives import accepts_singles
+
+_LEAST_DOF, _MOST_DOF = 1.0, 200.0  # ν is between these, with a flat density of its logarithm
+
+
+class PosteriorUnknowns(NamedTuple):
+    """One vector x taken apart: u (F,), the starts of all records (N, 2n), and the noise σ (S,), ν (S,)."""
+
+    u: Any
+    starts: Any
+    sigma: Any
+    dof: Any
+
+
+class Density:
+    """log p(x), called with x (D,), for records whose residuals are those of `question` at `point`.
+
+    - `first` (D,): the fit; `names` (D,): what the numbers are called.
+    - `start_places` (N, 2n): the places in x of the starts; D for one that is known, or that a system does not have.
+    - `noise_places`: the places in x of log σ.
+    - `shares` (S,): how many independent samples one sample of each signal is worth.
+    """
+
+    def __init__(
+        self, question: Residuals, noise: AbstractNoise, point: Trial, widths: NoiseScale, shares: np.ndarray,
+        prior: Callable | None = None,
+    ):  # fmt: skip
+        self.question, self.shares, self.prior, self.point, self.widths = question, shares, prior, point, widths
+        for part in question.parts:
+            part.system.require_traceable()
+        self.dtype = np.result_type(*(part.system.layout.dtype for part in question.parts))
+        self._tails = np.isfinite(widths.dof)
+        self.moves_dof = isinstance(noise, StudentT) and noise.dof is None
+        share = np.log(np.clip(widths.dof, 1.01 * _LEAST_DOF, 0.99 * _MOST_DOF) / _LEAST_DOF)
+        share = share / math.log(_MOST_DOF / _LEAST_DOF)
+        dof = np.log(share / (1 - share)) if self.moves_dof else np.zeros(0)
+        moves = np.zeros((len(question.pieces), question.states), bool)
+        for part in question.parts:
+            moves[part.rows, : part.system.states] = question.fitted[part.rows, None]
+        free, starts = len(point.u), point.starts[moves]
+        self.first = np.concatenate([point.u, starts, np.log(widths.sigma), dof])
+        self.start_places = np.full(moves.shape, len(self.first))
+        self.start_places[moves] = np.arange(free, free + len(starts))
+        self.noise_places = slice(free + len(starts), free + len(starts) + len(widths.sigma))
+        self.names = (*question.parameters.labels, *self._start_names(), *self._noise_names())
+
+    def _start_names(self) -> list[str]:
+        question = self.question
+        layouts = {row: part.system.layout for part in question.parts for row in part.rows.tolist()}
+        return [
+            f"starts{question.label(question.pieces[row].record).removeprefix('records')}.{half}{name[1:]}"
+            for row in np.flatnonzero(question.fitted).tolist()
+            for half in ("q", "qdot")
+            for name in layouts[row].names
+        ]
+
+    def _noise_names(self) -> list[str]:
+        names = self.question.names
+        return [f"log σ of {name}" for name in names] + [f"ν of {name}" for name in names] * self.moves_dof
+
+    def __len__(self) -> int:
+        return len(self.first)
+
+    def unknowns(self, x) -> PosteriorUnknowns:
+        """A vector (D,) taken apart."""
+        u, starts = x[: len(self.question.parameters)], jnp.asarray(self.point.starts, x.dtype)
+        starts = jnp.where(self.start_places < len(self), jnp.append(x, 0.0)[self.start_places], starts)
+        for part in self.question.parts:
+            starts = part.system.trace_starts(starts, part.rows, self.params(u))
+        dof = self._dof(x[self.noise_places.stop :]) if self.moves_dof else jnp.asarray(self.widths.dof, x.dtype)
+        return PosteriorUnknowns(u, starts, jnp.exp(x[self.noise_places]), dof)
+
+    @staticmethod
+    def _dof(moved):
+        return _LEAST_DOF * jnp.exp(math.log(_MOST_DOF / _LEAST_DOF) * jax.nn.sigmoid(moved))
+
+    def params(self, u):
+        """The user's pytree of parameters at u (F,)."""
+        return self.question.parameters.restore(self.question.parameters.numbers(u, jnp))
+
+    @accepts_singles(("x",))
+    def __call__(self, x):
+        """log p(x), up to a constant; −∞ where a motion could not be followed."""
+        return self.posterior(x, self.log_likelihood(x))
+
+    def posterior(self, x, log_likelihood):
+        """log p(x) with what the measurements contribute to it; −∞ where that is no number."""
+        at = self.unknowns(jnp.asarray(x, self.dtype))
+        total = log_likelihood + self.question.parameters.log_volume(at.u, jnp)
+        if self.prior is not None:
+            total = total + self.prior(self.params(at.u))
+        if self.moves_dof:
+            moved = x[-len(self.widths.sigma) :]
+            total = total + jnp.sum(jax.nn.log_sigmoid(moved) + jax.nn.log_sigmoid(-moved))
+        return jnp.where(jnp.isfinite(total), total, -jnp.inf)
+
+    def log_likelihood(self, x):
+        """Σ_s shares_s log L_s, up to a constant; NaN where a motion could not be followed."""
+        at = self.unknowns(jnp.asarray(x, self.dtype))
+        pairs = zip(self.question.batches, self.residuals(at), strict=True)
+        weighted = [np.sqrt(batch.weights) * residuals for batch, residuals in pairs]
+        batches = self.question.batches
+        return self.weighted_log_likelihood(weighted, [b.weights > 0 for b in batches], [b.sides for b in batches], at)
+
+    def residuals(self, at: PosteriorUnknowns) -> list:
+        """The outputs of the sensors less the measurements, (N, T, S), of every batch."""
+        found, signals = [], len(self.question.names)
+        for part in self.question.parts:
+            for batch in part.system.batches:
+                own = part.system.trace_residuals(batch, at.u, at.starts[part.rows[batch.rows], : part.system.states])
+                found.append(jnp.zeros((*own.shape[:2], signals), own.dtype).at[..., part.signals].set(own))
+        return found
+
+    def weighted_log_likelihood(self, weighted: list, counted: list, sides: list, at: PosteriorUnknowns):
+        """Σ_s shares_s log L_s, up to a constant, of √weight · residual (N, T, S) of every batch, where they count.
+
+        For a signal whose noise is Gaussian other numbers with the same sum of squares do as well.
+        """
+        exact = (self.question.weights > 0) & (True if self.question.sides is None else self.question.sides == 0)
+        total = -jnp.sum(self.shares * exact.sum(axis=0) * jnp.log(at.sigma))
+        dof = jnp.where(self._tails, at.dof, 1.0)
+        norm = gammaln((dof + 1) / 2) - gammaln(dof / 2) - 0.5 * jnp.log(dof)
+        for rows, counts, side in zip(weighted, counted, sides, strict=True):
+            squares = (rows / at.sigma) ** 2
+            each = jnp.where(self._tails, norm - (dof + 1) / 2 * jnp.log1p(squares / dof), -0.5 * squares)
+            if side is not None:
+                at_limit = jax.scipy.special.log_ndtr(jnp.where(side != 0, side * rows / at.sigma, 0.0))
+                each = jnp.where(side != 0, at_limit, each)
+            total = total + jnp.sum(jnp.where(counts, each * self.shares, 0.0))
+        return total
+
+    def _noise_covariance(self, samples: np.ndarray) -> np.ndarray:
+        """The covariance of log σ, and of the numbers that move ν, from Fisher's information of this many samples (S,).
+
+        Per sample of Student's t it is 2ν/(ν+3) for log σ, [ψ′(ν/2) − ψ′((ν+1)/2)]/4 − (ν+5)/(2ν(ν+1)(ν+3)) for ν and
+        −2/((ν+1)(ν+3)) between them. Source: Lange, Little & Taylor (1989), appendix B.
+        """
+        count, d = len(samples), np.where(self._tails, self.widths.dof, 1.0)
+        information = np.diag(samples * np.where(self._tails, 2 * d / (d + 3), 2.0))
+        if self.moves_dof:
+            share = 1 / (1 + np.exp(-self.first[-count:]))
+            rate = d * math.log(_MOST_DOF / _LEAST_DOF) * share * (1 - share)
+            own = 0.25 * (polygamma(1, d / 2) - polygamma(1, (d + 1) / 2)) - (d + 5) / (2 * d * (d + 1) * (d + 3))
+            both = np.diag(-2 * samples * rate / ((d + 1) * (d + 3)))
+            information = np.block(
+                [[information, both], [both, np.diag(samples * own * rate**2 + 2 * share * (1 - share))]]
+            )
+        return np.linalg.inv(information)
+
+    def covariance(self) -> np.ndarray:
+        """The covariance (D, D) of x in the approximation of least squares, about the fit.
+
+        Raises `ValueError` where something is not seen: there is no density then without a prior.
+        """
+        question, point = self.question, self.point
+        robust = np.array([(d + 1) / (d + 3) if np.isfinite(d) else 1.0 for d in self.widths.dof])
+        weight = np.sqrt(self.shares * robust) / self.widths.sigma
+        triangles = question.triangles(
+            point, [f * weight * self.widths.sigma for f in question.fisher_factors(point, self.widths)]
+        )
+        free, size = len(point.u), self.noise_places.start
+        precision = np.zeros((len(self) + 1, len(self) + 1))
+        for own, triangle in zip(self.start_places, triangles, strict=True):
+            own = [*own, *range(free)]
+            precision[np.ix_(own, own)] += triangle[:, :-1].T @ triangle[:, :-1]
+        precision = precision[:size, :size]
+        scale = np.sqrt(np.diag(precision))
+        if not (scale > 0).all():
+            raise ValueError(
+                f"Nothing that was measured depends on {self.names[int(np.argmin(scale))]}: fix it with `free`."
+            )
+        unit = precision / np.outer(scale, scale)
+        if np.linalg.eigvalsh(unit).min() < 1e-13:
+            raise ValueError(
+                "The data do not determine some combination of parameters and starts: fix one parameter with `free`."
+            )
+        found = np.zeros((len(self), len(self)))
+        found[size:, size:] = self._noise_covariance((question.weights > 0).sum(axis=0) * self.shares)
+        found[:size, :size] = np.linalg.inv(unit) / np.outer(scale, scale)
+        return found

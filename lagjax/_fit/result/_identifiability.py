@@ -1,0 +1,210 @@
+"""Identifiability: the parameters, and the combinations of them, that the data do not determine, in sentences.
+
+A null direction v of the parameters says that measurements do not change along v, at one point. In logarithms, with the
+relative changes dxᵢ/xᵢ as coordinates, what is seen is orthogonal to it: if that has small whole exponents, here and at
+another point, then only a product of powers enters, such as m·l. The same with the changes dxᵢ themselves finds sums.
+Every other direction is given in numbers.
+"""
+
+import re
+from fractions import Fraction
+
+import numpy as np
+
+from lagjax._fit.model._noise import NoiseScale
+from lagjax._fit.model._parameters import Parameters
+from lagjax._fit.model._residuals import LostTrial, Residuals, Trial
+from lagjax._fit.result._information import Information, confirmed_null, growth, null_space, row_sizes
+
+_MOST_NAMES = 12  # in one sentence
+
+_LARGEST_EXPONENT, _EXACT = 6, 1e-3  # of recognised products; how near to a whole number an exponent must be
+
+
+def unseen_sentences(question: Residuals, point: Trial, widths: NoiseScale, known: Information) -> tuple[str, ...]:
+    """A sentence for every set of parameters of which something is not seen, and one for those that rounding hides."""
+    hidden = _sentence_on_rounding(question, point, known)
+    null, parameters = known.confirmed, question.parameters
+    if not null.shape[1]:
+        return hidden
+    elsewhere = _null_elsewhere(question, point, widths)
+    spaces = [(parameters.jacobian(point.u) @ null, parameters.values(point.u))]
+    if elsewhere is not None:
+        u, other = elsewhere
+        spaces.append((parameters.jacobian(u) @ other, parameters.values(u)))
+    found = [_sentence(parameters, block, spaces) for block in _blocks(spaces[0][0])]
+    if not found:
+        ended = dict.fromkeys(parameters.labels[i] for i in np.flatnonzero(np.abs(null).max(axis=1) > 1e-6))
+        found = [f"At the end of its set, where nothing that was measured depends on it: {', '.join(ended)}."]
+    return (*found, *hidden)
+
+
+def _sentence_on_rounding(question: Residuals, point: Trial, known: Information) -> tuple[str, ...]:
+    """The sentence for parameters whose columns are drowned where sensitivities grow."""
+    if known.confirmed.shape[1] == known.null.shape[1]:
+        return ()
+    basis = np.linalg.qr(known.confirmed)[0]
+    left = known.null / np.linalg.norm(known.null, axis=0)
+    left = left - basis @ (basis.T @ left)
+    labels = question.parameters.labels
+    names = list(dict.fromkeys(labels[k] for k in np.flatnonzero(np.linalg.norm(left, axis=1) > 1e-5)))
+    sizes = row_sizes(question, point)
+    grown, record = max(
+        (growth([row[None]]), question.pieces[batch.rows[k]].record)
+        for batch, size in zip(question.batches, sizes, strict=True)
+        for k, row in enumerate(size)
+    )
+    return (
+        f"{question.label(record)} is chaotic: motions grow apart within it by a factor of {grown:.0e}, and rounding "
+        f"hides what it says about {_join_names(names)}. There are no intervals from records that long: cut it into "
+        "several shorter ones.",
+    )
+
+
+def _null_elsewhere(question: Residuals, point: Trial, widths: NoiseScale):
+    """Other values u of the free parameters, a few per cent away, and the null directions there."""
+    u = point.u
+    near = u + question.parameters.sizes(u) * np.random.default_rng(0).uniform(0.02, 0.06, len(u))
+    other = question.evaluate(near, point.starts)
+    if isinstance(other, LostTrial):
+        return None
+    factors = [np.sqrt(batch.weights) / widths.sigma for batch in question.batches]
+    null = null_space(question.triangles(other, factors), question.states)[0]
+    return near, confirmed_null(question, other, null)
+
+
+def _blocks(null: np.ndarray) -> list[np.ndarray]:
+    """The parameters of the null directions in sets, of which each is free by itself: rows that are not zero."""
+    reduced = _reduce_rows(null.T)
+    sets: list[set[int]] = []
+    for row in reduced:
+        own = set(np.flatnonzero(np.abs(row) > 1e-5 * np.abs(row).max()).tolist())
+        for other in [s for s in sets if s & own]:
+            sets.remove(other)
+            own |= other
+        sets.append(own)
+    return [np.array(sorted(s)) for s in sets]
+
+
+def _reduce_rows(rows: np.ndarray) -> np.ndarray:
+    """The reduced row echelon form of independent rows, with the largest pivots."""
+    rows = np.array(rows, float)
+    for i in range(len(rows)):
+        rest = np.abs(rows[i:])
+        k, column = np.unravel_index(np.argmax(rest), rest.shape)
+        if not rest[k, column] > 0:  # a direction along which numbers at the end of their sets no longer change
+            rows = rows[:i]
+            break
+        rows[[i, i + k]] = rows[[i + k, i]]
+        rows[i] /= rows[i, column]
+        others = np.arange(len(rows)) != i
+        rows[others] -= np.outer(rows[others, column], rows[i])
+    return np.where(np.abs(rows) > 1e-9, rows, 0.0)
+
+
+def _sentence(parameters: Parameters, block: np.ndarray, spaces) -> str:
+    """The sentence for one set of parameters, from the null directions of x and the values x at one or two points."""
+    names = [parameters.names[i] for i in block]
+    if len(block) == 1:
+        return f"Nothing that was measured depends on {names[0]}."
+    relative = [_directions_within(direction / np.where(x != 0, x, 1.0)[:, None], block) for direction, x in spaces]
+    absolute = [_directions_within(direction, block) for direction, _ in spaces]
+    if all(np.all(x[block] != 0) for _, x in spaces) and (rows := _whole_numbers(relative)) is not None:
+        if relative[0].shape[1] == 1 and np.ptp(relative[0]) < _EXACT * np.abs(relative[0]).max():
+            return f"A common factor of {_join_names(names)} is not seen, only their ratios: keep one of them fixed."
+        return f"Of {_join_names(names)} only {_join_names([_product(row, names) for row in rows])} {_verb(rows)} seen."
+    if (rows := _whole_numbers(absolute)) is not None:
+        return f"Of {_join_names(names)} only {_join_names([_sum(row, names) for row in rows])} {_verb(rows)} seen."
+    if (count := absolute[0].shape[1]) > 1:
+        return f"{count} combinations of {_join_names(names)} are not seen: keep {count} of them fixed."
+    changes = absolute[0][:, 0] / np.abs(absolute[0][:, 0]).max()
+    together = ", ".join(f"{name} by {change:+.3g}" for name, change in zip(names, changes, strict=True))
+    return (
+        f"A combination of {_join_names(names)} is not seen: to change {together}, in proportion, changes nothing "
+        "measured."
+    )
+
+
+def _directions_within(directions: np.ndarray, block: np.ndarray) -> np.ndarray:
+    """The directions that move only the parameters of one set, (len(block), K)."""
+    outside = np.delete(directions, block, axis=0)
+    if not outside.size:
+        return directions[block]
+    size = np.linalg.norm(directions, axis=0)
+    _, values, right = np.linalg.svd(outside / size)
+    values = np.append(values, np.zeros(directions.shape[1] - len(values)))
+    inside = right[values < 1e-5].T
+    return (directions / size @ inside)[block]
+
+
+def _whole_numbers(spaces: list[np.ndarray]) -> list[list[int]] | None:
+    """The rows orthogonal to a space of directions as small whole numbers, the same at all points; None if not so."""
+    first = spaces[0]
+    if len(spaces) < 2 or any(space.shape != first.shape or not space.size for space in spaces):
+        return None
+    _, values, right = np.linalg.svd(first.T)
+    rank = int((values > 1e-6 * values.max()).sum())
+    if rank == len(first):
+        return None
+    rows = []
+    for row in _reduce_rows(right[rank:]):
+        fractions = [Fraction(float(x)).limit_denominator(_LARGEST_EXPONENT) for x in row]
+        common = np.lcm.reduce([f.denominator for f in fractions])
+        whole = [int(f * int(common)) for f in fractions]
+        if max(map(abs, whole)) > _LARGEST_EXPONENT or np.abs(np.array(whole) / common - row).max() > _EXACT:
+            return None
+        rows.append(whole)
+    rows = _simplify_rows(rows)
+    for space in spaces[1:]:
+        left = np.array(rows, float) @ space
+        if np.abs(left).max() > _EXACT * np.abs(space).max():
+            return None
+    return rows
+
+
+def _simplify_rows(rows: list[list[int]]) -> list[list[int]]:
+    """Whole rows of the same span with fewer minus signs, and then smaller numbers: a·m and b·m, not a/b and a·m."""
+
+    def weight(row):
+        return sum(x < 0 for x in row), sum(map(abs, row)), [-x for x in row]  # the last so that a/b is not b/a
+
+    def positive_sign(row):
+        return min(row, [-x for x in row], key=weight)
+
+    rows = [positive_sign(row) for row in rows]
+    while True:  # the weights fall at every turn, and are whole
+        better = []
+        for i, row in enumerate(rows):
+            for other in rows[:i] + rows[i + 1 :]:
+                sums = [positive_sign([a + sign * b for a, b in zip(row, other, strict=True)]) for sign in (1, -1)]
+                better += [(weight(new), i, new) for new in sums if weight(new)[:2] < weight(row)[:2]]
+        if not better:
+            return sorted(rows, reverse=True)
+        _, i, new = min(better)
+        rows[i] = new
+
+
+def _product(row: list[int], names: list[str]) -> str:
+    above = [_power(name, x) for name, x in zip(names, row, strict=True) if x > 0]
+    below = [_power(name, -x) for name, x in zip(names, row, strict=True) if x < 0]
+    return "·".join(above) + (f"/({'·'.join(below)})" if len(below) > 1 else f"/{below[0]}" if below else "")
+
+
+def _power(name: str, exponent: int) -> str:
+    return name if exponent == 1 else f"{name}^{exponent}"
+
+
+def _sum(row: list[int], names: list[str]) -> str:
+    parts = [(x, name if abs(x) == 1 else f"{abs(x)} {name}") for x, name in zip(row, names, strict=True) if x]
+    text = "".join(f" {'+' if x > 0 else '−'} {part}" for x, part in parts)
+    return text.removeprefix(" + ")
+
+
+def _join_names(names: list[str]) -> str:
+    if len(names) > _MOST_NAMES:  # weights of a network: whole arrays instead of their numbers
+        names = list(dict.fromkeys(re.sub(r"\[[\d, ]+\]$", "", name) for name in names))
+    return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
+
+
+def _verb(rows: list) -> str:
+    return "is" if len(rows) == 1 else "are"

@@ -1,0 +1,249 @@
+"""The information of the data about the parameters: their covariance, and directions that nothing depends on.
+
+With the starts eliminated, a small change of the measurements by ε moves the free parameters by H⁻¹ Gᵀ ε: G has the
+rows of the parameters, made orthogonal to those of the starts, in units of the noise, and H = GᵀG. So
+
+    covariance = H⁻¹ (Gᵀ C G) H⁻¹,      C the correlation of the residuals, from the residuals themselves
+
+For white noise C = 1. At 1 kHz residuals are not white: they hold what the model lacks, and H⁻¹ alone would give
+intervals many times too small. Source: Newey & West, Econometrica 55 (1987) 703.
+
+Directions that nothing depends on have no variance: they are found as null directions of G (`null_space`), their
+parameters have infinite variance, and nothing is inverted there.
+
+Over a chaotic record sensitivities grow until all columns point along the one direction that grows fastest, and
+rounding hides the rest: G seems to have null directions where it has none. Null directions are the same whatever the
+rows are multiplied by, so they are looked for a second time where every row has length one (`confirmed`): what is null
+there is not seen, and what is not was drowned. Where rows grow by more than there are digits, all are.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from scipy.special import stdtrit
+
+from lagjax._fit.model._autocorrelation import autocorrelations, close_gaps, correlated_square
+from lagjax._fit.model._noise import NoiseScale, harmonics, rounding_square
+from lagjax._fit.model._residuals import Residuals, Trial, compress_rows
+
+LEVEL = 0.95  # the probability with which an interval holds its number, where no other one is given
+
+# Singular values below this fraction of the largest, of columns of length one, are null: derivatives are as accurate
+# as the motion, to 1e-9, and a direction that is really seen so little would need a million times the data.
+NULL = 1e-7
+
+# By how much the rows of a record grow before they can drown each other: a hundredth of what `NULL` tells from nothing,
+# so that two columns which grow like this still differ in their early rows where this says nothing.
+_GROWTH = 1e-2 / NULL
+
+# By how much they grow before the last digit of a number moves signals by their size: what was computed then is one
+# motion of many, and no derivative of it says how well anything is known.
+_LOST = 1.0 / np.finfo(float).eps
+
+# The length of a column below which it is zero: one over it must have a square, and some room, among finite numbers.
+_NOTHING = 1e-140
+
+
+class Information(NamedTuple):
+    """The information of the data about F free parameters.
+
+    - `covariance` (F, F) of u; infinite variance and NaN beside it where a parameter is not seen.
+    - `null` (F, K): the K directions of u that nothing depends on, as far as rounding lets one tell; `confirmed` are
+      those among them that nothing depends on.
+    - `effective` (S,): the number of samples of each signal that independent ones would need to say as much.
+    - `correlation` (S,): the correlation of neighbouring residuals, less what rounding makes of it.
+    - `white` (F, F): the covariance if residuals were white, zero where nothing is seen; `lost`: by how much variances
+      are larger because unknowns were fitted.
+    """
+
+    covariance: np.ndarray
+    null: np.ndarray
+    confirmed: np.ndarray
+    effective: np.ndarray
+    correlation: np.ndarray
+    white: np.ndarray
+    lost: float
+
+    def quantile(self, level: float) -> float:
+        """Student's t of a level, for the effective number of samples less that of parameters."""
+        require_level(level)
+        dof = max(float(self.effective.sum()) - len(self.covariance), 1.0)
+        return float(stdtrit(dof, 0.5 + 0.5 * level))
+
+
+def require_level(level) -> None:
+    if not (np.ndim(level) == 0 and 0 < level < 1):
+        raise ValueError(f"level must be between 0 and 1, as {LEVEL} is; got {level!r}.")
+
+
+def information(question: Residuals, point: Trial, widths: NoiseScale) -> Information:
+    factors = question.fisher_factors(point, widths)
+    triangles = question.triangles(point, factors)
+    null, basis = null_space(triangles, question.states)
+    if _is_lost(question, point):
+        null, basis = np.eye(len(point.u)), np.zeros((len(point.u), 0))
+    laws = autocorrelations(question, point, widths)
+    effective, correlation = (np.array(x) for x in zip(*((a.count / a.time, a.neighbour) for a in laws), strict=True))
+    free, unit = len(point.u), _lengths(triangles, question.states)  # of columns: their squares may be no numbers
+    middle, rows_of = np.zeros((free, free)), []
+    for batch, factor, slopes in zip(question.batches, factors, point.slopes, strict=True):
+        own = eliminate_starts(triangles[batch.rows], factor[..., None] * slopes, question.states) / unit
+        rows_of.append(own)
+        for s in np.flatnonzero(np.isnan(question.sensor.step)):
+            middle += correlated_square(close_gaps(own[:, :, s], batch.weights[..., s] > 0), laws[s].lags)
+    for s in np.flatnonzero(np.isfinite(question.sensor.step)).tolist():
+        sigma, step = widths.sigma[s], question.sensor.step[s]
+        _, rest, before = harmonics(step, sigma)
+        rows = [np.sqrt(b.weights[..., s, None]) / sigma * own[:, :, s]
+                for b, own in zip(question.batches, rows_of, strict=True)]  # fmt: skip
+        for g, b in zip(rows, question.batches, strict=True):
+            g = close_gaps(g, b.weights[..., s] > 0)
+            middle += before * correlated_square(g, laws[s].lags) + rest * correlated_square(g, np.ones(1))
+        middle += rounding_square(rows, question.exact_values(point, s), step, sigma)
+        share = min(before / sigma**2, 1.0)
+        worth = sum(float(w.sum()) for w in question.worths(point, widths, s))
+        effective[s], correlation[s] = worth / (1 + (laws[s].time - 1) * share), share * correlation[s]
+    # Student's t tells (ν+1)/(ν+3) of what a Gaussian of the same σ tells; the dof that were used up are counted.
+    used = free - null.shape[1] + question.unknowns
+    lost = max(effective.sum() / max(effective.sum() - used, 1.0), 1.0)
+    robust = np.mean([1.0 if np.isinf(d) else (d + 3) / (d + 1) for d in widths.dof])
+    rows, basis = _parameter_rows(triangles, question.states) / unit, basis * unit[:, None]
+    half = basis @ np.linalg.solve(basis.T @ (rows.T @ rows) @ basis, basis.T)
+    white = robust * half / unit / unit[:, None]
+    covariance = lost * robust * half @ middle @ half.T / unit / unit[:, None]
+    unseen = np.linalg.norm(null, axis=1) > 1e-6 if null.size else np.zeros(free, bool)
+    covariance[unseen] = np.nan
+    covariance[:, unseen] = np.nan
+    covariance[unseen, unseen] = np.inf
+    confirmed = null if not null.size else confirmed_null(question, point, null)
+    return Information(covariance, null, confirmed, effective, correlation, white, float(lost))
+
+
+def null_space(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
+    """Directions of u (F, K) that nothing depends on, the starts being free; and a basis (F, F − K) of the others."""
+    rows = _parameter_rows(triangles, states)
+    unit = _lengths(triangles, states)
+    if not len(unit):
+        return np.zeros((0, 0)), np.zeros((0, 0))
+    # From above zero by its own round-off, so that a column which is noise alone counts as nothing.
+    _, values, directions = np.linalg.svd(rows / unit)
+    values = np.append(values, np.zeros(len(unit) - len(values)))
+    small = values <= NULL * max(values.max(initial=0.0), 1.0)
+    null = directions[small].T / unit[:, None]
+    null = null / np.abs(null).max(axis=0, initial=0.0)  # before squares of it are no numbers
+    null = null / np.linalg.norm(null, axis=0)
+    return null, directions[~small].T / unit[:, None]
+
+
+def _is_lost(question: Residuals, point: Trial) -> bool:
+    """True if the last digit of a parameter moves a signal by its size, because motions grow apart.
+
+    Growth alone is not enough: a drive that sets in smoothly begins with rows as small as numbers can be.
+    """
+    sizes, states = question.parameters.sizes(point.u), question.states
+    moved = max(
+        np.abs(slopes[..., states:] * sizes / question.size[:, None]).max(initial=0.0) for slopes in point.slopes
+    )
+    return moved > _LOST and growth(row_sizes(question, point)) > _LOST
+
+
+def confirmed_null(question: Residuals, point: Trial, null: np.ndarray) -> np.ndarray:
+    """The null directions, of (F, K), that are not the work of rounding, (F, K′)."""
+    sizes = row_sizes(question, point)
+    if growth(sizes) < _GROWTH:
+        return null
+    with np.errstate(divide="ignore"):
+        level = [np.where(size > 0, 1.0 / size, 0.0) for size in sizes]
+    return null_space(question.triangles(point, level), question.states)[0]
+
+
+def row_sizes(question: Residuals, point: Trial) -> list[np.ndarray]:
+    """The length of the row of each sample (N, T, S) of every batch, its columns as fractions of their largest."""
+    largest = np.max([np.abs(slopes).max(axis=(0, 1, 2)) for slopes in point.slopes], axis=0)
+    columns = np.where(largest > 0, largest, 1.0)
+    return [
+        np.where(batch.weights > 0, _norm(slopes / columns, -1), 0.0)
+        for batch, slopes in zip(question.batches, point.slopes, strict=True)
+    ]
+
+
+def growth(sizes: list[np.ndarray]) -> float:
+    """The growth of rows (N, T, S) along the record in which they grow most, from the first that is not zero."""
+    found = 1.0
+    for row in (row for batch in sizes for row in batch.max(axis=2)):
+        (places,) = np.nonzero(row)
+        if len(places):
+            found = max(found, float(row.max() / row[places[0]]))
+    return found
+
+
+def _parameter_rows(triangles: np.ndarray, states: int) -> np.ndarray:
+    """The rows of the parameters, orthogonal to those of the starts: a triangle with F columns."""
+    own = eliminate_starts(triangles, triangles[..., :-1], states)
+    return compress_rows(own.reshape(1, own.shape[0] * own.shape[1], own.shape[-1]))[0]
+
+
+def _lengths(triangles: np.ndarray, states: int) -> np.ndarray:
+    """The length of the column of each parameter (F,), one for a column of nothing."""
+    length = _norm(triangles[..., states:-1], (0, 1))
+    return np.where(length > _NOTHING, length, 1.0)
+
+
+def _norm(x: np.ndarray, axis) -> np.ndarray:
+    """The Euclidean norm along axes, also where squares are no numbers."""
+    largest = np.abs(x).max(axis=axis, keepdims=True)
+    unit = np.where(largest > 0, largest, 1.0)
+    return np.sqrt(np.sum((x / unit) ** 2, axis=axis)) * unit.squeeze(axis)
+
+
+def eliminate_starts(triangles: np.ndarray, slopes: np.ndarray, states: int) -> np.ndarray:
+    """Columns of parameters less what the starts can do instead: `slopes` (N, ..., D) → (N, ..., F).
+
+    Directions of a start that nothing depends on can do nothing: they are left out.
+    """
+    of_starts, of_u = triangles[..., :states], triangles[..., states:-1]
+    u, values, v = np.linalg.svd(of_starts, full_matrices=False)
+    keep = values > 1e-10 * np.maximum(values.max(axis=1, keepdims=True), np.finfo(float).tiny)
+    inverse = np.where(keep, 1.0 / np.where(keep, values, 1.0), 0.0)
+    instead = np.matmul(v.swapaxes(1, 2) * inverse[:, None], np.matmul(u.swapaxes(1, 2), of_u))
+    shape = (len(slopes), *[1] * (slopes.ndim - 3), *instead.shape[1:])
+    return slopes[..., states:] - np.matmul(slopes[..., :states], instead.reshape(shape))
+
+
+def covariance_of_one_start(
+    rows: np.ndarray, states: int, known: Information, share: float
+) -> tuple[np.ndarray, np.ndarray]:
+    """The uncertainty of a start by weighted rows (T, S, 2n + F): covariance (2n, 2n) for fixed parameters, and A⁺B.
+
+    Every sample is worth the `share` of an independent one.
+    """
+    flat = rows.reshape(-1, rows.shape[-1])
+    u, values, v = np.linalg.svd(flat[:, :states], full_matrices=False)
+    sees = values > 1e-10 * values.max()
+    into = (u[:, sees] / values[sees]) @ v[sees]
+    return known.lost / share * into.T @ into, into.T @ flat[:, states:]
+
+
+def signal_deviations(slopes: np.ndarray, states: int, start: np.ndarray, follows: np.ndarray, known: Information):
+    """The standard deviations (T, S) of signals whose derivatives are `slopes` (T, S, 2n + F).
+
+    They come from the parameters as far as these are seen, and from a start of covariance `start` (2n, 2n) of its own
+    that `follows` (2n, F) the parameters.
+    """
+    a = slopes[..., :states]
+    along = slopes[..., states:] - a @ follows
+    covariance = _identifiable_covariance(known)
+    variance = np.einsum("tsf,fg,tsg->ts", along, covariance, along) + np.einsum("tsi,ij,tsj->ts", a, start, a)
+    return np.where(_depends_on_unseen(along, known), np.inf, np.sqrt(np.maximum(variance, 0.0)))
+
+
+def _identifiable_covariance(known: Information) -> np.ndarray:
+    """The covariance (F, F) of what is seen, zero along what is not; with white residuals where some is not."""
+    return known.covariance if not known.null.size else known.lost * known.white
+
+
+def _depends_on_unseen(rows: np.ndarray, known: Information) -> np.ndarray:
+    """True if rows (..., F) of derivatives depend on a direction that is not seen."""
+    if not known.null.size:
+        return np.zeros(rows.shape[:-1], bool)
+    return (np.abs(rows @ known.null) > 1e-6 * np.abs(rows).max(initial=0.0)).any(axis=-1)

@@ -1,0 +1,112 @@
+"""Verdict: the result of a search in words.
+
+At the end of a search every number is moved along a straight line: x + δx, the full step of Gauss and Newton without
+bounds. A positive number that is smaller than its standard error is one that the data do not need; one whose step leads
+beyond a bound by more than two standard errors is held there by the bound alone.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax._fit.model._noise import AbstractNoise
+from lagjax._fit.model._parameters import Parameters
+from lagjax._fit.model._records import Record
+from lagjax._fit.model._residuals import Residuals, Trial
+from lagjax._fit.model._sensor_faults import TOO_COARSE, constant_signals, describe_sensors
+from lagjax._fit.model._transforms import Between, Positive
+from lagjax._fit.result._influence import disagreements
+from lagjax._fit.result._information import Information
+from lagjax._fit.search._descent import Descent, column_norms, eliminate
+from lagjax._fit.search._unexplained import Unexplained, measure_unexplained, unexplained_motion
+
+_BEYOND = 2.0  # standard errors that a step must lead beyond a bound: of sound fits at a bound one in forty does
+
+_CORRELATED = 0.5
+
+
+class Verdict(NamedTuple):
+    """A flag that a fit can be relied upon, the sentences that say why, and what it leaves."""
+
+    ok: bool
+    message: str
+    left: "Unexplained"
+
+
+def verdict(
+    descent: Descent, unseen: tuple[str, ...], known: Information, question: Residuals, noise: AbstractNoise
+) -> Verdict:
+    parts = [descent.message]
+    if known.confirmed.shape[1]:
+        parts.append("Not everything that is free is seen: fix it, or measure more.")
+    left = measure_unexplained(question, descent.point, descent.widths)
+    parts += left.motion + left.noise
+    triangles = question.linearise(descent.point, descent.widths)
+    at_ends, named = _describe_ends(question.parameters, descent.point, triangles, question.states, known)
+    parts += at_ends
+    # Half a step of the search is one standard deviation: the interval then spans more than a factor of fifty.
+    wide = 2 * _deviations(known) > question.parameters.reach
+    labels = dict.fromkeys(question.parameters.labels[i] for i in np.flatnonzero(wide & ~named))
+    if labels:
+        parts.append(f"Hardly seen, or at the end of what its transform allows: {', '.join(labels)}.")
+    apart, pulls = disagreements(
+        question, triangles, known, ~named, unexplained_motion(question, descent.point, descent.widths)
+    )
+    parts += apart + pulls
+    for part in question.parts:
+        records, own = [r for r in part.system.records if isinstance(r, Record)], part.sensor_noise(descent.widths)
+        if records:
+            parts += describe_sensors(records, noise, part.system.signals.names, part.system.sensor, own.sigma)
+    if np.nanmax(known.correlation) > _CORRELATED:
+        parts.append("The residuals are correlated: they hold motion that the scene lacks, and intervals allow for it.")
+    ok = descent.converged and not (unseen or left.motion or apart)
+    ok &= not any("take noise=" in text or TOO_COARSE in text for text in parts)
+    if not ok or at_ends or labels:
+        still = [
+            text for part in question.parts for text in constant_signals(part.system.records, part.system.signals.names)
+        ]
+        parts, ok = parts + still, ok and not still
+    return Verdict(ok, " ".join(parts), left)
+
+
+def _deviations(known: Information) -> np.ndarray:
+    """The standard deviations of u (F,), zero where something is not identifiable: `unseen_sentences` says that."""
+    return np.sqrt(np.nan_to_num(np.diag(known.covariance), posinf=0.0))
+
+
+def _describe_ends(parameters: Parameters, point: Trial, triangles, states: int, known: Information):
+    """Sentences for the numbers at the end of their sets, and for each unknown whether there is one (F,)."""
+    found, named = [], np.zeros(len(parameters), bool)
+    if known.null.shape[1] or not len(parameters):
+        return found, named
+    none = np.zeros(len(parameters))
+    step = eliminate(triangles, states, column_norms(triangles, states), 1e-14, (none, none)).u
+    deviations = _deviations(known)
+    for unknown, (label, transform) in enumerate(zip(parameters.labels, parameters.maps, strict=True)):
+        if not isinstance(transform, Positive | Between):
+            continue
+        u = point.u[unknown : unknown + 1]
+        slope = float(transform.slope(u)[0])
+        text = _describe_end(
+            label, transform, float(transform.value(u)[0]), slope * step[unknown], slope * deviations[unknown]
+        )
+        if text is not None:
+            found.append(text)
+            named[unknown] = True
+    return found, named
+
+
+def _describe_end(name: str, transform: Positive | Between, x: float, step: float, error: float) -> str | None:
+    """The sentence for one number x whose step on a straight line, and whose standard error there, are given."""
+    ends = [(0.0, -1)] if isinstance(transform, Positive) else [(transform.lower, -1), (transform.upper, 1)]
+    for end, side in ends:
+        if side * (x + step - end) > _BEYOND * error:
+            return (
+                f"{name} stands at {x:.3g}, held by the bound {end:g} of its transform: the data want it near "
+                f"{x + step:.3g} ± {error:.2g}. Widen the bound, or doubt the scene."
+            )
+        if abs(x - end) < error and side * (x - end) <= 0 and side * step >= -error:
+            if end == 0.0:
+                return f"{name} is {x:.2g} ± {error:.2g}: the data do not tell it from zero."
+            return f"{name} goes to its bound {end:g}, which is within its standard error {error:.2g}."
+    return None

@@ -1,0 +1,186 @@
+"""States and time scales, read off the data by local cubics."""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from lagjax._fit.model._inputs import constant_tables
+from lagjax._fit.model._motions import AbstractMotions
+from lagjax._fit.model._records import Record, inputs_between, restore_structure
+from lagjax._fit.model._residuals import SystemResiduals
+from lagjax._fit.model._sensors import unwrap_record
+
+_DEGREE = 3  # of local polynomials: velocities without the bias that curvature gives to lines
+
+_WINDOWS = (7, 13, 25, 49, 97, 193)  # samples in one of them
+
+_PROBES = 32  # places of a record where its time scale is looked at
+
+_WORSE_WINDOW = 1.3  # what a window may leave, in units of what the shortest leaves
+
+_WINDOWS_IN_ALL = 256  # places of all records where curvature is looked at
+
+_QUARTER = (
+    0.25  # of a period, by which the motion over a segment may be wrong: beyond a half residuals have false minima
+)
+
+
+class Reader(NamedTuple):
+    """Positions and velocities of one record from local cubics: each signal is a coordinate.
+
+    `windows` (S,) are the samples in one cubic, `scatter` (S,) what the shortest leave, `periods` (S,) those of signals
+    that are known less whole periods, else infinite.
+    """
+
+    record: Record
+    windows: tuple[int, ...]
+    scatter: tuple[float, ...]
+    periods: tuple[float, ...]
+
+    @classmethod
+    def from_record(cls, record: Record, probes: int = 256, periods: np.ndarray | None = None) -> "Reader":
+        """A reader with the longest windows whose cubics leave at most `_WORSE_WINDOW` times what the shortest leave.
+
+        Beyond these they no longer follow the motion. They are tried at `probes` places.
+        """
+        places = choose_places(record, probes)
+        windows, scatter = zip(*(_window(record.ts[places], *signal) for signal in _signals(record)), strict=True)
+        each = np.full(len(windows), np.inf) if periods is None else periods
+        return cls(record, windows, scatter, tuple(each.tolist()))
+
+    def states(self, places) -> np.ndarray:
+        read = self.read(places)
+        return np.stack([one[k] for k in (0, 1) for one in read], axis=-1)
+
+    def read(self, places) -> list[tuple]:
+        """The result of `_read_states` for every signal at the samples `places`."""
+        ts = self.record.ts[places]
+        return [
+            _read_states(ts, *signal, window)
+            for signal, window in zip(_signals(self.record), self.windows, strict=True)
+        ]
+
+
+def choose_places(record: Record, count: int) -> np.ndarray:
+    """Places of samples from the first to the last, evenly chosen, `count` of them at most."""
+    return np.unique(np.linspace(0, len(record) - 1, count).astype(int))
+
+
+def _signals(record: Record) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Times and values of every signal, where it is not missing."""
+    columns = record.matrix.T
+    return [(record.ts[np.isfinite(column)], column[np.isfinite(column)]) for column in columns]
+
+
+def _read_states(ts: np.ndarray, t: np.ndarray, y: np.ndarray, window: int):
+    """The values of a signal (t, y) and its rates at the times `ts`, what is left, and the local cubics there.
+
+    Where hardly anything was measured the signal is taken to be at rest.
+    """
+    if len(t) <= _DEGREE + 1:
+        level = np.full(len(ts), np.mean(y) if len(y) else 0.0)
+        return level, np.zeros(len(ts)), 0.0, level[:, None]
+    return _local_cubics(ts, t, y, min(window, len(t)))
+
+
+def _window(ts: np.ndarray, t: np.ndarray, y: np.ndarray) -> tuple[int, float]:
+    """The number of samples in the window for one signal, and the scatter about the shortest."""
+    scatter = _read_states(ts, t, y, _WINDOWS[0])[2]
+    best, most = _WINDOWS[0], _WORSE_WINDOW * scatter
+    for window in _WINDOWS[1:]:
+        if window > len(t) or _read_states(ts, t, y, window)[2] > most:
+            break
+        best = window
+    return best, scatter
+
+
+def _local_cubics(ts, t, y, window: int):
+    """Cubics through the `window` samples of (t, y) about each of the times `ts`: values, rates, what is left, and
+    the coefficients (M, 4) of the powers of the time since."""
+    after = np.searchsorted(t, ts)
+    first = np.clip(after - window // 2, 0, len(t) - window)
+    places = first[:, None] + np.arange(window)
+    offsets = t[places] - ts[:, None]
+    length = np.abs(offsets).max(axis=1, keepdims=True)
+    powers = (offsets / length)[..., None] ** np.arange(min(_DEGREE, window - 1) + 1)
+    # On [-1, 1] the normal equations of a cubic have a condition below 1e3.
+    transposed = powers.swapaxes(1, 2)
+    coefficients = np.linalg.solve(transposed @ powers, transposed @ y[places][..., None])
+    left = (powers @ coefficients)[..., 0] - y[places]
+    coefficients = coefficients[..., 0]
+    dof = max(window - powers.shape[-1], 1)
+    cubics = coefficients / length ** np.arange(powers.shape[-1])
+    return cubics[:, 0], cubics[:, 1], float(np.sqrt(np.mean(left**2) * window / dof)), cubics
+
+
+def short_windows(readers: list[Reader], length: float) -> tuple[list[Record], np.ndarray]:
+    """Short records, each `length` long, of the local cubics at some places of all records, and the states there.
+
+    Motions that are shorter than the time between samples see the curvature of the cubics: what a scene says about
+    accelerations, without a second derivative of the data.
+    """
+    found, states = [], []
+    for reader in readers:
+        places = choose_places(reader.record, max(4, _WINDOWS_IN_ALL // len(readers)))
+        offsets = np.linspace(0.0, length, 4)
+        cubics = [
+            _read_states(reader.record.ts[places], *s, w)[3]
+            for s, w in zip(_signals(reader.record), reader.windows, strict=True)
+        ]
+        values = np.stack([np.polynomial.polynomial.polyval(offsets, c.T) for c in cubics], axis=-1)
+        structured = [restore_structure(v, reader.record) for v in values]
+        found += [
+            Record(t + offsets, v, inputs_between(reader.record, t + offsets))
+            for t, v in zip(reader.record.ts[places], structured, strict=True)
+        ]
+        states.append(reader.states(places))
+    return found, np.concatenate(states)
+
+
+class TimeScales(NamedTuple):
+    """The duration for which a motion looks like a straight line, by the data and by the scene at their states."""
+
+    data: float
+    scene: float
+
+
+def time_scales(readers: list[Reader], motions: AbstractMotions, numbers: np.ndarray) -> TimeScales:
+    """The shortest times over which a motion looks like a straight line, with the parameters `numbers` (P,).
+
+    That of the data is the ratio of the spread of a coordinate to its rate, about 1/ω; that of the scene the root of
+    the spread of the coordinates, in units of each, over the accelerations there. Where nothing moves, they are
+    infinite.
+    """
+    places = [choose_places(reader.record, _PROBES) for reader in readers]
+    states = [reader.states(some) for reader, some in zip(readers, places, strict=True)]
+    t = np.concatenate([reader.record.ts[some] for reader, some in zip(readers, places, strict=True)])
+    y, n = np.concatenate(states), states[0].shape[1] // 2
+    within = np.concatenate([state[:, :n] - state[:, :n].mean(axis=0) for state in states])
+    inputs = np.concatenate([reader.record.input_matrix[some] for reader, some in zip(readers, places, strict=True)])
+    pulled = motions.rate(t, y, numbers, constant_tables(t, inputs))
+    pulled = np.where(np.isfinite(pulled), pulled, 0.0)
+    spread, rate, pulled = (np.sqrt(np.mean(x**2, axis=0)) for x in (within, y[:, n:], pulled))
+    spread = np.minimum(spread, _QUARTER * np.array(readers[0].periods))
+    with np.errstate(divide="ignore", invalid="ignore"):
+        both = spread / rate, np.sqrt(spread / pulled)
+    return TimeScales(*(float(one[np.isfinite(one) & (one > 0)].min(initial=np.inf)) for one in both))
+
+
+def build_reader(record: Record, about: SystemResiduals, numbers: np.ndarray, probes: int = 256) -> Reader | None:
+    """A reader of states off a record; None where its signals are no positions, or go round too fast to tell."""
+    if not about.signals.look_like_positions(record):
+        return None
+    periods = about.signals.periods
+    smooth = unwrap_record(record, periods)
+    if smooth is None:
+        return None
+    read = about.signals.positions(smooth, numbers)
+    if np.isfinite(periods).any():  # in the units of coordinates
+        gain = np.nanstd(read.matrix, axis=0) / np.maximum(np.nanstd(smooth.matrix, axis=0), np.finfo(float).tiny)
+        periods = np.where(np.isfinite(periods), gain * periods, np.inf)
+    return Reader.from_record(read, probes, periods)
+
+
+def pad_states(state: np.ndarray, states: int) -> np.ndarray:
+    """States (..., 2n) of a system, with zeros up to those of the one with the most coordinates."""
+    return np.concatenate([state, np.zeros((*state.shape[:-1], states - state.shape[-1]))], axis=-1)
