@@ -1,7 +1,8 @@
-"""The measurements at the states of a motion whose laws are known, in two ways.
+"""The measurements at the states of a motion whose laws are known.
 
-`Law.measurements` takes a `Sample` of many states, which programs evaluate in NumPy without compiling anything.
-`measurements_at` is the same for one state in JAX: for values that are being traced, and for scenes without programs.
+`Law.measurements` takes a `Sample` of many states, which programs evaluate in NumPy without compiling anything;
+`Law.measurements_at` takes one state in JAX: for values that are being traced, and for scenes without programs. Both
+give the quantities of the scene to `_measure`, which holds the laws, for arrays of either library.
 """
 
 from functools import partial
@@ -12,9 +13,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._equations import SADDLE, Derivation, Motion, Sample, derivation_of, distances, solve_saddle
+from lagjax._equations import (
+    SADDLE,
+    Derivation,
+    Motion,
+    Sample,
+    derivation_of,
+    distances,
+    factorize,
+    saddle,
+    solve_saddle,
+)
 from lagjax._interface import Layout
-from lagjax._program import Program, Unlowerable, lower
+from lagjax._program import Unlowerable, lower
 from lagjax._scene import System
 
 _CHUNK = 2**21  # numbers that programs return together, 16 MB
@@ -57,54 +68,32 @@ class Law(NamedTuple):
         works, conserved = _constants(system, derivation)
         return cls(derivation, works, conserved, tuple((f"{mode}: " if mode else "") + name for name in names))
 
-    # ---- by programs, in NumPy ----
+    # ---- many states, by programs ----
 
     def measurements(self, momenta: tuple[int, ...], tolerances, sample: Sample) -> Measurements:
         """The `Measurements` at S states; `tolerances` are rtol and atol, () or (S,) each."""
-        return sample.evaluate_in_parts(partial(self._measurements, momenta), self._portion(_QUANTITIES), *tolerances)
+
+        def measure_part(part: Sample, *tolerances) -> Measurements:
+            of, by_q = part.quantities(*_QUANTITIES), part.momenta_by_q(momenta)
+            columns = [np.reshape(x, (-1, 1)) for x in tolerances]
+            return self._measure(momenta, columns, part.q, part.qdot, of, by_q, self._finite(part))
+
+        return sample.evaluate_in_parts(measure_part, self._portion(_QUANTITIES), *tolerances)
 
     def powers(self, sample: Sample) -> np.ndarray:
         """dh/dt at S states, shape (S,)."""
-        return sample.evaluate_in_parts(self._powers, self._portion(_QUANTITIES))
+        names = (*_SOURCES, *(SADDLE if self.motion.constrained else ()))
+        return sample.evaluate_in_parts(
+            lambda part: self._power(part.quantities(*names), part.qdot), self._portion(_QUANTITIES)
+        )
 
     def accelerations(self, sample: Sample) -> np.ndarray:
         """q̈ at S states, shape (S, n)."""
-        return sample.evaluate_in_parts(Sample.solve_acceleration, self._portion(SADDLE))
+        return sample.evaluate_in_parts(lambda part: _solve(part.quantities(*SADDLE))[0], self._portion(SADDLE))
 
     def _portion(self, names: tuple[str, ...]) -> int:
         """The number of states of which programs return these quantities together."""
         return max(1, _CHUNK // sum(self.derivation.count(name) for name in names))
-
-    def _measurements(self, momenta, sample: Sample, *tolerances) -> Measurements:
-        q, qdot, of = sample.q, sample.qdot, sample.quantities(*_QUANTITIES)
-        (rtol, atol), far, fast = (np.reshape(x, (-1, 1)) for x in tolerances), np.abs(q), np.abs(qdot)
-        with np.errstate(all="ignore"):
-            energy = np.einsum("si,si->s", of["momentum"], qdot) - of["lagrangian"]
-            conserved = np.concatenate([energy[:, None], of["momentum"][:, list(momenta)]], axis=1)
-            by_q = np.abs(np.concatenate([of["energy_by_q"][:, None], sample.momenta_by_q(momenta)], axis=1))
-            of_energy = np.einsum("sij,sj->si", of["mass_matrix"], qdot)[:, None]
-            by_qdot = np.abs(np.concatenate([of_energy, of["mass_matrix"][:, list(momenta)]], axis=1))
-            sizes = np.einsum("ski,si->sk", by_q, far) + np.einsum("ski,si->sk", by_qdot, fast)
-            sizes[:, 0] += np.einsum("si,si->s", np.abs(of["momentum"]), fast) + np.abs(of["lagrangian"])
-            slopes = np.einsum("ski,si->sk", by_q, rtol * far + atol)
-            slopes += np.einsum("ski,si->sk", by_qdot, rtol * fast + atol)
-            off_q, off_qdot = distances(of["residual"], of["rates"], of["jacobian"], self.derivation.position_count)
-            power, acceleration = np.zeros(len(q), q.dtype), np.zeros_like(q)
-            if self.works:
-                acceleration, multipliers = solve_saddle(of)
-                power = _power_of(of, qdot, multipliers)
-            return Measurements(
-                conserved, slopes, sizes, power, acceleration, off_q, off_qdot,
-                _conditions(of["mass_matrix"]), self._finite(sample),
-            )  # fmt: skip
-
-    def _powers(self, sample: Sample) -> np.ndarray:
-        if not self.works:
-            return np.zeros(len(sample.q), sample.q.dtype)
-        driven = not self.derivation.absent("driving").all()
-        of = sample.quantities(*_SOURCES, *(SADDLE if driven else ()))
-        with np.errstate(all="ignore"):
-            return _power_of(of, sample.qdot, solve_saddle(of)[1] if driven else np.zeros_like(of["driving"]))
 
     def _finite(self, sample: Sample) -> np.ndarray:
         """True if M, F, G and γ have finite derivatives by all inputs at S states, (S,).
@@ -125,29 +114,83 @@ class Law(NamedTuple):
             return finite
         doubtful = [x if np.ndim(x) == 0 else x[~finite] for x in sample.columns]
         try:
-            slopes = self._total_slopes.evaluate_many(doubtful)
+            slopes = lower(
+                partial(_slopes_of_all, self.motion), *self.derivation.state_shapes, budget=_DERIVATIVE_BUDGET
+            ).evaluate_many(doubtful)
         except Unlowerable:
             return finite
         finite = finite.copy()
         finite[~finite] = np.isfinite(slopes).all(axis=0)
         return finite
 
-    @property
-    def _total_slopes(self) -> Program:
-        motion = self.derivation.motion
-        return lower(
-            lambda *state: _slopes_of_all(motion, *state), *self.derivation.state_shapes, budget=_DERIVATIVE_BUDGET
+    # ---- one state, in JAX ----
+
+    def measurements_at(self, momenta: tuple[int, ...], tolerances, q, qdot, t, params) -> Measurements:
+        """The `Measurements` at one state, with the momenta of the coordinates in `momenta`."""
+        motion, state, chosen = self.motion, (q, qdot, t, params), jnp.asarray(momenta, int)
+        by_q = jax.jacrev(lambda *state: motion.momentum(*state)[chosen])(*state)
+        finite = jnp.all(jnp.stack([jnp.isfinite(leaf).all() for leaf in _slopes_of_all(motion, *state)]))
+        return self._measure(momenta, tolerances, q, qdot, motion.quantities(*state), by_q, finite)
+
+    def power_at(self, q, qdot, t, params) -> jax.Array:
+        """dh/dt at one state, ()."""
+        return self._power(self.motion.quantities(q, qdot, t, params), qdot)
+
+    # ---- the laws ----
+
+    @np.errstate(all="ignore")
+    def _measure(self, momenta, tolerances, q, qdot, of, momenta_by_q, finite) -> Measurements:
+        """The `Measurements` from the quantities `of` states q, q̇ (…, n), their ∂pᵢ/∂q (…, k − 1, n) and `finite` (…).
+
+        Arrays of NumPy have an axis of states, those of JAX none.
+        """
+        xp, (rtol, atol), chosen = qdot.__array_namespace__(), tolerances, np.array(momenta, int)
+        momentum, mass, far, fast = of["momentum"], of["mass_matrix"], xp.abs(q), xp.abs(qdot)
+        energy = xp.einsum("...i,...i->...", momentum, qdot) - of["lagrangian"]
+        by_q = xp.abs(xp.concatenate([of["energy_by_q"][..., None, :], momenta_by_q], axis=-2))
+        of_energy = xp.einsum("...ij,...j->...i", mass, qdot)[..., None, :]
+        by_qdot = xp.abs(xp.concatenate([of_energy, mass[..., chosen, :]], axis=-2))
+
+        def add_changes(of_q, of_qdot):
+            return xp.einsum("...ki,...i->...k", by_q, of_q) + xp.einsum("...ki,...i->...k", by_qdot, of_qdot)
+
+        terms = xp.einsum("...i,...i->...", xp.abs(momentum), fast) + xp.abs(of["lagrangian"])
+        is_energy = np.arange(1 + len(chosen)) == 0
+        off_q, off_qdot = distances(of["residual"], of["rates"], of["jacobian"], self.derivation.position_count)
+        return Measurements(
+            conserved=xp.concatenate([energy[..., None], momentum[..., chosen]], axis=-1),
+            slopes=add_changes(rtol * far + atol, rtol * fast + atol),
+            sizes=add_changes(far, fast) + is_energy * terms[..., None],
+            power=self._power(of, qdot),
+            acceleration=_solve(of)[0] if self.works else xp.zeros_like(q),
+            distances=off_q,
+            rates=off_qdot,
+            mass=_conditions(mass),
+            finite=finite,
         )
+
+    @np.errstate(all="ignore")
+    def _power(self, of: dict[str, Any], qdot):
+        """dh/dt = −∂L/∂t + Q·q̇ + λ·(G q̇), where G q̇ = −∂f/∂t, and −a(q, 0, t) for velocities, (…)."""
+        xp = qdot.__array_namespace__()
+        if not self.works:
+            return xp.zeros_like(of["lagrangian_by_t"])
+        power = xp.einsum("...i,...i->...", of["nonconservative_force"], qdot) - of["lagrangian_by_t"]
+        return power - xp.einsum("...k,...k->...", _solve(of)[1], of["driving"]) if self.motion.constrained else power
 
 
 _SOURCES = ("lagrangian_by_t", "nonconservative_force", "driving")
 _QUANTITIES = ("lagrangian", "momentum", "energy_by_q", "residual", "rates", *SADDLE, *_SOURCES)
 
 
-def _power_of(of: dict[str, np.ndarray], qdot, multipliers) -> np.ndarray:
-    """dh/dt = −∂L/∂t + Q·q̇ + λ·(G q̇), where G q̇ = −∂f/∂t, and −a(q, 0, t) for velocities."""
-    power = -of["lagrangian_by_t"] + np.einsum("si,si->s", of["nonconservative_force"], qdot)
-    return power - np.einsum("sk,sk->s", multipliers, of["driving"])
+@np.errstate(all="ignore")
+def _solve(of: dict[str, Any]) -> tuple[Any, Any]:
+    """q̈ and λ from the quantities `SADDLE` of states in NumPy, or of one state in JAX."""
+    if isinstance(of["force"], np.ndarray):
+        return solve_saddle(of)
+    if not of["gamma"].size:
+        return factorize(of["mass_matrix"]).solve(of["force"]), of["gamma"]
+    return saddle(*(of[name] for name in SADDLE))[:2]
 
 
 def _conditions(matrix):
@@ -195,42 +238,9 @@ def _constants(system: System, derivation: Derivation) -> tuple[bool, tuple[int,
         return could_work, None
 
 
-# ---- one state, in JAX -----------------------------------------------------------------------------------------------
-
-
-def measurements_at(law: Law, momenta: tuple[int, ...], tolerances, q, qdot, t, params) -> Measurements:
-    """The `Measurements` at one state, with the momenta of the coordinates in `momenta`."""
-    motion, state = law.motion, (q, qdot, t, params)
-    conserved = motion.energy_and_momenta(momenta, *state)
-    by_q, by_qdot = map(jnp.abs, jax.jacrev(motion.energy_and_momenta, argnums=(1, 2))(momenta, *state))
-    (rtol, atol), far, fast = tolerances, jnp.abs(q), jnp.abs(qdot)
-    terms = jnp.abs(motion.momentum(*state)) @ fast + jnp.abs(motion.lagrangian(*state))
-    off_q, off_qdot = motion.constraints.distances(*state)
-    return Measurements(
-        conserved=conserved,
-        slopes=by_q @ (rtol * far + atol) + by_qdot @ (rtol * fast + atol),
-        sizes=(by_q @ far + by_qdot @ fast).at[0].add(terms),
-        power=power_at(law, *state),
-        acceleration=motion.acceleration(*state) if law.works else jnp.zeros_like(q),
-        distances=off_q,
-        rates=off_qdot,
-        mass=_conditions(motion.mass_matrix(*state)),
-        finite=jnp.all(jnp.stack([jnp.isfinite(leaf).all() for leaf in _slopes_of_all(motion, *state)])),
-    )
-
-
-def power_at(law: Law, q, qdot, t, params) -> jax.Array:
-    """dh/dt = −∂L/∂t + Q·q̇ + λ·(G q̇), where G q̇ = −∂f/∂t, and −a(q, 0, t) for velocities."""
-    motion, state = law.motion, (q, qdot, t, params)
-    if not law.works:
-        return jnp.zeros((), q.dtype)
-    power = motion.nonconservative_force(*state) @ qdot - jax.grad(motion.lagrangian, argnums=2)(*state)
-    return power - motion.multipliers(*state) @ motion.constraints.driving(*state) if motion.constrained else power
-
-
 def _slopes_of_all(motion: Motion, q, qdot, t, params) -> list[jax.Array]:
     """The derivatives of the sum of M, F, G and γ by q, q̇, t and every parameter."""
-    floats, others = eqx.partition(params, _is_inexact)
+    floats, others = eqx.partition(params, lambda leaf: jnp.issubdtype(jnp.result_type(leaf), jnp.inexact))
 
     def total(q, qdot, t, floats):
         state = q, qdot, t, eqx.combine(floats, others)
@@ -239,7 +249,3 @@ def _slopes_of_all(motion: Motion, q, qdot, t, params) -> list[jax.Array]:
         return sum(jnp.sum(part) for part in parts)
 
     return jax.tree.leaves(jax.grad(total, argnums=(0, 1, 2, 3))(q, qdot, t, floats))
-
-
-def _is_inexact(leaf) -> bool:
-    return jnp.issubdtype(jnp.result_type(leaf), jnp.inexact)

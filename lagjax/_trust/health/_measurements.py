@@ -20,7 +20,7 @@ from lagjax._equations import Sample, borders_of, is_lowered, map_in_chunks
 from lagjax._interface import Layout, is_concrete
 from lagjax._primitives import DOUBLE, widen, with_doubles
 from lagjax._run import Members
-from lagjax._trust.health._laws import Law, Measurements, measurements_at, power_at
+from lagjax._trust.health._laws import Law, Measurements
 
 PyTree = Any
 
@@ -139,30 +139,23 @@ def _conserved(laws: list[Law]) -> tuple[int, ...] | None:
 
 def path_of(members: Members) -> SampledPath:
     """The states of all members."""
-    run, count = members.trajectory, members.count
-    ts = members.shared(run.ts, 1)
-    q, qdot = members.flat(run.q), members.flat(run.qdot)
-    mode = np.zeros(ts.shape, int) if run.mode is None else np.asarray(run.mode).reshape(ts.shape)
-    t, ends = ts, np.broadcast_to(np.arange(1, ts.shape[1]), (count, ts.shape[1] - 1))
+    run, ts = members.trajectory, members.shared(members.trajectory.ts, 1)
+    transitions = None
     if run.transitions is not None:
-        transitions = run.transitions
-        times = np.asarray(transitions.t).reshape(count, -1)
-        source = np.asarray(transitions.source).reshape(times.shape)
-        ends = _ends(np, ts, times)
-        more = (members.flat(transitions.q), members.flat(transitions.qdot), times, source)
-        q, qdot, t, mode = (np.concatenate(pair, axis=1) for pair in zip((q, qdot, t, mode), more, strict=True))
-    tolerances = run.tolerances
-    if tolerances is not None:
-        rtol, atol = (members.shared(x, 0).astype(q.dtype) for x in tolerances)
-        tolerances = np.maximum(rtol, np.finfo(q.dtype).eps), atol
-    steps = np.asarray(run.stats["num_accepted_steps"], q.dtype).reshape(count)
-    return SampledPath(q, qdot, t, mode, ts, ends, steps, tolerances, _precision_of(run, q))
+        times, source = (np.asarray(x).reshape(members.count, -1) for x in (run.transitions.t, run.transitions.source))
+        transitions = members.flat(run.transitions.q), members.flat(run.transitions.qdot), times, source
+    mode, q = None if run.mode is None else np.asarray(run.mode).reshape(ts.shape), members.flat(run.q)
+    tolerances = run.tolerances and [members.shared(x, 0) for x in run.tolerances]
+    steps = np.asarray(run.stats["num_accepted_steps"]).reshape(members.count)
+    q = members.flat(run.q)
+    return _join_states(
+        np, (q, members.flat(run.qdot), ts, mode), transitions, steps, tolerances, _precision_of(run, q)
+    )
 
 
 def _report_of(members: Members, laws: list[Law]) -> dict[str, Any]:
     """The fields of `Health` that are measured, with the batch axes of the trajectory."""
     path, momenta = path_of(members), _conserved(laws) or ()
-    starts = np.cumsum([0, *(len(law.names) for law in laws)])
 
     def evaluate_by_mode(function: Callable, q, qdot, t, mode):
         """`function(law, index, member, sample)` on the states of each mode, in the order of all states, (N, S, …)."""
@@ -188,10 +181,7 @@ def _report_of(members: Members, laws: list[Law]) -> dict[str, Any]:
 
     def measure_sample(law, index, member, sample) -> Measurements:
         tolerances = (0.0, 0.0) if path.tolerances is None else (x[member] for x in path.tolerances)
-        found = law.measurements(momenta, tuple(tolerances), sample)
-        before, after = int(starts[index]), int(starts[-1] - starts[index + 1])
-        distances, rates = (np.pad(x, ((0, 0), (before, after))) for x in (found.distances, found.rates))
-        return found._replace(distances=distances, rates=rates)
+        return _pad_constraints(law.measurements(momenta, tuple(tolerances), sample), laws, index)
 
     def evaluate_law(function: Callable) -> Callable:
         return partial(evaluate_by_mode, lambda law, index, member, sample: function(law, sample))
@@ -216,8 +206,10 @@ def _measure_traced(trajectory, axes, tree, steps):
         layout = Layout.from_state(*jax.tree.map(lambda leaf: leaf[0], (q, qdot)))
         laws = _laws(trajectory, layout, params)
         names["all"] = _names(laws, layout)
-        path = _path_of_one(layout, q, qdot, times_and_tolerances, mode, steps, transitions)
-        path = path._replace(precision=_precision_of(trajectory, path.q))
+        flat, (ts, tolerances) = jax.vmap(layout.flatten), times_and_tolerances
+        more = transitions and (flat(transitions.q), flat(transitions.qdot), transitions.t, transitions.source)
+        outputs, precision = (flat(q), flat(qdot), ts, mode), _precision_of(trajectory, layout)
+        path = _join_states(jnp, outputs, more, steps, tolerances, precision)
         momenta, numbers = _conserved(laws) or (), eqx.filter(params, eqx.is_array)
         tolerances = (0.0, 0.0) if path.tolerances is None else path.tolerances
         size = _CHUNK // (members * layout.size**2)
@@ -225,10 +217,10 @@ def _measure_traced(trajectory, axes, tree, steps):
         def evaluate_in_chunks(function):
             return lambda *states: map_in_chunks(partial(_evaluate_mode, laws, function), states, size)
 
-        sample = evaluate_in_chunks(lambda law, q, v, t: measurements_at(law, momenta, tolerances, q, v, t, numbers))
+        sample = evaluate_in_chunks(lambda law, *state: law.measurements_at(momenta, tolerances, *state, numbers))
         between = Rates(
-            evaluate_in_chunks(lambda law, q, v, t: power_at(law, q, v, t, numbers)),
-            evaluate_in_chunks(lambda law, q, v, t: law.motion.acceleration(q, v, t, numbers)),
+            evaluate_in_chunks(lambda law, *state: law.power_at(*state, numbers)),
+            evaluate_in_chunks(lambda law, *state: law.motion.acceleration(*state, numbers)),
         )
         return _report(path, laws, momenta, sample, between)
 
@@ -236,44 +228,47 @@ def _measure_traced(trajectory, axes, tree, steps):
     return fields, names["all"]
 
 
-def _path_of_one(layout: Layout, q, qdot, times_and_tolerances, mode, steps, transitions) -> SampledPath:
-    def flat(tree):
-        return jax.vmap(layout.flatten)(tree)
-
-    ts, tolerances = times_and_tolerances
-    mode = jnp.zeros(ts.size, int) if mode is None else mode
-    q, v, t, ends = flat(q), flat(qdot), ts, jnp.arange(1, ts.size)
-    if transitions is not None:
-        q, v = jnp.concatenate([q, flat(transitions.q)]), jnp.concatenate([v, flat(transitions.qdot)])
-        t, mode = jnp.concatenate([t, transitions.t]), jnp.concatenate([mode, transitions.source])
-        ends = _ends(jnp, ts, transitions.t)
-    if tolerances is not None:
-        rtol, atol = (jnp.asarray(x, layout.dtype) for x in tolerances)
-        tolerances = jnp.maximum(rtol, jnp.finfo(layout.dtype).eps), atol
-    return SampledPath(q, v, t, mode, ts, ends, steps.astype(layout.dtype), tolerances, layout.dtype)
-
-
 def _evaluate_mode(laws: list[Law], function: Callable, q, qdot, t, mode):
     """`function(law, q, qdot, t)` by the law of the state's mode; distances from other modes' constraints are zero."""
-    starts = np.cumsum([0, *(len(law.names) for law in laws)])
     total = None
     for index, law in enumerate(laws):
         value = function(law, q, qdot, t)
         if isinstance(value, Measurements):
-            distances, rates = (
-                jnp.zeros(starts[-1], q.dtype).at[starts[index] : starts[index + 1]].set(of_law)
-                for of_law in (value.distances, value.rates)
-            )
-            value = value._replace(distances=distances, rates=rates)
-        total = value if total is None else _select(mode == index, value, total)
+            value = _pad_constraints(value, laws, index)
+        if total is not None:
+            value = jax.tree.map(partial(jnp.where, mode == index), value, total)
+        total = value
     return total
 
 
-def _select(which, new, old):
-    return jax.tree.map(lambda a, b: jnp.where(which, a, b), new, old)
-
-
 # ---- what the path shows: arrays of either library -------------------------------------------------------------------
+
+
+def _join_states(xp, outputs: tuple, transitions: tuple | None, steps, tolerances, precision) -> SampledPath:
+    """The path through outputs and the states before transitions, both q, q̇, t and mode (None: there is one)."""
+    q, qdot, ts, mode = outputs
+    ends = xp.broadcast_to(xp.arange(1, ts.shape[-1]), (*ts.shape[:-1], ts.shape[-1] - 1))
+    t, mode, dtype = ts, xp.zeros(ts.shape, int) if mode is None else mode, q.dtype
+    if transitions is not None:
+        ends = _ends(xp, ts, transitions[2])
+        q, qdot, t, mode = (
+            xp.concatenate(pair, axis=ts.ndim - 1) for pair in zip((q, qdot, t, mode), transitions, strict=True)
+        )
+    if tolerances is not None:
+        rtol, atol = (xp.asarray(x, dtype) for x in tolerances)
+        tolerances = xp.maximum(rtol, np.finfo(dtype).eps), atol
+    return SampledPath(q, qdot, t, mode, ts, ends, xp.asarray(steps, dtype), tolerances, precision)
+
+
+def _pad_constraints(measured: Measurements, laws: list[Law], index: int) -> Measurements:
+    """The measurements by one of several laws, with zeros as the distances from the constraints of the others."""
+    counts = [len(law.names) for law in laws]
+    around = sum(counts[:index]), sum(counts[index + 1 :])
+
+    def pad(x):
+        return x.__array_namespace__().pad(x, [(0, 0)] * (x.ndim - 1) + [around])
+
+    return measured._replace(distances=pad(measured.distances), rates=pad(measured.rates))
 
 
 def _report(path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample: Callable, between: "Rates") -> dict:
