@@ -51,7 +51,7 @@ from lagjax._native._frame import Fields, Frame, Lane
 from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._retraction import Retraction
 from lagjax._native._roots import Roots, Touch
-from lagjax._native._saltation import NUMBERS, GuardTable, Saltation
+from lagjax._native._saltation import GuardTable, Saltation
 from lagjax._native._step import absolute_tolerance
 from lagjax._native._taylor import TaylorSeries, integer
 from lagjax._program import _borders
@@ -215,14 +215,13 @@ class BorderControl:
         """Note where guard g is crossed, if that is sooner than what was noted before."""
         code = frame.code
         j = self.table.place(code, g, "piece")
-        a, b, d, e, below, above, k, l, _ = (self.table.number(code, g, name) for name in NUMBERS)
         piece = self._piece(frame, j)
-        level = piece * d + e + code.select(piece <= 0.0, code.lanes_of(below), 0.0)
-        level = level + code.select(piece >= 0.0, code.lanes_of(above), 0.0)
+        side, level, beyond = (self.table.rule(code, g, name) for name in ("side", "level", "beyond"))
+        level = level(piece, lambda where, x: code.select(where, code.lanes_of(x), 0.0))
         if any(guard.of_table for guard in self.guards):
             is_table = code.lanes_of(code.as_double(self.table.place(code, g, "of_table"))) > 0.0
             level = code.select(is_table, frame["level", g], level)
-        side, beyond = piece * a + b, piece * k + l
+        side, beyond = side(piece), beyond(piece)
         is_share = code.lanes_of(code.flag(self.table.place(code, g, "on") >= 0)) > 0.0
         undecided = code.compare("==", side, 0.0)
         # Nothing is looked for along the border that the motion slides on, or in the share of one that does not.
@@ -356,9 +355,9 @@ class BorderControl:
                 least = unit * code.select(far, AT_REST, SETS_OUT)
                 frame["level", g] = code.select(last > least, last, least)
             if self.borders.kinds[guard.piece] == _borders.TABLE:
-                index = self._piece(frame, integer(code, guard.piece)) + guard.e
+                index = self._piece(frame, integer(code, guard.piece)) + guard.level.offset
                 knot, inside = self._knot(frame, guard.piece, index)
-                frame["level", g] = code.select(inside, knot, NOWHERE if guard.e else -NOWHERE)
+                frame["level", g] = code.select(inside, knot, NOWHERE if guard.level.offset else -NOWHERE)
 
     @property
     def slides(self) -> bool:
@@ -718,7 +717,7 @@ class BorderControl:
                 frame["touch", back] = code.select(is_share, Touch.NONE, Touch.VALUE)
             with code.only_if(slide >= 0):
                 below = code.select(self._piece(frame, j) < frame["beyond"], self._piece(frame, j), frame["beyond"])
-                is_sign = code.lanes_of(self.table.number(code, g, "k")) <= 0.0
+                is_sign = code.lanes_of(self.table.rule(code, g, "beyond").slope) <= 0.0
                 with frame.where(slides):
                     frame["params", place] = code.select(is_sign, -1.0, below)
                     frame["params", slide + self.motion.parameters] = 1
@@ -762,9 +761,7 @@ class BorderControl:
             if guard.piece not in self.kicks_in_time:
                 continue
             piece = self._piece(frame, integer(code, guard.piece))
-            side = piece * guard.a + guard.b
-            level = piece * guard.d + guard.e + code.select(piece <= 0.0, frame.constant(guard.below), 0.0)
-            level = level + code.select(piece >= 0.0, frame.constant(guard.above), 0.0)
+            side, level = guard.side(piece), guard.level(piece, lambda where, x: code.select(where, x, 0.0))
             level = frame["level", g] if guard.of_table else level
             self.roots.polynomial(frame, integer(code, guard.piece), degree, h, side, level)
             end, slope = code.variable(frame.constant(0.0)), code.variable(frame.constant(0.0))
@@ -777,7 +774,7 @@ class BorderControl:
                 (frame["last"] > 0.0) & (frame["forward"] > 0.0) & code.compare("!=", side, 0.0) & (end.value <= noise)
             )
             with frame.where(there & code.compare("==", frame["nearest"], one) & code.compare("!=", h, 0.0)):
-                frame["crossed"], frame["beyond"] = float(g + 1), piece * guard.k + guard.l
+                frame["crossed"], frame["beyond"] = float(g + 1), guard.beyond(piece)
 
     def _kick(self, base: int) -> Code:
         """`()`: the velocities behind the border, in the lanes that are to `kicks`; 2 there if they do not pass it."""
@@ -864,7 +861,7 @@ class BorderControl:
             place = self.table.place(code, on, "piece") + self.motion.parameters
             order = code.lanes_of(code.as_double(self.table.place(code, on, "order")))
             with frame.where(hit):
-                frame["params", place] = frame["params", place] + self.table.number(code, g, "gains")
+                frame["params", place] = frame["params", place] + code.as_double(self.table.place(code, g, "gains"))
                 frame["touch", self.table.place(code, g, "rest")] = Touch.NONE
                 frame["touch", on] = code.select(again, order, order + Touch.VALUE)
             if self.borders.releases:  # the vector of a cone has been given a length beyond its level
@@ -875,7 +872,7 @@ class BorderControl:
     def _is_cone(self, frame: Frame, g: Value) -> Value:
         """True in all lanes if guard g is that of a cone, or a share."""
         code = frame.code
-        return code.lanes_of(code.flag(code.compare("==", self.table.number(code, g, "k"), 0.0))) > 0.0
+        return code.lanes_of(code.flag(code.compare("==", self.table.rule(code, g, "beyond").slope, 0.0))) > 0.0
 
     def _release(self, frame: Frame, crossed: Value) -> None:
         """Let the vectors of cones that hold no longer set out, with a speed that is twice what counts as none."""

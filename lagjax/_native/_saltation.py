@@ -9,6 +9,7 @@ crossed, none of this exists: derivatives are NaN there, but for first ones wher
 import math
 from collections.abc import Callable
 from enum import IntEnum
+from typing import Any
 
 import numpy as np
 
@@ -18,12 +19,13 @@ from lagjax._native._frame import Fields, Frame, Index, Numbers, Vectors, intege
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._tangent_memory import Directions
 from lagjax._native._taylor import TaylorSeries
-from lagjax._program._borders import Borders
+from lagjax._program._borders import Affine, Borders, Level
 from lagjax._program._jump import Jump
 from lagjax._program._look_ups import Table
 
-NUMBERS = ("a", "b", "d", "e", "below", "above", "k", "l", "gains")
-PLACES = ("piece", "back", "slide", "on", "order", "rest", "of_table")
+# The rules of a guard by name, each with the place of its first number among those of the guard.
+_RULES, _NUMBERS = {"side": (0, Affine), "level": (2, Level), "beyond": (6, Affine)}, 8
+_PLACES = ("piece", "back", "slide", "on", "order", "rest", "gains", "of_table")
 
 
 class Hit(IntEnum):
@@ -44,11 +46,11 @@ class GuardTable:
 
     def __init__(self, motion: TaylorSeries, borders: Borders):
         self.motion, self.borders = motion, borders
-        numbers = np.array([[getattr(guard, name) for name in NUMBERS] for guard in borders.guards] or [[0.0]])
-        self._numbers = integers(motion.module, np.frombuffer(numbers.tobytes(), np.int64))
+        rules = [[x for name in _RULES for x in getattr(guard, name)] for guard in borders.guards] or [[0.0]]
+        self._rules = integers(motion.module, np.array(rules, float).view(np.int64))
         self._places = integers(
             motion.module,
-            np.array([[getattr(g, name) for name in PLACES] for g in borders.guards] or [[0]], np.int64),
+            np.array([[getattr(g, name) for name in _PLACES] for g in borders.guards] or [[0]], np.int64),
         )
         self.guards = len(borders.guards)
         first = self.guards + 1
@@ -61,14 +63,15 @@ class GuardTable:
         self.movable = [j for _, j in self.knots if borders.moving_table(j) is not None]
         self.coincide = first + len(borders.clocks)
 
-    def number(self, code: Code, g: Value, name: str) -> Value:
-        """A number of guard g."""
-        place = g * len(NUMBERS) + NUMBERS.index(name)
-        return code.load(code.element(Value(code, self._numbers), place), DOUBLE)
+    def rule(self, code: Code, g: Value, name: str) -> Any:
+        """The `side`, the `level` or the piece `beyond` of guard g, as functions of its piece."""
+        (first, kind), row = _RULES[name], Value(code, self._rules)
+        places = range(first, first + len(kind._fields))
+        return kind(*(code.load(code.element(row, g * _NUMBERS + k), DOUBLE) for k in places))
 
     def place(self, code: Code, g: Value, name: str) -> Value:
         """A number of another guard, or of a piece; −1 where there is none."""
-        place = g * len(PLACES) + PLACES.index(name)
+        place = g * len(_PLACES) + _PLACES.index(name)
         return code.load(code.element(Value(code, self._places), place, INTEGER), INTEGER)
 
     def crosses_guard(self, frame: Frame) -> Value:
@@ -102,7 +105,7 @@ class GuardTable:
         self._note_pieces(frame, where)
         with code.loop(self.guards) as g:
             j = self.place(code, g, "piece")
-            side = frame["pieces_before", j] * self.number(code, g, "a") + self.number(code, g, "b")
+            side = self.rule(code, g, "side")(frame["pieces_before", j])
             hit = where & code.compare("==", crossed, code.lanes_of(code.as_double(g + 1)))
             decided = code.compare("!=", side, 0.0)
             if self.borders.kicking:  # where L jumps, a motion that begins on the border comes from what L is there
@@ -112,7 +115,7 @@ class GuardTable:
                 frame["hit", j] = 1
                 frame["is_hit"] = Hit.BORDER
                 if self.borders.levels_move:
-                    frame["entry", j] = frame["params", j + motion.parameters] + self.number(code, g, "e")
+                    frame["entry", j] = frame["params", j + motion.parameters] + self.rule(code, g, "level").offset
 
     def note_knot(self, frame: Frame, where: Value) -> None:
         """The same of knots that are parameters."""

@@ -63,11 +63,34 @@ _WITHOUT_ANY = {"input", "constant", "add", "sub", "neg", "sin", "cos"}  # no pi
 _SINGULAR_AT_ZERO, _SINGULAR_AT_ONE = ("sqrt", "rsqrt", "cbrt", "log", "pow"), ("log1p", "asin", "acos", "acosh")
 
 
-class Guard(NamedTuple):
-    """A border of piece number `piece`, with p the piece: of its switching number u, σ (u − level) > 0.
+class Affine(NamedTuple):
+    """`slope` p + `offset`, of a piece p."""
 
-    σ = a p + b. The level is d p + e, and `below` more where p ≤ 0, `above` more where p ≥ 0. Beyond it the piece is
-    k p + l, whose border on this side is guard `back`.
+    slope: float
+    offset: float
+
+    def __call__(self, piece):
+        return piece * self.slope + self.offset
+
+
+class Level(NamedTuple):
+    """`slope` p + `offset`, of a piece p, and `below` more where p ≤ 0, `above` more where p ≥ 0."""
+
+    slope: float = 0.0
+    offset: float = 0.0
+    below: float = 0.0
+    above: float = 0.0
+
+    def __call__(self, piece, number_where: Callable):
+        """The level of a piece; `number_where(condition, x)` is x where the condition holds, else 0."""
+        level = piece * self.slope + self.offset + number_where(piece <= 0.0, self.below)
+        return level + number_where(piece >= 0.0, self.above)
+
+
+class Guard(NamedTuple):
+    """A border of piece number `piece`: of its switching number u, σ (u − level) > 0, with σ = ±1 the `side`.
+
+    Beyond it the piece is `beyond`, whose border on this side is guard `back`.
 
     Where both sides push onto the border of `piece`, piece number `slide` becomes 1: the motion slides along it, with
     α of the acceleration on the upper side and 1 − α of that on the lower one; its piece is the one below, and guard
@@ -77,20 +100,15 @@ class Guard(NamedTuple):
     """
 
     piece: int
-    a: float
-    b: float
-    d: float
-    e: float
-    below: float
-    above: float
-    k: float
-    l: float
+    side: Affine
+    level: Level
+    beyond: Affine
     back: int
     slide: int = -1
     on: int = -1
     order: int = 0
     rest: int = -1
-    gains: float = 0.0
+    gains: int = 0
     of_table: int = 0
 
 
@@ -831,6 +849,7 @@ def _guards(kinds: Sequence[int], slides: Sequence[Slide]) -> tuple[Guard, ...]:
     this many borders that push onto each other come to rest (Murty, Linear Algebra Appl. 9 (1974) 65).
     """
     guards: list[Guard] = []
+    as_it_is, zero = Affine(1.0, 0.0), Level()
     sliding = [slide.piece for slide in slides]
     first = len(kinds) - len(sliding)
     for j, kind in enumerate(kinds[:first]):
@@ -838,30 +857,29 @@ def _guards(kinds: Sequence[int], slides: Sequence[Slide]) -> tuple[Guard, ...]:
         if kind == CLOCK or (kind == CONE and j not in sliding):
             continue
         if kind == CONE:  # whose level is a speed that counts as none
-            of_piece = [Guard(j, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, k, of_table=1)]
+            of_piece = [Guard(j, as_it_is, zero, Affine(0.0, -1.0), k, of_table=1)]
         elif kind == SIGN:
-            of_piece = [Guard(j, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, -1.0, 0.0, k)]
-        else:
-            floors = kind in (FLOOR, TABLE)  # between numbers p and p + 1, or the entries with these indices
-            below, above = (0.0, 0.0) if floors else (-1.0, 1.0)
-            of = int(kind == TABLE)
+            of_piece = [Guard(j, as_it_is, zero, Affine(-1.0, 0.0), k)]
+        else:  # between the numbers p and p + 1, or the entries with these indices, or of a `TRUNC` around 0
+            lower, upper = Level(1.0, 0.0), Level(1.0, 1.0)
+            if kind == TRUNC:
+                lower, upper = Level(1.0, below=-1.0), Level(1.0, above=1.0)
+            of_table = int(kind == TABLE)
             of_piece = [
-                Guard(j, 0.0, 1.0, 1.0, 0.0, below, 0.0, 1.0, -1.0, k + 1, of_table=of),
-                Guard(j, 0.0, -1.0, 1.0, 1.0 if floors else 0.0, 0.0, above, 1.0, 1.0, k, of_table=of),
+                Guard(j, Affine(0.0, 1.0), lower, Affine(1.0, -1.0), k + 1, of_table=of_table),
+                Guard(j, Affine(0.0, -1.0), upper, Affine(1.0, 1.0), k, of_table=of_table),
             ]
         if j in sliding:
-            lower, upper = (
-                k,
-                k + len(of_piece) - 1,
-            )  # the borders of a piece; the upper one of the piece below is slid on
+            last = k + len(of_piece) - 1  # the upper border of a piece, which that below it slides on
             slide, (_, order, width, *_) = first + sliding.index(j), slides[sliding.index(j)]
-            of_piece = [guard._replace(slide=slide, order=order, rest=upper) for guard in of_piece]
+            of_piece = [guard._replace(slide=slide, order=order, rest=last) for guard in of_piece]
+            none = Affine(0.0, 0.0)
             of_piece += [
-                Guard(slide, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, upper + 1, on=upper, rest=upper),
-                Guard(slide, -1.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, upper + 2, on=lower, rest=upper, gains=width),
+                Guard(slide, as_it_is, zero, none, last + 1, on=last, rest=last),
+                Guard(slide, Affine(-1.0, 0.0), Level(0.0, 1.0), none, last + 2, on=k, rest=last, gains=int(width)),
             ]
             if kind == CONE:  # which is left on one side alone
-                of_piece[-2:] = [of_piece[-2]._replace(gains=width)]
+                of_piece[-2:] = [of_piece[-2]._replace(gains=int(width))]
         guards += of_piece
     return tuple(guards)
 

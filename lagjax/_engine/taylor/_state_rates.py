@@ -48,13 +48,13 @@ def _pieces(borders, rows: Rows, n: int) -> list[Any]:
     count, zero = len(borders.switches), jnp.zeros_like(rows.first[..., 0])
     pieces = list(emit_rows(borders.decide, rows._replace(pieces=[zero] * (2 * count))))
     # Along a border in position a motion slides at rest, which `decide` knows, and so it rests on a cone.
-    guards = [guard for guard in borders.guards if guard.slide >= 0 and guard.k != 0.0 and guard.order < 2]
+    guards = [guard for guard in borders.guards if guard.slide >= 0 and guard.beyond.slope != 0.0 and guard.order < 2]
     switches = _evaluate_pieces(borders, rows, pieces)[1]
     sides: dict[int, tuple] = {}
     for guard in guards:  # of the borders of a piece the nearest one counts
         j, piece = guard.piece, pieces[guard.piece]
-        beyond = guard.k * piece + guard.l
-        below, above = (zero - 1, zero + 1) if guard.k < 0 else (jnp.minimum(piece, beyond), jnp.maximum(piece, beyond))
+        beyond, ends = guard.beyond(piece), (zero - 1, zero + 1)
+        below, above = ends if guard.beyond.slope < 0 else (jnp.minimum(piece, beyond), jnp.maximum(piece, beyond))
         found = jnp.abs(switches[j] - _level(borders, guard, rows, piece)), below, above
         known = sides.get(guard.slide, (j, *found))[1:]
         sides[guard.slide] = (j, *(jnp.where(found[0] < known[0], x, y) for x, y in zip(found, known, strict=True)))
@@ -81,9 +81,9 @@ def _pieces(borders, rows: Rows, n: int) -> list[Any]:
 
 def _level(borders, guard, rows: Rows, piece):
     """The level of a guard of this piece."""
-    index = guard.d * piece + guard.e
     if guard.of_table:
+        index = guard.level.slope * piece + guard.level.offset
         table = borders.tables[guard.piece].table
         entry = emit_look_up("take", table, rows.entries, piece.dtype, index)
         return jnp.where((index >= 0) & (index < table.count), entry, jnp.inf)
-    return index + jnp.where(piece <= 0, guard.below, 0.0) + jnp.where(piece >= 0, guard.above, 0.0)
+    return guard.level(piece, lambda where, x: jnp.where(where, x, 0.0))
