@@ -20,11 +20,10 @@ import numpy as np
 
 from lagjax._analysis import Modes
 from lagjax._fit import Fit, Record, draw_record, record_matrix
-from lagjax._interface import Function, Layout, accept, is_known
+from lagjax._interface import Function, Layout, accept, is_known, join_names
 from lagjax._run import Crossings, Trajectory
 from lagjax._show import COLORS, course_of, courses_of, join_curve, require_points, times_of_members
 from lagjax._trust import WorkPrecision
-from lagjax._trust.checks import join_names
 from lagjax._trust.health import does_work
 
 MARKERS = ("o", "s", "^", "D", "v", "P", "X")

@@ -1,8 +1,10 @@
-"""The outcomes of a trajectory: result codes, what to try when one is bad, and the exception that carries it.
+"""The outcomes of a trajectory in words: result codes, what to try, the exception that carries one, and lists of names.
 
 The codes are diffrax's own and ours. They travel inside `jit` and `vmap` as arrays, one per member of a batch;
 only `simulate` turns one into an exception.
 """
+
+from collections.abc import Sequence
 
 import diffrax
 import jax
@@ -139,3 +141,8 @@ def show_str(result, printer, cycle: bool) -> None:
     except Exception:  # a display must not fail
         text = repr(result)
     printer.text(text)
+
+
+def join_names(names: Sequence[str], longest: int = 8) -> str:
+    """Names separated by commas, the `longest` first of them and how many more."""
+    return ", ".join(names[:longest]) + (f" and {len(names) - longest} more" if len(names) > longest else "")

@@ -13,7 +13,7 @@ import numpy as np
 from lagjax._engine import Problem, choose
 from lagjax._engine.diffrax import ArrayEquations, form_of
 from lagjax._equations import dependent_rows, pieces_of_motion
-from lagjax._interface import show_str
+from lagjax._interface import join_names, show_str
 from lagjax._native import Nesting, is_large, pieces_of
 from lagjax._program import CLOCK, FLOOR, SIGN, TABLE, TRUNC, Program, Unlowerable
 
@@ -21,6 +21,9 @@ _PIECES = {
     SIGN: "the sign of", FLOOR: "the whole part of", TRUNC: "the whole part of", CLOCK: "samples by",
     TABLE: "a table by",
 }  # fmt: skip
+
+
+_LISTED = 12  # names that a row of an explanation lists
 
 
 @dataclass(frozen=True)
@@ -81,11 +84,11 @@ class Explanation:
     _repr_pretty_ = show_str
 
     def __str__(self) -> str:
-        rows = [("coordinates", f"{len(self.coordinates)}: {_join_names(self.coordinates)}")]
+        rows = [("coordinates", f"{len(self.coordinates)}: {join_names(self.coordinates, _LISTED)}")]
         if self.cyclic is not None:
-            reads = _join_names(self.mass_matrix_depends_on or ())
+            reads = join_names(self.mass_matrix_depends_on or (), _LISTED) or "none"
             rows += [
-                ("cyclic", _join_names(self.cyclic)),
+                ("cyclic", join_names(self.cyclic, _LISTED) or "none"),
                 ("mass matrix", f"{self.mass_matrix}; depends on {reads}"),
                 ("velocity terms", "yes" if self.velocity_terms else "no"),
                 ("explicit time", "yes" if self.explicit_time else "no"),
@@ -97,9 +100,9 @@ class Explanation:
         if self.narrow:
             rows.append(("narrow features", _count_names(self.narrow)))
         if self.constraints:
-            rows.append(("constraints", f"{len(self.constraints)}: {_join_names(self.constraints)}"))
+            rows.append(("constraints", f"{len(self.constraints)}: {join_names(self.constraints, _LISTED)}"))
         for name, others in (self.dependent_constraints or {}).items():
-            rows.append(("dependent", f"{name} on {_join_names(others)}"))
+            rows.append(("dependent", f"{name} on {join_names(others, _LISTED)}"))
         if self.operations is not None:
             rows.append(("operations", f"{self.operations} per acceleration, {self.traced_operations} as derived"))
         if self.projection_operations is not None:
@@ -167,7 +170,7 @@ def _borders(problem: Problem, inputs: tuple[str, ...]) -> dict[str, Any]:
         return {"borders": (), "narrow": (), "borders_located": True}
 
     def read_by(node: int) -> str:
-        return _join_names(tuple(inputs[i] for i in sorted(borders.read_by(node)) if i < len(inputs)))
+        return join_names([inputs[i] for i in sorted(borders.read_by(node)) if i < len(inputs)], _LISTED) or "none"
 
     kinds = zip(borders.switches, borders.kinds, strict=True)
     in_machine_code = choose(problem).refusal is None and pieces_of(derivation.acceleration, Nesting(n)) is not None
@@ -189,7 +192,7 @@ def _borders_in_lines(problem: Problem) -> dict[str, Any]:
 
 def _count_names(names: tuple[str, ...]) -> str:
     """The count of names, and each of them once."""
-    return f"{len(names)}: {_join_names(tuple(dict.fromkeys(names)))}"
+    return f"{len(names)}: {join_names(list(dict.fromkeys(names)), _LISTED)}"
 
 
 def _pattern(parts: Program, n: int) -> str:
@@ -199,8 +202,3 @@ def _pattern(parts: Program, n: int) -> str:
         return "diagonal"
     connected = np.linalg.matrix_power((filled | np.eye(n, dtype=bool)).astype(float), n) > 0
     return "dense" if connected.all() else "block-diagonal"
-
-
-def _join_names(names: tuple[str, ...], longest: int = 12) -> str:
-    shown = ", ".join(names[:longest]) or "none"
-    return shown + (f", … ({len(names) - longest} more)" if len(names) > longest else "")

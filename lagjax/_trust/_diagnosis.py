@@ -32,12 +32,12 @@ from lagjax._equations import (
     pieces_of,
     poles,
 )
-from lagjax._interface import RESULTS, Layout, code_of, halves, not_finite, numbers_at
+from lagjax._interface import RESULTS, Layout, code_of, halves, join_names, not_finite, numbers_at
 from lagjax._primitives import sentence
 from lagjax._program import Unlowerable
 from lagjax._run import Trajectory
 from lagjax._scene import System
-from lagjax._trust.checks import check, join_names
+from lagjax._trust.checks import check
 
 LARGEST = 128  # coordinates up to which `check` is called: it takes a second there
 LONGEST = 4000  # equations of a function up to which they are gone through one by one: some 50 µs each

@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from lagjax._engine import DEFAULT_RTOL
-from lagjax._interface import Layout, is_concrete, not_finite, require_number
+from lagjax._interface import Layout, is_concrete, join_names, not_finite, require_number
 from lagjax._native import ATOL_OVER_MOTION, ATOL_OVER_RTOL
 from lagjax._primitives import accepts_singles
 from lagjax._scene import System, require_system
@@ -28,10 +28,10 @@ from lagjax._trust.checks import (
     _mass,
     _stiffness,
 )
-from lagjax._trust.checks._findings import Finding, Findings, join_names, sort_findings
+from lagjax._trust.checks._findings import Finding, Findings
 from lagjax._trust.checks._scene_at_start import CheckedScene
 
-__all__ = ["Finding", "Findings", "check", "join_names"]
+__all__ = ["Finding", "Findings", "check"]
 
 PyTree = Any
 
@@ -80,8 +80,8 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
         raise ValueError("check needs numbers, not traced values: call it outside of jit, vmap and grad, on one state.")
     reported = _inputs(layout, q, qdot, t, params)
     if any(finding.level == "error" for finding in reported):
-        return sort_findings(reported)
-    return sort_findings([*reported, *_scene_findings(system, q, qdot, t, params)])
+        return Findings.sort(reported)
+    return Findings.sort([*reported, *_scene_findings(system, q, qdot, t, params)])
 
 
 @accepts_singles(("q", "qdot"), ("t", "params"))

@@ -12,8 +12,9 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax._equations import Sample
+from lagjax._interface import join_names
 from lagjax._program import BELOW, Borders, StraightLine, Unlowerable, evaluate, live
-from lagjax._trust.checks._findings import Finding, join_names
+from lagjax._trust.checks._findings import Finding
 from lagjax._trust.checks._jumps_nearby import OF_FORCE
 from lagjax._trust.checks._scene_at_start import CheckedScene
 

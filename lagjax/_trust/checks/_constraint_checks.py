@@ -3,9 +3,9 @@
 import numpy as np
 
 from lagjax._equations import dependent_rows, require_consistent
-from lagjax._interface import Layout
+from lagjax._interface import Layout, join_names
 from lagjax._trust.checks._derivative_checks import position_count
-from lagjax._trust.checks._findings import Finding, join_names
+from lagjax._trust.checks._findings import Finding
 from lagjax._trust.checks._mass import null_velocities
 from lagjax._trust.checks._scene_at_start import CheckedScene
 

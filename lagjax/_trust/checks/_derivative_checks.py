@@ -3,8 +3,9 @@
 import numpy as np
 
 from lagjax._equations import Offender, offenders, pieces_of
+from lagjax._interface import join_names
 from lagjax._trust.checks._differences import Slopes, differ, ladder, slopes
-from lagjax._trust.checks._findings import Finding, join_names
+from lagjax._trust.checks._findings import Finding
 from lagjax._trust.checks._jumps_nearby import OF_FORCE
 from lagjax._trust.checks._scene_at_start import CheckedScene, Sides
 

@@ -44,6 +44,11 @@ class Findings:
 
     found: tuple[Finding, ...]
 
+    @classmethod
+    def sort(cls, found: list[Finding]) -> "Findings":
+        """The findings by level, those of one level in the order of `found`."""
+        return cls(tuple(sorted(found, key=lambda finding: _ORDER[finding.level])))
+
     @property
     def ok(self) -> bool:
         """True if there is no error among them."""
@@ -67,13 +72,3 @@ class Findings:
             return "Nothing found."
         more = len(self.found) - _SHOWN
         return "\n".join([*map(str, self.found[:_SHOWN]), *([f"… and {more} more"] if more > 0 else [])])
-
-
-def sort_findings(found: list[Finding]) -> Findings:
-    """The findings sorted by level, those of one level in the order of `found`."""
-    return Findings(tuple(sorted(found, key=lambda finding: _ORDER[finding.level])))
-
-
-def join_names(names: tuple[str, ...] | list[str], longest: int = 8) -> str:
-    """Names separated by commas, the `longest` first of them and how many more."""
-    return ", ".join(names[:longest]) + (f" and {len(names) - longest} more" if len(names) > longest else "")

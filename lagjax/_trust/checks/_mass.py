@@ -16,7 +16,8 @@ import numpy as np
 
 from lagjax._engine import DEFAULT_RTOL
 from lagjax._equations import diagonal_scale, eigen, null_directions, null_space, singular_threshold
-from lagjax._trust.checks._findings import Finding, join_names
+from lagjax._interface import join_names
+from lagjax._trust.checks._findings import Finding
 from lagjax._trust.checks._scene_at_start import CheckedScene
 
 
