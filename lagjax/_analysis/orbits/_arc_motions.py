@@ -79,14 +79,13 @@ class Arcs:
         self.conserves = not self.derivation.works
 
     @classmethod
-    def from_system(cls, system: System, q0, qdot0, params: PyTree, rtol: float, what: str) -> "Arcs":
-        """The arcs of a scene whose state has the structure of (q0, qdot0).
+    def from_system(cls, system: System, layout: Layout, params: PyTree, rtol: float, what: str) -> "Arcs":
+        """The arcs of a scene whose states have this layout.
 
         Raises `ValueError`, a sentence about `what` they are for, where the scene has constraints or no machine code.
         """
         system = require_system(system)
         require_untraced((system, params), "A parameter")
-        layout = Layout.from_state(q0, qdot0)
         if has_constraints(system):
             raise ValueError(
                 f"{what} cannot be found with constraints yet: give the scene coordinates that need none, angles of "

@@ -9,16 +9,15 @@ Source: Keller, *Lectures on Numerical Methods in Bifurcation Problems* (1987), 
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from lagjax._analysis.orbits._arc_motions import Arcs
 from lagjax._analysis.orbits._continuation import FamilyPoint, FamilyTangent, Follower, correct, tangent_at
 from lagjax._analysis.orbits._family import Family, first_point, parameter_index
 from lagjax._analysis.orbits._flat_starts import starts
-from lagjax._analysis.orbits._orbit import RTOL, Orbit, assess_orbits
+from lagjax._analysis.orbits._orbit import RTOL, FlatOrbits, Orbit, assess_orbits, restore_orbits
 from lagjax._equations import decide
-from lagjax._interface import Layout, halves, require_tolerance
+from lagjax._interface import Layout, require_tolerance
 from lagjax._primitives import accepts_singles
 from lagjax._scene import System
 
@@ -72,16 +71,13 @@ def branch_off(
             "family again with another first step, so that its neighbours lie elsewhere."
         )
     found = assess_orbits(follower.closing(point.numbers), point.chain, before.symmetries.shape[1])
-    q, qdot = map(follower.arcs.layout.restore, halves(found.y[0]))
-    arrays = jax.tree.map(jnp.asarray, (q, qdot, *(x[0] for x in found[1:6])))
-    return Orbit._make([*arrays, found.message[0]])
+    return restore_orbits(follower.arcs.layout, FlatOrbits(*(x[0] for x in found)), found.message[0])
 
 
 def _follower(system: System, family: Family, k: int, turns: int, params, by: str) -> Follower:
     """The follower of orbits of this family, traversed once or twice, in the units of orbit k."""
     period, layout, y0 = _start(family, k, turns)
-    q, qdot = map(layout.restore, halves(y0[0]))
-    arcs = Arcs.from_system(system, q, qdot, params, RTOL, "Families")
+    arcs = Arcs.from_system(system, layout, params, RTOL, "Families")
     place = None if by == "energy" else parameter_index(params, by)
     return Follower(arcs.with_numbers(_numbers(arcs, place, family, k)), place, y0, period)
 

@@ -9,8 +9,6 @@ Source: Arnold, *On a characteristic class entering in quantization conditions*,
 Duistermaat, *On the Morse index in variational calculus*, Adv. Math. 21 (1976) 173.
 """
 
-import itertools
-
 import numpy as np
 
 from lagjax._analysis.orbits._arc_motions import Arcs, Units
@@ -31,15 +29,16 @@ def conjugate_times(arcs: Arcs, y: np.ndarray, times: np.ndarray, units: Units) 
     for k, start in enumerate(y):
         ts = np.linspace(times[k], times[k + 1], _GLANCES + 1)
         frames = _frames(arcs, start, ts, frame, units)
-        counts = _count_conjugate_times(arcs, start, ts, frames, units)
+        phases = _phases(arcs, _states(arcs, start, ts), ts, frames, units)
         for j in range(_GLANCES):
             if k == j == 0:
                 continue  # the start itself, where all paths meet
-            for nth in range(counts[j]):
+            for nth in range(_count_turns(phases[j], phases[j + 1])):
                 found.append(_locate_conjugate_time(arcs, start, ts[0], ts[j], ts[j + 1], frame, frames[j], nth, units))
         frame = frames[-1]
     found = np.sort(np.array(found))
-    at_end = bool((found > times[-1] - _AT_END * duration).any()) or _is_singular(frame, n)
+    singular = decide(frame[:n], absolute=_AT_END).rank < n  # the first rows B of an orthonormal plane, to rounding
+    at_end = bool((found > times[-1] - _AT_END * duration).any() or singular)
     return found[found <= times[-1] - _AT_END * duration], at_end
 
 
@@ -72,17 +71,10 @@ def _count_turns(before: np.ndarray, after: np.ndarray) -> int:
     return int(np.argmin([np.abs(shift).max() for shift in shifts]))
 
 
-def _count_conjugate_times(arcs: Arcs, start, ts, frames, units: Units) -> list[int]:
-    """The number of conjugate times between neighbouring ones of these times."""
-    phases = _phases(arcs, _states(arcs, start, ts), ts, frames, units)
-    return [_count_turns(a, b) for a, b in itertools.pairwise(phases)]
-
-
 def _locate_conjugate_time(arcs: Arcs, start, t_first, low, high, frame, frame_low, nth: int, units: Units) -> float:
     """The time of the nth conjugate time between `low` and `high`, counted from 0, by bisection."""
-    ts = np.array([t_first, low]) if low > t_first else np.array([t_first])
-    state = _states(arcs, start, ts)[-1:] if len(ts) > 1 else start[None]
-    before = _phases(arcs, state, ts[-1:], frame_low[None], units)[0]
+    state = _states(arcs, start, np.array([t_first, low]))[-1:] if low > t_first else start[None]
+    before = _phases(arcs, state, np.array([low]), frame_low[None], units)[0]
     for _ in range(_TRIALS):
         middle = (low + high) / 2
         if not low < middle < high:
@@ -95,8 +87,3 @@ def _locate_conjugate_time(arcs: Arcs, start, t_first, low, high, frame, frame_l
         else:
             low = middle
     return float((low + high) / 2)
-
-
-def _is_singular(frame: np.ndarray, n: int) -> bool:
-    """True if B, the first rows of an orthonormal plane (2n, n), is singular to the rounding of tangents."""
-    return bool(decide(frame[:n], absolute=_AT_END).rank < n)

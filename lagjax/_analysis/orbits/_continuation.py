@@ -18,6 +18,7 @@ Source: Allgower & Georg, *Numerical Continuation Methods* (1990), §6.1 (steps 
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 
 from lagjax._analysis.orbits import _shooting
@@ -54,9 +55,8 @@ class FamilyPoint(NamedTuple):
     right: np.ndarray
 
     @property
-    def free(self) -> np.ndarray:
-        """The first state and the period, (2n + 1,)."""
-        return np.append(self.chain.y[0, 0], self.chain.period)
+    def unknowns(self) -> "FamilyUnknowns":
+        return FamilyUnknowns(self.chain.y, self.chain.period, self.numbers)
 
     def closed(self, share: float) -> bool:
         """True if all arcs could be followed and close to this share of the size of the state."""
@@ -78,16 +78,6 @@ class FamilyUnknowns(NamedTuple):
     y: np.ndarray
     period: np.ndarray
     numbers: np.ndarray
-
-    @classmethod
-    def from_point(cls, point: FamilyPoint) -> "FamilyUnknowns":
-        return cls(point.chain.y, point.chain.period, point.numbers)
-
-    def plus(self, other: "FamilyUnknowns", by: float = 1.0) -> "FamilyUnknowns":
-        return FamilyUnknowns(*(mine + by * one for mine, one in zip(self, other, strict=True)))
-
-    def times(self, by: float) -> "FamilyUnknowns":
-        return FamilyUnknowns(*(by * mine for mine in self))
 
 
 class Follower:
@@ -144,7 +134,7 @@ class Follower:
 
     def move(self, point: FamilyPoint, first: np.ndarray, right: float) -> FamilyPoint:
         """The point after a change (2n + F,) of its free numbers; the states of its inner arcs follow."""
-        return self.rebuild(point, FamilyUnknowns.from_point(point).plus(self.complete_change(point, first, right)))
+        return self.rebuild(point, jax.tree.map(np.add, point.unknowns, self.complete_change(point, first, right)))
 
     def rebuild(self, point: FamilyPoint, whole: "FamilyUnknowns") -> FamilyPoint:
         """The point with the numbers `whole`, its arcs at the same parts of the period as those of `point`."""
@@ -281,13 +271,13 @@ def step_along(follower: Follower, last: FamilyPoint, tangent: FamilyTangent, st
 
 def _chord(follower: Follower, last: FamilyPoint, point: FamilyPoint, step: float) -> np.ndarray:
     """The change of what is free, (2n + F,), in units of the step."""
-    change = point.free - last.free
-    if not follower.period_is_free:
-        change = change[:-1]
+    change = jax.tree.map(np.subtract, point.unknowns, last.unknowns)
+    parts = [change.y[0, 0]]
+    if follower.period_is_free:
+        parts.append(change.period)
     if follower.place is not None:
-        by = point.numbers[follower.place] - last.numbers[follower.place]
-        change = np.append(change, by / follower.of_parameter)
-    return change / step
+        parts.append(change.numbers[[follower.place]] / follower.of_parameter)
+    return np.concatenate(parts) / step
 
 
 def next_step(step: float, there: FamilyStep) -> float:

@@ -9,6 +9,7 @@ periodic solutions of conservative systems*, Int. J. Bifurcation and Chaos 13 (2
 D 181 (2003) 1.
 """
 
+import operator
 from typing import Any, NamedTuple
 
 import jax
@@ -117,8 +118,7 @@ def family(
     if jnp.ndim(orbit.period) or not bool(orbit.ok):
         raise ValueError("orbit must be one periodic orbit that is ok: of a batch take one member, and see why not.")
     period, layout, y0 = starts(orbit.q0, orbit.qdot0, orbit.period, "period")
-    q, qdot = map(layout.restore, halves(y0[0]))
-    arcs = Arcs.from_system(system, q, qdot, params, RTOL, "Families")
+    arcs = Arcs.from_system(system, layout, params, RTOL, "Families")
     place = None if by == "energy" else parameter_index(params, by)
     follower = Follower(arcs, place, y0, period.ravel(), until)
     if by == "energy" and not arcs.conserves:
@@ -287,11 +287,11 @@ def _orbit_between(
     most: int,
 ) -> _Member | None:  # fmt: skip
     """The orbit at arc length s between members of `found` at a and b; None where it belongs to another family."""
-    ends = [FamilyUnknowns.from_point(found[x].point) for x in (a, b)]
-    slopes = [_rate(follower, found[x], across) for x in (a, b)]
     u, width = (s - a) / (b - a), b - a
-    guess = ends[0].times((1 + 2 * u) * (1 - u) ** 2).plus(ends[1], u**2 * (3 - 2 * u))
-    guess = guess.plus(slopes[0], width * u * (1 - u) ** 2).plus(slopes[1], width * u**2 * (u - 1))
+    shares = (1 + 2 * u) * (1 - u) ** 2, u**2 * (3 - 2 * u), width * u * (1 - u) ** 2, width * u**2 * (u - 1)
+    ends = (found[x].point.unknowns for x in (a, b))
+    slopes = (_rate(follower, found[x], across) for x in (a, b))
+    guess = jax.tree.map(lambda *parts: sum(map(operator.mul, shares, parts)), *ends, *slopes)
     there = correct(follower, follower.rebuild(found[a].point, guess), across, left_out)
     tangent = None if there is None else tangent_at(follower, there[0], found[a].tangent, left_out)
     if there is None or tangent is None or tangent.vector @ across.vector < _ALONG:
@@ -310,8 +310,7 @@ def _rate(follower: Follower, member: _Member, across: FamilyTangent) -> FamilyU
 
 def _build_family(follower: Follower, members: list[_Member], message: str) -> Family:
     """The family in the user's structure."""
-    arrays = zip(*(member.found[:6] for member in members), strict=True)
-    found = FlatOrbits._make([*map(np.concatenate, arrays), ()])
+    found = FlatOrbits(*map(np.concatenate, zip(*(member.found for member in members), strict=True)))
     points, layout = [member.point for member in members], follower.arcs.layout
     value, energy = (np.array([of(point) for point in points]) for of in (follower.value, follower.energy))
     q, qdot = map(layout.restore, halves(found.y))

@@ -50,8 +50,7 @@ def _quotient(null: np.ndarray, of_transpose: np.ndarray) -> np.ndarray:
     w, ell = np.linalg.qr(null)[0], np.linalg.qr(of_transpose)[0]
     # Directions of W that ℓ does not see; those it sees are simple multipliers, outside of ker ℓ.
     inside = w @ decide(ell.T @ w, absolute=_SEEN).null
-    away = np.concatenate([ell, inside], axis=1)
-    return np.linalg.svd(away, full_matrices=True)[0][:, away.shape[1] :]
+    return decide(np.concatenate([ell, inside], axis=1).T).null
 
 
 _SEEN = 1e-5  # the cosine of W and ℓ that tells a simple multiplier 1 from a Jordan block
@@ -73,11 +72,19 @@ def passage_determinant(reduced: Reduced, sign: int) -> float:
     Of the cyclic matrix of the arcs, not of multipliers: two that meet at 1 are known to half the digits only, their
     product with those of the others to all.
     """
-    count, m, _ = reduced.growth.shape
-    cyclic = np.eye(count * m).reshape(count, m, count, m)
+    growth = reduced.growth.copy()
+    growth[0] *= sign
+    cyclic = _cyclic_matrix(growth)
+    return float(np.linalg.det(np.eye(len(cyclic)) - cyclic))
+
+
+def _cyclic_matrix(growth: np.ndarray) -> np.ndarray:
+    """The matrix (K m, K m) with blocks G_k (K, m, m), each of which takes part k to the part after it."""
+    count, m, _ = growth.shape
+    cyclic = np.zeros((count, m, count, m))
     for k in range(count):
-        cyclic[(k + 1) % count, :, k, :] -= (sign if k == 0 else 1) * reduced.growth[k]
-    return float(np.linalg.det(cyclic.reshape(count * m, count * m)))
+        cyclic[(k + 1) % count, :, k, :] = growth[k]
+    return cyclic.reshape(count * m, count * m)
 
 
 def pairing_error(multipliers: np.ndarray) -> float:
@@ -89,13 +96,9 @@ def pairing_error(multipliers: np.ndarray) -> float:
 def _product_eigenvalues(growth: np.ndarray) -> np.ndarray:
     """The eigenvalues of G_(K−1) … G_0, as K-th powers of those of the cyclic matrix that has them as its blocks."""
     growth = _merge_factors(growth)
-    count, m, _ = growth.shape
+    count, roots = len(growth), np.linalg.eigvals(_cyclic_matrix(growth)).astype(complex)
     if count == 1:
-        return np.linalg.eigvals(growth[0]).astype(complex)
-    cyclic = np.zeros((count, m, count, m))
-    for k in range(count):
-        cyclic[(k + 1) % count, :, k, :] = growth[k]
-    roots = np.linalg.eigvals(cyclic.reshape(count * m, count * m)).astype(complex)
+        return roots
     # The roots of one multiplier stand on a circle, a turn divided by K apart: one of each comes of sorting by power.
     powers = np.exp(count * np.log(np.where(roots == 0, 1e-300, roots)))
     return _group_means(powers, count)
@@ -124,17 +127,12 @@ _LITTLE = 100.0
 
 def _group_means(powers: np.ndarray, count: int) -> np.ndarray:
     """Means of the groups of `count` values that belong to one multiplier each."""
-    left, chosen = list(range(len(powers))), []
-    order = sorted(left, key=lambda i: -abs(powers[i]))
-    waiting = dict.fromkeys(order)
-    while waiting:
-        first = next(iter(waiting))
-        distance = sorted(waiting, key=lambda i: abs(powers[i] - powers[first]))
-        group = distance[:count]
-        chosen.append(np.mean(powers[group]))
-        for i in group:
-            del waiting[i]
-    return np.array(chosen)
+    means, rest = [], powers[np.argsort(-np.abs(powers), kind="stable")]
+    while len(rest):
+        near = np.argsort(np.abs(rest - rest[0]), kind="stable")
+        means.append(np.mean(rest[near[:count]]))
+        rest = rest[np.sort(near[count:])]
+    return np.array(means)
 
 
 def _pair_reciprocals(values: np.ndarray) -> np.ndarray:

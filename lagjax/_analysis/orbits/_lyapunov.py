@@ -18,7 +18,7 @@ import numpy as np
 
 from lagjax._analysis.orbits._arc_motions import Arcs
 from lagjax._analysis.orbits._flat_starts import starts
-from lagjax._interface import SUCCESSFUL, SimulationError, halves, require_flag, show_str
+from lagjax._interface import SUCCESSFUL, SimulationError, require_flag, show_str
 from lagjax._primitives import accepts_singles, sentence
 from lagjax._scene import System
 
@@ -87,18 +87,12 @@ def lyapunov_spectrum(
     """
     require_flag(throw, "throw")
     durations, layout, y0 = starts(q0, qdot0, duration, "duration")
-    arcs = Arcs.from_system(system, *_first_state(layout, y0), params, rtol, "Lyapunov exponents")
+    arcs = Arcs.from_system(system, layout, params, rtol, "Lyapunov exponents")
     pieces = _pieces(arcs, y0, durations.ravel(), throw and durations.ndim == 0)
     size = max(1, _PORTION // pieces)
     parts = [_spectra(arcs, y0[k : k + size], durations.ravel()[k : k + size], pieces) for k in range(0, len(y0), size)]
     exponents = np.concatenate(parts)
     return jnp.asarray(exponents if durations.ndim else exponents[0])
-
-
-def _first_state(layout, y0) -> tuple[PyTree, PyTree]:
-    """The first of states y0 (B, 2n) in the user's structure, (q, q̇)."""
-    q, qdot = map(layout.restore, halves(y0[0]))
-    return q, qdot
 
 
 def _pieces(arcs: Arcs, y0, duration, throw: bool) -> int:
@@ -169,7 +163,7 @@ def lyapunov_exponent(
     ```
     """
     durations, layout, y0 = starts(q0, qdot0, duration, "duration")
-    arcs = Arcs.from_system(system, *_first_state(layout, y0), params, rtol, "Lyapunov exponents")
+    arcs = Arcs.from_system(system, layout, params, rtol, "Lyapunov exponents")
     parts = [
         _largest(arcs, y0[k : k + _MEMBERS], durations.ravel()[k : k + _MEMBERS]) for k in range(0, len(y0), _MEMBERS)
     ]

@@ -13,7 +13,7 @@ from lagjax._analysis.orbits._flat_starts import starts
 from lagjax._analysis.orbits._floquet import UNCERTAIN, UNSTABLE, multipliers_of, pairing_error, reduce
 from lagjax._analysis.orbits._shooting import Chain, Closing
 from lagjax._equations import decide, singular_threshold
-from lagjax._interface import SUCCESSFUL, SimulationError, halves, require_finite, require_flag, require_number
+from lagjax._interface import SUCCESSFUL, Layout, SimulationError, halves, require_finite, require_flag, require_number
 from lagjax._primitives import accepts_singles
 from lagjax._scene import System
 
@@ -138,16 +138,19 @@ def periodic_orbit(
     """
     require_flag(throw, "throw")
     periods, layout, y0 = starts(q0, qdot0, period, "period")
-    q, qdot = map(layout.restore, halves(y0[0]))
-    arcs = Arcs.from_system(system, q, qdot, params, RTOL, "Periodic orbits")
+    arcs = Arcs.from_system(system, layout, params, RTOL, "Periodic orbits")
     found = find(_closing(arcs, energy, image), y0, periods.ravel())
     if periods.ndim == 0:
         if throw and not found.ok[0]:
             raise SimulationError(found.message[0], None)
-        found = FlatOrbits._make([*(x[0] for x in found[:6]), str(found.message[0])])
+        return restore_orbits(layout, FlatOrbits(*(x[0] for x in found)), found.message[0])
+    return restore_orbits(layout, found, tuple(found.message))
+
+
+def restore_orbits(layout: Layout, found: "FlatOrbits", message: str | tuple[str, ...]) -> Orbit:
+    """The orbits in the user's structure."""
     q, qdot = map(layout.restore, halves(found.y))
-    arrays = jax.tree.map(jnp.asarray, (q, qdot, *found[1:6]))
-    return Orbit._make([*arrays, found.message])
+    return Orbit._make([*jax.tree.map(jnp.asarray, (q, qdot, *found[1:6])), message])
 
 
 def _closing(arcs: Arcs, energy, image) -> Closing:
@@ -187,7 +190,7 @@ class FlatOrbits(NamedTuple):
     closure: np.ndarray
     stable: np.ndarray
     ok: np.ndarray
-    message: tuple[str, ...]
+    message: np.ndarray  # of text
 
 
 def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> FlatOrbits:
@@ -195,7 +198,10 @@ def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> FlatOrbits:
     arcs = closing.arcs
     counts = arc_counts(arcs, y0, period)
     most = np.minimum(_MOST_ARCS, _MORE * counts)
-    found = _nothing(len(y0), y0.shape[1])
+    nothing, never = np.full(y0.shape, np.nan), np.zeros(len(y0), bool)
+    found = FlatOrbits(
+        nothing, nothing[:, 0], nothing.astype(complex), nothing[:, 0], never, never, np.full(len(y0), "", object)
+    )
     waiting, gained = np.arange(len(y0)), np.ones(len(y0), bool)
     while len(waiting):
         for count in np.unique(counts[waiting]).tolist():
@@ -206,7 +212,7 @@ def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> FlatOrbits:
                 trial = assess_orbits(closing, _shooting.close(closing, y, period[some], parts, units))
                 better = ~(found.closure[some] <= trial.closure)
                 gained[some] = better | ~found.ok[some]
-                found = _replace_members(found, some[better], FlatOrbits._make(np.array(x)[better] for x in trial))
+                found = _shooting.replace_members(found, some[better], FlatOrbits(*(x[better] for x in trial)))
         worse = ~(found.closure[waiting] <= WELL_CLOSED) & gained[waiting]
         waiting = waiting[worse & (counts[waiting] < most[waiting])]
         counts[waiting] = np.minimum(_MOST_ARCS, 2 * counts[waiting])
@@ -221,40 +227,19 @@ def arc_counts(arcs: Arcs, y0, period) -> np.ndarray:
     return np.minimum(_MOST_ARCS, 2 ** np.ceil(np.log2(count))).astype(int)
 
 
-def _nothing(size: int, states: int) -> FlatOrbits:
-    blank = np.full(size, np.nan)
-    multipliers = np.full((size, states), np.nan, complex)
-    return FlatOrbits(
-        np.full((size, states), np.nan), blank, multipliers, blank.copy(), np.zeros(size, bool), np.zeros(size, bool),
-        ("",) * size,
-    )  # fmt: skip
-
-
-def _replace_members(found: FlatOrbits, places: np.ndarray, others: FlatOrbits) -> FlatOrbits:
-    """The orbits with those at indices `places` replaced by `others`."""
-    arrays = [np.array(x) for x in found[:6]]
-    for mine, new in zip(arrays, others[:6], strict=True):
-        mine[places] = new
-    message = list(found.message)
-    for place, text in zip(places.tolist(), list(others.message), strict=True):
-        message[place] = text
-    return FlatOrbits._make([*arrays, tuple(message)])
-
-
 def assess_orbits(closing: Closing, chain: Chain, most: int | None = None) -> FlatOrbits:
     """The orbits that the chains of a search are: multipliers, stability, and a sentence where one is no orbit.
 
     At most `most` directions count as symmetries; None counts all that monodromy − 1 sends to zero.
     """
     closure = chain.closure()
-    message = [_sentence(chain, k) for k in range(len(closure))]
+    message = np.array([_sentence(chain, k) for k in range(len(closure))], object)
     ok = np.array([not text for text in message])
     multipliers = np.full((len(ok), chain.y.shape[2]), np.nan, complex)
-    places = np.flatnonzero(ok)
-    if len(places):
-        closed = chain.select(places)
+    if ok.any():
+        closed = chain.select(ok)
         known = _shooting.symmetries(closed, most)
-        for k, place in enumerate(places.tolist()):
+        for k, place in enumerate(np.flatnonzero(ok).tolist()):
             multipliers[place] = multipliers_of(reduce(closed.growth[k], *known[k]), closing.arcs.conserves)
     stable = np.abs(np.where(np.isnan(multipliers), np.inf, multipliers)).max(axis=1) < 1 + UNSTABLE
     off = np.array([pairing_error(row) if closing.arcs.conserves else 0.0 for row in multipliers])
@@ -264,7 +249,7 @@ def assess_orbits(closing: Closing, chain: Chain, most: int | None = None) -> Fl
             f"The orbit closes, but its multipliers are uncertain: pairs that should multiply to 1 miss it by "
             f"{off[place]:.2g}, so that nothing is known of its stability."
         )
-    return FlatOrbits(chain.states(), chain.periods(), multipliers, closure, stable & ok, ok, tuple(message))
+    return FlatOrbits(chain.states(), chain.periods(), multipliers, closure, stable & ok, ok, message)
 
 
 def _sentence(chain: Chain, k: int) -> str:

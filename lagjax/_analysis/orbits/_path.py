@@ -93,7 +93,8 @@ def action(system: System, path: Trajectory | Callable, t_start=None, t_end=None
         ts, states = _motion_states(system, path, params)
     else:
         ts, states = _function_states(path, t_start, t_end)
-    coarse, fine = (_integral(system, states, edges, params) for edges in (ts, _halve_panels(ts)))
+    halved = np.sort(np.concatenate([ts, (ts[1:] + ts[:-1]) / 2]))[:: 1 if ts[-1] > ts[0] else -1]
+    coarse, fine = (_integral(system, states, edges, params) for edges in (ts, halved))
     if not abs(float(coarse[0] - fine[0])) <= _RESOLVED * abs(float(fine[1])):
         raise ValueError(
             f"The action is not resolved: {float(coarse[0]):.9g} and, on parts half as long, {float(fine[0]):.9g}. The "
@@ -125,10 +126,6 @@ def _function_states(path, t_start, t_end) -> tuple[np.ndarray, Callable]:
         return jax.vmap(lambda t: jax.jvp(path, (t,), (jnp.ones_like(t),)))(times)
 
     return np.linspace(float(t_start), float(t_end), _PANELS + 1), states
-
-
-def _halve_panels(ts: np.ndarray) -> np.ndarray:
-    return np.sort(np.concatenate([ts, (ts[1:] + ts[:-1]) / 2]))[:: 1 if ts[-1] > ts[0] else -1]
 
 
 def _integral(system: System, states: Callable, edges: np.ndarray, params) -> tuple[jax.Array, jax.Array]:
@@ -181,7 +178,7 @@ def find_path(
     if not t_end > t_start:
         raise ValueError(f"t_end must be later than t_start; got {t_end} and {t_start}.")
     layout = Layout.from_state(q_start, q_end)
-    arcs = Arcs.from_system(system, q_start, q_end, params, RTOL, "Paths")
+    arcs = Arcs.from_system(system, layout, params, RTOL, "Paths")
     ends = [
         np.asarray(concatenate_leaves(jax.tree.leaves(as_arrays(q, layout.dtype, "state")), np.dtype(float)))
         for q in (q_start, q_end)
@@ -195,7 +192,8 @@ def find_path(
     if message:
         if throw:
             raise SimulationError(message, None)
-        return _nothing(chain, message)
+        lost, closure = jnp.asarray(np.nan), jnp.asarray(chain.closure()[0])
+        return Path(None, None, None, lost, jnp.zeros(0), -1, False, closure, False, message)
     return _build_path(system, arcs, chain, ends[0], times, params)
 
 
@@ -245,14 +243,9 @@ def _why_not(closing: Closing, chain: Chain, times) -> str:
     )
 
 
-def _nothing(chain: Chain, message: str) -> Path:
-    lost = jnp.asarray(np.nan)
-    return Path(None, None, None, lost, jnp.zeros(0), -1, False, jnp.asarray(chain.closure()[0]), False, message)
-
-
 def _build_path(system: System, arcs: Arcs, chain: Chain, q_start: np.ndarray, times, params) -> Path:
     """The path in the user's structure, with its action and its second variation."""
-    restore, states = arcs.layout.restore, chain.y[0] * chain.of_state
+    restore, states = arcs.layout.restore, chain.y[0] * chain.units.state
     states[0, : arcs.size] = q_start  # exactly, not by way of the units
     conjugate, at_end = conjugate_times(arcs, states, times, chain.units)
     (q, qdot), end = map(restore, halves(states[0])), arcs.ends(times[-2:][None], states[-1:]).path[0, -1]

@@ -17,13 +17,16 @@ Source: Stoer & Bulirsch, *Introduction to Numerical Analysis*, §7.3.5; Deuflha
 Problems* (2004), §3.3 and §7.1, for the damping and the rank.
 """
 
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
+import jax
 import numpy as np
 
-from lagjax._analysis.orbits._arc_motions import Arc, Arcs, Units
+from lagjax._analysis.orbits._arc_motions import Arcs, Units
 from lagjax._analysis.orbits._condensation import Condensed, condense
 from lagjax._equations import Decided, decide, singular_threshold
+
+Members = TypeVar("Members")
 
 # Relative to the largest singular value: below, a direction counts as degenerate. Measured on the 695 planar orbits,
 # true ones are above 1e-6 and degenerate ones of a closed orbit below 1e-11. Twice as much changes no rank there.
@@ -76,10 +79,6 @@ class Closing(NamedTuple):
         """S y for rows (R, 2n)."""
         return y @ self.matrix.T + self.shift
 
-    def map_back(self, y: np.ndarray) -> np.ndarray:
-        """S⁻¹ y for rows (R, 2n)."""
-        return np.linalg.solve(self.matrix, (y - self.shift).T).T
-
     def conditions(self, y0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The error of the energy of first states (B, 2n), (B, m), and its slopes (B, m, 2n); m is 0 or 1."""
         if self.energy is None:
@@ -94,34 +93,29 @@ class Chain(NamedTuple):
     All is in the `units` of each chain, in which metres and seconds do not matter.
     `defect` (B, K, 2n) is end of an arc minus the next state, `growth` (B, K, 2n, 2n) the derivatives of the arcs,
     `rate` (B, K, 2n) that of the ends in time; those of the last arc are taken back by S. `off` (B, m) and `slope`
-    (B, m, 2n) are conditions on the first state. `ok` (B,) tells whether all arcs could be followed.
+    (B, m, 2n) are conditions on the first state. `ok` (B,) tells whether all arcs could be followed, and `why` (B,), of
+    text, why not.
     """
 
     y: np.ndarray
     period: np.ndarray
     parts: np.ndarray
-    of_state: np.ndarray
-    of_time: np.ndarray
-    of_length: np.ndarray
+    units: Units
     defect: np.ndarray
     growth: np.ndarray
     rate: np.ndarray
     off: np.ndarray
     slope: np.ndarray
     ok: np.ndarray
-    why: tuple[str, ...]
-
-    @property
-    def units(self) -> Units:
-        return Units(self.of_state, self.of_time, self.of_length)
+    why: np.ndarray
 
     def states(self) -> np.ndarray:
         """The first states (B, 2n) in the units of the user."""
-        return self.y[:, 0] * self.of_state
+        return self.y[:, 0] * self.units.state
 
     def periods(self) -> np.ndarray:
         """The periods (B,) in the unit of the user."""
-        return self.period * self.of_time
+        return self.period * self.units.time
 
     def size(self) -> np.ndarray:
         """The largest number of a state, (B,)."""
@@ -138,20 +132,18 @@ class Chain(NamedTuple):
 
     def select(self, chosen: np.ndarray) -> "Chain":
         """The chains at `chosen`: indices, or a mask (B,)."""
-        places = np.flatnonzero(chosen) if chosen.dtype == bool else chosen
-        return Chain._make([*(x[places] for x in self[:_ARRAYS]), tuple(self.why[k] for k in places.tolist())])
-
-    def replace_members(self, places: np.ndarray, others: "Chain") -> "Chain":
-        arrays = [np.array(x) for x in self[:_ARRAYS]]
-        for mine, new in zip(arrays, others[:_ARRAYS], strict=True):
-            mine[places] = new
-        why = list(self.why)
-        for place, text in zip(places.tolist(), others.why, strict=True):
-            why[place] = text
-        return Chain._make([*arrays, tuple(why)])
+        return jax.tree.map(lambda x: x[chosen], self)
 
 
-_ARRAYS = 12  # of the fields of a chain
+def replace_members(members: Members, places: np.ndarray, others: Members) -> Members:
+    """The `members`, arrays with these as first axis, with those at indices `places` replaced by `others`."""
+
+    def replace(x: np.ndarray, new: np.ndarray) -> np.ndarray:
+        x = x.copy()
+        x[places] = new
+        return x
+
+    return jax.tree.map(replace, members, others)
 
 
 def guesses(closing: Closing, y0: np.ndarray, period: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -186,24 +178,17 @@ def follow(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarra
     ok = np.asarray(arc.ok.reshape(chains, count).all(axis=1))
     end, growth = arc.end.reshape(y.shape), arc.by_start.reshape(*y.shape, states)
     inverse = np.linalg.inv(closing.matrix)
-    end[:, -1], rate[:, -1] = closing.map_back(end[:, -1]), rate[:, -1] @ inverse.T
+    end[:, -1], rate[:, -1] = np.linalg.solve(closing.matrix, (end[:, -1] - closing.shift).T).T, rate[:, -1] @ inverse.T
     growth[:, -1] = inverse @ growth[:, -1]
     end = end / of_state
     defect = end - closing.target(y, end, units.state)
     off, slope = closing.conditions(y[:, 0] * units.state)
     rate, slope = rate * units.time[:, None, None] / of_state, slope * of_state
-    why = _why(arcs, arc, rows, times, ok)
-    return Chain(y, period, parts, *units, defect, units.growth(growth), rate, off, slope, ok, why)
-
-
-def _why(arcs: Arcs, arc: Arc, rows, times, ok) -> tuple[str, ...]:
-    """The reason why each chain stopped, "" where none did."""
-    count = len(arc.ok) // len(ok)
-    texts = [""] * len(ok)
+    why = np.full(chains, "", object)
     for k in np.flatnonzero(~ok).tolist():
         row = k * count + int(np.argmin(arc.ok[k * count : (k + 1) * count]))
-        texts[k] = arcs.why_not(row, arc, rows, times[row, 1])
-    return tuple(texts)
+        why[k] = arcs.why_not(row, arc, rows, times[row, 1])
+    return Chain(y, period, parts, units, defect, units.growth(growth), rate, off, slope, ok, why)
 
 
 class NewtonEquations(NamedTuple):
@@ -264,7 +249,7 @@ def close(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray
         better = _improve(closing, chain.select(places))
         gained = better.merit() < 0.9 * chain.merit()[places]
         lower = better.merit() < chain.merit()[places]
-        chain = chain.replace_members(places[lower], better.select(lower))
+        chain = replace_members(chain, places[lower], better.select(lower))
         active[places[~gained]] = False
     return chain
 
@@ -280,7 +265,7 @@ def _improve(closing: Closing, chain: Chain) -> Chain:
         trial = follow(closing, y, period, here.parts, here.units)
         lower = trial.merit() < (1 - 0.25 * scale) * here.merit()
         near = here.merit() < 1e3 * _ENOUGH * here.size()  # where rounding decides
-        best = best.replace_members(waiting[lower], trial.select(lower))
+        best = replace_members(best, waiting[lower], trial.select(lower))
         waiting = waiting[~lower & ~near]
         if not len(waiting):
             break
