@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from lagjax._analysis._scene_state import SceneState
-from lagjax._analysis._solve import is_root, levenberg_marquardt, polish, shortest_preimage
+from lagjax._analysis._solve import is_root, levenberg_marquardt, newton, shortest_preimage
 from lagjax._analysis._state_of_rest import settle
 from lagjax._equations import ROUNDINGS, least_norm
 from lagjax._interface import compile_for_one_call, describe_numbers, is_known, require_flag, show_str
@@ -153,7 +153,7 @@ def _solve_balance(has_terms: bool, *arguments) -> tuple[Vector, Array, Bool[Arr
     least = jnp.abs(start).at[n:].max(_TINY * unit[n:] * jnp.max(jnp.abs(start / unit)[n:], initial=0.0))
 
     def find(_, start):
-        z = polish(residual, levenberg_marquardt(residual, start, least, unit), least, unit)
+        z = newton(residual, levenberg_marquardt(residual, start, least, unit), unit)
         # What converges to zero ends at a tiny number: what is nothing beside the start after three roundings is zero.
         return jnp.where(jnp.abs(z) < jnp.finfo(z.dtype).eps ** 3 * jnp.abs(start), 0.0, z)
 

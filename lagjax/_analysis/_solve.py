@@ -1,7 +1,8 @@
 """Newton's method, damped where a root is far, of JAX; its linear systems need be neither symmetric nor regular.
 
-`newton` begins near a root, `levenberg_marquardt` far from one, and `polish` ends at rounding what that has found. All
-steps are those of `shortest_solution`, but damped ones, whose matrix is regular. No kernel of LAPACK runs in XLA. The
+`newton` begins near a root and ends at rounding, `levenberg_marquardt` begins far from one. All steps are those of
+`shortest_solution`, but damped ones, whose matrix is regular. No kernel of LAPACK runs in XLA, where batched ones may
+wait for each other for ever: so these are not the solvers of optimistix, whose steps are QR and LU decompositions. The
 iteration of orbits and paths, `lagjax._analysis.orbits._shooting`, is in NumPy: a trial there is a run of machine code,
 of as many members as still gain.
 """
@@ -38,10 +39,11 @@ def shortest_preimage(linear: Callable[[Vector], Vector], right: Vector, unit: V
     return shortest_solution(jax.vmap(linear, out_axes=1)(jnp.eye(right.size, dtype=right.dtype)), right, unit)
 
 
-def newton(f: Callable[[Vector], Vector], start: Vector) -> Vector:
+def newton(f: Callable[[Vector], Vector], start: Vector, unit: Vector | float = 1.0) -> Vector:
     """x with f(x) = 0 that Newton's method reaches from `start` (n,), for `jax.lax.custom_root`; look at f(x).
 
-    A step is halved until f is finite and smaller, or no larger but for rounding.
+    A step is halved until f is finite and smaller, or no larger but for rounding. Steps are the shortest ones in `unit`
+    (n,) where the derivatives are singular.
     """
 
     def moves(carry):
@@ -51,28 +53,13 @@ def newton(f: Callable[[Vector], Vector], start: Vector) -> Vector:
     def once(carry):
         x, _, count = carry
         value, jacobian = f(x), jax.jacfwd(f)(x)
-        new = x - _shorten_step(f, x, value, shortest_solution(jacobian, value))
-        # Each number of x in units of its own, in which all make as much of f.
-        unit = 1 / _scales(jacobian)[1]
-        size = jnp.max(unit * jnp.maximum(jnp.abs(new), jnp.abs(x)), initial=jnp.finfo(x.dtype).tiny)
-        return new, jnp.max(unit * jnp.abs(new - x), initial=0.0) / size, count + 1
+        new = x - _shorten_step(f, x, value, shortest_solution(jacobian, value, unit))
+        # Each number of x by what it makes of f.
+        weight = 1 / _scales(jacobian)[1]
+        size = jnp.max(weight * jnp.maximum(jnp.abs(new), jnp.abs(x)), initial=jnp.finfo(x.dtype).tiny)
+        return new, jnp.max(weight * jnp.abs(new - x), initial=0.0) / size, count + 1
 
     return jax.lax.while_loop(moves, once, (start, jnp.ones((), start.dtype), 0))[0]
-
-
-def polish(f: Callable[[Vector], Vector], x: Vector, least: Vector, unit: Vector) -> Vector:
-    """x after Newton steps near a root, as exact as rounding allows; each is taken where it is small.
-
-    `least` (n,) are the sizes below which numbers of x do not count; steps are the shortest ones in `unit`
-    (n,) where the derivatives are singular.
-    """
-
-    def once(_, x):
-        jacobian = jax.jacfwd(f)(x)
-        step = shortest_solution(jacobian, f(x), unit)
-        return jnp.where(relative_size(jacobian, step, x, least) < 1e-3, x - step, x)
-
-    return jax.lax.fori_loop(0, _POLISH, once, x)
 
 
 def is_root(
@@ -158,7 +145,6 @@ _AT_REST = 1e-14  # of the size of x: some tens of roundings, the square of whic
 # Newton steps: one where f is linear, five to new coordinates of a state, ten to a velocity in relativity. Halvings of
 # one that leads out of where f is defined, as beyond the velocity of light.
 _STEPS, _HALVINGS = 50, 30
-_POLISH = 3  # steps at the end, of which two reach rounding
 
 
 def _scales(matrix: Matrix) -> tuple[Vector, Vector]:
