@@ -16,26 +16,3 @@ from lagjax._analysis._noether import cyclic_coordinates, noether_charge
 from lagjax._analysis._routh import Routhian, routhian
 from lagjax._analysis._same_motion import SameMotion, same_motion
 from lagjax._analysis._symmetries import Conserved, ConservedQuantities, conserved_quantities
-
-__all__ = [
-    "CanonicalTrajectory",
-    "ChangedCoordinates",
-    "Conserved",
-    "ConservedQuantities",
-    "Equilibrium",
-    "Hamiltonian",
-    "Linearization",
-    "Modes",
-    "Routhian",
-    "SameMotion",
-    "change_coordinates",
-    "conserved_quantities",
-    "cyclic_coordinates",
-    "equilibrium",
-    "hamiltonian",
-    "linearize",
-    "noether_charge",
-    "normal_modes",
-    "routhian",
-    "same_motion",
-]

@@ -18,18 +18,3 @@ from lagjax._engine._problem import (
     rows,
 )
 from lagjax._engine._stop_reason import AHEAD
-
-__all__ = [
-    "AHEAD",
-    "DEFAULT_RTOL",
-    "LEAST_RTOL",
-    "AbstractEngine",
-    "Batch",
-    "Problem",
-    "Solution",
-    "axes_per_leaf",
-    "choose",
-    "concatenate_leaves",
-    "requested_engine",
-    "rows",
-]

@@ -26,7 +26,7 @@ import numpy as np
 
 from lagjax._equations._linear import rank_tolerance, singular_threshold
 from lagjax._program import orthogonalize, row_weights, solve_orthogonalized
-from lagjax._program import scalars as xp
+from lagjax._program import scalar_algebra as xp
 
 # The part of a pivot that elimination has to leave for a matrix to count as regular in the regular-M variant: four
 # digits of an acceleration may be lost, and twelve remain. Twice as large, a few more states take the general variant,

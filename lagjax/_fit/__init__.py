@@ -69,30 +69,6 @@ from lagjax._primitives import DOUBLE, with_doubles
 from lagjax._run.hybrid import Hybrid, Scene, first_law, require_scene
 from lagjax._scene import HOLDS
 
-__all__ = [
-    "Clipped",
-    "Comparison",
-    "Delayed",
-    "Experiments",
-    "Fit",
-    "Gaussian",
-    "Guess",
-    "Prediction",
-    "Profile",
-    "Quantised",
-    "Record",
-    "StudentT",
-    "Timings",
-    "angle",
-    "between",
-    "draw_record",
-    "fit",
-    "inertia",
-    "positive",
-    "record_matrix",
-    "simplex",
-    "wrapped",
-]  # fmt: skip
 PyTree = Any
 
 METHODS = ("auto", "segments", "whole", "gradient")

@@ -39,7 +39,6 @@ from lagjax._native import _gpu as gpu
 from lagjax._native._constants import (
     ATOL_OVER_MOTION,
     ATOL_OVER_RTOL,
-    DISCONTINUOUS,
     DONE,
     EVENT,
     GUARD_NOISE,
@@ -48,68 +47,23 @@ from lagjax._native._constants import (
     LEAST_ORDER,
     NOT_FINITE,
     OUT_OF_STEPS,
-    PROJECTION_FAILED,
     SINGLE_NOISE,
     SINGULAR,
     SMALLEST_STEP,
     STEP_TOO_SMALL,
 )
-from lagjax._native._derivative_handler import DerivativePlan, derivative_handler
+from lagjax._native._derivative_handler import derivative_handler
 from lagjax._native._guards import Guards, append_guards
 from lagjax._native._handler import Plan, handler, unavailable
 from lagjax._native._ir import lanes
 from lagjax._native._kernel import (
     Begun,
     Kernel,
-    Outcome,
     cores,
     floor_of,
 )
 from lagjax._native._line_handler import LineCode, line_handler
-from lagjax._native._motion_parts import Projection, pieces_of, recurrences, require_recurrences
+from lagjax._native._motion_parts import Projection, pieces_of, require_recurrences
 from lagjax._native._taylor import is_large, order_for
 from lagjax._native._threads import map_in_threads
 from lagjax._program._jump import Nesting
-
-__all__ = [
-    "ATOL_OVER_MOTION",
-    "ATOL_OVER_RTOL",
-    "DISCONTINUOUS",
-    "DONE",
-    "EVENT",
-    "GUARD_NOISE",
-    "INSTANT",
-    "LARGEST_LINE",
-    "LEAST_ORDER",
-    "NOT_FINITE",
-    "OUT_OF_STEPS",
-    "PROJECTION_FAILED",
-    "SINGLE_NOISE",
-    "SINGULAR",
-    "SMALLEST_STEP",
-    "STEP_TOO_SMALL",
-    "Begun",
-    "DerivativePlan",
-    "Guards",
-    "Kernel",
-    "LineCode",
-    "Nesting",
-    "Outcome",
-    "Plan",
-    "Projection",
-    "append_guards",
-    "cores",
-    "derivative_handler",
-    "floor_of",
-    "gpu",
-    "handler",
-    "is_large",
-    "lanes",
-    "line_handler",
-    "map_in_threads",
-    "order_for",
-    "pieces_of",
-    "recurrences",
-    "require_recurrences",
-    "unavailable",
-]  # fmt: skip

@@ -15,23 +15,3 @@ from lagjax._primitives._failures import (
     raise_where_failed,
     sentence,
 )
-
-__all__ = [
-    "DOUBLE",
-    "SINGLE",
-    "VaryingPrimitive",
-    "accepts_singles",
-    "attach_derivative",
-    "batch_in_front",
-    "compute_in_doubles",
-    "cond_alike",
-    "differentiable_where",
-    "lost_unless",
-    "marks_absent",
-    "nan_unless",
-    "raise_where_failed",
-    "sentence",
-    "vary_alike",
-    "widen",
-    "with_doubles",
-]

@@ -44,7 +44,7 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 from jax.extend import core
 
-from lagjax._program import _scalars as scalars
+from lagjax._program import _scalars as scalar_algebra
 from lagjax._program._borders import BELOW, CLOCK, FLOOR, SIGN, TABLE, TRUNC, Borders, borders, distances, is_smooth
 from lagjax._program._differentiation import Derivatives, copy_nodes, pullback, pushforward, with_tangents
 from lagjax._program._emit import Rows, apply_in_jax, emit, emit_look_up, emit_rows, plain_elementary
@@ -57,20 +57,10 @@ from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, live, sink_negations
 from lagjax._program._rounding import rounding
 from lagjax._program._scalars import Scalars, apply_function, concatenate, scatter, stack
-from lagjax._program._series import LinearSystem, Series, StraightLine, series
-from lagjax._program.lowering import _complex, _eigenvalues, _special  # noqa: F401  they register their rules
+from lagjax._program._series import LinearSystem, StraightLine, series
+from lagjax._program.lowering import _complex, _eigenvalues, _special
 from lagjax._program.lowering._matrices import orthogonalize, row_weights, solve_orthogonalized
 from lagjax._program.lowering._rules import LARGEST_UNFOLDED, Expansion, expand_primitive, has_own_rules, inputs_of
-
-__all__ = [
-    "BELOW", "CLOCK", "FLOOR", "OPERATIONS", "SIGN", "TABLE", "TRUNC", "Borders", "Derivatives", "Expansion", "Graph",
-    "Groups", "Program", "Scalars", "Series", "StraightLine", "Tape", "Unlowerable", "apply_function", "apply_in_jax",
-    "borders", "concatenate", "copy_nodes", "distances", "emit", "emit_look_up", "evaluate", "expand_primitive",
-    "groups_of", "has_own_rules", "inputs_of", "is_smooth", "live", "lower", "lower_formula", "lower_scalars",
-    "lower_solution", "machine_memory", "operations_that_fit", "orthogonalize", "pause_collections", "plain_elementary",
-    "pullback", "pushforward", "row_weights", "scalars", "scatter", "series", "solve_orthogonalized", "stack",
-    "steps_of", "table_of", "trace_jaxpr", "with_tangents",
-]  # fmt: skip
 
 
 def lower(function: Callable, *examples, budget: int = 20_000) -> "Program":

@@ -8,19 +8,3 @@ from lagjax._run._batch_members import Members
 from lagjax._run._crossings import Crossings, crossings, directions_of, restore_crossings, sections_of, surfaces_in
 from lagjax._run._simulate import simulate, simulate_batch, trajectory_of
 from lagjax._run._trajectory import State, Trajectory, Transitions
-
-__all__ = [
-    "Crossings",
-    "Members",
-    "State",
-    "Trajectory",
-    "Transitions",
-    "crossings",
-    "directions_of",
-    "restore_crossings",
-    "sections_of",
-    "simulate",
-    "simulate_batch",
-    "surfaces_in",
-    "trajectory_of",
-]

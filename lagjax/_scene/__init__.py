@@ -9,23 +9,3 @@ from lagjax._scene._closed_over import Lifted, Unchanged, function_from_trace, l
 from lagjax._scene._explanation import Explanation
 from lagjax._scene._samples import HOLDS, MARGINS, continued, samples, unevenly_spaced
 from lagjax._scene._system import ROLES, System, present_system, replace_functions, require_system
-
-__all__ = [
-    "HOLDS",
-    "MARGINS",
-    "ROLES",
-    "Explanation",
-    "Lifted",
-    "System",
-    "Unchanged",
-    "continued",
-    "function_from_trace",
-    "lift_batch",
-    "lift_problem",
-    "open_jaxpr",
-    "present_system",
-    "replace_functions",
-    "require_system",
-    "samples",
-    "unevenly_spaced",
-]

@@ -12,8 +12,3 @@ from lagjax._show._course import course_of, courses_of, join_curve
 from lagjax._show._export import dataset, frame, intervals
 from lagjax._show._notebook import COLORS, cell, trajectory_html
 from lagjax._show._summary import summary, times_of_members
-
-__all__ = [
-    "COLORS", "Animation", "cell", "course_of", "courses_of", "dataset", "frame", "intervals", "join_curve",
-    "make_animation", "require_points", "summary", "times_of_members", "trajectory_html",
-]  # fmt: skip

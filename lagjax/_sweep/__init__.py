@@ -31,7 +31,7 @@ from lagjax._sweep._description import Description, Sections
 from lagjax._sweep._job import Job, precision, uses_doubles
 from lagjax._sweep._members import axes_of
 from lagjax._sweep._statistics import Statistics, Summary, from_bytes, merge, summary
-from lagjax._sweep._status import Failure, Progress, Status, status
+from lagjax._sweep._status import Progress, Status, status
 from lagjax._sweep._store import NOT_DONE, RESULT, Store
 from lagjax._sweep._workers import (
     look_in_children,
@@ -44,10 +44,6 @@ from lagjax._sweep._workers import (
     work,
     work_in_children,
 )
-
-__all__ = [
-    "Failure", "Progress", "Statistics", "Status", "Store", "Summary", "Sweep", "run_store", "status", "sweep",
-]  # fmt: skip
 
 PyTree = Any
 

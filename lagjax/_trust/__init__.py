@@ -6,5 +6,3 @@ with the line of code; `_precision` holds `work_precision`: what a digit costs.
 
 from lagjax._trust._diagnosis import describe_failure
 from lagjax._trust._precision import WorkPrecision, WorkPrecisionRow, work_precision
-
-__all__ = ["WorkPrecision", "WorkPrecisionRow", "describe_failure", "work_precision"]

@@ -10,7 +10,7 @@ import pytest
 
 import lagjax
 
-PACKAGE = Path(lagjax.__file__).parent
+PACKAGE, TESTS = Path(lagjax.__file__).parent, Path(__file__).parents[1]
 
 DEVELOPMENT = (Path(__file__).parents[2] / "docs" / "development.md").read_text()
 # From the top of the street to its end, as the table there lists it. A new module must take a place in it.
@@ -84,6 +84,22 @@ def test_packages_have_doors():
             is_file = (PACKAGE.parent / (node.module.replace(".", "/") + ".py")).exists()
             assert not (is_file and there.startswith("_")), f"{path} imports {node.module} past its door"
             assert not private, f"{path} imports {private} from {node.module}"
+
+
+def test_doors_offer_what_is_used():
+    """Every name that a door imports is used in it, or imported from it by another file."""
+    texts = {path: ast.parse(path.read_text()) for folder in (PACKAGE, TESTS) for path in folder.rglob("*.py")}
+    nodes = [node for tree in texts.values() for node in ast.walk(tree)]
+    taken = {(node.module, alias.name) for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names}
+    called = {node.attr for node in nodes if isinstance(node, ast.Attribute)} | set(lagjax._interface.PLACES)
+    for door in PACKAGE.glob("_*/**/__init__.py"):
+        module = ".".join(door.parent.relative_to(PACKAGE.parent).parts)
+        used = {node.id for node in ast.walk(texts[door]) if isinstance(node, ast.Name)}
+        for node in texts[door].body:
+            for alias in node.names if isinstance(node, ast.ImportFrom) else ():
+                name = alias.asname or alias.name
+                if node.module != "lagjax._program.lowering":  # whose rules are registered by the import
+                    assert (module, name) in taken or name in used | called, f"{module} imports {name} for nobody"
 
 
 def test_the_head_of_a_room_names_its_files():

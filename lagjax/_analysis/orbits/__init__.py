@@ -12,17 +12,3 @@ from lagjax._analysis.orbits._family import Family, family
 from lagjax._analysis.orbits._lyapunov import LyapunovExponent, lyapunov_exponent, lyapunov_spectrum
 from lagjax._analysis.orbits._orbit import Orbit, periodic_orbit
 from lagjax._analysis.orbits._path import Path, action, find_path
-
-__all__ = [
-    "Family",
-    "LyapunovExponent",
-    "Orbit",
-    "Path",
-    "action",
-    "branch_off",
-    "family",
-    "find_path",
-    "lyapunov_exponent",
-    "lyapunov_spectrum",
-    "periodic_orbit",
-]

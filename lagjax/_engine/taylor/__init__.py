@@ -41,12 +41,6 @@ from lagjax._native import Guards, Nesting, append_guards, pieces_of
 from lagjax._primitives import compute_in_doubles
 from lagjax._program import Program, Unlowerable
 
-__all__ = [
-    "KEPT", "MOST_GUARDS", "Flow", "Guarded", "Guards", "MachineCode", "Noted", "StepStore", "Surfaces", "Tolerances",
-    "crossing_variation", "flow_of", "jvp", "lowered_motion", "portions", "project_start_tangents",
-    "require_one_number", "surfaces_of", "tolerances_of", "vector_of", "vjp",
-]  # fmt: skip
-
 
 # Not an equinox.Module: its methods are pytrees of their own, and to make one takes as long as ten steps.
 @jax.tree_util.register_static

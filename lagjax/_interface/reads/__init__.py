@@ -18,5 +18,3 @@ names that it makes up, the inside of objects written in C (a generator, a rando
 
 from lagjax._interface.reads._edition import Edition, place_in
 from lagjax._interface.reads._identity import array_text, hash_of, identity, source, strip_addresses
-
-__all__ = ["Edition", "array_text", "hash_of", "identity", "place_in", "source", "strip_addresses"]

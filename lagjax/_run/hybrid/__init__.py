@@ -40,8 +40,6 @@ from lagjax._run.hybrid._mode import Transition
 from lagjax._run.hybrid._transition_rounds import IN_ONE_PLACE, Ending, RoundPlan, TransitionRecord, hybrid_motion
 from lagjax._scene import System, present_system, require_system
 
-__all__ = ["Hybrid", "Scene", "Transition", "first_law", "laws", "require_scene", "simulate_hybrid"]
-
 PyTree = Any
 # The part of a motion below which a time between transitions is none: bounces that pile up come down to the rounding of
 # the time before they are given up, and a reset that leaves a motion on its surface does so behind a longer one.

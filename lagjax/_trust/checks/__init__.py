@@ -31,8 +31,6 @@ from lagjax._trust.checks import (
 from lagjax._trust.checks._findings import Finding, Findings
 from lagjax._trust.checks._scene_at_start import CheckedScene
 
-__all__ = ["Finding", "Findings", "check"]
-
 PyTree = Any
 
 # Units of atol: in a motion that is smaller, the errors that atol allows add up to a hundredth within a hundred steps.

@@ -44,8 +44,6 @@ from lagjax._trust.health._border_counts import Met, count_borders, is_piecewise
 from lagjax._trust.health._global_error import global_error
 from lagjax._trust.health._measurements import SLACK, SMALLEST, VISIBLE, Extreme, does_work, measure_trajectory
 
-__all__ = ["Extreme", "Health", "does_work", "examine"]
-
 # The part of steps rejected beyond which the motion meets something that the step control does not get over.
 UNSTEADY = 0.5
 
