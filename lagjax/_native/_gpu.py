@@ -14,18 +14,19 @@ What is here needs no GPU: it is assembled and checked on CPUs. `benchmarks.gpu`
 """
 
 import functools
+import math
 import os
-import re
 import sys
 import threading
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import llvmlite.binding as llvm
+from llvmlite import ir
 
 from lagjax._native._constants import LEAST_ORDER
 from lagjax._native._gpu_entry import MOTION, TRANSPOSE, Entry, GpuForm, OneLane, motion_entry, transpose_entry
-from lagjax._native._ir import COUNTED
+from lagjax._native._ir import DOUBLE, Code
 from lagjax._native._taylor import TaylorSeries, order_for
 from lagjax._program._graph import Unlowerable
 
@@ -47,7 +48,6 @@ MOST_COEFFICIENTS = {MOTION: 250, TRANSPOSE: 200}
 # Doubles of the steps that all threads of a launch may write down: 2 GiB. Of a double pendulum, with as many threads as
 # there are, two thousand steps.
 LARGEST_RECORD = 2**28
-_TO_COUNTED = re.compile(rf'  br label %"({COUNTED}[.\d]*)"')
 _FAR_ANGLES = ("sin", "cos")  # the C library's part in a sine is that of angles beyond 2**20
 _lock = threading.Lock()
 
@@ -112,7 +112,7 @@ def motion_for_gpus(lane: OneLane, form: GpuForm) -> str:
     Raises `Unlowerable` where its functions need libdevice, and that is missing.
     """
     with _lock:
-        return _assembly(motion_entry(lane, form.order), [(lane.text, form)])
+        return _assembly(motion_entry(lane, form.order), [_parse(lane, form)])
 
 
 def transpose_for_gpus(lane: OneLane, back: OneLane, form: GpuForm) -> str:
@@ -121,29 +121,34 @@ def transpose_for_gpus(lane: OneLane, back: OneLane, form: GpuForm) -> str:
     Raises `Unlowerable` where that takes too much memory, or libdevice.
     """
     require_room(lane.size + back.size if form.unrolled else max(lane.size, back.size))
-    text = re.sub(r'@"(begin|run)"', r'@"\1_back"', back.text)
     with _lock:
-        entry = transpose_entry(lane, back, form)
-        return _assembly(entry, [(lane.text, form), (text, form)])
+        there_and_back = [_parse(lane, form), _parse(back, form)]
+        for name in ("begin", "run"):
+            there_and_back[1].get_function(name).name = f"{name}_back"
+        return _assembly(transpose_entry(lane, back, form), there_and_back)
 
 
-def _assembly(entry: str, parts: Sequence[tuple[str, GpuForm]]) -> str:
+def _parse(lane: OneLane, form: GpuForm) -> llvm.ModuleRef:
+    return llvm.parse_assembly(lane.unrolled if form.unrolled else lane.text)
+
+
+def _assembly(entry: str, parts: Sequence[llvm.ModuleRef]) -> str:
     """The PTX of an entry, linked with the modules that it calls."""
-    machine, external = _target().create_target_machine(cpu=_PROCESSOR, features=_VERSION, opt=3), set()
-    texts = [_unroll_loops(text) if form.unrolled else text for text, form in parts]
-    for text in texts:
-        external |= {*re.findall(r'^declare (?:double|float) @"?(\w+)"?\(', text, re.MULTILINE)}
-    external -= {*_FAR_ANGLES, "llvm"}
-    modules = [_parse_module(text, external, machine) for text in (entry, *map(_refuse_far_angles, texts))]
+    machine = _target().create_target_machine(cpu=_PROCESSOR, features=_VERSION, opt=3)
+    called = [of for part in parts for of in part.functions if of.is_declaration and not of.name.startswith("llvm.")]
+    external = [of for of in called if of.name not in _FAR_ANGLES]
+    whole, others = llvm.parse_assembly(entry), [*parts, _refuse_far_angles()]
     if external:
         if (library := libdevice()) is None:
             raise Unlowerable(
-                f"its {', '.join(sorted(external))} come from NVIDIA's libdevice, which is not here; "
-                "`pip install nvidia-cuda-nvcc-cu12` has it"
+                f"its {', '.join(sorted({of.name for of in external}))} come from NVIDIA's libdevice, which is not "
+                "here; `pip install nvidia-cuda-nvcc-cu12` has it"
             )
-        modules.append(llvm.parse_bitcode(library))
-        modules[-1].triple, modules[-1].data_layout = machine.triple, str(machine.target_data)
-    whole, *others = modules
+        others.append(llvm.parse_bitcode(library))
+        for function in external:
+            function.name = f"__nv_{function.name}"
+    for module in (whole, *others):
+        module.triple, module.data_layout = machine.triple, str(machine.target_data)
     for module in others:
         whole.link_in(module)
     for function in whole.functions:
@@ -153,38 +158,18 @@ def _assembly(entry: str, parts: Sequence[tuple[str, GpuForm]]) -> str:
     return machine.emit_assembly(_optimise(whole, machine))
 
 
-def _parse_module(text: str, external: Iterable[str], machine: llvm.TargetMachine) -> llvm.ModuleRef:
-    """The module of a text for the machine; its `external` functions are those of libdevice."""
-    text = text.replace('target triple = ""', f'target triple = "{machine.triple}"')
-    text = text.replace('target datalayout = ""', f'target datalayout = "{machine.target_data}"')
-    if external:
-        text = re.sub(rf'@"?({"|".join(sorted(external))})"?\(', r"@__nv_\1(", text)
-    return llvm.parse_assembly(text)
-
-
-def _refuse_far_angles(text: str) -> str:
-    """The text of a module in which the sine of an angle beyond 2**20 is NaN.
+def _refuse_far_angles() -> llvm.ModuleRef:
+    """A module in which the sine of an angle beyond 2**20 is NaN.
 
     A step to there is refused, so that the motion ends and says so. libdevice has such sines, with a reduction that
     every thread would keep room for.
     """
+    module = ir.Module("far_angles")
+    module.triple = ""
     for name in _FAR_ANGLES:
-        nan = f'define internal double @"{name}"(double %x) {{\n  ret double 0x7FF8000000000000\n}}'
-        text = re.sub(rf'declare double @"{name}"\([^)]*\)', nan, text)
-    return text
-
-
-def _unroll_loops(text: str) -> str:
-    """The text of a module in which the branches that close its counted loops ask for these to be unrolled."""
-    entered, lines = set(), []
-    for line in text.splitlines():
-        if line.startswith("define"):
-            entered = set()
-        elif branch := _TO_COUNTED.fullmatch(line):
-            line += ", !llvm.loop !0" if branch[1] in entered else ""  # the first branch to it enters the loop
-            entered.add(branch[1])
-        lines.append(line)
-    return "\n".join([*lines, "!0 = distinct !{!0, !1}", '!1 = !{!"llvm.loop.unroll.full"}', ""])
+        code = Code(module, name, [DOUBLE], lanes=1, result=DOUBLE, public=True)
+        code.finish(code.as_value(math.nan, DOUBLE))
+    return llvm.parse_assembly(str(module))
 
 
 def _optimise(module: llvm.ModuleRef, machine: llvm.TargetMachine) -> llvm.ModuleRef:

@@ -17,7 +17,7 @@ from llvmlite import ir
 from lagjax._native import _adjoint, _integrator
 from lagjax._native._frame import CACHE_LINE, LANE
 from lagjax._native._handler import job_of
-from lagjax._native._ir import BIT, DOUBLE, FLOAT, INTEGER, POINTER, Code, Value
+from lagjax._native._ir import BIT, DOUBLE, FLOAT, INTEGER, POINTER, Code, Value, unroll_loops
 from lagjax._native._run_records import RECORDED
 from lagjax._native._taylor import TaylorSeries
 
@@ -73,7 +73,8 @@ class OneLane(NamedTuple):
 
     A thread remembers `size` doubles. The motion has this many `states` (2n) and `numbers` of a member, `row` doubles
     are written down of a step, and its series have this many rows, those of the state among them. Of a `large` motion,
-    which is in tables, no loop can be unrolled. The series may be of `single` precision.
+    which is in tables, no loop can be unrolled; of another one the text `unrolled` asks for that. The series may be of
+    `single` precision.
     """
 
     text: str
@@ -84,6 +85,7 @@ class OneLane(NamedTuple):
     series: int
     large: bool
     single: bool = False
+    unrolled: str = ""
 
     @classmethod
     def from_motion(cls, motion: TaylorSeries) -> "OneLane":
@@ -91,7 +93,10 @@ class OneLane(NamedTuple):
         states, text = motion.states, str(motion.module)
         row, series = states + RECORDED + motion.recorded_pieces, states + motion.series.rows
         single = motion.layout.number == FLOAT
-        return cls(text, motion.layout.size, states, motion.member_stride, row, series, motion.large, single)
+        if not motion.large:
+            unroll_loops(motion.module)
+        form = text, motion.layout.size, states, motion.member_stride, row, series, motion.large, single
+        return cls(*form, "" if motion.large else str(motion.module))
 
 
 def motion_entry(motion: OneLane, order: int) -> str:
@@ -133,8 +138,9 @@ class _Thread:
 
     def finish(self) -> str:
         """The text of the module."""
+        self.code.function.calling_convention = "ptx_kernel"
         self.code.finish()
-        return str(self.module).replace("define void", "define ptx_kernel void")
+        return str(self.module)
 
     def number(self, name: str) -> Value:
         """One of the entry's numbers."""

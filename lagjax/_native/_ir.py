@@ -112,6 +112,21 @@ def _object(text: str, level: int) -> bytes:
         parsed.close()  # what the code is made from takes ten times its memory
 
 
+def unroll_loops(module: ir.Module) -> None:
+    """Ask for the counted loops of a module to be unrolled, by the branches that close them."""
+    loop: Any = module.add_metadata([module.add_metadata(["llvm.loop.unroll.full"])])
+    loop.operands = (loop, *loop.operands)  # a loop is known by a node that names itself
+    for function in module.functions:
+        entered = set()
+        for block in function.blocks:
+            target = block.terminator.operands[0] if isinstance(block.terminator, ir.Branch) else None
+            if target is not None and target.name.startswith(COUNTED):
+                if target in entered:  # the first branch to it enters the loop
+                    block.instructions[-1] = block.terminator = ir.Branch(block, "br", [target])
+                    block.terminator.set_metadata("llvm.loop", loop)
+                entered.add(target)
+
+
 @dataclass(frozen=True, eq=False)
 class Value:
     """The result of an instruction; `it` is llvmlite's value, which has no annotations that hold."""
