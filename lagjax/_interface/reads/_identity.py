@@ -167,7 +167,7 @@ class Walk:
         }
         used = inside | outside | {name: module for name, module in imported.items() if module is not None}
         yield "code", code_text(function.__code__)
-        yield "defaults", [function.__defaults__, function.__kwdefaults__]
+        yield "defaults", (function.__defaults__, function.__kwdefaults__)
         yield from sorted(self._add_module_attributes(used, names.attributes | names.globals).items())
         yield from self._function_attributes(function)
 

@@ -5,6 +5,7 @@ gone again, and only another text is another function. An array is compared by i
 """
 
 import collections
+import functools
 import types
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any
@@ -32,10 +33,10 @@ class Marks:
         if key is SIZE:
             self._contents.append((len, place, SIZE, len(place), None))
         elif key is not None:
-            reader = next((reader for kind, reader in _READERS.items() if isinstance(place, kind)), getattr)
-            self._values.append((reader, place, key, value))
+            self._values.append((_reader(place), place, key, value))
         elif not isinstance(place, tuple | frozenset):
-            self._contents.append((_content, place, None, _content(place), _parts(place)))
+            content, parts = _content_reader(place)
+            self._contents.append((content, place, None, content(place), parts))
 
     @property
     def keys(self) -> dict[tuple[int, str], Any]:
@@ -54,7 +55,7 @@ class Marks:
         """The places, with their keys, where something else is now."""
         try:
             for reader, place, key, value in self._values:
-                if reader(place, key) is not value:
+                if reader(key, ABSENT) is not value:
                     yield place, key
             for reader, place, key, content, _ in self._contents:
                 if reader(place) != content:
@@ -63,25 +64,28 @@ class Marks:
             yield None, None
 
 
-_READERS: dict[type, Callable] = {
-    dict: lambda place, key: place.get(key, ABSENT),
-    type: lambda place, key: place.__dict__.get(key, ABSENT),
-    types.CellType: lambda place, key: place.cell_contents,
-}
+def _reader(place: Any) -> Callable[[str, Any], Any]:
+    """A function of a key and of what to return if nothing is under it: a method written in C, where there is one."""
+    if isinstance(place, types.CellType):
+        return lambda key, default: place.cell_contents
+    if isinstance(place, dict | type):
+        return place.get if isinstance(place, dict) else place.__dict__.get
+    return functools.partial(getattr, place)
 
 
-def _parts(place: Any) -> tuple | None:
-    """All that a container holds; None of a large one, and of what is an array or shows one."""
-    if not isinstance(place, Mapping | list | set | collections.deque) or len(place) > LARGEST_CONTAINER:
-        return None
-    return (*place.keys(), *place.values()) if isinstance(place, Mapping) else tuple(place)
+def _content_reader(place: Any) -> tuple[Callable[[Any], Any], tuple | None]:
+    """A function of a place, of what is compared of its content; and what its identities are those of, to be kept."""
+    if not isinstance(place, Mapping | list | set | collections.deque):
+        return _read_bytes, None
+    if len(place) > LARGEST_CONTAINER:
+        return len, None
+    if isinstance(place, Mapping):
+        return lambda table: (*map(id, table.keys()), *map(id, table.values())), (*place.keys(), *place.values())
+    return lambda row: tuple(map(id, row)), tuple(place)
 
 
-def _content(place: Any) -> Any:
-    """The identities of what a container holds, or its length; of an array, or what shows one, its bytes or samples."""
-    if isinstance(place, Mapping | list | set | collections.deque):
-        parts = _parts(place)
-        return len(place) if parts is None else tuple(map(id, parts))
+def _read_bytes(place: Any) -> tuple:
+    """The shape, the dtype and the bytes of an array, or of what shows one; of a large one those of some numbers."""
     array = np.asarray(place)
     whole = array.nbytes <= LARGEST_ARRAY
     numbers = array if whole else array.flat[np.linspace(0, array.size - 1, SAMPLED).astype(int)]
