@@ -72,35 +72,29 @@ def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordin
         Q, Qdot, t = jax.tree.map(lambda x: jnp.asarray(x, float), (Q, Qdot, t))
         return jax.jvp(lambda Q, t: present(place)(Q, t=t, params=params), (Q, t), (Qdot, jnp.ones_like(t)))
 
-    def lagrangian(Q, Qdot, t, params):
-        return system.lagrangian(*old_state(Q, Qdot, t, params), t=t, params=params)
+    def of_old_state(function: Function):
+        return lambda Q, Qdot, t, params: function(*old_state(Q, Qdot, t, params), t=t, params=params)
 
-    def forces(Q, Qdot, t, params):
-        assert system.forces is not None
-        force = system.forces(*old_state(Q, Qdot, t, params), t=t, params=params)
-        return jax.vjp(lambda Q: place(Q, t=t, params=params), Q)[1](force)[0]
+    def of_old_place(function: Function):
+        return lambda Q, t, params: function(place(Q, t=t, params=params), t=t, params=params)
 
-    def dissipation(Q, Qdot, t, params):
-        assert system.dissipation is not None
-        return system.dissipation(*old_state(Q, Qdot, t, params), t=t, params=params)
+    def pull_back(function: Function):
+        force = of_old_state(function)
 
-    def constraints(Q, t, params):
-        assert system.constraints is not None
-        return system.constraints(place(Q, t=t, params=params), t=t, params=params)
+        def forces(Q, Qdot, t, params):
+            return jax.vjp(lambda Q: place(Q, t=t, params=params), Q)[1](force(Q, Qdot, t, params))[0]
 
-    def velocity_constraints(Q, Qdot, t, params):
-        assert system.velocity_constraints is not None
-        return system.velocity_constraints(*old_state(Q, Qdot, t, params), t=t, params=params)
+        return forces
 
-    def replace_role(function: Function | None, changed: Callable, roles: int = 2) -> Callable | None:
-        return None if function is None else restrict_signature(changed, {*function.extras, *place.extras}, roles)
+    def change(function: Function | None, how: Callable = of_old_state, roles: int = 2) -> Any:
+        return function and restrict_signature(how(function), {*function.extras, *place.extras}, roles)
 
     changed = System(
-        restrict_signature(lagrangian, {*system.lagrangian.extras, *place.extras}),
-        forces=replace_role(system.forces, forces),
-        dissipation=replace_role(system.dissipation, dissipation),
-        constraints=replace_role(system.constraints, constraints, 1),
-        velocity_constraints=replace_role(system.velocity_constraints, velocity_constraints),
+        change(system.lagrangian),
+        forces=change(system.forces, pull_back),
+        dissipation=change(system.dissipation),
+        constraints=change(system.constraints, of_old_place, 1),
+        velocity_constraints=change(system.velocity_constraints),
         path=system.path,  # pyright: ignore[reportArgumentType]
     )
 

@@ -125,6 +125,7 @@ def _changes(weights: Array, fields: Fields, states: FlatState, *arguments) -> t
 
 
 def _change(scene: SceneState, fields: Fields, transform: Callable, state: FlatState) -> tuple:
+    """The fields of `Changes` of one transformation at one state."""
     q, qdot, t = state.q, state.qdot, state.t
 
     def change(qdot):

@@ -179,7 +179,11 @@ def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> 
     basis = _tangent_basis(jacobian[:, keep], rank)
     within = tuple(basis.T @ x @ basis for x in reduced)
     solve = _reversible_modes if reversible else _general_modes
-    exponents, amplitudes = solve(*within) if basis.shape[1] else _none(q.dtype)
+    if basis.shape[1]:
+        exponents, amplitudes = solve(*within)
+    else:
+        exponents = jnp.zeros((0, 2), jnp.result_type(q.dtype, jnp.complex64))
+        amplitudes = jnp.zeros((0, 0), q.dtype)
     moved = (basis.astype(amplitudes.dtype) @ amplitudes).T  # (k, n without the cyclic ones)
     shapes = jnp.zeros((len(moved), len(q)), moved.dtype).at[:, keep].set(moved)
     shapes = shapes.at[:, gone].set(follow(moved, exponents[:, 0]))
@@ -274,10 +278,6 @@ def _tangent_basis(jacobian: Float[Array, "m n"], rank: int) -> Float[Array, "n 
     # Zero in value, as `jacobian @ basis` is; its derivative keeps the basis on the tangent space.
     correct = jax.vmap(lambda b: jacobian.T @ least_norm(jacobian @ jacobian.T, b), in_axes=1, out_axes=1)
     return basis - correct(jacobian @ basis)
-
-
-def _none(dtype) -> tuple[Array, Array]:
-    return jnp.zeros((0, 2), jnp.result_type(dtype, jnp.complex64)), jnp.zeros((0, 0), dtype)
 
 
 def _reversible_modes(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Array, Array]:

@@ -5,6 +5,7 @@
 R is a Lagrangian for the other coordinates s. The cyclic ones c follow by an integral over the time.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -94,7 +95,6 @@ class _CyclicSplit(NamedTuple):
         return jnp.zeros(self.layout.size, self.layout.dtype).at[self.left].set(s).at[self.gone].set(c)
 
     def lagrangian(self, s, sdot, cdot, t, params):
-        """L, in which the cyclic coordinates may have any value."""
         q, qdot = self.join_coordinates(s, jnp.zeros(len(self.gone))), self.join_coordinates(sdot, cdot)
         return present(self.system.lagrangian)(self.layout.restore(q), self.layout.restore(qdot), t=t, params=params)
 
@@ -111,18 +111,15 @@ class _CyclicSplit(NamedTuple):
         return factorize(mass).solve(missing)
 
     def routh(self, s, sdot, t, params):
-        """R."""
         cdot = self.cyclic_velocity(s, sdot, t, params)
         return self.lagrangian(s, sdot, cdot, t, params["params"]) - params["momenta"] @ cdot
 
     def reduce(self, q, qdot, t: Any = 0.0, params=None) -> tuple[Array, Array, dict]:
-        """(s, ṡ, the parameters of the reduced scene)."""
         p = self.layout.flatten(self.system.momentum(q, qdot, t, params))[self.gone]
         q, qdot = self.layout.flatten(q), self.layout.flatten(qdot)
         return q[self.left], qdot[self.left], {"momenta": p, "params": params}
 
     def restore(self, s, sdot, c, params, t=0.0) -> tuple[PyTree, PyTree]:
-        """(q, q̇)."""
         cdot = self.cyclic_velocity(s, sdot, jnp.asarray(t, self.layout.dtype), params)
         return self.layout.restore(self.join_coordinates(s, c)), self.layout.restore(self.join_coordinates(sdot, cdot))
 
@@ -144,16 +141,6 @@ def _simulate(whole: _CyclicSplit, reduced: System, q0, qdot0, ts, params=None, 
     every = slice(None, None, _NODES + 1)
     s, v = done.q[every], done.qdot[every]
     q, qdot = jax.vmap(lambda s, v, c, t: whole.restore(s, v, c, momenta, t))(s, v, c, ts)
-    end = State(ts[-1], jax.tree.map(lambda x: x[-1], q), jax.tree.map(lambda x: x[-1], qdot))
-    fields = {name: getattr(done, name) for name in Trajectory.__dataclass_fields__}
-    return Trajectory.from_fields(
-        **{
-            **fields,
-            "ts": ts,
-            "q": q,
-            "qdot": qdot,
-            "end": end,
-            "system": present_system(whole.system),
-            "params": params,
-        }
-    )
+    end = State(ts[-1], *jax.tree.map(lambda x: x[-1], (q, qdot)))
+    system = present_system(whole.system)
+    return dataclasses.replace(done, ts=ts, q=q, qdot=qdot, end=end, system=system, params=params)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lagjax._engine.taylor import lowered_motion
-from lagjax._equations import Derivation, Motion, Sample, Scales, columns_of, derivation_of, has_constraints
+from lagjax._equations import Derivation, Motion, Sample, Scales, borders_of, derivation_of, has_constraints
 from lagjax._interface import Layout, as_arrays, is_concrete, require_finite
 from lagjax._program import Unlowerable
 from lagjax._scene import ROLES, System, require_system
@@ -55,7 +55,6 @@ class SceneState(NamedTuple):
 
     @property
     def arguments(self) -> tuple:
-        """The arguments of `from_arguments`."""
         return self.system, self.layout, self.q, self.qdot, self.params
 
     @property
@@ -79,18 +78,11 @@ class SceneState(NamedTuple):
     @property
     def piecewise(self) -> bool:
         """True if the motion decides on something: a comparison, an absolute value, a floor."""
-        if self.lowered is None:
-            return False
-        try:
-            borders = self.derivation.borders
-        except Unlowerable:
-            return False
-        return borders is not None and bool(borders.switches)
+        return self.lowered is not None and borders_of(self.derivation) is not None
 
     def require_autonomous(self, what: str) -> None:
         """Raise `ValueError` where a function of the scene depends on the time."""
-        roles = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
-        asking = [role for role in roles if (f := getattr(self.system, role)) is not None and "t" in f.extras]
+        asking = [role for role in ROLES if (f := getattr(self.system, role)) is not None and "t" in f.extras]
         if not asking:
             return
         derivation, time = self.lowered, 2 * self.layout.size
@@ -106,12 +98,9 @@ class SceneState(NamedTuple):
         """The coordinates that nothing depends on and nothing acts on, read off the scene's programs."""
         if self.lowered is None:
             return ()
-        return tuple(i for i in self.derivation.conserved if not self._read(i))
-
-    def _read(self, coordinate: int) -> bool:
-        return any(
-            coordinate in self.derivation.reads(name) for name in ("lagrangian", "nonconservative_force", "residual")
-        )
+        names = "lagrangian", "nonconservative_force", "residual"
+        read = set().union(*map(self.derivation.reads, names))
+        return tuple(i for i in self.derivation.conserved if i not in read)
 
     @property
     def reversible(self) -> bool:
@@ -127,9 +116,10 @@ class SceneState(NamedTuple):
             return False
         draws = np.random.default_rng(1).uniform(0.3, 1.2, (3, len(self.derivation.scalar_shapes)))
         draws = draws.astype(self.layout.dtype)
-        q, t, numbers = draws[:, :n], draws[:, 2 * n], list(draws[:, 2 * n + 1 :].T)
+        draws[:, n : 2 * n] = 0.0
+        sample = Sample.from_states(self.derivation, draws[:, : 2 * n], draws[:, 2 * n], draws[:, 2 * n + 1 :].T)
         with np.errstate(all="ignore"):
-            momentum = self.derivation.evaluate(("momentum",), columns_of(q, np.zeros_like(q), t, numbers))["momentum"]
+            momentum = sample.quantities("momentum")["momentum"]
         return bool(np.isfinite(momentum).any() and (momentum[np.isfinite(momentum)] == 0).all())
 
     @property
@@ -148,15 +138,14 @@ class SceneState(NamedTuple):
         return self.motion.mass_matrix_and_force(q, qdot, jnp.zeros((), q.dtype), self.numbers)[1]
 
     def mass_matrix(self, q: Vector, qdot: Vector) -> Float[Array, "n n"]:
-        """M, (n, n)."""
         return self.motion.mass_matrix(q, qdot, jnp.zeros((), q.dtype), self.numbers)
 
     def jacobian(self, q: Vector, qdot: Vector) -> Float[Array, "m n"]:
         """G, (m, n), of m constraints or none."""
         return self.motion.constraints.jacobian_and_gamma(q, qdot, jnp.zeros((), q.dtype), self.numbers)[0]
 
-    def holds(self, q: Vector) -> Float[Array, " k"]:
-        """f, the constraints on positions, (k,)."""
+    def position_constraints(self, q: Vector) -> Float[Array, " k"]:
+        """f of the constraints f = 0, (k,)."""
         return self.motion.constraints.f(q, jnp.zeros((), q.dtype), self.numbers)
 
 

@@ -10,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._analysis._coordinates import restrict_signature
 from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._solve import levenberg_marquardt
 from lagjax._interface import SimulationError
@@ -36,7 +37,10 @@ def settle(scene: SceneState) -> PyTree:
         rate = 0.5**stage / scales.t
         params = {"of": scene.params, "rate": jnp.asarray(rate, layout.dtype)}
         if scene.constrained:
-            q, qdot = system.project(_approach_constraints(scene, q), qdot, 0.0, params)
+            # By damped least squares towards the constraints first: the projection converges only near them.
+            place, unit = layout.flatten(q), jnp.asarray(scales.q, layout.dtype)
+            near = levenberg_marquardt(scene.position_constraints, place, jnp.abs(place), unit)
+            q, qdot = system.project(layout.restore(near), qdot, 0.0, params)
         try:
             run = simulate(system, q, qdot, jnp.array([0.0, _TIMES / rate], layout.dtype), params, rtol=_RTOL)
         except SimulationError as error:
@@ -50,13 +54,6 @@ def settle(scene: SceneState) -> PyTree:
     )
 
 
-def _approach_constraints(scene: SceneState, q: PyTree) -> PyTree:
-    """q after damped least-squares steps towards the constraints: the projection converges only near them."""
-    place = scene.layout.flatten(q)
-    unit = jnp.asarray(scene.scales.q, place.dtype)
-    return scene.layout.restore(levenberg_marquardt(scene.holds, place, jnp.abs(place), unit))
-
-
 def _add_friction(system: System) -> System:
     """The scene at t = 0 with ½ c q̇ᵀM q̇ added to its dissipation; `params` are {"of": its own, "rate": c}."""
 
@@ -68,16 +65,16 @@ def _add_friction(system: System) -> System:
         own = 0.0 if system.dissipation is None else system.dissipation(q, qdot, t=0.0, params=params["of"])
         return own + params["rate"] * kinetic
 
-    def fix_time(function):
-        return lambda q, qdot, params: function(q, qdot, t=0.0, params=params["of"])
+    def fix_time(function, roles=2) -> Any:
+        def fixed(*state_t_params):
+            return function(*state_t_params[:roles], t=0.0, params=state_t_params[-1]["of"])
 
-    def fix_position_time(function):
-        return lambda q, params: function(q, t=0.0, params=params["of"])
+        return function and restrict_signature(fixed, {"params"}, roles)
 
     return System(
         fix_time(system.lagrangian),
-        forces=None if system.forces is None else fix_time(system.forces),
+        forces=fix_time(system.forces),
         dissipation=dissipation,
-        constraints=None if system.constraints is None else fix_position_time(system.constraints),
-        velocity_constraints=None if system.velocity_constraints is None else fix_time(system.velocity_constraints),
+        constraints=fix_time(system.constraints, roles=1),
+        velocity_constraints=fix_time(system.velocity_constraints),
     )

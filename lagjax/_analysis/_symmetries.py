@@ -158,30 +158,20 @@ def conserved_quantities(
     measured = _measure_columns(scene, fields, here)
     known, names = textbook_symmetries(scene.layout, fields), scene.layout.names
     space = measured.symmetries(measured.of_lagrangian, measured.of_others)
-    chosen = _verify(_choose_basis(space, known, fields, names), _measure_columns(scene, fields, fresh))
+    verified = _measure_columns(scene, fields, fresh)
+    rows, left = np.concatenate([verified.of_lagrangian, verified.of_others]), _SLACK * verified.threshold
+    basis = _choose_basis(space, known, fields, names)
+    chosen = [(name, w) for name, w in basis if np.abs(rows @ w).max() <= left * np.abs(w).max()]
     quantities, notes = _quantities(scene, fields, chosen, fresh)
     found = {name for name, _ in chosen}
     if measured.of_others.size:
-        of_lagrangian = measured.symmetries(measured.of_lagrangian)
-        broken = [
-            name for name in _listed_names(_choose_basis(of_lagrangian, known, fields, names)) if name not in found
-        ]
+        of_lagrangian = _choose_basis(measured.symmetries(measured.of_lagrangian), known, fields, names)
+        broken = [name for name, _ in of_lagrangian if name not in found and not name.startswith(_DEPENDENT)]
         notes += [f"not conserved: {name}, by a symmetry of L that a force or a constraint breaks" for name in broken]
     notes += _approximate_symmetries(measured, space, known)
     if piecewise:
         notes.append("L or a force is piecewise: beyond borders farther off than states were drawn nothing was tested")
     return ConservedQuantities(quantities, tuple(notes), measured.threshold)
-
-
-def _listed_names(chosen: list[tuple[str, np.ndarray]]) -> list[str]:
-    """The names of symmetries, without those that follow from others."""
-    return [name for name, _ in chosen if not name.startswith(_DEPENDENT)]
-
-
-def _verify(chosen: list[tuple[str, np.ndarray]], fresh: "_SymmetryColumns") -> list[tuple[str, np.ndarray]]:
-    """The symmetries that hold at fresh states as well."""
-    rows = np.concatenate([fresh.of_lagrangian, fresh.of_others])
-    return [(name, w) for name, w in chosen if np.abs(rows @ w).max() <= _SLACK * fresh.threshold * np.abs(w).max()]
 
 
 def _approximate_symmetries(

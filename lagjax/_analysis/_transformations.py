@@ -37,7 +37,6 @@ class Fields(NamedTuple):
 
     @property
     def count(self) -> int:
-        """K, the number of transformations."""
         return len(self.names)
 
     def split_weights(self, weights):
@@ -96,7 +95,6 @@ def fields_of(layout: Layout, scale: np.ndarray, time: float, own: dict[str, Cal
 
 
 def _maps(layout: Layout, scale: np.ndarray) -> list[tuple[str, np.ndarray]]:
-    """Matrices A (n, n) by name."""
     n, names = layout.size, layout.names
     if n <= _ALL_MAPS:
         maps = []
@@ -106,25 +104,18 @@ def _maps(layout: Layout, scale: np.ndarray) -> list[tuple[str, np.ndarray]]:
                 a[i, j] = scale[i] / scale[j]
                 maps.append((f"d{names[i]} = {names[j]}", a))
         return maps
-    return [(f"{name} of {layout.paths[k]}", a) for k, name, a in leaf_maps(layout)]
-
-
-def leaf_maps(layout: Layout) -> list[tuple[int, str, np.ndarray]]:
-    """Rotations of each leaf in every plane of its last axis, and its scaling: which leaf, the name, A (n, n)."""
+    # Rotations of each leaf in every plane of its last axis, and its scaling.
     maps, begin = [], 0
-    for k, shape in enumerate(layout.shapes):
+    for path, shape in zip(layout.paths, layout.shapes, strict=True):
         size = int(np.prod(shape, dtype=int))
         place = np.arange(begin, begin + size)
-        scaling = np.zeros((layout.size, layout.size))
-        scaling[place, place] = 1.0
-        maps.append((k, "scaling", scaling))
+        maps.append((f"scaling of {path}", np.diag(np.isin(np.arange(n), place).astype(float))))
         if shape and shape[-1] in _SPACE:
             vectors = place.reshape(-1, shape[-1])
             for i in range(shape[-1]):
                 for j in range(i + 1, shape[-1]):
-                    a = np.zeros((layout.size, layout.size))
-                    a[vectors[:, i], vectors[:, j]], a[vectors[:, j], vectors[:, i]] = -1.0, 1.0
-                    maps.append((k, f"rotation in the plane {i}{j}", a))
+                    rotation = _rotation(n, vectors[:, i], vectors[:, j])
+                    maps.append((f"rotation in the plane {i}{j} of {path}", rotation))
         begin += size
     return maps
 
@@ -136,7 +127,9 @@ def textbook_symmetries(layout: Layout, fields: Fields) -> list[tuple[str, np.nd
     """Combinations that textbooks name: the name of what they conserve, and their weights (K,)."""
     n, axes = layout.size, _axes(layout)
     one, first_own = np.eye(n), fields.count - len(fields.own)
-    along = [(i, d, _indicator(n, vectors[:, i])) for d, vectors in axes.items() for i in range(d)]
+    along = [
+        (i, d, np.isin(np.arange(n), vectors[:, i]).astype(float)) for d, vectors in axes.items() for i in range(d)
+    ]
     space = {d: "" if len(axes) == 1 else f" of {d}" for d in axes}
     # The signs are those of what is conserved: h, p, M X − P t.
     known = [("energy", fields.weights(alpha=-1.0))]
@@ -150,13 +143,6 @@ def textbook_symmetries(layout: Layout, fields: Fields) -> list[tuple[str, np.nd
     known += [("dilation", fields.weights(a=-0.5 * one, beta=-1.0))]  # h t − ½ p·q
     known += [(name, np.eye(fields.count)[first_own + k]) for k, name in enumerate(fields.names[first_own:])]
     return [(name, weights) for name, weights in known if weights is not None]
-
-
-def _indicator(n: int, places: np.ndarray) -> np.ndarray:
-    """The vector (n,) that is 1 at `places` and 0 elsewhere."""
-    vector = np.zeros(n)
-    vector[places] = 1.0
-    return vector
 
 
 def _axes(layout: Layout) -> dict[int, np.ndarray]:
@@ -176,13 +162,16 @@ def _rotations(layout: Layout, axes: dict[int, np.ndarray]) -> list[tuple[str, n
     for d, vectors in axes.items():
         for i in range(d):
             for j in range(i + 1, d):
-                a = np.zeros((n, n))
-                a[vectors[:, i], vectors[:, j]], a[vectors[:, j], vectors[:, i]] = -1.0, 1.0
-                rotations.append((f"in the plane {i}{j}", a))
+                rotations.append((f"in the plane {i}{j}", _rotation(n, vectors[:, i], vectors[:, j])))
     if n <= _ALL_MAPS:
         for i in range(n):
             for j in range(i + 1, n):
-                a = np.zeros((n, n))
-                a[i, j], a[j, i] = -1.0, 1.0
-                rotations.append((f"of {layout.names[i]}, {layout.names[j]}", a))
+                rotations.append((f"of {layout.names[i]}, {layout.names[j]}", _rotation(n, i, j)))
     return rotations
+
+
+def _rotation(n: int, first, second) -> np.ndarray:
+    """A (n, n) that turns the coordinates at the places `first` into those at `second`."""
+    a = np.zeros((n, n))
+    a[first, second], a[second, first] = -1.0, 1.0
+    return a
