@@ -6,6 +6,7 @@ follows all directions over the steps of the motion, without a program of XLA, s
 nothing, and no kernel of LAPACK runs inside of one.
 """
 
+import copy
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,7 +14,7 @@ import numpy as np
 from lagjax._analysis.orbits._flat_starts import require_untraced
 from lagjax._engine import Problem
 from lagjax._engine.taylor import KEPT, MachineCode, flow_of, jvp, tolerances_of
-from lagjax._equations import Scales, columns_of, has_constraints
+from lagjax._equations import Sample, Scales, has_constraints
 from lagjax._interface import SUCCESSFUL, Layout, halves
 from lagjax._primitives import sentence
 from lagjax._scene import System, require_system
@@ -98,8 +99,7 @@ class Arcs:
 
     def with_numbers(self, numbers: np.ndarray) -> "Arcs":
         """The arcs of the scene with other parameters (P,)."""
-        other = object.__new__(Arcs)
-        other.__dict__.update(self.__dict__)
+        other = copy.copy(self)
         other.numbers = numbers
         return other
 
@@ -155,51 +155,44 @@ class Arcs:
         `time` (R,) is that of a change; by default it is read off the velocities and accelerations.
         """
         n = self.size
-        mass = np.abs(self.quantities(("mass_matrix",), 0.0, y0)["mass_matrix"][:, np.arange(n), np.arange(n)])
-        root = np.sqrt(np.where(mass > 0, mass, mass.max(axis=1, initial=0.0)[:, None]))
-        root = np.where((root > 0) & np.isfinite(root), root, 1.0)
+        mass = np.abs(self.sample(0.0, y0).quantities("mass_matrix")["mass_matrix"][:, np.arange(n), np.arange(n)])
+        root = _or_one(np.sqrt(np.where(mass > 0, mass, mass.max(axis=1, initial=0.0)[:, None])))
         far, fast, bend = (np.abs(x * root).max(axis=1) for x in (*halves(y0), halves(self.rate(0.0, y0))[1]))
         with np.errstate(all="ignore"):
             if time is None:
                 length = np.where(far > 0, far, fast**2 / bend)
                 rate = np.maximum(fast / length, np.sqrt(bend / length))
                 for row in np.flatnonzero(~((length > 0) & (rate > 0) & np.isfinite(length * rate))):
-                    scales = self._scales(y0[row])
+                    scales = Scales.from_quantities(self._evaluate, *halves(y0[row]))  # which takes a hundred forces
                     length[row], rate[row] = np.abs(scales.q * root[row]).max(), 1 / scales.t
                 rate = _or_one(rate)
             else:
                 rate = 2 * np.pi / time
                 length = np.maximum(far, fast / rate)
-        of_q = (length := _or_one(length))[:, None] / root
+        length = _or_one(length)
+        of_q = length[:, None] / root
         return Units(np.concatenate([of_q, rate[:, None] * of_q], axis=1), 1 / rate, length)
 
-    def _scales(self, y: np.ndarray) -> Scales:
-        """The scales at one state (2n,), which need some hundred forces."""
+    def _evaluate(self, name: str, q: np.ndarray, qdot: np.ndarray) -> np.ndarray:
+        return self.sample(0.0, np.concatenate([q, qdot], axis=1)).quantities(name)[name]
 
-        def evaluated(name, q, qdot):
-            return self.quantities((name,), 0.0, np.concatenate([q, qdot], axis=1))[name]
-
-        return Scales.from_quantities(evaluated, *halves(y))
+    def sample(self, t, y: np.ndarray) -> Sample:
+        """The scene at states (R, 2n) and times () or (R,)."""
+        return Sample.from_states(self.derivation, y, np.broadcast_to(np.asarray(t, float), (len(y),)), self.numbers)
 
     def rate(self, t, y: np.ndarray) -> np.ndarray:
         """ẏ = (q̇, q̈), (R, 2n), at states (R, 2n) and times () or (R,)."""
         values = self.flow.general_program.evaluate_many([*y.T, t, *self.numbers])
         return np.concatenate([y[:, self.size :], values[: self.size].T], axis=1)
 
-    def quantities(self, names: tuple[str, ...], t, y: np.ndarray) -> dict[str, np.ndarray]:
-        """The quantities of `Motion.quantities` with these names at states (R, 2n), each (R, …)."""
-        q, qdot = halves(y)
-        t = np.broadcast_to(np.asarray(t, float), (len(y),))
-        return self.derivation.evaluate(names, columns_of(q, qdot, t, list(self.numbers)))
-
     def energy(self, t, y: np.ndarray) -> np.ndarray:
         """h = p·q̇ − L (R,)."""
-        of = self.quantities(("lagrangian", "momentum"), t, y)
+        of = self.sample(t, y).quantities("lagrangian", "momentum")
         return np.sum(of["momentum"] * halves(y)[1], axis=1) - of["lagrangian"].reshape(len(y))
 
     def energy_slope(self, t, y: np.ndarray) -> np.ndarray:
         """∂h/∂y (R, 2n)."""
-        of = self.quantities(("energy_by_q", "mass_matrix"), t, y)
+        of = self.sample(t, y).quantities("energy_by_q", "mass_matrix")
         return np.concatenate([of["energy_by_q"], np.einsum("rij,rj->ri", of["mass_matrix"], halves(y)[1])], axis=1)
 
     def canonical(self, t, y: np.ndarray, units: Units) -> np.ndarray:
@@ -207,20 +200,13 @@ class Arcs:
 
         The product of the units of qᵢ and pᵢ is then the same for all i, so that the symplectic form is the usual one.
         """
-        n = self.size
-        by_q = np.moveaxis(np.array(self._momentum_by_q(t, y)).reshape(n, n, len(y)), 2, 0)
+        n, sample = self.size, self.sample(t, y)
         chart = np.zeros((len(y), 2 * n, 2 * n))
-        chart[:, :n, :n], chart[:, n:, :n] = np.eye(n), by_q
-        chart[:, n:, n:] = self.quantities(("mass_matrix",), t, y)["mass_matrix"]
+        chart[:, :n, :n], chart[:, n:, :n] = np.eye(n), sample.momenta_by_q(tuple(range(n)))
+        chart[:, n:, n:] = sample.quantities("mass_matrix")["mass_matrix"]
         of_q = units.state[:, :n]
         of_p = (units.length**2 / units.time)[:, None] / of_q
         return chart * units.state[:, None, :] / np.concatenate([of_q, of_p], axis=1)[:, :, None]
-
-    def _momentum_by_q(self, t, y: np.ndarray) -> list:
-        program = self.derivation.momenta_by_q(tuple(range(self.size)))
-        t = np.broadcast_to(np.asarray(t, float), (len(y),))
-        values = program.evaluate_many(columns_of(*halves(y), t, list(self.numbers)))
-        return [np.broadcast_to(value, (len(y),)) for value in values]
 
     def why_not(self, row: int, arc: Arc, y0: np.ndarray, t_last: float) -> str:
         """The failure of an arc, in a sentence."""

@@ -61,8 +61,13 @@ def branch_off(
         )
     turns = 2 if bool(family.doubling[index]) else 1
     beside = next(k for k in (index - 1, index + 1, index) if 0 <= k < len(family.value))
-    follower = _follower(system, family, index, turns, params, by)
-    here, neighbour = (_member_point(follower, family, k, turns) for k in (index, beside))
+    (y0, period, layout), (y0_beside, period_beside, _) = (_start(family, k, turns) for k in (index, beside))
+    place = None if by == "energy" else parameter_index(params, by)
+    arcs = Arcs.from_system(system, layout, params, RTOL, "Families")
+    numbers, numbers_beside = (_numbers(arcs, place, family, k) for k in (index, beside))
+    follower = Follower(arcs.with_numbers(numbers), place, y0, period)
+    here = first_point(follower, y0, period, numbers)
+    neighbour = first_point(follower, y0_beside, period_beside, numbers_beside)
     before = tangent_at(follower, neighbour, None)
     point = None if before is None else _branching_orbit(follower, here, before, float(size))
     if before is None or point is None:
@@ -74,24 +79,11 @@ def branch_off(
     return restore_orbits(follower.arcs.layout, FlatOrbits(*(x[0] for x in found)), found.message[0])
 
 
-def _follower(system: System, family: Family, k: int, turns: int, params, by: str) -> Follower:
-    """The follower of orbits of this family, traversed once or twice, in the units of orbit k."""
-    period, layout, y0 = _start(family, k, turns)
-    arcs = Arcs.from_system(system, layout, params, RTOL, "Families")
-    place = None if by == "energy" else parameter_index(params, by)
-    return Follower(arcs.with_numbers(_numbers(arcs, place, family, k)), place, y0, period)
-
-
-def _member_point(follower: Follower, family: Family, k: int, turns: int) -> FamilyPoint:
-    """The point at orbit k of a family, traversed `turns` times."""
-    period, _, y0 = _start(family, k, turns)
-    return first_point(follower, y0, period, _numbers(follower.arcs, follower.place, family, k))
-
-
-def _start(family: Family, k: int, turns: int) -> tuple[np.ndarray, Layout, np.ndarray]:
+def _start(family: Family, k: int, turns: int) -> tuple[np.ndarray, np.ndarray, Layout]:
+    """The first state (1, 2n) of orbit k and its period (1,), traversed `turns` times, and the layout of the state."""
     q0, qdot0 = jax.tree.map(lambda x: x[k], (family.q0, family.qdot0))
     period, layout, y0 = starts(q0, qdot0, turns * family.period[k], "period")
-    return period.ravel(), layout, y0
+    return y0, period.ravel(), layout
 
 
 def _numbers(arcs: Arcs, place: int | None, family: Family, k: int) -> np.ndarray:

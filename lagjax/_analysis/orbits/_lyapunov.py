@@ -88,20 +88,16 @@ def lyapunov_spectrum(
     require_flag(throw, "throw")
     durations, layout, y0 = starts(q0, qdot0, duration, "duration")
     arcs = Arcs.from_system(system, layout, params, rtol, "Lyapunov exponents")
-    pieces = _pieces(arcs, y0, durations.ravel(), throw and durations.ndim == 0)
+    spans = durations.ravel()
+    run = arcs.ends(np.stack([np.zeros_like(spans), spans], axis=1), y0)
+    if throw and durations.ndim == 0 and run.result[0] != SUCCESSFUL:
+        reason = sentence(run.result[0], run.t_end[0], spans[0], run.y_end[0], layout.names)
+        raise SimulationError(reason or "", None)
+    pieces = max(1, -(-int(run.accepted.max()) // _STEPS_OF_ARC))
     size = max(1, _PORTION // pieces)
-    parts = [_spectra(arcs, y0[k : k + size], durations.ravel()[k : k + size], pieces) for k in range(0, len(y0), size)]
+    parts = [_spectra(arcs, y0[k : k + size], spans[k : k + size], pieces) for k in range(0, len(y0), size)]
     exponents = np.concatenate(parts)
     return jnp.asarray(exponents if durations.ndim else exponents[0])
-
-
-def _pieces(arcs: Arcs, y0, duration, throw: bool) -> int:
-    """The number of arcs of each motion. Raises `SimulationError` for a motion that cannot be followed."""
-    run = arcs.ends(np.stack([np.zeros_like(duration), duration], axis=1), y0)
-    if throw and run.result[0] != SUCCESSFUL:
-        names = arcs.layout.names
-        raise SimulationError(sentence(run.result[0], run.t_end[0], duration[0], run.y_end[0], names) or "", None)
-    return max(1, -(-int(run.accepted.max()) // _STEPS_OF_ARC))
 
 
 def _spectra(arcs: Arcs, y0: np.ndarray, duration: np.ndarray, pieces: int) -> np.ndarray:

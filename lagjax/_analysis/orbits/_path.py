@@ -266,5 +266,5 @@ def _arc_action(arcs: Arcs, y, t_first, t_last) -> float:
     half = np.diff(edges) / 2
     times = ((edges[:-1] + half)[:, None] + half[:, None] * _NODES).ravel()
     path = arcs.ends(np.append(t_first, times)[None], y[None]).path[0, 1:]
-    values = arcs.quantities(("lagrangian",), times, path)["lagrangian"].reshape(len(half), -1)
+    values = arcs.sample(times, path).quantities("lagrangian")["lagrangian"].reshape(len(half), -1)
     return float(half @ values @ _WEIGHTS)
