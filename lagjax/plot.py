@@ -450,13 +450,13 @@ def fit(fit: Fit, record: int = 0, *, figure=None):
     """
     _require(fit, "fit", Fit, "fit")
     matplotlib = _matplotlib()
-    one, columns = fit.records[record], fit.question.columns(record)
-    names = fit.question.names[columns]
+    one, columns = fit.records[record], fit.residual_function.columns(record)
+    names = fit.residual_function.names[columns]
     if figure is None:
         figure = matplotlib.pyplot.figure(figsize=(max(6.4, 3.6 * len(names)), 4.6), layout="constrained")
     axes = figure.subplots(2, len(names), squeeze=False, sharex="col", gridspec_kw={"height_ratios": [2, 1]})
-    residuals = fit.question.end_to_end(fit.residuals)[record]
-    draw_record(axes, one, record_matrix(residuals, one), names, fit.widths.sigma[columns])
+    residuals = fit.residual_function.end_to_end(fit.residuals)[record]
+    draw_record(axes, one, record_matrix(residuals, one), names, fit.noise_scale.sigma[columns])
     return axes
 
 

@@ -236,21 +236,19 @@ def _fit_checked(
     settings: _Settings, scenes: list["_GivenSystem"], params0: PyTree, parameters: Parameters
 ) -> tuple[Fit, Verdict]:
     """The fit of records that were checked. Raises `Unfollowed` where the first trial cannot be followed."""
-    question = Residuals([_build_residuals(scene, parameters, settings.noise) for scene in scenes])
-    _require_one_beginning(question, settings.starts, settings.method)
-    readers = _readers(scenes, question)
+    residuals = Residuals([_build_residuals(scene, parameters, settings.noise) for scene in scenes])
+    _require_one_beginning(residuals, settings.starts, settings.method)
+    readers = _readers(scenes, residuals)
     if settings.progress:
-        question.watch = _Printer(question.size)
-    y0 = _starts(question, readers, params0)
+        residuals.watch = _Printer(residuals.size)
+    y0 = _starts(residuals, readers, params0)
     readers = _cuttable_readers(scenes, readers, settings.method)
     first, noise = parameters.inverse(parameters.first), settings.noise
     if settings.method == "gradient":
-        return _build_result(settings, search_by_gradient(question, first, y0, noise, readers), None)
-    weak = functools.partial(start_by_weak_form, question, readers=readers or [])
-    search = functools.partial(
-        search_records, question, noise=noise, method=settings.method, readers=readers, weak=weak
-    )
-    descent, waterfall = run_multistart(question, search, first, y0, settings.starts, settings.seed)
+        return _build_result(settings, search_by_gradient(residuals, first, y0, noise, readers), None)
+    weak = functools.partial(start_by_weak_form, residuals, readers=readers or [])
+    search = functools.partial(search_records, residuals, law=noise, method=settings.method, readers=readers, weak=weak)
+    descent, waterfall = run_multistart(residuals, search, first, y0, settings.starts, settings.seed)
     return _build_result(settings, search_again(descent, noise), waterfall)
 
 
@@ -277,16 +275,16 @@ def _scenes(system, records, params0, observe, hold: str) -> list[_GivenSystem]:
     return scenes
 
 
-def _require_one_beginning(question: Residuals, starts: int, method: str) -> None:
+def _require_one_beginning(residuals: Residuals, starts: int, method: str) -> None:
     """Raise `ValueError` where many starts, or a descent by gradients, are chosen and cannot be."""
-    if not len(question.parameters) and (method == "gradient" or starts > 1):
+    if not len(residuals.parameters) and (method == "gradient" or starts > 1):
         raise ValueError(
             "No parameter is free, so there is one place to begin: leave `starts` at 1, and `method` at 'auto', which "
             "fits the starts of records."
         )
     if method == "gradient" and starts > 1:
         raise ValueError('method="gradient" goes down from one start: leave `starts` at 1.')
-    for one in [part.system for part in question.parts] if starts > 1 else []:
+    for one in [part.system for part in residuals.parts] if starts > 1 else []:
         if one.signals.delays is not None:
             raise ValueError("starts must be 1 where sensors are lagjax.Delayed: their search has one beginning.")
         if one.manifold is not None and one.fitted.any():
@@ -417,13 +415,13 @@ def _require_length(recordings: list[Record], longest: float) -> None:
             )
 
 
-def _readers(scenes: list[_GivenSystem], question: Residuals) -> list[Reader | None] | None:
+def _readers(scenes: list[_GivenSystem], residuals: Residuals) -> list[Reader | None] | None:
     """Readers of states off the data, for each record whose signals are positions; None where there is no such record.
 
     All records of a system together try windows at a few hundred places.
     """
-    readers, numbers = [], question.parameters.first
-    for scene, part in zip(scenes, question.parts, strict=True):
+    readers, numbers = [], residuals.parameters.first
+    for scene, part in zip(scenes, residuals.parts, strict=True):
         probes = max(8, 256 // len(scene.records))
         readers += [
             build_reader(record, part.system, numbers, probes) if isinstance(record, Record) else None
@@ -448,14 +446,14 @@ def _cuttable_readers(
     return left if any(reader is not None for reader in left) else None
 
 
-def _starts(question: Residuals, readers: list[Reader | None] | None, params0: PyTree) -> np.ndarray:
+def _starts(residuals: Residuals, readers: list[Reader | None] | None, params0: PyTree) -> np.ndarray:
     """The first guess of the starts of all records, (N, 2n) of the system with the most coordinates."""
     found = []
-    for part in question.parts:
+    for part in residuals.parts:
         own = None if readers is None else readers[part.records]
         with errors_of_system(part.name):
             found += [_start(part.system, own, k, params0) for k in range(len(part.system.records))]
-    return np.stack([pad_states(state, question.states) for state in found])
+    return np.stack([pad_states(state, residuals.states) for state in found])
 
 
 def _start(system: SystemResiduals, readers: list[Reader | None] | None, place: int, params0: PyTree) -> np.ndarray:
@@ -494,57 +492,57 @@ class _Printer:
 
 
 def _build_result(settings: _Settings, descent: Descent, waterfall: Waterfall | None) -> tuple[Fit, Verdict]:
-    point, widths, question = descent.point, descent.widths, descent.question
-    parameters, question.watch = question.parameters, None
-    known = information(question, point, widths)
-    unseen = unseen_sentences(question, point, widths, known)
-    found = verdict(descent, unseen, known, question, settings.noise)
+    point, noise, residuals = descent.point, descent.noise, descent.residuals
+    parameters, residuals.watch = residuals.parameters, None
+    known = information(residuals, point, noise)
+    unseen = unseen_sentences(residuals, point, noise, known)
+    found = verdict(descent, unseen, known, residuals, settings.noise)
     done = Fit(
         params=parameters.restore(parameters.numbers(point.u)),
-        starts=question.group_by_system(
-            [question.restore_state(k, point.starts[row]) for k, row in enumerate(question.firsts)]
+        starts=residuals.group_by_system(
+            [residuals.restore_state(k, point.starts[row]) for k, row in enumerate(residuals.firsts)]
         ),
         covariance=Covariance(parameters.names, parameters.covariance(point.u, known.covariance)),
-        noise=_noise_by_name(question, widths, known),
-        residuals=question.group_by_system(_record_residuals(question, point)),
+        noise=_noise_by_name(residuals, noise, known),
+        residuals=residuals.group_by_system(_record_residuals(residuals, point)),
         unseen=unseen,
         ok=found.ok,
         message=found.message,
-        log_likelihood=question.log_likelihood(point, widths),
+        log_likelihood=residuals.log_likelihood(point, noise),
         trials=descent.trials,
         waterfall=waterfall,
-        records=tuple(question.records),
+        records=tuple(residuals.records),
         parameters=parameters,
         u=point.u,
         states=point.starts,
         law=settings.noise,
         information=known,
-        widths=widths,
-        question=question,
+        noise_scale=noise,
+        residual_function=residuals,
         system=settings.system,
         observe=settings.observe,
     )
     return done, found
 
 
-def _noise_by_name(question: Residuals, widths, known: Information) -> dict[str, SignalNoise]:
-    samples = (question.weights > 0).sum(axis=0)
-    columns = zip(widths.sigma, widths.dof, samples, known.effective, 2 * (1 - known.correlation), strict=True)
+def _noise_by_name(residuals: Residuals, noise, known: Information) -> dict[str, SignalNoise]:
+    samples = (residuals.weights > 0).sum(axis=0)
+    columns = zip(noise.sigma, noise.dof, samples, known.effective, 2 * (1 - known.correlation), strict=True)
     return {
         name: SignalNoise(float(sigma), float(dof), int(count), float(effective), float(watson))
-        for name, (sigma, dof, count, effective, watson) in zip(question.names, columns, strict=True)
+        for name, (sigma, dof, count, effective, watson) in zip(residuals.names, columns, strict=True)
     }
 
 
-def _record_residuals(question: Residuals, point) -> list[PyTree]:
+def _record_residuals(residuals: Residuals, point) -> list[PyTree]:
     """The residuals of every record in its structure, NaN where nothing was measured."""
-    columns = [question.columns(k) for k in range(len(question.records))]
+    columns = [residuals.columns(k) for k in range(len(residuals.records))]
     found = [
-        np.full((len(record), c.stop - c.start), np.nan) for record, c in zip(question.records, columns, strict=True)
+        np.full((len(record), c.stop - c.start), np.nan) for record, c in zip(residuals.records, columns, strict=True)
     ]
-    for batch, residuals in zip(question.batches, point.residuals, strict=True):
-        for row, left, weights in zip(batch.rows.tolist(), residuals, batch.weights, strict=True):
-            record, places = question.pieces[row]
+    for batch, own in zip(residuals.batches, point.residuals, strict=True):
+        for row, left, weights in zip(batch.rows.tolist(), own, batch.weights, strict=True):
+            record, places = residuals.pieces[row]
             matrix = np.where(weights > 0, left, np.nan)[: len(places), columns[record]]
             found[record][places] = matrix
-    return [restore_structure(matrix, record) for matrix, record in zip(found, question.records, strict=True)]
+    return [restore_structure(matrix, record) for matrix, record in zip(found, residuals.records, strict=True)]

@@ -267,8 +267,8 @@ def test_a_record_that_disagrees_is_named(done):
 def test_a_shift_without_a_record_is_that_of_the_fit_without_it(done):
     rows = records(4, seed=8)
     fits = [lagjax.fit(SCENE, some, TRUTH, free=FREE, transforms=lagjax.positive) for some in (rows, rows[1:])]
-    whole, triangles = fits[0], fits[0].question.triangles(
-        fits[0]._point, [np.sqrt(b.weights) / fits[0].widths.sigma for b in fits[0].question.batches]
+    whole, triangles = fits[0], fits[0].residual_function.triangles(
+        fits[0]._point, [np.sqrt(b.weights) / fits[0].noise_scale.sigma for b in fits[0].residual_function.batches]
     )  # fmt: skip
     variances = np.diag(whole.information.covariance), np.diag(whole.information.white)
     shift = shifts_without(2, triangles, np.arange(4), *variances)[0].sizes

@@ -47,13 +47,13 @@ def joint():
 
 
 def test_trials_of_one_batch_are_those_one_by_one_also_where_one_fails(joint):
-    question = joint.question
+    residuals = joint.residual_function
     u = joint.u + np.array([[0.0], [0.05], [np.nan], [-0.05]])
     starts = joint.states + 0.01 * np.arange(4)[:, None, None]
-    trials = question.evaluate_trials(u, starts)
+    trials = residuals.evaluate_trials(u, starts)
     assert [hasattr(trial, "text") for trial in trials] == [False, False, True, False]
     for k in (0, 1, 3):
-        alone = question.evaluate(u[k], starts[k], notify=False)
+        alone = residuals.evaluate(u[k], starts[k], notify=False)
         for kind in ("residuals", "slopes"):
             for mine, own in zip(getattr(trials[k], kind), getattr(alone, kind), strict=True):
                 np.testing.assert_allclose(mine, own, rtol=1e-12, atol=1e-12)

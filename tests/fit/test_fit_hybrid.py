@@ -99,7 +99,7 @@ def test_slopes_and_the_density_of_hybrid_motion_are_those_of_differences(stuck)
         {"seen": BLOCK, "heard": BLOCK}, {"seen": stuck, "heard": heard}, {"k": 3.9, "kinetic": 0.6, "static": 1.2},
         free={"k": True, "kinetic": True, "static": True}, method="whole",
     )  # fmt: skip
-    question, point, h = fit.question, fit._point, 1e-6
+    function, point, h = fit.residual_function, fit._point, 1e-6
     for k in range(5):
         moved = []
         for sign in (-h, h):
@@ -108,7 +108,7 @@ def test_slopes_and_the_density_of_hybrid_motion_are_those_of_differences(stuck)
                 u[k] += sign
             else:
                 starts[0, k - 3] += sign
-            moved.append(question.evaluate(u, starts))
+            moved.append(function.evaluate(u, starts))
         column = k + 2 if k < 3 else k - 3
         for residuals, slopes in zip(zip(*(one.residuals for one in moved), strict=True), point.slopes, strict=True):
             change = (residuals[1] - residuals[0]) / (2 * h)

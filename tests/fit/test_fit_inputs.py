@@ -115,8 +115,10 @@ def test_a_start_may_follow_from_the_parameters():
     fit = lagjax.fit(SCENE, record, {**TRUTH, "at": 0.1}, method="whole")
     assert fit.params["at"] == pytest.approx(0.3, abs=1e-7) and fit.starts[0][0] == fit.params["at"]
     h = 1e-5
-    ends = [fit.question.evaluate(fit.u + way * h * np.eye(4)[0], np.zeros((1, 2))).residuals[0] for way in (1, -1)]
-    slopes = fit.question.evaluate(fit.u, np.zeros((1, 2))).slopes[0]
+    ends = [
+        fit.residual_function.evaluate(fit.u + way * h * np.eye(4)[0], np.zeros((1, 2))).residuals[0] for way in (1, -1)
+    ]
+    slopes = fit.residual_function.evaluate(fit.u, np.zeros((1, 2))).slopes[0]
     np.testing.assert_allclose(slopes[..., 2], (ends[0] - ends[1]) / (2 * h), atol=1e-7)
 
 
@@ -148,9 +150,9 @@ def test_the_delay_of_a_sensor_is_found_with_exact_derivatives():
     assert fit.params["tau"] == pytest.approx(0.037, abs=1e-6) and fit.params["k"] == pytest.approx(4.0, rel=1e-6)
     assert np.abs(fit.starts[0][0] - 0.3) < 1e-6
     u, states = fit.u - 1e-2, fit.states
-    slopes = fit.question.evaluate(u, states).slopes[0]
+    slopes = fit.residual_function.evaluate(u, states).slopes[0]
     for k, step in enumerate(1e-5 * np.eye(len(u))):
-        ends = [fit.question.evaluate(u + way * step, states).residuals[0] for way in (1, -1)]
+        ends = [fit.residual_function.evaluate(u + way * step, states).residuals[0] for way in (1, -1)]
         np.testing.assert_allclose(slopes[..., 2 + k], (ends[0] - ends[1]) / 2e-5, rtol=1e-5, atol=1e-7)
     shown = fit.predict(record)
     assert np.isnan(shown.values["a"][:5]).all() and np.abs(shown.residuals["a"][6:]).max() < 1e-6
@@ -163,9 +165,9 @@ def test_sensors_with_a_delay_may_see_time_and_inputs():
     record = lagjax.Record(TS, u, {"u": u}, start=(0.3, -0.2))
     fit = lagjax.fit(SCENE, record, {**TRUTH, "tau": 0.033}, observe=observe, hold="linear", method="whole")
     at, h = fit.parameters.inverse(fit.parameters.first), 1e-6
-    slopes = fit.question.evaluate(at, fit.states).slopes[0]
+    slopes = fit.residual_function.evaluate(at, fit.states).slopes[0]
     for k, step in enumerate(h * np.eye(len(at))):
-        ends = [fit.question.evaluate(at + way * step, fit.states).residuals[0] for way in (1, -1)]
+        ends = [fit.residual_function.evaluate(at + way * step, fit.states).residuals[0] for way in (1, -1)]
         np.testing.assert_allclose(slopes[..., 2 + k], (ends[0] - ends[1]) / (2 * h), rtol=1e-4, atol=1e-6)
 
 

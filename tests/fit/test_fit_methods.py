@@ -358,9 +358,9 @@ def test_a_report_is_one_file_with_everything(tmp_path):
 
 def weak(fit, u):
     readers = [Reader.from_record(record) for record in fit.records]
-    scale = min(time_scales(readers, fit.question.systems[0].motions, fit.parameters.numbers(fit.u)))
-    return _weak_form.weak_form_residuals(fit.question.systems[0], readers, scale), _weak_form.fit_weak_form(
-        [(fit.question.systems[0], readers, scale)], u
+    scale = min(time_scales(readers, fit.residual_function.systems[0].motions, fit.parameters.numbers(fit.u)))
+    return _weak_form.weak_form_residuals(fit.residual_function.systems[0], readers, scale), _weak_form.fit_weak_form(
+        [(fit.residual_function.systems[0], readers, scale)], u
     )
 
 
@@ -426,6 +426,6 @@ def test_inputs_drive_the_density_the_weak_form_and_many_starts():
     central = [(value(x + step) - value(x - step)) / 2e-5 for step in 1e-5 * np.eye(len(x))]
     np.testing.assert_allclose(jax.jit(jax.grad(density))(x), central, rtol=1e-5, atol=1e-4)
     readers = [Reader.from_record(one)]
-    scale = min(time_scales(readers, fit.question.systems[0].motions, fit.parameters.numbers(fit.u)))
-    u = _weak_form.fit_weak_form([(fit.question.systems[0], readers, scale)], fit.u + 2.0)
+    scale = min(time_scales(readers, fit.residual_function.systems[0].motions, fit.parameters.numbers(fit.u)))
+    u = _weak_form.fit_weak_form([(fit.residual_function.systems[0], readers, scale)], fit.u + 2.0)
     np.testing.assert_allclose(fit.parameters.values(u), [0.3, 4.0], rtol=0.1)

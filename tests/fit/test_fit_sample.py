@@ -142,15 +142,15 @@ class Correlated:
     """Stands in for a density: numbers inside of their sets, beside a bound, and far better known than a bound."""
 
     def __init__(self, y):
-        self.question = SimpleNamespace(parameters=Parameters.from_pytree(y, None, BOUNDED))
-        self.first = np.append(self.question.parameters.inverse(self.question.parameters.first), -2.0)
+        self.residuals = SimpleNamespace(parameters=Parameters.from_pytree(y, None, BOUNDED))
+        self.first = np.append(self.residuals.parameters.inverse(self.residuals.parameters.first), -2.0)
         self.point, self.dtype = SimpleNamespace(u=self.first[:-1]), np.dtype(float)
 
     def __len__(self):
         return len(self.first)
 
     def covariance(self):
-        by_u = np.append(np.diag(self.question.parameters.jacobian(self.point.u)), 1.0)
+        by_u = np.append(np.diag(self.residuals.parameters.jacobian(self.point.u)), 1.0)
         rows = np.random.default_rng(1).normal(size=(9, len(self))) / np.array([0.1, 2.0, 0.01, 1.0, 0.3])
         return np.linalg.inv(rows.T @ rows) / np.outer(by_u, by_u)
 

@@ -61,12 +61,12 @@ def test_parameters_and_start_come_out_of_crossing_times(exact):
 @pytest.mark.slow
 def test_times_have_the_derivatives_of_differences_forward_and_in_reverse(exact):
     fit = lagjax.fit(SCENE, timings(exact, lagjax.Guess(*START)), TRUTH)
-    question, starts = fit.question, np.array([START])
-    point, h = question.evaluate(fit.u, starts), 1e-5
+    residuals, starts = fit.residual_function, np.array([START])
+    point, h = residuals.evaluate(fit.u, starts), 1e-5
     for k, step in enumerate(h * np.eye(4)):
-        ends = [question.evaluate(fit.u + way * step[2:], starts + way * step[:2]).residuals[0] for way in (1, -1)]
+        ends = [residuals.evaluate(fit.u + way * step[2:], starts + way * step[:2]).residuals[0] for way in (1, -1)]
         np.testing.assert_allclose(point.slopes[0][..., k], (ends[0] - ends[1]) / (2 * h), rtol=1e-6, atol=1e-8)
-    [clock] = question.systems[0].clocks.values()
+    [clock] = residuals.systems[0].clocks.values()
     times, back = jax.vjp(clock.times, starts[0], fit.parameters.numbers(fit.u))
     weights = np.linspace(-1.0, 2.0, len(times))
     np.testing.assert_allclose(np.concatenate(back(weights)), weights @ point.slopes[0][0, :, 0], rtol=1e-8, atol=1e-11)

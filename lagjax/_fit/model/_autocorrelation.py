@@ -23,20 +23,20 @@ class Correlation(NamedTuple):
     neighbour: float
 
 
-def autocorrelations(question: Residuals, point: Trial, widths: NoiseScale) -> list[Correlation]:
-    return [_autocorrelation(question, point, widths, signal) for signal in range(len(widths.sigma))]
+def autocorrelations(residuals: Residuals, point: Trial, noise: NoiseScale) -> list[Correlation]:
+    return [_autocorrelation(residuals, point, noise, signal) for signal in range(len(noise.sigma))]
 
 
-def _autocorrelation(question: Residuals, point: Trial, widths: NoiseScale, signal: int) -> Correlation:
+def _autocorrelation(residuals: Residuals, point: Trial, noise: NoiseScale, signal: int) -> Correlation:
     """The correlation of the residuals of one signal, over all pieces.
 
     It is cut where it first is no larger than two standard errors, and tapered by Parzen's window of three times that
     length: then its spectrum is nowhere negative.
     """
-    dof = widths.dof[signal]
+    dof = noise.dof[signal]
     sums, count = np.zeros(1), 0
-    for batch, residuals in zip(question.batches, point.residuals, strict=True):
-        z = np.sqrt(batch.weights[..., signal]) * residuals[..., signal] / widths.sigma[signal]
+    for batch, r in zip(residuals.batches, point.residuals, strict=True):
+        z = np.sqrt(batch.weights[..., signal]) * r[..., signal] / noise.sigma[signal]
         z, curvature = scores(z, None if batch.sides is None else batch.sides[..., signal])
         if not np.isinf(dof):
             z = z * (dof + 1) / (dof + z**2)  # what enters the likelihood's slope
@@ -111,7 +111,7 @@ def correlated_square(rows: np.ndarray, lags: np.ndarray) -> np.ndarray:
     return np.einsum("ntf,ntg->fg", rows, smooth)
 
 
-def independent_share(question: Residuals, point: Trial, widths: NoiseScale) -> float:
+def independent_share(residuals: Residuals, point: Trial, noise: NoiseScale) -> float:
     """The number of independent samples that one sample is worth, over all signals: at most 1."""
-    laws = autocorrelations(question, point, widths)
+    laws = autocorrelations(residuals, point, noise)
     return sum(law.count / law.time for law in laws) / max(sum(law.count for law in laws), 1)

@@ -35,7 +35,7 @@ class PosteriorUnknowns(NamedTuple):
 
 
 class Density:
-    """log p(x), called with x (D,), for records whose residuals are those of `question` at `point`.
+    """log p(x), called with x (D,), for records whose residuals are those of `residuals` at `point`.
 
     - `first` (D,): the fit; `names` (D,): what the numbers are called.
     - `start_places` (N, 2n): the places in x of the starts; D for one that is known, or that a system does not have.
@@ -44,40 +44,40 @@ class Density:
     """
 
     def __init__(
-        self, question: Residuals, noise: AbstractNoise, point: Trial, widths: NoiseScale, shares: np.ndarray,
+        self, residuals: Residuals, law: AbstractNoise, point: Trial, noise: NoiseScale, shares: np.ndarray,
         prior: Callable | None = None,
     ):  # fmt: skip
-        self.question, self.shares, self.prior, self.point, self.widths = question, shares, prior, point, widths
-        for part in question.parts:
+        self.residuals, self.shares, self.prior, self.point, self.noise = residuals, shares, prior, point, noise
+        for part in residuals.parts:
             part.system.require_traceable()
-        self.dtype = np.result_type(*(part.system.layout.dtype for part in question.parts))
-        self._tails = np.isfinite(widths.dof)
-        self.moves_dof = isinstance(noise, StudentT) and noise.dof is None
-        share = np.log(np.clip(widths.dof, 1.01 * _LEAST_DOF, 0.99 * _MOST_DOF) / _LEAST_DOF)
+        self.dtype = np.result_type(*(part.system.layout.dtype for part in residuals.parts))
+        self._tails = np.isfinite(noise.dof)
+        self.moves_dof = isinstance(law, StudentT) and law.dof is None
+        share = np.log(np.clip(noise.dof, 1.01 * _LEAST_DOF, 0.99 * _MOST_DOF) / _LEAST_DOF)
         share = share / math.log(_MOST_DOF / _LEAST_DOF)
         dof = np.log(share / (1 - share)) if self.moves_dof else np.zeros(0)
-        moves = np.zeros((len(question.pieces), question.states), bool)
-        for part in question.parts:
-            moves[part.rows, : part.system.states] = question.fitted[part.rows, None]
+        moves = np.zeros((len(residuals.pieces), residuals.states), bool)
+        for part in residuals.parts:
+            moves[part.rows, : part.system.states] = residuals.fitted[part.rows, None]
         free, starts = len(point.u), point.starts[moves]
-        self.first = np.concatenate([point.u, starts, np.log(widths.sigma), dof])
+        self.first = np.concatenate([point.u, starts, np.log(noise.sigma), dof])
         self.start_places = np.full(moves.shape, len(self.first))
         self.start_places[moves] = np.arange(free, free + len(starts))
-        self.noise_places = slice(free + len(starts), free + len(starts) + len(widths.sigma))
-        self.names = (*question.parameters.labels, *self._start_names(), *self._noise_names())
+        self.noise_places = slice(free + len(starts), free + len(starts) + len(noise.sigma))
+        self.names = (*residuals.parameters.labels, *self._start_names(), *self._noise_names())
 
     def _start_names(self) -> list[str]:
-        question = self.question
-        layouts = {row: part.system.layout for part in question.parts for row in part.rows.tolist()}
+        residuals = self.residuals
+        layouts = {row: part.system.layout for part in residuals.parts for row in part.rows.tolist()}
         return [
-            f"starts{question.label(question.pieces[row].record).removeprefix('records')}.{half}{name[1:]}"
-            for row in np.flatnonzero(question.fitted).tolist()
+            f"starts{residuals.label(residuals.pieces[row].record).removeprefix('records')}.{half}{name[1:]}"
+            for row in np.flatnonzero(residuals.fitted).tolist()
             for half in ("q", "qdot")
             for name in layouts[row].names
         ]
 
     def _noise_names(self) -> list[str]:
-        names = self.question.names
+        names = self.residuals.names
         return [f"log σ of {name}" for name in names] + [f"ν of {name}" for name in names] * self.moves_dof
 
     def __len__(self) -> int:
@@ -85,11 +85,11 @@ class Density:
 
     def unknowns(self, x) -> PosteriorUnknowns:
         """A vector (D,) taken apart."""
-        u, starts = x[: len(self.question.parameters)], jnp.asarray(self.point.starts, x.dtype)
+        u, starts = x[: len(self.residuals.parameters)], jnp.asarray(self.point.starts, x.dtype)
         starts = jnp.where(self.start_places < len(self), jnp.append(x, 0.0)[self.start_places], starts)
-        for part in self.question.parts:
+        for part in self.residuals.parts:
             starts = part.system.trace_starts(starts, part.rows, self.params(u))
-        dof = self._dof(x[self.noise_places.stop :]) if self.moves_dof else jnp.asarray(self.widths.dof, x.dtype)
+        dof = self._dof(x[self.noise_places.stop :]) if self.moves_dof else jnp.asarray(self.noise.dof, x.dtype)
         return PosteriorUnknowns(u, starts, jnp.exp(x[self.noise_places]), dof)
 
     @staticmethod
@@ -98,7 +98,7 @@ class Density:
 
     def params(self, u):
         """The user's pytree of parameters at u (F,)."""
-        return self.question.parameters.restore(self.question.parameters.numbers(u, jnp))
+        return self.residuals.parameters.restore(self.residuals.parameters.numbers(u, jnp))
 
     @accepts_singles(("x",))
     def __call__(self, x):
@@ -108,26 +108,26 @@ class Density:
     def posterior(self, x, log_likelihood):
         """log p(x) with what the measurements contribute to it; −∞ where that is no number."""
         at = self.unknowns(jnp.asarray(x, self.dtype))
-        total = log_likelihood + self.question.parameters.log_volume(at.u, jnp)
+        total = log_likelihood + self.residuals.parameters.log_volume(at.u, jnp)
         if self.prior is not None:
             total = total + self.prior(self.params(at.u))
         if self.moves_dof:
-            moved = x[-len(self.widths.sigma) :]
+            moved = x[-len(self.noise.sigma) :]
             total = total + jnp.sum(jax.nn.log_sigmoid(moved) + jax.nn.log_sigmoid(-moved))
         return jnp.where(jnp.isfinite(total), total, -jnp.inf)
 
     def log_likelihood(self, x):
         """Σ_s shares_s log L_s, up to a constant; NaN where a motion could not be followed."""
         at = self.unknowns(jnp.asarray(x, self.dtype))
-        pairs = zip(self.question.batches, self.residuals(at), strict=True)
-        weighted = [np.sqrt(batch.weights) * residuals for batch, residuals in pairs]
-        batches = self.question.batches
+        pairs = zip(self.residuals.batches, self.evaluate(at), strict=True)
+        weighted = [np.sqrt(batch.weights) * r for batch, r in pairs]
+        batches = self.residuals.batches
         return self.weighted_log_likelihood(weighted, [b.weights > 0 for b in batches], [b.sides for b in batches], at)
 
-    def residuals(self, at: PosteriorUnknowns) -> list:
+    def evaluate(self, at: PosteriorUnknowns) -> list:
         """The outputs of the sensors less the measurements, (N, T, S), of every batch."""
-        found, signals = [], len(self.question.names)
-        for part in self.question.parts:
+        found, signals = [], len(self.residuals.names)
+        for part in self.residuals.parts:
             for batch in part.system.batches:
                 own = part.system.trace_residuals(batch, at.u, at.starts[part.rows[batch.rows], : part.system.states])
                 found.append(jnp.zeros((*own.shape[:2], signals), own.dtype).at[..., part.signals].set(own))
@@ -138,7 +138,7 @@ class Density:
 
         For a signal whose noise is Gaussian other numbers with the same sum of squares do as well.
         """
-        exact = (self.question.weights > 0) & (True if self.question.sides is None else self.question.sides == 0)
+        exact = (self.residuals.weights > 0) & (True if self.residuals.sides is None else self.residuals.sides == 0)
         total = -jnp.sum(self.shares * exact.sum(axis=0) * jnp.log(at.sigma))
         dof = jnp.where(self._tails, at.dof, 1.0)
         norm = gammaln((dof + 1) / 2) - gammaln(dof / 2) - 0.5 * jnp.log(dof)
@@ -157,7 +157,7 @@ class Density:
         Per sample of Student's t it is 2ν/(ν+3) for log σ, [ψ′(ν/2) − ψ′((ν+1)/2)]/4 − (ν+5)/(2ν(ν+1)(ν+3)) for ν and
         −2/((ν+1)(ν+3)) between them. Source: Lange, Little & Taylor (1989), appendix B.
         """
-        count, d = len(samples), np.where(self._tails, self.widths.dof, 1.0)
+        count, d = len(samples), np.where(self._tails, self.noise.dof, 1.0)
         information = np.diag(samples * np.where(self._tails, 2 * d / (d + 3), 2.0))
         if self.moves_dof:
             share = 1 / (1 + np.exp(-self.first[-count:]))
@@ -174,11 +174,11 @@ class Density:
 
         Raises `ValueError` where something is not seen: there is no density then without a prior.
         """
-        question, point = self.question, self.point
-        robust = np.array([(d + 1) / (d + 3) if np.isfinite(d) else 1.0 for d in self.widths.dof])
-        weight = np.sqrt(self.shares * robust) / self.widths.sigma
-        triangles = question.triangles(
-            point, [f * weight * self.widths.sigma for f in question.fisher_factors(point, self.widths)]
+        residuals, point = self.residuals, self.point
+        robust = np.array([(d + 1) / (d + 3) if np.isfinite(d) else 1.0 for d in self.noise.dof])
+        weight = np.sqrt(self.shares * robust) / self.noise.sigma
+        triangles = residuals.triangles(
+            point, [f * weight * self.noise.sigma for f in residuals.fisher_factors(point, self.noise)]
         )
         free, size = len(point.u), self.noise_places.start
         precision = np.zeros((len(self) + 1, len(self) + 1))
@@ -197,6 +197,6 @@ class Density:
                 "The data do not determine some combination of parameters and starts: fix one parameter with `free`."
             )
         found = np.zeros((len(self), len(self)))
-        found[size:, size:] = self._noise_covariance((question.weights > 0).sum(axis=0) * self.shares)
+        found[size:, size:] = self._noise_covariance((residuals.weights > 0).sum(axis=0) * self.shares)
         found[:size, :size] = np.linalg.inv(unit) / np.outer(scale, scale)
         return found

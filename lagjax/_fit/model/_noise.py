@@ -67,7 +67,7 @@ class Sensor(NamedTuple):
 class AbstractNoise(abc.ABC):  # noqa: B024
     """A law for the scatter of measurements, which is normal where the law says no more."""
 
-    def widths(self, residuals: np.ndarray, weights: np.ndarray, least: np.ndarray, sides=None) -> NoiseScale:
+    def estimate(self, residuals: np.ndarray, weights: np.ndarray, least: np.ndarray, sides=None) -> NoiseScale:
         """The noise of S signals that makes these residuals (M, S) likeliest; no σ is smaller than `least` (S,).
 
         `sides` (M, S), None for zeros, are 1 where a sample is at the upper limit of its sensor, −1 at the lower one.
@@ -75,14 +75,14 @@ class AbstractNoise(abc.ABC):  # noqa: B024
         """
         counted = (weights > 0) & (True if sides is None else sides == 0)
         sigma = np.sqrt((weights * residuals**2).sum(axis=0, where=counted) / np.maximum(counted.sum(axis=0), 1))
-        widths = NoiseScale(np.maximum(sigma, least), np.full(len(least), np.inf))
+        noise = NoiseScale(np.maximum(sigma, least), np.full(len(least), np.inf))
         for _ in range(_ROUNDS if sides is not None else 0):
-            score, curvature = scores(np.sqrt(weights) * residuals / widths.sigma, sides)
+            score, curvature = scores(np.sqrt(weights) * residuals / noise.sigma, sides)
             share = (score**2).sum(axis=0, where=weights > 0) / np.maximum(
                 curvature.sum(axis=0, where=weights > 0), 1e-9
             )
-            widths = widths._replace(sigma=np.maximum(widths.sigma * np.sqrt(share), least))
-        return widths
+            noise = noise._replace(sigma=np.maximum(noise.sigma * np.sqrt(share), least))
+        return noise
 
     def sensor(self, records: list[Record]) -> "Sensor | None":
         """The sensors of these records; None where the records are to tell."""
@@ -188,7 +188,7 @@ class StudentT(AbstractNoise):
         if self.dof is not None and not (np.ndim(self.dof) == 0 and np.isfinite(self.dof) and self.dof >= _NARROWEST):
             raise ValueError(f"StudentT(dof) needs a number of degrees of freedom of at least 1; got {self.dof!r}.")
 
-    def widths(self, residuals, weights, least, sides=None):
+    def estimate(self, residuals, weights, least, sides=None):
         """σ by its fixed point σ² = mean of c w e² with c = (ν+1)/(ν + z²), ν by search over its logarithm."""
         found = [
             self._fit_signal(np.sqrt(weights[keep, s]) * residuals[keep, s], least[s])
@@ -225,7 +225,7 @@ class KnownNoise(AbstractNoise):
 
     known: NoiseScale
 
-    def widths(self, residuals, weights, least, sides=None):
+    def estimate(self, residuals, weights, least, sides=None):
         return self.known
 
 
@@ -248,7 +248,7 @@ def _cost(scaled: np.ndarray, sigma: float, dof: float) -> float:
 
 
 def scores(z: np.ndarray, sides: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    """The slope and the curvature of −log L by x/σ of samples of standardised size z; `sides` as for `widths`."""
+    """The slope and the curvature of −log L by x/σ of samples of standardised size z; `sides` as for `estimate`."""
     if sides is None:
         return z, np.ones_like(z)
     u = sides * z
@@ -258,22 +258,22 @@ def scores(z: np.ndarray, sides: np.ndarray | None) -> tuple[np.ndarray, np.ndar
     return np.where(sides == 0, z, -sides * mills), np.where(sides == 0, 1.0, curvature)
 
 
-def counts(widths: NoiseScale, residuals: np.ndarray, weights: np.ndarray, sides=None) -> np.ndarray:
+def counts(noise: NoiseScale, residuals: np.ndarray, weights: np.ndarray, sides=None) -> np.ndarray:
     """The weight of each sample in the next sum of squares of e/σ, in the shape of the residuals."""
-    z = np.sqrt(weights) * residuals / widths.sigma
+    z = np.sqrt(weights) * residuals / noise.sigma
     with np.errstate(invalid="ignore"):  # ∞/∞ where the noise is Gaussian
-        robust = np.where(np.isinf(widths.dof), 1.0, (widths.dof + 1) / (widths.dof + z**2))
+        robust = np.where(np.isinf(noise.dof), 1.0, (noise.dof + 1) / (noise.dof + z**2))
     return weights * robust * scores(z, sides)[1]
 
 
-def log_likelihood(widths: NoiseScale, residuals: np.ndarray, weights: np.ndarray, sides=None) -> float:
+def log_likelihood(noise: NoiseScale, residuals: np.ndarray, weights: np.ndarray, sides=None) -> float:
     """The logarithm of the likelihood of residuals (M, S) whose samples are independent."""
     total = 0.0
     if sides is not None:
         at_limit = (sides != 0) & (weights > 0)
-        total = float(log_ndtr(sides * np.sqrt(weights) * residuals / widths.sigma).sum(where=at_limit))
+        total = float(log_ndtr(sides * np.sqrt(weights) * residuals / noise.sigma).sum(where=at_limit))
         weights = np.where(at_limit, 0.0, weights)
-    for s, (sigma, dof) in enumerate(zip(*widths, strict=True)):
+    for s, (sigma, dof) in enumerate(zip(*noise, strict=True)):
         keep = weights[:, s] > 0
         if not keep.any():
             continue

@@ -411,10 +411,10 @@ class SystemPart(NamedTuple):
     def name(self) -> str | None:
         return self.system.name
 
-    def sensor_noise(self, widths: NoiseScale) -> NoiseScale:
+    def sensor_noise(self, noise: NoiseScale) -> NoiseScale:
         """The noise of the signals of records among that of all signals, without that of crossing times."""
         own = slice(self.signals.start, self.signals.start + len(self.system.signals.names))
-        return NoiseScale(widths.sigma[own], widths.dof[own])
+        return NoiseScale(noise.sigma[own], noise.dof[own])
 
 
 class Residuals:
@@ -551,37 +551,37 @@ class Residuals:
         return Trial(u, placed, residuals, slopes, across if across.any() else None)
 
     def noise_scale(self, point: Trial, noise: AbstractNoise) -> NoiseScale:
-        return noise.widths(point.flat(), self.weights, self.least, self.sides)
+        return noise.estimate(point.flat(), self.weights, self.least, self.sides)
 
-    def factors(self, point: Trial, widths: NoiseScale) -> list[np.ndarray]:
+    def factors(self, point: Trial, noise: NoiseScale) -> list[np.ndarray]:
         """√count/σ of every sample, by which its residual enters the sum of squares."""
         return [
-            np.sqrt(counts(widths, r, batch.weights, batch.sides)) / widths.sigma
+            np.sqrt(counts(noise, r, batch.weights, batch.sides)) / noise.sigma
             for r, batch in zip(point.residuals, self.batches, strict=True)
         ]
 
-    def log_likelihood(self, point: Trial, widths: NoiseScale) -> float:
+    def log_likelihood(self, point: Trial, noise: NoiseScale) -> float:
         """The logarithm of the likelihood of the residuals of a trial, as if all samples were independent."""
-        return log_likelihood(widths, point.flat(), self.weights, self.sides)
+        return log_likelihood(noise, point.flat(), self.weights, self.sides)
 
-    def fisher_factors(self, point: Trial, widths: NoiseScale) -> list[np.ndarray]:
+    def fisher_factors(self, point: Trial, noise: NoiseScale) -> list[np.ndarray]:
         """√weight/σ of every sample, times the root of the curvature of what is at the limit of a sensor."""
-        return self.factors(point, widths._replace(dof=np.full(len(widths.dof), np.inf)))
+        return self.factors(point, noise._replace(dof=np.full(len(noise.dof), np.inf)))
 
-    def working_trial(self, point: Trial, widths: NoiseScale) -> Trial:
+    def working_trial(self, point: Trial, noise: NoiseScale) -> Trial:
         """The trial with residuals of which those at the limit of a sensor have the slope of their likelihood."""
         return point if self.sides is None else point._replace(
-            residuals=[self._working(batch, r, widths) for batch, r in zip(self.batches, point.residuals, strict=True)]
+            residuals=[self._working(batch, r, noise) for batch, r in zip(self.batches, point.residuals, strict=True)]
         )  # fmt: skip
 
     @staticmethod
-    def _working(batch: Samples, residuals: np.ndarray, widths: NoiseScale) -> np.ndarray:
-        unit = widths.sigma / np.sqrt(np.where(batch.weights > 0, batch.weights, 1.0))
+    def _working(batch: Samples, residuals: np.ndarray, noise: NoiseScale) -> np.ndarray:
+        unit = noise.sigma / np.sqrt(np.where(batch.weights > 0, batch.weights, 1.0))
         score, curvature = scores(residuals / unit, batch.sides)
         safe = np.maximum(curvature, np.finfo(float).tiny)
         return np.where(curvature > np.finfo(float).tiny, unit * score / safe, 0.0)
 
-    def cost(self, point: Trial, factors: list[np.ndarray], widths: NoiseScale) -> float:
+    def cost(self, point: Trial, factors: list[np.ndarray], noise: NoiseScale) -> float:
         """Half the weighted sum of squares, and −log of the probability of samples at the limit of a sensor."""
         total = 0.0
         for f, r, batch in zip(factors, point.residuals, self.batches, strict=True):
@@ -589,13 +589,13 @@ class Residuals:
                 total += 0.5 * float(np.sum((f * r) ** 2))
             else:
                 at_limit = (batch.sides != 0) & (batch.weights > 0)
-                u = batch.sides * np.sqrt(batch.weights) * r / widths.sigma
+                u = batch.sides * np.sqrt(batch.weights) * r / noise.sigma
                 total += float(np.sum(np.where(at_limit, -log_ndtr(u), 0.5 * (f * r) ** 2)))
         return total
 
-    def linearise(self, point: Trial, widths: NoiseScale) -> np.ndarray:
+    def linearise(self, point: Trial, noise: NoiseScale) -> np.ndarray:
         """The triangles of the least squares about a trial."""
-        return self.triangles(self.working_trial(point, widths), self.factors(point, widths))
+        return self.triangles(self.working_trial(point, noise), self.factors(point, noise))
 
     def triangles(self, point: Trial, factors: list[np.ndarray]) -> np.ndarray:
         """The weighted rows of each piece, compressed: (N, D + 1, D + 1), the residual as last column."""
@@ -619,20 +619,20 @@ class Residuals:
         pairs = zip(self.batches, point.residuals, strict=True)
         return [batch.values[..., signal] + r[..., signal] for batch, r in pairs]
 
-    def worths(self, point: Trial, widths: NoiseScale, signal: int) -> list[np.ndarray]:
+    def worths(self, point: Trial, noise: NoiseScale, signal: int) -> list[np.ndarray]:
         """The worth of each sample in independent ones, (N, T) of every batch, where the sensor of a signal rounds."""
         found = []
         for batch, exact in zip(self.batches, self.exact_values(point, signal), strict=True):
             found.append(np.zeros(exact.shape))
             for own, x, there in zip(found[-1], exact, batch.weights[..., signal] > 0, strict=True):
-                own[there] = worths(x[there], self.sensor.step[signal], widths.sigma[signal])
+                own[there] = worths(x[there], self.sensor.step[signal], noise.sigma[signal])
         return found
 
-    def count_runs_once(self, point: Trial, widths: NoiseScale) -> "Residuals":
+    def count_runs_once(self, point: Trial, noise: NoiseScale) -> "Residuals":
         """The same residuals, where samples that share a rounding error have together the weight of one."""
         other, weights = copy.copy(self), [batch.weights.copy() for batch in self.batches]
         for s in np.flatnonzero(np.isfinite(self.sensor.step)).tolist():
-            each = self.worths(point, widths, s)
+            each = self.worths(point, noise, s)
             mean = sum(float(w.sum()) for w in each) / max((self.weights[:, s] > 0).sum(), 1)
             for w, worth in zip(weights, each, strict=True):
                 w[..., s] *= worth / mean

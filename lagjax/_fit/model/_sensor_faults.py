@@ -68,13 +68,13 @@ def _find_placeholder(column: np.ndarray, period: float) -> tuple[float, int] | 
 
 
 def describe_sensors(
-    records: list[Record], noise, names: tuple[str, ...], sensor: Sensor, sigma: np.ndarray
+    records: list[Record], law, names: tuple[str, ...], sensor: Sensor, sigma: np.ndarray
 ) -> list[str]:
     """A sentence for every signal of a system whose sensor rounds, or is at a limit, and the law does not say so."""
-    is_student = isinstance(noise, StudentT)
+    is_student = isinstance(law, StudentT)
     if is_student:  # it knows no limits
         sensor = Sensor(sensor.step, *find_sensor(records)[1:])
-    given = noise.sensor(records) or Sensor(*np.full((3, len(names)), np.nan))
+    given = law.sensor(records) or Sensor(*np.full((3, len(names)), np.nan))
     found = []
     for k, name in enumerate(names):
         step, some = sensor.step[k], np.concatenate([present_samples(record, k) for record in records])

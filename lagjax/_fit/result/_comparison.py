@@ -52,14 +52,17 @@ def comparison(fits: dict[str, Any], folds: int) -> Comparison:
     if not (isinstance(folds, int | np.integer) and (folds == 0 or 2 <= folds <= records)):
         raise ValueError(f"folds must be 0, or from 2 to the number of records, {records}; got {folds!r}.")
     share = min(effective_share(fit) for fit in fits.values())
-    count = share * first.question.measured
+    count = share * first.residual_function.measured
     free = tuple(len(fit.u) - fit.information.null.shape[1] for fit in fits.values())
     logs = tuple(share * fit.log_likelihood for fit in fits.values())
     aic = tuple(float(2 * k - 2 * log) for k, log in zip(free, logs, strict=True))
     bic = tuple(float(np.log(count) * k - 2 * log) for k, log in zip(free, logs, strict=True))
     names, best, left = tuple(fits), int(np.argmin(bic)), None
     if folds:
-        apart = [cross_validate(fit.question, fit.u, fit.states, fit.law, fit.widths, folds) for fit in fits.values()]
+        apart = [
+            cross_validate(fit.residual_function, fit.u, fit.states, fit.law, fit.noise_scale, folds)
+            for fit in fits.values()
+        ]
         left, best = tuple(rms for rms, _ in apart), _choose_simplest(free, np.array([scores for _, scores in apart]))
     rows = _table(names, free, logs, aic, bic, left)
     margin = np.partition(np.array(bic), 1)[1] - min(bic)
@@ -100,23 +103,23 @@ def _table(names, free, logs, aic, bic, left) -> list[str]:
     return rows
 
 
-def cross_validate(question: Residuals, u: np.ndarray, states: np.ndarray, law, widths: NoiseScale, folds: int):
+def cross_validate(residuals: Residuals, u: np.ndarray, states: np.ndarray, law, noise: NoiseScale, folds: int):
     """The root mean square residuals by signal of records that were left out, and for each group their mean logarithm.
 
-    Infinite where one cannot be followed. A signal that only the records left out have is as noisy as `widths` (S,) of
+    Infinite where one cannot be followed. A signal that only the records left out have is as noisy as `noise` (S,) of
     all of them say.
     """
-    failed = dict.fromkeys(question.names, np.inf), np.full(folds, np.inf)
+    failed = dict.fromkeys(residuals.names, np.inf), np.full(folds, np.inf)
     scores = np.zeros(folds)
-    groups = np.array([piece.record for piece in question.pieces]) % folds
-    squares, weights = dict.fromkeys(question.names, 0.0), dict.fromkeys(question.names, 0.0)
+    groups = np.array([piece.record for piece in residuals.pieces]) % folds
+    squares, weights = dict.fromkeys(residuals.names, 0.0), dict.fromkeys(residuals.names, 0.0)
     for group in range(folds):
-        rest = _select_pieces(question, groups != group)
+        rest = _select_pieces(residuals, groups != group)
         done = minimise(rest, u, states[groups != group], law, _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
         if isinstance(done, LostTrial):
             return failed
-        apart = _select_pieces(question, groups == group).with_parameters(question.parameters.fix(done.point.u))
-        known = _collect_noise(apart.names, (question.names, widths), (rest.names, done.widths))
+        apart = _select_pieces(residuals, groups == group).with_parameters(residuals.parameters.fix(done.point.u))
+        known = _collect_noise(apart.names, (residuals.names, noise), (rest.names, done.noise))
         end = minimise(
             apart, np.zeros(0), states[groups == group], KnownNoise(known), _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT
         )
@@ -127,19 +130,19 @@ def cross_validate(question: Residuals, u: np.ndarray, states: np.ndarray, law, 
         scores[group] = 0.5 * np.mean(np.log(np.maximum(square[shown] / weight[shown], apart.least[shown] ** 2)))
         for name, some, count in zip(apart.names, square, weight, strict=True):
             squares[name], weights[name] = squares[name] + some, weights[name] + count
-    rms = {name: float(np.sqrt(squares[name] / weights[name])) for name in question.names if weights[name]}
+    rms = {name: float(np.sqrt(squares[name] / weights[name])) for name in residuals.names if weights[name]}
     return rms, scores
 
 
 def _collect_noise(names: tuple[str, ...], *known: tuple[tuple[str, ...], NoiseScale]) -> NoiseScale:
     """The noise of signals by their names, from the last of several that knows it."""
-    found = {name: one for own, widths in known for name, one in zip(own, zip(*widths, strict=True), strict=True)}
+    found = {name: one for own, noise in known for name, one in zip(own, zip(*noise, strict=True), strict=True)}
     return NoiseScale(*(np.array(numbers) for numbers in zip(*(found[name] for name in names), strict=True)))
 
 
-def _select_pieces(question: Residuals, keep: np.ndarray) -> Residuals:
+def _select_pieces(residuals: Residuals, keep: np.ndarray) -> Residuals:
     """The residuals of some of the pieces, without a watch."""
-    part = question.with_pieces([p for p, k in zip(question.pieces, keep, strict=True) if k], question.fitted[keep])
+    part = residuals.with_pieces([p for p, k in zip(residuals.pieces, keep, strict=True) if k], residuals.fitted[keep])
     part.watch = None
     return part
 

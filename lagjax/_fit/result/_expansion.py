@@ -69,7 +69,7 @@ class Chart(NamedTuple):
     @staticmethod
     def from_density(density: Density) -> "Chart":
         """The chart about a fit. Raises `ValueError` where something is not seen."""
-        parameters, u = density.question.parameters, density.point.u
+        parameters, u = density.residuals.parameters, density.point.u
         ends = np.array([transform.bounds for transform in parameters.maps]).reshape(-1, 2)
         bounded = np.flatnonzero(np.isfinite(ends).any(axis=1))
         low, high = ends[bounded].T
@@ -192,19 +192,19 @@ class Surrogate(NamedTuple):
 def expand_residuals(chart: Chart) -> Surrogate | str:
     """The expansion about the centre of a chart; or a sentence that says why there is none."""
     density = chart.density
-    question, free = density.question, len(density.point.u)
-    states = question.states if question.fitted.any() else 0
+    residuals, free = density.residuals, len(density.point.u)
+    states = residuals.states if residuals.fitted.any() else 0
     unknowns = states + free
-    size = sum(batch.weights.size for batch in question.batches) * (1 + unknowns + unknowns * (unknowns + 1) // 2)
-    plain = not np.isfinite(density.widths.dof).any() and question.sides is None
+    size = sum(batch.weights.size for batch in residuals.batches) * (1 + unknowns + unknowns * (unknowns + 1) // 2)
+    plain = not np.isfinite(density.noise.dof).any() and residuals.sides is None
     if size > _LARGEST and not plain:
         return f"The expansion of its residuals to second order would hold {size} numbers, more than {_LARGEST}."
     found = _differentiate_twice(chart, states)
     if isinstance(found, LostTrial):
-        return f"One standard deviation from the fit a motion fails. {question.describe_failure(found)}"
+        return f"One standard deviation from the fit a motion fails. {residuals.describe_failure(found)}"
     middle, slopes, bends = found
     blocks = []
-    for k, batch in enumerate(question.batches):
+    for k, batch in enumerate(residuals.batches):
         first = np.sqrt(batch.weights) * middle.residuals[k]
         rows, counts = _polynomials(first, slopes[k], bends[k]), batch.weights > 0
         if plain and rows.shape[1] > rows.shape[3]:
@@ -256,17 +256,17 @@ def _trial(chart: Chart, zeta: np.ndarray) -> Trial | LostTrial:
     """The residuals and their derivatives at ζ (D,)."""
     density, x = chart.density, chart.evaluate_unknowns(zeta)
     starts = np.where(density.start_places < len(x), np.append(x, 0.0)[density.start_places], density.point.starts)
-    return density.question.evaluate(x[: len(density.point.u)], starts, notify=False)
+    return density.residuals.evaluate(x[: len(density.point.u)], starts, notify=False)
 
 
 def _jacobians(chart: Chart, trial: Trial, zeta: np.ndarray, states: int) -> list[np.ndarray]:
     """The slopes of the weighted residuals of every batch by ζ, (N, T, S, d)."""
     density = chart.density
-    question, free, places = density.question, len(density.point.u), _places(density, states)
+    residuals, free, places = density.residuals, len(density.point.u), _places(density, states)
     padded = np.pad(chart.jacobian(zeta), (0, 1))
     columns = [padded[np.ix_(row, row)] for row in places]  # of the start and the parameters by ζ
     found = []
-    for batch, slopes in zip(question.batches, trial.slopes, strict=True):
+    for batch, slopes in zip(residuals.batches, trial.slopes, strict=True):
         own = slopes[..., slopes.shape[-1] - states - free :]
         by = np.stack([columns[row] for row in batch.rows])
         found.append(np.sqrt(batch.weights)[..., None] * np.einsum("ntsd,nde->ntse", own, by))

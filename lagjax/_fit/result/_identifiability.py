@@ -21,13 +21,13 @@ _MOST_NAMES = 12  # in one sentence
 _LARGEST_EXPONENT, _EXACT = 6, 1e-3  # of recognised products; how near to a whole number an exponent must be
 
 
-def unseen_sentences(question: Residuals, point: Trial, widths: NoiseScale, known: Information) -> tuple[str, ...]:
+def unseen_sentences(residuals: Residuals, point: Trial, noise: NoiseScale, known: Information) -> tuple[str, ...]:
     """A sentence for every set of parameters of which something is not seen, and one for those that rounding hides."""
-    hidden = _sentence_on_rounding(question, point, known)
-    null, parameters = known.confirmed, question.parameters
+    hidden = _sentence_on_rounding(residuals, point, known)
+    null, parameters = known.confirmed, residuals.parameters
     if not null.shape[1]:
         return hidden
-    elsewhere = _null_elsewhere(question, point, widths)
+    elsewhere = _null_elsewhere(residuals, point, noise)
     spaces = [(parameters.jacobian(point.u) @ null, parameters.values(point.u))]
     if elsewhere is not None:
         u, other = elsewhere
@@ -39,38 +39,38 @@ def unseen_sentences(question: Residuals, point: Trial, widths: NoiseScale, know
     return (*found, *hidden)
 
 
-def _sentence_on_rounding(question: Residuals, point: Trial, known: Information) -> tuple[str, ...]:
+def _sentence_on_rounding(residuals: Residuals, point: Trial, known: Information) -> tuple[str, ...]:
     """The sentence for parameters whose columns are drowned where sensitivities grow."""
     if known.confirmed.shape[1] == known.null.shape[1]:
         return ()
     basis = np.linalg.qr(known.confirmed)[0]
     left = known.null / np.linalg.norm(known.null, axis=0)
     left = left - basis @ (basis.T @ left)
-    labels = question.parameters.labels
+    labels = residuals.parameters.labels
     names = list(dict.fromkeys(labels[k] for k in np.flatnonzero(np.linalg.norm(left, axis=1) > 1e-5)))
-    sizes = row_sizes(question, point)
+    sizes = row_sizes(residuals, point)
     grown, record = max(
-        (growth([row[None]]), question.pieces[batch.rows[k]].record)
-        for batch, size in zip(question.batches, sizes, strict=True)
+        (growth([row[None]]), residuals.pieces[batch.rows[k]].record)
+        for batch, size in zip(residuals.batches, sizes, strict=True)
         for k, row in enumerate(size)
     )
     return (
-        f"{question.label(record)} is chaotic: motions grow apart within it by a factor of {grown:.0e}, and rounding "
+        f"{residuals.label(record)} is chaotic: motions grow apart within it by a factor of {grown:.0e}, and rounding "
         f"hides what it says about {_join_names(names)}. There are no intervals from records that long: cut it into "
         "several shorter ones.",
     )
 
 
-def _null_elsewhere(question: Residuals, point: Trial, widths: NoiseScale):
+def _null_elsewhere(residuals: Residuals, point: Trial, noise: NoiseScale):
     """Other values u of the free parameters, a few per cent away, and the null directions there."""
     u = point.u
-    near = u + question.parameters.sizes(u) * np.random.default_rng(0).uniform(0.02, 0.06, len(u))
-    other = question.evaluate(near, point.starts)
+    near = u + residuals.parameters.sizes(u) * np.random.default_rng(0).uniform(0.02, 0.06, len(u))
+    other = residuals.evaluate(near, point.starts)
     if isinstance(other, LostTrial):
         return None
-    factors = [np.sqrt(batch.weights) / widths.sigma for batch in question.batches]
-    null = null_space(question.triangles(other, factors), question.states)[0]
-    return near, confirmed_null(question, other, null)
+    factors = [np.sqrt(batch.weights) / noise.sigma for batch in residuals.batches]
+    null = null_space(residuals.triangles(other, factors), residuals.states)[0]
+    return near, confirmed_null(residuals, other, null)
 
 
 def _blocks(null: np.ndarray) -> list[np.ndarray]:

@@ -24,7 +24,7 @@ _OWN = 0.2  # of the motion left in a record, explained by parameters of its own
 
 
 def disagreements(
-    question: Residuals, triangles: np.ndarray, known: Information, inside: np.ndarray, motion: dict[int, float]
+    residuals: Residuals, triangles: np.ndarray, known: Information, inside: np.ndarray, motion: dict[int, float]
 ) -> tuple[list[str], list[str]]:
     """Sentences for the records without which a parameter would move by more than they can have by chance: for those of
     another motion, and for those that show, each in its way, what the scene lacks.
@@ -32,14 +32,14 @@ def disagreements(
     Only of parameters `inside` (F,) of their sets: at a bound the sum of squares has a slope. `motion` is the sum of
     squares of what the fit leaves in a record beyond white noise.
     """
-    records = np.array([piece.record for piece in question.pieces])
+    records = np.array([piece.record for piece in residuals.pieces])
     count = len(np.unique(records))
     if known.null.shape[1] or count < 2 or not inside.any():
         return [], []
-    columns = np.concatenate([np.ones(question.states, bool), inside, [True]])
+    columns = np.concatenate([np.ones(residuals.states, bool), inside, [True]])
     variances = np.diag(known.covariance)[inside], np.diag(known.white)[inside]
-    shifts = shifts_without(question.states, triangles[..., columns], records, *variances)
-    labels = [label for label, keep in zip(question.parameters.labels, inside, strict=True) if keep]
+    shifts = shifts_without(residuals.states, triangles[..., columns], records, *variances)
+    labels = [label for label, keep in zip(residuals.parameters.labels, inside, strict=True) if keep]
     worst = [(k, int(np.argmax(np.abs(shift.sizes)))) for k, shift in shifts.items()]
     worst = sorted((-abs(shifts[k].sizes[i]), k, i) for k, i in worst if abs(shifts[k].sizes[i]) > _DISAGREE)
     apart = [(k, i) for _, k, i in worst if shifts[k].explained > _OWN * motion.get(k, 0.0)]
@@ -49,9 +49,9 @@ def disagreements(
     else:
         apart, pulls, how = apart[:MOST_NAMED], pulls[:1], "disagrees with the others"
     return (
-        [f"{question.label(k)} {how}: without it {_shift_clause(labels[i], shifts[k].sizes[i])}." for k, i in apart],
+        [f"{residuals.label(k)} {how}: without it {_shift_clause(labels[i], shifts[k].sizes[i])}." for k, i in apart],
         [
-            f"Without {question.label(k)} {_shift_clause(labels[i], shifts[k].sizes[i])}, more than its interval "
+            f"Without {residuals.label(k)} {_shift_clause(labels[i], shifts[k].sizes[i])}, more than its interval "
             f"allows for. Parameters of its own would explain {100 * shifts[k].explained / motion[k]:.2g} % of the "
             "motion that is left in it: the scene lacks something that differs from record to record."
             for k, i in pulls

@@ -76,38 +76,38 @@ def require_level(level) -> None:
         raise ValueError(f"level must be between 0 and 1, as {LEVEL} is; got {level!r}.")
 
 
-def information(question: Residuals, point: Trial, widths: NoiseScale) -> Information:
-    factors = question.fisher_factors(point, widths)
-    triangles = question.triangles(point, factors)
-    null, basis = null_space(triangles, question.states)
-    if _is_lost(question, point):
+def information(residuals: Residuals, point: Trial, noise: NoiseScale) -> Information:
+    factors = residuals.fisher_factors(point, noise)
+    triangles = residuals.triangles(point, factors)
+    null, basis = null_space(triangles, residuals.states)
+    if _is_lost(residuals, point):
         null, basis = np.eye(len(point.u)), np.zeros((len(point.u), 0))
-    laws = autocorrelations(question, point, widths)
+    laws = autocorrelations(residuals, point, noise)
     effective, correlation = (np.array(x) for x in zip(*((a.count / a.time, a.neighbour) for a in laws), strict=True))
-    free, unit = len(point.u), _lengths(triangles, question.states)  # of columns: their squares may be no numbers
+    free, unit = len(point.u), _lengths(triangles, residuals.states)  # of columns: their squares may be no numbers
     middle, rows_of = np.zeros((free, free)), []
-    for batch, factor, slopes in zip(question.batches, factors, point.slopes, strict=True):
-        own = eliminate_starts(triangles[batch.rows], factor[..., None] * slopes, question.states) / unit
+    for batch, factor, slopes in zip(residuals.batches, factors, point.slopes, strict=True):
+        own = eliminate_starts(triangles[batch.rows], factor[..., None] * slopes, residuals.states) / unit
         rows_of.append(own)
-        for s in np.flatnonzero(np.isnan(question.sensor.step)):
+        for s in np.flatnonzero(np.isnan(residuals.sensor.step)):
             middle += correlated_square(close_gaps(own[:, :, s], batch.weights[..., s] > 0), laws[s].lags)
-    for s in np.flatnonzero(np.isfinite(question.sensor.step)).tolist():
-        sigma, step = widths.sigma[s], question.sensor.step[s]
+    for s in np.flatnonzero(np.isfinite(residuals.sensor.step)).tolist():
+        sigma, step = noise.sigma[s], residuals.sensor.step[s]
         _, rest, before = harmonics(step, sigma)
         rows = [np.sqrt(b.weights[..., s, None]) / sigma * own[:, :, s]
-                for b, own in zip(question.batches, rows_of, strict=True)]  # fmt: skip
-        for g, b in zip(rows, question.batches, strict=True):
+                for b, own in zip(residuals.batches, rows_of, strict=True)]  # fmt: skip
+        for g, b in zip(rows, residuals.batches, strict=True):
             g = close_gaps(g, b.weights[..., s] > 0)
             middle += before * correlated_square(g, laws[s].lags) + rest * correlated_square(g, np.ones(1))
-        middle += rounding_square(rows, question.exact_values(point, s), step, sigma)
+        middle += rounding_square(rows, residuals.exact_values(point, s), step, sigma)
         share = min(before / sigma**2, 1.0)
-        worth = sum(float(w.sum()) for w in question.worths(point, widths, s))
+        worth = sum(float(w.sum()) for w in residuals.worths(point, noise, s))
         effective[s], correlation[s] = worth / (1 + (laws[s].time - 1) * share), share * correlation[s]
     # Student's t tells (ν+1)/(ν+3) of what a Gaussian of the same σ tells; the dof that were used up are counted.
-    used = free - null.shape[1] + question.unknowns
+    used = free - null.shape[1] + residuals.unknowns
     lost = max(effective.sum() / max(effective.sum() - used, 1.0), 1.0)
-    robust = np.mean([1.0 if np.isinf(d) else (d + 3) / (d + 1) for d in widths.dof])
-    rows, basis = _parameter_rows(triangles, question.states) / unit, basis * unit[:, None]
+    robust = np.mean([1.0 if np.isinf(d) else (d + 3) / (d + 1) for d in noise.dof])
+    rows, basis = _parameter_rows(triangles, residuals.states) / unit, basis * unit[:, None]
     half = basis @ np.linalg.solve(basis.T @ (rows.T @ rows) @ basis, basis.T)
     white = robust * half / unit / unit[:, None]
     covariance = lost * robust * half @ middle @ half.T / unit / unit[:, None]
@@ -115,7 +115,7 @@ def information(question: Residuals, point: Trial, widths: NoiseScale) -> Inform
     covariance[unseen] = np.nan
     covariance[:, unseen] = np.nan
     covariance[unseen, unseen] = np.inf
-    confirmed = null if not null.size else confirmed_null(question, point, null)
+    confirmed = null if not null.size else confirmed_null(residuals, point, null)
     return Information(covariance, null, confirmed, effective, correlation, white, float(lost))
 
 
@@ -135,35 +135,35 @@ def null_space(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarr
     return null, directions[~small].T / unit[:, None]
 
 
-def _is_lost(question: Residuals, point: Trial) -> bool:
+def _is_lost(residuals: Residuals, point: Trial) -> bool:
     """True if the last digit of a parameter moves a signal by its size, because motions grow apart.
 
     Growth alone is not enough: a drive that sets in smoothly begins with rows as small as numbers can be.
     """
-    sizes, states = question.parameters.sizes(point.u), question.states
+    sizes, states = residuals.parameters.sizes(point.u), residuals.states
     moved = max(
-        np.abs(slopes[..., states:] * sizes / question.size[:, None]).max(initial=0.0) for slopes in point.slopes
+        np.abs(slopes[..., states:] * sizes / residuals.size[:, None]).max(initial=0.0) for slopes in point.slopes
     )
-    return moved > _LOST and growth(row_sizes(question, point)) > _LOST
+    return moved > _LOST and growth(row_sizes(residuals, point)) > _LOST
 
 
-def confirmed_null(question: Residuals, point: Trial, null: np.ndarray) -> np.ndarray:
+def confirmed_null(residuals: Residuals, point: Trial, null: np.ndarray) -> np.ndarray:
     """The null directions, of (F, K), that are not the work of rounding, (F, K′)."""
-    sizes = row_sizes(question, point)
+    sizes = row_sizes(residuals, point)
     if growth(sizes) < _GROWTH:
         return null
     with np.errstate(divide="ignore"):
         level = [np.where(size > 0, 1.0 / size, 0.0) for size in sizes]
-    return null_space(question.triangles(point, level), question.states)[0]
+    return null_space(residuals.triangles(point, level), residuals.states)[0]
 
 
-def row_sizes(question: Residuals, point: Trial) -> list[np.ndarray]:
+def row_sizes(residuals: Residuals, point: Trial) -> list[np.ndarray]:
     """The length of the row of each sample (N, T, S) of every batch, its columns as fractions of their largest."""
     largest = np.max([np.abs(slopes).max(axis=(0, 1, 2)) for slopes in point.slopes], axis=0)
     columns = np.where(largest > 0, largest, 1.0)
     return [
         np.where(batch.weights > 0, _norm(slopes / columns, -1), 0.0)
-        for batch, slopes in zip(question.batches, point.slopes, strict=True)
+        for batch, slopes in zip(residuals.batches, point.slopes, strict=True)
     ]
 
 

@@ -60,17 +60,17 @@ class Prediction(NamedTuple):
         return jax.tree.map(np.subtract, self.values, half), jax.tree.map(np.add, self.values, half)
 
 
-def _half_widths(deviation: np.ndarray, widths: NoiseScale, level: float, columns) -> np.ndarray:
+def _half_widths(deviation: np.ndarray, noise: NoiseScale, level: float, columns) -> np.ndarray:
     """Half of the band of one leaf of signals, whose places among all signals are the next of `columns`."""
     flat = deviation.reshape(len(deviation), -1)
     own = [next(columns) for _ in range(flat.shape[1])]
-    noise = widths.sigma[own] * stdtrit(np.minimum(widths.dof[own], 1e9), 0.5 + 0.5 * level)
-    return np.sqrt((ndtri(0.5 + 0.5 * level) * flat) ** 2 + noise**2).reshape(deviation.shape)
+    scatter = noise.sigma[own] * stdtrit(np.minimum(noise.dof[own], 1e9), 0.5 + 0.5 * level)
+    return np.sqrt((ndtri(0.5 + 0.5 * level) * flat) ** 2 + scatter**2).reshape(deviation.shape)
 
 
 def predict_record(fit, record: Record, system: str | None) -> Prediction:
     """The motion of the scene of a `Fit` over a record of the system of this name; see `Fit.predict`."""
-    [record], part = require_records([record]), fit.question.find_part(system)
+    [record], part = require_records([record]), fit.residual_function.find_part(system)
     about = part.system
     first = next((one for one in about.records if isinstance(one, Record)), None)
     if not isinstance(record, Record) or first is None:
@@ -86,14 +86,16 @@ def predict_record(fit, record: Record, system: str | None) -> Prediction:
     is_known = state is not None and not isinstance(record.start, Guess)
     if state is None:
         state = _read_start(record, about, fit.parameters.numbers(fit.u))
-    question = Residuals([about.with_records([record], np.array([not is_known]), fixed, about.manifold)])
+    residuals = Residuals([about.with_records([record], np.array([not is_known]), fixed, about.manifold)])
     if is_known:
-        point = question.evaluate(np.zeros(0), state[None])
+        point = residuals.evaluate(np.zeros(0), state[None])
     else:
-        done = minimise(question, np.zeros(0), state[None], KnownNoise(part.sensor_noise(fit.widths)), enough=1e-3)
+        done = minimise(
+            residuals, np.zeros(0), state[None], KnownNoise(part.sensor_noise(fit.noise_scale)), enough=1e-3
+        )
         point = done if isinstance(done, LostTrial) else done.point
     if isinstance(point, LostTrial):
-        raise ValueError(question.describe_failure(point))
+        raise ValueError(residuals.describe_failure(point))
     n = layout.size
     start = layout.restore(point.starts[0, :n]), layout.restore(point.starts[0, n:])
     ts = np.asarray(record.ts, layout.dtype)
@@ -102,22 +104,22 @@ def predict_record(fit, record: Record, system: str | None) -> Prediction:
     scene, params = about.scene, fit.params
     scene, params = (scene, params) if form is None else form.bind_samples(scene, params, *driven)
     trajectory = simulate(scene, q0, qdot0, cast(jax.Array, ts), params)  # NumPy's is as good
-    values, deviation = _predict_signals(fit, part, record, question, point)
+    values, deviation = _predict_signals(fit, part, record, residuals, point)
     left = wrap_residuals(values - record.matrix, about.signals.periods)
     left = np.where(record.weight_matrix > 0, left, np.nan)
-    noise = part.sensor_noise(fit.widths)
+    noise = part.sensor_noise(fit.noise_scale)
     noise = noise._replace(sigma=noise.sigma * np.sqrt(fit.information.lost))
     shown, missed, uncertain = (restore_structure(matrix, record) for matrix in (values, left, deviation))
     return Prediction(trajectory, shown, missed, start, uncertain, noise)
 
 
-def _predict_signals(fit, part: SystemPart, record: Record, question: Residuals, point: Trial):
+def _predict_signals(fit, part: SystemPart, record: Record, residuals: Residuals, point: Trial):
     """The signals (T, S) of a record that was followed, at all its times, and their standard deviations."""
     planned, slopes = _follow_record(fit, part.system, record, point.starts[0])
-    known, states = fit.information, question.states
+    known, states = fit.information, residuals.states
     own, follows = np.zeros((states, states)), np.zeros((states, len(fit.u)))
-    if question.fitted[0]:
-        rows = np.sqrt(record.weight_matrix)[..., None] / part.sensor_noise(fit.widths).sigma[:, None] * slopes
+    if residuals.fitted[0]:
+        rows = np.sqrt(record.weight_matrix)[..., None] / part.sensor_noise(fit.noise_scale).sigma[:, None] * slopes
         own, follows = covariance_of_one_start(rows, states, known, effective_share(fit))
     return planned.matrix, signal_deviations(slopes, states, own, follows, known)
 
@@ -152,7 +154,7 @@ def planned_rows(fit, part: SystemPart, name: str, record: Record) -> np.ndarray
     state = known_start(record, part.system.layout, 0, fit.params)
     assert state is not None
     planned, slopes = _follow_record(fit, part.system, record, state)
-    sigma = part.sensor_noise(fit.widths).sigma[:, None]
+    sigma = part.sensor_noise(fit.noise_scale).sigma[:, None]
     weights = planned.weight_matrix[..., None] * (effective_share(fit) / sigma**2)
     rows, states = np.sqrt(weights) * slopes, part.system.states
     own = rows[..., states:]

@@ -67,16 +67,16 @@ class _Place(NamedTuple):
 class _ProfileLine:
     """The values of one unknown, each of which begins from its neighbours."""
 
-    def __init__(self, question: Residuals, u, starts, widths: NoiseScale, known: Information, which: int):
-        self.question, self.widths, self.which = question, widths, which
+    def __init__(self, residuals: Residuals, u, starts, noise: NoiseScale, known: Information, which: int):
+        self.residuals, self.noise, self.which = residuals, noise, which
         reported, white = known.covariance[which, which], known.white[which, which]
         self.scale = white / reported if np.isfinite(reported) and reported > 0 else 1.0 / known.lost
-        self.wide = min(float(np.sqrt(reported)), float(question.parameters.reach[which]))
-        done = minimise(question, u, starts, KnownNoise(widths), _ENOUGH, _TRIALS)
+        self.wide = min(float(np.sqrt(reported)), float(residuals.parameters.reach[which]))
+        done = minimise(residuals, u, starts, KnownNoise(noise), _ENOUGH, _TRIALS)
         if isinstance(done, LostTrial):
-            raise ValueError(question.describe_failure(done))
+            raise ValueError(residuals.describe_failure(done))
         self.u, point = done.point.u, done.point
-        self.best = question.log_likelihood(point, widths)
+        self.best = residuals.log_likelihood(point, noise)
         self.places = [_Place(float(self.u[which]), np.delete(self.u, which), point.starts, 0.0)]
 
     def deviance(self, at: float) -> float:
@@ -86,11 +86,11 @@ class _ProfileLine:
             return again[0]
         u = self.u.copy()
         u[self.which] = at
-        question = self.question.with_parameters(self.question.parameters.fix(u, self.which))
+        residuals = self.residuals.with_parameters(self.residuals.parameters.fix(u, self.which))
         for others, starts in self._guesses(at):
-            done = minimise(question, others, starts, KnownNoise(self.widths), _ENOUGH, _TRIALS)
+            done = minimise(residuals, others, starts, KnownNoise(self.noise), _ENOUGH, _TRIALS)
             if not isinstance(done, LostTrial):
-                lost = self.best - question.log_likelihood(done.point, self.widths)
+                lost = self.best - residuals.log_likelihood(done.point, self.noise)
                 self.places.append(_Place(at, done.point.u, done.point.starts, 2.0 * self.scale * lost))
                 return self.places[-1].deviance
         return np.inf
@@ -109,16 +109,16 @@ class _ProfileLine:
     def minimum(self, place: _Place) -> tuple[float, float] | None:
         """The minimum that a search from one place ends in: the unknown and D there."""
         u = np.insert(place.others, self.which, place.at)
-        done = minimise(self.question, u, place.starts, KnownNoise(self.widths), _ENOUGH, 2 * _TRIALS)
+        done = minimise(self.residuals, u, place.starts, KnownNoise(self.noise), _ENOUGH, 2 * _TRIALS)
         if isinstance(done, LostTrial):
             return None
-        lost = self.best - self.question.log_likelihood(done.point, self.widths)
+        lost = self.best - self.residuals.log_likelihood(done.point, self.noise)
         return float(done.point.u[self.which]), 2.0 * self.scale * lost
 
 
-def profile(question: Residuals, u, starts, widths: NoiseScale, known: Information, name: str, level: float) -> Profile:
-    parameters = question.parameters
-    line = _ProfileLine(question, u, starts, widths, known, parameters.unknown(name))
+def profile(residuals: Residuals, u, starts, noise: NoiseScale, known: Information, name: str, level: float) -> Profile:
+    parameters = residuals.parameters
+    line = _ProfileLine(residuals, u, starts, noise, known, parameters.unknown(name))
     threshold = known.quantile(level) ** 2
     ends = [_find_end(line, side, threshold, parameters.room[line.which]) for side in (-1.0, 1.0)]
     minima = _minima(line, threshold)

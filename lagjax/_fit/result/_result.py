@@ -103,8 +103,8 @@ class Fit:
     states: np.ndarray = field(repr=False)
     law: AbstractNoise = field(repr=False)
     information: Information = field(repr=False)
-    widths: NoiseScale = field(repr=False)
-    question: Residuals = field(repr=False)
+    noise_scale: NoiseScale = field(repr=False)
+    residual_function: Residuals = field(repr=False)
     system: Any = field(repr=False)
     observe: Any = field(repr=False)
 
@@ -117,7 +117,7 @@ class Fit:
         return cell(repr(self), self._draw_first, (5.2, 2.8))
 
     def _draw_first(self, figure) -> None:
-        drawn = next(one for one in map(self._system_drawing, self.question.parts) if one.records)
+        drawn = next(one for one in map(self._system_drawing, self.residual_function.parts) if one.records)
         axes = figure.subplots(2, min(2, len(drawn.names)), squeeze=False, gridspec_kw={"height_ratios": [2, 1]})
         draw_record(axes, drawn.records[0], drawn.residuals[0], drawn.names[:2], drawn.sigma)
 
@@ -134,13 +134,13 @@ class Fit:
     @property
     def rms(self) -> dict[str, float]:
         """The root mean square of the residuals of each signal, in its own unit."""
-        squares, count = np.zeros((2, len(self.question.names)))
-        each = self.question.end_to_end(self.residuals)
+        squares, count = np.zeros((2, len(self.residual_function.names)))
+        each = self.residual_function.end_to_end(self.residuals)
         for k, (residuals, record) in enumerate(zip(each, self.records, strict=True)):
-            matrix, columns = record_matrix(residuals, record), self.question.columns(k)
+            matrix, columns = record_matrix(residuals, record), self.residual_function.columns(k)
             squares[columns] += np.nansum(matrix**2, axis=0)
             count[columns] += np.isfinite(matrix).sum(axis=0)
-        return dict(zip(self.question.names, np.sqrt(squares / count).tolist(), strict=True))
+        return dict(zip(self.residual_function.names, np.sqrt(squares / count).tolist(), strict=True))
 
     def intervals(self, level: float = LEVEL) -> tuple[PyTree, PyTree]:
         """The ends (low, high) of the intervals that hold each free number with probability `level`, as two pytrees.
@@ -172,7 +172,7 @@ class Fit:
 
         Source: Venzon & Moolgavkar, Applied Statistics 37 (1988) 87; Raue et al., Bioinformatics 25 (2009) 1923.
         """
-        return profile(self.question, self.u, self.states, self.widths, self.information, name, level)
+        return profile(self.residual_function, self.u, self.states, self.noise_scale, self.information, name, level)
 
     def log_density(self, prior: Callable | None = None) -> Density:
         """The logarithm of the posterior density of all unknowns: a function of one vector for `jax.jit`, `jax.grad`.
@@ -183,7 +183,7 @@ class Fit:
         least squares, and `params(u)` turns the first numbers into the user's pytree.
         """
         shares = np.array([noise.effective / noise.samples for noise in self.noise.values()])
-        return Density(self.question, self.law, self._point, self.widths, shares, prior)
+        return Density(self.residual_function, self.law, self._point, self.noise_scale, shares, prior)
 
     @with_doubles
     def sample(self, draws: int = 1000, seed: int = 0, *, chains: int = 4, prior: Callable | None = None) -> Any:
@@ -218,7 +218,7 @@ class Fit:
     @functools.cached_property
     def _point(self) -> Trial:
         """The trial that the search ended at, computed anew."""
-        point = self.question.evaluate(self.u, self.states)
+        point = self.residual_function.evaluate(self.u, self.states)
         assert isinstance(point, Trial)  # it was computed before
         return point
 
@@ -257,7 +257,7 @@ class Fit:
         named = candidates if isinstance(candidates, dict) else {f"[{k}]": one for k, one in enumerate(candidates)}
         if not named:
             raise ValueError("candidates is empty: give at least one lagjax.Record.")
-        part = self.question.find_part(system)
+        part = self.residual_function.find_part(system)
         rows = [planned_rows(self, part, name, record) for name, record in named.items()]
         return rank_experiments(list(named), rows, self.parameters.labels, self.information)
 
@@ -271,7 +271,7 @@ class Fit:
         tables = {"Parameters": cells_of_parameters(self), "Noise": cells_of_noise(self)}
         texts = {"What to measure next": str(self.next_experiment(experiments))} if experiments else {}
         pictures = build_pictures(
-            [self._system_drawing(part) for part in self.question.parts], self.covariance, self.waterfall
+            [self._system_drawing(part) for part in self.residual_function.parts], self.covariance, self.waterfall
         )
         text = render_page(build_title(self), self.message, self.ok, self.unseen, tables, pictures, texts)
         with open(path, "w", encoding="utf-8") as file:
@@ -279,11 +279,11 @@ class Fit:
 
     def _system_drawing(self, part: SystemPart) -> SystemDrawing:
         """The records of one system with their residuals."""
-        residuals = self.question.end_to_end(self.residuals)[part.records]
+        residuals = self.residual_function.end_to_end(self.residuals)[part.records]
         pairs = [pair for pair in zip(residuals, part.system.records, strict=True) if isinstance(pair[1], Record)]
         records, matrices = [record for _, record in pairs], [record_matrix(r, record) for r, record in pairs]
         return SystemDrawing(
-            part.name, records, matrices, part.system.signals.names, part.sensor_noise(self.widths).sigma
+            part.name, records, matrices, part.system.signals.names, part.sensor_noise(self.noise_scale).sigma
         )
 
     @with_doubles

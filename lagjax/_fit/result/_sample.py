@@ -324,7 +324,7 @@ def _check_agreement(density: Density, drawn: Draws) -> dict[str, float]:
 def inference_data(density: Density, drawn: Draws) -> Any:
     """Draws as arviz knows them: the parameters, `q0` and `qdot0` of the records, `sigma` and `dof` of the signals."""
     arviz = _arviz()
-    question, parameters = density.question, density.question.parameters
+    residuals, parameters = density.residuals, density.residuals.parameters
     chains, draws, size = drawn.x.shape
     at = jax.jit(jax.vmap(lambda x: _named_unknowns(density, x)))(jnp.asarray(drawn.x.reshape(-1, size)))
     values, starts, sigma, dof = (np.asarray(x).reshape(chains, draws, *x.shape[1:]) for x in at)
@@ -336,7 +336,7 @@ def inference_data(density: Density, drawn: Draws) -> Any:
         else:  # numbers of the array that are kept have no draws: the others go by their own names
             names = dict(zip(parameters.places.tolist(), parameters.names, strict=True))
             posterior |= {names[place]: values[..., place] for place in part.places.tolist()}
-    for part in question.parts:
+    for part in residuals.parts:
         fitted, layout = part.system.fitted, part.system.layout
         of = "" if part.name is None else f"{part.name}: "
         if fitted.any():
@@ -344,9 +344,9 @@ def inference_data(density: Density, drawn: Draws) -> Any:
             coords |= dict(zip(axes, (np.flatnonzero(fitted), list(layout.names)), strict=True))
             posterior |= {f"{of}q0": own[..., : layout.size], f"{of}qdot0": own[..., layout.size :]}
             dims |= {f"{of}q0": axes, f"{of}qdot0": axes}
-    coords["signal"] = list(question.names)
+    coords["signal"] = list(residuals.names)
     posterior["sigma"], dims["sigma"] = sigma, ["signal"]
-    if np.isfinite(density.widths.dof).any():
+    if np.isfinite(density.noise.dof).any():
         posterior["dof"], dims["dof"] = dof, ["signal"]
     stats = {
         "lp": drawn.log_density, "n_steps": drawn.steps, "diverging": drawn.diverged,
@@ -358,7 +358,7 @@ def inference_data(density: Density, drawn: Draws) -> Any:
 
 def _named_unknowns(density: Density, x):
     at = density.unknowns(x)
-    numbers = density.question.parameters.numbers(at.u, jnp)
+    numbers = density.residuals.parameters.numbers(at.u, jnp)
     return numbers, at.starts, at.sigma, jnp.broadcast_to(at.dof, at.sigma.shape)
 
 

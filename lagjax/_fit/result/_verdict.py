@@ -34,36 +34,38 @@ class Verdict(NamedTuple):
 
 
 def verdict(
-    descent: Descent, unseen: tuple[str, ...], known: Information, question: Residuals, noise: AbstractNoise
+    descent: Descent, unseen: tuple[str, ...], known: Information, residuals: Residuals, law: AbstractNoise
 ) -> Verdict:
     parts = [descent.message]
     if known.confirmed.shape[1]:
         parts.append("Not everything that is free is seen: fix it, or measure more.")
-    left = measure_unexplained(question, descent.point, descent.widths)
+    left = measure_unexplained(residuals, descent.point, descent.noise)
     parts += left.motion + left.noise
-    triangles = question.linearise(descent.point, descent.widths)
-    at_ends, named = _describe_ends(question.parameters, descent.point, triangles, question.states, known)
+    triangles = residuals.linearise(descent.point, descent.noise)
+    at_ends, named = _describe_ends(residuals.parameters, descent.point, triangles, residuals.states, known)
     parts += at_ends
     # Half a step of the search is one standard deviation: the interval then spans more than a factor of fifty.
-    wide = 2 * _deviations(known) > question.parameters.reach
-    labels = dict.fromkeys(question.parameters.labels[i] for i in np.flatnonzero(wide & ~named))
+    wide = 2 * _deviations(known) > residuals.parameters.reach
+    labels = dict.fromkeys(residuals.parameters.labels[i] for i in np.flatnonzero(wide & ~named))
     if labels:
         parts.append(f"Hardly seen, or at the end of what its transform allows: {', '.join(labels)}.")
     apart, pulls = disagreements(
-        question, triangles, known, ~named, unexplained_motion(question, descent.point, descent.widths)
+        residuals, triangles, known, ~named, unexplained_motion(residuals, descent.point, descent.noise)
     )
     parts += apart + pulls
-    for part in question.parts:
-        records, own = [r for r in part.system.records if isinstance(r, Record)], part.sensor_noise(descent.widths)
+    for part in residuals.parts:
+        records, own = [r for r in part.system.records if isinstance(r, Record)], part.sensor_noise(descent.noise)
         if records:
-            parts += describe_sensors(records, noise, part.system.signals.names, part.system.sensor, own.sigma)
+            parts += describe_sensors(records, law, part.system.signals.names, part.system.sensor, own.sigma)
     if np.nanmax(known.correlation) > _CORRELATED:
         parts.append("The residuals are correlated: they hold motion that the scene lacks, and intervals allow for it.")
     ok = descent.converged and not (unseen or left.motion or apart)
     ok &= not any("take noise=" in text or TOO_COARSE in text for text in parts)
     if not ok or at_ends or labels:
         still = [
-            text for part in question.parts for text in constant_signals(part.system.records, part.system.signals.names)
+            text
+            for part in residuals.parts
+            for text in constant_signals(part.system.records, part.system.signals.names)
         ]
         parts, ok = parts + still, ok and not still
     return Verdict(ok, " ".join(parts), left)

@@ -28,7 +28,7 @@ _STILL = 1.0  # what log L may gain over the last tenth of the steps where the d
 
 
 def descend_gradient(
-    question: Residuals, u: np.ndarray, starts: np.ndarray, noise: AbstractNoise, steps: int,
+    residuals: Residuals, u: np.ndarray, starts: np.ndarray, law: AbstractNoise, steps: int,
     notify: Callable[[str], None] | None = None,
 ) -> tuple[np.ndarray, np.ndarray, bool] | LostTrial:  # fmt: skip
     """u (F,), the starts (N, 2n) after this many steps, and whether log L has come to rest.
@@ -36,13 +36,13 @@ def descend_gradient(
     A `LostTrial` where the motion from the first trial cannot be followed; later ones are passed over.
     """
     optax = _optax()
-    whole = NoiseScale(question.size, np.full(len(question.size), np.inf))
-    density = Density(question, noise, Trial(u, starts, [], []), whole, np.ones(len(question.size)))
-    first = _initial_unknowns(density, question, noise)
+    whole = NoiseScale(residuals.size, np.full(len(residuals.size), np.inf))
+    density = Density(residuals, law, Trial(u, starts, [], []), whole, np.ones(len(residuals.size)))
+    first = _initial_unknowns(density, residuals, law)
     if isinstance(first, LostTrial):
         return first
     scale = jnp.asarray(_units(density, first), density.dtype)
-    cost = lambda z: -density.log_likelihood(first + scale * z) / question.measured  # noqa: E731
+    cost = lambda z: -density.log_likelihood(first + scale * z) / residuals.measured  # noqa: E731
     rate = optax.warmup_cosine_decay_schedule(0.0, _RATE, int(_WARM * steps) + 1, steps)
     adam = optax.apply_if_finite(optax.chain(optax.clip_by_global_norm(1.0), optax.adam(rate)), steps)
 
@@ -60,39 +60,39 @@ def descend_gradient(
         carry = go(carry)
         costs.append(float(carry[2][0]))
         if notify is not None:
-            notify(f"step {(k + 1) * _PORTION}: log likelihood {-costs[-1] * question.measured:.6g}")
+            notify(f"step {(k + 1) * _PORTION}: log likelihood {-costs[-1] * residuals.measured:.6g}")
     if not np.isfinite(costs[-1]):
         return LostTrial(0, "The gradient is not finite at any trial.")
     x = np.asarray(first + scale * carry[2][1], float)
     rest = costs[-max(1, len(costs) // 10) - 1] if len(costs) > 1 else np.inf
     at = density.unknowns(jnp.asarray(x, scale.dtype))
-    return x[: len(u)], np.asarray(at.starts, float), bool((rest - costs[-1]) * question.measured < _STILL)
+    return x[: len(u)], np.asarray(at.starts, float), bool((rest - costs[-1]) * residuals.measured < _STILL)
 
 
-def _initial_unknowns(density: Density, question: Residuals, noise: AbstractNoise) -> np.ndarray | LostTrial:
+def _initial_unknowns(density: Density, residuals: Residuals, law: AbstractNoise) -> np.ndarray | LostTrial:
     """The first x (D,), with the noise that its residuals have."""
     at = density.unknowns(jnp.asarray(density.first, density.dtype))
-    left = [np.asarray(residuals, float) for residuals in density.residuals(at)]
-    for batch, residuals in zip(question.batches, left, strict=True):
-        bad = ~np.isfinite(residuals).all(axis=(1, 2))
+    left = [np.asarray(r, float) for r in density.evaluate(at)]
+    for batch, r in zip(residuals.batches, left, strict=True):
+        bad = ~np.isfinite(r).all(axis=(1, 2))
         if bad.any():
             return LostTrial(
                 int(batch.rows[int(np.argmax(bad))]), "Its motion could not be followed from the first trial."
             )
     flat = np.concatenate([r.reshape(-1, r.shape[-1]) for r in left])
-    widths = noise.widths(flat, question.weights, question.least, question.sides)
+    scale = law.estimate(flat, residuals.weights, residuals.least, residuals.sides)
     x = density.first.copy()
-    x[density.noise_places] = np.log(widths.sigma)
+    x[density.noise_places] = np.log(scale.sigma)
     return x
 
 
 def _units(density: Density, x: np.ndarray) -> np.ndarray:
     """The units in which x moves: of parameters one, or as large as they are; of starts their size over all records."""
-    question, free = density.question, len(density.question.parameters)
+    residuals, free = density.residuals, len(density.residuals.parameters)
     scale = np.ones(len(x))
-    unbounded = np.isinf(question.parameters.reach)
+    unbounded = np.isinf(residuals.parameters.reach)
     scale[:free] = np.where(unbounded, np.maximum(1.0, np.abs(x[:free])), 1.0)
-    for part in question.parts:
+    for part in residuals.parts:
         fitted = part.rows[part.system.fitted]
         if len(fitted):
             places = density.start_places[fitted, : part.system.states]
@@ -102,10 +102,10 @@ def _units(density: Density, x: np.ndarray) -> np.ndarray:
 
 
 def build_descent(
-    question: Residuals, u: np.ndarray, starts: np.ndarray, noise, steps: int, rest: bool
+    residuals: Residuals, u: np.ndarray, starts: np.ndarray, law, steps: int, rest: bool
 ) -> Descent | LostTrial:
     """The result of the descent, with the derivatives that intervals need."""
-    point = question.evaluate(u, starts)
+    point = residuals.evaluate(u, starts)
     if isinstance(point, LostTrial):
         return point
     text = f"The descent by gradients came to rest within {steps} steps."
@@ -114,7 +114,7 @@ def build_descent(
             f"The descent by gradients was stopped after {steps} steps, and the likelihood still grew: go on from "
             "there, with fit.params in the place of params0."
         )
-    return Descent(point, question.noise_scale(point, noise), rest, steps, text, question)
+    return Descent(point, residuals.noise_scale(point, law), rest, steps, text, residuals)
 
 
 def _optax() -> Any:

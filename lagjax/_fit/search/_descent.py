@@ -48,14 +48,14 @@ _KINK = (
 
 class Descent(NamedTuple):
     """The end of a search: the last trial, its noise, whether it converged, how many trials, a sentence, and the
-    residuals that it minimised, `question`."""
+    residuals that it minimised, `residuals`."""
 
     point: Trial
-    widths: NoiseScale
+    noise: NoiseScale
     converged: bool
     trials: int
     message: str
-    question: Residuals
+    residuals: Residuals
 
 
 class DescentStep(NamedTuple):
@@ -84,10 +84,10 @@ class Anchor(NamedTuple):
 
 
 def minimise(
-    question: Residuals,
+    residuals: Residuals,
     u: np.ndarray,
     starts: np.ndarray,
-    noise: AbstractNoise,
+    law: AbstractNoise,
     enough: float,
     limit: int = 60,
     anchor: Anchor | None = None,
@@ -99,39 +99,39 @@ def minimise(
     parameter is further than √(2 enough) standard deviations from the minimum.
     A `LostTrial` is returned where the motion from the first trial cannot be followed.
     """
-    point = question.evaluate(u, starts)
+    point = residuals.evaluate(u, starts)
     if isinstance(point, LostTrial):
         return point
     anchor = Anchor.none(u) if anchor is None else anchor
     damping, trials, falls = _FIRST, 1, [(1, np.inf)]
     while True:
-        model = _model(question, point, noise, anchor)
+        model = _model(residuals, point, law, anchor)
         left = model.step(_LEAST).gain
-        near = left <= _NEAR * question.measured
-        if left <= enough or (near and left * independent_share(question, point, model.widths) <= enough):
-            return Descent(point, model.widths, True, trials, f"The search converged after {trials} trials.", question)
+        near = left <= _NEAR * residuals.measured
+        if left <= enough or (near and left * independent_share(residuals, point, model.noise) <= enough):
+            return Descent(point, model.noise, True, trials, f"The search converged after {trials} trials.", residuals)
         recent = sum(fall for trial, fall in falls if trial > trials - _PATIENCE)
-        if trials > _PATIENCE and recent * independent_share(question, point, model.widths) <= enough:
+        if trials > _PATIENCE and recent * independent_share(residuals, point, model.noise) <= enough:
             text = _KINK.format(trials, left, _PATIENCE, recent)
-            return Descent(point, model.widths, False, trials, text, question)
-        better, damping, trials = _find_better_trial(question, point, model, anchor, damping, trials, limit)
+            return Descent(point, model.noise, False, trials, text, residuals)
+        better, damping, trials = _find_better_trial(residuals, point, model, anchor, damping, trials, limit)
         if better is not None:
             falls.append(
-                (trials, model.cost - question.cost(better, model.factors, model.widths) - anchor.cost(better.u))
+                (trials, model.cost - residuals.cost(better, model.factors, model.noise) - anchor.cost(better.u))
             )
         if better is None and trials < limit:
             text = f"The search stopped where rounding hides what is left, after {trials} trials."
-            return Descent(point, model.widths, True, trials, text, question)
+            return Descent(point, model.noise, True, trials, text, residuals)
         if better is None:
             text = f"The search was stopped after {trials} trials: half the sum of squares may fall by {left:.2g}."
-            return Descent(point, model.widths, False, trials, text, question)
+            return Descent(point, model.noise, False, trials, text, residuals)
         point = better
 
 
 class _Model(NamedTuple):
     """The least squares about one trial: what it is made of, and half its sum of squares."""
 
-    widths: NoiseScale
+    noise: NoiseScale
     factors: list[np.ndarray]
     triangles: np.ndarray
     states: int
@@ -144,17 +144,17 @@ class _Model(NamedTuple):
         return eliminate(self.triangles, self.states, scale, damping, self.pull, self.limits)
 
 
-def _model(question: Residuals, point: Trial, noise: AbstractNoise, anchor: Anchor) -> _Model:
-    widths = question.noise_scale(point, noise)
-    factors = question.factors(point, widths)
-    triangles = question.linearise(point, widths)
-    cost = question.cost(point, factors, widths) + anchor.cost(point.u)
+def _model(residuals: Residuals, point: Trial, law: AbstractNoise, anchor: Anchor) -> _Model:
+    noise = residuals.noise_scale(point, law)
+    factors = residuals.factors(point, noise)
+    triangles = residuals.linearise(point, noise)
+    cost = residuals.cost(point, factors, noise) + anchor.cost(point.u)
     pull = anchor.weight, anchor.pull(point.u)
-    return _Model(widths, factors, triangles, question.states, pull, question.parameters.limits(point.u), cost)
+    return _Model(noise, factors, triangles, residuals.states, pull, residuals.parameters.limits(point.u), cost)
 
 
 def _find_better_trial(
-    question: Residuals, point: Trial, model: _Model, anchor: Anchor, damping: float, trials: int, limit: int
+    residuals: Residuals, point: Trial, model: _Model, anchor: Anchor, damping: float, trials: int, limit: int
 ) -> tuple[Trial | None, float, int]:
     """The first trial that is better, the damping to go on with, and the count of trials.
 
@@ -165,10 +165,10 @@ def _find_better_trial(
         step = model.step(damping)
         if step.gain <= _FLAT * model.cost or damping > _MOST:
             break
-        trial = question.evaluate(question.parameters.take_step(point.u, step.u), point.starts + step.starts)
+        trial = residuals.evaluate(residuals.parameters.take_step(point.u, step.u), point.starts + step.starts)
         trials += 1
         if not isinstance(trial, LostTrial):
-            fall = model.cost - question.cost(trial, model.factors, model.widths) - anchor.cost(trial.u)
+            fall = model.cost - residuals.cost(trial, model.factors, model.noise) - anchor.cost(trial.u)
             if fall > 0.0:
                 return trial, max(_LEAST, damping * max(0.1, 1.0 - (2.0 * fall / step.gain - 1.0) ** 3)), trials
         damping, growth = damping * growth, 2.0 * growth

@@ -65,9 +65,9 @@ def random_starts(parameters: Parameters, u: np.ndarray, count: int, seed: int) 
     return np.stack([u, *(parameters.draw(u, rng) for _ in range(count - 1))])
 
 
-def short_search(question: Residuals, u: np.ndarray, starts: np.ndarray) -> Trials:
+def short_search(residuals: Residuals, u: np.ndarray, starts: np.ndarray) -> Trials:
     """The results of the starts u (K, F) after a few steps, from the records' starts (N, 2n); in order."""
-    part = _subsample(question)
+    part = _subsample(residuals)
     at = _evaluate_starts(part, u, np.repeat(starts[None], len(u), axis=0))
     damping = np.full(len(u), _FIRST_DAMPING)
     for _ in range(_SHORT_STEPS):
@@ -84,8 +84,8 @@ def short_search(question: Residuals, u: np.ndarray, starts: np.ndarray) -> Tria
     return Trials(at.u[order], at.starts[order], at.misfits[order])
 
 
-def misfit(widths: NoiseScale, question: Residuals) -> float:
-    return float(np.exp(np.mean(np.log(widths.sigma / question.size))))
+def misfit(noise: NoiseScale, residuals: Residuals) -> float:
+    return float(np.exp(np.mean(np.log(noise.sigma / residuals.size))))
 
 
 def distinct_minima(trials: Trials, count: int) -> list[int]:
@@ -106,45 +106,45 @@ class _EvaluatedStarts(NamedTuple):
     triangles: np.ndarray
 
 
-def _subsample(question: Residuals) -> Residuals:
+def _subsample(residuals: Residuals) -> Residuals:
     chosen = lambda count: np.unique(np.linspace(0, count - 1, _SHORT_SAMPLES).astype(int))  # noqa: E731
-    pieces = [Piece(piece.record, piece.places[chosen(len(piece.places))]) for piece in question.pieces]
-    return question.with_pieces(pieces, question.fitted)
+    pieces = [Piece(piece.record, piece.places[chosen(len(piece.places))]) for piece in residuals.pieces]
+    return residuals.with_pieces(pieces, residuals.fitted)
 
 
-def _evaluate_starts(question: Residuals, u: np.ndarray, starts: np.ndarray) -> _EvaluatedStarts:
+def _evaluate_starts(residuals: Residuals, u: np.ndarray, starts: np.ndarray) -> _EvaluatedStarts:
     """The misfits and triangles of trials u (K, F) and starts (K, N, 2n), a portion of them at once."""
-    columns = question.states + u.shape[1] + 1
+    columns = residuals.states + u.shape[1] + 1
     found = _EvaluatedStarts(
         u.copy(), starts.copy(), np.full(len(u), np.inf), np.zeros((*starts.shape[:2], columns, columns))
     )  # fmt: skip
-    largest = max(batch.ts.size for batch in question.batches) * question.states * columns
+    largest = max(batch.ts.size for batch in residuals.batches) * residuals.states * columns
     portion = max(1, _ROOM // largest)
     for begin in range(0, len(u), portion):
         some = slice(begin, begin + portion)
-        for k, trial in enumerate(question.evaluate_trials(u[some], starts[some]), begin):
+        for k, trial in enumerate(residuals.evaluate_trials(u[some], starts[some]), begin):
             if not isinstance(trial, LostTrial):
-                noise = question.noise_scale(trial, Gaussian())
-                found.starts[k], found.misfits[k] = trial.starts, misfit(noise, question)
-                found.triangles[k] = question.linearise(trial, noise)
+                noise = residuals.noise_scale(trial, Gaussian())
+                found.starts[k], found.misfits[k] = trial.starts, misfit(noise, residuals)
+                found.triangles[k] = residuals.linearise(trial, noise)
     return found
 
 
-def _step(question: Residuals, at: _EvaluatedStarts, k: int, damping: float) -> tuple[np.ndarray, np.ndarray]:
-    triangles, states, none = at.triangles[k], question.states, np.zeros(at.u.shape[1])
-    limits = question.parameters.limits(at.u[k])
+def _step(residuals: Residuals, at: _EvaluatedStarts, k: int, damping: float) -> tuple[np.ndarray, np.ndarray]:
+    triangles, states, none = at.triangles[k], residuals.states, np.zeros(at.u.shape[1])
+    limits = residuals.parameters.limits(at.u[k])
     step = eliminate(triangles, states, column_norms(triangles, states), damping, (none, none), limits)
-    return question.parameters.take_step(at.u[k], step.u), at.starts[k] + step.starts
+    return residuals.parameters.take_step(at.u[k], step.u), at.starts[k] + step.starts
 
 
 _BEST = 4  # of many starts go through the whole search
 
 
-def run_multistart(question: Residuals, search, u, y0, starts: int, seed: int) -> tuple[Descent, Waterfall | None]:
+def run_multistart(residuals: Residuals, search, u, y0, starts: int, seed: int) -> tuple[Descent, Waterfall | None]:
     """The best of the searches from u and from `starts` − 1 random values, and what all of them came to."""
     if starts == 1:
         return search(u, y0), None
-    trials = short_search(question, random_starts(question.parameters, u, starts, seed), y0)
+    trials = short_search(residuals, random_starts(residuals.parameters, u, starts, seed), y0)
     misfits, done = trials.misfits.copy(), []
     chosen = distinct_minima(trials, _BEST)
     for place, at in [*((k, (trials.u[k], trials.starts[k])) for k in chosen), (None, (u, y0))]:
@@ -155,8 +155,8 @@ def run_multistart(question: Residuals, search, u, y0, starts: int, seed: int) -
                 raise  # not one start could be followed
             continue
         if place is not None:
-            misfits[place] = misfit(done[-1].widths, question)
-    best = max(done, key=lambda one: (one.question is question, one.question.log_likelihood(one.point, one.widths)))
+            misfits[place] = misfit(done[-1].noise, residuals)
+    best = max(done, key=lambda one: (one.residuals is residuals, one.residuals.log_likelihood(one.point, one.noise)))
     misfits = np.sort(misfits)
-    misfits[0] = min(misfits[0], misfit(best.widths, question))
+    misfits[0] = min(misfits[0], misfit(best.noise, residuals))
     return best, Waterfall(misfits)

@@ -33,13 +33,13 @@ class Unexplained(NamedTuple):
     worst: list[int]
 
 
-def measure_unexplained(question: Residuals, point: Trial, widths: NoiseScale) -> Unexplained:
+def measure_unexplained(residuals: Residuals, point: Trial, noise: NoiseScale) -> Unexplained:
     """The share of the signals that a trial leaves, where that is much."""
-    left, noisy, shares, doubted, many = [], [], [0.0], False, len(question.records) > 1
-    of_records = np.zeros(len(question.records))
-    for signal, name in enumerate(question.names):
-        rounding = np.nan_to_num(question.sensor.step[signal]) ** 2 / 12
-        parts = {k: _parts(rows, rounding) for k, rows in _rows_of_signal(question, point, widths, signal).items()}
+    left, noisy, shares, doubted, many = [], [], [0.0], False, len(residuals.records) > 1
+    of_records = np.zeros(len(residuals.records))
+    for signal, name in enumerate(residuals.names):
+        rounding = np.nan_to_num(residuals.sensor.step[signal]) ** 2 / 12
+        parts = {k: _parts(rows, rounding) for k, rows in _rows_of_signal(residuals, point, noise, signal).items()}
         if not parts:
             continue
         samples = sum(part.samples for part in parts.values())
@@ -63,7 +63,7 @@ def measure_unexplained(question: Residuals, point: Trial, widths: NoiseScale) -
         worst = sorted(each, key=lambda k: -each[k])[:MOST_NAMED] if many and len(each) < len(parts) else []
         left += [
             f"The fit leaves {_percent(np.sqrt(parts[k].left), np.sqrt(parts[k].own))} of {name} in "
-            f"{question.label(k)}, and less in others: is it a record of this scene, with the signs of the others?"
+            f"{residuals.label(k)}, and less in others: is it a record of this scene, with the signs of the others?"
             for k in worst
         ]
     return Unexplained(left, noisy, float(max(shares)), doubted, np.argsort(-of_records, kind="stable").tolist())
@@ -92,16 +92,16 @@ def _parts(row: tuple[np.ndarray, np.ndarray, np.ndarray], rounding: float) -> _
     return _Parts(samples, np.sum(counts * rows**2) / samples, motion, np.sum(counts * (values - mean) ** 2) / samples)
 
 
-def _rows_of_signal(question: Residuals, point: Trial, widths: NoiseScale, signal: int) -> dict[int, tuple]:
+def _rows_of_signal(residuals: Residuals, point: Trial, noise: NoiseScale, signal: int) -> dict[int, tuple]:
     """The residuals, values and weights of every record that has a signal, (M, T) for its M pieces."""
     found: dict[int, list] = {}
-    columns = zip(question.batches, point.residuals, question.factors(point, widths), strict=True)
-    for batch, residuals, factors in columns:
-        counts = (factors[..., signal] * widths.sigma[signal]) ** 2
+    columns = zip(residuals.batches, point.residuals, residuals.factors(point, noise), strict=True)
+    for batch, r, factors in columns:
+        counts = (factors[..., signal] * noise.sigma[signal]) ** 2
         for row, place in enumerate(batch.rows):
             if counts[row].any():
-                each = residuals[row, :, signal], batch.values[row, :, signal], counts[row]
-                found.setdefault(question.pieces[place].record, []).append(each)
+                each = r[row, :, signal], batch.values[row, :, signal], counts[row]
+                found.setdefault(residuals.pieces[place].record, []).append(each)
     return {k: tuple(_pad_rows([one[i] for one in pieces]) for i in range(3)) for k, pieces in found.items()}
 
 
@@ -111,11 +111,11 @@ def _pad_rows(rows: list[np.ndarray]) -> np.ndarray:
     return np.stack([np.pad(row, (0, longest - len(row))) for row in rows])
 
 
-def unexplained_motion(question: Residuals, point: Trial, widths: NoiseScale) -> dict[int, float]:
+def unexplained_motion(residuals: Residuals, point: Trial, noise: NoiseScale) -> dict[int, float]:
     """The sum of squares that a trial leaves beyond white noise in every record, in units of the noise."""
     found: dict[int, float] = {}
-    for signal in range(len(question.names)):
-        for k, rows in _rows_of_signal(question, point, widths, signal).items():
-            part = _parts(rows, np.nan_to_num(question.sensor.step[signal]) ** 2 / 12)
-            found[k] = found.get(k, 0.0) + part.samples * part.motion / widths.sigma[signal] ** 2
+    for signal in range(len(residuals.names)):
+        for k, rows in _rows_of_signal(residuals, point, noise, signal).items():
+            part = _parts(rows, np.nan_to_num(residuals.sensor.step[signal]) ** 2 / 12)
+            found[k] = found.get(k, 0.0) + part.samples * part.motion / noise.sigma[signal] ** 2
     return found
