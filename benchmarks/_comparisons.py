@@ -30,7 +30,7 @@ from lagjax._equations._derivation import derivation_of
 from lagjax._interface._layout import Layout
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, compile_module, lanes
 from lagjax._native._lanes import emit, sincos_function
-from lagjax._program import StraightLine, lower
+from lagjax._program import lower
 
 TOLERANCE = 1e-9
 Rows = list[dict[str, Any]]
@@ -114,7 +114,7 @@ def _in_machine_code(case: Case) -> Callable[[], None] | None:
     sincos = sincos_function(module, width)
     code = Code(module, "evaluate", [POINTER, INTEGER], width, public=True)
     states, groups = code.arguments
-    line = StraightLine(program.nodes, program.kinds, program.outputs)
+    line = program.line
     with code.loop(EVALUATIONS), code.loop(groups) as group:
         places = [code.element(states, (group * (2 * n) + i) * width) for i in range(2 * n)]
         y = [code.load(place, vector) for place in places]

@@ -205,7 +205,7 @@ class Derivation:
         try:
             if key not in self._programs:
                 program = self.program(*names)
-                self._programs[key] = program.rounding_of(range(len(program.outputs)), program.size)
+                self._programs[key] = program.rounding_of(range(len(program.line.outputs)), program.size)
             if all(map(is_concrete, state)):
                 return self._programs[key].evaluate_many(np.concatenate([np.ravel(x) for x in state]))[:, 0]
         except Unlowerable:

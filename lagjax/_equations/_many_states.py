@@ -16,7 +16,7 @@ import numpy as np
 from lagjax._equations._derivation import Derivation, columns_of, derivation_of, numbers_of
 from lagjax._equations._linear import saddle_many
 from lagjax._interface import Layout, halves
-from lagjax._program import Program, Unlowerable, evaluate
+from lagjax._program import Program, Unlowerable
 
 PyTree = Any
 
@@ -110,7 +110,7 @@ class Sample(NamedTuple):
         if borders is None:
             return np.zeros(len(self.q))
         flags = np.zeros(2 * len(borders.switches))
-        found = evaluate(borders.decide, [*self.columns, *flags])
+        found = borders.decide.evaluate([*self.columns, *flags])
         return np.sqrt(np.arange(2, 2 + len(found))) @ np.where(np.isfinite(found), found, 0.5)
 
 

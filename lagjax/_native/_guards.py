@@ -67,7 +67,7 @@ def append_guards(program: Recurrent, size: int, values: Recurrent, slides: bool
 def drop_guards(found: Borders, size: int) -> tuple[Recurrent, Series]:
     """The program along the pieces that were found, without the guards, and its series: for derivatives over steps."""
     line = found.program.line
-    program = found.program._replace(line=line._replace(outputs=line.outputs[: size + 1]))
+    program = found.program._replace(line=line.replace(outputs=line.outputs[: size + 1]))
     return program, series(program, size, moving=2 * size + 1, followed=found.followed)
 
 

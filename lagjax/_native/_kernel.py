@@ -27,9 +27,7 @@ from lagjax._native._handler import Plan, Rest, allocate_aligned, handler
 from lagjax._native._integrator import Integrator
 from lagjax._native._ir import DOUBLE, FLOAT, compile_module, lanes
 from lagjax._native._motion_parts import Chosen, MotionParts, Projection, choose_parameters
-from lagjax._native._packs import forget_stages
 from lagjax._native._run_records import RECORDED
-from lagjax._native._schedule import forget_joined
 from lagjax._native._single_member import fills_lanes
 from lagjax._native._table_reads import SET_NUMBERS
 from lagjax._native._tangent import Tangent
@@ -161,8 +159,6 @@ class Kernel:
             integrator = Integrator(
                 self._parts, self._guards, self._error_groups, width=self.width, number=number, for_gpus=for_gpus
             )  # fmt: skip
-        forget_joined()
-        forget_stages()
         return integrator
 
     def _gpu_programs(self, single: bool) -> "_gpu.GpuPrograms":
@@ -336,8 +332,6 @@ class Kernel:
         """The kernel of tangents, whose directions stand side by side or members do; compiled on first use."""
         with pause_collections():
             tangent = Tangent(self._derivative_parts, width=1 if side_by_side else self.width, lanes=self.width)
-        forget_joined()
-        forget_stages()
         return _Compiled(tangent.motion, tangent.motion.layout, tangent.job, self._rounds, pointers=3)
 
     def plan(self, rtol: float, atol: float, max_steps: int) -> Plan:
@@ -388,8 +382,6 @@ class Kernel:
     def _adjoint(self, width: int, number: ir.Type = DOUBLE) -> Adjoint:
         with pause_collections():
             adjoint = Adjoint(self._derivative_parts, width=width, number=number)
-        forget_joined()
-        forget_stages()
         return adjoint
 
     def _strides(self, ts, params) -> dict[str, int]:

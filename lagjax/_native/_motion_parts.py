@@ -173,7 +173,7 @@ def choose_parameters(
                 )
                 for op, of, a in line.nodes
             )
-            return line._replace(nodes=tuple(nodes))
+            return line.replace(nodes=tuple(nodes))
 
         dtypes = (*one.dtypes[:first], *(kinds[i] for i in positions))
         mechanics = getattr(one, "mechanics", None)

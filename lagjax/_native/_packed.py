@@ -26,10 +26,10 @@ from lagjax._native._packs import (
     Stage,
     arrangement,
     limit_modes,
-    program_stages,
+    stages,
     vector_runs,
 )
-from lagjax._native._schedule import OperationKind, Same
+from lagjax._native._schedule import OperationKind, join_operations
 from lagjax._native._tables import WORD, Tables, word
 from lagjax._program._series import StraightLine
 
@@ -39,7 +39,6 @@ _COPY, _STORE = (OperationKind(op, None, ("float",), "float", (None,)) for op in
 class _StoredProgram(NamedTuple):
     """A program with the kinds of its operations, in stages; its last outputs, this many, are stored somewhere else."""
 
-    line: StraightLine
     kinds: list[OperationKind]
     stages: list[Stage]
     stored: int
@@ -54,7 +53,7 @@ class Packed(Tables):
     def __init__(self, function, wide, sincos: Code, lanes: int):
         self.lanes = lanes
         self._numbers: dict[tuple[OperationKind, tuple[int, ...]], int] = {}
-        self._programs: dict[int, _StoredProgram] = {}  # by the program, which lives as long
+        self._programs: dict[StraightLine, _StoredProgram] = {}
         self._arranged: dict[tuple, tuple[Arranged, str]] = {}
         super().__init__(function, sincos, wide)
 
@@ -68,12 +67,12 @@ class Packed(Tables):
         They stay until this place of the kernel is passed again. The last outputs go `to` some other place instead;
         where the same program is run without one, nothing becomes of them.
         """
-        if to is None and id(line) in self._programs:
-            stored = self._programs[id(line)].stored
+        if to is None and line in self._programs:
+            stored = self._programs[line].stored
         else:
             stored = 0 if to is None else len(to)
         plan, name, staying = self._arrangement(line, self._places(frame, inputs), stored)
-        kinds = self._programs[id(line)].kinds
+        kinds = self._programs[line].kinds
         outputs = plan.places[list(line.outputs)]
         runs = [(kinds[run.kind], run) for run in limit_modes(plan.runs, self.lanes)]
         first = self._layout.place(name, 0)
@@ -111,7 +110,7 @@ class Packed(Tables):
 
     def _arrangement(self, line: StraightLine, inputs: list[int], stored: int) -> tuple[Arranged, str, int]:
         """The program as runs, the field in which its numbers lie, and how many outputs stay there."""
-        key, program = (id(line), tuple(inputs)), self._program(line, stored)
+        key, program = (line, tuple(inputs)), self._program(line, stored)
         if key not in self._arranged:
             places = self._places_of(line, inputs)
             staying = len(line.outputs) - stored
@@ -132,9 +131,11 @@ class Packed(Tables):
         return places
 
     def _program(self, line: StraightLine, stored: int) -> list[Stage]:
-        if id(line) not in self._programs:
-            self._programs[id(line)] = _StoredProgram(line, *program_stages(Same(line)), stored)
-        return self._programs[id(line)].stages
+        if line not in self._programs:
+            kinds, operations = join_operations(line)
+            program = stages(operations, len(line.nodes), line.outputs)
+            self._programs[line] = _StoredProgram(kinds.all, program, stored)
+        return self._programs[line].stages
 
     # ---- the table of a program ----
 

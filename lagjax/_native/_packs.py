@@ -16,8 +16,8 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax._native._constants import LEAST_FILLED, LEAST_RUN, LONG_RUN, OFTEN_PACKED
-from lagjax._native._schedule import OperationKind, Same, ScheduledOperation, join_operations
-from lagjax._program._series import StraightLine
+from lagjax._native._schedule import ScheduledOperation, join_operations
+from lagjax._program._line import StraightLine, group_by_level
 
 # How an operand of a run lies in memory: consecutive numbers, one number, or anywhere.
 SIDE_BY_SIDE, ONE, ANYWHERE = range(3)
@@ -51,15 +51,8 @@ class Run(NamedTuple):
 
 def stages(operations: Sequence[ScheduledOperation], nodes: int, kept: Sequence[int]) -> list[Stage]:
     """The stages of a program of this many nodes, in an order in which they can run; nodes that are `kept` live on."""
-    level = [0] * nodes
-    groups: dict[tuple[int, int], list[ScheduledOperation]] = {}
-    for operation in operations:
-        depth = 1 + max((level[x] for x in operation.operands), default=0)
-        for x in operation.results:
-            if x >= 0:
-                level[x] = depth
-        groups.setdefault((depth, operation.kind), []).append(operation)
-    ordered = [groups[key] for key in sorted(groups)]
+    groups = group_by_level(operations, nodes)
+    ordered = [[operations[k] for k in groups[key]] for key in sorted(groups)]
     last = np.full(nodes + 1, -1)
     arrays = []
     for s, group in enumerate(ordered):
@@ -72,22 +65,11 @@ def stages(operations: Sequence[ScheduledOperation], nodes: int, kept: Sequence[
     return [Stage(kind, operands, results, int(last[results].max())) for kind, operands, results in arrays]
 
 
-@functools.lru_cache(maxsize=4)  # used where the form of a motion is chosen, and where it is compiled
-def program_stages(same: Same) -> tuple[list[OperationKind], list[Stage]]:
-    """A program in stages, and the kinds of their operations."""
-    kinds, operations = join_operations(same.line)
-    return kinds, stages(operations, len(same.line.nodes), same.line.outputs)
-
-
-def forget_stages() -> None:
-    """Forget what was kept of programs for their compilation: it is large, and of no use afterwards."""
-    program_stages.cache_clear()
-
-
+@functools.lru_cache(maxsize=16)  # used where the form of a motion is chosen, and where it is compiled
 def fills(line: StraightLine, width: int) -> bool:
     """True if most lanes of this many have something to do where alike operations of a program stand in them."""
-    _, program = program_stages(Same(line))
-    counts = np.array([stage.results.shape[1] for stage in program])
+    groups = group_by_level(join_operations(line)[1], len(line.nodes))
+    counts = np.array([len(group) for group in groups.values()])
     return bool(counts.sum() >= LEAST_FILLED * width * (-(-counts // width)).sum())
 
 

@@ -8,7 +8,6 @@
 Nothing here knows LLVM.
 """
 
-import functools
 from collections import Counter, defaultdict
 from typing import NamedTuple
 
@@ -73,7 +72,7 @@ def schedule(line: StraightLine, stored: int) -> Schedule:
     The last outputs, this many, are `stored` somewhere else as soon as they are there.
     """
     nodes, uses = line.nodes, count_uses(line.nodes, line.outputs)
-    kinds, operations = _join_same(Same(line))
+    kinds, operations = join_operations(line)
     staying = len(line.outputs) - stored
     outputs, copies = _outputs(line, operations, kinds, staying)
     groups = _group_operations(_insert_copies(operations, copies))
@@ -84,34 +83,10 @@ def schedule(line: StraightLine, stored: int) -> Schedule:
     return Schedule(kinds.all, groups, slots, staying, size, inputs, constants)
 
 
-class Same:
-    """A program that is equal to nothing but itself: a key that costs nothing."""
-
-    def __init__(self, line: StraightLine):
-        self.line = line
-
-    def __hash__(self) -> int:
-        return id(self.line)
-
-    def __eq__(self, other) -> bool:
-        return isinstance(other, Same) and self.line is other.line
-
-
-def join_operations(line: StraightLine) -> tuple[list[OperationKind], list[ScheduledOperation]]:
+def join_operations(line: StraightLine) -> "tuple[_Kinds, list[ScheduledOperation]]":
     """The operations that the outputs of a program need, each after those that it reads, and their kinds."""
-    kinds, operations = _join_same(Same(line))
-    return kinds.all, operations
-
-
-@functools.lru_cache(maxsize=4)  # used where the form of a motion is chosen, and where it is compiled
-def _join_same(same: Same) -> tuple["_Kinds", list[ScheduledOperation]]:
-    uses, kinds = count_uses(same.line.nodes, same.line.outputs), _Kinds()
-    return kinds, _join_pairs(_operations(same.line, uses, kinds), uses, kinds)
-
-
-def forget_joined() -> None:
-    """Forget what was kept of programs for their compilation: it is large, and of no use afterwards."""
-    _join_same.cache_clear()
+    uses, kinds = count_uses(line.nodes, line.outputs), _Kinds()
+    return kinds, _join_pairs(_operations(line, uses, kinds), uses, kinds)
 
 
 # ---- operations ------------------------------------------------------------------------------------------------------

@@ -38,7 +38,7 @@ class Tables:
         self._kinds: dict[tuple[OperationKind, int], int] = {}
         self._constants: dict[bytes, int] = {}
         self._fields: list[str] = []
-        self._schedules: dict[int, tuple[StraightLine, Schedule]] = {}  # by the program, which lives as long
+        self._schedules: dict[StraightLine, Schedule] = {}
         self._execute: Frame = (executing or function)("execute", POINTER, INTEGER)
         self._prepare: Frame = function("prepare")
         self._module, self._layout = self._prepare.code.module, self._prepare.layout
@@ -54,9 +54,9 @@ class Tables:
         They stay until this place of the kernel is passed again. The last outputs go `to` some other place instead;
         where the same program is run without one, nothing becomes of them.
         """
-        if id(line) not in self._schedules:
-            self._schedules[id(line)] = line, schedule(line, 0 if to is None else len(to))
-        _, plan = self._schedules[id(line)]
+        if line not in self._schedules:
+            self._schedules[line] = schedule(line, 0 if to is None else len(to))
+        plan = self._schedules[line]
         name, lying = self._field(plan.size), self._places(frame, inputs)
         places = {node: self._layout.place(name, slot) for node, slot in plan.slots.items()}
         places |= {node: self._constant(number) for node, number in plan.constants.items()}

@@ -69,7 +69,7 @@ class TaylorSeries:
         self.form = self._form()
         # The program whose first outputs are q̈. As a table the zeroth order is there already, and little longer.
         line = program.line
-        self.acceleration = series.zeroth_order if large else line._replace(outputs=line.outputs[: self.n])
+        self.acceleration = series.zeroth_order if large else line.replace(outputs=line.outputs[: self.n])
         self._sums = self._sums_function()
         self.coefficients = self._coefficients_function()
 

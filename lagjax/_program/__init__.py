@@ -27,9 +27,10 @@ function and lowered in turn, on first use.
 `_operations` has a row for each operation: its value, its derivatives, its series. `_graph` shares and, by `_simplify`,
 folds; `_scalars` writes formulas on it, `_passes` finish it; `_differentiation` differentiates it. Series: `_series`,
 with `_recurrences` for operations that have one of their own. Pieces: `_borders` (where they meet), `_sliding` (along
-them), `_jump` and `_kick` (over them), `_powers` (where no series helps), `_look_ups` (tables). Values: `_emit` for
-JAX, `_evaluate` and `_groups` for NumPy, `_rounding` for their error; `_elementary` and `_digits` are sine and cosine
-for CPUs. `_memory` bounds what a graph may take. `lowering/` turns JAX's operations into scalars.
+them), `_jump` and `_kick` (over them), `_powers` (where no series helps), `_look_ups` (tables). A program
+consists of a `_line`, with its values in NumPy; `_emit` is for JAX, `_rounding` for their error, `_elementary` and
+`_digits` are sine and cosine for CPUs. `_memory` bounds what a graph may take. `lowering/` turns JAX's operations into
+scalars.
 """
 
 import functools
@@ -48,16 +49,15 @@ from lagjax._program import _scalars as scalar_algebra
 from lagjax._program._borders import BELOW, CLOCK, FLOOR, SIGN, TABLE, TRUNC, Borders, borders, distances, is_smooth
 from lagjax._program._differentiation import Derivatives, copy_nodes, pullback, pushforward, with_tangents
 from lagjax._program._emit import Rows, apply_in_jax, emit, emit_look_up, emit_rows, plain_elementary
-from lagjax._program._evaluate import evaluate, round_off, steps_of, vjp
-from lagjax._program._graph import MANY, Graph, Node, Tape, Unlowerable
-from lagjax._program._groups import Groups, groups_of
+from lagjax._program._graph import MANY, Graph, Tape, Unlowerable
+from lagjax._program._line import StraightLine
 from lagjax._program._look_ups import table_of
 from lagjax._program._memory import machine_memory, operations_that_fit, pause_collections
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
-from lagjax._program._passes import eliminate_dead_code, factor, live, sink_negations
+from lagjax._program._passes import eliminate_dead_code, factor, sink_negations
 from lagjax._program._rounding import rounding
 from lagjax._program._scalars import Scalars, apply_function, concatenate, scatter, stack
-from lagjax._program._series import LinearSystem, StraightLine, series
+from lagjax._program._series import LinearSystem, series
 from lagjax._program.lowering import _complex, _eigenvalues, _special
 from lagjax._program.lowering._matrices import orthogonalize, row_weights, solve_orthogonalized
 from lagjax._program.lowering._rules import LARGEST_UNFOLDED, Expansion, expand_primitive, has_own_rules, inputs_of
@@ -109,7 +109,7 @@ def lower_scalars(
         graph, places = sink_negations(*factor(graph, places))
     origin = Origin(graph, tuple(places)) if len(graph.nodes) > MANY else None
     line = eliminate_dead_code(graph, places)
-    return Program(*line, expansion.traced_operations, function, shapes, budget, origin=origin)
+    return Program(line, expansion.traced_operations, function, shapes, budget, origin=origin)
 
 
 def lower_formula(formula: Callable, *shapes, budget: int, graph: Graph | None = None) -> "Program":
@@ -154,7 +154,7 @@ def lower_solution(
     program = lower_scalars(expand_system, in_jax, tuple(shapes), budget, graph)
     places, (of_z, of_entries, of_right), of_factors, factors = counts[0]
     ends = np.cumsum([size, 1, of_z - size, of_entries, of_right])
-    z, _, others, entries, right, leaves = np.split(np.array(program.outputs), ends)
+    z, _, others, entries, right, leaves = np.split(np.array(program.line.outputs), ends)
     scalar = jnp.result_type(float)
     tree = jax.tree.structure(factors)
     vectors = [jax.ShapeDtypeStruct(shape, scalar) for shape in (*of_factors, (of_right,))]
@@ -168,7 +168,7 @@ def lower_solution(
 
     return replace(
         program,
-        outputs=program.outputs[: size + 1],
+        line=program.line.replace(outputs=program.line.outputs[: size + 1]),
         origin=None,
         function=in_jax,
         linear=LinearSystem(
@@ -176,7 +176,7 @@ def lower_solution(
             entries=dict(zip(map(tuple, places.tolist()), entries.tolist(), strict=True)),
             right=tuple(right.tolist()),
             factors=tuple(leaves.tolist()),
-            solve=functools.cache(lambda: lower_scalars(solution, solution_in_jax, tuple(vectors), budget)),
+            solve=functools.cache(lambda: lower_scalars(solution, solution_in_jax, tuple(vectors), budget).line),
         ),
     )
 
@@ -203,9 +203,7 @@ class Program:
     from the same inputs, where L or a constraint is piecewise.
     """
 
-    nodes: tuple[Node, ...]
-    kinds: tuple[str, ...]
-    outputs: tuple[int, ...]
+    line: StraightLine
     traced_operations: int
     function: Callable
     shapes: tuple[jax.ShapeDtypeStruct, ...]
@@ -214,11 +212,6 @@ class Program:
     linear: LinearSystem | None = None
     origin: Origin | None = None
     mechanics: StraightLine | None = None
-
-    @property
-    def line(self) -> StraightLine:
-        """The operations alone."""
-        return StraightLine(self.nodes, self.kinds, self.outputs)
 
     @property
     def complete(self) -> "Program":
@@ -241,12 +234,12 @@ class Program:
         graph, ids = first.expansion.graph, stack(scalars).ids.tolist()
         nodes = copy_nodes(graph, self.line, ids, [graph.position(i) for i in ids] if self.looks_up else None)
         first.expansion.traced_operations += self.operations
-        return Scalars(first.expansion, np.array([nodes[i] for i in self.outputs], dtype=np.int64))
+        return Scalars(first.expansion, np.array([nodes[i] for i in self.line.outputs], dtype=np.int64))
 
-    @functools.cached_property
+    @property
     def looks_up(self) -> bool:
         """True if it reads tables (see `_look_ups`)."""
-        return any(op in LOOK_UPS for op, _, _ in self.nodes)
+        return self.line.looks_up
 
     def compute_outputs(self, first, numbers) -> tuple:
         """The outputs at inputs `first` (m,), then `numbers` (P,), which stay one array where they are many."""
@@ -289,19 +282,11 @@ class Program:
         `columns` holds one entry for each input: a number, or S of them, shape (S,). Floats have the precision of the
         columns.
         """
-        return evaluate(self.line, columns, self._steps, self._groups)
-
-    @functools.cached_property
-    def _steps(self) -> Callable:
-        return functools.cache(functools.partial(steps_of, self.line))
-
-    @functools.cached_property
-    def _groups(self) -> Groups | None:
-        return groups_of(self.line)
+        return self.line.evaluate(columns)
 
     def round_off_many(self, columns) -> np.ndarray:
         """The rounding error of every output at S states, shape (outputs, S), to first order."""
-        return round_off(self.line, columns)
+        return self.line.round_off(columns)
 
     def vjp_many(self, columns, cotangents) -> list:
         """Σₖ cotangentₖ ∂outputₖ/∂input for every input, in NumPy; None where nothing flows to an input.
@@ -309,7 +294,7 @@ class Program:
         Of the operations as they stand here, without the user's own rules for derivatives. All of the values are kept
         in between: some hundred states at once are enough.
         """
-        return vjp(self.line, columns, cotangents, self._groups)
+        return self.line.vjp(columns, cotangents)
 
     def own_outputs(self, *scalars) -> Scalars | None:
         """The outputs in the graph that the program was cut out of, where the scalars are its inputs there."""
@@ -331,25 +316,22 @@ class Program:
 
     def select_outputs(self, positions: Sequence[int], function: Callable) -> "Program":
         """The program of some of the outputs; `function` is the JAX function that gives just these, leaf by leaf."""
-        nodes, kinds, outputs = live(self.nodes, self.kinds, [self.outputs[i] for i in positions])
+        line = eliminate_dead_code(self.line, [self.line.outputs[i] for i in positions])
         origin = self.origin and self.origin._replace(outputs=tuple(self.origin.outputs[i] for i in positions))
-        line = {"nodes": nodes, "kinds": kinds, "outputs": outputs}
-        return replace(self, **line, function=function, otherwise=None, linear=None, origin=origin)
+        return replace(self, line=line, function=function, otherwise=None, linear=None, origin=origin)
 
     def rounding_of(self, positions: Sequence[int], moving: int) -> "Program":
         """The program of the running errors of some outputs (see `_rounding`); it has no derivatives."""
-        line = StraightLine(*live(self.nodes, self.kinds, [self.outputs[i] for i in positions]))
+        line = eliminate_dead_code(self.line, [self.line.outputs[i] for i in positions])
         graph = Graph.from_line(line, 20 * self.budget)
         with np.errstate(all="ignore"):
             errors = rounding(graph, line, range(len(line.nodes)), moving)
-        nodes, kinds, outputs = eliminate_dead_code(graph, errors)
-        line = {"nodes": nodes, "kinds": kinds, "outputs": outputs}
-        return replace(self, **line, otherwise=None, linear=None, origin=None)
+        return replace(self, line=eliminate_dead_code(graph, errors), otherwise=None, linear=None, origin=None)
 
-    @functools.cached_property
+    @property
     def operations(self) -> int:
         """The number of arithmetic operations of one evaluation."""
-        return sum(op not in ("input", "constant") for op, _, _ in self.nodes)
+        return self.line.operations
 
     def constant(self, output: int) -> float | None:
         """The value of an output that does not depend on the inputs, else None."""
@@ -357,26 +339,26 @@ class Program:
 
     def find_inputs(self, outputs: Sequence[int]) -> frozenset[int]:
         """The positions of the inputs that any of some outputs depends on."""
-        seen, stack = set(), [self.outputs[k] for k in outputs]
+        seen, stack = set(), [self.line.outputs[k] for k in outputs]
         while stack:
             i = stack.pop()
             if i not in seen:
                 seen.add(i)
-                stack.extend(self.nodes[i][1])
-        read = {self.nodes[i][2] for i in seen if self.nodes[i][0] == "input"}
-        tables = (table_of(self.nodes[i][2]).positions for i in seen if self.nodes[i][0] in LOOK_UPS)
+                stack.extend(self.line.nodes[i][1])
+        read = {self.line.nodes[i][2] for i in seen if self.line.nodes[i][0] == "input"}
+        tables = (table_of(self.line.nodes[i][2]).positions for i in seen if self.line.nodes[i][0] in LOOK_UPS)
         return frozenset(read.union(*tables))
 
     def depends(self, output: int) -> frozenset[int]:
         """The positions of the inputs that an output depends on."""
-        mask = self._dependencies[self.outputs[output]]
+        mask = self._dependencies[self.line.outputs[output]]
         return frozenset(i for i in range(mask.bit_length()) if mask >> i & 1)
 
     @functools.cached_property
     def _dependencies(self) -> list[int]:
         """The inputs that each node depends on, as a bit mask."""
         masks: list[int] = []
-        for op, operands, attribute in self.nodes:
+        for op, operands, attribute in self.line.nodes:
             masks.append(functools.reduce(int.__or__, (masks[i] for i in operands), 0))
             if op == "input":
                 masks[-1] = 1 << attribute
@@ -389,7 +371,7 @@ class Program:
 
     @functools.cached_property
     def _differentiable(self) -> Callable:
-        run = jax.custom_jvp(lambda *scalars: emit(self.nodes, self.kinds, self.outputs, scalars))
+        run = jax.custom_jvp(lambda *scalars: emit(self.line, scalars))
 
         @functools.partial(run.defjvp, symbolic_zeros=True)
         def rule(primals, tangents):

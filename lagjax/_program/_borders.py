@@ -32,7 +32,7 @@ from lagjax._program._kick import Jumping, Kick, Mechanics, kick_line
 from lagjax._program._look_ups import Located, Table
 from lagjax._program._memory import pause_collections
 from lagjax._program._operations import OPERATIONS
-from lagjax._program._passes import eliminate_dead_code, live
+from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._powers import find_powers
 from lagjax._program._rounding import rounding
 from lagjax._program._series import LinearSystem, Recurrent, StraightLine
@@ -202,7 +202,7 @@ class Borders(NamedTuple):
     def switching(self) -> StraightLine:
         """The program of the switching numbers that are `shaken`."""
         nodes = [self.switches[j] for j in self.shaken]
-        return StraightLine(*live(self.program.line.nodes, self.program.line.kinds, nodes))
+        return eliminate_dead_code(self.program.line, nodes)
 
     @property
     def followed(self) -> tuple[int, ...]:
@@ -642,7 +642,7 @@ class _Rewriting:
         count, kick = len(switches), None
         if self.mechanics:
             kick = self._kick(line, switches, kicking)
-            line = line._replace(outputs=line.outputs[: -self.mechanics])
+            line = line.replace(outputs=line.outputs[: -self.mechanics])
         dtypes = (*program.dtypes, *[np.dtype(float)] * count)
         pieced = Pieced(line, program.size + count, dtypes, linear, _LARGEST * program.budget)
         kinds = (*self.kinds, *[SLIDE] * len(sliding))
@@ -824,7 +824,7 @@ class _Rewriting:
         for j, kind in enumerate(self.kinds):  # what cannot rest moves
             if kind == CONE and all(slide.piece != j for slide in slides):
                 pieces[j] = one
-        return StraightLine(*eliminate_dead_code(graph, pieces + goes_on))
+        return eliminate_dead_code(graph, pieces + goes_on)
 
 
 def _raw(graph: Graph, kind: int, x: int, table: Located | None) -> int:
@@ -1073,7 +1073,7 @@ def distances(found: Borders) -> StraightLine:
         if kind != SIGN:
             level = graph.apply("floor", graph.apply("add", x, graph.constant(0.5, "float")))
         results.append(graph.apply("sub", x, level))
-    return StraightLine(*eliminate_dead_code(graph, results))
+    return eliminate_dead_code(graph, results)
 
 
 def _copy_deciding(
@@ -1097,5 +1097,5 @@ def _copy_deciding(
 def gradient(borders: Borders, by: Sequence[int]) -> StraightLine:
     """The derivatives by the inputs `by` of Σ hⱼ uⱼ, with m numbers hⱼ after the inputs of the program."""
     program = borders.program
-    line = StraightLine(*live(program.line.nodes, program.line.kinds, borders.switches))
+    line = eliminate_dead_code(program.line, borders.switches)
     return pullback(line, program.dtypes, by, range(len(borders.switches)))

@@ -20,10 +20,10 @@ from typing import Any
 import numpy as np
 
 from lagjax._program._graph import INPUTS, Graph, Node, Tape
+from lagjax._program._line import StraightLine
 from lagjax._program._look_ups import Table, move_look_up
 from lagjax._program._operations import LOOK_UPS, OPERATIONS, is_function
-from lagjax._program._passes import eliminate_dead_code, factor, replace_by_inputs, sink_negations
-from lagjax._program._series import StraightLine
+from lagjax._program._passes import eliminate_dead_code, factor, sink_negations
 
 _Rule = Callable[[int], int]
 Tangents = dict[int, int]  # by the number of the direction; a direction that is not there has none
@@ -327,7 +327,7 @@ def with_tangents(
         for output, direction in of:
             node = line.outputs[output]
             results.append(placed.nodes[node] if direction is None else moved[direction].get(node, zero))
-        return StraightLine(*eliminate_dead_code(*sink_negations(*factor(graph, results))))
+        return eliminate_dead_code(*sink_negations(*factor(graph, results)))
 
 
 def gradient_in(graph: Graph, line: StraightLine, nodes: list[int], node: int, by: Sequence[int]) -> list[int]:
@@ -365,10 +365,11 @@ class _PlacedLine(Derivatives):
     def finish_line(self, results: list[int], known: Sequence[int], first: int) -> StraightLine:
         """The line of some results, which reads the outputs `known` of the line as inputs from `first` on."""
         results, count = results + [self.nodes[self.line.outputs[i]] for i in known], len(results)
-        done = StraightLine(*eliminate_dead_code(*sink_negations(*factor(self.graph, results))))
+        done = eliminate_dead_code(*sink_negations(*factor(self.graph, results)))
         values = done.outputs[count:]
         positions = {node: first + k for k, node in enumerate(values) if done.nodes[node][1]}
-        return StraightLine(*replace_by_inputs(done.nodes, done.kinds, done.outputs[:count], positions))
+        nodes = tuple(("input", (), positions[i]) if i in positions else node for i, node in enumerate(done.nodes))
+        return eliminate_dead_code(done.replace(nodes=nodes), done.outputs[:count])
 
     def tangents(
         self, of_inputs: dict[int, int], places: dict[int, int], beside: "TangentTable | None" = None

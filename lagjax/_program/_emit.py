@@ -14,10 +14,9 @@ from jax.experimental.xla_metadata import set_xla_metadata
 
 from lagjax._interface import default_platform
 from lagjax._program import _elementary
-from lagjax._program._graph import Node
+from lagjax._program._line import StraightLine
 from lagjax._program._look_ups import BESIDE, Table, table_of
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
-from lagjax._program._series import StraightLine
 
 _state = threading.local()
 
@@ -37,18 +36,19 @@ def plain_elementary() -> Iterator[None]:
         _state.plain = before
 
 
-def emit(nodes: tuple[Node, ...], kinds: tuple[str, ...], outputs: tuple[int, ...], scalars: tuple) -> tuple:
+def emit(line: StraightLine, scalars: tuple) -> tuple:
     """The outputs for these inputs, all of the shape the inputs broadcast to."""
     shape = jnp.broadcast_shapes(*(jnp.shape(x) for x in scalars))
 
     def entries(table):
         return jnp.stack(jnp.broadcast_arrays(*(scalars[i] for i in table.positions)), axis=-1)
 
-    return _emit_outputs(nodes, kinds, outputs, scalars, shape, entries)
+    return _emit_outputs(line, scalars, shape, entries)
 
 
-def _emit_outputs(nodes, kinds, outputs, scalars, shape: tuple[Any, ...], entries: Callable) -> tuple:
-    """The outputs of the operations `nodes`, each broadcast to `shape`."""
+def _emit_outputs(line: StraightLine, scalars, shape: tuple[Any, ...], entries: Callable) -> tuple:
+    """The outputs, each broadcast to `shape`."""
+    nodes, kinds = line.nodes, line.kinds
     fast = frozenset() if getattr(_state, "plain", False) else _elementary.FAST.keys()
     precision = _precision(nodes, kinds, scalars)
     dtypes = [precision if kind == "float" else np.dtype(kind) for kind in kinds]
@@ -72,7 +72,7 @@ def _emit_outputs(nodes, kinds, outputs, scalars, shape: tuple[Any, ...], entrie
         else:
             xs = _align_shapes([values[operand] for operand in operands])
             values[i] = _fast_function(op)(*xs) if op in fast else _apply(op, xs, attribute)
-    return tuple(jnp.broadcast_to(jnp.asarray(values[i]), shape) for i in outputs)
+    return tuple(jnp.broadcast_to(jnp.asarray(values[i]), shape) for i in line.outputs)
 
 
 class Rows(NamedTuple):
@@ -98,7 +98,7 @@ class Rows(NamedTuple):
 def emit_rows(line: StraightLine, rows: Rows) -> tuple:
     """`emit` for inputs of which most are looked up in tables: none of these is taken apart."""
     shape = jnp.broadcast_shapes(rows.first.shape[:-1], rows.numbers.shape[:-1])
-    return _emit_outputs(line.nodes, line.kinds, line.outputs, rows, shape, rows.entries)
+    return _emit_outputs(line, rows, shape, rows.entries)
 
 
 def emit_look_up(op: str, attribute, entries: Callable, precision, x) -> jax.Array:

@@ -20,7 +20,7 @@ whoever runs the program checks what comes out of it.
 import functools
 import itertools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -47,6 +47,21 @@ PAIRS = 2**60
 
 Node = tuple[str, tuple[int, ...], Any]
 _ARITHMETIC = frozenset(("add", "sub", "mul"))
+
+
+def find_ancestors(nodes: Sequence[Node], outputs: Iterable[int], powers: Mapping[int, tuple] = {}) -> list[int]:
+    """The nodes that some nodes depend on, and these, in order; those of `powers` depend on the base given there."""
+    marks, order = bytearray(len(nodes)), []
+    for i in outputs:
+        marks[i] = 1
+    i = marks.rfind(1)
+    while i >= 0:
+        order.append(i)
+        for x in nodes[i][1] if i not in powers else powers[i][:1]:
+            marks[x] = 1
+        i = marks.rfind(1, 0, i)
+    order.reverse()
+    return order
 
 
 class Graph:
@@ -95,18 +110,7 @@ class Graph:
 
     def find_ancestors(self, outputs: Iterable[int], as_derived: bool = False) -> list[int]:
         """The nodes that some nodes depend on, and these, in order; `as_derived`, powers depend on their base."""
-        marks, nodes, order = bytearray(len(self.nodes)), self.nodes, []
-        powers = self.powers if as_derived else {}
-        for i in outputs:
-            marks[i] = 1
-        i = marks.rfind(1)
-        while i >= 0:
-            order.append(i)
-            for x in nodes[i][1] if i not in powers else powers[i][:1]:
-                marks[x] = 1
-            i = marks.rfind(1, 0, i)
-        order.reverse()
-        return order
+        return find_ancestors(self.nodes, outputs, self.powers if as_derived else {})
 
     # ---- what overflows where it no longer matters, as cosh u in 1/cosh u ----
 

@@ -30,7 +30,7 @@ from lagjax._program._borders import Borders, Pieced
 from lagjax._program._differentiation import TangentTable, copy_nodes, pullback_and_entries, tangents_in, with_tangents
 from lagjax._program._graph import Graph, Unlowerable
 from lagjax._program._look_ups import Table, shift_look_up
-from lagjax._program._passes import eliminate_dead_code, live
+from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._series import StraightLine
 
 # Explicit Runge–Kutta methods of order s with s stages: what of the stages before goes into each, and into the step.
@@ -102,7 +102,7 @@ class Jump(NamedTuple):
 
     def accelerations(self, size: int) -> StraightLine:
         """The line from the same inputs to the accelerations before and behind the border alone."""
-        return StraightLine(*live(self.line.nodes, self.line.kinds, self.line.outputs[-2 * size :]))
+        return eliminate_dead_code(self.line, self.line.outputs[-2 * size :])
 
     def transposed(self, size: int, parameters: int) -> tuple[StraightLine, tuple[Table, ...]]:
         """The line from all but the upper rows, and cotangents of their jumps, to cotangents of these rows.
@@ -136,7 +136,7 @@ class Jump(NamedTuple):
             elif op == "eq" and of_upper[-1]:  # all that is read of them is whether a tangent is zero: it is not
                 op, operands, attribute, of_upper[-1] = "constant", (), False, False
             nodes.append((op, operands, attribute))
-        line = StraightLine(*live(tuple(nodes), line.kinds, line.outputs))
+        line = eliminate_dead_code(line.replace(nodes=tuple(nodes)), line.outputs)
         return line, tables
 
 
@@ -153,7 +153,7 @@ def with_borders_of_tangents(borders: Borders, size: int, directions: int, membe
     places = [*of_rows[0], *(first_piece + j for j in range(pieces))]
     moving = [{i: place for i, place in enumerate(row) if i != 2 * n} for row in of_rows[1:]]
     followed = list(borders.followed)
-    line = program.line._replace(outputs=(*program.line.outputs[: n + 1], *followed))
+    line = program.line.replace(outputs=(*program.line.outputs[: n + 1], *followed))
     every = [None, *range(directions)]
     of = [(i, row) for row in every for i in range(n)] + [(n + k, None) for k in range(1 + len(followed))]
     tables = [_table_of_row(row * member) for row in range(1, rows)]
@@ -166,7 +166,7 @@ def with_borders_of_tangents(borders: Borders, size: int, directions: int, membe
     dtypes = (np.dtype(float),) * (first_piece + pieces)
     decided = {i: place for i, place in enumerate(places)}
     decided |= {program.size + j: first_piece + pieces + j for j in range(pieces)}
-    line = line._replace(outputs=line.outputs[: rows * n + 1])
+    line = line.replace(outputs=line.outputs[: rows * n + 1])
     return borders._replace(
         program=Pieced(line, len(dtypes), dtypes, None, max(program.budget, len(line.nodes))),
         switches=switches[:pieces], arguments=switches[pieces:], decide=_renumber_inputs(borders.decide, decided),
@@ -190,7 +190,7 @@ def _table_of_row(shift: int) -> TangentTable:
 
 def _renumber_inputs(line: StraightLine, places: dict[int, int]) -> StraightLine:
     """The line with other numbers of its inputs."""
-    return line._replace(nodes=tuple((op, of, places[x]) if op == "input" else (op, of, x) for op, of, x in line.nodes))
+    return line.replace(nodes=tuple((op, of, places[x]) if op == "input" else (op, of, x) for op, of, x in line.nodes))
 
 
 # ---- the jump --------------------------------------------------------------------------------------------------------
@@ -232,14 +232,14 @@ class _OverBorder:
         self.terms = self._leibniz()
         self.stages = _STAGES[len(directions) - 1]
         dtypes = [*program.dtypes[: self.moving], *[np.dtype(float)] * (self.pieces + self.chosen)]
-        line = StraightLine(*live(program.line.nodes, program.line.kinds, program.line.outputs[:size]))
+        line = eliminate_dead_code(program.line, program.line.outputs[:size])
         self.switch = _switching_number(borders, program.size)
         fixed = self.pieces + self.chosen
         self.field, self.switches = (self._add_rows(line, dtypes, fixed) for line in (line, self.switch))
         largest = len(self.field.nodes) + len(self.switches.nodes) + len(line.nodes)
         self.kick = None
         if borders.kicking and borders.kick is not None:
-            line = borders.kick.line._replace(outputs=borders.kick.line.outputs[:size])
+            line = borders.kick.line.replace(outputs=borders.kick.line.outputs[:size])
             kinds = [*program.dtypes[: self.moving], *[np.dtype(float)] * (self.pieces + fixed)]
             self.kick = self._add_rows(line, kinds, self.pieces + fixed)
             largest += len(self.kick.nodes)
@@ -360,7 +360,7 @@ class _OverBorder:
         for row in range(1, self.rows):
             for x, y in zip(place[: 2 * n], back[: 2 * n], strict=True):
                 results.append(zero if y[row] is None else graph.apply("sub", y[row], x[row]))
-        line = StraightLine(*eliminate_dead_code(graph, [*results, *a_before, *a_behind]))
+        line = eliminate_dead_code(graph, [*results, *a_before, *a_behind])
         return Jump(line, self.orders, self.lower, 2 * self.pieces + self.chosen)
 
     def _inputs(self) -> tuple[list[Jet], list[int], list[int], list[int]]:
@@ -388,7 +388,7 @@ def _switching_number(borders: Borders, size: int) -> StraightLine:
     Levels that are parameters are entries of tables, whose numbers are inputs behind these. Others do not matter.
     """
     program, m = borders.program, len(borders.switches)
-    line = StraightLine(*live(program.line.nodes, program.line.kinds, borders.switches))
+    line = eliminate_dead_code(program.line, borders.switches)
     graph = Graph(10 * len(line.nodes) + 1000)
     kinds = {node[2]: kind for node, kind in zip(line.nodes, line.kinds, strict=True) if node[0] == "input"}
     nodes = copy_nodes(graph, line, [graph.input(i, kinds.get(i, "float")) for i in range(size)])
@@ -399,4 +399,4 @@ def _switching_number(borders: Borders, size: int) -> StraightLine:
             entry = graph.apply("take", graph.input(size + m + j, "float"), attribute=table)
             number = graph.apply("sub", number, entry)
         total = graph.apply("add", total, graph.apply("mul", weight, number))
-    return StraightLine(*eliminate_dead_code(graph, [total]))
+    return eliminate_dead_code(graph, [total])

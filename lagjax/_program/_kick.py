@@ -24,11 +24,10 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax._program._differentiation import copy_nodes, gradient_in
-from lagjax._program._evaluate import evaluate
 from lagjax._program._graph import Graph
 from lagjax._program._look_ups import BESIDE, shift_look_up, table_of
 from lagjax._program._operations import LOOK_UPS
-from lagjax._program._passes import eliminate_dead_code, live
+from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._rounding import rounding
 from lagjax._program._series import StraightLine
 from lagjax._program._sliding import dot, eliminate, substitute
@@ -129,7 +128,7 @@ def kick_line(
     mu = f("select", in_space, zero, f("div", f("sub", speed, b), c))
     kicked = [f("add", x, f("mul", mu, y)) for x, y in zip(w, across, strict=True)]
     lacks = f("lt", squared, zero)
-    return StraightLine(*eliminate_dead_code(graph, [*kicked, f("select", lacks, one, zero)]))
+    return eliminate_dead_code(graph, [*kicked, f("select", lacks, one, zero)])
 
 
 class _Sides:
@@ -228,7 +227,7 @@ class Jumping:
 
     def _shift(self, line: StraightLine) -> StraightLine:
         nodes = ((op, of, self._near(a) if op in LOOK_UPS else a) for op, of, a in line.nodes)
-        return line._replace(nodes=tuple(nodes))
+        return line.replace(nodes=tuple(nodes))
 
     def _states(self, count: int) -> np.ndarray:
         """States that nothing speaks for; entries of tables that are parameters increase."""
@@ -246,7 +245,7 @@ class Jumping:
         columns[first : first + 2 * m] = 0.0
         columns[first + given, states] = np.nan_to_num(pieces)
         columns[first + m + given, states] = ~np.isnan(pieces)
-        found = np.array(evaluate(self.decide, list(columns)))[:m]
+        found = np.array(self.decide.evaluate(list(columns)))[:m]
         found[given, states] = np.where(np.isnan(pieces), found[given, states], pieces)
         return found
 
@@ -269,18 +268,18 @@ class Jumping:
             for j, line, block in zip(candidates, lines, blocks, strict=True):
                 here = columns[:, block]
                 if not turn:
-                    target[:, block] = levels(j, evaluate(line, list(here))[0], self._entries(here), self.draw)
+                    target[:, block] = levels(j, line.evaluate(list(here))[0], self._entries(here), self.draw)
                 for _ in range(_STEPS):
-                    u, _, *slopes = evaluate(line, list(here))
+                    u, _, *slopes = line.evaluate(list(here))
                     step = (u - target[0, block]) / sum(s * s for s in slopes)
                     here[: self.moving] -= np.where(np.isfinite(step), step, 0.0) * np.array(slopes)
         near = np.zeros(len(given), bool)
         for line, block in zip(lines, blocks, strict=True):
-            u, error, *_ = evaluate(line, list(columns[:, block]))
+            u, error, *_ = line.evaluate(list(columns[:, block]))
             near[block] = np.abs(u - target[0, block]) <= _HIT * _EPS * (error + np.abs(target[0, block]))
         for side in range(2):
             columns[size + side * m : size + (side + 1) * m] = self._decide(columns, given, target[1 + side])
-        values = np.array(evaluate(self._differences(nodes), list(columns)))
+        values = np.array(self._differences(nodes).evaluate(list(columns)))
         change, noise = np.abs(values[: len(nodes)]), values[len(nodes) :]
         known = near & np.isfinite(change).all(axis=0) & np.isfinite(noise).all(axis=0)
         jumps = known & (change > _NOISE * _EPS * noise).any(axis=0)
@@ -303,11 +302,11 @@ class Jumping:
         graph = Graph(_LARGEST * len(self.line.nodes) + 10_000)
         sides = _Sides(graph, self.line, self.size, self.m)
         changes = [sides.difference(i) for i in nodes]
-        return self._with_rounding(StraightLine(*eliminate_dead_code(graph, changes)), len(changes))
+        return self._with_rounding(eliminate_dead_code(graph, changes), len(changes))
 
     def _distance(self, j: int) -> StraightLine:
         """Switching number j, its rounding error, and its slopes by q, q̇ and t."""
-        line = StraightLine(*live(self.line.nodes, self.line.kinds, [self.switches[j]]))
+        line = eliminate_dead_code(self.line, [self.switches[j]])
         return self._with_rounding(line, 1, range(self.moving))
 
     def _with_rounding(self, line: StraightLine, count: int, by: Sequence[int] = ()) -> StraightLine:
@@ -319,4 +318,4 @@ class Jumping:
         slopes = gradient_in(graph, line, places, line.outputs[0], by) if by else []
         outputs = [*(places[i] for i in line.outputs), *errors, *slopes]
         assert len(line.outputs) == count
-        return StraightLine(*eliminate_dead_code(graph, outputs))
+        return eliminate_dead_code(graph, outputs)

@@ -4,9 +4,8 @@ import functools
 from collections import Counter
 from collections.abc import Callable, Sequence
 
-from lagjax._program._graph import LONGEST, MANY, Graph, Node
-
-Line = tuple[tuple[Node, ...], tuple[str, ...], tuple[int, ...]]  # nodes, kinds and outputs
+from lagjax._program._graph import LONGEST, MANY, Graph, Node, find_ancestors
+from lagjax._program._line import StraightLine
 
 
 def factor(graph: Graph, outputs: list[int]) -> tuple[Graph, list[int]]:
@@ -120,13 +119,13 @@ def _negative(graph, i) -> int | None:
     return None
 
 
-def eliminate_dead_code(graph: Graph, outputs: list[int]) -> Line:
-    """The nodes that the outputs depend on, renumbered."""
-    kept = graph.find_ancestors(outputs)
-    if len(kept) == len(graph.nodes):
-        return tuple(graph.nodes), tuple(graph.kinds), tuple(outputs)
+def eliminate_dead_code(of: Graph | StraightLine, outputs: Sequence[int]) -> StraightLine:
+    """The nodes of a graph or a line that these depend on, renumbered, as a line with these outputs."""
+    nodes, kept = of.nodes, find_ancestors(of.nodes, outputs)
+    if len(kept) == len(nodes):
+        return StraightLine(tuple(nodes), tuple(of.kinds), tuple(outputs))
     position = dict(zip(kept, range(len(kept)), strict=True))
-    renumbered, nodes = [], graph.nodes
+    renumbered = []
     for i in kept:
         node = op, operands, attribute = nodes[i]
         if len(operands) == 2:
@@ -135,22 +134,7 @@ def eliminate_dead_code(graph: Graph, outputs: list[int]) -> Line:
         elif operands:
             node = op, tuple([position[x] for x in operands]), attribute
         renumbered.append(node)
-    return tuple(renumbered), tuple([graph.kinds[i] for i in kept]), tuple([position[i] for i in outputs])
-
-
-def live(nodes, kinds, outputs) -> Line:
-    """The nodes that some outputs of a straight line depend on, renumbered."""
-    graph = Graph(len(nodes) + 1)
-    graph.nodes, graph.kinds = list(nodes), list(kinds)
-    return eliminate_dead_code(graph, list(outputs))
-
-
-def replace_by_inputs(nodes, kinds, outputs, positions: dict[int, int]) -> Line:
-    """A straight line in which some nodes, whose values are known, are inputs at these positions instead."""
-    graph = Graph(len(nodes) + 1)
-    graph.nodes = [("input", (), positions[i]) if i in positions else node for i, node in enumerate(nodes)]
-    graph.kinds = list(kinds)
-    return eliminate_dead_code(graph, list(outputs))
+    return StraightLine(tuple(renumbered), tuple([of.kinds[i] for i in kept]), tuple([position[i] for i in outputs]))
 
 
 def count_uses(nodes: Sequence[Node], outputs: Sequence[int]) -> list[int]:

@@ -1,15 +1,15 @@
 """The rounding errors of a straight line, as nodes of a graph: running errors, to first order.
 
 Every operation adds one unit in the last place of its result to what its operands bring along, so that terms that
-cancel leave theirs behind. `_evaluate.round_off` says the same of arrays. Source: Higham, *Accuracy and Stability of
+cancel leave theirs behind. `StraightLine.round_off` says the same of arrays. Source: Higham, *Accuracy and Stability of
 Numerical Algorithms*, §3.3.
 """
 
 from collections.abc import Sequence
 
 from lagjax._program._graph import Graph
+from lagjax._program._line import StraightLine
 from lagjax._program._operations import OPERATIONS
-from lagjax._program._series import StraightLine
 
 
 def rounding(graph: Graph, line: StraightLine, nodes: Sequence[int], moving: int) -> list[int]:

@@ -32,23 +32,11 @@ from typing import Any, NamedTuple, Protocol
 
 import numpy as np
 
-from lagjax._program._graph import Graph, Node, Unlowerable
+from lagjax._program._graph import Graph, Unlowerable
+from lagjax._program._line import StraightLine
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, sink_negations
 from lagjax._program._recurrences import choose, finite
-
-
-class StraightLine(NamedTuple):
-    """Operations in order, as in `Program`."""
-
-    nodes: tuple[Node, ...]
-    kinds: tuple[str, ...]
-    outputs: tuple[int, ...]
-
-    def constant(self, output: int) -> float | None:
-        """The value of an output that does not depend on the inputs, else None."""
-        op, _, attribute = self.nodes[self.outputs[output]]
-        return attribute if op == "constant" else None
 
 
 class LinearSystem(NamedTuple):
@@ -62,7 +50,7 @@ class LinearSystem(NamedTuple):
     entries: dict[tuple[int, int], int]
     right: tuple[int, ...]
     factors: tuple[int, ...]
-    solve: Callable[[], Any]
+    solve: Callable[[], StraightLine]
     others: dict[tuple[int, int], int] = {}  # noqa: RUF012  (never written to)
 
 
@@ -266,14 +254,14 @@ class _Recurrences:
                     residual[row] = apply("sub", residual[row], taken)
         return self._inline(system.solve(), system.factors, residual)
 
-    def _inline(self, program, factors, right: list[int]) -> list[int]:
-        """The outputs of a program of factors (order zero) and a right-hand side (order k), as recursion nodes."""
+    def _inline(self, line: StraightLine, factors, right: list[int]) -> list[int]:
+        """The outputs of a line of factors (order zero) and a right-hand side (order k), as recursion nodes."""
         places: list[tuple[bool, int]] = []  # whether of the zeroth order, and which node
 
         def recursion_node(place):
             return self.value(place[1]) if place[0] else place[1]
 
-        for (op, operands, attribute), kind in zip(program.nodes, program.kinds, strict=True):
+        for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):
             of = [places[i] for i in operands]
             if op == "input":
                 i = attribute - len(factors)
@@ -287,7 +275,7 @@ class _Recurrences:
                 places.append((False, self.order_recursion.apply("mul", recursion_node(of[0]), self.value(inverse))))
             else:
                 places.append((False, self.order_recursion.apply(op, *map(recursion_node, of), attribute=attribute)))
-        return [recursion_node(places[i]) for i in program.outputs]
+        return [recursion_node(places[i]) for i in line.outputs]
 
     # ---- the end: only what the outputs need ----
 
@@ -315,8 +303,8 @@ class _Recurrences:
         return Series(
             self.size,
             self.moving,
-            StraightLine(*eliminate_dead_code(*sink_negations(self.zeroth_order, self.outputs + values))),
-            StraightLine(*eliminate_dead_code(*sink_negations(self.order_recursion, rates + kept))),
+            eliminate_dead_code(*sink_negations(self.zeroth_order, self.outputs + values)),
+            eliminate_dead_code(*sink_negations(self.order_recursion, rates + kept)),
             len(values),
             tuple((place[a], place[b]) for _, a, b in products),
             len(kept),

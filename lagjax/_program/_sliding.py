@@ -25,7 +25,7 @@ from scipy.sparse.csgraph import connected_components
 
 from lagjax._program._differentiation import copy_nodes, gradient_in
 from lagjax._program._graph import Graph
-from lagjax._program._passes import live
+from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._series import LinearSystem, StraightLine
 
 # Borders that act on each other, whose elimination takes a third of the cube; and borders in all, of which each solves
@@ -187,7 +187,7 @@ class _SlidingForces:
         held.put_back(self.n, range(len(levels)), levels, lambda left: equations.solve(self.graph, left), pushed)
         retraction, moved = held.finish()
         of_slides = tuple(frozenset().union(*some) for some in self._group_rows(moved))
-        release = StraightLine(*live(self.graph.nodes, self.graph.kinds, release))
+        release = eliminate_dead_code(self.graph, release)
         return Sliding(line, range(len(self.line.nodes)), shares, linear, retraction, of_slides, release)
 
     def _group_rows(self, of_rows: Sequence) -> list[list]:
@@ -213,7 +213,7 @@ class _SlidingForces:
 
     def _solve(self, right: Sequence[int]) -> list[int]:
         """z of A z = r."""
-        line = self.linear.solve().line
+        line = self.linear.solve()
         nodes = copy_nodes(self.graph, line, [*self.linear.factors, *right])
         return [nodes[i] for i in line.outputs]
 
@@ -418,7 +418,7 @@ class _SlidingForces:
             at |= {x: graph.constant(value, "float") for x, value in known.items() if value is not None}
             right, ends = inputs[len(factors) : len(factors) + count], inputs[len(factors) + count :]
             left = list(ends)
-            inner = system.solve().line
+            inner = system.solve()
 
             def apply_inverse(right):
                 nodes = copy_nodes(graph, inner, [*inputs[: len(system.factors)], *right])
@@ -515,7 +515,7 @@ class _Held:
     def _evaluate(self, nodes: Sequence[int]) -> list[int]:
         """Nodes of the program at the state."""
         graph = self.graph
-        line = StraightLine(*live(graph.nodes, graph.kinds, nodes))
+        line = eliminate_dead_code(graph, nodes)
         given = {node[2]: i for i, node in enumerate(graph.nodes) if node[0] == "input"} | self.state
         places = copy_nodes(graph, line, [given.get(i, self.zero) for i in range(1 + max(given))])
         return [places[i] for i in line.outputs]
@@ -523,7 +523,7 @@ class _Held:
     def finish(self) -> tuple[StraightLine, tuple[frozenset[int], ...]]:
         """The line from the inputs of the program to the state, and which coordinates each border moves."""
         graph = self.graph
-        line = StraightLine(*live(graph.nodes, graph.kinds, [self.state[i] for i in range(2 * self.n)]))
+        line = eliminate_dead_code(graph, [self.state[i] for i in range(2 * self.n)])
         return line, tuple(frozenset(_constants(graph, response)) for response in self.responses)
 
 

@@ -17,8 +17,8 @@ from lagjax._equations import _derivation
 from lagjax._equations import _many_states as many_states
 from lagjax._equations._derivation import Derivation, columns_of, derivation_of, numbers_of
 from lagjax._interface._layout import Layout
-from lagjax._program import OPERATIONS, Unlowerable, evaluate, lower, pullback
-from lagjax._program._evaluate import CHUNK
+from lagjax._program import OPERATIONS, Unlowerable, lower, pullback
+from lagjax._program._line import CHUNK
 from lagjax._trust.checks import _scene_at_start as of_check
 from lagjax._trust.health import _measurements as of_health
 
@@ -60,7 +60,7 @@ def test_every_operation_for_many_states_at_once_and_its_transpose():
     np.testing.assert_allclose(pulled, exact, rtol=1e-12, atol=1e-13)
     # As a straight line of its own.
     transposed = pullback(program.line, program.dtypes, [0, 1], range(len(weights)))
-    np.testing.assert_allclose(evaluate(transposed, [*x, *weights]), exact, rtol=1e-12, atol=1e-13)
+    np.testing.assert_allclose(transposed.evaluate([*x, *weights]), exact, rtol=1e-12, atol=1e-13)
     # Of many outputs at one state: cotangents side by side.
     rows = program.vjp_many(x[:, 3], np.eye(len(weights)))
     np.testing.assert_allclose(np.stack(rows) @ weights, [column[3] for column in pulled], rtol=1e-12, atol=1e-13)

@@ -1,6 +1,8 @@
 """Large scenes of one member alone: alike operations of one program in the lanes of vectors."""
 
+import gc
 import itertools
+import weakref
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +10,7 @@ import numpy as np
 import pytest
 
 from lagjax import _native
-from lagjax._native import _kernel, _packs, _schedule, _taylor
+from lagjax._native import _kernel, _packed, _packs, _schedule, _taylor
 from lagjax._native._packs import ANYWHERE, ONE, SIDE_BY_SIDE
 from lagjax._program import OPERATIONS, lower
 
@@ -59,7 +61,7 @@ def results(kind, operands):
 def computed(line, numbers, few_modes):
     """The outputs of a program by its runs, vector by vector, in a memory that is used again; and the runs."""
     kinds, operations = _schedule.join_operations(line)
-    program = _packs.stages(operations, len(line.nodes), line.outputs)
+    kinds, program = kinds.all, _packs.stages(operations, len(line.nodes), line.outputs)
     memory, places, after = np.full(100_000, np.nan), np.full(len(line.nodes), -1), itertools.count(10)
     for node, (op, _, attribute) in enumerate(line.nodes):
         if op in ("input", "constant"):
@@ -146,12 +148,21 @@ def test_members_of_a_large_scene_are_integrated_one_after_the_other(monkeypatch
 def test_the_choice_is_made_once_and_nothing_stays_of_the_compilation(monkeypatch):
     monkeypatch.setattr(_taylor, "LARGEST_LINE", -1)
     monkeypatch.setattr(_kernel, "LARGEST_SHARED", 0)
+    made = []
+
+    def note_stages(*arguments):
+        found = _packs.stages(*arguments)
+        made.extend(weakref.ref(stage.operands) for stage in found)
+        return found
+
+    monkeypatch.setattr(_packed, "stages", note_stages)
     kernel = _native.Kernel(cluster(9), 18)
     alone = kernel.select_kernel(8)
     kernel.select_kernel(8)._forward  # noqa: B018
     monkeypatch.setattr(_kernel, "fills_lanes", None)
     assert kernel.select_kernel(3) is alone is kernel.select_width(1)
-    assert not _packs.program_stages.cache_info().currsize and not _schedule._join_same.cache_info().currsize
+    gc.collect()
+    assert made and all(of() is None for of in made)
 
 
 def test_a_scene_in_which_everything_waits_for_what_comes_before_keeps_members_in_lanes(monkeypatch):

@@ -228,7 +228,7 @@ def test_samples_are_no_inputs_of_a_program():
         return lagjax.samples(knots, params["u"], "cubic")(t) * params["gain"]
 
     program = lower(force, 0.0, {"u": jax.ShapeDtypeStruct((count,), float), "gain": 1.0})
-    assert program.operations < 100 and sum(op in LOOK_UPS for op, *_ in program.nodes) < 16
+    assert program.operations < 100 and sum(op in LOOK_UPS for op, *_ in program.line.nodes) < 16
     assert program.find_inputs([0]) == frozenset(range(count + 2))
     values, t = np.sin(knots), np.array([0.5, 20.1234])
     found = program.evaluate_many([t, 2.0, *values])[0]

@@ -14,9 +14,7 @@ from sweeps import sweep
 import lagjax
 from lagjax._equations._derivation import derivation_of
 from lagjax._interface._layout import Layout
-from lagjax._program import Unlowerable, lower
-from lagjax._program._evaluate import evaluate, vjp
-from lagjax._program._groups import groups_of
+from lagjax._program import Unlowerable, lower, pullback
 
 TOLERANCE = 4e-15
 
@@ -483,7 +481,7 @@ def test_identity():
     program, again = (lower(jnp.sin, 0.3) for _ in range(2))
     assert program != again and len({program, again, program}) == 2
     with pytest.raises(AttributeError):
-        program.nodes = ()
+        program.line = None
 
 
 # ---- refusals -------------------------------------------------------------------------------------------------------
@@ -633,7 +631,7 @@ def test_lanes_broadcast():
 @pytest.mark.parametrize("held", [2**21, 20_000])  # all states together; a few at a time
 def test_groups_have_the_values_and_derivatives_of_single_nodes(monkeypatch, held):
     # Pairs of bodies, of which some are beyond a border where the branch not taken has no derivative.
-    monkeypatch.setattr("lagjax._program._evaluate.MOST_HELD", held)
+    monkeypatch.setattr("lagjax._program._line.MOST_HELD", held)
     i, j = np.triu_indices(50, 1)
 
     def forces(x, k):
@@ -645,14 +643,17 @@ def test_groups_have_the_values_and_derivatives_of_single_nodes(monkeypatch, hel
 
     x = np.random.default_rng(0).normal(size=(50, 7))
     program = lower(forces, x[:, 0], jnp.asarray(2))
-    groups = groups_of(program.line)
-    assert groups is not None and 50 * len(groups.groups) < len(program.nodes)
+    assert 50 * len(program.line.groups.each) < len(program.line.nodes)
     columns = [*x, np.asarray(2)]
-    np.testing.assert_allclose(program.evaluate_many(columns), evaluate(program.line, columns), rtol=1e-13)
+    found = program.evaluate_many(columns)
+    with monkeypatch.context() as patch:
+        patch.setattr("lagjax._program._line.MOST_STATES", 0)
+        np.testing.assert_allclose(found, program.evaluate_many(columns), rtol=1e-13)
+    transposed = pullback(program.line, program.dtypes, range(50), range(44))
     one, many = [*x[:, 0], np.asarray(2)], [x[k] for k in range(44)]
     for at, cotangents in [(columns, [1.0, -2.0] * 22), (columns, [None, x[0], *[None] * 42]), (one, many)]:
-        found, expected = program.vjp_many(at, cotangents), vjp(program.line, at, cotangents)
-        assert [part is None for part in found] == [part is None for part in expected]
-        for part, other in zip(found, expected, strict=True):
-            if part is not None:
-                np.testing.assert_allclose(part, np.broadcast_to(other, 7), rtol=1e-11, atol=1e-12)
+        bars = [np.zeros(7) if x is None else np.broadcast_to(x, 7) for x in cotangents]
+        *found, of_integer = program.vjp_many(at, cotangents)
+        assert of_integer is None
+        for part, other in zip(found, transposed.evaluate([*at, *bars]), strict=True):
+            np.testing.assert_allclose(0.0 if part is None else part, other, rtol=1e-11, atol=1e-12)

@@ -17,10 +17,8 @@ from lagjax._interface._layout import Layout
 from lagjax._native import _motion_parts as _parts
 from lagjax._program import (
     OPERATIONS,
-    StraightLine,
     Unlowerable,
     emit,
-    evaluate,
     lower,
     lower_solution,
     pullback,
@@ -54,14 +52,14 @@ def coefficients(function, order, q, v, t, *params):
 def coefficients_of(program, found, order, numbers):
     """The series of q, from q, q̇, t and parameters: a run of the zeroth order, and one of the recursion per order."""
     n, (q, v) = found.size, np.split(np.array(numbers[: 2 * found.size]), 2)
-    out = evaluate(found.zeroth_order, numbers)[:, 0]
-    values = out[len(program.outputs) :]
+    out = found.zeroth_order.evaluate(numbers)[:, 0]
+    values = out[len(program.line.outputs) :]
     np.testing.assert_array_equal(out[:n], program.evaluate(*numbers)[:n])
     y, rows = np.zeros((2 * n, order + 1)), np.zeros((found.rows, order + 1))
     y[:, 0], y[:n, 1], y[n:, 1] = [*q, *v], v, out[:n]
     for k in range(1, order):
         sums = [sum(rows[a, j] * rows[b, k - j] for j in range(1, k)) for a, b in found.cauchy_products]
-        out = evaluate(found.order_recursion, [*y[:, k], float(k == 1), float(k), 1.0 / k, *values, *sums])[:, 0]
+        out = found.order_recursion.evaluate([*y[:, k], float(k == 1), float(k), 1.0 / k, *values, *sums])[:, 0]
         rows[:, k] = out[n:]
         y[:n, k + 1], y[n:, k + 1] = y[n:, k] / (k + 1), np.array(out[:n]) / (k + 1)
     return y[:n]
@@ -415,11 +413,11 @@ def test_the_state_may_be_of_first_order():
     # ẏ = f(t, y), with time first, as the inputs come: e^{t²/2} by y' = t y
     program = lower(lambda t, y, p: p * t * y, 0.0, 1.0, 1.0)
     found = series(program, 1, 2)
-    start = evaluate(found.zeroth_order, [0.0, 1.0, 1.0])[:, 0]
+    start = found.zeroth_order.evaluate([0.0, 1.0, 1.0])[:, 0]
     values, y, rows = start[1:], [1.0, start[0]], np.zeros((found.rows, 12))
     for k in range(1, 12):
         sums = [sum(rows[a, j] * rows[b, k - j] for j in range(1, k)) for a, b in found.cauchy_products]
-        out = evaluate(found.order_recursion, [float(k == 1), y[k], float(k), 1.0 / k, *values, *sums])[:, 0]
+        out = found.order_recursion.evaluate([float(k == 1), y[k], float(k), 1.0 / k, *values, *sums])[:, 0]
         rows[:, k] = out[1:]
         y.append(out[0] / (k + 1))
     expected = [0.5 ** (k // 2) / float(mpmath.factorial(k // 2)) if k % 2 == 0 else 0.0 for k in range(13)]
@@ -451,17 +449,17 @@ def test_pullback_is_the_transposed_derivative():
     function = lambda x, y, z: (jnp.exp(x), jnp.where(z > 0, x * x / y, 0.0), jnp.exp(x) * jnp.sin(y) + z)
     scalar = jax.ShapeDtypeStruct((), np.float64)
     program = lower(function, scalar, scalar, scalar)
-    line = StraightLine(program.nodes, program.kinds, program.outputs)
+    line = program.line
     inputs, bars, by, of = (0.7, -1.3, 0.4), (0.9, -0.2), [0, 1], [0, 1]
     exact = jax.vjp(lambda x, y: function(x, y, inputs[2])[:2], *inputs[:2])[1](bars)
     plain = pullback(line, [np.dtype(float)] * 3, by, of)
-    np.testing.assert_allclose(emit(*plain, (*inputs, *bars)), exact, rtol=1e-14)
+    np.testing.assert_allclose(emit(plain, (*inputs, *bars)), exact, rtol=1e-14)
     # With eˣ from outside it is not computed again.
     known = pullback(line, [np.dtype(float)] * 3, by, [0, 2], known=[0])
     assert "exp" not in {op for op, _, _ in known.nodes}
     value = function(*inputs)
     again = jax.vjp(lambda x, y: function(x, y, inputs[2])[::2], *inputs[:2])[1](bars)
-    np.testing.assert_allclose(emit(*known, (*inputs, *bars, value[0])), again, rtol=1e-14)
+    np.testing.assert_allclose(emit(known, (*inputs, *bars, value[0])), again, rtol=1e-14)
 
 
 def test_arithmetic_is_known_to_have_a_series_without_making_it():

@@ -273,7 +273,7 @@ def _make_flow(derivation: Derivation, path: str, guards: Guards | None) -> Flow
 
 def _require_increasing(program: Program, vector) -> None:
     """Raise `ValueError` where the knots of a look-up, among the parameters, do not increase."""
-    for op, _, attribute in program.nodes if program.looks_up else ():
+    for op, _, attribute in program.line.nodes if program.looks_up else ():
         if op == "locate" and attribute.table.numbers is None:
             knots = np.asarray(vector)[np.array(attribute.table.positions) - (program.size - len(vector))]
             wrong = np.flatnonzero(~(np.diff(knots) > 0))

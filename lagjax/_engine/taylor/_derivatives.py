@@ -18,7 +18,7 @@ from lagjax._engine.taylor._flow import Flow, Tolerances
 from lagjax._engine.taylor._kept_steps import KEPT, Steps, StepStore
 from lagjax._interface import SUCCESSFUL
 from lagjax._native import Projection
-from lagjax._program import Program, StraightLine, evaluate, pullback, pushforward
+from lagjax._program import Program, StraightLine, pullback, pushforward
 
 LARGEST_PORTION = 2**23  # numbers of the steps that are written down at once: 64 MiB
 _ROOM_AGAIN = 2  # times the steps that were taken: those that are undone and those of a first try are written, too
@@ -224,12 +224,12 @@ def _vjp_by_jacobian(
 def project_start_tangents(projection: Projection, t, y0, params, dy0, dparams) -> np.ndarray:
     """The tangents (N, m, 2n) of the projection of the starts."""
     inputs = _start_columns(t, y0, params, dy0, dparams)
-    return evaluate(_projection_pushforward(projection.state, y0.shape[1]), inputs).T.reshape(dy0.shape)
+    return _projection_pushforward(projection.state, y0.shape[1]).evaluate(inputs).T.reshape(dy0.shape)
 
 
 def _transpose_start_projection(projection: Projection, t, y0, params, y_ct) -> tuple[np.ndarray, np.ndarray]:
     """The transpose of `project_start_tangents`: cotangents (N, m, 2n) of starts, and (N, m, P) of parameters."""
-    back = evaluate(_projection_pullback(projection.state, y0.shape[1]), _start_columns(t, y0, params, y_ct)).T
+    back = _projection_pullback(projection.state, y0.shape[1]).evaluate(_start_columns(t, y0, params, y_ct)).T
     back = back.reshape(*y_ct.shape[:2], -1)
     return back[..., : y0.shape[1]], back[..., y0.shape[1] :]
 
@@ -255,7 +255,7 @@ def _transpose_projection(flow: Flow, projection: Projection, ts, path, params, 
     numbers = np.broadcast_to(params[:, None, None], (*place.shape[:-1], flow.numbers))
     parts = place, t[..., None], numbers, path_ct[:, :, 1:-1]
     columns = [x.reshape(place[..., 0].size, x.shape[-1]).T for x in parts]  # a scene may have no numbers
-    back = evaluate(_projection_pullback(projection.state, flow.states), list(np.concatenate(columns))).T
+    back = _projection_pullback(projection.state, flow.states).evaluate(list(np.concatenate(columns))).T
     back = back.reshape(*place.shape[:-1], -1)
     path_ct[:, :, 1:-1] = back[..., : flow.states]
     params_ct += back[..., flow.states :].sum(axis=2)
@@ -275,9 +275,8 @@ def _project_tangents(flow: Flow, projection: Projection, ts, path, params, path
     )
     parts = place, t, numbers, path_dot[:, :, 1:-1], moving
     columns = [x.reshape(place[..., 0].size, x.shape[-1]).T for x in parts]  # a scene may have no numbers
-    path_dot[:, :, 1:-1] = evaluate(
-        _projection_pushforward(projection.state, flow.states), list(np.concatenate(columns))
-    ).T.reshape(shape)
+    forward = _projection_pushforward(projection.state, flow.states)
+    path_dot[:, :, 1:-1] = forward.evaluate(list(np.concatenate(columns))).T.reshape(shape)
 
 
 @functools.lru_cache(maxsize=64)

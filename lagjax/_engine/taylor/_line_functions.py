@@ -18,7 +18,6 @@ operation: derivatives of a motion by its duration compiled for 14 s longer with
 
 import functools
 import math
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
@@ -31,17 +30,13 @@ from lagjax._native import LARGEST_LINE, LineCode, line_handler
 from lagjax._primitives import VaryingPrimitive, batch_in_front
 from lagjax._program import (
     Graph,
-    Groups,
     Program,
     StraightLine,
     Unlowerable,
     copy_nodes,
     emit,
-    evaluate,
-    groups_of,
     pullback,
     pushforward,
-    steps_of,
 )
 
 _TARGET = "lagjax_line"
@@ -74,7 +69,7 @@ def line_of(program: Program, count: int | None = None) -> "Line":
 
 @functools.lru_cache(maxsize=64)
 def _line_of(line: StraightLine, count: int | None, dtypes: tuple[np.dtype, ...]) -> "Line":
-    line = line._replace(outputs=line.outputs[:count])
+    line = line.replace(outputs=line.outputs[:count])
     if any(dtype.kind != "f" for dtype in dtypes):
         graph, ids = Graph(3 * len(line.nodes) + len(dtypes)), []
         for i, dtype in enumerate(dtypes):
@@ -106,16 +101,6 @@ class Line:
         except Unlowerable:
             return None
 
-    @functools.cached_property
-    def _steps(self) -> Callable:
-        """The calls of NumPy, one after the other, for a precision; they take longer to write down than to do."""
-        return functools.cache(functools.partial(steps_of, self.line))
-
-    @functools.cached_property
-    def _groups(self) -> Groups | None:
-        """Its alike operations side by side, if there are many."""
-        return groups_of(self.line)
-
     def evaluate(self, *parts: np.ndarray) -> np.ndarray:
         """The outputs (…, outputs) at inputs that are given in parts (…, some): by NumPy at first.
 
@@ -126,7 +111,7 @@ class Line:
         if self._calls * _NODES_PER_CALL >= len(self.line.nodes) and self.code is not None:
             found = self.code(rows)
         else:
-            found = evaluate(self.line, list(rows.T), self._steps, self._groups).T
+            found = self.line.evaluate(list(rows.T)).T
         return found.reshape(*parts[0].shape[:-1], self.outputs)
 
     @functools.cached_property
@@ -224,8 +209,7 @@ def _register(primitive, of, width) -> None:
         return mlir.lower_fun(call_code, multiple_results=False)(context, *arrays, line=line)
 
     def compile_operations(*arrays, line: Line):
-        nodes, kinds, results = of(line).line
-        return jnp.stack(emit(nodes, kinds, results, tuple(x[..., i] for x in arrays for i in range(x.shape[-1]))), -1)
+        return jnp.stack(emit(of(line).line, tuple(x[..., i] for x in arrays for i in range(x.shape[-1]))), axis=-1)
 
     def call_from_gpu(*arrays, line: Line):
         if len(of(line).line.nodes) <= LARGEST_COMPILED:

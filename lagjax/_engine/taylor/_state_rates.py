@@ -39,7 +39,7 @@ def _evaluate_pieces(borders, rows: Rows, pieces) -> tuple[tuple, tuple]:
     """The outputs of the program on these pieces, and the switching numbers."""
     line = borders.program.line
     count = len(line.outputs)
-    values = emit_rows(line._replace(outputs=(*line.outputs, *borders.switches)), rows._replace(pieces=pieces))
+    values = emit_rows(line.replace(outputs=(*line.outputs, *borders.switches)), rows._replace(pieces=pieces))
     return values[:count], values[count:]
 
 

@@ -137,7 +137,7 @@ class Surfaces(NamedTuple):
 
         def followed(y, numbers):
             def away(y):
-                more = () if pieces is None else emit(*pieces, (*y, *vector_of(numbers)))
+                more = () if pieces is None else emit(pieces, (*y, *vector_of(numbers)))
                 return jnp.stack([*values(y, numbers), *more])
 
             rate = rate_of(y, numbers)
@@ -156,7 +156,7 @@ def _rate_errors(complete: Program, count: int) -> Program:
 def _borders_of(values: Program, n: int) -> StraightLine | None:
     """The distances of guards from the borders at which they may jump; None of smooth ones, or without a program."""
     try:
-        found = borders(values, n, slides=False, watched=len(values.outputs))
+        found = borders(values, n, slides=False, watched=len(values.line.outputs))
     except Unlowerable:
         return None
     return None if found is None or not found.switches else distances(found)
@@ -194,7 +194,7 @@ def crossing_variation(surfaces: Surfaces) -> Callable:
 
     def follow(t, y, numbers):
         program, n = surfaces.followed(), y.shape[0] // 2
-        found = outputs(program, len(program.outputs), jnp.append(y, t), numbers)
+        found = outputs(program, len(program.line.outputs), jnp.append(y, t), numbers)
         return jnp.split(found, [len(found) // 2 - n, len(found) - 2 * n])
 
     def move_to_zero(k, taken, t, y, numbers):

@@ -80,7 +80,7 @@ def _build_tangent_program(program: Program, n: int, rows: int, numbers: int, ou
     shapes = ((rows, n), (rows, n), (), (rows, numbers))
     structs = tuple(jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes)
     budget = max(program.budget, len(line.nodes))
-    return Program(*line, len(line.nodes), lambda *xs: jax.tree.leaves(function(*xs)), structs, budget)
+    return Program(line, len(line.nodes), lambda *xs: jax.tree.leaves(function(*xs)), structs, budget)
 
 
 def _differentiate_rows(function: Callable, q, v, p):

@@ -32,7 +32,6 @@ from lagjax._fit.model._records import start_pair
 from lagjax._interface import ENDED_WELL, Layout, halves
 from lagjax._native import Projection
 from lagjax._primitives import sentence
-from lagjax._program import evaluate
 from lagjax._run import simulate
 from lagjax._run.hybrid import Hybrid, Scene, first_law
 from lagjax._scene import System
@@ -267,7 +266,7 @@ def _project_by_newton(
     for _ in range(_STEPS):
         if np.nanmax(np.abs(y - before), initial=0.0) <= _STILL * np.nanmax(np.abs(y), initial=0.0):
             break
-        before, y = y, evaluate(projection.state.line, [*y.T, t, *rows.T]).T
+        before, y = y, projection.state.line.evaluate([*y.T, t, *rows.T]).T
     still = np.abs(y - before).max(axis=1) <= _STILL * np.abs(y).max(axis=1)
     y = np.where(still[:, None], y, np.nan)
     along = np.zeros((count, states + len(directions), states)), np.zeros((states + len(directions), len(numbers)))

@@ -30,7 +30,6 @@ from lagjax._program._differentiation import Derivatives, copy_nodes
 from lagjax._program._graph import Graph, Unlowerable
 from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._scalars import Scalars
-from lagjax._program._series import StraightLine
 from lagjax._program.lowering._rules import Expansion, inputs_of, lowers
 
 # The rows of the largest matrix that is written out.
@@ -208,7 +207,7 @@ def _matrix_of(expansion: Expansion, matvec, constants) -> np.ndarray:
     ):
         for j, entry in tangents.items():
             row[j] = entry
-    line = StraightLine(*eliminate_dead_code(apart.graph, entries.ravel().tolist()))
+    line = eliminate_dead_code(apart.graph, entries.ravel().tolist())
     given = [i for x in constants for i in x.ravel().tolist()]
     nodes = copy_nodes(expansion.graph, line, given)
     return np.array([nodes[i] for i in line.outputs], dtype=np.int64).reshape(entries.shape)

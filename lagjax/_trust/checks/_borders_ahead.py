@@ -13,7 +13,7 @@ import numpy as np
 
 from lagjax._equations import Sample
 from lagjax._interface import join_names
-from lagjax._program import BELOW, Borders, StraightLine, Unlowerable, evaluate, live
+from lagjax._program import BELOW, Borders, Unlowerable, eliminate_dead_code
 from lagjax._trust.checks._findings import Finding
 from lagjax._trust.checks._jumps_nearby import OF_FORCE
 from lagjax._trust.checks._scene_at_start import CheckedScene
@@ -42,14 +42,14 @@ class _VariedInput(NamedTuple):
         borders, line = self.borders, self.borders.program.line
         first, count = borders.program.size - len(borders.switches), len(borders.switches)
         read = sorted(k - first for k in borders.read_by(node) if k >= first)
-        value = StraightLine(*live(line.nodes, line.kinds, [node]))
-        decide = StraightLine(*live(*borders.decide[:2], [borders.decide.outputs[j] for j in read]))
+        value = eliminate_dead_code(line, [node])
+        decide = eliminate_dead_code(borders.decide, [borders.decide.outputs[j] for j in read])
 
         def evaluate_node(x):
             columns, pieces = self._sample(x).columns, np.zeros((count, len(x)))
             if read:
-                pieces[read] = np.nan_to_num(evaluate(decide, [*columns, *np.zeros(2 * count)]))
-            return evaluate(value, [*columns, *pieces])[0]
+                pieces[read] = np.nan_to_num(decide.evaluate([*columns, *np.zeros(2 * count)]))
+            return value.evaluate([*columns, *pieces])[0]
 
         return evaluate_node
 

@@ -105,11 +105,11 @@ class Law(NamedTuple):
         program = self.derivation.program(*SADDLE)
 
         def finite_at(part: Sample):
-            bars = program.vjp_many(part.columns, [1.0] * len(program.outputs))
+            bars = program.vjp_many(part.columns, [1.0] * len(program.line.outputs))
             flags = [np.isfinite(np.broadcast_to(bar, len(part.q))) for bar in bars if bar is not None]
             return np.broadcast_to(np.all(flags, axis=0), len(part.q))
 
-        finite = sample.evaluate_in_parts(finite_at, max(1, _STORED // len(program.nodes)))
+        finite = sample.evaluate_in_parts(finite_at, max(1, _STORED // len(program.line.nodes)))
         if finite.all():
             return finite
         doubtful = [x if np.ndim(x) == 0 else x[~finite] for x in sample.columns]
