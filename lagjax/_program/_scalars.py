@@ -6,6 +6,7 @@ arrays, where JAX is to differentiate or batch it.
 """
 
 from collections.abc import Callable, Sequence
+from functools import partialmethod
 from typing import Any
 
 import jax
@@ -42,41 +43,18 @@ class Scalars:
     def __neg__(self):
         return self.map("neg", self)
 
-    def __add__(self, other):
-        return self.map("add", self, other)
+    def _forward(self, op: str, other) -> "Scalars":
+        return self.map(op, self, other)
 
-    def __radd__(self, other):
-        return self.map("add", other, self)
+    def _reflected(self, op: str, other) -> "Scalars":
+        return self.map(op, other, self)
 
-    def __sub__(self, other):
-        return self.map("sub", self, other)
-
-    def __rsub__(self, other):
-        return self.map("sub", other, self)
-
-    def __mul__(self, other):
-        return self.map("mul", self, other)
-
-    def __rmul__(self, other):
-        return self.map("mul", other, self)
-
-    def __truediv__(self, other):
-        return self.map("div", self, other)
-
-    def __rtruediv__(self, other):
-        return self.map("div", other, self)
-
-    def __le__(self, other):
-        return self.map("le", self, other)
-
-    def __gt__(self, other):
-        return self.map("gt", self, other)
-
-    def __eq__(self, other):  # type: ignore[override]
-        return self.map("eq", self, other)
-
-    def __or__(self, other):
-        return self.map("or", self, other)
+    __add__, __radd__ = partialmethod(_forward, "add"), partialmethod(_reflected, "add")
+    __sub__, __rsub__ = partialmethod(_forward, "sub"), partialmethod(_reflected, "sub")
+    __mul__, __rmul__ = partialmethod(_forward, "mul"), partialmethod(_reflected, "mul")
+    __truediv__, __rtruediv__ = partialmethod(_forward, "div"), partialmethod(_reflected, "div")
+    __le__, __gt__ = partialmethod(_forward, "le"), partialmethod(_forward, "gt")
+    __eq__, __or__ = partialmethod(_forward, "eq"), partialmethod(_forward, "or")  # type: ignore[assignment]
 
 
 def _scalars(*xs) -> Scalars | None:

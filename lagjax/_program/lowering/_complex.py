@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax._program._scalars import Scalars
-from lagjax._program.lowering._rules import COMPLEX, Expansion
+from lagjax._program.lowering._rules import COMPLEX, Expansion, lowers
 
 
 class Pair(NamedTuple):
@@ -260,7 +260,7 @@ def _ids_of(expansion: Expansion, value: "Pair | Scalars") -> np.ndarray:
     return value.ids if isinstance(value, Scalars) else expansion.pair(value.re.ids, value.im.ids)
 
 
-def _elementwise(name: str, function: Callable) -> Callable:
+def _elementwise(function: Callable) -> Callable:
     def rule(expansion, params, *arguments):
         return _ids_of(expansion, function(*(_pair_of(expansion, x) for x in arguments)))
 
@@ -275,24 +275,16 @@ def _partwise(name: str) -> Callable:
     return rule
 
 
-COMPLEX.update({name: _elementwise(name, function) for name, function in _FUNCTIONS.items()})
+COMPLEX.update({name: _elementwise(function) for name, function in _FUNCTIONS.items()})
 COMPLEX.update({name: _partwise(name) for name in _PARTWISE})
 
 
-def _lowers(name: str) -> Callable:
-    def register(rule):
-        COMPLEX[name] = rule
-        return rule
-
-    return register
-
-
-@_lowers("complex")
+@lowers("complex", table=COMPLEX)
 def _complex(expansion, params, re, im):
     return expansion.pair(*np.broadcast_arrays(re, im))
 
 
-@_lowers("convert_element_type")
+@lowers("convert_element_type", table=COMPLEX)
 def _convert_element_type(expansion, params, x):
     if np.issubdtype(params["new_dtype"], np.complexfloating):
         return (
@@ -303,12 +295,12 @@ def _convert_element_type(expansion, params, x):
     return expansion.lower_primitive("convert_element_type", params, [expansion.parts(x)[0]])
 
 
-@_lowers("integer_pow")
+@lowers("integer_pow", table=COMPLEX)
 def _integer_pow(expansion, params, x):
     return _ids_of(expansion, _whole_power(_pair_of(expansion, x), params["y"]))
 
 
-@_lowers("reduce_prod")
+@lowers("reduce_prod", table=COMPLEX)
 def _product(expansion, params, x):
     rows = np.moveaxis(x, params["axes"], range(len(params["axes"])))
     rows = rows.reshape(-1, *rows.shape[len(params["axes"]) :])
@@ -317,7 +309,7 @@ def _product(expansion, params, x):
     return _ids_of(expansion, functools.reduce(lambda a, b: a * b, (_pair_of(expansion, row) for row in rows)))
 
 
-@_lowers("dot_general")
+@lowers("dot_general", table=COMPLEX)
 def _dot_general(expansion, params, x, y):
     params = {**params, "preferred_element_type": None}
     a, b = expansion.parts(x), expansion.parts(y)
@@ -330,7 +322,7 @@ def _dot_general(expansion, params, x, y):
 # ---- Fourier transforms ---------------------------------------------------------------------------------------------
 
 
-@_lowers("fft")
+@lowers("fft", table=COMPLEX)
 def _fourier(expansion, params, x):
     """Sums Σ xⱼ e^(∓2πi jk/n) along the last axes, of which that of a real transform is the last one."""
     kind, lengths = params["fft_type"].name, params["fft_lengths"]
@@ -341,9 +333,8 @@ def _fourier(expansion, params, x):
     for axis in axes[:-1] if kind == "IRFFT" else axes:
         x = _map_rows(expansion, x, axis, lambda rows: _transform_rows(rows, turn))
     if kind == "IRFFT":
-        x = expansion.parts(
-            _map_rows(expansion, x, axes[-1], lambda rows: _transform_rows(_complete_spectrum(rows, lengths[-1]), turn))
-        )[0]
+        whole = lambda rows: _transform_rows(_complete_spectrum(rows, lengths[-1]), turn)  # noqa: E731
+        x = expansion.parts(_map_rows(expansion, x, axes[-1], whole))[0]
     if turn < 0:
         return x
     number = expansion.constants(1.0 / math.prod(lengths))
@@ -358,10 +349,9 @@ def _map_rows(expansion: Expansion, x: np.ndarray, axis: int, transform: Callabl
 
 def _complete_spectrum(rows: list[Pair], n: int) -> list[Pair]:
     """All n coefficients of a real function, from those of frequencies that are not negative."""
-    first = Pair(rows[0].re, 0.0 * rows[0].im)
-    half = [first, *rows[1:]]
-    if n % 2 == 0 and n > 1:
-        half[-1] = Pair(rows[-1].re, 0.0 * rows[-1].im)
+    half = list(rows)
+    for k in (0, n // 2) if n % 2 == 0 else (0,):  # these are real
+        half[k] = Pair(rows[k].re, 0.0 * rows[k].im)
     return half + [half[n - k].conjugate for k in range(len(half), n)]
 
 

@@ -21,11 +21,11 @@ The formulas are for `Scalars` as well as for arrays of JAX.
 """
 
 import functools
-import itertools
 import operator
 from typing import Any
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from lagjax._program import _scalars as xp
 from lagjax._program._graph import Unlowerable
@@ -66,7 +66,11 @@ def eigen_3(a) -> list[Pair]:
     xx, yy, zz, xy, xz, yz = (_divide_or_zero(x, scale) for x in entries)
     ratio = 0.5 * (xx * (yy * zz - yz * yz) - xy * (xy * zz - yz * xz) + xz * (xy * yz - yy * xz))
     is_low = xp.prefers(0.0, ratio)
-    root = _far_root(xp.where(is_low, -ratio, ratio))
+    size = xp.where(is_low, -ratio, ratio)
+    root = _START[0] + size * (_START[1] + _START[2] * size)
+    for _ in range(_STEPS):
+        square = root * root
+        root = (8.0 * root * square + size) / (12.0 * square - 3.0)
     far = xp.where(is_low, -2.0 * root, 2.0 * root)
     # The adjugate of what is left is the projection on the vector times its trace, 3 (far² − 1) > 0. The axis with the
     # largest component becomes the first one.
@@ -108,15 +112,6 @@ class _AxisExchange:
         """A vector with its components in their places."""
         x, y, z = vector
         return [self.pick(x, y, z), self.pick(y, x, y), self.pick(z, z, x)]
-
-
-def _far_root(ratio):
-    """The largest root of 4 x³ − 3 x = ρ for 0 ≤ ρ ≤ 1, cos(arccos(ρ) / 3)."""
-    x = _START[0] + ratio * (_START[1] + _START[2] * ratio)
-    for _ in range(_STEPS):
-        square = x * x
-        x = (8.0 * x * square + ratio) / (12.0 * square - 3.0)
-    return x
 
 
 def _divide_or_zero(x, by):
@@ -161,7 +156,9 @@ def _eigh(expansion: Expansion, params, a: np.ndarray) -> list[np.ndarray]:
 def _order_eigenpairs(expansion: Expansion, a: np.ndarray) -> list[tuple[int, list[int]]]:
     """The eigenpairs of a matrix of ids, block by block, in order."""
     n, zero = len(a), expansion.graph.constant(0.0, "float")
-    values, vectors, blocks = [], [], _blocks(expansion, a)
+    filled = np.reshape([expansion.graph.value(i) != 0 for i in a.ravel().tolist()], a.shape)
+    count, labels = connected_components(np.tril(filled), directed=False)  # its zeros keep these parts apart
+    values, vectors, blocks = [], [], [np.flatnonzero(labels == k) for k in range(count)]
     for block in blocks:
         for value, parts in eigen(Scalars(expansion, a[np.ix_(block, block)])):
             vector = np.full(n, zero)
@@ -176,15 +173,6 @@ def _order_eigenpairs(expansion: Expansion, a: np.ndarray) -> list[tuple[int, li
             pair = vectors[k], vectors[k + 1]
             vectors[k], vectors[k + 1] = (expansion.map("select", wrong, *of) for of in (pair, pair[::-1]))
     return [(int(value), vector.tolist()) for value, vector in zip(values, vectors, strict=True)]
-
-
-def _blocks(expansion: Expansion, a: np.ndarray) -> list[list[int]]:
-    """The rows of the parts of a symmetric matrix that its zeros keep apart."""
-    blocks: list[list[int]] = []
-    for i in range(len(a)):
-        joined = [block for block in blocks if any(expansion.graph.value(int(a[i, j])) != 0 for j in block)]
-        blocks = [block for block in blocks if block not in joined] + [[*itertools.chain(*joined), i]]
-    return [sorted(block) for block in blocks]
 
 
 def _fix_sign(expansion: Expansion, vector: list) -> np.ndarray:

@@ -20,10 +20,11 @@ as for arrays of JAX.
 import functools
 import itertools
 import operator
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from lagjax._program import _scalars as xp
 from lagjax._program._differentiation import Derivatives, copy_nodes
@@ -123,22 +124,12 @@ def determinant(a):
         longer: dict[tuple[int, ...], Any] = {}
         for columns in itertools.combinations(range(n), k + 1):
             terms = [a[k, j] * minors[(*columns[:i], *columns[i + 1 :])] for i, j in enumerate(columns)]
-            longer[columns] = _alternate_signs(terms)
+            total = terms[-1]
+            for i, term in enumerate(reversed(terms[:-1])):
+                total = total + term if i % 2 else total - term
+            longer[columns] = total
         minors = longer
     return minors[tuple(range(n))]
-
-
-def _alternate_signs(terms: list):
-    """The last term, less the one before it, plus the one before that, and so on."""
-    total = terms[-1]
-    for i, term in enumerate(reversed(terms[:-1])):
-        total = total + term if i % 2 else total - term
-    return total
-
-
-def log_determinant(a):
-    """log |det A| for A (n, n)."""
-    return 0.5 * (_sum(xp.logarithm(orthogonalize(a).squares)) - _sum(xp.logarithm(row_weights(a))))
 
 
 def cholesky(a):
@@ -213,25 +204,16 @@ def _matrix_of(expansion: Expansion, matvec, constants) -> np.ndarray:
     return np.array([nodes[i] for i in line.outputs], dtype=np.int64).reshape(entries.shape)
 
 
-def _blocks(expansion: Expansion, matrix: np.ndarray) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+def _blocks(expansion: Expansion, matrix: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
     """The rows and columns of the parts of a matrix that its zeros keep apart; the whole where one is not square."""
-    values = [expansion.graph.value(i) for i in matrix.ravel().tolist()]
-    filled = np.array([value != 0 for value in values]).reshape(matrix.shape)
-    blocks, left = [], np.ones(len(filled), bool)
-    while left.any():
-        rows = np.zeros(len(filled), bool)
-        rows[np.argmax(left)] = True
-        while True:
-            columns = filled[rows].any(axis=0)
-            more = rows | filled[:, columns].any(axis=1)
-            if (more == rows).all():
-                break
-            rows = more
-        left &= ~rows
-        blocks.append((np.flatnonzero(rows), np.flatnonzero(columns)))
-    if any(len(rows) != len(columns) for rows, columns in blocks):  # singular, whatever the numbers
-        blocks = [(np.arange(len(filled)), np.arange(len(filled)))]
-    yield from blocks
+    n, values = len(matrix), [expansion.graph.value(i) for i in matrix.ravel().tolist()]
+    links = np.zeros((2 * n, 2 * n), bool)  # of rows with columns
+    links[:n, n:] = np.reshape([value != 0 for value in values], matrix.shape)
+    _, labels = connected_components(links, directed=False)
+    parts = [labels == k for k in dict.fromkeys(labels[:n].tolist())]
+    if any(part[:n].sum() != part[n:].sum() for part in parts):  # singular, whatever the numbers
+        parts = [np.ones(2 * n, bool)]
+    return [(np.flatnonzero(part[:n]), np.flatnonzero(part[n:])) for part in parts]
 
 
 def _require_small(what: str, size: int) -> None:
@@ -279,6 +261,7 @@ def _determinant(expansion, params, a):
 def _log_determinant(expansion, params, a):
     def sign_and_logarithm(a):
         value = determinant(a)
-        return [value.map("sign", value), log_determinant(a)]
+        squares, weights = orthogonalize(a).squares, row_weights(a)
+        return [value.map("sign", value), 0.5 * (_sum(xp.logarithm(squares)) - _sum(xp.logarithm(weights)))]
 
     return _map_matrices("a determinant", sign_and_logarithm, expansion, a)

@@ -52,11 +52,8 @@ class Expansion:
             return self.constants(atom.val) if isinstance(atom, core.Literal) else scope[atom]
 
         for equation in live_equations(jaxpr):
-            scope |= zip(
-                equation.outvars,
-                self._equation(equation, [read(atom) for atom in find_variables(equation)]),
-                strict=True,
-            )
+            results = self._equation(equation, [read(atom) for atom in find_variables(equation)])
+            scope |= zip(equation.outvars, results, strict=True)
         return [read(atom) for atom in jaxpr.outvars]
 
     def run_closed(self, jaxpr, arguments) -> list[np.ndarray]:
@@ -137,16 +134,13 @@ class Expansion:
             self.work(variable.aval.size)
         if name == "mul" and equation.invars[0] is equation.invars[1]:
             name, arguments = "square", arguments[:1]
-        if (
-            name not in MOVES
-            and name not in _WITH_BODIES
-            and any(is_complex(atom.aval.dtype) for atom in [*equation.invars, *equation.outvars])
-        ):
-            if name not in COMPLEX:
-                raise Unlowerable(f"the primitive `{name}` of complex numbers has no scalar form here")
+        atoms = () if name in MOVES or name in _WITH_BODIES else (*equation.invars, *equation.outvars)
+        if not any(is_complex(atom.aval.dtype) for atom in atoms):
+            result = self.lower_primitive(name, equation.params, arguments)
+        elif name in COMPLEX:
             result = COMPLEX[name](self, equation.params, *arguments)
         else:
-            result = self.lower_primitive(name, equation.params, arguments)
+            raise Unlowerable(f"the primitive `{name}` of complex numbers has no scalar form here")
         return list(result) if equation.primitive.multiple_results else [result]
 
     def lower_primitive(self, name: str, params, arguments):
@@ -239,23 +233,19 @@ def formula_of(equation) -> str | None:
     return next((name for name in ("det", "slogdet") if text in _determinant(name, shape, dtype)), None)
 
 
-def is_formula(equation) -> bool:
-    """True for a call of such a function, and for one that does nothing but call it."""
-    body = equation.params.get("call_jaxpr")
-    inner = body.eqns if equation.primitive.name == "custom_jvp_call" else ()
-    return formula_of(equation) is not None or (len(inner) == 1 and formula_of(inner[0]) is not None)
-
-
 _OWN_RULES = frozenset(("stop_gradient", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"))
 
 
 def has_own_rules(jaxpr) -> bool:
     """True if a jaxpr, or one that it calls, asks for other derivatives than those of its operations."""
-    return any(
-        not is_formula(equation)
-        and (equation.primitive.name in _OWN_RULES or any(has_own_rules(inner) for inner in _inner_jaxprs(equation)))
-        for equation in live_equations(jaxpr)
-    )
+    for equation in live_equations(jaxpr):
+        name = equation.primitive.name
+        inner = equation.params["call_jaxpr"].eqns if name == "custom_jvp_call" else ()
+        if formula_of(equation) or (len(inner) == 1 and formula_of(inner[0])):  # nothing but a call of a formula
+            continue
+        if name in _OWN_RULES or any(map(has_own_rules, _inner_jaxprs(equation))):
+            return True
+    return False
 
 
 def _inner_jaxprs(equation) -> list:
@@ -347,29 +337,21 @@ _WITH_BODIES = frozenset((*_CALLS, "scan", "while", "cond"))
 _PASSING_ON = frozenset(("gather", "dynamic_slice", "lagjax_locate", "convert_element_type", *_WITH_BODIES))
 
 
-def lowers(*names):
+def lowers(*names, table: dict = LOWER):
     """The decorator of the function that lowers these primitives."""
 
     def register(rule):
-        LOWER.update(dict.fromkeys(names, rule))
+        table.update(dict.fromkeys(names, rule))
         return rule
 
     return register
 
 
-@lowers("add_any")
-def _add_any(expansion, params, x, y):
-    return expansion.map("add", x, y)
+def _rename(op: str) -> Callable:
+    return lambda expansion, params, *xs: expansion.map(op, *xs)
 
 
-@lowers("lt_to")
-def _is_less_in_total_order(expansion, params, x, y):
-    return expansion.map("lt", x, y)
-
-
-@lowers("le_to")
-def _is_not_more_in_total_order(expansion, params, x, y):
-    return expansion.map("le", x, y)
+LOWER.update({"add_any": _rename("add"), "lt_to": _rename("lt"), "le_to": _rename("le")})
 
 
 @lowers("square")
@@ -418,14 +400,9 @@ def _integer_pow(expansion, params, x):
     exponent, graph, moduli = params["y"], expansion.graph, expansion.moduli
     expansion.work(x.size)
     expansion.traced_operations += x.size
-    half = exponent // 2
-    return _ids(
-        [
-            graph.power(moduli[i], half) if exponent == 2 * half and i in moduli else graph.power(i, exponent)
-            for i in x.ravel().tolist()
-        ],
-        x.shape,
-    )
+    base, half = (moduli, exponent // 2) if exponent % 2 == 0 else ({}, exponent)
+    powers = (graph.power(base[i], half) if i in base else graph.power(i, exponent) for i in x.ravel().tolist())
+    return _ids([*powers], x.shape)
 
 
 @lowers("pow")
@@ -519,14 +496,6 @@ def _dot_general(expansion, params, x, y):
     return expansion.fold("add", expansion.map("mul", left, right))
 
 
-REDUCTIONS = {
-    "reduce_sum": ("add", 0.0), "reduce_prod": ("mul", 1.0), "reduce_max": ("max", -np.inf),
-    "reduce_min": ("min", np.inf), "reduce_and": ("and", True), "reduce_or": ("or", False),
-    "reduce_xor": ("xor", False),
-}  # fmt: skip
-CUMULATIONS = {"cumsum": "add", "cumprod": "mul", "cummax": "max", "cummin": "min"}
-
-
 def _reduction(op, empty):
     def rule(expansion, params, x):
         rows = np.moveaxis(x, params["axes"], range(len(params["axes"])))
@@ -548,10 +517,6 @@ def _cumulation(op):
     return rule
 
 
-LOWER.update({name: _reduction(*meaning) for name, meaning in REDUCTIONS.items()})
-LOWER.update({name: _cumulation(op) for name, op in CUMULATIONS.items()})
-
-
 def _first_extreme(better):
     """The index of the largest or smallest element along an axis, the first of equal ones."""
 
@@ -569,7 +534,13 @@ def _first_extreme(better):
     return rule
 
 
-LOWER.update({"argmax": _first_extreme("gt"), "argmin": _first_extreme("lt")})
+LOWER.update({
+    "reduce_sum": _reduction("add", 0.0), "reduce_prod": _reduction("mul", 1.0), "reduce_or": _reduction("or", False),
+    "reduce_max": _reduction("max", -np.inf), "reduce_min": _reduction("min", np.inf),
+    "reduce_and": _reduction("and", True), "reduce_xor": _reduction("xor", False),
+    "cumsum": _cumulation("add"), "cumprod": _cumulation("mul"), "cummax": _cumulation("max"),
+    "cummin": _cumulation("min"), "argmax": _first_extreme("gt"), "argmin": _first_extreme("lt"),
+})  # fmt: skip
 
 
 @lowers("sort")
@@ -599,17 +570,20 @@ def _dynamic_slice(expansion, params, x, *starts):
     sizes, starts = params["slice_sizes"], expansion.real(np.array(starts[: x.ndim]))
     if not are_numbers(expansion, starts):
         return look_up_windows(expansion, x, starts, range(x.ndim), sizes, None)
+    return x[_window(expansion, starts, x.shape, sizes)]
+
+
+def _window(expansion, starts, shape, sizes) -> tuple[slice, ...]:
+    """The place of a window of these sizes, which fits into an array."""
     starts = expansion.require_numbers(starts, "the start of a slice")
-    starts = [min(max(start, 0), n - size) for start, n, size in zip(starts, x.shape, sizes, strict=True)]
-    return x[tuple(slice(start, start + size) for start, size in zip(starts, sizes, strict=True))]
+    starts = np.clip(starts, 0, np.array(shape, np.int64) - np.array(sizes, np.int64)).tolist()
+    return tuple(slice(start, start + size) for start, size in zip(starts, sizes, strict=True))
 
 
 @lowers("dynamic_update_slice")
 def _dynamic_update_slice(expansion, params, x, update, *starts):
-    starts = expansion.require_numbers(np.array(starts), "the start of a slice")
-    starts = [min(max(start, 0), n - size) for start, n, size in zip(starts, x.shape, update.shape, strict=True)]
     result = x.copy()
-    result[tuple(slice(start, start + size) for start, size in zip(starts, update.shape, strict=True))] = update
+    result[_window(expansion, np.array(starts), x.shape, update.shape)] = update
     return result
 
 
@@ -656,25 +630,23 @@ def _locate(expansion, params, knots, x):
 
 @lowers("gather")
 def _gather(expansion, params, x, indices):
-    d, indices = params["dimension_numbers"], expansion.real(indices)
+    d, indices, clips = params["dimension_numbers"], expansion.real(indices), _clips(params["mode"])
+    missing = np.nan if params["fill_value"] is None else float(params["fill_value"])
     if not are_numbers(expansion, indices) and not d.operand_batching_dims:
-        missing = np.nan if params["fill_value"] is None else params["fill_value"]
-        found = look_up_windows(
-            expansion, x, indices, d.start_index_map, params["slice_sizes"], None if _clips(params["mode"]) else missing
-        )
+        sizes = params["slice_sizes"]
+        found = look_up_windows(expansion, x, indices, d.start_index_map, sizes, None if clips else missing)
         found = np.squeeze(found, tuple(indices.ndim - 1 + axis for axis in d.collapsed_slice_dims))
         return np.moveaxis(found, range(indices.ndim - 1, found.ndim), d.offset_dims)
     indices = expansion.require_numbers(indices, "an index")
     places = _places(
         indices, x.shape, d.offset_dims, d.collapsed_slice_dims, d.start_index_map, d.operand_batching_dims,
-        d.start_indices_batching_dims, params["slice_sizes"], _clips(params["mode"]),
+        d.start_indices_batching_dims, params["slice_sizes"], clips,
     )  # fmt: skip
     if (places >= 0).all():
         return x.ravel()[places]
     if x.size and expansion.graph.kinds[x.flat[0]] != "float":
         raise Unlowerable("an index into an array that is not of floats is out of bounds")
-    missing = np.nan if params["fill_value"] is None else params["fill_value"]
-    return np.append(x.ravel(), expansion.constants(float(missing)))[places]
+    return np.append(x.ravel(), expansion.constants(missing))[places]
 
 
 def _scatter(op):
@@ -696,8 +668,7 @@ def _scatter(op):
     return rule
 
 
-SCATTERS = {"scatter": None, "scatter-add": "add", "scatter-sub": "sub", "scatter-mul": "mul"}
-LOWER.update({name: _scatter(op) for name, op in {**SCATTERS, "scatter-min": "min", "scatter-max": "max"}.items()})
+LOWER.update({f"scatter-{op}": _scatter(op) for op in ("add", "sub", "mul", "min", "max")}, scatter=_scatter(None))
 
 # ---- calls, loops and branches --------------------------------------------------------------------------------------
 
@@ -735,10 +706,8 @@ def _side_of_search(body, arguments) -> Literal["right", "left"] | None:
     if len(arguments) != 2 or arguments[0].ndim != 1 or not len(arguments[0]) or len(body.out_avals) != 1:
         return None
     shapes, count = [variable.aval for variable in body.jaxpr.invars], len(arguments[0])
-    if (
-        not all(jnp.issubdtype(shape.dtype, jnp.floating) for shape in shapes)
-        or body.out_avals[0].shape != shapes[1].shape
-    ):
+    floats = all(jnp.issubdtype(shape.dtype, jnp.floating) for shape in shapes)
+    if not floats or body.out_avals[0].shape != shapes[1].shape:
         return None
     sides: list[Literal["right", "left"]] = ["right", "left"]
     trial = Expansion(Graph(10_000))
@@ -752,7 +721,10 @@ def _side_of_search(body, arguments) -> Literal["right", "left"] | None:
 
 @lowers("scan")
 def _scan(expansion, params, *arguments):
-    consts, carry = _parts_of_scan(params)
+    if "num_carry" in params:
+        consts, carry = params["num_consts"], params["num_carry"]
+    else:  # since JAX 0.11
+        consts, carry, _ = map(len, params["ft_in"].unpack())
     constants, state, columns = arguments[:consts], arguments[consts : consts + carry], arguments[consts + carry :]
     order = range(params["length"])[:: -1 if params["reverse"] else 1]
     rows = {}
@@ -763,14 +735,6 @@ def _scan(expansion, params, *arguments):
     outputs = params["jaxpr"].out_avals[carry:]
     empty = [np.zeros((0, *aval.shape), dtype=np.int64) for aval in outputs]
     return [*state, *(map(np.stack, zip(*(rows[k] for k in sorted(rows)), strict=True)) if rows else empty)]
-
-
-def _parts_of_scan(params) -> tuple[int, int]:
-    """The numbers of a scan's constants, and of the arrays that it carries."""
-    if "num_carry" in params:
-        return params["num_consts"], params["num_carry"]
-    consts, carry, _ = params["ft_in"].unpack()  # since JAX 0.11
-    return len(consts), len(carry)
 
 
 @lowers("while")

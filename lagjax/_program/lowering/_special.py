@@ -85,21 +85,16 @@ def polygamma(order: int, x: Scalars) -> Any:
         value = value + factorial * _power(1.0 / (z + float(i)), n + 1)
     sign = (-1.0) ** (n + 1)
     cotangent = 1.0 / reflected.map("tan", math.pi * reflected)
-    more = math.pi ** (n + 1) * _polynomial(_derivative_of_cotangent(n), cotangent)
+    slope = np.polynomial.Polynomial([0.0, 1.0])  # dⁿ/dxⁿ cot x as a polynomial of c = cot x, by c' = −(1 + c²)
+    for _ in range(n):
+        slope = slope.deriv() * np.polynomial.Polynomial([-1.0, 0.0, -1.0])
+    more = math.pi ** (n + 1) * _polynomial(slope.coef.tolist(), cotangent)
     return xp.where(negative, -value - more, sign * value)
 
 
 def _power(x: Any, n: int) -> Any:
     """xⁿ, n ≥ 1."""
     return math.prod([x] * (n - 1), start=x)
-
-
-def _derivative_of_cotangent(n: int) -> list[float]:
-    """The coefficients of dⁿ/dxⁿ cot x, a polynomial of c = cot x, by c' = −(1 + c²)."""
-    found = np.polynomial.Polynomial([0.0, 1.0])
-    for _ in range(n):
-        found = found.deriv() * np.polynomial.Polynomial([-1.0, 0.0, -1.0])
-    return found.coef.tolist()
 
 
 def scaled_bessel(order: int, x: Scalars) -> Any:
@@ -169,35 +164,32 @@ def _fraction(x: Any, shift: float, numerator: Callable[[int], float], least: fl
     return cut(x, length)
 
 
-def _register(name: str, formula) -> None:
-    @lowers(name)
-    def rule(expansion, params, x: np.ndarray) -> np.ndarray:
-        return formula(Scalars(expansion, x)).ids
+for _name, _formula in {
+    "lgamma": log_gamma,
+    "digamma": lambda x: polygamma(0, x),
+    "bessel_i0e": lambda x: scaled_bessel(0, x),
+    "bessel_i1e": lambda x: scaled_bessel(1, x),
+}.items():
+    lowers(_name)(lambda expansion, params, x, formula=_formula: formula(Scalars(expansion, x)).ids)
 
 
-_register("lgamma", log_gamma)
-_register("digamma", lambda x: polygamma(0, x))
-_register("bessel_i0e", lambda x: scaled_bessel(0, x))
-_register("bessel_i1e", lambda x: scaled_bessel(1, x))
+def _order(expansion, order: np.ndarray, function: str, largest: int) -> int:
+    """The order of a function of several, which must be one known number."""
+    a = "an" if function[0] == "e" else "a"
+    orders = set(expansion.require_numbers(order, f"the order of {a} {function}").ravel().tolist())
+    if len(orders) != 1 or not 0 <= (n := orders.pop()) <= largest:
+        raise Unlowerable(f"{function}s of several orders, or of one beyond {largest}, are not written out")
+    return n
 
 
 @lowers("polygamma")
 def _polygamma(expansion, params, order: np.ndarray, x: np.ndarray) -> np.ndarray:
-    orders = set(expansion.require_numbers(order, "the order of a polygamma function").ravel().tolist())
-    if len(orders) != 1 or not 0 <= (n := orders.pop()) <= _MOST_DERIVATIVES:
-        raise Unlowerable(
-            f"polygamma functions of several orders, or of one beyond {_MOST_DERIVATIVES}, are not written out"
-        )
-    return polygamma(n, Scalars(expansion, x)).ids
+    return polygamma(_order(expansion, order, "polygamma function", _MOST_DERIVATIVES), Scalars(expansion, x)).ids
 
 
 @lowers("expn")
 def _exponential_integral(expansion, params, order: np.ndarray, x: np.ndarray) -> list[np.ndarray]:
-    orders = set(expansion.require_numbers(order, "the order of an exponential integral").ravel().tolist())
-    if len(orders) != 1 or not 0 <= (n := orders.pop()) <= _LARGEST_ORDER:
-        raise Unlowerable(
-            f"exponential integrals of several orders, or of one beyond {_LARGEST_ORDER}, are not written out"
-        )
+    n = _order(expansion, order, "exponential integral", _LARGEST_ORDER)
     return [exponential_integral(n, Scalars(expansion, x)).ids]
 
 
