@@ -133,7 +133,11 @@ def _insert_part(kind: OperationKind, place: int, part: OperationKind) -> Operat
 
 def _operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> list[ScheduledOperation]:
     """The operations that the outputs need, each after those that it reads."""
-    angles, operations, numbers = _angles(line, uses), [], {}
+    angles: dict[int, list[int]] = {}  # the nodes of the sine and the cosine of each; -1 where one is not needed
+    for i, (op, operands, _) in enumerate(line.nodes):
+        if uses[i] and op in ("sin", "cos"):
+            angles.setdefault(operands[0], [-1, -1])[op == "cos"] = i
+    operations, numbers = [], {}
     for i, (op, operands, attribute) in enumerate(line.nodes):
         if not uses[i] or op in ("input", "constant"):
             continue
@@ -149,15 +153,6 @@ def _operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> list[Sche
             numbers[key] = kinds.number(op, attribute, tuple(line.kinds[x] for x in operands), line.kinds[i])
         operations.append(ScheduledOperation(numbers[key], operands, results))
     return operations
-
-
-def _angles(line: StraightLine, uses: list[int]) -> dict[int, list[int]]:
-    """The nodes of the sine and the cosine of every angle; -1 where one is not needed."""
-    pairs: dict[int, list[int]] = {}
-    for i, (op, operands, _) in enumerate(line.nodes):
-        if uses[i] and op in ("sin", "cos"):
-            pairs.setdefault(operands[0], [-1, -1])[op == "cos"] = i
-    return pairs
 
 
 def _outputs(
@@ -248,12 +243,10 @@ class _Work:
         still = []
         for i in self._open:
             if (operation := self.by_node[i]) is not None:
-                found = False
-                for place, x in enumerate(operation.operands):
-                    if self._single[x]:
-                        pairs[operation.kind, place, self.by_node[x].kind] += 1  # type: ignore[union-attr]
-                        found = True
-                if found:
+                single = [(place, x) for place, x in enumerate(operation.operands) if self._single[x]]
+                for place, x in single:
+                    pairs[operation.kind, place, self.by_node[x].kind] += 1  # type: ignore[union-attr]
+                if single:
                     still.append(i)
         self._open = still
         chosen: dict[int, tuple[int, int]] = {}

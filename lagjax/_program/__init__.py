@@ -49,7 +49,7 @@ from lagjax._program import _scalars as scalar_algebra
 from lagjax._program._borders import BELOW, CLOCK, FLOOR, SIGN, TABLE, TRUNC, Borders, borders, distances, is_smooth
 from lagjax._program._differentiation import Derivatives, copy_nodes, pullback, pushforward, with_tangents
 from lagjax._program._emit import Rows, apply_in_jax, emit, emit_look_up, emit_rows, plain_elementary
-from lagjax._program._graph import MANY, Graph, Tape, Unlowerable
+from lagjax._program._graph import MANY, Graph, Tape, Unlowerable, find_ancestors
 from lagjax._program._line import StraightLine
 from lagjax._program._look_ups import table_of
 from lagjax._program._memory import machine_memory, operations_that_fit, pause_collections
@@ -144,7 +144,8 @@ def lower_solution(
         leaves = jax.tree.leaves(factors)
         z = solve(factors, right)
         counts.append((places, [x.ids.size for x in (z, entries, right)], [x.shape for x in leaves], factors))
-        return [z.ids[:size], _ids_of(expansion, number), z.ids[size:], *(x.ids for x in (entries, right, *leaves))]
+        number = number.ids if isinstance(number, Scalars) else expansion.constants(number)
+        return [z.ids[:size], number, z.ids[size:], *(x.ids for x in (entries, right, *leaves))]
 
     def solve_system(*arguments):
         _, _, right, factors, number = system(*arguments)
@@ -179,10 +180,6 @@ def lower_solution(
             solve=functools.cache(lambda: lower_scalars(solution, solution_in_jax, tuple(vectors), budget).line),
         ),
     )
-
-
-def _ids_of(expansion: Expansion, number) -> np.ndarray:
-    return number.ids if isinstance(number, Scalars) else expansion.constants(number)
 
 
 class Origin(NamedTuple):
@@ -254,22 +251,14 @@ class Program:
         """
         return emit_rows(self.line, Rows(first, numbers))
 
-    @property
+    @functools.cached_property
     def size(self) -> int:
         """The number of its inputs."""
-        return self._size
-
-    @functools.cached_property
-    def _size(self) -> int:
         return sum(math.prod(shape.shape) for shape in self.shapes)
 
-    @property
+    @functools.cached_property
     def dtypes(self) -> tuple[np.dtype, ...]:
         """The type of every scalar it takes."""
-        return self._dtypes
-
-    @functools.cached_property
-    def _dtypes(self) -> tuple[np.dtype, ...]:
         return tuple(dtype for shape in self.shapes for dtype in [shape.dtype] * math.prod(shape.shape))
 
     def evaluate(self, *numbers) -> np.ndarray:
@@ -298,11 +287,11 @@ class Program:
 
     def own_outputs(self, *scalars) -> Scalars | None:
         """The outputs in the graph that the program was cut out of, where the scalars are its inputs there."""
-        first = next((x for x in scalars if isinstance(x, Scalars)), None)
-        if self.origin is None or first is None or self.origin.graph is not first.expansion.graph:
+        first, origin = next((x for x in scalars if isinstance(x, Scalars)), None), self.origin
+        if origin is None or first is None or origin.graph is not first.expansion.graph:
             return None
-        same = [self.origin.graph.position(i) for i in stack(scalars).ids.tolist()] == list(range(self.size))
-        return Scalars(first.expansion, np.array(self.origin.outputs, dtype=np.int64)) if same else None
+        same = [origin.graph.position(i) for i in stack(scalars).ids.tolist()] == list(range(self.size))
+        return Scalars(first.expansion, np.array(origin.outputs, dtype=np.int64)) if same else None
 
     def append_inputs(self, count: int) -> "Program":
         """The program with `count` more floats after its inputs; it reads none of them."""
@@ -339,33 +328,14 @@ class Program:
 
     def find_inputs(self, outputs: Sequence[int]) -> frozenset[int]:
         """The positions of the inputs that any of some outputs depends on."""
-        seen, stack = set(), [self.line.outputs[k] for k in outputs]
-        while stack:
-            i = stack.pop()
-            if i not in seen:
-                seen.add(i)
-                stack.extend(self.line.nodes[i][1])
-        read = {self.line.nodes[i][2] for i in seen if self.line.nodes[i][0] == "input"}
-        tables = (table_of(self.line.nodes[i][2]).positions for i in seen if self.line.nodes[i][0] in LOOK_UPS)
-        return frozenset(read.union(*tables))
+        nodes = self.line.nodes
+        seen = [nodes[i] for i in find_ancestors(nodes, [self.line.outputs[k] for k in outputs])]
+        tables = (table_of(attribute).positions for op, _, attribute in seen if op in LOOK_UPS)
+        return frozenset({attribute for op, _, attribute in seen if op == "input"}.union(*tables))
 
     def depends(self, output: int) -> frozenset[int]:
         """The positions of the inputs that an output depends on."""
-        mask = self._dependencies[self.line.outputs[output]]
-        return frozenset(i for i in range(mask.bit_length()) if mask >> i & 1)
-
-    @functools.cached_property
-    def _dependencies(self) -> list[int]:
-        """The inputs that each node depends on, as a bit mask."""
-        masks: list[int] = []
-        for op, operands, attribute in self.line.nodes:
-            masks.append(functools.reduce(int.__or__, (masks[i] for i in operands), 0))
-            if op == "input":
-                masks[-1] = 1 << attribute
-            elif op in LOOK_UPS:
-                for position in table_of(attribute).positions:
-                    masks[-1] |= 1 << position
-        return masks
+        return self.find_inputs([output])
 
     # ---- derivatives: from the function, not from the emitted code ----
 
@@ -402,13 +372,9 @@ class Program:
     def _tangent_programs(self) -> Callable:
         @functools.cache
         def tangent_program(active):
-            count = len(active)
-            scalar = jax.ShapeDtypeStruct((), jnp.result_type(float))
-            return _lower_leaves(
-                lambda *xs: self._push(active, xs[: len(self.shapes)], xs[len(self.shapes) :]),
-                (*self.shapes, *[scalar] * count),
-                4 * self.budget,
-            )
+            scalar, leaves = jax.ShapeDtypeStruct((), jnp.result_type(float)), len(self.shapes)
+            push = lambda *xs: self._push(active, xs[:leaves], xs[leaves:])  # noqa: E731
+            return _lower_leaves(push, (*self.shapes, *[scalar] * len(active)), 4 * self.budget)
 
         return tangent_program
 
@@ -430,11 +396,10 @@ class Program:
 
     def _call_function(self, *scalars) -> list:
         """The outputs of the lowered function itself, at scalars: the program must agree with them."""
-        leaves, start = [], 0
+        parts, leaves = iter(scalars), []
         for shape in self.shapes:
-            parts = scalars[start : start + shape.size]
-            leaves.append(jnp.stack(parts).reshape(shape.shape) if parts else jnp.zeros(shape.shape, shape.dtype))
-            start += shape.size
+            some = [next(parts) for _ in range(shape.size)]
+            leaves.append(jnp.stack(some).reshape(shape.shape) if some else jnp.zeros(shape.shape, shape.dtype))
         return [x for leaf in self.function(*leaves) for x in jnp.ravel(leaf)]
 
 

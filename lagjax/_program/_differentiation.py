@@ -77,7 +77,7 @@ class Derivatives:
         """
         first: dict[int, int] = {}
         same = [first.setdefault(i, k) if together else k for k, i in enumerate(nodes)]
-        varied, once_more = (self._find_varying(tape, nodes, frozenset(inputs)) for inputs in (by, again))
+        varied, once_more = (self._find_varying(tape, nodes, inputs) for inputs in (by, again))
         cotangents, results = {same[output]: self._number(1.0)}, {}
         for k in range(output, -1, -1):
             if not varied[k] or (g := cotangents.pop(k, None)) is None:
@@ -107,11 +107,11 @@ class Derivatives:
                     self._add(cotangents, x, rule(g))
         return [cotangents.get(i, self._number(0.0)) for i in by]
 
-    def _find_varying(self, tape: Tape, nodes: list[int], by: frozenset[int]) -> list[bool]:
+    def _find_varying(self, tape: Tape, nodes: list[int], by: Sequence[int]) -> list[bool]:
         """True for every scalar of a tape that depends on the inputs `by` and has a derivative."""
-        varied: list[bool] = []
+        varied, inputs = [], frozenset(by)
         for k, (op, operands, attribute) in enumerate(tape.nodes):
-            depends = attribute in by if op == "input" else any(varied[x] for x in operands)
+            depends = attribute in inputs if op == "input" else any(varied[x] for x in operands)
             varied.append(depends and tape.kinds[k] == "float" and self.graph.value(nodes[k]) is None)
         return varied
 
@@ -174,7 +174,7 @@ class Derivatives:
                 return self._mask_quotient(result, w, operands[1])
             slope = rule(self._apply, self._number, self._number(1.0), w, *operands)
             if len(operands) == 1 and is_function(op):
-                result = self._zero_where(self.graph.is_flat_by(operands[0], slope), result)
+                result = self._zero_where(self.graph.vanishes(self.graph.apply("mul", slope, operands[0])), result)
             return self._mask_product(result, g, slope)
 
         return [bind_rule(rule) for rule in OPERATIONS[op].transpose()] if operands else []

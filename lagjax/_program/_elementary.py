@@ -48,12 +48,6 @@ TURNS_EXCESS = (-5.495794539456256e-07, -4.386488188738019e-14, -1.1005340588554
 ANGLE_LIMIT = 2.0**53
 
 
-def _is_fast(x) -> bool:
-    """True if x is a strongly typed float64, and the platform a CPU."""
-    weak = getattr(x, "weak_type", type(x) in (bool, int, float, complex))
-    return not weak and jnp.result_type(x) == jnp.float64 and default_platform() == "cpu"
-
-
 # ---- small tools ----------------------------------------------------------------------------------------------------
 
 
@@ -72,11 +66,6 @@ def _bits(x):
 
 def _float(bits):
     return lax.bitcast_convert_type(bits, jnp.float64)
-
-
-def _integer_bits(k):
-    """The integer-valued k in the low bits of an integer.  AVX2 cannot convert float64 to int64, but it can add."""
-    return _bits(k + 1.5 * 2.0**52)
 
 
 # ---- sine and cosine ------------------------------------------------------------------------------------------------
@@ -100,7 +89,8 @@ def _reduce(x):
     # Once more, for arguments next to a multiple of pi/2, where `r` is all cancellation.
     low = m * e[2] - k * p[2]
     high, r = r, r + low
-    return r, tail + ((high - r) + low) - k * p[3], _integer_bits(k)
+    # The low bits of a sum are those of k: AVX2 cannot convert float64 to int64, but it can add.
+    return r, tail + ((high - r) + low) - k * p[3], _bits(k + 1.5 * 2.0**52)
 
 
 def _sincos_kernel(x):
@@ -134,18 +124,10 @@ def _sincos_jvp(args, tangents):
 
 def sincos(x):
     """(sin x, cos x), for little more than the price of one."""
-    return _sincos(jnp.asarray(x)) if _is_fast(x) else (jnp.sin(x), jnp.cos(x))
-
-
-def sin(x):
-    """Sine; the module's head states its accuracy and range."""
-    return sincos(x)[0] if _is_fast(x) else jnp.sin(x)
-
-
-def cos(x):
-    """Cosine; the module's head states its accuracy and range."""
-    return sincos(x)[1] if _is_fast(x) else jnp.cos(x)
+    weak = getattr(x, "weak_type", type(x) in (bool, int, float, complex))
+    is_fast = not weak and jnp.result_type(x) == jnp.float64 and default_platform() == "cpu"
+    return _sincos(jnp.asarray(x)) if is_fast else (jnp.sin(x), jnp.cos(x))
 
 
 # Keyed by the name of the JAX primitive each one stands in for.
-FAST = {"sin": sin, "cos": cos}
+FAST = {"sin": lambda x: sincos(x)[0], "cos": lambda x: sincos(x)[1]}

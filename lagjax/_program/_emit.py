@@ -50,9 +50,12 @@ def _emit_outputs(line: StraightLine, scalars, shape: tuple[Any, ...], entries: 
     """The outputs, each broadcast to `shape`."""
     nodes, kinds = line.nodes, line.kinds
     fast = frozenset() if getattr(_state, "plain", False) else _elementary.FAST.keys()
-    precision = _precision(nodes, kinds, scalars)
+    positions = [node[2] for node, kind in zip(nodes, kinds, strict=True) if node[0] == "input" and kind == "float"]
+    precision = jnp.result_type(float, *(scalars[i] for i in positions))
     dtypes = [precision if kind == "float" else np.dtype(kind) for kind in kinds]
-    paired = _find_paired_angles(nodes) if fast else frozenset()
+    # The angles whose sine and cosine are both wanted.
+    sines, cosines = ({operands[0] for op, operands, _ in nodes if op == name} for name in ("sin", "cos"))
+    paired = sines & cosines if fast else frozenset()
     values: list = [None] * len(nodes)
     pairs: dict[int, tuple] = {}
 
@@ -117,18 +120,6 @@ def emit_look_up(op: str, attribute, entries: Callable, precision, x) -> jax.Arr
         return jnp.where(jnp.isnan(x), -1, found).astype(precision)
 
     return jnp.vectorize(piece, signature="(k),()->()")(values, x)
-
-
-def _precision(nodes, kinds, scalars):
-    """The float type that the float inputs promote to; the default one where there are none."""
-    positions = [node[2] for node, kind in zip(nodes, kinds, strict=True) if node[0] == "input" and kind == "float"]
-    return jnp.result_type(float, *(scalars[i] for i in positions))
-
-
-def _find_paired_angles(nodes) -> frozenset[int]:
-    """The angles whose sine and cosine are both wanted."""
-    sines, cosines = ({operands[0] for op, operands, _ in nodes if op == name} for name in ("sin", "cos"))
-    return frozenset(sines & cosines)
 
 
 def _binade(x):

@@ -20,7 +20,7 @@ whoever runs the program checks what comes out of it.
 import functools
 import itertools
 import math
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -132,7 +132,7 @@ class Graph:
     def is_huge(self, v: int) -> int:
         """True where v is so large that its coefficients may be infinite: the square of 1/v is zero; or no number."""
         first = len(self.nodes)
-        found = self._vanishes(self.apply("div", self.constant(1.0, "float"), v))
+        found = self.vanishes(self.apply("div", self.constant(1.0, "float"), v))
         return self._bound(first, found)
 
     def finite_part(self, v: int) -> int:
@@ -142,13 +142,9 @@ class Graph:
 
     def is_flat_quotient(self, w: int, v: int) -> int:
         """True where w = u/v is zero to every digit, as v is huge."""
-        return self.apply("and", self.is_huge(v), self._vanishes(w))
+        return self.apply("and", self.is_huge(v), self.vanishes(w))
 
-    def is_flat_by(self, u: int, slope: int) -> int:
-        """True where a function with this slope is flat to every digit, as u is so large."""
-        return self._vanishes(self.apply("mul", slope, u))
-
-    def _vanishes(self, x: int) -> int:
+    def vanishes(self, x: int) -> int:
         """True where the square of x is zero, or x is no number."""
         return self.apply("not", self.apply("prefers", self.apply("mul", x, x), self.constant(0.0, "float")))
 
@@ -419,7 +415,11 @@ class Graph:
     def _pythagoras(self, terms: dict[int, float]) -> None:
         """Replace `c*sin(x)**2*y + c*cos(x)**2*y` by `c*y`, in place."""
         for base in list(terms):
-            for sine, rest in self._squared_sines(base):
+            factors = self._factors.get(base, ())
+            for k, (sine, other) in enumerate(itertools.pairwise(factors)):
+                if sine != other or self.nodes[sine][0] != "sin":
+                    continue
+                rest = factors[:k] + factors[k + 2 :]
                 cosine = self.find("cos", *self.nodes[sine][1])
                 partner = None if cosine is None else self._products.get(tuple(sorted([*rest, cosine, cosine])))
                 if base in terms and partner in terms and terms[partner] == terms[base]:
@@ -427,13 +427,6 @@ class Graph:
                     del terms[partner]
                     left = functools.reduce(lambda x, y: self.apply("mul", x, y), rest, self.constant(1, "float"))
                     terms[left] = terms.get(left, 0.0) + coefficient
-
-    def _squared_sines(self, product: int) -> Iterator[tuple[int, tuple[int, ...]]]:
-        """Every sine that a product holds twice, with the other factors."""
-        factors = self._factors.get(product, ())
-        for k, (i, j) in enumerate(itertools.pairwise(factors)):
-            if i == j and self.nodes[i][0] == "sin":
-                yield i, factors[:k] + factors[k + 2 :]
 
 
 class Tape(Graph):

@@ -124,7 +124,9 @@ class _Recurrences:
         self._rows: dict[tuple[int | _Component, bool], int] = {}
         self._coefficients: dict[int, int | _Unknown | None] = {}  # None: constant along the motion
         # Of an elimination no coefficient is needed: it is most of a large program.
-        self._find(self._find_required(program.linear))
+        linear = program.linear
+        required = () if linear is None else (*linear.right, *linear.entries.values(), *linear.others.values())
+        self._find(list(required or self.outputs[:size]))
         self._find_added(len(program.line.nodes))
         self.solution = [] if program.linear is None else self._solution(program.linear)
         if program.linear is not None:  # what is followed may depend on it
@@ -138,12 +140,6 @@ class _Recurrences:
             for of, _ in new:
                 if not isinstance(of, _Component):
                     self.coefficient(of)
-
-    def _find_required(self, linear) -> list[int]:
-        """The nodes whose coefficients are required: of the linear system, or of the outputs themselves."""
-        if linear is None:
-            return self.outputs[: self.size]
-        return [*linear.right, *linear.entries.values(), *linear.others.values()]
 
     def _find_added(self, first: int) -> None:
         """The coefficients of the nodes from `first` on: the rules add derivatives at the end."""
@@ -286,7 +282,9 @@ class _Recurrences:
         rows = list(self._rows)
         needed: set[int] = set()
         while True:
-            wanted = self._find_reached([*rates, *followed, *(self._row_coefficient(*rows[r]) for r in needed)])
+            roots = [*rates, *followed, *(self._row_coefficient(*rows[r]) for r in needed)]
+            reached = set(self.order_recursion.find_ancestors(roots))
+            wanted = [key for key, node in self._given.items() if node in reached]
             read = {row for kind, *which in wanted if kind == "product" for row in which}
             if read == needed:
                 break
@@ -297,7 +295,9 @@ class _Recurrences:
         place = {row: k for k, row in enumerate(sorted(needed))}
         # The recursion does not read the values of the nodes that are followed.
         order = [("value", node) for node in values] + [None] * len(followed) + products
-        self._renumber({self._given[key]: self.moving + 2 + k for k, key in enumerate(order) if key is not None})
+        for k, key in enumerate(order):
+            if key is not None:
+                self.order_recursion.nodes[self._given[key]] = "input", (), self.moving + 2 + k
         kept = [self._row_coefficient(*rows[r]) for r in sorted(needed)] + followed
         values += self.followed
         return Series(
@@ -320,15 +320,6 @@ class _Recurrences:
     def _row_coefficient(self, node: "int | _Component", by_order: bool) -> int:
         c = self.solution[node.i] if isinstance(node, _Component) else self._output_coefficient(node)
         return self.order_recursion.apply("mul", self.k, c) if by_order else c
-
-    def _find_reached(self, roots: list[int]) -> list[tuple]:
-        """The keys of `_given` that these nodes of the recursion depend on, in the order of their first use."""
-        reached = set(self.order_recursion.find_ancestors(roots))
-        return [key for key, node in self._given.items() if node in reached]
-
-    def _renumber(self, positions: dict[int, int]) -> None:
-        for node, position in positions.items():
-            self.order_recursion.nodes[node] = ("input", (), position)
 
 
 class _Component(NamedTuple):
