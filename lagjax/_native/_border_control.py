@@ -51,7 +51,7 @@ from lagjax._native._frame import Fields, Frame, Lane
 from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._retraction import Retraction
 from lagjax._native._roots import Roots, Touch
-from lagjax._native._saltation import GuardTable, Saltation
+from lagjax._native._saltation import Crossed, GuardTable, Saltation
 from lagjax._native._step import absolute_tolerance
 from lagjax._native._taylor import TaylorSeries, integer
 from lagjax._program import _borders
@@ -105,7 +105,6 @@ class BorderControl:
             "touch": guards,  # the `Touch` of a guard where the step begins
             "stays": pieces,  # 1 for a piece that is not decided anew
             "at_knots": 1,  # the number of steps that ended at entries of tables
-            "crossed": 1,  # the guard that the step ends at, from 1 on, or behind these a clock; 0 without any
             "beyond": 1,  # the piece beyond it
             "at_rest": 1,  # 1 if the motion would be at the guard in no time
             "planned_h": 1,  # the step without borders
@@ -183,7 +182,7 @@ class BorderControl:
         code, (order,), h = frame.code, frame.arguments, frame["h"]
         degree = self.motion.followed_degree(code, order)
         frame["planned_h"], frame["nearest"] = h, 1.0
-        frame["crossed"] = frame["beyond"] = 0.0
+        frame["crossed"], frame["crossed_number"], frame["beyond"] = Crossed.NOTHING, 0.0, 0.0
         if self.pieces:
             clocks = sorted(enumerate(self.borders.clocks), key=lambda clock: clock[1] not in self.borders.kicking)
             for c, j in clocks:
@@ -246,7 +245,7 @@ class BorderControl:
         sooner = is_cone & (rate > 0.0) & (length > level) & (part < frame["nearest"])
         with frame.where(sooner):
             frame["nearest"] = part
-            frame["crossed"] = 0.0
+            frame["crossed"] = Crossed.NOTHING
 
     def _look_along(self, frame: Frame, g: Value, degree: Value, h: Value, undecided, beyond, idle, comes) -> None:
         """The first root of guard g, whose polynomial is in `poly`; `beyond` it is that piece.
@@ -281,11 +280,11 @@ class BorderControl:
         # Of two at one instant that of the piece on which the other one depends, which comes first, is crossed.
         apart = code.select(frame["crossed"] > 0.0, 1.0 - AT_ONCE, 1.0) if self.borders.nested else 1.0
         sooner = (root < frame["nearest"] * apart) & code.compare("!=", h, 0.0) & ~idle
-        number = code.select(is_root, code.lanes_of(code.as_double(g + 1)), 0.0)
         with frame.where(sooner):
             frame["nearest"] = root
             frame["at_rest"] = at_rest
-            frame["crossed"] = number
+            frame["crossed"] = code.select(is_root, Crossed.GUARD, Crossed.NOTHING)
+            frame["crossed_number"] = code.as_double(g)
             frame["beyond"] = code.select(undecided, leads, beyond)
 
     # ---- tables: borders at their entries ----
@@ -322,7 +321,7 @@ class BorderControl:
             sooner = sooner | (inside & at_end & code.compare("==", frame["crossed"], 0.0))
         with frame.where(sooner):
             frame["nearest"] = left / size
-            frame["crossed"] = float(len(self.guards) + 1 + c)
+            frame["crossed"], frame["crossed_number"] = Crossed.KNOT, float(c)
 
     def _note_coincidence(self, frame: Frame, h: Value) -> None:
         """Entries of several tables at one instant, one of which may be moved."""
@@ -336,7 +335,7 @@ class BorderControl:
             if j in self.table.movable:
                 moves = moves + code.flag(at_once)
         with frame.where((count > 1.0) & (moves > 0.0)):
-            frame["crossed"] = float(self.table.coincide)
+            frame["crossed"] = Crossed.KNOTS
 
     def _instant(self, frame: Frame) -> Value:
         """The largest difference of two times that count as the same."""
@@ -374,7 +373,7 @@ class BorderControl:
             with frame.where(frame["touch", g] >= Touch.SLIDING):
                 frame["slides"] = 1
 
-    def _go_on(self, frame: Frame, crossed: Value, going: Value) -> None:
+    def _go_on(self, frame: Frame, going: Value) -> None:
         """Past borders, and entries of tables.
 
         A motion that slides along another border, or touches it, does so no more where that jumps.
@@ -382,10 +381,10 @@ class BorderControl:
         shaken, line, code = self.borders.shaken, self.borders.switching, frame.code
         before = self.motion.evaluate_now(frame, line) if shaken else []
         before = [code.variable(before[k]) for k in range(len(shaken))]
-        self._go_beyond(frame, crossed)
+        self._go_beyond(frame)
         if self.borders.clocks:
             self._pass_knots(frame, going)
-        self._decide_others(frame, crossed)
+        self._decide_others(frame, going)
         after = self.motion.evaluate_now(frame, line) if shaken else []
         for k, j in enumerate(shaken):
             jump = code.intrinsic("fabs", after[k] - before[k].value)
@@ -398,9 +397,9 @@ class BorderControl:
                         if guard.slide >= 0:
                             frame["params", self.motion.parameters + guard.slide] = 0.0
         if shaken:
-            self._decide_others(frame, crossed)
+            self._decide_others(frame, going)
 
-    def _decide_others(self, frame: Frame, crossed: Value) -> None:
+    def _decide_others(self, frame: Frame, going: Value) -> None:
         """Decide the pieces anew that touch no border, where one is crossed on which others depend."""
         code = frame.code
         if not self.borders.nested:
@@ -412,7 +411,7 @@ class BorderControl:
         with code.loop(len(self.guards)) as g:
             with frame.where(frame["touch", g] > Touch.NONE):
                 frame["stays", self.table.place(code, g, "piece")] = 1
-        with frame.where(crossed > 0.0):
+        with frame.where(going):
             frame["undecided"] = 1
         frame.call(self.decide)
 
@@ -529,7 +528,7 @@ class BorderControl:
         sooner = matters & (root > 0.0) & (root < frame["nearest"]) & code.compare("!=", h, 0.0)
         with frame.where(sooner):
             frame["nearest"] = root
-            frame["crossed"] = 0.0
+            frame["crossed"] = Crossed.NOTHING
 
     def _leads(self, frame: Frame, degree: Value) -> Value:
         """The sign of the first coefficient behind c₀ that is not zero."""
@@ -588,12 +587,12 @@ class BorderControl:
         """A step that has become shorter than planned does not reach its border."""
         code = frame.code
         reached = code.compare("==", frame["h"], frame["cut"])
-        frame["crossed"] = code.select(reached, frame["crossed"], 0.0)
+        frame["crossed"] = code.select(reached, frame["crossed"], Crossed.NOTHING)
         frame["stepped"] = stepped = code.compare("!=", frame["h"], 0.0)
         if self.borders.kicking:  # steps that are recorded: those of no length, too, where a kick begins or ends them
             stepped = stepped | (self.table.kicks(frame) & ~self._begins_behind(frame))
             frame["counts"] = stepped | (frame["last"] > 0.0)
-        at_knot = (frame["stepped"] > 0.0) & (frame["crossed"] > float(len(self.guards)))
+        at_knot = (frame["stepped"] > 0.0) & (frame["crossed"] > Crossed.GUARD)
         frame["at_knots"] = frame["at_knots"] + code.flag(at_knot)
         for name in ("is_hit", "grazes", "stops"):
             with frame.where(stepped):
@@ -609,7 +608,7 @@ class BorderControl:
         frame, motion, n = self.motion.function("graze"), self.motion, self.motion.n
         code, order, by = frame.code, frame.job("order"), [*range(base), *range(n, n + base)]
         line = _borders.gradient(self.borders, by)
-        ends = self.table.crosses_guard(frame) & (frame["counts" if self.borders.kicking else "stepped"] > 0.0)
+        ends = self.table.crosses(frame, Crossed.GUARD) & (frame["counts" if self.borders.kicking else "stepped"] > 0.0)
         with code.only_if(code.any_lane(ends)):
             self.table.note_hit(frame, ends)
             state = motion.move_state(frame, motion.increments(frame, order, frame["h"])[0])
@@ -651,8 +650,8 @@ class BorderControl:
         """`()`: after the step, the pieces beyond the borders that were reached."""
         frame = self.motion.function("cross")
         code = frame.code
-        stepped, crossed = frame["stepped"] > 0.0, frame["crossed"]
-        crosses, was_cut = crossed > 0.0, code.compare("!=", frame["cut"], frame["planned_h"])
+        stepped, crosses = frame["stepped"] > 0.0, frame["crossed"] > Crossed.NOTHING
+        was_cut = code.compare("!=", frame["cut"], frame["planned_h"])
         if self.retraction is not None:  # borders that are left before the step begins do not take the state
             self.retraction.undo(frame, ~stepped)
         with code.loop(len(self.guards)) as g:
@@ -669,15 +668,15 @@ class BorderControl:
             if self.note is not None:
                 frame.call(self.note)
             if self.borders.release.outputs:
-                self._release(frame, crossed)
+                self._release(frame)
             if self.kick is not None:
-                self._note_kick(frame, crossed)
-            self._go_on(frame, crossed, crosses)
+                self._note_kick(frame)
+            self._go_on(frame, crosses)
             with frame.where(crosses):
                 if self.returns:
                     frame["h_before"] = 0.0
             if self.kick is not None:
-                self._kick_or_reflect(frame, self.kick, crossed, crosses)
+                self._kick_or_reflect(frame, self.kick, crosses)
             if self.jump is not None:
                 frame.call(self.jump)
             # A border at which a step of no length ends, too, whether it is crossed or only met.
@@ -689,7 +688,7 @@ class BorderControl:
                 frame["code"] = DISCONTINUOUS
         return frame.finish()
 
-    def _go_beyond(self, frame: Frame, crossed: Value) -> None:
+    def _go_beyond(self, frame: Frame) -> None:
         """The pieces beyond the borders, which touch them; a piece that touches one is not decided anew.
 
         A motion that would go back over the border at once is pushed onto it from both sides: it slides. So does one
@@ -700,7 +699,7 @@ class BorderControl:
         no_time = ~again & (code.intrinsic("fabs", frame["cut"]) <= NO_TIME * frame["smallest"])
         no_time = (no_time | (~again & (frame["stops"] > 0.0))) & (frame["at_rest"] > 0.0)
         with code.loop(len(self.guards)) as g:
-            hit = code.compare("==", crossed, code.lanes_of(code.as_double(g + 1)))
+            hit = self.table.crosses(frame, Crossed.GUARD, g)
             j, back, slide = (self.table.place(code, g, name) for name in ("piece", "back", "slide"))
             place = j + self.motion.parameters
             by_position = code.lanes_of(code.flag(self.table.place(code, g, "order") > 1)) > 0.0
@@ -727,19 +726,15 @@ class BorderControl:
 
     # ---- where L jumps ----
 
-    def _note_kick(self, frame: Frame, crossed: Value) -> None:
+    def _note_kick(self, frame: Frame) -> None:
         """Note the pieces before the border, and which switching number is zero there."""
         code = frame.code
         with code.loop(self.pieces) as j:
             frame["kick_before", j] = self._piece(frame, j)
             frame["kick_hit", j] = 0.0
         with code.loop(len(self.guards)) as g:
-            hit, j = (
-                code.compare("==", crossed, code.lanes_of(code.as_double(g + 1))),
-                self.table.place(code, g, "piece"),
-            )
-            with frame.where(hit):
-                frame["kick_hit", j] = 1.0
+            with frame.where(self.table.crosses(frame, Crossed.GUARD, g)):
+                frame["kick_hit", self.table.place(code, g, "piece")] = 1.0
 
     def _begins_behind(self, frame: Frame) -> Value:
         """True where a motion begins at an instant at which L jumps: with the velocities behind it, in time's order."""
@@ -748,7 +743,7 @@ class BorderControl:
         found = frame.constant(0.0) > 0.0
         for g, guard in enumerate(self.guards):
             if guard.piece in self.kicks_in_time and self.borders.kinds[guard.piece] == _borders.SIGN:
-                found = found | code.compare("==", frame["crossed"], float(g + 1))
+                found = found | self.table.crosses(frame, Crossed.GUARD, g)
         return begins & found & code.compare("==", frame["h"], 0.0)
 
     def _look_at_end(self, frame: Frame, degree: Value, h: Value) -> None:
@@ -774,7 +769,8 @@ class BorderControl:
                 (frame["last"] > 0.0) & (frame["forward"] > 0.0) & code.compare("!=", side, 0.0) & (end.value <= noise)
             )
             with frame.where(there & code.compare("==", frame["nearest"], one) & code.compare("!=", h, 0.0)):
-                frame["crossed"], frame["beyond"] = float(g + 1), guard.beyond(piece)
+                frame["crossed"], frame["crossed_number"] = Crossed.GUARD, float(g)
+                frame["beyond"] = guard.beyond(piece)
 
     def _kick(self, base: int) -> Code:
         """`()`: the velocities behind the border, in the lanes that are to `kicks`; 2 there if they do not pass it."""
@@ -801,7 +797,7 @@ class BorderControl:
                 frame["kicks"] = 2.0
         return frame.finish()
 
-    def _kick_or_reflect(self, frame: Frame, kick: Code, crossed: Value, crosses: Value) -> None:
+    def _kick_or_reflect(self, frame: Frame, kick: Code, crosses: Value) -> None:
         """Give the motion the velocities that it has where L jumps: behind the border, or before it once more."""
         code, kicks = frame.code, frame.constant(0.0)
         for j in self.borders.kicking:
@@ -820,7 +816,7 @@ class BorderControl:
                 with frame.where(reflected):
                     frame["params", j + self.motion.parameters] = frame["kick_before", j]
             with code.loop(len(self.guards)) as g:
-                at_border = code.compare("==", crossed, code.lanes_of(code.as_double(g + 1)))
+                at_border = self.table.crosses(frame, Crossed.GUARD, g)
                 with frame.where(reflected):
                     frame["touch", g] = code.select(at_border, Touch.VALUE, Touch.NONE)
             frame["kicks"] = code.select(reflected, 1.0, 0.0)
@@ -874,17 +870,17 @@ class BorderControl:
         code = frame.code
         return code.lanes_of(code.flag(code.compare("==", self.table.rule(code, g, "beyond").slope, 0.0))) > 0.0
 
-    def _release(self, frame: Frame, crossed: Value) -> None:
+    def _release(self, frame: Frame) -> None:
         """Let the vectors of cones that hold no longer set out, with a speed that is twice what counts as none."""
         code, motion, n = frame.code, self.motion, len(self.borders.release.outputs)
         shares = self.borders.releases
         base, leaves = n // (2 * len(shares)), frame.constant(0.0) > 0.0
         for g in shares:
-            leaves = leaves | code.compare("==", crossed, float(g + 1))
+            leaves = leaves | self.table.crosses(frame, Crossed.GUARD, g)
         with code.only_if(code.any_lane(leaves)):
             out, speed = motion.evaluate_now(frame, self.borders.release), 2.0 * SETS_OUT * absolute_tolerance(frame)
             for k, g in enumerate(shares):
-                hit = code.compare("==", crossed, float(g + 1))
+                hit = self.table.crosses(frame, Crossed.GUARD, g)
                 for i in range(base):
                     places = 2 * k * base + i, (2 * k + 1) * base + i
                     if all(self.borders.release.constant(place) == 0.0 for place in places):

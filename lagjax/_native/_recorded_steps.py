@@ -16,7 +16,7 @@ from lagjax._native._motion_parts import MotionParts
 from lagjax._native._retraction import Retraction
 from lagjax._native._run_records import RECORDED
 from lagjax._native._saltation import GuardTable, Saltation
-from lagjax._native._taylor import TaylorSeries, is_large
+from lagjax._native._taylor import AT_BORDER, TaylorSeries, is_large
 
 
 class Replay:
@@ -42,7 +42,7 @@ class Replay:
         more += [line for line in (parts.borders and parts.borders.retraction,) if line]
         large = is_large(parts.program, parts.projection, times=2, more=more)
         if parts.borders is not None:
-            fields = fields | Saltation.fields(parts.borders) | at_borders | {"crossed": 1, "grazes": 1}
+            fields = fields | Saltation.fields(parts.borders) | at_borders
         number = DOUBLE if large else number  # tables do not tell the time from the state
         self.motion = motion = TaylorSeries(
             name, parts, job, fields, large, width, keep_sums=True, number=number
@@ -124,5 +124,5 @@ class Replay:
                 first = row + (RECORDED + motion.states)
                 with code.loop(motion.pieces) as j:
                     lane["params", j + motion.parameters] = frame.read("record", first + j)
-                for k, name in enumerate(("crossed", "grazes")):
+                for k, name in enumerate(AT_BORDER):
                     lane[name] = frame.read("record", first + (motion.pieces + k))

@@ -4,7 +4,7 @@ from lagjax._native._constants import DONE, EPS
 from lagjax._native._frame import EXACT, Fields, Frame, Index, Lane
 from lagjax._native._ir import Code, Value
 from lagjax._native._projection import Projector
-from lagjax._native._taylor import TaylorSeries
+from lagjax._native._taylor import AT_BORDER, TaylorSeries
 
 _INSTANT = 4.0 * EPS  # the largest difference of two times that count as the same, relative to them
 RECORDED = 4  # numbers of a step that are written down before its state: time, size, member, number of the step
@@ -110,12 +110,12 @@ class Output:
                     self._record_pieces(frame, lane, row + (RECORDED + motion.states))
 
     def _record_pieces(self, frame: Frame, lane: Lane, row: Value) -> None:
-        """The pieces of the step, the number of the border that it ends at, and whether that is grazed."""
+        """The pieces of the step, and what it ends at (`AT_BORDER`)."""
         pieces = self.motion.pieces
         with frame.code.loop(pieces) as j:
             frame.write("record", row + j, lane["params", j + self.motion.parameters])
-        frame.write("record", row + pieces, lane["crossed"])
-        frame.write("record", row + (pieces + 1), lane["grazes"])
+        for k, name in enumerate(AT_BORDER):
+            frame.write("record", row + (pieces + k), lane[name])
 
     # ---- the end of a member ----
 

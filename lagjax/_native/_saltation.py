@@ -6,6 +6,7 @@ derivative does. Where the border is grazed, so that a change of the state withi
 crossed, none of this exists: derivatives are NaN there, but for first ones where the acceleration is continuous.
 """
 
+import functools
 import math
 from collections.abc import Callable
 from enum import IntEnum
@@ -36,6 +37,15 @@ class Hit(IntEnum):
     SEVERAL = 2
 
 
+class Crossed(IntEnum):
+    """The border at the end of a step: none, a guard, a knot of a clock, or knots of several at one instant."""
+
+    NOTHING = 0
+    GUARD = 1
+    KNOT = 2
+    KNOTS = 3
+
+
 class GuardTable:
     """The guards of all pieces (`_program._borders.Guard`) as constants of a kernel, for loops over them; and `knots`.
 
@@ -53,15 +63,10 @@ class GuardTable:
             np.array([[getattr(g, name) for name in _PLACES] for g in borders.guards] or [[0]], np.int64),
         )
         self.guards = len(borders.guards)
-        first = self.guards + 1
-        # What is `crossed` at a knot of each piece, and where knots of two do.
-        self.knots = [
-            (first + c, j)
-            for c, j in enumerate(borders.clocks)
-            if borders.moving_table(j) is not None or j in borders.kicking
-        ]
-        self.movable = [j for _, j in self.knots if borders.moving_table(j) is not None]
-        self.coincide = first + len(borders.clocks)
+        moves = {j: borders.moving_table(j) is not None for j in borders.clocks}
+        # The number and the piece of each clock that has knots.
+        self.knots = [(c, j) for c, j in enumerate(borders.clocks) if moves[j] or j in borders.kicking]
+        self.movable = [j for _, j in self.knots if moves[j]]
 
     def rule(self, code: Code, g: Value, name: str) -> Any:
         """The `side`, the `level` or the piece `beyond` of guard g, as functions of its piece."""
@@ -74,39 +79,38 @@ class GuardTable:
         place = g * len(_PLACES) + _PLACES.index(name)
         return code.load(code.element(Value(code, self._places), place, INTEGER), INTEGER)
 
-    def crosses_guard(self, frame: Frame) -> Value:
-        """True if a step ends at a border that the motion comes to, not at an instant."""
-        crosses = frame["crossed"] > 0.0
-        return crosses & (frame["crossed"] <= float(self.guards)) if self.borders.clocks else crosses
+    def crosses(self, frame: Frame, kind: Crossed, number: Index | None = None) -> Value:
+        """True if a step ends at a guard, or at knots: at any of them, or at that with this number."""
+        code, crosses = frame.code, frame.code.compare("==", frame["crossed"], float(kind))
+        if number is None:
+            return crosses
+        at = code.as_double(number) if isinstance(number, Value) else float(number)
+        return crosses & code.compare("==", frame["crossed_number"], code.lanes_of(at))
 
     def crosses_knot(self, frame: Frame) -> Value:
         """True if a step ends at knots that are parameters."""
-        found = frame.code.compare("==", frame["crossed"], float(self.coincide))
-        for crossed, _ in self.knots:
-            found = found | frame.code.compare("==", frame["crossed"], float(crossed))
-        return found
+        at_knots = [self.crosses(frame, Crossed.KNOT, c) for c, _ in self.knots]
+        return functools.reduce(Value.__or__, at_knots, self.crosses(frame, Crossed.KNOTS))
 
     def kicks(self, frame: Frame) -> Value:
         """True if a step ends at a border at which L jumps."""
-        found = frame.code.compare("!=", frame["crossed"], frame["crossed"])
-        numbers = [g + 1 for g, guard in enumerate(self.borders.guards) if guard.piece in self.borders.kicking]
-        numbers += [self.guards + 1 + c for c, j in enumerate(self.borders.clocks) if j in self.borders.kicking]
-        for number in [*numbers, *([self.coincide] if self.movable else [])]:
-            found = found | frame.code.compare("==", frame["crossed"], float(number))
-        return found
+        kicking, crosses = self.borders.kicking, functools.partial(self.crosses, frame)
+        ends = [crosses(Crossed.GUARD, g) for g, guard in enumerate(self.borders.guards) if guard.piece in kicking]
+        ends += [crosses(Crossed.KNOT, c) for c, j in enumerate(self.borders.clocks) if j in kicking]
+        return functools.reduce(Value.__or__, [*ends, *([crosses(Crossed.KNOTS)] if self.movable else [])])
 
     def note_hit(self, frame: Frame, where: Value | None = None) -> None:
         """The pieces, and which switching number the guard `crossed` has; none where a motion begins on the border.
 
         In the lanes `where` a step ends at one, which are all of them by default.
         """
-        motion, code, crossed = self.motion, frame.code, frame["crossed"]
+        motion, code = self.motion, frame.code
         where = frame.constant(0.0) <= 0.0 if where is None else where
         self._note_pieces(frame, where)
         with code.loop(self.guards) as g:
             j = self.place(code, g, "piece")
             side = self.rule(code, g, "side")(frame["pieces_before", j])
-            hit = where & code.compare("==", crossed, code.lanes_of(code.as_double(g + 1)))
+            hit = where & self.crosses(frame, Crossed.GUARD, g)
             decided = code.compare("!=", side, 0.0)
             if self.borders.kicking:  # where L jumps, a motion that begins on the border comes from what L is there
                 decided = decided | self.kicks(frame)
@@ -125,9 +129,9 @@ class GuardTable:
         where = where & self.crosses_knot(frame)
         with code.only_if(code.any_lane(where)):
             self._note_pieces(frame, where)
-            both = where & code.compare("==", frame["crossed"], float(self.coincide))
-            for k, (crossed, j) in enumerate(self.knots):
-                with frame.where(both | (where & code.compare("==", frame["crossed"], float(crossed)))):
+            both = where & self.crosses(frame, Crossed.KNOTS)
+            for k, (c, j) in enumerate(self.knots):
+                with frame.where(both | (where & self.crosses(frame, Crossed.KNOT, c))):
                     # Where several coincide no rational directions of theirs cancel, to a jump of nothing.
                     frame["hit", j] = math.exp(k)
                     if self.borders.levels_move:
@@ -161,6 +165,8 @@ class Saltation:
         """The fields of a thread's memory."""
         pieces = len(borders.switches)
         return {
+            "crossed": 1,  # the `Crossed` that the step ends at
+            "crossed_number": 1,  # the number of that guard, or clock
             "pieces_before": pieces,  # the pieces before the border
             "hit": pieces,  # not 0 for the piece whose switching number is zero at the border
             # The number of the entry that is the level there; follows `hit`.
@@ -303,7 +309,7 @@ class Saltation:
 
     def _crosses(self, frame: Frame) -> Value:
         """True if a step ends at a border whose instant varies."""
-        crosses = self.table.crosses_guard(frame)
+        crosses = self.table.crosses(frame, Crossed.GUARD)
         return crosses | self.table.crosses_knot(frame) if self.table.knots else crosses
 
     def _choice(self, numbers: Callable) -> list:
@@ -348,7 +354,7 @@ class Saltation:
         motion, base = self.motion, self.base
         frame = motion.function("back_border")
         code = frame.code
-        frame["crossed"] = code.select(frame["has_after"] > 0.0, frame["crossed"], 0.0)
+        frame["crossed"] = code.select(frame["has_after"] > 0.0, frame["crossed"], Crossed.NOTHING)
         with code.only_if(code.any_lane(self._crosses(frame))):
             self._note_edge(frame)
             gain, tables, entries = self._cotangent_jumps(frame, frame.vectors("pieces_after", motion.pieces))

@@ -23,6 +23,8 @@ from lagjax._native._table_reads import LookUps
 from lagjax._native._tables import Tables
 from lagjax._program._series import Recurrent, Series, StraightLine
 
+AT_BORDER = "crossed", "crossed_number", "grazes"  # what is recorded of the border that a step ends at, and its pieces
+
 
 def size_of_series(series: Series) -> int:
     """The doubles of the series of one member, of its state and of the rows of its products."""
@@ -56,7 +58,7 @@ class TaylorSeries:
         self.program, self.series, self.n, self.states = program, series, series.size, 2 * series.size
         self.numbers = program.size - self.states - 1  # parameters, and the pieces of a piecewise program
         self.pieces, self.parameters, self.kept = pieces, self.numbers - pieces, kept
-        self.recorded_pieces = pieces and pieces + 2  # numbers that are recorded behind the state of a step
+        self.recorded_pieces = pieces and pieces + len(AT_BORDER)  # numbers that are recorded behind a step's state
         self.keep_sums, self.job = keep_sums, job
         self.module = ir.Module(name)
         self.module.triple = ""

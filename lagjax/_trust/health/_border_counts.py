@@ -13,6 +13,7 @@ from lagjax._engine import Problem
 from lagjax._engine.taylor import Flow, StepStore, Tolerances, flow_of, portions
 from lagjax._equations import derivation_of, pieces_of_motion
 from lagjax._interface import Layout
+from lagjax._native import Crossed
 from lagjax._program import Unlowerable
 from lagjax._run import Members
 from lagjax._scene import System
@@ -89,17 +90,17 @@ def _count(
     assert borders is not None  # without a series there are none, and none are counted
     again = flow.follow(*motions, tolerances, store, 2 * int(steps.sum()) + len(places))
     guards, pieces = borders.guards, len(borders.switches)
-    # Numbers beyond those of guards are entries of tables that the time comes to, which are no borders.
+    # The time comes to entries of tables, too, which are no borders.
     enters, leaves = (np.array([getattr(guard, name) >= 0 for guard in guards] + [False]) for name in ("slide", "on"))
     slides = sorted({guard.slide for guard in guards if guard.slide >= 0})
     for run, rows, members in store.runs(again.ticket):
         for row, member in zip(rows, members, strict=True):
             table = run.table[run.first[member] : run.first[member] + run.counts[member]]
-            place, crossed, grazes = places[row], table[:, -2], table[:, -1] > 0
+            place, (crossed, number), grazes = places[row], table[:, -3:-1].astype(int).T, table[:, -1] > 0
             along = table[:, flow.states + 4 : flow.states + 4 + pieces][:, slides] > 0.5
             begins = along & ~np.vstack([np.zeros((1, len(slides)), bool), along[:-1]])
-            number = np.clip(crossed.astype(int) - 1, 0, len(guards))
-            at_border = (crossed > 0) & (number < len(guards)) & ~leaves[number]
+            number = np.where(crossed == Crossed.GUARD, number, len(guards))
+            at_border = (crossed == Crossed.GUARD) & ~leaves[number]
             # A border that the motion slides along from there on has not been crossed.
             to_slide = np.append(np.any(begins, axis=1)[1:], False) & enters[number]
             into.slid[place] += int(begins.sum())
