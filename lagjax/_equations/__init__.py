@@ -10,7 +10,15 @@ velocities and time are at a state; `_blame` which operations of a user's functi
 and in which line.
 """
 
-from lagjax._equations._blame import Offender, borders_of_motion, offenders, pieces_of, pieces_of_motion, poles
+from lagjax._equations._blame import (
+    Offender,
+    borders_of_motion,
+    describe_pieces,
+    offenders,
+    pieces_of,
+    pieces_of_motion,
+    poles,
+)
 from lagjax._equations._consistency import has_constraints, inconsistent_members, require_consistent
 from lagjax._equations._constraints import ROUNDINGS, Constraints, distances, rank_lost
 from lagjax._equations._derivation import Derivation, columns_of, derivation_of, numbers_of
@@ -24,10 +32,12 @@ from lagjax._equations._linear import (
     least_norm,
     null_directions,
     rank,
+    rank_tolerance,
     saddle,
     schur_complement,
     schur_complements,
     singular_threshold,
+    unit_diagonal,
 )
 from lagjax._equations._many_states import SADDLE, Sample, borders_of, is_lowered, map_in_chunks, solve_saddle
 from lagjax._equations._motion import Motion

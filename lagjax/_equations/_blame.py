@@ -6,7 +6,7 @@ where a function may have a kink or a jump. Both know the line of the user's cod
 """
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -16,6 +16,7 @@ import numpy as np
 from jax.extend import core, source_info_util
 
 from lagjax._equations._motion import Motion
+from lagjax._interface import join_names
 from lagjax._program import OPERATIONS, apply_in_jax, expand_primitive
 
 _PACKAGE = str(Path(__file__).parents[1])
@@ -139,16 +140,18 @@ _LOOPS = ("scan", "while", "sort")  # which decide inside: the whole numbers tha
 
 def borders_of_motion(motion: Motion, *state) -> list[tuple[str, str, Any]]:
     """`borders` of L, the forces and the dissipation of a scene."""
-    return [border for function in _functions_of(motion) for border in borders(function, *state)]
+    return [border for function in motion.functions for border in borders(function, *state)]
 
 
 def pieces_of_motion(motion: Motion, *state) -> list[tuple[str, str, int]]:
     """`pieces_of` L, the forces and the dissipation of a scene."""
-    return [piece for function in _functions_of(motion) for piece in pieces_of(function, *state)]
+    return [piece for function in motion.functions for piece in pieces_of(function, *state)]
 
 
-def _functions_of(motion: Motion) -> list[Callable]:
-    return [f for f in (motion.lagrangian, motion.forces, motion.dissipation) if f is not None]
+def describe_pieces(functions: Sequence[Callable], arguments: tuple) -> str:
+    """The operations at which functions are pieced together, and their lines: three at most; empty where none is."""
+    places = (f"{name}{place}" for function in functions for name, place, _ in pieces_of(function, *arguments))
+    return join_names(list(dict.fromkeys(places)), 3)
 
 
 def _side_of(name: str) -> Callable | None:

@@ -45,7 +45,7 @@ class Factorization(eqx.Module):
         """x with M x = b; NaN where M is singular. Differentiated implicitly: one more solve with the same inverse."""
 
         def times_matrix(y):
-            return _scaled(self.matrix, self.scale) @ y
+            return self.scale * (self.matrix @ (self.scale * y))
 
         def solve_by_inverse(_, scaled):
             x = self.inverse @ _permute_rows(scaled, self.order)
@@ -64,8 +64,8 @@ class Factorization(eqx.Module):
 def factorize(matrix: Matrix) -> Factorization:
     """Scale and invert a symmetric matrix."""
     matrix = 0.5 * (matrix + matrix.T)
-    scale = jax.lax.stop_gradient(diagonal_scale(matrix))
-    inverse, order, pivots = invert(jax.lax.stop_gradient(_scaled(matrix, scale)))
+    scaled, scale = jax.lax.stop_gradient(unit_diagonal(matrix))
+    inverse, order, pivots = invert(scaled)
     pivots, threshold = jnp.abs(pivots), singular_threshold(matrix.shape[0], matrix.dtype)
     return Factorization(matrix, scale, inverse, order, jnp.min(pivots) <= threshold * jnp.max(pivots))
 
@@ -82,9 +82,10 @@ def diagonal_scale(matrix):
     return 1 / xp.sqrt(xp.where(size > 0, size, 1))
 
 
-def _scaled(matrix, scale):
-    """Symmetric matrices (..., n, n) with both sides scaled by (..., n)."""
-    return scale[..., :, None] * matrix * scale[..., None, :]
+def unit_diagonal(matrix):
+    """Symmetric matrices (..., n, n) with both sides scaled to a unit diagonal, and the `diagonal_scale` (..., n)."""
+    scale = diagonal_scale(matrix)
+    return scale[..., :, None] * matrix * scale[..., None, :], scale
 
 
 def singular_threshold(n: int, dtype) -> float:
@@ -115,8 +116,8 @@ def null_directions(matrix: np.ndarray, threshold: float | None = None) -> np.nd
     An eigenvalue counts as zero up to `threshold`, by default `singular_threshold`, of the largest.
     """
     threshold = singular_threshold(len(matrix), matrix.dtype) if threshold is None else threshold
-    scale = diagonal_scale(matrix)
-    values, vectors = eigen(_scaled(matrix, scale))
+    scaled, scale = unit_diagonal(matrix)
+    values, vectors = eigen(scaled)
     null = np.abs(values) <= threshold * max(np.abs(values).max(), np.finfo(matrix.dtype).tiny)
     directions = (scale[:, None] * vectors[:, null]).T
     return directions / np.linalg.norm(directions, axis=1, keepdims=True)
@@ -286,8 +287,8 @@ def _inverse_on_range(matrix: Matrix) -> Matrix:
     It is applied to right-hand sides in the range alone: what dependent constraints ask for is tested to be consistent
     before a motion starts. So it chooses among multipliers that all give the same motion, and hides no contradiction.
     """
-    scale = diagonal_scale(matrix)
-    inverse, basis, pairs = _independent(_scaled(matrix, scale), scale)
+    scaled, scale = unit_diagonal(matrix)
+    inverse, basis, pairs = _independent(scaled, scale)
     some = scale[:, None] * inverse * scale  # solves S x = b, but its x need not be the shortest
     # The part of x in the range of S is the shortest one: P x with P = B (BᵀB)⁻¹ Bᵀ, where B is the basis of the range
     # scaled back. BᵀB is at least the unit matrix; where B has no column, that of the unit matrix takes its place.
@@ -350,8 +351,8 @@ def solve_many(matrix: Matrices, b: np.ndarray) -> np.ndarray:
     if matrix.shape[1] == 1:
         return b / np.where(matrix == 0, np.nan, matrix)
     matrix = 0.5 * (matrix + np.swapaxes(matrix, 1, 2))
-    scale = diagonal_scale(matrix)
-    scaled, finite = _or_unit(_scaled(matrix, scale))
+    scaled, scale = unit_diagonal(matrix)
+    scaled, finite = _or_unit(scaled)
     sizes = np.abs(np.linalg.eigvalsh(scaled))
     regular = sizes.min(axis=1) > singular_threshold(matrix.shape[1], matrix.dtype) * sizes.max(axis=1)
     scaled = np.where(regular[:, None, None], scaled, np.eye(matrix.shape[1], dtype=matrix.dtype))
@@ -380,8 +381,8 @@ def schur_complements(matrix: Matrices, jacobian: np.ndarray) -> np.ndarray:
 
 def _least_norm_many(matrix: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The shortest X (S, m, k) with S X = b, as `least_norm`, for S symmetric matrices (S, m, m) of any rank."""
-    scale = diagonal_scale(matrix)
-    scaled, finite = _or_unit(_scaled(matrix, scale))
+    scaled, scale = unit_diagonal(matrix)
+    scaled, finite = _or_unit(scaled)
     values, vectors = np.linalg.eigh(scaled)
     in_range = np.abs(values) > rank_tolerance(matrix.dtype)
     inverse = np.where(in_range, 1 / np.where(in_range, values, 1), 0)[:, :, None]

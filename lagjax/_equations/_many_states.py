@@ -99,11 +99,6 @@ class Sample(NamedTuple):
             parts.append(function(part, *others))
         return parts[0] if len(parts) == 1 else jax.tree.map(lambda *some: np.concatenate(some), *parts)
 
-    def solve_acceleration(self) -> np.ndarray:
-        """q̈ (S, n) from the quantities `SADDLE`. Raises `Unlowerable`."""
-        with np.errstate(all="ignore"):
-            return solve_saddle(self.quantities(*SADDLE))[0]
-
     def pieces(self) -> np.ndarray:
         """A number (S,) that is another one where the accelerations decide on other pieces."""
         borders = borders_of(self.derivation)

@@ -32,6 +32,11 @@ class Motion(eqx.Module):
     dissipation: Callable | None
     constraints: Constraints = Constraints()
 
+    @property
+    def functions(self) -> list[Callable]:
+        """L, the forces and the dissipation, as far as the scene has them."""
+        return [f for f in (self.lagrangian, self.forces, self.dissipation) if f is not None]
+
     # ---- without constraints ----
 
     def momentum(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
@@ -68,14 +73,6 @@ class Motion(eqx.Module):
     def energy(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Scalar:
         """h = p·q̇ − L, with dh/dt = −∂L/∂t + Q·q̇ along the motion."""
         return self.momentum(q, qdot, t, params) @ qdot - self.lagrangian(q, qdot, t, params)
-
-    def energy_and_momenta(
-        self, coordinates: tuple[int, ...], q: Vector, qdot: Vector, t: Time, params: PyTree
-    ) -> Float[Array, " 1+c"]:
-        """h, then pᵢ for the c `coordinates` i, shape (1 + c,): what may be conserved."""
-        momentum = self.momentum(q, qdot, t, params)
-        energy = momentum @ qdot - self.lagrangian(q, qdot, t, params)
-        return jnp.concatenate([energy[None], momentum[jnp.asarray(coordinates, int)]])
 
     # ---- with constraints ----
 

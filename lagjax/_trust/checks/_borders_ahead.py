@@ -101,7 +101,8 @@ def _moving(borders: Borders, node: int, moving: int) -> set[int]:
 
 def _jumps(along: _VariedInput, switches: list[Callable], name: str) -> Iterator[tuple[str, str]]:
     """A kind of finding, and the places where an acceleration jumps along the number."""
-    places = _distinct(np.concatenate([_zeros(switch, along.start) for switch in switches]))
+    places = np.sort(np.concatenate([_zeros(switch, along.start) for switch in switches]))
+    places = places[np.diff(places, prepend=-np.inf) > 1e-8 * (1 + np.abs(places))]  # once each, to rounding
     beside = 1e-7 * (1 + np.abs(places))
     before, after, more = (along.accelerations(places + k * beside) for k in (-1, 1, 3))
     size = np.abs([before, after, more]).max(axis=(0, 1))
@@ -145,42 +146,37 @@ def _finding(kind: str, places: str, names: tuple[str, ...]) -> Finding:
 
 
 def _zeros(function: Callable, start: float) -> np.ndarray:
-    """Zeros of a function of (S,), by Newton's method from many places."""
-    x = start + _PLACES * max(1.0, abs(start))
-    for _ in range(_NEWTON):
+    """Zeros of a function of (S,)."""
+
+    def newton_step(x):
         step = 1e-6 * (1 + np.abs(x))
         low, middle, high = (function(x + k * step) for k in (-1, 0, 1))
-        with np.errstate(all="ignore"):
-            move = middle * 2 * step / (high - low)
-        x, rests = _take_step(x, move, _AT_REST)
-        if rests.all():
-            break
-    return x[rests]
+        return middle * 2 * step / (high - low)
+
+    return _iterate_to_rest(newton_step, start, _AT_REST)
 
 
 def _tops(function: Callable, start: float) -> tuple[np.ndarray, np.ndarray]:
     """The stationary points of a function of (S,), by parabolas through three places; its second derivatives there."""
-    x, step = start + _PLACES * max(1.0, abs(start)), 1e-2
-    for _ in range(_NEWTON):
+    step = 1e-2
+
+    def parabola(x):
         low, middle, high = (function(x + k * step) for k in (-1, 0, 1))
-        with np.errstate(all="ignore"):
-            bend = (high - 2 * middle + low) / step**2
-            move = (high - low) / (2 * step) / bend
-        x, rests = _take_step(x, move, 1e-6)
+        return (high - low) / (2 * step), (high - 2 * middle + low) / step**2
+
+    places = _iterate_to_rest(lambda x: np.divide(*parabola(x)), start, 1e-6)
+    places = np.unique(np.round(places, 6))
+    return places, parabola(places)[1]
+
+
+@np.errstate(all="ignore")
+def _iterate_to_rest(newton_step: Callable, start: float, rest: float) -> np.ndarray:
+    """The places where Newton's method, from many of them, moves by no more than `rest` of their size."""
+    x, rests = start + _PLACES * max(1.0, abs(start)), np.zeros(len(_PLACES), bool)
+    for _ in range(_NEWTON):
         if rests.all():
             break
-    places, first = np.unique(np.round(x[rests], 6), return_index=True)
-    return places, bend[rests][first]
-
-
-def _take_step(x: np.ndarray, move: np.ndarray, rest: float) -> tuple[np.ndarray, np.ndarray]:
-    """The places x − move, and which of them moved by no more than `rest` of their size."""
-    x = x - np.where(np.isfinite(move), move, 0.0)
-    with np.errstate(invalid="ignore"):
-        return x, np.abs(move) <= rest * (1 + np.abs(x))
-
-
-def _distinct(x: np.ndarray) -> np.ndarray:
-    """The numbers once each, to rounding."""
-    x = np.sort(x[np.isfinite(x)])
-    return x[np.append(True, np.diff(x) > 1e-8 * (1 + np.abs(x[:-1])))] if x.size else x
+        step = newton_step(x)
+        x = x - np.where(np.isfinite(step), step, 0.0)
+        rests = np.abs(step) <= rest * (1 + np.abs(x))
+    return x[rests]

@@ -4,7 +4,6 @@ import numpy as np
 
 from lagjax._equations import dependent_rows, require_consistent
 from lagjax._interface import Layout, join_names
-from lagjax._trust.checks._derivative_checks import position_count
 from lagjax._trust.checks._findings import Finding
 from lagjax._trust.checks._mass import null_velocities
 from lagjax._trust.checks._scene_at_start import CheckedScene
@@ -19,7 +18,7 @@ def findings(scene: CheckedScene) -> list[Finding]:
     bad = [k for k in range(len(names)) if not (np.isfinite(residual[k]) and np.isfinite(jacobian[0, k]).all())]
     if bad:
         return [_not_finite(names[k], residual[k]) for k in bad]
-    positions = position_count(scene)
+    positions = scene.derivation.position_count
     idle = [k for k in range(len(names)) if not jacobian[0, k].any()]
     reported = [_idle(names[k], k >= positions, residual[k], jacobian[:, k]) for k in idle]
     reported += _not_affine(names, jacobian, positions, scene.layout)

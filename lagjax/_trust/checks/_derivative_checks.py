@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from lagjax._equations import Offender, offenders, pieces_of
+from lagjax._equations import describe_pieces, offenders
 from lagjax._interface import join_names
 from lagjax._trust.checks._differences import Slopes, differ, ladder, slopes
 from lagjax._trust.checks._findings import Finding
@@ -19,11 +19,7 @@ _RANDOM = 8
 
 def findings(scene: CheckedScene) -> list[Finding]:
     """All there is to say about L, the forces and D, one after the other."""
-    reported = _values(scene)
-    if reported:
-        return reported
-    reported = _not_finite(scene)
-    if reported:
+    if reported := _values(scene) or _not_finite(scene):
         return reported
     if scene.layout.size > _ALL_AT_ONCE and scene.is_lowered and _agree(scene):
         return []
@@ -42,13 +38,10 @@ def _values(scene: CheckedScene) -> list[Finding]:
                               ("dissipation", "D", scene.dissipation)):  # fmt: skip
         if not np.isfinite(value).all():
             where = () if value.ndim == 0 else _select_names(scene.layout.names, ~np.isfinite(value))
-            message = f"{name}{' of ' + join_names(where) if where else ''} is {_first_bad(value)} at this state"
+            first, of = value[~np.isfinite(value)].ravel()[0], f" of {join_names(where)}" if where else ""
+            message = f"{name}{of} is {first} at this state"
             reported.append(Finding("value_not_finite", "error", where, message + _blame(scene, role, "value")))
     return reported
-
-
-def _first_bad(value: np.ndarray) -> str:
-    return str(value[~np.isfinite(value)].ravel()[0])
 
 
 def _not_finite(scene: CheckedScene) -> list[Finding]:
@@ -103,17 +96,8 @@ def _blame(scene: CheckedScene, role: str, order: str) -> str:
         return ". No single operation is to blame: large numbers may overflow together; look at the units."
     first = offending[0]
     hidden = first.fault == "value" and order != "value"
-    return f": {first}. {_BRANCH if hidden else _remedy(first)}".rstrip()
-
-
-def _remedy(offender: Offender) -> str:
-    return _REMEDIES.get(offender.name, "Write it so that it is smooth there, or start elsewhere.")
-
-
-def _blame_for_kink(scene: CheckedScene, role: str) -> str:
-    function = getattr(scene.motion, role)
-    places = list(dict.fromkeys(f"{name}{place}" for name, place, _ in pieces_of(function, *scene.state)))
-    return f" (the function is pieced together by {join_names(places, 3)})" if places else ""
+    remedy = _REMEDIES.get(first.name, "Write it so that it is smooth there, or start elsewhere.")
+    return f": {first}. {_BRANCH if hidden else remedy}"
 
 
 # ---- against finite differences --------------------------------------------------------------------------------------
@@ -141,7 +125,7 @@ def _blocks(scene: CheckedScene, round_off):
         blocks.append(("D", "dissipation", by_v, range(n, 2 * n), range(first, constraint)))
     count = len(scene.residual)
     if np.isfinite(scene.residual).all() and np.isfinite(m.jacobian[0]).all():
-        positions = position_count(scene)
+        positions = scene.derivation.position_count
         by_q, by_v = (Slopes(m.jacobian[0, k].T, of_rows[k].T) for k in (slice(positions), slice(positions, None)))
         blocks += [
             ("a constraint", "constraints", by_q, range(n), range(constraint, constraint + positions)),
@@ -149,10 +133,6 @@ def _blocks(scene: CheckedScene, round_off):
              range(constraint + positions, constraint + count)),
         ]  # fmt: skip
     return [block for block in blocks if len(block[-1])]
-
-
-def position_count(scene: CheckedScene) -> int:
-    return scene.derivation.position_count
 
 
 def _agree(scene: CheckedScene) -> bool:
@@ -196,8 +176,10 @@ def _compare_derivatives(
         slope = (
             f"The slope of {name} along {names[i]} is {behind.value[i, k]:.6g} below this state and "
             f"{ahead.value[i, k]:.6g} above it"
-            f"{_blame_for_kink(scene, role) if role in ('lagrangian', 'dissipation') else ''}"
         )
+        if role in ("lagrangian", "dissipation"):
+            pieces = describe_pieces([getattr(scene.motion, role)], scene.state)
+            slope += f" (the function is pieced together by {pieces})" if pieces else ""
         of_force = role == "dissipation" or (role == "lagrangian" and not (name == "L" and directions[i] >= n))
         if of_force:
             rest = (

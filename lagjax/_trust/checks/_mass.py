@@ -12,10 +12,12 @@ examined, which is regular when the saddle point is (`_linear`). States nearby t
                                                            parametrisation of a path where L is of degree one in q̇
 """
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from lagjax._engine import DEFAULT_RTOL
-from lagjax._equations import diagonal_scale, eigen, null_directions, null_space, singular_threshold
+from lagjax._equations import eigen, null_directions, null_space, singular_threshold, unit_diagonal
 from lagjax._interface import join_names
 from lagjax._trust.checks._findings import Finding
 from lagjax._trust.checks._scene_at_start import CheckedScene
@@ -65,7 +67,7 @@ def _singular(scene: CheckedScene, augmented: np.ndarray, usable: list[int]) -> 
     if not rest or not len(here := among_rest(0)):
         return empty_rows
     where = tuple(names[rest[i]] for i in np.flatnonzero(np.abs(here).max(axis=0) > 1e-6))
-    combinations = "; ".join(_combination(u, [names[i] for i in rest]) for u in here)
+    combinations = "; ".join(describe_direction(u, [names[i] for i in rest]) for u in here)
     what = "The saddle point of M and the constraints" if constrained else "The mass matrix d2L/dqdot2"
     kind, why = _classify(scene, here, {k: among_rest(k) for k in usable})
     return [*empty_rows, Finding(kind, "error", where, f"{what} is singular along {combinations}, {why}")]
@@ -108,7 +110,7 @@ def _classify(scene: CheckedScene, here: np.ndarray, nearby: dict[int, np.ndarra
             "the velocity itself: L is of degree one in the velocities, and every parametrisation of the path is as "
             "good as another. Take one of the coordinates as t, or, where L is a length alone, integrate its square."
         )
-    if nearby and all(_same_space(here, directions) for directions in nearby.values()):
+    if nearby and all(_spans(here, directions) for directions in nearby.values()):
         return "velocity_combination", (
             "here and nearby: L has no kinetic energy along this combination of velocities. Add it (a missing mass?), "
             "or use fewer coordinates."
@@ -121,24 +123,18 @@ def _classify(scene: CheckedScene, here: np.ndarray, nearby: dict[int, np.ndarra
 
 def _homogeneous(scene: CheckedScene, states: list[int]) -> bool:
     """True if M q̇ = 0 at all of these states: L is of degree one in the velocities."""
-    m = scene.measured
-
-    def annihilates(mass, v):
-        return np.abs(mass @ v).max() <= np.sqrt(np.finfo(mass.dtype).eps) * np.abs(mass).max() * np.abs(v).max()
-
-    in_motion = [k for k in states if m.velocity[k].any()]
-    return bool(in_motion) and all(annihilates(m.mass[k], m.velocity[k]) for k in in_motion)
+    pairs = [(scene.measured.mass[k], v) for k in states if (v := scene.measured.velocity[k]).any()]
+    least = np.sqrt(np.finfo(scene.layout.dtype).eps)
+    return bool(pairs) and all(np.abs(m @ v).max() <= least * np.abs(m).max() * np.abs(v).max() for m, v in pairs)
 
 
-def _same_space(one: np.ndarray, other: np.ndarray) -> bool:
+def _spans(one: np.ndarray, other: np.ndarray) -> bool:
     """True if the rows of two arrays (k, n) span the same space, up to √eps."""
-    if one.shape != other.shape:
-        return False
-    basis = np.linalg.qr(other.T)[0]
-    return bool(np.abs(one - one @ basis @ basis.T).max() < np.sqrt(np.finfo(one.dtype).eps))
+    beyond = one - one @ (basis := np.linalg.qr(other.T)[0]) @ basis.T if one.shape == other.shape else np.inf
+    return bool(np.abs(beyond).max() < np.sqrt(np.finfo(one.dtype).eps))
 
 
-def _combination(direction: np.ndarray, names: list[str]) -> str:
+def describe_direction(direction: np.ndarray, names: Sequence[str]) -> str:
     """A direction as +1 dq[0] -0.3 dq[1]."""
     direction = direction / direction[np.argmax(np.abs(direction))]
     terms = [f"{c:+.3g} d{name}" for c, name in zip(direction, names, strict=True) if abs(c) > 1e-6]
@@ -178,16 +174,16 @@ def _nearly_singular(here: np.ndarray, others: list[np.ndarray], names) -> list[
 
 def _signs(mass: np.ndarray, rows: np.ndarray, names) -> list[Finding]:
     """Negative kinetic energy along velocities that the constraints allow."""
-    scale = diagonal_scale(mass)
+    scaled, scale = unit_diagonal(mass)
     free = null_space(rows * scale)
     if not free.shape[1]:
         return []
-    values, vectors = eigen(free.T @ (scale[:, None] * mass * scale) @ free)
+    values, vectors = eigen(free.T @ scaled @ free)
     negative = values < -_rounding(mass) * np.abs(values).max()
     if not negative.any():
         return []
     direction = scale * (free @ vectors[:, 0])
-    combination = _combination(direction, list(names))
+    combination = describe_direction(direction, names)
     where = tuple(name for name, c in zip(names, direction, strict=True) if abs(c) > 1e-6 * np.abs(direction).max())
     whole = "negative definite" if negative.all() else "indefinite"
     return [Finding(
@@ -197,20 +193,13 @@ def _signs(mass: np.ndarray, rows: np.ndarray, names) -> list[Finding]:
     )]  # fmt: skip
 
 
-def _spread(matrix: np.ndarray) -> float:
-    """The largest |eigenvalue| of a symmetric matrix over the smallest."""
-    sizes = np.abs(eigen(matrix)[0])
-    with np.errstate(divide="ignore"):
-        return float(sizes.max() / sizes.min())
-
-
 def _condition(matrix: np.ndarray, names, default_rtol: float) -> list[Finding]:
-    scale = diagonal_scale(matrix)
-    condition, raw = _spread(scale[:, None] * matrix * scale), _spread(matrix)
+    values, vectors = eigen(unit_diagonal(matrix)[0])
+    with np.errstate(divide="ignore"):
+        condition, raw = (np.abs(x).max() / np.abs(x).min() for x in (values, eigen(matrix)[0]))
     lost = condition * np.finfo(matrix.dtype).eps
     if lost <= default_rtol:
         return []
-    _, vectors = eigen(scale[:, None] * matrix * scale)
     where = tuple(name for name, c in zip(names, vectors[:, 0], strict=True) if abs(c) > 0.1)
     message = (
         f"The mass matrix has the condition {condition:.1e} after scaling each coordinate ({raw:.1e} before): "

@@ -10,7 +10,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._equations import Derivation, Motion, Sample, Scales, augment, is_lowered, numbers_of
+from lagjax._equations import (
+    Derivation,
+    Motion,
+    Sample,
+    Scales,
+    augment,
+    decide,
+    is_lowered,
+    numbers_of,
+    rank_tolerance,
+)
 from lagjax._interface import Layout, as_arrays
 from lagjax._program import Unlowerable
 from lagjax._scene import System
@@ -161,8 +171,7 @@ class CheckedScene(NamedTuple):
             return np.full_like(b, np.nan)
         if not len(rows):
             return units[:, None] * np.linalg.solve(scaled, units[:, None] * b)
-        tolerance = float(np.finfo(matrix.dtype).eps) ** (2 / 3)
-        return units[:, None] * np.linalg.lstsq(scaled, units[:, None] * b, rcond=tolerance)[0]
+        return units[:, None] * decide(scaled, rank_tolerance(matrix.dtype)).least_norm((units[:, None] * b).T).T
 
 
 class Measured(NamedTuple):

@@ -55,7 +55,6 @@ def _symmetric(matrix: np.ndarray, mass: np.ndarray) -> np.ndarray:
 
 def _trusted_roots(matrix: np.ndarray, eps: float) -> np.ndarray:
     """`_trusted_eigenvalues` for ẍ = K x, of which the eigenvalues are ±√ of those of K: an eighth of the work."""
-
     symmetric = np.array_equal(matrix, matrix.T)
     noise = 64 * eps * np.abs(matrix).max() * np.random.default_rng(0).standard_normal(matrix.shape)
     if symmetric:
@@ -64,9 +63,7 @@ def _trusted_roots(matrix: np.ndarray, eps: float) -> np.ndarray:
     def roots(k):
         return np.sqrt((np.linalg.eigvalsh(k) if symmetric else np.linalg.eigvals(k)).astype(complex))
 
-    values, perturbed = roots(matrix), roots(matrix + noise)
-    nearest = np.abs(values[:, None] - perturbed).min(axis=1)
-    trusted = values[(np.abs(values) > 0) & (nearest < 0.1 * np.abs(values))]
+    trusted = _trust(roots(matrix), roots(matrix + noise))
     return np.concatenate([trusted, -trusted])
 
 
@@ -78,8 +75,11 @@ def _trusted_eigenvalues(linear: np.ndarray, eps: float) -> np.ndarray:
     speed = np.sqrt(np.abs(linear[len(linear) // 2 :]).max()) or 1.0
     scale = np.repeat([1.0, speed], len(linear) // 2)  # the time in units in which both halves are alike
     linear = linear * scale / scale[:, None]
-    values = np.linalg.eigvals(linear)
     noise = 64 * eps * np.abs(linear).max() * np.random.default_rng(0).standard_normal(linear.shape)
-    perturbed = np.linalg.eigvals(linear + noise)
+    return _trust(np.linalg.eigvals(linear), np.linalg.eigvals(linear + noise))
+
+
+def _trust(values: np.ndarray, perturbed: np.ndarray) -> np.ndarray:
+    """The values that are not zero, and which their perturbation has moved by less than a tenth."""
     nearest = np.abs(values[:, None] - perturbed).min(axis=1)
     return values[(np.abs(values) > 0) & (nearest < 0.1 * np.abs(values))]

@@ -23,6 +23,7 @@ from lagjax._equations import (
     factorize,
     saddle,
     solve_saddle,
+    unit_diagonal,
 )
 from lagjax._interface import Layout
 from lagjax._program import Unlowerable, lower
@@ -200,9 +201,7 @@ def _conditions(matrix):
     by side in one program of JAX deadlock (`_linear`).
     """
     xp = matrix.__array_namespace__()
-    diagonal = xp.abs(xp.diagonal(matrix, axis1=-2, axis2=-1))
-    scale = 1 / xp.sqrt(xp.where(diagonal > 0, diagonal, 1))
-    values, scaled = _eigenvalues(xp, xp.stack([matrix, scale[..., :, None] * matrix * scale[..., None, :]]))
+    values, scaled = _eigenvalues(xp, xp.stack([matrix, unit_diagonal(matrix)[0]]))
     spread = (xp.max(xp.abs(x), axis=-1) / xp.min(xp.abs(x), axis=-1) for x in (values, scaled))
     return xp.stack([xp.min(values, axis=-1), *spread], axis=-1)
 
