@@ -12,9 +12,9 @@ and functions, modules imported inside. Installed packages are named, not read.
 names that it makes up, the inside of objects written in C (a generator, a random generator, a lock), and what
 `functools.cache` or another memory of the user's own keeps.
 
-`Walk` and `identity` stand in `_identity`, `Edition` in `_edition`; `_marks` makes the next look quick,
-`_names_in_code` reads byte code.
+`Walk` and `identity` stand in `_identity`, which reads byte code for them, `Edition` in `_edition`; `_marks` makes the
+next look quick.
 """
 
-from lagjax._interface.reads._edition import Edition, place_in
-from lagjax._interface.reads._identity import array_text, hash_of, identity, source, strip_addresses
+from lagjax._interface.reads._edition import Edition
+from lagjax._interface.reads._identity import array_text, hash_of, identity, place_in, source, strip_addresses

@@ -11,7 +11,6 @@ JAX keeps the traces of helpers that a function hands to it, as the branches of 
 
 import collections
 import contextlib
-import enum
 import functools
 import pickle
 import threading
@@ -24,14 +23,10 @@ import jax
 import numpy as np
 from jax.core import Tracer
 
-from lagjax._interface.reads._identity import CHANGING, Walk, array_text
+from lagjax._interface.reads._identity import CHANGING, Walk, array_text, place_in
 from lagjax._interface.reads._marks import LARGEST_ARRAY, LARGEST_CONTAINER, SIZE, Marks
-from lagjax._interface.reads._names_in_code import ReadNames
 
 _MOST_THINGS = 2000  # functions, classes and objects of one walk, some 50 ms; what is beyond is known by its identity
-_CONSTRUCTING = frozenset(
-    "__init__ __new__ __post_init__ __init_subclass__ __class_getitem__ __repr__ __str__ __del__".split()
-)
 # Part of the key under which JAX keeps traces. JAX wants it to be made before anything is traced: here.
 _context = jax.make_user_context(None)
 _inside = threading.local()  # whether a function of the user is being traced
@@ -160,13 +155,14 @@ class _Watch:
         return edition
 
     def _walk(self) -> "tuple[_LiveWalk, str]":
-        names: set[str] | None = set()
+        wanted: set[str] | None = set()
         while True:  # ends, as names only become more
-            walk = _LiveWalk(names)
-            text = walk.text(self.function)
-            if walk.names == names:
+            walk = _LiveWalk(wanted)
+            text, code = walk.text(self.function), walk.code
+            names = None if wanted is None or code.reflects else wanted | code.globals | code.attributes
+            if names == wanted:
                 return walk, text
-            names = walk.names
+            wanted = names
 
     def settle(self) -> None:
         """Look what has changed while the function ran: what it writes to is not watched from now on."""
@@ -196,67 +192,23 @@ class _LiveWalk(Walk):
 
     # A mapping of another class is an object: what it gives may be made anew each time.
     containers = (dict, types.MappingProxyType, list, tuple, set, frozenset, collections.deque)
+    most_things, largest_container = _MOST_THINGS, LARGEST_CONTAINER
 
     def __init__(self, wanted: set[str] | None):
-        super().__init__()
-        self.marks = Marks()
-        self.held: list[Any] = []  # what is known by its identity
-        self.tracers: list[Any] = []
-        self.names = None if wanted is None else set(wanted)  # None: all of them
-        self._wanted = wanted
-        self._stored: set[str] = set()
-        self._of_libraries: set[int] = set()  # whose objects may remember what they like
+        super().__init__(wanted)
+        self.marks, self.tracers = Marks(), []
 
     def is_own(self, place: Any, key: str | None) -> bool:
         """True if code that was met may have changed what is there."""
-        if key is None or self.names is None:
+        if key is None or self.wanted is None:
             return place is not None
-        return key in self._stored or id(place) in self._of_libraries
-
-    # ---- what a walk asks for ----
+        return key in self.code.stored or id(place) in self.of_libraries
 
     def read(self, place: Any, key: Any, value: Any) -> Any:
         if (id(place), key) in _own:
             return CHANGING
         self.marks.mark(place, key, value)
         return value
-
-    def counts(self, attributes: dict[str, Any], users: bool) -> None:
-        self.marks.mark(attributes, SIZE, None)
-        if not users:
-            self._of_libraries.add(id(attributes))
-
-    def meets(self, names: ReadNames) -> None:
-        self._stored |= names.stored
-        if self.names is not None:
-            self.names = None if names.reflects else self.names | names.globals | names.attributes
-
-    def wants(self, name: str, value: Any, owner: Any) -> bool:
-        if isinstance(value, functools.cached_property):
-            self._stored.add(name)
-        if self._wanted is None or name in self._wanted or isinstance(owner, enum.EnumType):
-            return True
-        if isinstance(owner, type) and name in _CONSTRUCTING:
-            return owner.__name__ in self._wanted
-        return isinstance(owner, type) and name.startswith("__")
-
-    def opaque(self, thing: Any) -> list[tuple[str, Any]]:
-        try:
-            shown = repr(thing)
-        except Exception:
-            return [("is", self._identity(thing))]
-        return [("is", self._identity(thing))] if " at 0x" in shown.lower() else [("shown", shown)]
-
-    def numbered(self, value: Any) -> str:
-        if id(value) not in self._numbers and len(self.things) >= _MOST_THINGS:
-            return self._identity(value)
-        return super().numbered(value)
-
-    def container(self, value: Any, deep: int) -> str:
-        if len(value) <= LARGEST_CONTAINER:
-            return super().container(value, deep)
-        count = len(value)
-        return CHANGING if self.read(value, None, value) is CHANGING else f"{count} in {self._identity(value)}"
 
     def describe_array(self, array: Any) -> str:
         if isinstance(array, Tracer):
@@ -267,23 +219,11 @@ class _LiveWalk(Walk):
             if array.dtype == object and array.size <= LARGEST_CONTAINER:
                 return f"{array.shape} {[self.name(x) for x in array.flat]}"
         if array.nbytes > LARGEST_ARRAY:
-            return f"{array.dtype}{array.shape} {self._identity(array)}"
+            return f"{array.dtype}{array.shape} {self.hold(array)}"
         try:
             return array_text(array)
         except Exception:  # an array that is not in this process, or was given away
-            return self._identity(array)
-
-    def _identity(self, thing: Any) -> str:
-        return f"{type(thing).__qualname__} {place_in(self.held, thing)}"
-
-
-def place_in(things: list, thing: Any) -> int:
-    """The place of this very thing in a list, to whose end it goes if it is not there."""
-    for k, other in enumerate(things):
-        if other is thing:
-            return k
-    things.append(thing)
-    return len(things) - 1
+            return self.hold(array)
 
 
 def _difference(old: Edition, now: Edition) -> str:

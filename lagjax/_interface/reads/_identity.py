@@ -8,11 +8,13 @@ nothing of what libraries keep for themselves enters. What is of an installed pa
 import array
 import collections
 import dataclasses
+import dis
 import enum
 import functools
 import hashlib
 import importlib.util
 import inspect
+import math
 import re
 import sys
 import types
@@ -23,12 +25,14 @@ from typing import Any
 import jax
 import numpy as np
 
-from lagjax._interface.reads._marks import ABSENT
-from lagjax._interface.reads._names_in_code import ReadNames, names_of
+from lagjax._interface.reads._marks import ABSENT, SIZE
 
 _LONG = 400  # characters of a value that is shown; of a longer one its hash
 _DEEP = 50  # containers within containers: one that is deeper contains itself
 _ATOMS = (type(None), bool, int, float, complex, str, bytes, type(Ellipsis), slice, range)
+_CONSTRUCTING = frozenset(
+    "__init__ __new__ __post_init__ __init_subclass__ __class_getitem__ __repr__ __str__ __del__".split()
+)
 CHANGING = "what the function itself changes"  # in the place of such a value
 
 
@@ -40,17 +44,19 @@ def identity(value: Any) -> str:
 class Walk:
     """Functions, classes and objects in the order in which they are met; each of them is described once.
 
-    A subclass may look on while the walk goes from one to another (`read`), leave out attributes that no code names
-    (`wants`), and describe what has no text (`opaque`).
+    Of attributes those with names in `wanted` are read, None: all. A subclass may look on while the walk goes from one
+    place to another (`read`), and keep `held` by its identity what is too large, or has no text.
     """
 
     containers: tuple[type, ...] = (Mapping, list, tuple, set, frozenset, collections.deque)
+    most_things = largest_container = math.inf
 
-    def __init__(self):
-        self.things: list[Any] = []  # held, so that no address is used twice
+    def __init__(self, wanted: set[str] | None = None):
+        self.wanted, self.things = wanted, []  # held, so that no address is used twice
+        self.held: list[Any] = []
+        self.code = ReadNames()  # of all functions that were met
+        self.of_libraries: set[int] = set()  # attributes of objects that may remember what they like
         self._numbers: dict[int, int] = {}
-
-    # ---- what a subclass may change ----
 
     def read(self, place: Any, key: Any, value: Any) -> Any:
         """A value that is found in a dict or an object by a key, or in a cell; with the key None the place itself.
@@ -59,22 +65,22 @@ class Walk:
         """
         return value
 
-    def counts(self, attributes: dict[str, Any], users: bool) -> None:
-        """The attributes of an object, of which some are read, and others may be added; `users`: of a user's class."""
+    def describe_array(self, value: Any) -> str:
+        return array_text(value)
 
     def wants(self, name: str, value: Any, owner: Any) -> bool:
         """True if an attribute of an object, a class or a function of the user is one of the things it reads."""
-        return True
+        if isinstance(value, functools.cached_property):
+            self.code.stored.add(name)
+        if self.wanted is None or name in self.wanted or isinstance(owner, enum.EnumType):
+            return True
+        if isinstance(owner, type) and name in _CONSTRUCTING:
+            return owner.__name__ in self.wanted
+        return isinstance(owner, type) and name.startswith("__")
 
-    def meets(self, names: ReadNames) -> None:
-        """Code that is among what is read names these."""
-
-    def opaque(self, thing: Any) -> list[tuple[str, Any]]:
-        """The words for an object whose inside cannot be seen."""
-        return [("shown", strip_addresses(repr(thing)))]
-
-    def describe_array(self, value: Any) -> str:
-        return array_text(value)
+    def hold(self, thing: Any) -> str:
+        """The name of a thing that is known by its identity."""
+        return f"{type(thing).__qualname__} {place_in(self.held, thing)}"
 
     # ---- the walk ----
 
@@ -110,6 +116,8 @@ class Walk:
     def numbered(self, value: Any) -> str:
         """The number of a function, a class or an object, whose line comes later."""
         if id(value) not in self._numbers:
+            if len(self.things) >= self.most_things:
+                return self.hold(value)
             self._numbers[id(value)] = len(self.things)
             self.things.append(value)
         return f"#{self._numbers[id(value)]}"
@@ -118,6 +126,8 @@ class Walk:
         """A container with all that is in it, which may be containers: `deep` of them are around it."""
         if (value := self.read(value, None, value)) is CHANGING:
             return CHANGING
+        if len(value) > self.largest_container:
+            return f"{len(value)} in {self.hold(value)}"
         kind = "" if type(value) in (dict, list, tuple, set, frozenset) else self.name(type(value))
         if isinstance(value, Mapping):
             return (
@@ -159,12 +169,10 @@ class Walk:
             yield from inside.items()
             return
         names, outer = names_of(function.__code__), function.__globals__
-        self.meets(names)
+        self.code.add(names)
         outside = {name: self.read(outer, name, outer.get(name, ABSENT)) for name in sorted(names.globals)}
         outside = {name: value for name, value in outside.items() if value is not ABSENT}
-        imported = {
-            ".".join((".",) * level) + name: _import_module(outer, level, name) for level, name, _ in names.imports
-        }
+        imported = {"." * level + name: _import_module(outer, level, name) for level, name in names.imports}
         used = inside | outside | {name: module for name, module in imported.items() if module is not None}
         yield "code", code_text(function.__code__)
         yield "defaults", (function.__defaults__, function.__kwdefaults__)
@@ -179,7 +187,7 @@ class Walk:
             if name != "__wrapped__" and (is_plain or not name.startswith("_")) and self.wants(name, x, function)
         ]
 
-    def _add_module_attributes(self, used: dict[str, Any], names: frozenset[str]) -> dict[str, Any]:
+    def _add_module_attributes(self, used: dict[str, Any], names: set[str]) -> dict[str, Any]:
         """The values `used` by name, and the attributes `names` of the user's modules among them, as of `helpers.f`."""
         found, waiting, modules = dict(used), list(used.items()), set()
         for path, value in waiting:  # which grows meanwhile
@@ -196,41 +204,59 @@ class Walk:
         yield "bases", [*kind.__bases__, *([] if type(kind) is type else [type(kind)])]
         held = kind.__dict__
         for name, value in sorted(held.items()):
-            if isinstance(value, staticmethod | classmethod):
-                inner: Any = value.__func__
-            else:
-                inner = getattr(value, "method", value)  # equinox wraps those of its modules
+            # A method of a module of equinox is wrapped.
+            place = "__func__" if isinstance(value, staticmethod | classmethod) else "method"
+            inner: Any = getattr(value, place, value)
             if _is_said_by_class(name, inner) and self.wants(name, inner, kind):
                 yield name, CHANGING if self.read(kind, name, value) is CHANGING else inner
 
     def _state(self, thing: Any) -> list[tuple[str, Any]]:
         """The attributes of an object by name; of what converts to an array, its values."""
+        inside, users = getattr(thing, "__dict__", {}), _is_users(type(thing).__module__)
         try:
-            if hasattr(type(thing), "__array__") and not _is_users(type(thing).__module__):
+            if hasattr(type(thing), "__array__") and not users:
                 return [("values", self.read(thing, None, np.asarray(thing)))]
         except Exception:  # an object of its own kind, such as a set of tables
             pass
-        return self._attributes(thing)
-
-    def _attributes(self, thing: Any) -> list[tuple[str, Any]]:
-        inside, users = getattr(thing, "__dict__", {}), _is_users(type(thing).__module__)
         if not isinstance(inside, dict):
             inside = {}
-        slots = [name for kind in type(thing).__mro__ for name in _slot_names(kind)]
         if dataclasses.is_dataclass(thing):
             fields = [x.name for x in dataclasses.fields(thing)]
             held = {name: inside[name] if name in inside else getattr(thing, name, None) for name in fields}
         else:
+            slots = [kind.__dict__.get("__slots__", ()) for kind in type(thing).__mro__]
+            slots = [name for names in slots for name in ((names,) if isinstance(names, str) else names)]
             held = {name: getattr(thing, name) for name in slots if hasattr(thing, name)} | inside
             if users:
                 held = {name: x for name, x in held.items() if self.wants(name, x, thing)}
             else:  # not its caches, unless there is nothing else, as in what delegates to another object
                 held = {name: x for name, x in held.items() if not name.startswith("_") or _is_plain(x)} or held
         held = {name: self.read(inside if name in inside else thing, name, x) for name, x in held.items()}
-        if held or users:
-            self.counts(inside, users)
-            return sorted(held.items())
-        return self.opaque(thing)
+        if not held and not users:
+            return self._opaque(thing)
+        self.read(inside, SIZE, None)
+        if not users:
+            self.of_libraries.add(id(inside))
+        return sorted(held.items())
+
+    def _opaque(self, thing: Any) -> list[tuple[str, Any]]:
+        """The words for an object whose inside cannot be seen; it is `held` where they do not tell it from others."""
+        try:
+            shown = repr(thing)
+        except Exception:
+            shown = f"{type(thing).__qualname__} at 0x"
+        if " at 0x" in shown.lower():
+            self.hold(thing)
+        return [("shown", strip_addresses(shown))]
+
+
+def place_in(things: list, thing: Any) -> int:
+    """The place of this very thing in a list, to whose end it goes if it is not there."""
+    for k, other in enumerate(things):
+        if other is thing:
+            return k
+    things.append(thing)
+    return len(things) - 1
 
 
 def _is_filled(cell: types.CellType) -> bool:
@@ -250,12 +276,6 @@ def _is_said_by_class(name: str, value: Any) -> bool:
 
 def _is_plain(value: Any) -> bool:
     return isinstance(value, int | float | complex | str | np.ndarray | jax.Array)
-
-
-def _slot_names(kind: type) -> tuple[str, ...]:
-    """The names in the `__slots__` of a class itself, without those of its bases."""
-    slots = kind.__dict__.get("__slots__", ())
-    return (slots,) if isinstance(slots, str) else tuple(slots)
 
 
 def _import_module(names: dict[str, Any], level: int, name: str) -> types.ModuleType | None:
@@ -297,6 +317,61 @@ def _is_users(module: str | None) -> bool:
         return False
     places = getattr(sys.modules.get(root), "__file__", None) or ""
     return not {"site-packages", "dist-packages"} & set(PurePath(places).parts)
+
+
+# ---- names in code ---------------------------------------------------------------------------------------------------
+
+# What makes names up while it runs: where code uses one of these, any attribute may be read.
+_REFLECTING = frozenset(
+    "getattr setattr hasattr vars dir globals locals eval exec __dict__ __getattribute__ asdict astuple fields "
+    "attrgetter inspect".split()
+)
+_OF_GLOBALS = frozenset("LOAD_NAME STORE_NAME DELETE_NAME LOAD_FROM_DICT_OR_GLOBALS".split())
+
+
+@dataclasses.dataclass
+class ReadNames:
+    """The names in code, those in the functions inside of it included.
+
+    `globals`; `attributes`; `imports`, each (level, module); `stored`: globals, free variables and attributes that it
+    sets.
+    """
+
+    globals: set[str] = dataclasses.field(default_factory=set)
+    attributes: set[str] = dataclasses.field(default_factory=set)
+    stored: set[str] = dataclasses.field(default_factory=set)
+    imports: set[tuple[int, str]] = dataclasses.field(default_factory=set)
+
+    @property
+    def reflects(self) -> bool:
+        """True if the code makes names up."""
+        return bool(_REFLECTING & (self.globals | self.attributes))
+
+    def add(self, other: "ReadNames") -> None:
+        for field in dataclasses.fields(self):
+            getattr(self, field.name).update(getattr(other, field.name))
+
+
+@functools.lru_cache(maxsize=4096)
+def names_of(code: types.CodeType) -> ReadNames:
+    """The names in a code object, found once for each."""
+    names, last_but_one, last = ReadNames(), None, None  # loaded before an import: its level, and what is taken
+    for step in dis.get_instructions(code):
+        operation, name = step.opname, step.argval
+        if operation == "IMPORT_NAME":
+            names.imports.add((last_but_one if isinstance(last_but_one, int) else 0, name))
+        elif operation in _OF_GLOBALS or operation.endswith("_GLOBAL"):
+            names.globals.add(name)
+        elif operation.endswith(("_ATTR", "_METHOD")) or operation == "IMPORT_FROM":
+            names.attributes.add(name[-1] if isinstance(name, tuple) else name)
+        if operation.startswith(("STORE_", "DELETE_")) and isinstance(name, str):
+            names.stored.add(name)
+        if operation.startswith("LOAD_"):
+            last_but_one, last = last, name
+    for inner in code.co_consts:
+        if isinstance(inner, types.CodeType):
+            names.add(names_of(inner))
+    return names
 
 
 # ---- words -----------------------------------------------------------------------------------------------------------
