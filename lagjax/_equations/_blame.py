@@ -5,6 +5,7 @@ or second derivative is not finite, is an `Offender`; comparisons and their like
 where a function may have a kink or a jump. Both know the line of the user's code that they come from.
 """
 
+import functools
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -52,7 +53,9 @@ def offenders(function: Callable, *arguments, derivatives: bool = True) -> list[
             return
         name = _name(equation)
         if not all(_finite(x) for x in results):
-            collected.append(Offender(name, _operands(_reorder_operands(equation, operands), results), place, "value"))
+            if equation.primitive.name == "select_n" and len(operands) == 3:
+                operands = [operands[0], operands[2], operands[1]]  # as users write it: condition, if true, if not
+            collected.append(Offender(name, _operands(operands, results), place, "value"))
         elif derivatives and chosen and all(map(_finite, operands)) and any(_floating(x) for x in results):
             first, second = _derivatives(equation, operands, chosen)
             for fault, values in (("first derivative", first), ("second derivative", second)):
@@ -101,7 +104,10 @@ def borders(function: Callable, *arguments) -> list[tuple[str, str, Any]]:
     collected = []
 
     def visit(equation, operands, moves, results, place):
-        side, name = _side_of(equation.primitive.name), _name(equation)
+        name, row = _name(equation), OPERATIONS.get(equation.primitive.name)
+        side = _SIDES.get(equation.primitive.name)
+        if row is not None and row.side is not None:
+            side = functools.partial(row.side, apply_in_jax, float)
         of_floats = any(m and _floating(x) for m, x in zip(moves, operands, strict=True))
         if side is not None and (of_floats or (name == "cond" and moves[0])):
             collected.append((name, place, jnp.asarray(side(results[0], *operands), float)))
@@ -152,15 +158,6 @@ def describe_pieces(functions: Sequence[Callable], arguments: tuple) -> str:
     """The operations at which functions are pieced together, and their lines: three at most; empty where none is."""
     places = (f"{name}{place}" for function in functions for name, place, _ in pieces_of(function, *arguments))
     return join_names(list(dict.fromkeys(places)), 3)
-
-
-def _side_of(name: str) -> Callable | None:
-    """`(result, *operands)` → on which side of its border a primitive is; None where it has no border."""
-    row = OPERATIONS.get(name)
-    if row is None or row.side is None:
-        return _SIDES.get(name)
-    side = row.side
-    return lambda result, *operands: side(apply_in_jax, float, result, *operands)
 
 
 # ---- following a jaxpr -----------------------------------------------------------------------------------------------
@@ -252,17 +249,7 @@ def _derivatives(equation, operands, chosen: list[int]) -> tuple[list, list]:
 def _name(equation) -> str:
     body = _body(equation) if equation.primitive.name in _RULES else None
     own = getattr(getattr(body[0], "debug_info", None), "func_name", None) if body else None
-    return own or _WRITTEN.get(equation.primitive.name, equation.primitive.name)
-
-
-_WRITTEN = {"select_n": "where"}  # what users call it
-
-
-def _reorder_operands(equation, operands) -> list:
-    """The operands in the order in which users write them: where(condition, if true, if not)."""
-    if equation.primitive.name == "select_n" and len(operands) == 3:
-        return [operands[0], operands[2], operands[1]]
-    return operands
+    return own or {"select_n": "where"}.get(equation.primitive.name, equation.primitive.name)  # as users call it
 
 
 def _place(equation) -> str:

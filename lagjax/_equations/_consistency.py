@@ -37,7 +37,8 @@ def require_consistent(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, pa
     start = _start(system, layout, ts, q0, qdot0, params)
     _require_gradients(names, start)
     dependent = dependent_rows(start.schur)
-    if not (start.driven or _reads_time(system)):
+    functions = system.constraints, system.velocity_constraints  # one that asks for the time may prescribe a motion
+    if not (start.driven or any("t" in function.extras for function in functions if function is not None)):
         _require_room(names, start, layout.size, len(names) - len(dependent))
     tolerance = TOLERANCE[layout.dtype]
     if next(_faults(names, start, dependent, tolerance, np.zeros((3, len(names)))), None) is None:
@@ -46,8 +47,11 @@ def require_consistent(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, pa
     terms = derivation.term_sizes(q[0], qdot[0], t, numbers, ("residual", "rates", "gamma"))
     rounding = ROUNDINGS * np.finfo(layout.dtype).eps * rows_of_terms(terms, (3, len(names)))
     for is_of_q, sentence in _faults(names, start, dependent, tolerance, rounding):
-        if not is_of_q or _nothing_to_find(system, q0, qdot0, ts[0], params):
-            raise ValueError(sentence)
+        if is_of_q:  # constraints that ask for different steps may still meet somewhere
+            nearest, _ = eqx.filter_jit(system.project)(q0, qdot0, ts[0], params)
+            if all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(nearest)):
+                continue
+        raise ValueError(sentence)
 
 
 def _faults(names, start, dependent, tolerance, rounding) -> Iterator[tuple[bool, str]]:
@@ -135,12 +139,6 @@ def _contradiction(names, values, what, lengths, dependent, tolerance, size, rou
     return None
 
 
-def _nothing_to_find(system, q0, qdot0, t, params) -> bool:
-    """True if `project` finds no consistent q: constraints that ask for different steps may still meet somewhere."""
-    q, _ = eqx.filter_jit(system.project)(q0, qdot0, t, params)
-    return not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves(q))
-
-
 @accepts_singles(("values",), ("ts",))
 def inconsistent_members(system, layout: Layout, ts, values: dict, axes: dict) -> jax.Array | None:
     """True for each member of a batch that starts off its constraints, shape (N,); None if that cannot be known.
@@ -199,12 +197,6 @@ _ASKED = ("mass_matrix", "jacobian", "gamma", "residual", "rates", "driving")
 def has_constraints(system) -> bool:
     """True if a motion of the scene can start off its constraints."""
     return system.constraints is not None or system.velocity_constraints is not None
-
-
-def _reads_time(system) -> bool:
-    """True if a constraint asks for the time: it may prescribe a motion."""
-    functions = system.constraints, system.velocity_constraints
-    return any("t" in function.extras for function in functions if function is not None)
 
 
 def _all_concrete(tree: PyTree) -> bool:

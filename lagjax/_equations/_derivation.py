@@ -168,14 +168,15 @@ class Derivation:
         """The program for these of `Motion.quantities`, end to end, each in C order."""
         if names not in self._programs:
             positions = [k for name in names for k in self._positions(name)]
-            structure = jax.tree.structure(tuple(self.state_shapes))
-
-            def chosen(*leaves):
-                values = self._traced_once.quantities(*jax.tree.unflatten(structure, leaves))
-                return [values[name] for name in names]
-
-            self._programs[names] = self._whole.select_outputs(positions, chosen)
+            self._programs[names] = self._select(positions, lambda values: [values[name] for name in names])
         return self._programs[names]
+
+    def _select(self, positions: list[int], choose: Callable) -> Program:
+        """The program for numbers of `_whole`, at these positions; `choose` takes them from arrays, by their names."""
+        structure = jax.tree.structure(tuple(self.state_shapes))
+        return self._whole.select_outputs(
+            positions, lambda *leaves: choose(self._traced_once.quantities(*jax.tree.unflatten(structure, leaves)))
+        )
 
     @functools.cached_property
     def _starts(self) -> dict[str, int]:
@@ -228,11 +229,8 @@ class Derivation:
     def momenta_by_q(self, momenta: tuple[int, ...]) -> Program:
         """∂pᵢ/∂q for the coordinates i in `momenta`, shape (len(momenta), n)."""
         if momenta not in self._by_q:
-
-            def chosen(*state):
-                return self._traced_once.momentum(*state)[jnp.asarray(momenta, int)]
-
-            self._by_q[momenta] = lower(jax.jacrev(chosen), *self.state_shapes, budget=OPERATION_BUDGET)
+            chosen = jax.jacrev(lambda *state: self._traced_once.momentum(*state)[jnp.asarray(momenta, int)])
+            self._by_q[momenta] = lower(chosen, *self.state_shapes, budget=OPERATION_BUDGET)
         return self._by_q[momenta]
 
     # ---- what is solved for ----
@@ -308,11 +306,11 @@ class Derivation:
             return None
         n, parts = self.layout.size, self.program("mass_matrix", "jacobian")
 
-        def scales_from_arrays(values, qdot):
+        def of_arrays(values, qdot):
             return velocity_scales(values[: n * n].reshape(n, n), values[n * n :].reshape(-1, n), qdot)
 
         def scales(*scalars):
-            return apply_function(scales_from_arrays, parts.vector(*scalars), stack(scalars[n : 2 * n]))
+            return apply_function(of_arrays, parts.vector(*scalars), stack(scalars[n : 2 * n]))
 
         return lower_formula(scales, *self.scalar_shapes, budget=OPERATION_BUDGET, graph=self._graph)
 
@@ -476,15 +474,8 @@ class Derivation:
             _, _, right, factors, singular = dense(*scalars)
             return [*solve(factors, right), jnp.asarray(singular)]
 
-        program = lower_solution(
-            system,
-            elimination.solve,
-            n,
-            *self.scalar_shapes,
-            budget=OPERATION_BUDGET,
-            graph=self._graph,
-            in_jax=solve_dense,
-        )
+        options = {"budget": OPERATION_BUDGET, "graph": self._graph, "in_jax": solve_dense}
+        program = lower_solution(system, elimination.solve, n, *self.scalar_shapes, **options)
         return program if self._agrees(program) else None
 
     def _agrees(self, program: Program) -> bool:
@@ -506,15 +497,13 @@ class Derivation:
         positions += range(starts[saddle.c], starts[saddle.c] + constraints)
         if saddle.b is not None:
             positions += range(starts[saddle.b], starts[saddle.b] + n)
-        structure = jax.tree.structure(tuple(self.state_shapes))
 
-        def chosen(*leaves):
-            values = self._traced_once.quantities(*jax.tree.unflatten(structure, leaves))
+        def chosen(values):
             table = jnp.concatenate([values["mass_matrix"], values["jacobian"]])
             right = [] if saddle.b is None else [values[saddle.b]]
             return [table[row, column], values[saddle.c][:constraints], *right]
 
-        cut = functools.cache(lambda: self._whole.select_outputs(positions, chosen))
+        cut = functools.cache(lambda: self._select(positions, chosen))
 
         def parts(*scalars):
             whole = self._whole.own_outputs(*scalars)
@@ -523,7 +512,7 @@ class Derivation:
         return parts
 
     def _rows(self, saddle: _Saddle) -> int:
-        """The number of constraints of this system; those on positions come first."""
+        """The number of constraints of this system."""
         return self.shape("jacobian")[0] if saddle.velocities else self.position_count
 
     @functools.cached_property
@@ -559,21 +548,17 @@ class Derivation:
         matrix that is a series in something small, as 1/(c² r) in relativity, is positive definite where that is small:
         a scene counts as positive definite that is so at all states near, or at all far away.
         """
+        n, m = self.layout.size, self._rows(saddle)
         for reach in (1.0, _FAR):
-            if (regular := self._definite(saddle, self._samples(reach))) is not None:
+            regular = definite = True
+            for matrix, jacobian in self._samples(reach):
+                lowest, size, rows = _lowest_eigenvalue(matrix), np.abs(matrix).max(), jacobian[:m]
+                regular = regular and bool(lowest > 1e-10 * size)
+                augmented = _lowest_eigenvalue(matrix + rows.T @ rows) if m else lowest
+                definite = definite and ((n <= 2 and not m) or bool(augmented >= -1e-12 * size))
+            if definite:
                 return regular
         return None
-
-    def _definite(self, saddle: _Saddle, samples: list[tuple[np.ndarray, np.ndarray]]) -> bool | None:
-        """True if M is regular at these samples; None where what is eliminated is not positive definite."""
-        n, m, regular = self.layout.size, self._rows(saddle), True
-        for matrix, jacobian in samples:
-            lowest, size, rows = _lowest_eigenvalue(matrix), np.abs(matrix).max(), jacobian[:m]
-            regular = regular and lowest > 1e-10 * size
-            augmented = _lowest_eigenvalue(matrix + rows.T @ rows) if m else lowest
-            if (n > 2 or m) and augmented < -1e-12 * size:
-                return None
-        return bool(regular)
 
 
 def _lowest_eigenvalue(matrix: np.ndarray) -> float:

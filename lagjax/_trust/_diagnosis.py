@@ -21,15 +21,14 @@ import numpy as np
 from lagjax._engine import AHEAD
 from lagjax._equations import (
     Derivation,
-    Offender,
     Sample,
     derivation_of,
+    describe_pieces,
     eigen,
     is_lowered,
     null_directions,
     numbers_of,
     offenders,
-    pieces_of,
     poles,
 )
 from lagjax._interface import RESULTS, Layout, code_of, halves, join_names, not_finite, numbers_at
@@ -37,7 +36,7 @@ from lagjax._primitives import sentence
 from lagjax._program import Unlowerable
 from lagjax._run import Trajectory
 from lagjax._scene import System
-from lagjax._trust.checks import check
+from lagjax._trust.checks import check, describe_direction
 
 LARGEST = 128  # coordinates up to which `check` is called: it takes a second there
 LONGEST = 4000  # equations of a function up to which they are gone through one by one: some 50 µs each
@@ -77,19 +76,6 @@ class Ended(NamedTuple):
     by_resets: bool = False  # whether the states of a hybrid motion are reset on the way
 
 
-class Undefined(NamedTuple):
-    """The quantities that are not finite, at a state (2n,) and a time, at the end of a motion or just `ahead` of it."""
-
-    what: str  # "the force on"
-    role: str  # of the function of the scene that it comes from
-    names: tuple[str, ...]
-    values: tuple[float, ...]
-    y: np.ndarray
-    t: float
-    ahead: bool
-    by_time: bool  # whether time alone, without the motion, leads there
-
-
 def describe_failure(trajectory: Trajectory, layout: Layout, why: str | None) -> str:
     """The whole message of a single motion that failed: why it did, its last state and the diagnosis."""
     end, system = trajectory.end, trajectory.system
@@ -113,22 +99,16 @@ def diagnosis(system: System, layout: Layout, params, ended: Ended) -> str:
 
 def _find_cause(system: System, layout: Layout, params, ended: Ended) -> str:
     derivation = derivation_of(system, layout, params)
-    state = layout.restore(ended.y[: layout.size]), layout.restore(ended.y[layout.size :])
-    first = layout.restore(ended.y_first[: layout.size]), layout.restore(ended.y_first[layout.size :])
-    bad = not_finite(params, "params") + not_finite(first[0], "q0") + not_finite(first[1], "qdot0")
-    if bad:
+    q0, qdot0 = map(layout.restore, halves(ended.y_first))
+    if bad := not_finite(params, "params") + not_finite(q0, "q0") + not_finite(qdot0, "qdot0"):
         where, value = bad[0]
         return f"\n{where} is {value}: every number must be finite."
     if not np.isfinite(ended.y).all():
         return f"\n{_reset_to_nothing(layout, ended) if ended.by_resets else _OVERSTEPPED}"
-    undefined = _undefined(derivation, ended) or _undefined_by_jax(derivation, params, ended)
-    if undefined is not None:
-        return f"\n{_describe_undefined(undefined)}{_line(derivation, params, undefined)}."
-    if text := _singular_mass(derivation, ended):
-        return f"\n{text}"
-    if (at := _running_away(derivation, ended)) is not None:
-        return f"\n{_escape(derivation, ended, at, _pole(derivation, params, ended))}"
-    return _run_check(system, derivation, state, params, ended) or _budget(ended)
+    text = _undefined(derivation, params, ended) or _singular_mass(derivation, ended)
+    if not text and (at := _running_away(derivation, ended)) is not None:
+        text = _escape(derivation, params, ended, at)
+    return f"\n{text}" if text else _run_check(system, derivation, params, ended) or _budget(ended)
 
 
 def _reset_to_nothing(layout: Layout, ended: Ended) -> str:
@@ -161,84 +141,52 @@ def _states_ahead(ended: Ended, rate: np.ndarray) -> tuple[np.ndarray, np.ndarra
 
 
 @np.errstate(all="ignore")
-def _undefined(derivation: Derivation, ended: Ended) -> Undefined | None:
-    """The first of the scene's quantities that is not finite at the end or just ahead; None where all are."""
+def _quantities_ahead(derivation: Derivation, numbers, ended: Ended) -> tuple[np.ndarray, np.ndarray, dict]:
+    """States, times and the scene's quantities there; without programs, forces and the gradient of L by JAX."""
+    (_, v), motion, values = halves(ended.y), derivation.motion, {}
     try:
-        rate = np.concatenate([halves(ended.y)[1], _acceleration(derivation, ended)])
-        y, t = _states_ahead(ended, rate)
-        values = Sample.from_states(derivation, y, t, ended.numbers).quantities(*(name for name, *_ in _QUANTITIES))
+        y, t = _states_ahead(ended, np.concatenate([v, _acceleration(derivation, ended)]))
+        names = [name for name, *_ in _QUANTITIES]
+        return y, t, Sample.from_states(derivation, y, t, ended.numbers).quantities(*names)
     except Unlowerable:
-        return None
-    return _first_undefined(derivation.layout, ended, y, t, values)
+        y, t = _states_ahead(ended, np.concatenate([v, np.zeros(len(v))]))
+    for name, function in (("given_force", motion.forces), ("lagrangian_by_q", jax.grad(motion.lagrangian))):
+        if function is not None and len(v) <= LARGEST and _is_short(function, (*halves(ended.y), ended.t, numbers)):
+            values[name] = np.stack(
+                [function(*map(jnp.asarray, (*halves(y[k]), t[k])), numbers) for k in range(len(y))]
+            )
+    return y, t, values
 
 
-def _undefined_by_jax(derivation: Derivation, params, ended: Ended) -> Undefined | None:
-    """The first quantity that is not finite in a scene without programs, among its forces and the gradient of L."""
-    if is_lowered(derivation) or derivation.layout.size > LARGEST:
-        return None
-    motion, numbers = derivation.motion, jax.tree.map(jnp.asarray, eqx.filter(params, eqx.is_array_like))
-    slope = jax.grad(motion.lagrangian)
-    functions: dict[str, Callable | None] = {"given_force": motion.forces, "lagrangian_by_q": slope}
-    states, times = _states_ahead(ended, np.concatenate([halves(ended.y)[1], np.zeros(derivation.layout.size)]))
-    values = {
-        name: np.stack(
-            [function(*halves(jnp.asarray(y)), jnp.asarray(t), numbers) for y, t in zip(states, times, strict=True)]
-        )
-        for name, function in functions.items()
-        if function is not None and _is_short(function, (*halves(ended.y), ended.t, numbers))
-    }
-    return _first_undefined(derivation.layout, ended, states, times, values)
-
-
-def _first_undefined(layout: Layout, ended: Ended, y, t, values: dict[str, np.ndarray]) -> Undefined | None:
-    along = 1 + len(AHEAD)
+def _undefined(derivation: Derivation, params, ended: Ended) -> str:
+    """A sentence about the first of the scene's quantities that is not finite at the end or just ahead; or nothing."""
+    numbers, along = eqx.filter(params, eqx.is_array_like), 1 + len(AHEAD)
+    y, t, values = _quantities_ahead(derivation, numbers, ended)
     for row in range(along):
         for name, what, role in _QUANTITIES:
-            if name not in values or not values[name][row].size:
-                continue
-            numbers = _coordinate_values(name, values[name])
-            bad = ~np.isfinite(numbers[row])
-            if bad.any():
-                by_time = bool(row and not np.isfinite(numbers[row - 1 + along][bad]).any())
-                names = tuple(name for name, is_bad in zip(layout.names, bad, strict=True) if is_bad)
-                shown = tuple(float(x) for x in numbers[row][bad])
-                return Undefined(what, role, names, shown, y[row], float(t[row]), row > 0, by_time)
-    return None
+            of = values.get(name, np.zeros((len(y), 0)))
+            # Of a matrix one number a column: 0 where the column is finite, else NaN.
+            of = of if of.ndim == 2 or not of.size else np.where(np.isfinite(of).all(axis=1), 0.0, np.nan)
+            bad = np.flatnonzero(~np.isfinite(of[row]))
+            if bad.size:
+                shown = join_names([f"{derivation.layout.names[i]} ({of[row, i]})" for i in bad])
+                by_time = row and not np.isfinite(of[row - 1 + along, bad]).any()
+                since = f", from t = {t[row]:.9g} on, whatever the state" if by_time else ""
+                offender = _offender(derivation, role, (*halves(y[row]), float(t[row]), numbers))
+                return f"Not finite {'just ahead' if row else 'there'}: {what} {shown}{since}{offender}."
+    return ""
 
 
-def _coordinate_values(name: str, values: np.ndarray) -> np.ndarray:
-    """Values (S, n) as they are; of matrices (S, n, n) one number a column: 0 where the column is finite, else NaN."""
-    if values.ndim == 2:
-        return values
-    return np.where(np.isfinite(values).all(axis=1), 0.0, np.nan)
-
-
-def _describe_undefined(undefined: Undefined) -> str:
-    quantities = join_names([f"{n} ({x})" for n, x in zip(undefined.names, undefined.values, strict=True)])
-    since = f", from t = {undefined.t:.9g} on, whatever the state" if undefined.by_time else ""
-    return f"Not finite {'just ahead' if undefined.ahead else 'there'}: {undefined.what} {quantities}{since}"
-
-
-def _line(derivation: Derivation, params, undefined: Undefined) -> str:
-    """The operation to blame, and its line, as the end of a sentence."""
-    arguments = (*halves(undefined.y), undefined.t, eqx.filter(params, eqx.is_array_like))
-    offender = _offender(_function(derivation, undefined.role), arguments, undefined.role)
-    return "" if offender is None else f". It comes from {offender}"
-
-
-def _offender(function: Callable | None, arguments: tuple, role: str) -> Offender | None:
-    if function is None or not _is_short(function, arguments):
-        return None
-    found = offenders(function, *arguments, derivatives=role != "forces")
-    return found[0] if found else None
-
-
-def _function(derivation: Derivation, role: str) -> Callable | None:
+def _offender(derivation: Derivation, role: str, arguments: tuple) -> str:
+    """The operation to blame of one of the scene's functions, and its line, as the end of a sentence."""
     motion = derivation.motion
+    function, on = getattr(motion, role), motion.constraints.on_positions
     if role == "constraints":
-        on = motion.constraints.on_positions
-        return None if on is None else lambda q, qdot, t, params: on(q, t, params)
-    return getattr(motion, role)
+        function = on and (lambda q, qdot, t, params: on(q, t, params))
+    if function is None or not _is_short(function, arguments):
+        return ""
+    to_blame = offenders(function, *arguments, derivatives=role != "forces")
+    return f". It comes from {to_blame[0]}" if to_blame else ""
 
 
 def _is_short(function: Callable, arguments: tuple) -> bool:
@@ -295,11 +243,7 @@ def _describe_null(mass: np.ndarray, names: tuple[str, ...]) -> str:
             f"Singular there: L has no kinetic energy in the velocity of {', '.join(unused)} (absent from L, or linear "
             "in it)."
         )
-    combinations = []
-    for direction in null_directions(mass):
-        direction = direction / direction[np.argmax(np.abs(direction))]
-        terms = [f"{c:+.3g} d{name}" for c, name in zip(direction, names, strict=True) if abs(c) > 1e-6]
-        combinations.append(" ".join(terms))
+    combinations = [describe_direction(direction, names) for direction in null_directions(mass)]
     if not combinations:
         return (
             "It is regular there, but not positive definite, and more than two coordinates are solved for without "
@@ -326,8 +270,11 @@ def _running_away(derivation: Derivation, ended: Ended) -> int | None:
     return fastest if scale < part * abs(ended.t_last - ended.t_first) and velocity[fastest] > 0 else None
 
 
-def _escape(derivation: Derivation, ended: Ended, place: int, pole: Offender | None) -> str:
-    """The place that a coordinate runs away to; `pole` is the operation that is near one, where that is known."""
+def _escape(derivation: Derivation, params, ended: Ended, place: int) -> str:
+    """The place that a coordinate runs away to: a pole of an operation of the force or of L, or infinity."""
+    motion, arguments = derivation.motion, (*halves(ended.y), ended.t, eqx.filter(params, eqx.is_array_like))
+    functions = [f for f in (motion.forces, motion.lagrangian) if f is not None and _is_short(f, arguments)]
+    pole = next((near for function in functions for near in poles(function, *arguments)), None)
     name, (q, v), (q_first, v_first) = derivation.layout.names[place], halves(ended.y), halves(ended.y_first)
     grown = f"its velocity was {v_first[place]:.3g} at the start and is {v[place]:.3g} where {name} = {q[place]:.3g}"
     if pole is not None:
@@ -350,16 +297,6 @@ def _escape(derivation: Derivation, ended: Ended, place: int, pole: Offender | N
     )
 
 
-def _pole(derivation: Derivation, params, ended: Ended) -> Offender | None:
-    """The first operation of the force or of L that is next to a pole at the end of the motion."""
-    arguments = (*halves(ended.y), ended.t, eqx.filter(params, eqx.is_array_like))
-    for role in ("forces", "lagrangian"):
-        function = getattr(derivation.motion, role)
-        if function is not None and _is_short(function, arguments) and (near := poles(function, *arguments)):
-            return near[0]
-    return None
-
-
 # ---- what else there is ----------------------------------------------------------------------------------------------
 
 # Findings of `check` that explain why steps became short, in the order in which they are reported.
@@ -369,27 +306,23 @@ _EXPLAIN = (
 )  # fmt: skip
 
 
-def _run_check(system: System, derivation: Derivation, state, params, ended: Ended) -> str:
+def _run_check(system: System, derivation: Derivation, params, ended: Ended) -> str:
     """The first finding of `check` at the end that explains the failure."""
     if derivation.layout.size > (LARGEST if is_lowered(derivation) else 16):
         return ""
-    q, qdot = state
+    q, qdot = map(derivation.layout.restore, halves(ended.y))
     found = {finding.kind: finding for finding in reversed(list(check(system, q, qdot, ended.t, params)))}
     kinds = (*_EXPLAIN, "border") if _CODES[ended.code] == "acceleration_discontinuous" else _EXPLAIN
     kind = next((kind for kind in kinds if kind in found), None)
     if kind is None:
         return ""
-    where = _borders(derivation, params, ended) if kind == "border" else ""
+    where = ""
+    if kind == "border":
+        arguments = (*halves(ended.y), ended.t, eqx.filter(params, eqx.is_array_like))
+        functions = [f for f in (derivation.motion.forces, derivation.motion.lagrangian) if f is not None]
+        pieces = describe_pieces([f for f in functions if _is_short(f, arguments)], arguments)
+        where = f" The scene is pieced together by {pieces}." if pieces else ""
     return f"\nThere check says: {found[kind].message}{where}{_budget(ended)}"
-
-
-def _borders(derivation: Derivation, params, ended: Ended) -> str:
-    """A sentence about the operations at which the force and L are pieced together."""
-    arguments = (*halves(ended.y), ended.t, eqx.filter(params, eqx.is_array_like))
-    functions = [f for f in (derivation.motion.forces, derivation.motion.lagrangian) if f is not None]
-    functions = [f for f in functions if _is_short(f, arguments)]
-    places = list(dict.fromkeys(f"{name}{place}" for f in functions for name, place, _ in pieces_of(f, *arguments)))
-    return f" The scene is pieced together by {join_names(places, 3)}." if places else ""
 
 
 def _budget(ended: Ended) -> str:

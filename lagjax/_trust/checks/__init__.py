@@ -29,6 +29,7 @@ from lagjax._trust.checks import (
     _stiffness,
 )
 from lagjax._trust.checks._findings import Finding, Findings
+from lagjax._trust.checks._mass import describe_direction
 from lagjax._trust.checks._scene_at_start import CheckedScene
 
 PyTree = Any

@@ -36,7 +36,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from lagjax._interface import RESULTS, Layout, advice, is_concrete, show_str
+from lagjax._interface import RESULTS, Layout, advice, is_concrete, name_of, show_str
 from lagjax._run import Members
 from lagjax._scene import System
 from lagjax._trust._diagnosis import diagnosis, motion_end
@@ -78,9 +78,8 @@ def _guards(transitions) -> tuple[Array, Array] | None:
 
 def _diagnosis(trajectory) -> str:
     """The obstacle of the first member that failed; nothing where none did, or where that is being traced."""
-    if not isinstance(trajectory.system, System):
-        return ""
-    if not all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
+    concrete = all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory))
+    if not isinstance(trajectory.system, System) or not concrete:
         return ""
     failed = np.argwhere(~np.asarray(trajectory.ok))
     if not len(failed):
@@ -237,7 +236,9 @@ class Health(eqx.Module):
         sides = "" if self.borders_located else "make it an event or a mode, or "
         sentences = {name: _SENTENCES[name].format(_member_share(members), sides) for name, members in raised.items()}
         if "result" in raised:
-            sentences["result"] += " " + self._advice()
+            codes, counts = np.unique(np.asarray(self.result._value)[~np.asarray(self.ok)], return_counts=True)
+            name = name_of(codes[np.argmax(counts)])  # of most of the members that failed
+            sentences["result"] += f" {name}: {advice(getattr(RESULTS, name))}"
             if self.diagnosis:
                 of = f" Of the first of them: {self.diagnosis}" if self.ok.ndim else f" {self.diagnosis}"
                 sentences["result"] += of.replace("\n", " ")
@@ -268,12 +269,14 @@ class Health(eqx.Module):
 
     def __str__(self) -> str:
         rows = [("result", self._results()), ("steps", self._steps())]
-        known = f"; the work between outputs is known to {_greatest(self.work_error):.1e}" if self.works else ""
+        error = np.max(np.nan_to_num(np.asarray(self.work_error, float), nan=-np.inf))
+        known = f"; the work between outputs is known to {error:.1e}" if self.works else ""
         law = "power balance" if self.works else "energy"
         rows.append((law, f"off by {_worst(self.energy, self._energy_limit)}{known}"))
         if self.momentum_names is None:
             rows.append(("momenta", "not known which are conserved: the scene has no scalar program"))
-        rows += [("borders", text) for text in self._border_contacts()]
+        if text := self._border_contacts():
+            rows.append(("borders", text))
         rows += _worst_row("momenta", self.momentum_names or (), self.momentum, self.momentum_allowed)
         for k, (what, off) in enumerate((("q", self.constraint_distance), ("qdot", self.constraint_rate))):
             allowed = np.broadcast_to(np.asarray(self.constraint_allowed)[..., k, None], off.value.shape)
@@ -292,43 +295,30 @@ class Health(eqx.Module):
         rows += [("" if k else "verdict", line) for k, line in enumerate(lines)]
         return "\n".join(f"{name:17s} {text}" for name, text in rows)
 
-    def _border_contacts(self) -> list[str]:
-        """A row of the report about the borders that the motion crossed, slid along or grazed, where it did."""
+    def _border_contacts(self) -> str:
+        """A row of the report about the borders that the motion crossed, slid along or grazed; empty if it met none."""
         if self.borders is None:
-            return [] if self.borders_located else ["not located"]
+            return "" if self.borders_located else "not located"
         crossed, slid, grazed = (np.asarray(x) for x in self.borders[:3])
-        if not (crossed.any() or slid.any() or grazed.any()):
-            return []
         most = "" if crossed.ndim == 0 else "at most "
-        parts = [f"{most}{crossed.max()} crossed"]
+        parts = [f"{most}{crossed.max()} crossed"] if crossed.any() or slid.any() or grazed.any() else []
         parts += [f"{most}{slid.max()} slid along"] if slid.any() else []
         if grazed.any():
-            t = np.asarray(self.borders.t)
-            parts.append(f"{most}{grazed.max()} grazed, the first at t = {np.nanmin(t):.6g}")
-        return ["; ".join(parts)]
+            parts.append(f"{most}{grazed.max()} grazed, the first at t = {np.nanmin(np.asarray(self.borders.t)):.6g}")
+        return "; ".join(parts)
 
     def _results(self) -> str:
         codes, counts = np.unique(np.asarray(self.result._value), return_counts=True)
         if self.ok.ndim == 0:
-            return _RESULT_NAMES[int(codes[0])]
-        listed = [f"{counts[k]} {_RESULT_NAMES[int(codes[k])]}" for k in np.argsort(-counts)]
+            return name_of(codes[0])
+        listed = [f"{counts[k]} {name_of(codes[k])}" for k in np.argsort(-counts)]
         return f"of {self.ok.size} members " + ", ".join(listed)
-
-    def _advice(self) -> str:
-        """The advice for the result of most of the members that failed."""
-        codes, counts = np.unique(np.asarray(self.result._value)[~np.asarray(self.ok)], return_counts=True)
-        name = _RESULT_NAMES[int(codes[np.argmax(counts)])]
-        return f"{name}: {advice(getattr(RESULTS, name))}"
 
     def _steps(self) -> str:
         accepted, rejected = (np.asarray(x).ravel() for x in (self.accepted_steps, self.rejected_steps))
         if self.ok.ndim == 0:
             return f"{accepted[0]} accepted, {rejected[0]} rejected"
         return f"{np.median(accepted):.0f} accepted, at most {accepted.max()}; at most {rejected.max()} rejected"
-
-
-def _greatest(values) -> float:
-    return float(np.max(np.nan_to_num(np.asarray(values, float), nan=-np.inf)))
 
 
 def _exceeds(xp, extreme: Extreme, allowed):
@@ -371,7 +361,6 @@ def _member(index) -> str:
     return str(int(index[0])) if len(index) == 1 else str(tuple(int(i) for i in index))
 
 
-_RESULT_NAMES = {int(item._value): name for name, item in RESULTS._name_to_item.items()}
 _SENTENCES = {
     "result": "The motion did not reach its end{0}.",
     "energy": (

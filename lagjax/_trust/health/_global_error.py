@@ -6,7 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._interface import is_concrete
-from lagjax._trust.health._measurements import Extreme
+from lagjax._trust.health._measurements import Extreme, extreme
 
 # The largest rtol of a reference, over that of the trajectory: its error is then a tenth of what it measures. With a
 # fifth, an error estimate could be off by a quarter.
@@ -70,8 +70,5 @@ def _states(trajectory) -> jax.Array:
 def _global_error(states, reference, ts, floor) -> Extreme:
     both = jnp.isfinite(states).all(axis=-1) & jnp.isfinite(reference).all(axis=-1)
     size = jnp.max(jnp.where(both[..., None], jnp.abs(reference), 0.0), axis=-2, keepdims=True) + floor
-    error = jnp.max(jnp.where(both[..., None], jnp.abs(states - reference), -jnp.inf) / size, axis=-1)
-    place = jnp.argmax(error, axis=-1, keepdims=True)
-    value, t = (jnp.take_along_axis(x, place, axis=-1)[..., 0] for x in (error, jnp.broadcast_to(ts, error.shape)))
-    reached = both.any(axis=-1)
-    return Extreme(jnp.where(reached, value, jnp.nan), jnp.where(reached, t, jnp.nan))
+    error = jnp.max(jnp.abs(states - reference) / size, axis=-1)
+    return extreme(jnp, error.ndim - 1, jnp.broadcast_to(ts, error.shape), error, both)

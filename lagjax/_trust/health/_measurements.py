@@ -282,7 +282,7 @@ def _report(path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample
     samples = sample(q, qdot, path.t, xp.maximum(mode, 0))
     drifts, work_error = _drifts(path, laws, momenta, samples, reached, between)
     here = jax.tree.map(lambda leaf: leaf[(slice(None),) * axis + (slice(T),)], samples)
-    on_path, extreme = reached[..., :T], partial(_extreme, xp, axis, path.ts)
+    on_path, most = reached[..., :T], partial(extreme, xp, axis, path.ts)
     limits, size = _limits(path, here, on_path)
     owner = np.repeat(np.arange(len(laws)), [len(law.names) for law in laws])
     in_force = on_path[..., None] & (mode[..., :T, None] == owner)
@@ -296,7 +296,7 @@ def _report(path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample
     finest = max(math.sqrt(eps), SLACK * eps) if fixed else SLACK * path.tolerances[0]
     fine, none = here.finite | ~on_path, xp.zeros(path.ts.shape[:-1], dtype)
     all_fine, first = xp.all(fine, axis=axis), xp.argmin(fine, axis=axis)
-    energy = extreme(drifts[..., 0], on_path)
+    energy = most(drifts[..., 0], on_path)
     return {
         "energy": energy,
         "energy_allowed": limits[..., 0],
@@ -304,14 +304,14 @@ def _report(path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample
         "outputs_needed": _outputs_needed(xp, T, energy.value, work_error, size[..., 0]),
         "amplitude": _amplitude(xp, q[..., :T, :], on_path),
         "amplitude_needed": none if fixed else SMALLEST * path.tolerances[1] + none,
-        "momentum": extreme(drifts[..., 1:], on_path),
+        "momentum": most(drifts[..., 1:], on_path),
         "momentum_allowed": limits[..., 1:],
-        "constraint_distance": extreme(here.distances, in_force),
-        "constraint_rate": extreme(here.rates, in_force),
+        "constraint_distance": most(here.distances, in_force),
+        "constraint_rate": most(here.rates, in_force),
         "constraint_allowed": near * xp.stack(spans, axis=-1),
-        "smallest_eigenvalue": extreme(here.mass[..., 0], on_path, largest=False),
-        "condition": extreme(here.mass[..., 1], on_path),
-        "scaled_condition": extreme(here.mass[..., 2], on_path),
+        "smallest_eigenvalue": most(here.mass[..., 0], on_path, largest=False),
+        "condition": most(here.mass[..., 1], on_path),
+        "scaled_condition": most(here.mass[..., 2], on_path),
         "scaled_condition_allowed": none + (math.inf if may_be_singular else finest / np.finfo(path.precision).eps),
         "gradients_finite": all_fine,
         "gradients_time": xp.where(all_fine, math.nan, _pick(xp, path.ts, first)),
@@ -517,7 +517,7 @@ def _limits(path: SampledPath, here: Measurements, on_path) -> tuple[Any, Any]:
     return allowed + ROUND_OFF * float(np.finfo(size.dtype).eps) * (1 + xp.sqrt(steps)) * size, size
 
 
-def _extreme(xp, axis: int, ts, values, at, largest: bool = True) -> Extreme:
+def extreme(xp, axis: int, ts, values, at, largest: bool = True) -> Extreme:
     """The extreme of `values` along the axis of time where `at` holds; a NaN there is more extreme than any number."""
     extra = (1,) * (values.ndim - ts.ndim)
     at = xp.broadcast_to(at.reshape(at.shape + (1,) * (values.ndim - at.ndim)), values.shape)
