@@ -23,20 +23,14 @@ def as_arrays(tree: PyTree, dtype, name: str = "params") -> PyTree:
     Raises `TypeError` or `ValueError`, with the name of the leaf, for what is neither a number nor can be a part of the
     program.
     """
-    leaves, structure = _flatten(tree, name)
+    try:
+        leaves, structure = jax.tree.flatten(tree)  # the names of leaves cost more than all else
+    except ValueError:
+        _, leaves, structure = labelled_leaves(tree, name)  # which raises a sentence
     if not all(_is_plain(leaf, dtype) for leaf in leaves):
         labels, leaves, structure = labelled_leaves(tree, name)
         return structure.unflatten(_leaf_as_array(*of, dtype) for of in zip(leaves, labels, strict=True))
     return structure.unflatten([np.asarray(leaf, dtype) if type(leaf) is float else leaf for leaf in leaves])
-
-
-def _flatten(tree: PyTree, name: str) -> tuple[list, Any]:
-    """The leaves of a pytree, whose names cost more than all else, and its structure."""
-    try:
-        return jax.tree.flatten(tree)
-    except ValueError:
-        _, leaves, structure = labelled_leaves(tree, name)  # which raises a sentence
-        return leaves, structure
 
 
 def _is_plain(leaf, dtype) -> bool:
@@ -48,7 +42,12 @@ def _is_plain(leaf, dtype) -> bool:
 
 def _leaf_as_array(leaf, label: str, dtype):
     if not eqx.is_array_like(leaf):  # a function, a string: part of the program
-        _require_hashable(leaf, label)
+        try:
+            hash(leaf)
+        except TypeError:
+            raise TypeError(
+                f"{label} is a {type(leaf).__name__}, neither a number nor hashable: it can be no part of a program."
+            ) from None
         return leaf
     require_numbers(leaf, label)
     if np.ma.is_masked(leaf):
@@ -89,15 +88,6 @@ def require_numbers(leaf, label: str) -> None:
         kind = getattr(leaf, "dtype", None)
         got = type(leaf).__name__ if kind is None else f"an array of {kind}"
         raise TypeError(f"{label} must hold numbers that JAX knows; got {got}.")
-
-
-def _require_hashable(leaf, label: str) -> None:
-    try:
-        hash(leaf)
-    except TypeError:
-        raise TypeError(
-            f"{label} is a {type(leaf).__name__}, neither a number nor hashable: it can be no part of a program."
-        ) from None
 
 
 def _as_array(x, dtype=None):
@@ -212,9 +202,11 @@ def output_times(ts, dtype) -> jax.Array | np.ndarray:
     if is_concrete(times):
         values = np.asarray(times)
         if not _is_monotonic(values):
+            gaps = np.sign(np.diff(values))
+            place = int(np.argmax(gaps != gaps[0])) if gaps[0] else 0
             raise ValueError(
                 f"ts must be strictly increasing or strictly decreasing, in {np.dtype(dtype).name}; it is not between "
-                f"ts[{_first_bad_gap(np.diff(values))}] and the next."
+                f"ts[{place}] and the next."
             )
     return times
 
@@ -223,10 +215,6 @@ def _is_monotonic(values: np.ndarray) -> bool:
     """True if numbers increase or decrease strictly."""
     later, earlier = values[1:], values[:-1]
     return bool((later > earlier).all() or (later < earlier).all())
-
-
-def _first_bad_gap(gaps: np.ndarray) -> int:
-    return int(np.argmax(np.sign(gaps) != np.sign(gaps[0]))) if gaps[0] != 0 else 0
 
 
 def require_tolerance(value, name: str):

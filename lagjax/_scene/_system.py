@@ -4,7 +4,6 @@ A `System` holds the user's functions, checked for their signatures when it is b
 first meet a state. `System._motion(layout)` is the same scene in flat coordinates, as an integration takes it.
 """
 
-import math
 import operator
 from collections.abc import Callable
 from typing import Any, Literal
@@ -107,13 +106,10 @@ class System(eqx.Module):
         if not isinstance(path, str) or path not in ("auto", "scalar", "array"):
             raise ValueError(f"path must be 'auto', 'scalar' or 'array'; got {path!r}.")
         self.path = path
-        self.lagrangian = _accept(lagrangian, "lagrangian")
-        self.forces = None if forces is None else _accept(forces, "forces")
-        self.dissipation = None if dissipation is None else _accept(dissipation, "dissipation")
-        self.constraints = None if constraints is None else _accept(constraints, "constraints", ("q",))
-        self.velocity_constraints = (
-            None if velocity_constraints is None else _accept(velocity_constraints, "velocity_constraints")
-        )
+        functions: tuple[Any, ...] = lagrangian, forces, dissipation, constraints, velocity_constraints
+        for role, function in zip(ROLES, functions, strict=True):
+            roles, absent = ("q",) if role == "constraints" else ("q", "qdot"), function is None and role != ROLES[0]
+            setattr(self, role, None if absent else accept(function, role, roles, ("t", "params", "inputs")))
 
     def __repr__(self) -> str:
         """One line: the functions of the scene and what each asks for. `equinox.tree_pprint` prints the fields."""
@@ -242,7 +238,7 @@ class System(eqx.Module):
 
         code = eqx.filter(params, eqx.is_array_like, inverse=True)  # functions and strings: no part of the data
 
-        def flatten_function(function: Function, to_array: Callable) -> Callable:
+        def flatten_function(function: Any, to_array: Callable) -> Any:
             """The user's function in flat coordinates, the last of which are (t, params); `to_array` flattens it."""
 
             def flat(*arguments):
@@ -250,18 +246,18 @@ class System(eqx.Module):
                 trees = map(layout.restore, vectors)
                 return to_array(function(*trees, t=t, params=eqx.combine(numbers, code)))
 
-            return flat
+            return function and flat
 
-        def optional(function: Function | None, to_array: Callable) -> Callable | None:
-            return None if function is None else flatten_function(function, to_array)
+        def concatenate(tree: PyTree) -> jax.Array:
+            return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(tree)])
 
         return Motion(
             lagrangian=flatten_function(self.lagrangian, lambda value: value),
-            forces=optional(self.forces, layout.flatten),
-            dissipation=optional(self.dissipation, lambda value: value),
+            forces=flatten_function(self.forces, layout.flatten),
+            dissipation=flatten_function(self.dissipation, lambda value: value),
             constraints=Constraints(
-                optional(self.constraints, _concatenate),
-                optional(self.velocity_constraints, _concatenate),
+                flatten_function(self.constraints, concatenate),
+                flatten_function(self.velocity_constraints, concatenate),
             ),
         )
 
@@ -278,13 +274,9 @@ class System(eqx.Module):
 
     def _split_by_constraint(self, flat: jax.Array, layout: Layout, params: PyTree) -> PyTree:
         """`flat` (m,), a number for each constraint, in the structure of `multipliers`."""
-        structure = self._constraint_structure(layout, params)
-        ends = np.cumsum([0, *(math.prod(leaf.shape) for leaf in jax.tree.leaves(structure))]).tolist()
-        pieces = [
-            flat[start:end].reshape(leaf.shape)
-            for start, end, leaf in zip(ends[:-1], ends[1:], jax.tree.leaves(structure), strict=True)
-        ]
-        parts = jax.tree.unflatten(jax.tree.structure(structure), pieces)
+        leaves, tree = jax.tree.flatten(self._constraint_structure(layout, params))
+        pieces = jnp.split(flat, np.cumsum([leaf.size for leaf in leaves])[:-1])
+        parts = jax.tree.unflatten(tree, [x.reshape(leaf.shape) for x, leaf in zip(pieces, leaves, strict=True)])
         if len(parts) == 1:
             return parts[0]
         return {**parts[0], **parts[1]} if all(isinstance(part, dict) for part in parts) else parts
@@ -367,7 +359,10 @@ class System(eqx.Module):
             except ValueNotKnown:
                 raise
             except (TypeError, KeyError, IndexError, AttributeError) as error:
-                error.add_note(_structure_of(role, state))
+                # A dict, where it expects a number, speaks of neither.
+                leaves = jax.tree_util.tree_leaves_with_path(state)[:8]
+                shown = ", ".join(f"q{jax.tree_util.keystr(path)} of shape {leaf.shape}" for path, leaf in leaves)
+                error.add_note(f"{role} was called with {shown}. Give q, qdot and params the structure that it reads.")
                 raise
 
         for function, role in ((self.lagrangian, "lagrangian"), (self.dissipation, "dissipation")):
@@ -377,13 +372,6 @@ class System(eqx.Module):
             _require_structure(output_shapes(self.forces, "forces"), layout)
         if self.constraints is not None or self.velocity_constraints is not None:
             _require_constraints(self._constraint_structure(layout, params))
-
-
-def _structure_of(role: str, state: PyTree) -> str:
-    """The arguments of a function that fails: a dict, where it expects a number, speaks of neither."""
-    leaves = jax.tree_util.tree_leaves_with_path(state)
-    shown = ", ".join(f"q{jax.tree_util.keystr(path)} of shape {leaf.shape}" for path, leaf in leaves[:8])
-    return f"{role} was called with {shown}. Give q, qdot and params the structure that it reads."
 
 
 def require_system(system: Any) -> System:
@@ -418,11 +406,6 @@ def replace_functions(system: System, functions: dict[str, Function | None]) -> 
     for name, value in (functions | {"path": system.path}).items():
         object.__setattr__(other, name, value)
     return other
-
-
-def _accept(function: Callable, role: str, roles: tuple[str, ...] = ("q", "qdot")) -> Function:
-    """A function of a scene, which may ask for inputs, too."""
-    return accept(function, role, roles, ("t", "params", "inputs"))
 
 
 # The functions of `Motion` in terms of `Motion.quantities` and q̇ (S, n) at S states: which of them, and the formula.
@@ -463,13 +446,9 @@ def _require_scalar(value: PyTree, role: str) -> None:
         raise TypeError(f"{role} must return a real floating-point number; got {value.dtype}.")
 
 
-def _concatenate(tree: PyTree) -> jax.Array:
-    return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(tree)])
-
-
 def _require_constraints(structure: tuple) -> None:
     leaves = jax.tree.leaves(structure)
-    if not leaves or not sum(math.prod(leaf.shape) for leaf in leaves):
+    if not sum(leaf.size for leaf in leaves):
         raise TypeError("constraints must return at least one number that is to be zero.")
     if not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
         raise TypeError("constraints must return real floating-point numbers.")
