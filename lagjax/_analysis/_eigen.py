@@ -18,6 +18,8 @@ import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 from jaxtyping import Array, Float
 
+from lagjax._equations import decide
+
 Matrix = Float[Array, "n n"]
 
 # Eigenvalues that differ by less than this many units of round-off of the largest count as equal. LAPACK's errors are a
@@ -179,10 +181,7 @@ def _eigen_jvp(primals, tangents):
 def null_space(rows: Float[Array, "m n"], rank: int) -> Float[Array, "n n-rank"]:
     """An orthonormal basis, a vector a column, of what m rows of this rank send to zero; without derivatives."""
     n = rows.shape[1]
+    lengths = jnp.linalg.norm(rows, axis=1, keepdims=True)
+    unit = jax.lax.stop_gradient(rows / jnp.where(lengths > 0, lengths, 1))
     shape = (jax.ShapeDtypeStruct((n, n - rank), rows.dtype),)
-    return _call_numpy(lambda g: _each(lambda a: [_null(a, rank)], g), shape, jax.lax.stop_gradient(rows))[0]
-
-
-def _null(rows: np.ndarray, rank: int) -> np.ndarray:
-    lengths = np.linalg.norm(rows, axis=1, keepdims=True)
-    return np.linalg.svd(rows / np.where(lengths > 0, lengths, 1))[2][rank:].T
+    return _call_numpy(lambda g: _each(lambda a: [decide(a).right[:, rank:]], g), shape, unit)[0]

@@ -22,7 +22,7 @@ from lagjax._analysis._potential import absorb_potential_forces
 from lagjax._analysis._random_states import perturb_last_digits, random_states
 from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._transformations import Fields, fields_of, textbook_symmetries
-from lagjax._equations import decide
+from lagjax._equations import decide, span_outside
 from lagjax._interface import Layout, accept, compile_for_one_call, show_str
 from lagjax._primitives import accepts_singles
 from lagjax._run import Trajectory
@@ -296,9 +296,8 @@ def _choose_basis(
         if np.linalg.norm(new) > 1e-7:
             taken = np.column_stack([taken, new / np.linalg.norm(new)])
             chosen.append((name, weights))
-    rest = space - taken @ (taken.T @ space)
-    left = np.linalg.svd(rest, full_matrices=False)[0][:, : space.shape[1] - taken.shape[1]]
-    return chosen + [(_describe_combination(row, fields, names), row) for row in _echelon_form(left.T)]
+    rest = span_outside(space, taken)
+    return chosen + [(_describe_combination(row, fields, names), row) for row in _echelon_form(rest.T)]
 
 
 def _echelon_form(rows: np.ndarray) -> np.ndarray:

@@ -41,5 +41,5 @@ from lagjax._equations._linear import (
 )
 from lagjax._equations._many_states import SADDLE, Sample, borders_of, is_lowered, map_in_chunks, solve_saddle
 from lagjax._equations._motion import Motion
-from lagjax._equations._rank import Decided, decide, null_space
+from lagjax._equations._rank import Decided, decide, null_space, span_outside
 from lagjax._equations._scales import Scales

@@ -62,3 +62,13 @@ def null_space(rows: np.ndarray, threshold: float | None = None) -> np.ndarray:
     threshold = float(np.sqrt(np.finfo(rows.dtype).eps)) if threshold is None else threshold
     lengths = np.linalg.norm(rows, axis=1, keepdims=True)
     return decide(rows / np.where(lengths > 0, lengths, 1), threshold).null
+
+
+def span_outside(basis: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """An orthonormal basis (n, k) of the part of the span of `basis` (n, m) that is not in the span of `known` (n, l).
+
+    Both are orthonormal. Singular values are the sines of angles to `known`, one or zero but for rounding where its
+    span lies in the other; the largest comes first.
+    """
+    left, sines, _ = np.linalg.svd(basis - known @ (known.T @ basis), full_matrices=False)
+    return left[:, sines > 0.5]

@@ -16,7 +16,7 @@ from lagjax._analysis.orbits._continuation import FamilyPoint, FamilyTangent, Fo
 from lagjax._analysis.orbits._family import Family, first_point, parameter_index
 from lagjax._analysis.orbits._flat_starts import starts
 from lagjax._analysis.orbits._orbit import RTOL, FlatOrbits, Orbit, assess_orbits, restore_orbits
-from lagjax._equations import decide
+from lagjax._equations import decide, span_outside
 from lagjax._interface import Layout, require_tolerance
 from lagjax._primitives import accepts_singles
 from lagjax._scene import System
@@ -106,9 +106,9 @@ def _branching_orbit(follower: Follower, here: FamilyPoint, before: FamilyTangen
     known[:states, :count] = still @ (still.T @ before.symmetries[:states])
     known[:, count] = null @ (null.T @ before.vector)
     known = np.linalg.qr(known)[0]
-    left, sizes, _ = np.linalg.svd(null - known @ (known.T @ null), full_matrices=False)
-    if not sizes[0] > 0.5:
+    directions = span_outside(null, known)
+    if not directions.shape[1]:
         return None
-    across = FamilyTangent(left[:, 0], before.rank, before.symmetries)
+    across = FamilyTangent(directions[:, 0], before.rank, before.symmetries)
     there = correct(follower, follower.move(here, size * across.vector, 0.0), across)
     return None if there is None else there[0]

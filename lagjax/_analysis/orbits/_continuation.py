@@ -26,7 +26,7 @@ from lagjax._analysis.orbits._arc_motions import Arcs
 from lagjax._analysis.orbits._condensation import Condensed, condense
 from lagjax._analysis.orbits._orbit import CLOSED
 from lagjax._analysis.orbits._shooting import Chain, Closing
-from lagjax._equations import decide
+from lagjax._equations import decide, span_outside
 
 _TRIALS = 8  # of Newton's method: beyond, the step along the family was too long
 # A step is repeated at half its length beyond these: the ratio of the second correction to the first, the first one in
@@ -195,24 +195,15 @@ def tangent_at(
         count = min(count, before.symmetries.shape[1]) if at_least else count
     symmetries = np.zeros((point.matrix.shape[1], count))
     symmetries[:states] = still.right[:, states - count :]
-    if before is None:
-        symmetries = _remove_direction(symmetries, slope)
-    null = whole.right[:, rank - left_out :]
-    left, sizes, _ = np.linalg.svd(null - symmetries @ (symmetries.T @ null), full_matrices=False)
-    left = left[:, sizes > 0.5]
-    vector = left @ (left.T @ (slope if before is None else before.vector))
+    if before is None:  # that in which the value rises is no symmetry
+        along = symmetries.T @ slope
+        symmetries = symmetries @ decide(along[None], absolute=1e-6 * float(np.linalg.norm(slope))).null
+    across = span_outside(whole.right[:, rank - left_out :], symmetries)
+    vector = across @ (across.T @ (slope if before is None else before.vector))
     length = np.linalg.norm(vector)
     if not length > 1e-6 * (np.linalg.norm(slope) if before is None else 1.0):
         return None
     return FamilyTangent(vector / length, rank, symmetries)
-
-
-def _remove_direction(basis: np.ndarray, vector: np.ndarray) -> np.ndarray:
-    """An orthonormal basis of what is orthogonal to `vector` in the span of the orthonormal `basis` (m, k)."""
-    along = basis.T @ vector
-    if not np.linalg.norm(along) > 1e-6 * np.linalg.norm(vector):
-        return basis
-    return basis @ np.linalg.svd(along[None], full_matrices=True)[2][1:].T
 
 
 class FamilyStep(NamedTuple):
