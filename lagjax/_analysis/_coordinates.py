@@ -72,28 +72,28 @@ def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordin
         Q, Qdot, t = jax.tree.map(lambda x: jnp.asarray(x, float), (Q, Qdot, t))
         return jax.jvp(lambda Q, t: present(place)(Q, t=t, params=params), (Q, t), (Qdot, jnp.ones_like(t)))
 
-    def of_old_state(function: Function):
+    def compose_state(function: Function):
         return lambda Q, Qdot, t, params: function(*old_state(Q, Qdot, t, params), t=t, params=params)
 
-    def of_old_place(function: Function):
+    def compose_place(function: Function):
         return lambda Q, t, params: function(place(Q, t=t, params=params), t=t, params=params)
 
-    def pull_back(function: Function):
-        force = of_old_state(function)
+    def compose_force(function: Function):
+        force = compose_state(function)
 
         def forces(Q, Qdot, t, params):
             return jax.vjp(lambda Q: place(Q, t=t, params=params), Q)[1](force(Q, Qdot, t, params))[0]
 
         return forces
 
-    def change(function: Function | None, how: Callable = of_old_state, roles: int = 2) -> Any:
+    def change(function: Function | None, how: Callable = compose_state, roles: int = 2) -> Any:
         return function and restrict_signature(how(function), {*function.extras, *place.extras}, roles)
 
     changed = System(
         change(system.lagrangian),
-        forces=change(system.forces, pull_back),
+        forces=change(system.forces, compose_force),
         dissipation=change(system.dissipation),
-        constraints=change(system.constraints, of_old_place, 1),
+        constraints=change(system.constraints, compose_place, 1),
         velocity_constraints=change(system.velocity_constraints),
         path=system.path,  # pyright: ignore[reportArgumentType]
     )
