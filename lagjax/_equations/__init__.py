@@ -21,7 +21,7 @@ from lagjax._equations._blame import (
 )
 from lagjax._equations._consistency import has_constraints, inconsistent_members, require_consistent
 from lagjax._equations._constraints import ROUNDINGS, Constraints, distances, rank_lost
-from lagjax._equations._derivation import Derivation, columns_of, derivation_of, numbers_of
+from lagjax._equations._derivation import Derivation, derivation_of, numbers_of
 from lagjax._equations._linear import (
     augment,
     dependent_rows,
