@@ -12,7 +12,6 @@ Three rooms, each of which imports only from those before it:
     result/    Fit: intervals, what is not seen, verdict, profile, draws, predictions, report
 """
 
-import functools
 import sys
 import time
 import warnings
@@ -20,58 +19,33 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from lagjax._engine import DEFAULT_RTOL
-from lagjax._equations import has_constraints
-from lagjax._fit.model._inputs import Form, input_functions
-from lagjax._fit.model._motions import Manifold, choose_motions
-from lagjax._fit.model._noise import AbstractNoise, Clipped, Gaussian, Quantised, Sensor, StudentT, read_sensor
+from lagjax._fit.model._assembly import GivenSystem, assemble_residuals, read_systems
+from lagjax._fit.model._noise import AbstractNoise, Clipped, Gaussian, Quantised, StudentT
 from lagjax._fit.model._parameters import Parameters
-from lagjax._fit.model._pieces import whole_pieces
-from lagjax._fit.model._records import (
-    Guess,
-    Record,
-    errors_of_system,
-    known_start,
-    require_interpolation,
-    require_records,
-    require_untraced,
-    restore_structure,
-    start_pair,
-    systems_by_name,
-)
-from lagjax._fit.model._residuals import LostTrial, Residuals, SystemResiduals
-from lagjax._fit.model._sensor_faults import constant_signals, require_measurements
-from lagjax._fit.model._sensors import UNCLEAR, Delayed, require_no_jumps, sensors, wrapped
-from lagjax._fit.model._signals import Signals
-from lagjax._fit.model._timings import Timings, build_clock
+from lagjax._fit.model._records import Guess, Record, require_untraced
+from lagjax._fit.model._residuals import LostTrial, Point, Residuals
+from lagjax._fit.model._sensors import Delayed, wrapped
+from lagjax._fit.model._timings import Timings
 from lagjax._fit.model._transforms import angle, between, inertia, positive, simplex
 from lagjax._fit.result._comparison import Comparison
 from lagjax._fit.result._experiments import Experiments
-from lagjax._fit.result._identifiability import unseen_sentences
-from lagjax._fit.result._information import Information, information
 from lagjax._fit.result._mistakes import SECONDS, find_mistake, possible_mistakes
 from lagjax._fit.result._prediction import Prediction
 from lagjax._fit.result._profile import Profile
 from lagjax._fit.result._report import draw_record, record_matrix
-from lagjax._fit.result._result import Covariance, Fit, SignalNoise
-from lagjax._fit.result._verdict import Verdict, verdict
-from lagjax._fit.search._descent import Descent
-from lagjax._fit.search._multistart import Waterfall, run_multistart
-from lagjax._fit.search._reader import Reader, TimeScales, build_reader, pad_states, time_scales
-from lagjax._fit.search._search import Unfollowed, search_again, search_by_gradient, search_records, start_by_weak_form
+from lagjax._fit.result._result import Fit
+from lagjax._fit.search._multistart import run_multistart
+from lagjax._fit.search._reader import TimeScales, first_starts, read_records, time_scales
+from lagjax._fit.search._search import Search, Unfollowed, search_again
 from lagjax._fit.search._unexplained import Unexplained
-from lagjax._interface import Layout, find_params_expression
-from lagjax._primitives import DOUBLE, with_doubles
-from lagjax._run.hybrid import Hybrid, Scene, first_law, require_scene
+from lagjax._primitives import with_doubles
+from lagjax._run.hybrid import Scene
 from lagjax._scene import HOLDS
 
 PyTree = Any
-
-METHODS = ("auto", "segments", "whole", "gradient")
+_METHODS = ("auto", "segments", "whole", "gradient")
 # Free numbers from which on a sentence says that another method may be meant. Of a network of 337 a trial takes half a
 # minute, and the gradient's whole descent as long; scenes of 50 need no such advice.
 _MANY = 100
@@ -156,8 +130,8 @@ def fit(
         raise ValueError(f"starts must be a positive whole number; got {starts!r}.")
     if not (isinstance(seed, int | np.integer) and seed >= 0):
         raise ValueError(f"seed must be a whole number, 0 or larger; got {seed!r}.")
-    if method not in METHODS:
-        raise ValueError(f"method must be one of {', '.join(map(repr, METHODS))}; got {method!r}.")
+    if method not in _METHODS:
+        raise ValueError(f"method must be one of {', '.join(map(repr, _METHODS))}; got {method!r}.")
     if hold not in HOLDS:
         raise ValueError(f"hold must be one of {', '.join(map(repr, HOLDS))}; got {hold!r}.")
     require_untraced(params0, "params0")
@@ -166,9 +140,9 @@ def fit(
         raise TypeError(
             f"noise must be lagjax.Gaussian(), StudentT(), Quantised(step) or Clipped(low, high); got {noise!r}."
         )
-    scenes = _scenes(system, records, params0, observe, hold)
+    given = read_systems(system, records, params0, observe, hold)
     parameters = Parameters.from_pytree(params0, free, transforms)
-    settings = _Settings(system, observe, noise, int(starts), method, int(seed), progress)
+    search = _FitSearch(params0, parameters, noise, int(starts), method, int(seed), progress)
     if len(parameters) > _MANY and method != "gradient":
         warnings.warn(
             f"{len(parameters)} numbers are free, and with method={method!r} every trial follows that many derivatives "
@@ -178,298 +152,87 @@ def fit(
         )
     begun = time.process_time()
     try:
-        done, judged = _fit_checked(settings, scenes, params0, parameters)
+        done, left = search.fit(given)
     except Unfollowed as reason:
-        nothing = Unexplained([str(reason)], [], np.inf, True, list(range(len(scenes[0].records))))
-        more = _mistakes(settings, scenes, params0, parameters, nothing, time.process_time() - begun)
+        nothing = Unexplained([str(reason)], [], np.inf, True, list(range(len(given[0].records))))
+        more = search.find_mistake(given, nothing, time.process_time() - begun)
         raise Unfollowed(" ".join([str(reason), *more])) from reason.__cause__
-    if not judged.left.doubted:
+    if not left.doubted:
         return done
-    more = _mistakes(settings, scenes, params0, parameters, judged.left, time.process_time() - begun)
+    more = search.find_mistake(given, left, time.process_time() - begun)
     return replace(done, ok=done.ok and not more, message=" ".join([done.message, *more]))
 
 
-def _mistakes(
-    settings: "_Settings",
-    scenes: list["_GivenSystem"],
-    params0: PyTree,
-    parameters: Parameters,
-    left: Unexplained,
-    spent: float,
-) -> list[str]:
-    """The mistakes in records of which a fit leaves much, as far as fits of other records tell; `spent` is the
-    processor time that it took, and the tries may take, or more where it explains nothing."""
-    if len(scenes) > 1 or settings.method == "gradient":
-        return []
-    [scene] = scenes
-    once, about = settings._replace(starts=1, progress=False), _build_residuals(scene, parameters, settings.noise)
-    reading = [reader for reader in _readers(scenes, Residuals([about])) or [] if reader is not None]
-    if not about.signals.names:
-        return []
+class _FitSearch(NamedTuple):
+    """The settings of a fit, for these records and for others without a mistake."""
 
-    def share(records: list[Any]) -> float | None:
-        try:
-            _, judged = _fit_checked(once, [scene._replace(records=records)], params0, parameters)
-        except ValueError:
-            return None
-        return None if judged.left.motion else judged.left.share
-
-    scales = time_scales(reading, about.motions, parameters.first) if reading else TimeScales(1.0, 1.0)
-    slower = scales.data / scales.scene if np.isfinite(scales.data) else 1.0
-    possible = possible_mistakes(scene.records, about.signals.names, left.worst, slower)
-    return find_mistake(share, possible, left.share, max(spent, SECONDS) if left.motion else spent)
-
-
-class _Settings(NamedTuple):
-    """The settings of a search."""
-
-    system: Any
-    observe: Any
-    noise: AbstractNoise
+    params0: PyTree
+    parameters: Parameters
+    law: AbstractNoise
     starts: int
     method: str
     seed: int
     progress: bool
 
+    def fit(self, given: list[GivenSystem]) -> tuple[Fit, Unexplained]:
+        """The fit of records that were checked, and what it leaves. Raises `Unfollowed` where the first trial cannot be
+        followed."""
+        residuals = assemble_residuals(given, self.parameters, self.law)
+        self._require_one_beginning(residuals)
+        readers = read_records(residuals)
+        if self.progress:
+            residuals.watch = _Printer(residuals.size)
+        u = self.parameters.inverse(self.parameters.first)
+        point, waterfall = Point(u, first_starts(residuals, readers, self.params0)), None
+        search = Search(residuals, self.law, self.method, readers)
+        if self.method == "gradient":
+            descent = search.descend_gradient(point)
+        else:
+            descent, waterfall = run_multistart(residuals, search, point, self.starts, self.seed)
+            descent = search_again(descent, self.law)
+        residuals.watch = descent.residuals.watch = None
+        return Fit.from_descent(descent, self.law, waterfall)
 
-def _fit_checked(
-    settings: _Settings, scenes: list["_GivenSystem"], params0: PyTree, parameters: Parameters
-) -> tuple[Fit, Verdict]:
-    """The fit of records that were checked. Raises `Unfollowed` where the first trial cannot be followed."""
-    residuals = Residuals([_build_residuals(scene, parameters, settings.noise) for scene in scenes])
-    _require_one_beginning(residuals, settings.starts, settings.method)
-    readers = _readers(scenes, residuals)
-    if settings.progress:
-        residuals.watch = _Printer(residuals.size)
-    y0 = _starts(residuals, readers, params0)
-    readers = _cuttable_readers(scenes, readers, settings.method)
-    first, noise = parameters.inverse(parameters.first), settings.noise
-    if settings.method == "gradient":
-        return _build_result(settings, search_by_gradient(residuals, first, y0, noise, readers), None)
-    weak = functools.partial(start_by_weak_form, residuals, readers=readers or [])
-    search = functools.partial(search_records, residuals, law=noise, method=settings.method, readers=readers, weak=weak)
-    descent, waterfall = run_multistart(residuals, search, first, y0, settings.starts, settings.seed)
-    return _build_result(settings, search_again(descent, noise), waterfall)
-
-
-class _GivenSystem(NamedTuple):
-    """One system of a fit: its name, None for the only one, its records and sensors, and the structure of its inputs
-    and coordinates."""
-
-    name: str | None
-    system: Scene
-    records: list[Any]
-    observe: Callable | Delayed | None
-    form: Form | None
-    layout: Layout
-
-
-def _scenes(system, records, params0, observe, hold: str) -> list[_GivenSystem]:
-    scenes = []
-    for name, one, own, shown in systems_by_name(system, records, observe):
-        with errors_of_system(name):
-            one = require_scene(one)
-            own = require_records(own)
-            form = _form(one, own, hold)
-            scenes.append(_GivenSystem(name, one, own, shown, form, _layout(one, own, params0, form)))
-    return scenes
-
-
-def _require_one_beginning(residuals: Residuals, starts: int, method: str) -> None:
-    """Raise `ValueError` where many starts, or a descent by gradients, are chosen and cannot be."""
-    if not len(residuals.parameters) and (method == "gradient" or starts > 1):
-        raise ValueError(
-            "No parameter is free, so there is one place to begin: leave `starts` at 1, and `method` at 'auto', which "
-            "fits the starts of records."
-        )
-    if method == "gradient" and starts > 1:
-        raise ValueError('method="gradient" goes down from one start: leave `starts` at 1.')
-    for one in [part.system for part in residuals.parts] if starts > 1 else []:
-        if one.signals.delays is not None:
-            raise ValueError("starts must be 1 where sensors are lagjax.Delayed: their search has one beginning.")
-        if one.manifold is not None and one.fitted.any():
-            raise ValueError("starts must be 1 where starts on constraints are fitted: their search has one beginning.")
-        if one.clocks:
-            raise ValueError("starts must be 1 where there are lagjax.Timings: their search has one beginning.")
-
-
-def _form(system: Scene, records: list[Record], hold: str) -> Form | None:
-    """The structure of the inputs. Raises `ValueError` where the scene asks for some, and there are none."""
-    asking = input_functions(system)
-    if asking and isinstance(system, Hybrid):
-        raise ValueError(f"{asking[0]} asks for `inputs`, which hybrid motion has none of: make it a function of `t`.")
-    for place, record in enumerate(records):
-        if asking and (not isinstance(record, Record) or record.input_structure is None):
+    def _require_one_beginning(self, residuals: Residuals) -> None:
+        """Raise `ValueError` where many starts, or a descent by gradients, are chosen and cannot be."""
+        if not len(self.parameters) and (self.method == "gradient" or self.starts > 1):
             raise ValueError(
-                f"{asking[0]} asks for `inputs`, which records[{place}] has none of: give Record(..., inputs=...)."
+                "No parameter is free, so there is one place to begin: leave `starts` at 1, and `method` at 'auto', "
+                "which fits the starts of records."
             )
-    structures = [record.input_structure for record in records if isinstance(record, Record)]
-    if not structures or structures[0] is None:
-        return None
-    for place, record in enumerate(records):
-        require_interpolation(record, hold, f"records[{place}]")
-    tree, shapes = structures[0]
-    return Form(tree, shapes, hold)
+        if self.method == "gradient" and self.starts > 1:
+            raise ValueError('method="gradient" goes down from one start: leave `starts` at 1.')
+        for part in residuals.parts if self.starts > 1 else []:
+            why = (
+                "sensors are lagjax.Delayed" if part.signals.delays is not None
+                else "starts on constraints are fitted" if part.fits_on_constraints
+                else "there are lagjax.Timings" if part.clocks else None
+            )  # fmt: skip
+            if why is not None:
+                raise ValueError(f"starts must be 1 where {why}: their search has one beginning.")
 
+    def find_mistake(self, given: list[GivenSystem], left: Unexplained, spent: float) -> list[str]:
+        """The mistakes in records of which a fit leaves much, as far as fits of other records tell; `spent` is the
+        processor time that it took, and the tries may take, or more where it explains nothing."""
+        if len(given) > 1 or self.method == "gradient":
+            return []
+        once, residuals = self._replace(starts=1, progress=False), assemble_residuals(given, self.parameters, self.law)
+        [part], [system] = residuals.parts, given
+        if not part.signals.names:
+            return []
 
-def _layout(system: Scene, records: list[Record], params0, form: Form | None) -> Layout:
-    """The structure of the coordinates: that of a start that a record gives, or else that of its values."""
-    place = next((k for k, record in enumerate(records) if record.start is not None), None)
-    if place is not None:
-        begun = start_pair(records[place].start, params0)
-    else:  # no record is of crossing times: those have starts
-        begun = 2 * (jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), records[0].values),)
-    q, qdot = jax.tree.map(jnp.asarray, begun)
-    scene, params = first_law(system), params0
-    if form is not None:
-        scene, params = form.drive_scene(scene), form.params(params0, 2)
-    try:
-        jax.eval_shape(lambda q, qdot: scene.energy(q, qdot, 0.0, params), q, qdot)
-    except Exception as reason:
-        if where := find_params_expression(reason):
-            raise ValueError(
-                f"The scene's functions ask for `{where}`, which params0 does not have ({type(reason).__name__}: "
-                f"{str(reason).splitlines()[0]}): params0 is {jax.tree.structure(params0)}."
-            ) from reason
-        if place is not None:
-            raise ValueError(
-                f"The scene's functions cannot be called with the start of records[{place}] ({type(reason).__name__}: "
-                f"{str(reason).splitlines()[0]}): give it in the structure of q."
-            ) from reason
-        raise ValueError(
-            "The scene's functions cannot be called with coordinates of the structure of `values`, which q is taken to "
-            f"have where no record has a start ({type(reason).__name__}: {str(reason).splitlines()[0]}). If the values "
-            "are something else, give every record start=(q0, qdot0), or lagjax.Guess(q0, qdot0) to fit it."
-        ) from reason
-    return replace(Layout.from_state(q, qdot), dtype=DOUBLE)
+        def share(records: list[Any]) -> float | None:
+            try:
+                _, left = once.fit([system._replace(records=records)])
+            except ValueError:
+                return None
+            return None if left.motion else left.share
 
-
-def _build_residuals(scene: _GivenSystem, parameters: Parameters, noise: AbstractNoise) -> SystemResiduals:
-    with errors_of_system(scene.name):
-        return _system_residuals(*scene, parameters, noise)
-
-
-def _system_residuals(name, system, records, observe, form, layout, parameters, noise) -> SystemResiduals:
-    rtol = DEFAULT_RTOL
-    motions = choose_motions(system, layout, parameters, rtol, None, form)
-    recordings = [record for record in records if isinstance(record, Record)]
-    if isinstance(observe, Delayed):
-        _require_length(recordings, observe.longest)
-    signals = Signals(observe, layout, parameters, recordings[0] if recordings else None, form)
-    _require_no_jumps(system, records, observe, signals)
-    _require_motion(recordings, signals.names, records)
-    if not isinstance(noise, StudentT):
-        require_measurements(recordings, signals.names, signals.periods)
-    sensor = read_sensor(recordings, noise, signals.names, signals.periods)
-    every = np.concatenate([record.matrix for record in recordings]) if recordings else np.zeros((1, 0))
-    size = np.sqrt(np.nanmean(every**2, axis=0))  # root mean squares
-    timings = {k: record for k, record in enumerate(records) if isinstance(record, Timings)}
-    clocks = {k: build_clock(system, layout, parameters, record, rtol) for k, record in timings.items()}
-    if timings:
-        size = np.append(size, max(np.ptp(record.ts) for record in timings.values()))
-        sensor = Sensor(*(np.append(x, np.nan) for x in sensor))
-    fitted = np.array([record.start is None or isinstance(record.start, Guess) for record in records])
-    manifold = None
-    if isinstance(system, Hybrid):
-        _require_supported(system, fitted, observe)
-    elif has_constraints(system) and not input_functions(system):
-        manifold = Manifold(system, layout, parameters, motions.projection)
-    elif has_constraints(system) and fitted.any():
-        raise ValueError("A start on constraints of a scene with `inputs` cannot be fitted: give start=(q0, qdot0).")
-    return SystemResiduals(
-        name, system, records, whole_pieces(records), fitted, motions, signals, parameters,
-        np.where(size > 0, size, 1.0), rtol, clocks, manifold, sensor,
-    )  # fmt: skip
-
-
-def _require_no_jumps(scene: Scene, records: list[Any], observe, signals: Signals) -> None:
-    """Raise `ValueError` where a signal jumps by a period without `lagjax.wrapped`; hybrid motion may jump."""
-    if isinstance(scene, Hybrid) or sensors(observe)[1] is not None:
-        return
-    for place, record in enumerate(records):
-        if isinstance(record, Record):
-            require_no_jumps(record, f"records[{place}]", signals.names, sensors(observe)[0] is None)
-
-
-def _require_motion(recordings: list[Record], names: tuple[str, ...], records: list[Any]) -> None:
-    """Raise `ValueError` where starts are fitted, and no signal of any record ever changes."""
-    still = constant_signals(recordings, names)
-    if still and len(still) == len(names) * len(records) and all(record.start is None for record in records):
-        raise ValueError(f"{still[0]} So it is with all signals of all records: nothing moves that could be fitted.")
-
-
-def _require_supported(scene: Hybrid, fitted: np.ndarray, observe) -> None:
-    if fitted.any() and has_constraints(first_law(scene)):
-        raise ValueError("A start on constraints of hybrid motion cannot be fitted: give start=(q0, qdot0).")
-    if isinstance(observe, Delayed):
-        raise ValueError("Sensors of hybrid motion cannot be lagjax.Delayed: keep the delay, and shift the times.")
-
-
-def _require_length(recordings: list[Record], longest: float) -> None:
-    """Raise `ValueError` for a record of which the delay of its sensors leaves nothing."""
-    for place, record in enumerate(recordings):
-        if (length := record.ts[-1] - record.ts[0]) < longest:
-            raise ValueError(
-                f"Record {place} is {length:g} long, shorter than the longest delay of its sensors, {longest:g}: "
-                "nothing is left of it. Leave it out, or bound the delay closer."
-            )
-
-
-def _readers(scenes: list[_GivenSystem], residuals: Residuals) -> list[Reader | None] | None:
-    """Readers of states off the data, for each record whose signals are positions; None where there is no such record.
-
-    All records of a system together try windows at a few hundred places.
-    """
-    readers, numbers = [], residuals.parameters.first
-    for scene, part in zip(scenes, residuals.parts, strict=True):
-        probes = max(8, 256 // len(scene.records))
-        readers += [
-            build_reader(record, part.system, numbers, probes) if isinstance(record, Record) else None
-            for record in scene.records
-        ]
-    return readers if any(reader is not None for reader in readers) else None
-
-
-def _cuttable_readers(
-    scenes: list[_GivenSystem], readers: list[Reader | None] | None, method: str
-) -> list[Reader | None] | None:
-    """The readers of records that may be cut into segments: not of hybrid motion, whose mode is known at first only.
-
-    Raises `ValueError` where the method needs some, and there are none for that reason.
-    """
-    hybrid = [isinstance(scene.system, Hybrid) for scene in scenes for _ in scene.records]
-    if method == "segments" and all(hybrid):
-        raise ValueError(
-            'method="segments" cannot cut hybrid motion, whose mode is known at its start alone: leave it.'
-        )
-    left = [None if is_hybrid else reader for is_hybrid, reader in zip(hybrid, readers or [], strict=False)]
-    return left if any(reader is not None for reader in left) else None
-
-
-def _starts(residuals: Residuals, readers: list[Reader | None] | None, params0: PyTree) -> np.ndarray:
-    """The first guess of the starts of all records, (N, 2n) of the system with the most coordinates."""
-    found = []
-    for part in residuals.parts:
-        own = None if readers is None else readers[part.records]
-        with errors_of_system(part.name):
-            found += [_start(part.system, own, k, params0) for k in range(len(part.system.records))]
-    return np.stack([pad_states(state, residuals.states) for state in found])
-
-
-def _start(system: SystemResiduals, readers: list[Reader | None] | None, place: int, params0: PyTree) -> np.ndarray:
-    record = system.records[place]
-    state = known_start(record, system.layout, place, params0)
-    if state is not None:
-        return state
-    reader = None if readers is None else readers[place]
-    if reader is None and isinstance(record, Record) and system.signals.look_like_positions(record):
-        raise ValueError(UNCLEAR.format(f"records[{place}]"))
-    if reader is None:
-        raise ValueError(
-            f"records[{place}] needs a start, because its values do not have the structure of q: give "
-            "start=(q0, qdot0) if it is known, else start=lagjax.Guess(q0, qdot0)."
-        )
-    return reader.states(np.array([0]))[0]
+        reading = [reader for reader in read_records(residuals) if reader is not None]
+        scales = time_scales(reading, part.motions, self.parameters.first) if reading else TimeScales(1.0, 1.0)
+        slower = scales.data / scales.scene if np.isfinite(scales.data) else 1.0
+        possible = possible_mistakes(system.records, part.signals.names, left.worst, slower)
+        return find_mistake(share, possible, left.share, max(spent, SECONDS) if left.motion else spent)
 
 
 class _Printer:
@@ -486,63 +249,3 @@ class _Printer:
             rms = np.sqrt(np.mean(trial.flat() ** 2, axis=0)) / self.size
             text = f"{len(trial.starts)} motions, residuals {np.exp(np.mean(np.log(rms))):.4g} of the signals"
         print(f"trial {self.trials}: {text}", file=sys.stderr, flush=True)
-
-
-# ---- what came out ---------------------------------------------------------------------------------------------------
-
-
-def _build_result(settings: _Settings, descent: Descent, waterfall: Waterfall | None) -> tuple[Fit, Verdict]:
-    point, noise, residuals = descent.point, descent.noise, descent.residuals
-    parameters, residuals.watch = residuals.parameters, None
-    known = information(residuals, point, noise)
-    unseen = unseen_sentences(residuals, point, noise, known)
-    found = verdict(descent, unseen, known, residuals, settings.noise)
-    done = Fit(
-        params=parameters.restore(parameters.numbers(point.u)),
-        starts=residuals.group_by_system(
-            [residuals.restore_state(k, point.starts[row]) for k, row in enumerate(residuals.firsts)]
-        ),
-        covariance=Covariance(parameters.names, parameters.covariance(point.u, known.covariance)),
-        noise=_noise_by_name(residuals, noise, known),
-        residuals=residuals.group_by_system(_record_residuals(residuals, point)),
-        unseen=unseen,
-        ok=found.ok,
-        message=found.message,
-        log_likelihood=residuals.log_likelihood(point, noise),
-        trials=descent.trials,
-        waterfall=waterfall,
-        records=tuple(residuals.records),
-        parameters=parameters,
-        u=point.u,
-        states=point.starts,
-        law=settings.noise,
-        information=known,
-        noise_scale=noise,
-        residual_function=residuals,
-        system=settings.system,
-        observe=settings.observe,
-    )
-    return done, found
-
-
-def _noise_by_name(residuals: Residuals, noise, known: Information) -> dict[str, SignalNoise]:
-    samples = (residuals.weights > 0).sum(axis=0)
-    columns = zip(noise.sigma, noise.dof, samples, known.effective, 2 * (1 - known.correlation), strict=True)
-    return {
-        name: SignalNoise(float(sigma), float(dof), int(count), float(effective), float(watson))
-        for name, (sigma, dof, count, effective, watson) in zip(residuals.names, columns, strict=True)
-    }
-
-
-def _record_residuals(residuals: Residuals, point) -> list[PyTree]:
-    """The residuals of every record in its structure, NaN where nothing was measured."""
-    columns = [residuals.columns(k) for k in range(len(residuals.records))]
-    found = [
-        np.full((len(record), c.stop - c.start), np.nan) for record, c in zip(residuals.records, columns, strict=True)
-    ]
-    for batch, own in zip(residuals.batches, point.residuals, strict=True):
-        for row, left, weights in zip(batch.rows.tolist(), own, batch.weights, strict=True):
-            record, places = residuals.pieces[row]
-            matrix = np.where(weights > 0, left, np.nan)[: len(places), columns[record]]
-            found[record][places] = matrix
-    return [restore_structure(matrix, record) for matrix, record in zip(found, residuals.records, strict=True)]

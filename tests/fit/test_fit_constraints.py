@@ -6,6 +6,7 @@ import pytest
 from lagrangians import weight_in_gravity
 
 import lagjax
+from lagjax._fit.model._residuals import Point
 
 TRUTH = {"g": 9.81, "c": 0.2, "length": 0.8}
 TS = np.linspace(0.0, 3.0, 61)
@@ -48,9 +49,11 @@ def test_the_derivatives_are_those_of_differences_also_by_the_length_of_the_rod(
     record, truth = measured(0.0)
     fit = lagjax.fit(SCENE, record, TRUTH, method="whole")
     u, states = fit.parameters.inverse(np.asarray(fit.parameters.first)), truth[None]
-    point = fit.residual_function.evaluate(u, states)
+    point = fit.residual_function.evaluate(Point(u, states))
     for k, step in enumerate(1e-5 * np.eye(4 + len(u))):
-        ends = [fit.residual_function.evaluate(u + w * step[4:], states + w * step[:4]).residuals[0] for w in (1, -1)]
+        ends = [
+            fit.residual_function.evaluate(Point(u + w * step[4:], states + w * step[:4])).residuals[0] for w in (1, -1)
+        ]
         np.testing.assert_allclose(point.slopes[0][..., k], (ends[0] - ends[1]) / 2e-5, rtol=1e-5, atol=1e-6)
     assert fit.params["length"] == pytest.approx(0.8, rel=1e-7)
 

@@ -7,6 +7,7 @@ import pytest
 from scipy import stats
 
 import lagjax
+from lagjax._fit.model._residuals import Point
 
 TS = np.linspace(0.0, 3.0, 31)
 TRUTH, FREE = {"k": 4.0, "c": 1.5}, {"k": True, "c": False}
@@ -50,10 +51,10 @@ def test_trials_of_one_batch_are_those_one_by_one_also_where_one_fails(joint):
     residuals = joint.residual_function
     u = joint.u + np.array([[0.0], [0.05], [np.nan], [-0.05]])
     starts = joint.states + 0.01 * np.arange(4)[:, None, None]
-    trials = residuals.evaluate_trials(u, starts)
+    trials = residuals.evaluate_trials(Point(u, starts))
     assert [hasattr(trial, "text") for trial in trials] == [False, False, True, False]
     for k in (0, 1, 3):
-        alone = residuals.evaluate(u[k], starts[k], notify=False)
+        alone = residuals.evaluate(Point(u[k], starts[k]), notify=False)
         for kind in ("residuals", "slopes"):
             for mine, own in zip(getattr(trials[k], kind), getattr(alone, kind), strict=True):
                 np.testing.assert_allclose(mine, own, rtol=1e-12, atol=1e-12)

@@ -8,6 +8,7 @@ from lagrangians import free_particle, spring
 from scipy.optimize import least_squares
 
 import lagjax
+from lagjax._fit.model._residuals import Point
 
 G, E, V0 = 9.81, 0.9, 3.0
 
@@ -108,7 +109,7 @@ def test_slopes_and_the_density_of_hybrid_motion_are_those_of_differences(stuck)
                 u[k] += sign
             else:
                 starts[0, k - 3] += sign
-            moved.append(function.evaluate(u, starts))
+            moved.append(function.evaluate(Point(u, starts)))
         column = k + 2 if k < 3 else k - 3
         for residuals, slopes in zip(zip(*(one.residuals for one in moved), strict=True), point.slopes, strict=True):
             change = (residuals[1] - residuals[0]) / (2 * h)

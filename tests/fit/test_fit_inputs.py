@@ -12,6 +12,7 @@ from scipy.signal import lsim
 import lagjax
 from lagjax._fit.model import _inputs, _motions
 from lagjax._fit.model._parameters import Parameters
+from lagjax._fit.model._residuals import Point
 from lagjax._interface._layout import Layout
 
 TRUTH = {"k": 4.0, "c": 0.3, "gain": 1.5}
@@ -116,9 +117,10 @@ def test_a_start_may_follow_from_the_parameters():
     assert fit.params["at"] == pytest.approx(0.3, abs=1e-7) and fit.starts[0][0] == fit.params["at"]
     h = 1e-5
     ends = [
-        fit.residual_function.evaluate(fit.u + way * h * np.eye(4)[0], np.zeros((1, 2))).residuals[0] for way in (1, -1)
+        fit.residual_function.evaluate(Point(fit.u + way * h * np.eye(4)[0], np.zeros((1, 2)))).residuals[0]
+        for way in (1, -1)
     ]
-    slopes = fit.residual_function.evaluate(fit.u, np.zeros((1, 2))).slopes[0]
+    slopes = fit.residual_function.evaluate(Point(fit.u, np.zeros((1, 2)))).slopes[0]
     np.testing.assert_allclose(slopes[..., 2], (ends[0] - ends[1]) / (2 * h), atol=1e-7)
 
 
@@ -150,9 +152,9 @@ def test_the_delay_of_a_sensor_is_found_with_exact_derivatives():
     assert fit.params["tau"] == pytest.approx(0.037, abs=1e-6) and fit.params["k"] == pytest.approx(4.0, rel=1e-6)
     assert np.abs(fit.starts[0][0] - 0.3) < 1e-6
     u, states = fit.u - 1e-2, fit.states
-    slopes = fit.residual_function.evaluate(u, states).slopes[0]
+    slopes = fit.residual_function.evaluate(Point(u, states)).slopes[0]
     for k, step in enumerate(1e-5 * np.eye(len(u))):
-        ends = [fit.residual_function.evaluate(u + way * step, states).residuals[0] for way in (1, -1)]
+        ends = [fit.residual_function.evaluate(Point(u + way * step, states)).residuals[0] for way in (1, -1)]
         np.testing.assert_allclose(slopes[..., 2 + k], (ends[0] - ends[1]) / 2e-5, rtol=1e-5, atol=1e-7)
     shown = fit.predict(record)
     assert np.isnan(shown.values["a"][:5]).all() and np.abs(shown.residuals["a"][6:]).max() < 1e-6
@@ -165,9 +167,9 @@ def test_sensors_with_a_delay_may_see_time_and_inputs():
     record = lagjax.Record(TS, u, {"u": u}, start=(0.3, -0.2))
     fit = lagjax.fit(SCENE, record, {**TRUTH, "tau": 0.033}, observe=observe, hold="linear", method="whole")
     at, h = fit.parameters.inverse(fit.parameters.first), 1e-6
-    slopes = fit.residual_function.evaluate(at, fit.states).slopes[0]
+    slopes = fit.residual_function.evaluate(Point(at, fit.states)).slopes[0]
     for k, step in enumerate(h * np.eye(len(at))):
-        ends = [fit.residual_function.evaluate(at + way * step, fit.states).residuals[0] for way in (1, -1)]
+        ends = [fit.residual_function.evaluate(Point(at + way * step, fit.states)).residuals[0] for way in (1, -1)]
         np.testing.assert_allclose(slopes[..., 2 + k], (ends[0] - ends[1]) / (2 * h), rtol=1e-4, atol=1e-6)
 
 

@@ -10,6 +10,7 @@ import pytest
 from lagrangians import damping, pendulum_in_gravity
 
 import lagjax
+from lagjax._fit.model._residuals import Point
 
 TRUTH = {"g": 9.81, "c": 0.05}
 START = (1.0, 0.0)
@@ -62,9 +63,11 @@ def test_parameters_and_start_come_out_of_crossing_times(exact):
 def test_times_have_the_derivatives_of_differences_forward_and_in_reverse(exact):
     fit = lagjax.fit(SCENE, timings(exact, lagjax.Guess(*START)), TRUTH)
     residuals, starts = fit.residual_function, np.array([START])
-    point, h = residuals.evaluate(fit.u, starts), 1e-5
+    point, h = residuals.evaluate(Point(fit.u, starts)), 1e-5
     for k, step in enumerate(h * np.eye(4)):
-        ends = [residuals.evaluate(fit.u + way * step[2:], starts + way * step[:2]).residuals[0] for way in (1, -1)]
+        ends = [
+            residuals.evaluate(Point(fit.u + way * step[2:], starts + way * step[:2])).residuals[0] for way in (1, -1)
+        ]
         np.testing.assert_allclose(point.slopes[0][..., k], (ends[0] - ends[1]) / (2 * h), rtol=1e-6, atol=1e-8)
     [clock] = residuals.systems[0].clocks.values()
     times, back = jax.vjp(clock.times, starts[0], fit.parameters.numbers(fit.u))
@@ -167,3 +170,14 @@ def test_a_crossing_that_does_not_happen_is_named(exact):
     numbers = {"bottom": [0, 1, 2], "gate": [40]}
     with pytest.raises(ValueError, match=r"There are \d+ crossings of section\['gate'\] up to t = .*, but number 40"):
         lagjax.fit(SCENE, timings(few, numbers=numbers), TRUTH)
+
+
+def test_times_with_stated_errors_beside_a_record_are_fitted_whole():
+    # In units of the stated errors σ of the times is about one, which says nothing about how far segments are followed.
+    ts = np.linspace(0.0, 8.0, 161)
+    q = np.asarray(lagjax.simulate(SCENE, *START, ts, TRUTH).q) + 1e-3 * np.random.default_rng(0).normal(size=161)
+    times = measured(1e-3)
+    of_times = timings(times, lagjax.Guess(1.0, 0.0), weights={name: np.full(len(t), 1e6) for name, t in times.items()})
+    fit = lagjax.fit(SCENE, [of_times, lagjax.Record(ts, q)], {"g": 9.5, "c": 0.05})
+    assert fit.ok and list(fit.noise) == ["q", "times"] and "pieces" not in fit.message, fit.message
+    assert fit.params["g"] == pytest.approx(9.81, rel=1e-3)

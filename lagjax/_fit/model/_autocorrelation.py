@@ -41,14 +41,10 @@ def _autocorrelation(residuals: Residuals, point: Trial, noise: NoiseScale, sign
         if not np.isinf(dof):
             z = z * (dof + 1) / (dof + z**2)  # what enters the likelihood's slope
         counted = batch.weights[..., signal] > 0
-        own, count = (
-            lag_products(z / np.sqrt(np.maximum(curvature, 1e-99)), counted),
-            count + round(curvature.sum(where=counted)),
-        )
-        longer = np.zeros(max(len(sums), len(own)))
-        longer[: len(sums)] += sums
-        longer[: len(own)] += own
-        sums = longer
+        own = lag_products(z / np.sqrt(np.maximum(curvature, 1e-99)), counted)
+        count += round(curvature.sum(where=counted))
+        length = max(len(sums), len(own))
+        sums = np.pad(sums, (0, length - len(sums))) + np.pad(own, (0, length - len(own)))
     law = sums / sums[0] if sums[0] > 0 else np.eye(1, len(sums))[0]
     insignificant = np.flatnonzero(law <= 2.0 / np.sqrt(count))
     cut = int(insignificant[0]) if len(insignificant) else len(law)
@@ -67,7 +63,6 @@ def lag_products(rows: np.ndarray, counted: np.ndarray) -> np.ndarray:
 
 
 _LAGS = 20  # of residuals that hold motion some are correlated over the first lags, unless a period has two samples
-
 _CHANCE = 4.0  # standard errors of a correlation: white residuals show it at one of this many lags in 1 of 800 fits
 
 

@@ -49,8 +49,13 @@ class Density:
     ):  # fmt: skip
         self.residuals, self.shares, self.prior, self.point, self.noise = residuals, shares, prior, point, noise
         for part in residuals.parts:
-            part.system.require_traceable()
-        self.dtype = np.result_type(*(part.system.layout.dtype for part in residuals.parts))
+            if part.fits_on_constraints:
+                raise ValueError(
+                    "There is no density for starts on constraints that are fitted: give start=(q0, qdot0)."
+                )
+            if part.signals.delays is not None:
+                raise ValueError("There is no density for lagjax.Delayed sensors: keep the delay, and shift the times.")
+        self.dtype = np.result_type(*(part.layout.dtype for part in residuals.parts))
         self._tails = np.isfinite(noise.dof)
         self.moves_dof = isinstance(law, StudentT) and law.dof is None
         share = np.log(np.clip(noise.dof, 1.01 * _LEAST_DOF, 0.99 * _MOST_DOF) / _LEAST_DOF)
@@ -58,7 +63,7 @@ class Density:
         dof = np.log(share / (1 - share)) if self.moves_dof else np.zeros(0)
         moves = np.zeros((len(residuals.pieces), residuals.states), bool)
         for part in residuals.parts:
-            moves[part.rows, : part.system.states] = residuals.fitted[part.rows, None]
+            moves[part.frame.rows, : part.states] = residuals.fitted[part.frame.rows, None]
         free, starts = len(point.u), point.starts[moves]
         self.first = np.concatenate([point.u, starts, np.log(noise.sigma), dof])
         self.start_places = np.full(moves.shape, len(self.first))
@@ -68,7 +73,7 @@ class Density:
 
     def _start_names(self) -> list[str]:
         residuals = self.residuals
-        layouts = {row: part.system.layout for part in residuals.parts for row in part.rows.tolist()}
+        layouts = {row: part.layout for part in residuals.parts for row in part.frame.rows.tolist()}
         return [
             f"starts{residuals.label(residuals.pieces[row].record).removeprefix('records')}.{half}{name[1:]}"
             for row in np.flatnonzero(residuals.fitted).tolist()
@@ -88,7 +93,7 @@ class Density:
         u, starts = x[: len(self.residuals.parameters)], jnp.asarray(self.point.starts, x.dtype)
         starts = jnp.where(self.start_places < len(self), jnp.append(x, 0.0)[self.start_places], starts)
         for part in self.residuals.parts:
-            starts = part.system.trace_starts(starts, part.rows, self.params(u))
+            starts = part.trace_starts(starts, self.params(u))
         dof = self._dof(x[self.noise_places.stop :]) if self.moves_dof else jnp.asarray(self.noise.dof, x.dtype)
         return PosteriorUnknowns(u, starts, jnp.exp(x[self.noise_places]), dof)
 
@@ -126,12 +131,11 @@ class Density:
 
     def evaluate(self, at: PosteriorUnknowns) -> list:
         """The outputs of the sensors less the measurements, (N, T, S), of every batch."""
-        found, signals = [], len(self.residuals.names)
-        for part in self.residuals.parts:
-            for batch in part.system.batches:
-                own = part.system.trace_residuals(batch, at.u, at.starts[part.rows[batch.rows], : part.system.states])
-                found.append(jnp.zeros((*own.shape[:2], signals), own.dtype).at[..., part.signals].set(own))
-        return found
+        return [
+            part.trace_residuals(batch, at.u, at.starts[part.frame.rows[batch.rows], : part.states])
+            for part in self.residuals.parts
+            for batch in part.batches
+        ]
 
     def weighted_log_likelihood(self, weighted: list, counted: list, sides: list, at: PosteriorUnknowns):
         """Σ_s shares_s log L_s, up to a constant, of √weight · residual (N, T, S) of every batch, where they count.

@@ -21,9 +21,7 @@ from lagjax._run.hybrid import Scene, laws
 from lagjax._scene import MARGINS, System, continued, samples
 
 PyTree = Any
-
 _LEAST_ROOM, _GROWTH = 16, 4  # of tables: at most four times what is needed, and six programs up to 16 000 samples
-
 _FUNCTIONS = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
 
 

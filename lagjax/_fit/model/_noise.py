@@ -38,7 +38,6 @@ from scipy.special import gammaln, log_ndtr
 from lagjax._fit.model._records import Record, real_numbers, spread_over_signals
 
 _WIDEST, _NARROWEST = 200.0, 1.0  # ν: beyond 200 it is a Gaussian to a percent, below 1 there is not even a mean
-
 _ROUNDS = 30  # of the fixed point for σ, which gains a factor of three or more in each
 
 
@@ -288,7 +287,6 @@ def log_likelihood(noise: NoiseScale, residuals: np.ndarray, weights: np.ndarray
 
 
 _LAG = 1.2  # ratio of the lags at which neighbours are compared: how many there are is known to as much
-
 _HARMONICS = 20  # of the errors' covariance: what they leave, 3 % of step²/12, counts as independent
 
 
@@ -329,11 +327,8 @@ def rounding_square(rows: list[np.ndarray], x: list[np.ndarray], step: float, si
 
 
 _LATTICE = 0.02  # of a step that a multiple may be off, in text of few digits or float32; chance is off by 0.25
-
 _EQUAL = 0.02  # of neighbours that are equal: with fewer, rounding errors are independent anyhow
-
 _BEFORE, _RISE = 10, 16  # samples before a limit at most, over which a motion that is cut off rises by as many steps
-
 _RUN, _AT_LIMIT = 3, 0.01  # equal values in a row at a limit of a sensor, and the share of all samples in such rows
 
 

@@ -40,7 +40,7 @@ class Samples(NamedTuple):
     sides: np.ndarray | None = None
 
 
-def batches(records: list[Any], pieces: list[Piece], eps: float = 2.3e-16, hold: str = "zero") -> list[Samples]:
+def batch_pieces(records: list[Any], pieces: list[Piece], eps: float = 2.3e-16, hold: str = "zero") -> list[Samples]:
     """The pieces in batches, none of which is longer than twice its shortest piece: at most half of the room is empty.
 
     `eps` is the round-off of the numbers that the motion is computed in, `hold` says what inputs are between samples.

@@ -1,7 +1,6 @@
 """Records: the measurements as the user gives them, checked; and several systems by their names."""
 
-import contextlib
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
@@ -391,51 +390,3 @@ def _convert_to_float(number):
     if not eqx.is_array_like(number) or jnp.issubdtype(kind := jnp.result_type(number), jnp.complexfloating):
         raise TypeError(f"A start must hold real numbers; got {number!r}.")
     return number if jnp.issubdtype(kind, jnp.floating) else jnp.asarray(number, float)
-
-
-def systems_by_name(system, records, observe) -> list[tuple[str | None, Any, Any, Any]]:
-    """Name, system, records and `observe` of every system; the name of the only one is None.
-
-    Raises where one argument is a dict by names and another is not, or of other names.
-    """
-    if not isinstance(system, dict):
-        if isinstance(records, dict):
-            raise TypeError("records is a dict, so system must be a dict of systems by the same names.")
-        if isinstance(observe, dict):
-            raise TypeError("observe is a dict, so system must be a dict of systems by the same names.")
-        return [(None, system, records, observe)]
-    if not system:
-        raise ValueError("system is an empty dict: give at least one lagjax.System by its name.")
-    for name in system:
-        if not isinstance(name, str):
-            raise TypeError(f"The systems of a fit have names; {name!r} is no str.")
-    _require_names("records", records, system)
-    if isinstance(observe, dict):
-        _require_names("observe", observe, system)
-    return [
-        (name, one, records[name], observe[name] if isinstance(observe, dict) else observe)
-        for name, one in system.items()
-    ]
-
-
-def _require_names(what: str, given, systems: dict) -> None:
-    names = ", ".join(map(repr, systems))
-    if not isinstance(given, dict):
-        raise TypeError(
-            f"system is a dict, so {what} must be a dict by the same names, {names}; got {type(given).__name__}."
-        )
-    if lacking := [name for name in systems if name not in given]:
-        raise ValueError(f"{what} has nothing for the system {lacking[0]!r}: it needs the names {names}.")
-    if beyond := [name for name in given if name not in systems]:
-        raise ValueError(f"{what} has {beyond[0]!r}, which is the name of no system: these are {names}.")
-
-
-@contextlib.contextmanager
-def errors_of_system(name: str | None) -> Iterator[None]:
-    """Errors that are raised in this context begin with the name of the system, where there are several."""
-    try:
-        yield
-    except (TypeError, ValueError) as reason:
-        if name is None or type(reason) not in (TypeError, ValueError):
-            raise
-        raise type(reason)(f"Of the system {name!r}: {reason}") from reason

@@ -1,11 +1,11 @@
 """Residuals: the measured signals less those of the motions of a trial, with their derivatives.
 
-It holds `Residuals`, the problem that every search, density and interval is about, `SystemResiduals`, the part of it
-that is of one system, `Trial`, one trial, and the triangles that rows are compressed to.
+It holds `Residuals`, which every search, density and interval is about, `SystemResiduals`, the part of it that is of
+one system, `Point` and `Trial`, and the triangles that rows are compressed to.
 
-The unknowns are u (F,), the free parameters as their transforms move them, and the starts (N, 2n) of the N pieces of
-records. A residual of piece k depends on u and on start k alone: the rows of a piece, D = 2n + F columns and the
-residual, are compressed to a triangle of D + 1 rows (QR), in which all sums of squares are the same.
+The unknowns are a `Point`: u (F,), the free parameters as their transforms move them, and the starts (N, 2n) of the N
+pieces of records. A residual of piece k depends on u and on start k alone: the rows of a piece, D = 2n + F columns and
+the residual, are compressed to a triangle of D + 1 rows (QR), in which all sums of squares are the same.
 
 **One system is a list of one.** Each system has its own coordinates, sensors and inputs; all share u. Once the start of
 a piece is eliminated only the columns of the parameters are left, and these are the same for all, so that the search
@@ -14,13 +14,16 @@ smaller system leaves the last ones without any influence, like those of a start
 systems stand side by side, with no weight where a record does not have them.
 
 **One evaluation.** `evaluate_trials` has an axis of trials: a search has one, multistart many, which are members of one
-batch of motions. `SystemResiduals.traced` is the same map for JAX, from which densities have their gradients: back over
-the steps of motions, where `evaluate` goes forward along every unknown. Both take the same batches, sensors and clocks.
+batch of motions. `SystemResiduals.trace_residuals` is the same map for JAX, from which densities have their gradients:
+back over the steps of motions, where trials go forward along every unknown. Both take the same batches, sensors and
+clocks.
 """
 
 import copy
+import functools
 import itertools
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple
 
 import jax
@@ -29,10 +32,10 @@ import numpy as np
 from scipy.special import log_ndtr
 
 from lagjax._fit.model._inputs import Driven, constant_tables, input_functions, inputs_at
-from lagjax._fit.model._motions import AbstractMotions, Manifold, Origins, ProjectedStarts, RecordMotion
+from lagjax._fit.model._motions import AbstractMotions, Manifold, Origins, RecordMotion
 from lagjax._fit.model._noise import AbstractNoise, NoiseScale, Sensor, counts, log_likelihood, scores, worths
 from lagjax._fit.model._parameters import Parameters
-from lagjax._fit.model._pieces import Piece, Samples, batches, whole_pieces
+from lagjax._fit.model._pieces import Piece, Samples, batch_pieces, whole_pieces
 from lagjax._fit.model._records import start_pair
 from lagjax._fit.model._sensors import wrap_residuals
 from lagjax._fit.model._signals import Signals
@@ -41,6 +44,16 @@ from lagjax._interface import Layout, halves
 from lagjax._run import simulate
 from lagjax._run.hybrid import Scene
 from lagjax._scene import System
+
+
+class Point(NamedTuple):
+    """The unknowns of a fit: u (F,), which move the free parameters, and the starts (N, 2n) of the pieces of records.
+
+    The points of K trials are (K, F) and (K, N, 2n).
+    """
+
+    u: np.ndarray
+    starts: np.ndarray
 
 
 class Trial(NamedTuple):
@@ -56,7 +69,12 @@ class Trial(NamedTuple):
     slopes: list[np.ndarray]
     across: np.ndarray | None = None
 
+    @property
+    def point(self) -> Point:
+        return Point(self.u, self.starts)
+
     def flat(self) -> np.ndarray:
+        """The residuals of all batches, (M, S)."""
         return np.concatenate([r.reshape(-1, r.shape[-1]) for r in self.residuals])
 
 
@@ -67,58 +85,66 @@ class LostTrial(NamedTuple):
     text: str
 
 
-class _PendingTrial(NamedTuple):
-    """One trial of a system under way: the parameters (P,) and their directions (F, P), the starts, how these move
-    with the unknown states, (N, 2n, 2n) or None for the identity, and with u, (N, F, 2n); and what is known so far."""
+class _SystemTrial(NamedTuple):
+    """The unknowns of one system in a trial: its parameters (P,) and their directions (F, P), its starts, how these
+    move with the unknown states, (N, 2n, 2n) or None for the identity, and with u, (N, F, 2n)."""
 
     numbers: np.ndarray
     directions: np.ndarray
     starts: np.ndarray
     tangents: np.ndarray | None
-    moved: np.ndarray
-    residuals: list[np.ndarray]
-    slopes: list[np.ndarray]
+    starts_dot: np.ndarray
 
 
+class SystemFrame(NamedTuple):
+    """The place of one system among all: which of all pieces are its own, `rows`, which records, and its first signal.
+
+    Of all systems together: the `sensor` and the `periods` of the S signals, and the most numbers of a start, `states`.
+    """
+
+    rows: np.ndarray
+    records: slice
+    first: int
+    sensor: Sensor
+    periods: np.ndarray
+    states: int
+
+
+@dataclass(eq=False)
 class SystemResiduals:
     """The residuals of pieces of the records of one system, called `name`, None where there is no other.
 
     `fitted` (N,) says of each piece whether its start is free; `size` (S,) is the root mean square of the signals, and
-    that times `rtol`, the tolerance of the motion, the smallest noise that can be estimated; `periods` (S,) are those
-    of wrapped signals, up to which residuals are known. Where some pieces are `Timings`, with `clocks` by the number of
-    the record, crossing times are one more signal, the last.
+    that times `rtol`, the tolerance of the motion, the smallest noise that can be estimated. Where some pieces are
+    `Timings`, with `clocks` by the number of the record, crossing times are one more signal, the last. Rows and columns
+    are those of `frame`, once the system is a part of `Residuals`.
     """
 
-    def __init__(
-        self,
-        name: str | None,
-        scene: Scene,
-        records: list[Any],
-        pieces: list[Piece],
-        fitted: np.ndarray,
-        motions: AbstractMotions,
-        signals: Signals,
-        parameters: Parameters,
-        size: np.ndarray,
-        rtol: float,
-        clocks: dict[int, Clock] | None = None,
-        manifold: Manifold | None = None,
-        sensor: Sensor | None = None,
-    ):
-        self.name, self.scene = name, scene
-        self.records, self.pieces, self.fitted = records, pieces, fitted
-        self.clocks, self.manifold = {} if clocks is None else clocks, manifold
-        timed = any(piece.record in self.clocks for piece in pieces)
-        self.names = (*signals.names, *(("times",) if timed else ()))
-        self.periods = np.append(signals.periods, [np.inf] * timed)
-        self.sensor = Sensor(*np.full((3, len(self.names)), np.nan)) if sensor is None else sensor
-        self.size, self.rtol, self.least = size[: len(self.names)], rtol, rtol * size[: len(self.names)]
-        self.motions, self.signals, self.parameters = motions, signals, parameters
-        self.layout: Layout = signals.layout
+    name: str | None
+    scene: Scene
+    records: list[Any]
+    pieces: list[Piece]
+    fitted: np.ndarray
+    motions: AbstractMotions
+    signals: Signals
+    parameters: Parameters
+    size: np.ndarray
+    rtol: float
+    clocks: dict[int, Clock]
+    manifold: Manifold | None
+    sensor: Sensor
+    frame: Any = None
+
+    def __post_init__(self):
+        timed = any(piece.record in self.clocks for piece in self.pieces)
+        self.names = (*self.signals.names, *(("times",) if timed else ()))
+        self.size, self.sensor = self.size[: len(self.names)], Sensor(*(x[: len(self.names)] for x in self.sensor))
+        self.least = self.rtol * self.size
+        self.layout: Layout = self.signals.layout
         self.states = 2 * self.layout.size
-        self.batches: list[Samples] = self._build_batches()
-        starts = [records[piece.record].start if piece.places[0] == 0 else None for piece in pieces]
-        self.origins = Origins(starts, self.layout, parameters)
+        starts = [self.records[piece.record].start if piece.places[0] == 0 else None for piece in self.pieces]
+        self.origins = Origins(starts, self.layout, self.parameters)
+        self.fits_on_constraints = self.manifold is not None and bool(self.fitted.any())
 
     def with_parameters(self, parameters: Parameters) -> "SystemResiduals":
         """The same residuals where other parameters are free."""
@@ -126,106 +152,95 @@ class SystemResiduals:
         other.parameters = parameters
         return other
 
-    def with_pieces(self, pieces: list[Piece], fitted: np.ndarray) -> "SystemResiduals":
-        return SystemResiduals(
-            self.name, self.scene, self.records, pieces, fitted, self.motions, self.signals, self.parameters,
-            self.size, self.rtol, self.clocks, self.manifold, self.sensor,
-        )  # fmt: skip
-
     def with_records(
         self, records: list[Any], fitted: np.ndarray, parameters: Parameters | None = None,
         manifold: Manifold | None = None,
     ) -> "SystemResiduals":  # fmt: skip
         """The residuals of other records of the system with the same signals, each in one piece."""
-        parameters = self.parameters if parameters is None else parameters
-        return SystemResiduals(
-            self.name, self.scene, records, whole_pieces(records), fitted, self.motions, self.signals, parameters,
-            self.size, self.rtol, None, manifold, self.sensor,
+        return replace(
+            self, records=records, pieces=whole_pieces(records), fitted=fitted, clocks={}, manifold=manifold,
+            parameters=self.parameters if parameters is None else parameters,
         )  # fmt: skip
 
     def columns(self, record: int) -> slice:
-        last = len(self.signals.names)
-        return slice(last, last + 1) if record in self.clocks else slice(0, last)
+        """The columns of the signals of a record among all."""
+        first, last = self.frame.first, self.frame.first + len(self.signals.names)
+        return slice(last, last + 1) if record in self.clocks else slice(first, last)
 
-    def _build_batches(self) -> list[Samples]:
+    def sensor_noise(self, noise: NoiseScale) -> NoiseScale:
+        """The noise of the signals of records among that of all signals, without that of crossing times."""
+        own = slice(self.frame.first, self.frame.first + len(self.signals.names))
+        return NoiseScale(noise.sigma[own], noise.dof[own])
+
+    @functools.cached_property
+    def batches(self) -> list[Samples]:
         """The records in batches, then each of the timings as a batch of its own, all with a column for each signal."""
         sensed = [row for row, piece in enumerate(self.pieces) if piece.record not in self.clocks]
-        eps, hold = (
-            float(np.finfo(self.layout.dtype).eps),
-            "zero" if self.signals.form is None else self.signals.form.hold,
+        hold = "zero" if self.signals.form is None else self.signals.form.hold
+        some = batch_pieces(
+            self.records, [self.pieces[row] for row in sensed], float(np.finfo(self.layout.dtype).eps), hold
         )
-        some = batches(self.records, [self.pieces[row] for row in sensed], eps, hold)
         found = [batch._replace(rows=np.array(sensed)[batch.rows]) for batch in some]
         for row, (k, _) in enumerate(self.pieces):
             if k in self.clocks:
                 record = self.records[k]
                 weights, values = record.weight_matrix[None], np.nan_to_num(record.matrix)[None]
-                found.append(
-                    Samples(np.array([row]), values[..., 0], values, weights, np.zeros((1, len(record), 0)), None)
-                )
-        return [self._widen_columns(batch) for batch in found]
-
-    def _widen_columns(self, batch: Samples) -> Samples:
-        columns = self.columns(self.pieces[batch.rows[0]].record)
-        values, weights = np.zeros((2, *batch.ts.shape, len(self.names)))
-        values[..., columns], weights[..., columns] = batch.values, batch.weights
-        if self.signals.delays is not None and columns.start == 0:
-            weights[batch.ts < batch.ts[:, :1] + self.signals.delays.longest] = 0.0
-        return batch._replace(values=values, weights=weights, sides=self.sensor.sides(values))
+                inputs = np.zeros((1, len(record), 0))
+                found.append(Samples(np.array([row]), values[..., 0], values, weights, inputs, None))
+        for k, batch in enumerate(found):
+            columns = self.columns(self.pieces[batch.rows[0]].record)
+            values, weights = np.zeros((2, *batch.ts.shape, len(self.frame.periods)))
+            values[..., columns], weights[..., columns] = batch.values, batch.weights
+            if self.signals.delays is not None and self.pieces[batch.rows[0]].record not in self.clocks:
+                weights[batch.ts < batch.ts[:, :1] + self.signals.delays.longest] = 0.0
+            found[k] = batch._replace(values=values, weights=weights, sides=self.frame.sensor.sides(values))
+        return found
 
     # ---- the trials of a search ----
 
-    def evaluate(self, u: np.ndarray, starts: np.ndarray) -> list[Trial | LostTrial]:
-        """The residuals of K trials, u (K, F) and starts (K, N, 2n), or of each the first piece whose motion failed.
+    def append_residuals(self, trials: list[Trial]) -> list[LostTrial | None]:
+        """Append the residuals of this system to trials, whose starts move to where the motions begin.
 
-        The motions of all trials are one run for every batch of pieces.
+        For each trial None, or the first piece whose motion failed. The motions of all trials are one run for every
+        batch of pieces.
         """
-        found: list[Any] = [self._begin_trial(*one) for one in zip(u, starts, strict=True)]
+        begun: list[Any] = [self._begin_trial(trial) for trial in trials]
         for batch in self.batches:
-            going = [k for k, trial in enumerate(found) if isinstance(trial, _PendingTrial)]
-            for k, shown in zip(going, self._evaluate_signals(batch, [found[k] for k in going]), strict=True):
+            going = [k for k, own in enumerate(begun) if isinstance(own, _SystemTrial)]
+            for k, shown in zip(going, self._evaluate_signals(batch, [begun[k] for k in going]), strict=True):
                 if isinstance(shown, LostTrial):
-                    found[k] = shown
+                    begun[k] = shown
                 else:
-                    self._append_residuals(batch, found[k], *shown)
-        return [
-            one
-            if isinstance(one, LostTrial)
-            else Trial(at, one.starts, one.residuals, one.slopes, self._normal_projector(one))
-            for at, one in zip(u, found, strict=True)
-        ]
+                    self._append_batch(batch, trials[k], *shown)
+        return [own if isinstance(own, LostTrial) else None for own in begun]
 
-    def _begin_trial(self, u: np.ndarray, starts: np.ndarray) -> _PendingTrial | LostTrial:
-        numbers, directions = self.parameters.numbers(u), self.parameters.directions(u)
-        starts, moved = self.origins.move(starts, numbers, directions)
+    def _lost(self, row: Any, text: str) -> LostTrial:
+        return LostTrial(int(self.frame.rows[row]), text)
+
+    def _begin_trial(self, trial: Trial) -> _SystemTrial | LostTrial:
+        rows, states = self.frame.rows, self.states
+        numbers, directions = self.parameters.numbers(trial.u), self.parameters.directions(trial.u)
+        starts, starts_dot = self.origins.move(trial.starts[rows, :states], numbers, directions)
         tangents = None
-        if self.manifold is not None and self.fitted.any():
-            starts, tangents, moved = self._project_starts(starts, moved, numbers, directions)
+        if self.fits_on_constraints:
+            assert self.manifold is not None and trial.across is not None
+            some, tangents = self.fitted, np.tile(np.eye(states), (len(starts), 1, 1))
+            t = np.array([self.records[piece.record].ts[piece.places[0]] for piece in self.pieces])
+            starts[some], tangents[some], starts_dot[some] = self.manifold.project(
+                starts[some], t[some], numbers, directions
+            )
             if (lost := ~np.isfinite(starts).all(axis=1)).any():
-                return LostTrial(
+                return self._lost(
                     int(np.argmax(lost)), "No start near the one that was tried satisfies the constraints."
                 )
+            trial.across[rows, :states, :states] = np.eye(states) - tangents
         if not (np.isfinite(numbers).all() and np.isfinite(directions).all() and np.isfinite(starts).all()):
-            return LostTrial(0, "A parameter is not finite.")
-        return _PendingTrial(numbers, directions, starts, tangents, moved, [], [])
-
-    def _project_starts(self, starts, moved, numbers, directions) -> ProjectedStarts:
-        """The starts that are fitted put on the constraints; the others as they are."""
-        assert self.manifold is not None
-        t = np.array([self.records[piece.record].ts[piece.places[0]] for piece in self.pieces])
-        some, free = self.fitted, ProjectedStarts(starts, np.tile(np.eye(self.states), (len(starts), 1, 1)), moved)
-        for mine, new in zip(free, self.manifold.project(starts[some], t[some], numbers, directions), strict=True):
-            mine[some] = new
-        return free
-
-    def _normal_projector(self, trial: _PendingTrial) -> np.ndarray | None:
-        """The part of a change of each start across the constraints (N, 2n, 2n), None where there are none."""
-        if trial.tangents is None:
-            return None
-        return np.where(self.fitted[:, None, None], np.eye(self.states) - trial.tangents, 0.0)
+            return self._lost(0, "A parameter is not finite.")
+        trial.starts[rows, :states] = starts
+        return _SystemTrial(numbers, directions, starts, tangents, starts_dot)
 
     def _evaluate_signals(
-        self, batch: Samples, trials: list[_PendingTrial]
+        self, batch: Samples, trials: list[_SystemTrial]
     ) -> list[tuple[np.ndarray, np.ndarray] | LostTrial]:
         """The signals of each trial for a batch (N, T, S), and their tangents (N, T, S, D)."""
         clock = self.clocks.get(self.pieces[batch.rows[0]].record)
@@ -233,12 +248,15 @@ class SystemResiduals:
             return [self._evaluate_times(clock, batch, trial) for trial in trials]
         if self.signals.delays is not None:
             return [self._check_signals(batch, self._evaluate_delayed(batch, trial)) for trial in trials]
-        motions = self._follow(batch, batch.ts, trials)
-        return [
-            self._check_signals(batch, self._observe_motion(batch, *one)) for one in zip(trials, motions, strict=True)
+        shown = [
+            motion
+            if isinstance(motion, LostTrial)
+            else self.signals.evaluate(motion, batch.ts, batch.inputs, trial.numbers, self._directions(batch, trial)[1])
+            for trial, motion in zip(trials, self._follow(batch, batch.ts, trials), strict=True)
         ]
+        return [self._check_signals(batch, one) for one in shown]
 
-    def _follow(self, batch: Samples, ts: np.ndarray, trials: list[_PendingTrial]) -> list[RecordMotion | LostTrial]:
+    def _follow(self, batch: Samples, ts: np.ndarray, trials: list[_SystemTrial]) -> list[RecordMotion | LostTrial]:
         """The motions of each trial at the times `ts` (N, T) of the pieces of a batch, in one run of all."""
         if not trials:
             return []
@@ -257,33 +275,28 @@ class SystemResiduals:
             part = RecordMotion(*(x[k * members : (k + 1) * members] for x in motion))
             if not part.ok:
                 row, text = part.describe_failure(ts, self.layout)
-                part = LostTrial(int(batch.rows[row]), text)
+                part = self._lost(batch.rows[row], text)
             found.append(part)
         return found
 
-    def _directions(self, batch: Samples, trial: _PendingTrial) -> tuple[np.ndarray, np.ndarray]:
+    def _directions(self, batch: Samples, trial: _SystemTrial) -> tuple[np.ndarray, np.ndarray]:
         """Directions of the starts (N, D, 2n) and of the parameters (D, P): D = 2n + F, or F where no start is free."""
         directions, states = trial.directions, self.states if self.fitted[batch.rows].any() else 0
         y0_dot = np.zeros((len(batch.rows), states + len(directions), self.states))
         y0_dot[:, :states] = np.eye(states, self.states)
         if trial.tangents is not None and states:
             y0_dot[:, :states] = trial.tangents[batch.rows].swapaxes(1, 2)
-        y0_dot[:, states:] = trial.moved[batch.rows]
+        y0_dot[:, states:] = trial.starts_dot[batch.rows]
         return y0_dot, np.concatenate([np.zeros((states, directions.shape[1])), directions])
 
-    def _observe_motion(self, batch: Samples, trial: _PendingTrial, motion: RecordMotion | LostTrial):
-        if isinstance(motion, LostTrial):
-            return motion
-        return self.signals.evaluate(motion, batch.ts, batch.inputs, trial.numbers, self._directions(batch, trial)[1])
-
-    def _evaluate_delayed(self, batch: Samples, trial: _PendingTrial) -> tuple[np.ndarray, np.ndarray] | LostTrial:
+    def _evaluate_delayed(self, batch: Samples, trial: _SystemTrial) -> tuple[np.ndarray, np.ndarray] | LostTrial:
         """The signals of one trial, of each delay those that have it at earlier times, and their tangents."""
         delays, signals, numbers = self.signals.delays, self.signals, trial.numbers
         assert delays is not None
         numbers_dot = self._directions(batch, trial)[1]
         each = delays.evaluate(numbers)
         if text := delays.refuses(each):
-            return LostTrial(int(batch.rows[0]), text)
+            return self._lost(batch.rows[0], text)
         values = np.zeros((*batch.ts.shape, len(signals.names)))
         slopes = np.zeros((*values.shape, len(numbers_dot)))
         for delay in each:
@@ -291,7 +304,9 @@ class SystemResiduals:
             [motion] = self._follow(batch, ts, [trial])
             if isinstance(motion, LostTrial):
                 return motion
-            inputs, rates = self._inputs_at(batch, ts)
+            inputs, rates = batch.inputs, np.zeros_like(batch.inputs)
+            if batch.table is not None and signals.form is not None:
+                inputs, rates = map(np.asarray, inputs_at(batch.table, ts, signals.form.hold))
             ts_dot = -numbers_dot @ delay.slopes
             y, n = motion.path.reshape(-1, self.states), self.layout.size
             pulled = self.motions.rate(ts.ravel(), y, numbers, constant_tables(ts.ravel(), inputs.reshape(len(y), -1)))
@@ -301,53 +316,45 @@ class SystemResiduals:
             values[..., delay.signals], slopes[..., delay.signals, :] = (x[:, :, delay.signals] for x in some)
         return values, slopes
 
-    def _inputs_at(self, batch: Samples, ts: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The inputs (N, T, I) at other times `ts` (N, T) of the pieces of a batch, and their rates there."""
-        if batch.table is None or self.signals.form is None:
-            return batch.inputs, np.zeros_like(batch.inputs)
-        values, rates = inputs_at(batch.table, ts, self.signals.form.hold)
-        return np.asarray(values), np.asarray(rates)
-
     def _check_signals(self, batch: Samples, shown: tuple[np.ndarray, np.ndarray] | LostTrial):
         """The signals and their tangents; a failure where one that counts is not finite."""
         if isinstance(shown, LostTrial):
             return shown
         values, by_unknowns = shown
-        counted = batch.weights[..., : len(self.signals.names)] > 0
+        counted = batch.weights[..., self.columns(self.pieces[batch.rows[0]].record)] > 0
         bad = counted & ~(np.isfinite(values) & np.isfinite(by_unknowns).all(axis=-1))
         if bad.any():
             row, place, signal = np.argwhere(bad)[0]
             sample = self.pieces[batch.rows[row]].places[place]
-            return LostTrial(
-                int(batch.rows[row]),
+            return self._lost(
+                batch.rows[row],
                 f"What `observe` returns for {self.signals.names[signal]}, or its derivative, is not finite at sample "
                 f"{sample}, t = {batch.ts[row, place]:g}.",
             )
         return shown
 
-    def _evaluate_times(self, clock: Clock, batch: Samples, trial: _PendingTrial):
+    def _evaluate_times(self, clock: Clock, batch: Samples, trial: _SystemTrial):
         """The crossing times (1, M, 1) of a batch of one, and how they move (1, M, 1, D); or a failure."""
         y0, numbers = trial.starts[batch.rows[0]], trial.numbers
         y0_dot, numbers_dot = self._directions(batch, trial)
         times, slopes = map(np.asarray, clock.tangents(y0, numbers, y0_dot[0], numbers_dot))
         if not np.isfinite(times).all():
-            return LostTrial(int(batch.rows[0]), clock.describe_failure(y0, numbers))
+            return self._lost(batch.rows[0], clock.describe_failure(y0, numbers))
         if not np.isfinite(slopes).all():
-            return LostTrial(int(batch.rows[0]), "The derivatives of its crossing times are not finite.")
+            return self._lost(batch.rows[0], "The derivatives of its crossing times are not finite.")
         return times[None, :, None], slopes[None, :, None]
 
-    def _append_residuals(
-        self, batch: Samples, trial: _PendingTrial, values: np.ndarray, by_unknowns: np.ndarray
-    ) -> None:
-        """Append the residuals of one batch and their derivatives, with a column for every signal."""
+    def _append_batch(self, batch: Samples, trial: Trial, values: np.ndarray, by_unknowns: np.ndarray) -> None:
+        """Append the residuals of one batch and their derivatives, with a column for every signal and unknown."""
         counted, columns = batch.weights > 0, self.columns(self.pieces[batch.rows[0]].record)
-        missing = self.states + len(self.parameters) - by_unknowns.shape[-1]  # of starts, where none is free
-        by_unknowns = np.pad(by_unknowns, ((0, 0), (0, 0), (0, 0), (missing, 0)))
-        by_unknowns[~self.fitted[batch.rows], ..., : self.states] = 0.0
-        left, moved = np.zeros(counted.shape), np.zeros(counted.shape + by_unknowns.shape[3:])
-        left[..., columns], moved[..., columns, :] = values, by_unknowns
-        trial.residuals.append(np.where(counted, wrap_residuals(left - batch.values, self.periods), 0.0))
-        trial.slopes.append(np.where(counted[..., None], moved, 0.0))
+        free = len(self.parameters)
+        states = by_unknowns.shape[-1] - free  # none where no start is free
+        shown, slopes = np.zeros(counted.shape), np.zeros((*counted.shape, self.frame.states + free))
+        shown[..., columns], slopes[..., columns, self.frame.states :] = values, by_unknowns[..., states:]
+        fitted = self.fitted[batch.rows, None, None, None]
+        slopes[..., columns, :states] = np.where(fitted, by_unknowns[..., :states], 0.0)
+        trial.residuals.append(np.where(counted, wrap_residuals(shown - batch.values, self.frame.periods), 0.0))
+        trial.slopes.append(np.where(counted[..., None], slopes, 0.0))
 
     # ---- the same for JAX ----
 
@@ -358,10 +365,6 @@ class SystemResiduals:
         numbers = self.parameters.numbers(u, jnp)
         params = self.parameters.restore(numbers)
         record = self.pieces[batch.rows[0]].record
-        if record in self.clocks:
-            times = self.clocks[record].times(starts[0], numbers)
-            shown = jnp.zeros(batch.values.shape).at[0, :, -1].set(times)
-            return jnp.where(batch.weights > 0, shown - batch.values, 0.0)
         form = signals.form if signals.form is not None and input_functions(self.scene) else None
         scene = self.scene
         if form is not None and isinstance(scene, System):
@@ -376,45 +379,22 @@ class SystemResiduals:
 
         ts, values, inputs = (jnp.asarray(x, u.dtype) for x in (batch.ts, batch.values, batch.inputs))
         table = None if batch.table is None else tuple(jnp.asarray(x, u.dtype) for x in batch.table)
-        shown = jax.vmap(sense)(ts, starts, inputs, table)
-        shown = jnp.zeros(values.shape, values.dtype).at[..., : shown.shape[-1]].set(shown)
-        return jnp.where(batch.weights > 0, wrap_residuals(shown - values, self.periods, jnp), 0.0)
+        if record in self.clocks:
+            shown = self.clocks[record].times(starts[0], numbers)[None, :, None]
+        else:
+            shown = jax.vmap(sense)(ts, starts, inputs, table)
+        shown = jnp.zeros(values.shape, values.dtype).at[..., self.columns(record)].set(shown)
+        return jnp.where(batch.weights > 0, wrap_residuals(shown - values, self.frame.periods, jnp), 0.0)
 
-    def trace_starts(self, starts, rows: np.ndarray, params):
-        """The starts (M, 2n) of all systems for JAX, of which some of this one, at `rows` (N,), are functions of the
-        parameters."""
-        for row, piece in zip(rows, self.pieces, strict=True):
+    def trace_starts(self, starts, params):
+        """The starts (M, 2n) of all systems for JAX, of which some of this one are functions of the parameters."""
+        for row, piece in zip(self.frame.rows, self.pieces, strict=True):
             start = self.records[piece.record].start
             if callable(start) and piece.places[0] == 0:
                 pair = start_pair(start, params)
                 flat = jnp.concatenate([self.layout.flatten(half) for half in pair])
                 starts = starts.at[row, : self.states].set(flat)
         return starts
-
-    def require_traceable(self) -> None:
-        if self.manifold is not None and self.fitted.any():
-            raise ValueError("There is no density for starts on constraints that are fitted: give start=(q0, qdot0).")
-        if self.signals.delays is not None:
-            raise ValueError("There is no density for lagjax.Delayed sensors: keep the delay, and shift the times.")
-
-
-class SystemPart(NamedTuple):
-    """One system among several: the residuals of its pieces, which of all pieces these are, `rows`, and which of all
-    records and signals are its own."""
-
-    system: SystemResiduals
-    rows: np.ndarray
-    records: slice
-    signals: slice
-
-    @property
-    def name(self) -> str | None:
-        return self.system.name
-
-    def sensor_noise(self, noise: NoiseScale) -> NoiseScale:
-        """The noise of the signals of records among that of all signals, without that of crossing times."""
-        own = slice(self.signals.start, self.signals.start + len(self.system.signals.names))
-        return NoiseScale(noise.sigma[own], noise.dof[own])
 
 
 class Residuals:
@@ -448,46 +428,34 @@ class Residuals:
         self.states = max(system.states for system in systems)
         self.parts = self._split_by_system()
         self.names = tuple(
-            signal if part.name is None else f"{part.name}: {signal}"
-            for part in self.parts
-            for signal in part.system.names
+            signal if part.name is None else f"{part.name}: {signal}" for part in self.parts for signal in part.names
         )
-        self.size = np.concatenate([part.system.size for part in self.parts])
-        self.least = np.concatenate([part.system.least for part in self.parts])
-        self.batches = [self._embed_batch(part, batch) for part in self.parts for batch in part.system.batches]
+        self.size = np.concatenate([part.size for part in self.parts])
+        self.least = np.concatenate([part.least for part in self.parts])
+        self.batches = [b._replace(rows=part.frame.rows[b.rows]) for part in self.parts for b in part.batches]
         self.weights = np.concatenate([b.weights.reshape(-1, len(self.names)) for b in self.batches])
-        self.sensor = Sensor(
-            *(np.concatenate(x) for x in zip(*(part.system.sensor for part in self.parts), strict=True))
-        )
-        self.sides = None
-        if any(b.sides is not None for b in self.batches):
-            self.sides = np.concatenate(
-                [np.reshape(np.zeros_like(b.weights) if b.sides is None else b.sides, (-1, len(self.names)))
-                 for b in self.batches]
-            )  # fmt: skip
+        self.sensor: Sensor = self.parts[0].frame.sensor
+        sides = [b.sides.reshape(-1, len(self.names)) for b in self.batches if b.sides is not None]
+        self.sides = np.concatenate(sides) if sides else None
         self.measured = int((self.weights > 0).sum())
 
-    def _split_by_system(self) -> list[SystemPart]:
-        owner, found, signals = np.array([piece.record for piece in self.pieces]), [], 0
+    def _split_by_system(self) -> list[SystemResiduals]:
+        owner, parts, places = np.array([piece.record for piece in self.pieces]), [], []
         for system, records in zip(self.systems, self._records, strict=True):
             rows = np.flatnonzero((owner >= records.start) & (owner < records.stop))
-            if not len(rows):
-                continue
-            own = [Piece(self.pieces[row].record - records.start, self.pieces[row].places) for row in rows]
-            part = system.with_pieces(own, self.fitted[rows])
-            found.append(SystemPart(part, rows, records, slice(signals, signals + len(part.names))))
-            signals += len(part.names)
-        return found
-
-    def _embed_batch(self, part: SystemPart, batch: Samples) -> Samples:
-        """A batch of one system with the rows and signals of all."""
-        values, weights = np.zeros((2, *batch.ts.shape, len(self.names)))
-        values[..., part.signals], weights[..., part.signals] = batch.values, batch.weights
-        sides = batch.sides
-        if sides is not None:
-            sides = np.zeros_like(values)
-            sides[..., part.signals] = batch.sides
-        return batch._replace(rows=part.rows[batch.rows], values=values, weights=weights, sides=sides)
+            if len(rows):
+                own = [Piece(self.pieces[row].record - records.start, self.pieces[row].places) for row in rows]
+                parts.append(replace(system, pieces=own, fitted=self.fitted[rows]))
+                places.append((rows, records))
+        firsts = np.cumsum([0, *(len(part.names) for part in parts)]).tolist()
+        sensor = Sensor(*(np.concatenate(x) for x in zip(*(part.sensor for part in parts), strict=True)))
+        periods = [
+            np.append(part.signals.periods, np.full(len(part.names), np.inf))[: len(part.names)] for part in parts
+        ]
+        return [
+            replace(part, frame=SystemFrame(rows, records, first, sensor, np.concatenate(periods), self.states))
+            for part, (rows, records), first in zip(parts, places, firsts, strict=False)
+        ]
 
     def with_pieces(self, pieces: list[Piece], fitted: np.ndarray) -> "Residuals":
         """The residuals of other pieces of the records; the signals are those of systems with a piece."""
@@ -497,58 +465,33 @@ class Residuals:
         """The same residuals where other parameters are free."""
         other = copy.copy(self)
         other.parameters = parameters
-        other.systems = [system.with_parameters(parameters) for system in self.systems]
-        other.parts = [part._replace(system=part.system.with_parameters(parameters)) for part in self.parts]
+        other.systems, other.parts = (
+            [system.with_parameters(parameters) for system in some] for some in (self.systems, self.parts)
+        )
         return other
 
     # ---- trials ----
 
-    def evaluate(self, u: np.ndarray, starts: np.ndarray, notify: bool = True) -> Trial | LostTrial:
-        """The residuals of one trial u (F,), starts (N, 2n), or the first piece whose motion failed.
-
-        With `notify` false `watch` is not called.
-        """
-        [trial] = self.evaluate_trials(u[None], starts[None])
+    def evaluate(self, point: Point, notify: bool = True) -> Trial | LostTrial:
+        """The residuals at one point, or the first piece whose motion failed. With `notify` false `watch` is not
+        called."""
+        [trial] = self.evaluate_trials(Point(point.u[None], point.starts[None]))
         if notify and self.watch is not None:
             self.watch(trial)
         return trial
 
-    def evaluate_trials(self, u: np.ndarray, starts: np.ndarray) -> list[Trial | LostTrial]:
-        """The residuals of K trials, u (K, F) and starts (K, N, 2n); of each the first piece whose motion failed."""
-        found: list[list[Trial] | LostTrial] = [[] for _ in u]
-        for part in self.parts:
-            going = [k for k, points in enumerate(found) if not isinstance(points, LostTrial)]
-            own = starts[going][:, part.rows, : part.system.states]
-            for k, point in zip(going, part.system.evaluate(u[going], own), strict=True):
-                points = found[k]
-                if isinstance(point, LostTrial):
-                    found[k] = LostTrial(int(part.rows[point.piece]), point.text)
-                elif not isinstance(points, LostTrial):
-                    points.append(point)
-        return [
-            points if isinstance(points, LostTrial) else self._join_trials(y, points)
-            for y, points in zip(starts, found, strict=True)
+    def evaluate_trials(self, points: Point) -> list[Trial | LostTrial]:
+        """The residuals at the points of K trials; of each the first piece whose motion failed."""
+        constrained, states = any(part.fits_on_constraints for part in self.parts), self.states
+        found: list[Any] = [
+            Trial(u, starts.copy(), [], [], np.zeros((len(starts), states, states)) if constrained else None)
+            for u, starts in zip(*points, strict=True)
         ]
-
-    def _join_trials(self, starts: np.ndarray, points: list[Trial]) -> Trial:
-        if len(points) == 1 and self.parts[0].system.states == self.states:
-            return points[0]
-        u, placed, residuals, slopes = points[0].u, starts.copy(), [], []
-        across = np.zeros((len(starts), self.states, self.states))
-        for part, point in zip(self.parts, points, strict=True):
-            states = part.system.states
-            placed[part.rows, :states] = point.starts
-            if point.across is not None:
-                across[part.rows, :states, :states] = point.across
-            for left, moved in zip(point.residuals, point.slopes, strict=True):
-                wide = np.zeros((*left.shape[:2], len(self.names)))
-                wide[..., part.signals] = left
-                by_unknowns = np.zeros((*wide.shape, self.states + len(u)))
-                by_unknowns[..., part.signals, :states] = moved[..., :states]
-                by_unknowns[..., part.signals, self.states :] = moved[..., states:]
-                residuals.append(wide)
-                slopes.append(by_unknowns)
-        return Trial(u, placed, residuals, slopes, across if across.any() else None)
+        for part in self.parts:
+            going = [k for k, trial in enumerate(found) if isinstance(trial, Trial)]
+            for k, lost in zip(going, part.append_residuals([found[k] for k in going]), strict=True):
+                found[k] = found[k] if lost is None else lost
+        return found
 
     def noise_scale(self, point: Trial, noise: AbstractNoise) -> NoiseScale:
         return noise.estimate(point.flat(), self.weights, self.least, self.sides)
@@ -644,12 +587,13 @@ class Residuals:
 
     @property
     def unknowns(self) -> int:
-        return sum(part.system.states * int(part.system.fitted.sum()) for part in self.parts)
+        """The numbers of all starts that are fitted."""
+        return sum(part.states * int(part.fitted.sum()) for part in self.parts)
 
     def columns(self, record: int) -> slice:
+        """The columns of the signals of a record."""
         part = self._owner(record)
-        own = part.system.columns(record - part.records.start)
-        return slice(part.signals.start + own.start, part.signals.start + own.stop)
+        return part.columns(record - part.frame.records.start)
 
     def label(self, record: int) -> str:
         """The name by which the user reaches a record: `records[0]`, or `records['name'][0]`."""
@@ -657,7 +601,7 @@ class Residuals:
         name = self.systems[place].name
         return f"records{'' if name is None else f'[{name!r}]'}[{record - self._records[place].start}]"
 
-    def find_part(self, name: str | None) -> SystemPart:
+    def find_part(self, name: str | None) -> SystemResiduals:
         """One of the systems by its name, or the only one. Raises `ValueError` for a name that there is not."""
         parts = {part.name: part for part in self.parts}
         if name not in parts:
@@ -666,8 +610,8 @@ class Residuals:
             raise ValueError(f"This is a fit of several systems: give system=, one of {', '.join(map(repr, parts))}.")
         return parts[name]
 
-    def _owner(self, record: int) -> SystemPart:
-        return next(part for part in self.parts if part.records.start <= record < part.records.stop)
+    def _owner(self, record: int) -> SystemResiduals:
+        return next(part for part in self.parts if record < part.frame.records.stop)
 
     def describe_failure(self, failure: LostTrial) -> str:
         piece = self.pieces[failure.piece]
@@ -682,14 +626,14 @@ class Residuals:
 
     def restore_state(self, record: int, state: np.ndarray) -> tuple:
         """The pair (q, q̇) of a state of a record, of which other systems may leave the last numbers unused."""
-        layout = self._owner(record).system.layout
+        layout = self._owner(record).layout
         return layout.restore(state[: layout.size]), layout.restore(state[layout.size : 2 * layout.size])
 
     def group_by_system(self, values: Sequence) -> Any:
         """The values of every record as a tuple, or in a dict of tuples by the names of systems."""
         if self.parts[0].name is None:
             return tuple(values)
-        return {part.name: tuple(values[part.records]) for part in self.parts}
+        return {part.name: tuple(values[part.frame.records]) for part in self.parts}
 
     def end_to_end(self, groups: Any) -> list:
         """The values that `group_by_system` returned, for all records in order."""

@@ -9,11 +9,8 @@ from lagjax._fit.model._records import Record
 from lagjax._fit.model._sensors import wrap_residuals
 
 _FEWEST = 8  # samples that do not change
-
 _JUMP = 3.0  # times the most that other neighbours differ by: neither motion nor noise jumps so far and back
-
 _FAR = 30.0  # times the spread of the others, from which on one sample is no measurement
-
 _KINDS, _REPEATED = 5, 3  # values that are looked at, and how often they must be there
 
 
@@ -114,7 +111,5 @@ def present_samples(record: Record, signal: int) -> np.ndarray:
 
 
 _FEW_STEPS = 2.5  # of rounding in a signal: below, errors are as large as it, and no small change of a fit
-
 TOO_COARSE = "there are no intervals from lines that far apart."
-
 _ROUNDED = 0.05  # of the variance of the noise, from which on a sentence tells of rounding

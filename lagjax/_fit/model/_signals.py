@@ -80,9 +80,7 @@ class Delays:
 
 
 _AT_ONCE = 2048  # samples in one call of the compiled sensors: one program for records of any length
-
 _NEWTON, _CLOSE = 8, 1e-6  # steps from what sensors show to positions, and the last of them: noise is larger
-
 _SINGULAR = 1e8  # condition from which sensors do not tell positions: that of units which differ by a million is less
 
 

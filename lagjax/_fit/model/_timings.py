@@ -25,7 +25,6 @@ from lagjax._run.hybrid import Hybrid, Scene, Transition
 from lagjax._scene import System
 
 PyTree = Any
-
 _BUDGET = 10_000_000  # steps: observations last for thousands of periods
 
 # Mean times between crossings that are waited for behind the last measured one: a trial may come later.

@@ -456,11 +456,8 @@ def _helmert(n: int) -> np.ndarray:
 
 
 positive = Positive()
-
 angle = Angle()
-
 simplex = Simplex()
-
 inertia = Inertia()
 
 

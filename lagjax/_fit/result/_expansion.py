@@ -44,7 +44,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._fit.model._density import Density
-from lagjax._fit.model._residuals import LostTrial, Trial, compress_rows
+from lagjax._fit.model._residuals import LostTrial, Point, Trial, compress_rows
 from lagjax._fit.model._transforms import AbstractSeparable
 
 # In σ: a centre nearer to a bound is moved to here, where φ′ = ½ (log 2), so that both sides of it are inside the set.
@@ -256,7 +256,7 @@ def _trial(chart: Chart, zeta: np.ndarray) -> Trial | LostTrial:
     """The residuals and their derivatives at ζ (D,)."""
     density, x = chart.density, chart.evaluate_unknowns(zeta)
     starts = np.where(density.start_places < len(x), np.append(x, 0.0)[density.start_places], density.point.starts)
-    return density.residuals.evaluate(x[: len(density.point.u)], starts, notify=False)
+    return density.residuals.evaluate(Point(x[: len(density.point.u)], starts), notify=False)
 
 
 def _jacobians(chart: Chart, trial: Trial, zeta: np.ndarray, states: int) -> list[np.ndarray]:

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lagjax._equations import decide
 from lagjax._fit.result._information import Information
 
 
@@ -51,21 +52,12 @@ def rank_experiments(
 ) -> Experiments:
     """The information of planned records; their rows (M, F) have starts eliminated and are in units of the noise."""
     unseen = known.null
-    basis = np.linalg.svd(unseen, full_matrices=True)[0][:, unseen.shape[1] :] if unseen.size else np.eye(len(labels))
-    have = _information(known, basis)
+    basis = decide(unseen.T).null if unseen.size else np.eye(len(labels))
+    have = np.linalg.inv(basis.T @ known.identifiable @ basis)
     gains = [_gain(g, basis, unseen, have) for g in rows]
     order = sorted(range(len(rows)), key=lambda k: (-gains[k][1], -gains[k][0]))
     gain, new, deviations = (np.array([gains[k][i] for k in order]) for i in range(3))
     return Experiments(tuple(names[k] for k in order), gain, new, labels, deviations)
-
-
-def _information(known: Information, basis: np.ndarray) -> np.ndarray:
-    """M in the coordinates of what is seen: the inverse of the reported covariance where that is finite."""
-    finite = np.isfinite(np.diag(known.covariance))
-    if finite.all():
-        return np.linalg.inv(basis.T @ known.covariance @ basis)
-    # Beside unseen combinations the covariance of white residuals is there in the seen directions.
-    return np.linalg.inv(basis.T @ (known.lost * known.white) @ basis)
 
 
 def _gain(g: np.ndarray, basis: np.ndarray, unseen: np.ndarray, have: np.ndarray) -> tuple[float, int, np.ndarray]:
@@ -74,9 +66,8 @@ def _gain(g: np.ndarray, basis: np.ndarray, unseen: np.ndarray, have: np.ndarray
     gain = np.linalg.slogdet(have + seen.T @ seen)[1] - np.linalg.slogdet(have)[1]
     new = 0
     if unseen.size:
-        size = np.linalg.norm(g) or 1.0
-        values = np.linalg.svd(g @ unseen, compute_uv=False)
-        new = int((values > 1e-6 * size * np.linalg.norm(unseen, 2)).sum())
+        size = float(np.linalg.norm(g)) or 1.0
+        new = int(decide(g @ unseen, absolute=1e-6 * size * float(np.linalg.norm(unseen, 2))).rank)
     before, after = (np.diag(basis @ np.linalg.inv(m) @ basis.T) for m in (have, have + seen.T @ seen))
     lost = np.linalg.norm(unseen, axis=1) > 1e-6 if unseen.size else np.zeros(len(before), bool)
     with np.errstate(invalid="ignore", divide="ignore"):

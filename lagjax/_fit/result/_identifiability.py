@@ -11,27 +11,31 @@ from fractions import Fraction
 
 import numpy as np
 
-from lagjax._fit.model._noise import NoiseScale
+from lagjax._equations import decide
 from lagjax._fit.model._parameters import Parameters
-from lagjax._fit.model._residuals import LostTrial, Residuals, Trial
+from lagjax._fit.model._residuals import Point, Residuals, Trial
 from lagjax._fit.result._information import Information, confirmed_null, growth, null_space, row_sizes
+from lagjax._fit.search._descent import Descent
 
 _MOST_NAMES = 12  # in one sentence
-
 _LARGEST_EXPONENT, _EXACT = 6, 1e-3  # of recognised products; how near to a whole number an exponent must be
 
 
-def unseen_sentences(residuals: Residuals, point: Trial, noise: NoiseScale, known: Information) -> tuple[str, ...]:
+def unseen_sentences(descent: Descent, known: Information) -> tuple[str, ...]:
     """A sentence for every set of parameters of which something is not seen, and one for those that rounding hides."""
-    hidden = _sentence_on_rounding(residuals, point, known)
+    residuals, trial = descent.residuals, descent.trial
+    hidden = _sentence_on_rounding(residuals, trial, known)
     null, parameters = known.confirmed, residuals.parameters
     if not null.shape[1]:
         return hidden
-    elsewhere = _null_elsewhere(residuals, point, noise)
-    spaces = [(parameters.jacobian(point.u) @ null, parameters.values(point.u))]
-    if elsewhere is not None:
-        u, other = elsewhere
-        spaces.append((parameters.jacobian(u) @ other, parameters.values(u)))
+    spaces = [(parameters.jacobian(trial.u) @ null, parameters.values(trial.u))]
+    # The null directions a few per cent away, too.
+    near = trial.u + parameters.sizes(trial.u) * np.random.default_rng(0).uniform(0.02, 0.06, len(trial.u))
+    other = residuals.evaluate(Point(near, trial.starts))
+    if isinstance(other, Trial):
+        factors = [np.sqrt(batch.weights) / descent.noise.sigma for batch in residuals.batches]
+        there = confirmed_null(residuals, other, null_space(residuals.triangles(other, factors), residuals.states)[0])
+        spaces.append((parameters.jacobian(near) @ there, parameters.values(near)))
     found = [_sentence(parameters, block, spaces) for block in _blocks(spaces[0][0])]
     if not found:
         ended = dict.fromkeys(parameters.labels[i] for i in np.flatnonzero(np.abs(null).max(axis=1) > 1e-6))
@@ -39,7 +43,7 @@ def unseen_sentences(residuals: Residuals, point: Trial, noise: NoiseScale, know
     return (*found, *hidden)
 
 
-def _sentence_on_rounding(residuals: Residuals, point: Trial, known: Information) -> tuple[str, ...]:
+def _sentence_on_rounding(residuals: Residuals, trial: Trial, known: Information) -> tuple[str, ...]:
     """The sentence for parameters whose columns are drowned where sensitivities grow."""
     if known.confirmed.shape[1] == known.null.shape[1]:
         return ()
@@ -48,7 +52,7 @@ def _sentence_on_rounding(residuals: Residuals, point: Trial, known: Information
     left = left - basis @ (basis.T @ left)
     labels = residuals.parameters.labels
     names = list(dict.fromkeys(labels[k] for k in np.flatnonzero(np.linalg.norm(left, axis=1) > 1e-5)))
-    sizes = row_sizes(residuals, point)
+    sizes = row_sizes(residuals, trial)
     grown, record = max(
         (growth([row[None]]), residuals.pieces[batch.rows[k]].record)
         for batch, size in zip(residuals.batches, sizes, strict=True)
@@ -59,18 +63,6 @@ def _sentence_on_rounding(residuals: Residuals, point: Trial, known: Information
         f"hides what it says about {_join_names(names)}. There are no intervals from records that long: cut it into "
         "several shorter ones.",
     )
-
-
-def _null_elsewhere(residuals: Residuals, point: Trial, noise: NoiseScale):
-    """Other values u of the free parameters, a few per cent away, and the null directions there."""
-    u = point.u
-    near = u + residuals.parameters.sizes(u) * np.random.default_rng(0).uniform(0.02, 0.06, len(u))
-    other = residuals.evaluate(near, point.starts)
-    if isinstance(other, LostTrial):
-        return None
-    factors = [np.sqrt(batch.weights) / noise.sigma for batch in residuals.batches]
-    null = null_space(residuals.triangles(other, factors), residuals.states)[0]
-    return near, confirmed_null(residuals, other, null)
 
 
 def _blocks(null: np.ndarray) -> list[np.ndarray]:
@@ -131,10 +123,7 @@ def _directions_within(directions: np.ndarray, block: np.ndarray) -> np.ndarray:
     if not outside.size:
         return directions[block]
     size = np.linalg.norm(directions, axis=0)
-    _, values, right = np.linalg.svd(outside / size)
-    values = np.append(values, np.zeros(directions.shape[1] - len(values)))
-    inside = right[values < 1e-5].T
-    return (directions / size @ inside)[block]
+    return (directions / size @ decide(outside / size, absolute=1e-5).null)[block]
 
 
 def _whole_numbers(spaces: list[np.ndarray]) -> list[list[int]] | None:
@@ -142,12 +131,11 @@ def _whole_numbers(spaces: list[np.ndarray]) -> list[list[int]] | None:
     first = spaces[0]
     if len(spaces) < 2 or any(space.shape != first.shape or not space.size for space in spaces):
         return None
-    _, values, right = np.linalg.svd(first.T)
-    rank = int((values > 1e-6 * values.max()).sum())
-    if rank == len(first):
+    orthogonal = decide(first.T, 1e-6).null
+    if not orthogonal.size:
         return None
     rows = []
-    for row in _reduce_rows(right[rank:]):
+    for row in _reduce_rows(orthogonal.T):
         fractions = [Fraction(float(x)).limit_denominator(_LARGEST_EXPONENT) for x in row]
         common = np.lcm.reduce([f.denominator for f in fractions])
         whole = [int(f * int(common)) for f in fractions]

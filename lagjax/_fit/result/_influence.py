@@ -14,12 +14,13 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lagjax._equations import decide
 from lagjax._fit.model._residuals import Residuals, compress_rows
 from lagjax._fit.result._information import Information, eliminate_starts
 from lagjax._fit.search._unexplained import MOST_NAMED
 
 _DISAGREE = 5.0  # standard deviations of a shift: twenty records of ten parameters show it in one of 1e4 fits
-
+_SEEN = 1e-5  # of the largest singular value of columns in units of their standard deviations
 _OWN = 0.2  # of the motion left in a record, explained by parameters of its own: 0.9 and more for another machine
 
 
@@ -87,15 +88,14 @@ def shifts_without(states: int, triangles, records: np.ndarray, variances, white
     for k in np.unique(records):
         rows = own[records != k].reshape(-1, own.shape[-1])
         rest = compress_rows(rows[None])[0][:, :-1] / size
-        values = np.linalg.svd(rest, compute_uv=False)
-        if values[-1] < 1e-5 * values[0]:
+        if decide(rest, _SEEN).rank < rest.shape[1]:
             continue
         mine = own[records == k].reshape(-1, own.shape[-1])
         slopes, residuals = mine[:, :-1] / size, mine[:, -1]
         without, beside = np.linalg.inv(rest.T @ rest), np.linalg.inv(whole.T @ whole)
         shift = without @ slopes.T @ residuals
         chance = np.sqrt(np.maximum(np.diag(without) - np.diag(beside), 1e-12 * np.diag(without)))
-        axes, values, _ = np.linalg.svd(slopes, full_matrices=False)
-        along = axes[:, values > 1e-5 * values[0]].T @ residuals
+        decided = decide(slopes, _SEEN)
+        along = decided.left[:, : int(decided.rank)].T @ residuals
         found[int(k)] = Shift(shift / (chance * growth), float(along @ along))
     return found

@@ -22,9 +22,11 @@ from typing import NamedTuple
 import numpy as np
 from scipy.special import stdtrit
 
+from lagjax._equations import decide
 from lagjax._fit.model._autocorrelation import autocorrelations, close_gaps, correlated_square
-from lagjax._fit.model._noise import NoiseScale, harmonics, rounding_square
+from lagjax._fit.model._noise import harmonics, rounding_square
 from lagjax._fit.model._residuals import Residuals, Trial, compress_rows
+from lagjax._fit.search._descent import Descent
 
 LEVEL = 0.95  # the probability with which an interval holds its number, where no other one is given
 
@@ -42,6 +44,7 @@ _LOST = 1.0 / np.finfo(float).eps
 
 # The length of a column below which it is zero: one over it must have a square, and some room, among finite numbers.
 _NOTHING = 1e-140
+_UNFELT = 1e-10  # of the largest singular value of a start: a direction of it that nothing depends on
 
 
 class Information(NamedTuple):
@@ -64,6 +67,11 @@ class Information(NamedTuple):
     white: np.ndarray
     lost: float
 
+    @property
+    def identifiable(self) -> np.ndarray:
+        """The covariance (F, F) of what is seen, zero along what is not; with white residuals where some is not."""
+        return self.lost * self.white if self.null.size else self.covariance
+
     def quantile(self, level: float) -> float:
         """Student's t of a level, for the effective number of samples less that of parameters."""
         require_level(level)
@@ -76,18 +84,24 @@ def require_level(level) -> None:
         raise ValueError(f"level must be between 0 and 1, as {LEVEL} is; got {level!r}.")
 
 
-def information(residuals: Residuals, point: Trial, noise: NoiseScale) -> Information:
-    factors = residuals.fisher_factors(point, noise)
-    triangles = residuals.triangles(point, factors)
+def information(descent: Descent) -> Information:
+    """The information of the data where a search ended."""
+    residuals, trial, noise = descent.residuals, descent.trial, descent.noise
+    factors = residuals.fisher_factors(trial, noise)
+    triangles = residuals.triangles(trial, factors)
     null, basis = null_space(triangles, residuals.states)
-    if _is_lost(residuals, point):
-        null, basis = np.eye(len(point.u)), np.zeros((len(point.u), 0))
-    laws = autocorrelations(residuals, point, noise)
+    free = len(trial.u)
+    # Growth alone is not enough: a drive that sets in smoothly begins with rows as small as numbers can be.
+    sizes, states = residuals.parameters.sizes(trial.u), residuals.states
+    last = [np.abs(x[..., states:] * sizes / residuals.size[:, None]).max(initial=0.0) for x in trial.slopes]
+    if max(last) > _LOST and growth(row_sizes(residuals, trial)) > _LOST:
+        null, basis = np.eye(free), np.zeros((free, 0))
+    laws = autocorrelations(residuals, trial, noise)
     effective, correlation = (np.array(x) for x in zip(*((a.count / a.time, a.neighbour) for a in laws), strict=True))
-    free, unit = len(point.u), _lengths(triangles, residuals.states)  # of columns: their squares may be no numbers
+    unit = _lengths(triangles, states)  # of columns: their squares may be no numbers
     middle, rows_of = np.zeros((free, free)), []
-    for batch, factor, slopes in zip(residuals.batches, factors, point.slopes, strict=True):
-        own = eliminate_starts(triangles[batch.rows], factor[..., None] * slopes, residuals.states) / unit
+    for batch, factor, slopes in zip(residuals.batches, factors, trial.slopes, strict=True):
+        own = eliminate_starts(triangles[batch.rows], factor[..., None] * slopes, states) / unit
         rows_of.append(own)
         for s in np.flatnonzero(np.isnan(residuals.sensor.step)):
             middle += correlated_square(close_gaps(own[:, :, s], batch.weights[..., s] > 0), laws[s].lags)
@@ -99,15 +113,15 @@ def information(residuals: Residuals, point: Trial, noise: NoiseScale) -> Inform
         for g, b in zip(rows, residuals.batches, strict=True):
             g = close_gaps(g, b.weights[..., s] > 0)
             middle += before * correlated_square(g, laws[s].lags) + rest * correlated_square(g, np.ones(1))
-        middle += rounding_square(rows, residuals.exact_values(point, s), step, sigma)
+        middle += rounding_square(rows, residuals.exact_values(trial, s), step, sigma)
         share = min(before / sigma**2, 1.0)
-        worth = sum(float(w.sum()) for w in residuals.worths(point, noise, s))
+        worth = sum(float(w.sum()) for w in residuals.worths(trial, noise, s))
         effective[s], correlation[s] = worth / (1 + (laws[s].time - 1) * share), share * correlation[s]
     # Student's t tells (ν+1)/(ν+3) of what a Gaussian of the same σ tells; the dof that were used up are counted.
     used = free - null.shape[1] + residuals.unknowns
     lost = max(effective.sum() / max(effective.sum() - used, 1.0), 1.0)
     robust = np.mean([1.0 if np.isinf(d) else (d + 3) / (d + 1) for d in noise.dof])
-    rows, basis = _parameter_rows(triangles, residuals.states) / unit, basis * unit[:, None]
+    rows, basis = _parameter_rows(triangles, states) / unit, basis * unit[:, None]
     half = basis @ np.linalg.solve(basis.T @ (rows.T @ rows) @ basis, basis.T)
     white = robust * half / unit / unit[:, None]
     covariance = lost * robust * half @ middle @ half.T / unit / unit[:, None]
@@ -115,7 +129,7 @@ def information(residuals: Residuals, point: Trial, noise: NoiseScale) -> Inform
     covariance[unseen] = np.nan
     covariance[:, unseen] = np.nan
     covariance[unseen, unseen] = np.inf
-    confirmed = null if not null.size else confirmed_null(residuals, point, null)
+    confirmed = null if not null.size else confirmed_null(residuals, trial, null)
     return Information(covariance, null, confirmed, effective, correlation, white, float(lost))
 
 
@@ -126,25 +140,11 @@ def null_space(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarr
     if not len(unit):
         return np.zeros((0, 0)), np.zeros((0, 0))
     # From above zero by its own round-off, so that a column which is noise alone counts as nothing.
-    _, values, directions = np.linalg.svd(rows / unit)
-    values = np.append(values, np.zeros(len(unit) - len(values)))
-    small = values <= NULL * max(values.max(initial=0.0), 1.0)
-    null = directions[small].T / unit[:, None]
+    decided = decide(rows / unit, NULL, NULL)
+    null = decided.null / unit[:, None]
     null = null / np.abs(null).max(axis=0, initial=0.0)  # before squares of it are no numbers
     null = null / np.linalg.norm(null, axis=0)
-    return null, directions[~small].T / unit[:, None]
-
-
-def _is_lost(residuals: Residuals, point: Trial) -> bool:
-    """True if the last digit of a parameter moves a signal by its size, because motions grow apart.
-
-    Growth alone is not enough: a drive that sets in smoothly begins with rows as small as numbers can be.
-    """
-    sizes, states = residuals.parameters.sizes(point.u), residuals.states
-    moved = max(
-        np.abs(slopes[..., states:] * sizes / residuals.size[:, None]).max(initial=0.0) for slopes in point.slopes
-    )
-    return moved > _LOST and growth(row_sizes(residuals, point)) > _LOST
+    return null, decided.right[:, : int(decided.rank)] / unit[:, None]
 
 
 def confirmed_null(residuals: Residuals, point: Trial, null: np.ndarray) -> np.ndarray:
@@ -202,10 +202,7 @@ def eliminate_starts(triangles: np.ndarray, slopes: np.ndarray, states: int) -> 
     Directions of a start that nothing depends on can do nothing: they are left out.
     """
     of_starts, of_u = triangles[..., :states], triangles[..., states:-1]
-    u, values, v = np.linalg.svd(of_starts, full_matrices=False)
-    keep = values > 1e-10 * np.maximum(values.max(axis=1, keepdims=True), np.finfo(float).tiny)
-    inverse = np.where(keep, 1.0 / np.where(keep, values, 1.0), 0.0)
-    instead = np.matmul(v.swapaxes(1, 2) * inverse[:, None], np.matmul(u.swapaxes(1, 2), of_u))
+    instead = decide(of_starts[:, None], _UNFELT).least_norm(of_u.swapaxes(1, 2)).swapaxes(1, 2)
     shape = (len(slopes), *[1] * (slopes.ndim - 3), *instead.shape[1:])
     return slopes[..., states:] - np.matmul(slopes[..., :states], instead.reshape(shape))
 
@@ -218,10 +215,9 @@ def covariance_of_one_start(
     Every sample is worth the `share` of an independent one.
     """
     flat = rows.reshape(-1, rows.shape[-1])
-    u, values, v = np.linalg.svd(flat[:, :states], full_matrices=False)
-    sees = values > 1e-10 * values.max()
-    into = (u[:, sees] / values[sees]) @ v[sees]
-    return known.lost / share * into.T @ into, into.T @ flat[:, states:]
+    decided = decide(flat[:, :states], _UNFELT)
+    half = decided.right[:, : int(decided.rank)] / decided.values[: int(decided.rank)]
+    return known.lost / share * half @ half.T, decided.least_norm(flat[:, states:].T).T
 
 
 def signal_deviations(slopes: np.ndarray, states: int, start: np.ndarray, follows: np.ndarray, known: Information):
@@ -232,18 +228,6 @@ def signal_deviations(slopes: np.ndarray, states: int, start: np.ndarray, follow
     """
     a = slopes[..., :states]
     along = slopes[..., states:] - a @ follows
-    covariance = _identifiable_covariance(known)
-    variance = np.einsum("tsf,fg,tsg->ts", along, covariance, along) + np.einsum("tsi,ij,tsj->ts", a, start, a)
-    return np.where(_depends_on_unseen(along, known), np.inf, np.sqrt(np.maximum(variance, 0.0)))
-
-
-def _identifiable_covariance(known: Information) -> np.ndarray:
-    """The covariance (F, F) of what is seen, zero along what is not; with white residuals where some is not."""
-    return known.covariance if not known.null.size else known.lost * known.white
-
-
-def _depends_on_unseen(rows: np.ndarray, known: Information) -> np.ndarray:
-    """True if rows (..., F) of derivatives depend on a direction that is not seen."""
-    if not known.null.size:
-        return np.zeros(rows.shape[:-1], bool)
-    return (np.abs(rows @ known.null) > 1e-6 * np.abs(rows).max(initial=0.0)).any(axis=-1)
+    variance = np.einsum("tsf,fg,tsg->ts", along, known.identifiable, along) + np.einsum("tsi,ij,tsj->ts", a, start, a)
+    depends_on_unseen = (np.abs(along @ known.null) > 1e-6 * np.abs(along).max(initial=0.0)).any(axis=-1)
+    return np.where(depends_on_unseen, np.inf, np.sqrt(np.maximum(variance, 0.0)))

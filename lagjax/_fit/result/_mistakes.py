@@ -19,15 +19,10 @@ from lagjax._fit.model._records import Record, restore_structure
 from lagjax._fit.model._sensor_faults import present_samples
 
 _WIDE = 3.0  # rad: a signal of a smaller range is not tried as degrees, which would leave it 0.05
-
 _WIDEST = 20.0  # rad, three turns: of a larger range degrees are tried first
-
 _MOST = 4  # signals of which signs, places and origins are tried, and records that are left out: pairs grow as a square
-
 _BETTER = 0.2  # of what was left before, that the fit without the mistake may leave: chance halves it at best
-
 _SLOW = 30.0  # times slower than the scene moves, from which milliseconds are tried first: 1000, and a guess is off
-
 SECONDS = 10.0  # of processor time that tries may take where a fit explains nothing: some ten fits that fail
 
 

@@ -13,22 +13,19 @@ for κ; Raue et al., Bioinformatics 25 (2009) 1923, for what profiles say about 
 """
 
 import itertools
+from collections.abc import Iterator
 from typing import NamedTuple, cast
 
 import numpy as np
 from scipy.optimize import brentq
 
-from lagjax._fit.model._noise import KnownNoise, NoiseScale
-from lagjax._fit.model._residuals import LostTrial, Residuals
-from lagjax._fit.result._information import Information
+from lagjax._fit.model._noise import KnownNoise
+from lagjax._fit.model._residuals import LostTrial, Point, Residuals
 from lagjax._fit.search._descent import minimise
 
 _STEP, _MOST = 0.5, 14  # of the reported half width, doubling where little changes; values on one side
-
 _ENOUGH, _TRIALS = 1e-7, 25  # of the deviance, whose roots are wanted; of a search that begins nearby
-
 _FAR = 3.0  # times |value|, or units of u where that is a logarithm or the like: how far other minima are looked for
-
 _EXACT = 1e-4  # of the half width, to which an end is found
 
 
@@ -56,75 +53,79 @@ class Profile(NamedTuple):
 
 
 class _Place(NamedTuple):
-    """One value of the unknown, the other unknowns and the starts that suit it best, and the deviance."""
+    """One value of the unknown, the point of the other unknowns and the starts that suit it best, and the deviance."""
 
     at: float
-    others: np.ndarray
-    starts: np.ndarray
+    others: Point
     deviance: float
 
 
 class _ProfileLine:
-    """The values of one unknown, each of which begins from its neighbours."""
+    """The values of the unknown `which` of a fit, each of which begins from its neighbours."""
 
-    def __init__(self, residuals: Residuals, u, starts, noise: NoiseScale, known: Information, which: int):
-        self.residuals, self.noise, self.which = residuals, noise, which
+    def __init__(self, fit, which: int):
+        self.residuals, self.noise, self.which, known = fit.residual_function, fit.noise_scale, which, fit.information
         reported, white = known.covariance[which, which], known.white[which, which]
         self.scale = white / reported if np.isfinite(reported) and reported > 0 else 1.0 / known.lost
-        self.wide = min(float(np.sqrt(reported)), float(residuals.parameters.reach[which]))
-        done = minimise(residuals, u, starts, KnownNoise(noise), _ENOUGH, _TRIALS)
+        self.wide = min(float(np.sqrt(reported)), float(self.residuals.parameters.reach[which]))
+        self.best = 0.0
+        done = self._minimise(self.residuals, Point(fit.u, fit.states), _TRIALS)
         if isinstance(done, LostTrial):
-            raise ValueError(residuals.describe_failure(done))
-        self.u, point = done.point.u, done.point
-        self.best = residuals.log_likelihood(point, noise)
-        self.places = [_Place(float(self.u[which]), np.delete(self.u, which), point.starts, 0.0)]
+            raise ValueError(self.residuals.describe_failure(done))
+        self.u, lost = done[0].u, done[1]
+        self.best = -lost / (2.0 * self.scale)
+        others = done[0]._replace(u=np.delete(self.u, which))
+        self.places = [_Place(float(self.u[which]), others, 0.0)]
+
+    def _minimise(self, residuals: Residuals, point: Point, trials: int) -> tuple[Point, float] | LostTrial:
+        """The point that a search ends in, and D there."""
+        done = minimise(residuals, point, KnownNoise(self.noise), _ENOUGH, trials)
+        if isinstance(done, LostTrial):
+            return done
+        lost = self.best - residuals.log_likelihood(done.trial, self.noise)
+        return done.trial.point, 2.0 * self.scale * lost
 
     def deviance(self, at: float) -> float:
         """D where the unknown stands at a value; infinite where no motion could be followed."""
-        again = [place.deviance for place in self.places if place.at == at]
-        if again:
-            return again[0]
+        for place in self.places:
+            if place.at == at:
+                return place.deviance
         u = self.u.copy()
         u[self.which] = at
         residuals = self.residuals.with_parameters(self.residuals.parameters.fix(u, self.which))
-        for others, starts in self._guesses(at):
-            done = minimise(residuals, others, starts, KnownNoise(self.noise), _ENOUGH, _TRIALS)
+        for guess in self._guesses(at):
+            done = self._minimise(residuals, guess, _TRIALS)
             if not isinstance(done, LostTrial):
-                lost = self.best - residuals.log_likelihood(done.point, self.noise)
-                self.places.append(_Place(at, done.point.u, done.point.starts, 2.0 * self.scale * lost))
-                return self.places[-1].deviance
+                self.places.append(_Place(at, *done))
+                return done[1]
         return np.inf
 
-    def _guesses(self, at: float):
+    def _guesses(self, at: float) -> Iterator[Point]:
         """The other unknowns and the starts, along the line through the two nearest places, and at the nearest."""
         near = sorted(self.places, key=lambda place: abs(place.at - at))[:2]
         if len(near) == 2 and abs(at - near[0].at) <= 2 * abs(near[0].at - near[1].at):
             share = (at - near[0].at) / (near[0].at - near[1].at)
-            yield (
-                near[0].others + share * (near[0].others - near[1].others),
-                near[0].starts + share * (near[0].starts - near[1].starts),
-            )
-        yield near[0].others, near[0].starts
+            yield Point(*(x + share * (x - y) for x, y in zip(near[0].others, near[1].others, strict=True)))
+        yield near[0].others
 
     def minimum(self, place: _Place) -> tuple[float, float] | None:
         """The minimum that a search from one place ends in: the unknown and D there."""
-        u = np.insert(place.others, self.which, place.at)
-        done = minimise(self.residuals, u, place.starts, KnownNoise(self.noise), _ENOUGH, 2 * _TRIALS)
-        if isinstance(done, LostTrial):
-            return None
-        lost = self.best - self.residuals.log_likelihood(done.point, self.noise)
-        return float(done.point.u[self.which]), 2.0 * self.scale * lost
+        begin = place.others._replace(u=np.insert(place.others.u, self.which, place.at))
+        done = self._minimise(self.residuals, begin, 2 * _TRIALS)
+        return None if isinstance(done, LostTrial) else (float(done[0].u[self.which]), done[1])
 
 
-def profile(residuals: Residuals, u, starts, noise: NoiseScale, known: Information, name: str, level: float) -> Profile:
-    parameters = residuals.parameters
-    line = _ProfileLine(residuals, u, starts, noise, known, parameters.unknown(name))
-    threshold = known.quantile(level) ** 2
+def profile(fit, name: str, level: float) -> Profile:
+    """The profile of a parameter of a `Fit`; see `Fit.profile`."""
+    parameters = fit.parameters
+    line, row = _ProfileLine(fit, parameters.unknown(name)), parameters.row(name)
+    threshold = fit.information.quantile(level) ** 2
     ends = [_find_end(line, side, threshold, parameters.room[line.which]) for side in (-1.0, 1.0)]
     minima = _minima(line, threshold)
-    row = parameters.row(name)
 
     def value(at: float) -> float:
+        if np.isinf(at):
+            return at
         moved = line.u.copy()
         moved[line.which] = at
         return float(parameters.values(moved)[row])
@@ -135,14 +136,9 @@ def profile(residuals: Residuals, u, starts, noise: NoiseScale, known: Informati
     places = sorted(line.places, key=lambda place: place.at)
     return Profile(
         parameters.names[row], np.array([value(place.at) for place in places]),
-        np.array([place.deviance for place in places]), level, threshold,
-        (_end_value(value, ends[0]), _end_value(value, ends[1])), verdict,
+        np.array([place.deviance for place in places]), level, threshold, (value(ends[0]), value(ends[1])), verdict,
         tuple((value(at), d) for at, d in minima),
     )  # fmt: skip
-
-
-def _end_value(value, end: float) -> float:
-    return value(end) if np.isfinite(end) else end
 
 
 def _find_end(line: _ProfileLine, side: float, threshold: float, room: float) -> float:
@@ -169,24 +165,13 @@ def _find_end(line: _ProfileLine, side: float, threshold: float, room: float) ->
 
 
 def _locate_root(line: _ProfileLine, below: float, above: float, threshold: float) -> float:
-    """The value where the root of D is that of the threshold: a nearly linear function of the value."""
-    if np.isinf(line.deviance(above)):
-        return _bisect_end(line, below, above, threshold)
-    miss = lambda at: np.sqrt(max(line.deviance(at), 0.0)) - np.sqrt(threshold)  # noqa: E731
-    return float(cast(float, brentq(miss, below, above, xtol=_EXACT * abs(above - below))))
-
-
-def _bisect_end(line: _ProfileLine, below: float, above: float, threshold: float) -> float:
-    """The end between a value below the threshold and one that no motion follows; the last followed, if there is none.
-
-    Bisection: what cannot be followed is as far off as can be.
-    """
+    """The value where D is the threshold; where no motion follows `above`, the last value below it that one follows."""
+    if np.isfinite(line.deviance(above)):  # the root of D is a nearly linear function of the value
+        miss = lambda at: np.sqrt(max(line.deviance(at), 0.0)) - np.sqrt(threshold)  # noqa: E731
+        return float(cast(float, brentq(miss, below, above, xtol=_EXACT * abs(above - below))))
     for _ in range(12):
         middle = 0.5 * (below + above)
-        if line.deviance(middle) > threshold:
-            above = middle
-        else:
-            below = middle
+        below, above = (below, middle) if line.deviance(middle) > threshold else (middle, above)
     return below
 
 

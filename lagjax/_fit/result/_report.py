@@ -19,7 +19,6 @@ from lagjax._fit.model._records import Record
 from lagjax._fit.result._information import LEVEL
 
 BLUE, RED, GREY = "#0072B2", "#D55E00", "0.55"
-
 _MOST = 4000  # samples in one curve: more do not show
 
 
@@ -98,7 +97,6 @@ def style_axes(ax) -> None:
 
 
 _RECORDS, _SIGNALS = 6, 6  # that are drawn
-
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
 h1 { font-size: 1.5rem } h2 { font-size: 1.15rem; margin-top: 2.2rem }

@@ -14,11 +14,12 @@ import numpy as np
 from lagjax._fit.model._density import Density
 from lagjax._fit.model._noise import AbstractNoise, NoiseScale
 from lagjax._fit.model._parameters import Parameters
-from lagjax._fit.model._records import Record
-from lagjax._fit.model._residuals import Residuals, SystemPart, Trial
+from lagjax._fit.model._records import Record, restore_structure
+from lagjax._fit.model._residuals import Point, Residuals, SystemResiduals, Trial
 from lagjax._fit.result._comparison import Comparison, comparison
 from lagjax._fit.result._experiments import Experiments, rank_experiments
-from lagjax._fit.result._information import LEVEL, Information
+from lagjax._fit.result._identifiability import unseen_sentences
+from lagjax._fit.result._information import LEVEL, Information, information
 from lagjax._fit.result._prediction import Prediction, planned_rows, predict_record
 from lagjax._fit.result._profile import Profile, profile
 from lagjax._fit.result._report import (
@@ -33,7 +34,10 @@ from lagjax._fit.result._report import (
     render_page,
 )
 from lagjax._fit.result._sample import draw, inference_data
+from lagjax._fit.result._verdict import verdict
+from lagjax._fit.search._descent import Descent
 from lagjax._fit.search._multistart import Waterfall
+from lagjax._fit.search._unexplained import Unexplained, measure_unexplained
 from lagjax._primitives import with_doubles
 from lagjax._show import cell, intervals
 
@@ -105,8 +109,42 @@ class Fit:
     information: Information = field(repr=False)
     noise_scale: NoiseScale = field(repr=False)
     residual_function: Residuals = field(repr=False)
-    system: Any = field(repr=False)
-    observe: Any = field(repr=False)
+
+    @classmethod
+    def from_descent(
+        cls, descent: Descent, law: AbstractNoise, waterfall: Waterfall | None
+    ) -> "tuple[Fit, Unexplained]":
+        """The fit that a search ended at, and what it leaves of the signals."""
+        residuals, trial, noise = descent.residuals, descent.trial, descent.noise
+        parameters, known = residuals.parameters, information(descent)
+        unseen, left = unseen_sentences(descent, known), measure_unexplained(descent)
+        ok, message = verdict(descent, unseen, known, left, law)
+        starts = [residuals.restore_state(k, trial.starts[row]) for k, row in enumerate(residuals.firsts)]
+        samples = (residuals.weights > 0).sum(axis=0)
+        columns = noise.sigma, noise.dof, samples, known.effective, 2 * (1 - known.correlation)
+        signals = [SignalNoise(*(x.item() for x in one)) for one in zip(*columns, strict=True)]
+        fit = cls(
+            params=parameters.restore(parameters.numbers(trial.u)),
+            starts=residuals.group_by_system(starts),
+            covariance=Covariance(parameters.names, parameters.covariance(trial.u, known.covariance)),
+            noise=dict(zip(residuals.names, signals, strict=True)),
+            residuals=residuals.group_by_system(_record_residuals(residuals, trial)),
+            unseen=unseen,
+            ok=ok,
+            message=message,
+            log_likelihood=residuals.log_likelihood(trial, noise),
+            trials=descent.trials,
+            waterfall=waterfall,
+            records=tuple(residuals.records),
+            parameters=parameters,
+            u=trial.u,
+            states=trial.starts,
+            law=law,
+            information=known,
+            noise_scale=noise,
+            residual_function=residuals,
+        )
+        return fit, left
 
     def __repr__(self) -> str:
         return lab_book(self)
@@ -172,7 +210,7 @@ class Fit:
 
         Source: Venzon & Moolgavkar, Applied Statistics 37 (1988) 87; Raue et al., Bioinformatics 25 (2009) 1923.
         """
-        return profile(self.residual_function, self.u, self.states, self.noise_scale, self.information, name, level)
+        return profile(self, name, level)
 
     def log_density(self, prior: Callable | None = None) -> Density:
         """The logarithm of the posterior density of all unknowns: a function of one vector for `jax.jit`, `jax.grad`.
@@ -218,9 +256,9 @@ class Fit:
     @functools.cached_property
     def _point(self) -> Trial:
         """The trial that the search ended at, computed anew."""
-        point = self.residual_function.evaluate(self.u, self.states)
-        assert isinstance(point, Trial)  # it was computed before
-        return point
+        trial = self.residual_function.evaluate(Point(self.u, self.states))
+        assert isinstance(trial, Trial)  # it was computed before
+        return trial
 
     def _ends(self, level: float) -> tuple[np.ndarray, np.ndarray]:
         wide = self.information.quantile(level) * np.sqrt(np.diag(self.covariance.matrix))
@@ -277,13 +315,13 @@ class Fit:
         with open(path, "w", encoding="utf-8") as file:
             file.write(text)
 
-    def _system_drawing(self, part: SystemPart) -> SystemDrawing:
+    def _system_drawing(self, part: SystemResiduals) -> SystemDrawing:
         """The records of one system with their residuals."""
-        residuals = self.residual_function.end_to_end(self.residuals)[part.records]
-        pairs = [pair for pair in zip(residuals, part.system.records, strict=True) if isinstance(pair[1], Record)]
+        residuals = self.residual_function.end_to_end(self.residuals)[part.frame.records]
+        pairs = [pair for pair in zip(residuals, part.records, strict=True) if isinstance(pair[1], Record)]
         records, matrices = [record for _, record in pairs], [record_matrix(r, record) for r, record in pairs]
         return SystemDrawing(
-            part.name, records, matrices, part.system.signals.names, part.sensor_noise(self.noise_scale).sigma
+            part.name, records, matrices, part.signals.names, part.sensor_noise(self.noise_scale).sigma
         )
 
     @with_doubles
@@ -300,3 +338,17 @@ class Fit:
         """
         others = other if isinstance(other, dict) else {"the other": other}
         return comparison({"this": self, **others}, folds)
+
+
+def _record_residuals(residuals: Residuals, trial: Trial) -> list[PyTree]:
+    """The residuals of every record in its structure, NaN where nothing was measured."""
+    columns = [residuals.columns(k) for k in range(len(residuals.records))]
+    found = [
+        np.full((len(record), c.stop - c.start), np.nan) for record, c in zip(residuals.records, columns, strict=True)
+    ]
+    for batch, own in zip(residuals.batches, trial.residuals, strict=True):
+        for row, left, weights in zip(batch.rows.tolist(), own, batch.weights, strict=True):
+            record, places = residuals.pieces[row]
+            matrix = np.where(weights > 0, left, np.nan)[: len(places), columns[record]]
+            found[record][places] = matrix
+    return [restore_structure(matrix, record) for matrix, record in zip(found, residuals.records, strict=True)]

@@ -46,35 +46,24 @@ from lagjax._fit.model._density import Density
 from lagjax._fit.result._expansion import Chart, Surrogate, expand_residuals
 
 _ACCEPTED = 0.85  # the mean acceptance that steps are tuned for
-
 _ROUNDS = (400, 800, 3200)  # draws of all chains from π*: each round has the metric of the one before
-
 _ROUNDS_OF_MOTIONS = (200, 400, 800)  # of π, where each costs as many motions as draws do later
-
 _FEWEST = 50  # of them of one chain: its step needs this many
-
 _MOST_INNER = 64  # steps of the sampler along π* for one draw: a motion is waited for no longer than that
-
 _PILOT = 64  # draws of π* that are weighed with π before the first draw
-
 _LEAST = 0.2  # of them are accepted, or π* is given up: fewer, and a chain may stay where π* is too small
 
 # π* is too narrow where weights π/π* have a Pareto tail of this shape: means of them do not settle then (Vehtari et
 # al., J. Mach. Learn. Res. 25 (2024) 72). The shape means nothing where nearly all draws are accepted.
 _HEAVY, _NEARLY_ALL = 0.7, 0.9
-
 _WORTH = 0.1  # of the draws along π* must be independent, or π is followed: so do draws of the exact density everywhere
-
 _DOUBLINGS = 6  # of one trajectory: 64 steps. In a metric that fits 3 do; a metric that does not would take thousands
-
 _TRIED = 100  # draws for the start of a chain where the density is not zero
-
 _FEWEST_TO_TELL = 4  # draws of a chain, halves of which are compared
 
 # Quantiles at 2.5 % of 100 independent draws are known to 1.6 %: half as many, and an end of an interval may be the
 # largest draw of all. Chains of 100 good draws have r-hat up to 1.03; ones that sit in different places, 1.1 and more.
 _RELIABLE, _APART = 100, 1.05
-
 _SETTLING = 10  # draws that are thrown away: chains begin at draws of π*, which the exact density has not judged
 
 
@@ -337,10 +326,10 @@ def inference_data(density: Density, drawn: Draws) -> Any:
             names = dict(zip(parameters.places.tolist(), parameters.names, strict=True))
             posterior |= {names[place]: values[..., place] for place in part.places.tolist()}
     for part in residuals.parts:
-        fitted, layout = part.system.fitted, part.system.layout
+        fitted, layout = part.fitted, part.layout
         of = "" if part.name is None else f"{part.name}: "
         if fitted.any():
-            own, axes = starts[..., part.rows[fitted], : part.system.states], [f"{of}record", f"{of}coordinate"]
+            own, axes = starts[..., part.frame.rows[fitted], : part.states], [f"{of}record", f"{of}coordinate"]
             coords |= dict(zip(axes, (np.flatnonzero(fitted), list(layout.names)), strict=True))
             posterior |= {f"{of}q0": own[..., : layout.size], f"{of}qdot0": own[..., layout.size :]}
             dims |= {f"{of}q0": axes, f"{of}qdot0": axes}

@@ -5,12 +5,9 @@ bounds. A positive number that is smaller than its standard error is one that th
 beyond a bound by more than two standard errors is held there by the bound alone.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
 from lagjax._fit.model._noise import AbstractNoise
-from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._records import Record
 from lagjax._fit.model._residuals import Residuals, Trial
 from lagjax._fit.model._sensor_faults import TOO_COARSE, constant_signals, describe_sensors
@@ -18,57 +15,43 @@ from lagjax._fit.model._transforms import Between, Positive
 from lagjax._fit.result._influence import disagreements
 from lagjax._fit.result._information import Information
 from lagjax._fit.search._descent import Descent, column_norms, eliminate
-from lagjax._fit.search._unexplained import Unexplained, measure_unexplained, unexplained_motion
+from lagjax._fit.search._unexplained import Unexplained, unexplained_motion
 
 _BEYOND = 2.0  # standard errors that a step must lead beyond a bound: of sound fits at a bound one in forty does
-
 _CORRELATED = 0.5
 
 
-class Verdict(NamedTuple):
-    """A flag that a fit can be relied upon, the sentences that say why, and what it leaves."""
-
-    ok: bool
-    message: str
-    left: "Unexplained"
-
-
 def verdict(
-    descent: Descent, unseen: tuple[str, ...], known: Information, residuals: Residuals, law: AbstractNoise
-) -> Verdict:
+    descent: Descent, unseen: tuple[str, ...], known: Information, left: Unexplained, law: AbstractNoise
+) -> tuple[bool, str]:
+    """A flag that a fit can be relied upon, and the sentences that say why, where the search leaves `left`."""
+    residuals = descent.residuals
     parts = [descent.message]
     if known.confirmed.shape[1]:
         parts.append("Not everything that is free is seen: fix it, or measure more.")
-    left = measure_unexplained(residuals, descent.point, descent.noise)
     parts += left.motion + left.noise
-    triangles = residuals.linearise(descent.point, descent.noise)
-    at_ends, named = _describe_ends(residuals.parameters, descent.point, triangles, residuals.states, known)
+    triangles = residuals.linearise(descent.trial, descent.noise)
+    at_ends, named = _describe_ends(residuals, descent.trial, triangles, known)
     parts += at_ends
     # Half a step of the search is one standard deviation: the interval then spans more than a factor of fifty.
     wide = 2 * _deviations(known) > residuals.parameters.reach
     labels = dict.fromkeys(residuals.parameters.labels[i] for i in np.flatnonzero(wide & ~named))
     if labels:
         parts.append(f"Hardly seen, or at the end of what its transform allows: {', '.join(labels)}.")
-    apart, pulls = disagreements(
-        residuals, triangles, known, ~named, unexplained_motion(residuals, descent.point, descent.noise)
-    )
+    apart, pulls = disagreements(residuals, triangles, known, ~named, unexplained_motion(descent))
     parts += apart + pulls
     for part in residuals.parts:
-        records, own = [r for r in part.system.records if isinstance(r, Record)], part.sensor_noise(descent.noise)
+        records, own = [r for r in part.records if isinstance(r, Record)], part.sensor_noise(descent.noise)
         if records:
-            parts += describe_sensors(records, law, part.system.signals.names, part.system.sensor, own.sigma)
+            parts += describe_sensors(records, law, part.signals.names, part.sensor, own.sigma)
     if np.nanmax(known.correlation) > _CORRELATED:
         parts.append("The residuals are correlated: they hold motion that the scene lacks, and intervals allow for it.")
     ok = descent.converged and not (unseen or left.motion or apart)
     ok &= not any("take noise=" in text or TOO_COARSE in text for text in parts)
     if not ok or at_ends or labels:
-        still = [
-            text
-            for part in residuals.parts
-            for text in constant_signals(part.system.records, part.system.signals.names)
-        ]
+        still = [x for part in residuals.parts for x in constant_signals(part.records, part.signals.names)]
         parts, ok = parts + still, ok and not still
-    return Verdict(ok, " ".join(parts), left)
+    return ok, " ".join(parts)
 
 
 def _deviations(known: Information) -> np.ndarray:
@@ -76,32 +59,28 @@ def _deviations(known: Information) -> np.ndarray:
     return np.sqrt(np.nan_to_num(np.diag(known.covariance), posinf=0.0))
 
 
-def _describe_ends(parameters: Parameters, point: Trial, triangles, states: int, known: Information):
+def _describe_ends(residuals: Residuals, trial: Trial, triangles: np.ndarray, known: Information):
     """Sentences for the numbers at the end of their sets, and for each unknown whether there is one (F,)."""
-    found, named = [], np.zeros(len(parameters), bool)
+    parameters, states = residuals.parameters, residuals.states
+    found, named, none = [], np.zeros(len(parameters), bool), np.zeros(len(parameters))
     if known.null.shape[1] or not len(parameters):
         return found, named
-    none = np.zeros(len(parameters))
     step = eliminate(triangles, states, column_norms(triangles, states), 1e-14, (none, none)).u
     deviations = _deviations(known)
-    for unknown, (label, transform) in enumerate(zip(parameters.labels, parameters.maps, strict=True)):
+    for k, (label, transform) in enumerate(zip(parameters.labels, parameters.maps, strict=True)):
         if not isinstance(transform, Positive | Between):
             continue
-        u = point.u[unknown : unknown + 1]
-        slope = float(transform.slope(u)[0])
-        text = _describe_end(
-            label, transform, float(transform.value(u)[0]), slope * step[unknown], slope * deviations[unknown]
-        )
+        x, slope = float(transform.value(trial.u[k])), float(transform.slope(trial.u[k]))
+        text = _describe_end(label, transform.bounds, x, slope * step[k], slope * deviations[k])
         if text is not None:
             found.append(text)
-            named[unknown] = True
+            named[k] = True
     return found, named
 
 
-def _describe_end(name: str, transform: Positive | Between, x: float, step: float, error: float) -> str | None:
+def _describe_end(name: str, bounds: tuple[float, float], x: float, step: float, error: float) -> str | None:
     """The sentence for one number x whose step on a straight line, and whose standard error there, are given."""
-    ends = [(0.0, -1)] if isinstance(transform, Positive) else [(transform.lower, -1), (transform.upper, 1)]
-    for end, side in ends:
+    for end, side in zip(bounds, (-1, 1), strict=True):
         if side * (x + step - end) > _BEYOND * error:
             return (
                 f"{name} stands at {x:.3g}, held by the bound {end:g} of its transform: the data want it near "

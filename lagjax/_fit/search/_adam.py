@@ -9,7 +9,6 @@ Source: Kingma & Ba, *Adam* (2015); Loshchilov & Hutter, *SGDR* (2017), for the 
 """
 
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -17,30 +16,35 @@ import numpy as np
 
 from lagjax._fit.model._density import Density
 from lagjax._fit.model._noise import AbstractNoise, NoiseScale
-from lagjax._fit.model._residuals import LostTrial, Residuals, Trial
-from lagjax._fit.search._descent import Descent
+from lagjax._fit.model._residuals import LostTrial, Point, Residuals, Trial
 
 _RATE, _WARM = 1e-2, 0.05  # the largest step, in units of each number; the share of steps over which it rises
-
 _PORTION = 100  # steps in one call: of them the best is kept
-
 _STILL = 1.0  # what log L may gain over the last tenth of the steps where the descent has come to its end
 
 
 def descend_gradient(
-    residuals: Residuals, u: np.ndarray, starts: np.ndarray, law: AbstractNoise, steps: int,
-    notify: Callable[[str], None] | None = None,
-) -> tuple[np.ndarray, np.ndarray, bool] | LostTrial:  # fmt: skip
-    """u (F,), the starts (N, 2n) after this many steps, and whether log L has come to rest.
+    residuals: Residuals, point: Point, law: AbstractNoise, steps: int, notify: Callable[[str], None] | None = None
+) -> tuple[Point, bool] | LostTrial:
+    """The point after this many steps, and whether log L has come to rest.
 
     A `LostTrial` where the motion from the first trial cannot be followed; later ones are passed over.
     """
-    optax = _optax()
+    try:
+        import optax
+    except ImportError:
+        raise ImportError('method="gradient" needs the package optax: pip install lagjax[neural].') from None
     whole = NoiseScale(residuals.size, np.full(len(residuals.size), np.inf))
-    density = Density(residuals, law, Trial(u, starts, [], []), whole, np.ones(len(residuals.size)))
-    first = _initial_unknowns(density, residuals, law)
-    if isinstance(first, LostTrial):
-        return first
+    density = Density(residuals, law, Trial(*point, [], []), whole, np.ones(len(residuals.size)))
+    first = density.first.copy()
+    each = [np.asarray(r, float) for r in density.evaluate(density.unknowns(jnp.asarray(first, density.dtype)))]
+    for batch, r in zip(residuals.batches, each, strict=True):
+        if (bad := ~np.isfinite(r).all(axis=(1, 2))).any():
+            piece = int(batch.rows[int(np.argmax(bad))])
+            return LostTrial(piece, "Its motion could not be followed from the first trial.")
+    flat = np.concatenate([r.reshape(-1, r.shape[-1]) for r in each])
+    scatter = law.estimate(flat, residuals.weights, residuals.least, residuals.sides)
+    first[density.noise_places] = np.log(scatter.sigma)
     scale = jnp.asarray(_units(density, first), density.dtype)
     cost = lambda z: -density.log_likelihood(first + scale * z) / residuals.measured  # noqa: E731
     rate = optax.warmup_cosine_decay_schedule(0.0, _RATE, int(_WARM * steps) + 1, steps)
@@ -66,24 +70,9 @@ def descend_gradient(
     x = np.asarray(first + scale * carry[2][1], float)
     rest = costs[-max(1, len(costs) // 10) - 1] if len(costs) > 1 else np.inf
     at = density.unknowns(jnp.asarray(x, scale.dtype))
-    return x[: len(u)], np.asarray(at.starts, float), bool((rest - costs[-1]) * residuals.measured < _STILL)
-
-
-def _initial_unknowns(density: Density, residuals: Residuals, law: AbstractNoise) -> np.ndarray | LostTrial:
-    """The first x (D,), with the noise that its residuals have."""
-    at = density.unknowns(jnp.asarray(density.first, density.dtype))
-    left = [np.asarray(r, float) for r in density.evaluate(at)]
-    for batch, r in zip(residuals.batches, left, strict=True):
-        bad = ~np.isfinite(r).all(axis=(1, 2))
-        if bad.any():
-            return LostTrial(
-                int(batch.rows[int(np.argmax(bad))]), "Its motion could not be followed from the first trial."
-            )
-    flat = np.concatenate([r.reshape(-1, r.shape[-1]) for r in left])
-    scale = law.estimate(flat, residuals.weights, residuals.least, residuals.sides)
-    x = density.first.copy()
-    x[density.noise_places] = np.log(scale.sigma)
-    return x
+    return Point(x[: len(point.u)], np.asarray(at.starts, float)), bool(
+        (rest - costs[-1]) * residuals.measured < _STILL
+    )
 
 
 def _units(density: Density, x: np.ndarray) -> np.ndarray:
@@ -93,33 +82,9 @@ def _units(density: Density, x: np.ndarray) -> np.ndarray:
     unbounded = np.isinf(residuals.parameters.reach)
     scale[:free] = np.where(unbounded, np.maximum(1.0, np.abs(x[:free])), 1.0)
     for part in residuals.parts:
-        fitted = part.rows[part.system.fitted]
+        fitted = part.frame.rows[part.fitted]
         if len(fitted):
-            places = density.start_places[fitted, : part.system.states]
+            places = density.start_places[fitted, : part.states]
             size = np.sqrt(np.mean(x[places] ** 2, axis=0))
             scale[places] = np.where(size > 0, size, 1.0)
     return scale
-
-
-def build_descent(
-    residuals: Residuals, u: np.ndarray, starts: np.ndarray, law, steps: int, rest: bool
-) -> Descent | LostTrial:
-    """The result of the descent, with the derivatives that intervals need."""
-    point = residuals.evaluate(u, starts)
-    if isinstance(point, LostTrial):
-        return point
-    text = f"The descent by gradients came to rest within {steps} steps."
-    if not rest:
-        text = (
-            f"The descent by gradients was stopped after {steps} steps, and the likelihood still grew: go on from "
-            "there, with fit.params in the place of params0."
-        )
-    return Descent(point, residuals.noise_scale(point, law), rest, steps, text, residuals)
-
-
-def _optax() -> Any:
-    try:
-        import optax
-    except ImportError:
-        raise ImportError('method="gradient" needs the package optax: pip install lagjax[neural].') from None
-    return optax

@@ -19,26 +19,23 @@ Source: Moré, *The Levenberg–Marquardt algorithm: implementation and theory* 
 Nielsen & Tingleff, *Methods for non-linear least squares problems* (2004), §3.2, for λ; Bock (1987) for elimination.
 """
 
+import functools
 from typing import NamedTuple
 
 import numpy as np
 
 from lagjax._fit.model._autocorrelation import independent_share
 from lagjax._fit.model._noise import AbstractNoise, NoiseScale
-from lagjax._fit.model._residuals import LostTrial, Residuals, Trial, compress_rows, qr_triangle
+from lagjax._fit.model._residuals import LostTrial, Point, Residuals, Trial, compress_rows, qr_triangle
 
 # Damping, relative to the squared norms of the columns. The first step is nearly that of Gauss and Newton; below the
 # least one, damping is below the round-off of derivatives and only keeps columns that nothing depends on from moving.
 _FIRST, _LEAST, _MOST = 1e-4, 1e-14, 1e12
-
 _PATIENCE = (
     12  # trials that lowered the sum of squares by less than what ends a search, while derivatives promised more
 )
-
 _NEAR = 1e-3  # per sample: where it pays to look at how much the residuals are correlated
-
 _FLAT = 1e-13  # relative: half the sum of squares is itself rounded to so much
-
 _KINK = (
     "The search stopped at a kink of the sum of squares after {} trials: derivatives promise to lower half of it by "
     "{:.2g}, the last {} trials lowered it by {:.2g}. Motion that sticks, or strikes, has such kinks; friction that "
@@ -47,15 +44,15 @@ _KINK = (
 
 
 class Descent(NamedTuple):
-    """The end of a search: the last trial, its noise, whether it converged, how many trials, a sentence, and the
-    residuals that it minimised, `residuals`."""
+    """The end of a search for the minimum of `residuals`: the last trial, its noise, whether the search converged, how
+    many trials it took, and a sentence."""
 
-    point: Trial
+    residuals: Residuals
+    trial: Trial
     noise: NoiseScale
     converged: bool
     trials: int
     message: str
-    residuals: Residuals
 
 
 class DescentStep(NamedTuple):
@@ -72,103 +69,85 @@ class Anchor(NamedTuple):
     centre: np.ndarray
     weight: np.ndarray
 
-    @classmethod
-    def none(cls, u: np.ndarray) -> "Anchor":
-        return cls(u, np.zeros_like(u))
-
     def pull(self, u: np.ndarray) -> np.ndarray:
         return self.weight * (u - self.centre)
 
-    def cost(self, u: np.ndarray) -> float:
-        return 0.5 * float(np.sum(self.pull(u) ** 2))
+
+class _Model:
+    """The least squares about one trial, with the noise and the weights of its samples; `cost` is half their sum."""
+
+    def __init__(self, residuals: Residuals, trial: Trial, law: AbstractNoise, anchor: Anchor):
+        self.residuals, self.trial, self.anchor = residuals, trial, anchor
+        self.noise = residuals.noise_scale(trial, law)
+        self.factors = residuals.factors(trial, self.noise)
+        self.triangles = residuals.linearise(trial, self.noise)
+        self.cost = self.cost_of(trial)
+
+    def cost_of(self, trial: Trial) -> float:
+        pulled = 0.5 * float(np.sum(self.anchor.pull(trial.u) ** 2))
+        return self.residuals.cost(trial, self.factors, self.noise) + pulled
+
+    def step(self, damping: float) -> DescentStep:
+        u, states = self.trial.u, self.residuals.states
+        pull, limits = (self.anchor.weight, self.anchor.pull(u)), self.residuals.parameters.limits(u)
+        return eliminate(self.triangles, states, column_norms(self.triangles, states), damping, pull, limits)
+
+    def is_enough(self, gain: float, enough: float) -> bool:
+        """True if half the sum of squares is at most `enough`, correlated residuals counted for what they are worth."""
+        return gain <= enough or (
+            gain <= _NEAR * self.residuals.measured
+            and gain * independent_share(self.residuals, self.trial, self.noise) <= enough
+        )
 
 
 def minimise(
-    residuals: Residuals,
-    u: np.ndarray,
-    starts: np.ndarray,
-    law: AbstractNoise,
-    enough: float,
-    limit: int = 60,
-    anchor: Anchor | None = None,
+    residuals: Residuals, point: Point, law: AbstractNoise, enough: float, limit: int = 60, anchor: Anchor | None = None
 ) -> Descent | LostTrial:
-    """The unknowns that make the measurements likeliest, by a search from (u, starts).
+    """The unknowns that make the measurements likeliest, by a search from a point.
 
     It ends when a step without damping, within the reach of the transforms, promises to lower half the sum of squares,
     in units of the noise, by less than `enough`, correlated residuals counted for what they are worth: then no
     parameter is further than √(2 enough) standard deviations from the minimum.
     A `LostTrial` is returned where the motion from the first trial cannot be followed.
     """
-    point = residuals.evaluate(u, starts)
-    if isinstance(point, LostTrial):
-        return point
-    anchor = Anchor.none(u) if anchor is None else anchor
+    trial = residuals.evaluate(point)
+    if isinstance(trial, LostTrial):
+        return trial
+    anchor = Anchor(point.u, np.zeros_like(point.u)) if anchor is None else anchor
     damping, trials, falls = _FIRST, 1, [(1, np.inf)]
     while True:
-        model = _model(residuals, point, law, anchor)
-        left = model.step(_LEAST).gain
-        near = left <= _NEAR * residuals.measured
-        if left <= enough or (near and left * independent_share(residuals, point, model.noise) <= enough):
-            return Descent(point, model.noise, True, trials, f"The search converged after {trials} trials.", residuals)
-        recent = sum(fall for trial, fall in falls if trial > trials - _PATIENCE)
-        if trials > _PATIENCE and recent * independent_share(residuals, point, model.noise) <= enough:
-            text = _KINK.format(trials, left, _PATIENCE, recent)
-            return Descent(point, model.noise, False, trials, text, residuals)
-        better, damping, trials = _find_better_trial(residuals, point, model, anchor, damping, trials, limit)
-        if better is not None:
-            falls.append(
-                (trials, model.cost - residuals.cost(better, model.factors, model.noise) - anchor.cost(better.u))
-            )
+        model = _Model(residuals, trial, law, anchor)
+        gain = model.step(_LEAST).gain
+        end = functools.partial(Descent, residuals, trial, model.noise)
+        if model.is_enough(gain, enough):
+            return end(True, trials, f"The search converged after {trials} trials.")
+        recent = sum(fall for place, fall in falls if place > trials - _PATIENCE)
+        if trials > _PATIENCE and model.is_enough(recent, enough):
+            return end(False, trials, _KINK.format(trials, gain, _PATIENCE, recent))
+        better, damping, trials = _find_better_trial(model, damping, trials, limit)
         if better is None and trials < limit:
-            text = f"The search stopped where rounding hides what is left, after {trials} trials."
-            return Descent(point, model.noise, True, trials, text, residuals)
+            return end(True, trials, f"The search stopped where rounding hides what is left, after {trials} trials.")
         if better is None:
-            text = f"The search was stopped after {trials} trials: half the sum of squares may fall by {left:.2g}."
-            return Descent(point, model.noise, False, trials, text, residuals)
-        point = better
+            text = f"The search was stopped after {trials} trials: half the sum of squares may fall by {gain:.2g}."
+            return end(False, trials, text)
+        falls.append((trials, model.cost - model.cost_of(better)))
+        trial = better
 
 
-class _Model(NamedTuple):
-    """The least squares about one trial: what it is made of, and half its sum of squares."""
-
-    noise: NoiseScale
-    factors: list[np.ndarray]
-    triangles: np.ndarray
-    states: int
-    pull: tuple[np.ndarray, np.ndarray]
-    limits: tuple[np.ndarray, np.ndarray]
-    cost: float
-
-    def step(self, damping: float) -> DescentStep:
-        scale = column_norms(self.triangles, self.states)
-        return eliminate(self.triangles, self.states, scale, damping, self.pull, self.limits)
-
-
-def _model(residuals: Residuals, point: Trial, law: AbstractNoise, anchor: Anchor) -> _Model:
-    noise = residuals.noise_scale(point, law)
-    factors = residuals.factors(point, noise)
-    triangles = residuals.linearise(point, noise)
-    cost = residuals.cost(point, factors, noise) + anchor.cost(point.u)
-    pull = anchor.weight, anchor.pull(point.u)
-    return _Model(noise, factors, triangles, residuals.states, pull, residuals.parameters.limits(point.u), cost)
-
-
-def _find_better_trial(
-    residuals: Residuals, point: Trial, model: _Model, anchor: Anchor, damping: float, trials: int, limit: int
-) -> tuple[Trial | None, float, int]:
+def _find_better_trial(model: _Model, damping: float, trials: int, limit: int) -> tuple[Trial | None, float, int]:
     """The first trial that is better, the damping to go on with, and the count of trials.
 
     There is none, but None, after `limit` trials, or where steps promise no more than sums of squares are rounded to.
     """
-    growth = 2.0
+    growth, at, residuals = 2.0, model.trial, model.residuals
     while trials < limit:
         step = model.step(damping)
         if step.gain <= _FLAT * model.cost or damping > _MOST:
             break
-        trial = residuals.evaluate(residuals.parameters.take_step(point.u, step.u), point.starts + step.starts)
+        trial = residuals.evaluate(Point(residuals.parameters.take_step(at.u, step.u), at.starts + step.starts))
         trials += 1
         if not isinstance(trial, LostTrial):
-            fall = model.cost - residuals.cost(trial, model.factors, model.noise) - anchor.cost(trial.u)
+            fall = model.cost - model.cost_of(trial)
             if fall > 0.0:
                 return trial, max(_LEAST, damping * max(0.1, 1.0 - (2.0 * fall / step.gain - 1.0) ** 3)), trials
         damping, growth = damping * growth, 2.0 * growth

@@ -1,25 +1,21 @@
 """States and time scales, read off the data by local cubics."""
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
+from lagjax._fit.model._assembly import errors_of_system
 from lagjax._fit.model._inputs import constant_tables
 from lagjax._fit.model._motions import AbstractMotions
-from lagjax._fit.model._records import Record, inputs_between, restore_structure
-from lagjax._fit.model._residuals import SystemResiduals
-from lagjax._fit.model._sensors import unwrap_record
+from lagjax._fit.model._records import Record, inputs_between, known_start, restore_structure
+from lagjax._fit.model._residuals import Residuals, SystemResiduals
+from lagjax._fit.model._sensors import UNCLEAR, unwrap_record
 
 _DEGREE = 3  # of local polynomials: velocities without the bias that curvature gives to lines
-
 _WINDOWS = (7, 13, 25, 49, 97, 193)  # samples in one of them
-
 _PROBES = 32  # places of a record where its time scale is looked at
-
 _WORSE_WINDOW = 1.3  # what a window may leave, in units of what the shortest leaves
-
 _WINDOWS_IN_ALL = 256  # places of all records where curvature is looked at
-
 _QUARTER = (
     0.25  # of a period, by which the motion over a segment may be wrong: beyond a half residuals have false minima
 )
@@ -179,6 +175,43 @@ def build_reader(record: Record, about: SystemResiduals, numbers: np.ndarray, pr
         gain = np.nanstd(read.matrix, axis=0) / np.maximum(np.nanstd(smooth.matrix, axis=0), np.finfo(float).tiny)
         periods = np.where(np.isfinite(periods), gain * periods, np.inf)
     return Reader.from_record(read, probes, periods)
+
+
+def read_records(residuals: Residuals) -> list[Reader | None]:
+    """Readers of states off the data, for each record whose signals are positions; None for others.
+
+    All records of a system together try windows at a few hundred places.
+    """
+    numbers = residuals.parameters.first
+    return [
+        build_reader(record, part, numbers, max(8, 256 // len(part.records))) if isinstance(record, Record) else None
+        for part in residuals.parts
+        for record in part.records
+    ]
+
+
+def first_starts(residuals: Residuals, readers: list[Reader | None], params0: Any) -> np.ndarray:
+    """The first guess of the starts of all records, (N, 2n) of the system with the most coordinates."""
+    found = []
+    for part in residuals.parts:
+        for place, (record, reader) in enumerate(zip(part.records, readers[part.frame.records], strict=True)):
+            with errors_of_system(part.name):
+                state = known_start(record, part.layout, place, params0)
+                state = read_start(reader, record, part, f"records[{place}]") if state is None else state
+                found.append(pad_states(state, residuals.states))
+    return np.stack(found)
+
+
+def read_start(reader: Reader | None, record: Any, part: SystemResiduals, called: str) -> np.ndarray:
+    """The first state (2n,) of a record. Raises `ValueError` where it cannot be read off the data."""
+    if reader is not None:
+        return reader.states(np.array([0]))[0]
+    if isinstance(record, Record) and part.signals.look_like_positions(record):
+        raise ValueError(UNCLEAR.format(called))
+    raise ValueError(
+        f"{called} needs a start, because its values do not have the structure of q: give start=(q0, qdot0) if it is "
+        "known, else start=lagjax.Guess(q0, qdot0)."
+    )
 
 
 def pad_states(state: np.ndarray, states: int) -> np.ndarray:

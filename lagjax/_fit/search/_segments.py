@@ -8,7 +8,6 @@ from lagjax._fit.model._pieces import Piece
 from lagjax._fit.model._records import Record
 
 _PER_SCALE = 24  # samples per time scale that early levels look at: more cost time and find the same
-
 _FEWEST_IN_SEGMENT = 8  # samples
 
 

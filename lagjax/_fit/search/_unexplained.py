@@ -9,20 +9,16 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax._fit.model._autocorrelation import correlated_power
-from lagjax._fit.model._noise import NoiseScale
-from lagjax._fit.model._residuals import Residuals, Trial
+from lagjax._fit.search._descent import Descent
 
 MOST_NAMED = 3
-
 _UNEXPLAINED = 0.3  # of a signal's size, left as motion: sound fits leave 1e-3 to 0.1, a false minimum 0.4 to 1
-
 _DOUBTED = 0.05  # of a signal's size, left as motion, from which a fit of other records is tried
-
 _FAINT = 0.1  # of a signal's size over all records: what is left of a record that hardly moves is not looked at
 
 
 class Unexplained(NamedTuple):
-    """Sentences on the residuals of a trial: for signals of which motion is left, and for those whose noise is as large
+    """Sentences on what a search leaves: for signals of which motion is left, and for those whose noise is as large
     as they are; the largest share of a signal that is left, whether it holds motion at all, and the records, the worst
     first."""
 
@@ -33,13 +29,13 @@ class Unexplained(NamedTuple):
     worst: list[int]
 
 
-def measure_unexplained(residuals: Residuals, point: Trial, noise: NoiseScale) -> Unexplained:
-    """The share of the signals that a trial leaves, where that is much."""
-    left, noisy, shares, doubted, many = [], [], [0.0], False, len(residuals.records) > 1
+def measure_unexplained(done: Descent) -> Unexplained:
+    """The share of the signals that the end of a search leaves, where that is much."""
+    residuals = done.residuals
+    left, noisy, shares, doubted = [], [], [0.0], False
     of_records = np.zeros(len(residuals.records))
     for signal, name in enumerate(residuals.names):
-        rounding = np.nan_to_num(residuals.sensor.step[signal]) ** 2 / 12
-        parts = {k: _parts(rows, rounding) for k, rows in _rows_of_signal(residuals, point, noise, signal).items()}
+        parts = _measure_records(done, signal)
         if not parts:
             continue
         samples = sum(part.samples for part in parts.values())
@@ -60,7 +56,7 @@ def measure_unexplained(residuals: Residuals, point: Trial, noise: NoiseScale) -
             for k, part in parts.items()
             if part.motion > max(_UNEXPLAINED**2 * part.own, (_FAINT * own) ** 2)
         }
-        worst = sorted(each, key=lambda k: -each[k])[:MOST_NAMED] if many and len(each) < len(parts) else []
+        worst = sorted(each, key=lambda k: -each[k])[:MOST_NAMED] if len(each) < len(parts) else []
         left += [
             f"The fit leaves {_percent(np.sqrt(parts[k].left), np.sqrt(parts[k].own))} of {name} in "
             f"{residuals.label(k)}, and less in others: is it a record of this scene, with the signs of the others?"
@@ -73,7 +69,7 @@ def _percent(part: float, whole: float) -> str:
     return f"{100 * part / whole:.3g} %" if part < 10.0 * whole else "far more than all"
 
 
-class _Parts(NamedTuple):
+class _Part(NamedTuple):
     """Of one signal in one record: the samples that count, and mean squares of the residuals, of what these hold beyond
     white noise and rounding, and of the signal about its mean."""
 
@@ -83,39 +79,34 @@ class _Parts(NamedTuple):
     own: float
 
 
-def _parts(row: tuple[np.ndarray, np.ndarray, np.ndarray], rounding: float) -> _Parts:
-    rows, values, counts = row
-    samples, root = counts.sum(), np.sqrt(counts)
-    mean = np.sum(counts * values) / samples
-    motion = correlated_power(root * rows, counts > 0) * (counts > 0).sum() / samples
-    motion = max(motion - rounding, 0.0)
-    return _Parts(samples, np.sum(counts * rows**2) / samples, motion, np.sum(counts * (values - mean) ** 2) / samples)
-
-
-def _rows_of_signal(residuals: Residuals, point: Trial, noise: NoiseScale, signal: int) -> dict[int, tuple]:
-    """The residuals, values and weights of every record that has a signal, (M, T) for its M pieces."""
-    found: dict[int, list] = {}
-    columns = zip(residuals.batches, point.residuals, residuals.factors(point, noise), strict=True)
+def _measure_records(done: Descent, signal: int) -> dict[int, _Part]:
+    """The mean squares of one signal in every record that has it."""
+    residuals, trial, noise = done.residuals, done.trial, done.noise
+    rounding, pieces = np.nan_to_num(residuals.sensor.step[signal]) ** 2 / 12, {}
+    columns = zip(residuals.batches, trial.residuals, residuals.factors(trial, noise), strict=True)
     for batch, r, factors in columns:
         counts = (factors[..., signal] * noise.sigma[signal]) ** 2
         for row, place in enumerate(batch.rows):
             if counts[row].any():
-                each = r[row, :, signal], batch.values[row, :, signal], counts[row]
-                found.setdefault(residuals.pieces[place].record, []).append(each)
-    return {k: tuple(_pad_rows([one[i] for one in pieces]) for i in range(3)) for k, pieces in found.items()}
+                own = np.stack([r[row, :, signal], batch.values[row, :, signal], counts[row]])
+                pieces.setdefault(residuals.pieces[place].record, []).append(own)
+    found = {}
+    for k, rows in pieces.items():
+        longest = max(row.shape[1] for row in rows)
+        padded = np.stack([np.pad(row, ((0, 0), (0, longest - row.shape[1]))) for row in rows], axis=1)
+        r, values, counts = padded
+        samples = counts.sum()
+        mean = np.sum(counts * values) / samples
+        motion = correlated_power(np.sqrt(counts) * r, counts > 0) * (counts > 0).sum() / samples
+        squares = (np.sum(counts * x**2) / samples for x in (r, values - mean))
+        found[k] = _Part(samples, next(squares), max(motion - rounding, 0.0), next(squares))
+    return found
 
 
-def _pad_rows(rows: list[np.ndarray]) -> np.ndarray:
-    """Rows of different lengths as one array, with zeros behind the shorter ones."""
-    longest = max(map(len, rows))
-    return np.stack([np.pad(row, (0, longest - len(row))) for row in rows])
-
-
-def unexplained_motion(residuals: Residuals, point: Trial, noise: NoiseScale) -> dict[int, float]:
-    """The sum of squares that a trial leaves beyond white noise in every record, in units of the noise."""
+def unexplained_motion(done: Descent) -> dict[int, float]:
+    """The sum of squares that a search leaves beyond white noise in every record, in units of the noise."""
     found: dict[int, float] = {}
-    for signal in range(len(residuals.names)):
-        for k, rows in _rows_of_signal(residuals, point, noise, signal).items():
-            part = _parts(rows, np.nan_to_num(residuals.sensor.step[signal]) ** 2 / 12)
-            found[k] = found.get(k, 0.0) + part.samples * part.motion / noise.sigma[signal] ** 2
+    for signal, sigma in enumerate(done.noise.sigma):
+        for k, part in _measure_records(done, signal).items():
+            found[k] = found.get(k, 0.0) + part.samples * part.motion / sigma**2
     return found

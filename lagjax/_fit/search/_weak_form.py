@@ -30,13 +30,9 @@ from lagjax._run.hybrid import Hybrid
 from lagjax._scene import System
 
 _SAMPLES_OF_WEAK_FORM = 2000  # of all records, at most
-
 _FEWEST_IN_WINDOW = 9  # samples in a window
-
 _POWER = 4  # of the bump (1 − s²)ᵖ, whose first derivatives vanish at its ends
-
 _TRIALS_OF_WEAK_FORM = 100
-
 _WIDE = 3.0  # time scales in half a window: a bump sees what turns over within it
 
 

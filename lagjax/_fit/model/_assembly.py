@@ -1,0 +1,212 @@
+"""Assembly: the residuals of scenes and records as the user gives them, all of it checked."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from dataclasses import replace
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._engine import DEFAULT_RTOL
+from lagjax._equations import has_constraints
+from lagjax._fit.model._inputs import Form, input_functions
+from lagjax._fit.model._motions import Manifold, choose_motions
+from lagjax._fit.model._noise import AbstractNoise, Sensor, StudentT, read_sensor
+from lagjax._fit.model._parameters import Parameters
+from lagjax._fit.model._pieces import whole_pieces
+from lagjax._fit.model._records import Guess, Record, require_interpolation, require_records, start_pair
+from lagjax._fit.model._residuals import Residuals, SystemResiduals
+from lagjax._fit.model._sensor_faults import constant_signals, require_measurements
+from lagjax._fit.model._sensors import Delayed, require_no_jumps, sensors
+from lagjax._fit.model._signals import Signals
+from lagjax._fit.model._timings import Timings, build_clock
+from lagjax._interface import Layout, find_params_expression
+from lagjax._primitives import DOUBLE
+from lagjax._run.hybrid import Hybrid, Scene, first_law, require_scene
+
+PyTree = Any
+
+
+class GivenSystem(NamedTuple):
+    """One system of a fit: its name, None for the only one, its records and sensors, and the structure of its inputs
+    and coordinates."""
+
+    name: str | None
+    system: Scene
+    records: list[Any]
+    observe: Callable | Delayed | None
+    form: Form | None
+    layout: Layout
+
+
+def read_systems(system, records, params0: PyTree, observe, hold: str) -> list[GivenSystem]:
+    """The systems of a fit as the user gives them, checked."""
+    found = []
+    for name, one, own, shown in _systems_by_name(system, records, observe):
+        with errors_of_system(name):
+            one, own = require_scene(one), require_records(own)
+            form = _read_form(one, own, hold)
+            found.append(GivenSystem(name, one, own, shown, form, _read_layout(one, own, params0, form)))
+    return found
+
+
+def assemble_residuals(given: list[GivenSystem], parameters: Parameters, law: AbstractNoise) -> Residuals:
+    """The residuals of all systems. Raises `ValueError` for records that no motion of a scene can have."""
+    systems = []
+    for one in given:
+        with errors_of_system(one.name):
+            systems.append(_assemble_system(one, parameters, law))
+    return Residuals(systems)
+
+
+def _assemble_system(given: GivenSystem, parameters: Parameters, law: AbstractNoise) -> SystemResiduals:
+    name, system, records, observe, form, layout = given
+    motions = choose_motions(system, layout, parameters, DEFAULT_RTOL, None, form)
+    recordings = [record for record in records if isinstance(record, Record)]
+    if isinstance(observe, Delayed):
+        for place, record in enumerate(recordings):
+            if (length := record.ts[-1] - record.ts[0]) < observe.longest:
+                raise ValueError(
+                    f"Record {place} is {length:g} long, shorter than the longest delay of its sensors, "
+                    f"{observe.longest:g}: nothing is left of it. Leave it out, or bound the delay closer."
+                )
+    signals = Signals(observe, layout, parameters, recordings[0] if recordings else None, form)
+    _require_motion(given, recordings, signals)
+    if not isinstance(law, StudentT):
+        require_measurements(recordings, signals.names, signals.periods)
+    sensor = read_sensor(recordings, law, signals.names, signals.periods)
+    every = np.concatenate([record.matrix for record in recordings]) if recordings else np.zeros((1, 0))
+    size = np.sqrt(np.nanmean(every**2, axis=0))  # root mean squares
+    timings = {k: record for k, record in enumerate(records) if isinstance(record, Timings)}
+    clocks = {k: build_clock(system, layout, parameters, record, DEFAULT_RTOL) for k, record in timings.items()}
+    if timings:
+        size = np.append(size, max(np.ptp(record.ts) for record in timings.values()))
+        sensor = Sensor(*(np.append(x, np.nan) for x in sensor))
+    fitted = np.array([record.start is None or isinstance(record.start, Guess) for record in records])
+    manifold = None
+    if isinstance(system, Hybrid):
+        if fitted.any() and has_constraints(first_law(system)):
+            raise ValueError("A start on constraints of hybrid motion cannot be fitted: give start=(q0, qdot0).")
+        if isinstance(observe, Delayed):
+            raise ValueError("Sensors of hybrid motion cannot be lagjax.Delayed: keep the delay, and shift the times.")
+    elif has_constraints(system) and not input_functions(system):
+        manifold = Manifold(system, layout, parameters, motions.projection)
+    elif has_constraints(system) and fitted.any():
+        raise ValueError("A start on constraints of a scene with `inputs` cannot be fitted: give start=(q0, qdot0).")
+    return SystemResiduals(
+        name, system, records, whole_pieces(records), fitted, motions, signals, parameters,
+        np.where(size > 0, size, 1.0), DEFAULT_RTOL, clocks, manifold, sensor,
+    )  # fmt: skip
+
+
+def _require_motion(given: GivenSystem, recordings: list[Record], signals: Signals) -> None:
+    """Raise `ValueError` where a signal jumps by a period without `lagjax.wrapped`, or where starts are fitted, and no
+    signal of any record ever changes. Hybrid motion may jump."""
+    of_state, wrap = sensors(given.observe)
+    for place, record in enumerate(given.records):
+        if isinstance(record, Record) and not isinstance(given.system, Hybrid) and wrap is None:
+            require_no_jumps(record, f"records[{place}]", signals.names, of_state is None)
+    still = constant_signals(recordings, signals.names)
+    if len(still) == len(signals.names) * len(given.records) > 0 and all(one.start is None for one in given.records):
+        raise ValueError(f"{still[0]} So it is with all signals of all records: nothing moves that could be fitted.")
+
+
+def _read_form(system: Scene, records: list[Record], hold: str) -> Form | None:
+    """The structure of the inputs. Raises `ValueError` where the scene asks for some, and there are none."""
+    asking = input_functions(system)
+    if asking and isinstance(system, Hybrid):
+        raise ValueError(f"{asking[0]} asks for `inputs`, which hybrid motion has none of: make it a function of `t`.")
+    for place, record in enumerate(records):
+        if asking and (not isinstance(record, Record) or record.input_structure is None):
+            raise ValueError(
+                f"{asking[0]} asks for `inputs`, which records[{place}] has none of: give Record(..., inputs=...)."
+            )
+    structures = [record.input_structure for record in records if isinstance(record, Record)]
+    if not structures or structures[0] is None:
+        return None
+    for place, record in enumerate(records):
+        require_interpolation(record, hold, f"records[{place}]")
+    tree, shapes = structures[0]
+    return Form(tree, shapes, hold)
+
+
+def _read_layout(system: Scene, records: list[Record], params0, form: Form | None) -> Layout:
+    """The structure of the coordinates: that of a start that a record gives, or else that of its values."""
+    place = next((k for k, record in enumerate(records) if record.start is not None), None)
+    if place is not None:
+        begun = start_pair(records[place].start, params0)
+    else:  # no record is of crossing times: those have starts
+        begun = 2 * (jax.tree.map(lambda leaf: jnp.zeros(leaf.shape[1:]), records[0].values),)
+    q, qdot = jax.tree.map(jnp.asarray, begun)
+    scene, params = first_law(system), params0
+    if form is not None:
+        scene, params = form.drive_scene(scene), form.params(params0, 2)
+    try:
+        jax.eval_shape(lambda q, qdot: scene.energy(q, qdot, 0.0, params), q, qdot)
+    except Exception as reason:
+        if where := find_params_expression(reason):
+            raise ValueError(
+                f"The scene's functions ask for `{where}`, which params0 does not have ({type(reason).__name__}: "
+                f"{str(reason).splitlines()[0]}): params0 is {jax.tree.structure(params0)}."
+            ) from reason
+        if place is not None:
+            raise ValueError(
+                f"The scene's functions cannot be called with the start of records[{place}] ({type(reason).__name__}: "
+                f"{str(reason).splitlines()[0]}): give it in the structure of q."
+            ) from reason
+        raise ValueError(
+            "The scene's functions cannot be called with coordinates of the structure of `values`, which q is taken to "
+            f"have where no record has a start ({type(reason).__name__}: {str(reason).splitlines()[0]}). If the values "
+            "are something else, give every record start=(q0, qdot0), or lagjax.Guess(q0, qdot0) to fit it."
+        ) from reason
+    return replace(Layout.from_state(q, qdot), dtype=DOUBLE)
+
+
+def _systems_by_name(system, records, observe) -> list[tuple[str | None, Any, Any, Any]]:
+    """Name, system, records and `observe` of every system; the name of the only one is None.
+
+    Raises where one argument is a dict by names and another is not, or of other names.
+    """
+    if not isinstance(system, dict):
+        if isinstance(records, dict):
+            raise TypeError("records is a dict, so system must be a dict of systems by the same names.")
+        if isinstance(observe, dict):
+            raise TypeError("observe is a dict, so system must be a dict of systems by the same names.")
+        return [(None, system, records, observe)]
+    if not system:
+        raise ValueError("system is an empty dict: give at least one lagjax.System by its name.")
+    for name in system:
+        if not isinstance(name, str):
+            raise TypeError(f"The systems of a fit have names; {name!r} is no str.")
+    _require_names("records", records, system)
+    if isinstance(observe, dict):
+        _require_names("observe", observe, system)
+    return [
+        (name, one, records[name], observe[name] if isinstance(observe, dict) else observe)
+        for name, one in system.items()
+    ]
+
+
+def _require_names(what: str, given, systems: dict) -> None:
+    names = ", ".join(map(repr, systems))
+    if not isinstance(given, dict):
+        raise TypeError(
+            f"system is a dict, so {what} must be a dict by the same names, {names}; got {type(given).__name__}."
+        )
+    if lacking := [name for name in systems if name not in given]:
+        raise ValueError(f"{what} has nothing for the system {lacking[0]!r}: it needs the names {names}.")
+    if beyond := [name for name in given if name not in systems]:
+        raise ValueError(f"{what} has {beyond[0]!r}, which is the name of no system: these are {names}.")
+
+
+@contextlib.contextmanager
+def errors_of_system(name: str | None) -> Iterator[None]:
+    """Errors that are raised in this context begin with the name of the system, where there are several."""
+    try:
+        yield
+    except (TypeError, ValueError) as reason:
+        if name is None or type(reason) not in (TypeError, ValueError):
+            raise
+        raise type(reason)(f"Of the system {name!r}: {reason}") from reason
