@@ -1,6 +1,6 @@
 """Report: a fit in words, in figures drawn with matplotlib, and as a page of HTML with these inside.
 
-It holds `lab_book` (what `print(fit)` shows), the functions that draw, `SystemDrawing` and `render_page`.
+It holds `lab_book` (what `print(fit)` shows), the functions that draw, and `render_page`.
 
 The figures do without the state machine of matplotlib, and `lagjax.plot` draws them too.
 """
@@ -9,26 +9,18 @@ import base64
 import html
 import io
 from collections import Counter
-from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import numpy as np
 
 from lagjax._fit.model._records import Record
+from lagjax._fit.model._residuals import SystemResiduals
 from lagjax._fit.result._information import LEVEL
 
 BLUE, RED, GREY = "#0072B2", "#D55E00", "0.55"
 _MOST = 4000  # samples in one curve: more do not show
-
-
-def matplotlib_or_refuse(what: str) -> Any:
-    """The module matplotlib. Raises `ImportError` with a sentence where it is missing."""
-    try:
-        import matplotlib.figure
-    except ImportError:
-        raise ImportError(f"{what} needs the package matplotlib: pip install lagjax[examples].") from None
-    return matplotlib
 
 
 def draw_record(axes, record: Record, residuals: np.ndarray, names: tuple[str, ...], sigma: np.ndarray) -> None:
@@ -106,21 +98,18 @@ img { max-width: 100% } pre { background: #f4f4f4; padding: .7rem; overflow-x: a
 """
 
 
-def render_page(
-    title: str, message: str, ok: bool, unseen: Sequence[str], tables: dict[str, list[list[str]]],
-    figures: dict[str, list[str]], texts: dict[str, str],
-) -> str:  # fmt: skip
-    """The file: a verdict, what is not seen, tables by their headings, pictures, and texts as they are printed."""
-    escaped = html.escape
-    parts = [f"<h1>{escaped(title)}</h1>", f"<p{'' if ok else ' class=no'}>{escaped(message)}</p>"]
-    parts += [f'<p class="no">Not seen: {escaped(sentence)}</p>' for sentence in unseen]
-    for heading, (head, *rows) in tables.items():
+def render_page(fit, texts: dict[str, str]) -> str:
+    """The file of a fit: its verdict, what is not seen, tables, pictures, and texts by their headings."""
+    escaped, title = html.escape, build_title(fit)
+    parts = [f"<h1>{escaped(title)}</h1>", f"<p{'' if fit.ok else ' class=no'}>{escaped(fit.message)}</p>"]
+    parts += [f'<p class="no">Not seen: {escaped(sentence)}</p>' for sentence in fit.unseen]
+    for heading, (head, *rows) in {"Parameters": _parameter_cells(fit), "Noise": _noise_cells(fit)}.items():
         cells = "".join(f"<th>{escaped(cell)}</th>" for cell in head)
         body = "".join("<tr>" + "".join(f"<td>{escaped(cell)}</td>" for cell in row) + "</tr>" for row in rows)
         parts.append(f"<h2>{escaped(heading)}</h2><table><tr>{cells}</tr>{body}</table>")
     for heading, text in texts.items():
         parts.append(f"<h2>{escaped(heading)}</h2><pre>{escaped(text)}</pre>")
-    for heading, pictures in figures.items():
+    for heading, pictures in _build_pictures(fit).items():
         images = "".join(f'<p><img alt="{escaped(heading)}" src="data:image/png;base64,{one}"></p>' for one in pictures)
         parts.append(f"<h2>{escaped(heading)}</h2>{images}")
     head = f'<meta charset="utf-8"><title>{escaped(title)}</title><style>{_STYLE}</style>'
@@ -128,7 +117,10 @@ def render_page(
 
 
 def _render_picture(size: tuple[float, float], draw: Callable[[Any], None]) -> str:
-    matplotlib = matplotlib_or_refuse("Fit.report")
+    try:
+        import matplotlib.figure
+    except ImportError:
+        raise ImportError("Fit.report needs the package matplotlib: pip install lagjax[examples].") from None
     figure = matplotlib.figure.Figure(figsize=size, layout="constrained", dpi=110)
     draw(figure)
     file = io.BytesIO()
@@ -136,59 +128,52 @@ def _render_picture(size: tuple[float, float], draw: Callable[[Any], None]) -> s
     return base64.b64encode(file.getvalue()).decode()
 
 
-class SystemDrawing(NamedTuple):
-    """Records of one system, their residuals (T, S), and its signals with their noise (S,); `name` None: the only."""
-
-    name: str | None
-    records: list
-    residuals: list[np.ndarray]
-    names: tuple[str, ...]
-    sigma: np.ndarray
-
-
-def build_pictures(systems: list[SystemDrawing], covariance, waterfall) -> dict[str, list[str]]:
+def _build_pictures(fit) -> dict[str, list[str]]:
+    """The pictures of a fit by their headings."""
     figures = {}
-    for system in systems:
-        of_one = "" if system.name is None else f"{system.name}: "
-        figures |= {of_one + heading: pictures for heading, pictures in _record_figures(*system[1:]).items()}
-    side = min(3.2 + 0.45 * len(covariance.names), 12.0)
-    if covariance.names:
-        figures["Correlations of the parameters"] = [
-            _render_picture(
-                (side + 1.0, side), lambda f: draw_correlations(f.subplots(), covariance.matrix, covariance.names)
-            )
-        ]
-    if waterfall is not None:
-        figures["Waterfall of the starts"] = [
-            _render_picture((6.4, 3.2), lambda figure: draw_waterfall(figure.subplots(), waterfall.misfits))
-        ]
+    for part in fit.residual_function.parts:
+        of_one = "" if part.name is None else f"{part.name}: "
+        figures |= {of_one + heading: pictures for heading, pictures in _draw_records(fit, part).items()}
+    names, matrix = fit.covariance
+    if names:
+        side = min(3.2 + 0.45 * len(names), 12.0)
+        picture = _render_picture((side + 1.0, side), lambda f: draw_correlations(f.subplots(), matrix, names))
+        figures["Correlations of the parameters"] = [picture]
+    if fit.waterfall is not None:
+        picture = _render_picture((6.4, 3.2), lambda f: draw_waterfall(f.subplots(), fit.waterfall.misfits))
+        figures["Waterfall of the starts"] = [picture]
     return figures
 
 
-def _record_figures(records, residuals: list[np.ndarray], names, sigma) -> dict[str, list[str]]:
-    """Data over fit of the records of one system, whose residuals are (T, S), by their headings."""
+def recordings(fit, part: SystemResiduals) -> list[tuple[Record, np.ndarray]]:
+    """The records of one system of a fit, each with its residuals (T, S)."""
+    residuals = fit.residual_function.end_to_end(fit.residuals)[part.frame.records]
+    pairs = zip(part.records, residuals, strict=True)
+    return [(record, record_matrix(r, record)) for record, r in pairs if isinstance(record, Record)]
+
+
+def _draw_records(fit, part: SystemResiduals) -> dict[str, list[str]]:
+    """Data over fit of the records of one system, and its residuals, by their headings."""
+    pairs, names, sigma = recordings(fit, part), part.signals.names, part.sensor_noise(fit.noise_scale).sigma
+    if not pairs:
+        return {}
     count = min(len(names), _SIGNALS)
 
-    def draw_one(k):
+    def draw_one(k: int) -> str:
         def draw(figure):
             axes = figure.subplots(2, count, squeeze=False, gridspec_kw={"height_ratios": [2, 1]})
-            draw_record(axes, records[k], residuals[k], names[:count], sigma)
+            draw_record(axes, *pairs[k], names[:count], sigma)
             figure.suptitle(f"records[{k}]", fontsize="medium")
 
         return _render_picture((max(6.4, 3.6 * count), 4.2), draw)
 
-    figures = {}
-    if len(records):
-        shown = np.unique(np.linspace(0, len(records) - 1, min(len(records), _RECORDS)).astype(int))
-        heading = "Data over fit, and residuals"
-        if len(shown) < len(records) or count < len(names):
-            heading += f" (records {', '.join(map(str, shown))} of {len(records)}; {count} of {len(names)} signals)"
-        figures[heading] = [draw_one(k) for k in shown]
-        every = np.concatenate(residuals)
-        figures["Residuals against the normal distribution"] = [
-            _render_picture((6.4, 3.6), lambda figure: draw_residuals(figure.subplots(), every, sigma, names))
-        ]
-    return figures
+    shown = np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _RECORDS)).astype(int))
+    heading = "Data over fit, and residuals"
+    if len(shown) < len(pairs) or count < len(names):
+        heading += f" (records {', '.join(map(str, shown))} of {len(pairs)}; {count} of {len(names)} signals)"
+    every = np.concatenate([r for _, r in pairs])
+    against = _render_picture((6.4, 3.6), lambda figure: draw_residuals(figure.subplots(), every, sigma, names))
+    return {heading: [draw_one(k) for k in shown], "Residuals against the normal distribution": [against]}
 
 
 _LISTED = 8  # numbers of one array that a table lists; of more it says how many there are
@@ -196,14 +181,11 @@ _LISTED = 8  # numbers of one array that a table lists; of more it says how many
 
 def lab_book(fit) -> str:
     """The table of parameters, the noise of the signals, what is not seen, and the verdict."""
-    lines = [
-        build_title(fit),
-        "",
-        *_table_of_parameters(fit),
-        "",
-        *_table_of_noise(fit),
-        "",
-    ]
+    parameters = ["All parameters are kept: starts and noise were fitted."]
+    if fit.parameters.names:
+        parameters = _align(_parameter_cells(fit), {"value": 12, f"{100 * LEVEL:g} % interval": 27})
+    noise = _align(_noise_cells(fit), {"RMS": 10, "noise σ": 10, "ν": 8, "samples": 8, "effective": 9})
+    lines = [build_title(fit), "", *parameters, "", *noise, ""]
     lines += [f"not seen    {sentence}" for sentence in fit.unseen]
     if fit.waterfall is not None:
         lines.append(f"starts      {fit.waterfall}")
@@ -219,56 +201,41 @@ def build_title(fit) -> str:
     return f"Fit of {len(fit.u)} parameter{'s' * (len(fit.u) != 1)} to {of_records}"
 
 
-def cells_of_parameters(fit) -> list[list[str]]:
+def _parameter_cells(fit) -> list[list[str]]:
+    """The table of the free numbers, its head first: of long arrays their number."""
+    rows = [["parameter", "value", f"{100 * LEVEL:g} % interval", "relative"]]
     low, high = fit._ends(LEVEL)
-    rows = [["parameter", "value", "from", f"to ({100 * LEVEL:g} %)", "± relative"]]
-    for name, x, a, b in zip(fit.parameters.names, fit.parameters.values(fit.u), low, high, strict=True):
-        half = 50 * (b - a) / abs(x) if x else np.inf
-        rows.append([name, f"{x:.6g}", f"{a:.6g}", f"{b:.6g}", f"{half:.2g} %" if np.isfinite(half) else "not seen"])
+    owners = [part.label for part in fit.parameters.parts for _ in part.places]
+    many = {label: count for label, count in Counter(owners).items() if count > _LISTED}
+    rows += [[label, f"{count} numbers", "", ""] for label, count in many.items()]
+    numbers = zip(owners, fit.parameters.names, fit.parameters.values(fit.u), low, high, strict=True)
+    for owner, name, x, a, b in numbers:
+        if owner not in many:
+            relative = 50 * (b - a) / abs(x) if x else np.inf
+            shown = f"± {relative:.2g} %" if np.isfinite(relative) else "not seen"
+            rows.append([name, f"{x:.6g}", f"{a:>12.6g} … {b:>12.6g}", shown])
     return rows
 
 
-def cells_of_noise(fit) -> list[list[str]]:
-    rows = [["signal", "RMS", "σ", "ν", "samples", "effective", "Durbin–Watson"]]
+def _noise_cells(fit) -> list[list[str]]:
+    """The table of the noise of the signals, its head first; ν where one has tails."""
+    rows = [["signal", "RMS", "noise σ", "ν", "samples", "effective", "Durbin–Watson"]]
     for (name, noise), rms in zip(fit.noise.items(), fit.rms.values(), strict=True):
         numbers = f"{rms:.3g}", f"{noise.sigma:.3g}", f"{noise.dof:.3g}", f"{noise.samples}", f"{noise.effective:.0f}"
         rows.append([name, *numbers, f"{noise.durbin_watson:.2f}"])
-    return rows
-
-
-def _table_of_parameters(fit) -> list[str]:
-    if not fit.parameters.names:
-        return ["All parameters are kept: starts and noise were fitted."]
-    low, high = fit._ends(LEVEL)
-    values = fit.parameters.values(fit.u)
-    width = max(len(name) for name in (*fit.parameters.names, "parameter"))
-    rows = [f"{'parameter':<{width}}  {'value':>12}  {f'{100 * LEVEL:g} % interval':>27}  relative"]
-    owners = [part.label for part in fit.parameters.parts for _ in part.places]
-    many = {label: count for label, count in Counter(owners).items() if count > _LISTED}
-    for label, count in many.items():
-        rows.append(f"{label:<{width}}  {f'{count} numbers':>12}")
-    for owner, name, x, a, b in zip(owners, fit.parameters.names, values, low, high, strict=True):
-        if owner in many:
-            continue
-        relative = 100 * (b - a) / 2 / abs(x) if x else np.inf
-        shown = f"± {relative:.2g} %" if np.isfinite(relative) else "not seen"
-        rows.append(f"{name:<{width}}  {x:>12.6g}  {a:>12.6g} … {b:>12.6g}  {shown}")
-    return rows
-
-
-def _table_of_noise(fit) -> list[str]:
-    width = max(len(name) for name in (*fit.noise, "signal"))
     has_tails = any(np.isfinite(noise.dof) for noise in fit.noise.values())
-    tails = "         ν" if has_tails else ""
-    head = f"{'signal':<{width}}  {'RMS':>10}  {'noise σ':>10}{tails}"
-    rows = [f"{head}  {'samples':>8}  {'effective':>9}  Durbin–Watson"]
-    for (name, noise), rms in zip(fit.noise.items(), fit.rms.values(), strict=True):
-        tail = f"{noise.dof:>10.3g}" if has_tails else ""
-        rows.append(
-            f"{name:<{width}}  {rms:>10.3g}  {noise.sigma:>10.3g}{tail}  {noise.samples:>8}  {noise.effective:>9.0f}  "
-            f"{noise.durbin_watson:.2f}"
-        )
-    return rows
+    return rows if has_tails else [row[:3] + row[4:] for row in rows]
+
+
+def _align(rows: list[list[str]], widths: dict[str, int]) -> list[str]:
+    """The lines of a table: numbers to the right, as wide as `widths` by their heads say, the first and last column to
+    the left."""
+    first = max(len(row[0]) for row in rows)
+    return [
+        "  ".join([f"{row[0]:<{first}}", *(f"{x:>{widths[h]}}" for x, h in zip(row[1:-1], rows[0][1:-1], strict=True)),
+                   row[-1]]).rstrip()
+        for row in rows
+    ]  # fmt: skip
 
 
 def record_matrix(values: Any, record) -> np.ndarray:

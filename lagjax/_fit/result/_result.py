@@ -15,24 +15,14 @@ from lagjax._fit.model._density import Density
 from lagjax._fit.model._noise import AbstractNoise, NoiseScale
 from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._records import Record, restore_structure
-from lagjax._fit.model._residuals import Point, Residuals, SystemResiduals, Trial
+from lagjax._fit.model._residuals import Point, Residuals, Trial
 from lagjax._fit.result._comparison import Comparison, comparison
 from lagjax._fit.result._experiments import Experiments, rank_experiments
 from lagjax._fit.result._identifiability import unseen_sentences
 from lagjax._fit.result._information import LEVEL, Information, information
 from lagjax._fit.result._prediction import Prediction, planned_rows, predict_record
 from lagjax._fit.result._profile import Profile, profile
-from lagjax._fit.result._report import (
-    SystemDrawing,
-    build_pictures,
-    build_title,
-    cells_of_noise,
-    cells_of_parameters,
-    draw_record,
-    lab_book,
-    record_matrix,
-    render_page,
-)
+from lagjax._fit.result._report import draw_record, lab_book, record_matrix, recordings, render_page
 from lagjax._fit.result._sample import draw, inference_data
 from lagjax._fit.result._verdict import verdict
 from lagjax._fit.search._descent import Descent
@@ -155,9 +145,11 @@ class Fit:
         return cell(repr(self), self._draw_first, (5.2, 2.8))
 
     def _draw_first(self, figure) -> None:
-        drawn = next(one for one in map(self._system_drawing, self.residual_function.parts) if one.records)
-        axes = figure.subplots(2, min(2, len(drawn.names)), squeeze=False, gridspec_kw={"height_ratios": [2, 1]})
-        draw_record(axes, drawn.records[0], drawn.residuals[0], drawn.names[:2], drawn.sigma)
+        parts = self.residual_function.parts
+        part, pairs = next((part, pairs) for part in parts if (pairs := recordings(self, part)))
+        names = part.signals.names[:2]
+        axes = figure.subplots(2, len(names), squeeze=False, gridspec_kw={"height_ratios": [2, 1]})
+        draw_record(axes, *pairs[0], names, part.sensor_noise(self.noise_scale).sigma)
 
     def to_pandas(self, level: float = LEVEL):
         """A `pandas.DataFrame` with a row per free number, by its name: value, and low and high of its interval.
@@ -306,23 +298,10 @@ class Fit:
         With `experiments`, a set of planned records, it also says what to measure next (`next_experiment`). It needs
         matplotlib.
         """
-        tables = {"Parameters": cells_of_parameters(self), "Noise": cells_of_noise(self)}
         texts = {"What to measure next": str(self.next_experiment(experiments))} if experiments else {}
-        pictures = build_pictures(
-            [self._system_drawing(part) for part in self.residual_function.parts], self.covariance, self.waterfall
-        )
-        text = render_page(build_title(self), self.message, self.ok, self.unseen, tables, pictures, texts)
+        text = render_page(self, texts)
         with open(path, "w", encoding="utf-8") as file:
             file.write(text)
-
-    def _system_drawing(self, part: SystemResiduals) -> SystemDrawing:
-        """The records of one system with their residuals."""
-        residuals = self.residual_function.end_to_end(self.residuals)[part.frame.records]
-        pairs = [pair for pair in zip(residuals, part.records, strict=True) if isinstance(pair[1], Record)]
-        records, matrices = [record for _, record in pairs], [record_matrix(r, record) for r, record in pairs]
-        return SystemDrawing(
-            part.name, records, matrices, part.signals.names, part.sensor_noise(self.noise_scale).sigma
-        )
 
     @with_doubles
     def compare(self, other: "Fit | dict[str, Fit]", *, folds: int = 0) -> Comparison:
