@@ -112,7 +112,8 @@ def test_chains_that_stand_still_along_the_expansion_are_not_kept(bent, monkeypa
 
 def test_an_expansion_that_would_not_fit_says_so(bent, monkeypatch):
     monkeypatch.setattr(_expansion, "_LARGEST", 5)
-    assert "more than 5" in str(_expansion.expand_residuals(Chart.from_density(bent.log_density())))
+    with pytest.raises(_expansion.Unexpanded, match="more than 5"):
+        _expansion.expand_residuals(Chart.from_density(bent.log_density()))
 
 
 @pytest.mark.slow

@@ -100,7 +100,7 @@ class Parameters:
         return self._cuts[-1][0].stop if self.parts else 0
 
     def inverse(self, values: np.ndarray) -> np.ndarray:
-        """u (F,) of the free numbers among all `values` (P,)."""
+        """The unknowns u (F,) at which the free ones among all `values` (P,) stand."""
         return np.concatenate([np.zeros(0), *(part.transform.inverse(values[part.places]) for part in self.parts)])
 
     def numbers(self, u, xp: Any = np):
@@ -185,16 +185,12 @@ class Parameters:
     @property
     def reach(self) -> np.ndarray:
         """The largest change of each u (F,) in one step."""
-        return self._gather_attribute("reach")
+        return np.array([transform.reach for transform in self.maps])
 
     @property
     def room(self) -> np.ndarray:
         """The distance from one value of each u (F,) at which others are distinct."""
-        return self._gather_attribute("room")
-
-    def _gather_attribute(self, name: str) -> np.ndarray:
-        rows = (np.full(own.stop - own.start, getattr(part.transform, name)) for own, _, part in self._cuts)
-        return np.concatenate([np.zeros(0), *rows])
+        return np.array([transform.room for transform in self.maps])
 
     def sizes(self, u: np.ndarray) -> np.ndarray:
         """Changes of u (F,), each of which changes the free numbers by about their own size."""

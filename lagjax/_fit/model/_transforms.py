@@ -26,12 +26,14 @@ class AbstractTransform(abc.ABC):
     """A smooth map x(u) from real numbers (m,) onto the values (n,) that the numbers of one leaf may have.
 
     `reach` is how far a step of the search may change u: beyond it x(u) is nothing like its tangent. `room` is the
-    distance from one u within which another one is neither at a bound of the set nor the same value again. Functions
-    that take `xp` compute with NumPy, or with `jax.numpy` inside of a program of JAX.
+    distance from one u within which another one is neither at a bound of the set nor the same value again. `separable`
+    maps move every number by itself, so that one can be kept and the others moved. Functions that take `xp` compute
+    with NumPy, or with `jax.numpy` inside of a program of JAX.
     """
 
     reach: ClassVar[float] = 2.0
     room: ClassVar[float] = 40.0
+    separable: ClassVar[bool] = False
 
     def specialize(self, x: np.ndarray, shape: tuple[int, ...]) -> "AbstractTransform":
         """The map for a leaf of this shape that starts at `x` (n,), where the map depends on that."""
@@ -78,11 +80,6 @@ class AbstractTransform(abc.ABC):
         return u + step
 
     @property
-    def separable(self) -> bool:
-        """True if every number moves by itself, so that one can be kept and the others moved."""
-        return False
-
-    @property
     def bounds(self) -> tuple[float, float]:
         """Between which two numbers each number moves by itself; ∓∞ where there is no such bound."""
         return -np.inf, np.inf
@@ -91,13 +88,11 @@ class AbstractTransform(abc.ABC):
 class AbstractSeparable(AbstractTransform):
     """A map that moves every number by itself, x_i = x(u_i), and increases."""
 
+    separable: ClassVar[bool] = True
+
     @abc.abstractmethod
     def slope(self, u, xp: Any = np) -> Any:
         """dx/du."""
-
-    @property
-    def separable(self) -> bool:
-        return True
 
     def jacobian(self, u):
         return np.diag(self.slope(u))

@@ -189,8 +189,12 @@ class Surrogate(NamedTuple):
         return jnp.einsum("ntsq,nq->nts", jnp.asarray(block.rows, own.dtype), powers)
 
 
-def expand_residuals(chart: Chart) -> Surrogate | str:
-    """The expansion about the centre of a chart; or a sentence that says why there is none."""
+class Unexpanded(Exception):
+    """There is no expansion, or it is not good enough to draw from: its argument says why."""
+
+
+def expand_residuals(chart: Chart) -> Surrogate:
+    """The expansion about the centre of a chart. Raises `Unexpanded` where there is none."""
     density = chart.density
     residuals, free = density.residuals, len(density.point.u)
     states = residuals.states if residuals.fitted.any() else 0
@@ -198,11 +202,10 @@ def expand_residuals(chart: Chart) -> Surrogate | str:
     size = sum(batch.weights.size for batch in residuals.batches) * (1 + unknowns + unknowns * (unknowns + 1) // 2)
     plain = not np.isfinite(density.noise.dof).any() and residuals.sides is None
     if size > _LARGEST and not plain:
-        return f"The expansion of its residuals to second order would hold {size} numbers, more than {_LARGEST}."
-    found = _differentiate_twice(chart, states)
-    if isinstance(found, LostTrial):
-        return f"One standard deviation from the fit a motion fails. {residuals.describe_failure(found)}"
-    middle, slopes, bends = found
+        raise Unexpanded(
+            f"The expansion of its residuals to second order would hold {size} numbers, more than {_LARGEST}."
+        )
+    middle, slopes, bends = _differentiate_twice(chart, states)
     blocks = []
     for k, batch in enumerate(residuals.batches):
         first = np.sqrt(batch.weights) * middle.residuals[k]
@@ -212,29 +215,28 @@ def expand_residuals(chart: Chart) -> Surrogate | str:
             counts = np.ones(rows.shape[:3], bool)
         blocks.append(Block(rows, counts, _places(density, states)[batch.rows], batch.sides))
     if (size := sum(block.rows.size for block in blocks)) > _LARGEST:
-        return f"The expansion of its residuals to second order holds {size} numbers, more than {_LARGEST}."
+        raise Unexpanded(f"The expansion of its residuals to second order holds {size} numbers, more than {_LARGEST}.")
     return Surrogate(chart, blocks)
 
 
-def _differentiate_twice(chart: Chart, states: int) -> tuple[Trial, list[np.ndarray], list[np.ndarray]] | LostTrial:
-    """The trial at the centre, and of every batch J (N, T, S, d) and H (N, T, S, d, d); or the motion that failed."""
+def _differentiate_twice(chart: Chart, states: int) -> tuple[Trial, list[np.ndarray], list[np.ndarray]]:
+    """The trial at the centre, and of every batch J (N, T, S, d) and H (N, T, S, d, d)."""
 
-    def evaluate(zeta: np.ndarray) -> tuple[Trial, list[np.ndarray]] | LostTrial:
-        trial = _trial(chart, zeta)
-        return trial if isinstance(trial, LostTrial) else (trial, _jacobians(chart, trial, zeta, states))
+    def evaluate(zeta: np.ndarray) -> tuple[Trial, list[np.ndarray]]:
+        density, x = chart.density, chart.evaluate_unknowns(zeta)
+        starts = np.where(density.start_places < len(x), np.append(x, 0.0)[density.start_places], density.point.starts)
+        trial = density.residuals.evaluate(Point(x[: len(density.point.u)], starts), notify=False)
+        if isinstance(trial, LostTrial):
+            text = density.residuals.describe_failure(trial)
+            raise Unexpanded(f"One standard deviation from the fit a motion fails. {text}")
+        return trial, _jacobians(chart, trial, zeta, states)
 
     ways, columns = _directions(chart.density, states), []
-    centre = evaluate(np.zeros(len(chart.centre)))
-    if isinstance(centre, LostTrial):
-        return centre
+    middle, slopes = evaluate(np.zeros(len(chart.centre)))
     for way, step in zip(ways.T, chart.room(ways), strict=True):
-        right, left = evaluate(step * way), evaluate(-step * way)
-        if isinstance(right, LostTrial):
-            return right
-        if isinstance(left, LostTrial):
-            return left
-        columns.append([(more - less) / (2 * step) for more, less in zip(right[1], left[1], strict=True)])
-    return centre[0], centre[1], [np.stack(bends, axis=-1) for bends in zip(*columns, strict=True)]
+        right, left = evaluate(step * way)[1], evaluate(-step * way)[1]
+        columns.append([(more - less) / (2 * step) for more, less in zip(right, left, strict=True)])
+    return middle, slopes, [np.stack(bends, axis=-1) for bends in zip(*columns, strict=True)]
 
 
 def _places(density: Density, states: int) -> np.ndarray:
@@ -250,13 +252,6 @@ def _directions(density: Density, states: int) -> np.ndarray:
     for row in places:
         ways[row, np.arange(len(row))] = 1.0
     return ways[:-1]
-
-
-def _trial(chart: Chart, zeta: np.ndarray) -> Trial | LostTrial:
-    """The residuals and their derivatives at ζ (D,)."""
-    density, x = chart.density, chart.evaluate_unknowns(zeta)
-    starts = np.where(density.start_places < len(x), np.append(x, 0.0)[density.start_places], density.point.starts)
-    return density.residuals.evaluate(Point(x[: len(density.point.u)], starts), notify=False)
 
 
 def _jacobians(chart: Chart, trial: Trial, zeta: np.ndarray, states: int) -> list[np.ndarray]:

@@ -43,7 +43,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._fit.model._density import Density
-from lagjax._fit.result._expansion import Chart, Surrogate, expand_residuals
+from lagjax._fit.result._expansion import Chart, Surrogate, Unexpanded, expand_residuals
 
 _ACCEPTED = 0.85  # the mean acceptance that steps are tuned for
 _ROUNDS = (400, 800, 3200)  # draws of all chains from π*: each round has the metric of the one before
@@ -85,29 +85,35 @@ def draw(density: Density, draws: int, chains: int, seed: int) -> Draws:
     """Draws of the posterior, from starts that are dispersed as the posterior is."""
     _blackjax()
     chart = Chart.from_density(density)
-    drawn = _sample_expansion(chart, draws, chains, seed)
-    return _sample_exact(chart, draws, chains, seed, drawn) if isinstance(drawn, str) else drawn
+    try:
+        return _sample_expansion(chart, draws, chains, seed)
+    except Unexpanded as reason:
+        return _sample_exact(chart, draws, chains, seed, str(reason))
 
 
-def _sample_expansion(chart: Chart, draws: int, chains: int, seed: int) -> Draws | str:
-    """Draws that the exact density accepts or refuses; or a sentence that says why the expansion is not good enough."""
+def _sample_expansion(chart: Chart, draws: int, chains: int, seed: int) -> Draws:
+    """Draws that the exact density accepts or refuses. Raises `Unexpanded` where the expansion is not good enough."""
     surrogate = expand_residuals(chart)
-    if isinstance(surrogate, str):
-        return surrogate
     warming, weighing, going = jax.random.split(jax.random.key(seed), 3)
     sampler, state, many = _tune_sampler(surrogate, chart, _ROUNDS, chains, warming)
     if math.isinf(many):
-        return "Along the expansion of its residuals to second order the chains did not move."
+        raise Unexpanded("Along the expansion of its residuals to second order the chains did not move.")
     sampler = sampler._replace(inner=min(max(math.ceil(many), 1), _MOST_INNER))
     exact = jax.jit(jax.vmap(chart.log_density))
     share, start = _weigh_expansion(sampler, exact, state, weighing)
     if share < _LEAST:
-        return f"Of draws of the expansion of its residuals to second order the exact density accepts {share:.2f}."
+        raise Unexpanded(
+            f"Of draws of the expansion of its residuals to second order the exact density accepts {share:.2f}."
+        )
     drawn, tail = _correct_draws(surrogate, sampler, exact, start, draws, going)
     if drawn.acceptance.mean() < _NEARLY_ALL and tail > _HEAVY:
-        return f"The expansion of its residuals to second order is too narrow: π/π* has a Pareto tail of {tail:.2f}."
+        raise Unexpanded(
+            f"The expansion of its residuals to second order is too narrow: π/π* has a Pareto tail of {tail:.2f}."
+        )
     if (worth := agreement(drawn.x).effective.min()) < _WORTH * draws * chains:
-        return f"Of {draws * chains} draws along the expansion of its residuals {worth:.0f} were independent."
+        raise Unexpanded(
+            f"Of {draws * chains} draws along the expansion of its residuals {worth:.0f} were independent."
+        )
     return drawn
 
 
