@@ -38,7 +38,7 @@ import numpy as np
 import lagjax
 from benchmarks import _report
 from benchmarks._figures import write_picture
-from lagjax._sweep import Progress, Store, run_store, status
+from lagjax._sweep import Files, Progress, run_store, status
 from lagjax._sweep._batch import run_batch
 from lagjax._sweep._description import Sections
 
@@ -73,12 +73,13 @@ def grid(members: int) -> dict[str, np.ndarray]:
 
 
 RULE = dict(
-    q0=start, qdot0=jnp.zeros(2), params=SCENE.params, keep=keep, crossings=FLIPS, rtol=RTOL,
+    q0=start, qdot0=jnp.zeros(2), params=SCENE.params, keep=keep,
 )  # fmt: skip
 
 
-def run(store: Path, over: dict, **more) -> lagjax.Sweep:
+def run(path: Path, over: dict, unit: int | None = None, max_steps: int = 65_536, **more) -> lagjax.Sweep:
     """The sweep of this file."""
+    store = lagjax.Store(path, unit=unit, max_steps=max_steps, crossings=FLIPS, rtol=RTOL)
     return lagjax.sweep(SCENE.system, over, jnp.array([0.0, DURATION]), store=store, **{**RULE, **more})
 
 
@@ -94,7 +95,7 @@ def rate(options: argparse.Namespace) -> dict[str, Any]:
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
         place, memory = Path(folder) / "store", _Memory()
         _begin(place, over)
-        store, parts = Store(place), {"bare": _bare(over), "plain": _bare(over, None)}
+        store, parts = Files(place), {"bare": _bare(over), "plain": _bare(over, None)}
         units = math.ceil(_left(place) / options.rounds)
         spent = {"sweep": np.zeros(2), **{name: np.zeros(2) for name in parts}}
         show = Progress(store, store.spec(), options.progress)

@@ -37,9 +37,7 @@ def swept(side, duration, store):
         qdot0=jnp.zeros(2),
         params=SCENE.params,
         keep=keep,
-        event=FLIP,
-        rtol=1e-6,
-        store=store,
+        store=lagjax.Store(store, event=FLIP, rtol=1e-6),
     )
 
 

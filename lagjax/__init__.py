@@ -42,7 +42,7 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 
 **Many members, few numbers of each**
 
-- `sweep`: up to 10⁸ members in a store, as a `Sweep`, with its `Statistics` (a `Summary` each) and `Status`
+- `sweep`: up to 10⁸ members in a `Store`, as a `Sweep`, with its `Statistics` (a `Summary` each) and `Status`
 - `designs`: points to sweep over: random, Sobol's, Latin hypercubes
 
 **More**
@@ -109,7 +109,7 @@ if TYPE_CHECKING:  # each is imported on first use: all of them take as long as 
     from lagjax._run import crossings, simulate, simulate_batch
     from lagjax._run.hybrid import Hybrid, Transition, simulate_hybrid
     from lagjax._scene import samples
-    from lagjax._sweep import Statistics, Sweep, sweep
+    from lagjax._sweep import Statistics, Store, Sweep, sweep
     from lagjax._trust import work_precision
     from lagjax._trust.checks import check
     from lagjax.results import *  # noqa: F403
@@ -128,6 +128,7 @@ __all__ = [
     "Record",
     "SimulationError",
     "Statistics",
+    "Store",
     "StudentT",
     "Sweep",
     "System",

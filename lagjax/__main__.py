@@ -4,7 +4,7 @@ import argparse
 import sys
 from pathlib import Path
 
-from lagjax._sweep import Progress, Store, run_store, status
+from lagjax._sweep import Files, Progress, Sweep, run_store
 
 
 def main(arguments: list[str] | None = None) -> int:
@@ -18,26 +18,26 @@ def main(arguments: list[str] | None = None) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    store = Store(options.store.absolute())
+    store = Files(options.store.absolute())
     spec = store.spec()
     show = Progress(store, spec, not options.quiet)
     count = run_store(store, show, options.units, (options.part, options.of))
     show.end()
-    print(f"{count} units done here\n{status(store)}")
+    print(f"{count} units done here\n{Sweep(store.path)}")
     return 0
 
 
 def _status(options: argparse.Namespace) -> int:
-    print(status(Store(options.store.absolute())))
+    print(Sweep(options.store.absolute()))
     return 0
 
 
 def _check(options: argparse.Namespace) -> int:
-    store = Store(options.store.absolute())
-    damaged = store.find_damage(store.spec(), store.finished_units(), whole=True)
+    swept = Sweep(options.store.absolute())
+    damaged = swept.damaged()
     for text in damaged.values():
         print(text)
-    print(f"{len(store.finished_units())} units are done, {len(damaged)} of them damaged.")
+    print(f"{len(Files(swept.store).finished_units())} units are done, {len(damaged)} of them damaged.")
     return 1 if damaged else 0
 
 

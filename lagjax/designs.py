@@ -1,7 +1,5 @@
 """Designs: points that are chosen by a rule instead of listed, for `over` of `lagjax.sweep`.
 
-A design computes its values from their numbers and the rule alone: no worker needs the values of another one.
-
 - `random`: independent uniform numbers
 - `sobol`: Sobol's sequence, scrambled, whose means have small errors
 - `latin_hypercube`: one point in each of equal parts of every interval
@@ -10,6 +8,7 @@ A design computes its values from their numbers and the rule alone: no worker ne
 
 import hashlib
 import warnings
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -46,47 +45,30 @@ class Design:
         """The rule without the count."""
         return {"rule": self.kind, "seed": self.seed, "low": list(self.low), "high": list(self.high)}
 
-    @classmethod
-    def from_axis(cls, axis: dict) -> "Design":
-        """The design from the description of an axis in a sweep's store."""
-        return cls(axis["rule"], axis["size"], axis["seed"], tuple(axis["low"]), tuple(axis["high"]))
-
-    def piece(self, names: tuple[str, ...], start: int) -> np.ndarray:
-        """The values (m, names) from the one with the number `start` on, a multiple of `SLICE`; m is at most that."""
-        draw = {"random": self._random, "sobol": self._sobol, "latin_hypercube": self._hypercube}[self.kind]
-        units = draw(names, start, min(SLICE, self.count - start))
-        columns = np.empty(units.shape[::-1])  # one by one: a loop over so few names would be the inner one
-        for k, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
-            np.multiply(units[:, k], high - low, out=columns[k])
-            columns[k] += low
-        return columns.T
-
-    def _key(self, names: tuple[str, ...]) -> int:
-        """A key of 128 bits, from the seed and the names: two axes with one seed are drawn independently."""
+    def pieces(self, names: tuple[str, ...]) -> Iterator[np.ndarray]:
+        """The values (m, names) in order, at most `SLICE` at a time; a Latin hypercube is drawn as a whole."""
         mixed = int.from_bytes(hashlib.sha256("\n".join(names).encode()).digest()[:8], "little")
-        return (mixed << 64) | self.seed
+        key = (mixed << 64) | self.seed  # two axes with one seed are drawn independently
+        if self.kind == "random":
+            numbers = np.random.Generator(np.random.Philox(key=key))
 
-    def _random(self, names, start: int, count: int) -> np.ndarray:
-        """Member k takes numbers k·d … k·d + d − 1 of the counter-based generator Philox 4×64."""
-        bits = np.random.Philox(key=self._key(names))
-        block, inside = divmod(start * len(names), 4)  # the counter advances by one for every four numbers
-        bits.advance(block)
-        numbers = np.random.Generator(bits).random(inside + count * len(names))
-        return numbers[inside:].reshape(-1, len(names))
+            def draw(n: int) -> np.ndarray:
+                return numbers.random((n, len(names)))
+        else:
+            from scipy.stats import qmc
 
-    def _sobol(self, names, start: int, count: int) -> np.ndarray:
-        from scipy.stats import qmc
-
-        engine = qmc.Sobol(len(names), scramble=True, rng=np.random.default_rng(self._key(names)))
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", UserWarning)  # that the count is no power of two: the user's choice
-            return (engine.fast_forward(start) if start else engine).random(count)
-
-    def _hypercube(self, names, start: int, count: int) -> np.ndarray:
-        from scipy.stats import qmc
-
-        everything = qmc.LatinHypercube(len(names), rng=np.random.default_rng(self._key(names))).random(self.count)
-        return everything[start : start + count]
+            kind = qmc.Sobol if self.kind == "sobol" else qmc.LatinHypercube  # the first scrambled, by default
+            draw = kind(len(names), rng=np.random.default_rng(key)).random
+        most = SLICE if self.kind in GROWING else self.count
+        for start in range(0, self.count, most):
+            with warnings.catch_warnings():
+                warnings.simplefilter("ignore", UserWarning)  # that the count is no power of two: the user's choice
+                units = draw(min(most, self.count - start))
+            columns = np.empty(units.shape[::-1])  # one by one: a loop over so few names would be the inner one
+            for k, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
+                np.multiply(units[:, k], high - low, out=columns[k])
+                columns[k] += low
+            yield columns.T
 
 
 def random(count: int, seed: int = 0, low=0.0, high=1.0) -> Design:

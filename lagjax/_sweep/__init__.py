@@ -1,14 +1,15 @@
 """`sweep`: one scene for many starts and parameters, a few numbers kept of each motion, in a store that is the job.
 
-over, q0, keep, … ──► Description, Grid ──► Store ──► units, computed by any number of workers ──► xarray
+over, q0, keep, … ──► Description, Grid ──► Files ──► units, computed by any number of workers ──► xarray
 
 _members       the points of a sweep: axes, the grid of members, its units (`lagjax.designs` has the rules for axes)
 _statistics    statistics of all members, unit by unit, without a list of their values
 _description   the scene and the user's functions; their text, by which stores are compared; their way to a worker
-_store         the files of a store
+_files         the files of a store
 _batch         a batch of members: their motions, the crossings on the way, what is kept of each
 _job           a store with its functions in a process; the computation of a unit
-_begin         stores that are begun: new ones, those with members of another, those that continue its motions
+_begin         stores that are begun, and those that are there
+_extend        the part of a new store that another one has: members, or the starts of motions that continue
 _workers       units in this process, by executors, in child processes
 _status        the progress of a store
 """
@@ -16,7 +17,7 @@ _status        the progress of a store
 import os
 import warnings
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -26,13 +27,13 @@ import numpy as np
 
 from lagjax._interface import output_times, require_flag
 from lagjax._run.hybrid import Hybrid, Scene, require_scene
-from lagjax._sweep._begin import begin, continues, final_states_of, first_look, require_same
-from lagjax._sweep._description import Description, Sections
-from lagjax._sweep._job import Job, precision, uses_doubles
+from lagjax._sweep._begin import begin, first_look, resume
+from lagjax._sweep._description import Description, Sections, uses_doubles
+from lagjax._sweep._files import NOT_DONE, RESULT, Files
+from lagjax._sweep._job import Job, precision
 from lagjax._sweep._members import axes_of
 from lagjax._sweep._statistics import Statistics, Summary, from_bytes, merge, summary
 from lagjax._sweep._status import Progress, Status, status
-from lagjax._sweep._store import NOT_DONE, RESULT, Store
 from lagjax._sweep._workers import (
     look_in_children,
     require_executor,
@@ -49,6 +50,65 @@ PyTree = Any
 
 
 @dataclass(frozen=True)
+class Store:
+    """A folder for `lagjax.sweep`, and what is settled with it: its units, and how accurately motions are followed.
+
+    `sweep(…, store="map.zarr")` is `sweep(…, store=lagjax.Store("map.zarr"))`.
+
+    - `path`: the folder.
+    - `unit`: the number of members in a unit of work. A unit is a chunk of the store, and all that is lost with a
+      worker that dies. By default as many as take 20 s here, with at most 64 MiB of kept quantities.
+    - `part`: (k, n) computes every n-th unit from the k-th on, as task k of an array of n batch jobs, counted from 0.
+      The tasks share the disk; whichever is first begins the store. What a task that died has left, a later run of
+      any part, or of the whole, computes.
+    - `extend`: a store of the same scene, from which the members that are also in `over` are copied, for more members
+      of a design or a finer grid. It is not changed. For a later end let `keep` return {"end": trajectory.end, …}, and
+      give `ts` that begin at the last time of that store: its motions continue from there, and `keep` sees the rest of
+      them. Members that ended before that time keep their `result`. Once begun, a store does not need the other one.
+    - `rtol`, `atol`, `max_steps`, `event`, `solver`: as in `simulate_batch`.
+    - `crossings`: arguments of `lagjax.crossings`, {"section": …, "direction": …, "count": …}. Then `keep(trajectory,
+      crossings)` also gets the `Crossings` of that motion, which does not end at them: the time of the first event and
+      the final state come from one run, if `ts` are two times.
+
+    `event`, `crossings`, `solver` and a later end are not for a `Hybrid`, whose transitions watch the motion.
+
+    ```python
+    import lagjax
+
+    store = lagjax.Store("map.zarr", unit=10_000, rtol=1e-6)
+    ```
+    """
+
+    path: str | Path
+    unit: int | None = None
+    part: tuple[int, int] = (0, 1)
+    extend: str | Path | None = None
+    rtol: float | None = None
+    atol: float | None = None
+    max_steps: int = 65_536
+    event: Any = None
+    crossings: dict[str, Any] | None = None
+    solver: Any = None
+
+
+def _as_store(store: Any, arguments: dict[str, Any]) -> Store:
+    """The store, with arguments that once were those of `sweep` itself; a warning tells where they are now."""
+    place = store if isinstance(store, Store) else Store(store)
+    if not arguments:
+        return place
+    if unknown := set(arguments) - {field.name for field in fields(Store)}:
+        raise TypeError(f"sweep() got an unexpected keyword argument {min(unknown)!r}")
+    shown = ", ".join(f"{name}=…" for name in arguments)
+    warnings.warn(
+        f"sweep(…, {shown}) is sweep(…, store=lagjax.Store({os.fspath(place.path)!r}, {shown})) now; the old spelling "
+        "goes with the next version.",
+        DeprecationWarning,
+        stacklevel=3,
+    )
+    return replace(place, **arguments)
+
+
+@dataclass(frozen=True)
 class Sweep:
     """A sweep that was begun, known by the path of its `store`: its members, progress, statistics and damage.
 
@@ -61,7 +121,7 @@ class Sweep:
 
     def __post_init__(self):
         object.__setattr__(self, "store", Path(self.store))
-        Store(self.store).spec()
+        Files(self.store).spec()
 
     def __repr__(self) -> str:
         return str(self.status())
@@ -80,7 +140,7 @@ class Sweep:
             import xarray
         except ImportError:
             raise ImportError("Sweep.open() needs the package xarray: pip install xarray.") from None
-        store = Store(self.store)
+        store = Files(self.store)
         spec = store.spec()
         store.require_arrays(spec)
         data = xarray.open_zarr(self.store)
@@ -96,11 +156,11 @@ class Sweep:
 
     def status(self) -> Status:
         """The progress: units that are done, the ends of members, those that failed, and the worst change of energy."""
-        return status(Store(self.store))
+        return status(Files(self.store))
 
     def statistics(self) -> dict[str, Summary]:
         """The statistics named in `reduce` over all finished units, by the names of the quantities."""
-        store = Store(self.store)
+        store = Files(self.store)
         spec, totals = store.spec(), {}
         for unit in sorted(store.finished_units()) if spec["reduce"] else ():
             for name, part in from_bytes(store.statistics(unit)).items():
@@ -110,7 +170,7 @@ class Sweep:
 
     def damaged(self) -> dict[int, str]:
         """The damage of finished units, in words by units. All are read; the next run computes these again."""
-        store = Store(self.store)
+        store = Files(self.store)
         return store.find_damage(store.spec(), store.finished_units(), whole=True)
 
 
@@ -123,45 +183,32 @@ def sweep(
     qdot0: PyTree,
     params: PyTree = None,
     keep: Callable,
-    store: str | Path,
     reduce: dict[str, Statistics] | None = None,
-    unit: int | None = None,
-    extend: str | Path | None = None,
+    store: Store | str | Path,
     executor: Any = None,
     isolate: bool | float = False,
-    part: tuple[int, int] = (0, 1),
     progress: bool = True,
-    rtol: float | None = None,
-    atol: float | None = None,
-    max_steps: int = 65_536,
-    event: Any = None,
-    crossings: dict[str, Any] | None = None,
-    solver: Any = None,
+    **arguments: Any,
 ) -> Sweep:
     r"""Run `system` for every point of `over`, keep a few numbers of each motion, and store them in a folder.
 
     The store is the job. Called again with the same description, `sweep` computes what is missing, also after a
     failure of the machine at any moment; so does `python -m lagjax sweep run STORE`. First each reads what is done of
     its units, and computes again what is not as it was written; for a million units that takes six minutes, and a
-    second more for each gigabyte. Several machines work by an `executor`, or each on its `part` of the units.
+    second more for each gigabyte. Several machines work by an `executor`, or each on its part of the units.
 
     **Run only stores of your own**: `python -m lagjax sweep run`, `isolate` and an `executor` unpickle the functions in
     the store, which can be any code.
 
     **What runs**
 
-    - `system`: a `System`, or a `Hybrid`, of which `keep` gets the trajectory that `simulate_hybrid` returns. Its
-      transitions watch the motion in machine code: `event`, `crossings` and `solver` are not for it, nor a later end.
+    - `system`: a `System`, or a `Hybrid`, of which `keep` gets the trajectory that `simulate_hybrid` returns.
     - `over`: a dict of axes, of which the product is swept. A 1-D array is an axis by its name; a design of
       `lagjax.designs` (`random`, `sobol`, `latin_hypercube`) draws its values by a rule; a tuple of names with a tuple
       of arrays, or with a design, varies several together. There may be 10⁸ members: they are never listed.
     - `ts`: output times, shape (T,), of every member.
     - `q0`, `qdot0`, `params`: values for all, or functions of one member's point, which is a dict of numbers by the
       names in `over`.
-    - `rtol`, `atol`, `max_steps`, `event`, `solver`: as in `simulate_batch`.
-    - `crossings`: arguments of `lagjax.crossings`, {"section": …, "direction": …, "count": …}. Then `keep(trajectory,
-      crossings)` also gets the `Crossings` of that motion, which does not end at them: the time of the first event and
-      the final state come from one run, if `ts` are two times.
 
     **What is kept**
 
@@ -169,27 +216,20 @@ def sweep(
     - `reduce`: for quantities that are too many to keep, a dict of `lagjax.Statistics` by their names: count, mean,
       variance, extremes with their members, histogram, quantiles. These are merged in the order of the units and stored
       instead of the members' values; `Sweep.statistics()` reads them.
-    - `store`: a folder. `xarray.open_zarr(store)` reads it, with the names of `over` as dimensions and coordinates, the
-      kept quantities as variables, and `result`: how each member ended, −1 for those still to do. Missing values are
-      NaN, or the least integer of an integer type.
-    - `extend`: a store of the same scene, from which the members that are also in `over` are copied, for more members
-      of a design or a finer grid. It is not changed. For a later end let `keep` return {"end": trajectory.end, …}, and
-      give `ts` that begin at the last time of that store: its motions continue from there, and `keep` sees the rest of
-      them. Members that ended before that time keep their `result`.
+    - `store`: a folder, or a `lagjax.Store` with tolerances, events, crossings, the size of units, a part of them, or
+      another store to extend. `xarray.open_zarr(path)` reads it, with the names of `over` as dimensions and
+      coordinates, the kept quantities as variables, and `result`: how each member ended, −1 for those still to do.
+      Missing values are NaN, or the least integer of an integer type.
 
     **Where it runs**
 
-    - `unit`: the number of members in a unit of work. A unit is a chunk of the store, and all that is lost with a
-      worker that dies. By default as many as take 20 s here, with at most 64 MiB of kept quantities.
     - `executor`: any `concurrent.futures.Executor`, such as dask's `client.get_executor()`; a task is a unit. By
       default this process works, with the machine code's threads on all cores, and writes a unit while it computes the
       next.
     - `isolate`: compute in a child process. A unit whose child dies, or takes longer than `isolate` seconds over a
       batch (True: 600), is halved until the members that end it are known; these are labelled `crashed`.
-    - `part`: (k, n) computes every n-th unit from the k-th on, as task k of an array of n batch jobs, counted from 0.
-      The tasks share the disk; whichever is first begins the store. What a task that died has left, a later run of
-      any part, or of the whole, computes.
     - `progress`: a line on stderr.
+    - `arguments`: those of `Store`, which once were given here; with a warning.
 
     A store knows the scene and `keep` by their code and by all that this reads: helpers, globals, closures, classes
     with all their attributes, modules imported inside. What it cannot know is what a function reads from files, from
@@ -230,34 +270,37 @@ def sweep(
     """
     system = require_scene(system)
     require_flag(progress, "progress")
-    settings = dict(rtol=rtol, atol=atol, max_steps=max_steps, event=event, solver=solver)
+    settled = _as_store(store, arguments)
+    settings = {name: getattr(settled, name) for name in ("rtol", "atol", "max_steps", "event", "solver")}
     if isinstance(system, Hybrid):
-        _require_no_arguments(event=event, crossings=crossings, solver=solver)
-    sections = Sections.from_arguments(crossings, _callable(keep), settings)
-    description = Description(system, _times(ts), q0, qdot0, params, keep, _reduce(reduce), settings, sections)
-    if executor is not None and isolate:
-        raise ValueError("isolate is for sweeps of this process: give it, or an executor, whose processes may die too.")
+        names = ("event", "crossings", "solver")
+        if given := [name for name in names if getattr(settled, name) is not None]:
+            raise ValueError(
+                f"{' and '.join(given)} of sweep: for the motion of one System. Transitions watch a hybrid motion, in "
+                "machine code; one without a reset notes where it is crossed, and `trajectory.transitions` tells when."
+            )
+    if not callable(keep):
+        raise TypeError(f"keep must be a function of a trajectory that returns a dict; got {keep!r}.")
+    reduce = {} if reduce is None else reduce
+    if not isinstance(reduce, dict) or not all(isinstance(how, Statistics) for how in reduce.values()):
+        raise TypeError("reduce must be a dict of lagjax.Statistics by the names that keep returns.")
+    sections = Sections.from_arguments(settled.crossings, keep, settings)
+    description = Description(system, _times(ts), q0, qdot0, params, keep, reduce, settings, sections)
     if executor is not None:
         require_executor(executor)
-    axes, place, limit, chosen = axes_of(over), _place(store, "store"), require_limit(isolate), require_part(part)
-    other = None if extend is None else _place(extend, "extend")
+        if isolate:
+            raise ValueError("isolate is for sweeps of this process: give it, or an executor, whose processes may die.")
+    axes, limit, part = axes_of(over), require_limit(isolate), require_part(settled.part)
+    place, compiled = _folder(settled.path, "store"), []
+    other = None if settled.extend is None else _folder(settled.extend, "extend")
     with precision(uses_doubles()):
-        if place.exists() and other is not None and not place.spec()["continues"]:
-            other = None  # of which the members were taken: it may be gone
-        if other is not None and continues(other, description):
-            if isinstance(system, Hybrid):
-                raise ValueError(
-                    "A hybrid motion cannot continue from a store, which does not keep its last mode: begin again at "
-                    f"ts[0], with another store than {str(extend)!r}."
-                )
-            description = replace(description, left=final_states_of(other, axes, description))
         if not place.exists():
-            look = first_look if limit is None else partial(look_in_children, limit=limit)
-            begin(place, axes, description, unit, look, other)
+            look = partial(first_look, compiled=compiled) if limit is None else partial(look_in_children, limit=limit)
+            begin(place, axes, description, settled.unit, look, other)
         spec = place.spec()
-        require_same(place, spec, axes, description)
-        job = Job.from_store(place, spec, description)
-        show, units = Progress(place, spec, progress), units_to_compute(job, chosen)
+        description = resume(place, spec, axes, description, other)
+        job = Job.from_store(place, spec, description, *compiled)
+        show, units = Progress(place, spec, progress), units_to_compute(job, part)
         if executor is not None:
             submit(job, units, executor, show)
         elif limit is not None:
@@ -268,33 +311,10 @@ def sweep(
     return Sweep(place.path)
 
 
-def _place(path: Any, name: str) -> Store:
+def _folder(path: Any, name: str) -> Files:
     if not isinstance(path, str | os.PathLike) or not str(path):
         raise TypeError(f"{name} must be the name of a folder, such as 'map.zarr'; got {path!r}.")
-    return Store(Path(path).expanduser().absolute())
-
-
-def _callable(keep: Any) -> Callable:
-    if not callable(keep):
-        raise TypeError(f"keep must be a function of a trajectory that returns a dict; got {keep!r}.")
-    return keep
-
-
-def _require_no_arguments(**arguments: Any) -> None:
-    """Raise `ValueError` for arguments that a hybrid motion does not have."""
-    if given := [name for name, value in arguments.items() if value is not None]:
-        raise ValueError(
-            f"{' and '.join(given)} of sweep: for the motion of one System. Transitions watch a hybrid motion, in "
-            "machine code; one without a reset notes where it is crossed, and `trajectory.transitions` tells when."
-        )
-
-
-def _reduce(reduce: Any) -> dict[str, Statistics]:
-    if reduce is None:
-        return {}
-    if not isinstance(reduce, dict) or not all(isinstance(how, Statistics) for how in reduce.values()):
-        raise TypeError("reduce must be a dict of lagjax.Statistics by the names that keep returns.")
-    return reduce
+    return Files(Path(path).expanduser().absolute())
 
 
 def _times(ts) -> np.ndarray:

@@ -21,9 +21,7 @@ from lagjax._engine.taylor import MachineCode, Noted, flow_of, tolerances_of
 from lagjax._equations import has_constraints
 from lagjax._interface import RESULTS, SUCCESSFUL, as_arrays, code_of, name_of, result_from
 from lagjax._run import (
-    State,
     Trajectory,
-    Transitions,
     restore_crossings,
     sections_of,
     simulate,
@@ -33,7 +31,7 @@ from lagjax._run import (
 )
 from lagjax._run.hybrid import Hybrid, Scene
 from lagjax._sweep._description import NOT_TRACEABLE, Description, Sections
-from lagjax._sweep._store import RESULT, Quantity
+from lagjax._sweep._files import RESULT, Quantity
 
 PyTree = Any
 CRASHED, KEEP_FAILED = 1000, 1001  # result codes of the sweep's own, far from those of `lagjax.RESULTS`
@@ -60,38 +58,6 @@ class KeptResults(NamedTuple):
     engine: str
 
 
-def batches_of(description: Description, conserves: bool) -> "Batches":
-    """The function that computes batches of a sweep; the last eight stay, with what was compiled for them."""
-    fixed = (
-        description.system,
-        description.q0,
-        description.qdot0,
-        description.params,
-        description.keep,
-        *description.settings.values(),
-    )
-    sections = description.sections and description.sections._replace(
-        functions=tuple(map(id, description.sections.functions))
-    )
-    key = (
-        *map(id, (*fixed, *description.settings.values())),
-        sections,
-        description.left and description.left.path,
-        description.ts.tobytes(),
-        bool(conserves),
-        jax.dtypes.canonicalize_dtype(float),
-    )
-    if key not in _remembered:
-        while len(_remembered) >= _REMEMBERED:
-            _remembered.pop(next(iter(_remembered)))
-        _remembered[key] = Batches(description, conserves)  # holds what the key names, so that no number is used twice
-    return _remembered[key]
-
-
-_REMEMBERED = 8
-_remembered: "dict[tuple, Batches]" = {}
-
-
 class Batches:
     """Computes batches of one sweep; what it compiles it keeps."""
 
@@ -99,8 +65,10 @@ class Batches:
         self.description, self.conserves = description, conserves
         self.quantities: list[Quantity] = []  # what is kept of each member, once that is known
         self.slow: dict[str, str] = {}  # which functions are called member by member, and why
-        begin = description.left or description
-        roles = {"q0": begin.q0, "qdot0": begin.qdot0, "params": description.params}
+        roles = {role: getattr(description, role) for role in ("q0", "qdot0", "params")}
+        if names := description.starts:
+            roles["q0"] = lambda point: jax.tree.map(point.__getitem__, names.q)
+            roles["qdot0"] = lambda point: jax.tree.map(point.__getitem__, names.qdot)
         if not any(map(callable, roles.values())):
             raise ValueError(
                 "None of q0, qdot0 and params is a function: all members would be the same. Write q0=lambda point: "
@@ -154,7 +122,12 @@ class Batches:
                 return self._keep_compiled(motions)
             except NOT_TRACEABLE as why:
                 self.slow["keep"] = _first_line(why)
-        drift = np.asarray(self._compute_drifts(motions.arrays, motions.params)) if self.conserves else None
+        drift = None
+        if self.conserves:
+            drift_of = jax.vmap(
+                lambda arrays, params: self._drift(self._trajectory(arrays[0], params)), (0, self._axes[2])
+            )
+            drift = np.asarray(jax.jit(drift_of)(motions.arrays, motions.params))
         kept, complaints = self._keep_one_by_one(motions)
         return kept, drift, complaints
 
@@ -179,19 +152,27 @@ class Batches:
     ) -> tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]:
         """The kept values of all members at once; blank, with a complaint, where `keep` raises while it runs."""
         everyone = np.arange(len(motions.run.result._value))
+
+        def why_raised(members: np.ndarray) -> str | None:
+            try:
+                self._keep_members(motions, np.resize(members, len(everyone)))  # of one shape, which is compiled
+            except jax.errors.JaxRuntimeError as error:  # of a callback; its line stands in all that XLA says about it
+                lines = [line.strip() for line in str(error).split("\n")]
+                said = next((line for line in reversed(lines) if _RAISED.match(line)), lines[0])
+                return f"keep raised {said[:200]}"
+
         try:
             return *self._keep_members(motions, None), {}
         except jax.errors.JaxRuntimeError:
-            complaints = self._find_members_that_raise(motions, everyone)
+            complaints = find_failing(everyone, why_raised, _MOST_RAISE)
             well = np.setdiff1d(everyone, list(complaints))
             if not complaints or not well.size:  # too little memory; or it always raises
                 raise
         bad = np.isin(everyone, list(complaints))
         kept, drift = self._keep_members(motions, np.where(bad, well[0], everyone))
+        kept = {name: x.copy() for name, x in kept.items()}
         for name, x in kept.items():
-            kept[name] = np.where(
-                bad.reshape(-1, *[1] * (x.ndim - 1)), Quantity(name, x.shape[1:], x.dtype).filling, x
-            ).astype(x.dtype)
+            x[bad] = Quantity(name, x.shape[1:], x.dtype).filling
         return kept, None if drift is None else np.where(bad, np.nan, drift), complaints
 
     def _keep_members(self, motions: "_BatchMotions", which: np.ndarray | None) -> tuple[dict[str, np.ndarray], Any]:
@@ -200,20 +181,7 @@ class Batches:
         if which is not None:
             arrays = jax.tree.map(lambda x: np.asarray(x)[which], arrays)
         kept, drift = self._keep_all(*arrays)
-        return {name: np.asarray(x) for name, x in _flatten_names(kept).items()}, None if drift is None else np.asarray(
-            drift
-        )
-
-    def _find_members_that_raise(self, motions: "_BatchMotions", everyone: np.ndarray) -> dict[int, str]:
-        """The members for which `keep` raises in a callback, with the errors: by halves, in equal batches."""
-
-        def why_raised(some: np.ndarray) -> str | None:
-            try:
-                self._keep_members(motions, np.resize(some, len(everyone)))
-            except jax.errors.JaxRuntimeError as error:
-                return f"keep raised {_callback_error(error)}"
-
-        return find_failing(everyone, why_raised, _MOST_RAISE)
+        return _arrays_by_name(kept), None if drift is None else np.asarray(drift)
 
     def _keep_vectorized(self, arrays: tuple, params: PyTree) -> tuple:
         """The result of `keep` for every member, and the change of the energy."""
@@ -225,27 +193,19 @@ class Batches:
 
         return jax.vmap(keep_member, in_axes=(0, self._axes[2]))(arrays, params)
 
-    def _compute_drifts(self, arrays: tuple, params: PyTree):
-        def member_drift(arrays, params):
-            return self._drift(self._trajectory(arrays[0], params))
-
-        return jax.jit(jax.vmap(member_drift, in_axes=(0, self._axes[2])))(arrays, params)
-
     def _keep_member(self, trajectory: Trajectory, crossings: Any) -> dict:
         keep, extras = self.description.keep, {} if self.description.sections is None else {"crossings": crossings}
         kept = keep(trajectory, **extras)
         _require_dict(kept)
         return kept
 
-    def _trajectory(self, arrays: tuple, params: PyTree) -> Trajectory:
-        q, qdot, code, end, stats, mode, transitions = arrays
-        scene, hybrid = self.description.system, {"mode": None, "transitions": None, "mode_names": ()}
-        if isinstance(scene, Hybrid):
-            hybrid = {"mode": mode, "transitions": Transitions(*transitions), "mode_names": tuple(scene.modes)}
+    def _trajectory(self, arrays: dict, params: PyTree) -> Trajectory:
+        scene, code = self.description.system, arrays["code"]
+        modes = dict(scene.modes) if isinstance(scene, Hybrid) else None
         return Trajectory.from_fields(
-            ts=jnp.asarray(self.description.ts), q=q, qdot=qdot, result=result_from(code), end=State(*end), stats=stats,
-            system=dict(scene.modes) if isinstance(scene, Hybrid) else scene, params_axes=None, engine="",
-            params=self.description.params if self._axes[2] is None else params, tolerances=self._tolerances, **hybrid,
+            **{name: x for name, x in arrays.items() if name != "code"}, result=result_from(code), engine="",
+            ts=jnp.asarray(self.description.ts), tolerances=self._tolerances, system=modes or scene, params_axes=None,
+            params=self.description.params if self._axes[2] is None else params, mode_names=tuple(modes or ()),
         )  # fmt: skip
 
     def _drift(self, run: Trajectory):
@@ -269,7 +229,11 @@ class Batches:
         for k, row in enumerate(rows):
             if row is not None and (wrong := _misfit(expected, row)):
                 rows[k], complaints[k] = None, wrong
-        return {q.name: _stack_rows(q, rows) for q in expected}, complaints
+        kept = {q.name: np.full((len(rows), *q.shape), q.filling, q.dtype) for q in expected}
+        for k, row in enumerate(rows):
+            for name, x in (row or {}).items():
+                kept[name][k] = x
+        return kept, complaints
 
     def _rows(self, motions: "_BatchMotions") -> tuple[list[dict[str, np.ndarray] | None], dict[int, Exception]]:
         """The result of `keep` for each member by name, None where it raised; and the exceptions."""
@@ -279,7 +243,7 @@ class Batches:
             try:
                 one, crossed, own_params = jax.tree.map(lambda x, k=k: x[k], (*arrays, params))
                 kept = self._keep_member(self._trajectory(one, own_params), crossed)
-                rows.append({name: np.asarray(x) for name, x in _flatten_names(kept).items()})
+                rows.append(_arrays_by_name(kept))
             except Exception as error:  # of the user's function: only this member is lost
                 rows.append(None)
                 errors[k] = error
@@ -314,21 +278,21 @@ def _start_one_by_one(role: str, function: Callable, points: dict[str, np.ndarra
 
 
 def find_failing(members: np.ndarray, why_failed: Callable[[np.ndarray], str | None], most: int) -> dict[int, str]:
-    """Those of some members that fail, with the reasons, by halving groups that fail; none where more than `most` do.
+    """The members that fail, with the reasons, by halving groups that fail; none where more than `most` do.
 
     `why_failed` says of a group of members why it fails, None where it does not.
     """
-    found, waiting = {}, [members]
-    while waiting and len(found) <= most:
-        some = waiting.pop()
-        if (why := why_failed(some)) is None:
+    failing, groups = {}, [members]
+    while groups and len(failing) <= most:
+        group = groups.pop()
+        if (why := why_failed(group)) is None:
             continue
-        half = len(some) // 2
+        half = len(group) // 2
         if half:
-            waiting += [some[half:], some[:half]]
+            groups += [group[half:], group[:half]]
         else:
-            found[int(some[0])] = why
-    return found if len(found) <= most else {}
+            failing[int(group[0])] = why
+    return failing if len(failing) <= most else {}
 
 
 def quantities_of(kept: KeptResults) -> list[Quantity]:
@@ -351,10 +315,10 @@ def _common_quantities(rows: list[dict[str, np.ndarray]]) -> list[Quantity]:
     return common
 
 
-def _arrays(run: Trajectory) -> tuple:
-    stats = {name: count for name, count in run.stats.items() if jnp.ndim(count)}  # what is of each member
-    transitions = None if run.transitions is None else tuple(run.transitions)
-    return run.q, run.qdot, run.result._value, tuple(run.end), stats, run.mode, transitions
+def _arrays(run: Trajectory) -> dict[str, Any]:
+    """The fields that differ between members, as arrays."""
+    fields = {name: getattr(run, name) for name in ("q", "qdot", "end", "mode", "transitions")}
+    return fields | {"code": run.result._value, "stats": {k: x for k, x in run.stats.items() if jnp.ndim(x)}}
 
 
 def _misfit(expected: list[Quantity], row: dict[str, np.ndarray]) -> str | None:
@@ -368,11 +332,6 @@ def _misfit(expected: list[Quantity], row: dict[str, np.ndarray]) -> str | None:
         if not np.can_cast(row[q.name].dtype, q.dtype, "same_kind"):
             return f"keep returned {q.name!r} of type {row[q.name].dtype}, of other members {q.dtype}"
     return None
-
-
-def _stack_rows(q: Quantity, rows: list) -> np.ndarray:
-    nothing = np.full(q.shape, q.filling, q.dtype)
-    return np.stack([nothing if row is None else row[q.name].astype(q.dtype) for row in rows])
 
 
 def _require_dict(kept: Any) -> None:
@@ -392,9 +351,9 @@ def _require_dict(kept: Any) -> None:
             raise TypeError(f"keep returns {name!r}, which is of type {what}: numbers can be kept.")
 
 
-def _flatten_names(kept: dict) -> dict[str, Any]:
+def _arrays_by_name(kept: dict) -> dict[str, np.ndarray]:
     """The leaves of what `keep` returns by names, those of inner trees with points: 'end.theta'."""
-    return dict(zip(jax.tree.leaves(names_of(kept)), jax.tree.leaves(kept), strict=True))
+    return dict(zip(jax.tree.leaves(names_of(kept)), map(np.asarray, jax.tree.leaves(kept)), strict=True))
 
 
 def names_of(kept: dict) -> dict:
@@ -402,12 +361,6 @@ def names_of(kept: dict) -> dict:
     return jax.tree_util.tree_map_with_path(
         lambda path, _: ".".join(str(getattr(k, "key", getattr(k, "name", getattr(k, "idx", k)))) for k in path), kept
     )
-
-
-def _callback_error(error: BaseException) -> str:
-    """The exception of a callback, out of all that XLA says about it."""
-    lines = [line.strip() for line in str(error).split("\n")]
-    return next((line for line in reversed(lines) if _RAISED.match(line)), lines[0])[:200]
 
 
 def _first_line(error: BaseException) -> str:
@@ -423,10 +376,8 @@ _INCONSISTENT = code_of(RESULTS.inconsistent_start)
 def _hybrid_batch(scene: Hybrid, axes: tuple, **tolerances) -> Callable:
     """`simulate` for all members at once, compiled."""
 
-    def follow_member(q0, qdot0, ts, params):
-        return simulate(scene, q0, qdot0, ts, params, throw=False, **tolerances)
-
     of_q0, of_qdot0, of_params = axes
+    follow_member = functools.partial(simulate, scene, throw=False, **tolerances)
     return jax.jit(jax.vmap(follow_member, in_axes=(of_q0, of_qdot0, None, of_params)))
 
 
@@ -450,11 +401,14 @@ def run_batch(
     )
     solution, noted = _follow_crossings(batch, sections)
     if len(ts) == 2 and not has_constraints(system):
-        params = as_arrays(params, batch.member.layout.dtype)
-        run = trajectory_of(batch.member, MachineCode(), _replace_path(solution, batch), batch.y0, params, axes[2])
+        params, reached = as_arrays(params, batch.member.layout.dtype), (solution.result == SUCCESSFUL)[:, None]
+        ends = np.stack([np.asarray(batch.y0), np.where(reached, solution.y_end, np.nan)], axis=1)  # at both times
+        run = trajectory_of(batch.member, MachineCode(), solution._replace(path=ends), batch.y0, params, axes[2])
     else:
         run = simulate_batch(system, q0, qdot0, ts, params, batch_axes=axes, **settings)
-        noted = _drop_inconsistent(noted, np.asarray(run.result._value) != _INCONSISTENT)
+        starts = np.asarray(run.result._value) != _INCONSISTENT  # others are not followed, and cross nothing
+        t, y = np.where(starts[:, None], noted.t, np.nan), np.where(starts[:, None, None], noted.y, np.nan)
+        noted = Noted(t, y, np.where(starts, noted.count, 0))
     ok = (solution.result == SUCCESSFUL) & (noted.count <= sections.count)
     return run, restore_crossings(batch.member.layout, sections.names, noted, ok)
 
@@ -470,16 +424,3 @@ def _follow_crossings(batch: Batch, sections: Sections) -> tuple[Solution, Noted
     path = solution.path.reshape(len(y0), len(sections.functions), sections.count + 1, -1)
     rows = np.moveaxis(path, 1, 0)
     return solution, Noted(rows[:, :, :-1, 0], rows[:, :, :-1, 1:], rows[:, :, -1, 0])
-
-
-def _replace_path(solution: Solution, batch: Batch) -> Solution:
-    """The solution with the states at the first and the last time, NaN where that was not reached, as its path."""
-    reached = (solution.result == SUCCESSFUL)[:, None]
-    path = np.stack([np.asarray(batch.y0), np.where(reached, solution.y_end, np.nan)], axis=1)
-    return solution._replace(path=path)
-
-
-def _drop_inconsistent(noted: Noted, starts: np.ndarray) -> Noted:
-    """The crossings without those of members that do not start on their constraints and are not followed."""
-    t, y = np.where(starts[:, None], noted.t, np.nan), np.where(starts[:, None, None], noted.y, np.nan)
-    return Noted(t, y, np.where(starts, noted.count, 0))

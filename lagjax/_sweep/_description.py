@@ -8,9 +8,10 @@ what JAX does not trace here, `keep` above all, `reads.identity` decides it: the
 
 import difflib
 import inspect
+import json
 import pickle
 import sys
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -24,6 +25,7 @@ from lagjax._interface import accept, require_budget
 from lagjax._interface.reads import array_text, hash_of, identity, source, strip_addresses
 from lagjax._run import directions_of, sections_of
 from lagjax._run.hybrid import Hybrid, Scene
+from lagjax._sweep._members import Axis, describe_axes
 from lagjax._sweep._statistics import Statistics
 
 PyTree = Any
@@ -97,19 +99,10 @@ def _parameters(keep: Callable) -> list[str]:
 
 
 class FinalStates(NamedTuple):
-    """The states from which motions continue: the path of their store, and its names of the leaves of q and q̇."""
+    """The names, in a member's point, of the leaves of the state from which its motion continues."""
 
-    path: str
     q: PyTree
     qdot: PyTree
-
-    def q0(self, point: dict[str, Any]) -> PyTree:
-        """q of a member, whose point has the values by these names."""
-        return jax.tree.map(point.__getitem__, self.q)
-
-    def qdot0(self, point: dict[str, Any]) -> PyTree:
-        """q̇ of a member, whose point has the values by these names."""
-        return jax.tree.map(point.__getitem__, self.qdot)
 
 
 @dataclass(frozen=True)
@@ -125,9 +118,9 @@ class Description:
     reduce: dict[str, Statistics]
     settings: dict[str, Any]  # of `simulate_batch`: rtol, atol, max_steps, event, solver
     sections: Sections | None = None  # whose crossings keep gets
-    left: FinalStates | None = None  # the states from which they continue, instead of q0 and qdot0
+    starts: FinalStates | None = None  # of motions that continue those of another store, instead of q0 and qdot0
 
-    def start(self, point: dict[str, Any]) -> tuple[PyTree, PyTree, PyTree]:
+    def evaluate_start(self, point: dict[str, Any]) -> tuple[PyTree, PyTree, PyTree]:
         """(q0, qdot0, params) of the member at a point. Raises `ValueError` where they ask it for another name."""
         try:
             q0, qdot0, params = (x(point) if callable(x) else x for x in (self.q0, self.qdot0, self.params))
@@ -142,17 +135,28 @@ class Description:
     def shapes(self, names: list[str]) -> tuple[PyTree, PyTree, PyTree]:
         """(q0, qdot0, params) of a member whose point has these names: shapes, or numbers that are as good."""
         try:
-            return jax.eval_shape(self.start, {name: jnp.zeros(()) for name in names})
+            return jax.eval_shape(self.evaluate_start, {name: jnp.zeros(()) for name in names})
         except NOT_TRACEABLE:
-            return self.start({name: 0.5 for name in names})
+            return self.evaluate_start({name: 0.5 for name in names})
 
     def described(self) -> dict:
         """The numbers among it, by name, for the store."""
-        shown: dict[str, Any] = {name: _value_text(self.settings[name]) for name in _NUMBERS}
-        shown["solver"] = None if self.settings["solver"] is None else identity(self.settings["solver"])
-        times = {"ends": [float(self.ts[0]), float(self.ts[-1])], "outputs": len(self.ts), "sha256": hash_of(self.ts)}
-        shown["crossings"] = self.sections.described() if self.sections else None
-        return {"ts": times, **shown, "reduce": {name: how.described() for name, how in self.reduce.items()}}
+        solver = self.settings["solver"]
+        return {
+            "ts": {
+                "ends": [float(self.ts[0]), float(self.ts[-1])],
+                "outputs": len(self.ts),
+                "sha256": hash_of(self.ts),
+            },
+            **{name: _value_text(self.settings[name]) for name in _NUMBERS},
+            "solver": None if solver is None else identity(solver),
+            "crossings": self.sections.described() if self.sections else None,
+            "reduce": {name: how.described() for name, how in self.reduce.items()},
+        }
+
+
+def uses_doubles() -> bool:
+    return jax.dtypes.canonicalize_dtype(np.float64) == np.float64
 
 
 # ---- text and hash ---------------------------------------------------------------------------------------------------
@@ -162,26 +166,28 @@ def texts(description: Description, names: list[str]) -> dict[str, dict[str, str
     """The text of every function and value, and its program as JAX traces it (the text where it cannot)."""
     point = {name: jnp.zeros(()) for name in names}
     q, qdot, params = description.shapes(names)
-    found = {}
+    entries = {}
     for name, function in _functions(description.system).items():
         arguments = (q,) if name.split()[0] == "constraints" else (q, qdot)
-        found[name] = _entry(function.code.function, _defer_trace(function, arguments, params), function.arrays)
-    if isinstance(description.system, Hybrid):
-        found["transitions"] = _entry(_plan(description.system), None)
+        entries[name] = _entry(function.code.function, _defer_trace(function, arguments, params), function.arrays)
+    if isinstance(scene := description.system, Hybrid):  # its modes and transitions without their functions
+        arrows = [(t.source, t.target, t.direction) for t in scene.transitions]
+        plan = [list(scene.modes), scene.start, scene.max_transitions, arrows]
+        entries["transitions"] = _entry(plan, None)
     event = description.settings.get("event")
     if event is not None:
         condition = getattr(event, "cond_fn", event)
         of_event = _defer_trace(accept(condition, "event"), (q, qdot), params) if callable(condition) else None
-        found["event"] = _entry(condition, of_event)
-        found["event"]["program"] += "\n" + identity([getattr(event, name, None) for name in _OF_EVENTS])
+        entries["event"] = _entry(condition, of_event)
+        entries["event"]["program"] += "\n" + identity([getattr(event, name, None) for name in _OF_EVENTS])
     for name, section in description.sections.named_functions().items() if description.sections else ():
         of_section = _defer_trace(accept(section, "section"), (q, qdot), params)
-        found[f"crossings of {name}"] = _entry(section, of_section)
+        entries[f"crossings of {name}"] = _entry(section, of_section)
     for role in ("q0", "qdot0", "params"):
         value = getattr(description, role)
-        found[role] = _entry(value, (lambda f=value: jax.make_jaxpr(f)(point)) if callable(value) else None)
-    found["keep"] = _entry(description.keep, None)
-    return found
+        entries[role] = _entry(value, (lambda f=value: jax.make_jaxpr(f)(point)) if callable(value) else None)
+    entries["keep"] = _entry(description.keep, None)
+    return entries
 
 
 def _functions(scene: Scene) -> dict[str, Any]:
@@ -193,12 +199,6 @@ def _functions(scene: Scene) -> dict[str, Any]:
         for k, transition in enumerate(scene.transitions):
             named |= {f"{role} of transition {k}": getattr(transition, role) for role in ("guard", "reset")}
     return {name: function for name, function in named.items() if function is not None}
-
-
-def _plan(scene: Hybrid) -> list:
-    """The modes and transitions of a hybrid scene without their functions."""
-    arrows = [(t.source, t.target, t.direction) for t in scene.transitions]
-    return [list(scene.modes), scene.start, scene.max_transitions, arrows]
 
 
 def _defer_trace(function, arguments: tuple, params) -> Callable:
@@ -235,7 +235,7 @@ def _value_text(value: PyTree) -> str:
     return "\n".join(lines) or "None"
 
 
-def difference(before: dict[str, dict[str, str]], now: dict[str, dict[str, str]]) -> str | None:
+def _difference(before: dict[str, dict[str, str]], now: dict[str, dict[str, str]]) -> str | None:
     """The differences between the texts in a store and those of a call, line by line; None where there are none."""
     parts = []
     for role in dict.fromkeys([*before, *now]):
@@ -247,6 +247,26 @@ def difference(before: dict[str, dict[str, str]], now: dict[str, dict[str, str]]
         lines = list(difflib.unified_diff(old[kind].split("\n"), new[kind].split("\n"), "store", "now", "", "", 1, ""))
         parts.append("\n".join([f"{role}{why}:", *lines[2 : 2 + _SHOWN]]))
     return "\n".join(parts) or None
+
+
+def compared_entries(axes: tuple[Axis, ...], description: Description) -> dict:
+    """The entries of a store's description that are compared, as JSON keeps them."""
+    names = [name for axis in axes for name in axis.names]
+    entries = {"axes": [axis.described() for axis in axes], "x64": uses_doubles(), **description.described()}
+    return json.loads(json.dumps(entries | {"scene": texts(description, names)}))
+
+
+def differences(spec: dict, here: dict, entries: Iterable[str], roles: Iterable[str] | None = None) -> list[str]:
+    """The differences between these entries of a store and of a call, in words; of the scene those of some `roles`."""
+    lines = []
+    for name in entries:
+        if name == "scene":
+            before, now = ({x: of["scene"][x] for x in roles or of["scene"] if x in of["scene"]} for of in (spec, here))
+            lines += [change] if (change := _difference(before, now)) else []
+        elif spec[name] != here[name]:
+            before, now = (describe_axes(x[name]) if name == "axes" else x[name] for x in (spec, here))
+            lines.append(f"{name}: {before} in the store, now {now}")
+    return lines
 
 
 # ---- to another process ----------------------------------------------------------------------------------------------

@@ -4,17 +4,15 @@ The batches of a unit follow from its size alone, all of one size; the last is f
 member, which are thrown away. So a member stands at the same place of the same batch whoever computes it.
 """
 
-import hashlib
-import json
 import math
-import os
 import platform
 import threading
 import time
 import warnings
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
@@ -25,34 +23,35 @@ import jax
 import numpy as np
 from llvmlite import binding as llvm
 
-from lagjax._interface import ENDED_WELL, SUCCESSFUL
-from lagjax._sweep._batch import CRASHED, KEEP_FAILED, Batches, KeptResults, batches_of, label
-from lagjax._sweep._description import Description, FinalStates, difference, texts, unpack_description
+import lagjax
+from lagjax._interface import ENDED_WELL
+from lagjax._sweep._batch import CRASHED, KEEP_FAILED, Batches, KeptResults, label
+from lagjax._sweep._description import Description, differences, texts, unpack_description, uses_doubles
+from lagjax._sweep._files import RESULT, Files
 from lagjax._sweep._members import Grid, points_of
 from lagjax._sweep._statistics import partial_of, to_bytes
-from lagjax._sweep._store import RESULT, Store
 
 
 @dataclass(frozen=True)
 class Job:
     """A store, its description, and what computes its members."""
 
-    store: Store
+    store: Files
     spec: dict
     grid: Grid
     description: Description
     batches: Batches
 
     @classmethod
-    def from_store(cls, store: Store, spec: dict, description: Description) -> "Job":
-        """The job of a store whose functions are at hand."""
+    def from_store(cls, store: Files, spec: dict, description: Description, batches: Batches | None = None) -> "Job":
+        """The job of a store whose functions are at hand; `batches` may have been compiled for them."""
         if spec.get("cpu", cpu()) != cpu():
             warnings.warn(
                 f"{store.path} was begun on a CPU of the kind {spec['cpu']}, and continues here on {cpu()}: members "
                 "that are computed here may differ from those of that one, as by a change of rounding.",
                 stacklevel=4,
             )
-        batches = batches_of(description, spec["conserves"])
+        batches = batches or Batches(description, spec["conserves"])
         batches.quantities = [q for q in store.quantities({**spec, "reduce": {}}) if q != RESULT]
         return cls(store, spec, store.grid(spec), description, batches)
 
@@ -63,10 +62,6 @@ class Job:
                 f"{self.store.path} was begun with the engine {self.spec['engine']}, here {kept.engine} integrates: "
                 "the bits would differ. Choose the same device, by JAX_PLATFORMS=cpu for machine code."
             )
-
-
-def uses_doubles() -> bool:
-    return jax.dtypes.canonicalize_dtype(np.float64) == np.float64
 
 
 @contextmanager
@@ -98,11 +93,8 @@ _process_precision: list[bool] = []  # that of the process before the first one 
 
 def _doubles_in_process() -> bool:
     """True if this process computes in doubles, whatever this thread has chosen: as a thread sees it that has not."""
-    seen: list[bool] = []
-    thread = threading.Thread(target=lambda: seen.append(uses_doubles()))
-    thread.start()
-    thread.join()
-    return seen[0]
+    with ThreadPoolExecutor(1) as thread:
+        return thread.submit(uses_doubles).result()
 
 
 def _set_doubles_in_process(doubles: bool) -> None:
@@ -110,39 +102,25 @@ def _set_doubles_in_process(doubles: bool) -> None:
         jax.config.update("jax_enable_x64", doubles)
 
 
-def source_path(description: Description, store: Store) -> str | None:
-    """The store of the ends of motions, as a path from this one's folder: both may be moved, or seen, elsewhere."""
-    return None if description.left is None else os.path.relpath(description.left.path, store.path.parent)
-
-
-def _relocate_source(description: Description, store: Store, path: str | None) -> Description:
-    """The motions of a store, left where `path` leads from its folder. Raises `FileNotFoundError` if that is gone."""
-    if description.left is None or path is None:
-        return description
-    other = Store((store.path.parent / path).resolve())
-    other.spec()
-    return replace(description, left=description.left._replace(path=str(other.path)))
-
-
 def open_job(path: str) -> Job:
     """The job of a store in a process that knows nothing but its path. Raises where it is not what was begun.
 
     A store that was removed and made anew is another one; each is opened once.
     """
-    store = Store(Path(path))
-    return _open_job(path, hashlib.sha256(json.dumps(store.spec()).encode() + store.scene()).hexdigest())
+    store = Files(Path(path))
+    return _open_job(path, store.identity())
 
 
 @lru_cache(maxsize=4)
 def _open_job(path: str, content: str) -> Job:
-    store = Store(Path(path))
+    store = Files(Path(path))
     spec = store.spec()
     require_versions(store, spec)
     with precision(bool(spec["x64"])):
-        description = _relocate_source(unpack_description(store.scene(), spec["path"]), store, spec["continues"])
+        description = unpack_description(store.scene(), spec["path"])
         names = [name for axis in spec["axes"] for name in axis["names"]]
-        if change := difference(spec["scene"], texts(description, names)):
-            raise ValueError(f"{store.path}: the scene is not here what it was when the store was begun.\n{change}")
+        if change := differences(spec, {"scene": texts(description, names)}, ["scene"]):
+            raise ValueError(f"{store.path}: the scene is not here what it was when the store was begun.\n{change[0]}")
         return Job.from_store(store, spec, description)
 
 
@@ -155,17 +133,10 @@ def cpu() -> str:
 def versions() -> dict[str, str]:
     """The versions that the bits of a store depend on, and that of Python, whose code travels."""
     of_packages = {name: metadata.version(name) for name in ("jax", "jaxlib", "diffrax", "numpy")}
-    return {"lagjax": _own_version(), "python": ".".join(platform.python_version_tuple()[:2]), **of_packages}
+    return {"lagjax": lagjax.__version__, "python": ".".join(platform.python_version_tuple()[:2]), **of_packages}
 
 
-def _own_version() -> str:
-    try:
-        return metadata.version("lagjax")
-    except metadata.PackageNotFoundError:
-        return "unknown"
-
-
-def require_versions(store: Store, spec: dict) -> None:
+def require_versions(store: Files, spec: dict) -> None:
     """Raise `ValueError` where this process would compute other bits, or cannot read the functions."""
     here = versions()
     other = [f"{name} {was}, here {here[name]}" for name, was in spec["versions"].items() if here.get(name) != was]
@@ -192,56 +163,55 @@ class Unit(NamedTuple):
 
 def parts(job: Job, unit: int) -> list[tuple[np.ndarray, int]]:
     """The batches of a unit: its members in each, all of one length, and how many of them are not copies."""
-    known, _ = job.store.copied_members(unit)
-    left = np.arange(job.grid.size(unit))
-    left = np.setdiff1d(left, known) if known.size else left
-    if not left.size:
+    members = np.setdiff1d(np.arange(job.grid.size(unit)), job.store.copied(unit).members)
+    if not members.size:
         return []
-    batch = math.ceil(len(left) / math.ceil(len(left) / job.spec["batch"]))
-    starts = range(0, len(left), batch)
-    return [(left[np.minimum(np.arange(k, k + batch), len(left) - 1)], min(batch, len(left) - k)) for k in starts]
+    batch = math.ceil(len(members) / math.ceil(len(members) / job.spec["batch"]))
+    firsts = range(0, len(members), batch)
+    last = len(members) - 1
+    return [(members[np.minimum(np.arange(k, k + batch), last)], min(batch, len(members) - k)) for k in firsts]
 
 
-def starts(job: Job, unit: int) -> tuple[Callable[[np.ndarray], dict[str, np.ndarray]], np.ndarray]:
-    """The points of some members of a unit, as a function; and the earlier results of all, of motions that continue."""
-    box, shape = job.grid.box(unit), job.grid.box_shape(unit)
-    axes, more, before = job.store.coordinates(job.spec["axes"], box), {}, np.full(job.grid.size(unit), SUCCESSFUL)
-    if job.description.left is not None:
-        more, before = states(job.description.left, box)
-    return lambda which: points_of(axes, shape, which) | {name: x[which] for name, x in more.items()}, before
+def unit_points(job: Job, unit: int) -> Callable[[np.ndarray], dict[str, np.ndarray]]:
+    """The points of members of a unit, as a function of their places in it."""
+    axes, shape = job.store.coordinates(job.spec["axes"], job.grid.box(unit)), job.grid.box_shape(unit)
+    starts = job.store.copied(unit).starts
+    return lambda which: points_of(axes, shape, which) | {name: x[which] for name, x in starts.items()}
 
 
 def compute(
-    job: Job, unit: int, crashed: Mapping[int, str] = NONE, notify: Callable[[int], None] = lambda _: None
+    job: Job, unit: int, crashed: Mapping[int, str] = NONE, before_batch: Callable[[], None] = lambda: None
 ) -> Unit:
-    """Compute a unit without members that are known to end their process; `notify(k)` precedes the k-th batch."""
+    """Compute a unit without members that are known to end their process."""
     began, spent = time.monotonic(), time.process_time()
-    size, (points, before) = job.grid.size(unit), starts(job, unit)
-    drifts, complaints = np.full(size, np.nan), {}
-    known, of_known = job.store.copied_members(unit)
-    values = {q.name: np.empty((size, *q.shape), q.dtype) for q in (*job.batches.quantities, RESULT)}
-    for name, x in of_known.items():
-        values[name][known] = x
-    for k, (which, count) in enumerate(parts(job, unit)):
-        notify(k)
-        kept, own = job.batches(points(_replace_crashed(which, crashed))), which[:count]
-        job.require_engine(kept)
-        for name, x in {**kept.values, RESULT.name: kept.result}.items():
-            values[name][own] = x[:count]
-        if kept.drift is not None:
-            drifts[own] = kept.drift[:count]
-        complaints |= {int(own[j]): text for j, text in kept.complaints.items() if j < count}
-    ended = np.flatnonzero(before != SUCCESSFUL)  # before these motions began
-    _clear_members(job, values, drifts, ended, before[ended])
-    _clear_members(job, values, drifts, list(crashed), CRASHED)
-    complaints |= crashed
+    size, points, copied = job.grid.size(unit), unit_points(job, unit), job.store.copied(unit)
+    drifts, complaints = np.full(size, np.nan), dict(crashed)
+    values = {q.name: np.full((size, *q.shape), q.filling, q.dtype) for q in (*job.batches.quantities, RESULT)}
     result = values[RESULT.name]
-    record = record_of(job.grid, unit, result, job.spec["engine"], complaints) | _largest_drift(
-        job, unit, result, drifts
-    )
+    result[list(crashed)] = CRASHED
+    for name, x in copied.values.items():
+        values[name][copied.members] = x
+    for which, count in parts(job, unit):
+        before_batch()
+        kept = job.batches(points(_replace_crashed(which, crashed)))
+        job.require_engine(kept)
+        rows = np.flatnonzero(~np.isin(which[:count], list(crashed)))
+        own = which[rows]
+        for name, x in {**kept.values, RESULT.name: kept.result}.items():
+            values[name][own] = x[rows]
+        if kept.drift is not None:
+            drifts[own] = kept.drift[rows]
+        complaints |= {int(which[j]): kept.complaints[int(j)] for j in rows if j in kept.complaints}
+    record = record_of(job.grid, unit, result, job.spec["engine"], complaints)
+    drifts = np.where(np.isin(result, (*ENDED_WELL, KEEP_FAILED)), drifts, np.nan)
+    if np.isfinite(drifts).any():  # the largest change of energy, and its member
+        worst = int(np.nanargmax(drifts))
+        record["drift"] = [float(drifts[worst]), int(job.grid.numbers(unit, np.array(worst)))]
     record |= {"cpu": cpu(), "slow": job.batches.slow}
     record |= {"seconds": time.monotonic() - began, "cpu_seconds": time.process_time() - spent}
-    return Unit(values, record, _statistics(job, unit, values))
+    ok, numbers = np.isin(result, ENDED_WELL), job.grid.numbers(unit, np.arange(size))
+    reduced = {name: partial_of(how, values[name], ok, numbers) for name, how in job.description.reduce.items()}
+    return Unit(values, record, to_bytes(reduced) if reduced else b"")
 
 
 def _replace_crashed(which: np.ndarray, crashed: Mapping[int, str]) -> np.ndarray:
@@ -250,13 +220,6 @@ def _replace_crashed(which: np.ndarray, crashed: Mapping[int, str]) -> np.ndarra
     if bad.all():
         raise ValueError("All members of a batch end their process: look at one of them alone, with `simulate`.")
     return np.where(bad, which[~bad][0], which)
-
-
-def _clear_members(job: Job, values: dict[str, np.ndarray], drifts: np.ndarray, which, result) -> None:
-    """Set members, of which only the results are known, to the filling."""
-    for q in job.batches.quantities:
-        values[q.name][which] = q.filling
-    values[RESULT.name][which], drifts[which] = result, np.nan
 
 
 def record_of(grid: Grid, unit: int, result: np.ndarray, engine: str, complaints: Mapping[int, str] = NONE) -> dict:
@@ -273,38 +236,3 @@ def record_of(grid: Grid, unit: int, result: np.ndarray, engine: str, complaints
             for j, number in zip(failed, grid.numbers(unit, failed), strict=True)
         ],
     }
-
-
-def _largest_drift(job: Job, unit: int, result: np.ndarray, drifts: np.ndarray) -> dict:
-    """The entry "drift" of a record: the largest change of energy and its member; none where no energy is known."""
-    drifts = np.where(np.isin(result, (*ENDED_WELL, KEEP_FAILED)), drifts, np.nan)
-    if not np.isfinite(drifts).any():
-        return {}
-    worst = int(np.nanargmax(drifts))
-    return {"drift": [float(drifts[worst]), int(job.grid.numbers(unit, np.array([worst]))[0])]}
-
-
-def _statistics(job: Job, unit: int, values: dict[str, np.ndarray]) -> bytes:
-    if not job.description.reduce:
-        return b""
-    ok = np.isin(values[RESULT.name], ENDED_WELL)
-    numbers = job.grid.numbers(unit, np.arange(len(ok)))
-    return to_bytes({name: partial_of(how, values[name], ok, numbers) for name, how in job.description.reduce.items()})
-
-
-def states(left: FinalStates, box: tuple[slice, ...]) -> tuple[dict[str, np.ndarray], np.ndarray]:
-    """The states (m, …) by name from which the members of a box continue, and their results (m,) before.
-
-    States of members that failed or were ended by an event are NaN: they do not continue.
-    """
-    store = Store(Path(left.path))
-
-    def read(name: str) -> np.ndarray:
-        values = np.asarray(store.array(name)[box])
-        return values.reshape(-1, *values.shape[len(box) :])
-
-    result = read(RESULT.name)
-    found = {name: read(name) for name in jax.tree.leaves((left.q, left.qdot))}
-    for values in found.values():
-        values[result != SUCCESSFUL] = np.nan
-    return found, result

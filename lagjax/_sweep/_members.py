@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 
-from lagjax import designs
 from lagjax.designs import Design
 
 RESERVED = ("result",)
@@ -35,11 +34,10 @@ class Axis:
 
     def pieces(self) -> Iterator[tuple[int, np.ndarray]]:
         """(start, values (m, names)), one after the other."""
-        if isinstance(self.source, Design):
-            for start in range(0, self.size, designs.SLICE):
-                yield start, self.source.piece(self.names, start)
-        else:
-            yield 0, np.stack(self.source, axis=1)
+        start = 0
+        for values in self.source.pieces(self.names) if isinstance(self.source, Design) else [np.stack(self.source, 1)]:
+            yield start, values
+            start += len(values)
 
     def described(self) -> dict:
         """The names, the size and the rule, or a hash of the values."""

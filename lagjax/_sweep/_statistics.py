@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._sweep._store import arrays_as_bytes
+from lagjax._sweep._files import arrays_as_bytes
 
 RELATIVE = 1e-3  # of a quantile: its error, as a part of it; bins of a sketch, and its bytes, go as one over it
 _LOG_GAMMA = np.log((1 + RELATIVE) / (1 - RELATIVE))

@@ -7,8 +7,8 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax._interface import show_str
+from lagjax._sweep._files import Files
 from lagjax._sweep._members import text_of
-from lagjax._sweep._store import Store
 
 WELL = ("successful", "event_occurred")
 _RECENT = 32  # units whose times give the rate
@@ -85,7 +85,7 @@ class Status(NamedTuple):
         return "\n".join(lines)
 
 
-def status(store: Store) -> Status:
+def status(store: Files) -> Status:
     spec = store.spec()
     store.require_arrays(spec)
     grid, finished = store.grid(spec), store.finished_units()
@@ -111,7 +111,7 @@ def status(store: Store) -> Status:
     )  # fmt: skip
 
 
-def point(store: Store, spec: dict, member: int) -> dict[str, float]:
+def point(store: Files, spec: dict, member: int) -> dict[str, float]:
     """The point of a member, by its number."""
     places = np.unravel_index(member, tuple(spec["shape"]))
     return {
@@ -121,7 +121,7 @@ def point(store: Store, spec: dict, member: int) -> dict[str, float]:
     }
 
 
-def _rate(store: Store, done: list[int], records: list[dict]) -> float | None:
+def _rate(store: Files, done: list[int], records: list[dict]) -> float | None:
     """Members per second, from the times of the last files; the disk's clock is one for all workers."""
     if not records:
         return None
@@ -145,7 +145,7 @@ def duration(seconds: float) -> str:
 class Progress:
     """A line on stderr that is written again and again: done, rate, what failed, what is left."""
 
-    def __init__(self, store: Store, spec: dict, shown: bool):
+    def __init__(self, store: Files, spec: dict, shown: bool):
         self.store, self.shown, self.members = store, shown, store.grid(spec).members
         self._begun, self._known, self._last = None, {}, 0.0
 

@@ -10,8 +10,9 @@ next run computes it. So no worker has to know of another, and the disk needs no
 
 **A child** is started afresh, never forked, and without the user's script: it reads from the store what it computes.
 Where it dies, or takes too long over a batch, the members of its unit are halved in further children until those are
-known that end them; the unit is then computed without them, every other member where it stood before. The executors of
-the standard library and pebble were considered: their children import the user's script, which then needs a guard.
+known that end them; the unit is then computed without them, every other member where it stood before. A
+`ProcessPoolExecutor` of one, or pebble, would not do: their children import the user's script, which then needs a
+guard, and the first does not tell how its child ended.
 """
 
 import faulthandler
@@ -25,18 +26,19 @@ import traceback
 import warnings
 from collections.abc import Callable
 from concurrent.futures import FIRST_COMPLETED, Executor, Future, ThreadPoolExecutor, wait
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
 import jax
 import numpy as np
 
-from lagjax._sweep._batch import KeptResults, find_failing
-from lagjax._sweep._begin import first_look
-from lagjax._sweep._description import Description, pack_description, unpack_description, users_path
-from lagjax._sweep._job import Job, Unit, compute, open_job, parts, precision, starts, uses_doubles
+from lagjax._sweep._batch import find_failing
+from lagjax._sweep._begin import Look, first_look
+from lagjax._sweep._description import Description, pack_description, unpack_description, users_path, uses_doubles
+from lagjax._sweep._files import Files
+from lagjax._sweep._job import Job, Unit, compute, open_job, parts, precision, unit_points
 from lagjax._sweep._status import Progress
-from lagjax._sweep._store import Store
 
 # ---- units in this process -------------------------------------------------------------------------------------------
 
@@ -69,10 +71,10 @@ def units_to_compute(job: Job, part: slice) -> list[int]:
         first = "; ".join(list(damaged.values())[:_NAMED])
         more = f"; and {len(damaged) - _NAMED} units more" if len(damaged) > _NAMED else ""
         warnings.warn(f"{store.path}: {first}{more}. What is damaged is computed again.", stacklevel=3)
-    left = sorted(chosen - (finished - set(damaged)))
-    if left:
+    missing = sorted(chosen - (finished - set(damaged)))
+    if missing:
         job.store.require_writable()
-    return left
+    return missing
 
 
 def work(job: Job, units: list[int], notify: Notify = lambda: None) -> int:
@@ -97,7 +99,7 @@ def _write(job: Job, unit: int, done: Unit, notify: Notify) -> None:
     notify()
 
 
-def run_store(store: Store, notify: Notify = lambda: None, most: int | None = None, part: Any = (0, 1)) -> int:
+def run_store(store: Files, notify: Notify = lambda: None, most: int | None = None, part: Any = (0, 1)) -> int:
     """Compute units of a store that is known by its path alone, `most` at most; return their number."""
     chosen = require_part(part)
     job = open_job(str(store.path.resolve()))
@@ -111,37 +113,32 @@ _WINDOW = 64  # units that an executor is given at a time: a scheduler holds thi
 _POLL = 0.2  # seconds between two looks at tasks that are no futures
 
 
-def run_unit(path: str, unit: int) -> None:
-    """Compute one unit of a store, in whatever process this is."""
-    work(open_job(path), [unit])
-
-
 def submit(job: Job, units: list[int], executor: Any, notify: Notify) -> None:
     """Compute these units by an executor, some at a time."""
-    path, running = str(job.store.path.resolve()), set()
+    path, remaining, running = str(job.store.path.resolve()), iter(units), set()
     try:
-        for unit in units:
-            running.add(executor.submit(run_unit, path, unit))
-            if len(running) >= _WINDOW:
-                _collect(running, notify)
-        while running:
-            _collect(running, notify)
+        while True:
+            for unit in islice(remaining, _WINDOW - len(running)):
+                running.add(executor.submit(run_unit, path, unit))
+            if not running:
+                return
+            finished = _wait_for_first(running)
+            running -= finished
+            for task in finished:
+                task.result()  # raises what it has raised
+            notify()
     except BaseException:  # of a task, or Ctrl-C: a pool would finish the waiting tasks before it ends
         for task in running:
             task.cancel()
         raise
 
 
-def _collect(running: set[Any], notify: Notify) -> None:
-    """Wait for one of these tasks, and take out those that are done. Raises what a task has raised."""
-    finished = _wait_for_some(running)
-    running -= finished
-    for task in finished:
-        task.result()
-    notify()
+def run_unit(path: str, unit: int) -> None:
+    """Compute one unit of a store, in whatever process this is."""
+    work(open_job(path), [unit])
 
 
-def _wait_for_some(running: set[Any]) -> set[Any]:
+def _wait_for_first(running: set[Any]) -> set[Any]:
     """The tasks that are done, one at least; tasks that are no futures, as those of submitit, are polled."""
     if all(isinstance(task, Future) for task in running):
         return wait(running, return_when=FIRST_COMPLETED).done
@@ -184,15 +181,15 @@ def require_limit(isolate: Any) -> float | None:
 
 def work_in_children(job: Job, units: list[int], limit: float, shown: bool) -> None:
     """Compute these units in child processes. Raises `RuntimeError` at the end for units that cannot be computed."""
-    path, lost, left = str(job.store.path.resolve()), {}, units
-    while left:
+    path, lost, missing = str(job.store.path.resolve()), {}, units
+    while missing:
         try:
-            _call_child(_compute_units, path, left, limit, shown, limit=limit)
+            _call_child(_compute_units, path, missing, {}, limit, shown, limit=limit)
         except _ChildDeath as death:  # over the first unit that is not done
-            unit = next((unit for unit in left if not job.store.has_finished(unit)), None)
+            unit = next((unit for unit in missing if not job.store.has_finished(unit)), None)
             if unit is not None and not _compute_rest(job, path, unit, limit):
                 lost[unit] = str(death)
-        left = [unit for unit in left if unit not in lost and not job.store.has_finished(unit)]
+        missing = [unit for unit in missing if unit not in lost and not job.store.has_finished(unit)]
     if lost:
         names = "; ".join(f"unit {unit} ({why})" for unit, why in lost.items())
         raise RuntimeError(
@@ -214,26 +211,24 @@ def _compute_rest(job: Job, path: str, unit: int, limit: float) -> bool:
     members = np.concatenate([which[:count] for which, count in parts(job, unit)])
     crashed = find_failing(members, why_crashed, _MOST)
     try:
-        _call_child(_compute_unit, path, unit, crashed, limit, limit=limit)
+        _call_child(_compute_units, path, [unit], crashed, limit, False, limit=limit)
     except _ChildDeath:
         return False
     return True
 
 
-def look_in_children(
-    description: Description, points: dict[str, np.ndarray], limit: float
-) -> tuple[KeptResults, float, bool]:
-    """The kept values of a few members (`first_look`), of those at least that do not end the child."""
+def look_in_children(description: Description, points: dict[str, np.ndarray], limit: float) -> Look:
+    """A first look at members at these points, or at those of them that do not end the child."""
     request = pack_description(description), users_path(), uses_doubles()
-    why, waiting = "", [points]
-    while waiting:
-        some = waiting.pop(0)
+    why, groups = "", [points]
+    while groups:
+        group = groups.pop(0)
         try:
-            return _call_child(_look, *request, some, limit=limit)
+            return _call_child(_look, *request, group, limit=limit)
         except _ChildDeath as death:
-            half, why = len(next(iter(some.values()))) // 2, str(death)
+            half, why = len(next(iter(group.values()))) // 2, str(death)
         if half:
-            waiting += [{name: x[part] for name, x in some.items()} for part in (slice(half), slice(half, None))]
+            groups += [{name: x[part] for name, x in group.items()} for part in (slice(half), slice(half, None))]
     raise RuntimeError(f"Every member that was tried ends its process ({why}): look at one with `simulate`.")
 
 
@@ -289,32 +284,27 @@ def _set_alarm(limit: float) -> None:
     faulthandler.dump_traceback_later(limit, exit=True)
 
 
-def _compute_units(path: str, units: list[int], limit: float, shown: bool) -> None:
-    show = Progress(open_job(path).store, open_job(path).spec, shown)
-    for unit in units:
-        _compute_unit(path, unit, {}, limit)
-        show()
-
-
-def _compute_unit(path: str, unit: int, crashed: dict[int, str], limit: float) -> None:
+def _compute_units(path: str, units: list[int], crashed: dict[int, str], limit: float, shown: bool) -> None:
+    """Compute these units, each without the members that are known to end their process."""
     job = _open_here(path)
-    done = compute(job, unit, crashed, lambda _: _set_alarm(limit))
-    faulthandler.cancel_dump_traceback_later()  # a slow disk is no reason to end
-    job.store.write_unit(job.spec, unit, *done)
+    show = Progress(job.store, job.spec, shown)
+    for unit in units:
+        done = compute(job, unit, crashed, lambda: _set_alarm(limit))
+        faulthandler.cancel_dump_traceback_later()  # a slow disk is no reason to end
+        job.store.write_unit(job.spec, unit, *done)
+        show()
 
 
 def _probe(path: str, unit: int, members: np.ndarray, limit: float) -> None:
     """Compute some members of a unit, in batches no larger than that takes."""
     job = _open_here(path)
-    (points, _), size = starts(job, unit), min(job.spec["batch"], 2 ** (len(members) - 1).bit_length())
+    points, size = unit_points(job, unit), min(job.spec["batch"], 2 ** (len(members) - 1).bit_length())
     for k in range(0, len(members), size):
         _set_alarm(limit)
         job.batches(points(np.resize(members[k : k + size], size)))
 
 
-def _look(
-    data: bytes, path: list[str], doubles: bool, points: dict[str, np.ndarray]
-) -> tuple[KeptResults, float, bool]:
+def _look(data: bytes, path: list[str], doubles: bool, points: dict[str, np.ndarray]) -> Look:
     jax.config.update("jax_enable_x64", doubles)
     return first_look(unpack_description(data, path), points)
 

@@ -19,13 +19,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from stores import run_sweep
 
 import lagjax
 from lagjax import __main__ as command_line
 from lagjax import designs
-from lagjax._sweep import _job, _statistics, _store, _workers
+from lagjax._sweep import _files, _job, _statistics, _workers
+from lagjax._sweep._files import Files
 from lagjax._sweep._members import Grid, axes_of
-from lagjax._sweep._store import Store
 
 GRAVITY = 9.81
 
@@ -53,7 +54,7 @@ RULE = dict(q0=angle_of, qdot0=0.0, params=length_of, keep=keep, unit=10, progre
 
 
 def swept(folder, over=OVER, **changes):
-    return lagjax.sweep(PENDULUM, over, TS, **{**RULE, "store": folder / "store", **changes})
+    return run_sweep(PENDULUM, over, TS, **{**RULE, "store": folder / "store", **changes})
 
 
 def digests(folder, store="store"):
@@ -121,7 +122,7 @@ WITH_CROSSINGS = dict(keep=keep_end_and_crossings, crossings=BOTTOM)
 @pytest.mark.parametrize("times", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_last_state_and_first_crossing_from_one_sweep(tmp_path, times):
     ts = jnp.linspace(0.0, 2.0, times)
-    data = lagjax.sweep(PENDULUM, OVER, ts, **{**RULE, **WITH_CROSSINGS, "store": tmp_path / "store"}).open()
+    data = run_sweep(PENDULUM, OVER, ts, **{**RULE, **WITH_CROSSINGS, "store": tmp_path / "store"}).open()
     length, angle = (x.ravel() for x in np.meshgrid(*OVER.values(), indexing="ij"))
     starts = (angle, np.zeros_like(angle), ts, length)
     bare = lagjax.simulate_batch(PENDULUM, *starts, batch_axes=(0, 0, 0))
@@ -141,19 +142,19 @@ def test_last_state_and_first_crossing_from_one_sweep(tmp_path, times):
 @pytest.mark.parametrize("how", [dict(isolate=True), dict(unit=1), dict(unit=42)])
 def test_crossings_do_not_depend_on_neighbours_and_workers(tmp_path, how, monkeypatch):
     ts, rule = jnp.array([0.0, 2.0]), {**RULE, **WITH_CROSSINGS}
-    whole = lagjax.sweep(PENDULUM, OVER, ts, **{**rule, "store": tmp_path / "whole"}).open().load()
+    whole = run_sweep(PENDULUM, OVER, ts, **{**rule, "store": tmp_path / "whole"}).open().load()
     store = tmp_path / "store"
     stopped = lambda job, left, tell: _workers.work(job, left[:2], tell)
     monkeypatch.setattr("lagjax._sweep.work", stopped)
-    lagjax.sweep(PENDULUM, OVER, ts, **{**rule, "store": store, **how})
+    run_sweep(PENDULUM, OVER, ts, **{**rule, "store": store, **how})
     monkeypatch.undo()
-    data = lagjax.sweep(PENDULUM, OVER, ts, **{**rule, "store": store, **how}).open()
+    data = run_sweep(PENDULUM, OVER, ts, **{**rule, "store": store, **how}).open()
     for name, values in whole.items():
         np.testing.assert_array_equal(data[name].values, values.values)
     with pytest.raises(ValueError, match=r"'count': 2.* in the store, now .*'count': 3"):
-        lagjax.sweep(PENDULUM, OVER, ts, **{**rule, "store": store, "crossings": BOTTOM | {"count": 3}})
+        run_sweep(PENDULUM, OVER, ts, **{**rule, "store": store, "crossings": BOTTOM | {"count": 3}})
     with pytest.raises(ValueError, match=r"(?s)crossings of section.*-    return q.*\+    return q - 0.1"):
-        lagjax.sweep(PENDULUM, OVER, ts, **{**rule, "store": store, "crossings": BOTTOM | {"section": beside_it}})
+        run_sweep(PENDULUM, OVER, ts, **{**rule, "store": store, "crossings": BOTTOM | {"section": beside_it}})
 
 
 def beside_it(q, qdot):
@@ -168,7 +169,7 @@ def test_crossings_of_several_sections_under_constraints(tmp_path):
     on_it = lambda angle: jnp.stack([jnp.sin(angle), -jnp.cos(angle)])
     q0 = lambda point: (1.0 + 1e-3 * (point["angle"] > 1.4)) * on_it(point["angle"])
     keep = lambda trajectory, crossings: {"times": {name: x.t for name, x in crossings.items()}}
-    run = lagjax.sweep(
+    run = run_sweep(
         disk, {"angle": angles}, jnp.array([0.0, 1.0]), q0=q0, qdot0=jnp.zeros(2), keep=keep,
         crossings={"section": sections, "count": 3}, store=tmp_path / "store", progress=False,
     )  # fmt: skip
@@ -203,6 +204,17 @@ def test_statistics_leave_out_what_is_not_finite():
         got = _statistics.summary(how, total, ())
         assert got.count == 2 and got.mean == -0.5 and got.variance == 4.5 and got.min_member == 13
     assert np.isnan(_statistics.summary(how, nothing, ()).mean)
+
+
+def test_old_arguments_say_the_new_ones(tmp_path, undisturbed):
+    old = dict(RULE, store=tmp_path / "store", part=(0, 1))
+    with pytest.warns(
+        DeprecationWarning, match=r"sweep\(…, store=lagjax.Store\('.*store', unit=…, part=…\)\) n"
+    ) as told:
+        lagjax.sweep(PENDULUM, OVER, TS, **old)
+    assert told[0].filename == __file__ and digests(tmp_path) == undisturbed
+    with pytest.raises(TypeError, match=r"sweep\(\) got an unexpected keyword argument 'units'"):
+        lagjax.sweep(PENDULUM, OVER, TS, **old, units=3)
 
 
 # ---- members and units -----------------------------------------------------------------------------------------------
@@ -256,7 +268,7 @@ def begun(folder, units=0, **changes):
         run = _workers.work
         patch.setattr("lagjax._sweep.work", lambda job, left, tell: run(job, left[:units], tell))
         swept(folder, **changes)
-    return Store(folder / "store")
+    return Files(folder / "store")
 
 
 def test_goes_on_where_it_stopped(tmp_path, undisturbed):
@@ -296,16 +308,16 @@ def test_changed_descriptions_are_refused_with_the_difference(tmp_path, undistur
 
     common = {**RULE, "store": tmp_path / "store"}
     with pytest.raises(ValueError, match=r"(?s)another description.*\+.*2 \* GRAVITY \* params"):
-        lagjax.sweep(lagjax.System(heavier), OVER, TS, **common)
+        run_sweep(lagjax.System(heavier), OVER, TS, **common)
     with pytest.raises(ValueError, match=r"length.*angle.*in the store, now"):
         swept(tmp_path, OVER | {"angle": np.linspace(0.0, 3.0, 8)})
     with pytest.raises(ValueError, match="rtol: None in the store, now 1e-06"):
         swept(tmp_path, rtol=1e-6)
     with pytest.raises(ValueError, match="keep"):
         swept(tmp_path, keep=lambda trajectory: {"end": trajectory.q[-2]})
-    lagjax.sweep(by_constant(1.0), OVER, TS, **{**common, "store": tmp_path / "constant"})
+    run_sweep(by_constant(1.0), OVER, TS, **{**common, "store": tmp_path / "constant"})
     with pytest.raises(ValueError, match="its text is the same; a value that it uses is not"):
-        lagjax.sweep(by_constant(2.0), OVER, TS, **{**common, "store": tmp_path / "constant"})
+        run_sweep(by_constant(2.0), OVER, TS, **{**common, "store": tmp_path / "constant"})
     assert digests(tmp_path) == undisturbed
 
 
@@ -335,7 +347,7 @@ def test_failures_cost_the_others_nothing(tmp_path):
     system, of = lagjax.System(outwards), lambda point: {"pull": point["pull"], "k": point["k"]}
     q0 = lambda point: jnp.where(point["start"] < 0, jnp.nan, point["start"])
     rule = {**RULE, "store": tmp_path / "store", "q0": q0, "params": of, "unit": 70, "max_steps": 300}
-    told = lagjax.sweep(system, over, TS, **rule).status()
+    told = run_sweep(system, over, TS, **rule).status()
     assert {f.member for f in told.failures} == {5, 20, 77, 150} and told.results["successful"] == 296
     assert {f.result for f in told.failures} == {"nonfinite_state", "dt_min_reached", "max_steps_reached"}
     ends, well = lagjax.Sweep(tmp_path / "store").open().end.values, (start > 0) & (pull == 0) & (k == 0)
@@ -361,7 +373,7 @@ def test_keep_in_numpy_may_fail_for_a_member(tmp_path):
 
 @pytest.mark.parametrize("number, words", [(errno.ENOSPC, "disk is full"), (errno.EROFS, "read-only")])
 def test_disks_that_refuse(tmp_path, undisturbed, monkeypatch, number, words):
-    write, count = _store.write_through, []
+    write, count = _files.write_through, []
 
     def refuse(file, data):
         count.append(file)
@@ -369,11 +381,11 @@ def test_disks_that_refuse(tmp_path, undisturbed, monkeypatch, number, words):
             raise OSError(number, os.strerror(number))
         write(file, data)
 
-    monkeypatch.setattr(_store, "write_through", refuse)
+    monkeypatch.setattr(_files, "write_through", refuse)
     with pytest.raises(OSError, match=words) as error:
         swept(tmp_path)
     assert error.value.errno == number and "unit" in str(error.value)
-    store = Store(tmp_path / "store")
+    store = Files(tmp_path / "store")
     with pytest.raises(OSError, match=f"nothing was computed: .*{words}"):
         store.require_writable()
     done = store.finished_units()
@@ -414,30 +426,24 @@ def test_what_is_damaged_is_told_and_computed_again(tmp_path, undisturbed, by_co
     assert digests(tmp_path) == undisturbed and not run.damaged() and run.status().units_done == 6
 
 
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"chunk": [0, 7]}, {"shape": [6, 8]}, {"chunk": [1, 8]}, {"batch": 0}, {"axes": 3}, {"ts": ...},
-        {"kept": [{"name": "end", "shape": [], "dtype": "O"}]},
-        {"kept": [{"name": "../../x", "shape": [], "dtype": "<f8"}]},
-        {"kept": [{"name": "/x", "shape": [], "dtype": "<f8"}]}, b"\xff\xfe", b"[]", b"{",
-    ],
-    ids=str,
-)  # fmt: skip
-def test_a_damaged_description_is_a_sentence(tmp_path, change):
-    file = tmp_path / ".sweep" / "spec.json"
-    file.parent.mkdir()
-    spec = {
-        "format": _store.FORMAT, "axes": [{"names": ["a"], "size": 6}, {"names": ["b"], "size": 7}], "shape": [6, 7],
-        "chunk": [1, 7], "batch": 4, "kept": [], "reduce": {}, **dict.fromkeys(_store._OF_SPEC),
-    }  # fmt: skip
-    file.write_text(json.dumps(spec))
-    assert Store(tmp_path).spec() == spec
-    if isinstance(change, dict):
-        change = json.dumps({name: x for name, x in (spec | change).items() if x is not ...}).encode()
-    file.write_bytes(change)
-    with pytest.raises(ValueError, match=r"spec\.json cannot be read \(.*the store is damaged\. Begin the same sweep"):
-        Store(tmp_path).spec()
+def test_a_damaged_description_is_a_sentence(tmp_path):
+    store = swept(tmp_path).store
+    file, damaged = (
+        store / ".sweep" / "spec.json",
+        r"spec\.json cannot be read \(.*the store is damaged\. Begin the same",
+    )
+    spec = json.loads(file.read_bytes())
+    changed = [json.dumps(spec | change).encode() for change in ({"chunk": [0, 7]}, {"axes": 3}, {"rtol": 1e-3})]
+    for content in (*changed, b"\xff\xfe", b"[]", b"{", b"", b"3"):
+        file.write_bytes(content)
+        with pytest.raises(ValueError, match=damaged):
+            lagjax.Sweep(store)
+    del spec["sha256"]
+    for name in ("../../x", "/x"):  # of a stranger, who knows how it is written
+        own = spec | {"kept": [{"name": name, "shape": [], "dtype": "<f8"}]}
+        file.write_bytes(_files._json({"sha256": _files._hash_of(_files._json(own)), **own}))
+        with pytest.raises(ValueError, match=damaged):
+            lagjax.Sweep(store)
 
 
 def test_damaged_metadata_are_a_sentence_whose_advice_helps(tmp_path, undisturbed, capsys):
@@ -490,20 +496,14 @@ def test_units_whose_chunks_are_gone_are_not_done(tmp_path, capsys):
     assert run.status().done == told.members
 
 
-@pytest.mark.slow
-def test_stores_of_another_version_are_left_alone(tmp_path, undisturbed):
+def test_stores_of_another_version_are_left_alone(tmp_path, undisturbed, monkeypatch):
     swept(tmp_path)
-    file = tmp_path / "store" / ".sweep" / "spec.json"
-    spec = json.loads(file.read_text())
-    for change, words in (
-        ({"format": 7}, "store of format 7"),
-        ({"versions": spec["versions"] | {"jax": "0.1"}}, "0.1"),
-    ):
-        file.write_text(json.dumps(spec | change))
-        with pytest.raises(ValueError, match=words):
-            swept(tmp_path)
-    file.write_text("{")
-    with pytest.raises(ValueError, match="cannot be read"):
+    here = _job.versions()
+    monkeypatch.setattr(_job, "versions", lambda: here | {"jax": "0.1"})
+    with pytest.raises(ValueError, match=r"begun with jax .*, here 0.1: its numbers would not be of one program"):
+        swept(tmp_path)
+    monkeypatch.setattr(_files, "FORMAT", 7)
+    with pytest.raises(ValueError, match=r"is a store of format 5, .*this lagjax writes format 7"):
         swept(tmp_path)
     assert digests(tmp_path) == undisturbed
 
@@ -524,7 +524,7 @@ def test_a_store_whose_creation_was_interrupted_is_made_anew(tmp_path, undisturb
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch, pytest.raises(KeyboardInterrupt):
-        patch.setattr(_store.Store, "write", interrupted)
+        patch.setattr(_files.Files, "write", interrupted)
         swept(tmp_path)
     assert not list(tmp_path.iterdir())
     swept(tmp_path)
@@ -582,7 +582,7 @@ def test_a_finer_grid_takes_what_is_known(tmp_path, monkeypatch):
     with pytest.raises(ValueError, match=r"rtol: None in the store, now 1e-05"):
         swept(tmp_path, finer, store=tmp_path / "other", extend=coarse, rtol=1e-5)
     with pytest.raises(ValueError, match=r"(?s)ts: .*give ts that begin at 2, where"):
-        lagjax.sweep(PENDULUM, OVER, 2 * TS, **{**RULE, "store": tmp_path / "other", "extend": coarse})
+        run_sweep(PENDULUM, OVER, 2 * TS, **{**RULE, "store": tmp_path / "other", "extend": coarse})
     assert not (tmp_path / "other").exists() and whole.status().done == 91
 
 
@@ -608,8 +608,8 @@ TO_ONE, TO_TWO = TS[:3], TS[2:]
 def in_pieces(folder, **changes):
     """The sweeps from 0 to 1, and from there to 2."""
     rule = {**RULE, "keep": keep_end, **changes}
-    first = lagjax.sweep(PENDULUM, OVER, TO_ONE, **{**rule, "store": folder / "first"})
-    return first, lagjax.sweep(PENDULUM, OVER, TO_TWO, **{**rule, "store": folder / "rest", "extend": first.store})
+    first = run_sweep(PENDULUM, OVER, TO_ONE, **{**rule, "store": folder / "first"})
+    return first, run_sweep(PENDULUM, OVER, TO_TWO, **{**rule, "store": folder / "rest", "extend": first.store})
 
 
 def test_a_later_end_goes_on_from_the_states_that_are_kept(tmp_path):
@@ -625,16 +625,16 @@ def test_a_later_end_goes_on_from_the_states_that_are_kept(tmp_path):
     np.testing.assert_array_equal(two["end.q"].values.ravel(), bare.q[:, -1])
     other = {**RULE, "store": tmp_path / "other", "extend": first.store}
     with pytest.raises(ValueError, match=r"axes: .* in the store, now"):
-        lagjax.sweep(PENDULUM, {**OVER, "length": [1.0]}, TO_TWO, **other)
+        run_sweep(PENDULUM, {**OVER, "length": [1.0]}, TO_TWO, **other)
     with pytest.raises(ValueError, match=r"(?s)which cannot continue.*q0"):
-        lagjax.sweep(PENDULUM, OVER, TO_TWO, **{**other, "q0": 0.5})
+        run_sweep(PENDULUM, OVER, TO_TWO, **{**other, "q0": 0.5})
     with pytest.raises(ValueError, match="does not have the states in which its motions ended"):
-        lagjax.sweep(PENDULUM, OVER, TS + 2.0, **{**other, "extend": swept(tmp_path).store})
+        run_sweep(PENDULUM, OVER, TS + 2.0, **{**other, "extend": swept(tmp_path).store})
     with pytest.raises(ValueError, match=r"continues: .* in the store, now None"):
-        lagjax.sweep(PENDULUM, OVER, TO_TWO, **{**RULE, "keep": keep_end, "store": rest.store})
+        run_sweep(PENDULUM, OVER, TO_TWO, **{**RULE, "keep": keep_end, "store": rest.store})
     (first.store / ".sweep" / "done" / "0.json").unlink()
     with pytest.raises(ValueError, match="1 units are not done"):
-        lagjax.sweep(PENDULUM, OVER, TO_TWO, **other)
+        run_sweep(PENDULUM, OVER, TO_TWO, **other)
     assert not (tmp_path / "other").exists()
 
 
@@ -649,10 +649,10 @@ def test_a_later_end_of_members_that_have_ended_and_by_other_workers(tmp_path, m
     for name in ("end.t", "end.q", "end.qdot"):
         np.testing.assert_allclose(np.where(fell, one[name], two[name]), both[name], atol=1e-7)
     rule = {**RULE, "keep": keep_end, "extend": first.store, "event": at_the_bottom}
-    children = lagjax.sweep(PENDULUM, OVER, TO_TWO, **{**rule, "store": tmp_path / "children", "isolate": True})
+    children = run_sweep(PENDULUM, OVER, TO_TWO, **{**rule, "store": tmp_path / "children", "isolate": True})
     monkeypatch.setattr("lagjax._sweep.work", lambda *_: None)
-    begun = lagjax.sweep(PENDULUM, OVER, TO_TWO, **{**rule, "store": tmp_path / "shell"})
-    assert worker(Store(begun.store)).wait() == 0
+    begun = run_sweep(PENDULUM, OVER, TO_TWO, **{**rule, "store": tmp_path / "shell"})
+    assert worker(Files(begun.store)).wait() == 0
     assert digests(tmp_path, "rest") == digests(tmp_path, "shell") == digests(tmp_path, children.store)
 
 
@@ -890,7 +890,7 @@ def test_the_first_look_finds_a_type_for_all_members(tmp_path):
 
     pendulum = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
     angles = np.array([0.1, 0.2, 1.0, 2.0])
-    swept = lagjax.sweep(
+    swept = run_sweep(
         pendulum, {"angle": angles}, jnp.linspace(0.0, 5.0, 6), q0=lambda p: p["angle"], qdot0=0.0, keep=keep,
         store=tmp_path / "types.zarr", progress=False,
     )  # fmt: skip
@@ -903,7 +903,7 @@ def test_a_store_opens_without_its_script_and_without_a_writable_disk(tmp_path):
     pendulum = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
 
     def again():
-        return lagjax.sweep(
+        return run_sweep(
             pendulum, {"angle": np.linspace(0.1, 1.0, 4)}, jnp.linspace(0.0, 1.0, 3), q0=lambda p: p["angle"],
             qdot0=0.0, keep=lambda trajectory: {"q": trajectory.q[-1]}, store=tmp_path / "s.zarr", progress=False,
         )  # fmt: skip
@@ -913,7 +913,7 @@ def test_a_store_opens_without_its_script_and_without_a_writable_disk(tmp_path):
     assert there == swept and there.status().done == 4 and there.damaged() == {} and there.statistics() == {}
     writes = []
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(Store, "write", lambda self, file, data, name: writes.append(name))
+        patch.setattr(Files, "write", lambda self, file, data, name: writes.append(name))
         assert again() == swept and not writes
     with pytest.raises(FileNotFoundError, match="is no store of a sweep"):
         lagjax.Sweep(tmp_path / "other.zarr")
@@ -943,7 +943,7 @@ BOUNCES = dict(
 @pytest.mark.slow
 def test_a_hybrid_scene(tmp_path):  # compiles the motion of a ball for one shape, and for one member
     scene = bouncing()
-    kept = lagjax.sweep(scene, **BOUNCES, store=tmp_path / "store").open()
+    kept = run_sweep(scene, **BOUNCES, store=tmp_path / "store").open()
     heights, g = BOUNCES["over"]["height"], 9.81
     np.testing.assert_allclose(kept["first"], np.sqrt(2 * heights / g), rtol=1e-12)  # the fall from rest
     falls = np.sqrt(2 * heights / g)[:, None] * np.cumsum([1.0, *(2 * 0.8**k for k in range(1, 12))])
@@ -954,26 +954,26 @@ def test_a_hybrid_scene(tmp_path):  # compiles the motion of a ball for one shap
     assert float(kept.q[4]) == float(one.q[-1])
     for other, words in ((bouncing(0.7), "reset of transition 0"), (bouncing(max_transitions=5), "transitions")):
         with pytest.raises(ValueError, match=f"What differs:\n{words}"):
-            lagjax.sweep(other, **BOUNCES, store=tmp_path / "store")
+            run_sweep(other, **BOUNCES, store=tmp_path / "store")
     for name, value in (("event", lambda q, v: q), ("crossings", {"section": lambda q, v: v}), ("solver", "Tsit5")):
         with pytest.raises(ValueError, match=f"{name} of sweep: for the motion of one System"):
-            lagjax.sweep(scene, **BOUNCES, store=tmp_path / "other", **{name: value})
+            run_sweep(scene, **BOUNCES, store=tmp_path / "other", **{name: value})
     with pytest.raises(ValueError, match="A hybrid motion cannot continue from a store"):
         later = BOUNCES | {"ts": np.linspace(1.5, 2.0, 3)}
-        lagjax.sweep(scene, **later, store=tmp_path / "later", extend=tmp_path / "store")
+        run_sweep(scene, **later, store=tmp_path / "later", extend=tmp_path / "store")
 
 
 @pytest.mark.slow
 def test_hybrid_motion_in_units_workers_and_children(tmp_path, monkeypatch):
     short = bouncing(max_transitions=3)
-    whole = lagjax.sweep(short, **BOUNCES, store=tmp_path / "whole")
+    whole = run_sweep(short, **BOUNCES, store=tmp_path / "whole")
     spent = lagjax.RESULTS.max_transitions_reached._value
     assert set(whole.open().result.values.tolist()) == {int(spent), int(lagjax.RESULTS.successful._value)}
     assert "max_transitions_reached, at height = 0.3" in str(whole)
-    lagjax.sweep(short, **BOUNCES, store=tmp_path / "children", isolate=True, unit=4)
+    run_sweep(short, **BOUNCES, store=tmp_path / "children", isolate=True, unit=4)
     monkeypatch.setattr("lagjax._sweep.work", lambda *_: None)
-    begun = lagjax.sweep(short, **BOUNCES, store=tmp_path / "shell", unit=2)
-    assert worker(Store(begun.store)).wait() == 0
+    begun = run_sweep(short, **BOUNCES, store=tmp_path / "shell", unit=2)
+    assert worker(Files(begun.store)).wait() == 0
     for name in ("children", "shell"):
         for quantity, values in whole.open().items():
             np.testing.assert_array_equal(lagjax.Sweep(tmp_path / name).open()[quantity], values)

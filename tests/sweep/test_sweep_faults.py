@@ -11,12 +11,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from stores import run_sweep
 
 import lagjax
 import lagjax.__main__
 from lagjax._sweep import _batch, _begin, _job
+from lagjax._sweep._files import Files
 from lagjax._sweep._members import axes_of
-from lagjax._sweep._store import Store
 
 PENDULUM = lagjax.System(lambda q, qdot, params: 0.5 * params**2 * qdot**2 + 9.81 * params * jnp.cos(q))
 TS = jnp.linspace(0.0, 2.0, 5)
@@ -28,7 +29,7 @@ RULE = dict(
 
 
 def swept(store, over=OVER, ts=TS, **changes):
-    return lagjax.sweep(PENDULUM, over, ts, **{**RULE, "store": store, **changes})
+    return run_sweep(PENDULUM, over, ts, **{**RULE, "store": store, **changes})
 
 
 # ---- members for which the user's functions raise --------------------------------------------------------------------
@@ -139,7 +140,7 @@ def test_the_first_look_stays_within_the_memory(tmp_path, monkeypatch):
 
 def test_the_first_look_at_many_axes_is_as_small():
     over = {f"x{k}": [0.0, 1.0] for k in range(40)}
-    points = _begin._sample_points(axes_of(over), lagjax._sweep._description.Description(*[None] * 8))
+    points = _begin._sample_points(axes_of(over), None)
     assert 2048 < len(points["x0"]) <= 4096
 
 
@@ -147,7 +148,7 @@ def test_the_first_look_at_many_axes_is_as_small():
 
 
 def test_of_several_who_make_a_store_the_first_one_stays(tmp_path):
-    store = Store(tmp_path / "store")
+    store = Files(tmp_path / "store")
     store.path.mkdir()  # an empty folder is nothing yet
 
     def make(aside, text):
@@ -161,7 +162,7 @@ def test_of_several_who_make_a_store_the_first_one_stays(tmp_path):
         assert store.exists()
         make(second, "second")
     assert (store.job / "spec.json").read_text() == "first" and os.listdir(tmp_path) == ["store"]
-    with pytest.raises(KeyboardInterrupt), Store(tmp_path / "other").create_aside() as aside:
+    with pytest.raises(KeyboardInterrupt), Files(tmp_path / "other").create_aside() as aside:
         make(aside, "half")
         raise KeyboardInterrupt
     assert os.listdir(tmp_path) == ["store"]
@@ -179,10 +180,10 @@ jax.config.update("jax_enable_x64", True)
 system = lagjax.System(lambda q, qdot, params: 0.5 * params**2 * qdot**2 + 9.81 * params * jnp.cos(q))
 while time.time() < float(sys.argv[2]):
     time.sleep(0.001)
-run = lagjax.sweep(
+run = run_sweep(
     system, {"length": np.linspace(0.5, 1.5, 6), "angle": np.linspace(0.0, 3.0, 7)}, jnp.linspace(0.0, 2.0, 5),
-    q0=lambda point: point["angle"], qdot0=0.0, params=lambda point: point["length"], unit=7, progress=False,
-    keep=lambda trajectory: {"end": trajectory.q[-1]}, store=sys.argv[1], part=(int(sys.argv[3]), 2),
+    q0=lambda point: point["angle"], qdot0=0.0, params=lambda point: point["length"], progress=False,
+    keep=lambda trajectory: {"end": trajectory.q[-1]}, store=lagjax.Store(sys.argv[1], 7, (int(sys.argv[3]), 2)),
 )
 assert run.status().done >= 21 and not run.damaged()
 """
@@ -205,11 +206,11 @@ def drawn(count, seed=3, kind=lagjax.designs.random):
 
 
 @pytest.mark.slow
-def test_to_extend_ten_million_members_reads_none_of_their_values(tmp_path, monkeypatch):
+def test_to_extend_a_design_reads_none_of_its_values(tmp_path, monkeypatch):
     monkeypatch.setattr("lagjax._sweep.work", lambda *_: None)
-    few = swept(tmp_path / "few", drawn(10**7), unit=10**6)
-    monkeypatch.setattr(Store, "coordinates", lambda *_: pytest.fail("read values"))
-    swept(tmp_path / "many", drawn(3 * 10**7), unit=10**6, extend=few.store)
+    few = swept(tmp_path / "few", drawn(10**6), unit=10**5)
+    monkeypatch.setattr(Files, "coordinates", lambda *_: pytest.fail("read values"))
+    swept(tmp_path / "many", drawn(2 * 10**6), unit=10**5, extend=few.store)
 
 
 @pytest.mark.slow
@@ -235,7 +236,7 @@ def test_a_later_end_of_stores_that_were_moved(tmp_path):
     assert lagjax.__main__.main(["sweep", "run", str(rest), "--quiet"]) == 0
     (record / "0.json").unlink()
     assert swept(rest, extend=tmp_path / "there" / "first", **rule).status().done == 42
-    os.rename(tmp_path / "there" / "first", tmp_path / "there" / "gone")
+    os.rename(tmp_path / "there" / "first", tmp_path / "there" / "gone")  # its states were copied
     (record / "0.json").unlink()
     _job._open_job.cache_clear()
-    assert lagjax.__main__.main(["sweep", "run", str(rest), "--quiet"]) == 1
+    assert lagjax.__main__.main(["sweep", "run", str(rest), "--quiet"]) == 0

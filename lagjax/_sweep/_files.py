@@ -1,7 +1,8 @@
-"""`Store`: a folder that is a zarr group for readers, and the job for workers.
+"""`Files`: a folder that is a zarr group for readers, and the job for workers.
 
     STORE/zarr.json, <name>/zarr.json, <name>/c/…    arrays, one chunk a unit: plain numbers and their checksum
-    STORE/.sweep/spec.json, scene.pkl                what is swept
+    STORE/.sweep/spec.json, scene.pkl                the description, with its own hash, and the functions
+    STORE/.sweep/copied/UNIT.npz                     members and starts of a unit that another store had
     STORE/.sweep/done/UNIT.json, UNIT.npz            a unit that is finished: counts, hashes, statistics
     STORE/.sweep/aside/                              files that are being written
     .STORE.begun-…                                   a store that is being made, beside the place that it will take
@@ -22,34 +23,27 @@ import time
 import warnings
 from collections.abc import Iterable, Iterator
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from lagjax import designs
 from lagjax._sweep._members import Axis, Grid, hash_columns
-from lagjax.designs import Design
 
-FORMAT = 4
+FORMAT = 5
 _CHECKSUM = 4  # bytes of it, at the end of a chunk
 _STATISTICS = "/statistics"  # among the hashes of a record; no quantity has a slash in its name
-_OF_RECORD = {"sha256", "members", "results", "failed", "slow", "seconds"}
-_OF_SPEC = (
-    "versions", "x64", "engine", "conserves", "continues", "scene", "path", "ts", "rtol", "atol", "max_steps", "solver",
-    "crossings",
-)  # fmt: skip
+_RECORD_ENTRIES = {"sha256", "members", "results", "failed", "slow", "seconds"}
 _ADVICE = (
     "Begin the same sweep, with the same `unit`, in another folder, and copy this one file from there: it is the same. "
     "Then run the sweep again."
 )
 _READERS, _AHEAD = 8, 1024  # threads that look at files at once, as a disk far away answers late; units given to them
-JOB = ".sweep"
-KNOWN = "known"  # the folder of members that were taken from another store
-_LEFT = 3600.0  # seconds after which a file aside belongs to a dead worker; a live one writes for seconds
+_DEAD = 3600.0  # seconds after which a file aside belongs to a dead worker; a live one writes for seconds
 _ABANDONED = 86_400.0  # seconds after which a store that was never made ready is removed; to make one takes minutes
 _FULL = (errno.ENOSPC, errno.EDQUOT)
 _REFUSED = (errno.EROFS, errno.EACCES, errno.EPERM)
@@ -82,8 +76,16 @@ class Quantity:
 RESULT, NOT_DONE = Quantity("result", (), np.dtype("int16")), -1
 
 
+class Copied(NamedTuple):
+    """Of a unit: members (m,) that are not computed, their values by name, and starts of all members by name."""
+
+    members: np.ndarray
+    values: dict[str, np.ndarray]
+    starts: dict[str, np.ndarray]
+
+
 @dataclass(frozen=True)
-class Store:
+class Files:
     """The files of one sweep."""
 
     path: Path
@@ -91,7 +93,7 @@ class Store:
     @property
     def job(self) -> Path:
         """The folder of what is for workers alone."""
-        return self.path / JOB
+        return self.path / ".sweep"
 
     # ---- the description ----
 
@@ -101,22 +103,25 @@ class Store:
         if not file.exists():
             raise FileNotFoundError(
                 errno.ENOENT,
-                f"{self.path} is no store of a sweep, for it has no {JOB}/spec.json: name another folder, or empty "
+                f"{self.path} is no store of a sweep, for it has no .sweep/spec.json: name another folder, or empty "
                 "this one",
             )
         try:
             spec: Any = json.loads(file.read_bytes())
-            fault = None if isinstance(spec, dict) else "it is no description"
-        except ValueError as why:  # of what is no UTF-8, too
-            spec, fault = None, str(why)
-        if not fault and spec.get("format") != FORMAT:
+            written, fault = spec.pop("sha256", None), "it is not what was written"
+        except (ValueError, AttributeError, TypeError) as why:  # of what is no UTF-8, no JSON, no dict
+            spec, written, fault = {"format": FORMAT}, None, str(why)
+        if spec.get("format") != FORMAT:
             raise ValueError(
                 f"{self.path} is a store of format {spec.get('format')}, written by lagjax "
                 f"{spec.get('versions', {}).get('lagjax')}; this lagjax writes format {FORMAT}. xarray can read it as "
                 "it is; to continue it, use that version."
             )
-        if fault := fault or _fault_of(spec):
+        if _hash_of(_json(spec)) != written:
             raise ValueError(f"{file} cannot be read ({fault}): the store is damaged. {_ADVICE}")
+        names = [name for x in (*spec["axes"], *spec["kept"]) for name in x.get("names", [x.get("name")])]
+        if bad := [name for name in names if not is_file_name(name)]:  # a stranger's store stays in its folder
+            raise ValueError(f"{file} cannot be read ({bad[0]!r} is no name): the store is damaged. {_ADVICE}")
         return spec
 
     def require_arrays(self, spec: dict) -> None:
@@ -124,33 +129,36 @@ class Store:
 
         Links are refused, too: what is written to a store stays in it.
         """
-        grid, one = self.grid(spec), np.dtype(float)
+        grid, zarr = self.grid(spec), require_zarr()
         axes = {name: axis for axis in spec["axes"] for name in axis["names"]}
-        wanted = {name: ((axis["size"],), (min(axis["size"], designs.SLICE),), one) for name, axis in axes.items()}
+        wanted: dict = {
+            name: ((x["size"],), (min(x["size"], designs.SLICE),), np.dtype(float)) for name, x in axes.items()
+        }
         wanted |= {q.name: (grid.shape + q.shape, grid.chunk + q.shape, q.dtype) for q in self.quantities(spec)}
         for name, expected in wanted.items():
             own = self.path / name
             if own.is_symlink() or (own / "c").is_symlink():
                 raise ValueError(f"{own} is a link, or its chunks are: a store has none. Move the whole store instead.")
-            for folder, open_array in (
-                (self.path, lambda name=name: require_zarr().open_consolidated(str(self.path), mode="r")[name]),
-                (own, partial(self.array, name)),
-            ):
+            for folder in (self.path, own):
                 try:
-                    array: Any = open_array()
-                    found = array.shape, array.chunks, array.dtype
-                    fault = None if found == expected else f"it tells of {found}, where {expected} was written"
+                    array: Any = (
+                        self.array(name) if folder == own else zarr.open_consolidated(str(folder), mode="r")[name]
+                    )
+                    here = array.shape, array.chunks, array.dtype
+                    fault = None if here == expected else f"it tells of {here}, where {expected} was written"
                 except Exception as why:  # whatever zarr makes of bytes that it did not write
                     fault = str(why) or type(why).__name__
                 if fault:
                     raise ValueError(f"{folder}/zarr.json cannot be read ({fault}): the store is damaged. {_ADVICE}")
         for axis in spec["axes"]:
-            if axis["rule"] != "values":  # designs are drawn again
-                continue
-            columns = [np.asarray(self.array(name)[:]) for name in axis["names"]]
-            if hash_columns(columns) != axis["sha256"]:
-                names = " or ".join(f"{self.path / name}/c" for name in axis["names"])
-                raise ValueError(f"{names} has other values than were written: the store is damaged. {_ADVICE}")
+            if axis["rule"] == "values" and axis["sha256"] != hash_columns(
+                self.coordinates([axis], (slice(None),))[0].values()
+            ):
+                raise self._damaged_coordinates(axis)
+
+    def identity(self) -> str:
+        """The hash of the description and the functions: a store that was made anew is another one."""
+        return _hash_of((self.job / "spec.json").read_bytes() + self.scene())
 
     def scene(self) -> bytes:
         """The functions of the sweep, as bytes."""
@@ -169,7 +177,7 @@ class Store:
         return self.path.exists() and not (self.path.is_dir() and not any(self.path.iterdir()))
 
     @contextmanager
-    def create_aside(self) -> "Iterator[Store]":
+    def create_aside(self) -> "Iterator[Files]":
         """A store in a folder beside this one's, which takes its place when the `with` statement ends.
 
         So a store is there when it is whole. Of several processes that make it at once the first one's stays.
@@ -181,7 +189,7 @@ class Store:
             for folder in place.parent.glob(glob.escape(begun) + "*"):
                 if folder.stat().st_mtime < time.time() - _ABANDONED:
                     shutil.rmtree(folder, ignore_errors=True)
-            aside = Store(place.parent / f"{begun}{os.getpid()}-{os.urandom(4).hex()}")
+            aside = Files(place.parent / f"{begun}{os.getpid()}-{os.urandom(4).hex()}")
             try:
                 yield aside
                 os.rename(aside.path, place)
@@ -194,52 +202,48 @@ class Store:
     def create(self, spec: dict, scene: bytes, axes: tuple[Axis, ...], title: str, codes: dict[int, str]) -> None:
         """Make the store with empty arrays and the coordinates."""
         zarr = require_zarr()
-        for folder in ("done", "aside"):
+        for folder in ("done", "aside", "copied"):
             (self.job / folder).mkdir(parents=True)
         group = zarr.create_group(str(self.path), overwrite=False, attributes={"title": title})
         group.attrs["coordinates"] = " ".join(name for axis in axes for name in axis.names)
-        for axis in axes:
-            _write_axis(group, axis)
-        grid, dimensions = self.grid(spec), tuple(axis.dimension for axis in axes)
-        for q in self.quantities(spec):
-            about: dict = {}
-            if q == RESULT:
-                about = {"flag_values": list(codes), "flag_meanings": " ".join(codes.values())}
-            group.create_array(
-                q.name, shape=grid.shape + q.shape, chunks=grid.chunk + q.shape, dtype=q.dtype,
-                compressors=zarr.codecs.Crc32cCodec(), filters=None,
-                fill_value=NOT_DONE if q == RESULT else q.filling, dimension_names=dimensions + q.dimensions,
-                attributes=about,
+
+        def add_array(name, shape, chunk, dtype, filling, dimensions, attributes=None):
+            return group.create_array(
+                name, shape=shape, chunks=chunk, dtype=dtype, fill_value=filling, dimension_names=dimensions,
+                attributes=attributes, compressors=zarr.codecs.Crc32cCodec(), filters=None,
             )  # fmt: skip
+
+        for axis in axes:
+            size = (axis.size,), (min(axis.size, designs.SLICE),)
+            arrays = [add_array(name, *size, "float64", np.nan, (axis.dimension,)) for name in axis.names]
+            for start, values in axis.pieces():
+                for column, array in zip(values.T, arrays, strict=True):
+                    array[start : start + len(column)] = column
+        grid, dimensions = self.grid(spec), tuple(axis.dimension for axis in axes)
+        flags = {"flag_values": list(codes), "flag_meanings": " ".join(codes.values())}
+        for q in self.quantities(spec):
+            filling, attributes = (NOT_DONE, flags) if q == RESULT else (q.filling, None)
+            size = grid.shape + q.shape, grid.chunk + q.shape
+            add_array(q.name, *size, q.dtype, filling, dimensions + q.dimensions, attributes)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # that it is no part of the format yet; readers then list no folders
             zarr.consolidate_metadata(str(self.path))
-        self.write(self.job / "scene.pkl", scene, "spec")
-        self.write(self.job / "spec.json", json.dumps(spec, indent=1, ensure_ascii=False).encode(), "spec")
+        self.write(self.job / "scene.pkl", scene)
+        self.write(self.job / "spec.json", _json({"sha256": _hash_of(_json(spec)), **spec}))
 
     def coordinates(self, axes: list[dict], box: tuple[slice, ...]) -> list[dict[str, np.ndarray]]:
-        """The values along each axis of a box of members, by names; those of designs are drawn, and written if new."""
+        """The values along each axis of a box of members, by names. Raises `ValueError` where they are damaged."""
         sides = []
         for axis, part in zip(axes, box, strict=True):
-            names = axis["names"]
-            if axis["rule"] == "values":
-                sides.append({name: np.asarray(self.array(name)[part]) for name in names})
-                continue
-            first = part.start // designs.SLICE
-            pieces = [self._draw(axis, k) for k in range(first, (part.stop - 1) // designs.SLICE + 1)]
-            inside = slice(part.start - first * designs.SLICE, part.stop - first * designs.SLICE)
-            sides.append(dict(zip(names, np.concatenate(pieces)[inside].T, strict=True)))
+            try:
+                sides.append({name: np.asarray(self.array(name)[part]) for name in axis["names"]})
+            except ValueError as why:  # its checksum
+                raise self._damaged_coordinates(axis) from why
         return sides
 
-    def _draw(self, axis: dict, k: int) -> np.ndarray:
-        """Piece k of the coordinates of a design (members, names), which is written where no chunk is there."""
-        values = Design.from_axis(axis).piece(tuple(axis["names"]), k * designs.SLICE)
-        for name, column in zip(axis["names"], values.T, strict=True):
-            file, chunk = self.path / name / "c" / str(k), np.full(min(axis["size"], designs.SLICE), np.nan)
-            if not file.exists():  # whoever does writes the same
-                chunk[: len(column)] = column
-                self.write(file, chunk.astype("<f8", copy=False).data, f"{name}-{k}")
-        return values
+    def _damaged_coordinates(self, axis: dict) -> ValueError:
+        names = " or ".join(f"{self.path / name}/c" for name in axis["names"])
+        return ValueError(f"{names} has other values than were written: the store is damaged. {_ADVICE}")
 
     def array(self, name: str):
         return require_zarr().open_array(str(self.path / name), mode="r")
@@ -256,7 +260,7 @@ class Store:
     def record(self, unit: int) -> dict:
         """The notes on a finished unit. Raises `ValueError` where they are not what was written."""
         record = json.loads((self.job / "done" / f"{unit}.json").read_bytes())
-        if not isinstance(record, dict) or not _OF_RECORD <= set(record):
+        if not isinstance(record, dict) or not _RECORD_ENTRIES <= set(record):
             raise ValueError("it is no record of a unit")
         return record
 
@@ -264,61 +268,56 @@ class Store:
         """The statistics of a unit, as bytes."""
         return (self.job / "done" / f"{unit}.npz").read_bytes()
 
-    def copied_members(self, unit: int) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-        """Members of a unit that were taken from another store: which of it, and what is kept of them by name."""
-        file = self.job / KNOWN / f"{unit}.npz"
+    def copied(self, unit: int) -> Copied:
+        """The members and starts of a unit that were taken from another store."""
+        file = self.job / "copied" / f"{unit}.npz"
         if not file.exists():
-            return np.zeros(0, int), {}
+            return Copied(np.zeros(0, int), {}, {})
         with np.load(file) as arrays:
-            return arrays["which"], {name[3:]: arrays[name] for name in arrays if name.startswith("of ")}
+            values, starts = ({name[3:]: arrays[name] for name in arrays if name[:3] == x} for x in ("of ", "at "))
+            return Copied(arrays["members"], values, starts)
+
+    def write_copied(self, unit: int, copied: Copied) -> None:
+        """Write down members and starts of a unit that another store has."""
+        arrays = {f"of {name}": x for name, x in copied.values.items()}
+        arrays |= {f"at {name}": x for name, x in copied.starts.items()}
+        self.write(self.job / "copied" / f"{unit}.npz", arrays_as_bytes({"members": copied.members, **arrays}))
 
     def write_unit(self, spec: dict, unit: int, values: dict[str, np.ndarray], record: dict, statistics: bytes) -> None:
         """Write the chunks of a unit (values (members, …) by name), and then that it is done."""
         grid, hashes = self.grid(spec), {}
         with self.explain_errors(f"unit {unit} was not written"):
             for q in self.quantities(spec):
-                data = _append_checksum(self._chunk(grid, unit, q, values[q.name]))
-                hashes[q.name] = hashlib.sha256(data.data).hexdigest()
-                self.write(self.chunk_file(grid, unit, q.name, q.shape), data, f"{unit}-{q.name}")
+                data = _encode_chunk(grid, unit, q, values[q.name])
+                hashes[q.name] = _hash_of(data)
+                self.write(self.chunk_file(grid, unit, q), data)
             if statistics:
-                hashes[_STATISTICS] = hashlib.sha256(statistics).hexdigest()
-                self.write(self.job / "done" / f"{unit}.npz", statistics, f"{unit}-statistics")
-            text = json.dumps(record | {"sha256": hashes})
-            self.write(self.job / "done" / f"{unit}.json", text.encode(), f"{unit}-done")
+                hashes[_STATISTICS] = _hash_of(statistics)
+                self.write(self.job / "done" / f"{unit}.npz", statistics)
+            self.write(self.job / "done" / f"{unit}.json", json.dumps(record | {"sha256": hashes}).encode())
 
-    def _chunk(self, grid: Grid, unit: int, q: Quantity, values: np.ndarray) -> np.ndarray:
-        """The bytes of a chunk: the values of a box in their place, what lies beyond the grid filled."""
-        shape = grid.box_shape(unit)
-        values = np.ascontiguousarray(values, q.dtype).reshape(shape + q.shape)
-        if shape != grid.chunk:
-            whole = np.full(grid.chunk + q.shape, NOT_DONE if q == RESULT else q.filling, q.dtype)
-            whole[tuple(map(slice, shape))] = values
-            values = whole
-        little = values.astype(values.dtype.newbyteorder("<"), copy=False)
-        return np.ascontiguousarray(little).reshape(-1).view(np.uint8)
-
-    def chunk_file(self, grid: Grid, unit: int, name: str, inner: tuple[int, ...]) -> Path:
+    def chunk_file(self, grid: Grid, unit: int, q: Quantity) -> Path:
         """The path at which zarr looks for the chunk of a unit."""
-        return self.path / name / "c" / "/".join(map(str, grid.place(unit) + (0,) * len(inner)))
+        return self.path / q.name / "c" / "/".join(map(str, grid.place(unit) + (0,) * len(q.shape)))
 
     def undo(self, spec: dict, unit: int) -> None:
         """Make a unit one that is still to be done, for those who read `result` too."""
         with self.explain_errors(f"unit {unit} is damaged, and stays so"):
             (self.job / "done" / f"{unit}.json").unlink(missing_ok=True)
             if unit < self.grid(spec).units:
-                self.chunk_file(self.grid(spec), unit, RESULT.name, RESULT.shape).unlink(missing_ok=True)
+                self.chunk_file(self.grid(spec), unit, RESULT).unlink(missing_ok=True)
 
     def find_damage(self, spec: dict, units: Iterable[int], whole: bool = False) -> dict[int, str]:
         """The damage of finished units, in words: files that lack or have another size or, `whole`, hash.
 
         A unit of four chunks takes 0.3 ms; to read them a tenth of that more, and a second for a gigabyte.
         """
-        units, found = sorted(units), {}
+        units, damage = sorted(units), {}
         with ThreadPoolExecutor(_READERS) as readers:
             for k in range(0, len(units), _AHEAD):
-                some = units[k : k + _AHEAD]
-                found |= dict(zip(some, readers.map(partial(self._damage_of, spec, whole), some), strict=True))
-        return {unit: text for unit, text in found.items() if text}
+                these = units[k : k + _AHEAD]
+                damage |= dict(zip(these, readers.map(partial(self._damage_of, spec, whole), these), strict=True))
+        return {unit: text for unit, text in damage.items() if text}
 
     def _damage_of(self, spec: dict, whole: bool, unit: int) -> str | None:
         grid = self.grid(spec)
@@ -328,10 +327,10 @@ class Store:
             hashes = self.record(unit)["sha256"]
         except (ValueError, OSError):
             return f"unit {unit}: its record cannot be read"
-        files: list[tuple[str, str, Path, int | None]] = [
-            (f"chunk of {q.name!r}", q.name, self.chunk_file(grid, unit, q.name, q.shape), _chunk_bytes(grid, q))
-            for q in self.quantities(spec)
-        ]
+        files: list[tuple[str, str, Path, int | None]] = []
+        for q in self.quantities(spec):
+            size = _CHECKSUM + q.dtype.itemsize * math.prod(grid.chunk + q.shape)
+            files.append((f"chunk of {q.name!r}", q.name, self.chunk_file(grid, unit, q), size))
         if spec["reduce"]:
             files.append(("file of statistics", _STATISTICS, self.job / "done" / f"{unit}.npz", None))
         for what, name, file, size in files:
@@ -339,38 +338,34 @@ class Store:
             if there is None or size not in (None, there):
                 have = "is not there" if there is None else f"has {there} bytes, where it should have {size}"
                 return f"unit {unit}: its {what} {have}"
-            if whole and hashlib.sha256(file.read_bytes()).hexdigest() != hashes.get(name):
+            if whole and _hash_of(file.read_bytes()) != hashes.get(name):
                 return f"unit {unit}: its {what} is not what was written"
         return None
 
     # ---- files ----
 
-    def write(self, file: Path, data, name: str) -> None:
+    def write(self, file: Path, data) -> None:
         """Write a file aside, have it on the disk, and rename it."""
-        aside = self.job / "aside" / f"{os.getpid()}-{os.urandom(4).hex()}-{name}"
+        aside = self.job / "aside" / f"{os.getpid()}-{os.urandom(4).hex()}-{file.name}"
         try:
             write_through(aside, data)
             file.parent.mkdir(parents=True, exist_ok=True)
             os.replace(aside, file)
         finally:
-            try:
+            with suppress(OSError):  # read-only: there is nothing to remove
                 aside.unlink(missing_ok=True)
-            except OSError:  # read-only: there is nothing to remove
-                pass
 
     def require_writable(self) -> None:
         """Raise `OSError`, with a sentence, where nothing can be written here; remove what dead workers have left."""
         with self.explain_errors("nothing was computed"):
             probe = self.job / "aside" / f"probe-{os.getpid()}-{os.urandom(4).hex()}"
-            self.write(probe, b"", "probe")
+            self.write(probe, b"")
             now = probe.stat().st_mtime  # by the clock of the disk
             probe.unlink(missing_ok=True)
             for file in (self.job / "aside").iterdir():
-                try:
-                    if file.stat().st_mtime < now - _LEFT:
+                with suppress(FileNotFoundError):  # another one removes it
+                    if file.stat().st_mtime < now - _DEAD:
                         file.unlink()
-                except FileNotFoundError:  # another one removes it
-                    pass
 
     @contextmanager
     def explain_errors(self, what: str) -> Iterator[None]:
@@ -390,42 +385,28 @@ class Store:
             ) from error
 
 
-def _chunk_bytes(grid: Grid, q: Quantity) -> int:
-    """The size of a chunk, with its checksum."""
-    return _CHECKSUM + q.dtype.itemsize * math.prod(grid.chunk + q.shape)
-
-
 def is_file_name(name: Any) -> bool:
     """True for the name of an array, which is that of a folder of the store."""
     return isinstance(name, str) and bool(name) and not set(name) & set("/\\\0") and name[0] != "."
 
 
-def _fault_of(spec: dict) -> str | None:
-    """A reason, in words, why a description is not what was written; None where it may be."""
-    try:
-        shape, chunk = spec["shape"], spec["chunk"]
-        sizes = [*shape, *chunk, spec["batch"], *(size + 1 for x in spec["kept"] for size in x["shape"])]
-        if not all(type(size) is int and size > 0 for size in sizes):
-            return f"{sizes} are no sizes"
-        fits = shape == [axis["size"] for axis in spec["axes"]]
-        if not fits or any(part > size for part, size in zip(chunk, shape, strict=True)):
-            return f"shape {shape} and chunk {chunk} do not fit its axes"
-        names = [name for x in (*spec["axes"], *spec["kept"]) for name in x.get("names", [x.get("name")])]
-        if bad := [name for name in names if not is_file_name(name)]:
-            return f"{bad[0]!r} is no name"
-        if bad := [x["dtype"] for x in spec["kept"] if np.dtype(x["dtype"]).kind not in "fciub"]:
-            return f"{bad[0]!r} is no type of numbers"
-        missing = [name for name in _OF_SPEC if name not in spec] + [x for x in spec["reduce"] if x not in names]
-        return f"{missing[0]!r} is missing" if missing else None
-    except (KeyError, TypeError, ValueError, AttributeError) as why:
-        return f"{type(why).__name__}: {why}"
-
-
-def _append_checksum(data: np.ndarray) -> np.ndarray:
-    """The bytes of a chunk as the codec crc32c of zarr writes them: the checksum behind the numbers."""
+def _encode_chunk(grid: Grid, unit: int, q: Quantity, values: np.ndarray) -> bytes:
+    """A chunk as zarr writes it: the values of a box in their place, what lies beyond the grid filled; the checksum."""
     import google_crc32c  # which zarr's codec takes it from
 
-    return np.append(data, np.frombuffer(google_crc32c.value(data.tobytes()).to_bytes(_CHECKSUM, "little"), np.uint8))
+    whole = np.full(grid.chunk + q.shape, NOT_DONE if q == RESULT else q.filling, q.dtype.newbyteorder("<"))
+    shape = grid.box_shape(unit)
+    whole[tuple(map(slice, shape))] = np.reshape(values, shape + q.shape)
+    data = whole.tobytes()
+    return data + google_crc32c.value(data).to_bytes(_CHECKSUM, "little")
+
+
+def _json(spec: dict) -> bytes:
+    return json.dumps(spec, indent=1, ensure_ascii=False).encode()
+
+
+def _hash_of(data: bytes) -> str:
+    return hashlib.sha256(data).hexdigest()
 
 
 def arrays_as_bytes(arrays: dict[str, np.ndarray]) -> bytes:
@@ -441,29 +422,6 @@ def write_through(file: Path, data) -> None:
         opened.write(data)
         opened.flush()
         os.fsync(opened.fileno())
-
-
-def _is_drawn_late(rule: str, size: int) -> bool:
-    """True if the coordinates of an axis are written by those who compute its members: so that 10⁸ cost no time."""
-    return rule != "values" and size > designs.SLICE
-
-
-def _write_axis(group, axis: Axis) -> None:
-    """The values along an axis as coordinates, some at a time."""
-    chunk = min(axis.size, designs.SLICE)
-    arrays = [
-        group.create_array(
-            name, shape=(axis.size,), chunks=(chunk,), dtype="float64", compressors=None, filters=None,
-            fill_value=np.nan, dimension_names=(axis.dimension,),
-        )
-        for name in axis.names
-    ]  # fmt: skip
-    if isinstance(axis.source, Design) and _is_drawn_late(axis.source.kind, axis.size):
-        return
-    for start, values in axis.pieces():
-        for column, array in zip(values.T, arrays, strict=True):
-            for begin in range(0, len(column), designs.SLICE):
-                array[start + begin : start + begin + designs.SLICE] = column[begin : begin + designs.SLICE]
 
 
 def require_zarr():

@@ -1,0 +1,195 @@
+"""The part of a new store that another one has: members, or the starts of motions that continue.
+
+**Members**: a member is known where all of its coordinates, bit for bit, are those of a member of the other store that
+is done. In a unit of the new store the known members are those of a product of places along each axis. Units of which
+all are known are written at once; of the others they are copied, and not computed.
+
+**A later end**: the kept values do not determine how a motion continues; its last state does, where `keep` returns
+`trajectory.end` by some name. The new store has the same members, and output times that begin at the last one of the
+other. Their last states are copied as starts; members that ended before are copied with their `result`.
+
+After that the other store is not read any more.
+"""
+
+import json
+import warnings
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._interface import SUCCESSFUL
+from lagjax._run import State
+from lagjax._run.hybrid import Hybrid
+from lagjax._sweep._batch import names_of
+from lagjax._sweep._description import MOTION, Description, FinalStates, compared_entries, differences
+from lagjax._sweep._files import RESULT, Copied, Files
+from lagjax._sweep._job import record_of, require_versions
+from lagjax._sweep._members import Axis
+from lagjax.designs import GROWING
+
+_EXTENSIBLE = ("x64", "engine", "ts", "rtol", "atol", "max_steps", "solver", "crossings", "kept", "reduce", "scene")
+
+
+def require_extensible(old: Files, now: dict) -> None:
+    """Raise `ValueError`, with the difference, where the members of `old` are not those of the new store."""
+    spec, now = old.spec(), json.loads(json.dumps(now))
+    _require_whole(old, spec)
+    lines = differences(spec, now, _EXTENSIBLE)
+    names = [[axis["names"] for axis in x["axes"]] for x in (spec, now)]
+    if names[0] != names[1]:
+        lines.append(f"names of over: {names[0]} in the store, now {names[1]}")
+    if spec["reduce"]:
+        lines.append("reduce: statistics do not tell of single members, so that none of them is known")
+    if lines:
+        later = ""
+        if spec["ts"] != now["ts"]:
+            later = (
+                "\nThe kept values do not determine how a motion continues. For a later end give ts that begin at "
+                f"{spec['ts']['ends'][1]:g}, where the motions of that store end; else leave extend= away."
+            )
+        raise ValueError(f"{old.path} has members of another description. What differs:\n" + "\n".join(lines) + later)
+
+
+def _require_whole(other: Files, spec: dict) -> None:
+    """Raise `ValueError` where this process is of another version than a store, or some of its chunks are not there."""
+    require_versions(other, spec)
+    if damaged := other.find_damage(spec, other.finished_units()):
+        raise ValueError(f"{other.path}: {next(iter(damaged.values()))}. Run that sweep again: it computes it again.")
+
+
+def copy_members(old: Files, new: Files) -> None:
+    """Copy the members that `old` has into `new`, of which nothing is done yet."""
+    before, spec = old.spec(), new.spec()
+    grid, places = new.grid(spec), list(map(partial(_MatchingPlaces.between, old, new), before["axes"], spec["axes"]))
+    if not all(place.common for place in places):
+        warnings.warn(
+            f"{old.path} has no member that is also in `over`, so that all are computed: compare the values of its "
+            "axes, and the seeds and bounds of its designs. A latin hypercube cannot be extended.",
+            stacklevel=4,
+        )
+        return
+    for unit in range(grid.units):
+        box = [place(part) for place, part in zip(places, grid.box(unit), strict=True)]
+        inside = [np.flatnonzero(x >= 0) for x in box]
+        if not all(len(x) for x in inside):
+            continue
+        values = _read_members(old, before, [x[i] for x, i in zip(box, inside, strict=True)])
+        finished = values[RESULT.name] >= 0
+        members = np.ravel_multi_index(np.ix_(*inside), grid.box_shape(unit)).ravel()[finished]
+        values = {name: x[finished] for name, x in values.items()}
+        if len(members) == grid.size(unit):
+            record = record_of(grid, unit, values[RESULT.name], spec["engine"]) | {"seconds": 0.0, "cpu_seconds": 0.0}
+            new.write_unit(spec, unit, values, record, b"")
+        elif len(members):
+            new.write_copied(unit, Copied(members, values, {}))
+
+
+class _MatchingPlaces(NamedTuple):
+    """The places in the old store with the values of those along an axis of the new one; −1 where there is none.
+
+    `places` (size,) lists them; None where both have one rule, by which the first `common` ones are the same.
+    """
+
+    common: int
+    places: np.ndarray | None
+
+    @classmethod
+    def between(cls, old: Files, new: Files, old_axis: dict, new_axis: dict) -> "_MatchingPlaces":
+        """Those of an axis. Values are read where no one rule gives them."""
+        if old_axis | {"size": 0} == new_axis | {"size": 0} and old_axis["rule"] in GROWING:
+            return cls(min(old_axis["size"], new_axis["size"]), None)
+        sides = [store.coordinates([x], (slice(None),))[0] for store, x in ((old, old_axis), (new, new_axis))]
+        before, now = (np.stack([side[name] for name in new_axis["names"]], axis=1) for side in sides)
+        place_of = {row.tobytes(): k for k, row in enumerate(before)}
+        places = np.array([place_of.get(row.tobytes(), -1) for row in now])
+        return cls(int(np.sum(places >= 0)), places)
+
+    def __call__(self, part: slice) -> np.ndarray:
+        if self.places is not None:
+            return self.places[part]
+        numbers = np.arange(part.start, part.stop)
+        return np.where(numbers < self.common, numbers, -1)
+
+
+def _read_members(old: Files, spec: dict, places: list[np.ndarray]) -> dict[str, np.ndarray]:
+    """The stored values of a product of members, (members, …) by name."""
+    runs = [slice(int(x[0]), int(x[-1]) + 1) if np.all(np.diff(x) == 1) else x for x in places]  # read as they lie
+    read = {q: np.asarray(old.array(q.name).oindex[(*runs, *map(slice, q.shape))]) for q in old.quantities(spec)}
+    return {q.name: values.reshape(-1, *q.shape) for q, values in read.items()}
+
+
+# ---- a later end -----------------------------------------------------------------------------------------------------
+
+
+class LaterEnd(NamedTuple):
+    """The last states in a store, from which motions continue: their name in it, and the names of their leaves."""
+
+    store: Files
+    end: str
+    starts: FinalStates
+
+    def read(self, box: tuple[slice, ...]) -> tuple[dict[str, np.ndarray], np.ndarray]:
+        """The states (m, …) of the members of a box by name, NaN where they do not continue; and their results (m,)."""
+        names = [*jax.tree.leaves(tuple(self.starts)), RESULT.name]
+        *states, result = (np.asarray(self.store.array(name)[box]) for name in names)
+        states, result = [x.reshape(-1, *x.shape[len(box) :]) for x in states], result.ravel()
+        for x in states:
+            x[result != SUCCESSFUL] = np.nan
+        return dict(zip(names[:-1], states, strict=True)), result
+
+    def copy(self, new: Files) -> None:
+        """Write the states down as starts of the same members of a new store; members that ended keep their result."""
+        grid = new.grid(new.spec())
+        for unit in range(grid.units):
+            states, result = self.read(grid.box(unit))
+            ended = np.flatnonzero(result != SUCCESSFUL)
+            new.write_copied(unit, Copied(ended, {RESULT.name: result[ended]}, states))
+
+
+def continues(other: Files, description: Description) -> bool:
+    """True if the output times of these motions begin at the last one of a store."""
+    return float(description.ts[0]) == other.spec()["ts"]["ends"][1]
+
+
+def later_end_of(other: Files, axes: tuple[Axis, ...], description: Description) -> LaterEnd | None:
+    """The last states in a store, if these motions continue its own; None if they begin at another time.
+
+    Raises `ValueError` where they continue, and cannot.
+    """
+    if not continues(other, description):
+        return None
+    if isinstance(description.system, Hybrid):
+        raise ValueError(
+            "A hybrid motion cannot continue from a store, which does not keep its last mode: begin again at ts[0], "
+            f"with another store than {str(other.path)!r}."
+        )
+    spec = other.spec()
+    _require_whole(other, spec)
+    if lines := differences(spec, compared_entries(axes, description), ("axes", "x64", "scene"), MOTION):
+        raise ValueError(
+            f"{other.path} has motions of another description, which cannot continue. What differs:\n"
+            + "\n".join(lines)
+        )
+    if missing := other.grid(spec).units - len(other.finished_units()):
+        raise ValueError(f"{other.path}: {missing} units are not done; motions can continue when they are.")
+    names = [name for axis in spec["axes"] for name in axis["names"]]
+    shapes, state = {x.name: x.shape for x in other.quantities(spec)}, description.shapes(names)[:2]
+    for end in (name.removesuffix(".t") for name in shapes if name.endswith(".t")):
+        starts = start_names(description, names, end)
+        leaves = zip(*map(jax.tree.leaves, (tuple(starts), state)), strict=True)
+        if all(shapes.get(name) == jnp.shape(x) for name, x in leaves):
+            return LaterEnd(other, end, starts)
+    raise ValueError(
+        f"{other.path} does not have the states in which its motions ended, from which they could continue: let keep "
+        "return them, as in {'end': trajectory.end, …}."
+    )
+
+
+def start_names(description: Description, names: list[str], end: str) -> FinalStates:
+    """The names of the starts of motions that continue, whose ends another store has by the name `end`."""
+    q, qdot, _ = description.shapes(names)
+    state = names_of({end: State(jnp.zeros(()), q, qdot)})[end]
+    return FinalStates(state.q, state.qdot)
