@@ -172,32 +172,21 @@ def summary(how: Statistics, total: Partial, shape: tuple[int, ...]) -> Summary:
     empty = total.count == 0
     with np.errstate(invalid="ignore", divide="ignore"):
         variance = np.where(total.count > 1, total.square / (total.count - 1), np.nan)
-    ends = [np.where(empty, np.nan, x) for x in (total.least, total.greatest)]
-    quantiles = None
-    if how.quantiles:
-        rows = [_quantiles(how, total.sketch[total.sketch[:, 0] == c, 1:]) for c in range(len(total.count))]
-        quantiles = np.array(rows).reshape(*shape, len(how.quantiles))
+    mean, least, greatest = (np.where(empty, np.nan, x) for x in (total.mean, total.least, total.greatest))
+    numbers = (
+        total.count, total.missing, mean, variance, least, total.least_member, greatest, total.greatest_member,
+    )  # fmt: skip
+    quantiles = np.full((len(total.count), len(how.quantiles)), np.nan)
+    for c in np.flatnonzero(~empty) if how.quantiles else ():
+        bins, counts = total.sketch[total.sketch[:, 0] == c, 1:].T
+        ranks = np.array(how.quantiles) * (counts.sum() - 1)
+        quantiles[c] = _bin_centres(bins[np.searchsorted(np.cumsum(counts), ranks, side="right")])
     return Summary(
-        count=total.count.reshape(shape),
-        missing=total.missing.reshape(shape),
-        mean=np.where(empty, np.nan, total.mean).reshape(shape),
-        variance=variance.reshape(shape),
-        min=ends[0].reshape(shape),
-        min_member=total.least_member.reshape(shape),
-        max=ends[1].reshape(shape),
-        max_member=total.greatest_member.reshape(shape),
+        *(x.reshape(shape) for x in numbers),
         histogram=None if how.edges is None else total.histogram.reshape(*shape, -1),
         outside=None if how.edges is None else total.outside.reshape(*shape, 2),
-        quantiles=quantiles,
+        quantiles=quantiles.reshape(*shape, -1) if how.quantiles else None,
     )
-
-
-def _quantiles(how: Statistics, sketch: np.ndarray) -> list[float]:
-    if not len(sketch):
-        return [np.nan] * len(how.quantiles)
-    below = np.cumsum(sketch[:, 1])
-    ranks = [level * (below[-1] - 1) for level in how.quantiles]
-    return [float(_bin_centres(sketch[np.searchsorted(below, rank, side="right"), 0])) for rank in ranks]
 
 
 # ---- as bytes --------------------------------------------------------------------------------------------------------

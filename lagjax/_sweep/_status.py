@@ -2,6 +2,7 @@
 
 import sys
 import time
+from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
@@ -92,10 +93,7 @@ def status(store: Files) -> Status:
     damaged = store.find_damage(spec, finished)
     done = sorted(finished - set(damaged))
     records = [store.record(unit) for unit in done]
-    results: dict[str, int] = {}
-    for record in records:
-        for name, count in record["results"].items():
-            results[name] = results.get(name, 0) + count
+    results = sum((Counter(record["results"]) for record in records), Counter())
     failed = [row for record in records for row in record["failed"]]
     failures = tuple(Failure(number, point(store, spec, number), name, why) for number, name, why in failed[:_LISTED])
     drifts = [tuple(record["drift"]) for record in records if "drift" in record]
@@ -105,7 +103,7 @@ def status(store: Files) -> Status:
     return Status(
         store=str(store.path), done=members, members=grid.members, units_done=len(done), units=grid.units,
         rate=rate,
-        left=None if rate is None else (grid.members - members) / rate, results=results, failures=failures,
+        left=None if rate is None else (grid.members - members) / rate, results=dict(results), failures=failures,
         drift=None if worst is None else (worst[0], worst[1], point(store, spec, worst[1])), slow=slow,
         cpus=tuple(dict.fromkeys(record["cpu"] for record in records if "cpu" in record)), damaged=damaged,
     )  # fmt: skip
@@ -147,7 +145,7 @@ class Progress:
 
     def __init__(self, store: Files, spec: dict, shown: bool):
         self.store, self.shown, self.members = store, shown, store.grid(spec).members
-        self._begun, self._known, self._last = None, {}, 0.0
+        self._begun, self._counted, self._results, self._last = None, set(), Counter(), 0.0
 
     def __call__(self) -> None:
         """Look at the store, and print."""
@@ -155,23 +153,16 @@ class Progress:
         if not self.shown or now - self._last < 0.2:
             return
         self._last = now
-        for unit in self.store.finished_units() - set(self._known):
-            record = self.store.record(unit)
-            self._known[unit] = record["members"], record["results"]
-        done = sum(members for members, _ in self._known.values())
-        if self._begun is None:
-            self._begun = (now, done)
+        for unit in self.store.finished_units() - self._counted:
+            self._counted.add(unit)
+            self._results.update(self.store.record(unit)["results"])
+        done = self._results.total()
+        since, before = self._begun = self._begun or (now, done)
         line = f"{done:,} of {self.members:,} members"
-        since, before = self._begun
         if done > before and now > since:
             rate = (done - before) / (now - since)
             line += f", {rate:,.0f} per second, {duration((self.members - done) / rate)} left"
-        failed: dict[str, int] = {}
-        for _, results in self._known.values():
-            for name, count in results.items():
-                if name not in WELL:
-                    failed[name] = failed.get(name, 0) + count
-        line += "".join(f", {count} {name}" for name, count in failed.items())
+        line += "".join(f", {count} {name}" for name, count in self._results.items() if name not in WELL)
         print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
 
     def end(self) -> None:
