@@ -278,20 +278,21 @@ def _start_one_by_one(role: str, function: Callable, points: dict[str, np.ndarra
 
 
 def find_failing(members: np.ndarray, why_failed: Callable[[np.ndarray], str | None], most: int) -> dict[int, str]:
-    """The members that fail, with the reasons, by halving groups that fail; none where more than `most` do.
+    """The members, of some that fail together, that fail, with the reasons, by halves; none where more than `most` do.
 
     `why_failed` says of a group of members why it fails, None where it does not.
     """
     failing, groups = {}, [members]
     while groups and len(failing) <= most:
         group = groups.pop()
-        if (why := why_failed(group)) is None:
-            continue
         half = len(group) // 2
-        if half:
-            groups += [group[half:], group[:half]]
-        else:
-            failing[int(group[0])] = why
+        if group is not members or not half:  # all of them together are known to fail
+            if (why := why_failed(group)) is None:
+                continue
+            if not half:
+                failing[int(group[0])] = why
+                continue
+        groups += [group[half:], group[:half]]
     return failing if len(failing) <= most else {}
 
 
