@@ -59,6 +59,7 @@ from lagjax._native._ir import lanes
 from lagjax._native._kernel import (
     Begun,
     Kernel,
+    Record,
     cores,
     floor_of,
 )

@@ -21,7 +21,7 @@ from lagjax._native._constants import (
     VECTORS_PER_THREAD,
 )
 from lagjax._native._derivative_handler import DerivativePlan
-from lagjax._native._frame import LANE, Memory
+from lagjax._native._frame import LANE
 from lagjax._native._guards import Guards
 from lagjax._native._handler import Plan, Rest, allocate_aligned, handler
 from lagjax._native._integrator import Integrator
@@ -43,7 +43,7 @@ from lagjax._program._series import Recurrent
 _SECONDS_AN_OPERATION = 1e-7
 # A derivative runs a motion again that takes a thirtieth of a slice, a millisecond at most: less than Python with kept
 # steps. Where fewer rounds than these are in that, hardly a motion ends in time, and would be run twice for nothing.
-_SLICES_OF_SWEEP, _LEAST_ROUNDS = 30, 16
+_RERUNS_PER_SLICE, _LEAST_ROUNDS = 30, 16
 
 
 class Outcome(NamedTuple):
@@ -68,6 +68,18 @@ class Outcome(NamedTuple):
     idle: int
     table: np.ndarray | None
     complete: np.ndarray | None
+
+
+class Record(NamedTuple):
+    """The steps of N members for a derivative: member k has `counts[k]` rows of `table` from `first[k]` on.
+
+    The series of the steps are of this `order`.
+    """
+
+    table: np.ndarray
+    first: np.ndarray
+    counts: np.ndarray
+    order: int
 
 
 class Begun(NamedTuple):
@@ -155,11 +167,8 @@ class Kernel:
         return self._parts.chosen
 
     def _integrator(self, number: ir.Type = DOUBLE, for_gpus: bool = False) -> Integrator:
-        with pause_collections():
-            integrator = Integrator(
-                self._parts, self._guards, self._error_groups, width=self.width, number=number, for_gpus=for_gpus
-            )  # fmt: skip
-        return integrator
+        given = self._parts, self._guards, self._error_groups
+        return _write(Integrator, *given, width=self.width, number=number, for_gpus=for_gpus)
 
     def _gpu_programs(self, single: bool) -> "_gpu.GpuPrograms":
         """The programs for GPUs; those in `single` precision of a kernel that `allows_singles`."""
@@ -182,10 +191,7 @@ class Kernel:
 
     @functools.cached_property
     def _forward(self) -> "_Compiled":
-        integrator = self._integrator()
-        motion = integrator.motion
-        more = motion.recorded_pieces
-        return _Compiled(motion, motion.layout, integrator.job, self._rounds, pointers=4, more=more)
+        return _Compiled(self._integrator(), self._rounds)
 
     @property
     def _notes(self) -> bool:
@@ -262,29 +268,19 @@ class Kernel:
         path, y_end, *others = (block[begin:end] for begin, end in itertools.pairwise(ends))
         return Begun(path.reshape(members, times, states), y_end.reshape(members, states), *others)
 
-    def vjp(
-        self, ts, params, table, first, counts, path_ct, y_ct, order: int
-    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def vjp(self, ts, params, record: Record, path_ct, y_ct) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The transposed derivative of a run, over the steps it wrote down.
 
-        The steps of member k are `counts[k]` rows of `table` from `first[k]` on. From the cotangents of the outputs,
-        `path_ct` (N, T, 2n), of which the first and the last are not looked at, and of the states at the end, `y_ct`
-        (N, 2n), to those of the initial states (N, 2n) and of the parameters (N, P). The last array (N,) estimates how
-        large the last terms of the series of a tangent may have been, relative to the tangent.
+        From the cotangents of the outputs, `path_ct` (N, T, 2n), of which the first and the last are not looked at, and
+        of the states at the end, `y_ct` (N, 2n), to those of the initial states (N, 2n) and of the parameters (N, P).
+        The last array (N,) estimates how large the last terms of the series of a tangent may have been, relative to the
+        tangent.
         """
-        ts, params, path_ct, table = _contiguous(ts, params, path_ct, table)
-        first, counts = (np.ascontiguousarray(x, np.int64) for x in (first, counts))
-        y_ct, params_ct = np.array(y_ct, np.float64, order="C"), np.zeros((len(y_ct), self.numbers))
-        excess = np.zeros(len(y_ct))
-        arrays = dict(
-            next_member=np.zeros(1, np.int64), ts=ts, params=params, record=table, first_step=first, steps=counts,
-            path_ct=path_ct, y_ct=y_ct, params_ct=params_ct, excess=excess,
-        )  # fmt: skip
-        members, times = path_ct.shape[:2]
-        numbers = dict(**self._strides(ts, params), members=members, times=times, order=order)
-        back, threads = self._transpose_kernel(members)
-        back(arrays, numbers, threads)
-        return y_ct, params_ct, excess
+        y_ct = np.array(y_ct, np.float64, order="C")
+        results = y_ct, np.zeros((len(y_ct), self.numbers)), np.zeros(len(y_ct))
+        arrays = dict(zip(("y_ct", "params_ct", "excess"), results, strict=True)) | dict(path_ct=path_ct)
+        self._go_over(self._transpose_kernel(len(y_ct)), ts, params, record, arrays)
+        return results
 
     def _transpose_kernel(self, members: int) -> "tuple[_Compiled, int]":
         """The transpose for this many members, and on how many threads."""
@@ -293,32 +289,36 @@ class Kernel:
         return kernel._backward, min(kernel.threads(members * MOTIONS_PER_ADJOINT), -(-members // kernel.width))
 
     def jvp(
-        self, ts, params, table, first, counts, y_dot, params_dot, order: int, floor: float
+        self, ts, params, record: Record, y_dot, params_dot, floor: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The derivative of a run along m directions, over the steps it wrote down.
 
-        The steps of member k are `counts[k]` rows of `table` from `first[k]` on. From the tangents of the initial
-        states, `y_dot` (N, m, 2n), and of the parameters, `params_dot` (N, m, P), to those of the outputs, an array
-        (N, m, T, 2n) of which the last is not written, and of the states at the end (N, m, 2n). The last array (N,)
-        says how large the last two terms of the series of a tangent became, at most, relative to the tangent or to the
-        `floor`.
+        From the tangents of the initial states, `y_dot` (N, m, 2n), and of the parameters, `params_dot` (N, m, P), to
+        those of the outputs, an array (N, m, T, 2n) of which the last is not written, and of the states at the end
+        (N, m, 2n). The last array (N,) says how large the last two terms of the series of a tangent became, at most,
+        relative to the tangent or to the `floor`.
         """
-        ts, params, params_dot, table = _contiguous(ts, params, params_dot, table)
-        first, counts = (np.ascontiguousarray(x, np.int64) for x in (first, counts))
-        y_dot, excess = np.array(y_dot, np.float64, order="C"), np.zeros(len(y_dot))
-        members, directions, times = *y_dot.shape[:2], ts.shape[1]
-        path_dot = np.full((members, directions, times, self.states), np.nan)
-        arrays = dict(
-            next_member=np.zeros(1, np.int64), ts=ts, params=params, record=table, first_step=first, steps=counts,
-            path_dot=path_dot, y_dot=y_dot, params_dot=params_dot, excess=excess,
-        )  # fmt: skip
-        numbers = dict(
-            **self._strides(ts, params), members=members, times=times, order=order, directions=directions,
-            floor=floor,
-        )  # fmt: skip
-        forward, threads = self._tangent_kernel(members, directions)
-        forward(arrays, numbers, threads)
-        return path_dot, y_dot, excess
+        y_dot = np.array(y_dot, np.float64, order="C")
+        members, directions = y_dot.shape[:2]
+        path_dot = np.full((members, directions, np.shape(ts)[1], self.states), np.nan)
+        results = path_dot, y_dot, np.zeros(members)
+        arrays = dict(zip(("path_dot", "y_dot", "excess"), results, strict=True)) | dict(params_dot=params_dot)
+        kernel = self._tangent_kernel(members, directions)
+        self._go_over(kernel, ts, params, record, arrays, directions=directions, floor=floor)
+        return results
+
+    def _go_over(
+        self, kernel: "tuple[_Compiled, int]", ts, params, record: Record, arrays: dict, **numbers: float
+    ) -> None:
+        """Let a kernel of derivatives, and so many threads, go over the steps of a record; `arrays` are its own."""
+        names = ("ts", "params", "record", *arrays)
+        arrays = dict(zip(names, _contiguous(ts, params, record.table, *arrays.values()), strict=True))
+        ts, params = arrays["ts"], arrays["params"]
+        first, counts = (np.ascontiguousarray(x, np.int64) for x in (record.first, record.counts))
+        arrays |= dict(next_member=np.zeros(1, np.int64), first_step=first, steps=counts)
+        numbers |= dict(members=len(first), times=ts.shape[1], order=record.order, **self._strides(ts, params))
+        compiled, threads = kernel
+        compiled(arrays, numbers, threads)
 
     def _tangent_kernel(self, members: int, directions: int) -> "tuple[_Compiled, int]":
         """The tangents of this many members along this many directions, and on how many threads."""
@@ -330,9 +330,8 @@ class Kernel:
 
     def _compile_tangents(self, side_by_side: bool) -> "_Compiled":
         """The kernel of tangents, whose directions stand side by side or members do; compiled on first use."""
-        with pause_collections():
-            tangent = Tangent(self._derivative_parts, width=1 if side_by_side else self.width, lanes=self.width)
-        return _Compiled(tangent.motion, tangent.motion.layout, tangent.job, self._rounds, pointers=3)
+        width = 1 if side_by_side else self.width
+        return _Compiled(_write(Tangent, self._derivative_parts, width=width, lanes=self.width), self._rounds)
 
     def plan(self, rtol: float, atol: float, max_steps: int) -> Plan:
         """The plan by which a handler begins a run; it lives as long as this kernel."""
@@ -341,23 +340,23 @@ class Kernel:
         return Plan(begin, run, size, self.states, self.numbers, order_for(rtol), max_steps, rounds, rtol, atol)
 
     @property
-    def rounds_of_sweep(self) -> int:
+    def rounds_of_rerun(self) -> int:
         """Rounds of a motion that is rather run again for a derivative than kept; 0 where that would take too long.
 
         Or where more is written down of a step than its state: that of a piecewise program.
         """
         if self.borders is not None and self.borders.switches:
             return 0
-        rounds = self._rounds // _SLICES_OF_SWEEP
+        rounds = self._rounds // _RERUNS_PER_SLICE
         return rounds if rounds >= _LEAST_ROUNDS else 0
 
-    def sweep_plan(
+    def derivative_plan(
         self, kind: str, members: int, times: int, directions: int, rtol: float, atol: float, max_steps: int
     ) -> DerivativePlan:
         """The plan of derivatives of this many members; it lives as long as this kernel."""
         motion = self.select_width(members)._forward
         sweep, _ = self._tangent_kernel(members, directions) if kind == "jvp" else self._transpose_kernel(members)
-        rounds, others = self.rounds_of_sweep, self.numbers if kind == "vjp" else directions * times * self.states
+        rounds, others = self.rounds_of_rerun, self.numbers if kind == "vjp" else directions * times * self.states
         sizes = (size for of in (motion, sweep) for size in (of.layout.size, len(LANE) * of.layout.width))
         memory, integers, memory_of_sweep, integers_of_sweep = sizes
         return DerivativePlan(
@@ -376,13 +375,10 @@ class Kernel:
     @functools.cached_property
     def _backward(self) -> "_Compiled":
         """The transpose, compiled on first use."""
-        adjoint = self._adjoint(self.width)
-        return _Compiled(adjoint.motion, adjoint.motion.layout, adjoint.job, self._rounds, pointers=3)
+        return _Compiled(self._adjoint(self.width), self._rounds)
 
     def _adjoint(self, width: int, number: ir.Type = DOUBLE) -> Adjoint:
-        with pause_collections():
-            adjoint = Adjoint(self._derivative_parts, width=width, number=number)
-        return adjoint
+        return _write(Adjoint, self._derivative_parts, width=width, number=number)
 
     def _strides(self, ts, params) -> dict[str, int]:
         return dict(
@@ -393,16 +389,23 @@ class Kernel:
         return min(cores(), max(1, members // (VECTORS_PER_THREAD * self.width)))
 
 
+def _write(kind: Callable, *parts, **options):
+    """The module of a kernel, of this kind, written down."""
+    with pause_collections():
+        return kind(*parts, **options)
+
+
 class _Compiled:
     """The functions `begin` and `run` of a module: all members of a job, on several threads.
 
-    `rounds` is how many of them a slice has at first, `more` the numbers
-    that are written down behind the state of a step.
+    `rounds` is how many of them a slice has at first, `more` the numbers that are written down behind the state of a
+    step.
     """
 
-    def __init__(self, motion: TaylorSeries, layout: Memory, job: Callable, rounds: int, pointers: int, more: int = 0):
-        self.rounds, self.more = rounds, more
-        self.layout, self._job, self._counts_idle = layout, job, pointers == 4
+    def __init__(self, built: Integrator | Tangent | Adjoint, rounds: int):
+        motion = built.motion
+        self.layout, self._job, self._counts_idle = motion.layout, built.job, isinstance(built, Integrator)
+        self.rounds, self.more = rounds, motion.recorded_pieces
         self._numbers = motion.look_up.numbers
         names = ("begin", "run") if self._numbers is None else ("begin", "run", SET_NUMBERS)
         # The engine holds the code that the others point to.
@@ -411,7 +414,9 @@ class _Compiled:
             ctypes.CFUNCTYPE(None, ctypes.c_void_p)(at[SET_NUMBERS])(self._numbers.ctypes.data)
         self.places = at["begin"], at["run"]
         self._begin = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3)(at["begin"])
-        self._run = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * pointers, ctypes.c_int64)(at["run"])
+        self._run = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * (3 + self._counts_idle), ctypes.c_int64)(
+            at["run"]
+        )
 
     def __call__(
         self, arrays: Mapping[str, np.ndarray | None], numbers: Mapping[str, float], threads: int, rest=None

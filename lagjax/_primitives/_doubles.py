@@ -24,7 +24,7 @@ from jax.core import ShapedArray
 from jax.interpreters import ad, batching, mlir
 
 from lagjax._interface import dtype_of, is_concrete
-from lagjax._primitives._custom import VaryingPrimitive
+from lagjax._primitives._linear_map import LinearMap, compute_on_host, is_zero
 
 PyTree = Any
 
@@ -41,7 +41,8 @@ def compute_in_doubles(function: Callable, *arguments: PyTree) -> PyTree:
     """
     leaves, tree = jax.tree.flatten(arguments)
     places = [i for i, leaf in enumerate(leaves) if isinstance(leaf, jax.Array | np.ndarray | np.generic)]
-    arrays, is_on, made = [_round_array(leaves[i]) for i in places], has_doubles(), {}
+    arrays = [x.astype(_NARROW[x.dtype]) if x.dtype in _NARROW else x for x in map(leaves.__getitem__, places)]
+    is_on, made = has_doubles(), {}
 
     def call_with_arrays(*arrays):
         filled = list(leaves)
@@ -110,11 +111,6 @@ def has_doubles() -> bool:
     return jax.dtypes.canonicalize_dtype(DOUBLE) == DOUBLE
 
 
-def _round_array(array):
-    """The array in single precision, if it is of floats."""
-    return array if array.dtype not in _NARROW else array.astype(_NARROW[array.dtype])
-
-
 def widen(tree: PyTree) -> PyTree:
     """The arrays of a pytree in NumPy, floats in double precision."""
     return jax.tree.map(lambda x: _widen(x) if isinstance(x, jax.Array | np.ndarray | np.generic) else x, tree)
@@ -157,21 +153,20 @@ class _Map:
     def derivative(self, size: int, moving: tuple[int, ...], results: dict[int, ShapedArray]) -> "_Map":
         """(*its `size` arguments, *tangents of those that are `moving`) ↦ the tangents of these `results`."""
 
-        def restrict_to_moving(arguments):
-            def function(*some):
-                given = dict(zip(moving, some, strict=True))
-                found = self.function(*(given.get(i, x) for i, x in enumerate(arguments)))
-                return [found[i] for i in results]
+        def restrict_to_moving(arguments, others):
+            def function(*moved):
+                given = dict(zip(moving, moved, strict=True))
+                values = self.function(*(given.get(i, x) for i, x in enumerate(arguments)))
+                return [values[i] for i in results]
 
-            return function, tuple(jnp.asarray(arguments[i]) for i in moving)
+            return function, tuple(jnp.asarray(arguments[i]) for i in moving), tuple(map(jnp.asarray, others))
 
         def forward(*given):
-            function, at = restrict_to_moving(given[:size])
-            return jax.jvp(function, at, tuple(map(jnp.asarray, given[size:])))[1]
+            return jax.jvp(*restrict_to_moving(given[:size], given[size:]))[1]
 
         def back(*given):
-            function, at = restrict_to_moving(given[:size])
-            return list(jax.vjp(function, *at)[1](list(map(jnp.asarray, given[size:]))))
+            function, at, cotangents = restrict_to_moving(given[:size], given[size:])
+            return list(jax.vjp(function, *at)[1](list(cotangents)))
 
         return _Map(forward, len(moving), back, tuple(results.values()))
 
@@ -186,17 +181,7 @@ class _Map:
         results = self.results and tuple(ShapedArray((size, *x.shape), x.dtype) for x in self.results)
         return _Map(jax.vmap(self.function, in_axes=axes), self.linear, transposed, results)
 
-    def transpose(self, count: int, results: tuple[ShapedArray, ...]) -> "_Map":
-        """(*x, *w) ↦ the cotangents of v, which are the `results`, linear in the `count` cotangents w."""
-        assert self.transposed is not None
-        return _Map(self.transposed, count, self.function, results)
 
-
-computed_p = VaryingPrimitive("lagjax_in_doubles")
-computed_p.multiple_results = True
-
-
-@computed_p.def_abstract_eval
 def _shapes(*arrays, of: _Map, keeps_integers: bool):
     if of.results is not None:
         return list(of.results)
@@ -204,13 +189,6 @@ def _shapes(*arrays, of: _Map, keeps_integers: bool):
         wide = [jax.ShapeDtypeStruct(x.shape, _WIDE.get(x.dtype, x.dtype)) for x in arrays]
         results = jax.eval_shape(of.function, *wide)
     return [ShapedArray(x.shape, _narrow(x.dtype, keeps_integers)) for x in results]
-
-
-@computed_p.def_impl
-def _evaluate(*arrays, of: _Map, keeps_integers: bool):
-    with jax.enable_x64(True):
-        results = of.function(*map(_widen, arrays))
-        return [jax.device_put(_narrow_array(x, keeps_integers)) for x in results]
 
 
 def _lower(ctx, *arrays, of: _Map, keeps_integers: bool):
@@ -222,22 +200,13 @@ def _lower(ctx, *arrays, of: _Map, keeps_integers: bool):
         return mlir.lower_fun(rounded, multiple_results=True)(ctx, *arrays)
 
 
-def _jvp(primals, tangents, *, of: _Map, **settings):
-    first = len(primals) - of.linear
-    bind = functools.partial(computed_p.bind, **settings)
-    results = bind(*primals, of=of)
+def _vary(primals, tangents, results, *, of: _Map, **settings):
     floats = {i: _shape_of(x) for i, x in enumerate(results) if jnp.issubdtype(x.dtype, jnp.inexact)}
-    parts = []
-    if not all(isinstance(x, ad.Zero) for x in tangents[first:]):
-        parts.append(bind(*primals[:first], *map(ad.instantiate_zeros, tangents[first:]), of=of))
-    moving = tuple(i for i, x in enumerate(tangents[:first]) if not isinstance(x, ad.Zero))
-    if moving:
-        derivative = of.derivative(len(primals), moving, floats)
-        parts.append(bind(*primals, *(tangents[i] for i in moving), of=derivative))
-    along: list = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in results]
-    for i, *terms in zip(floats, *parts, strict=True) if parts else ():
-        along[i] = sum(terms[1:], terms[0])
-    return results, along
+    moving = tuple(i for i, x in enumerate(tangents) if not is_zero(x))
+    derivative = of.derivative(len(primals), moving, floats)
+    changes = computed_p.bind(*primals, *(tangents[i] for i in moving), of=derivative, **settings)
+    changes = dict(zip(floats, changes, strict=True))
+    return [changes.get(i) for i in range(len(results))]
 
 
 def _shape_of(x) -> ShapedArray:
@@ -245,13 +214,10 @@ def _shape_of(x) -> ShapedArray:
     return ShapedArray(aval.shape, aval.dtype)
 
 
-def _transpose(cotangents, *arguments, of: _Map, **settings):
-    first = len(arguments) - of.linear
-    known = [ad.instantiate_zeros(x) for x in cotangents]
-    of = of.transpose(len(known), tuple(map(_shape_of, arguments[first:])))
-    found = computed_p.bind(*arguments[:first], *known, of=of, **settings)
-    linear = zip(arguments[first:], found, strict=True)
-    return [None] * first + [new if ad.is_undefined_primal(x) else None for x, new in linear]
+def _transpose(known, cotangents, moving, *, of: _Map, **settings):
+    assert of.transposed is not None
+    transposed = _Map(of.transposed, len(cotangents), of.function, tuple(map(_shape_of, moving)))
+    return computed_p.bind(*known, *cotangents, of=transposed, **settings)
 
 
 def _batch(arrays, axes, *, of: _Map, **settings):
@@ -267,7 +233,10 @@ def _batch(arrays, axes, *, of: _Map, **settings):
     return results, [0] * len(results)
 
 
+computed_p = LinearMap("lagjax_in_doubles", _shapes, _vary, lambda *, of, **_: of.linear, _transpose)
+compute_on_host(
+    computed_p,
+    lambda *arrays, of, keeps_integers: [_narrow_array(x, keeps_integers) for x in of.function(*map(_widen, arrays))],
+)
 mlir.register_lowering(computed_p, _lower)
-ad.primitive_jvps[computed_p] = _jvp
-ad.primitive_transposes[computed_p] = _transpose
 batching.primitive_batchers[computed_p] = _batch

@@ -19,7 +19,14 @@ from jax.experimental.buffer_callback import buffer_callback
 from jax.interpreters import ad, batching, mlir
 
 from lagjax._interface import ENDED_WELL, RESULTS, SimulationError, advice, code_of, result_from
-from lagjax._primitives._custom import VaryingPrimitive, batch_in_front, cond_alike
+from lagjax._primitives._linear_map import (
+    LinearMap,
+    VaryingPrimitive,
+    batch_in_front,
+    compute_on_host,
+    cond_alike,
+    is_zero,
+)
 
 
 def raise_where_failed(tree, result, end, t_last, names: tuple[str, ...]):
@@ -29,7 +36,7 @@ def raise_where_failed(tree, result, end, t_last, names: tuple[str, ...]):
     time it was to reach, and `names` (n,) those of the coordinates. Inside `jax.jit` the error is JAX's own, and its
     text ends with this one.
     """
-    passed = check_p.bind(*map(jnp.asarray, (result, end[0], t_last, end[1])), names=names)
+    (passed,) = check_p.bind(*map(jnp.asarray, (result, end[0], t_last, end[1])), names=names)
 
     def checked(leaf):
         if not jnp.issubdtype(jnp.result_type(leaf), jnp.floating):
@@ -76,28 +83,34 @@ def _raise(result, t_end, t_last, y_end, *, names) -> None:
         raise SimulationError(text, None)
 
 
-check_p = VaryingPrimitive("lagjax_check")
-check_p.def_abstract_eval(lambda result, t_end, *_, **__: ShapedArray(result.shape, t_end.dtype))
+check_p = LinearMap(
+    "lagjax_check",
+    lambda result, t_end, *_, **__: [ShapedArray(result.shape, t_end.dtype)],
+    vary=lambda *_, **__: [None],
+)
 
 
-@check_p.def_impl
-def _check_eagerly(result, *values, **settings):
-    _raise(*map(np.asarray, (result, *values)), **settings)
-    return jnp.zeros(jnp.shape(result), values[0].dtype)
+def _check(result, t_end, *others, names):
+    _raise(result, t_end, *others, names=names)
+    return [np.zeros(result.shape, t_end.dtype)]
+
+
+compute_on_host(check_p, _check)
 
 
 def _lower_with(on_host):
     """One comparison where all is well; the host is called only where something failed."""
 
-    def check(result, *values, **settings):
+    def check(result, t_end, *others, names):
         def host(*arrays):
-            _raise(*map(np.asarray, arrays), **settings)
+            _raise(*map(np.asarray, arrays), names=names)
 
-        shape = jax.ShapeDtypeStruct(result.shape, values[0].dtype)
+        shape = jax.ShapeDtypeStruct(result.shape, t_end.dtype)
         well = jnp.isin(result, jnp.asarray(ENDED_WELL, result.dtype)).all()
-        return cond_alike(well, lambda *_: jnp.zeros(shape.shape, shape.dtype), on_host(host, shape), result, *values)
+        given = result, t_end, *others
+        return [cond_alike(well, lambda *_: jnp.zeros(shape.shape, shape.dtype), on_host(host, shape), *given)]
 
-    return mlir.lower_fun(check, multiple_results=False)
+    return mlir.lower_fun(check, multiple_results=True)
 
 
 def _call_on_buffers(host, shape):
@@ -110,18 +123,6 @@ def _call_on_copies(host, shape):
 
 mlir.register_lowering(check_p, _lower_with(_call_on_copies))
 mlir.register_lowering(check_p, _lower_with(_call_on_buffers), platform="cpu")
-
-
-def _zero_derivative(primals, tangents, **settings):
-    passed = check_p.bind(*primals, **settings)
-    return passed, ad.Zero(jax.typeof(passed).to_tangent_aval())
-
-
-ad.primitive_jvps[check_p] = _zero_derivative
-batching.primitive_batchers[check_p] = lambda args, axes, **settings: (
-    check_p.bind(*batch_in_front(args, axes), **settings),
-    0,
-)
 
 
 # ---- outputs that were not reached -----------------------------------------------------------------------------------
@@ -189,7 +190,7 @@ def _nan_unless_transpose(cotangent, reached, x, *inputs, marks, batch):
 def _nan_unless_jvp(primals, tangents, **settings):
     """Its derivative varies with what varies, and once more with everything."""
     reached, x, *inputs = primals
-    moving = [t for t in tangents[2:] if not isinstance(t, ad.Zero)]
+    moving = [t for t in tangents[2:] if not is_zero(t)]
     along = ad.instantiate_zeros(tangents[1])
     values = nan_unless_p.bind(*primals, **settings)
     return values, nan_unless_p.bind(reached, along, *moving, x, *inputs, **settings | {"marks": True})

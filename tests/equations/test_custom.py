@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from lagjax._primitives._custom import attach_derivative
+from lagjax._primitives import attach_derivative
 
 
 def moved(t, y):

@@ -52,18 +52,16 @@ def batch(members: int, seed: int = 0):
 
 def by_tangents(flow, ts, y0, numbers, run, path_bar, y_bar):
     """The cotangents of (y0, params) from the whole Jacobian, (N, 2n + P)."""
-    inputs, residuals = y0.shape[1] + numbers.shape[1], (run.path, run.result, run.accepted, run.ticket)
+    inputs, motions = y0.shape[1] + numbers.shape[1], _derivatives.Motions.from_solution(ts, y0, numbers, run)
     directions = np.split(np.broadcast_to(np.eye(inputs), (len(y0), inputs, inputs)), [y0.shape[1]], axis=2)
-    path, end = _derivatives.jvp(flow, ts, y0, numbers, residuals, *directions, TOLERANCES)
+    path, end = _derivatives.jvp(flow, motions, *directions, TOLERANCES)
     return np.einsum("nrts,nts->nr", path, path_bar) + np.einsum("nrs,ns->nr", end, y_bar)
 
 
 def vjp(flow, ts, y0, numbers, run, path_bar, y_bar):
     """One cotangent for each member."""
-    residuals = run.path, run.result, run.accepted, run.ticket
-    y0_bar, params_bar = _derivatives.vjp(
-        flow, ts, y0, numbers, residuals, path_bar[:, None], y_bar[:, None], TOLERANCES
-    )
+    motions = _derivatives.Motions.from_solution(ts, y0, numbers, run)
+    y0_bar, params_bar = _derivatives.vjp(flow, motions, path_bar[:, None], y_bar[:, None], TOLERANCES)
     return np.concatenate([y0_bar[:, 0], params_bar[:, 0]], axis=1)
 
 

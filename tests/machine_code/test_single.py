@@ -18,7 +18,7 @@ import pytest
 from sweeps import sweep
 
 import lagjax
-from lagjax._primitives._doubles import compute_in_doubles
+from lagjax._primitives import compute_in_doubles
 
 EPS = float(np.finfo(np.float32).eps)
 TS = np.linspace(0, 10, 11, dtype=np.float32)

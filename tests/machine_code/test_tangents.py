@@ -36,8 +36,8 @@ def starts(members):
 
 def along(flow, y0, numbers, dy0, dparams, ts=TS):
     run = flow.run(ts, y0, numbers, TOLERANCES)
-    residuals = run.path, run.result, run.accepted, run.ticket
-    return _derivatives.jvp(flow, ts, y0, numbers, residuals, dy0, dparams, TOLERANCES)
+    motions = _derivatives.Motions.from_solution(ts, y0, numbers, run)
+    return _derivatives.jvp(flow, motions, dy0, dparams, TOLERANCES)
 
 
 def test_tangents_are_central_differences(flow):
@@ -125,8 +125,8 @@ def test_tangents_of_motions_whose_steps_are_gone(flow, monkeypatch):
     y0, numbers, rng = starts(5)
     dy0, dparams = rng.normal(size=(5, 2, 4)), rng.normal(size=(5, 2, 3))
     run = flow.run(TS, y0, numbers, TOLERANCES, _derivatives.KEPT)
-    residuals = run.path, run.result, run.accepted, run.ticket
-    kept = _derivatives.jvp(flow, TS, y0, numbers, residuals, dy0, dparams, TOLERANCES)
+    motions = _derivatives.Motions.from_solution(TS, y0, numbers, run)
+    kept = _derivatives.jvp(flow, motions, dy0, dparams, TOLERANCES)
     runs, follow = [], _flow.Flow.follow
     monkeypatch.setattr(_flow.Flow, "follow", lambda *given: runs.append(given) or follow(*given))
     for a, b in zip(along(flow, y0, numbers, dy0, dparams), kept, strict=True):
@@ -139,13 +139,13 @@ def test_the_adjoints_of_two_vectors_of_members_go_on_two_threads_with_the_same_
     members = 2 * _native.lanes()
     y0, numbers, rng = starts(members)
     run = flow.run(TS, y0, numbers, TOLERANCES)
-    residuals = run.path, run.result, run.accepted, run.ticket
+    motions = _derivatives.Motions.from_solution(TS, y0, numbers, run)
     path_ct, end_ct = rng.normal(size=(members, 1, TS.size, 4)), rng.normal(size=(members, 1, 4))
     asked, found, together = [], [], _kernel.run_on_threads
     monkeypatch.setattr(_kernel, "run_on_threads", lambda work, count: (asked.append(count), together(work, count))[1])
     for cores in (1, 2):
         monkeypatch.setattr(_kernel, "cores", lambda cores=cores: cores)
-        found.append(_derivatives.vjp(flow, TS, y0, numbers, residuals, path_ct, end_ct, TOLERANCES))
+        found.append(_derivatives.vjp(flow, motions, path_ct, end_ct, TOLERANCES))
     assert asked[-1] == 2 and set(asked[:-1]) == {1}  # each time the motion once more, and back over it
     for one, two in zip(*found, strict=True):
         np.testing.assert_array_equal(one, two)

@@ -136,7 +136,8 @@ kernel, ts = _native.Kernel(program, 1), np.linspace(0.0, 3.0, 7)[None]
 done = kernel(ts, [[1.0, 0.0]], [[1.0]], 1e-12, 1e-15, 100, 100)
 np.testing.assert_allclose(done.path[0, :, 0], np.cos(ts[0]), atol=1e-11)
 bars = np.zeros((1, 7, 2)), np.array([[1.0, 0.0]])
-start, numbers, _ = kernel.vjp(ts, [[1.0]], done.table, [0], done.steps, *bars, _native.order_for(1e-12))
+steps = _native.Record(done.table, [0], done.steps, _native.order_for(1e-12))
+start, numbers, _ = kernel.vjp(ts, [[1.0]], steps, *bars)
 np.testing.assert_allclose(start, [[np.cos(3.0), np.sin(3.0)]], atol=1e-11)
 np.testing.assert_allclose(numbers, [[-1.5 * np.sin(3.0)]], atol=1e-11)  # of cos(sqrt(k) t)
 """

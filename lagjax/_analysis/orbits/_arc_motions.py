@@ -13,7 +13,7 @@ import numpy as np
 
 from lagjax._analysis.orbits._flat_starts import require_untraced
 from lagjax._engine import Problem
-from lagjax._engine.taylor import KEPT, MachineCode, flow_of, jvp, tolerances_of
+from lagjax._engine.taylor import KEPT, MachineCode, Motions, flow_of, jvp, tolerances_of
 from lagjax._equations import Sample, Scales, has_constraints
 from lagjax._interface import SUCCESSFUL, Layout, halves
 from lagjax._primitives import sentence
@@ -141,10 +141,8 @@ class Arcs:
         well = run.result == SUCCESSFUL
         moved = np.full(dy0.shape, np.nan)
         if well.any():
-            times, start, dy0, dparams, *steps = (
-                x[well] for x in (times, y0, dy0, dparams, run.path, run.result, run.accepted, run.ticket)
-            )
-            moved[well] = jvp(self.flow, times, start, params, steps, dy0, dparams, self.tolerances)[1]
+            motions = Motions.from_solution(times, y0, params, run).take(np.flatnonzero(well))
+            moved[well] = jvp(self.flow, motions, dy0[well], dparams[well], self.tolerances)[1]
         end = np.where(well[:, None], run.y_end, np.nan)
         moved = np.swapaxes(moved, 1, 2)
         return Arc(end, moved[..., :states], moved[..., states:], run.result, run.t_end, run.accepted)

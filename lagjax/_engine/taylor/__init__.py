@@ -29,7 +29,7 @@ from lagjax._engine.taylor._crossing import (
     surfaces_of,
     surfaces_of_event,
 )
-from lagjax._engine.taylor._derivatives import jvp, portions, project_start_tangents, vjp
+from lagjax._engine.taylor._derivatives import Motions, jvp, portions, project_start_tangents, vjp
 from lagjax._engine.taylor._flow import Flow, Tolerances, unfit
 from lagjax._engine.taylor._gpu_launch import adapt_tolerances
 from lagjax._engine.taylor._kept_steps import KEPT, StepStore

@@ -26,7 +26,6 @@ from lagjax._primitives import cond_alike, vary_alike
 
 NO_HANDLER = _native.unavailable(jax.ffi.include_dir())
 _TARGET = "lagjax_integrate"
-_SWEEPS = ("jvp", "vjp")
 _lock = threading.Lock()
 
 
@@ -44,15 +43,15 @@ def call_host(host: Callable, shapes, *arrays) -> tuple:
     return tuple(buffer_callback(callback, tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in shapes))(*arrays))
 
 
-def has_handler(flow: Flow, members: int) -> bool:
+def begins_in_handler(flow: Flow, members: int) -> bool:
     """True if a run of this many members begins in the handler."""
     notes = flow.guards is not None and flow.guards.notes
     return NO_HANDLER is None and not notes and flow.kernel.select_kernel(members).threads(members) == 1
 
 
-def has_sweep(flow: Flow, members: int) -> bool:
+def derivatives_begin_in_handler(flow: Flow, members: int) -> bool:
     """True if derivatives of this many members begin in a handler, with their motion run once more."""
-    return has_handler(flow, members) and flow.projection is None and flow.kernel.rounds_of_sweep > 0
+    return begins_in_handler(flow, members) and flow.projection is None and flow.kernel.rounds_of_rerun > 0
 
 
 def run_by_handler(
@@ -84,26 +83,27 @@ def run_by_handler(
 
     def continue_on_host(*arrays):
         # The callback lives as long as the compiled program, and with it what the handler needs.
-        return call_host(functools.partial(host, needed=(plan, kernel)), shapes, *arrays)
+        return call_host(lambda *arrays, _needed=(plan, kernel): host(*arrays), shapes, *arrays)
 
     well = _has_ended_well(begun)
     return tuple(cond_alike(well, convert_results, continue_on_host, ts, y0, params, *begun))
 
 
-def sweep_by_handler(kind: str, flow: Flow, tolerances: Tolerances, ts, y0, params, argument, start) -> tuple:
-    """The results of a sweep over the motions of N members, not too many for one thread (`_native.SweepHandler`).
+def derivative_by_handler(kind: str, flow: Flow, tolerances: Tolerances, rows: tuple) -> tuple:
+    """The derivative "jvp" or "vjp" of the motions of N members, not too many for one thread.
 
-    Then `excess` (N,); whether it is done, () of bool; and what must live as long as the compiled program.
+    `rows` are the arguments of its handler (`_native.derivative_handler`). Then come `excess` (N,); whether it is done,
+    () of bool; and what must live as long as the compiled program.
     """
     _register()
+    ts, y0, *_, start = rows
     (members, states), times = y0.shape, ts.shape[1]
     directions = start.shape[1] if kind == "jvp" else 1
-    plan = flow.kernel.sweep_plan(kind, members, times, directions, *tolerances[:3])
+    plan = flow.kernel.derivative_plan(kind, members, times, directions, *tolerances[:3])
     second = (members, directions, times, states) if kind == "jvp" else (members, flow.numbers)
     shapes = start.shape, second, (members,), (1,), (plan.scratch(members, times),)
     call = jax.ffi.ffi_call(f"lagjax_{kind}", [jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes])
-    given = ts, y0, params, argument, start
-    *results, done, _ = vary_alike(call(*given, plan=np.int64(ctypes.addressof(plan))), like=given)
+    *results, done, _ = vary_alike(call(*rows, plan=np.int64(ctypes.addressof(plan))), like=rows)
     return *results, done[0] > 0, (plan, flow.kernel)
 
 
@@ -122,7 +122,7 @@ def _register() -> None:
 @functools.cache
 def _register_once() -> None:
     addresses = {_TARGET: _native.handler().address}
-    addresses |= {f"lagjax_{kind}": _native.derivative_handler(kind).address for kind in _SWEEPS}
+    addresses |= {f"lagjax_{kind}": _native.derivative_handler(kind).address for kind in ("jvp", "vjp")}
     for target, address in addresses.items():
         jax.ffi.register_ffi_target(target, capsule(address), platform="cpu", api_version=1)
 

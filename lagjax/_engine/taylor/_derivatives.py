@@ -9,11 +9,12 @@ with the number of parameters. A name that ends in `_ct` is a cotangent, one tha
 import functools
 import math
 from collections.abc import Callable, Iterator
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
 from lagjax import _native
+from lagjax._engine._problem import Solution
 from lagjax._engine.taylor._flow import Flow, Tolerances
 from lagjax._engine.taylor._kept_steps import KEPT, Steps, StepStore
 from lagjax._interface import SUCCESSFUL
@@ -25,38 +26,75 @@ _ROOM_AGAIN = 2  # times the steps that were taken: those that are undone and th
 MOST_PARTS, TRIES = 64, 4  # of a step that is too long, at once; and how often they are divided once more
 
 
-def jvp(flow: Flow, ts, y0, params, solution, dy0, dparams, tolerances: Tolerances) -> tuple[np.ndarray, np.ndarray]:
+class Motions(NamedTuple):
+    """Runs of a flow, of which derivatives are taken: what went in, and the results that say how far they came.
+
+    Of N members: `ts` (1 or N, T), `y0` (N, 2n), `params` (1 or N, P), `path` (N, T, 2n), and `result`, `accepted` and
+    `ticket` (N,) of the `Solution`.
+    """
+
+    ts: Any
+    y0: Any
+    params: Any
+    path: Any
+    result: Any
+    accepted: Any
+    ticket: Any
+
+    @classmethod
+    def from_solution(cls, ts, y0, params, solution: Solution) -> "Motions":
+        """The motions of a run and its solution."""
+        return cls(ts, y0, params, solution.path, solution.result, solution.accepted, solution.ticket)
+
+    def take(self, rows: np.ndarray) -> "Motions":
+        """The members `rows` (R,); an array (1, …) that all share stays."""
+        shared = [len(x) == 1 and name in ("ts", "params") for name, x in self._asdict().items()]
+        return Motions(*(x if alike else x[rows] for x, alike in zip(self, shared, strict=True)))
+
+
+def jvp(flow: Flow, motions: Motions, dy0, dparams, tolerances: Tolerances) -> tuple[np.ndarray, np.ndarray]:
     """The derivative of `Flow.run` along m directions for each of N members, between fixed times.
 
-    `solution` is (path, result, accepted, ticket) of the run; `dy0` (N, m, 2n), `dparams` (N, m, P) → δpath
-    (N, m, T, 2n), NaN where the motion did not come, and δy_end (N, m, 2n), NaN where it failed.
+    `dy0` (N, m, 2n), `dparams` (N, m, P) → δpath (N, m, T, 2n), NaN where the motion did not come, and δy_end
+    (N, m, 2n), NaN where it failed.
     """
-    path, result, accepted, ticket = solution
+    ts, y0, params, path, result, *_ = motions
     members, m = dy0.shape[:2]
     if flow.projection is not None:
         dy0 = project_start_tangents(flow.projection, ts[:, :1], y0, params, dy0, dparams)
     groups = _groups_of_directions(members, m)
     directions = math.ceil(m / groups)
     padding = ((0, 0), (0, groups * directions - m), (0, 0))
-    dy0, dparams = (np.pad(x, padding).reshape(members * groups, directions, -1) for x in (dy0, dparams))
-    # In units of its largest number, so that the tolerances mean the same for tangents of any length.
-    length = np.abs(np.concatenate([dy0, dparams], axis=2)).max(axis=2, initial=0.0, keepdims=True)
-    unit = np.where(length > 0, length, 1.0)
-    dy0, dparams = dy0 / unit, dparams / unit
+    padded = (np.pad(x, padding).reshape(members * groups, directions, -1) for x in (dy0, dparams))
+    *dots, unit = scale_directions(*padded)
     rows = np.repeat(np.arange(members), groups)
-    params = _repeat_rows(params, members)
-    some = ts if len(ts) == 1 else ts[rows], y0[rows], params[rows], accepted[rows], ticket[rows]
-    path_dot, y_dot = _jvp_over_steps(flow, *some, dy0, dparams, tolerances)
-    path_dot, y_dot = path_dot * unit[..., None], y_dot * unit
-    path_dot = path_dot.reshape(members, groups * directions, *path.shape[1:])[:, :m]
-    y_dot = y_dot.reshape(members, groups * directions, -1)[:, :m]
+    path_dot, y_dot = _jvp_over_steps(flow, motions.take(rows), dots, tolerances)
+    of_groups = path_dot * unit[..., None], y_dot * unit
+    path_dot, y_dot = (x.reshape(members, groups * directions, *x.shape[2:])[:, :m] for x in of_groups)
     if flow.projection is not None and path.shape[1] > 2:
-        dparams = (dparams * unit).reshape(members, groups * directions, -1)[:, :m]
-        _project_tangents(flow, flow.projection, ts, path, params, path_dot, dparams)
+        inner = path_dot[:, :, 1:-1]
+        inner[:] = _differentiate_projection(
+            pushforward, flow.projection, inner.shape[:-1], *_inner_states(motions), inner, dparams[:, :, None]
+        )
     path_dot[:, :, -1] = y_dot
     path_dot[~np.broadcast_to(np.isfinite(path)[:, None], path_dot.shape)] = np.nan
     y_dot[result != SUCCESSFUL] = np.nan
     return path_dot, y_dot
+
+
+def scale_directions(dy0, dparams, library: Any = np) -> tuple:
+    """Directions in units of their largest number, (…, 1), so that tolerances mean the same for tangents of any length.
+
+    Returns both parts, and the units.
+    """
+    length = library.abs(library.concatenate([dy0, dparams], axis=-1)).max(axis=-1, initial=0.0, keepdims=True)
+    unit = library.where(length > 0, length, 1.0)
+    return dy0 / unit, dparams / unit, unit
+
+
+def start_outputs(ts, dy0, path_dot, library: Any = np):
+    """The tangents of outputs (N, m, T, 2n), those of the start where an output is the start itself."""
+    return library.where((ts == ts[:, :1])[:, None, :, None], dy0[:, :, None], path_dot)
 
 
 def _groups_of_directions(members: int, m: int) -> int:
@@ -75,139 +113,105 @@ def _groups_of_directions(members: int, m: int) -> int:
     return 2 if work(2) < work(1) else 1
 
 
-def _jvp_over_steps(
-    flow: Flow, ts, y0, params, accepted, ticket, dy0, dparams, tolerances
-) -> tuple[np.ndarray, np.ndarray]:
+def _jvp_over_steps(flow: Flow, motions: Motions, dots, tolerances) -> tuple[np.ndarray, np.ndarray]:
     """`jvp` of some directions a row, over the steps that were taken."""
+    dy0, dparams = dots
     y_dot = np.array(dy0, np.float64)
-    path_dot = np.full((*dy0.shape[:2], ts.shape[1], flow.states), np.nan)
+    path_dot = np.full((*dy0.shape[:2], *motions.path.shape[1:]), np.nan)
 
     def advance_tangents(steps: Steps, rows, members):
-        times = ts if len(ts) == 1 else ts[rows]
+        of = motions.take(rows)
         path_dot[rows], y_dot[rows], excess = steps.kernel.jvp(
-            times, params[rows], steps.table, steps.first[members], steps.counts[members], dy0[rows], dparams[rows],
-            steps.order, tolerances.floor,
-        )  # fmt: skip
+            of.ts, of.params, steps.record(members), dy0[rows], dparams[rows], tolerances.floor
+        )
         return excess / tolerances.largest_excess
 
-    for steps, rows, members in _steps_of(flow, ts, y0, params, accepted, ticket, tolerances):
-        excess = advance_tangents(steps, rows, members)
-
-        def divide(k: int, steps=steps, rows=rows, members=members, excess=excess):
-            row = rows[k : k + 1]
-            again = functools.partial(advance_tangents, rows=row, members=np.zeros(1, int))
-            if (
-                _sweep_divided_steps(flow, steps, members[k], params[row[0]], tolerances, excess[k : k + 1], again)
-                is None
-            ):
-                path_dot[row], y_dot[row] = np.nan, np.nan
-
-        _native.map_in_threads(np.flatnonzero(excess > 1.0).tolist(), divide, _native.cores())
-    at_start = np.broadcast_to((ts == ts[:, :1])[:, None], path_dot.shape[:3])  # also where there was no step
-    return np.where(at_start[..., None], dy0[:, :, None], path_dot), y_dot
+    for row in _go_over_steps(flow, motions, tolerances, advance_tangents, advance_tangents):
+        path_dot[row], y_dot[row] = np.nan, np.nan
+    return start_outputs(motions.ts, dy0, path_dot), y_dot
 
 
 # ---- vector–Jacobian products ---------------------------------------------------------------------------------------
 
 
-def vjp(flow: Flow, ts, y0, params, solution, path_ct, end_ct, tolerances: Tolerances) -> tuple[np.ndarray, np.ndarray]:
+def vjp(flow: Flow, motions: Motions, path_ct, end_ct, tolerances: Tolerances) -> tuple[np.ndarray, np.ndarray]:
     """The transpose of `jvp`: from m cotangents of the outputs of each of N motions to those of what went in.
 
-    `solution` is (path, result, accepted, ticket) of the run; `path_ct` (N, m, T, 2n) and `end_ct` (N, m, 2n) →
-    cotangents of `y0` (N, m, 2n) and of `params` (N, m, P). A cotangent that is not zero, of an output that was
-    not reached or of the end of a motion that failed, makes all of them NaN: there is no derivative.
+    `path_ct` (N, m, T, 2n) and `end_ct` (N, m, 2n) → cotangents of `y0` (N, m, 2n) and of `params` (N, m, P). A
+    cotangent that is not zero, of an output that was not reached or of the end of a motion that failed, makes all of
+    them NaN: there is no derivative.
     """
-    path, result, accepted, ticket = solution
+    ts, y0, params, path, *_ = motions
     members, m = end_ct.shape[:2]
     if m > flow.states + flow.numbers:
-        return _vjp_by_jacobian(flow, ts, y0, params, solution, path_ct, end_ct, tolerances)
-    path_ct, lost = mask_cotangents(path, result, path_ct, end_ct)
-    params = _repeat_rows(params, members)
+        return _vjp_by_jacobian(flow, motions, path_ct, end_ct, tolerances)
+    path_ct, lost = mask_cotangents(motions, path_ct, end_ct)
     params_ct = np.zeros((members, m, flow.numbers))
     if flow.projection is not None and path.shape[1] > 2:
-        _transpose_projection(flow, flow.projection, ts, path, params, path_ct, params_ct)
-    done = (result == SUCCESSFUL)[:, None, None]
-    end_ct = end_ct + np.where(done, path_ct[:, :, -1], 0.0)
-    path_ct[:, :, -1] = 0.0
+        inner = path_ct[:, :, 1:-1]
+        back = _differentiate_projection(pullback, flow.projection, inner.shape[:-1], *_inner_states(motions), inner)
+        inner[:], params_ct = back[..., : flow.states], back[..., flow.states :].sum(axis=2)
 
-    first, rows = ts[:, :1], np.repeat(np.arange(members), m)
-    ts = ts if len(ts) == 1 else ts[rows]
-    y_ct, more = _vjp_over_steps(
-        flow, ts, y0[rows], params[rows], accepted[rows], ticket[rows], path_ct.reshape(members * m, *path.shape[1:]),
-        end_ct.reshape(members * m, -1), tolerances,
-    )  # fmt: skip
-    y_ct, more = y_ct.reshape(members, m, -1), more.reshape(members, m, -1) + params_ct
+    of_rows = motions.take(np.repeat(np.arange(members), m))
+    go_back = functools.partial(_vjp_over_steps, flow, of_rows, tolerances=tolerances)
+    path_ct, end_ct = (x.reshape(members * m, *x.shape[2:]) for x in (path_ct, end_ct))
+    y_ct, more = (x.reshape(members, m, -1) for x in transpose_outputs(go_back, of_rows.ts, path_ct, end_ct))
+    params_ct = params_ct + more
     if flow.projection is not None:
-        y_ct, of_projection = _transpose_start_projection(flow.projection, first, y0, params, y_ct)
-        more = more + of_projection
-    y_ct[lost], more[lost] = np.nan, np.nan
-    return y_ct, more
+        start = y0[:, None], ts[:, None, :1], params[:, None]
+        back = _differentiate_projection(pullback, flow.projection, (members, m), *start, y_ct)
+        y_ct, params_ct = back[..., : flow.states], params_ct + back[..., flow.states :]
+    y_ct[lost], params_ct[lost] = np.nan, np.nan
+    return y_ct, params_ct
 
 
-def mask_cotangents(path, result, path_ct, end_ct, library: Any = np) -> tuple:
+def mask_cotangents(motions: Motions, path_ct, end_ct, library: Any = np) -> tuple:
     """Cotangents (N, m, T, 2n), zero where an output was not reached; and whether one is lost there, (N, m)."""
-    reached = library.isfinite(path)[:, None]
-    lost = ((path_ct != 0) & ~reached).any(axis=(2, 3))
-    lost |= (end_ct != 0).any(axis=2) & (result != SUCCESSFUL)[:, None]
-    return library.where(reached, path_ct, 0.0), lost
+    reached, failed = library.isfinite(motions.path)[:, None], (motions.result != SUCCESSFUL)[:, None]
+    lost = ((path_ct != 0) & ~reached).any(axis=(2, 3)) | ((end_ct != 0).any(axis=2) & failed)
+    is_last = np.arange(path_ct.shape[2])[:, None] == path_ct.shape[2] - 1
+    return library.where(reached & ~(failed[..., None, None] & is_last), path_ct, 0.0), lost
 
 
-def _vjp_over_steps(
-    flow: Flow, ts, y0, params, accepted, ticket, path_ct, end_ct, tolerances
-) -> tuple[np.ndarray, np.ndarray]:
+def transpose_outputs(go_back: Callable, ts, path_ct, end_ct, library: Any = np) -> tuple:
+    """The cotangents of starts, and what else `go_back(path_ct, end_ct)` gives, from those of outputs and ends.
+
+    `go_back` takes the outputs between: the last one is the end of the motion, and some may be its start.
+    """
+    y_ct, *more = go_back(path_ct, end_ct + path_ct[:, -1])
+    at_start = (ts == ts[:, :1])[:, :-1, None]
+    return y_ct + library.sum(path_ct[:, :-1] * at_start, axis=1), *more
+
+
+def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -> tuple[np.ndarray, np.ndarray]:
     """`vjp` of one cotangent a row, over the steps that were taken."""
-    y_ct, params_ct = np.full(end_ct.shape, np.nan), np.full((len(y0), flow.numbers), np.nan)
+    y_ct, params_ct = np.full(end_ct.shape, np.nan), np.full((len(end_ct), flow.numbers), np.nan)
+    direction = np.random.default_rng(0).normal(size=flow.states + flow.numbers)
 
     def transpose_steps(steps: Steps, rows, members):
-        times = ts if len(ts) == 1 else ts[rows]
+        of = motions.take(rows)
         y_ct[rows], params_ct[rows], excess = steps.kernel.vjp(
-            times, params[rows], steps.table, steps.first[members], steps.counts[members], path_ct[rows],
-            end_ct[rows], steps.order,
-        )  # fmt: skip
-        return excess > tolerances.largest_excess
+            of.ts, of.params, steps.record(members), path_ct[rows], end_ct[rows]
+        )
+        return excess / tolerances.largest_excess
 
-    for steps, rows, members in _steps_of(flow, ts, y0, params, accepted, ticket, tolerances):
-        long = np.flatnonzero(transpose_steps(steps, rows, members))
-        if not long.size:
-            continue
-        probe = functools.partial(_probe_series, flow, ts, params, tolerances)
-        excess = probe(steps, rows[long], members[long])
+    def probe(steps: Steps, rows, members):
+        """The size of the last terms of the series of a tangent, in units of the limit, along any direction at all."""
+        of, record = motions.take(rows), steps.record(members)
+        y_dot, params_dot = (np.tile(x, (len(rows), 1, 1)) for x in np.split(direction, [flow.states]))
+        excess = steps.kernel.jvp(of.ts, of.params, record, y_dot, params_dot, tolerances.floor)[2]
+        return excess / tolerances.largest_excess
 
-        def divide(k: int, steps=steps, rows=rows, members=members, long=long, excess=excess, probe=probe):
-            row = rows[long[k : k + 1]]
-            again = functools.partial(probe, rows=row, members=np.zeros(1, int))
-            number = params[row[0]]
-            better = _sweep_divided_steps(
-                flow, steps, int(members[long[k]]), number, tolerances, excess[k : k + 1], again
-            )
-            if better is None:
-                y_ct[row], params_ct[row] = np.nan, np.nan
-            else:
-                transpose_steps(better, row, np.zeros(1, int))  # here, so that no more than one table a thread is kept
-
-        _native.map_in_threads(np.flatnonzero(excess > 1.0).tolist(), divide, _native.cores())
-    at_start = (ts == ts[:, :1])[:, :, None]  # outputs that are the initial state; steps begin after them
-    return y_ct + np.sum(path_ct * at_start, axis=1), params_ct
+    for row in _go_over_steps(flow, motions, tolerances, transpose_steps, probe):
+        y_ct[row], params_ct[row] = np.nan, np.nan
+    return y_ct, params_ct
 
 
-def _probe_series(flow: Flow, ts, params, tolerances, steps: Steps, rows, members) -> np.ndarray:
-    """The size of the last terms of the series of a tangent, in units of the limit, along any direction at all."""
-    direction = np.random.default_rng(0).normal(size=flow.states + flow.numbers)
-    y_dot, params_dot = (np.tile(x, (len(rows), 1, 1)) for x in np.split(direction, [flow.states]))
-    excess = steps.kernel.jvp(
-        ts if len(ts) == 1 else ts[rows], params[rows], steps.table, steps.first[members], steps.counts[members], y_dot,
-        params_dot, steps.order, tolerances.floor,
-    )[2]  # fmt: skip
-    return excess / tolerances.largest_excess
-
-
-def _vjp_by_jacobian(
-    flow: Flow, ts, y0, params, solution, path_ct, end_ct, tolerances
-) -> tuple[np.ndarray, np.ndarray]:
+def _vjp_by_jacobian(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -> tuple[np.ndarray, np.ndarray]:
     """`vjp` from the whole Jacobian: for more cotangents than there are numbers that vary."""
     inputs = flow.states + flow.numbers
-    unit = np.broadcast_to(np.eye(inputs), (len(y0), inputs, inputs))
-    path, end = jvp(flow, ts, y0, params, solution, unit[..., : flow.states], unit[..., flow.states :], tolerances)
+    unit = np.broadcast_to(np.eye(inputs), (len(end_ct), inputs, inputs))
+    path, end = jvp(flow, motions, unit[..., : flow.states], unit[..., flow.states :], tolerances)
     used = np.einsum("nmts,nrts->nmr", path_ct, np.where(np.isfinite(path), path, 0.0))
     used += np.einsum("nms,nrs->nmr", end_ct, np.where(np.isfinite(end), end, 0.0))
     path_lost, end_lost = (~np.all(np.isfinite(x), axis=1, keepdims=True) for x in (path, end))
@@ -216,126 +220,112 @@ def _vjp_by_jacobian(
     return used[..., : flow.states], used[..., flow.states :]
 
 
+# ---- projections -----------------------------------------------------------------------------------------------------
 # Off the constraints a motion depends on where its steps end, for there it is projected; and a motion with tangents
 # takes other steps. In its second derivative a start that moves on the constraints leaves them. So the motion is
-# differentiated as if it began at the projection of its start, which is that start.
+# differentiated as if it began at the projection of its start, which is that start. Outputs between are projected too;
+# that squares the distance to the constraints: its derivative at the projected state is that at the state before.
 
 
 def project_start_tangents(projection: Projection, t, y0, params, dy0, dparams) -> np.ndarray:
     """The tangents (N, m, 2n) of the projection of the starts."""
-    inputs = _start_columns(t, y0, params, dy0, dparams)
-    return _projection_pushforward(projection.state, y0.shape[1]).evaluate(inputs).T.reshape(dy0.shape)
+    start = y0[:, None], t[:, None], params[:, None]
+    return _differentiate_projection(pushforward, projection, dy0.shape[:2], *start, dy0, dparams)
 
 
-def _transpose_start_projection(projection: Projection, t, y0, params, y_ct) -> tuple[np.ndarray, np.ndarray]:
-    """The transpose of `project_start_tangents`: cotangents (N, m, 2n) of starts, and (N, m, P) of parameters."""
-    back = _projection_pullback(projection.state, y0.shape[1]).evaluate(_start_columns(t, y0, params, y_ct)).T
-    back = back.reshape(*y_ct.shape[:2], -1)
-    return back[..., : y0.shape[1]], back[..., y0.shape[1] :]
+def _inner_states(motions: Motions) -> tuple:
+    """The states at the inner output times, the start where one was not reached; these times; the parameters."""
+    path = np.where(np.isfinite(motions.path), motions.path, motions.path[:, :1])
+    return path[:, None, 1:-1], motions.ts[:, None, 1:-1, None], motions.params[:, None, None]
 
 
-def _start_columns(t, y0, params, *moving) -> list:
-    """The inputs of a projection's derivatives at N starts, in m directions each: columns of N m numbers."""
-    members, m = moving[0].shape[:2]
-    parts = y0, t, params, *moving
-    parts = [np.broadcast_to(x if x.ndim == 3 else x[:, None], (members, m, x.shape[-1])) for x in parts]
-    return list(np.concatenate([x.reshape(members * m, x.shape[-1]).T for x in parts]))
+def _differentiate_projection(differentiate: Callable, projection: Projection, shape: tuple, *parts) -> np.ndarray:
+    """The pushforward or the pullback of a projection, at states of this `shape`, one after the other.
 
-
-def _transpose_projection(flow: Flow, projection: Projection, ts, path, params, path_ct, params_ct) -> None:
-    """Take cotangents back through the projection that put the outputs on the constraints, all but the first and last.
-
-    Changes `path_ct` and `params_ct` in place. The projection squares the distance to the constraints: its derivative
-    at the projected state is that at the state before.
+    `parts` (…, numbers) are the states, times and parameters, then tangents or cotangents.
     """
-    members, m, times, _ = path_ct.shape
-    place = np.broadcast_to(np.where(np.isfinite(path), path, path[:, :1])[:, None, 1:-1],
-                            (members, m, times - 2, flow.states))  # fmt: skip
-    t = np.broadcast_to(ts[:, None, 1:-1], place.shape[:-1])
-    numbers = np.broadcast_to(params[:, None, None], (*place.shape[:-1], flow.numbers))
-    parts = place, t[..., None], numbers, path_ct[:, :, 1:-1]
-    columns = [x.reshape(place[..., 0].size, x.shape[-1]).T for x in parts]  # a scene may have no numbers
-    back = _projection_pullback(projection.state, flow.states).evaluate(list(np.concatenate(columns))).T
-    back = back.reshape(*place.shape[:-1], -1)
-    path_ct[:, :, 1:-1] = back[..., : flow.states]
-    params_ct += back[..., flow.states :].sum(axis=2)
-
-
-def _project_tangents(flow: Flow, projection: Projection, ts, path, params, path_dot, dparams) -> None:
-    """Take tangents through the projection that put the outputs on the constraints, all but the first and last.
-
-    Changes `path_dot` in place; `_transpose_projection` is its transpose.
-    """
-    members, m, times, _ = path_dot.shape
-    shape = members, m, times - 2, flow.states
-    place = np.broadcast_to(np.where(np.isfinite(path), path, path[:, :1])[:, None, 1:-1], shape)
-    t = np.broadcast_to(ts[:, None, 1:-1], shape[:-1])[..., None]
-    numbers, moving = (
-        np.broadcast_to(x, (*shape[:-1], flow.numbers)) for x in (params[:, None, None], dparams[:, :, None])
-    )
-    parts = place, t, numbers, path_dot[:, :, 1:-1], moving
-    columns = [x.reshape(place[..., 0].size, x.shape[-1]).T for x in parts]  # a scene may have no numbers
-    forward = _projection_pushforward(projection.state, flow.states)
-    path_dot[:, :, 1:-1] = forward.evaluate(list(np.concatenate(columns))).T.reshape(shape)
+    line = _projection_line(differentiate, projection.state, parts[0].shape[-1])
+    columns = [np.broadcast_to(x, (*shape, x.shape[-1])).reshape(math.prod(shape), x.shape[-1]).T for x in parts]
+    return line.evaluate(list(np.concatenate(columns))).T.reshape(*shape, -1)
 
 
 @functools.lru_cache(maxsize=64)
-def _projection_pushforward(program: Program, t: int) -> StraightLine:
-    """The tangents of the outputs of a projection, from its inputs and tangents of all but the time, input `t`."""
+def _projection_line(differentiate: Callable, program: Program, t: int) -> StraightLine:
+    """The derivative of a projection, from its inputs and what moves; by all of these but the time, input `t`."""
     by = [i for i in range(program.size) if i != t]
-    return pushforward(program.line, [np.dtype(float)] * program.size, by, range(t))
-
-
-@functools.lru_cache(maxsize=64)
-def _projection_pullback(program: Program, t: int) -> StraightLine:
-    """The cotangents of a projection's inputs but the time, input `t`, from its inputs and those of its outputs."""
-    by = [i for i in range(program.size) if i != t]
-    return pullback(program.line, [np.dtype(float)] * program.size, by, range(t))
+    return differentiate(program.line, [np.dtype(float)] * program.size, by, range(t))
 
 
 # ---- the steps that a derivative goes over ---------------------------------------------------------------------------
 
 
-def _steps_of(
-    flow: Flow, ts, y0, params, accepted, ticket, tolerances
-) -> Iterator[tuple[Steps, np.ndarray, np.ndarray]]:
+def _go_over_steps(
+    flow: Flow, motions: Motions, tolerances: Tolerances, go: Callable, probe: Callable
+) -> Iterator[np.ndarray]:
+    """Let `go(steps, rows, members)` take a derivative over the steps of all rows; rows that no steps suit are given.
+
+    `go` and `probe` return how large the last terms of the series are, (R,), in units of the limit. `go` may bound that
+    from above; where `probe` is larger than 1, the steps are divided until they suit.
+    """
+    for steps, rows, members in _steps_of(flow, motions, tolerances):
+        excess = go(steps, rows, members)
+        long = np.flatnonzero(excess > 1.0)
+        if not long.size:
+            continue
+        excess = excess[long] if probe is go else probe(steps, rows[long], members[long])
+
+        def divide(k: int, steps=steps, rows=rows[long], members=members[long], excess=excess):
+            row, only = rows[k : k + 1], np.zeros(1, int)
+            numbers = motions.params[row[0] if len(motions.params) > 1 else 0]
+            measure = functools.partial(probe, rows=row, members=only)
+            better = _suitable_steps(flow, steps, int(members[k]), numbers, tolerances, excess[k : k + 1], measure)
+            if better is None:
+                return row
+            if probe is not go:  # here, so that no more than one table a thread is kept
+                go(better, row, only)
+
+        lost = _native.map_in_threads(np.flatnonzero(excess > 1.0).tolist(), divide, _native.cores())
+        yield from (row for row in lost if row is not None)
+
+
+def _steps_of(flow: Flow, motions: Motions, tolerances: Tolerances) -> Iterator[tuple[Steps, np.ndarray, np.ndarray]]:
     """The steps of all rows: those of a run, whose rows they are, and which members of the run.
 
     First those that are kept; motions whose steps are gone are run once more.
     """
-    waiting = np.ones(len(y0), bool)
-    for steps, rows, members in KEPT.runs(ticket):
+    waiting = np.ones(len(motions.y0), bool)
+    for steps, rows, members in KEPT.runs(motions.ticket):
         waiting[rows] = False
         yield steps, rows, members
-    for places in portions(np.flatnonzero(waiting), accepted * (flow.states + 4), LARGEST_PORTION):
-        store, some_ts = StepStore(), ts if len(ts) == 1 else ts[places]
-        room = _ROOM_AGAIN * int(accepted[places].sum()) + len(places)
-        again = flow.follow(some_ts, y0[places], params[places], tolerances, store, room)
-        for steps, rows, members in store.runs(again.ticket):
+    for places in portions(np.flatnonzero(waiting), motions.accepted * (flow.states + 4), LARGEST_PORTION):
+        store, again = StepStore(), motions.take(places)
+        room = _ROOM_AGAIN * int(again.accepted.sum()) + len(places)
+        ticket = flow.follow(*again[:3], tolerances, store, room).ticket
+        for steps, rows, members in store.runs(ticket):
             yield steps, places[rows], members
 
 
-def _sweep_divided_steps(
-    flow: Flow, steps: Steps, member: int, params, tolerances, excess, sweep: Callable
+def _suitable_steps(
+    flow: Flow, steps: Steps, member: int, params, tolerances, excess, measure: Callable
 ) -> Steps | None:
-    """`sweep(steps)` over the steps of a member in ever smaller parts: the steps that suit its tangents, or None.
+    """The steps of a member, divided into ever smaller parts until they suit its tangents; None where none do.
 
-    `excess` (1,), and what `sweep` returns, is how large the last terms of the series are, in units of the limit. Those
-    of a motion with constraints that do not fall as its steps do are rounding, as beside a dead centre: its own steps
-    are right.
+    `excess` (1,), and what `measure(steps)` returns, is how large the last terms of the series are, in units of the
+    limit. Those of a motion with constraints that do not fall as its steps do are rounding, as beside a dead centre:
+    its own steps are right.
     """
     parts = 1
     for _ in range(TRIES):
         before = float(excess[0])
-        parts *= math.ceil(min(MOST_PARTS, 1.1 * float(excess[0]) ** (1 / (steps.order - 1))))
+        parts *= math.ceil(min(MOST_PARTS, 1.1 * before ** (1 / (steps.order - 1))))
         divided = _divide_steps(flow, steps, member, params, tolerances, parts)
-        excess = sweep(divided)
+        excess = measure(divided)
         if not excess > 1.0:
             return divided
         if flow.projection is not None and float(excess[0]) > 0.5 * before:
             one = slice(member, member + 1)
             own = steps._replace(first=steps.first[one], counts=steps.counts[one], complete=steps.complete[one])
-            sweep(own)
+            measure(own)
             return own
     return None
 
@@ -354,14 +344,6 @@ def _divide_steps(flow: Flow, steps: Steps, member: int, params, tolerances: Tol
     table = np.concatenate([begins, path[:-1], more], axis=1)
     count = np.array([len(table)])
     return Steps(steps.kernel, steps.order, table, np.zeros(1, int), count, np.ones(1, bool))
-
-
-# ---- rows ------------------------------------------------------------------------------------------------------------
-
-
-def _repeat_rows(x: np.ndarray, rows: int) -> np.ndarray:
-    """An array (1, …) that all members share as one with a row for each; any other array as it is."""
-    return np.broadcast_to(x, (rows, *x.shape[1:])) if len(x) == 1 else x
 
 
 def portions(places: np.ndarray, numbers: np.ndarray, largest: int) -> list[np.ndarray]:

@@ -64,17 +64,15 @@ def run_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params) -> tuple:
     return _solution(*launch(gpu.MOTION, program, members, arrays, shapes), states=not notes)
 
 
-def transpose_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params, path_ct, end_ct) -> tuple | None:
+def transpose_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params, path_ct, end_ct) -> tuple:
     """The cotangents of `y0` (N, 2n) and of the parameters (N, P), from those of outputs and ends.
 
     `path_ct` is (N, T, 2n), of which the first and the last output are not looked at, `end_ct` (N, 2n). Then `excess`
-    (N,), as of `Kernel.vjp`, and which are done (N,): all but those with more steps than a thread can write down. None
-    where a GPU cannot go back over the steps of this scene.
+    (N,), as of `Kernel.vjp`, and which are done (N,): all but those with more steps than a thread can write down.
+
+    Raises `Unlowerable` where a GPU cannot go back over the steps of this scene.
     """
-    try:
-        program, row = flow.kernel.for_gpus(tolerances.allow_singles).transpose(tolerances.rtol)
-    except Unlowerable:
-        return None
+    program, row = flow.kernel.for_gpus(tolerances.allow_singles).transpose(tolerances.rtol)
     members, threads = len(y0), math.prod(gpu.grid(gpu.TRANSPOSE, len(y0)))
     room = min(tolerances.max_steps, gpu.LARGEST_RECORD // (threads * row))
     arrays = _inputs(gpu.TRANSPOSE, ts, y0, params, flow, tolerances, room=room)

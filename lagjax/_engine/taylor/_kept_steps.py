@@ -8,12 +8,11 @@ import itertools
 import threading
 from collections import OrderedDict
 from collections.abc import Iterator
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
-if TYPE_CHECKING:
-    from lagjax._native import Kernel
+from lagjax._native import Kernel, Record
 
 LARGEST_KEPT = 2**26  # numbers of steps that are kept for a derivative that may follow: half a GiB
 
@@ -26,12 +25,16 @@ class Steps(NamedTuple):
     steps are not all there.
     """
 
-    kernel: "Kernel"
+    kernel: Kernel
     order: int
     table: np.ndarray
     first: np.ndarray
     counts: np.ndarray
     complete: np.ndarray
+
+    def record(self, members) -> Record:
+        """The steps of some members, for a derivative."""
+        return Record(self.table, self.first[members], self.counts[members], self.order)
 
 
 class StepStore:

@@ -23,11 +23,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
-from jax.interpreters import ad, batching, mlir
+from jax.interpreters import mlir
 
 from lagjax._engine.taylor._call import NO_HANDLER, call_host, capsule
 from lagjax._native import LARGEST_LINE, LineCode, line_handler
-from lagjax._primitives import VaryingPrimitive, batch_in_front
+from lagjax._primitives import LinearMap, compute_on_host
 from lagjax._program import (
     Graph,
     Program,
@@ -135,92 +135,66 @@ class Line:
 
     def __call__(self, x):
         """g(x) of rows x (…, inputs), under every transformation of JAX."""
-        return value_p.bind(x, line=self)
+        return value_p.bind(x, line=self)[0]
 
 
 # ---- primitives ------------------------------------------------------------------------------------------------------
 
-value_p, forward_p, back_p = (VaryingPrimitive(f"lagjax_line_{name}") for name in ("value", "forward", "back"))
 
+class _LineMap(LinearMap):
+    """The line `of(line)` of rows of arrays that stand side by side, with `width(line)` results a row."""
 
-def _derivative_of_value(primals, tangents, *, line: Line):
-    (x,), (dx,) = primals, tangents
-    return value_p.bind(x, line=line), forward_p.bind(x, ad.instantiate_zeros(dx), line=line)
+    def __init__(self, name: str, of: Callable, width: Callable, linear: int = 0, transpose: Callable | None = None):
+        def shape(x, *_, line: Line):
+            return [ShapedArray((*x.shape[:-1], width(line)), np.dtype(float))]
 
+        def vary(primals, tangents, _, *, line: Line):
+            return forward_p.bind(jnp.concatenate(primals, axis=-1), tangents[0], line=of(line))
 
-def _derivative_of_linear(primitive, of):
-    """The derivative rule of `primitive`, (x, v) ↦ A(x) v, whose line with inputs (x, v) is `of(line)`."""
+        super().__init__(f"lagjax_line_{name}", shape, vary, linear, transpose)
+        self.of, self.shape = of, shape
+        compute_on_host(self, self.evaluate)
+        mlir.register_lowering(self, self._lower_on_cpu, platform="cpu")
+        mlir.register_lowering(self, mlir.lower_fun(self._call_from_gpu, multiple_results=True), platform="cuda")
 
-    def rule(primals, tangents, *, line: Line):
-        (x, v), (dx, dv) = primals, tangents
-        total = None if isinstance(dv, ad.Zero) else primitive.bind(x, dv, line=line)
-        if not isinstance(dx, ad.Zero):
-            more = forward_p.bind(jnp.concatenate([x, v], axis=-1), dx, line=of(line))
-            total = more if total is None else total + more
-        return primitive.bind(x, v, line=line), total
+    def evaluate(self, *arrays, line: Line):
+        """By NumPy, or machine code, at once."""
+        return [self.of(line).evaluate(*map(np.asarray, arrays))]
 
-    return rule
+    def _lower_on_cpu(self, context, *arrays, line: Line):
+        of, call = self.of(line), self._compile_operations
+        if not context.module_context.lowering_parameters.for_export:  # where it runs elsewhere
+            code = of.code if len(of.line.nodes) <= LARGEST_LINE else None
+            call = self._call_host if code is None else self._call_code
+            if code is not None:
+                _register_handler()
+                # What XLA compiled keeps its callbacks; this one is never called, and keeps the machine code.
+                context.module_context.add_host_callback(functools.partial(id, code))
+        return mlir.lower_fun(call, multiple_results=True)(context, *arrays, line=line)
 
+    def _call_host(self, *arrays, line: Line):
+        return call_host(functools.partial(self.evaluate, line=line), self.shape(*arrays, line=line), *arrays)
 
-def _transpose_rule(primitive):
-    return lambda cotangent, x, v, *, line: [None, primitive.bind(x, ad.instantiate_zeros(cotangent), line=line)]
+    def _call_code(self, *arrays, line: Line):
+        x, of = jnp.concatenate(arrays, axis=-1), self.of(line)
+        assert of.code is not None
+        rows = jax.ShapeDtypeStruct((math.prod(x.shape[:-1]), of.outputs), np.float64)
+        result = jax.ffi.ffi_call(_TARGET, rows)(x.reshape(-1, x.shape[-1]), line=np.int64(of.code.address))
+        return [result.reshape(*x.shape[:-1], of.outputs)]
 
+    def _compile_operations(self, *arrays, line: Line):
+        columns = tuple(x[..., i] for x in arrays for i in range(x.shape[-1]))
+        return [jnp.stack(emit(self.of(line).line, columns), axis=-1)]
 
-def _batch_rule(primitive):
-    return lambda arrays, axes, *, line: (primitive.bind(*batch_in_front(arrays, axes), line=line), 0)
+    def _call_from_gpu(self, *arrays, line: Line):
+        if len(self.of(line).line.nodes) <= LARGEST_COMPILED:
+            return self._compile_operations(*arrays, line=line)
 
+        def evaluate(*arrays):
+            with jax.enable_x64(True):
+                return jax.device_put(self.evaluate(*arrays, line=line))
 
-def _register(primitive, of, width) -> None:
-    """A primitive, the line `of(line)` in NumPy, `width(line)` numbers a row: at once, or in a callback of XLA's."""
-
-    def host(*arrays, line: Line):
-        return [of(line).evaluate(*arrays)]
-
-    def shape(x, *_, line: Line):
-        return ShapedArray((*x.shape[:-1], width(line)), np.dtype(float))
-
-    def evaluate(*arrays, line: Line):
-        with jax.enable_x64(True):
-            return jax.device_put(compute(*arrays, line=line))
-
-    def compute(*arrays, line: Line):
-        return host(*map(np.asarray, arrays), line=line)[0]
-
-    def call_back(*arrays, line: Line):
-        return call_host(functools.partial(host, line=line), [shape(*arrays, line=line)], *arrays)[0]
-
-    def call_code(*arrays, line: Line):
-        x = jnp.concatenate(arrays, axis=-1)
-        result, code = shape(*arrays, line=line), of(line).code
-        assert code is not None
-        rows = jax.ShapeDtypeStruct((math.prod(x.shape[:-1]), of(line).outputs), np.float64)
-        found = jax.ffi.ffi_call(_TARGET, rows)(x.reshape(-1, x.shape[-1]), line=np.int64(code.address))
-        return found.reshape(result.shape)
-
-    def lower_on_cpu(context, *arrays, line: Line):
-        if context.module_context.lowering_parameters.for_export:  # it runs elsewhere
-            return mlir.lower_fun(compile_operations, multiple_results=False)(context, *arrays, line=line)
-        code = of(line).code if len(of(line).line.nodes) <= LARGEST_LINE else None
-        if code is None:
-            return mlir.lower_fun(call_back, multiple_results=False)(context, *arrays, line=line)
-        _register_handler()
-        # What XLA compiled keeps its callbacks; this one is never called, and keeps the machine code.
-        context.module_context.add_host_callback(functools.partial(id, code))
-        return mlir.lower_fun(call_code, multiple_results=False)(context, *arrays, line=line)
-
-    def compile_operations(*arrays, line: Line):
-        return jnp.stack(emit(of(line).line, tuple(x[..., i] for x in arrays for i in range(x.shape[-1]))), axis=-1)
-
-    def call_from_gpu(*arrays, line: Line):
-        if len(of(line).line.nodes) <= LARGEST_COMPILED:
-            return compile_operations(*arrays, line=line)
-        return jax.pure_callback(functools.partial(compute, line=line), shape(*arrays, line=line), *arrays)
-
-    primitive.def_abstract_eval(shape)
-    primitive.def_impl(evaluate)
-    mlir.register_lowering(primitive, lower_on_cpu, platform="cpu")
-    mlir.register_lowering(primitive, mlir.lower_fun(call_from_gpu, multiple_results=False), platform="cuda")
-    batching.primitive_batchers[primitive] = _batch_rule(primitive)
+        return jax.pure_callback(evaluate, self.shape(*arrays, line=line), *arrays)
 
 
 @functools.cache
@@ -228,11 +202,14 @@ def _register_handler() -> None:
     jax.ffi.register_ffi_target(_TARGET, capsule(line_handler()), platform="cpu", api_version=1)
 
 
-_register(value_p, lambda line: line, lambda line: line.outputs)
-_register(forward_p, lambda line: line.forward, lambda line: line.outputs)
-_register(back_p, lambda line: line.back, lambda line: line.count)
-ad.primitive_jvps[value_p] = _derivative_of_value
-ad.primitive_jvps[forward_p] = _derivative_of_linear(forward_p, lambda line: line.forward)
-ad.primitive_jvps[back_p] = _derivative_of_linear(back_p, lambda line: line.back)
-ad.primitive_transposes[forward_p] = _transpose_rule(back_p)
-ad.primitive_transposes[back_p] = _transpose_rule(forward_p)
+value_p = _LineMap("value", lambda line: line, lambda line: line.outputs)
+forward_p = _LineMap(
+    "forward",
+    lambda line: line.forward,
+    lambda line: line.outputs,
+    1,
+    lambda x, w, _, line: back_p.bind(*x, *w, line=line),
+)
+back_p = _LineMap(
+    "back", lambda line: line.back, lambda line: line.count, 1, lambda x, w, _, line: forward_p.bind(*x, *w, line=line)
+)

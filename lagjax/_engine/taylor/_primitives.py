@@ -33,7 +33,14 @@ from jax.interpreters import ad, batching, mlir
 
 from lagjax._engine._problem import Solution
 from lagjax._engine.taylor import _derivatives
-from lagjax._engine.taylor._call import call_host, has_handler, has_sweep, run_by_handler, sweep_by_handler
+from lagjax._engine.taylor._call import (
+    begins_in_handler,
+    call_host,
+    derivative_by_handler,
+    derivatives_begin_in_handler,
+    run_by_handler,
+)
+from lagjax._engine.taylor._derivatives import Motions
 from lagjax._engine.taylor._flow import Flow, Tolerances
 from lagjax._engine.taylor._gpu_launch import adapt_tolerances, run_on_gpu, transpose_on_gpu
 from lagjax._engine.taylor._kept_steps import KEPT
@@ -42,8 +49,16 @@ from lagjax._engine.taylor._state_rates import rate
 from lagjax._engine.taylor._variational import from_rows, to_rows
 from lagjax._interface import SUCCESSFUL, default_platform
 from lagjax._native import Begun, Projection
-from lagjax._primitives import VaryingPrimitive, cond_alike
-from lagjax._program import Program
+from lagjax._primitives import (
+    LinearMap,
+    VaryingPrimitive,
+    compute_on_host,
+    cond_alike,
+    cotangent_of,
+    is_zero,
+    zero_like,
+)
+from lagjax._program import Program, Unlowerable
 
 
 def run(flow: Flow, tolerances: Tolerances, ts, y0, params) -> Solution:
@@ -65,18 +80,26 @@ def compile_once(function, *first, **settings):
 # ---- on the host: NumPy arrays with any batch axes in front ----------------------------------------------------------
 
 
-def _rows(arrays, inner, shared=(), library: Any = np):
-    """Each array with one row a member, or one row where that is all there is to a `shared` one; and the batch axes."""
-    leading = [x.shape[: x.ndim - k] for x, k in zip(arrays, inner, strict=True)]
-    batch = np.broadcast_shapes(*leading)
+# Axes of the arguments of a run, those of a batch left out; `_derivatives.Motions` are these, then its results.
+_RUN, _MOTIONS = (1, 1, 1), (1, 1, 1, 2, 0, 0, 0)
+_GIVEN = len(_MOTIONS)
+
+
+def _rows(arrays, inner, library: Any = np):
+    """Each array with one row a member, `ts` and `params` with one where that is all there is; and the batch axes."""
+    batch = _batch_of(arrays, inner)
 
     def rows(place, x, k):
         own = x.shape[x.ndim - k :]
-        if place in shared and x.size == math.prod(own):
+        if place in (0, 2) and x.size == math.prod(own):
             return x.reshape(1, *own)
         return library.broadcast_to(x, batch + own).reshape(math.prod(batch), *own)
 
     return [rows(place, x, k) for place, (x, k) in enumerate(zip(arrays, inner, strict=True))], batch
+
+
+def _batch_of(arrays, inner):
+    return np.broadcast_shapes(*(x.shape[: x.ndim - k] for x, k in zip(arrays, inner, strict=True)))
 
 
 def _restore_batch(results, batch):
@@ -84,46 +107,31 @@ def _restore_batch(results, batch):
 
 
 def _run_on_host(ts, y0, params, *, flow, tolerances, keep):
-    rows, batch = _rows((ts, y0, params), (1, 1, 1), shared=(0, 2))
+    rows, batch = _rows((ts, y0, params), _RUN)
     return _restore_batch(flow.run(*rows, tolerances, KEPT if keep else None)[:_OUTPUTS], batch)
 
 
-def _continue_run(ts, y0, params, *begun, flow, tolerances, **_):
-    """The results of a run of rows of members, of which a handler has done what it could."""
-    return flow.run(ts, y0, params, tolerances, begun=Begun(*begun))[:_OUTPUTS]
+def _derive_on_host(derive, inner, args, *, flow, tolerances, **_):
+    """`_derivatives.jvp` or `vjp`, whose last arguments have these `inner` axes."""
+    rows, batch = _rows(args, (*_MOTIONS, *inner))
+    return _restore_batch(derive(flow, Motions(*rows[:_GIVEN]), *rows[_GIVEN:], tolerances), batch)
 
 
-def _run_again(ts, y0, params, *_, flow, tolerances, **__):
-    """The results of a run of rows of members whose steps are kept: from the beginning."""
-    return flow.run(ts, y0, params, tolerances, KEPT)[:_OUTPUTS]
+def _jvp_on_host(*args, **settings):
+    return _derive_on_host(_derivatives.jvp, (2, 2), args, **settings)
 
 
-def _jvp_on_host(ts, y0, params, path, result, accepted, ticket, dy0, dparams, *, flow, tolerances, **_):
-    arrays = ts, y0, params, path, result, accepted, ticket, dy0, dparams
-    (ts, y0, params, *rest), batch = _rows(arrays, (1, 1, 1, 2, 0, 0, 0, 2, 2), shared=(0, 2))
-    return _restore_batch(_derivatives.jvp(flow, ts, y0, params, rest[:4], *rest[4:], tolerances=tolerances), batch)
-
-
-def _vjp_on_host(ts, y0, params, path, result, accepted, ticket, path_ct, end_ct, *, flow, tolerances, **_):
-    arrays = ts, y0, params, path, result, accepted, ticket, path_ct, end_ct
-    (ts, y0, params, *rest), batch = _rows(arrays, (1, 1, 1, 2, 0, 0, 0, 3, 2), shared=(0, 2))
-    return _restore_batch(_derivatives.vjp(flow, ts, y0, params, rest[:4], *rest[4:], tolerances=tolerances), batch)
+def _vjp_on_host(*args, **settings):
+    return _derive_on_host(_derivatives.vjp, (3, 2), args, **settings)
 
 
 # ---- primitives ------------------------------------------------------------------------------------------------------
 
-run_p, jvp_p, vjp_p, curvature_p = (VaryingPrimitive(f"lagjax_{name}") for name in ("run", "jvp", "vjp", "curvature"))
-# Of run: a `Solution` but for the last field, which is that of a batch. jvp and vjp take of a run its ts, y0,
-# params, path, result, accepted, ticket.
-_OUTPUTS, _GIVEN = len(Solution._fields) - 1, 7
+_OUTPUTS = len(Solution._fields) - 1  # of run: a `Solution` but for the last field, which is that of a batch
 
 
 def _run(ts, y0, params, **settings) -> Solution:
     return Solution(*run_p.bind(ts, y0, params, **settings))
-
-
-def _batch_of(args, inner):
-    return np.broadcast_shapes(*(x.shape[: x.ndim - k] for x, k in zip(args, inner, strict=True)))
 
 
 def _floats(*shapes):
@@ -131,25 +139,24 @@ def _floats(*shapes):
 
 
 def _run_shapes(ts, y0, params, *, flow, tolerances, **_):
-    batch = _batch_of((ts, y0, params), (1, 1, 1))
+    batch = _batch_of((ts, y0, params), _RUN)
     counts = [ShapedArray(batch, np.dtype(int))] * (_OUTPUTS - 3)
     floats = _floats((*batch, *flow.path_shape(ts.shape[-1], tolerances.notes)), (*batch, flow.states), batch)
     return [*floats, *counts]
 
 
 def _jvp_shapes(*args, flow, **_):
-    batch, m = _batch_of((*args[:3], *args[_GIVEN:]), (1, 1, 1, 2, 2)), args[_GIVEN].shape[-2]
+    batch, m = _batch_of((*args[:3], *args[_GIVEN:]), (*_RUN, 2, 2)), args[_GIVEN].shape[-2]
     return _floats((*batch, m, args[0].shape[-1], flow.states), (*batch, m, flow.states))
 
 
 def _vjp_shapes(*args, flow, **_):
-    batch = _batch_of(args, (1, 1, 1, 2, 0, 0, 0, 3, 2))
-    m = args[-1].shape[-2]
+    batch, m = _batch_of(args, (*_MOTIONS, 3, 2)), args[-1].shape[-2]
     return _floats((*batch, m, flow.states), (*batch, m, flow.numbers))
 
 
 def _curvature_shapes(*args, flow, **_):
-    batch = _batch_of(args, (1, 1, 1, 2, 1, 1, 1))
+    batch = _batch_of(args, (*_RUN, 2, 1, 1, 1))
     return _floats((*batch, flow.states), (*batch, flow.numbers))
 
 
@@ -160,7 +167,7 @@ def _curvature_composed(ts, y0, params, path_ct, end_ct, dy0, dparams, *, flow, 
     solution = _run(*given, flow=larger, tolerances=tolerances, keep=True)
     path_ct, end_ct = (from_rows(jnp.stack([jnp.zeros_like(ct), ct], axis=-2)) for ct in (path_ct, end_ct))
     cts = path_ct[..., None, :, :], end_ct[..., None, :]
-    state_ct, numbers_ct = vjp_p.bind(*given, *_residuals(solution), *cts, flow=larger, tolerances=tolerances)
+    state_ct, numbers_ct = vjp_p.bind(*_motions(*given, solution), *cts, flow=larger, tolerances=tolerances)
     state_ct, numbers_ct = to_rows(state_ct[..., 0, :], flow.size)[..., 0, :], numbers_ct[..., 0, : flow.numbers]
     return [state_ct * length, numbers_ct * length]
 
@@ -204,99 +211,62 @@ def _rate(flow: Flow, *state):
     return compile_once(rate, flow)(*state)
 
 
-def _residuals(solution: Solution):
-    """The outcome of a run that `jvp` and `vjp` take; their values do not vary with it."""
-    given = solution.path, solution.result, solution.accepted, solution.ticket
-    return tuple(jax.lax.stop_gradient(x) for x in given)
+def _motions(ts, y0, params, solution: Solution) -> Motions:
+    """The arguments of `jvp` and `vjp` that are those of a run and its outcome, with which their values do not vary."""
+    return Motions.from_solution(ts, y0, params, jax.tree.map(jax.lax.stop_gradient, solution))
 
 
 # ---- derivatives -----------------------------------------------------------------------------------------------------
 
 
-def _zero(tangent) -> bool:
-    return isinstance(tangent, ad.Zero)
-
-
-def _value(tangent):
-    """A tangent as an array; zeros where it is known to be none."""
-    return ad.instantiate_zeros(tangent)
-
-
 def _derivative_of_run(primals, tangents, *, flow, tolerances, keep):
     (ts, y0, params), (dts, dy0, dparams) = primals, tangents
-    if flow.guards is not None or all(map(_zero, tangents)):
-        outs = run_p.bind(*primals, flow=flow, tolerances=tolerances, keep=keep)
-        return outs, [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in outs]
-    outs = run_p.bind(*primals, flow=flow, tolerances=tolerances, keep=True)
+    varies = flow.guards is None and not all(map(is_zero, tangents))
+    outs = run_p.bind(*primals, flow=flow, tolerances=tolerances, keep=keep or varies)
+    along = list(map(zero_like, outs))
+    if not varies:
+        return outs, along
     solution = Solution(*outs)
-    dy0, dparams = _value(dy0), _value(dparams)
-    if not _zero(dts):
+    dy0, dparams = map(ad.instantiate_zeros, (dy0, dparams))
+    if not is_zero(dts):
         dy0 = dy0 - _rate(flow, ts[..., 0], y0, params) * dts[..., :1]
     direction = [x[..., None, :] for x in (dy0, dparams)]
-    d_path, d_end = jvp_p.bind(*primals, *_residuals(solution), *direction, flow=flow, tolerances=tolerances)
+    motions = _motions(ts, y0, params, solution)
+    d_path, d_end = jvp_p.bind(*motions, *direction, flow=flow, tolerances=tolerances)
     d_path, d_end, d_t_end = d_path[..., 0, :, :], d_end[..., 0, :], jnp.zeros_like(solution.t_end)
-    if not _zero(dts):
+    if not is_zero(dts):
         reached, done = jnp.isfinite(solution.path), solution.result == SUCCESSFUL
         places = jnp.where(reached, solution.path, y0[..., None, :])
         rates = _rate(flow, ts, places, params[..., None, :]) * dts[..., None]
         d_path = d_path + jnp.where(reached, rates, 0.0)
         d_end = d_end + jnp.where(done[..., None], rates[..., -1, :], 0.0)
         d_t_end = jnp.where(done, dts[..., -1], 0.0)
-    counts = [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in outs[3:]]
-    return outs, [d_path, d_end, d_t_end, *counts]
+    return outs, [d_path, d_end, d_t_end, *along[3:]]
 
 
-def _add(one, other):
-    return [a + b for a, b in zip(one, other, strict=True)]
+def _vary_jvp(primals, tangents, _, **settings):
+    """The change of `jvp` with ts, y0 and params."""
+    dy0, dparams = primals[_GIVEN:]
+
+    def compose_jvp(*moving):
+        ts, y0, params = (x[..., None, :] for x in moving)
+        return _jvp_composed(ts, y0, params, dy0, dparams, **settings)
+
+    return jax.jvp(compose_jvp, primals[:3], tuple(map(ad.instantiate_zeros, tangents[:3])))[1]
 
 
-def _linear_part(primitive, primals, tangents, count, settings):
-    """The derivative of a primitive by its last `count` arguments, in which it is linear; None without any."""
-    if all(map(_zero, tangents[-count:])):
-        return None
-    return primitive.bind(*primals[:-count], *map(_value, tangents[-count:]), **settings)
-
-
-def _derivative_of_jvp(primals, tangents, **settings):
-    outs = jvp_p.bind(*primals, **settings)
-    total = _linear_part(jvp_p, primals, tangents, 2, settings)
-    if not all(map(_zero, tangents[:3])):
-        dy0, dparams = primals[_GIVEN:]
-
-        def compose_jvp(*moving):
-            ts, y0, params = (x[..., None, :] for x in moving)
-            return _jvp_composed(ts, y0, params, dy0, dparams, **settings)
-
-        more = list(jax.jvp(compose_jvp, primals[:3], tuple(map(_value, tangents[:3])))[1])
-        total = more if total is None else _add(total, more)
-    return outs, _fill_zeros(total, outs)
-
-
-def _fill_zeros(total, outs):
-    return [ad.Zero(jax.typeof(x).to_tangent_aval()) for x in outs] if total is None else total
-
-
-def _derivative_of_vjp(primals, tangents, **settings):
-    outs = vjp_p.bind(*primals, **settings)
-    total = _linear_part(vjp_p, primals, tangents, 2, settings)
-    if not all(map(_zero, tangents[:3])):
-        more = _vjp_variation(primals, tangents[:3], outs, settings)
-        total = more if total is None else _add(total, more)
-    return outs, _fill_zeros(total, outs)
-
-
-def _vjp_variation(primals, tangents, outs, settings):
+def _vary_vjp(primals, tangents, outs, **settings):
     """The change of `vjp` with ts, y0 and params, for each of its m cotangents."""
-    dts, dy0, dparams = tangents
-    (ts, y0, params), cts, total = primals[:3], primals[_GIVEN:], None
-    dy0, dparams = _value(dy0), _value(dparams)
-    if not _zero(dts):
+    (ts, y0, params), cts, dts = primals[:3], primals[_GIVEN:], tangents[0]
+    dy0, dparams = map(ad.instantiate_zeros, tangents[1:3])
+    total = None
+    if not is_zero(dts):
         total = _vjp_variation_in_time(primals, dts, outs, settings)
         dy0 = dy0 - _rate(settings["flow"], ts[..., 0], y0, params) * dts[..., :1]
     given = [x[..., None, :] for x in (ts, y0, params)]
     direction = [x[..., None, :] for x in (dy0, dparams)]
     more = curvature_p.bind(*given, *cts, *direction, **settings)
-    return list(more) if total is None else _add(total, more)
+    return more if total is None else [a + b for a, b in zip(total, more, strict=True)]
 
 
 def _vjp_variation_in_time(primals, dts, outs, settings):
@@ -326,62 +296,30 @@ def _vjp_variation_in_time(primals, dts, outs, settings):
     still = jnp.zeros_like(end_ct)
     y0_ct, more = vjp_p.bind(*primals[:_GIVEN], moved_ct, still, **settings)
     start = transpose_rate(first_rate, y0[..., None, :], outs[0], outs[1].shape)
-    return _add([y0_ct, more + params_ct], start)
+    return y0_ct + start[0], more + params_ct + start[1]
 
 
-def _derivative_of_curvature(primals, tangents, **settings):
-    outs = curvature_p.bind(*primals, **settings)
+def _vary_curvature(primals, tangents, _, **settings):
     given, cts, direction = primals[:3], primals[3:5], primals[5:]
-    total = None
-    parts = (
-        (tangents[3:5], lambda moving: curvature_p.bind(*given, *moving, *direction, **settings)),
-        (tangents[5:], lambda moving: curvature_p.bind(*given, *cts, *moving, **settings)),
-        (tangents[:3], lambda moving: jax.jvp(
-            lambda *given: _curvature_composed(*given, *cts, *direction, **settings), given, tuple(moving))[1]),
-    )  # fmt: skip
-    for moving, part in parts:
-        if not all(map(_zero, moving)):
-            more = part([_value(x) for x in moving])
-            total = list(more) if total is None else _add(total, more)
-    return outs, _fill_zeros(total, outs)
-
-
-# ---- transposes: of what is linear -----------------------------------------------------------------------------------
-
-
-def _sum_shared(cotangent, aval):
-    """A cotangent with the batch axes of an argument that was shared: the sum over those that shared it."""
-    axes = tuple(i for i, (a, b) in enumerate(zip(cotangent.shape, aval.shape, strict=True)) if a != b)
-    return jnp.sum(cotangent, axis=axes, keepdims=True) if axes else cotangent
-
-
-def _linear_cotangents(args, cotangents):
-    """The cotangents of the arguments that are linear here, None for the others."""
-    return [
-        _sum_shared(c, x.aval) if ad.is_undefined_primal(x) else None for x, c in zip(args, cotangents, strict=True)
-    ]
-
-
-def _transpose_rule(primitive):
-    def rule(cotangents, *args, **settings):
-        found = primitive.bind(*args[:_GIVEN], *map(_value, cotangents), **settings)
-        return [None] * _GIVEN + _linear_cotangents(args[_GIVEN:], found)
-
-    return rule
+    parts = []
+    if not all(map(is_zero, tangents[3:])):
+        parts.append(curvature_p.bind(*given, *map(ad.instantiate_zeros, tangents[3:]), *direction, **settings))
+    if not all(map(is_zero, tangents[:3])):
+        composed = lambda *given: _curvature_composed(*given, *cts, *direction, **settings)  # noqa: E731
+        parts.append(jax.jvp(composed, given, tuple(map(ad.instantiate_zeros, tangents[:3])))[1])
+    return [sum(terms[1:], terms[0]) for terms in zip(*parts, strict=True)]
 
 
 def _curvature_transpose(cotangents, *args, **settings):
-    moving, given, cts, direction = [_value(c) for c in cotangents], args[:3], args[3:5], args[5:]
+    """It is linear in its cotangents, too: the transpose in those is the second derivative along two directions."""
+    moving, given, cts, direction = map(ad.instantiate_zeros, cotangents), args[:3], args[3:5], args[5:]
     if any(map(ad.is_undefined_primal, direction)):
-        found = curvature_p.bind(*given, *cts, *moving, **settings)
-        return [None] * 5 + _linear_cotangents(direction, found)
+        second = curvature_p.bind(*given, *cts, *moving, **settings)
+        return [None] * 5 + list(map(cotangent_of, direction, second))
     ts, *state = given
-    state = tuple(
-        jnp.broadcast_to(x, jnp.broadcast_shapes(x.shape, m.shape)) for x, m in zip(state, moving, strict=True)
-    )
-    moving = tuple(jnp.broadcast_to(m, x.shape) for m, x in zip(moving, state, strict=True))
+    state, moving = zip(*(jnp.broadcast_arrays(x, m) for x, m in zip(state, moving, strict=True)), strict=True)
     second = jax.jvp(lambda *state: _jvp_composed(ts, *state, *direction, **settings), state, moving)[1]
-    return [None] * 3 + _linear_cotangents(cts, second) + [None] * 2
+    return [None] * 3 + list(map(cotangent_of, cts, second)) + [None] * 2
 
 
 # ---- batches ---------------------------------------------------------------------------------------------------------
@@ -421,19 +359,30 @@ def _batch_of_batches(primitive, outputs_after):
     return rule
 
 
-# ---- registration ----------------------------------------------------------------------------------------------------
+# ---- primitives ------------------------------------------------------------------------------------------------------
+
+run_p = VaryingPrimitive("lagjax_run")
+run_p.multiple_results = True
+run_p.def_abstract_eval(_run_shapes)
+jvp_p = LinearMap(
+    "lagjax_jvp", _jvp_shapes, _vary_jvp, 2, lambda given, w, _, **settings: vjp_p.bind(*given, *w, **settings)
+)
+vjp_p = LinearMap(
+    "lagjax_vjp", _vjp_shapes, _vary_vjp, 2, lambda given, w, _, **settings: jvp_p.bind(*given, *w, **settings)
+)
+curvature_p = LinearMap("lagjax_curvature", _curvature_shapes, _vary_curvature, 2)
+ad.primitive_jvps[run_p] = _derivative_of_run
+ad.primitive_transposes[curvature_p] = _curvature_transpose
+for _primitive, _batching in (
+    (run_p, _batch_rule(run_p)),
+    (jvp_p, _batch_of_batches(jvp_p, (2, 1))),
+    (vjp_p, _batch_of_batches(vjp_p, (1, 1))),
+    (curvature_p, _batch_rule(curvature_p)),
+):
+    batching.primitive_batchers[_primitive] = _batching
 
 
-def _register_on_host(primitive, host, shapes) -> None:
-    """A primitive that `host` computes from NumPy arrays, outside of `jit`."""
-    primitive.multiple_results = True
-    primitive.def_abstract_eval(shapes)
-
-    def evaluate(*args, **settings):
-        with jax.enable_x64(True):
-            return jax.device_put([np.asarray(x) for x in host(*map(np.asarray, args), **settings)])
-
-    primitive.def_impl(evaluate)
+# ---- outside of `jit`, and on CPUs -----------------------------------------------------------------------------------
 
 
 def _lowering_rule(form):
@@ -456,78 +405,75 @@ def _run_compiled(ts, y0, params, *, flow, tolerances, keep):
     """`run` of what XLA compiles: by the handler where that may be, else on the host."""
     settings = dict(flow=flow, tolerances=tolerances, keep=keep)
     shapes = _run_shapes(ts, y0, params, **settings)
-    rows, batch = _rows((ts, y0, params), (1, 1, 1), shared=(0, 2), library=jnp)
+    rows, batch = _rows((ts, y0, params), _RUN, library=jnp)
     with jax.enable_x64(True):  # where the kernel is made, and whatever was set where this is lowered
-        short = keep and has_sweep(flow, math.prod(batch))  # whose derivatives need no steps that are kept
-        if not (short or (not keep and has_handler(flow, math.prod(batch)))):
+        # Derivatives of short motions need no steps that are kept.
+        begins = derivatives_begin_in_handler if keep else begins_in_handler
+        if not begins(flow, math.prod(batch)):
             return call_host(functools.partial(_run_on_host, **settings), shapes, ts, y0, params)
         of_rows = [jax.ShapeDtypeStruct((len(rows[1]), *x.shape[len(batch) :]), x.dtype) for x in shapes]
-        host = functools.partial(_run_again if keep else _continue_run, **settings)
-        rounds = flow.kernel.rounds_of_sweep if keep else None
-        return _restore_batch(run_by_handler(flow, tolerances, host, of_rows, *rows, rounds=rounds), batch)
+
+        def finish_run(ts, y0, params, *begun):
+            """On the host: go on with what the handler has begun; or from the beginning, for steps that are kept."""
+            more = (KEPT,) if keep else (None, None, Begun(*begun))
+            return flow.run(ts, y0, params, tolerances, *more)[:_OUTPUTS]
+
+        rounds = flow.kernel.rounds_of_rerun if keep else None
+        return _restore_batch(run_by_handler(flow, tolerances, finish_run, of_rows, *rows, rounds=rounds), batch)
 
 
-def _compile_sweep(sweep_rows, run_on_host, shapes_of, inner, args, settings):
+def _compile_derivative(by_handler, run_on_host, shapes_of, inner, args, settings):
     """A derivative in what XLA compiles: by a handler where the motion was a short one, else on the host.
 
-    `sweep_rows(*rows)` gives the results for rows of members, whether these are done, and what they need to live.
+    `by_handler(*rows)` gives the results for rows of members, the sizes of the last terms (`Kernel.jvp`), whether these
+    are done, and what they need to live.
     """
     shapes, function = shapes_of(*args, **settings), functools.partial(run_on_host, **settings)
-    (ts, y0, params, *_, a, b), batch = _rows(args, (1, 1, 1, 2, 0, 0, 0, *inner), shared=(0, 2), library=jnp)
+    (ts, y0, params, *_, a, b), batch = _rows(args, (*_MOTIONS, *inner), library=jnp)
 
     def call_handler(*args):
-        *results, done, needed = sweep_rows(ts, y0, params, a, b)
+        *results, excess, done, needed = by_handler(ts, y0, params, a, b)
         host = functools.partial(call_host, functools.partial(function, needed=needed), shapes)
-        return cond_alike(done, lambda *_: tuple(_restore_batch(results, batch)), host, *args)
+        well = done & jnp.all(excess <= settings["tolerances"].largest_excess)
+        return cond_alike(well, lambda *_: tuple(_restore_batch(results, batch)), host, *args)
 
     with jax.enable_x64(True):  # where kernels are made, and whatever was set where this is lowered
         host = functools.partial(call_host, function, shapes)
-        if not has_sweep(settings["flow"], math.prod(batch)):
+        if not derivatives_begin_in_handler(settings["flow"], math.prod(batch)):
             return host(*args)
         return cond_alike(jnp.all(args[6] < 0), call_handler, host, *args)  # there are no steps that were kept
 
 
 def _jvp_compiled(*args, **settings):
-    flow, tolerances = settings["flow"], settings["tolerances"]
+    def by_handler(ts, y0, params, dy0, dparams):
+        dy0, dparams, unit = _derivatives.scale_directions(dy0, dparams, library=jnp)
+        end, path, *more = derivative_by_handler("jvp", **settings, rows=(ts, y0, params, dparams, dy0))
+        path = _derivatives.start_outputs(ts, dy0, path, library=jnp).at[:, :, -1].set(end)
+        return path * unit[..., None], end * unit, *more
 
-    def sweep_rows(ts, y0, params, dy0, dparams):
-        length = jnp.max(jnp.abs(jnp.concatenate([dy0, dparams], axis=2)), axis=2, keepdims=True)
-        unit = jnp.where(length > 0, length, 1.0)
-        end, path, excess, done, needed = sweep_by_handler(
-            "jvp", flow, tolerances, ts, y0, params, dparams / unit, dy0 / unit
-        )
-        path = jnp.where((ts == ts[:, :1])[:, None, :, None], dy0[:, :, None] / unit[..., None], path)
-        path = path.at[:, :, -1].set(end)
-        done &= jnp.all(excess <= tolerances.largest_excess)
-        return path * unit[..., None], end * unit, done, needed
-
-    return _compile_sweep(sweep_rows, _jvp_on_host, _jvp_shapes, (2, 2), args, settings)
+    return _compile_derivative(by_handler, _jvp_on_host, _jvp_shapes, (2, 2), args, settings)
 
 
 def _vjp_compiled(*args, **settings):
     """`vjp` of what XLA compiles, of one cotangent."""
-    flow, tolerances = settings["flow"], settings["tolerances"]
 
-    def sweep_rows(ts, y0, params, path_ct, end_ct):
-        path_ct, end_ct = path_ct[:, 0], end_ct[:, 0]
-        y_ct, params_ct, excess, done, needed = sweep_by_handler(
-            "vjp", flow, tolerances, ts, y0, params, path_ct, end_ct + path_ct[:, -1]
-        )
-        at_start = (ts == ts[:, :1])[:, :-1, None]  # outputs that are the initial state; steps begin after them
-        y_ct = y_ct + jnp.sum(path_ct[:, :-1] * at_start, axis=1)
-        done &= jnp.all(excess <= tolerances.largest_excess)
-        return y_ct[:, None], params_ct[:, None], done, needed
+    def by_handler(ts, y0, params, path_ct, end_ct):
+        def go_back(path_ct, end_ct):
+            return derivative_by_handler("vjp", **settings, rows=(ts, y0, params, path_ct, end_ct))
+
+        y_ct, params_ct, *more = _derivatives.transpose_outputs(go_back, ts, path_ct[:, 0], end_ct[:, 0], library=jnp)
+        return y_ct[:, None], params_ct[:, None], *more
 
     if args[-1].shape[-2] != 1:
         return call_host(functools.partial(_vjp_on_host, **settings), _vjp_shapes(*args, **settings), *args)
-    return _compile_sweep(sweep_rows, _vjp_on_host, _vjp_shapes, (3, 2), args, settings)
+    return _compile_derivative(by_handler, _vjp_on_host, _vjp_shapes, (3, 2), args, settings)
 
 
 # ---- on a GPU --------------------------------------------------------------------------------------------------------
 
 
 def _run_for_gpus(ts, y0, params, *, flow, tolerances, **_):
-    rows, batch = _rows((ts, y0, params), (1, 1, 1), shared=(0, 2), library=jnp)
+    rows, batch = _rows((ts, y0, params), _RUN, library=jnp)
     with jax.enable_x64(True):  # whatever was set where this is lowered
         return _restore_batch(run_on_gpu(flow, adapt_tolerances(flow, tolerances), *rows), batch)
 
@@ -548,48 +494,46 @@ def _vjp_for_gpus(*args, flow, tolerances):
     """`vjp`: back over the steps of the motion; of constraints, and where the steps do not do, by tangents."""
     settings = dict(flow=flow, tolerances=adapt_tolerances(flow, tolerances))
     with jax.enable_x64(True):
-        rows, batch = _rows(args, (1, 1, 1, 2, 0, 0, 0, 3, 2), shared=(0, 2), library=jnp)
-        ts, y0, params, path, result, *_, path_ct, end_ct = rows
-        members, m = end_ct.shape[:2]
+        rows, batch = _rows(args, (*_MOTIONS, 3, 2), library=jnp)
+        motions, (path_ct, end_ct) = Motions(*rows[:_GIVEN]), rows[_GIVEN:]
+        ts, (members, m) = motions.ts, end_ct.shape[:2]
         few = m <= flow.states + flow.numbers and flow.projection is None
-        reached_ct, lost = _derivatives.mask_cotangents(path, result, path_ct, end_ct, library=jnp)
-        swept = few and _sweep_on_gpu(ts, y0, params, reached_ct, result, end_ct, **settings)
-        if not swept:
+        reached_ct, lost = _derivatives.mask_cotangents(motions, path_ct, end_ct, library=jnp)
+        results = few and _go_back_on_gpu(motions, reached_ct, end_ct, **settings)
+        if not results:
             return _vjp_by_tangents(*args, **settings)
-        *found, done = (x.reshape(members, m, *x.shape[1:]) for x in swept)
+        *results, done = (x.reshape(members, m, *x.shape[1:]) for x in results)
         done = (done | lost).all(axis=1)
 
-        def replace_unfinished(*found):
+        def replace_unfinished(*results):
             times = jnp.where(done[:, None], ts[:, :1], ts)  # members that are done stay where they are
-            others = _vjp_by_tangents(times, y0, params, *rows[3:], **settings)
-            return tuple(jnp.where(done[:, None, None], a, b) for a, b in zip(found, others, strict=True))
+            others = _vjp_by_tangents(times, *rows[1:], **settings)
+            return tuple(jnp.where(done[:, None, None], a, b) for a, b in zip(results, others, strict=True))
 
-        found = cond_alike(jnp.all(done), lambda *found: found, replace_unfinished, *found)
-        return _restore_batch([jnp.where(lost[..., None], jnp.nan, x) for x in found], batch)
+        results = cond_alike(jnp.all(done), lambda *results: results, replace_unfinished, *results)
+        return _restore_batch([jnp.where(lost[..., None], jnp.nan, x) for x in results], batch)
 
 
-def _sweep_on_gpu(ts, y0, params, path_ct, result, end_ct, *, flow, tolerances):
+def _go_back_on_gpu(motions: Motions, path_ct, end_ct, *, flow, tolerances):
     """The cotangents of starts and parameters, a row for each of m cotangents of a member, and whether a row is right.
 
     None where the GPU cannot compute them.
     """
     members, m = end_ct.shape[:2]
-    ts, params = (x if len(x) == 1 else jnp.repeat(x, m, axis=0) for x in (ts, params))
-    end_ct = end_ct + jnp.where((result == SUCCESSFUL)[:, None, None], path_ct[:, :, -1], 0.0)
-    path_ct = path_ct.reshape(members * m, *path_ct.shape[2:])
-    given = ts, jnp.repeat(y0, m, axis=0), params, path_ct, end_ct.reshape(members * m, -1)
-    if (swept := transpose_on_gpu(flow, tolerances, *given)) is None:
+    ts, y0, params, *_ = motions.take(np.repeat(np.arange(members), m))
+    path_ct, end_ct = (x.reshape(members * m, *x.shape[2:]) for x in (path_ct, end_ct))
+    go_back = functools.partial(transpose_on_gpu, flow, tolerances, ts, y0, params)
+    try:
+        y_ct, params_ct, excess, done = _derivatives.transpose_outputs(go_back, ts, path_ct, end_ct, library=jnp)
+    except Unlowerable:
         return None
-    y_ct, params_ct, excess, done = swept
-    at_start = (ts == ts[:, :1])[:, :-1, None]  # outputs that are the initial state; steps begin after them
-    y_ct = y_ct + jnp.sum(path_ct[:, :-1] * at_start, axis=1)
     return y_ct, params_ct, done & (excess <= tolerances.largest_excess)
 
 
 def _vjp_by_tangents(ts, y0, params, *given, flow, tolerances):
     """`vjp`: the derivative along every number of the start and the parameters, times the cotangents."""
     *run, path_ct, end_ct = given
-    batch = _batch_of((ts, y0, params), (1, 1, 1))
+    batch = _batch_of((ts, y0, params), _RUN)
     basis = jnp.broadcast_to(jnp.eye(count := flow.states + flow.numbers), (*batch, count, count))
     along = basis[..., : flow.states], basis[..., flow.states :]
     path, end = _jvp_for_gpus(ts, y0, params, *run, *along, flow=flow, tolerances=tolerances)
@@ -602,27 +546,15 @@ def _vjp_by_tangents(ts, y0, params, *given, flow, tolerances):
     return [total[..., : flow.states], total[..., flow.states :]]
 
 
-_register_on_host(run_p, _run_on_host, _run_shapes)
-_register_on_host(jvp_p, _jvp_on_host, _jvp_shapes)
-_register_on_host(vjp_p, _vjp_on_host, _vjp_shapes)
-for _primitive, _compiled_form in ((run_p, _run_compiled), (jvp_p, _jvp_compiled), (vjp_p, _vjp_compiled)):
-    mlir.register_lowering(_primitive, _lowering_rule(_compiled_form), platform="cpu")
-curvature_p.multiple_results = True
-curvature_p.def_abstract_eval(_curvature_shapes)
+for _primitive, _host, _on_cpus, _on_gpus in (
+    (run_p, _run_on_host, _run_compiled, _run_for_gpus),
+    (jvp_p, _jvp_on_host, _jvp_compiled, _jvp_for_gpus),
+    (vjp_p, _vjp_on_host, _vjp_compiled, _vjp_for_gpus),
+):
+    compute_on_host(_primitive, _host)
+    mlir.register_lowering(_primitive, _lowering_rule(_on_cpus), platform="cpu")
+    mlir.register_lowering(_primitive, mlir.lower_fun(_on_gpus, multiple_results=True), platform="cuda")
 curvature_p.def_impl(lambda *args, **settings: compile_once(_curvature_composed, **settings)(*args))
 for _platform in ("cpu", "cuda"):
     _rule = mlir.lower_fun(_curvature_composed, multiple_results=True)
     mlir.register_lowering(curvature_p, _rule, platform=_platform)
-for _primitive, _form in ((run_p, _run_for_gpus), (jvp_p, _jvp_for_gpus), (vjp_p, _vjp_for_gpus)):
-    mlir.register_lowering(_primitive, mlir.lower_fun(_form, multiple_results=True), platform="cuda")
-
-for _primitive, _jvp, _transpose, _batching in (
-    (run_p, _derivative_of_run, None, _batch_rule(run_p)),
-    (jvp_p, _derivative_of_jvp, _transpose_rule(vjp_p), _batch_of_batches(jvp_p, (2, 1))),
-    (vjp_p, _derivative_of_vjp, _transpose_rule(jvp_p), _batch_of_batches(vjp_p, (1, 1))),
-    (curvature_p, _derivative_of_curvature, _curvature_transpose, _batch_rule(curvature_p)),
-):
-    ad.primitive_jvps[_primitive] = _jvp
-    if _transpose is not None:
-        ad.primitive_transposes[_primitive] = _transpose
-    batching.primitive_batchers[_primitive] = _batching

@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine import Problem, choose
-from lagjax._engine.taylor import KEPT, Flow, MachineCode, flow_of, jvp, project_start_tangents, tolerances_of
+from lagjax._engine.taylor import KEPT, Flow, MachineCode, Motions, flow_of, jvp, project_start_tangents, tolerances_of
 from lagjax._fit.model._inputs import Driven, Form, SampleTable, input_functions
 from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._records import start_pair
@@ -124,8 +124,8 @@ class _MachineCodeMotions(AbstractMotions):
             return RecordMotion(run.path, np.zeros((len(y0), 0, *run.path.shape[1:])), run.result, run.t_end, run.y_end)
         params_dot = np.zeros((*y0_dot.shape[:2], params.shape[1]))
         params_dot[..., : numbers.shape[-1]] = numbers_dot
-        steps = run.path, run.result, run.accepted, run.ticket
-        tangents, _ = jvp(flow, ts, y0, params, steps, y0_dot, params_dot, self.tolerances)
+        motions = Motions.from_solution(ts, y0, params, run)
+        tangents, _ = jvp(flow, motions, y0_dot, params_dot, self.tolerances)
         return RecordMotion(run.path, tangents, run.result, run.t_end, run.y_end)
 
     def rate(self, t, y, numbers, table=None):

@@ -1,0 +1,201 @@
+"""`LinearMap`: the one way in which a primitive of ours is taught to JAX, under all of its transformations.
+
+With y = f(x, v), linear in v, and D the derivative of f by x,
+
+    dy = f(x, dv) + D(x, v) dx            batches: one call, with the members in front
+    transposed: (x, w) ↦ the cotangents of v
+
+`attach_derivative` gives values the derivatives of another expression. `jax.custom_jvp` says the same, but inside
+`jax.lax.scan` its rule is lost where forward mode goes over reverse mode (jax 0.10: the value is then differentiated
+instead, without a word; tests/equations/test_custom.py keeps the case). A primitive of its own is not seen through.
+"""
+
+import functools
+from collections.abc import Callable, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray
+from jax.extend.core import Primitive
+from jax.interpreters import ad, batching, mlir
+from jax.sharding import PartitionSpec
+
+
+class VaryingPrimitive(Primitive):
+    """A primitive whose results vary, under `jax.shard_map`, along every mesh axis that an argument varies along.
+
+    JAX writes that into the types of arrays, and reads off them which cotangents are summed over the devices.
+    """
+
+    def bind(self, *args, **settings):
+        return super().bind(*vary_alike(args), **settings)
+
+    def def_abstract_eval(self, rule):
+        def add_axes(*args, **settings):
+            results = rule(*args, **settings)
+            given = next((x for x in args if x.mat.varying), None)
+            return results if given is None else jax.tree.map(functools.partial(_like, given), results)
+
+        super().def_abstract_eval(add_axes)
+        return rule
+
+
+def _like(given: ShapedArray, result: ShapedArray) -> ShapedArray:
+    """The type of a result that varies as the type that is given does."""
+    everywhere = given.sharding.update(spec=PartitionSpec(*[None] * result.ndim))
+    return result.update(sharding=everywhere, manual_axis_type=given.mat)
+
+
+def vary_alike(arrays: Sequence, like: Sequence = ()) -> list:
+    """These arrays, each varying along every mesh axis that one of them, or one of `like`, varies along."""
+    own = [jax.typeof(x).mat.varying for x in (*arrays, *like)]
+    axes = frozenset().union(*own)
+    return [
+        jax.lax.pcast(x, tuple(axes - here), to="varying") if axes - here else x
+        for x, here in zip(arrays, own[: len(arrays)], strict=True)
+    ]
+
+
+def cond_alike(predicate, when_true: Callable, when_false: Callable, *operands):
+    """`jax.lax.cond`, of which both branches' results vary as the operands do."""
+
+    def alike(branch):
+        def vary_results(*operands):
+            results, structure = jax.tree.flatten(branch(*operands))
+            return jax.tree.unflatten(structure, vary_alike(results, like=operands))
+
+        return vary_results
+
+    return jax.lax.cond(predicate, alike(when_true), alike(when_false), *operands)
+
+
+class LinearMap(VaryingPrimitive):
+    """A primitive (*x, *v; settings) ↦ a list of arrays, linear in its last `linear` arguments v.
+
+    `shapes` gives the types of its results. `vary(primals, tangents of x, results, **settings)` gives their change
+    along x, None for a result that has none; a tangent that is zero may be an `ad.Zero`. `transpose(x, w, v,
+    **settings)` gives the cotangents of v, of which only the shapes are known, from those of the results, w. `linear`
+    may be a function of the settings.
+    """
+
+    multiple_results = True
+
+    def __init__(
+        self,
+        name: str,
+        shapes: Callable,
+        vary: Callable,
+        linear: int | Callable = 0,
+        transpose: Callable | None = None,
+    ):
+        super().__init__(name)
+        self.def_abstract_eval(shapes)
+        self._vary, self._linear, self._transpose = vary, linear, transpose
+        ad.primitive_jvps[self] = self._derive
+        if transpose is not None:
+            ad.primitive_transposes[self] = self._pull_back
+        batching.primitive_batchers[self] = self._batch
+
+    def _first(self, arguments, settings: dict) -> int:
+        """The number of arguments x."""
+        return len(arguments) - (self._linear(**settings) if callable(self._linear) else self._linear)
+
+    def _derive(self, primals, tangents, **settings):
+        outs, first = self.bind(*primals, **settings), self._first(primals, settings)
+        parts = []
+        if not all(map(is_zero, tangents[first:])):
+            parts.append(self.bind(*primals[:first], *map(ad.instantiate_zeros, tangents[first:]), **settings))
+        if not all(map(is_zero, tangents[:first])):
+            parts.append(self._vary(primals, tangents[:first], outs, **settings))
+        terms = [[term for term in of if term is not None] for of in zip(*parts, strict=True)] or [[]] * len(outs)
+        return outs, [sum(of[1:], of[0]) if of else zero_like(x) for x, of in zip(outs, terms, strict=True)]
+
+    def _pull_back(self, cotangents, *arguments, **settings):
+        first = self._first(arguments, settings)
+        known, moving = arguments[:first], arguments[first:]
+        assert self._transpose is not None
+        found = self._transpose(known, list(map(ad.instantiate_zeros, cotangents)), moving, **settings)
+        return [None] * first + [cotangent_of(x, ct) for x, ct in zip(moving, found, strict=True)]
+
+    def _batch(self, arrays, axes, **settings):
+        outs = self.bind(*batch_in_front(arrays, axes), **settings)
+        return outs, [0] * len(outs)
+
+
+def compute_on_host(primitive: Primitive, function: Callable) -> None:
+    """Outside of `jit`, let `function` compute a primitive from arrays of NumPy, with float64 on."""
+
+    def evaluate(*arrays, **settings):
+        with jax.enable_x64(True):
+            return jax.device_put([np.asarray(x) for x in function(*map(np.asarray, arrays), **settings)])
+
+    primitive.def_impl(evaluate)
+
+
+def is_zero(tangent) -> bool:
+    return isinstance(tangent, ad.Zero)
+
+
+def zero_like(x) -> ad.Zero:
+    """The tangent of a result that does not vary."""
+    return ad.Zero(jax.typeof(x).to_tangent_aval())
+
+
+def cotangent_of(argument, cotangent):
+    """The cotangent of an argument of a transpose; None of one whose value is known.
+
+    Of one that was shared it is the sum over the axes of length one.
+    """
+    if not ad.is_undefined_primal(argument):
+        return None
+    shape = argument.aval.shape
+    axes = tuple(i for i, (a, b) in enumerate(zip(cotangent.shape, shape, strict=True)) if a != b)
+    return jnp.sum(cotangent, axis=axes, keepdims=True) if axes else cotangent
+
+
+def batch_in_front(arrays, axes) -> list:
+    """The arguments of a batching rule, each with the batch as its first axis, those that are shared as well."""
+    size = next(x.shape[axis] for x, axis in zip(arrays, axes, strict=True) if axis is not None)
+    return [
+        jnp.broadcast_to(x, (size, *x.shape)) if axis is None else jnp.moveaxis(x, axis, 0)
+        for x, axis in zip(arrays, axes, strict=True)
+    ]
+
+
+# ---- values with the derivatives of another expression ---------------------------------------------------------------
+
+
+def attach_derivative(function: Callable, values: tuple, *arguments) -> tuple:
+    """`values`, a tuple of arrays, with the derivatives of `function(*arguments)`, a tuple like it; of every order.
+
+    `function` may only vary with its arguments, which are arrays.
+    """
+    fixed = [jax.lax.stop_gradient(jnp.asarray(x)) for x in values]
+    return tuple(with_p.bind(*fixed, *map(jnp.asarray, arguments), function=function, count=len(fixed)))
+
+
+def _values(*arrays, function, count):
+    return list(arrays[:count])
+
+
+def _vary_expression(primals, tangents, _, *, function, count):
+    arguments, moving = primals[count:], tangents[count:]
+    floats = [i for i, x in enumerate(arguments) if jnp.issubdtype(x.dtype, jnp.floating)]
+
+    def call_with_floats(*some):
+        given = dict(zip(floats, some, strict=True))
+        return function(*(given.get(i, x) for i, x in enumerate(arguments)))
+
+    along = tuple(ad.instantiate_zeros(moving[i]) for i in floats)
+    return jax.jvp(call_with_floats, tuple(arguments[i] for i in floats), along)[1]
+
+
+def _batch_expression(arrays, axes, *, function, count):
+    return with_p.bind(*batch_in_front(arrays, axes), function=jax.vmap(function), count=count), [0] * count
+
+
+with_p = LinearMap("lagjax_differentiated_as", lambda *avals, count, **_: list(avals[:count]), vary=_vary_expression)
+with_p.def_impl(_values)
+mlir.register_lowering(with_p, mlir.lower_fun(_values, multiple_results=True))
+batching.primitive_batchers[with_p] = _batch_expression
