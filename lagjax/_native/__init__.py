@@ -54,12 +54,12 @@ from lagjax._native._constants import (
 )
 from lagjax._native._derivative_handler import derivative_handler
 from lagjax._native._guards import Guards, append_guards
-from lagjax._native._handler import Plan, handler, unavailable
+from lagjax._native._handler import Plan, handler, make_once, unavailable
 from lagjax._native._ir import lanes
 from lagjax._native._kernel import (
     Begun,
     Kernel,
-    Record,
+    StepRecord,
     cores,
     floor_of,
 )

@@ -8,8 +8,6 @@ handler says that it is not done, and its caller takes another way.
 """
 
 import ctypes
-import functools
-import threading
 from typing import NamedTuple
 
 from llvmlite import ir
@@ -17,13 +15,13 @@ from llvmlite import ir
 from lagjax._native import _adjoint, _integrator, _tangent
 from lagjax._native._constants import DONE
 from lagjax._native._frame import CACHE_LINE
-from lagjax._native._handler import call, handler_function, job_of, load_at, run_call
-from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value, compile_module, lanes
+from lagjax._native._handler import PlanCode, compile_handler, make_once
+from lagjax._native._ir import DOUBLE, INTEGER, Value
 from lagjax._native._run_records import RECORDED
 
-_COUNTERS = 4  # next member of both sweeps, next row, idle lanes
-_POINTERS = ("begin", "run", "begin_sweep", "run_sweep")
-_SIZES = ("memory", "lane_integers", "memory_of_sweep", "lane_integers_of_sweep")
+_COUNTERS = 4  # next member of the motion and of its derivative, next row, idle lanes
+_POINTERS = ("begin", "run", "begin_derivative", "run_derivative")
+_SIZES = ("memory", "memory_of_derivative", "lane_integers", "lane_integers_of_derivative")
 _NUMBERS = ("states", "numbers", "order", "max_steps", "rounds", "room", "directions", "others")
 
 
@@ -48,7 +46,7 @@ class DerivativePlan(ctypes.Structure):
 
 
 class Kind(NamedTuple):
-    """A sweep: the structure of its job; its fields for the third argument, the first result and the second.
+    """A derivative: the structure of its job; its fields for the third argument, the first result and the second.
 
     The first result begins as the fourth argument, the second as this number.
     """
@@ -67,70 +65,45 @@ KINDS = {
 ARGUMENTS, RESULTS = ("ts", "y0", "params", "argument", "start"), ("first", "second", "excess", "done", "scratch")
 
 
-class SweepHandler:
-    """XLA's handler for one kind of sweep, at `address`, for as long as this object lives.
+@make_once
+def derivative_handler(kind: str) -> int:
+    """The address of XLA's handler for the `kind` "jvp" or "vjp", made at the first call.
 
     Its arguments are `ts` (1 or N, T), `y0` (N, 2n), `params` (1 or N, P), then for "jvp" the tangents of the
     parameters (N, m, P) and of the states (N, m, 2n), for "vjp" the cotangents of the outputs (N, T, 2n) and of the end
     (N, 2n). Its results are the tangents of the end and of the outputs (N, m, T, 2n), or the cotangents of the states
     and of the parameters (N, P); `excess` (N,); `done`, 1 or 0; and what it needs for itself.
     """
-
-    def __init__(self, kind: str):
-        module = ir.Module(kind)
-        module.triple = ""
-        handler_function(module, len(ARGUMENTS), len(RESULTS), run_call(_SweepCode(module, KINDS[kind]).code))
-        self._engine, places = compile_module(module, ("handler",))
-        self.address = places["handler"]
+    write = lambda module: _DerivativeCode(module, KINDS[kind]).finish()  # noqa: E731
+    return compile_handler(kind, len(ARGUMENTS), len(RESULTS), write)["handler"]
 
 
-_lock = threading.Lock()
-
-
-def derivative_handler(kind: str) -> SweepHandler:
-    """The handler of this process for the `kind` "jvp" or "vjp", made at the first call."""
-    with _lock:
-        return _make_handler(kind)
-
-
-@functools.cache
-def _make_handler(kind: str) -> SweepHandler:
-    return SweepHandler(kind)
-
-
-class _SweepCode:
-    """Writes down `sweep(plan, *arguments, *results, members, times, rows of ts, rows of params)`."""
+class _DerivativeCode(PlanCode):
+    """Writes down `derivative(plan, *arguments, *results, members, times, rows of ts, rows of params)`."""
 
     def __init__(self, module: ir.Module, kind: Kind):
-        kinds = [POINTER] * (1 + len(ARGUMENTS) + len(RESULTS)) + [INTEGER] * 4
-        self.code, self.kind = Code(module, "sweep", kinds, lanes()), kind
-        self.plan, *pointers, self.members, self.times, rows_of_ts, rows_of_params = self.code.arguments
-        self.data = dict(zip((*ARGUMENTS, *RESULTS), pointers, strict=True))
-        self.strides = dict(
-            ts_stride=self.code.select(rows_of_ts > 1, self.times, 0),
-            params_stride=self.code.select(rows_of_params > 1, self.read_plan("numbers"), 0),
-        )
+        super().__init__(module, "derivative", DerivativePlan, (*ARGUMENTS, *RESULTS))
+        self.kind = kind
         self._carve()
-        self._write()
-        self.code.finish()
-
-    def read_plan(self, name: str, kind: ir.Type = INTEGER) -> Value:
-        return load_at(self.plan, getattr(DerivativePlan, name).offset, kind)
+        code, done = self.code, self.known["done"]
+        code.store(code.as_value(0.0, DOUBLE), done)
+        with code.only_if(self._run()):
+            self._order()
+            self._begin_results()
+            more = self._differentiate()
+            code.store(code.select(code.compare("==", more, 0), code.as_value(1.0, DOUBLE), 0.0), done)
 
     def _carve(self) -> None:
         """Give every array of the scratch its place: the memories of both kernels first, on cache lines, of zeros."""
-        code, members, states = self.code, self.members, self.read_plan("states")
-        address = Value(code, code.builder.ptrtoint(self.data["scratch"].it, INTEGER))
-        mask = ir.Constant(INTEGER, 8 * CACHE_LINE - 1)
-        end = code.element(self.data["scratch"], Value(code, code.builder.and_((0 - address).it, mask)) / 8)
-        rows = self.read_plan("room") * (states + RECORDED)
+        code, known, scratch = self.code, self.known, self.known["scratch"]
+        end, rows = code.element(scratch, self.skipped(scratch)), known["room"] * (known["states"] + RECORDED)
+        members = known["members"]
         sizes = {
-            **{name: self.read_plan(name) for name in ("memory", "memory_of_sweep")},
-            **{name: self.read_plan(name) for name in ("lane_integers", "lane_integers_of_sweep")},
+            **{name: known[name] for name in _SIZES},
             "counters": code.as_value(_COUNTERS, INTEGER),
             **dict.fromkeys(("first_step", "counts"), members),
-            "path": members * self.times * states,
-            "y_end": members * states,
+            "path": members * known["times"] * known["states"],
+            "y_end": members * known["states"],
             **dict.fromkeys(("t_end", "code", "steps", "rejected"), members),
             **dict.fromkeys(("rows", "record"), rows),
         }
@@ -140,36 +113,19 @@ class _SweepCode:
             total = total + size
             if name == "counters":
                 zeros = total
-        with code.loop(zeros) as i:
-            code.store(code.as_value(0.0, DOUBLE), code.element(end, i))
-
-    def _write(self) -> None:
-        code, done = self.code, self.data["done"]
-        code.store(code.as_value(0.0, DOUBLE), done)
-        with code.only_if(self._run()):
-            self._order()
-            self._begin_results()
-            more = self._sweep()
-            code.store(code.select(code.compare("==", more, 0), code.as_value(1.0, DOUBLE), 0.0), done)
+        self.clear(end, zeros)
 
     def _counter(self, i: int) -> Value:
         return self.code.element(self.at["counters"], i, INTEGER)
 
     def _run(self) -> Value:
         """Run the motions, with their steps written down; whether all reached their end."""
-        code, data, place = self.code, self.data, self.at
-        fields = {name: data[name] for name in ("ts", "y0", "params")} | self.strides
-        fields |= {name: place[name] for name in ("path", "y_end", "t_end", "code", "steps", "rejected")}
-        fields |= {name: self.read_plan(name) for name in ("order", "max_steps", "room")}
-        fields |= {name: self.read_plan(name, DOUBLE) for name in ("rtol", "atol")}
-        fields |= dict(members=self.members, times=self.times, record=place["rows"])
-        fields |= dict(next_member=self._counter(0), next_row=self._counter(1))
-        job = job_of(code, _integrator.JOB, fields)
-        given = job, place["memory"], place["lane_integers"]
-        call(code, self.read_plan("begin"), ir.VoidType(), *given)
-        more = call(code, self.read_plan("run"), INTEGER, *given, self._counter(2), self.read_plan("rounds"))
+        code, place = self.code, self.at
+        fields = place | dict(record=place["rows"], next_member=self._counter(0), next_row=self._counter(1))
+        memory = place["memory"], place["lane_integers"], self._counter(2)
+        more = self.run("", _integrator.JOB, fields, *memory, rounds=self.known["rounds"])
         well = code.variable(code.select(code.compare("==", more, 0), code.as_value(1, INTEGER), 0))
-        with code.only_if(well.value > 0), code.loop(self.members) as i:
+        with code.only_if(well.value > 0), code.loop(self.known["members"]) as i:
             ended = code.load(code.element(place["code"], i), DOUBLE)
             with code.only_if(code.compare("!=", ended, float(DONE))):
                 well.value = 0
@@ -177,9 +133,9 @@ class _SweepCode:
 
     def _order(self) -> None:
         """The rows of the steps, member by member."""
-        code, place, width = self.code, self.at, self.read_plan("states") + RECORDED
+        code, place, width = self.code, self.at, self.known["states"] + RECORDED
         first = code.variable(code.as_value(0, INTEGER))
-        with code.loop(self.members) as i:
+        with code.loop(self.known["members"]) as i:
             count = code.as_integer(code.load(code.element(place["steps"], i), DOUBLE))
             begin = first.value
             code.store(count, code.element(place["counts"], i, INTEGER))
@@ -194,25 +150,19 @@ class _SweepCode:
                 code.store(number, code.element(place["record"], to * width + k))
 
     def _begin_results(self) -> None:
-        code, data, members = self.code, self.data, self.members
-        with code.loop(members * self.read_plan("directions") * self.read_plan("states")) as i:
-            code.store(code.load(code.element(data["start"], i), DOUBLE), code.element(data["first"], i))
-        with code.loop(members * self.read_plan("others")) as i:
-            code.store(code.as_value(self.kind.begin, DOUBLE), code.element(data["second"], i))
-        with code.loop(members) as i:
-            code.store(code.as_value(0.0, DOUBLE), code.element(data["excess"], i))
+        code, known = self.code, self.known
+        with code.loop(known["members"] * known["directions"] * known["states"]) as i:
+            code.store(code.load(code.element(known["start"], i), DOUBLE), code.element(known["first"], i))
+        with code.loop(known["members"] * known["others"]) as i:
+            code.store(code.as_value(self.kind.begin, DOUBLE), code.element(known["second"], i))
+        self.clear(known["excess"], known["members"])
 
-    def _sweep(self) -> Value:
-        """The sweep over the steps; 1 if there is more to do."""
-        code, data, place, kind = self.code, self.data, self.at, self.kind
-        fields = {name: data[name] for name in ("ts", "params", "excess")} | self.strides
-        fields |= {kind.argument: data["argument"], kind.first: data["first"], kind.second: data["second"]}
+    def _differentiate(self) -> Value:
+        """The derivative over the steps; 1 if there is more to do."""
+        known, place, kind = self.known, self.at, self.kind
+        fields = {kind.argument: known["argument"], kind.first: known["first"], kind.second: known["second"]}
         fields |= dict(record=place["record"], first_step=place["first_step"], steps=place["counts"])
-        fields |= dict(members=self.members, times=self.times, order=self.read_plan("order"))
-        fields |= dict(directions=self.read_plan("directions"), floor=self.read_plan("floor", DOUBLE))
         fields |= dict(next_member=self._counter(3))
-        job = job_of(code, kind.job, fields)
-        given = job, place["memory_of_sweep"], place["lane_integers_of_sweep"]
-        call(code, self.read_plan("begin_sweep"), ir.VoidType(), *given)
-        rounds = self.read_plan("room") + self.members  # a step a round, and more where a lane takes a member
-        return call(code, self.read_plan("run_sweep"), INTEGER, *given, rounds)
+        memory = place["memory_of_derivative"], place["lane_integers_of_derivative"]
+        rounds = known["room"] + known["members"]  # a step a round, and more where a lane takes a member
+        return self.run("_derivative", kind.job, fields, *memory, rounds=rounds)

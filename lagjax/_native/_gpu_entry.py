@@ -105,9 +105,7 @@ def motion_entry(motion: OneLane, order: int) -> str:
     It calls the `begin` and `run` of an integrator (`_integrator`).
     """
     thread = _Thread(MOTION)
-    fields = {name: thread.at[name] for name in (*MOTION.arguments[:3], *MOTION.results)}
-    fields |= {name: thread.number(name) for name in MOTION.numbers} | {"order": thread.whole(order)}
-    job = job_of(thread.code, _integrator.JOB, fields)
+    job = job_of(thread.code, _integrator.JOB, thread.at | thread.numbers | {"order": thread.whole(order)})
     thread.run("", motion, job, thread.memory(motion.size), thread.words(1))
     return thread.finish()
 
@@ -131,7 +129,7 @@ class _Thread:
         self.code = Code(self.module, "integrate", kinds, lanes=1, public=True)
         self.lanes = self.words(len(LANE))
         self.at = dict(zip((*entry.arguments, *entry.results), self.code.arguments, strict=True))
-        self._numbers = {
+        self.numbers = {
             name: self.code.load(self.code.element(self.at["numbers"], i), _KINDS[name])
             for i, name in enumerate(entry.numbers)
         }  # fmt: skip
@@ -141,10 +139,6 @@ class _Thread:
         self.code.function.calling_convention = "ptx_kernel"
         self.code.finish()
         return str(self.module)
-
-    def number(self, name: str) -> Value:
-        """One of the entry's numbers."""
-        return self._numbers[name]
 
     def whole(self, x: int) -> Value:
         return self.code.as_value(x, INTEGER)
@@ -192,7 +186,7 @@ class _Thread:
             return Value(code, code.builder.atomic_rmw("add", counter.it, one, "monotonic"))
 
         member = code.variable(take())
-        with code.repeat_while(lambda: member.value < self.number("members")):
+        with code.repeat_while(lambda: member.value < self.numbers["members"]):
             yield member.value
             member.value = take()
 
@@ -203,12 +197,12 @@ class _Transpose(_Thread):
     def __init__(self, motion: OneLane, adjoint: OneLane, form: GpuForm):
         super().__init__(TRANSPOSE)
         code, states = self.code, motion.states
-        self.states, self.numbers = states, motion.numbers
-        self.common = {"members": self.whole(1), "order": self.whole(form.order)}
+        self.states = states
+        self.common = self.numbers | {"members": self.whole(1), "order": self.whole(form.order)}
         self.ends, self.path, self.y_end = self.words(2), self.words(2 * states), self.words(states)
         names = ("t_end", "code", "steps", "rejected", "next_member", "next_row", "first_step", "steps_back", "idle")
         self.own = {name: self.words(1) for name in names}
-        self.record = code.element(self.at["record"], self.index() * self.number("room") * motion.row)
+        self.record = code.element(self.at["record"], self.index() * self.numbers["room"] * motion.row)
         self.motion, self.adjoint = motion, adjoint
         # One memory after the other, or one for both: loops that are unrolled leave none of the first two.
         shared = None if form.unrolled else self.memory(max(motion.size, adjoint.size))
@@ -218,37 +212,35 @@ class _Transpose(_Thread):
 
     def _transpose(self, member: Value) -> None:
         """The results of a member."""
-        code, number = self.code, self.number
+        code, numbers = self.code, self.numbers
 
         def member_address(name: str, stride: Value | int) -> Value:
             return code.element(self.at[name], member * stride)
 
-        ts, params = member_address("ts", number("ts_stride")), member_address("params", number("params_stride"))
-        y_ct, params_ct = member_address("y_ct", self.states), member_address("params_ct", self.numbers)
+        ts, params = member_address("ts", numbers["ts_stride"]), member_address("params", numbers["params_stride"])
+        y_ct, params_ct = member_address("y_ct", self.states), member_address("params_ct", self.motion.numbers)
         self._follow(ts, member_address("y0", self.states), params)
         with code.loop(self.whole(self.states)) as i:
             code.store(code.load(code.element(member_address("end_ct", self.states), i), DOUBLE), code.element(y_ct, i))
-        with code.loop(self.whole(self.numbers)) as i:
+        with code.loop(self.whole(self.motion.numbers)) as i:
             code.store(code.as_value(0.0, DOUBLE), code.element(params_ct, i))
         code.store(code.as_value(0.0, DOUBLE), member_address("excess", 1))
-        fits = code.load(self.own["next_row"], INTEGER) <= number("room")
+        fits = code.load(self.own["next_row"], INTEGER) <= numbers["room"]
         code.store(code.flag(fits), member_address("done", 1))
         with code.only_if(fits):
-            path_ct = member_address("path_ct", number("times") * self.states)
+            path_ct = member_address("path_ct", numbers["times"] * self.states)
             self._go_back(ts=ts, params=params, path_ct=path_ct, y_ct=y_ct, params_ct=params_ct,
                           excess=member_address("excess", 1))  # fmt: skip
 
     def _follow(self, ts: Value, y0: Value, params: Value) -> None:
         """The motion from the first output time to the last one, with its steps written down."""
         code, own = self.code, self.own
-        for i, time in enumerate((self.whole(0), self.number("times") - 1)):
+        for i, time in enumerate((self.whole(0), self.numbers["times"] - 1)):
             code.store(code.load(code.element(ts, time), DOUBLE), code.element(self.ends, i))
         for name in ("next_member", "next_row"):
             code.store(self.whole(0), own[name])
-        fields = self.common | {name: own[name] for name in ("t_end", "code", "steps", "rejected")}
-        fields |= {name: own[name] for name in ("next_member", "next_row")} | dict(record=self.record)
-        fields |= dict(ts=self.ends, y0=y0, params=params, path=self.path, y_end=self.y_end, times=self.whole(2))
-        fields |= {name: self.number(name) for name in ("max_steps", "room", "rtol", "atol")}
+        fields = self.common | own | dict(record=self.record, times=self.whole(2))
+        fields |= dict(ts=self.ends, y0=y0, params=params, path=self.path, y_end=self.y_end)
         self.run("", self.motion, job_of(code, _integrator.JOB, fields), self.memories[0], own["idle"])
 
     def _go_back(self, **arrays: Value) -> None:
@@ -257,6 +249,5 @@ class _Transpose(_Thread):
         taken = code.as_integer(code.load(own["steps"], DOUBLE))
         for name, start in (("next_member", 0), ("first_step", 0), ("steps_back", taken)):
             code.store(code.as_value(start, INTEGER), own[name])
-        fields = self.common | arrays | dict(next_member=own["next_member"], times=self.number("times"))
-        fields |= dict(record=self.record, first_step=own["first_step"], steps=own["steps_back"])
+        fields = self.common | own | arrays | dict(record=self.record, steps=own["steps_back"])
         self.run("_back", self.adjoint, job_of(code, _adjoint.JOB, fields), self.memories[1])

@@ -142,7 +142,7 @@ RESULTS: tuple[str, ...] = ("path", "y_end", "t_end", "code", "steps", "rejected
 
 
 class Handler:
-    """Two functions in machine code, for as long as this object lives: `address` is where XLA's handler is.
+    """Two functions in machine code: `address` is where XLA's handler is.
 
     Its arguments are `ts` (1 or N, T), `y0` (N, 2n) and `params` (1 or N, P), its results `path` (N, T, 2n), `y_end`
     (N, 2n), then `t_end`, `code`, `steps` and `rejected`, each (N,), and the `rest` of the run (`Rest.size`), all of
@@ -153,38 +153,42 @@ class Handler:
     """
 
     def __init__(self):
-        module = ir.Module("handler")
-        module.triple = ""
-        handler_function(module, len(ARGUMENTS), len(RESULTS), run_call(_RunCode(module).code))
-        self._engine, places = compile_module(module, ("handler", "begin_run"))
+        places = compile_handler("handler", len(ARGUMENTS), len(RESULTS), _write_run, "begin_run")
         self.address, pointers = places["handler"], 1 + len(ARGUMENTS) + len(RESULTS)
         kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * pointers, *[ctypes.c_int64] * 4)
         self.begin = kind(places["begin_run"])
 
 
-_lock = threading.Lock()
+def make_once(make: Callable) -> Callable:
+    """A decorator: the function is called once in a process for the same arguments, by one thread at a time."""
+    lock, cached = threading.Lock(), functools.cache(make)
+
+    @functools.wraps(make)
+    def decorated(*arguments):
+        with lock:
+            return cached(*arguments)
+
+    return decorated
 
 
+@make_once
 def handler() -> Handler:
     """The handler of this process, made at the first call."""
-    with _lock:
-        return _make_handler()
-
-
-@functools.cache
-def _make_handler() -> Handler:
     return Handler()
 
 
 # ---- XLA's side ------------------------------------------------------------------------------------------------------
 
 
-def handler_function(module: ir.Module, arguments: int, results: int, work: Callable) -> None:
-    """`XLA_FFI_Error* handler(XLA_FFI_CallFrame*)`, which reads the frame.
+def compile_handler(name: str, arguments: int, results: int, write: Callable, *public: str) -> dict[str, int]:
+    """The addresses of a `handler`, `XLA_FFI_Error* (XLA_FFI_CallFrame*)`, and of the `public` functions beside it.
 
-    `work(code, plan, data, dims)` writes down what it does: with the address that is the attribute, with those of the
-    arguments and results, and with those of their sizes.
+    They hold as long as the process. `write(module)` gives what the handler does, `work(code, plan, data, dims)`: with
+    the address that is the attribute, with those of the arguments and results, and with those of their sizes.
     """
+    module = ir.Module(name)
+    module.triple = ""
+    work = write(module)
     code, null = Code(module, "handler", [POINTER], lanes(), result=POINTER, public=True), ir.Constant(POINTER, None)
     (frame,) = code.arguments
     extension = load_at(frame, _EXTENSION, POINTER)
@@ -196,20 +200,12 @@ def handler_function(module: ir.Module, arguments: int, results: int, work: Call
     buffers = [element(args, i) for i in range(arguments)] + [element(rets, i) for i in range(results)]
     work(code, plan, *([load_at(buffer, offset, POINTER) for buffer in buffers] for offset in (_DATA, _DIMS)))
     code.builder.ret(null)
+    engine, places = compile_module(module, ("handler", *public))
+    _engines.append(engine)
+    return places
 
 
-def run_call(run: Code) -> Callable:
-    """`work` of a handler: `run(plan, *data, members, times, rows of ts, rows of params)`.
-
-    The first three arguments are `ts`, `y0` and `params`.
-    """
-
-    def work(code: Code, plan: Value, data: list[Value], dims: list[Value]) -> None:
-        ts, y0, params = dims[:3]
-        sizes = load_at(y0, 0, INTEGER), load_at(ts, 8, INTEGER), load_at(ts, 0, INTEGER), load_at(params, 0, INTEGER)
-        code.call(run, plan, *data, *sizes)
-
-    return work
+_engines = []  # of what XLA has registered
 
 
 def _tell_version(code: Code, extension: Value) -> None:
@@ -236,54 +232,79 @@ def element(array: Value, index: int) -> Value:
 # ---- the run ---------------------------------------------------------------------------------------------------------
 
 
-class _RunCode:
-    """Writes down `begin_run(plan, *arguments, *results, members, times, rows of ts, rows of params)`."""
+class PlanCode:
+    """A function `(plan, *arrays, members, times, rows of ts, rows of params)` under construction.
 
-    def __init__(self, module: ir.Module):
-        kinds = [POINTER] * (1 + len(ARGUMENTS) + len(RESULTS)) + [INTEGER] * 4
-        self.code = Code(module, "begin_run", kinds, lanes(), public=True)
-        plan, *pointers, members, times, rows_of_ts, rows_of_params = self.code.arguments
-        self.plan, data = plan, dict(zip((*ARGUMENTS, *RESULTS), pointers, strict=True))
-        self._run(data, members, times, rows_of_ts, rows_of_params)
-        self.code.finish()
+    `known` has all of these, what the plan says, and the strides from member to member, by the names that the fields of
+    a job have. The first three arrays are `ts`, `y0` and `params`.
+    """
 
-    def _run(self, data: dict[str, Value], members: Value, times: Value, rows_of_ts: Value, rows_of_params: Value):
-        code, read_plan = self.code, self._read_plan
-        states, numbers = read_plan("states"), read_plan("numbers")
-        with code.loop(members * times * states) as i:
-            code.store(code.as_value(float("nan"), DOUBLE), code.element(data["path"], i))
-        memory, integers = self._rest(data.pop("rest"))
-        idle, next_member, more = (code.element(integers, _INTEGERS - _OTHERS + i, INTEGER) for i in (1, 2, 3))
-        fields: dict[str, Any] = dict(data)
-        fields |= {name: read_plan(name) for name in ("order", "max_steps")}
-        fields |= {name: read_plan(name, DOUBLE) for name in ("rtol", "atol")}
-        fields |= dict(members=members, times=times, next_member=next_member)
-        fields |= dict(ts_stride=code.select(rows_of_ts > 1, times, 0))
-        fields |= dict(params_stride=code.select(rows_of_params > 1, numbers, 0))
-        job = job_of(code, JOB, fields)
-        call(code, read_plan("begin"), ir.VoidType(), job, memory, integers)
-        code.store(call(code, read_plan("run"), INTEGER, job, memory, integers, idle, read_plan("rounds")), more)
+    def __init__(self, module: ir.Module, name: str, plan: type, arrays: tuple[str, ...]):
+        kinds = [POINTER] * (1 + len(arrays)) + [INTEGER] * 4
+        self.code = code = Code(module, name, kinds, lanes(), public=True)
+        address, *data, members, times, rows_of_ts, rows_of_params = code.arguments
+        self.known = dict(zip(arrays, data, strict=True)) | dict(members=members, times=times)
+        declared: Any = plan
+        for field, kind in declared._fields_:
+            offset = getattr(plan, field).offset
+            self.known[field] = load_at(address, offset, DOUBLE if kind is ctypes.c_double else INTEGER)
+        self.known["ts_stride"] = code.select(rows_of_ts > 1, times, 0)
+        self.known["params_stride"] = code.select(rows_of_params > 1, self.known["numbers"], 0)
 
-    def _read_plan(self, name: str, kind: ir.Type = INTEGER) -> Value:
-        return load_at(self.plan, getattr(Plan, name).offset, kind)
+    def run(self, kernel: str, job: type, fields: dict[str, Any], *memory: Value, rounds: Value) -> Value:
+        """Begin and run a kernel, by its name in the plan, on the memory and the integers of a thread.
 
-    def _rest(self, rest: Value) -> tuple[Value, Value]:
-        """The memory of the thread, of zeros and on the boundary of a cache line, and the integers, of zeros."""
-        code, size_of_memory = self.code, self._read_plan("memory")
-        address = Value(code, code.builder.ptrtoint(rest.it, INTEGER))
-        bytes_left = Value(code, code.builder.and_((0 - address).it, ir.Constant(INTEGER, 8 * CACHE_LINE - 1)))
-        skipped = bytes_left / 8
-        memory, integers = code.element(rest, skipped), code.element(rest, size_of_memory + CACHE_LINE)
-        with code.loop(size_of_memory / code.lanes) as i:
-            code.store(code.lanes_of(0.0), code.element(memory, i * code.lanes))
-        with code.loop(code.as_value(_INTEGERS, INTEGER)) as i:
-            code.store(code.as_value(0, INTEGER), code.element(integers, i, INTEGER))
-        code.store(skipped, code.element(integers, _INTEGERS - _OTHERS, INTEGER))
-        return memory, integers
+        The `fields` of the job stand before what is `known`. Returns 1 if there is more to do.
+        """
+        code = self.code
+        given = job_of(code, job, self.known | fields)
+        call(code, self.known[f"begin{kernel}"], ir.VoidType(), given, *memory[:2])
+        return call(code, self.known[f"run{kernel}"], INTEGER, given, *memory, rounds)
+
+    def clear(self, address: Value, count: Value, zero: float | int = 0.0) -> None:
+        """Set this many doubles, or integers, to zero."""
+        code, kind = self.code, DOUBLE if isinstance(zero, float) else INTEGER
+        with code.loop(count) as i:
+            code.store(code.as_value(zero, kind), code.element(address, i))
+
+    def skipped(self, address: Value) -> Value:
+        """The doubles from an address to the next boundary of a cache line."""
+        place = Value(self.code, self.code.builder.ptrtoint(address.it, INTEGER))
+        mask = ir.Constant(INTEGER, 8 * CACHE_LINE - 1)
+        return Value(self.code, self.code.builder.and_((0 - place).it, mask)) / 8
+
+    def finish(self) -> Callable:
+        """The `work` of a handler: a call of this function."""
+        function = self.code.finish()
+
+        def work(code: Code, plan: Value, data: list[Value], dims: list[Value]) -> None:
+            ts, y0, params = dims[:3]
+            places = (y0, 0), (ts, 8), (ts, 0), (params, 0)
+            code.call(function, plan, *data, *(load_at(size, offset, INTEGER) for size, offset in places))
+
+        return work
+
+
+def _write_run(module: ir.Module) -> Callable:
+    """`begin_run(plan, *arguments, *results, members, times, rows of ts, rows of params)`."""
+    run = PlanCode(module, "begin_run", Plan, (*ARGUMENTS, *RESULTS))
+    code, known = run.code, run.known
+    with code.loop(known["members"] * known["times"] * known["states"]) as i:
+        code.store(code.as_value(float("nan"), DOUBLE), code.element(known["path"], i))
+    rest, size = known["rest"], known["memory"]
+    skipped = run.skipped(rest)
+    memory, integers = code.element(rest, skipped), code.element(rest, size + CACHE_LINE)
+    run.clear(memory, size)
+    run.clear(integers, code.as_value(_INTEGERS, INTEGER), 0)
+    of_skipped, idle, next_member, more = (code.element(integers, _INTEGERS - i, INTEGER) for i in (4, 3, 2, 1))
+    code.store(skipped, of_skipped)
+    there_is = run.run("", JOB, {"next_member": next_member}, memory, integers, idle, rounds=known["rounds"])
+    code.store(there_is, more)
+    return run.finish()
 
 
 def job_of(code: Code, kind: type, fields: dict[str, Any]) -> Value:
-    """A job on the stack, a structure of this kind; fields that are not named are zero."""
+    """A job on the stack, a structure of this kind: of `fields` those that it declares, others zero."""
     kinds = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOUBLE}
     declared: Any = kind
     job = code.stack(len(declared._fields_))

@@ -70,7 +70,7 @@ class Outcome(NamedTuple):
     complete: np.ndarray | None
 
 
-class Record(NamedTuple):
+class StepRecord(NamedTuple):
     """The steps of N members for a derivative: member k has `counts[k]` rows of `table` from `first[k]` on.
 
     The series of the steps are of this `order`.
@@ -268,7 +268,7 @@ class Kernel:
         path, y_end, *others = (block[begin:end] for begin, end in itertools.pairwise(ends))
         return Begun(path.reshape(members, times, states), y_end.reshape(members, states), *others)
 
-    def vjp(self, ts, params, record: Record, path_ct, y_ct) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def vjp(self, ts, params, record: StepRecord, path_ct, y_ct) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The transposed derivative of a run, over the steps it wrote down.
 
         From the cotangents of the outputs, `path_ct` (N, T, 2n), of which the first and the last are not looked at, and
@@ -289,7 +289,7 @@ class Kernel:
         return kernel._backward, min(kernel.threads(members * MOTIONS_PER_ADJOINT), -(-members // kernel.width))
 
     def jvp(
-        self, ts, params, record: Record, y_dot, params_dot, floor: float
+        self, ts, params, record: StepRecord, y_dot, params_dot, floor: float
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The derivative of a run along m directions, over the steps it wrote down.
 
@@ -308,7 +308,7 @@ class Kernel:
         return results
 
     def _go_over(
-        self, kernel: "tuple[_Compiled, int]", ts, params, record: Record, arrays: dict, **numbers: float
+        self, kernel: "tuple[_Compiled, int]", ts, params, record: StepRecord, arrays: dict, **numbers: float
     ) -> None:
         """Let a kernel of derivatives, and so many threads, go over the steps of a record; `arrays` are its own."""
         names = ("ts", "params", "record", *arrays)
@@ -355,12 +355,11 @@ class Kernel:
     ) -> DerivativePlan:
         """The plan of derivatives of this many members; it lives as long as this kernel."""
         motion = self.select_width(members)._forward
-        sweep, _ = self._tangent_kernel(members, directions) if kind == "jvp" else self._transpose_kernel(members)
+        derivative, _ = self._tangent_kernel(members, directions) if kind == "jvp" else self._transpose_kernel(members)
         rounds, others = self.rounds_of_rerun, self.numbers if kind == "vjp" else directions * times * self.states
-        sizes = (size for of in (motion, sweep) for size in (of.layout.size, len(LANE) * of.layout.width))
-        memory, integers, memory_of_sweep, integers_of_sweep = sizes
+        memory, both = [of.layout.size for of in (motion, derivative)], (motion, derivative)
         return DerivativePlan(
-            *motion.places, *sweep.places, memory, integers, memory_of_sweep, integers_of_sweep, self.states,
+            *motion.places, *derivative.places, *memory, *(len(LANE) * of.layout.width for of in both), self.states,
             self.numbers, order_for(rtol), max_steps, rounds, rounds * motion.layout.width, directions, others, rtol,
             atol, floor_of(rtol, atol),
         )  # fmt: skip

@@ -5,17 +5,14 @@ One handler serves all lines: the attribute of a call is where the machine code 
 
 import ctypes
 import functools
-import threading
 
 import numpy as np
 from llvmlite import ir
 
-from lagjax._native._handler import call, handler_function, load_at
+from lagjax._native._handler import call, compile_handler, load_at, make_once
 from lagjax._native._ir import INTEGER, POINTER, Code, Value, compile_module
 from lagjax._native._lanes import emit, sincos_function
 from lagjax._program._series import StraightLine
-
-_lock = threading.Lock()
 
 
 class LineCode:
@@ -48,21 +45,12 @@ class LineCode:
         return found
 
 
+@make_once
 def line_handler() -> int:
     """The address of the handler of all lines: from x (rows, inputs) to a result (rows, outputs), both of doubles."""
-    with _lock:
-        return _make_handler()[1]
-
-
-@functools.cache
-def _make_handler() -> tuple:
-    module = ir.Module("line_handler")
-    module.triple = ""
 
     def evaluate(code: Code, line: Value, data: list[Value], dims: list[Value]) -> None:
         address = Value(code, code.builder.ptrtoint(line.it, INTEGER))
         call(code, address, ir.VoidType(), *data, load_at(dims[0], 0, INTEGER))
 
-    handler_function(module, 1, 1, evaluate)
-    engine, places = compile_module(module, ("handler",))
-    return engine, places["handler"]
+    return compile_handler("line_handler", 1, 1, lambda module: evaluate)["handler"]

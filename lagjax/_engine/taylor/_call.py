@@ -10,8 +10,6 @@ the version of XLA's interface that it knows; where `NO_HANDLER` says why that i
 """
 
 import ctypes
-import functools
-import threading
 from collections.abc import Callable
 
 import jax
@@ -26,7 +24,6 @@ from lagjax._primitives import cond_alike, vary_alike
 
 NO_HANDLER = _native.unavailable(jax.ffi.include_dir())
 _TARGET = "lagjax_integrate"
-_lock = threading.Lock()
 
 
 def call_host(host: Callable, shapes, *arrays) -> tuple:
@@ -114,15 +111,10 @@ def _has_ended_well(begun: _native.Begun):
     return (more == 0) & jnp.all(codes) & jnp.all(jnp.isfinite(begun.y_end))
 
 
+@_native.make_once
 def _register() -> None:
-    with _lock:
-        _register_once()
-
-
-@functools.cache
-def _register_once() -> None:
     addresses = {_TARGET: _native.handler().address}
-    addresses |= {f"lagjax_{kind}": _native.derivative_handler(kind).address for kind in ("jvp", "vjp")}
+    addresses |= {f"lagjax_{kind}": _native.derivative_handler(kind) for kind in ("jvp", "vjp")}
     for target, address in addresses.items():
         jax.ffi.register_ffi_target(target, capsule(address), platform="cpu", api_version=1)
 

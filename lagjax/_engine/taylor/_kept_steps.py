@@ -12,7 +12,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._native import Kernel, Record
+from lagjax._native import Kernel, StepRecord
 
 LARGEST_KEPT = 2**26  # numbers of steps that are kept for a derivative that may follow: half a GiB
 
@@ -32,9 +32,9 @@ class Steps(NamedTuple):
     counts: np.ndarray
     complete: np.ndarray
 
-    def record(self, members) -> Record:
+    def record(self, members) -> StepRecord:
         """The steps of some members, for a derivative."""
-        return Record(self.table, self.first[members], self.counts[members], self.order)
+        return StepRecord(self.table, self.first[members], self.counts[members], self.order)
 
 
 class StepStore:

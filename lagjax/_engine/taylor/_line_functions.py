@@ -26,7 +26,7 @@ from jax.core import ShapedArray
 from jax.interpreters import mlir
 
 from lagjax._engine.taylor._call import NO_HANDLER, call_host, capsule
-from lagjax._native import LARGEST_LINE, LineCode, line_handler
+from lagjax._native import LARGEST_LINE, LineCode, line_handler, make_once
 from lagjax._primitives import LinearMap, compute_on_host
 from lagjax._program import (
     Graph,
@@ -197,7 +197,7 @@ class _LineMap(LinearMap):
         return jax.pure_callback(evaluate, self.shape(*arrays, line=line), *arrays)
 
 
-@functools.cache
+@make_once
 def _register_handler() -> None:
     jax.ffi.register_ffi_target(_TARGET, capsule(line_handler()), platform="cpu", api_version=1)
 

@@ -422,17 +422,17 @@ def _run_compiled(ts, y0, params, *, flow, tolerances, keep):
         return _restore_batch(run_by_handler(flow, tolerances, finish_run, of_rows, *rows, rounds=rounds), batch)
 
 
-def _compile_derivative(by_handler, run_on_host, shapes_of, inner, args, settings):
+def _compile_derivative(run_handler, run_on_host, shapes_of, inner, args, settings):
     """A derivative in what XLA compiles: by a handler where the motion was a short one, else on the host.
 
-    `by_handler(*rows)` gives the results for rows of members, the sizes of the last terms (`Kernel.jvp`), whether these
-    are done, and what they need to live.
+    `run_handler(*rows)` gives the results for rows of members, the sizes of their last terms (`Kernel.jvp`), whether
+    they are done, and what they need to live.
     """
     shapes, function = shapes_of(*args, **settings), functools.partial(run_on_host, **settings)
     (ts, y0, params, *_, a, b), batch = _rows(args, (*_MOTIONS, *inner), library=jnp)
 
     def call_handler(*args):
-        *results, excess, done, needed = by_handler(ts, y0, params, a, b)
+        *results, excess, done, needed = run_handler(ts, y0, params, a, b)
         host = functools.partial(call_host, functools.partial(function, needed=needed), shapes)
         well = done & jnp.all(excess <= settings["tolerances"].largest_excess)
         return cond_alike(well, lambda *_: tuple(_restore_batch(results, batch)), host, *args)
@@ -445,19 +445,19 @@ def _compile_derivative(by_handler, run_on_host, shapes_of, inner, args, setting
 
 
 def _jvp_compiled(*args, **settings):
-    def by_handler(ts, y0, params, dy0, dparams):
+    def run_handler(ts, y0, params, dy0, dparams):
         dy0, dparams, unit = _derivatives.scale_directions(dy0, dparams, library=jnp)
         end, path, *more = derivative_by_handler("jvp", **settings, rows=(ts, y0, params, dparams, dy0))
         path = _derivatives.start_outputs(ts, dy0, path, library=jnp).at[:, :, -1].set(end)
         return path * unit[..., None], end * unit, *more
 
-    return _compile_derivative(by_handler, _jvp_on_host, _jvp_shapes, (2, 2), args, settings)
+    return _compile_derivative(run_handler, _jvp_on_host, _jvp_shapes, (2, 2), args, settings)
 
 
 def _vjp_compiled(*args, **settings):
     """`vjp` of what XLA compiles, of one cotangent."""
 
-    def by_handler(ts, y0, params, path_ct, end_ct):
+    def run_handler(ts, y0, params, path_ct, end_ct):
         def go_back(path_ct, end_ct):
             return derivative_by_handler("vjp", **settings, rows=(ts, y0, params, path_ct, end_ct))
 
@@ -466,7 +466,7 @@ def _vjp_compiled(*args, **settings):
 
     if args[-1].shape[-2] != 1:
         return call_host(functools.partial(_vjp_on_host, **settings), _vjp_shapes(*args, **settings), *args)
-    return _compile_derivative(by_handler, _vjp_on_host, _vjp_shapes, (3, 2), args, settings)
+    return _compile_derivative(run_handler, _vjp_on_host, _vjp_shapes, (3, 2), args, settings)
 
 
 # ---- on a GPU --------------------------------------------------------------------------------------------------------
