@@ -30,6 +30,7 @@ from lagjax._interface import (
     show_str,
 )
 from lagjax._primitives import marks_absent, raise_where_failed, sentence
+from lagjax._program import Unlowerable
 from lagjax._scene import System, require_system
 
 PyTree = Any
@@ -208,13 +209,15 @@ def surfaces_in(problem: Problem, functions, directions, names) -> Surfaces:
     if problem.is_single:
         with jax.enable_x64(True):
             return surfaces_in(problem.double_precision, functions, directions, names)
-    refusal = MachineCode().refuses(problem)
-    surfaces = refusal or surfaces_of(problem, functions, directions, "A section")
-    if not isinstance(surfaces, str):
-        refusal = MachineCode().refuses_crossings(problem, surfaces)
-        surfaces = refusal or surfaces
-    if isinstance(surfaces, str):
-        raise ValueError(f"crossings are found with machine code, and there is none for this scene: {surfaces}.")
+    try:
+        if refusal := MachineCode().refuses(problem):
+            raise Unlowerable(refusal)
+        surfaces = surfaces_of(problem, functions, directions, "A section")
+        if refusal := MachineCode().refuses_crossings(problem, surfaces):
+            raise Unlowerable(refusal)
+    except Unlowerable as reason:
+        text = f"crossings are found with machine code, and there is none for this scene: {reason}."
+        raise ValueError(text) from None
     for k in range(len(functions)):
         if not surfaces.values.depends(k) & set(range(2 * problem.layout.size + 1)):
             which = "section" if names is None else f"section[{names[k]!r}]"

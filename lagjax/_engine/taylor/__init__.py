@@ -30,7 +30,7 @@ from lagjax._engine.taylor._crossing import (
     surfaces_of_event,
 )
 from lagjax._engine.taylor._derivatives import Motions, jvp, portions, project_start_tangents, vjp
-from lagjax._engine.taylor._flow import Flow, Tolerances, unfit
+from lagjax._engine.taylor._flow import Flow, Tolerances, require_fit
 from lagjax._engine.taylor._gpu_launch import adapt_tolerances
 from lagjax._engine.taylor._kept_steps import KEPT, StepStore
 from lagjax._engine.taylor._lowered_motion import lowered_motion
@@ -109,10 +109,11 @@ class MachineCode(AbstractEngine):
                 return self.lacks(problem.double_precision)
         if not all(map(is_concrete, problem.tolerances)):
             return "the tolerances are being traced"
-        if problem.event is not None and isinstance(surfaces := surfaces_of_event(problem), str):
-            return surfaces
-        flow = _flow_of(problem)
-        return flow if isinstance(flow, str) else None
+        try:
+            _find_flow(problem)
+        except Unlowerable as reason:
+            return str(reason)
+        return None
 
     def declines(self, problem: Problem) -> str | None:
         """Why it is not the default for the problem, as the end of a sentence; None where it is.
@@ -143,7 +144,7 @@ class MachineCode(AbstractEngine):
         ts, y0, params = map(jnp.asarray, (problem.ts, problem.y0, problem.vector))
         if problem.event is None:
             return _primitives.run(flow, tolerances, ts, y0, params)
-        return motion_to_event(flow, _unguarded_flow(problem), _surfaces_of(problem), tolerances)(ts, y0, params)
+        return motion_to_event(flow, _unguarded_flow(problem), surfaces_of_event(problem), tolerances)(ts, y0, params)
 
     def solve_to_event(self, problem: Problem, sides) -> Solution:
         """The motion of one member to the first change of its guards; it remembers `sides` (see `Guards`).
@@ -212,10 +213,10 @@ def flow_of(problem: Problem) -> Flow:
     if problem.is_single:
         with jax.enable_x64(True):
             return flow_of(problem.double_precision)
-    flow = _flow_of(problem)
-    if isinstance(flow, str):
-        raise ValueError(f"There is no machine code for this scene: {flow}.")
-    return flow
+    try:
+        return _find_flow(problem)
+    except Unlowerable as reason:
+        raise ValueError(f"There is no machine code for this scene: {reason}.") from None
 
 
 def _flows_to_crossings(
@@ -231,43 +232,40 @@ def _unguarded_flow(problem: Problem) -> Flow:
     return flow_of(dataclasses.replace(problem, event=None, guards=None))
 
 
-def _surfaces_of(problem: Problem) -> Surfaces:
-    surfaces = surfaces_of_event(problem)
-    assert not isinstance(surfaces, str), surfaces
-    return surfaces
-
-
-def _flow_of(problem: Problem) -> Flow | str:
-    guards = problem.guards if problem.event is None else _surfaces_of(problem).guards()
-    return _make_flow(problem.derivation, problem.system.path, guards)
+def _find_flow(problem: Problem) -> Flow:
+    """The flow of a problem's scene in float64. Raises `Unlowerable` where it has none."""
+    guards = problem.guards if problem.event is None else surfaces_of_event(problem).guards()
+    flow = _make_flow(problem.derivation, problem.system.path, guards)
+    if isinstance(flow, Unlowerable):
+        raise Unlowerable(str(flow))
+    return flow
 
 
 @functools.lru_cache(maxsize=64)
-def _make_flow(derivation: Derivation, path: str, guards: Guards | None) -> Flow | str:
-    """The flow of a scene, or a sentence that says why it has none. Made once."""
+def _make_flow(derivation: Derivation, path: str, guards: Guards | None) -> Flow | Unlowerable:
+    """The flow of a scene, or why it has none. Made once."""
     if path == "array":
-        return "the array path was asked for"
+        return Unlowerable("the array path was asked for")
     if derivation.unhashable is not None:
-        return f"the scene cannot be remembered: {derivation.unhashable}"
+        return Unlowerable(f"the scene cannot be remembered: {derivation.unhashable}")
+    n = derivation.layout.size
     try:
         program, projection = derivation.acceleration, derivation.projection
+        if guards is not None and guards.remembers:
+            program = program.append_inputs(guards.inputs)
+        require_fit(program, n)
+        if reason := derivation.kick_refusal:
+            return Unlowerable(reason)
+        pieces = pieces_of(program, Nesting(n)) if derivation.kicks else None
     except Unlowerable as reason:
-        return str(reason)
-    n = derivation.layout.size
-    if guards is not None and guards.remembers:
-        program = program.append_inputs(guards.inputs)
-    if reason := unfit(program, n):
-        return reason
-    if reason := derivation.kick_refusal:
-        return reason
-    found = pieces_of(program, Nesting(n)) if derivation.kicks else None
+        return Unlowerable(str(reason))  # without the frames that it was raised in
     try:
         if guards is not None:
-            found = append_guards(program, n, guards.values, True).borders
+            pieces = append_guards(program, n, guards.values, True).borders
     except Unlowerable as reason:
-        return f"of a guard, {reason}"
-    if derivation.kicks and found is None:
-        return "L, or its momentum p = dL/dqdot, jumps at a border that no series leads to"
+        return Unlowerable(f"of a guard, {reason}")
+    if derivation.kicks and pieces is None:
+        return Unlowerable("L, or its momentum p = dL/dqdot, jumps at a border that no series leads to")
     return Flow.from_program(program, n, projection, guards)
 
 

@@ -51,43 +51,40 @@ class Noted(NamedTuple):
 # ---- an event as a surface -------------------------------------------------------------------------------------------
 
 
-def surfaces_of_event(problem: Problem) -> Surfaces | str:
-    """The functions of an event as surfaces, or why they are not for machine code, as the end of a sentence."""
+def surfaces_of_event(problem: Problem) -> Surfaces:
+    """The functions of an event as surfaces. Raises `Unlowerable` where they are not for machine code."""
     if "surfaces" not in problem.made:
         problem.made["surfaces"] = _surfaces_of_event(problem)
     return problem.made["surfaces"]
 
 
-def _surfaces_of_event(problem: Problem) -> Surfaces | str:
+def _surfaces_of_event(problem: Problem) -> Surfaces:
     event = problem.event
     assert event is not None
     if has_own_root_finder(event):
-        return "the event has a root finder of its own"
+        raise Unlowerable("the event has a root finder of its own")
     conditions = jax.tree.leaves(event.cond_fn, is_leaf=lambda leaf: callable(leaf))
     if any(eqx.is_array(leaf) for leaf in jax.tree.leaves(conditions)):
-        return "the event holds arrays of its own"
+        raise Unlowerable("the event holds arrays of its own")
     if len(conditions) > MOST_GUARDS:
-        return f"the event has {len(conditions)} functions, more than {MOST_GUARDS}"
+        raise Unlowerable(f"the event has {len(conditions)} functions, more than {MOST_GUARDS}")
     signs = signs_of_event(problem)
     if None in signs:
-        return "the event is true or false, and no comparison of two numbers"
+        raise Unlowerable("the event is true or false, and no comparison of two numbers")
     ways = jax.tree.leaves(event.direction, is_leaf=lambda leaf: leaf is None)
     directions = tuple(sign or (0 if way is None else 1 if way else -1) for sign, way in zip(signs, ways, strict=True))
     surfaces = surfaces_of(problem, tuple(conditions), directions, "An event")
-    return surfaces if isinstance(surfaces, str) else surfaces._replace(holds=tuple(map(bool, signs)))
+    return surfaces._replace(holds=tuple(map(bool, signs)))
 
 
-def surfaces_of(problem: Problem, functions: tuple, directions: tuple[int, ...], what: str) -> Surfaces | str:
-    """Functions of (q, qdot), and of t and params, as surfaces; or why they are not for machine code.
+def surfaces_of(problem: Problem, functions: tuple, directions: tuple[int, ...], what: str) -> Surfaces:
+    """Functions of (q, qdot), and of t and params, as surfaces. Raises `Unlowerable` where machine code has none.
 
-    Raises `TypeError` where one of them is not one real number; `what` it is.
+    And `TypeError` where one of them is not one real number; `what` it is.
     """
     code, structure = jax.tree.flatten(eqx.filter(problem.params, eqx.is_array_like, inverse=True))
-    try:
-        given = directions, tuple(code), structure, what, problem.is_rounded
-        return _lower_surfaces(problem.derivation, functions, *given)
-    except Unlowerable as reason:
-        return str(reason)
+    given = directions, tuple(code), structure, what, problem.is_rounded
+    return _lower_surfaces(problem.derivation, functions, *given)
 
 
 @functools.lru_cache(maxsize=64)

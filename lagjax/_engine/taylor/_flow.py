@@ -71,18 +71,14 @@ class Tolerances(NamedTuple):
         return self._replace(max_steps=4 * self.max_steps)
 
 
-def unfit(program: Program, size: int) -> str | None:
-    """Why there is no machine code for a scene, as the end of a sentence; None where there is."""
+def require_fit(program: Program, size: int) -> None:
+    """Raise `Unlowerable` where there is no machine code for the program of a scene."""
     if program.operations > LARGEST_PROGRAM:
-        return (
+        raise Unlowerable(
             f"its acceleration takes {program.operations} operations, more than the {LARGEST_PROGRAM} whose kernel and "
             f"derivatives fit into half of this machine's {machine_memory() / 1e9:.0f} GB of memory"
-        )  # fmt: skip
-    try:
-        _native.require_recurrences(program, size)
-    except Unlowerable as reason:
-        return str(reason)
-    return None
+        )
+    _native.require_recurrences(program, size)
 
 
 # ---- flows -----------------------------------------------------------------------------------------------------------

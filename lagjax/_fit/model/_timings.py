@@ -20,6 +20,7 @@ from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._records import Guess, MeasuredSignal, real_numbers, require_start
 from lagjax._interface import Layout, halves
 from lagjax._primitives import sentence
+from lagjax._program import Unlowerable
 from lagjax._run import Trajectory, Transitions, directions_of, sections_of, simulate
 from lagjax._run.hybrid import Hybrid, Scene, Transition
 from lagjax._scene import System
@@ -221,9 +222,13 @@ def _build_section_clock(
     params = parameters.restore(parameters.first)
     problem = Problem.from_system(system, layout, params, ts=span, rtol=_SHARPER * rtol, max_steps=_BUDGET)
     directions = directions_of(timings.direction, keys)
-    surfaces = MachineCode().refuses(problem) or surfaces_of(problem, functions, directions, "A section")
-    if isinstance(surfaces, str):
-        raise ValueError(f"Crossing times are found with machine code, and there is none for this scene: {surfaces}.")
+    try:
+        if refusal := MachineCode().refuses(problem):
+            raise Unlowerable(refusal)
+        surfaces = surfaces_of(problem, functions, directions, "A section")
+    except Unlowerable as reason:
+        text = f"Crossing times are found with machine code, and there is none for this scene: {reason}."
+        raise ValueError(text) from None
     room = int(flat.numbers.max()) + 1
 
     def motion(y0, numbers) -> Problem:
