@@ -18,7 +18,6 @@ from lagjax._primitives._linear_map import (
     LinearMap,
     VaryingPrimitive,
     attach_derivative,
-    batch_in_front,
     compute_on_host,
     cond_alike,
     cotangent_of,

@@ -84,7 +84,8 @@ class FineOutput(_Around):
 
         def increment(place):
             t = t0 + place * (t1 - t0)
-            return _cast_like(y0, terms.vf_prod(t, interpolant.evaluate(t), args, span))
+            slope = terms.vf_prod(t, interpolant.evaluate(t), args, span)
+            return jax.tree.map(lambda leaf, like: leaf.astype(like.dtype), slope, y0)
 
         def correction(y0, y1, k, *inside):
             cubic = (_hermite_slope(place, y1 - y0, k[0], k[-1]) for place in _INSIDE)
@@ -193,7 +194,9 @@ class Projected(_Around):
         failed = ~_contracts(y1, near, nearer)
         if error is not None:
             error = jax.tree.map(lambda e, a, b: jnp.abs(e) + jnp.abs(b - a), error, y1, near)
-        y1, error, dense = _nan_where(failed, (nearer, error, dense))
+        arrays, others = eqx.partition((nearer, error, dense), eqx.is_inexact_array)
+        lost = jax.tree.map(lambda leaf: jnp.where(failed, jnp.nan, leaf), arrays)
+        y1, error, dense = eqx.combine(lost, others)
         projection = diffrax.RESULTS.where(failed, self.FAILED, diffrax.RESULTS.successful)
         return y1, error, dense, state, diffrax.RESULTS.where(result == diffrax.RESULTS.successful, projection, result)
 
@@ -212,11 +215,3 @@ def _contracts(start: PyTree, near: PyTree, nearer: PyTree) -> jax.Array:
     leaves = jax.tree.leaves((nearer, start))
     size = jnp.max(jnp.stack([jnp.max(jnp.abs(leaf)) for leaf in leaves]))
     return second <= jnp.maximum(0.01 * first, 1e3 * float(jnp.finfo(leaves[0].dtype).eps) * size)
-
-
-def _nan_where(failed, tree: PyTree) -> PyTree:
-    return jax.tree.map(lambda leaf: jnp.where(failed, jnp.nan, leaf) if eqx.is_inexact_array(leaf) else leaf, tree)
-
-
-def _cast_like(y, increment):
-    return jax.tree.map(lambda leaf, like: leaf.astype(like.dtype), increment, y)

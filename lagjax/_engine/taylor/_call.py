@@ -82,7 +82,9 @@ def run_by_handler(
         # The callback lives as long as the compiled program, and with it what the handler needs.
         return call_host(lambda *arrays, _needed=(plan, kernel): host(*arrays), shapes, *arrays)
 
-    well = _has_ended_well(begun)
+    more = jax.lax.bitcast_convert_type(begun.rest[-1], np.int64)
+    ended = (begun.code == _native.DONE) | (begun.code >= _native.EVENT)
+    well = (more == 0) & jnp.all(ended) & jnp.all(jnp.isfinite(begun.y_end))
     return tuple(cond_alike(well, convert_results, continue_on_host, ts, y0, params, *begun))
 
 
@@ -102,13 +104,6 @@ def derivative_by_handler(kind: str, flow: Flow, tolerances: Tolerances, rows: t
     call = jax.ffi.ffi_call(f"lagjax_{kind}", [jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes])
     *results, done, _ = vary_alike(call(*rows, plan=np.int64(ctypes.addressof(plan))), like=rows)
     return *results, done[0] > 0, (plan, flow.kernel)
-
-
-def _has_ended_well(begun: _native.Begun):
-    """True if nothing is left to do, and no member failed."""
-    more = jax.lax.bitcast_convert_type(begun.rest[-1], np.int64)
-    codes = (begun.code == _native.DONE) | (begun.code >= _native.EVENT)
-    return (more == 0) & jnp.all(codes) & jnp.all(jnp.isfinite(begun.y_end))
 
 
 @_native.make_once
