@@ -11,11 +11,9 @@ and in which line.
 """
 
 from lagjax._equations._blame import (
-    Offender,
     borders_of_motion,
     describe_pieces,
     offenders,
-    pieces_of,
     pieces_of_motion,
     poles,
 )

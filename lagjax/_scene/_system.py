@@ -6,7 +6,7 @@ first meet a state. `System._motion(layout)` is the same scene in flat coordinat
 
 import operator
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Any, Literal, cast
 
 import equinox as eqx
 import jax
@@ -106,10 +106,11 @@ class System(eqx.Module):
         if not isinstance(path, str) or path not in ("auto", "scalar", "array"):
             raise ValueError(f"path must be 'auto', 'scalar' or 'array'; got {path!r}.")
         self.path = path
-        functions: tuple[Any, ...] = lagrangian, forces, dissipation, constraints, velocity_constraints
+        functions = lagrangian, forces, dissipation, constraints, velocity_constraints
         for role, function in zip(ROLES, functions, strict=True):
             roles, absent = ("q",) if role == "constraints" else ("q", "qdot"), function is None and role != ROLES[0]
-            setattr(self, role, None if absent else accept(function, role, roles, ("t", "params", "inputs")))
+            accepted = None if absent else accept(cast(Callable, function), role, roles, ("t", "params", "inputs"))
+            setattr(self, role, accepted)
 
     def __repr__(self) -> str:
         """One line: the functions of the scene and what each asks for. `equinox.tree_pprint` prints the fields."""
