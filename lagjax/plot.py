@@ -22,7 +22,16 @@ from lagjax._analysis import Modes
 from lagjax._fit import Fit, Record, draw_record, record_matrix
 from lagjax._interface import Function, Layout, accept, is_known, join_names
 from lagjax._run import Crossings, Trajectory
-from lagjax._show import COLORS, course_of, courses_of, join_curve, require_points, times_of_members
+from lagjax._show import (
+    COLORS,
+    course_of,
+    courses_of,
+    even_places,
+    join_curve,
+    require_points,
+    simplify_axes,
+    times_of_members,
+)
 from lagjax._trust import WorkPrecision
 from lagjax._trust.health import does_work
 
@@ -152,10 +161,7 @@ def compare(one: Trajectory, other, *coordinates: str, figure=None):
     t, q, _ = course.curve()
     ts, values, style = _other(other, layout)
     places = _places(layout, coordinates, most=4)
-    matplotlib = _matplotlib()
-    if figure is None:
-        figure = matplotlib.pyplot.figure(figsize=(max(6.4, 3.6 * len(places)), 4.6), layout="constrained")
-    axes = figure.subplots(2, len(places), squeeze=False, sharex="col", gridspec_kw={"height_ratios": [2, 1]})
+    axes = _two_rows(figure, len(places))
     for (above, below), i in zip(axes.T, places, strict=True):
         _axes(above).plot(t, q[:, i], color=COLORS[0], linewidth=1.5, label="motion")
         above.plot(ts, values[:, i], style, color=COLORS[1], markersize=3.0, linewidth=1.2, label="other")
@@ -211,7 +217,9 @@ def modes(modes: Modes, points: Callable | None = None, q: Any = None, params: A
     if points is not None and q is None:
         raise ValueError("To draw points give the equilibrium too: lagjax.plot.modes(modes, points, q, params).")
     if points is not None:
-        _require_like(q, jax.tree.map(lambda leaf: leaf[0], modes.shapes))
+        given, shape = (jax.tree.map(jnp.shape, x) for x in (q, jax.tree.map(lambda leaf: leaf[0], modes.shapes)))
+        if given != shape:
+            raise ValueError(f"q must be the equilibrium of these modes, with shapes {shape}; got {given}.")
     shown, shapes = min(_positive(count, "count"), len(frequencies)), _align_phases(modes.shapes)
     matplotlib = _matplotlib()
     if figure is None:
@@ -242,15 +250,6 @@ def _align_phases(shapes):
     total = sum(jnp.sum(jnp.square(leaf).reshape(len(leaf), -1), axis=1) for leaf in jax.tree.leaves(shapes))
     turn = jnp.exp(-0.5j * jnp.angle(total))
     return jax.tree.map(lambda leaf: jnp.real(leaf * turn.reshape(-1, *[1] * (leaf.ndim - 1))), shapes)
-
-
-def _require_like(q, shape) -> None:
-    """Raise where an equilibrium has another structure or other shapes than a mode."""
-    if jax.tree.map(jnp.shape, q) != jax.tree.map(jnp.shape, shape):
-        raise ValueError(
-            f"q must be the equilibrium of these modes, with shapes {jax.tree.map(jnp.shape, shape)}; got "
-            f"{jax.tree.map(jnp.shape, q)}."
-        )
 
 
 def _bars(ax, shape) -> None:
@@ -449,12 +448,9 @@ def fit(fit: Fit, record: int = 0, *, figure=None):
     >>> lagjax.plot.fit(fit, record=3)
     """
     _require(fit, "fit", Fit, "fit")
-    matplotlib = _matplotlib()
     one, columns = fit.records[record], fit.residual_function.columns(record)
     names = fit.residual_function.names[columns]
-    if figure is None:
-        figure = matplotlib.pyplot.figure(figsize=(max(6.4, 3.6 * len(names)), 4.6), layout="constrained")
-    axes = figure.subplots(2, len(names), squeeze=False, sharex="col", gridspec_kw={"height_ratios": [2, 1]})
+    axes = _two_rows(figure, len(names))
     residuals = fit.residual_function.end_to_end(fit.residuals)[record]
     draw_record(axes, one, record_matrix(residuals, one), names, fit.noise_scale.sigma[columns])
     return axes
@@ -526,12 +522,14 @@ def _axes(ax):
     """`ax`, or the one of a new figure, with a light grid behind the data and no box around it."""
     if ax is None:
         _, ax = _matplotlib().pyplot.subplots(figsize=(6.4, 4.2), layout="constrained")
-    ax.grid(color="0.9", linewidth=0.8)
-    ax.set_axisbelow(True)
-    ax.spines[["top", "right"]].set_visible(False)
-    ax.spines[["left", "bottom"]].set_color(GREY)
-    ax.tick_params(color=GREY)
-    return ax
+    return simplify_axes(ax)
+
+
+def _two_rows(figure, columns: int):
+    """Axes (2, columns) of `figure`, or of a new one: curves above, what is left of them below."""
+    if figure is None:
+        figure = _matplotlib().pyplot.figure(figsize=(max(6.4, 3.6 * columns), 4.6), layout="constrained")
+    return figure.subplots(2, columns, squeeze=False, sharex="col", gridspec_kw={"height_ratios": [2, 1]})
 
 
 def _legend(ax, title: str | None = None):
@@ -578,9 +576,8 @@ def _positive(count, name: str) -> int:
 def _curves(trajectory: Trajectory, members: int) -> tuple[Layout, list[tuple[np.ndarray, np.ndarray, np.ndarray]]]:
     """The curves (t, q, q̇) of at most this many members, evenly chosen, and the layout of their coordinates."""
     _require_numbers(trajectory, "trajectory")
-    count = max(1, np.size(trajectory.ok))
-    chosen = np.linspace(0, count - 1, min(_positive(members, "members"), count)).astype(int)
-    layout, courses = courses_of(trajectory, np.unique(chosen))
+    chosen = even_places(max(1, np.size(trajectory.ok)), _positive(members, "members"))
+    layout, courses = courses_of(trajectory, chosen)
     return layout, [course.curve() for course in courses]
 
 

@@ -3,6 +3,7 @@
 Trajectory ─► Course of each member ─► states at the frames ─► positions of points ─► pictures ─► a file
 """
 
+import itertools
 import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -17,7 +18,7 @@ import numpy as np
 from lagjax._interface import Function, accept, is_known
 from lagjax._run import Members
 from lagjax._show._course import course_of_member
-from lagjax._show._notebook import COLORS
+from lagjax._show._notebook import COLORS, simplify_axes
 
 PyTree = Any
 MEMBERS = 50  # that are drawn of a batch, the first ones
@@ -155,7 +156,9 @@ class Animation:
 
 def make_animation(trajectory, points: Callable, trace, speed: float, fps: float) -> Animation:
     """The `Animation` of a trajectory; see `Trajectory.animate`."""
-    _require_positive(speed=speed, fps=fps)
+    for name, value in (("speed", speed), ("fps", fps)):
+        if isinstance(value, bool) or np.ndim(value) or not np.isreal(value) or not 0 < value < np.inf:
+            raise ValueError(f"{name} must be a positive number; got {value!r}.")
     if not all(map(is_known, jax.tree.leaves((trajectory.ts, trajectory.q, trajectory.qdot)))):
         raise ValueError("animate draws numbers: call it outside of jit, vmap and grad.")
     function = accept(points, "points", ("q",))
@@ -192,20 +195,13 @@ def make_animation(trajectory, points: Callable, trace, speed: float, fps: float
     return Animation(positions, paths, (float(begin), end), float(speed), float(fps), _parse_trace(trace, shapes))
 
 
-def _require_positive(**numbers) -> None:
-    for name, value in numbers.items():
-        if isinstance(value, bool) or np.ndim(value) or not np.isreal(value) or not 0 < value < np.inf:
-            raise ValueError(f"{name} must be a positive number; got {value!r}.")
-
-
 # ---- where the points are --------------------------------------------------------------------------------------------
 
 
 def _positions(function: Function, members: Members, k: int, q: np.ndarray, times: np.ndarray) -> dict[str, np.ndarray]:
     """The points (frames, number, 2 or 3) of a member at its states q (frames, n), by name; NaN where q is."""
     states = members.layout.restore(q.astype(members.layout.dtype))
-    drawn = _evaluate_points(function, states, times.astype(members.layout.dtype), members.params_of(k))
-    named = drawn if isinstance(drawn, dict) else {"": drawn}
+    named = _evaluate_points(function, states, times.astype(members.layout.dtype), members.params_of(k))
     known = np.all(np.isfinite(q), axis=1)[:, None, None]
     positions = {str(name): require_points(name, np.asarray(value), len(q)) for name, value in named.items()}
     return {name: np.where(known, value, np.nan) for name, value in positions.items()}
@@ -213,13 +209,12 @@ def _positions(function: Function, members: Members, k: int, q: np.ndarray, time
 
 @eqx.filter_jit
 def _evaluate_points(function: Function, states, times, params):
-    def drawn(q, t):
+    def points_at(q, t):
         points = function(q, t=t, params=params)
-        if isinstance(points, dict):
-            return {name: jnp.asarray(value) for name, value in points.items()}
-        return jnp.asarray(points)
+        named = points if isinstance(points, dict) else {"": points}
+        return {name: jnp.asarray(value) for name, value in named.items()}
 
-    return jax.vmap(drawn)(states, times)
+    return jax.vmap(points_at)(states, times)
 
 
 def require_points(name, value: np.ndarray, frames: int) -> np.ndarray:
@@ -262,7 +257,7 @@ def _draw_film(ax, positions: dict[str, np.ndarray], times: np.ndarray, traces, 
     space = ax.name == "3d"
     opacity = max(0.2, len(next(iter(positions.values()))) ** -0.5)
     lines, faded, forward = [], [], np.sign(times[-1] - times[0])
-    colors = dict(zip(positions, _cycle_colors(len(positions)), strict=True))
+    colors = dict(zip(positions, itertools.cycle(COLORS), strict=False))
     for name, array in positions.items():
         stands = array.shape[2] > 1 and not np.ptp(array, axis=(0, 1)).any()  # a floor has no ends
         style = dict(color=colors[name], alpha=opacity, linewidth=2, marker="" if stands else "o", markersize=5)
@@ -271,7 +266,7 @@ def _draw_film(ax, positions: dict[str, np.ndarray], times: np.ndarray, traces, 
             lines.append((line, member))
     for name, t, path in traces:
         seen = np.searchsorted(forward * t, forward * times, side="right")  # of the path, at every frame
-        faded.append((_trace(ax, colors[name], space, opacity), t, path, seen, colors[name]))
+        faded.append((_trace(ax, space), t, path, seen, colors[name]))
     # Above the scene; at a height of its own, as matplotlib looks for none of a title that is hidden.
     clock = ax.set_title(f"t = {times[-1]:.{_digits(times)}f}", loc="left", y=1.0, fontsize="medium")
 
@@ -285,7 +280,7 @@ def _draw_film(ax, positions: dict[str, np.ndarray], times: np.ndarray, traces, 
             begin, recent = times[max(0, i - trail)], slice(max(0, seen[max(0, i - trail)] - 1), seen[i])
             collection.set_segments(np.stack([path[recent][:-1], path[recent][1:]], axis=1))
             age = (t[recent][1:] - begin) / (times[i] - begin if i else 1.0)
-            collection.set_color([(*_rgb(color), a * opacity) for a in np.clip(age, 0.0, 1.0)])
+            collection.set_color([(color, a * opacity) for a in np.clip(age, 0.0, 1.0)])
         clock.set_text(f"t = {times[i]:.{_digits(times)}f}")
         return ()
 
@@ -337,12 +332,7 @@ def _axes(figure, low: np.ndarray, high: np.ndarray):
             axis.set_ticks([middle], [f"{middle:.3g}"])
         else:
             axis.get_major_locator().set_params(nbins=round(_INTERVALS * share))
-    ax.grid(color="0.9", linewidth=0.8)
-    ax.set_axisbelow(True)
-    ax.spines[["top", "right"]].set_visible(False)
-    ax.spines[["left", "bottom"]].set_color("0.55")
-    ax.tick_params(color="0.55")
-    return ax
+    return simplify_axes(ax)
 
 
 def _limits(points: list[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
@@ -364,22 +354,13 @@ def _size(low: np.ndarray, high: np.ndarray) -> tuple[float, float]:
     return _SIZE * max(width, 0.5), round(_SIZE * max(height, 0.4) * _DPI / 2) * 2 / _DPI
 
 
-def _trace(ax, color: str, space: bool, opacity: float):
+def _trace(ax, space: bool):
     """An empty line whose pieces have colours of their own."""
-    matplotlib = _matplotlib()
     if space:
         from mpl_toolkits.mplot3d.art3d import Line3DCollection
 
         return ax.add_collection3d(Line3DCollection([np.zeros((2, 3))], linewidths=1.2), autolim=False)
-    return ax.add_collection(matplotlib.collections.LineCollection([], linewidths=1.2), autolim=False)
-
-
-def _cycle_colors(count: int) -> list[str]:
-    return [COLORS[k % len(COLORS)] for k in range(count)]
-
-
-def _rgb(color: str) -> tuple[float, ...]:
-    return tuple(int(color[k : k + 2], 16) / 255 for k in (1, 3, 5))
+    return ax.add_collection(_matplotlib().collections.LineCollection([], linewidths=1.2), autolim=False)
 
 
 def _digits(times: np.ndarray) -> int:

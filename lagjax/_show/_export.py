@@ -24,14 +24,17 @@ def dataset(trajectory, units: PyTree = None, time_unit: str | None = None):
     variables: dict[str, tuple] = {"ok": (members, np.asarray(trajectory.ok))}
     for name, tree, unit in (("q", trajectory.q, of_q), ("qdot", trajectory.qdot, of_qdot)):
         for (path, leaf), one in zip(jax.tree_util.tree_leaves_with_path(tree), unit, strict=True):
-            label = ".".join([name, *map(_key_text, path)])
+            # A key as plain text: 'theta' for a dict's or a NamedTuple's, '0' for a list's.
+            label = jax.tree_util.keystr((jax.tree_util.GetAttrKey(name), *path), simple=True, separator=".")
             inner = tuple(f"{label}_{axis}" for axis in range(leaf.ndim - len(members) - 1))
             attributes = {} if one is None else {"units": one}
             variables[label] = ((*members, "time", *inner), np.asarray(leaf), attributes)
     if trajectory.mode is not None:
         names = {"names": list(trajectory.mode_names)}
         variables["mode"] = ((*members, "time"), np.asarray(trajectory.mode), names)
-    times, shared = _times(trajectory)
+    times = times_of_members(trajectory)
+    shared = bool((times == times[(0,) * len(members)]).all())
+    times = times[(0,) * len(members)] if shared else times
     of_time = {} if time_unit is None else {"units": time_unit}
     own = {} if shared else {"t": ((*members, "time"), times, of_time)}
     coordinates = {"time": ("time", times, of_time)} if shared else own
@@ -42,13 +45,16 @@ def frame(trajectory, units: PyTree = None, time_unit: str | None = None):
     """A `pandas.DataFrame` of a trajectory: see `Trajectory.to_pandas`."""
     pandas = _package("pandas", "to_pandas()")
     _require_numbers(trajectory, "to_pandas()")
-    members, names = _member_axes(trajectory), _names(trajectory)
+    members = _member_axes(trajectory)
     batch, count = np.shape(trajectory.result._value), trajectory.ts.shape[-1]
     each = times_of_members(trajectory)
+    # The names of the coordinates, as messages have them, which begin with q.
+    first = jax.tree.map(lambda leaf: np.asarray(leaf)[(0,) * (len(batch) + 1)], (trajectory.q, trajectory.qdot))
+    names = [name.removeprefix("q") for name in Layout.from_state(*first).names]
     columns = {
-        name: column
+        which + name: column
         for which, tree in (("q", trajectory.q), ("qdot", trajectory.qdot))
-        for name, column in zip(_column_names(which, names), _columns(tree, len(batch) + 1), strict=True)
+        for name, column in zip(names, _columns(tree, len(batch) + 1), strict=True)
     }
     if trajectory.mode is not None:
         codes = np.asarray(trajectory.mode).ravel()
@@ -60,7 +66,7 @@ def frame(trajectory, units: PyTree = None, time_unit: str | None = None):
         index = pandas.Index(each.ravel(), name="t")
     table = pandas.DataFrame(columns, index=index)
     of_q, of_qdot = _units(trajectory.q, units, time_unit)
-    per_leaf = [leaf[0].size for leaf in _first_member(trajectory.q, len(batch))]
+    per_leaf = [np.size(leaf) for leaf in jax.tree.leaves(first[0])]
     spread = [unit for of in (of_q, of_qdot) for unit, size in zip(of, per_leaf, strict=True) for _ in range(size)]
     known = {name: unit for name, unit in zip(columns, spread, strict=False) if unit is not None}
     if time_unit is not None:
@@ -94,30 +100,6 @@ def _member_axes(trajectory) -> tuple[str, ...]:
     return ("member",) if rank == 1 else tuple(f"member_{axis}" for axis in range(rank))
 
 
-def _times(trajectory) -> tuple[np.ndarray, bool]:
-    """The times, (T,) where all members share them, else (…, T), and whether they do."""
-    rows = np.asarray(trajectory.ts).reshape(-1, trajectory.ts.shape[-1])
-    shared = bool((rows == rows[0]).all())
-    return (rows[0] if shared else times_of_members(trajectory)), shared
-
-
-def _first_member(tree: PyTree, axes: int) -> list[np.ndarray]:
-    """The leaves of the first member, with the time axis in front."""
-    return [np.asarray(leaf)[(0,) * axes] for leaf in jax.tree.leaves(tree)]
-
-
-def _names(trajectory) -> tuple[str, ...]:
-    """The names of the coordinates, as messages have them."""
-    axes = np.ndim(trajectory.result._value) + 1
-    one = jax.tree.map(lambda leaf: np.asarray(leaf)[(0,) * axes], (trajectory.q, trajectory.qdot))
-    return Layout.from_state(*one).names
-
-
-def _column_names(which: str, names: tuple[str, ...]) -> list[str]:
-    """The names of coordinates, which begin with q, with `which` in its place."""
-    return [which + name.removeprefix("q") for name in names]
-
-
 def _columns(tree: PyTree, axes: int) -> list[np.ndarray]:
     """Every scalar coordinate with the leading axes end to end."""
     leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
@@ -131,9 +113,10 @@ def _units(tree: PyTree, units: PyTree, time_unit: str | None) -> tuple[list, li
     try:
         whole = jax.tree.broadcast(units, tree, is_leaf=lambda unit: unit is None or isinstance(unit, str))
     except ValueError:
+        paths = ["q" + jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(tree)][:8]
         raise ValueError(
             f"units is {units!r}, which does not fit the structure of q: give text for all coordinates, or a pytree "
-            f"like q with text or None for each ({', '.join(_paths(tree))})."
+            f"like q with text or None for each ({', '.join(paths)})."
         ) from None
     of_q = jax.tree.leaves(whole, is_leaf=lambda unit: unit is None)
     if wrong := [unit for unit in of_q if not (unit is None or isinstance(unit, str))]:
@@ -141,12 +124,3 @@ def _units(tree: PyTree, units: PyTree, time_unit: str | None) -> tuple[list, li
     per_time = "" if time_unit is None else time_unit
     of_qdot = [f"{unit or 1}/{per_time}" if unit is not None and per_time else None for unit in of_q]
     return of_q, of_qdot
-
-
-def _paths(tree: PyTree) -> list[str]:
-    return ["q" + jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(tree)][:8]
-
-
-def _key_text(key: Any) -> str:
-    """A key of a pytree path as plain text: 'theta' for a dict's or a NamedTuple's, '0' for a list's."""
-    return str(getattr(key, "key", getattr(key, "name", getattr(key, "idx", key))))

@@ -49,7 +49,7 @@ def trajectory_html(trajectory) -> str | None:
 
 def _draw(figure, trajectory) -> None:
     codes = np.asarray(trajectory.result._value).ravel()
-    members, ax = _some(codes.size, MEMBERS), figure.subplots()
+    members, ax = even_places(codes.size, MEMBERS), figure.subplots()
     layout, courses = courses_of(trajectory, members)
     opacity = max(0.15, len(members) ** -0.5)
     curves = [_shorten(course) for course in courses]
@@ -61,7 +61,7 @@ def _draw(figure, trajectory) -> None:
         ax.plot([], [], " ", label=f"… ({layout.size - COORDINATES} more)")
     for member in members[~np.isin(codes[members], ENDED_WELL)]:
         ax.axvline(np.ravel(trajectory.end.t)[member], color="0.4", linewidth=0.8, linestyle=":")
-    plain(ax)
+    simplify_axes(ax, width=0.6).tick_params(labelsize="small")
     ax.set_xlabel("t", fontsize="small")
     for handle in ax.legend(
         frameon=False, fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5)
@@ -77,15 +77,16 @@ def _shorten(course: Course) -> tuple[np.ndarray, np.ndarray]:
     return times, course.states_at(times)[0]
 
 
-def plain(ax) -> None:
-    """A light grid behind the data, no box around it, small figures."""
-    ax.grid(color="0.9", linewidth=0.6)
+def simplify_axes(ax, width: float = 0.8):
+    """The axes with a light grid behind the data, and no box around it."""
+    ax.grid(color="0.9", linewidth=width)
     ax.set_axisbelow(True)
     ax.spines[["top", "right"]].set_visible(False)
     ax.spines[["left", "bottom"]].set_color("0.55")
-    ax.tick_params(color="0.55", labelsize="small")
+    ax.tick_params(color="0.55")
+    return ax
 
 
-def _some(count: int, most: int) -> np.ndarray:
+def even_places(count: int, most: int) -> np.ndarray:
     """Places among 0 … count − 1, evenly chosen, `most` of them at most."""
     return np.unique(np.linspace(0, count - 1, min(count, most)).astype(int))
