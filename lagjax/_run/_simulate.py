@@ -236,11 +236,7 @@ def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, 
         ts, q, qdot, result = jax.tree.map(jnp.asarray, arrays)
     else:
         ts, q, qdot, result = _device_arrays(arrays)
-    stats = {
-        "num_steps": solution.accepted + solution.rejected,
-        "num_accepted_steps": solution.accepted,
-        "num_rejected_steps": solution.rejected,
-    }
+    stats = step_counts(solution.accepted, solution.rejected)
     if solution.idle is not None:
         stats["num_wasted_lane_steps"] = solution.idle
     fixed_steps = isinstance(engine, Diffrax) and engine.dt is not None
@@ -275,6 +271,10 @@ def _device_arrays(arrays: tuple) -> tuple:
 
 _PROCESS = os.getpid()
 _as_they_are = jax.jit(lambda *arrays: arrays)
+
+
+def step_counts(accepted, rejected) -> dict:
+    return {"num_steps": accepted + rejected, "num_accepted_steps": accepted, "num_rejected_steps": rejected}
 
 
 def _mask_inconsistent(trajectory: Trajectory, inconsistent: jax.Array) -> Trajectory:

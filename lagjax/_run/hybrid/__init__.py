@@ -34,7 +34,7 @@ from lagjax._interface import (
     result_from,
 )
 from lagjax._primitives import DOUBLE, compute_in_doubles, marks_absent
-from lagjax._run._simulate import raise_unless_ok
+from lagjax._run._simulate import raise_unless_ok, step_counts
 from lagjax._run._trajectory import State, Trajectory, Transitions
 from lagjax._run.hybrid._mode import Transition
 from lagjax._run.hybrid._transition_rounds import IN_ONE_PLACE, Ending, RoundPlan, TransitionRecord, hybrid_motion
@@ -178,7 +178,9 @@ def simulate_hybrid(
     q0, qdot0 = as_arrays((q0, qdot0), layout.dtype, "state")
     require_consistent(modes[start], layout, problem.ts, q0, qdot0, problem.params)
     rtol, atol = float(MachineCode().rtol(problem.double_precision)), None if atol is None else float(atol)
-    plan = RoundPlan(modes, tuple(transitions), start, max_transitions, rtol, atol, max_steps, problem.is_single)
+    systems, switches = tuple(modes.values()), tuple(transitions)
+    limits = start, max_transitions, rtol, atol, max_steps, problem.is_single
+    plan = RoundPlan(tuple(modes), systems, switches, *limits)
     ending, record = _motion(plan, problem)
     trajectory = _trajectory(modes, problem, ending, record)
     return _raise_unless_ok(modes, trajectory, layout, ending.mode) if throw else trajectory
@@ -210,11 +212,7 @@ def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, reco
         qdot=qdot,
         result=result_from(ending.result),
         end=State(ending.t, *end),
-        stats={
-            "num_steps": accepted + rejected,
-            "num_accepted_steps": accepted,
-            "num_rejected_steps": rejected,
-        },
+        stats=step_counts(accepted, rejected),
         system=dict(modes),
         params=problem.params,
         mode=ending.modes,

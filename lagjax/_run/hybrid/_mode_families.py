@@ -69,7 +69,7 @@ def families(
             continue
         for modes, of_modes in found:
             first = modes[0]
-            alike = of_modes and _same_outline(systems[first], leaving[first], system, transitions)
+            alike = of_modes and _outline(systems[first], leaving[first]) == _outline(system, transitions)
             if alike and all(map(_differ_by_numbers, of_modes[0], traces)) and _few([*of_modes, traces]):
                 modes.append(k)
                 of_modes.append(traces)
@@ -165,14 +165,10 @@ def _trace(function: Function, roles: int, layout: Layout, params) -> _Traced:
     return _Traced(function, closed, jax.tree.structure(shapes))
 
 
-def _same_outline(one: System, of_one, other: System, of_other) -> bool:
-    """True if two modes have the same functions and transitions, but for what the functions give."""
-
-    def outline(system, leaving):
-        roles = [getattr(system, role) is None for role in ROLES]
-        return system.path, roles, [(t.direction, t.reset is None, t.fires) for t in leaving]
-
-    return outline(one, of_one) == outline(other, of_other)
+def _outline(system: System, leaving) -> tuple:
+    """The functions and transitions that a mode has, but for what the functions give."""
+    roles = [getattr(system, role) is None for role in ROLES]
+    return system.path, roles, [(t.direction, t.reset is None, t.fires) for t in leaving]
 
 
 def _few(traces: Sequence[list]) -> bool:
@@ -245,11 +241,10 @@ def _same_jaxpr(one: core.Jaxpr, other: core.Jaxpr, numbers: Callable = lambda a
         parameters = all(_same_parameter(a.params[name], b.params[name]) for name in a.params)
         return parameters and same_all(a.invars, b.invars) and same_all(a.outvars, b.outvars)
 
-    ends = (one.constvars, other.constvars), (one.invars, other.invars)
-    equations = len(one.eqns) == len(other.eqns)
     return (
-        all(same_all(*pair) for pair in ends)
-        and equations
+        same_all(one.constvars, other.constvars)
+        and same_all(one.invars, other.invars)
+        and len(one.eqns) == len(other.eqns)
         and all(map(same_equation, one.eqns, other.eqns))
         and same_all(one.outvars, other.outvars)
         and len(set(names.values())) == len(names)

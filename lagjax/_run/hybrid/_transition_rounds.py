@@ -57,11 +57,6 @@ class RoundPlan(eqx.Module):
     max_steps: int = eqx.field(static=True)
     is_single: bool = eqx.field(static=True)  # whether the start came in float32
 
-    def __init__(self, modes, transitions, start, max_transitions, rtol, atol, max_steps, is_single):
-        self.names, self.systems, self.transitions = tuple(modes), tuple(modes.values()), transitions
-        self.start, self.max_transitions, self.is_single = start, max_transitions, is_single
-        self.rtol, self.atol, self.max_steps = rtol, atol, max_steps
-
     def groups(self, layout: Layout, params: PyTree, widths: tuple) -> list["ModeGroup"]:
         """The modes with the transitions that leave them; those that differ by numbers alone are one group."""
         numbers = [tuple(k for k, t in enumerate(self.transitions) if t.source == name) for name in self.names]
@@ -73,14 +68,12 @@ class RoundPlan(eqx.Module):
             if len(family.modes) > 1:
                 own = Lifted(params, tuple(row[0] for row in family.rows))
             table = np.array([numbers[k] for k in family.modes], int).reshape(len(family.modes), -1)
-            targets = np.array([[self.names.index(self.transitions[k].target) for k in row] for row in table], int)
+            targets = np.array([self.names.index(self.transitions[k].target) for k in table.flat], int)
+            targets = targets.reshape(table.shape)
             problem = Problem.from_system(family.system, layout, own, **limits)
             problem = dataclasses.replace(problem, is_rounded=self.is_single)
-            mode = Mode.from_problem(
-                self.names[first], problem, family.leaving, table[0], targets.reshape(table.shape)[0]
-            )
-            mode = mode._replace(widths=widths)
-            groups.append(ModeGroup(family, mode, table, targets.reshape(table.shape)))
+            mode = Mode.from_problem(self.names[first], problem, family.leaving, table[0], targets[0])
+            groups.append(ModeGroup(family, mode._replace(widths=widths), table, targets))
         return groups
 
 
@@ -100,7 +93,6 @@ class ModeGroup(NamedTuple):
         return np.array(some, int), np.array([self.first.leaving[k].direction for k in some])
 
     def mode(self, row) -> Mode:
-        """One of its modes."""
         if len(self.family.modes) == 1:
             return self.first
         tables = self.family.rows, self.numbers, self.targets
@@ -199,7 +191,12 @@ def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree) -> tu
     still = jax.lax.stop_gradient(record)
     named = jnp.where(_go_in_turn(still), IN_TURN, jnp.where(_pile_up(still.t, ts[-1]), ZENO, TOO_MANY))
     ending = ending._replace(result=jnp.where(ending.result == TOO_MANY, named, ending.result))
-    return _lose_unreached(ending, record, (ts, y0, rounds.groups[0].first.vector))
+    # Derivatives of outputs that were not reached, and of absent transitions, are NaN.
+    inputs = ts, y0, rounds.groups[0].first.vector
+    happened = record.source >= 0
+    t, y, y_next = (lost_unless(happened[:, *[None] * (x.ndim - 1)], x, inputs) for x in record[:3])
+    path = lost_unless((ending.modes >= 0)[:, None], ending.path, inputs)
+    return ending._replace(path=path), record._replace(t=t, y=y, y_next=y_next)
 
 
 class _Rounds(NamedTuple):
@@ -265,6 +262,8 @@ class _Rounds(NamedTuple):
         put = outset.beyond & at_once
         known = before.memory, outset.sides, t_end <= outset.lasting
         exit, memory = self._pass_transition(group, mode, before, kinds, at_once, put, t_end, y_end, known)
+        places = self._places_of(mode)
+        are_let_out, first_time = here & outset.blows & ~((kinds > 0) & at_once), _pick(before.let_out, places)
         event = (changes > 0) & ~exit.piled_up
         result = jnp.where(exit.piled_up, ZENO, jnp.where(here & ~event, located.result, before.result))
         # A reset may give NaN, and a guard that is NaN never fires.
@@ -282,7 +281,7 @@ class _Rounds(NamedTuple):
             steps=before.steps + jnp.stack([located.accepted, located.rejected]),
             latest=exit.number,
             memory=memory,
-            let_out=self._note_let_out(mode, before, here & outset.blows & ~((kinds > 0) & at_once)),
+            let_out=_put(before.let_out, places, jnp.where(are_let_out & jnp.isnan(first_time), t_start, first_time)),
         )
         return after, event, TransitionRecord(exit.t, exit.y, exit.y_next, before.mode, exit.target, exit.order_matters)
 
@@ -408,34 +407,33 @@ class _Rounds(NamedTuple):
         return memory
 
     def _outset(self, group: ModeGroup, mode: Mode, guarded: Guarded | None, before: Ending) -> Outset:
-        """The guards of a mode where a motion begins in it.
-
-        A guard is on the side where it was, if the reset has not moved it. One that has been followed is on the side
-        where it goes, or else where it was; without a reset it has been crossed, and so has a jump. Of others on their
-        surface it is known that they can change in their direction, if in one. For those beyond it see `Transition`.
-        """
-        memory = before.memory
+        """The guards of a mode where a motion begins in it; for those beyond zero see `Transition`."""
         if guarded is None or mode.surfaces is None:
             return Outset(*jnp.zeros((2, 0)), *jnp.zeros((2, 0), bool))
-        places = self._places_of(mode)
-        values, was, rounding, largest = (_pick(x, places) for x in memory)
-        unmoved, followed = jnp.abs(guarded.values - values) <= rounding, mode.numbers == before.latest
+        last_values, last_sides, rounding, largest = (_pick(x, self._places_of(mode)) for x in before.memory)
         rates, noise = guarded.clear_rates(largest), rounding + guarded.of_time
-        goes, ways = jnp.sign(rates), np.array([float(transition.direction) for transition in mode.leaving])
-        crossed = np.array([transition.reset is None for transition in mode.leaving]) | mode.surfaces.have_no_rate
-        ahead = jnp.where(goes != 0, goes, jnp.where(crossed, -was, was))
-        sides = jnp.where(jnp.abs(guarded.values) > noise, jnp.sign(guarded.values), -ways)
-        sides = jnp.where(unmoved & (was != 0), jnp.where(followed, ahead, was), sides)
-        size = jnp.maximum(noise, _LEAST)
-        stays = jnp.where(goes == 0, before.t, before.t + 2.0 * noise / jnp.abs(rates))
+        directions = np.array([float(transition.direction) for transition in mode.leaving])
 
-        own = mode.targets == before.mode
-        chosen = np.array([(transition.fires == "beyond", transition.fires is None) for transition in mode.leaving])
-        far = guarded.values * ways > noise
-        leaves = far & (chosen[:, 0] | (chosen[:, 1] & ~own))
-        blows = far & chosen[:, 1] & own & self._are_blows(group, mode, guarded, rates, before)
-        sides = jnp.where(leaves, np.copysign(np.inf, -ways), jnp.where(blows, -ways, sides) * size)
-        return Outset(sides, jax.lax.stop_gradient(stays), leaves | blows, blows)
+        # A guard comes from the side where it is; on its surface it can change in its direction, if it has one.
+        sides = jnp.where(jnp.abs(guarded.values) > noise, jnp.sign(guarded.values), -directions)
+        # The one that fired last goes to the side of its rate. Without a rate it stays where it was, unless it was
+        # crossed: without a reset, and by a jump.
+        crossed = np.array([transition.reset is None for transition in mode.leaving]) | mode.surfaces.have_no_rate
+        fired_to = jnp.where(rates != 0, jnp.sign(rates), jnp.where(crossed, -last_sides, last_sides))
+        fired_last = mode.numbers == before.latest
+        # What the reset has not moved comes from where it was.
+        unmoved = (jnp.abs(guarded.values - last_values) <= rounding) & (last_sides != 0)
+        sides = jnp.where(unmoved, jnp.where(fired_last, fired_to, last_sides), sides)
+
+        back, beyond_zero = mode.targets == before.mode, guarded.values * directions > noise
+        always = np.array([transition.fires == "beyond" for transition in mode.leaving])
+        by_target = np.array([transition.fires is None for transition in mode.leaving])
+        at_once = beyond_zero & (always | (by_target & ~back))
+        blows = beyond_zero & by_target & back & self._are_blows(group, mode, guarded, rates, before)
+        from_behind = jnp.where(blows, -directions, sides) * jnp.maximum(noise, _LEAST)
+        sides = jnp.where(at_once, np.copysign(np.inf, -directions), from_behind)
+        lasting = jnp.where(rates == 0, before.t, before.t + 2.0 * noise / jnp.abs(rates))
+        return Outset(sides, jax.lax.stop_gradient(lasting), at_once | blows, blows)
 
     def _are_blows(self, group: ModeGroup, mode: Mode, guarded: Guarded, rates, before: Ending) -> jax.Array:
         """True for every guard, (K,), whose reset keeps it off its surface: turns it round, or puts it back.
@@ -453,13 +451,6 @@ class _Rounds(NamedTuple):
         later, moved = after.clear_rates() * ways, (guarded.values[some] - after.values) * ways
         turned = jnp.where(rates[some] * ways < 0, later >= 0, later <= 0)
         return are_blows.at[some].set(turned | (moved > after.rounding))
-
-    def _note_let_out(self, mode: Mode, before: Ending, are_let_out) -> jax.Array:
-        """The first times at which guards were let out, (K,), with those of this round."""
-        places = self._places_of(mode)
-        known = _pick(before.let_out, places)
-        now = jnp.where(are_let_out & jnp.isnan(known), jax.lax.stop_gradient(before.t), known)
-        return _put(before.let_out, places, now)
 
     def _places_of(self, mode: Mode):
         """The places of a mode's transitions among all, (K of the mode, K) of bool."""
@@ -520,15 +511,16 @@ def _pile_up(times, end) -> jax.Array:
     flight and a contact, say) repeats in between: three intervals whose two ratios agree, and are below one. Or the
     time does not move any more.
     """
-    apart = next((k for k in (6, 2, 1) if 3 * k < times.size), None)
-    if apart is None:
+    pattern = next((k for k in (6, 2, 1) if 3 * k < times.size), None)
+    if pattern is None:
         return jnp.asarray(False)  # too few to tell
-    first, second, third = jnp.diff(times[-1 - 3 * apart :: apart])
-    before, ratio = second / first, third / second
-    steady = jnp.abs(jnp.log(ratio) - jnp.log(before)) <= STEADY * jnp.abs(jnp.log(before))
-    rounding = 4 * float(jnp.finfo(times.dtype).eps) * jnp.abs(times[-1])
-    lost = (third <= rounding) & (apart > 1)  # one alone may be two transitions at the same instant
-    return lost | ((ratio < 1) & steady & (times[-1] + third * ratio / (1 - ratio) < end))
+    first, second, third = jnp.diff(times[-1 - 3 * pattern :: pattern])
+    last_ratio, ratio = second / first, third / second
+    agree = jnp.abs(jnp.log(ratio) - jnp.log(last_ratio)) <= STEADY * jnp.abs(jnp.log(last_ratio))
+    limit = times[-1] + third * ratio / (1 - ratio)
+    # One interval alone may be that of two transitions at the same instant.
+    stands_still = (third <= 4 * float(jnp.finfo(times.dtype).eps) * jnp.abs(times[-1])) & (pattern > 1)
+    return stands_still | ((ratio < 1) & agree & (limit < end))
 
 
 def _go_in_turn(record: TransitionRecord) -> jax.Array:
@@ -540,11 +532,3 @@ def _go_in_turn(record: TransitionRecord) -> jax.Array:
     before = jnp.max(jnp.where(same, -jnp.inf, record.t))
     both = (kinds[-IN_ONE_PLACE:] != kinds[-1]).any()
     return same[-IN_ONE_PLACE:].all() & both & (last - before > APART * jnp.abs(last))
-
-
-def _lose_unreached(ending: Ending, record: TransitionRecord, inputs) -> tuple[Ending, TransitionRecord]:
-    """The ending and the record with NaN derivatives of outputs that were not reached and of absent transitions."""
-    happened = record.source >= 0
-    t, y, y_next = (lost_unless(happened[:, *[None] * (x.ndim - 1)], x, inputs) for x in record[:3])
-    path = lost_unless((ending.modes >= 0)[:, None], ending.path, inputs)
-    return ending._replace(path=path), record._replace(t=t, y=y, y_next=y_next)
