@@ -197,7 +197,6 @@ def least_multipliers(scene: SceneState, q: Vector) -> Array:
 
 
 def _sentence(scene: SceneState) -> str:
-    """The reason why no equilibrium was found from the guess."""
     force = scene.force(scene.q, scene.qdot)
     gradient = jax.jacfwd(scene.force)(scene.q, scene.qdot)
     names = scene.layout.names

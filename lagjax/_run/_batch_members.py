@@ -69,7 +69,6 @@ class Members:
         )
 
     def numbers_of(self, k: int) -> np.ndarray:
-        """The numbers (P,) in the parameters of member k."""
         return np.array([x if np.ndim(x) == 0 else x[k] for x in self.numbers])
 
     def params_of(self, k: int) -> PyTree:

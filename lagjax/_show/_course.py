@@ -85,7 +85,6 @@ def course_of(trajectory) -> tuple[Layout, Course]:
 
 
 def course_of_member(members: Members, k: int) -> Course:
-    """Member k between its outputs."""
     trajectory, place = members.trajectory, np.unravel_index(k, members.batch) if members.batch else ()
     changes, end = trajectory.transitions, trajectory.end
 

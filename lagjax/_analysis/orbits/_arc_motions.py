@@ -98,7 +98,6 @@ class Arcs:
         return cls(problem, np.asarray(problem.vector))
 
     def with_numbers(self, numbers: np.ndarray) -> "Arcs":
-        """The arcs of the scene with other parameters (P,)."""
         other = copy.copy(self)
         other.numbers = numbers
         return other
@@ -207,7 +206,6 @@ class Arcs:
         return chart * units.state[:, None, :] / np.concatenate([of_q, of_p], axis=1)[:, :, None]
 
     def why_not(self, row: int, arc: Arc, y0: np.ndarray, t_last: float) -> str:
-        """The failure of an arc, in a sentence."""
         if arc.result[row] == SUCCESSFUL:
             return "Its derivatives are not finite."
         return sentence(arc.result[row], arc.t_end[row], t_last, y0[row], self.layout.names) or ""

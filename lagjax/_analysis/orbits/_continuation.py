@@ -165,7 +165,6 @@ class Follower:
         return slope
 
     def value(self, point: FamilyPoint) -> float:
-        """The energy, or the parameter."""
         if self.place is not None:
             return float(point.numbers[self.place])
         return float(self.arcs.energy(0.0, point.chain.states())[0])

@@ -129,7 +129,6 @@ def family(
 
 
 def parameter_index(params: PyTree, name: str) -> int:
-    """The place of the parameter among all numbers."""
     labels, leaves, _ = labelled_leaves(params, "params")
     begin = 0
     for label, leaf in zip(labels, leaves, strict=True):
@@ -309,7 +308,6 @@ def _rate(follower: Follower, member: _Member, across: FamilyTangent) -> FamilyU
 
 
 def _build_family(follower: Follower, members: list[_Member], message: str) -> Family:
-    """The family in the user's structure."""
     found = FlatOrbits(*map(np.concatenate, zip(*(member.found for member in members), strict=True)))
     points, layout = [member.point for member in members], follower.arcs.layout
     value, energy = (np.array([of(point) for point in points]) for of in (follower.value, follower.energy))

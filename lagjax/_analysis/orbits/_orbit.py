@@ -148,7 +148,6 @@ def periodic_orbit(
 
 
 def restore_orbits(layout: Layout, found: "FlatOrbits", message: str | tuple[str, ...]) -> Orbit:
-    """The orbits in the user's structure."""
     q, qdot = map(layout.restore, halves(found.y))
     return Orbit._make([*jax.tree.map(jnp.asarray, (q, qdot, *found[1:6])), message])
 

@@ -53,7 +53,6 @@ class Closing(NamedTuple):
 
     @classmethod
     def plain(cls, arcs: Arcs, energy: float | None = None) -> "Closing":
-        """Orbits that return to where they began."""
         return cls(arcs, np.eye(2 * arcs.size), np.zeros(2 * arcs.size), energy)
 
     @property
@@ -203,7 +202,6 @@ class NewtonEquations(NamedTuple):
 
 
 def equations(closing: Closing, chain: Chain) -> NewtonEquations:
-    """The equations at these chains."""
     condensed = condense(chain.growth, np.stack([chain.rate * np.diff(chain.parts)[..., None], chain.defect], axis=3))
     of_first, of_last = closing.free()
     regular, of_period = condensed.first @ of_first + condensed.last @ of_last, condensed.more[..., :1]

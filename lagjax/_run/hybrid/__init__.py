@@ -196,7 +196,6 @@ def _motion(plan: RoundPlan, problem: Problem) -> tuple[Ending, TransitionRecord
 
 
 def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, record: TransitionRecord) -> Trajectory:
-    """The motion in the pytree of the user."""
     states, (accepted, rejected) = (ending.path, ending.y, record.y, record.y_next), ending.steps
     (q, qdot), end, (q_before, qdot_before), (q_next, qdot_next) = (
         map(problem.layout.restore, halves(y)) for y in states
@@ -274,7 +273,6 @@ def _last_transitions(trajectory: Trajectory) -> str:
 
 
 def _present(modes: dict[str, System], transitions) -> tuple[dict[str, System], list[Transition]]:
-    """Modes and transitions with their functions as they are now."""
     systems = {name: present_system(mode) for name, mode in modes.items()}
     return systems, [transition.now() for transition in transitions]
 

@@ -106,7 +106,6 @@ class Transition(eqx.Module):
         return f"Transition({self.source!r} → {self.target!r} where {self.guard.name} {way} zero{more})"
 
     def now(self) -> "Transition":
-        """The transition with its functions as they are now."""
         functions = self.guard, self.reset
         now = present(self.guard), None if self.reset is None else present(self.reset)
         if all(map(operator.is_, functions, now)):
@@ -160,7 +159,6 @@ class Mode(NamedTuple):
 
     @property
     def layout(self) -> Layout:
-        """The structure of the coordinates."""
         return self.problem.layout
 
     @property
