@@ -845,7 +845,7 @@ def test_what_is_raised_in_a_child_is_raised(tmp_path):
 
 
 @pytest.mark.slow
-def test_members_that_take_too_long(tmp_path):
+def test_members_that_take_too_long(tmp_path):  # it waits four times for a child that would not end; little CPU
     run = swept(tmp_path, {"length": [0.5, 1.0]}, q0=1.0, keep=never_at_one, isolate=5.0, unit=2)
     assert [f.member for f in run.status().failures] == [1] and "longer than 5 s" in run.status().failures[0].why
 
