@@ -251,14 +251,18 @@ class Program:
         """
         return emit_rows(self.line, Rows(first, numbers))
 
-    @functools.cached_property
+    @property
     def size(self) -> int:
         """The number of its inputs."""
-        return sum(math.prod(shape.shape) for shape in self.shapes)
+        return len(self._dtypes)
 
-    @functools.cached_property
+    @property
     def dtypes(self) -> tuple[np.dtype, ...]:
         """The type of every scalar it takes."""
+        return self._dtypes
+
+    @functools.cached_property
+    def _dtypes(self) -> tuple[np.dtype, ...]:
         return tuple(dtype for shape in self.shapes for dtype in [shape.dtype] * math.prod(shape.shape))
 
     def evaluate(self, *numbers) -> np.ndarray:
