@@ -12,41 +12,8 @@ does not decide on which side the next step begins.
 
 import itertools
 import math
-from collections.abc import Iterator
 
-from lagjax._native._constants import (
-    ABRUPT,
-    ARGUMENT,
-    AT_ONCE,
-    AT_REST,
-    BEYOND,
-    DISCONTINUOUS,
-    EARLY,
-    EPS,
-    FAINT,
-    FAR,
-    GROWTH,
-    GROWTH_OF_LENGTH,
-    JUMP_NOISE,
-    LARGEST_FALL,
-    LAST_STEPS,
-    LEAST_ORDER,
-    MAX_ORDER,
-    MOST_CROSSINGS,
-    MOST_LOOKS,
-    MOST_TURNS,
-    NARROWEST,
-    NEARBY,
-    NEGLIGIBLE,
-    NO_TIME,
-    PAST,
-    RESOLVED,
-    RISE,
-    SETS_OUT,
-    SHORT_OF,
-    STEEP,
-    SWITCH_TOLERANCES,
-)
+from lagjax._native import _constants as limits
 from lagjax._native._frame import Fields, Frame, Lane
 from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._retraction import Retraction
@@ -60,11 +27,6 @@ from lagjax._program._jump import Jump, Nesting
 
 NOWHERE = 1e300  # a level that no switching number comes to
 _AT_END = 16.0  # roundings of the time by which the end of a motion may miss an instant and is still taken to be there
-
-
-def _least_fall(exponent: float) -> float:
-    """By which factor the base of a power may fall in a step of the least order."""
-    return max(math.exp(-RISE * (LEAST_ORDER - 1) / exponent), LARGEST_FALL)
 
 
 class BorderControl:
@@ -99,7 +61,6 @@ class BorderControl:
 
     @staticmethod
     def fields(borders: _borders.Borders) -> Fields:
-        """The fields of a thread's memory."""
         guards, pieces = len(borders.guards), len(borders.switches)
         fields: Fields = {
             "touch": guards,  # the `Touch` of a guard where the step begins
@@ -127,10 +88,9 @@ class BorderControl:
                 "kicks": 1,  # 1 to kick the motion; 2 if it does not pass the border
                 "counts": 1,  # 1 if the step is one that is recorded, be it of no length
             }
-        return fields | Roots.fields(MAX_ORDER + 2) | Saltation.fields(borders)
+        return fields | Roots.fields(limits.MAX_ORDER + 2) | Saltation.fields(borders)
 
     def begin(self, frame: Frame, lane: Lane) -> None:
-        """A lane has taken a member."""
         lane["approach"] = 0.0
         if not self.pieces:
             return
@@ -190,13 +150,19 @@ class BorderControl:
             if self.table.movable and len(self.borders.clocks) > 1:
                 self._note_coincidence(frame, h)
             self._note_levels(frame)
-            self._note_slides(frame)
+            if self.slides:
+                frame["slides"] = 0.0
+                with code.loop(len(self.guards)) as g, frame.where(frame["touch", g] >= Touch.SLIDING):
+                    frame["slides"] = 1
             with code.loop(len(self.guards)) as g:
                 self._look(frame, g, degree, h)
         frame["next_approach"] = 0.0
-        for feature, first, end in self._rows_of_features():
+        first = 0
+        for feature, row in itertools.groupby(self.borders.features):  # which shares its code: as of a chain's bonds
+            end = first + len(list(row))
             with code.loop(integer(code, end), start=first) as i:
                 self._look_ahead(frame, i, feature, degree, h)
+            first = end
         frame["approach"] = frame["next_approach"]
         cut = frame["nearest"] < 1.0
         if self.borders.kicking:
@@ -227,7 +193,7 @@ class BorderControl:
         idle = (frame["touch", g] >= Touch.SLIDING) | (undecided & is_share)
         with code.only_if(code.any_lane(~idle)):
             self.roots.polynomial(frame, j, degree, h, code.select(undecided, 1.0, side), level)
-            at_limit = (code.intrinsic("fabs", frame["poly", 0]) <= JUMP_NOISE) & (frame["steps"] > 0.0)
+            at_limit = (code.intrinsic("fabs", frame["poly", 0]) <= limits.JUMP_NOISE) & (frame["steps"] > 0.0)
             if self.borders.releases:
                 self._limit_growth(frame, g, level)
             comes = ~undecided & (~is_share | at_limit) & (frame["touch", g] <= Touch.NONE)
@@ -241,7 +207,7 @@ class BorderControl:
         code = frame.code
         is_cone = self._is_cone(frame, g) & (code.lanes_of(code.as_double(self.table.place(code, g, "on"))) < 0.0)
         length, rate = frame["poly", 0] + level, frame["poly", 1]
-        part = GROWTH_OF_LENGTH * length / rate
+        part = limits.GROWTH_OF_LENGTH * length / rate
         sooner = is_cone & (rate > 0.0) & (length > level) & (part < frame["nearest"])
         with frame.where(sooner):
             frame["nearest"] = part
@@ -252,20 +218,25 @@ class BorderControl:
 
         A border that it `comes` to where another one has been met is met in a step of its own: each shifts tangents.
         """
-        code, leads = frame.code, self._leads(frame, degree)
+        code, leads = frame.code, frame.code.variable(frame.constant(0.0))
+        with code.loop(degree) as i:  # the sign of the first coefficient behind c₀ that is not zero
+            c = frame["poly", degree - i]
+            leads.value = code.select(code.compare("!=", c, 0.0), code.select(c > 0.0, 1, -1.0), leads.value)
+        leads = leads.value
         self._divide(frame, g, degree)
         # A move of less than a part of atol does not count as leaving a border that the motion touches. Where borders
         # hold together what moves by rounding, they are left and met in turn at one instant: then more is rounding.
         turns = 1.0 + code.maximum(frame["idle_crossings"] - float(len(self.guards)), frame.constant(0.0))
-        turns = code.select(turns < MOST_TURNS, turns, MOST_TURNS)
+        turns = code.select(turns < limits.MOST_TURNS, turns, limits.MOST_TURNS)
         patience = (turns * turns) * (turns * turns) * turns
-        nothing = self.roots.size(frame, degree) <= NEGLIGIBLE * code.lanes_of(absolute_tolerance(frame)) * patience
+        atol = absolute_tolerance(frame)
+        nothing = self.roots.size(frame, degree) <= limits.NEGLIGIBLE * code.lanes_of(atol) * patience
         touches = frame["touch", g] > Touch.NONE
         if self.slides:  # along u = 0 another border of |u| is there by rounding
             touches = touches | (frame["slides"] > 0.0)
         first = [code.intrinsic("fabs", frame["poly", k]) for k in range(3)]  # the last ones may have become zero
         idle = idle | (((nothing & touches) | (first[0] + first[1] + first[2] < frame.digits.tiny)) & ~undecided)
-        self._shorten(frame, degree, SWITCH_TOLERANCES * frame.job("rtol"), absolute_tolerance(frame), RESOLVED)
+        self._shorten(frame, degree, limits.SWITCH_TOLERANCES * frame.job("rtol"), atol, limits.RESOLVED)
         frame.call(self.roots.first_root, degree)
         self._look_closer(frame, degree)
         # At rest but for what it gains in so little time: u̇ is of the size of ü t.
@@ -274,11 +245,11 @@ class BorderControl:
         # A number that is zero leaves zero as its first coefficient says, or stays.
         leaves = undecided & code.compare("!=", leads, 0.0)
         root = code.select(undecided, code.select(leaves, 0.0, 2.0), self._place(frame))
-        instant = NO_TIME * frame["smallest"] / code.intrinsic("fabs", h)
+        instant = limits.NO_TIME * frame["smallest"] / code.intrinsic("fabs", h)
         root = code.select(comes & (root < instant) & (instant < 1.0), instant, root)
         is_root = leaves | (~undecided & (frame["is_root"] > 0.0) & (frame["root"] < 1.0))
         # Of two at one instant that of the piece on which the other one depends, which comes first, is crossed.
-        apart = code.select(frame["crossed"] > 0.0, 1.0 - AT_ONCE, 1.0) if self.borders.nested else 1.0
+        apart = code.select(frame["crossed"] > 0.0, 1.0 - limits.AT_ONCE, 1.0) if self.borders.nested else 1.0
         sooner = (root < frame["nearest"] * apart) & code.compare("!=", h, 0.0) & ~idle
         with frame.where(sooner):
             frame["nearest"] = root
@@ -339,7 +310,7 @@ class BorderControl:
 
     def _instant(self, frame: Frame) -> Value:
         """The largest difference of two times that count as the same."""
-        return frame.code.maximum(frame.code.intrinsic("fabs", frame["t"]), frame["smallest"]) * (4.0 * EPS)
+        return frame.code.maximum(frame.code.intrinsic("fabs", frame["t"]), frame["smallest"]) * (4.0 * limits.EPS)
 
     def _note_levels(self, frame: Frame) -> None:
         """The levels of guards that change: entries on both sides of the pieces of tables, and the speeds of cones."""
@@ -348,10 +319,10 @@ class BorderControl:
             if self.borders.kinds[guard.piece] == _borders.CONE:
                 rate = self.motion.followed_coefficient(frame, integer(code, guard.piece), integer(code, 1))
                 fall = (0.0 - rate) * frame["forward"]
-                last = fall * (LAST_STEPS * frame["smallest"])  # what is gone in the shortest steps
+                last = fall * (limits.LAST_STEPS * frame["smallest"])  # what is gone in the shortest steps
                 unit = code.lanes_of(absolute_tolerance(frame))
-                far = self.motion.followed_value(frame, integer(code, guard.piece)) > AT_REST * unit
-                least = unit * code.select(far, AT_REST, SETS_OUT)
+                far = self.motion.followed_value(frame, integer(code, guard.piece)) > limits.AT_REST * unit
+                least = unit * code.select(far, limits.AT_REST, limits.SETS_OUT)
                 frame["level", g] = code.select(last > least, last, least)
             if self.borders.kinds[guard.piece] == _borders.TABLE:
                 index = self._piece(frame, integer(code, guard.piece)) + guard.level.offset
@@ -362,16 +333,6 @@ class BorderControl:
     def slides(self) -> bool:
         """True if the motion may slide along a border that other switching numbers depend on."""
         return _borders.SLIDE in self.borders.kinds
-
-    def _note_slides(self, frame: Frame) -> None:
-        """Set `slides` to 1 in the lanes whose motion slides along any border."""
-        if not self.slides:
-            return
-        code = frame.code
-        frame["slides"] = 0.0
-        with code.loop(len(self.guards)) as g:
-            with frame.where(frame["touch", g] >= Touch.SLIDING):
-                frame["slides"] = 1
 
     def _go_on(self, frame: Frame, going: Value) -> None:
         """Past borders, and entries of tables.
@@ -424,26 +385,17 @@ class BorderControl:
                 place = self.motion.parameters + j
                 frame["params", place] = frame["params", place] + frame["forward"]
 
-    def _rows_of_features(self) -> Iterator[tuple[Feature, int, int]]:
-        """Every kind of feature, and the numbers of the first one of a row of these and of the next one after it.
-
-        A row shares its code: a chain has a feature in every bond.
-        """
-        first = 0
-        for feature, row in itertools.groupby(self.borders.features):
-            end = first + len(list(row))
-            yield feature, first, end
-            first = end
-
     def _look_ahead(self, frame: Frame, i: Value, feature: Feature, degree: Value, h: Value) -> None:
         """The step ends where the argument of feature number i has come as near as one step may bring it."""
         code, j = frame.code, i + self.pieces
         moves, last = self._moves(frame, j, degree, h)
-        rise = code.lanes_of(code.as_double(degree)) * (RISE / feature.scale)
-        near = ~((moves < rise) & (last < ARGUMENT))
+        rise = code.lanes_of(code.as_double(degree)) * (limits.RISE / feature.scale)
+        near = ~((moves < rise) & (last < limits.ARGUMENT))
         if feature.kind == FALLS:
             size = code.intrinsic("fabs", self.motion.followed_value(frame, j))
-            near = ~(moves < (1.0 - _least_fall(feature.scale)) * size)
+            # The base of the power may fall by this in a step of the least order.
+            fall = max(math.exp(-limits.RISE * (limits.LEAST_ORDER - 1) / feature.scale), limits.LARGEST_FALL)
+            near = ~(moves < (1.0 - fall) * size)
         if feature.kind in (SQUARED, UP_TO, GROWS):  # which change by more than their argument does
             near = frame.constant(0.0) <= 0.0
         with code.only_if(code.any_lane(near)):
@@ -468,51 +420,51 @@ class BorderControl:
         """With its argument u: where α + β u is zero, the step ends."""
         code, scale = frame.code, feature.scale
         u = self.motion.followed_value(frame, j)
-        rise = code.lanes_of(code.as_double(degree)) * RISE
+        rise = code.lanes_of(code.as_double(degree)) * limits.RISE
         side = code.select(u < 0.0, -1.0, 1.0)
-        of_size, absolute = frame.constant(0.0), frame.constant(ARGUMENT)
+        of_size, absolute = frame.constant(0.0), frame.constant(limits.ARGUMENT)
         if feature.kind == UP_TO:
             matters, slope, start = code.compare("!=", u, 0.0), side, side * u
-            of_size, absolute = frame.constant(ABRUPT), frame.constant(0.0)
+            of_size, absolute = frame.constant(limits.ABRUPT), frame.constant(0.0)
         elif feature.kind == FALLS:
-            fall = code.maximum(code.library("exp", rise * (-1.0 / scale)), frame.constant(LARGEST_FALL))
+            fall = code.maximum(code.library("exp", rise * (-1.0 / scale)), frame.constant(limits.LARGEST_FALL))
             matters, slope, start = code.compare("!=", u, 0.0), side, side * (u - fall * u)
-            absolute = ARGUMENT * (fall * (side * u))
+            absolute = limits.ARGUMENT * (fall * (side * u))
         elif feature.kind == GROWS:
             level = code.maximum(
-                code.library("exp", rise * (1.0 / scale)) * u, frame.constant(math.exp(-FAINT / scale))
+                code.library("exp", rise * (1.0 / scale)) * u, frame.constant(math.exp(-limits.FAINT / scale))
             )
             matters, slope, start = level > 0.0, frame.constant(-1.0), level - u
-            absolute = ARGUMENT * level
+            absolute = limits.ARGUMENT * level
         elif feature.kind == SQUARED:
             near = code.maximum(u * u - rise, 0.0)
-            level = code.intrinsic("sqrt", code.select(near > FAINT, FAINT, near))
+            level = code.intrinsic("sqrt", code.select(near > limits.FAINT, limits.FAINT, near))
             matters, slope, start = near > 0.0, side, side * u - level
         else:
             slope = frame.constant(-scale) if feature.kind == BELOW else scale * side
-            level = code.maximum(rise - slope * u, -FAINT)
+            level = code.maximum(rise - slope * u, -limits.FAINT)
             matters = level < (float("inf") if feature.kind == BELOW else 0.0)
             start = level + slope * u
             if feature.kind == BELOW:  # from above it comes to where there is a series again, and then is told in parts
-                above, falls = u * scale - BEYOND, self.motion.followed_coefficient(frame, j, 1) * h < 0.0
-                high = (above > 0.0) | ((u * scale > STEEP) & falls)
+                above, falls = u * scale - limits.BEYOND, self.motion.followed_coefficient(frame, j, 1) * h < 0.0
+                high = (above > 0.0) | ((u * scale > limits.STEEP) & falls)
                 slope = code.select(high, scale, slope)
                 start = code.select(high, code.maximum(above, rise), start)
         if feature.kind <= SQUARED:
-            far = start > FAR
-            start = code.select(far, (1.0 - LARGEST_FALL) * start, start)
-            of_size = code.select(far, ARGUMENT * LARGEST_FALL, of_size)
+            far = start > limits.FAR
+            start = code.select(far, (1.0 - limits.LARGEST_FALL) * start, start)
+            of_size = code.select(far, limits.ARGUMENT * limits.LARGEST_FALL, of_size)
         self.roots.polynomial(frame, j, degree, h, slope, u - start / slope)
         if feature.kind == FALLS:  # one that rises is told by fewer terms
             self.roots.sum_up(frame, degree)
             rises = frame["falls"] < start
             size = start + frame["rises"]
-            matters = matters & ~(rises & (self.roots.last_terms(frame, degree) < ARGUMENT * size))
+            matters = matters & ~(rises & (self.roots.last_terms(frame, degree) < limits.ARGUMENT * size))
         self._shorten(frame, degree, of_size, absolute)
         frame.call(self.roots.first_root, degree)
         root = self._place(frame)
         if feature.kind in (UP_TO, FALLS):
-            nearby = NEARBY if feature.kind == UP_TO else NARROWEST
+            nearby = limits.NEARBY if feature.kind == UP_TO else limits.NARROWEST
             way, whole = frame["root"] * frame["part"], code.intrinsic("fabs", h)
             whole = code.maximum(whole, frame["approach"])
             far = way * code.intrinsic("fabs", h) > nearby * whole
@@ -521,7 +473,7 @@ class BorderControl:
             with frame.where(comes):
                 frame["next_approach"] = whole
             if feature.kind == UP_TO:
-                past = code.select(far, way * SHORT_OF, way * PAST + NEARBY)
+                past = code.select(far, way * limits.SHORT_OF, way * limits.PAST + limits.NEARBY)
                 root = code.select(found, past, root)
             else:
                 matters = matters & (far | ~found)
@@ -529,15 +481,6 @@ class BorderControl:
         with frame.where(sooner):
             frame["nearest"] = root
             frame["crossed"] = Crossed.NOTHING
-
-    def _leads(self, frame: Frame, degree: Value) -> Value:
-        """The sign of the first coefficient behind c₀ that is not zero."""
-        code, leads = frame.code, frame.code.variable(frame.constant(0.0))
-        with code.loop(degree) as i:
-            c = frame["poly", degree - i]
-            sign = code.select(c > 0.0, 1, -1.0)
-            leads.value = code.select(code.compare("!=", c, 0.0), sign, leads.value)
-        return leads.value
 
     def _shorten(self, frame: Frame, degree: Value, rtol: Value, atol: Value, share: float = math.inf) -> None:
         """Halve the interval until the last terms are below atol, or a `share` of Σ |cₖ|, + rtol Σ |cₖ|."""
@@ -556,9 +499,9 @@ class BorderControl:
 
         def early():
             is_root = (frame["is_root"] > 0.0) & (frame["poly", 0] > 0.0)
-            return is_root & (frame["root"] < EARLY)
+            return is_root & (frame["root"] < limits.EARLY)
 
-        with code.repeat_while(lambda: code.any_lane(early()), at_most=MOST_LOOKS):
+        with code.repeat_while(lambda: code.any_lane(early()), at_most=limits.MOST_LOOKS):
             straight = 0.0 - 4.0 * frame["poly", 0] / frame["poly", 1]  # for a root that is zero to rounding
             reach = code.select(frame["root"] > 0.0, 2.0 * frame["root"], straight)
             self.roots.stretch(frame, degree, code.select(early() & (reach > 0.0) & (reach < 1.0), reach, 1.0))
@@ -620,7 +563,7 @@ class BorderControl:
                 for i in motion.form.each(code, base):
                     slope = code.intrinsic("fabs", slopes[i + part * base])
                     size = slope * code.intrinsic("fabs", state[i + part * n])
-                    rounding.value += size * EPS
+                    rounding.value += size * limits.EPS
                     error.value += rtol * size + slope * code.lanes_of(atol)
             rate, bend = self._rates(frame, order)
             is_hit = ends & (frame["is_hit"] > 0.0)
@@ -633,7 +576,7 @@ class BorderControl:
     def _rates(self, frame: Frame, order: Value) -> tuple[Value, Value]:
         """u̇ and ü at the end of the step, of the switching number that is `hit`."""
         code, h = frame.code, frame["h"]
-        degree = code.select(order < MAX_ORDER, order, MAX_ORDER - 1)
+        degree = code.select(order < limits.MAX_ORDER, order, limits.MAX_ORDER - 1)
         first = self.motion.series.rows - self.motion.series.followed
         rate, bend = (code.variable(frame.constant(0.0)) for _ in range(2))
         with code.loop(degree, start=0) as i:
@@ -663,7 +606,7 @@ class BorderControl:
             planned = code.intrinsic("fabs", frame["planned_h"])
             reached = was_cut & code.compare("==", frame["h"], frame["cut"])
             with frame.where(reached):
-                frame["longest"] = GROWTH * planned
+                frame["longest"] = limits.GROWTH * planned
                 frame["h"] = frame["planned_h"]
             if self.note is not None:
                 frame.call(self.note)
@@ -683,9 +626,9 @@ class BorderControl:
             idle = code.select(stepped, 0.0, frame["idle_crossings"] + 1.0)
             with frame.where(stepped | crosses | was_cut):
                 frame["idle_crossings"] = idle
-            many = frame["idle_crossings"] > float(MOST_CROSSINGS * (len(self.guards) + len(self.borders.clocks)))
-            with frame.where(many):
-                frame["code"] = DISCONTINUOUS
+            most = float(limits.MOST_CROSSINGS * (len(self.guards) + len(self.borders.clocks)))
+            with frame.where(frame["idle_crossings"] > most):
+                frame["code"] = limits.DISCONTINUOUS
         return frame.finish()
 
     def _go_beyond(self, frame: Frame) -> None:
@@ -696,7 +639,7 @@ class BorderControl:
         comes to rest.
         """
         code, again = frame.code, frame["stepped"] <= 0.0
-        no_time = ~again & (code.intrinsic("fabs", frame["cut"]) <= NO_TIME * frame["smallest"])
+        no_time = ~again & (code.intrinsic("fabs", frame["cut"]) <= limits.NO_TIME * frame["smallest"])
         no_time = (no_time | (~again & (frame["stops"] > 0.0))) & (frame["at_rest"] > 0.0)
         with code.loop(len(self.guards)) as g:
             hit = self.table.crosses(frame, Crossed.GUARD, g)
@@ -764,7 +707,7 @@ class BorderControl:
                 c = frame["poly", k]
                 end.value = end.value + c
                 slope.value = slope.value + c * code.lanes_of(code.as_double(k))
-            noise = _AT_END * EPS * code.intrinsic("fabs", frame["t_end"] / h * slope.value)
+            noise = _AT_END * limits.EPS * code.intrinsic("fabs", frame["t_end"] / h * slope.value)
             there = (
                 (frame["last"] > 0.0) & (frame["forward"] > 0.0) & code.compare("!=", side, 0.0) & (end.value <= noise)
             )
@@ -878,7 +821,8 @@ class BorderControl:
         for g in shares:
             leaves = leaves | self.table.crosses(frame, Crossed.GUARD, g)
         with code.only_if(code.any_lane(leaves)):
-            out, speed = motion.evaluate_now(frame, self.borders.release), 2.0 * SETS_OUT * absolute_tolerance(frame)
+            out = motion.evaluate_now(frame, self.borders.release)
+            speed = 2.0 * limits.SETS_OUT * absolute_tolerance(frame)
             for k, g in enumerate(shares):
                 hit = self.table.crosses(frame, Crossed.GUARD, g)
                 for i in range(base):

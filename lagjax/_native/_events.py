@@ -13,29 +13,15 @@ from enum import IntEnum
 
 import numpy as np
 
-from lagjax._native._constants import (
-    BISECTIONS,
-    CONTINUOUS,
-    EPS,
-    FALL,
-    GUARD_NOISE,
-    GUARD_TERMS,
-    INSTANT,
-    LITTLE,
-    MOST_CHANGES,
-    MOST_CORRECTIONS,
-    NOT_FINITE,
-    ROOT_NOISE,
-    SEEN,
-    WITHOUT_SERIES,
-)
+from lagjax._native import _constants as limits
 from lagjax._native._frame import EXACT, Fields, Frame, Lane, integers
+from lagjax._native._guards import Guards
 from lagjax._native._ir import INTEGER, Code, Value, Variable
 from lagjax._native._roots import Roots, Touch
 from lagjax._native._run_records import Output
 from lagjax._native._step import StepControl
 from lagjax._native._taylor import TaylorSeries, double
-from lagjax._program._series import StraightLine
+from lagjax._program._borders import reads_inputs
 
 
 class Change(IntEnum):
@@ -46,41 +32,24 @@ class Change(IntEnum):
 
 
 class Events:
-    """The changes of sign of the guards `values`, each in its direction (−1, 0, +1): they end the motion, or are noted.
+    """The changes of sign of guards, the last of what the series of a motion follow: they end it, or are noted."""
 
-    The guards are what the series follow from number `first` on; those that are `piecewise` depend on pieces. The
-    outputs of `complete` are what `Guards` says of its program.
-    """
-
-    def __init__(
-        self,
-        motion: TaylorSeries,
-        step: StepControl,
-        output: Output,
-        roots: Roots,
-        values: StraightLine,
-        complete: StraightLine,
-        directions: tuple[int, ...],
-        piecewise: tuple[bool, ...],
-        first: int,
-        notes: bool,
-        remembers: bool,
-        is_rounded: bool,
-        holds: tuple[bool, ...],
-    ):
-        self.directions, self.remembers, self.is_rounded, self.holds = directions, remembers, is_rounded, holds
-        self.motion, self.step, self.output, self.roots = motion, step, output, roots
-        self.values, self.complete, self.count, self.first, self.notes = values, complete, len(directions), first, notes
+    def __init__(self, motion: TaylorSeries, step: StepControl, output: Output, roots: Roots, guards: Guards):
+        self.motion, self.step, self.output, self.roots, self.guards = motion, step, output, roots, guards
+        self.count, self.notes = len(guards.directions), guards.notes
+        self.first = motion.series.followed - self.count
+        program = motion.program
+        outputs = program.line.outputs[len(program.line.outputs) - self.count :]
+        piecewise = reads_inputs(program.line, outputs, program.size - motion.pieces)
         self.can_jump = any(piecewise)
-        self.table = integers(motion.module, np.array(list(zip(directions, piecewise, strict=True)), np.int64))
+        self.table = integers(motion.module, np.array(list(zip(guards.directions, piecewise, strict=True)), np.int64))
         self.guard = self._guard()
         self.begin_sides = self._begin_sides()
-        self.note = self._note() if notes else None
+        self.note = self._note() if self.notes else None
         self.look = self._look()
 
     @staticmethod
     def fields(guards: int) -> Fields:
-        """The fields of a thread's memory, of every guard and of all of them."""
         return {
             "guard": guards,  # its value
             "side": guards,  # its sign at the end of the step
@@ -105,10 +74,9 @@ class Events:
         }
 
     def begin(self, frame: Frame, lane: Lane) -> None:
-        """A lane has taken a member."""
         with frame.code.loop(self.count) as g:
             lane["passed_at", g] = float("inf")
-            for name in ("noted", "contact", "met", "waits", *(["zero"] if self.is_rounded else [])):
+            for name in ("noted", "contact", "met", "waits", *(["zero"] if self.guards.is_rounded else [])):
                 lane[name, g] = 0.0
 
     # ---- the guards ----
@@ -118,13 +86,12 @@ class Events:
         frame = self.motion.function("guard", INTEGER, self.motion.vector)
         order, s = frame.arguments
         moved = self.motion.move_state(frame, self.motion.increments(frame, order, s)[0])
-        guards = self.motion.evaluate(frame, self.values, moved, s)
+        guards = self.motion.evaluate(frame, self.guards.values.line, moved, s)
         for i in range(self.count):
-            frame["guard", i] = guards[i] - frame["zero", i] if self.is_rounded else guards[i]
+            frame["guard", i] = guards[i] - frame["zero", i] if self.guards.is_rounded else guards[i]
         return frame.finish()
 
     def _guard_value(self, frame: Frame, order: Value, g: Value, s: Value) -> Value:
-        """Guard g a time s after the present one."""
         frame.call(self.guard, order, s)
         return frame["guard", g]
 
@@ -146,43 +113,43 @@ class Events:
         with code.loop(count) as g:
             frame["contact", g] = frame["met", g] = 0.0
         with code.only_if(code.any_lane(fresh)):
-            frame.call(self.guard, order, LITTLE * frame["h"])
-            instant = INSTANT * frame["smallest"]
-            out = self.motion.evaluate_now(frame, self.complete)
+            frame.call(self.guard, order, limits.LITTLE * frame["h"])
+            instant = limits.INSTANT * frame["smallest"]
+            out = self.motion.evaluate_now(frame, self.guards.program.line)
             rate_noises = [self._rate_noise(frame, i, out[i + 3 * count]) for i in range(count)]
             for i in range(count):
                 of_rate = code.intrinsic("fabs", frame["h"]) * rate_noises[i]
-                frame["noise", i] = GUARD_NOISE * out[i + 2 * count] + of_rate
+                frame["noise", i] = limits.GUARD_NOISE * out[i + 2 * count] + of_rate
             with code.loop(count) as g:
                 self._note_lead(frame, order, g)
             for i in range(count):
                 before, (value, rate, size) = self._side_before(frame, i), (out[i + k * count] for k in range(3))
-                moved, later, noise = code.intrinsic("fabs", rate), frame["guard", i], GUARD_NOISE * size
+                moved, later, noise = code.intrinsic("fabs", rate), frame["guard", i], limits.GUARD_NOISE * size
                 from_there = code.intrinsic("fabs", before)
                 on_it = code.intrinsic("fabs", value) <= noise + moved * instant
-                if self.remembers:
+                if self.guards.remembers:
                     on_it = on_it | (code.intrinsic("fabs", value) <= from_there)
-                elif self.is_rounded:
+                elif self.guards.is_rounded:
                     on_it = on_it | (code.intrinsic("fabs", value) <= out[i + 4 * count])
                 leaves, order_of_zero = moved > rate_noises[i], frame["lead_order", i]
                 sound = order_of_zero > 0.0
                 turn = code.select(sound, frame["lead", i], later - value)
                 bends = code.intrinsic("fabs", turn) > code.select(sound, 0.0, noise)
                 before = self._sign(frame, before)
-                unclear = code.select(code.compare("!=", before, 0.0), 0.0, turn if self.is_rounded else later)
+                unclear = code.select(code.compare("!=", before, 0.0), 0.0, turn if self.guards.is_rounded else later)
                 going = code.select(leaves, rate * frame["forward"], code.select(bends, turn, unclear))
-                there = on_it | (value * before < 0.0) if self.remembers else on_it
+                there = on_it | (value * before < 0.0) if self.guards.remembers else on_it
                 goes_on = (going * before < 0.0) | ~(from_there < float("inf"))
-                met = fresh & there & goes_on & (before * float(self.directions[i]) <= 0.0)
-                if any(self.holds[i : i + 1]):
-                    met = met | (fresh & ~on_it & (value * float(self.directions[i]) > 0.0))
+                met = fresh & there & goes_on & (before * float(self.guards.directions[i]) <= 0.0)
+                if any(self.guards.holds[i : i + 1]):
+                    met = met | (fresh & ~on_it & (value * float(self.guards.directions[i]) > 0.0))
                 kind = code.select(before > 0.0, Change.FALLS, Change.RISES)
                 frame["met", i] = code.select(met, kind, 0.0)
                 stays = met | code.compare("==", going, 0.0)
                 side = code.select(on_it, code.select(stays, before, going), value)
                 with frame.where(fresh):
                     frame["side", i] = self._sign(frame, side)
-                    if self.is_rounded:
+                    if self.guards.is_rounded:
                         frame["zero", i] = code.select(on_it, value, 0.0)
                 zeros = code.select(leaves, Touch.VALUE, code.select(sound, order_of_zero, Touch.RATE))
                 frame["contact", i] = code.select(fresh & on_it, zeros, Touch.NONE)
@@ -202,7 +169,7 @@ class Events:
         with code.loop(degree + 1, start=1) as k:
             size.value += code.intrinsic("fabs", power_after(k))
             power.value = power.value * frame["h"]
-        noise, power = frame["noise", g] + GUARD_NOISE * size.value, code.variable(frame["h"])
+        noise, power = frame["noise", g] + limits.GUARD_NOISE * size.value, code.variable(frame["h"])
         last = code.select(noise < float("inf"), code.lanes_of(code.as_number(degree + 1)), 0.0)
         frame["lead", g], frame["lead_order", g] = 0.0, last
         with code.loop(degree + 1, start=2) as k:
@@ -215,9 +182,9 @@ class Events:
 
     def _rate_noise(self, frame: Frame, i: int, size: Value) -> Value:
         """The rounding of the rate of surface i, whose terms have this size; or what is remembered of it."""
-        if self.remembers:
+        if self.guards.remembers:
             return frame["params", self.motion.parameters - self.count + i]
-        return GUARD_NOISE * size
+        return limits.GUARD_NOISE * size
 
     def _side_before(self, frame: Frame, i: int) -> Value:
         """The side of surface i from which a motion comes that begins on it, as a sign; 0 where that is unknown.
@@ -225,9 +192,9 @@ class Events:
         It comes from where it can change in the direction of the guard. To note what changes, it begins here. What is
         remembered is as large as rounding may have made the guard, before it came near zero.
         """
-        if self.remembers:
+        if self.guards.remembers:
             return frame["params", self.motion.parameters - 2 * self.count + i]
-        return frame.constant(0.0 if self.notes else -float(self.directions[i]))
+        return frame.constant(0.0 if self.notes else -float(self.guards.directions[i]))
 
     def _sign(self, frame: Frame, x: Value) -> Value:
         code = frame.code
@@ -247,7 +214,7 @@ class Events:
         size = code.intrinsic("fabs", frame["h"])
         cut = (frame["seen"] < 1.0) & (frame["seen"] * size < frame["first_at"])
         with code.only_if(code.any_lane(cut)):
-            least = INSTANT * frame["smallest"]
+            least = limits.INSTANT * frame["smallest"]
             after = code.maximum(frame["seen"] * size, code.select(least < size, least, size))
             frame["is_cut"] = cut
             with frame.where(cut):
@@ -295,12 +262,11 @@ class Events:
         return frame.finish()
 
     def _look_at(self, frame: Frame, order: Value, g: Value) -> None:
-        """The changes of guard g along the step."""
         code, roots, h = frame.code, self.roots, frame["h"]
         degree, j = self.motion.followed_degree(code, order), g + self.first
         moving, value = code.compare("!=", h, 0.0) & (frame["met", g] <= 0.0), self.motion.followed_value(frame, j)
-        side, zero = frame["side", g], frame["zero", g] if self.is_rounded else 0.0
-        value = value - zero if self.is_rounded else value
+        side, zero = frame["side", g], frame["zero", g] if self.guards.is_rounded else 0.0
+        value = value - zero if self.guards.is_rounded else value
         side = code.select(code.compare("==", side, 0.0), self._sign(frame, value), side)
         roots.polynomial(frame, j, degree, h, side, zero)
         clear = self._is_clear(frame, degree)
@@ -328,7 +294,7 @@ class Events:
         moving = code.compare("!=", h, 0.0) & (frame["met", g] <= 0.0)
         unknown = moving & ~(code.intrinsic("fabs", value) < float("inf"))
         with frame.where(unknown):
-            frame["code"] = float(NOT_FINITE)
+            frame["code"] = float(limits.NOT_FINITE)
             frame["last"] = 0.0
         frame["h"] = code.select(unknown, 0.0, h)
         sound, moving = size < float("inf"), moving & ~unknown
@@ -342,7 +308,7 @@ class Events:
         frame["doubt"], frame["begin"] = roots.last_terms(frame, degree), 0.0
         instant = 0.25 * frame["smallest"]  # no time is known better than this
         frame["instant"] = instant / (code.intrinsic("fabs", h) * frame["part"])
-        rounding = (ROOT_NOISE * EPS) * frame["kept", g]
+        rounding = (limits.ROOT_NOISE * limits.EPS) * frame["kept", g]
         rounding = code.select(
             (rounding < float("inf")) & code.compare("!=", frame["contact", g], Touch.VALUE), rounding, 0.0
         )
@@ -355,14 +321,14 @@ class Events:
 
     def _is_long(self, last: Value, before: Value, size: Value) -> Value:
         """The lanes whose last terms are large, or do not fall: the polynomial may leave out as much as they are."""
-        return (last > GUARD_TERMS * size) | ((last > FALL * before) & (last > SEEN * size))
+        return (last > limits.GUARD_TERMS * size) | ((last > limits.FALL * before) & (last > limits.SEEN * size))
 
     def _leave_surface(self, frame: Frame, g: Value, degree: Value, size: Value) -> None:
         """A motion that begins on the surface, or has just gone through it, is not to do so by rounding."""
         code, contact = frame.code, frame["contact", g]
         since = code.intrinsic("fabs", frame["t"] - frame["passed_at", g])
-        known = (since <= INSTANT * frame["smallest"]) | (frame["waited", g] > 0.0)
-        on = (contact > Touch.NONE) | (known & (code.intrinsic("fabs", frame["poly", 0]) <= CONTINUOUS * size))
+        known = (since <= limits.INSTANT * frame["smallest"]) | (frame["waited", g] > 0.0)
+        on = (contact > Touch.NONE) | (known & (code.intrinsic("fabs", frame["poly", 0]) <= limits.CONTINUOUS * size))
         with frame.where(on):
             frame["poly", 0] = 0.0
         with code.only_if(code.any_lane(contact > Touch.VALUE)), code.loop(degree + 1, start=1) as k:
@@ -377,7 +343,7 @@ class Events:
         def searching():
             return looking.value > 0.0
 
-        with code.repeat_while(lambda: code.any_lane(searching()), at_most=MOST_CHANGES):
+        with code.repeat_while(lambda: code.any_lane(searching()), at_most=limits.MOST_CHANGES):
             frame.call(self.roots.next_root, degree)
             root, part = frame["root"], frame["part"]
             is_root = searching() & (root < 1.0) & (frame["is_root"] > 0.0)
@@ -426,17 +392,17 @@ class Events:
         def moves():  # each lane as long as it needs, so that its neighbours do not change its last digit
             return going.value > 0.0
 
-        with code.repeat_while(lambda: code.any_lane(moves()), at_most=MOST_CORRECTIONS):
+        with code.repeat_while(lambda: code.any_lane(moves()), at_most=limits.MOST_CORRECTIONS):
             here = at.value
             after = here - side * self._guard_value(frame, order, g, here) / rate
             near = code.intrinsic("fabs", after - start) <= 0.1 * code.intrinsic("fabs", scale)
             after = code.select(moves() & near, after, here)
             after = code.select(after * frame["forward"] > 0.0, after, 0.0)
             at.value = after
-            far = code.intrinsic("fabs", after - here) > INSTANT * frame["smallest"]
+            far = code.intrinsic("fabs", after - here) > limits.INSTANT * frame["smallest"]
             going.value = code.flag(far & moves())
         at = at.value
-        lost = (frame["contact", g] > 0.0) & (code.intrinsic("fabs", at) <= 0.25 * INSTANT * frame["smallest"])
+        lost = (frame["contact", g] > 0.0) & (code.intrinsic("fabs", at) <= 0.25 * limits.INSTANT * frame["smallest"])
         return code.select(lost, 0.0, at)  # time does not move
 
     def _take(self, frame: Frame, order: Value, g: Value, changes: Value, s: Value, ahead: Variable) -> Value:
@@ -470,10 +436,10 @@ class Events:
         """A part of the step, at whose end the guard is looked at; a change before that is found by bisection."""
         code, side, h = frame.code, ahead.value, frame["h"]
         with code.only_if(code.any_lane(where)):
-            self._see(frame, where, frame.constant(WITHOUT_SERIES))
+            self._see(frame, where, frame.constant(limits.WITHOUT_SERIES))
             changes = where & (side * self._guard_value(frame, order, g, h) < 0.0)
             low, high = code.variable(frame.constant(0.0)), code.variable(h)
-            with code.loop(BISECTIONS):
+            with code.loop(limits.BISECTIONS):
                 middle = 0.5 * (low.value + high.value)
                 same = side * self._guard_value(frame, order, g, middle) > 0.0
                 for end, here in ((low, same), (high, ~same)):

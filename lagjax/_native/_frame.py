@@ -97,7 +97,6 @@ class Memory:
         return -(-self._doubles[0] // self.width) * self.width
 
     def extend_by(self, fields: Fields) -> None:
-        """More fields, behind all others."""
         for name, shape in fields.items():
             field = Field(shape) if isinstance(shape, int) else Field(*shape)
             self._fields[name], self._offsets[name] = field, self.end
@@ -143,9 +142,7 @@ class Frame:
     """A function of a kernel under construction, with named access to all that it sees."""
 
     def __init__(self, module: ir.Module, layout: Memory, job: type, name: str, *kinds: ir.Type, **options):
-        self.code = Code(
-            module, name, [POINTER] * 3 + list(kinds), layout.width, number=layout.number, **options
-        )  # fmt: skip
+        self.code = Code(module, name, [POINTER] * 3 + list(kinds), layout.width, number=layout.number, **options)
         self.layout, self.width, self.vector = layout, layout.width, self.code.vector
         self._fields = dict(job._fields_)
         self._job, self._memory, self._integers, *self.arguments = self.code.arguments
@@ -155,7 +152,6 @@ class Frame:
 
     @property
     def digits(self) -> Digits:
-        """The rounding of the numbers of a state."""
         return SINGLE_DIGITS if self.layout.number == FLOAT else DIGITS
 
     def __getitem__(self, key: "str | tuple") -> Value:
@@ -212,7 +208,6 @@ class Frame:
         return Vectors(count, lambda i: self[name, *index(i)], write, place, k * stride)
 
     def constant(self, x: float) -> Value:
-        """A vector with one number in every lane."""
         return self.code.lanes_of(x)
 
     def lane(self, index: Value) -> "Lane":
@@ -232,18 +227,12 @@ class Frame:
         return self.code.load(self.code.element(self._job, position, INTEGER), kind)
 
     def read(self, name: str, index: Index, kind: ir.Type = DOUBLE) -> Value:
-        """An element of an array that the job points to."""
         return self.code.load(self.code.element(self.job(name), index, kind), kind)
 
     def write(self, name: str, index: Index, value: Value) -> None:
-        """Set an element of an array that the job points to."""
         if element_of(value.it.type) == FLOAT:
             value = self.code.as_value(value, DOUBLE)
         self.code.store(value, self.code.element(self.job(name), index))
-
-    def next_member(self) -> Value:
-        """The number of the next member that no thread has taken; from `members` on, none is left."""
-        return self.next("next_member")
 
     def next(self, name: str) -> Value:
         """The value of a counter that all threads share, which grows by one."""
@@ -251,13 +240,11 @@ class Frame:
         return Value(self.code, self.code.builder.atomic_rmw("add", counter.it, ir.Constant(INTEGER, 1), "monotonic"))
 
     def time(self, member: Value, index: Index) -> Value:
-        """An output time of a member."""
         return self.read("ts", member * self.job("ts_stride") + index)
 
     # ---- functions ----
 
     def memory_at(self, offset: Value) -> Value:
-        """The address that lies this many doubles behind the beginning of the memory."""
         return self.code.element(self._memory, offset)
 
     def call(self, function: Code, *arguments: Value) -> None:

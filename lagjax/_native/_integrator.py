@@ -31,8 +31,6 @@ from lagjax._native._run_records import Output
 from lagjax._native._single_member import SingleMember, fills_lanes
 from lagjax._native._step import PARTS, StepControl
 from lagjax._native._taylor import TaylorSeries, double, integer, is_large
-from lagjax._program._borders import reads_inputs
-from lagjax._program._series import Recurrent
 
 JOB = job(
     "Job",
@@ -85,33 +83,18 @@ class Integrator:
         has_pieces = borders is not None and borders.switches
         alone = large and width == 1 and not has_pieces and chosen is None and not for_gpus
         kind = SingleMember if alone and fills_lanes(series) else TaylorSeries
-        self.motion = motion = kind(
-            "motion", parts, JOB, fields, large, width, kept=self.guards, number=number
-        )  # fmt: skip
-        self.projector = projection and Projector(
-            motion, projection.state, projection.velocity_scale, self.base_size
-        )  # fmt: skip
+        self.motion = motion = kind("motion", parts, JOB, fields, large, width, kept=self.guards, number=number)
+        self.projector = projection and Projector(motion, projection.state, projection.velocity_scale, self.base_size)
         groups = tuple(range(n)) if error_groups is None else error_groups
         self.step = StepControl(motion, groups, self.projector, self.base_size)
         self.borders = borders and BorderControl(motion, borders, nesting, projection is not None, jump)
         self.output = Output(motion, self.projector)
-        self.events = guards and self._events(program, guards)
+        roots = Roots(motion) if guards and self.borders is None else self.borders and self.borders.roots
+        self.events = guards and roots and Events(motion, self.step, self.output, roots, guards)
         self.start_next = self._start_next()
         self._run()
         self._begin()
         motion.finish()
-
-    def _events(self, program: Recurrent, guards: Guards) -> Events:
-        """The guards, whose values are the last outputs of the program."""
-        roots = Roots(self.motion) if self.borders is None else self.borders.roots
-        outputs = program.line.outputs[len(program.line.outputs) - self.guards :]
-        piecewise = reads_inputs(program.line, outputs, program.size - self.motion.pieces)
-        lines = guards.values.line, guards.program.line
-        first = self.motion.series.followed - self.guards
-        return Events(
-            self.motion, self.step, self.output, roots, *lines, guards.directions, piecewise, first, self.notes,
-            guards.remembers, guards.is_rounded, guards.holds,
-        )  # fmt: skip
 
     # ---- members ----
 
@@ -119,7 +102,7 @@ class Integrator:
         """`(lane)`: the lane takes the next member, or none is left."""
         frame = self.motion.function("start_next", INTEGER)
         code, lane = frame.code, frame.lane(frame.arguments[0])
-        member = frame.next_member()
+        member = frame.next("next_member")
         there = member < frame.job("members")
         lane["member"] = code.select(there, member, -1)
         for name in ("h", "t_low", "steps", "rejected", *(_rank_drops.AT_FIRST_ZERO if self.projector else ())):

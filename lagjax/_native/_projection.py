@@ -25,7 +25,6 @@ class Projector:
 
     @staticmethod
     def fields(n: int) -> Fields:
-        """The fields of a thread's memory."""
         return {
             "projected": 2 * n,  # the state at the end of the step, on the constraints
             "velocity_scale": n,  # of each coordinate; of derivatives it stays zero

@@ -13,7 +13,6 @@ from lagjax._native._tables import Tables
 
 
 def fields(n: int, guards: int) -> Fields:
-    """The fields of a thread's memory."""
     return {
         # Where the last long step began: the fields without `_before`, then.
         "y_before": 2 * n,

@@ -73,7 +73,7 @@ class Replay:
         lane = frame.lane(index)
         lane["step"], lane["member"] = 0, 0
         with code.repeat_while(lambda: (lane["member"] >= 0) & (lane["step"] <= 0)):
-            member = frame.next_member()
+            member = frame.next("next_member")
             there = member < frame.job("members")
             lane["member"] = code.select(there, member, -1)
             lane["step"] = frame.read("steps", code.select(there, member, 0), INTEGER)

@@ -42,7 +42,6 @@ class Retraction:
         })  # fmt: skip
 
     def _slides(self, numbers: Numbers) -> Value:
-        """The lanes whose motion slides along any border."""
         return functools.reduce(Value.__or__, [numbers(j + self.motion.parameters) > 0.0 for j in self.shares])
 
     # ---- the state ----
@@ -71,7 +70,6 @@ class Retraction:
         return frame.finish()
 
     def undo(self, frame: Frame, where: Value) -> None:
-        """The state as it was, in lanes that take no step."""
         with frame.where(where):
             for i in self.motion.form.each(frame.code, self.motion.states):
                 frame["y", i] = frame["unretracted", i]

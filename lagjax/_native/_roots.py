@@ -47,7 +47,6 @@ class Roots:
 
     @staticmethod
     def fields(columns: int) -> Fields:
-        """The fields of a thread's memory."""
         return {
             "poly": columns,  # the coefficients of P on [0, 1]
             "root": 1,  # the root, or up to where there is none; 2 without any
@@ -150,7 +149,6 @@ class Roots:
             frame[name] = sum.value
 
     def turn(self, frame: Frame, degree: Value, where: Value) -> None:
-        """Change the sign of the polynomial in some lanes."""
         code = frame.code
         with code.loop(degree + 1) as k:
             c = frame["poly", k]
@@ -231,7 +229,6 @@ class Roots:
         return (square * square) * (square * square)
 
     def _value_and_slope(self, frame: Frame, degree: Value, x: Value) -> tuple[Value, Value]:
-        """The polynomial and its slope, by Horner's scheme."""
         code = frame.code
         value, slope = code.variable(frame["poly", degree]), code.variable(frame.constant(0.0))
         with code.loop(degree + 1, start=1) as k:

@@ -162,7 +162,6 @@ class Saltation:
 
     @staticmethod
     def fields(borders: Borders) -> Fields:
-        """The fields of a thread's memory."""
         pieces = len(borders.switches)
         return {
             "crossed": 1,  # the `Crossed` that the step ends at
@@ -286,7 +285,6 @@ class Saltation:
     # ---- over steps that have been taken ----
 
     def fields_along(self) -> Fields:
-        """The fields that a thread keeps from one step to the next."""
         return {"edge": self.motion.states, "edge_t": 1}  # the state at the border, and the time there
 
     def _note_edge(self, frame: Frame) -> None:
@@ -308,7 +306,6 @@ class Saltation:
         return frame.finish()
 
     def _crosses(self, frame: Frame) -> Value:
-        """True if a step ends at a border whose instant varies."""
         crosses = self.table.crosses(frame, Crossed.GUARD)
         return crosses | self.table.crosses_knot(frame) if self.table.knots else crosses
 
@@ -416,12 +413,10 @@ class Saltation:
 
 
 def _some(numbers: Numbers, first: int, count: int) -> Numbers:
-    """A slice of numbers."""
     if isinstance(numbers, Vectors):
         return Vectors(count, lambda i: numbers[i + first])
     return numbers[first : first + count]
 
 
 def _field(frame: Frame, name: str, count: int, first: int = 0) -> Vectors:
-    """A slice of the vectors of a field."""
     return frame.vectors(name, count, lambda i: (i + first,))

@@ -20,19 +20,7 @@ coordinates of two arrays and of one.
 
 from collections.abc import Callable
 
-from lagjax._native._constants import (
-    ATOL_OVER_MOTION,
-    ATOL_OVER_RTOL,
-    CHECKS,
-    GROWTH,
-    GROWTH_AFTER_REJECTION,
-    NOT_FINITE,
-    PROJECTION_FAILED,
-    RUNNING,
-    SAFETY,
-    SINGULAR,
-    STEP_TOO_SMALL,
-)
+from lagjax._native import _constants as limits
 from lagjax._native._frame import EXACT, Fields, Frame, Index, Numbers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._projection import Projector, end_of_step
@@ -57,7 +45,6 @@ class StepControl:
 
     @staticmethod
     def fields(n: int) -> Fields:
-        """The fields of a thread's memory."""
         return {
             "low": 2 * n,  # what rounding took from the state
             "scale": 2 * n,  # 1 / (floor + rtol·size)
@@ -85,9 +72,9 @@ class StepControl:
         last, before = self._errors(frame, order)
         p = code.as_number(order)
         a, b = _power(code, last, -1.0 / p), _power(code, before, -1.0 / (p - 1.0))
-        size, longest = SAFETY * code.select(a < b, a, b), frame["longest"]
+        size, longest = limits.SAFETY * code.select(a < b, a, b), frame["longest"]
         size = code.select(size < longest, size, longest)
-        frame["growth"] = GROWTH
+        frame["growth"] = limits.GROWTH
         forward, end = frame["forward"], frame["t_end"]
         left = ((end - frame["t"]) - frame["t_low"]) * forward
         is_last = size >= left
@@ -96,8 +83,8 @@ class StepControl:
         sound = (last < float("inf")) & (before < float("inf")) & ~singular
         small = ~is_last & (step < frame["smallest"])
         going = active & sound & ~small
-        ending = code.select(small, STEP_TOO_SMALL, float(RUNNING))
-        frame["code"] = code.select(sound, ending, code.select(singular, SINGULAR, float(NOT_FINITE)))
+        ending = code.select(small, limits.STEP_TOO_SMALL, float(limits.RUNNING))
+        frame["code"] = code.select(sound, ending, code.select(singular, limits.SINGULAR, float(limits.NOT_FINITE)))
         frame["h"] = code.select(going, step * forward, 0.0)
         frame["last"] = going & is_last
 
@@ -142,9 +129,9 @@ class StepControl:
                 at_rest, frame.constant(float("inf")), code.maximum(frame["reach", place], largest)
             )
             largest = code.select(largest > 0.0, largest, speed * step)
-        share = ATOL_OVER_MOTION * largest
-        is_small = (share > 0.0) & (share < ATOL_OVER_RTOL)
-        floor = rtol * code.select(is_small, share, ATOL_OVER_RTOL)
+        share = limits.ATOL_OVER_MOTION * largest
+        is_small = (share > 0.0) & (share < limits.ATOL_OVER_RTOL)
+        floor = rtol * code.select(is_small, share, limits.ATOL_OVER_RTOL)
         return code.select(given > 0.0, given, floor)
 
     def _sizes(self, frame: Frame, half: int) -> Numbers:
@@ -215,7 +202,7 @@ class StepControl:
         with code.repeat_while(lambda: again.value > 0):
             again.value = 0
             frame["defect"] = 0.0
-            for place in CHECKS:
+            for place in limits.CHECKS:
                 frame.call(self.defect, order, double(code, place))
             if self.projector is not None:
                 frame["series_defect"] = frame["defect"]
@@ -233,10 +220,10 @@ class StepControl:
 
     def _reason(self, frame: Frame) -> Value:
         """Why no step is small enough: the series, or only the way from its end to the constraints."""
-        reason = frame.constant(STEP_TOO_SMALL)
+        reason = frame.constant(limits.STEP_TOO_SMALL)
         if self.projector is None:
             return reason
-        return frame.code.select(frame["series_defect"] <= 1.0, PROJECTION_FAILED, reason)
+        return frame.code.select(frame["series_defect"] <= 1.0, limits.PROJECTION_FAILED, reason)
 
     # ---- the step ----
 
@@ -275,14 +262,14 @@ class StepControl:
 def absolute_tolerance(frame: Frame) -> Value:
     """The absolute tolerance of numbers whose units are not those of the state, as of a border."""
     given = frame.job("atol")
-    return frame.code.select(given > 0.0, given, ATOL_OVER_RTOL * frame.job("rtol"))
+    return frame.code.select(given > 0.0, given, limits.ATOL_OVER_RTOL * frame.job("rtol"))
 
 
 def note_halved(frame: Frame, where: Value) -> None:
     """Note that the step of some lanes has become shorter: it is not the last one any more, and the next grows less."""
     with frame.where(where):
         frame["last"] = 0.0
-        frame["growth"] = GROWTH_AFTER_REJECTION
+        frame["growth"] = limits.GROWTH_AFTER_REJECTION
 
 
 def _power(code: Code, x: Value, exponent: Value) -> Value:

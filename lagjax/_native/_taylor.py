@@ -181,11 +181,9 @@ class TaylorSeries:
         return frame.vectors("values", self.series.values)
 
     def sums(self, frame: Frame) -> Vectors:
-        """The sums of the last order."""
         return frame.vectors("sums", len(self.series.cauchy_products), lambda i: (0, i))
 
     def rows_at(self, frame: Frame, k: Value) -> Vectors:
-        """The coefficients of order k of all rows."""
         return frame.vectors_at("rows", self.series.rows, k)
 
     def followed_value(self, frame: Frame, j: Value) -> Value:
@@ -269,13 +267,11 @@ class TaylorSeries:
     # ---- members and rounds ----
 
     def begin(self, frame: Frame, start_next: Code) -> None:
-        """Every lane takes a member."""
         self.form.prepare(frame)
         with frame.code.loop(self.width) as lane:
             frame.call(start_next, lane)
 
     def take_numbers(self, frame: Frame, lane: Lane, member: Value) -> None:
-        """The numbers of a member, in the lane that has taken it."""
         first = member * frame.job("params_stride")
         lane["first_number"] = frame.code.as_double(first)
         with frame.code.loop(self.parameters) as i:
@@ -288,7 +284,6 @@ class TaylorSeries:
             yield
 
     def is_unfinished(self, frame: Frame) -> Value:
-        """1 if a lane is active, else 0."""
         return frame.code.select(self._any_active(frame), integer(frame.code, 1), 0)
 
     def _any_active(self, frame: Frame) -> Value:

@@ -160,12 +160,10 @@ class Borders(NamedTuple):
 
     @property
     def kicking(self) -> tuple[int, ...]:
-        """The pieces with which L jumps."""
         return () if self.kick is None else self.kick.pieces
 
     @property
     def releases(self) -> list[int]:
-        """The guards beyond which a cone holds no longer."""
         return [
             g
             for g, guard in enumerate(self.guards)
@@ -174,7 +172,6 @@ class Borders(NamedTuple):
 
     @property
     def clocks(self) -> tuple[int, ...]:
-        """The pieces that change at instants that are known."""
         return tuple(j for j, kind in enumerate(self.kinds) if kind == CLOCK)
 
     def moving_table(self, j: int) -> Table | None:
@@ -184,7 +181,6 @@ class Borders(NamedTuple):
 
     @property
     def levels_move(self) -> bool:
-        """True if the levels of any piece are parameters."""
         return any(self.moving_table(j) is not None for j in range(len(self.switches)))
 
     @property
@@ -200,7 +196,6 @@ class Borders(NamedTuple):
 
     @property
     def switching(self) -> StraightLine:
-        """The program of the switching numbers that are `shaken`."""
         nodes = [self.switches[j] for j in self.shaken]
         return eliminate_dead_code(self.program.line, nodes)
 
@@ -240,7 +235,6 @@ def borders(program: Recurrent, size: int, slides: bool = True, watched: int = 0
 
 
 def is_smooth(line: StraightLine) -> bool:
-    """True if nothing in a line is piecewise."""
     return _PIECEWISE.isdisjoint(op for op, *_ in line.nodes)
 
 
@@ -360,7 +354,6 @@ class _Rewriting:
                 return i
 
     def _decides(self, i: int) -> bool:
-        """True if a node is a piecewise operation on floats."""
         (op, operands, attribute), kinds = self.program.line.nodes[i], self.program.line.kinds
         if op == "convert":
             return kinds[operands[0]] == "float" and attribute not in ("float", "bool")
@@ -369,7 +362,6 @@ class _Rewriting:
     # ---- the new nodes ----
 
     def _place(self, i: int) -> int:
-        """A node of the program in the new one."""
         (op, operands, attribute), kind = self.program.line.nodes[i], self.program.line.kinds[i]
         if op == "input":
             return self.graph.input(attribute, kind)
@@ -621,7 +613,6 @@ class _Rewriting:
     # ---- the end ----
 
     def build(self) -> Borders:
-        """The parts of the result."""
         program, features = self.program, dict(sorted(self.features.items(), key=lambda item: item[1]))
         line = StraightLine(
             tuple(self.graph.nodes), tuple(self.graph.kinds), tuple(self.places[i] for i in program.line.outputs)
@@ -828,7 +819,6 @@ class _Rewriting:
 
 
 def _raw(graph: Graph, kind: int, x: int, table: Located | None) -> int:
-    """The piece that a number is on."""
     if table is not None:
         return graph.apply("locate", x, attribute=table)
     if kind == SIGN:

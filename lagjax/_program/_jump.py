@@ -55,7 +55,6 @@ class Nesting(NamedTuple):
 
     @property
     def size(self) -> int:
-        """The number of all coordinates."""
         return self.base * math.prod(1 + count for count in self.directions)
 
     @property
@@ -189,7 +188,6 @@ def _table_of_row(shift: int) -> TangentTable:
 
 
 def _renumber_inputs(line: StraightLine, places: dict[int, int]) -> StraightLine:
-    """The line with other numbers of its inputs."""
     return line.replace(nodes=tuple((op, of, places[x]) if op == "input" else (op, of, x) for op, of, x in line.nodes))
 
 

@@ -52,7 +52,6 @@ class Mechanics(NamedTuple):
 
     @classmethod
     def from_nodes(cls, nodes: Sequence[int], n: int) -> "Mechanics":
-        """The parts of nodes that stand in this order."""
         m = (len(nodes) - 1 - n - n * n) // (n + 2)
         ends = np.cumsum([1, n, n * n, m * n, m, m]).tolist()
         first, *parts = (tuple(nodes[a:b]) for a, b in zip([0, *ends], ends, strict=False))

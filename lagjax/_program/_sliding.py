@@ -197,7 +197,6 @@ class _SlidingForces:
         ]
 
     def _release(self, directions: Sequence[int], slopes: Sequence[list[int]]) -> list[int]:
-        """The outputs of `Sliding.release`."""
         f, results = self.f, []
         for k, slide in enumerate(self.slides):
             if not slide.parts:
@@ -228,7 +227,6 @@ class _SlidingForces:
         return responses, effects
 
     def _largest_coupled(self, effects: list[list[int]]) -> int:
-        """The number of borders in the largest group of those that act on each other."""
         acts_on = np.array(effects).reshape(len(effects), -1) != self.zero
         _, groups = connected_components(acts_on, directed=False)
         return int(np.bincount(groups).max())
@@ -376,7 +374,6 @@ class _SlidingForces:
         return sides
 
     def _both_pieces(self, k: int) -> tuple[int, int]:
-        """The pieces below and above border k."""
         if self.slides[k].width > 1:  # of a sign
             return self.number(-1.0), self.one
         return self.pieces[k], self.f("add", self.pieces[k], self.one)
@@ -620,7 +617,6 @@ class _Equations(NamedTuple):
     whole: list[list[int]]
 
     def solve(self, graph: Graph, right: Sequence[int]) -> list[int]:
-        """Their solution."""
         x = substitute(graph, self.upper, self.lower, right)
         for _ in range(MENDED if self.whole else 0):
             left = [graph.apply("sub", b, dot(graph, row, x)) for b, row in zip(right, self.whole, strict=True)]
@@ -659,7 +655,6 @@ def eliminate(graph: Graph, rows: list[list[int]]) -> list[list[int]]:
 
 
 def substitute(graph: Graph, rows: Sequence, lower: Sequence, right: Sequence[int]) -> list[int]:
-    """The solution of linear equations that have been eliminated."""
     f, x, n, zero = graph.apply, list(right), len(rows), graph.constant(0.0, "float")
     for i in range(n):
         for k in range(i):
