@@ -339,7 +339,7 @@ def _divide_steps(flow: Flow, steps: Steps, member: int, params, tolerances: Tol
     path = flow.follow(times[None], first_state[:, : flow.states], params[None], tolerances).path[0]
     more = np.repeat(rows[:, 4 + flow.states :], parts, axis=0)  # of a piecewise program
     last = np.arange(1, len(more) + 1)[:, None] % parts == 0
-    more[:, -2:] = np.where(last, more[:, -2:], 0.0)  # which border it ends at, and whether that is grazed
+    more[:, -3:] = np.where(last, more[:, -3:], 0.0)  # which border it ends at, and whether that is grazed
     begins = np.stack([times[:-1], np.diff(times), *np.zeros((2, len(path) - 1))]).T
     table = np.concatenate([begins, path[:-1], more], axis=1)
     count = np.array([len(table)])
