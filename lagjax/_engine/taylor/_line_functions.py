@@ -18,6 +18,7 @@ operation: derivatives of a motion by its duration compiled for 14 s longer with
 
 import functools
 import math
+from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
