@@ -59,7 +59,6 @@ class SceneState(NamedTuple):
 
     @property
     def concrete(self) -> bool:
-        """True if there are numbers, and nothing is being traced."""
         return all(is_concrete(leaf) for leaf in jax.tree.leaves((self.system, self.q, self.qdot, self.numbers)))
 
     @property
@@ -68,7 +67,6 @@ class SceneState(NamedTuple):
 
     @property
     def lowered(self) -> Derivation | None:
-        """The derivation, where the scene has scalar programs."""
         try:
             self.derivation.shape("lagrangian")
         except Unlowerable:

@@ -158,7 +158,6 @@ def _reciprocal(size: Vector) -> Vector:
 
 
 def _inverse(matrix: Matrix) -> tuple[Matrix, Bool[Array, ""]]:
-    """The inverse, and whether there is none to working precision."""
     inverse, order, pivots = invert(matrix)
     sizes, n = jnp.abs(pivots), len(matrix)
     singular = jnp.min(sizes) <= singular_threshold(n, matrix.dtype) * jnp.max(sizes)

@@ -208,7 +208,6 @@ def _run(jaxpr, constants, arguments, moves, outer: str, visit: Callable, inside
 
 
 def _body(equation) -> tuple | None:
-    """The jaxpr that an equation calls, and its constants."""
     if equation.primitive.name == "call_hi_primitive":
         closed = expand_primitive(equation.params["_prim"])
         return closed.jaxpr, closed.consts

@@ -46,7 +46,6 @@ class Constraints(eqx.Module):
         return self.on_positions is not None or self.on_velocities is not None
 
     def f(self, q: Vector, t: Time, params: PyTree) -> Float[Array, " k"]:
-        """The values of the constraints on positions."""
         return jnp.zeros(0, q.dtype) if self.on_positions is None else self.on_positions(q, t, params)
 
     def a(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Float[Array, " m-k"]:

@@ -512,12 +512,10 @@ class Derivation:
         return parts
 
     def _rows(self, saddle: _Saddle) -> int:
-        """The number of constraints of this system."""
         return self.shape("jacobian")[0] if saddle.velocities else self.position_count
 
     @functools.cached_property
     def position_count(self) -> int:
-        """The number of constraints on positions, which come first."""
         q, _, t, numbers = self.state_shapes
         return jax.eval_shape(self._traced_once.constraints.f, q, t, numbers).size
 
@@ -572,7 +570,6 @@ def columns_of(q, qdot, t, numbers: Sequence) -> list:
 
 
 def numbers_of(params: PyTree) -> list:
-    """Every number in the parameters, one by one."""
     return [x for leaf in jax.tree.leaves(params) for x in np.ravel(np.asarray(leaf))]
 
 

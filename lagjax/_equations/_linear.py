@@ -62,7 +62,6 @@ class Factorization(eqx.Module):
 
 
 def factorize(matrix: Matrix) -> Factorization:
-    """Scale and invert a symmetric matrix."""
     matrix = 0.5 * (matrix + matrix.T)
     scaled, scale = jax.lax.stop_gradient(unit_diagonal(matrix))
     inverse, order, pivots = invert(scaled)

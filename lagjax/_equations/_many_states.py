@@ -47,7 +47,6 @@ class Sample(NamedTuple):
 
     @property
     def columns(self) -> list:
-        """The inputs of a program."""
         return columns_of(self.q, self.qdot, self.t, self.numbers)
 
     def quantities(self, *names: str) -> dict[str, np.ndarray]:
@@ -110,7 +109,6 @@ class Sample(NamedTuple):
 
 
 def is_lowered(derivation: Derivation) -> bool:
-    """True if a scene has programs."""
     try:
         return bool(derivation.program("mass_matrix").shapes)
     except Unlowerable:

@@ -35,7 +35,6 @@ class _Taped(NamedTuple):
 
     @property
     def value(self) -> Ids:
-        """The value in the graph, ()."""
         return np.array(self.nodes[self.output], dtype=np.int64)
 
 
@@ -126,7 +125,6 @@ class _ScalarState:
         return np.array([i in moving for i in values.ravel().tolist()], bool).reshape(values.shape)
 
     def map(self, op: str, *arrays: Ids) -> Ids:
-        """An operation, elementwise."""
         return self.expansion.map(op, *arrays)
 
 

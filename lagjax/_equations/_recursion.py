@@ -158,7 +158,6 @@ class _AffineNodes:
         self.definitions: list[Form] = []
 
     def add(self, i: int, terms: list[tuple[int, int]]) -> None:
-        """A node with these terms, which have been added before."""
         if i in self._forms:
             return
         form: Form = {}

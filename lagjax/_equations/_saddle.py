@@ -97,7 +97,6 @@ class SaddleElimination:
             self.count += len(rows)
 
     def _pivots(self) -> Iterator[_Pivot]:
-        """The steps of the elimination, in order."""
         for j in self.order:
             rows = self.below[j]
             first, second = np.tril_indices(len(rows), -1)
@@ -105,12 +104,10 @@ class SaddleElimination:
 
     @property
     def operations(self) -> int:
-        """About how many operations the elimination and one solution take."""
         return sum(len(rows) * (len(rows) + 6) + 3 for rows in self.below.values())
 
     @property
     def solution_operations(self) -> int:
-        """About how many of them one solution takes."""
         return sum(4 * len(rows) + 1 for rows in self.below.values())
 
     # ---- factors ----

@@ -112,7 +112,6 @@ _NOT_USERS = str(Path(__file__).parents[1]), str(Path(jax.__file__).parent)
 
 
 def _keys_of(roles: tuple, extras: dict[str, Any]) -> str:
-    """The keys that its arguments have, where those are dicts."""
     first = {"q": roles[0]} if roles else {}
     dicts = {name: value for name, value in (first | extras).items() if isinstance(value, dict)}
     if not dicts:

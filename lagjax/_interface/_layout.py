@@ -47,7 +47,6 @@ class Layout:
 
     @property
     def size(self) -> int:
-        """The number of scalar coordinates."""
         return sum(math.prod(shape) for shape in self.shapes)
 
     @property

@@ -10,5 +10,4 @@ PLACES: dict[str, str] = {}  # module of each function by its name
 
 
 def import_registered(name: str) -> Any:
-    """The function of this name, imported from its module."""
     return getattr(importlib.import_module(PLACES[name]), name)

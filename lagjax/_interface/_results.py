@@ -80,7 +80,6 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
 
 
 def code_of(result: diffrax.RESULTS) -> int:
-    """The integer by which a result is known inside arrays."""
     return int(result._value)
 
 
@@ -93,7 +92,6 @@ _STRUCTURE = jax.tree.structure(RESULTS.successful)
 
 
 def result_from(codes) -> RESULTS:
-    """The results with these codes, integers of any shape."""
     return jax.tree.unflatten(_STRUCTURE, [codes if isinstance(codes, jax.Array) else jnp.asarray(codes)])
 
 

@@ -152,14 +152,12 @@ def require_flag(value, name: str) -> None:
 
 
 def require_finite(tree: PyTree, name: str) -> None:
-    """Raise where a number is NaN or infinite, naming it."""
     if bad := not_finite(tree, name):
         where, value = bad[0]
         raise ValueError(f"{where} is {value}: every number given must be finite.")
 
 
 def require_number(value, name: str) -> None:
-    """Raise for anything but one real number."""
     kind = _dtype_of(value) if eqx.is_array_like(value) else None
     if kind is None or kind == jnp.bool_ or jnp.issubdtype(kind, jnp.complexfloating):
         raise TypeError(f"{name} must be a real number; got {value!r}.{_say_params(value)}")
@@ -212,7 +210,6 @@ def output_times(ts, dtype) -> jax.Array | np.ndarray:
 
 
 def _is_monotonic(values: np.ndarray) -> bool:
-    """True if numbers increase or decrease strictly."""
     later, earlier = values[1:], values[:-1]
     return bool((later > earlier).all() or (later < earlier).all())
 

@@ -182,7 +182,6 @@ def _borders(problem: Problem, inputs: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _borders_in_lines(problem: Problem) -> dict[str, Any]:
-    """The piecewise operations of the user's functions, by their lines."""
     n = problem.derivation.layout.size
     state = problem.y0[:n], problem.y0[n:], problem.ts[0], problem.numbers
     pieces = pieces_of_motion(problem.derivation.motion, *state)
@@ -191,7 +190,6 @@ def _borders_in_lines(problem: Problem) -> dict[str, Any]:
 
 
 def _count_names(names: tuple[str, ...]) -> str:
-    """The count of names, and each of them once."""
     return f"{len(names)}: {join_names(list(dict.fromkeys(names)), _LISTED)}"
 
 

@@ -126,7 +126,6 @@ class Animation:
                 return film.to_html5_video()
 
     def _film(self, fps: float):
-        """matplotlib's own animation, on a figure of its own."""
         figure, show, count = self._figure(fps)
         return _matplotlib().animation.FuncAnimation(
             figure, show, frames=count, init_func=lambda: (), interval=1000 / fps, cache_frame_data=False

@@ -44,7 +44,6 @@ _RAISED = re.compile(r"[\w.]+(Error|Exception|Warning|Interrupt): ")
 
 
 def label(code: int) -> str:
-    """The name of a result code in a store."""
     return NAMES.get(code) or name_of(code)
 
 
@@ -317,7 +316,6 @@ def _common_quantities(rows: list[dict[str, np.ndarray]]) -> list[Quantity]:
 
 
 def _arrays(run: Trajectory) -> dict[str, Any]:
-    """The fields that differ between members, as arrays."""
     fields = {name: getattr(run, name) for name in ("q", "qdot", "end", "mode", "transitions")}
     return fields | {"code": run.result._value, "stats": {k: x for k, x in run.stats.items() if jnp.ndim(x)}}
 

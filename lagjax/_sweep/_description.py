@@ -78,7 +78,6 @@ class Sections(NamedTuple):
         return cls(names, functions, directions, int(crossings.get("count", 64)))
 
     def described(self) -> dict:
-        """The part that is no function of them, for the store."""
         names = None if self.names is None else list(self.names)
         return {"names": names, "directions": list(self.directions), "count": self.count}
 

@@ -59,7 +59,6 @@ class Quantity:
 
     @property
     def dimensions(self) -> tuple[str, ...]:
-        """The names of the axes of its shape."""
         return tuple(f"{self.name}_{k}" for k in range(len(self.shape)))
 
     @property
@@ -92,7 +91,6 @@ class Files:
 
     @property
     def job(self) -> Path:
-        """The folder of what is for workers alone."""
         return self.path / ".sweep"
 
     # ---- the description ----
@@ -161,7 +159,6 @@ class Files:
         return _hash_of((self.job / "spec.json").read_bytes() + self.scene())
 
     def scene(self) -> bytes:
-        """The functions of the sweep, as bytes."""
         return (self.job / "scene.pkl").read_bytes()
 
     def grid(self, spec: dict) -> Grid:
@@ -265,7 +262,6 @@ class Files:
         return record
 
     def statistics(self, unit: int) -> bytes:
-        """The statistics of a unit, as bytes."""
         return (self.job / "done" / f"{unit}.npz").read_bytes()
 
     def copied(self, unit: int) -> Copied:
@@ -410,14 +406,12 @@ def _hash_of(data: bytes) -> str:
 
 
 def arrays_as_bytes(arrays: dict[str, np.ndarray]) -> bytes:
-    """Arrays by name as one file."""
     file = io.BytesIO()
     np.savez(file, allow_pickle=False, **arrays)
     return file.getvalue()
 
 
 def write_through(file: Path, data) -> None:
-    """Write a file and wait until the disk has it."""
     with open(file, "wb") as opened:
         opened.write(data)
         opened.flush()

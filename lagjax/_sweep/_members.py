@@ -29,7 +29,6 @@ class Axis:
 
     @property
     def dimension(self) -> str:
-        """The name of the axis in the store."""
         return "_".join(self.names)
 
     def pieces(self) -> Iterator[tuple[int, np.ndarray]]:
@@ -139,7 +138,6 @@ class Grid:
 
     @property
     def tiles(self) -> tuple[int, ...]:
-        """The number of units along each axis."""
         return tuple(math.ceil(size / part) for size, part in zip(self.shape, self.chunk, strict=True))
 
     @property
@@ -151,7 +149,6 @@ class Grid:
         return tuple(int(i) for i in np.unravel_index(unit, self.tiles))
 
     def box(self, unit: int) -> tuple[slice, ...]:
-        """The range of a unit along each axis."""
         parts = zip(self.place(unit), self.chunk, self.shape, strict=True)
         return tuple(slice(i * part, min((i + 1) * part, size)) for i, part, size in parts)
 
@@ -159,7 +156,6 @@ class Grid:
         return tuple(s.stop - s.start for s in self.box(unit))
 
     def size(self, unit: int) -> int:
-        """The number of members of a unit."""
         return math.prod(self.box_shape(unit))
 
     def numbers(self, unit: int, which: np.ndarray) -> np.ndarray:

@@ -47,7 +47,6 @@ class Statistics:
             raise ValueError(f"quantiles must lie between 0 and 1; got {self.quantiles}.")
 
     def described(self) -> dict:
-        """The description for the store."""
         edges = None if self.edges is None else self.edges.tolist()
         return {"edges": edges, "quantiles": list(self.quantiles)}
 
@@ -168,7 +167,6 @@ def merge(one: Partial | None, two: Partial) -> Partial:
 
 
 def summary(how: Statistics, total: Partial, shape: tuple[int, ...]) -> Summary:
-    """The statistics of a quantity of this shape."""
     empty = total.count == 0
     with np.errstate(invalid="ignore", divide="ignore"):
         variance = np.where(total.count > 1, total.square / (total.count - 1), np.nan)

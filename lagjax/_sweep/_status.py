@@ -110,7 +110,6 @@ def status(store: Files) -> Status:
 
 
 def point(store: Files, spec: dict, member: int) -> dict[str, float]:
-    """The point of a member, by its number."""
     places = np.unravel_index(member, tuple(spec["shape"]))
     return {
         name: float(np.asarray(store.array(name)[int(i)]))
@@ -133,7 +132,6 @@ def _rate(store: Files, done: list[int], records: list[dict]) -> float | None:
 
 
 def duration(seconds: float) -> str:
-    """A span of time in words: '1 h 23 min'."""
     if seconds < 90:
         return f"{seconds:.0f} s"
     minutes = round(seconds / 60)

@@ -134,7 +134,6 @@ def submit(job: Job, units: list[int], executor: Any, notify: Notify) -> None:
 
 
 def run_unit(path: str, unit: int) -> None:
-    """Compute one unit of a store, in whatever process this is."""
     work(open_job(path), [unit])
 
 

@@ -183,7 +183,6 @@ def work_precision(
 
 
 def _problem(system: System, q0: PyTree, qdot0: PyTree, ts, params: PyTree, batch_axes) -> Problem:
-    """The problem to be integrated, or that of one member."""
     system = require_system(system)
     if batch_axes is None:
         return Problem.from_arguments(system, Layout.from_state(q0, qdot0), q0, qdot0, ts, params)

@@ -169,7 +169,6 @@ def _member(follower: Follower, point: FamilyPoint, tangent: FamilyTangent, most
 
 
 def _follow_family(follower: Follower, y0, period, step: float, count: int) -> tuple[list[_Member], str]:
-    """The orbits of a family, and why it ends."""
     point, shortest, until = first_point(follower, y0, period, follower.arcs.numbers), _SHORTEST * step, follower.until
     if until is not None:
         follower.of_value = abs(until - follower.value(point)) or 1.0

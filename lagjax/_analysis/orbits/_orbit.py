@@ -252,7 +252,6 @@ def assess_orbits(closing: Closing, chain: Chain, most: int | None = None) -> Fl
 
 
 def _sentence(chain: Chain, k: int) -> str:
-    """Why a chain is no orbit; "" where it is one."""
     if not chain.ok[k]:
         return f"The motion from the guess cannot be followed for a period of {chain.periods()[k]:.6g}. {chain.why[k]}"
     if _shooting.is_equilibrium(chain.select(np.array([k])))[0]:

@@ -225,7 +225,6 @@ def _guess_states(layout: Layout, guess, ends, times) -> np.ndarray:
 
 
 def _why_not(closing: Closing, chain: Chain, times) -> str:
-    """Why no path was found; "" where one was."""
     between = f"between t = {times[0]:.6g} and {times[-1]:.6g}"
     if not chain.ok[0]:
         return (

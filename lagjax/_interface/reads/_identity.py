@@ -141,7 +141,6 @@ class Walk:
         return kind + "[" + ", ".join(self.name(x, deep) for x in list(value)) + "]"
 
     def line(self, thing: Any) -> str:
-        """The parts of a function, a class or an object."""
         if isinstance(thing, types.FunctionType):
             return self._parts("function", self._function_parts(thing))
         if isinstance(thing, type):
@@ -344,7 +343,6 @@ class ReadNames:
 
     @property
     def reflects(self) -> bool:
-        """True if the code makes names up."""
         return bool(_REFLECTING & (self.globals | self.attributes))
 
     def add(self, other: "ReadNames") -> None:
@@ -354,7 +352,6 @@ class ReadNames:
 
 @functools.lru_cache(maxsize=4096)
 def names_of(code: types.CodeType) -> ReadNames:
-    """The names in a code object, found once for each."""
     names, last_but_one, last = ReadNames(), None, None  # loaded before an import: its level, and what is taken
     for step in dis.get_instructions(code):
         operation, name = step.opname, step.argval
@@ -389,7 +386,6 @@ def source(function: Callable) -> str:
 
 
 def array_text(value: Any) -> str:
-    """An array in words, a large one by its hash."""
     try:
         array = np.asarray(value)
     except TypeError:  # keys of jax.random
@@ -400,17 +396,14 @@ def array_text(value: Any) -> str:
 
 
 def hash_of(array: np.ndarray) -> str:
-    """Sixteen digits of the SHA-256 of an array's bytes."""
     return hashlib.sha256(np.ascontiguousarray(array).tobytes()).hexdigest()[:16]
 
 
 def strip_addresses(text: str) -> str:
-    """A text without the places of objects in memory."""
     return re.sub(r"0x[0-9a-f]+", "0x", text)
 
 
 def shorten(text: str) -> str:
-    """A text, of a long one its beginning and its hash."""
     return text if len(text) <= _LONG else f"{text[:40]}… {hashlib.sha256(text.encode()).hexdigest()[:16]}"
 
 

@@ -48,11 +48,9 @@ class Marks:
         }
 
     def hold(self) -> bool:
-        """True if all is as it was."""
         return next(self.changed(), None) is None
 
     def changed(self) -> Iterator[tuple[Any, str | None]]:
-        """The places, with their keys, where something else is now."""
         try:
             for reader, place, key, value in self._values:
                 if reader(key, ABSENT) is not value:

@@ -197,7 +197,6 @@ class Mode(NamedTuple):
         return attach_derivative(moved, (t, y), k, taken, t, y, numbers)
 
     def is_inconsistent(self, t, y):
-        """True if a state is off the constraints of this mode."""
         system = self.problem.system
         if system.constraints is None and system.velocity_constraints is None:
             return jnp.asarray(False)

@@ -124,7 +124,6 @@ def _bumps(along: _VariedInput, exponents: list[Callable], name: str) -> Iterato
 
 
 def _nearest(places: np.ndarray, start: float, name: str) -> str:
-    """The nearest places, of times those to come."""
     ahead = places[places >= start] if name == "t" else places
     nearest = np.sort(ahead[np.argsort(np.abs(ahead - start))][:_NAMED]) + 0.0
     return ", ".join(f"{x:.6g}" for x in nearest) + (" and more" if len(ahead) > _NAMED else "")

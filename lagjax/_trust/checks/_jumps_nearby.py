@@ -46,7 +46,6 @@ class Discontinuity(NamedTuple):
 
 
 def findings(scene: CheckedScene) -> list[Finding]:
-    """A finding about the nearest jump, if there is one."""
     pieces = pieces_of_motion(scene.motion, *scene.state)
     if not pieces:
         return []

@@ -24,7 +24,6 @@ from lagjax._trust.checks._scene_at_start import CheckedScene
 
 
 def findings(scene: CheckedScene) -> list[Finding]:
-    """All that there is to say about the mass matrix."""
     m, names = scene.measured, scene.layout.names
     augmented = scene.augmented
     usable = [k for k in range(1, len(augmented)) if np.isfinite(augmented[k]).all()]

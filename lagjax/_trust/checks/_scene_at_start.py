@@ -61,7 +61,6 @@ class CheckedScene(NamedTuple):
 
     @property
     def motion(self) -> Motion:
-        """The functions of the scene, in flat coordinates."""
         return self.derivation.motion
 
     @property
@@ -119,7 +118,6 @@ class CheckedScene(NamedTuple):
 
     @property
     def dissipation(self) -> np.ndarray:
-        """D at the state, zero where there is none."""
         return self.measured.here[1 + self.layout.size] if self.motion.dissipation is not None else np.zeros(())
 
     @property

@@ -58,7 +58,6 @@ class Law(NamedTuple):
 
     @property
     def motion(self) -> Motion:
-        """The functions of the scene, in flat coordinates."""
         return self.derivation.motion
 
     @classmethod
@@ -93,7 +92,6 @@ class Law(NamedTuple):
         return sample.evaluate_in_parts(lambda part: _solve(part.quantities(*SADDLE))[0], self._portion(SADDLE))
 
     def _portion(self, names: tuple[str, ...]) -> int:
-        """The number of states of which programs return these quantities together."""
         return max(1, _CHUNK // sum(self.derivation.count(name) for name in names))
 
     def _finite(self, sample: Sample) -> np.ndarray:
@@ -134,7 +132,6 @@ class Law(NamedTuple):
         return self._measure(momenta, tolerances, q, qdot, motion.quantities(*state), by_q, finite)
 
     def power_at(self, q, qdot, t, params) -> jax.Array:
-        """dh/dt at one state, ()."""
         return self._power(self.motion.quantities(q, qdot, t, params), qdot)
 
     # ---- the laws ----

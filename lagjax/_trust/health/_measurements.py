@@ -75,7 +75,6 @@ class SampledPath(NamedTuple):
 
     @property
     def time(self) -> int:
-        """The axis of the states."""
         return self.q.ndim - 2
 
 
@@ -128,7 +127,6 @@ def _names(laws: list[Law], layout: Layout) -> Names:
 
 
 def _conserved(laws: list[Law]) -> tuple[int, ...] | None:
-    """The coordinates whose momenta are conserved in some mode."""
     if any(law.conserved is None for law in laws):
         return None
     return tuple(sorted({i for law in laws for i in law.conserved or ()}))
@@ -138,7 +136,6 @@ def _conserved(laws: list[Law]) -> tuple[int, ...] | None:
 
 
 def path_of(members: Members) -> SampledPath:
-    """The states of all members."""
     run, ts = members.trajectory, members.shared(members.trajectory.ts, 1)
     transitions = None
     if run.transitions is not None:
@@ -361,7 +358,6 @@ def _drifts(path: SampledPath, laws, momenta, samples: Measurements, reached, be
 
 
 def _take_ends(xp, axis: int, ends, x):
-    """x at the end of every piece."""
     return xp.take_along_axis(x, ends.reshape(ends.shape + (1,) * (x.ndim - ends.ndim)), axis=axis)
 
 
