@@ -12,6 +12,7 @@ Three rooms, each of which imports only from those before it:
     result/    Fit: intervals, what is not seen, verdict, profile, draws, predictions, report
 """
 
+import itertools
 import sys
 import time
 import warnings
@@ -181,7 +182,7 @@ class _FitSearch(NamedTuple):
         self._require_one_beginning(residuals)
         readers = read_records(residuals)
         if self.progress:
-            residuals.watch = _Printer(residuals.size)
+            residuals.watch = _print_trials(residuals.size)
         u = self.parameters.inverse(self.parameters.first)
         point, waterfall = Point(u, first_starts(residuals, readers, self.params0)), None
         search = Search(residuals, self.law, self.method, readers)
@@ -235,17 +236,16 @@ class _FitSearch(NamedTuple):
         return find_mistake(share, possible, left.share, max(spent, SECONDS) if left.motion else spent)
 
 
-class _Printer:
-    """Prints a line for every trial."""
+def _print_trials(size: np.ndarray) -> Callable[[Any], None]:
+    """A function that prints a line for every trial, of signals of this size (S,)."""
+    count = itertools.count(1)
 
-    def __init__(self, size: np.ndarray):
-        self.size, self.trials = size, 0
-
-    def __call__(self, trial) -> None:
-        self.trials += 1
+    def tell(trial) -> None:
         if isinstance(trial, LostTrial):
             text = f"the motion failed. {trial.text.splitlines()[0]}"
         else:
-            rms = np.sqrt(np.mean(trial.flat() ** 2, axis=0)) / self.size
+            rms = np.sqrt(np.mean(trial.flat() ** 2, axis=0)) / size
             text = f"{len(trial.starts)} motions, residuals {np.exp(np.mean(np.log(rms))):.4g} of the signals"
-        print(f"trial {self.trials}: {text}", file=sys.stderr, flush=True)
+        print(f"trial {next(count)}: {text}", file=sys.stderr, flush=True)
+
+    return tell

@@ -513,16 +513,14 @@ class Residuals:
 
     def working_trial(self, point: Trial, noise: NoiseScale) -> Trial:
         """The trial with residuals of which those at the limit of a sensor have the slope of their likelihood."""
-        return point if self.sides is None else point._replace(
-            residuals=[self._working(batch, r, noise) for batch, r in zip(self.batches, point.residuals, strict=True)]
-        )  # fmt: skip
-
-    @staticmethod
-    def _working(batch: Samples, residuals: np.ndarray, noise: NoiseScale) -> np.ndarray:
-        unit = noise.sigma / np.sqrt(np.where(batch.weights > 0, batch.weights, 1.0))
-        score, curvature = scores(residuals / unit, batch.sides)
-        safe = np.maximum(curvature, np.finfo(float).tiny)
-        return np.where(curvature > np.finfo(float).tiny, unit * score / safe, 0.0)
+        if self.sides is None:
+            return point
+        found, tiny = [], np.finfo(float).tiny
+        for batch, r in zip(self.batches, point.residuals, strict=True):
+            unit = noise.sigma / np.sqrt(np.where(batch.weights > 0, batch.weights, 1.0))
+            score, curvature = scores(r / unit, batch.sides)
+            found.append(np.where(curvature > tiny, unit * score / np.maximum(curvature, tiny), 0.0))
+        return point._replace(residuals=found)
 
     def cost(self, point: Trial, factors: list[np.ndarray], noise: NoiseScale) -> float:
         """Half the weighted sum of squares, and −log of the probability of samples at the limit of a sensor."""

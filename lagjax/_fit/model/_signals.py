@@ -43,7 +43,7 @@ class Delays:
 
     def __init__(self, delayed: Delayed, parameters: Parameters, record: Record):
         leaves, tree = jax.tree.flatten(record.values)
-        places = np.split(np.arange(record.matrix.shape[1]), np.cumsum([x[0].size for x in leaves])[:-1])
+        self.places = np.split(np.arange(record.matrix.shape[1]), np.cumsum([x[0].size for x in leaves])[:-1])
         self.longest = float(delayed.longest)
 
         def evaluate(numbers):
@@ -57,7 +57,6 @@ class Delays:
             return jnp.stack([jnp.asarray(one, numbers.dtype) for one in spread])
 
         self._value_and_jacobian = jax.jit(lambda numbers: (evaluate(numbers), jax.jacfwd(evaluate)(numbers)))
-        self.places = places
         # Leaves that share one number share one motion.
         jax.eval_shape(evaluate, jax.ShapeDtypeStruct(parameters.first.shape, parameters.first.dtype))
 
@@ -99,8 +98,7 @@ class Signals:
         record: Record | None,
         form: Form | None = None,
     ):
-        self.layout, self.parameters, self.form = layout, parameters, form
-        self.observe = observe
+        self.layout, self.form, self.observe = layout, form, observe
         self.delays: Delays | None = None
         if record is None:
             self.names, self._value_and_jacobians, self.periods = (), None, np.zeros(0)
@@ -110,11 +108,8 @@ class Signals:
         of_state, wrap = sensors(observe)
         self.periods = np.full(record.matrix.shape[1], np.inf) if wrap is None else wrap.periods(record)
         if of_state is None:
-            self.names, self._value_and_jacobians, self.evaluate_state = (
-                layout.names,
-                None,
-                lambda y, *_: y[: layout.size],
-            )
+            self.names, self._value_and_jacobians = layout.names, None
+            self.evaluate_state = lambda y, *_: y[: layout.size]
             if record.structure != (layout.tree, layout.shapes):
                 raise ValueError(
                     f"values must have the structure of q, {layout.tree} of shapes {layout.shapes}, where there is no "

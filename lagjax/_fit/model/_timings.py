@@ -21,7 +21,7 @@ from lagjax._fit.model._records import Guess, MeasuredSignal, real_numbers, requ
 from lagjax._interface import Layout, halves
 from lagjax._primitives import sentence
 from lagjax._program import Unlowerable
-from lagjax._run import Trajectory, Transitions, directions_of, sections_of, simulate
+from lagjax._run import directions_of, sections_of, simulate
 from lagjax._run.hybrid import Hybrid, Scene, Transition
 from lagjax._scene import System
 
@@ -283,7 +283,8 @@ def _build_transition_clock(
         return simulate(scene, q, qdot, span, parameters.restore(numbers), rtol=rtol, throw=False)
 
     def times(y0, numbers):
-        happened = _transitions(run(y0, numbers))
+        happened = run(y0, numbers).transitions
+        assert happened is not None
         mine = (happened.source == source) & (happened.target == target)  # (M, K)
         mine = mine & (jnp.cumsum(mine, axis=1) == number + 1)
         place = jnp.argmax(mine, axis=1)
@@ -294,13 +295,13 @@ def _build_transition_clock(
         t, moved = jax.linearize(times, y0, numbers)
         return t, jax.vmap(moved)(*directions).T
 
-    ended = jax.jit(lambda y0, numbers: _hybrid_end(run(y0, numbers)))
-
     def describe_failure(y0, numbers) -> str:
-        missing = ~np.isfinite(np.asarray(jax.jit(times)(y0, numbers)))
-        result, t_end, y_end, of_transitions = (np.asarray(x) for x in ended(y0, numbers))
-        first = int(np.argmax(missing))
-        happened = int((of_transitions == ways[first]).all(axis=1).sum())
+        missing, motion = ~np.isfinite(np.asarray(times(y0, numbers))), run(y0, numbers)
+        assert motion.transitions is not None
+        result, t_end, first = motion.result._value, motion.end.t, int(np.argmax(missing))
+        y_end = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves((motion.end.q, motion.end.qdot))])
+        source_k, target_k = ways[first]
+        happened = int(((motion.transitions.source == source_k) & (motion.transitions.target == target_k)).sum())
         between = " to ".join(repr(tuple(scene.modes)[k]) for k in ways[first])
         text = sentence(int(result), float(t_end), span[1], y_end, layout.names)
         return (
@@ -309,19 +310,6 @@ def _build_transition_clock(
         )
 
     return Clock(times, tangents, describe_failure)
-
-
-def _hybrid_end(run: Trajectory) -> tuple:
-    """The result, the last time and state of a hybrid motion, and which modes its transitions (K, 2) were between."""
-    flat = [jnp.ravel(leaf) for leaf in jax.tree.leaves((run.end.q, run.end.qdot))]
-    happened = _transitions(run)
-    between = jnp.stack([happened.source, happened.target], axis=1)
-    return run.result._value, run.end.t, jnp.concatenate(flat), between
-
-
-def _transitions(run: Trajectory) -> Transitions:
-    assert run.transitions is not None
-    return run.transitions
 
 
 def _mode_places(scene: Hybrid, transition: Transition) -> tuple[int, int]:

@@ -36,15 +36,12 @@ class Experiments(NamedTuple):
         width = max(len(name) for name in (*self.names, "experiment"))
         rows = [f"{'experiment':<{width}}  {'gain':>8}  {'volume':>8}  {'newly seen':>10}  most for"]
         for name, gain, new, after in zip(self.names, self.gain, self.newly_seen, self.deviations, strict=True):
-            rows.append(
-                f"{name:<{width}}  {gain:>8.3g}  {np.exp(-gain / 2):>8.3g}  {new:>10}  {self._describe_change(after)}"
-            )
+            known = np.where(np.isfinite(after), after, 1.0)
+            place = int(np.argmin(known))
+            change = f"{self.parameters[place]}, whose interval becomes {known[place]:.2g} of now"
+            change = change if known[place] < 1 else ""
+            rows.append(f"{name:<{width}}  {gain:>8.3g}  {np.exp(-gain / 2):>8.3g}  {new:>10}  {change}")
         return "\n".join(rows)
-
-    def _describe_change(self, after: np.ndarray) -> str:
-        known = np.where(np.isfinite(after), after, 1.0)
-        place = int(np.argmin(known))
-        return f"{self.parameters[place]}, whose interval becomes {known[place]:.2g} of now" if known[place] < 1 else ""
 
 
 def rank_experiments(

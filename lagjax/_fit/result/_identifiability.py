@@ -104,9 +104,9 @@ def _sentence(parameters: Parameters, block: np.ndarray, spaces) -> str:
     if all(np.all(x[block] != 0) for _, x in spaces) and (rows := _whole_numbers(relative)) is not None:
         if relative[0].shape[1] == 1 and np.ptp(relative[0]) < _EXACT * np.abs(relative[0]).max():
             return f"A common factor of {_join_names(names)} is not seen, only their ratios: keep one of them fixed."
-        return f"Of {_join_names(names)} only {_join_names([_product(row, names) for row in rows])} {_verb(rows)} seen."
+        return _sentence_on_seen(names, [_product(row, names) for row in rows])
     if (rows := _whole_numbers(absolute)) is not None:
-        return f"Of {_join_names(names)} only {_join_names([_sum(row, names) for row in rows])} {_verb(rows)} seen."
+        return _sentence_on_seen(names, [_sum(row, names) for row in rows])
     if (count := absolute[0].shape[1]) > 1:
         return f"{count} combinations of {_join_names(names)} are not seen: keep {count} of them fixed."
     changes = absolute[0][:, 0] / np.abs(absolute[0][:, 0]).max()
@@ -173,13 +173,9 @@ def _simplify_rows(rows: list[list[int]]) -> list[list[int]]:
 
 
 def _product(row: list[int], names: list[str]) -> str:
-    above = [_power(name, x) for name, x in zip(names, row, strict=True) if x > 0]
-    below = [_power(name, -x) for name, x in zip(names, row, strict=True) if x < 0]
+    powers = [(x, name if abs(x) == 1 else f"{name}^{abs(x)}") for name, x in zip(names, row, strict=True)]
+    above, below = [text for x, text in powers if x > 0], [text for x, text in powers if x < 0]
     return "·".join(above) + (f"/({'·'.join(below)})" if len(below) > 1 else f"/{below[0]}" if below else "")
-
-
-def _power(name: str, exponent: int) -> str:
-    return name if exponent == 1 else f"{name}^{exponent}"
 
 
 def _sum(row: list[int], names: list[str]) -> str:
@@ -194,5 +190,5 @@ def _join_names(names: list[str]) -> str:
     return names[0] if len(names) == 1 else f"{', '.join(names[:-1])} and {names[-1]}"
 
 
-def _verb(rows: list) -> str:
-    return "is" if len(rows) == 1 else "are"
+def _sentence_on_seen(names: list[str], seen: list[str]) -> str:
+    return f"Of {_join_names(names)} only {_join_names(seen)} {'is' if len(seen) == 1 else 'are'} seen."

@@ -55,17 +55,16 @@ class Prediction(NamedTuple):
         Raises `ValueError` for a level that is not between 0 and 1.
         """
         require_level(level)
-        columns = iter(range(len(self.widths.sigma)))
-        half = jax.tree.map(lambda leaf: _half_widths(leaf, self.widths, level, columns), self.deviation)
+        columns, share = iter(range(len(self.widths.sigma))), 0.5 + 0.5 * level
+
+        def half_width(deviation: np.ndarray) -> np.ndarray:
+            flat = deviation.reshape(len(deviation), -1)
+            own = [next(columns) for _ in range(flat.shape[1])]
+            scatter = self.widths.sigma[own] * stdtrit(np.minimum(self.widths.dof[own], 1e9), share)
+            return np.sqrt((ndtri(share) * flat) ** 2 + scatter**2).reshape(deviation.shape)
+
+        half = jax.tree.map(half_width, self.deviation)
         return jax.tree.map(np.subtract, self.values, half), jax.tree.map(np.add, self.values, half)
-
-
-def _half_widths(deviation: np.ndarray, noise: NoiseScale, level: float, columns) -> np.ndarray:
-    """Half of the band of one leaf of signals, whose places among all signals are the next of `columns`."""
-    flat = deviation.reshape(len(deviation), -1)
-    own = [next(columns) for _ in range(flat.shape[1])]
-    scatter = noise.sigma[own] * stdtrit(np.minimum(noise.dof[own], 1e9), 0.5 + 0.5 * level)
-    return np.sqrt((ndtri(0.5 + 0.5 * level) * flat) ** 2 + scatter**2).reshape(deviation.shape)
 
 
 def predict_record(fit, record: Record, system: str | None) -> Prediction:

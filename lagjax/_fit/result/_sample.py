@@ -321,7 +321,12 @@ def inference_data(density: Density, drawn: Draws) -> Any:
     arviz = _arviz()
     residuals, parameters = density.residuals, density.residuals.parameters
     chains, draws, size = drawn.x.shape
-    at = jax.jit(jax.vmap(lambda x: _named_unknowns(density, x)))(jnp.asarray(drawn.x.reshape(-1, size)))
+
+    def unknowns(x):
+        at = density.unknowns(x)
+        return parameters.numbers(at.u, jnp), at.starts, at.sigma, jnp.broadcast_to(at.dof, at.sigma.shape)
+
+    at = jax.jit(jax.vmap(unknowns))(jnp.asarray(drawn.x.reshape(-1, size)))
     values, starts, sigma, dof = (np.asarray(x).reshape(chains, draws, *x.shape[1:]) for x in at)
     posterior, dims, coords = {}, {}, {}
     for part in parameters.parts:
@@ -349,12 +354,6 @@ def inference_data(density: Density, drawn: Draws) -> Any:
     }  # fmt: skip
     attributes = {"sampler": drawn.sampler, **_check_agreement(density, drawn)}
     return arviz.from_dict(posterior=posterior, sample_stats=stats, dims=dims, coords=coords, attrs=attributes)
-
-
-def _named_unknowns(density: Density, x):
-    at = density.unknowns(x)
-    numbers = density.residuals.parameters.numbers(at.u, jnp)
-    return numbers, at.starts, at.sigma, jnp.broadcast_to(at.dof, at.sigma.shape)
 
 
 def _blackjax() -> Any:

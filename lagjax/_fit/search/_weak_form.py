@@ -24,30 +24,16 @@ from scipy.optimize import least_squares
 from lagjax._equations import has_constraints
 from lagjax._fit.model._inputs import Driven, constant_tables, input_functions
 from lagjax._fit.model._residuals import SystemResiduals
-from lagjax._fit.search._reader import Reader
+from lagjax._fit.search._reader import Reader, choose_places
 from lagjax._interface import halves
 from lagjax._run.hybrid import Hybrid
 from lagjax._scene import System
 
-_SAMPLES_OF_WEAK_FORM = 2000  # of all records, at most
+_SAMPLES = 2000  # of all records, at most
 _FEWEST_IN_WINDOW = 9  # samples in a window
 _POWER = 4  # of the bump (1 − s²)ᵖ, whose first derivatives vanish at its ends
-_TRIALS_OF_WEAK_FORM = 100
+_TRIALS = 100
 _WIDE = 3.0  # time scales in half a window: a bump sees what turns over within it
-
-
-class _Windows:
-    """Bumps on the samples of one record: `inside` and `rate` (W, T), which integrate with φ and φ̇ by trapezia."""
-
-    def __init__(self, ts: np.ndarray, half: float):
-        spans = np.gradient(ts)
-        spans[0], spans[-1] = 0.5 * (ts[1] - ts[0]), 0.5 * (ts[-1] - ts[-2])
-        half = min(max(half, 0.5 * _FEWEST_IN_WINDOW * np.max(np.diff(ts))), 0.5 * (ts[-1] - ts[0]))
-        count = max(1, int(np.ceil(2 * (ts[-1] - ts[0]) / half)) - 3)  # each begins a quarter behind the one before
-        centres = np.linspace(ts[0] + half, ts[-1] - half, count)
-        s = np.clip((ts - centres[:, None]) / half, -1.0, 1.0)
-        self.inside = spans * (1 - s**2) ** _POWER
-        self.rate = -2 * _POWER / half * spans * s * (1 - s**2) ** (_POWER - 1)
 
 
 def fit_weak_form(
@@ -77,7 +63,7 @@ def fit_weak_form(
     if not (np.isfinite(to_host(value)(u)).all() and np.isfinite(to_host(slope)(u)).all()):
         return None
     try:
-        done = least_squares(to_host(value), u, to_host(slope), x_scale="jac", max_nfev=_TRIALS_OF_WEAK_FORM)
+        done = least_squares(to_host(value), u, to_host(slope), x_scale="jac", max_nfev=_TRIALS)
     except (ValueError, np.linalg.LinAlgError):  # a trial that is not finite
         return None
     return done.x if np.isfinite(done.x).all() else None
@@ -89,7 +75,16 @@ def weak_form_residuals(system: SystemResiduals, readers: Sequence[Reader | None
     assert isinstance(scene, System)
     form = form if form is not None and input_functions(scene) else None
     scene = scene if form is None else form.drive_scene(scene)
-    pieces = _states_and_inputs([reader for reader in readers if reader is not None], _WIDE * scale)
+    pieces, reading = [], [reader for reader in readers if reader is not None]
+    for reader in reading:
+        record = reader.record
+        places = choose_places(record, min(max(_FEWEST_IN_WINDOW + 1, _SAMPLES // len(reading)), len(record)))
+        ts = record.ts[places]
+        if len(ts) > 2:
+            pieces.append((reader.states(places), ts, record.input_matrix[places], *_bumps(ts, _WIDE * scale)))
+    y, t, inputs = (np.concatenate([piece[k] for piece in pieces]) for k in range(3))
+    rate, inside = (block_diag(*[piece[k] for piece in pieces]) for k in (3, 4))
+    table = tuple(constant_tables(t, inputs)) if form is not None else None
 
     def momentum_and_force(y, t, table, numbers):
         params = parameters.restore(numbers)
@@ -100,10 +95,6 @@ def weak_form_residuals(system: SystemResiduals, readers: Sequence[Reader | None
 
     at_all = jax.vmap(momentum_and_force, in_axes=(0, 0, 0 if form is not None else None, None))
 
-    y, t, inputs = (np.concatenate([piece[k] for piece in pieces]) for k in range(3))
-    table = tuple(constant_tables(t, inputs)) if form is not None else None
-    rate, inside = (block_diag(*[getattr(piece[3], name) for piece in pieces]) for name in ("rate", "inside"))
-
     def residuals(u):
         p, force = jnp.moveaxis(at_all(y, t, table, parameters.numbers(u, jnp)), 1, 0)
         moved, forced = rate @ p, inside @ force
@@ -112,13 +103,12 @@ def weak_form_residuals(system: SystemResiduals, readers: Sequence[Reader | None
     return residuals
 
 
-def _states_and_inputs(readers: list[Reader], half: float) -> list[tuple]:
-    """States (T, 2n), times, inputs and windows of every record, thinned to this many samples in all."""
-    found = []
-    for reader in readers:
-        count = max(_FEWEST_IN_WINDOW + 1, _SAMPLES_OF_WEAK_FORM // len(readers))
-        places = np.unique(np.linspace(0, len(reader.record) - 1, min(count, len(reader.record))).astype(int))
-        ts = reader.record.ts[places]
-        if len(ts) > 2:
-            found.append((reader.states(places), ts, reader.record.input_matrix[places], _Windows(ts, half)))
-    return found
+def _bumps(ts: np.ndarray, half: float) -> tuple[np.ndarray, np.ndarray]:
+    """Bumps on the samples of one record, (W, T) each, which integrate with φ̇ and φ by trapezia."""
+    spans = np.gradient(ts)
+    spans[0], spans[-1] = 0.5 * (ts[1] - ts[0]), 0.5 * (ts[-1] - ts[-2])
+    half = min(max(half, 0.5 * _FEWEST_IN_WINDOW * np.max(np.diff(ts))), 0.5 * (ts[-1] - ts[0]))
+    count = max(1, int(np.ceil(2 * (ts[-1] - ts[0]) / half)) - 3)  # each begins a quarter behind the one before
+    centres = np.linspace(ts[0] + half, ts[-1] - half, count)
+    s = np.clip((ts - centres[:, None]) / half, -1.0, 1.0)
+    return -2 * _POWER / half * spans * s * (1 - s**2) ** (_POWER - 1), spans * (1 - s**2) ** _POWER
