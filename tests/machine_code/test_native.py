@@ -145,7 +145,7 @@ def program_of(name):
 
 
 def test_every_operation_is_in_a_family():
-    assert OPERATIONS.keys() <= {op for name in FAMILIES for op, _, _ in program_of(name).nodes}
+    assert OPERATIONS.keys() <= {op for name in FAMILIES for op, _, _ in program_of(name).line.nodes}
 
 
 @pytest.mark.parametrize("name", FAMILIES)
@@ -156,7 +156,7 @@ def test_operations(name):
         a, b = np.nan_to_num(a, posinf=7.0, neginf=-7.0), np.nan_to_num(b, posinf=7.0, neginf=-7.0)
     n = rng.integers(-3, 4, len(a))
     program = program_of(name)
-    found = lanewise(lambda code, sincos, xs: _lanes.emit(code, program, lambda i: xs[i], sincos, None), a, b, n)
+    found = lanewise(lambda code, sincos, xs: _lanes.emit(code, program.line, lambda i: xs[i], sincos, None), a, b, n)
     expected = np.array([program.evaluate(*row) for row in zip(a, b, n, strict=True)], float).T
     # NumPy rounds the library's functions a little differently; a fused sum is as far from it as one of its roundings.
     size = np.where(np.isfinite(a * a + b * b), a * a + b * b + 1, 0) if name == "fused" else 0.0
