@@ -189,6 +189,12 @@ def _offender(derivation: Derivation, role: str, arguments: tuple) -> str:
     return f". It comes from {to_blame[0]}" if to_blame else ""
 
 
+def _short_functions(derivation: Derivation, params, ended: Ended) -> tuple[list[Callable], tuple]:
+    """The forces and L, as far as the scene has them and they can be gone through; and their arguments at the end."""
+    motion, arguments = derivation.motion, (*halves(ended.y), ended.t, eqx.filter(params, eqx.is_array_like))
+    return [f for f in (motion.forces, motion.lagrangian) if f is not None and _is_short(f, arguments)], arguments
+
+
 def _is_short(function: Callable, arguments: tuple) -> bool:
     """True if a function has few enough equations to be gone through one by one."""
     return _equations(jax.make_jaxpr(function)(*arguments).jaxpr) <= LONGEST
@@ -272,8 +278,7 @@ def _running_away(derivation: Derivation, ended: Ended) -> int | None:
 
 def _escape(derivation: Derivation, params, ended: Ended, place: int) -> str:
     """The place that a coordinate runs away to: a pole of an operation of the force or of L, or infinity."""
-    motion, arguments = derivation.motion, (*halves(ended.y), ended.t, eqx.filter(params, eqx.is_array_like))
-    functions = [f for f in (motion.forces, motion.lagrangian) if f is not None and _is_short(f, arguments)]
+    functions, arguments = _short_functions(derivation, params, ended)
     pole = next((near for function in functions for near in poles(function, *arguments)), None)
     name, (q, v), (q_first, v_first) = derivation.layout.names[place], halves(ended.y), halves(ended.y_first)
     grown = f"its velocity was {v_first[place]:.3g} at the start and is {v[place]:.3g} where {name} = {q[place]:.3g}"
@@ -318,9 +323,7 @@ def _run_check(system: System, derivation: Derivation, params, ended: Ended) -> 
         return ""
     where = ""
     if kind == "border":
-        arguments = (*halves(ended.y), ended.t, eqx.filter(params, eqx.is_array_like))
-        functions = [f for f in (derivation.motion.forces, derivation.motion.lagrangian) if f is not None]
-        pieces = describe_pieces([f for f in functions if _is_short(f, arguments)], arguments)
+        pieces = describe_pieces(*_short_functions(derivation, params, ended))
         where = f" The scene is pieced together by {pieces}." if pieces else ""
     return f"\nThere check says: {found[kind].message}{where}{_budget(ended)}"
 

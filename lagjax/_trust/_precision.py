@@ -26,10 +26,7 @@ from lagjax._scene import System, require_system
 
 PyTree = Any
 
-_TOLERANCES = {
-    np.dtype("float64"): (1e-4, 1e-6, 1e-8, 1e-10, 1e-12),
-    np.dtype("float32"): (1e-2, 1e-3, 1e-4, 1e-5),
-}
+_TOLERANCES = {np.dtype("float64"): (1e-4, 1e-6, 1e-8, 1e-10, 1e-12), np.dtype("float32"): (1e-2, 1e-3, 1e-4, 1e-5)}
 # Tolerances of the reference and of the solve that checks it, in units of the round-off. Any tighter, and round-off in
 # the error estimate itself begins to reject steps.
 _REFERENCE, _CHECK = 50, 500
@@ -94,17 +91,10 @@ _HEADER = ("solver", "rtol", "error", "worst", "time", "per member", "accepted",
 def _cells(row: WorkPrecisionRow) -> tuple[str, ...]:
     """One row of the table that is printed, in the order of `_HEADER`."""
     return (
-        row.solver,
-        f"{row.rtol:.0e}",
-        f"{row.error:.1e}",
-        f"{row.worst_error:.1e}",
-        _duration(row.seconds),
-        _duration(row.seconds_per_trajectory),
-        f"{row.accepted_steps:.0f}",
-        f"{row.rejected_steps:.0f}",
-        f"{row.ok:.0%}",
-        f"{row.wasted:.0%}",
-    )
+        row.solver, f"{row.rtol:.0e}", f"{row.error:.1e}", f"{row.worst_error:.1e}",
+        _duration(row.seconds), _duration(row.seconds_per_trajectory),
+        f"{row.accepted_steps:.0f}", f"{row.rejected_steps:.0f}", f"{row.ok:.0%}", f"{row.wasted:.0%}",
+    )  # fmt: skip
 
 
 def work_precision(
@@ -192,10 +182,8 @@ def _problem(system: System, q0: PyTree, qdot0: PyTree, ts, params: PyTree, batc
 
 def _default_solvers(problem: Problem) -> dict[str, diffrax.AbstractSolver | None]:
     """The solvers that are measured by default; the first is that of `simulate`, named after its integrator."""
-    if isinstance(choose(problem).engine, MachineCode):
-        return {"default: Taylor (machine code)": None, **_SOLVERS}
-    others = {name: solver for name, solver in _SOLVERS.items() if name != _FIRST}
-    return {f"default: {_FIRST}": None, **others}
+    first = "Taylor (machine code)" if isinstance(choose(problem).engine, MachineCode) else _FIRST
+    return {f"default: {first}": None} | {name: solver for name, solver in _SOLVERS.items() if name != first}
 
 
 def _reference(run: Callable[[float], Trajectory], dtype) -> tuple[np.ndarray, np.ndarray]:

@@ -53,9 +53,8 @@ def count_borders(members: Members) -> tuple[bool, Met[np.ndarray] | None]:
     accepted, rejected = (members.shared(trajectory.stats[f"num_{kind}_steps"], 0) for kind in ("accepted", "rejected"))
     steps = accepted + rejected
     rtol, atol = (float(np.max(x)) for x in trajectory.tolerances)
-    flow = flow_of(
-        Problem.from_system(trajectory.system, members.layout, members.params, ts=ts[0], rtol=rtol, atol=atol)
-    )
+    system, layout = trajectory.system, members.layout
+    flow = flow_of(Problem.from_system(system, layout, members.params, ts=ts[0], rtol=rtol, atol=atol))
     if flow.borders is None:  # one without a series
         return False, None
     columns = [np.broadcast_to(x, members.count) for x in members.numbers]
@@ -63,7 +62,7 @@ def count_borders(members: Members) -> tuple[bool, Met[np.ndarray] | None]:
     moved = np.flatnonzero(np.isfinite(start).all(axis=1) & (ts[:, 1] != ts[:, 0]) & (steps > 0))
     for some in portions(moved, steps * (flow.states + 5 + len(flow.borders.switches)), LARGEST_PORTION):
         tolerances = Tolerances(rtol, atol, 2 * int(steps[some].max()) + 100)
-        _count(flow, (ts[some], start[some], params[some]), tolerances, steps[some], some, nothing)
+        _count(flow, ts[some], start[some], params[some], tolerances, steps[some], some, nothing)
     return True, nothing
 
 
@@ -77,18 +76,11 @@ def is_piecewise(system: System, layout: Layout, params) -> bool:
         return bool(pieces_of_motion(derivation.motion, rest, rest, rest.sum(), params))
 
 
-def _count(
-    flow: Flow,
-    motions: tuple[np.ndarray, np.ndarray, np.ndarray],
-    tolerances: Tolerances,
-    steps: np.ndarray,
-    places: np.ndarray,
-    into: Met[np.ndarray],
-) -> None:
+def _count(flow: Flow, ts, y0, params, tolerances: Tolerances, steps, places, into: Met[np.ndarray]) -> None:
     """Follow some motions, and add what they met `into` the counts at their places."""
     store, borders = StepStore(), flow.borders
     assert borders is not None  # without a series there are none, and none are counted
-    again = flow.follow(*motions, tolerances, store, 2 * int(steps.sum()) + len(places))
+    again = flow.follow(ts, y0, params, tolerances, store, 2 * int(steps.sum()) + len(places))
     guards, pieces = borders.guards, len(borders.switches)
     # The time comes to entries of tables, too, which are no borders.
     enters, leaves = (np.array([getattr(guard, name) >= 0 for guard in guards] + [False]) for name in ("slide", "on"))

@@ -77,6 +77,11 @@ class SampledPath(NamedTuple):
     def time(self) -> int:
         return self.q.ndim - 2
 
+    def take_ends(self, x):
+        """The entries at `ends` of an array over states, (…, T − 1, …)."""
+        ends = self.ends.reshape(self.ends.shape + (1,) * (x.ndim - self.ends.ndim))
+        return self.library.take_along_axis(x, ends, axis=self.time)
+
 
 def measure_trajectory(trajectory) -> tuple[dict[str, Any], Names]:
     """The fields of `Health` that are measured along the path, and names for them."""
@@ -141,13 +146,11 @@ def path_of(members: Members) -> SampledPath:
     if run.transitions is not None:
         times, source = (np.asarray(x).reshape(members.count, -1) for x in (run.transitions.t, run.transitions.source))
         transitions = members.flat(run.transitions.q), members.flat(run.transitions.qdot), times, source
-    mode, q = None if run.mode is None else np.asarray(run.mode).reshape(ts.shape), members.flat(run.q)
     tolerances = run.tolerances and [members.shared(x, 0) for x in run.tolerances]
     steps = np.asarray(run.stats["num_accepted_steps"]).reshape(members.count)
-    q = members.flat(run.q)
-    return _join_states(
-        np, (q, members.flat(run.qdot), ts, mode), transitions, steps, tolerances, _precision_of(run, q)
-    )
+    mode, q = None if run.mode is None else np.asarray(run.mode).reshape(ts.shape), members.flat(run.q)
+    outputs, precision = (q, members.flat(run.qdot), ts, mode), _precision_of(run, q)
+    return _join_states(np, outputs, transitions, steps, tolerances, precision)
 
 
 def _report_of(members: Members, laws: list[Law]) -> dict[str, Any]:
@@ -291,8 +294,7 @@ def _report(path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample
     near = math.sqrt(eps) if fixed else xp.maximum(path.tolerances[0], ROUND_OFF * eps)[..., None]
     may_be_singular = any(law.motion.constrained for law in laws)  # the constraints may hold what M does not
     finest = max(math.sqrt(eps), SLACK * eps) if fixed else SLACK * path.tolerances[0]
-    fine, none = here.finite | ~on_path, xp.zeros(path.ts.shape[:-1], dtype)
-    all_fine, first = xp.all(fine, axis=axis), xp.argmin(fine, axis=axis)
+    all_fine, none = xp.all(here.finite | ~on_path, axis=axis), xp.zeros(path.ts.shape[:-1], dtype)
     energy = most(drifts[..., 0], on_path)
     return {
         "energy": energy,
@@ -311,13 +313,8 @@ def _report(path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample
         "scaled_condition": most(here.mass[..., 2], on_path),
         "scaled_condition_allowed": none + (math.inf if may_be_singular else finest / np.finfo(path.precision).eps),
         "gradients_finite": all_fine,
-        "gradients_time": xp.where(all_fine, math.nan, _pick(xp, path.ts, first)),
+        "gradients_time": xp.where(all_fine, math.nan, most(1.0 - here.finite, on_path).t),
     }
-
-
-def _pick(xp, ts, place):
-    """The entry of ts (…, T) at the index `place` (…)."""
-    return xp.take_along_axis(ts, place[..., None], axis=-1)[..., 0]
 
 
 def _ends(xp, ts, transitions):
@@ -337,10 +334,7 @@ def _drifts(path: SampledPath, laws, momenta, samples: Measurements, reached, be
     A piece of the path, from an output to its entry in `ends`, counts for a quantity that its mode conserves; whatever
     changes the quantity between there and the next output, such as a transition, is left out.
     """
-    xp, axis, ends = path.library, path.time, path.ends
-    T = path.ts.shape[-1]
-    until = partial(_take_ends, xp, axis, ends)
-    values = samples.conserved
+    xp, until, T, values = path.library, path.take_ends, path.ts.shape[-1], samples.conserved
     start = values[..., : T - 1, :]
     measurable = until(reached) & reached[..., : T - 1]
     work, work_error = xp.zeros_like(start[..., 0]), xp.zeros_like(start[..., 0, 0])
@@ -352,13 +346,9 @@ def _drifts(path: SampledPath, laws, momenta, samples: Measurements, reached, be
     rise = values[..., 1:T, :] - start
     excused = rise - xp.where(counted, until(values) - start - expected, 0.0)
     # Where the piece lasts to the next output this is what is expected, without the rounding of three differences.
-    excused = xp.where(counted & (ends < T)[..., None], expected, excused)
-    before = xp.concatenate([xp.zeros_like(values[..., :1, :]), xp.cumsum(excused, axis=axis)], axis=axis)
+    excused = xp.where(counted & (path.ends < T)[..., None], expected, excused)
+    before = xp.concatenate([xp.zeros_like(values[..., :1, :]), xp.cumsum(excused, axis=-2)], axis=-2)
     return xp.abs(values[..., :T, :] - values[..., :1, :] - before), work_error
-
-
-def _take_ends(xp, axis: int, ends, x):
-    return xp.take_along_axis(x, ends.reshape(ends.shape + (1,) * (x.ndim - ends.ndim)), axis=axis)
 
 
 class Rates(NamedTuple):
@@ -397,8 +387,7 @@ def _work(path: SampledPath, samples: Measurements, measurable, between: Rates) 
     rule of order two. Where the power may jump, as the pieces of the program change, the error is as large as the power
     varies.
     """
-    xp, axis, T, n = path.library, path.time, path.ts.shape[-1], path.q.shape[-1]
-    until = partial(_take_ends, xp, axis, path.ends)
+    xp, until, T, n = path.library, path.take_ends, path.ts.shape[-1], path.q.shape[-1]
     (q, v, t, a, p), last = (path.q, path.qdot, path.t, samples.acceleration, samples.power), T - 1
     points, weights, more_points, more_weights, checked, corrections = (
         x.astype(q.dtype) for x in (_POINTS, _WEIGHTS, _MORE_POINTS, _MORE_WEIGHTS, _CHECKED, _CORRECTIONS)
