@@ -10,13 +10,7 @@ velocities and time are at a state; `_blame` which operations of a user's functi
 and in which line.
 """
 
-from lagjax._equations._blame import (
-    borders_of_motion,
-    describe_pieces,
-    offenders,
-    pieces_of_motion,
-    poles,
-)
+from lagjax._equations._blame import borders_of_motion, describe_pieces, offenders, pieces_of_motion, poles
 from lagjax._equations._consistency import has_constraints, inconsistent_members, require_consistent
 from lagjax._equations._constraints import ROUNDINGS, Constraints, distances, rank_lost
 from lagjax._equations._derivation import Derivation, derivation_of, numbers_of

@@ -119,12 +119,12 @@ def borders(function: Callable, *arguments) -> list[tuple[str, str, Any]]:
     return collected
 
 
-def pieces_of(function: Callable, *arguments) -> list[tuple[str, str, int]]:
-    """The name and place of every border of `function`, and how many numbers it compares; nothing is evaluated."""
+def pieces_of(functions: Sequence[Callable], *arguments) -> list[tuple[str, str, int]]:
+    """The name and place of every border of functions, and how many numbers it compares; nothing is evaluated."""
     collected = []
 
     def traced(*arguments):
-        collected.extend((name, place, np.size(side)) for name, place, side in borders(function, *arguments))
+        collected.extend((name, place, np.size(x)) for f in functions for name, place, x in borders(f, *arguments))
         return 0.0
 
     jax.eval_shape(traced, *arguments)
@@ -151,13 +151,12 @@ def borders_of_motion(motion: Motion, *state) -> list[tuple[str, str, Any]]:
 
 def pieces_of_motion(motion: Motion, *state) -> list[tuple[str, str, int]]:
     """`pieces_of` L, the forces and the dissipation of a scene."""
-    return [piece for function in motion.functions for piece in pieces_of(function, *state)]
+    return pieces_of(motion.functions, *state)
 
 
 def describe_pieces(functions: Sequence[Callable], arguments: tuple) -> str:
     """The operations at which functions are pieced together, and their lines: three at most; empty where none is."""
-    places = (f"{name}{place}" for function in functions for name, place, _ in pieces_of(function, *arguments))
-    return join_names(list(dict.fromkeys(places)), 3)
+    return join_names(list(dict.fromkeys(f"{name}{place}" for name, place, _ in pieces_of(functions, *arguments))), 3)
 
 
 # ---- following a jaxpr -----------------------------------------------------------------------------------------------

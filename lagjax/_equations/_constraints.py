@@ -70,13 +70,12 @@ class Constraints(eqx.Module):
         """G and γ of G q̈ = γ. γ is minus all that the time derivatives of f and a contain besides G q̈."""
         forward = qdot, jnp.ones_like(t)
 
-        def rate(q, t):
-            return jax.jvp(lambda q, t: self.f(q, t, params), (q, t), forward)[1]
+        def rate(function):
+            return lambda q, t: jax.jvp(function, (q, t), forward)[1]
 
         jacobian = [jax.jacfwd(self.f)(q, t, params), jax.jacfwd(self.a, argnums=1)(q, qdot, t, params)]
-        second_rate = jax.jvp(rate, (q, t), forward)[1]
-        rate_of_a = jax.jvp(lambda q, t: self.a(q, qdot, t, params), (q, t), forward)[1]
-        return jnp.concatenate(jacobian), -jnp.concatenate([second_rate, rate_of_a])
+        rates = rate(rate(lambda q, t: self.f(q, t, params))), rate(lambda q, t: self.a(q, qdot, t, params))
+        return jnp.concatenate(jacobian), -jnp.concatenate([of(q, t) for of in rates])
 
     def distances(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Row, Row]:
         """The `distances` of one state."""

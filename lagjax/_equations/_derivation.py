@@ -23,7 +23,7 @@ import numpy as np
 
 from lagjax._equations._blame import pieces_of_motion
 from lagjax._equations._constraints import velocity_scales
-from lagjax._equations._linear import solve_many
+from lagjax._equations._linear import eigen, solve_many
 from lagjax._equations._motion import Motion
 from lagjax._equations._quantities import OwnRules, quantities
 from lagjax._equations._recursion import Recursion, RecursiveElimination
@@ -124,7 +124,6 @@ class Derivation:
         self._made: dict[str, Any] = {}
         self._lock = threading.RLock()
         self._programs: dict[tuple[str, ...], Program] = {}
-        self._by_q: dict[tuple[int, ...], Program] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
         self._sampled: dict[float, list[tuple[np.ndarray, np.ndarray]]] = {}
         self._recursion: Recursion | None = None  # known once the quantities are
@@ -228,10 +227,11 @@ class Derivation:
 
     def momenta_by_q(self, momenta: tuple[int, ...]) -> Program:
         """∂pᵢ/∂q for the coordinates i in `momenta`, shape (len(momenta), n)."""
-        if momenta not in self._by_q:
+        key = "momenta_by_q", *map(str, momenta)
+        if key not in self._programs:
             chosen = jax.jacrev(lambda *state: self._traced_once.momentum(*state)[jnp.asarray(momenta, int)])
-            self._by_q[momenta] = lower(chosen, *self.state_shapes, budget=OPERATION_BUDGET)
-        return self._by_q[momenta]
+            self._programs[key] = lower(chosen, *self.state_shapes, budget=OPERATION_BUDGET)
+        return self._programs[key]
 
     # ---- what is solved for ----
 
@@ -306,11 +306,11 @@ class Derivation:
             return None
         n, parts = self.layout.size, self.program("mass_matrix", "jacobian")
 
-        def scales_from_arrays(values, qdot):
+        def of_arrays(values, qdot):
             return velocity_scales(values[: n * n].reshape(n, n), values[n * n :].reshape(-1, n), qdot)
 
         def scales(*scalars):
-            return apply_function(scales_from_arrays, parts.vector(*scalars), stack(scalars[n : 2 * n]))
+            return apply_function(of_arrays, parts.vector(*scalars), stack(scalars[n : 2 * n]))
 
         return lower_formula(scales, *self.scalar_shapes, budget=OPERATION_BUDGET, graph=self._graph)
 
@@ -550,18 +550,13 @@ class Derivation:
         for reach in (1.0, _FAR):
             regular = definite = True
             for matrix, jacobian in self._samples(reach):
-                lowest, size, rows = _lowest_eigenvalue(matrix), np.abs(matrix).max(), jacobian[:m]
+                lowest, size, rows = eigen(matrix)[0][0], np.abs(matrix).max(), jacobian[:m]
                 regular = regular and bool(lowest > 1e-10 * size)
-                augmented = _lowest_eigenvalue(matrix + rows.T @ rows) if m else lowest
+                augmented = eigen(matrix + rows.T @ rows)[0][0] if m else lowest
                 definite = definite and ((n <= 2 and not m) or bool(augmented >= -1e-12 * size))
             if definite:
                 return regular
         return None
-
-
-def _lowest_eigenvalue(matrix: np.ndarray) -> float:
-    diagonal = np.diagonal(matrix)
-    return float(diagonal.min() if np.array_equal(matrix, np.diag(diagonal)) else np.linalg.eigvalsh(matrix)[0])
 
 
 def columns_of(q, qdot, t, numbers: Sequence) -> list:
@@ -595,12 +590,6 @@ class _Structure(NamedTuple):
     leaves: tuple
 
 
-def _structure_of(leaf):
-    if type(leaf) is np.ndarray or eqx.is_array_like(leaf):
-        return _Number(np.shape(leaf), np.dtype(dtype_of(leaf)))
-    return leaf
-
-
 def derivation_of(system: Any, layout: Layout, params: PyTree) -> Derivation:
     """The derivation of a scene with parameters of this structure, whatever their values.
 
@@ -610,11 +599,14 @@ def derivation_of(system: Any, layout: Layout, params: PyTree) -> Derivation:
     arrays, scene = jax.tree.flatten(system)
     if arrays:
         numbers = eqx.filter(params, eqx.is_array_like)
-        return Derivation(
-            system._motion(layout, params), layout, numbers, "the functions of the scene hold arrays of their own"
-        )
+        reason = "the functions of the scene hold arrays of their own"
+        return Derivation(system._motion(layout, params), layout, numbers, reason)
     leaves, tree = jax.tree.flatten(params)
-    key = _Structure(scene, layout, tree, tuple(map(_structure_of, leaves)))
+    kept = (
+        _Number(np.shape(x), np.dtype(dtype_of(x))) if type(x) is np.ndarray or eqx.is_array_like(x) else x
+        for x in leaves
+    )
+    key = _Structure(scene, layout, tree, tuple(kept))
     try:
         hash(key)
     except TypeError as reason:

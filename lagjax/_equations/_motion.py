@@ -62,12 +62,8 @@ class Motion(eqx.Module):
 
     def mass_matrix_and_force(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Matrix, Vector]:
         """M and F = ∂L/∂q − (∂p/∂q) q̇ − ∂p/∂t + Q."""
-
-        def momentum_at_velocity(q, t):
-            return self.momentum(q, qdot, t, params)
-
         # (∂p/∂q) q̇ + ∂p/∂t is how p changes while q moves and q̇ does not: one directional derivative.
-        _, drift = jax.jvp(momentum_at_velocity, (q, t), (qdot, jnp.ones_like(t)))
+        _, drift = jax.jvp(lambda q, t: self.momentum(q, qdot, t, params), (q, t), (qdot, jnp.ones_like(t)))
         return self.mass_matrix(q, qdot, t, params), self.generalized_force(q, qdot, t, params) - drift
 
     def energy(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Scalar:

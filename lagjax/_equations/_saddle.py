@@ -19,6 +19,8 @@ The formulas are for vectors of `Scalars` as well as for arrays of JAX: a pivot,
 all that is left, at once.
 """
 
+import functools
+import operator
 from collections.abc import Iterator
 from typing import Any, NamedTuple
 
@@ -162,9 +164,7 @@ class SaddleElimination:
         """A flag that the rest of Mⱼⱼ is round-off, and its inverse; NaN where it is."""
         if not terms and not self.massless[j]:
             return diagonal == 0.0, 1.0 / diagonal
-        pivot = diagonal
-        for term in terms:
-            pivot = pivot - term
+        pivot = functools.reduce(operator.sub, terms, diagonal)
         lost = pivot <= (REGULAR if self.regular_only else singular_threshold(self.size, self.dtype)) * diagonal
         return lost, 1.0 / xp.where(lost, np.nan, pivot)
 
@@ -174,12 +174,8 @@ class SaddleElimination:
         The pivot is −G M⁻¹ Gᵀ of this constraint, and what those before it take off that. A row that is left out
         changes nothing where the constraints are consistent.
         """
-        own: Any = 0.0
-        for term in of_coordinates:
-            own = own + term
-        left = own
-        for term in of_constraints:
-            left = left + term
+        own: Any = sum(of_coordinates, start=0.0)
+        left = sum(of_constraints, start=own)
         lost = left <= (REGULAR if self.regular_only else rank_tolerance(self.dtype)) * own
         if self.regular_only:
             return lost, -1.0 / xp.where(lost, np.nan, left)

@@ -150,10 +150,7 @@ def _note(error: Exception, name: str, text: str) -> None:
 
 
 def accept(
-    function: Callable,
-    role: str,
-    roles: tuple[str, ...] = ("q", "qdot"),
-    extras: tuple[str, ...] = ("t", "params"),
+    function: Callable, role: str, roles: tuple[str, ...] = ("q", "qdot"), extras: tuple[str, ...] = ("t", "params")
 ) -> Function:
     """Check that `function` has the signature of its `role` in a scene; the result passes the extras it asks for.
 

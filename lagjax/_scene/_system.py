@@ -409,23 +409,18 @@ def replace_functions(system: System, functions: dict[str, Function | None]) -> 
     return other
 
 
+_OF_SCHUR, _OF_ENERGY = ("mass_matrix", "jacobian"), ("lagrangian", "momentum")
 # The functions of `Motion` in terms of `Motion.quantities` and q̇ (S, n) at S states: which of them, and the formula.
 _OF_QUANTITIES: dict[Callable, tuple[tuple[str, ...], Callable]] = {
     Motion.acceleration: (SADDLE, lambda of, v: solve_saddle(of)[0]),
     Motion.multipliers: (SADDLE, lambda of, v: solve_saddle(of)[1]),
     Motion.constraint_force: (SADDLE, lambda of, v: np.einsum("skn,sk->sn", of["jacobian"], solve_saddle(of)[1])),
-    Motion.schur_complement: (
-        ("mass_matrix", "jacobian"),
-        lambda of, v: schur_complements(of["mass_matrix"], of["jacobian"]),
-    ),
+    Motion.schur_complement: (_OF_SCHUR, lambda of, v: schur_complements(of["mass_matrix"], of["jacobian"])),
     Motion.mass_matrix: (("mass_matrix",), lambda of, v: of["mass_matrix"]),
     Motion.momentum: (("momentum",), lambda of, v: of["momentum"]),
     Motion.generalized_force: (("generalized_force",), lambda of, v: of["generalized_force"]),
     Motion.residual: (("residual",), lambda of, v: of["residual"]),
-    Motion.energy: (
-        ("lagrangian", "momentum"),
-        lambda of, v: np.einsum("si,si->s", of["momentum"], v) - of["lagrangian"],
-    ),
+    Motion.energy: (_OF_ENERGY, lambda of, v: np.einsum("si,si->s", of["momentum"], v) - of["lagrangian"]),
 }
 
 

@@ -130,12 +130,8 @@ class Walk:
             return f"{len(value)} in {self.hold(value)}"
         kind = "" if type(value) in (dict, list, tuple, set, frozenset) else self.name(type(value))
         if isinstance(value, Mapping):
-            return (
-                kind
-                + "{"
-                + ", ".join(f"{strip_addresses(repr(k))}: {self.name(x, deep)}" for k, x in list(value.items()))
-                + "}"
-            )
+            pairs = [f"{strip_addresses(repr(k))}: {self.name(x, deep)}" for k, x in list(value.items())]
+            return kind + "{" + ", ".join(pairs) + "}"
         if isinstance(value, set | frozenset):
             return kind + "{" + ", ".join(sorted(self.name(x, deep) for x in list(value))) + "}"
         return kind + "[" + ", ".join(self.name(x, deep) for x in list(value)) + "]"
