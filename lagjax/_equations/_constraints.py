@@ -77,12 +77,6 @@ class Constraints(eqx.Module):
         rates = rate(rate(lambda q, t: self.f(q, t, params))), rate(lambda q, t: self.a(q, qdot, t, params))
         return jnp.concatenate(jacobian), -jnp.concatenate([of(q, t) for of in rates])
 
-    def distances(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Row, Row]:
-        """The `distances` of one state."""
-        state = q, qdot, t, params
-        positions = self.f(q, t, params).size
-        return distances(self.residual(*state), self.rates(*state), self.jacobian_and_gamma(*state)[0], positions)
-
     def inconsistent(
         self, matrix: Float[Array, "n n"], q: Vector, qdot: Vector, t: Time, params: PyTree, span: Time, dtype, terms
     ) -> Bool[Array, ""]:
@@ -199,19 +193,6 @@ def rank_lost(schur_complement: Callable, start: tuple, end: tuple) -> Bool[Arra
 # ---- the way back ----------------------------------------------------------------------------------------------------
 
 
-def projected(
-    mass_matrix: Callable, constraints: Constraints, q: Vector, qdot: Vector, t: Time, params: PyTree
-) -> tuple[Vector, Vector]:
-    """(q, q̇) after one Newton step for the positions and one for the velocities, shape (n,) each.
-
-    That is enough after a step of an integration: close to the constraints Newton's method squares the distance.
-    `mass_matrix` takes (q, qdot, t, params).
-    """
-    if constraints.on_positions is not None:
-        q = q + constraints.position_step(mass_matrix(q, qdot, t, params), q, t, params)
-    return q, qdot + constraints.velocity_step(mass_matrix(q, qdot, t, params), q, qdot, t, params)
-
-
 # Newton's method doubles its digits from where it converges, and needs 4 to 8 steps from anywhere near; 300 times the
 # size of a circle away it takes 16. Doubled, this changes nothing but the time that is lost where there is no solution.
 _NEWTON_STEPS = 50
@@ -225,7 +206,8 @@ def nearest_consistent(
     q̂ minimises (q̂ − q)ᵀM(q̂ − q) with M = M(q, q̇) among all with f = 0, and then the velocities minimise the same form
     with M = M(q̂, q̇) among all that are consistent at q̂. The derivatives are those of that function, to every order:
     q̂ is a root of `_stationary`, and differentiated implicitly. A state that is not found has NaN for derivatives.
-    `terms` (2m,) are the sizes of the terms of `residual` and of `rates`, of which rounding is left.
+    `terms` (2m,) are the sizes of the terms of `residual` and of `rates`, of which rounding is left. `mass_matrix`
+    takes (q, qdot, t, params).
     """
     of_f, of_rates = rows_of_terms(terms, (2, len(constraints.residual(q, qdot, t, params))))
     if constraints.on_positions is not None:

@@ -56,7 +56,6 @@ PyTree = Any
 # While it is lowered, an operation takes about a kilobyte, and two where it is written anew.
 OPERATION_BUDGET = operations_that_fit(2000)
 
-
 # Operations of all quantities beyond which JAX differentiates arrays. Derivatives of programs take 100 µs for each;
 # those of arrays 2 s for what is vectorised, as 60 bodies are (39 000: 4 s), and 13 s for an arm that is written joint
 # by joint (7600: 1 s). Doubled, the first kind loses 3 s more; halved, arms of 12 joints compile for half a minute.

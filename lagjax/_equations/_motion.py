@@ -112,8 +112,13 @@ class Motion(eqx.Module):
         return self.constraints.residual(q, qdot, t, params)
 
     def projected(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Vector, Vector]:
-        """(q, q̇) after one Newton step of each kind back to the constraints, the shortest in the metric of M."""
-        return _constraints.projected(self.mass_matrix, self.constraints, q, qdot, t, params)
+        """(q, q̇) after one Newton step of each kind back to the constraints, the shortest in the metric of M.
+
+        That is enough after a step of an integration: close to the constraints Newton's method squares the distance.
+        """
+        if self.constraints.on_positions is not None:
+            q = q + self.constraints.position_step(self.mass_matrix(q, qdot, t, params), q, t, params)
+        return q, qdot + self.constraints.velocity_step(self.mass_matrix(q, qdot, t, params), q, qdot, t, params)
 
     def nearest_consistent(self, q: Vector, qdot: Vector, t: Time, params: PyTree, terms=0.0) -> tuple[Vector, Vector]:
         """The consistent state that is nearest to (q, q̇) in the metric of M; NaN where it is not found."""

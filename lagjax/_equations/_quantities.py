@@ -91,11 +91,8 @@ class _ScalarState:
         """∂valueᵢ/∂xⱼ for x = q or qdot, shape (values, n)."""
         one = self.expansion.graph.constant(1.0, "float")
         directions = [{i: one} for i in self.ids[by].tolist()]
-        rows, result = (
-            self.derivatives.directional_derivatives(values.tolist(), directions),
-            self.zeros((values.size, len(directions))),
-        )
-        for i, row in enumerate(rows):
+        result = self.zeros((values.size, len(directions)))
+        for i, row in enumerate(self.derivatives.directional_derivatives(values.tolist(), directions)):
             for j, derivative in row.items():
                 result[i, j] = derivative
         return result

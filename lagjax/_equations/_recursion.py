@@ -298,7 +298,8 @@ class _Elimination:
     """
 
     def __init__(self, elimination: RecursiveElimination, values: Scalars):
-        self._apply, graph = values.expansion.graph.apply, values.expansion.graph
+        self._graph = graph = values.expansion.graph
+        self._apply = graph.apply
         self._number = lambda x: graph.constant(x, "float")
         self._threshold = self._number(elimination.threshold)
         self.factors: list[int] = []
@@ -314,35 +315,34 @@ class _Elimination:
                 self._definitions.setdefault(row - elimination.velocities, {})[column] = node
         self._sizes = {u: node for (u, v), node in self._energy.items() if u == v}
 
-    def _plus(self, sum_: int | None, a: int, b: int) -> int:
-        part = self._apply("mul", a, b)
-        return part if sum_ is None else self._apply("add", sum_, part)
+    def _add(self, sums: dict, key, a: int, b: int) -> None:
+        """Add a product to the sum under a key."""
+        _add(self._graph, sums, key, self._apply("mul", a, b))
 
     def velocity(self, step: _Step) -> None:
         """Put its definition, Σ c u, in the place of a velocity w: r w + ½ h w² becomes Σ c u r + ½ h (Σ c u)²."""
         w, definition = step.unknown, self._definitions[step.unknown]
         own = self._energy.pop((w, w), None)
-        coupled = {u: self._energy.pop(_pair(w, u), None) for u in step.others}
+        coupled = {u: self._energy.pop(_pair(w, u)) for u in step.others if _pair(w, u) in self._energy}
         sums = dict(coupled)
         if own is not None:
             for u in step.terms:
-                sums[u] = self._plus(sums[u], own, definition[u])
+                self._add(sums, u, own, definition[u])
         for k, u in enumerate(step.others):
             for v in step.others[: k + 1]:
                 first, second = (u, v) if u in definition else (v, u)
                 if first not in definition:
                     continue
-                if (s := sums[second]) is not None:
-                    self._add(u, v, definition[first], s)
-                if second in definition and (r := coupled[first]) is not None:
-                    self._add(u, v, definition[second], r)
+                if second in sums:
+                    self._add(self._energy, _pair(u, v), definition[first], sums[second])
+                if second in definition and first in coupled:
+                    self._add(self._energy, _pair(u, v), definition[second], coupled[first])
         if (size := self._sizes.pop(w, None)) is not None:
             for u in step.terms:
-                square = self._apply("mul", definition[u], definition[u])
-                self._sizes[u] = self._plus(self._sizes.get(u), square, size)
+                self._add(self._sizes, u, self._apply("mul", definition[u], definition[u]), size)
         zero = self._number(0.0)
         self.factors += [definition[u] for u in step.terms]
-        self.factors += [zero if s is None else s for s in sums.values()]
+        self.factors += [sums.get(u, zero) for u in step.others]
         self.factors.append(zero if own is None else own)
 
     def coordinate(self, step: _Step) -> None:
@@ -363,10 +363,6 @@ class _Elimination:
                 taken, before = self._apply("mul", a, b), self._energy.get(pair)
                 self._energy[pair] = self._apply(*(("neg", taken) if before is None else ("sub", before, taken)))
         self.factors += [*lower, inverse]
-
-    def _add(self, u: int, v: int, a: int, b: int) -> None:
-        pair = _pair(u, v)
-        self._energy[pair] = self._plus(self._energy.get(pair), a, b)
 
 
 def _steps(size: int, terms: list[set[int]], energy: set[tuple[int, int]]) -> Iterator[_Step]:

@@ -35,7 +35,6 @@ from lagjax._program import scalar_algebra as xp
 # three times as expensive; much smaller, the error of an acceleration would exceed the tolerances.
 REGULAR = 1e-4
 
-
 # Coordinates of the largest M that is solved without being positive definite: 12 000 operations, 2 CPU s of LLVM. With
 # twice as many they would be eight times as many, and diffrax begins as soon.
 LARGEST_INDEFINITE = 16

@@ -105,8 +105,6 @@ _NO_COUNT = (
     "numbers in params have no values while it is traced, so that none can count a loop, index a list or be a shape: "
     "let the function close over that integer (n = 3 beside it, or functools.partial), and keep params for what varies."
 )
-
-
 _OF_A_SCENE = "a function of a scene"
 _NOT_USERS = str(Path(__file__).parents[1]), str(Path(jax.__file__).parent)
 

@@ -86,8 +86,6 @@ def code_of(result: diffrax.RESULTS) -> int:
 SUCCESSFUL = code_of(RESULTS.successful)
 EVENT_OCCURRED = code_of(RESULTS.event_occurred)
 ENDED_WELL = (SUCCESSFUL, EVENT_OCCURRED)
-
-
 _STRUCTURE = jax.tree.structure(RESULTS.successful)
 
 

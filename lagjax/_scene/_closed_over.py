@@ -77,15 +77,13 @@ def lift_problem(problem: Problem) -> Problem:
         return problem
     if jax.tree.leaves((problem.system, present)):  # what holds arrays of its own has no program anyway
         return problem
-    functions = {role: fields[role] for role in ROLES}
     values: list[Tracer] = []
 
     def lift(function: Any, roles: int = 2) -> Any:
         return _lift_function(function, roles, problem, values) if isinstance(function, Function) else function
 
-    system = replace_functions(
-        problem.system, {name: lift(f, 1 + (name != "constraints")) for name, f in functions.items()}
-    )
+    functions = {role: lift(fields[role], 1 if role == "constraints" else 2) for role in ROLES}
+    system = replace_functions(problem.system, functions)
     event = problem.event
     if event is not None:
         conditions = jax.tree.map(lift, event.cond_fn, is_leaf=_is_function)
@@ -107,10 +105,9 @@ def _is_function(x: Any) -> bool:
 
 
 def _lift_function(function: Function, roles: int, problem: Problem, values: list) -> Function:
-    extras = tuple(dict.fromkeys((*function.extras, "params")))
     if not function.code.tracers or "inputs" in function.extras:
-        unchanged = Unchanged(function)
-        return Function(None, Edition.from_function(unchanged), extras)
+        extras = tuple(dict.fromkeys((*function.extras, "params")))
+        return Function(None, Edition.from_function(Unchanged(function)), extras)
     numbers, rest = eqx.partition(problem.params, eqx.is_array_like)
     layout = problem.layout
     state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
@@ -121,10 +118,8 @@ def _lift_function(function: Function, roles: int, problem: Problem, values: lis
     closed, shapes = jax.make_jaxpr(call_with_numbers, return_shape=True)((state,) * roles, t, numbers)
     places = tuple(place_in(values, c) if isinstance(c, Tracer) else None for c in closed.consts)
     constants = tuple(None if isinstance(c, Tracer) else c for c in closed.consts)
-    structure = jax.tree.structure(shapes)
-    return function_from_trace(
-        function, open_jaxpr(closed), constants, places, structure, f"{places} {closed.in_avals}"
-    )
+    jaxpr, structure, how = open_jaxpr(closed), jax.tree.structure(shapes), f"{places} {closed.in_avals}"
+    return function_from_trace(function, jaxpr, constants, places, structure, how)
 
 
 def open_jaxpr(closed: core.ClosedJaxpr, more=(), **changes) -> core.Jaxpr:

@@ -21,8 +21,6 @@ _PIECES = {
     SIGN: "the sign of", FLOOR: "the whole part of", TRUNC: "the whole part of", CLOCK: "samples by",
     TABLE: "a table by",
 }  # fmt: skip
-
-
 _LISTED = 12  # names that a row of an explanation lists
 
 

@@ -54,8 +54,6 @@ _CODES = {
     code_of(getattr(RESULTS, name)): name
     for name in ("nonfinite_state", "dt_min_reached", "max_steps_reached", "acceleration_discontinuous")
 }
-
-
 _OVERSTEPPED = (
     "The state itself is not finite, from the first output on that is NaN: a step of a fixed length does not stop "
     "where the motion does. Leave dt out, and the message says what it runs into."

@@ -19,7 +19,7 @@ from lagjax._engine import DEFAULT_RTOL
 from lagjax._interface import Layout, is_concrete, join_names, not_finite, require_number
 from lagjax._native import ATOL_OVER_MOTION, ATOL_OVER_RTOL
 from lagjax._primitives import accepts_singles
-from lagjax._scene import System, require_system
+from lagjax._scene import ROLES, System, require_system
 from lagjax._trust.checks import (
     _borders_ahead,
     _constraint_checks,
@@ -190,8 +190,8 @@ def _acceleration(scene: CheckedScene) -> list[Finding]:
 
 
 def _time(scene: CheckedScene) -> list[Finding]:
-    functions = [getattr(scene.system, role) for role in _ROLES]
-    timed = tuple(role for role, f in zip(_ROLES, functions, strict=True) if f is not None and "t" in f.extras)
+    functions = {role: getattr(scene.system, role) for role in ROLES}
+    timed = tuple(role for role, f in functions.items() if f is not None and "t" in f.extras)
     if not timed:
         return []
     message = (
@@ -199,6 +199,3 @@ def _time(scene: CheckedScene) -> list[Finding]:
         "at the right ts[0]."
     )
     return [Finding("explicit_time", "advice", timed, message)]
-
-
-_ROLES = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
