@@ -20,14 +20,16 @@ import numpy as np
 
 from lagjax._analysis import Modes
 from lagjax._fit import Fit, Record, draw_record, record_matrix
-from lagjax._interface import Function, Layout, accept, is_known, join_names
+from lagjax._interface import Function, Layout, accept, join_names
 from lagjax._run import Crossings, Trajectory
 from lagjax._show import (
     COLORS,
     course_of,
     courses_of,
     even_places,
+    import_package,
     join_curve,
+    require_numbers,
     require_points,
     simplify_axes,
     times_of_members,
@@ -77,7 +79,7 @@ def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, me
     if layout.size == 1:
         ax.set_ylabel(layout.names[0])
         return ax
-    return _legend(ax, _share(len(shown), layout))
+    return _legend(ax, len(shown), layout)
 
 
 def space_time(trajectory: Trajectory, *, label: str | None = None, cmap: str = "viridis", ax=None):
@@ -131,7 +133,7 @@ def phase(trajectory: Trajectory, *coordinates: str, members: int = 30, ax=None)
         ax.set(xlabel=name, ylabel="qdot" + name.removeprefix("q"))
         return ax
     ax.set(xlabel="coordinate", ylabel="velocity")
-    return _legend(ax, _share(len(places), layout))
+    return _legend(ax, len(places), layout)
 
 
 def _places(layout: Layout, coordinates: tuple[str, ...], most: int = len(COLORS)) -> list[int]:
@@ -489,33 +491,21 @@ def state_map(x, y, values, *, label: str | None = None, cmap: str = "magma", no
 
     >>> lagjax.plot.state_map(th1, th2, flip_time, label="first flip [s]")
     """
-    values = np.asarray(values)
+    values = np.ma.masked_invalid(np.asarray(values))
     if values.shape != (len(y), len(x)):
         raise ValueError(f"values must have shape (len(y), len(x)) = {(len(y), len(x))}; got {values.shape}.")
     ax = _axes(ax)
     ax.grid(False)
-    (left, right), (bottom, top) = _edges(x), _edges(y)
+    colors, extent = _matplotlib().colormaps[cmap].with_extremes(bad="white"), (*_edges(x), *_edges(y))
     image = ax.imshow(
-        np.ma.masked_invalid(values),
-        extent=(left, right, bottom, top),
-        origin="lower",
-        aspect="auto",
-        interpolation="nearest",
-        cmap=_matplotlib().colormaps[cmap].with_extremes(bad="white"),
-        norm=norm,
+        values, extent=extent, origin="lower", aspect="auto", interpolation="nearest", cmap=colors, norm=norm
     )
     _colorbar(image, ax, label)
     return ax
 
 
 def _matplotlib():
-    try:
-        import matplotlib.collections
-        import matplotlib.colors
-        import matplotlib.pyplot
-    except ImportError:
-        raise ImportError("lagjax.plot needs the package matplotlib: pip install lagjax[examples].") from None
-    return matplotlib
+    return import_package("lagjax.plot", "matplotlib", "lagjax[examples]", "collections", "colors", "pyplot")
 
 
 def _axes(ax):
@@ -532,19 +522,15 @@ def _two_rows(figure, columns: int):
     return figure.subplots(2, columns, squeeze=False, sharex="col", gridspec_kw={"height_ratios": [2, 1]})
 
 
-def _legend(ax, title: str | None = None):
+def _legend(ax, shown: int = 0, layout: Layout | None = None):
+    """The axes with a legend, whose title says how many coordinates are `shown` where these are not all."""
+    title = None if layout is None or shown == layout.size else f"{shown} of {layout.size} coordinates"
     ax.legend(frameon=False, title=title)
     return ax
 
 
-def _share(shown: int, layout: Layout) -> str | None:
-    """The sentence that not all coordinates are shown; None where all are."""
-    return None if shown == layout.size else f"{shown} of {layout.size} coordinates"
-
-
 def _colorbar(mappable, ax, label):
-    bar = ax.figure.colorbar(mappable, ax=ax, label=label, pad=0.02)
-    bar.outline.set_visible(False)
+    ax.figure.colorbar(mappable, ax=ax, label=label, pad=0.02).outline.set_visible(False)
 
 
 def _edges(centres) -> tuple[float, float]:
@@ -563,8 +549,7 @@ def _require(value, name: str, kind: type, function: str, more: str = "") -> Non
 def _require_numbers(trajectory, name: str) -> None:
     """Raise for what is no trajectory, and for one that is being traced."""
     _require(trajectory, name, Trajectory, "simulate")
-    if not all(map(is_known, jax.tree.leaves((trajectory.ts, trajectory.q, trajectory.qdot)))):
-        raise ValueError("lagjax.plot draws numbers: call it outside of jit, vmap and grad.")
+    require_numbers(trajectory, "lagjax.plot draws")
 
 
 def _positive(count, name: str) -> int:

@@ -15,10 +15,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._interface import Function, accept, is_known
+from lagjax._interface import Function, accept
 from lagjax._run import Members
 from lagjax._show._course import course_of_member
 from lagjax._show._notebook import COLORS, simplify_axes
+from lagjax._show._summary import import_package, require_numbers
 
 PyTree = Any
 MEMBERS = 50  # that are drawn of a batch, the first ones
@@ -112,12 +113,12 @@ class Animation:
                 "imageio-ffmpeg. A .gif and an .html need none."
             )
         with matplotlib.rc_context({"animation.ffmpeg_path": program}):
-            self._film(self.fps).save(path, writer=matplotlib.animation.FFMpegWriter(fps=self.fps), dpi=_DPI)
+            self._film().save(path, writer=matplotlib.animation.FFMpegWriter(fps=self.fps), dpi=_DPI)
 
     def _page(self) -> str:
         """The film as HTML: a video where ffmpeg is there, else pictures and a few lines of JavaScript."""
         matplotlib, program = _matplotlib(), _ffmpeg()
-        film = self._film(self.fps)
+        film = self._film()
         # Beyond its limit matplotlib leaves frames out, or the whole video.
         with matplotlib.rc_context({"animation.embed_limit": _LARGEST, "savefig.dpi": _DPI}):
             if program is None:
@@ -125,10 +126,10 @@ class Animation:
             with matplotlib.rc_context({"animation.ffmpeg_path": program}):
                 return film.to_html5_video()
 
-    def _film(self, fps: float):
-        figure, show, count = self._figure(fps)
+    def _film(self):
+        figure, show, count = self._figure(self.fps)
         return _matplotlib().animation.FuncAnimation(
-            figure, show, frames=count, init_func=lambda: (), interval=1000 / fps, cache_frame_data=False
+            figure, show, frames=count, init_func=lambda: (), interval=1000 / self.fps, cache_frame_data=False
         )
 
     def _figure(self, fps: float) -> tuple[Any, Callable, int]:
@@ -158,8 +159,7 @@ def make_animation(trajectory, points: Callable, trace, speed: float, fps: float
     for name, value in (("speed", speed), ("fps", fps)):
         if isinstance(value, bool) or np.ndim(value) or not np.isreal(value) or not 0 < value < np.inf:
             raise ValueError(f"{name} must be a positive number; got {value!r}.")
-    if not all(map(is_known, jax.tree.leaves((trajectory.ts, trajectory.q, trajectory.qdot)))):
-        raise ValueError("animate draws numbers: call it outside of jit, vmap and grad.")
+    require_numbers(trajectory, "animate draws")
     function = accept(points, "points", ("q",))
     members = Members(trajectory)
     courses = [course_of_member(members, k) for k in range(min(members.count, MEMBERS))]
@@ -381,11 +381,5 @@ def _ffmpeg() -> str | None:
 
 
 def _matplotlib() -> Any:
-    try:
-        import matplotlib.animation
-        import matplotlib.backends.backend_agg
-        import matplotlib.collections
-        import matplotlib.figure
-    except ImportError:
-        raise ImportError("animate needs the package matplotlib: pip install lagjax[examples].") from None
-    return matplotlib
+    parts = "animation", "backends.backend_agg", "collections", "figure"
+    return import_package("animate", "matplotlib", "lagjax[examples]", *parts)

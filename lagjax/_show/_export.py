@@ -9,16 +9,16 @@ from typing import Any
 import jax
 import numpy as np
 
-from lagjax._interface import Layout, is_known
-from lagjax._show._summary import times_of_members
+from lagjax._interface import Layout
+from lagjax._show._summary import import_package, require_numbers, times_of_members
 
 PyTree = Any
 
 
 def dataset(trajectory, units: PyTree = None, time_unit: str | None = None):
     """An `xarray.Dataset` of a trajectory: see `Trajectory.to_xarray`."""
-    xarray = _package("xarray", "to_xarray()")
-    _require_numbers(trajectory, "to_xarray()")
+    xarray = import_package("to_xarray()", "xarray", "xarray")
+    require_numbers(trajectory, "to_xarray() copies")
     members = _member_axes(trajectory)
     of_q, of_qdot = _units(trajectory.q, units, time_unit)
     variables: dict[str, tuple] = {"ok": (members, np.asarray(trajectory.ok))}
@@ -43,8 +43,8 @@ def dataset(trajectory, units: PyTree = None, time_unit: str | None = None):
 
 def frame(trajectory, units: PyTree = None, time_unit: str | None = None):
     """A `pandas.DataFrame` of a trajectory: see `Trajectory.to_pandas`."""
-    pandas = _package("pandas", "to_pandas()")
-    _require_numbers(trajectory, "to_pandas()")
+    pandas = import_package("to_pandas()", "pandas", "pandas")
+    require_numbers(trajectory, "to_pandas() copies")
     members = _member_axes(trajectory)
     batch, count = np.shape(trajectory.result._value), trajectory.ts.shape[-1]
     each = times_of_members(trajectory)
@@ -78,20 +78,8 @@ def frame(trajectory, units: PyTree = None, time_unit: str | None = None):
 
 def intervals(names, values, low, high):
     """A `pandas.DataFrame` of numbers by name, with the ends of their intervals: see `Fit.to_pandas`."""
-    pandas = _package("pandas", "to_pandas()")
+    pandas = import_package("to_pandas()", "pandas", "pandas")
     return pandas.DataFrame({"value": values, "low": low, "high": high}, index=pandas.Index(names, name="parameter"))
-
-
-def _package(name: str, what: str):
-    try:
-        return __import__(name)
-    except ImportError:
-        raise ImportError(f"{what} needs the package {name}: pip install {name}.") from None
-
-
-def _require_numbers(trajectory, what: str) -> None:
-    if not all(map(is_known, jax.tree.leaves((trajectory.ts, trajectory.q, trajectory.qdot)))):
-        raise ValueError(f"{what} copies numbers: call it outside of jit, vmap and grad.")
 
 
 def _member_axes(trajectory) -> tuple[str, ...]:

@@ -8,6 +8,9 @@ Numbers that have no value yet, inside `jax.jit` or `jax.vmap`, are left out. Th
 `equinox.tree_pprint(trajectory)`.
 """
 
+import importlib
+from typing import Any
+
 import equinox as eqx
 import jax
 import numpy as np
@@ -36,6 +39,22 @@ def times_of_members(trajectory) -> np.ndarray:
     ts, batch = np.asarray(trajectory.ts), np.shape(trajectory.result._value)
     inner = (1,) * (len(batch) + 1 - ts.ndim)  # `simulate_batch` shares its times within each batch
     return np.broadcast_to(ts.reshape(*ts.shape[:-1], *inner, ts.shape[-1]), (*batch, ts.shape[-1]))
+
+
+def require_numbers(trajectory, what: str) -> None:
+    """Raise `ValueError` for a trajectory that is being traced; `what` says who does what with its numbers."""
+    if not all(map(is_known, jax.tree.leaves((trajectory.ts, trajectory.q, trajectory.qdot)))):
+        raise ValueError(f"{what} numbers: call it outside of jit, vmap and grad.")
+
+
+def import_package(what: str, name: str, source: str, *parts: str) -> Any:
+    """The package `name` with these submodules; raise `ImportError`, with its `source` for pip, where it is missing."""
+    try:
+        for part in parts:
+            importlib.import_module(f"{name}.{part}")
+        return importlib.import_module(name)
+    except ImportError:
+        raise ImportError(f"{what} needs the package {name}: pip install {source}.") from None
 
 
 def _contents(trajectory) -> str:
