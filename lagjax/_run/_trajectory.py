@@ -278,7 +278,7 @@ class Trajectory(eqx.Module):
         total = None
         for index, which in enumerate(self.mode_names):
             # Laws of another mode may be singular here: their NaN must not reach a derivative.
-            state = jax.tree.map(lambda x, here=mode == index: _varied_where(here, x), (q, qdot, t, params))
+            state = constant_unless(mode == index, (q, qdot, t, params))
             value = getattr(self.system[which], name)(*state)
             total = jax.tree.map(lambda x: jnp.full_like(x, jnp.nan), value) if total is None else total
             total = jax.tree.map(lambda new, old, here=mode == index: jnp.where(here, new, old), value, total)
@@ -299,5 +299,13 @@ def _require_like_constraints(modes: dict[str, System], name: str, q, qdot, para
         )
 
 
-def _varied_where(here, x):
-    return jnp.where(here, x, jax.lax.stop_gradient(x)) if eqx.is_array_like(x) else x
+def constant_unless(varies, tree: PyTree) -> PyTree:
+    """The numbers of a pytree, without derivatives unless `varies` holds."""
+
+    def constant(x):
+        if not eqx.is_array_like(x):
+            return x
+        still = jax.lax.stop_gradient(x)
+        return still if varies is False else jnp.where(varies, x, still)
+
+    return jax.tree.map(constant, tree)

@@ -23,7 +23,6 @@ import numpy as np
 from lagjax._engine import Problem, Solution
 from lagjax._engine.taylor import (
     Guarded,
-    Guards,
     MachineCode,
     Surfaces,
     crossing_variation,
@@ -143,7 +142,7 @@ class Mode(NamedTuple):
                 raise Unlowerable(refusal)
             surfaces = _surfaces(problem.derivation, problem.system, leaving, tuple(code), structure)
             surfaces = surfaces and surfaces._replace(is_rounded=problem.is_rounded)
-            guarded = dataclasses.replace(problem, guards=_watched_guards(surfaces))
+            guarded = dataclasses.replace(problem, guards=surfaces and surfaces.guards(remembers=True))
             if refusal := MachineCode().refuses(guarded):
                 raise Unlowerable(refusal)
         except Unlowerable as why:
@@ -177,7 +176,8 @@ class Mode(NamedTuple):
 
         Where it begins on a surface it comes from that one of the `sides` (see `_native.Guards`).
         """
-        guarded = dataclasses.replace(self.problem, ts=ts, y0=y0, guards=_watched_guards(self.surfaces))
+        guards = self.surfaces and self.surfaces.guards(remembers=True)
+        guarded = dataclasses.replace(self.problem, ts=ts, y0=y0, guards=guards)
         return MachineCode().solve_to_event(guarded, sides)
 
     # ---- through a transition ----
@@ -207,11 +207,6 @@ class Mode(NamedTuple):
         return motion.constraints.inconsistent(motion.mass_matrix(*state), *state, jnp.inf, dtype, terms)
 
 
-def _watched_guards(surfaces: Surfaces | None) -> Guards | None:
-    """Surfaces as machine code watches them along a mode."""
-    return None if surfaces is None else surfaces.guards(remembers=True)
-
-
 @functools.lru_cache(maxsize=64)
 def _surfaces(
     derivation: Derivation, system: System, leaving: tuple[Transition, ...], code: tuple, structure
@@ -223,29 +218,23 @@ def _surfaces(
     if not leaving:
         return None
     layout, multipliers = derivation.layout, derivation.multipliers
-    n = layout.size
 
-    def extras(y, params):
-        if multipliers is None:
-            return {}
-        flat = jnp.stack(multipliers.compute_outputs(y, vector_of(eqx.filter(params, eqx.is_array_like))))
-        return {"multipliers": system._split_by_constraint(flat, layout, params)}
+    def value(guard: Function):
+        if "multipliers" in guard.extras and multipliers is None:
+            raise ValueError("A guard asks for `multipliers`, but its mode has no constraints.")
 
-    def value(guard):
-        return lambda y, params: _value(
-            guard, layout.restore(y[:n]), layout.restore(y[n:-1]), {"t": y[-1], "params": params} | extras(y, params)
-        )
+        def value_at(y, params):
+            extras = {"t": y[-1], "params": params}
+            if multipliers is not None:
+                flat = jnp.stack(multipliers.compute_outputs(y, vector_of(eqx.filter(params, eqx.is_array_like))))
+                extras["multipliers"] = system._split_by_constraint(flat, layout, params)
+            return require_one_number(guard(*map(layout.restore, halves(y[:-1])), **extras), "A guard")
+
+        return value_at
 
     functions = [value(transition.guard) for transition in leaving]
     directions = tuple(transition.direction for transition in leaving)
     return Surfaces.from_functions(derivation, functions, directions, code, structure)
-
-
-def _value(guard: Function, q, qdot, extras) -> jax.Array:
-    """The value of a guard, after checking that it is one real number."""
-    if "multipliers" in guard.extras and "multipliers" not in extras:
-        raise ValueError("A guard asks for `multipliers`, but its mode has no constraints.")
-    return require_one_number(guard(q, qdot, **extras), "A guard")
 
 
 def state_after(transition: Transition, layout: Layout, t, y, params) -> jax.Array:

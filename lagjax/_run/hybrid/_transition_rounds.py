@@ -19,6 +19,7 @@ from lagjax._engine.taylor import Guarded, vector_of
 from lagjax._interface import RESULTS, SUCCESSFUL, Layout, code_of
 from lagjax._native import SINGLE_NOISE
 from lagjax._primitives import lost_unless
+from lagjax._run._trajectory import constant_unless
 from lagjax._run.hybrid._mode import Mode, Transition, state_after
 from lagjax._run.hybrid._mode_families import SystemFamily, families
 from lagjax._scene import Lifted, System
@@ -298,7 +299,7 @@ class _Rounds(NamedTuple):
             return none, self.no_memory(known[0].rounding, known[0].rate_rounding)
         happens, k = (kinds > 0).any(), jnp.argmax(kinds > 0)
         first, places = np.arange(len(mode.leaving)) == k, self._places_of(mode)
-        y_here, vector = _constant_unless(happens, (y, mode.vector))
+        y_here, vector = constant_unless(happens, (y, mode.vector))
         guarded = mode.guards_at(t, y, self.ts[-1])
         rates = guarded.clear_rates(_pick(known[0].rate_rounding, places))
         # It changes sign at once, against its rate: the motion that turns it round is lost in rounding.
@@ -310,7 +311,7 @@ class _Rounds(NamedTuple):
         for j, transition in enumerate(mode.leaving):
             if transition.reset is not None:
                 taken = happens & (k == j)
-                moved = state_after(transition, mode.layout, *_constant_unless(taken, (t_zero, y_zero, mode.params)))
+                moved = state_after(transition, mode.layout, *constant_unless(taken, (t_zero, y_zero, mode.params)))
                 y_next = jnp.where(taken, moved, y_next)
         target, number = (
             jnp.where(happens, _pick(jnp.asarray(x), first), other)
@@ -333,7 +334,7 @@ class _Rounds(NamedTuple):
         if some.size < 2:
             return jnp.asarray(False)
         # A loop that closes over numbers that vary cannot be transposed.
-        t, y, params, vector, latest = _constant_unless(False, (t, y, mode.params, mode.vector, self.ts[-1]))
+        t, y, params, vector, latest = constant_unless(False, (t, y, mode.params, mode.vector, self.ts[-1]))
         mode = mode._replace(vector=vector)
         there = (there & (mode.targets == place))[some]
         resets = [functools.partial(state_after, mode.leaving[k], mode.layout, t, params=params) for k in some]
@@ -444,7 +445,7 @@ class _Rounds(NamedTuple):
         are_blows = jnp.zeros(len(mode.leaving), bool)
         if not some.size:
             return are_blows
-        t, y, params = _constant_unless(False, (before.t, before.y, mode.params))
+        t, y, params = constant_unless(False, (before.t, before.y, mode.params))
         states = jnp.stack([state_after(mode.leaving[k], mode.layout, t, y, params) for k in some])
         after = jax.vmap(mode.guards_at, (None, 0, None))(t, states, self.ts[-1])
         after = jax.tree.map(lambda x: x[np.arange(some.size), some], after)
@@ -490,18 +491,6 @@ def _pick(x: jax.Array, places) -> jax.Array:
 def _put(x: jax.Array, places, values: jax.Array) -> jax.Array:
     """x (K,) with these values (k,) at their places (k, K)."""
     return jnp.where(places.any(0), _pick(values, places.T), x)
-
-
-def _constant_unless(varies, tree: PyTree) -> PyTree:
-    """The numbers of a pytree, without derivatives unless `varies` holds."""
-
-    def constant(x):
-        if not eqx.is_array_like(x):
-            return x
-        still = jax.lax.stop_gradient(x)
-        return still if varies is False else jnp.where(varies, x, still)
-
-    return jax.tree.map(constant, tree)
 
 
 def _pile_up(times, end) -> jax.Array:
