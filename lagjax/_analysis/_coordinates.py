@@ -4,6 +4,7 @@ With q = q(Q, t), q̇ = (∂q/∂Q) Q̇ + ∂q/∂t, L is a function of (Q, Q̇,
 for every set of coordinates. Forces become (∂q/∂Q)ᵀ F, so that they do the same work.
 """
 
+import inspect
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -33,7 +34,6 @@ class ChangedCoordinates(NamedTuple):
     new_from_old: Callable
 
     def __repr__(self) -> str:
-        """Three lines: the scene, and the ways of states with their arguments."""
         return (
             f"ChangedCoordinates: system {self.system!r}\n"
             "old_from_new(Q, Qdot, t, params) for states in the old coordinates\n"
@@ -68,7 +68,7 @@ def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordin
     system = require_system(system)
     place = accept(old_from_new, "old_from_new", ("Q",))
 
-    def old_state(Q, Qdot, t, params):
+    def old_state(Q, Qdot, t: Any = 0.0, params=None):
         Q, Qdot, t = jax.tree.map(lambda x: jnp.asarray(x, float), (Q, Qdot, t))
         return jax.jvp(lambda Q, t: present(place)(Q, t=t, params=params), (Q, t), (Qdot, jnp.ones_like(t)))
 
@@ -98,13 +98,10 @@ def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordin
         path=system.path,  # pyright: ignore[reportArgumentType]
     )
 
-    def to_old(Q, Qdot, t=0.0, params=None):
-        return old_state(Q, Qdot, t, params)
-
     def to_new(q, qdot, guess, t=0.0, params=None):
         return _new_state(present(place), q, qdot, guess, t, params)
 
-    return ChangedCoordinates(changed, to_old, to_new)
+    return ChangedCoordinates(changed, old_state, to_new)
 
 
 def restrict_signature(function: Callable, extras: set[str], roles: int = 2) -> Callable:
@@ -112,21 +109,14 @@ def restrict_signature(function: Callable, extras: set[str], roles: int = 2) -> 
 
     A function without `t` in its signature is known not to depend on the time.
     """
-    if roles == 1:
-        forms = {
-            (False, False): lambda q: function(q, 0.0, None),
-            (True, False): lambda q, t: function(q, t, None),
-            (False, True): lambda q, params: function(q, 0.0, params),
-            (True, True): lambda q, t, params: function(q, t, params),
-        }
-    else:
-        forms = {
-            (False, False): lambda q, qdot: function(q, qdot, 0.0, None),
-            (True, False): lambda q, qdot, t: function(q, qdot, t, None),
-            (False, True): lambda q, qdot, params: function(q, qdot, 0.0, params),
-            (True, True): lambda q, qdot, t, params: function(q, qdot, t, params),
-        }
-    return forms["t" in extras, "params" in extras]
+
+    def restricted(*state, t=0.0, params=None):
+        return function(*state, t, params)
+
+    names = *("q", "qdot")[:roles], *(name for name in ("t", "params") if name in extras)
+    parameters = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in names]
+    restricted.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
+    return restricted
 
 
 def _new_state(place: Function, q: PyTree, qdot: PyTree, guess: PyTree, t, params: PyTree) -> tuple[PyTree, PyTree]:

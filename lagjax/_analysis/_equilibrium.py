@@ -146,7 +146,10 @@ def _solve_balance(has_terms: bool, *arguments) -> tuple[Vector, Array, Bool[Arr
     def residual(z: Unknowns) -> Unknowns:
         return balance(scene, z[:n], z[n:])
 
-    start = jax.lax.stop_gradient(jnp.concatenate([scene.q, least_multipliers(scene, scene.q)]))
+    def multipliers_at(q: Vector) -> Array:
+        return least_multipliers(scene.jacobian(q, scene.qdot), scene.force(q, scene.qdot))
+
+    start = jax.lax.stop_gradient(jnp.concatenate([scene.q, multipliers_at(scene.q)]))
     unit = _units(jax.lax.stop_gradient(scene.mass_matrix(scene.q, scene.qdot)), jax.jacfwd(residual)(start))
 
     # A multiplier that is nothing beside the others is rounding.
@@ -164,8 +167,7 @@ def _solve_balance(has_terms: bool, *arguments) -> tuple[Vector, Array, Bool[Arr
         at = jax.lax.stop_gradient(q), scene.qdot, jnp.zeros((), q.dtype), scene.numbers
         terms = ROUNDINGS * jnp.finfo(q.dtype).eps ** 0.5 * scene.derivation.term_sizes(*at, ("force", "residual"))
     ok = is_root(residual, jax.lax.stop_gradient(z), terms, least=least, power=0.5)
-    multipliers = least_multipliers(scene, q)
-    return nan_unless(ok, q), nan_unless(ok, multipliers), ok
+    return nan_unless(ok, q), nan_unless(ok, multipliers_at(q)), ok
 
 
 def _units(mass: Float[Array, "n n"], jacobian: Float[Array, "n+m n+m"]) -> Unknowns:
@@ -188,12 +190,9 @@ def balance(scene: SceneState, q: Vector, multipliers: Array) -> Unknowns:
     return jnp.concatenate([force + jacobian.T @ multipliers, rows])
 
 
-def least_multipliers(scene: SceneState, q: Vector) -> Array:
+def least_multipliers(jacobian: Float[Array, "m n"], force: Vector) -> Array:
     """λ (m,) that leave the smallest force F + Gᵀλ; of least norm where constraints are redundant."""
-    if not scene.constrained:
-        return jnp.zeros(0, q.dtype)
-    jacobian = scene.jacobian(q, scene.qdot)
-    return -least_norm(jacobian @ jacobian.T, jacobian @ scene.force(q, scene.qdot))
+    return -least_norm(jacobian @ jacobian.T, jacobian @ force) if len(jacobian) else jnp.zeros(0, force.dtype)
 
 
 def _sentence(scene: SceneState) -> str:

@@ -53,7 +53,6 @@ class Hamiltonian(NamedTuple):
     simulate: Callable
 
     def __repr__(self) -> str:
-        """Three lines: the scene, and the functions with their arguments."""
         return (
             f"Hamiltonian of {self.system!r}\n"
             "energy, velocity and equations of (q, p, t, params), momentum of (q, qdot, t, params)\n"
@@ -84,9 +83,6 @@ def hamiltonian(system: System) -> Hamiltonian:
     if has_constraints(system):
         raise ValueError("hamiltonian takes systems without constraints: give L in coordinates that satisfy them.")
 
-    def momentum(q, qdot, t: Any = 0.0, params=None):
-        return system.momentum(q, qdot, t, params)
-
     def velocity(q, p, t: Any = 0.0, params=None):
         return _transform(system, q, p, t, params)[0]
 
@@ -98,10 +94,10 @@ def hamiltonian(system: System) -> Hamiltonian:
 
     def run(q0, p0, ts, params=None, **options):
         done = simulate(system, q0, velocity(q0, p0, jnp.asarray(ts)[0], params), ts, params, **options)
-        p = jax.vmap(lambda q, qdot, t: momentum(q, qdot, t, params))(done.q, done.qdot, done.ts)
+        p = jax.vmap(lambda q, qdot, t: system.momentum(q, qdot, t, params))(done.q, done.qdot, done.ts)
         return CanonicalTrajectory(done.ts, done.q, p, done.ok)
 
-    return Hamiltonian(system, energy, momentum, velocity, equations, run)
+    return Hamiltonian(system, energy, system.momentum, velocity, equations, run)
 
 
 def _transform(system: System, q: PyTree, p: PyTree, t, params: PyTree) -> tuple[PyTree, PyTree, Array]:

@@ -7,9 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lagjax._analysis._equilibrium import least_multipliers
 from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._smoothness import is_smooth, require_smooth
-from lagjax._equations import diagonal_scale, factorize, least_norm, saddle
+from lagjax._equations import diagonal_scale, factorize, saddle
 from lagjax._interface import compile_for_one_call, is_known, show_str
 from lagjax._primitives import accepts_singles, nan_unless
 from lagjax._scene import System
@@ -42,7 +43,6 @@ class Linearization(NamedTuple):
     _repr_pretty_ = show_str
 
     def __str__(self) -> str:
-        """An equation for each of the first coordinates; the shapes of many states."""
         if not is_known(self.A) or np.ndim(self.A) != 2:
             return f"Linearization: A {np.shape(self.A)}, B {np.shape(self.B)}"
         n, more = len(self.names), len(self.names) - _SHOWN
@@ -117,12 +117,9 @@ def _linearize(*arguments) -> tuple:
 
 
 def steady_matrices(scene: SceneState, q: Vector) -> tuple[Matrix, Matrix, Matrix, Array, Vector]:
-    """`matrices` at an equilibrium, where q̈ is zero whatever M is, and what is left of the forces there (n,)."""
-    jacobian = scene.jacobian(q, scene.qdot)
-    force = scene.force(q, scene.qdot)
-    multipliers = jnp.zeros(0, q.dtype)
-    if scene.constrained:
-        multipliers = -least_norm(jacobian @ jacobian.T, jacobian @ force)
+    """M, C + G, K and J at an equilibrium, where q̈ is zero whatever M is, and what is left of the forces there (n,)."""
+    jacobian, force = scene.jacobian(q, scene.qdot), scene.force(q, scene.qdot)
+    multipliers = least_multipliers(jacobian, force)
 
     def balance(q, qdot):
         return scene.force(q, qdot) + scene.jacobian(q, qdot).T @ multipliers

@@ -47,7 +47,6 @@ class SameMotion(NamedTuple):
     _repr_pretty_ = show_str
 
     def __str__(self) -> str:
-        """The verdict, the factor and what is left, in a sentence."""
         left = f"{self.residual:.1g} of the terms are left, and {self.threshold:.1g} may be rounding"
         if self.same:
             return f"The same motions: E_a = {self.factor:.9g} E_b; {left}."

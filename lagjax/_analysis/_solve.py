@@ -26,12 +26,27 @@ def shortest_solution(matrix: Matrix, b: Vector, unit: Vector | float = 1.0) -> 
     """
     matrix = matrix * unit
     rows, columns = (jax.lax.stop_gradient(scale) for scale in _scales(matrix))
-    inverse, singular = _inverse(jax.lax.stop_gradient(rows[:, None] * matrix * columns))
+    inverse, order, pivots = invert(jax.lax.stop_gradient(rows[:, None] * matrix * columns))
+    inverse, sizes = jnp.zeros_like(inverse).at[:, order].set(inverse), jnp.abs(pivots)
+    singular = jnp.min(sizes) <= singular_threshold(len(matrix), matrix.dtype) * jnp.max(sizes)
+
+    def refine(a, inverse, b):
+        x = inverse @ b
+        return x + inverse @ (b - a @ x)
 
     def regular(matrix, b):
-        return columns * _regular(rows[:, None] * matrix * columns, rows * b, inverse)
+        a = rows[:, None] * matrix * columns
+        return columns * jax.lax.custom_linear_solve(
+            lambda x: a @ x,
+            rows * b,
+            lambda _, b: refine(a, inverse, b),
+            transpose_solve=lambda _, b: refine(a.T, inverse.T, b),
+        )
 
-    return unit * jax.lax.cond(singular, _shortest, regular, matrix, b)
+    def shortest(matrix, b):
+        return matrix.T @ least_norm(matrix @ matrix.T, b)
+
+    return unit * jax.lax.cond(singular, shortest, regular, matrix, b)
 
 
 def shortest_preimage(linear: Callable[[Vector], Vector], right: Vector, unit: Vector | float = 1.0) -> Vector:
@@ -155,27 +170,3 @@ def _scales(matrix: Matrix) -> tuple[Vector, Vector]:
 
 def _reciprocal(size: Vector) -> Vector:
     return jnp.where(size > 0, 1 / jnp.where(size > 0, size, 1), 1)
-
-
-def _inverse(matrix: Matrix) -> tuple[Matrix, Bool[Array, ""]]:
-    inverse, order, pivots = invert(matrix)
-    sizes, n = jnp.abs(pivots), len(matrix)
-    singular = jnp.min(sizes) <= singular_threshold(n, matrix.dtype) * jnp.max(sizes)
-    return jnp.zeros_like(matrix).at[:, order].set(inverse), singular
-
-
-def _regular(matrix: Matrix, b: Vector, inverse: Matrix) -> Vector:
-    def refine(a, inverse, b):
-        x = inverse @ b
-        return x + inverse @ (b - a @ x)
-
-    return jax.lax.custom_linear_solve(
-        lambda x: matrix @ x,
-        b,
-        lambda _, b: refine(matrix, inverse, b),
-        transpose_solve=lambda _, b: refine(matrix.T, inverse.T, b),
-    )
-
-
-def _shortest(matrix: Matrix, b: Vector) -> Vector:
-    return matrix.T @ least_norm(matrix @ matrix.T, b)

@@ -70,7 +70,6 @@ class Conserved(NamedTuple):
         return trajectory.map_members(member_drift)
 
     def __repr__(self) -> str:
-        """The name of the charge, and whether it has a gauge term; its functions print nothing."""
         return f"Conserved({self.name!r}{'' if self.gauge is None else ', with a gauge term'})"
 
 
@@ -306,9 +305,8 @@ def _echelon_form(rows: np.ndarray) -> np.ndarray:
     for k in range(len(rows)):
         pivot = int(np.argmax(np.abs(rows[k])))
         rows[k] /= rows[k, pivot]
-        for j in range(len(rows)):
-            if j != k:
-                rows[j] -= rows[j, pivot] * rows[k]
+        others = np.arange(len(rows)) != k
+        rows[others] -= np.outer(rows[others, pivot], rows[k])
     rows[np.abs(rows) < 1e-9] = 0
     return rows
 

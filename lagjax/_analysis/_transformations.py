@@ -6,9 +6,11 @@ For few coordinates every matrix A is tried; for many only those that a leaf of 
 the planes of its last axis and its scaling, for each leaf. A symmetry is any combination of them.
 """
 
+import itertools
 from collections.abc import Callable
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -18,7 +20,7 @@ from lagjax._interface import Layout
 _ALL_MAPS = 12
 
 # Leaves whose last axis is so long are vectors, which can be rotated.
-_SPACE = (2, 3)
+_SPACE = (2,), (3,)
 
 
 class Fields(NamedTuple):
@@ -43,14 +45,8 @@ class Fields(NamedTuple):
         """Split weights (K,) by kind: time (), translations (n,), boosts (n,), maps (M,), time scale (), own (U,)."""
         n, m = len(self.scale), len(self.maps)
         first, last = 1 + 2 * n, 1 + 2 * n + m
-        return (
-            weights[0],
-            weights[1 : n + 1],
-            weights[n + 1 : first],
-            weights[first:last],
-            weights[last],
-            weights[last + 1 :],
-        )
+        shift, drift = weights[1:first].reshape(2, n)
+        return weights[0], shift, drift, weights[first:last], weights[last], weights[last + 1 :]
 
     def transform(self, weights, params) -> Callable:
         """The combination of all with these weights (K,), a function (q, t) → (ξ, τ)."""
@@ -95,29 +91,23 @@ def fields_of(layout: Layout, scale: np.ndarray, time: float, own: dict[str, Cal
 
 
 def _maps(layout: Layout, scale: np.ndarray) -> list[tuple[str, np.ndarray]]:
-    n, names = layout.size, layout.names
+    n, one, names = layout.size, np.eye(layout.size), layout.names
     if n <= _ALL_MAPS:
-        maps = []
-        for i in range(n):
-            for j in range(n):
-                a = np.zeros((n, n))
-                a[i, j] = scale[i] / scale[j]
-                maps.append((f"d{names[i]} = {names[j]}", a))
-        return maps
+        pairs = np.ndindex(n, n)
+        return [(f"d{names[i]} = {names[j]}", scale[i] / scale[j] * np.outer(one[i], one[j])) for i, j in pairs]
     # Rotations of each leaf in every plane of its last axis, and its scaling.
-    maps, begin = [], 0
-    for path, shape in zip(layout.paths, layout.shapes, strict=True):
-        size = int(np.prod(shape, dtype=int))
-        place = np.arange(begin, begin + size)
+    maps = []
+    for path, place in zip(layout.paths, _leaf_places(layout), strict=True):
         maps.append((f"scaling of {path}", np.diag(np.isin(np.arange(n), place).astype(float))))
-        if shape and shape[-1] in _SPACE:
-            vectors = place.reshape(-1, shape[-1])
-            for i in range(shape[-1]):
-                for j in range(i + 1, shape[-1]):
-                    rotation = _rotation(n, vectors[:, i], vectors[:, j])
-                    maps.append((f"rotation in the plane {i}{j} of {path}", rotation))
-        begin += size
+        if place.shape[-1:] in _SPACE:
+            for i, j in itertools.combinations(range(place.shape[-1]), 2):
+                maps.append((f"rotation in the plane {i}{j} of {path}", _rotation(n, place[..., i], place[..., j])))
     return maps
+
+
+def _leaf_places(layout: Layout) -> list[np.ndarray]:
+    """The places of coordinates in the flat vector, in the shape of each leaf."""
+    return jax.tree.leaves(layout.restore(np.arange(layout.size)))
 
 
 # ---- those that have a name in textbooks -----------------------------------------------------------------------------
@@ -147,12 +137,10 @@ def textbook_symmetries(layout: Layout, fields: Fields) -> list[tuple[str, np.nd
 
 def _axes(layout: Layout) -> dict[int, np.ndarray]:
     """The vectors of all leaves whose last axis is 2 or 3 long, places (vectors, d), by d."""
-    vectors, begin = {}, 0
-    for shape in layout.shapes:
-        size = int(np.prod(shape, dtype=int))
-        if shape and shape[-1] in _SPACE:
-            vectors.setdefault(shape[-1], []).append(np.arange(begin, begin + size).reshape(-1, shape[-1]))
-        begin += size
+    vectors = {}
+    for place in _leaf_places(layout):
+        if place.shape[-1:] in _SPACE:
+            vectors.setdefault(place.shape[-1], []).append(place.reshape(-1, place.shape[-1]))
     return {d: np.concatenate(parts) for d, parts in vectors.items()}
 
 
@@ -160,13 +148,11 @@ def _rotations(layout: Layout, axes: dict[int, np.ndarray]) -> list[tuple[str, n
     """Rotations of all vectors together; of two coordinates that are numbers where there are few."""
     n, rotations = layout.size, []
     for d, vectors in axes.items():
-        for i in range(d):
-            for j in range(i + 1, d):
-                rotations.append((f"in the plane {i}{j}", _rotation(n, vectors[:, i], vectors[:, j])))
+        for i, j in itertools.combinations(range(d), 2):
+            rotations.append((f"in the plane {i}{j}", _rotation(n, vectors[:, i], vectors[:, j])))
     if n <= _ALL_MAPS:
-        for i in range(n):
-            for j in range(i + 1, n):
-                rotations.append((f"of {layout.names[i]}, {layout.names[j]}", _rotation(n, i, j)))
+        for i, j in itertools.combinations(range(n), 2):
+            rotations.append((f"of {layout.names[i]}, {layout.names[j]}", _rotation(n, i, j)))
     return rotations
 
 

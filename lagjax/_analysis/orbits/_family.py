@@ -66,7 +66,6 @@ class Family(NamedTuple):
     message: str
 
     def __repr__(self) -> str:
-        """Three lines: how many orbits and between which values, what happens on the way, and why it ends."""
         count, periods = len(self.value), np.asarray(self.period)
         first = f"Family of {count} orbits, {int(np.sum(self.stable))} of them stable"
         span = f"from {float(self.value[0]):.9g} to {float(self.value[-1]):.9g}" if count else "empty"

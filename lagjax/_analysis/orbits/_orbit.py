@@ -55,7 +55,6 @@ class Orbit(NamedTuple):
     message: str | tuple[str, ...]
 
     def __repr__(self) -> str:
-        """Three lines: what it holds, its period and multipliers, and how well it closes."""
         return "\n".join(_lines(self))
 
 

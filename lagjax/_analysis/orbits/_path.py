@@ -58,7 +58,6 @@ class Path(NamedTuple):
     message: str
 
     def __repr__(self) -> str:
-        """Two lines: its action and what kind of extremum that is, and how well it joins; or why there is none."""
         if not self.ok:
             return f"Path: none was found. {self.message}"
         kind = "a minimum" if self.minimum else f"a saddle of index {self.index}"

@@ -74,10 +74,6 @@ class Closing(NamedTuple):
             target[:, -1] = np.concatenate([self.q_end / of_state[:, :n], end[:, -1, n:]], axis=1)
         return target
 
-    def images(self, y: np.ndarray) -> np.ndarray:
-        """S y for rows (R, 2n)."""
-        return y @ self.matrix.T + self.shift
-
     def conditions(self, y0: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """The error of the energy of first states (B, 2n), (B, m), and its slopes (B, m, 2n); m is 0 or 1."""
         if self.energy is None:
@@ -156,7 +152,7 @@ def guesses(closing: Closing, y0: np.ndarray, period: np.ndarray, count: int) ->
     if arcs.driven:
         parts = arcs.equal_shares(period, y0, count)
         return parts, arcs.ends(period[:, None] * parts, y0).path[:, :count]
-    half, images = count // 2, closing.images(y0)
+    half, images = count // 2, y0 @ closing.matrix.T + closing.shift
     ahead, back = arcs.equal_shares(period / 2, y0, half), arcs.equal_shares(-period / 2, images, half)
     first = arcs.ends(period[:, None] / 2 * ahead, y0).path
     second = arcs.ends(-period[:, None] / 2 * back, images).path
