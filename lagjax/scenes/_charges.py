@@ -130,11 +130,9 @@ def relativistic_charge_in_electric_field() -> Scene:
 
     >>> scene = lagjax.scenes.relativistic_charge_in_electric_field()
     """
+    system, rest = System(_relativistic_lagrangian), np.zeros(3)
     params = {"m": 1.0, "e": 1.0, "c": 1.0, "E": np.array([3.0, 0.0, 0.0]), "B": np.zeros(3)}
-    q0, qdot0 = np.zeros(3), np.zeros(3)
-    return conservative_scene(
-        System(_relativistic_lagrangian), params, q0, qdot0, duration=10.0, exact=_relativistic_electric_exact
-    )
+    return conservative_scene(system, params, rest, rest, duration=10.0, exact=_relativistic_electric_exact)
 
 
 def _relativistic_magnetic_exact(t, q0, qdot0, params):

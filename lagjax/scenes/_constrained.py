@@ -61,10 +61,8 @@ def rolling_cylinder_multipliers(theta1, theta1_start, params):
     >>> lagjax.scenes.rolling_cylinder_multipliers(0.5, 0.3, lagjax.scenes.rolling_cylinder().params)
     """
     alpha, weight = params["alpha"], params["M"] * params["g"]
-    return {
-        "contact": weight / (1 + alpha) * ((3 + alpha) * jnp.cos(theta1) - 2 * jnp.cos(theta1_start)),
-        "rolling": -alpha / (1 + alpha) * weight * jnp.sin(theta1),
-    }
+    contact = weight / (1 + alpha) * ((3 + alpha) * jnp.cos(theta1) - 2 * jnp.cos(theta1_start))
+    return {"contact": contact, "rolling": -alpha / (1 + alpha) * weight * jnp.sin(theta1)}
 
 
 def rolling_cylinder() -> Scene:
@@ -132,19 +130,15 @@ def cartesian_pendulum() -> Scene:
 
     >>> scene = lagjax.scenes.cartesian_pendulum(); scene.exact(1.0, scene.q0, scene.qdot0, scene.params)
     """
-    params = {"m": 1.0, "l": 1.0, "g": 9.81}
+    system, params = System(_masses_lagrangian, constraints=_rod), {"m": 1.0, "l": 1.0, "g": 9.81}
     q0, qdot0 = np.array([-1.0, 0.0]), np.array([0.0, 0.0])
-    return conservative_scene(
-        System(_masses_lagrangian, constraints=_rod), params, q0, qdot0, duration=10.0, exact=_cartesian_pendulum_exact
-    )
+    return conservative_scene(system, params, q0, qdot0, duration=10.0, exact=_cartesian_pendulum_exact)
 
 
 def _chain_at_rest(theta, params, constraints) -> Scene:
-    length = np.asarray(params["l"])
-    q0 = np.cumsum(length * np.array([np.sin(theta), -np.cos(theta)]), axis=1).T
-    return conservative_scene(
-        System(_masses_lagrangian, constraints=constraints), params, q0, qdot0=np.zeros_like(q0), duration=2.0
-    )
+    system = System(_masses_lagrangian, constraints=constraints)
+    q0 = np.cumsum(params["l"] * np.array([np.sin(theta), -np.cos(theta)]), axis=1).T
+    return conservative_scene(system, params, q0, np.zeros_like(q0), duration=2.0)
 
 
 def cartesian_double_pendulum() -> Scene:
@@ -206,10 +200,8 @@ def bead_on_wire(shape=parabola, *, params=None, x0=1.0) -> Scene:
     >>> scene = bead_on_wire(lambda x, params: jnp.cosh(x), params={"m": 1.0, "g": 9.81})
     """
     params = {"m": 1.0, "g": 9.81, "k": 1.5} if params is None else params
-    q0 = np.array([x0, float(shape(x0, params))])
-    return conservative_scene(
-        System(_masses_lagrangian, constraints=_Wire(shape)), params, q0, qdot0=np.zeros(2), duration=5.0
-    )
+    system, q0 = System(_masses_lagrangian, constraints=_Wire(shape)), np.array([x0, float(shape(x0, params))])
+    return conservative_scene(system, params, q0, np.zeros(2), duration=5.0)
 
 
 def _sphere(q, params):
@@ -222,10 +214,8 @@ def _particle_on_sphere_exact(t, q0, qdot0, params):
     angle, rate = _pendulum_exact(t, jnp.arctan2(rho, q0.z) - jnp.pi, 0.0, {"g": params["g"], "l": R})
     across, height = -R * jnp.sin(angle) / rho, -R * jnp.cos(angle)
     across_dot, height_dot = -R * jnp.cos(angle) * rate / rho, R * jnp.sin(angle) * rate
-    return (
-        Cartesian(q0.x * across, q0.y * across, height),
-        Cartesian(q0.x * across_dot, q0.y * across_dot, height_dot),
-    )
+    q = Cartesian(q0.x * across, q0.y * across, height)
+    return q, Cartesian(q0.x * across_dot, q0.y * across_dot, height_dot)
 
 
 def particle_on_sphere() -> Scene:
@@ -299,10 +289,6 @@ def _rolling_disc_exact(t, q0, qdot0, params):
     return q, Disc(R * spin * jnp.cos(phi), R * spin * jnp.sin(phi), qdot0.phi, spin)
 
 
-def _turning_rate(q, qdot, t, params):
-    return qdot.phi
-
-
 def rolling_disc(slope=0.3) -> Scene:
     """An upright disc that rolls without slipping on a plane tilted by `slope`; coordinates `Disc(x, y, phi, psi)`,
 
@@ -318,7 +304,7 @@ def rolling_disc(slope=0.3) -> Scene:
     system = System(_rolling_disc_lagrangian, velocity_constraints=_rolling_without_slipping)
     params = {"m": m, "R": R, "I": 0.5 * m * R**2, "J": 0.25 * m * R**2, "g": 9.81, "slope": slope}
     q0, qdot0 = Disc(0.0, 0.0, phi, 0.0), Disc(R * spin * np.cos(phi), R * spin * np.sin(phi), 1.3, spin)
-    more = {"turning rate": _turning_rate}
+    more = {"turning rate": lambda q, qdot, t, params: qdot.phi}
     return conservative_scene(system, params, q0, qdot0, duration=5.0, exact=_rolling_disc_exact, more=more)
 
 
@@ -352,7 +338,7 @@ def knife_edge() -> Scene:
     system = System(_knife_edge_lagrangian, velocity_constraints=_no_slip_across)
     params = {"m": 1.0, "J": 0.3, "g": 9.81, "slope": 0.4}
     q0, qdot0 = Blade(0.0, 0.0, 0.0), Blade(0.0, 0.0, 1.5)
-    more = {"turning rate": _turning_rate}
+    more = {"turning rate": lambda q, qdot, t, params: qdot.phi}
     return conservative_scene(system, params, q0, qdot0, duration=6.0, exact=_knife_edge_exact, more=more)
 
 
@@ -422,10 +408,8 @@ def _slider_crank_lagrangian(q, qdot, params):
 
 def _slider_crank_constraints(q, params):
     l1, l2 = params["l"]
-    return {
-        "along": l1 * jnp.cos(q.crank) + l2 * jnp.cos(q.rod) - q.x,
-        "across": l1 * jnp.sin(q.crank) + l2 * jnp.sin(q.rod),
-    }
+    along = l1 * jnp.cos(q.crank) + l2 * jnp.cos(q.rod) - q.x
+    return {"along": along, "across": l1 * jnp.sin(q.crank) + l2 * jnp.sin(q.rod)}
 
 
 def slider_crank(l1=1.0, l2=2.0) -> Scene:
@@ -445,9 +429,8 @@ def slider_crank(l1=1.0, l2=2.0) -> Scene:
     slide = -l1 * np.sin(crank) * rate - l2 * np.sin(rod) * rod_rate
     params = {"m": np.array([1.0, 1.0, 2.0]), "l": np.array([l1, l2]), "g": 9.81}
     q0, qdot0 = SliderCrank(crank, rod, l1 * np.cos(crank) + l2 * np.cos(rod)), SliderCrank(rate, rod_rate, slide)
-    return conservative_scene(
-        System(_slider_crank_lagrangian, constraints=_slider_crank_constraints), params, q0, qdot0, duration=3.0
-    )
+    system = System(_slider_crank_lagrangian, constraints=_slider_crank_constraints)
+    return conservative_scene(system, params, q0, qdot0, duration=3.0)
 
 
 class Squeezer(NamedTuple):
@@ -514,14 +497,10 @@ def _squeezer_constraints(q, params):
 
 
 _SQUEEZER_START = Squeezer(
-    beta=-0.0617138900142764496358948458001,
-    Theta=0.0,
-    gamma=0.455279819163070380255912382449,
-    Phi=0.222668390165885884674473185609,
-    delta=0.487364979543842550225598953530,
-    Omega=-0.222668390165885884674473185609,
-    epsilon=1.23054744454982119249735015568,
-)
+    beta=-0.0617138900142764496358948458001, Theta=0.0, gamma=0.455279819163070380255912382449,
+    Phi=0.222668390165885884674473185609, delta=0.487364979543842550225598953530,
+    Omega=-0.222668390165885884674473185609, epsilon=1.23054744454982119249735015568,
+)  # fmt: skip
 
 
 def andrews_squeezer() -> Scene:
@@ -533,8 +512,5 @@ def andrews_squeezer() -> Scene:
 
     >>> scene = andrews_squeezer(); scene.system.constraint_residual(scene.q0, scene.qdot0, params=scene.params)
     """
-    params = dict(_SQUEEZER)
-    q0, qdot0 = _SQUEEZER_START, Squeezer(*[0.0] * 7)
-    return conservative_scene(
-        System(_squeezer_lagrangian, constraints=_squeezer_constraints), params, q0, qdot0, duration=0.03
-    )
+    system = System(_squeezer_lagrangian, constraints=_squeezer_constraints)
+    return conservative_scene(system, dict(_SQUEEZER), _SQUEEZER_START, Squeezer(*[0.0] * 7), duration=0.03)

@@ -85,11 +85,9 @@ def restricted_three_body() -> Scene:
 
     >>> scene = lagjax.scenes.restricted_three_body()
     """
-    params = {"mu": 0.012277471}
+    system, params = System(_restricted_three_body_lagrangian), {"mu": 0.012277471}
     q0, qdot0 = np.array([0.994, 0.0]), np.array([0.0, -2.00158510637908252240537862224])
-    return conservative_scene(
-        System(_restricted_three_body_lagrangian), params, q0, qdot0, duration=17.0652165601579625588917206249
-    )
+    return conservative_scene(system, params, q0, qdot0, duration=17.0652165601579625588917206249)
 
 
 def _inverse_distances(q):
@@ -133,13 +131,8 @@ def figure_eight() -> Scene:
 
     >>> scene = lagjax.scenes.figure_eight()
     """
-    v = np.array([0.34711688811904, 0.53272494538798])
-    return n_body(
-        GM=[1.0, 1.0, 1.0],
-        q0=[[-1.0, 0.0], [1.0, 0.0], [0.0, 0.0]],
-        qdot0=[v, v, -2 * v],
-        duration=6.32591398292657,
-    )
+    q0, v = [[-1.0, 0.0], [1.0, 0.0], [0.0, 0.0]], np.array([0.34711688811904, 0.53272494538798])
+    return n_body([1.0, 1.0, 1.0], q0, [v, v, -2 * v], duration=6.32591398292657)
 
 
 def _einstein_infeld_hoffmann_lagrangian(q, qdot, params):

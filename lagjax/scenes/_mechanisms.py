@@ -40,10 +40,6 @@ def _wedge_exact(t, q0, qdot0, params):
     return q, WedgeAndMass(qdot0.X + a.X * t, qdot0.x + a.x * t)
 
 
-def _wedge_momentum(q, qdot, t, params):
-    return (params["M"] + params["m"]) * qdot.X + params["m"] * qdot.x
-
-
 def wedge() -> Scene:
     """A mass m on a wedge M that slides without friction,
 
@@ -53,11 +49,10 @@ def wedge() -> Scene:
 
     >>> scene = lagjax.scenes.wedge(); scene.system.acceleration(scene.q0, scene.qdot0, params=scene.params)
     """
-    params = {"M": 3.0, "m": 1.0, "g": 9.81, "alpha": 0.6}
+    system, params = System(_wedge_lagrangian), {"M": 3.0, "m": 1.0, "g": 9.81, "alpha": 0.6}
     q0, qdot0 = WedgeAndMass(0.0, 2.0), WedgeAndMass(0.0, 0.0)
-    return conservative_scene(
-        System(_wedge_lagrangian), params, q0, qdot0, duration=1.0, exact=_wedge_exact, more={"p_X": _wedge_momentum}
-    )
+    more = {"p_X": lambda q, qdot, t, params: (params["M"] + params["m"]) * qdot.X + params["m"] * qdot.x}
+    return conservative_scene(system, params, q0, qdot0, duration=1.0, exact=_wedge_exact, more=more)
 
 
 def _pendulum_lagrangian(q, qdot, params):
@@ -85,10 +80,8 @@ def pendulum() -> Scene:
 
     >>> scene = lagjax.scenes.pendulum(); scene.exact(1.0, scene.q0, scene.qdot0, scene.params)
     """
-    params = {"m": 1.0, "l": 1.0, "g": 9.81}
-    return conservative_scene(
-        System(_pendulum_lagrangian), params, q0=2.0, qdot0=1.0, duration=10.0, exact=_pendulum_exact
-    )
+    system, params = System(_pendulum_lagrangian), {"m": 1.0, "l": 1.0, "g": 9.81}
+    return conservative_scene(system, params, q0=2.0, qdot0=1.0, duration=10.0, exact=_pendulum_exact)
 
 
 def _double_pendulum_lagrangian(q, qdot, params):
@@ -108,9 +101,8 @@ def double_pendulum() -> Scene:
     >>> scene = lagjax.scenes.double_pendulum(); scene.system.mass_matrix(scene.q0, scene.qdot0, params=scene.params)
     """
     params = {"m1": 1.0, "m2": 1.0, "l1": 1.0, "l2": 1.0, "g": 9.81}
-    return conservative_scene(
-        System(_double_pendulum_lagrangian), params, q0=np.array([1.0, 1.5]), qdot0=np.array([0.0, 0.0]), duration=10.0
-    )
+    q0, qdot0 = np.array([1.0, 1.5]), np.array([0.0, 0.0])
+    return conservative_scene(System(_double_pendulum_lagrangian), params, q0, qdot0, duration=10.0)
 
 
 def double_pendulum_frequencies(params):
@@ -128,8 +120,7 @@ def double_pendulum_frequencies(params):
 
 def _chain_lagrangian(q, qdot, params):
     m, l, g = params["m"], params["l"], params["g"]
-    vx = jnp.cumsum(l * jnp.cos(q) * qdot)
-    vy = jnp.cumsum(l * jnp.sin(q) * qdot)
+    vx, vy = jnp.cumsum(l * jnp.cos(q) * qdot), jnp.cumsum(l * jnp.sin(q) * qdot)
     y = -jnp.cumsum(l * jnp.cos(q))
     return jnp.sum(0.5 * m * (vx**2 + vy**2) - m * g * y)
 
@@ -159,10 +150,6 @@ def _spherical_pendulum_lagrangian(q, qdot, params):
     return 0.5 * m * l**2 * (qdot.theta**2 + jnp.sin(q.theta) ** 2 * qdot.phi**2) + m * g * l * jnp.cos(q.theta)
 
 
-def _spherical_pendulum_p_phi(q, qdot, t, params):
-    return params["m"] * params["l"] ** 2 * jnp.sin(q.theta) ** 2 * qdot.phi
-
-
 def spherical_pendulum() -> Scene:
     """The spherical pendulum, L = ½ m l² (θ̇² + sin²θ φ̇²) + m g l cos θ; coordinates `Direction(theta, phi)`.
 
@@ -172,7 +159,7 @@ def spherical_pendulum() -> Scene:
     """
     params = {"m": 1.0, "l": 1.0, "g": 9.81}
     q0, qdot0 = Direction(1.0, 0.0), Direction(0.0, 2.0)
-    more = {"p_phi": _spherical_pendulum_p_phi}
+    more = {"p_phi": lambda q, qdot, t, params: params["m"] * (params["l"] * jnp.sin(q.theta)) ** 2 * qdot.phi}
     return conservative_scene(System(_spherical_pendulum_lagrangian), params, q0, qdot0, duration=10.0, more=more)
 
 

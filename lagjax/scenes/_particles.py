@@ -106,10 +106,8 @@ def morse_oscillator() -> Scene:
 
     >>> scene = lagjax.scenes.morse_oscillator(); scene.exact(1.0, scene.q0, scene.qdot0, scene.params)
     """
-    params = {"m": 1.0, "D": 1.0, "a": 1.0}
-    return conservative_scene(
-        System(_OneDimension(morse)), params, q0=1.2, qdot0=0.3, duration=20.0, exact=_morse_exact
-    )
+    system, params = System(_OneDimension(morse)), {"m": 1.0, "D": 1.0, "a": 1.0}
+    return conservative_scene(system, params, q0=1.2, qdot0=0.3, duration=20.0, exact=_morse_exact)
 
 
 class _ParticleInPotential(eqx.Module):
@@ -126,10 +124,9 @@ def harmonic_potential(q, params):
 
 def anisotropic_well(q, params):
     """U = ½ (k_x x² + k_y y² + k_z z²) + ¼ b r⁴, in any coordinates."""
-    x, y, z = q.cartesian()
-    stiffness = params["k"]
+    (x, y, z), k = q.cartesian(), params["k"]
     r_squared = x**2 + y**2 + z**2
-    return 0.5 * (stiffness[0] * x**2 + stiffness[1] * y**2 + stiffness[2] * z**2) + 0.25 * params["b"] * r_squared**2
+    return 0.5 * (k[0] * x**2 + k[1] * y**2 + k[2] * z**2) + 0.25 * params["b"] * r_squared**2
 
 
 def particle_in_potential(potential=anisotropic_well, *, q0=None, qdot0=None, params=None) -> Scene:
@@ -199,9 +196,8 @@ def central_force(potential=yukawa, coordinates=Polar, *, params=None) -> Scene:
     """
     q0, qdot0 = convert(Cartesian(1.0, 0.2, 0.5), Cartesian(-0.2, 0.7, 0.3), coordinates)
     params = {"m": 1.0, "k": 1.0, "a": 5.0} if params is None else params
-    return conservative_scene(
-        System(_CentralForce(potential)), params, q0, qdot0, duration=20.0, more={"angular_momentum": _angular_momentum}
-    )
+    more = {"angular_momentum": _angular_momentum}
+    return conservative_scene(System(_CentralForce(potential)), params, q0, qdot0, duration=20.0, more=more)
 
 
 class _Particles(eqx.Module):
