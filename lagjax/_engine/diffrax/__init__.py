@@ -31,6 +31,7 @@ from lagjax._engine._stop_reason import End, what_stopped
 from lagjax._engine.diffrax._equations import ArrayEquations as ArrayEquations
 from lagjax._engine.diffrax._equations import MotionEquations, form_of
 from lagjax._engine.diffrax._integrate import Jumps, Method, WithJumps, integrate
+from lagjax._engine.diffrax._jumps import freeze
 from lagjax._engine.diffrax._solvers import FineOutput, Projected
 from lagjax._equations import rank_lost
 from lagjax._interface import (
@@ -226,8 +227,7 @@ def _explain_result(solution: Solution, form: MotionEquations, start: RESULTS, t
 
     field = eqx.filter_closure_convert(form.acceleration, ts[0], last, numbers)
     # A name has no derivative, and the search for it is a loop that reverse mode could not go back through.
-    frozen = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, (field, ts, solution, numbers))
-    field, ts, solution, numbers = frozen
+    field, ts, solution, numbers = freeze((field, ts, solution, numbers))
 
     def acceleration(t, y):
         return field(t, halves(y), numbers)[0]

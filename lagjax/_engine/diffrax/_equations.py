@@ -2,10 +2,11 @@
 
 A small scene becomes a *scalar program*: the mass matrix is eliminated by formulas written out for exactly its pattern
 of zeros, and nothing is left that this scene does not need. Any other scene keeps the derivatives as JAX arrays. Both
-forms give the same motion to round-off, and are tested against each other.
+forms give the same motion to round-off, and are tested against each other. Each has `acceleration` and, for constrained
+scenes, `projected`: y after one Newton step of positions and of velocities back to the constraints. `params` holds
+numbers alone.
 """
 
-import abc
 from typing import Any
 
 import equinox as eqx
@@ -21,34 +22,15 @@ from lagjax._program import Program, Unlowerable
 PyTree = Any
 Vector = Float[Array, " n"]
 State = tuple[Vector, Vector]  # q and q̇
+Time = Float[Array, ""]
+Acceleration = tuple[Vector, Bool[Array, ""]]  # q̈, and whether the matrix that it was solved with is singular: then NaN
 
 # Operations of a program beyond which XLA takes longer to compile it than it saves, and batched elimination on arrays
 # overtakes written-out elimination: measured on chains of pendulums, where it lies at 12 links.
 LARGEST_XLA_PROGRAM = 2_000
 
 
-class MotionEquations(eqx.Module):
-    """ẏ = f(t, y, params) with y = (q, q̇), two vectors of shape (n,); params holds numbers alone."""
-
-    @abc.abstractmethod
-    def acceleration(self, t: Float[Array, ""], y: State, params: PyTree) -> tuple[Vector, Bool[Array, ""]]:
-        """q̈ (n,), and whether the matrix that it was solved with is singular: then q̈ is NaN."""
-
-    def vector_field(self, t: Float[Array, ""], y: State, params: PyTree) -> State:
-        """ẏ = (q̇, q̈)."""
-        return y[1], self.acceleration(t, y, params)[0]
-
-    @property
-    @abc.abstractmethod
-    def constrained(self) -> bool:
-        """True if the scene has constraints to project to."""
-
-    @abc.abstractmethod
-    def projected(self, t: Float[Array, ""], y: State, params: PyTree) -> State:
-        """y after one Newton step of positions and of velocities back to the constraints."""
-
-
-class ArrayEquations(MotionEquations):
+class ArrayEquations(eqx.Module):
     """The equations with M, F, G and γ as JAX arrays; `reason` says why the scene has no scalar program in use."""
 
     motion: Motion = eqx.field(static=True)
@@ -63,16 +45,14 @@ class ArrayEquations(MotionEquations):
     def constrained(self) -> bool:
         return self.motion.constrained
 
-    def projected(self, t, y, params):
-        """y after `Motion.projected`."""
+    def projected(self, t: Time, y: State, params: PyTree) -> State:
         return self.motion.projected(*y, t, params)
 
-    def acceleration(self, t, y, params):
-        """q̈ and whether it is singular, from `Motion.solved_acceleration`."""
+    def acceleration(self, t: Time, y: State, params: PyTree) -> Acceleration:
         return _compiled_once(self.accelerate, *y, t, params)
 
 
-class ScalarEquations(MotionEquations):
+class ScalarEquations(eqx.Module):
     """The equations as scalar programs, whose inputs are q, q̇, t and every number in params.
 
     `program` gives q̈ and whether its matrix is singular, `projection` (q, q̇) after a step back to the constraints.
@@ -91,18 +71,19 @@ class ScalarEquations(MotionEquations):
     def constrained(self) -> bool:
         return self.projection is not None
 
-    def projected(self, t, y, params):
-        """y after the program `projection`."""
+    def projected(self, t: Time, y: State, params: PyTree) -> State:
         state = _compiled_once(self.project, *y[0], *y[1], t, *_scalars(params))
         return jnp.stack(state[: len(state) // 2]), jnp.stack(state[len(state) // 2 :])
 
-    def acceleration(self, t, y, params):
-        """q̈ and whether it is singular, from `program`."""
+    def acceleration(self, t: Time, y: State, params: PyTree) -> Acceleration:
         *acceleration, singular = _compiled_once(self.accelerate, *y[0], *y[1], t, *_scalars(params))
         return jnp.stack(acceleration), singular
 
 
-def form_of(derivation: Derivation, path: str = "auto") -> "ScalarEquations | ArrayEquations":
+MotionEquations = ScalarEquations | ArrayEquations
+
+
+def form_of(derivation: Derivation, path: str = "auto") -> MotionEquations:
     """The form of its equations that suits a scene; `path` "scalar" or "array" insists on one.
 
     Raises `ValueError` where "scalar" is given and impossible, with the reason.
@@ -125,7 +106,6 @@ def form_of(derivation: Derivation, path: str = "auto") -> "ScalarEquations | Ar
 
 
 def _scalars(params: PyTree) -> list[jax.Array]:
-    """Every number in the parameters, as a list of scalars."""
     return [x for leaf in jax.tree.leaves(params) for x in ([leaf] if jnp.ndim(leaf) == 0 else jnp.ravel(leaf))]
 
 

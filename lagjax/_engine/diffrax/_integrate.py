@@ -20,7 +20,7 @@ import jax.numpy as jnp
 
 from lagjax._engine._problem import Solution
 from lagjax._engine.diffrax._equations import MotionEquations
-from lagjax._engine.diffrax._jumps import AdaptiveWrapper, Noting, may_jump, note_jumps
+from lagjax._engine.diffrax._jumps import AdaptiveWrapper, Noting, NotingAdaptive, freeze, may_jump
 from lagjax._engine.diffrax._solvers import Projected
 from lagjax._interface import ENDED_WELL, RESULTS, SUCCESSFUL, code_of, halves
 from lagjax._primitives import differentiable_where
@@ -56,49 +56,50 @@ def integrate(
     The state is one array: two of them take a solver twice as many operations of half the size.
 
     With `adjoint` None, and without an event, reverse mode goes over the recorded steps; otherwise derivatives are
-    those of the diffrax adjoint.
+    those of the diffrax adjoint. What f closes over (a parameter from outside, the weights of a neural Lagrangian)
+    becomes an argument.
     """
-    # What f closes over (a parameter from outside, the weights of a neural Lagrangian) becomes an argument.
-    field = eqx.filter_closure_convert(_flatten_function(form.vector_field), ts[0], y0, params)
-    project = (
-        eqx.filter_closure_convert(_flatten_function(form.projected), ts[0], y0, params) if form.constrained else None
-    )
+
+    def vector_field(t, y, params):
+        q, qdot = halves(y)
+        return jnp.concatenate([qdot, form.acceleration(t, (q, qdot), params)[0]])
+
+    def projected(t, y, params):
+        return jnp.concatenate(form.projected(t, halves(y), params))
+
+    field = eqx.filter_closure_convert(vector_field, ts[0], y0, params)
+    project = eqx.filter_closure_convert(projected, ts[0], y0, params) if form.constrained else None
     solution = _differentiable((field, project, ts, y0, params), method, adjoint, event)
     if project is not None:
         solution = solution._replace(path=jax.vmap(project, in_axes=(0, 0, None))(ts, solution.path, params))
     return solution
 
 
-def _flatten_function(function):
-    """The function (t, y, params) of states y (2n,) to (2n,) that `function` is of pairs (q, q̇) to such pairs."""
-    return lambda t, y, params: jnp.concatenate(function(t, halves(y), params))
-
-
 def _differentiable(moving, method: Method, adjoint, event) -> Solution:
     if adjoint is not None or event is not None:
         adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
-        if isinstance(adjoint, diffrax.BacksolveAdjoint) or not may_jump(*_initial_arguments(moving)):
+        if isinstance(adjoint, diffrax.BacksolveAdjoint) or not _may_jump(moving):
             return _solve(moving, method, adjoint, event)
         # It is not known here by what this will be differentiated: parameters count as fixed.
         solution, _, crossed = _call(moving, _note_jumps(moving, method, None), adjoint, event)
         y_end, path = (differentiable_where(~crossed, x) for x in (solution.y_end, solution.path))
         return solution._replace(path=path, y_end=y_end)
     # Tolerances and the smallest step follow from ts and the dtype; like all that sizes a step, they are data here.
-    frozen = jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, method)
-    return _solve_and_record(moving, frozen)
+    return _solve_and_record(moving, freeze(method))
 
 
-def _initial_arguments(moving) -> tuple:
-    """The field, and its arguments (t, y, params) at the start of the motion."""
+def _may_jump(moving) -> bool:
     field, _, ts, y0, params = moving
-    return field, ts[0], y0, params
+    return may_jump(field, ts[0], y0, params)
 
 
 def _note_jumps(moving, method: Method, varied) -> Method:
     """The method whose controller notes steps across a jump of the field that moves with the state or with `varied`."""
     field, _, _, _, params = moving
     varied = jax.tree.map(lambda _: False, (field, params)) if varied is None else varied
-    return eqx.tree_at(lambda m: m.controller, method, note_jumps(method.controller, field, varied))
+    adaptive = isinstance(method.controller, diffrax.AbstractAdaptiveStepSizeController)
+    noting: Any = NotingAdaptive if adaptive else Noting
+    return eqx.tree_at(lambda m: m.controller, method, noting(method.controller, field, varied))
 
 
 def _solve(moving, method: Method, adjoint, event=None) -> Solution:
@@ -161,7 +162,7 @@ def _forward(perturbed, moving, method):
     of_field, _, _, of_start, of_params = perturbed
     varied = of_field, of_params
     moves = any(jax.tree.leaves((varied, of_start)))
-    if moves and may_jump(*_initial_arguments(moving)):
+    if moves and _may_jump(moving):
         method = _note_jumps(moving, method, varied)
     solution, (times,), crossed = _call(moving, method, diffrax.ForwardMode(), None, record)
     if crossed is None:
@@ -202,19 +203,17 @@ class _RecordedSteps(diffrax.AbstractStepSizeController):
     jumps: "Jumps | None"
 
     def wrap(self, direction):
-        """The controller of steps in a time that is multiplied by `direction`, 1 or −1: that of backward motion."""
         times = jnp.where(jnp.isinf(self.times), jnp.inf, self.times * direction)
         if self.jumps is None:
             return _RecordedSteps(times, None)
         jumps = self.jumps.reversed(direction)
-        return _RecordedSteps(jumps.ends(times), jumps)  # what is recorded of a step is where the next one begins
+        times = _exchange(times, jumps.behind, jumps.before)
+        return _RecordedSteps(times, jumps)  # what is recorded of a step is where the next one begins
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        """The first time; the state counts the steps."""
-        return jnp.minimum(self.times[0], t1), jnp.array(1)
+        return jnp.minimum(self.times[0], t1), jnp.array(1)  # the number of steps
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
-        """Accept, and go on to the next time."""
         next_ = self.times.at[controller_state].get(mode="fill", fill_value=jnp.inf)
         begin, jumps = (t1, False) if self.jumps is None else self.jumps.next_start(t1)
         return True, begin, next_, jumps, controller_state + 1, diffrax.RESULTS.successful
@@ -251,10 +250,6 @@ class Jumps(eqx.Module):
         begin = _exchange(t, self.before, self.behind)
         return begin, begin != t
 
-    def ends(self, times):
-        """The ends of the steps behind which others begin at these times."""
-        return _exchange(times, self.behind, self.before)
-
     def first(self, begin, end):
         """`end`, or the first jump on the way from `begin` to it."""
         ahead = jnp.searchsorted(self.before, begin, side="right")
@@ -277,16 +272,13 @@ class WithJumps(AdaptiveWrapper):
         self.controller, self.jumps = controller, jumps
 
     def wrap(self, direction):
-        """The controller of steps in a time that is multiplied by `direction`, 1 or −1: that of backward motion."""
         return WithJumps(self.controller.wrap(direction), self.jumps.reversed(direction))
 
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        """The end of the first step, and the state of the controller."""
-        end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+    def init(self, terms, t0, *arguments):
+        end, state = self.controller.init(terms, t0, *arguments)
         return self.jumps.first(t0, end), state
 
     def adapt_step_size(self, *arguments):
-        """The controller's decision on a step; the next one ends at the first jump."""
         keep, begin, end, made_jump, state, result = self.controller.adapt_step_size(*arguments)
         behind, jumps = self.jumps.next_start(begin)
         return keep, behind, self.jumps.first(behind, end + (behind - begin)), made_jump | jumps, state, result

@@ -34,23 +34,19 @@ _DECIDING = frozenset((
 ))  # fmt: skip
 
 
+def freeze(tree):
+    """The tree, whose arrays have no derivatives."""
+    return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
+
+
 def may_jump(field, *arguments) -> bool:
     """True if a function has operations in it that decide on something."""
     return _decides(jax.make_jaxpr(lambda *xs: field(*xs))(*arguments).jaxpr)
 
 
 def _decides(jaxpr) -> bool:
-    for equation in jaxpr.eqns:
-        if equation.primitive.name in _DECIDING:
-            return True
-        for parameter in jax.tree.leaves(equation.params, is_leaf=_is_jaxpr):
-            if _is_jaxpr(parameter) and _decides(getattr(parameter, "jaxpr", parameter)):
-                return True
-    return False
-
-
-def _is_jaxpr(x) -> bool:
-    return isinstance(x, (core.Jaxpr, core.ClosedJaxpr))
+    decides = any(equation.primitive.name in _DECIDING for equation in jaxpr.eqns)
+    return decides or any(map(_decides, core.subjaxprs(jaxpr)))
 
 
 def crosses(field, varied, begin, end, params) -> jax.Array:
@@ -79,11 +75,7 @@ def crosses(field, varied, begin, end, params) -> jax.Array:
     jumps = change > _JUMPS[dtype] * jnp.maximum(jnp.abs(whole[2]), jnp.abs(whole[3])).max()
     size = _MOVED[dtype] * (jnp.abs(y0) + jnp.abs(y1 - y0) + 1e-3 * jnp.abs(y0).max())
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (_DRAWS, y0.size))
-    beside = [
-        acceleration_at(low, s * size)
-        for signs_of in signs
-        for s in (jnp.asarray(signs_of, dtype), -jnp.asarray(signs_of, dtype))
-    ]
+    beside = [acceleration_at(low, jnp.asarray(s, dtype) * size) for s in (*signs, *-signs)]
     t, y = t0 + low * (t1 - t0), y0 + low * (y1 - y0)
     for s in (1, -1):
         other, numbers = _perturb((field, params), varied, s * _MOVED[dtype])
@@ -123,7 +115,10 @@ class AdaptiveWrapper(diffrax.AbstractAdaptiveStepSizeController):
 
 
 class Noting(diffrax.AbstractStepSizeController):
-    """The steps of a controller; its state stands beside a flag, whether a step that was accepted crossed a jump."""
+    """The steps of a controller; its state stands beside a flag, whether a step that was accepted crossed a jump.
+
+    `direction`, 1 or −1, is the sign of the time of diffrax, which integrates forward; `varied` as for `crosses`.
+    """
 
     controller: Any
     field: Any
@@ -131,35 +126,21 @@ class Noting(diffrax.AbstractStepSizeController):
     direction: Any = 1
 
     def wrap(self, direction):
-        """The controller of steps in a time that is multiplied by `direction`, 1 or −1: that of backward motion."""
         return type(self)(self.controller.wrap(direction), self.field, self.varied, direction)
 
-    def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
-        """The end of the first step, and the state."""
-        end, state = self.controller.init(terms, t0, t1, y0, dt0, args, func, error_order)
+    def init(self, *arguments):
+        end, state = self.controller.init(*arguments)
         return end, (state, jnp.array(False))
 
     def adapt_step_size(self, t0, t1, y0, y1_candidate, args, y_error, error_order, controller_state):
-        """The controller's decision on a step; and whether that went across a jump."""
         state, crossed = controller_state
         keep, *more, state, result = self.controller.adapt_step_size(
             t0, t1, y0, y1_candidate, args, y_error, error_order, state
         )
-        fixed = jax.tree.map(
-            lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x,
-            (self.field, (t0 * self.direction, y0), (t1 * self.direction, y1_candidate), args),
-        )
-        field, begin, end, params = fixed
-        here = keep & crosses(field, self.varied, begin, end, params)
+        field, *step = freeze((self.field, (t0 * self.direction, y0), (t1 * self.direction, y1_candidate), args))
+        here = keep & crosses(field, self.varied, *step)
         return keep, *more, (state, crossed | here), result
 
 
 class NotingAdaptive(Noting, AdaptiveWrapper):
     """`Noting` of a controller whose steps adapt."""
-
-
-def note_jumps(controller, field, varied) -> Noting:
-    """A controller with the steps of `controller` that notes whether one of them crosses a jump; see `crosses`."""
-    adaptive = isinstance(controller, diffrax.AbstractAdaptiveStepSizeController)
-    kind: Any = NotingAdaptive if adaptive else Noting
-    return kind(controller, field, varied)

@@ -34,70 +34,6 @@ class _Around(diffrax.AbstractAdaptiveSolver):
         return self.solver.func(terms, t0, y0, args)
 
 
-class FineOutput(_Around):
-    r"""The steps of an explicit Runge–Kutta solver of diffrax, with better states between them.
-
-    The solver's own interpolant gives states at four points inside the step, the equations give the slopes there, and
-    the polynomial of degree seven through yₙ, yₙ₊₁, the slopes at both ends and these four slopes is the new
-    interpolant: one order higher than that of the states at which the slopes were taken. For `Dopri8` its error is 5 to
-    70 times smaller than that of the solver's own interpolant, and a few times that of the steps. It costs four
-    evaluations of the right-hand side per step: use it where states between steps are wanted.
-
-    `solver` is any explicit solver whose last slope is taken at the end of the step (FSAL), such as `diffrax.Dopri8()`
-    or `diffrax.Tsit5()`; it integrates a single `ODETerm`. Raises `TypeError` for any other.
-
-    Source: Enright, Jackson, Nørsett & Thomsen, *Interpolants for Runge–Kutta formulas*, ACM TOMS 12 (1986) 193–218,
-    §3 (boot-strapping).
-
-    ```python
-    import diffrax, jax.numpy as jnp, lagjax
-
-    diffrax.diffeqsolve(
-        diffrax.ODETerm(lambda t, y, args: -y),
-        lagjax.FineOutput(diffrax.Dopri8()),
-        0.0, 5.0, None, jnp.array(1.0),
-        saveat=diffrax.SaveAt(ts=jnp.linspace(0.0, 5.0, 50)),
-        stepsize_controller=diffrax.PIDController(rtol=1e-10, atol=1e-10),
-    )
-    ```
-    """
-
-    solver: diffrax.AbstractERK
-
-    interpolation_cls: ClassVar[Callable]
-
-    def __check_init__(self):
-        explicit = isinstance(self.solver, diffrax.AbstractERK)
-        tableau = self.solver.tableau if explicit else None
-        if not isinstance(tableau, diffrax.ButcherTableau) or not tableau.fsal:
-            raise TypeError(f"FineOutput takes an explicit FSAL Runge-Kutta solver of diffrax; got {self.solver!r}.")
-
-    @property
-    def term_structure(self):
-        """One term, of an ordinary differential equation."""
-        return diffrax.ODETerm
-
-    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
-        """The solver's step, and the polynomial through it and through the slopes at four points inside it."""
-        y1, error, dense, state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
-        interpolant, span = self.solver.interpolation_cls(t0=t0, t1=t1, **dense), terms.contr(t0, t1)
-
-        def increment(place):
-            t = t0 + place * (t1 - t0)
-            slope = terms.vf_prod(t, interpolant.evaluate(t), args, span)
-            return jax.tree.map(lambda leaf, like: leaf.astype(like.dtype), slope, y0)
-
-        def correction(y0, y1, k, *inside):
-            cubic = (_hermite_slope(place, y1 - y0, k[0], k[-1]) for place in _INSIDE)
-            residuals = [slope - of_cubic for slope, of_cubic in zip(inside, cubic, strict=True)]
-            return jnp.tensordot(jnp.asarray(_CORRECTION, y0.dtype), jnp.stack(residuals), axes=1)
-
-        increments = dense["k"]
-        ends = {"first": _pick(increments, 0), "last": _pick(increments, -1)}
-        polynomial = jax.tree.map(correction, y0, y1, increments, *map(increment, _INSIDE))
-        return y1, error, {"y0": y0, "y1": y1, **ends, "correction": polynomial}, state, result
-
-
 # The points inside a step, in equal parts. At Lobatto's nodes the slopes alone would fix yₙ₊₁, and a polynomial through
 # them could not take the solver's yₙ₊₁ as well.
 _INSIDE = (0.2, 0.4, 0.6, 0.8)
@@ -155,12 +91,64 @@ class _Polynomial(diffrax.AbstractLocalInterpolation):
         return jax.tree.map(value, self.y0, self.y1, self.first, self.last, self.correction)
 
 
-FineOutput.interpolation_cls = _Polynomial
+class FineOutput(_Around):
+    r"""The steps of an explicit Runge–Kutta solver of diffrax, with better states between them.
 
+    The solver's own interpolant gives states at four points inside the step, the equations give the slopes there, and
+    the polynomial of degree seven through yₙ, yₙ₊₁, the slopes at both ends and these four slopes is the new
+    interpolant: one order higher than that of the states at which the slopes were taken. For `Dopri8` its error is 5 to
+    70 times smaller than that of the solver's own interpolant, and a few times that of the steps. It costs four
+    evaluations of the right-hand side per step: use it where states between steps are wanted.
 
-def _pick(stacked: PyTree, index: int) -> PyTree:
-    """The pytree at one index of the first axis of all leaves."""
-    return jax.tree.map(lambda leaf: leaf[index], stacked)
+    `solver` is any explicit solver whose last slope is taken at the end of the step (FSAL), such as `diffrax.Dopri8()`
+    or `diffrax.Tsit5()`; it integrates a single `ODETerm`. Raises `TypeError` for any other.
+
+    Source: Enright, Jackson, Nørsett & Thomsen, *Interpolants for Runge–Kutta formulas*, ACM TOMS 12 (1986) 193–218,
+    §3 (boot-strapping).
+
+    ```python
+    import diffrax, jax.numpy as jnp, lagjax
+
+    diffrax.diffeqsolve(
+        diffrax.ODETerm(lambda t, y, args: -y),
+        lagjax.FineOutput(diffrax.Dopri8()),
+        0.0, 5.0, None, jnp.array(1.0),
+        saveat=diffrax.SaveAt(ts=jnp.linspace(0.0, 5.0, 50)),
+        stepsize_controller=diffrax.PIDController(rtol=1e-10, atol=1e-10),
+    )
+    ```
+    """
+
+    solver: diffrax.AbstractERK
+
+    term_structure: ClassVar = diffrax.ODETerm
+    interpolation_cls: ClassVar[Callable] = _Polynomial
+
+    def __check_init__(self):
+        explicit = isinstance(self.solver, diffrax.AbstractERK)
+        tableau = self.solver.tableau if explicit else None
+        if not isinstance(tableau, diffrax.ButcherTableau) or not tableau.fsal:
+            raise TypeError(f"FineOutput takes an explicit FSAL Runge-Kutta solver of diffrax; got {self.solver!r}.")
+
+    def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
+        """The solver's step, and the polynomial through it and through the slopes at four points inside it."""
+        y1, error, dense, state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, made_jump)
+        interpolant, span = self.solver.interpolation_cls(t0=t0, t1=t1, **dense), terms.contr(t0, t1)
+
+        def increment(place):
+            t = t0 + place * (t1 - t0)
+            slope = terms.vf_prod(t, interpolant.evaluate(t), args, span)
+            return jax.tree.map(lambda leaf, like: leaf.astype(like.dtype), slope, y0)
+
+        def correction(y0, y1, k, *inside):
+            cubic = (_hermite_slope(place, y1 - y0, k[0], k[-1]) for place in _INSIDE)
+            residuals = [slope - of_cubic for slope, of_cubic in zip(inside, cubic, strict=True)]
+            return jnp.tensordot(jnp.asarray(_CORRECTION, y0.dtype), jnp.stack(residuals), axes=1)
+
+        first, last = (jax.tree.map(lambda k, i=i: k[i], dense["k"]) for i in (0, -1))
+        polynomial = jax.tree.map(correction, y0, y1, dense["k"], *map(increment, _INSIDE))
+        coefficients = {"y0": y0, "y1": y1, "first": first, "last": last, "correction": polynomial}
+        return y1, error, coefficients, state, result
 
 
 class Projected(_Around):
