@@ -195,7 +195,6 @@ _ASKED = ("mass_matrix", "jacobian", "gamma", "residual", "rates", "driving")
 
 
 def has_constraints(system) -> bool:
-    """True if a motion of the scene can start off its constraints."""
     return system.constraints is not None or system.velocity_constraints is not None
 
 

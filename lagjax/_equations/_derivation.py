@@ -187,7 +187,6 @@ class Derivation:
         return self._shapes[name]
 
     def count(self, name: str) -> int:
-        """The count of numbers in one of `Motion.quantities`."""
         return int(np.prod(self.shape(name), dtype=int))
 
     def evaluate(self, names: Sequence[str], columns: Sequence) -> dict[str, np.ndarray]:

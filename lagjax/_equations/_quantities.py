@@ -107,11 +107,6 @@ class _ScalarState:
             rates[int(self.ids["t"])] = self.expansion.graph.constant(1.0, "float")
         return np.array(self.derivatives.directional_derivative(values.tolist(), rates), dtype=np.int64)
 
-    def zero(self, values: Ids) -> np.ndarray:
-        """True for each number that is zero whatever the state."""
-        graph = self.expansion.graph
-        return np.array([graph.value(i) == 0 for i in values.ravel().tolist()], bool).reshape(values.shape)
-
     def varying(self, values: Ids) -> np.ndarray:
         """True for each number that depends on q, q̇ or t."""
         graph = self.expansion.graph
@@ -120,9 +115,6 @@ class _ScalarState:
             if not moving.isdisjoint(graph.nodes[i][1]):
                 moving.add(i)
         return np.array([i in moving for i in values.ravel().tolist()], bool).reshape(values.shape)
-
-    def map(self, op: str, *arrays: Ids) -> Ids:
-        return self.expansion.map(op, *arrays)
 
 
 def quantities(
@@ -143,16 +135,16 @@ def quantities(
     if motion.dissipation is not None:
         taped = state.taped(motion.dissipation)
         dissipation, (damping,) = taped.value, state.gradient(taped, "qdot")
-    nonconservative = state.map("sub", forces, damping)
-    generalized = state.map("add", by_q, nonconservative)
+    nonconservative = state.expansion.map("sub", forces, damping)
+    generalized = state.expansion.map("add", by_q, nonconservative)
     result = {
         "lagrangian": lagrangian.value,
         "momentum": momentum,
         "mass_matrix": matrix,
         "lagrangian_by_q": by_q,
         "lagrangian_by_t": by_t,
-        "energy_by_q": state.map("sub", state.rate(by_q, qdot=state.ids["qdot"]), by_q),
-        "force": state.map("add", inertial, nonconservative),
+        "energy_by_q": state.expansion.map("sub", state.rate(by_q, qdot=state.ids["qdot"]), by_q),
+        "force": state.expansion.map("add", inertial, nonconservative),
         "given_force": forces,
         "dissipation": dissipation.reshape(-1),
         "dissipation_by_qdot": damping,
@@ -180,12 +172,12 @@ def _shorter_recursion(motion: Motion, state: _ScalarState, lagrangian: _Taped, 
     recursion = recursion_of(state.derivatives, int(lagrangian.value), state.ids["qdot"].tolist())
     if recursion is None:
         return None
-    sparse = RecursiveElimination(recursion, float)
-    dense = SaddleElimination((state.zero(matrix), np.zeros((0, len(matrix)), bool)), float, False, False)
+    sparse, graph = RecursiveElimination(recursion, float), state.expansion.graph
     if not sparse.complete:
         return None
+    zeros = np.array([graph.value(i) == 0 for i in matrix.ravel().tolist()], bool).reshape(matrix.shape)
+    dense = SaddleElimination((zeros, np.zeros((0, len(matrix)), bool)), float, False, False)
     nodes, entries = matrix[tuple(dense.entries.T)].tolist(), _entries(state, recursion).tolist()
-    graph = state.expansion.graph
     costs = (
         _cost(state, entries, sparse.entries, *sparse.operations([graph.value(i) for i in entries])),
         _cost(state, nodes, dense.entries, dense.operations, dense.solution_operations),
@@ -226,7 +218,7 @@ def _derivatives(state: _ScalarState, lagrangian: _Taped, rates: dict) -> tuple[
         by_q, momentum, by_t = state.gradient(lagrangian, "q", "qdot", "t", together=together)
         matrix = state.jacobian(momentum, "qdot")
         matrix = np.where(np.tri(len(matrix), dtype=bool), matrix, matrix.T)
-        inertial = state.map("sub", by_q, state.rate(momentum, **rates))
+        inertial = state.expansion.map("sub", by_q, state.rate(momentum, **rates))
         forms.append((by_q, momentum, by_t, matrix, inertial))
     if len(forms) == 1:
         return forms[0]
@@ -244,7 +236,7 @@ def _constraint_quantities(constraints: Constraints, state: _ScalarState, rates:
     rate = state.rate(f, **rates)
     return {
         "jacobian": np.concatenate([state.jacobian(f, "q"), state.jacobian(a, "qdot")]),
-        "gamma": state.map("neg", np.concatenate([state.rate(rate, **rates), state.rate(a, **rates)])),
+        "gamma": state.expansion.map("neg", np.concatenate([state.rate(rate, **rates), state.rate(a, **rates)])),
         "residual": np.concatenate([f, a]),
         "rates": np.concatenate([rate, a]),
         "driving": np.concatenate([state.rate(f, t=True), at_rest]),

@@ -64,7 +64,9 @@ class Function(eqx.Module):
         except (AttributeError, IndexError, TypeError) as reason:
             if isinstance(reason, _NO_VALUES):
                 what = _NO_COUNT if isinstance(reason, jax.errors.TracerIntegerConversionError) else _USE_JAX
-                raise ValueNotKnown(f"{self.name}{_place_of(reason)}: {what}") from None
+                where, text = _expression(reason)
+                at = f", {where}, `{text}`" if text else where and f", {where}"
+                raise ValueNotKnown(f"{self.name}{at}: {what}") from None
             asks = "params" in self.extras
             if asks and extras["params"] is None and not isinstance(reason, IndexError):  # None has no index to miss
                 raise TypeError(
@@ -122,12 +124,6 @@ def find_params_expression(reason: Exception) -> str | None:
     """The expression that read `params` where a function of the user failed; None where something else failed."""
     _, text = _expression(reason)
     return text if text.startswith(("params", "(params")) else None
-
-
-def _place_of(reason: Exception) -> str:
-    """The line and the expression of the user that failed, as the middle of a sentence."""
-    where, text = _expression(reason)
-    return f", {where}, `{text}`" if text else where and f", {where}"
 
 
 def _expression(reason: Exception) -> tuple[str, str]:

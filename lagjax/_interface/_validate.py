@@ -109,17 +109,13 @@ def require_concrete(tree: PyTree, what: str, instead: str) -> None:
 
 def not_finite(tree: PyTree, name: str) -> list[tuple[str, Any]]:
     """Every number that is NaN or infinite, with its name; values that are being traced have none yet."""
-    found = []
     if all(_is_finite(leaf) for leaf in jax.tree.leaves(tree)):  # the names of leaves cost more than all else
-        return found
+        return []
+    found = []
     for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
         if eqx.is_array_like(leaf) and is_concrete(leaf) and _dtype_of(leaf) is not None:
-            values = np.asarray(leaf)
-            finite = np.isfinite(values)
-            if finite.all():
-                continue
-            label = name + jax.tree_util.keystr(path)
-            for index in np.argwhere(~finite):
+            values, label = np.asarray(leaf), name + jax.tree_util.keystr(path)
+            for index in np.argwhere(~np.isfinite(values)):
                 found.append((label + (str(index.tolist()) if values.ndim else ""), values[tuple(index)]))
     return found
 
@@ -146,7 +142,6 @@ def require_budget(value, name: str) -> None:
 
 
 def require_flag(value, name: str) -> None:
-    """Raise `TypeError` for what is neither true nor false."""
     if not isinstance(value, bool | np.bool_):
         raise TypeError(f"{name} must be True or False; got {value!r}.")
 

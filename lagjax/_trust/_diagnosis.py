@@ -194,7 +194,6 @@ def _short_functions(derivation: Derivation, params, ended: Ended) -> tuple[list
 
 
 def _is_short(function: Callable, arguments: tuple) -> bool:
-    """True if a function has few enough equations to be gone through one by one."""
     return _equations(jax.make_jaxpr(function)(*arguments).jaxpr) <= LONGEST
 
 

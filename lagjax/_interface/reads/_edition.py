@@ -227,7 +227,6 @@ class _LiveWalk(Walk):
 
 
 def _difference(old: Edition, now: Edition) -> str:
-    """The value that a function read once, and the one that it reads now."""
     name = getattr(old.function, "__name__", type(old.function).__name__)
     pairs = zip(old.text.split("\n"), now.text.split("\n"), strict=False)
     was, is_now = next(((a.strip(), b.strip()) for a, b in pairs if a != b), ("another value", "this one"))

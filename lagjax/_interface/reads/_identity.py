@@ -111,11 +111,7 @@ class Walk:
             return value.__name__
         if (name := _library_name(value)) is not None:
             return name
-        return self.numbered(value)
-
-    def numbered(self, value: Any) -> str:
-        """The number of a function, a class or an object, whose line comes later."""
-        if id(value) not in self._numbers:
+        if id(value) not in self._numbers:  # of a function, a class or an object, whose line comes later
             if len(self.things) >= self.most_things:
                 return self.hold(value)
             self._numbers[id(value)] = len(self.things)

@@ -10,7 +10,6 @@ from lagjax._trust.checks._scene_at_start import CheckedScene
 
 
 def findings(scene: CheckedScene) -> list[Finding]:
-    """All there is to say about constraints on positions and on velocities."""
     if not scene.motion.constrained:
         return []
     residual, jacobian = scene.residual, scene.measured.jacobian

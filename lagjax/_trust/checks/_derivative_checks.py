@@ -18,7 +18,6 @@ _RANDOM = 8
 
 
 def findings(scene: CheckedScene) -> list[Finding]:
-    """All there is to say about L, the forces and D, one after the other."""
     if reported := _values(scene) or _not_finite(scene):
         return reported
     if scene.layout.size > _ALL_AT_ONCE and scene.is_lowered and _agree(scene):

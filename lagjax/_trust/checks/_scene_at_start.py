@@ -45,7 +45,6 @@ class CheckedScene(NamedTuple):
 
     @classmethod
     def from_state(cls, system: System, layout: Layout, q, qdot, t, params) -> "CheckedScene":
-        """The scene of `system` at a state, with its measurements there."""
         q, qdot, t, params = as_arrays((q, qdot, 1.0 * t, params), layout.dtype)
         state = layout.flatten(q), layout.flatten(qdot), jnp.asarray(t), eqx.filter(params, eqx.is_array_like)
         flat = [np.asarray(x) for x in state[:3]]

@@ -1,5 +1,7 @@
 """Time scales: the eigenvalues of the motion linearised at the state."""
 
+from collections.abc import Callable
+
 import numpy as np
 
 from lagjax._equations import null_space
@@ -11,7 +13,6 @@ _RATIO = 1e4
 
 
 def findings(scene: CheckedScene) -> list[Finding]:
-    """Advice where one part of the motion is much faster than another."""
     n, m = scene.layout.size, scene.measured
     # Constraints leave the velocities in the kernel of G free.
     free = null_space(m.jacobian[0]).astype(float)
@@ -55,15 +56,9 @@ def _symmetric(matrix: np.ndarray, mass: np.ndarray) -> np.ndarray:
 
 def _trusted_roots(matrix: np.ndarray, eps: float) -> np.ndarray:
     """`_trusted_eigenvalues` for ẍ = K x, of which the eigenvalues are ±√ of those of K: an eighth of the work."""
-    symmetric = np.array_equal(matrix, matrix.T)
-    noise = 64 * eps * np.abs(matrix).max() * np.random.default_rng(0).standard_normal(matrix.shape)
-    if symmetric:
-        noise = 0.5 * (noise + noise.T)
-
-    def roots(k):
-        return np.sqrt((np.linalg.eigvalsh(k) if symmetric else np.linalg.eigvals(k)).astype(complex))
-
-    trusted = _trust(roots(matrix), roots(matrix + noise))
+    # Of a symmetric matrix, `eigvalsh` reads one triangle: the noise is symmetric as well.
+    eigenvalues = np.linalg.eigvalsh if np.array_equal(matrix, matrix.T) else np.linalg.eigvals
+    trusted = _trust(lambda k: np.sqrt(eigenvalues(k).astype(complex)), matrix, eps)
     return np.concatenate([trusted, -trusted])
 
 
@@ -74,12 +69,12 @@ def _trusted_eigenvalues(linear: np.ndarray, eps: float) -> np.ndarray:
     """
     speed = np.sqrt(np.abs(linear[len(linear) // 2 :]).max()) or 1.0
     scale = np.repeat([1.0, speed], len(linear) // 2)  # the time in units in which both halves are alike
-    linear = linear * scale / scale[:, None]
-    noise = 64 * eps * np.abs(linear).max() * np.random.default_rng(0).standard_normal(linear.shape)
-    return _trust(np.linalg.eigvals(linear), np.linalg.eigvals(linear + noise))
+    return _trust(np.linalg.eigvals, linear * scale / scale[:, None], eps)
 
 
-def _trust(values: np.ndarray, perturbed: np.ndarray) -> np.ndarray:
-    """The values that are not zero, and which their perturbation has moved by less than a tenth."""
+def _trust(spectrum: Callable, matrix: np.ndarray, eps: float) -> np.ndarray:
+    """The values of a spectrum that are not zero, and that noise of the size of rounding moves by less than a tenth."""
+    noise = 64 * eps * np.abs(matrix).max() * np.random.default_rng(0).standard_normal(matrix.shape)
+    values, perturbed = spectrum(matrix), spectrum(matrix + noise)
     nearest = np.abs(values[:, None] - perturbed).min(axis=1)
     return values[(np.abs(values) > 0) & (nearest < 0.1 * np.abs(values))]
