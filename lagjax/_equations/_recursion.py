@@ -342,7 +342,7 @@ class _Elimination:
                 self._add(self._sizes, u, self._apply("mul", definition[u], definition[u]), size)
         zero = self._number(0.0)
         self.factors += [definition[u] for u in step.terms]
-        self.factors += [sums.get(u, zero) for u in step.others]
+        self.factors += [sums[u] if u in sums else zero for u in step.others]
         self.factors.append(zero if own is None else own)
 
     def coordinate(self, step: _Step) -> None:
