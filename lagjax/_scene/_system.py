@@ -224,7 +224,7 @@ class System(eqx.Module):
         require_number(t, "t")
         self, layout = present_system(self), Layout.from_state(q, qdot)
         facts = explain(Problem.from_system(self, layout, params))
-        if self.constraints is None and self.velocity_constraints is None:
+        if not self._constraint_roles:
             return facts
         names = self.constraint_names(layout, params)
         schur = self._evaluate_quantity(Motion.schur_complement, q, qdot, t, params)
@@ -263,15 +263,14 @@ class System(eqx.Module):
         )
 
     def _require_constraints(self) -> None:
-        if self.constraints is None and self.velocity_constraints is None:
+        if not self._constraint_roles:
             raise ValueError("This system has no constraints: give constraints=... or velocity_constraints=... to it.")
 
     def _evaluate_constraints(self, quantity: Callable, q, qdot, t, params) -> PyTree:
         self._require_constraints()
         self = present_system(self)
-        return self._split_by_constraint(
-            self._evaluate_quantity(quantity, q, qdot, t, params), Layout.from_state(q, qdot), params
-        )
+        flat = self._evaluate_quantity(quantity, q, qdot, t, params)
+        return self._split_by_constraint(flat, Layout.from_state(q, qdot), params)
 
     def _split_by_constraint(self, flat: jax.Array, layout: Layout, params: PyTree) -> PyTree:
         """`flat` (m,), a number for each constraint, in the structure of `multipliers`."""
@@ -284,22 +283,16 @@ class System(eqx.Module):
 
     def _constraint_structure(self, layout: Layout, params: PyTree) -> tuple:
         """The shapes that the constraint functions return, a tuple of one or two pytrees."""
-        numbers, code = eqx.partition(params, eqx.is_array_like)
+        return tuple(self._output_shapes(role, layout, params) for role in self._constraint_roles)
 
-        def output_shapes(q, t, p):
-            extras = {"t": t, "params": eqx.combine(p, code)}
-            positions = () if self.constraints is None else (self.constraints(q, **extras),)
-            velocities = () if self.velocity_constraints is None else (self.velocity_constraints(q, q, **extras),)
-            return positions + velocities
-
-        state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
-        return jax.eval_shape(output_shapes, state, t, numbers)
+    @property
+    def _constraint_roles(self) -> list[str]:
+        return [role for role in ("constraints", "velocity_constraints") if getattr(self, role) is not None]
 
     def constraint_names(self, layout: Layout, params: PyTree) -> list[str]:
         """A name for each of the m constraints, such as constraints['rod'] or velocity_constraints[1]."""
-        roles = [role for role in ("constraints", "velocity_constraints") if getattr(self, role) is not None]
         names = []
-        for role, part in zip(roles, self._constraint_structure(layout, params), strict=True):
+        for role, part in zip(self._constraint_roles, self._constraint_structure(layout, params), strict=True):
             for path, leaf in jax.tree_util.tree_leaves_with_path(part):
                 label = role + jax.tree_util.keystr(path)
                 names += [label + (str(list(index)) if leaf.shape else "") for index in np.ndindex(leaf.shape)]
@@ -349,30 +342,31 @@ class System(eqx.Module):
 
     def _check_outputs(self, layout: Layout, params: PyTree) -> None:
         """Trace each function once, on shapes alone, and say what is wrong with what it returns."""
-
-        def output_shapes(function, role):
-            state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
-            numbers, code = eqx.partition(params, eqx.is_array_like)
+        for role in ("lagrangian", "dissipation", "forces"):
+            if getattr(self, role) is None:
+                continue
             try:
-                return jax.eval_shape(
-                    lambda q, t, p: function(q, q, t=t, params=eqx.combine(p, code)), state, t, numbers
-                )
+                shapes = self._output_shapes(role, layout, params)
             except ValueNotKnown:
                 raise
             except (TypeError, KeyError, IndexError, AttributeError) as error:
                 # A dict, where it expects a number, speaks of neither.
-                leaves = jax.tree_util.tree_leaves_with_path(state)[:8]
-                shown = ", ".join(f"q{jax.tree_util.keystr(path)} of shape {leaf.shape}" for path, leaf in leaves)
+                of_leaves = list(zip(layout.paths, layout.shapes, strict=True))[:8]
+                shown = ", ".join(f"{path} of shape {shape}" for path, shape in of_leaves)
                 error.add_note(f"{role} was called with {shown}. Give q, qdot and params the structure that it reads.")
                 raise
-
-        for function, role in ((self.lagrangian, "lagrangian"), (self.dissipation, "dissipation")):
-            if function is not None:
-                _require_scalar(output_shapes(function, role), role)
-        if self.forces is not None:
-            _require_structure(output_shapes(self.forces, "forces"), layout)
-        if self.constraints is not None or self.velocity_constraints is not None:
+            _require_structure(shapes, layout) if role == "forces" else _require_scalar(shapes, role)
+        if self._constraint_roles:
             _require_constraints(self._constraint_structure(layout, params))
+
+    def _output_shapes(self, role: str, layout: Layout, params: PyTree) -> PyTree:
+        """The shapes that the function of a role returns, traced on shapes alone."""
+        numbers, code = eqx.partition(params, eqx.is_array_like)
+        function, count = getattr(self, role), 1 if role == "constraints" else 2
+        state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
+        return jax.eval_shape(
+            lambda q, t, p: function(*[q] * count, t=t, params=eqx.combine(p, code)), state, t, numbers
+        )
 
 
 def require_system(system: Any) -> System:
