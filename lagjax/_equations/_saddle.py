@@ -22,7 +22,7 @@ all that is left, at once.
 import functools
 import operator
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -38,21 +38,6 @@ REGULAR = 1e-4
 # Coordinates of the largest M that is solved without being positive definite: 12 000 operations, 2 CPU s of LLVM. With
 # twice as many they would be eight times as many, and diffrax begins as soon.
 LARGEST_INDEFINITE = 16
-
-
-class _Pivot(NamedTuple):
-    """One step of an elimination: the index of the pivot, those it is eliminated from, and places in vectors.
-
-    `column` has the places of Lᵢⱼ in L, and of Aᵢⱼ in A; `first`, `second` and `updated` are, for every pair of rows
-    below the pivot, their positions in the column and the place of what is taken off.
-    """
-
-    index: int
-    rows: np.ndarray
-    column: np.ndarray
-    first: np.ndarray
-    second: np.ndarray
-    updated: np.ndarray
 
 
 class SaddleElimination:
@@ -97,12 +82,6 @@ class SaddleElimination:
             self.slots[rows, j] = self.slots[j, rows] = np.arange(self.count, self.count + len(rows))
             self.count += len(rows)
 
-    def _pivots(self) -> Iterator[_Pivot]:
-        for j in self.order:
-            rows = self.below[j]
-            first, second = np.tril_indices(len(rows), -1)
-            yield _Pivot(j, rows, self.slots[rows, j], first, second, self.slots[rows[first], rows[second]])
-
     @property
     def operations(self) -> int:
         return sum(len(rows) * (len(rows) + 6) + 3 for rows in self.below.values())
@@ -135,29 +114,28 @@ class SaddleElimination:
         taken: list[list] = [[[], []] for _ in range(total)]
         inverse: list[Any] = [None] * total
         columns, losses = [], []
-        for j, rows, column, first, second, updated in self._pivots():
-            lost, inverse[j] = self._pivot(j, a[j], *taken[j])
-            if lost is not None:
+        for j in self.order:
+            rows, (of_coordinates, of_constraints) = self.below[j], taken[j]
+            if j < n:
+                lost, inverse[j] = self._mass_pivot(j, a[j], of_coordinates + of_constraints)
+            else:
+                lost, inverse[j] = self._constraint_pivot(of_coordinates, of_constraints)
+            if j < n or self.regular_only:
                 losses.append(lost)
             if not len(rows):
                 continue
-            scaled = a[column]  # L D
+            scaled = a[self.slots[rows, j]]  # L D
             lower = scaled * inverse[j]
             columns.append(lower)
             squares = lower * scaled
             for k, i in enumerate(rows.tolist()):
                 taken[i][j >= n].append(squares[k])
+            first, second = np.tril_indices(len(rows), -1)  # of every pair of rows below the pivot
+            updated = self.slots[rows[first], rows[second]]
             if len(updated):
                 a = xp.replace_entries(a, updated, a[updated] - lower[first] * scaled[second])
         lost = xp.fold("or", xp.stack(losses)) if losses else False
         return xp.concatenate(columns) if columns else a[:0], xp.stack(inverse), lost
-
-    def _pivot(self, j: int, diagonal, of_coordinates: list, of_constraints: list) -> tuple[Any, Any]:
-        """A flag that a pivot was lost, None where that does not count, and its inverse."""
-        if j < self.size:
-            return self._mass_pivot(j, diagonal, of_coordinates + of_constraints)
-        lost, inverse = self._constraint_pivot(of_coordinates, of_constraints)
-        return (lost if self.regular_only else None), inverse
 
     def _mass_pivot(self, j: int, diagonal, terms: list) -> tuple[Any, Any]:
         """A flag that the rest of Mⱼⱼ is round-off, and its inverse; NaN where it is."""
