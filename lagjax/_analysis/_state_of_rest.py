@@ -15,7 +15,7 @@ from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._solve import levenberg_marquardt
 from lagjax._interface import SimulationError
 from lagjax._run import simulate
-from lagjax._scene import System
+from lagjax._scene import ROLES, System
 
 PyTree = Any
 
@@ -65,16 +65,11 @@ def _add_friction(system: System) -> System:
         own = 0.0 if system.dissipation is None else system.dissipation(q, qdot, t=0.0, params=params["of"])
         return own + params["rate"] * kinetic
 
-    def fix_time(function, roles=2) -> Any:
-        def fixed(*state_t_params):
+    def fix_time(function, roles: int) -> Any:
+        def function_at_zero(*state_t_params):
             return function(*state_t_params[:roles], t=0.0, params=state_t_params[-1]["of"])
 
-        return function and restrict_signature(fixed, {"params"}, roles)
+        return function and restrict_signature(function_at_zero, {"params"}, roles)
 
-    return System(
-        fix_time(system.lagrangian),
-        forces=fix_time(system.forces),
-        dissipation=dissipation,
-        constraints=fix_time(system.constraints, roles=1),
-        velocity_constraints=fix_time(system.velocity_constraints),
-    )
+    fixed: dict[str, Any] = {role: fix_time(getattr(system, role), 1 if role == "constraints" else 2) for role in ROLES}
+    return System(**fixed | {"dissipation": dissipation})

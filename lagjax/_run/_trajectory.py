@@ -5,6 +5,7 @@ states are methods: they cost nothing until they are called, and they are differ
 motion (`_trust`, `_show`) stands above it: its methods import it when they are called (`_interface._registered`).
 """
 
+import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -261,16 +262,12 @@ class Trajectory(eqx.Module):
         self._require_present()
 
         def evaluate_member(q, qdot, times_and_tolerances, params, mode):
-            ts, _ = times_and_tolerances
-
-            def evaluate_output(q, qdot, t, mode):
-                return self._evaluate_output(name, q, qdot, t, params, mode)
-
-            return jax.vmap(evaluate_output)(q, qdot, ts, mode)
+            evaluate = functools.partial(self._evaluate_output, name, params)
+            return jax.vmap(evaluate)(q, qdot, times_and_tolerances[0], mode)
 
         return self.map_members(evaluate_member)
 
-    def _evaluate_output(self, name: str, q, qdot, t, params, mode) -> PyTree:
+    def _evaluate_output(self, name: str, params, q, qdot, t, mode) -> PyTree:
         if isinstance(self.system, System):
             return getattr(self.system, name)(q, qdot, t, params)
         if name not in ("energy", "momentum"):  # which every mode has

@@ -32,12 +32,12 @@ def dataset(trajectory, units: PyTree = None, time_unit: str | None = None):
     if trajectory.mode is not None:
         names = {"names": list(trajectory.mode_names)}
         variables["mode"] = ((*members, "time"), np.asarray(trajectory.mode), names)
-    times = times_of_members(trajectory)
-    shared = bool((times == times[(0,) * len(members)]).all())
-    times = times[(0,) * len(members)] if shared else times
+    times, first = times_of_members(trajectory), (0,) * len(members)
     of_time = {} if time_unit is None else {"units": time_unit}
-    own = {} if shared else {"t": ((*members, "time"), times, of_time)}
-    coordinates = {"time": ("time", times, of_time)} if shared else own
+    if (times == times[first]).all():
+        coordinates = {"time": ("time", times[first], of_time)}
+    else:
+        coordinates = {"t": ((*members, "time"), times, of_time)}
     return xarray.Dataset(variables, coords=coordinates)
 
 

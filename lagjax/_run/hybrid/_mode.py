@@ -11,7 +11,6 @@ these are the jump of a sensitivity at an event ("saltation matrix").
 
 import dataclasses
 import functools
-import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -105,11 +104,11 @@ class Transition(eqx.Module):
         return f"Transition({self.source!r} → {self.target!r} where {self.guard.name} {way} zero{more})"
 
     def now(self) -> "Transition":
-        functions = self.guard, self.reset
-        now = present(self.guard), None if self.reset is None else present(self.reset)
-        if all(map(operator.is_, functions, now)):
-            return self
-        return eqx.tree_at(lambda t: (t.guard, t.reset), self, now, is_leaf=lambda x: x is None)
+        guard, reset = present(self.guard), None if self.reset is None else present(self.reset)
+        return self if guard is self.guard and reset is self.reset else self.with_functions(guard, reset)
+
+    def with_functions(self, guard: Function, reset: Function | None) -> "Transition":
+        return eqx.tree_at(lambda t: (t.guard, t.reset), self, (guard, reset), is_leaf=lambda x: x is None)
 
 
 class Mode(NamedTuple):

@@ -49,10 +49,9 @@ class _Traced(NamedTuple):
 
 
 class _Site(NamedTuple):
-    """The place of a number in a trace: among its constants, the operands of equations (i, j), or the results."""
+    """A number of a trace, in the place ("constant", k), ("operand", i, j) of equation i, or ("result", j)."""
 
-    kind: str
-    place: tuple[int, ...]
+    place: tuple
     value: Any
     may_differ: bool
 
@@ -86,12 +85,9 @@ def _family(modes, traces, system: System, leaving: tuple[Transition, ...]) -> S
     rows: list[np.ndarray] = []
     functions = iter([_share_function(column, rows) for column in zip(*traces, strict=True)])
     system = replace_functions(system, {role: next(functions) for role in ROLES})
-    rest = list(functions)
-    shared = tuple(
-        eqx.tree_at(lambda t: (t.guard, t.reset), transition, (guard, reset), is_leaf=lambda x: x is None)
-        for transition, guard, reset in zip(leaving, rest[::2], rest[1::2], strict=True)
-    )
-    return SystemFamily(tuple(modes), system, shared, tuple(rows))
+    rest: list[Any] = list(functions)
+    shared = map(Transition.with_functions, leaving, rest[::2], rest[1::2])
+    return SystemFamily(tuple(modes), system, tuple(shared), tuple(rows))
 
 
 def _share_function(column: tuple, rows: list[np.ndarray]) -> Function | None:
@@ -105,7 +101,7 @@ def _share_function(column: tuple, rows: list[np.ndarray]) -> Function | None:
         return Function(None, Edition.from_function(unchanged), extras)
     places = {}
     for of_modes in _different(column):
-        places[of_modes[0].kind, of_modes[0].place] = len(rows)
+        places[of_modes[0].place] = len(rows)
         rows.append(np.stack([np.asarray(site.value) for site in of_modes]))
     jaxpr, constants, values = _promote_numbers(first.closed, places)
     how = f"numbers {places} {first.closed.in_avals}"
@@ -116,19 +112,19 @@ def _promote_numbers(closed: core.ClosedJaxpr, places: dict) -> tuple[core.Jaxpr
     """A trace whose numbers at `places` are arguments, its constants, and the row of numbers that each stands for."""
     jaxpr, more, rows = closed.jaxpr, [], []
 
-    def argument(kind, place, atom):
-        if (kind, place) not in places:
+    def argument(place, atom):
+        if place not in places:
             return atom
         more.append(core.Var(atom.aval))
-        rows.append(places[kind, place])
+        rows.append(places[place])
         return more[-1]
 
     equations = [
-        equation.replace(invars=[argument("operand", (i, j), x) for j, x in enumerate(equation.invars)])
+        equation.replace(invars=[argument(("operand", i, j), x) for j, x in enumerate(equation.invars)])
         for i, equation in enumerate(jaxpr.eqns)
     ]
-    results = [argument("result", (j,), x) for j, x in enumerate(jaxpr.outvars)]
-    own = [places.get(("constant", (k,))) for k in range(len(closed.consts))]
+    results = [argument(("result", j), x) for j, x in enumerate(jaxpr.outvars)]
+    own = [places.get(("constant", k)) for k in range(len(closed.consts))]
     constants = [None if row is not None else x for x, row in zip(closed.consts, own, strict=True)]
     jaxpr = open_jaxpr(closed, more, eqns=equations, outvars=results)
     return jaxpr, (*constants, *[None] * len(more)), (*own, *rows)
@@ -189,15 +185,15 @@ def _sites(closed: core.ClosedJaxpr) -> Iterator[_Site]:
     jaxpr = closed.jaxpr
     elsewhere = {x for e in jaxpr.eqns if e.primitive.name not in _ARITHMETIC for x in e.invars if _is_variable(x)}
     for k, (variable, value) in enumerate(zip(jaxpr.constvars, closed.consts, strict=True)):
-        yield _Site("constant", (k,), value, variable not in elsewhere and _is_float(variable))
+        yield _Site(("constant", k), value, variable not in elsewhere and _is_float(variable))
     for i, equation in enumerate(jaxpr.eqns):
         for j, x in enumerate(equation.invars):
             if not _is_variable(x):
                 free = equation.primitive.name in _ARITHMETIC and _is_float(x)
-                yield _Site("operand", (i, j), x.val, free)
+                yield _Site(("operand", i, j), x.val, free)
     for j, x in enumerate(jaxpr.outvars):
         if not _is_variable(x):
-            yield _Site("result", (j,), x.val, _is_float(x))
+            yield _Site(("result", j), x.val, _is_float(x))
 
 
 def _is_variable(x) -> bool:
