@@ -271,7 +271,7 @@ def _swings(ax, points: Function, q, shape, params, largest: float) -> None:
         at = jax.tree.map(lambda x, dx, s=swing: jnp.asarray(x) + s / size * dx, q, shape)
         drawn = points(at, t=jnp.zeros(()), params=params)
         for name, value in (drawn if isinstance(drawn, dict) else {"": drawn}).items():
-            line = require_points(name, np.asarray(value)[None], 1)[0]
+            line = require_points(name, np.asarray(value)[None])[0]
             if line.shape[-1] != 2:
                 raise ValueError("plot.modes draws in the plane: return points of two numbers, a projection of them.")
             ax.plot(*line.T, style, color=color, marker="o", markersize=4, linewidth=1.5)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array
 
-from lagjax._analysis._noether import FlatState, variation
+from lagjax._analysis._noether import FlatState, charge_at, variation
 from lagjax._analysis._potential import line_integral
 from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._transformations import Fields
@@ -132,9 +132,7 @@ def _change(scene: SceneState, fields: Fields, transform: Callable, state: FlatS
         return variation(scene, transform, q, qdot, t)
 
     def charge(q, qdot):
-        moved, of_time = transform(q, t)
-        place = q, qdot, t, scene.numbers
-        return scene.motion.momentum(*place) @ moved - of_time * scene.motion.energy(*place)
+        return charge_at(scene.motion, transform, q, qdot, t, scene.numbers)
 
     place = q, qdot, t, scene.numbers
     (moved, of_time), slope = transform(q, t), jax.grad(change)(jnp.zeros_like(qdot))

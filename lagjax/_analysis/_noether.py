@@ -16,6 +16,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from lagjax._analysis._scene_state import SceneState
+from lagjax._equations import Motion
 from lagjax._interface import Function, Layout, accept, present
 from lagjax._program import Unlowerable
 from lagjax._scene import System, present_system, require_system
@@ -82,12 +83,10 @@ def noether_charge(system: System, generator: Callable, gauge: Callable | None =
 
     def charge(q: PyTree, qdot: PyTree, t=0.0, params: PyTree = None) -> Float[Array, ""]:
         layout = Layout.from_state(q, qdot)
-        scene_q, scene_qdot = layout.flatten(q), layout.flatten(qdot)
-        t = jnp.asarray(t, layout.dtype)
-        motion, by = present_system(system)._motion(layout, params), present(generator)
-        change, change_of_time = flat_generator(by, layout)(scene_q, t, params)
-        state = scene_q, scene_qdot, t, eqx.filter(params, eqx.is_array_like)
-        value = motion.momentum(*state) @ change - change_of_time * motion.energy(*state)
+        change, t = flat_generator(present(generator), layout), jnp.asarray(t, layout.dtype)
+        state = layout.flatten(q), layout.flatten(qdot), t, eqx.filter(params, eqx.is_array_like)
+        motion = present_system(system)._motion(layout, params)
+        value = charge_at(motion, lambda q, t: change(q, t, params), *state)
         return value if gauge is None else value - present(gauge)(q, t=t, params=params)
 
     return charge
@@ -118,6 +117,12 @@ def flat_generator(generator: Function, layout: Layout) -> Callable:
 def _is_like(value: PyTree, layout: Layout) -> bool:
     leaves, tree = jax.tree.flatten(value)
     return tree == layout.tree and tuple(jnp.shape(leaf) for leaf in leaves) == layout.shapes
+
+
+def charge_at(motion: Motion, transform: Callable, q: Vector, qdot: Vector, t, numbers: PyTree) -> Float[Array, ""]:
+    """p·ξ − h τ of the transformation (ξ, τ) = `transform(q, t)` at a state."""
+    change, of_time = transform(q, t)
+    return motion.momentum(q, qdot, t, numbers) @ change - of_time * motion.energy(q, qdot, t, numbers)
 
 
 # ---- the variation of L ----------------------------------------------------------------------------------------------

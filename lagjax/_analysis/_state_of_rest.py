@@ -71,5 +71,7 @@ def _add_friction(system: System) -> System:
 
         return function and restrict_signature(function_at_zero, {"params"}, roles)
 
-    fixed: dict[str, Any] = {role: fix_time(getattr(system, role), 1 if role == "constraints" else 2) for role in ROLES}
-    return System(**fixed | {"dissipation": dissipation})
+    counts = {role: 1 if role == "constraints" else 2 for role in ROLES}
+    functions: dict[str, Any] = {role: fix_time(getattr(system, role), count) for role, count in counts.items()}
+    functions["dissipation"] = dissipation
+    return System(**functions)

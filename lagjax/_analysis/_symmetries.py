@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lagjax._analysis._gauge import changes_of, gauge_of, is_right
-from lagjax._analysis._noether import FlatState, euler_lagrange, flat_generator, variation
+from lagjax._analysis._noether import FlatState, charge_at, euler_lagrange, flat_generator, variation
 from lagjax._analysis._potential import absorb_potential_forces
 from lagjax._analysis._random_states import perturb_last_digits, random_states
 from lagjax._analysis._scene_state import SceneState
@@ -400,11 +400,10 @@ def _charge(scene: SceneState, fields: Fields, weights: np.ndarray, gauge: Calla
 
     @accepts_singles(("q", "qdot"), ("t", "params"))
     def charge(q, qdot, t=0.0, params=None):
-        here = system._motion(layout, params)
         numbers = eqx.filter(params, eqx.is_array_like)
         state = layout.flatten(q), layout.flatten(qdot), jnp.asarray(t, layout.dtype), numbers
-        change, of_time = fields.transform(jnp.asarray(weights, layout.dtype), params)(state[0], state[2])
-        value = here.momentum(*state) @ change - of_time * here.energy(*state)
+        transform = fields.transform(jnp.asarray(weights, layout.dtype), params)
+        value = charge_at(system._motion(layout, params), transform, *state)
         return value if gauge is None else value - gauge(q, t, params)
 
     return charge

@@ -64,9 +64,8 @@ class Members:
         x = np.asarray(x)
         if x.ndim < len(self.batch) + dimensions:
             x = np.expand_dims(x, x.ndim - dimensions)
-        return np.broadcast_to(x, self.batch + x.shape[len(self.batch) :]).reshape(
-            self.count, *x.shape[len(self.batch) :]
-        )
+        own = x.shape[len(self.batch) :]
+        return np.broadcast_to(x, self.batch + own).reshape(self.count, *own)
 
     def numbers_of(self, k: int) -> np.ndarray:
         return np.array([x if np.ndim(x) == 0 else x[k] for x in self.numbers])

@@ -202,7 +202,7 @@ def _positions(function: Function, members: Members, k: int, q: np.ndarray, time
     states = members.layout.restore(q.astype(members.layout.dtype))
     named = _evaluate_points(function, states, times.astype(members.layout.dtype), members.params_of(k))
     known = np.all(np.isfinite(q), axis=1)[:, None, None]
-    positions = {str(name): require_points(name, np.asarray(value), len(q)) for name, value in named.items()}
+    positions = {str(name): require_points(name, np.asarray(value)) for name, value in named.items()}
     return {name: np.where(known, value, np.nan) for name, value in positions.items()}
 
 
@@ -216,7 +216,7 @@ def _evaluate_points(function: Function, states, times, params):
     return jax.vmap(points_at)(states, times)
 
 
-def require_points(name, value: np.ndarray, frames: int) -> np.ndarray:
+def require_points(name, value: np.ndarray) -> np.ndarray:
     """The positions of one point or line at F frames, (F, k, 2 or 3). Raises `ValueError` for another shape."""
     if value.ndim == 2:  # one point
         value = value[:, None, :]

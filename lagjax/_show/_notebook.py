@@ -63,9 +63,8 @@ def _draw(figure, trajectory) -> None:
         ax.axvline(np.ravel(trajectory.end.t)[member], color="0.4", linewidth=0.8, linestyle=":")
     simplify_axes(ax, width=0.6).tick_params(labelsize="small")
     ax.set_xlabel("t", fontsize="small")
-    for handle in ax.legend(
-        frameon=False, fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5)
-    ).legend_handles:
+    legend = ax.legend(frameon=False, fontsize="small", loc="center left", bbox_to_anchor=(1.0, 0.5))
+    for handle in legend.legend_handles:
         handle.set_alpha(1.0)
 
 

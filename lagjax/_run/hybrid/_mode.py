@@ -123,7 +123,6 @@ class Mode(NamedTuple):
     numbers: Any
     targets: Any
     surfaces: Surfaces | None
-    params: PyTree
     vector: jax.Array  # every number in params, (P,)
     widths: tuple = ()  # of the first (q, q̇, t), and of params: their rounding, where the start came in float32
 
@@ -146,14 +145,12 @@ class Mode(NamedTuple):
                 raise Unlowerable(refusal)
         except Unlowerable as why:
             raise ValueError(f"The mode {name!r} has no machine code: {why}.") from None
-        return cls(problem, leaving, numbers, targets, surfaces, problem.params, jnp.asarray(problem.vector))
+        return cls(problem, leaving, numbers, targets, surfaces, jnp.asarray(problem.vector))
 
     def with_params(self, params: PyTree, numbers, targets) -> "Mode":
         """The mode of the same family that has these parameters, transition numbers and targets."""
         problem = dataclasses.replace(self.problem, params=params)
-        return self._replace(
-            problem=problem, numbers=numbers, targets=targets, params=params, vector=jnp.asarray(problem.vector)
-        )
+        return self._replace(problem=problem, numbers=numbers, targets=targets, vector=jnp.asarray(problem.vector))
 
     @property
     def layout(self) -> Layout:
@@ -196,11 +193,11 @@ class Mode(NamedTuple):
         return attach_derivative(moved, (t, y), k, taken, t, y, numbers)
 
     def is_inconsistent(self, t, y):
-        system = self.problem.system
+        system, params = self.problem.system, self.problem.params
         if system.constraints is None and system.velocity_constraints is None:
             return jnp.asarray(False)
-        motion = system._motion(self.layout, self.params)
-        t, y, numbers = jax.lax.stop_gradient((t, y, eqx.filter(self.params, eqx.is_array_like)))
+        motion = system._motion(self.layout, params)
+        t, y, numbers = jax.lax.stop_gradient((t, y, eqx.filter(params, eqx.is_array_like)))
         state, dtype = (*halves(y), t, numbers), SINGLE if self.problem.is_rounded else DOUBLE
         terms = self.problem.derivation.term_sizes(*state)
         return motion.constraints.inconsistent(motion.mass_matrix(*state), *state, jnp.inf, dtype, terms)

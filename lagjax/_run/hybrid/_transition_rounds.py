@@ -62,6 +62,7 @@ class RoundPlan(eqx.Module):
         """The modes with the transitions that leave them; those that differ by numbers alone are one group."""
         numbers = [tuple(k for k, t in enumerate(self.transitions) if t.source == name) for name in self.names]
         leaving = [tuple(self.transitions[k] for k in of_mode) for of_mode in numbers]
+        target_of = np.array([self.names.index(t.target) for t in self.transitions], int)
         limits = {"rtol": self.rtol, "atol": self.atol, "max_steps": self.max_steps}
         groups = []
         for family in families(self.systems, leaving, layout, params):
@@ -69,8 +70,7 @@ class RoundPlan(eqx.Module):
             if len(family.modes) > 1:
                 own = Lifted(params, tuple(row[0] for row in family.rows))
             table = np.array([numbers[k] for k in family.modes], int).reshape(len(family.modes), -1)
-            targets = np.array([self.names.index(self.transitions[k].target) for k in table.flat], int)
-            targets = targets.reshape(table.shape)
+            targets = target_of[table]
             problem = Problem.from_system(family.system, layout, own, **limits)
             problem = dataclasses.replace(problem, is_rounded=self.is_single)
             mode = Mode.from_problem(self.names[first], problem, family.leaving, table[0], targets[0])
@@ -98,7 +98,7 @@ class ModeGroup(NamedTuple):
             return self.first
         tables = self.family.rows, self.numbers, self.targets
         values, numbers, targets = jax.tree.map(lambda table: jnp.asarray(table)[row], tables)
-        return self.first.with_params(Lifted(self.first.params.params, values), numbers, targets)
+        return self.first.with_params(Lifted(self.first.problem.params.params, values), numbers, targets)
 
 
 class Ending(NamedTuple):
@@ -311,7 +311,8 @@ class _Rounds(NamedTuple):
         for j, transition in enumerate(mode.leaving):
             if transition.reset is not None:
                 taken = happens & (k == j)
-                moved = state_after(transition, mode.layout, *constant_unless(taken, (t_zero, y_zero, mode.params)))
+                state = constant_unless(taken, (t_zero, y_zero, mode.problem.params))
+                moved = state_after(transition, mode.layout, *state)
                 y_next = jnp.where(taken, moved, y_next)
         target, number = (
             jnp.where(happens, _pick(jnp.asarray(x), first), other)
@@ -334,7 +335,7 @@ class _Rounds(NamedTuple):
         if some.size < 2:
             return jnp.asarray(False)
         # A loop that closes over numbers that vary cannot be transposed.
-        t, y, params, vector, latest = constant_unless(False, (t, y, mode.params, mode.vector, self.ts[-1]))
+        t, y, params, vector, latest = constant_unless(False, (t, y, mode.problem.params, mode.vector, self.ts[-1]))
         mode = mode._replace(vector=vector)
         there = (there & (mode.targets == place))[some]
         resets = [functools.partial(state_after, mode.leaving[k], mode.layout, t, params=params) for k in some]
@@ -445,7 +446,7 @@ class _Rounds(NamedTuple):
         are_blows = jnp.zeros(len(mode.leaving), bool)
         if not some.size:
             return are_blows
-        t, y, params = constant_unless(False, (before.t, before.y, mode.params))
+        t, y, params = constant_unless(False, (before.t, before.y, mode.problem.params))
         states = jnp.stack([state_after(mode.leaving[k], mode.layout, t, y, params) for k in some])
         after = jax.vmap(mode.guards_at, (None, 0, None))(t, states, self.ts[-1])
         after = jax.tree.map(lambda x: x[np.arange(some.size), some], after)
