@@ -57,7 +57,6 @@ class Transitions(NamedTuple):
     _repr_pretty_ = show_str
 
     def __str__(self) -> str:
-        """Their times and modes, of one motion the first ten."""
         if not all(map(is_known, (self.t, self.count))):
             return repr(self)
         count = np.asarray(self.count)

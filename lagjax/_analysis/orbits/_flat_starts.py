@@ -30,18 +30,17 @@ def starts(q0: PyTree, qdot0: PyTree, time, name: str) -> tuple[np.ndarray, Layo
     if not (times > 0).all():
         raise ValueError(f"{name} must be positive; got {times.min()}.")
     leaves, dtype = jax.tree.leaves((q0, qdot0)), np.dtype(float)
-    if times.ndim == 0:
-        layout = Layout.from_state(q0, qdot0)
-        arrays = jax.tree.leaves(as_arrays((q0, qdot0), layout.dtype, "state"))
-        return times, layout, np.asarray(concatenate_leaves(arrays, dtype))[None]
-    if any(np.shape(leaf)[:1] != times.shape for leaf in leaves):
+    if times.ndim and any(np.shape(leaf)[:1] != times.shape for leaf in leaves):
         shapes = sorted({np.shape(leaf) for leaf in leaves})
         raise ValueError(
             f"{name} has shape {times.shape}, a batch: every leaf of q0 and qdot0 must have that many members as its "
             f"first axis; got shapes {shapes}."
         )
-    layout = Layout.from_state(*jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], (q0, qdot0)))
+    first = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], (q0, qdot0)) if times.ndim else (q0, qdot0)
+    layout = Layout.from_state(*first)
     arrays = jax.tree.leaves(as_arrays((q0, qdot0), layout.dtype, "state"))
+    if not times.ndim:
+        return times, layout, np.asarray(concatenate_leaves(arrays, dtype))[None]
     return times, layout, np.asarray(rows(arrays, [0] * len(arrays), len(times), dtype))
 
 

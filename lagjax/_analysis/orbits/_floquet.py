@@ -19,8 +19,6 @@ from lagjax._equations import decide
 # |multiplier| − 1 above this makes an orbit unstable. Multipliers on the unit circle come out within 1e-9 of it, where
 # two of them meet within the square root of their accuracy, 1e-6.
 UNSTABLE = 1e-5
-
-
 # Pairs that multiply to one within this have multipliers that a judgement about stability may rest on.
 UNCERTAIN = 1e-3
 
