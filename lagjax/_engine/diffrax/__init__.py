@@ -210,7 +210,7 @@ def _solve(engine: Diffrax, problem: Problem) -> Solution:
 
 def _state_result(y, acceleration, singular) -> RESULTS:
     """The result code of a motion from a state with this acceleration: successful if it can go on."""
-    finite = jax.tree.reduce(lambda all_, leaf: all_ & jnp.isfinite(leaf).all(), (y, acceleration), jnp.array(True))
+    finite = jnp.isfinite(y).all() & jnp.isfinite(acceleration).all()
     failed = jnp.where(singular, code_of(RESULTS.mass_matrix_singular), code_of(RESULTS.nonfinite_state))
     return result_from(jnp.where(finite, SUCCESSFUL, failed))
 
@@ -218,7 +218,7 @@ def _state_result(y, acceleration, singular) -> RESULTS:
 def _explain_result(solution: Solution, form: MotionEquations, start: RESULTS, ts, numbers) -> RESULTS:
     """The most telling of what diffrax reports, of the first and the last state, and of what the motion ran into."""
     last = halves(solution.y_end)
-    end = _state_result(last, *form.acceleration(solution.t_end, last, numbers))
+    end = _state_result(solution.y_end, *form.acceleration(solution.t_end, last, numbers))
     result = result_from(solution.result)
     stopped = (result != RESULTS.successful) & (result != RESULTS.event_occurred)
     unhealthy = (end != RESULTS.successful) & (stopped | (end == RESULTS.nonfinite_state))
@@ -263,8 +263,8 @@ def _flatten_event(problem: Problem, ts, y0, numbers) -> tuple[diffrax.Event, bo
     ways = jax.tree.leaves(event.direction, is_leaf=lambda leaf: leaf is None)
     conditions = [flat(function, sign) for function, sign in zip(functions, signs, strict=True)]
     ways = [sign > 0 if sign else way for sign, way in zip(signs, ways, strict=True)]
-    whole = (structure.unflatten(conditions), event.root_finder, structure.unflatten(ways))
-    return diffrax.Event(*whole), None not in signs
+    located = diffrax.Event(structure.unflatten(conditions), event.root_finder, structure.unflatten(ways))
+    return located, None not in signs
 
 
 # ---- what can be wrong with a solver ---------------------------------------------------------------------------------

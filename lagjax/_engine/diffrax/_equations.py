@@ -7,6 +7,7 @@ scenes, `projected`: y after one Newton step of positions and of velocities back
 numbers alone.
 """
 
+from contextlib import nullcontext
 from typing import Any
 
 import equinox as eqx
@@ -114,7 +115,5 @@ def _compiled_once(function, *arguments):
 
     On a GPU a call of its own costs as much as the arithmetic of a step, and compiling ten of them is quick.
     """
-    if default_platform() != "cpu":
-        return function(*arguments)
-    with set_xla_metadata(inlineable="false"):
+    with set_xla_metadata(inlineable="false") if default_platform() == "cpu" else nullcontext():
         return function(*arguments)

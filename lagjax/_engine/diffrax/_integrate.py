@@ -79,7 +79,7 @@ def _differentiable(moving, method: Method, adjoint, event) -> Solution:
     if adjoint is not None or event is not None:
         adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
         if isinstance(adjoint, diffrax.BacksolveAdjoint) or not _may_jump(moving):
-            return _solve(moving, method, adjoint, event)
+            return _call(moving, method, adjoint, event)[0]
         # It is not known here by what this will be differentiated: parameters count as fixed.
         solution, _, crossed = _call(moving, _note_jumps(moving, method, None), adjoint, event)
         y_end, path = (differentiable_where(~crossed, x) for x in (solution.y_end, solution.path))
@@ -102,13 +102,11 @@ def _note_jumps(moving, method: Method, varied) -> Method:
     return eqx.tree_at(lambda m: m.controller, method, noting(method.controller, field, varied))
 
 
-def _solve(moving, method: Method, adjoint, event=None) -> Solution:
-    """One integration by diffrax; `moving` is all that can be differentiated."""
-    return _call(moving, method, adjoint, event)[0]
-
-
 def _call(moving, method: Method, adjoint, event=None, *more: diffrax.SubSaveAt) -> tuple[Solution, Any, Any]:
-    """Call diffrax: the solution, what else it is to save, and where that is noted whether a step crossed a jump."""
+    """The solution, what `more` diffrax saves, and whether a step crossed a jump, where that is noted.
+
+    `moving` is all that can be differentiated.
+    """
     field, project, ts, y0, params = moving
     solver = method.solver if project is None else Projected(method.solver, project)
     saved = [diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True), *more]
@@ -131,7 +129,7 @@ def _call(moving, method: Method, adjoint, event=None, *more: diffrax.SubSaveAt)
     )
     accepted, rejected = (done.stats[f"num_{kind}_steps"] for kind in ("accepted", "rejected"))
     result = RESULTS.promote(done.result)._value
-    crossed = done.controller_state[1] if notes else None
+    crossed = done.controller_state[1] if notes else jnp.array(False)
     return Solution(done.ys[0], done.ys[1][0], done.ts[1][0], result, accepted, rejected), done.ys[2:], crossed
 
 
@@ -153,7 +151,7 @@ def _set_stage_loop(solver, adjoint):
 @eqx.filter_custom_vjp
 def _solve_and_record(moving, method):
     """The solution by the plain loop, `diffrax.ForwardMode`, which keeps nothing; reverse mode replays its steps."""
-    return _solve(moving, method, diffrax.ForwardMode())
+    return _call(moving, method, diffrax.ForwardMode())[0]
 
 
 @_solve_and_record.def_fwd
@@ -165,8 +163,6 @@ def _forward(perturbed, moving, method):
     if moves and _may_jump(moving):
         method = _note_jumps(moving, method, varied)
     solution, (times,), crossed = _call(moving, method, diffrax.ForwardMode(), None, record)
-    if crossed is None:
-        crossed = jnp.array(False)
     residuals = times, solution.t_end, solution.result, crossed
     well = jnp.isin(solution.result, jnp.asarray(ENDED_WELL, solution.result.dtype))
     lost = jnp.asarray(code_of(RESULTS.derivatives_lost), solution.result.dtype)
@@ -175,7 +171,6 @@ def _forward(perturbed, moving, method):
 
 @_solve_and_record.def_bwd
 def _backward(residuals, cotangents, perturbed, moving, method):
-    del perturbed
     times, t_end, result, crossed = residuals
 
     def replay(moving):
@@ -187,7 +182,7 @@ def _backward(residuals, cotangents, perturbed, moving, method):
         # The last step ends at ts[-1] itself, which may be differentiated, not at its recorded value.
         controller = _RecordedSteps(jnp.where(times == t_end, jnp.inf, times), method.jumps)
         again = Method(method.solver, controller, None, method.max_steps, diffrax.NoProgressMeter())
-        solution = _solve((field, project, ts, y0, params), again, diffrax.RecursiveCheckpointAdjoint())
+        solution, *_ = _call((field, project, ts, y0, params), again, diffrax.RecursiveCheckpointAdjoint())
         return solution[:3]
 
     replayed, pull_back = eqx.filter_vjp(replay, moving)

@@ -152,7 +152,7 @@ class FineOutput(_Around):
 
 
 class Projected(_Around):
-    """The steps of a solver, each followed by a projection of the state: `project(t, y, args)` → y, one Newton step.
+    """The steps of a solver, each followed by a projection of the state (2n,): `project(t, y, args)`, a Newton step.
 
     Two Newton steps are taken, the second of which says whether the method converges. Where it does not, the state is
     NaN, so that the step is rejected; where no step can be rejected (fixed steps), the run ends with
@@ -181,7 +181,7 @@ class Projected(_Around):
         nearer = self.project(t1, near, args)
         failed = ~_contracts(y1, near, nearer)
         if error is not None:
-            error = jax.tree.map(lambda e, a, b: jnp.abs(e) + jnp.abs(b - a), error, y1, near)
+            error = jnp.abs(error) + jnp.abs(near - y1)
         arrays, others = eqx.partition((nearer, error, dense), eqx.is_inexact_array)
         lost = jax.tree.map(lambda leaf: jnp.where(failed, jnp.nan, leaf), arrays)
         y1, error, dense = eqx.combine(lost, others)
@@ -189,17 +189,12 @@ class Projected(_Around):
         return y1, error, dense, state, diffrax.RESULTS.where(result == diffrax.RESULTS.successful, projection, result)
 
 
-def _contracts(start: PyTree, near: PyTree, nearer: PyTree) -> jax.Array:
+def _contracts(start: jax.Array, near: jax.Array, nearer: jax.Array) -> jax.Array:
     """True if Newton's method converges: its second step is a hundredth of its first, or rounding.
 
     Near a solution the method squares the distance; from too far away a step covers half of it at best, which a
     hundredth tells apart with room on both sides. A step of a thousand units of round-off counts as converged: so much
     the condition of the saddle point may leave.
     """
-    first, second = (
-        jnp.max(jnp.stack([jnp.max(jnp.abs(b - a)) for a, b in zip(*map(jax.tree.leaves, pair), strict=True)]))
-        for pair in ((start, near), (near, nearer))
-    )
-    leaves = jax.tree.leaves((nearer, start))
-    size = jnp.max(jnp.stack([jnp.max(jnp.abs(leaf)) for leaf in leaves]))
-    return second <= jnp.maximum(0.01 * first, 1e3 * float(jnp.finfo(leaves[0].dtype).eps) * size)
+    first, second, *sizes = (jnp.max(jnp.abs(x)) for x in (near - start, nearer - near, nearer, start))
+    return second <= jnp.maximum(0.01 * first, 1e3 * float(jnp.finfo(start.dtype).eps) * jnp.maximum(*sizes))
