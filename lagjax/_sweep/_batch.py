@@ -34,6 +34,7 @@ from lagjax._sweep._description import NOT_TRACEABLE, Description, Sections
 from lagjax._sweep._files import RESULT, Quantity
 
 PyTree = Any
+_Kept = tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]  # values, |h − h₀| and complaints
 CRASHED, KEEP_FAILED = 1000, 1001  # result codes of the sweep's own, far from those of `lagjax.RESULTS`
 NAMES = {CRASHED: "crashed", KEEP_FAILED: "keep_failed"}
 MOST = 16_384  # members of a batch: more are no faster in machine code, and take more memory
@@ -74,8 +75,7 @@ class Batches:
                 "point['theta'], with the names of `over`."
             )
         self._starts = {role: self._map_start(role, f) if callable(f) else None for role, f in roles.items()}
-        of_q0, of_qdot0, of_params = (0 if start else None for start in self._starts.values())
-        self._axes = (of_q0, of_qdot0, of_params)
+        self._axes = tuple(0 if start else None for start in self._starts.values())
         self._keep_all, self._tolerances = jax.jit(self._keep_vectorized), None
 
     def __call__(self, points: dict[str, np.ndarray]) -> KeptResults:
@@ -110,25 +110,19 @@ class Batches:
         )
         self._tolerances = None if isinstance(description.system, Hybrid) else run.tolerances
         for_members = values["params"] if self._axes[2] == 0 else None
-        return _BatchMotions(run, crossings, (_arrays(run), crossings), for_members), complaints
+        return _BatchMotions(run, (_arrays(run), crossings), for_members), complaints
 
-    def _keep_results(
-        self, motions: "_BatchMotions"
-    ) -> tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]:
+    def _keep_results(self, motions: "_BatchMotions") -> _Kept:
         """The result of `keep` for each member, the change of its energy, and the members for which `keep` raised."""
         if "keep" not in self.slow:
             try:
                 return self._keep_compiled(motions)
             except NOT_TRACEABLE as why:
                 self.slow["keep"] = _first_line(why)
-        drift = None
-        if self.conserves:
-            drift_of = jax.vmap(
-                lambda arrays, params: self._drift(self._trajectory(arrays[0], params)), (0, self._axes[2])
-            )
-            drift = np.asarray(jax.jit(drift_of)(motions.arrays, motions.params))
+        drift_of = jax.vmap(lambda arrays, params: self._drift(self._trajectory(arrays[0], params)), (0, self._axes[2]))
+        drift = jax.jit(drift_of)(motions.arrays, motions.params)
         kept, complaints = self._keep_one_by_one(motions)
-        return kept, drift, complaints
+        return kept, None if drift is None else np.asarray(drift), complaints
 
     # ---- compiled for all members ----
 
@@ -146,9 +140,7 @@ class Batches:
 
         return start
 
-    def _keep_compiled(
-        self, motions: "_BatchMotions"
-    ) -> tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]:
+    def _keep_compiled(self, motions: "_BatchMotions") -> _Kept:
         """The kept values of all members at once; blank, with a complaint, where `keep` raises while it runs."""
         everyone = np.arange(len(motions.run.result._value))
 
@@ -183,8 +175,6 @@ class Batches:
         return _arrays_by_name(kept), None if drift is None else np.asarray(drift)
 
     def _keep_vectorized(self, arrays: tuple, params: PyTree) -> tuple:
-        """The result of `keep` for every member, and the change of the energy."""
-
         def keep_member(arrays, params):
             run, crossings = arrays
             trajectory = self._trajectory(run, params)
@@ -236,44 +226,47 @@ class Batches:
 
     def _rows(self, motions: "_BatchMotions") -> tuple[list[dict[str, np.ndarray] | None], dict[int, Exception]]:
         """The result of `keep` for each member by name, None where it raised; and the exceptions."""
-        arrays = jax.tree.map(np.asarray, motions.arrays)
-        params, rows, errors = jax.tree.map(np.asarray, motions.params), [], {}
-        for k in range(len(motions.run.result._value)):
-            try:
-                one, crossed, own_params = jax.tree.map(lambda x, k=k: x[k], (*arrays, params))
-                kept = self._keep_member(self._trajectory(one, own_params), crossed)
-                rows.append(_arrays_by_name(kept))
-            except Exception as error:  # of the user's function: only this member is lost
-                rows.append(None)
-                errors[k] = error
-        return rows, errors
+        of_all = jax.tree.map(np.asarray, (*motions.arrays, motions.params))
+
+        def keep(k: int) -> dict[str, np.ndarray]:
+            run, crossings, params = jax.tree.map(lambda x: x[k], of_all)
+            return _arrays_by_name(self._keep_member(self._trajectory(run, params), crossings))
+
+        return _call_each(keep, len(motions.run.result._value))
 
 
 class _BatchMotions(NamedTuple):
-    """Motions of a batch and their crossings, the same as arrays of B members, and their params where these differ."""
+    """Motions of a batch, the arrays of B members in these and in their crossings, and params that differ by member."""
 
     run: Trajectory
-    crossings: Any
     arrays: tuple
     params: PyTree
 
 
 def _start_one_by_one(role: str, function: Callable, points: dict[str, np.ndarray], complaints: dict[int, str]):
     """`function(point)` called with numbers for each member; NaN, and the complaint, where it raises."""
-    rows, errors = [], {}
-    for k in range(len(next(iter(points.values())))):
-        try:
-            row = function({name: float(x[k]) for name, x in points.items()})
-            rows.append(jax.tree.map(lambda x: np.asarray(x, float), row))
-        except Exception as error:  # of the user's function: only this member is lost
-            rows.append(None)
-            errors[k] = error
-    well = next((row for row in rows if row is not None), None)
-    if well is None:
+
+    def start(k: int) -> PyTree:
+        return jax.tree.map(lambda x: np.asarray(x, float), function({name: float(x[k]) for name, x in points.items()}))
+
+    rows, errors = _call_each(start, len(next(iter(points.values()))))
+    if len(errors) == len(rows):
         raise errors[0]
     complaints |= {k: f"{role} raised {type(error).__name__}: {_first_line(error)}" for k, error in errors.items()}
-    nothing = jax.tree.map(lambda x: np.full_like(x, np.nan), well)
-    return jax.tree.map(lambda *leaves: np.stack(leaves), *(nothing if row is None else row for row in rows))
+    well = next(row for k, row in enumerate(rows) if k not in errors)
+    rows = [jax.tree.map(lambda x: np.full_like(x, np.nan), well) if k in errors else row for k, row in enumerate(rows)]
+    return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
+
+
+def _call_each(function: Callable[[int], Any], count: int) -> tuple[list[Any], dict[int, Exception]]:
+    """The results of a user's function for each member, None where it raised: that one is lost; and the exceptions."""
+    rows, errors = [None] * count, {}
+    for k in range(count):
+        try:
+            rows[k] = function(k)
+        except Exception as error:
+            errors[k] = error
+    return rows, errors
 
 
 def find_failing(members: np.ndarray, why_failed: Callable[[np.ndarray], str | None], most: int) -> dict[int, str]:
@@ -293,10 +286,6 @@ def find_failing(members: np.ndarray, why_failed: Callable[[np.ndarray], str | N
                 continue
         groups += [group[half:], group[:half]]
     return failing if len(failing) <= most else {}
-
-
-def quantities_of(kept: KeptResults) -> list[Quantity]:
-    return [Quantity(name, x.shape[1:], x.dtype) for name, x in kept.values.items()]
 
 
 def _common_quantities(rows: list[dict[str, np.ndarray]]) -> list[Quantity]:
@@ -356,7 +345,6 @@ def _arrays_by_name(kept: dict) -> dict[str, np.ndarray]:
 
 
 def names_of(kept: dict) -> dict:
-    """The result of `keep` with the name of every leaf in its place."""
     return jax.tree_util.tree_map_with_path(
         lambda path, _: ".".join(str(getattr(k, "key", getattr(k, "name", getattr(k, "idx", k)))) for k in path), kept
     )
@@ -373,8 +361,6 @@ _INCONSISTENT = code_of(RESULTS.inconsistent_start)
 
 @functools.lru_cache(maxsize=8)
 def _hybrid_batch(scene: Hybrid, axes: tuple, **tolerances) -> Callable:
-    """`simulate` for all members at once, compiled."""
-
     of_q0, of_qdot0, of_params = axes
     follow_member = functools.partial(simulate, scene, throw=False, **tolerances)
     return jax.jit(jax.vmap(follow_member, in_axes=(of_q0, of_qdot0, None, of_params)))
@@ -414,7 +400,7 @@ def run_batch(
 
 def _follow_crossings(batch: Batch, sections: Sections) -> tuple[Solution, Noted]:
     """The motions from the first to the last time, and the crossings of G sections, each with that axis in front."""
-    section = dict(sections.named_functions()) if sections.names else sections.functions[0]
+    section = sections.named_functions() if sections.names else sections.functions[0]
     surfaces = surfaces_in(batch.member, sections_of(section)[1], sections.directions, sections.names)
     problem = dataclasses.replace(batch.member, guards=surfaces.guards(notes=True))
     tolerances = tolerances_of(problem)._replace(notes=sections.count)

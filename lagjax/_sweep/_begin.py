@@ -11,14 +11,8 @@ import numpy as np
 from lagjax._interface import RESULTS, Layout, code_of
 from lagjax._run.hybrid import Hybrid
 from lagjax._sweep import _batch
-from lagjax._sweep._batch import Batches, KeptResults, label, quantities_of
-from lagjax._sweep._description import (
-    Description,
-    compared_entries,
-    differences,
-    pack_description,
-    users_path,
-)
+from lagjax._sweep._batch import Batches, KeptResults, label
+from lagjax._sweep._description import Description, compared_entries, differences, pack_description, users_path
 from lagjax._sweep._extend import LaterEnd, continues, copy_members, later_end_of, require_extensible, start_names
 from lagjax._sweep._files import FORMAT, NOT_DONE, RESULT, Files, Quantity, is_file_name
 from lagjax._sweep._job import cpu, require_versions, versions
@@ -76,7 +70,7 @@ def begin(
     scene, points = pack_description(description), _sample_points(axes, later)
     points = _thin_points(points, _members_in_memory(description, points))
     kept, seconds, conserves = look(description, points)
-    quantities = quantities_of(kept)
+    quantities = [Quantity(name, x.shape[1:], x.dtype) for name, x in kept.values.items()]
     _require_names(quantities, axes, description.reduce)
     most = _batch.MOST if kept.engine == "MachineCode" else _batch.MOST_ON_DEVICES
     spec = {
@@ -128,9 +122,9 @@ def _unit_size(unit: int | None, shape: tuple[int, ...], seconds: float, quantit
 def _members_in_memory(description: Description, points: dict[str, np.ndarray]) -> int:
     """The members whose paths, and what is noted on the way, take `PATH_BYTES`; none where one takes more."""
     q, qdot, _ = description.evaluate_start({name: x[0] for name, x in points.items()})
-    states = 2 * Layout.from_state(q, qdot).size
-    noted = description.sections.count_bytes(states) if description.sections else 0
-    return _batch.PATH_BYTES // (8 * states * len(description.ts) + noted)
+    states, sections = 2 * Layout.from_state(q, qdot).size, description.sections
+    noted = len(sections.functions) * (sections.count + 1) * (states + 1) if sections else 0
+    return _batch.PATH_BYTES // (8 * (states * len(description.ts) + noted))
 
 
 def _require_names(quantities: list[Quantity], axes: tuple[Axis, ...], reduce: dict) -> None:

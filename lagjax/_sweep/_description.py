@@ -32,7 +32,6 @@ PyTree = Any
 ROLES = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
 MOTION = (*ROLES, "q0", "qdot0", "params")  # what a motion depends on, besides its tolerances
 NOT_TRACEABLE = (jax.errors.JAXTypeError, jax.errors.JAXIndexError)
-_NUMBERS = ("rtol", "atol", "max_steps")
 _OF_EVENTS = ("direction", "root_finder")  # what a diffrax.Event has besides its condition
 _ARGUMENTS = ("section", "direction", "count")
 _SHOWN = 40  # lines of a difference
@@ -77,17 +76,8 @@ class Sections(NamedTuple):
         functions = (section,) if names is None else tuple(section.values())
         return cls(names, functions, directions, int(crossings.get("count", 64)))
 
-    def described(self) -> dict:
-        names = None if self.names is None else list(self.names)
-        return {"names": names, "directions": list(self.directions), "count": self.count}
-
     def named_functions(self) -> dict[str, Callable]:
-        """The functions, by what a store calls them."""
         return dict(zip(self.names or ("section",), self.functions, strict=True))
-
-    def count_bytes(self, states: int) -> int:
-        """The notes on a member whose state has this many numbers."""
-        return 8 * len(self.functions) * (self.count + 1) * (states + 1)
 
 
 def _parameters(keep: Callable) -> list[str]:
@@ -140,16 +130,12 @@ class Description:
 
     def described(self) -> dict:
         """The numbers among it, by name, for the store."""
-        solver = self.settings["solver"]
+        ts, solver, watched = self.ts, self.settings["solver"], self.sections
         return {
-            "ts": {
-                "ends": [float(self.ts[0]), float(self.ts[-1])],
-                "outputs": len(self.ts),
-                "sha256": hash_of(self.ts),
-            },
-            **{name: _value_text(self.settings[name]) for name in _NUMBERS},
+            "ts": {"ends": [float(ts[0]), float(ts[-1])], "outputs": len(ts), "sha256": hash_of(ts)},
+            **{name: _value_text(self.settings[name]) for name in ("rtol", "atol", "max_steps")},
             "solver": None if solver is None else identity(solver),
-            "crossings": self.sections.described() if self.sections else None,
+            "crossings": watched and {name: getattr(watched, name) for name in ("names", "directions", "count")},
             "reduce": {name: how.described() for name, how in self.reduce.items()},
         }
 
@@ -213,11 +199,11 @@ def _defer_trace(function, arguments: tuple, params) -> Callable:
 def _entry(value: Any, program: Callable | None, *more: Any) -> dict[str, str]:
     """The text of a function or a value, and what it computes: as JAX traces it, else its code and all that it uses."""
     text = source(value) if callable(value) else _value_text(value)
-    if program is None:
-        return {"text": text, "program": identity(value)}
     try:
-        closed = program()
-    except Exception:  # not written in jax.numpy, or it needs leaves that are no numbers: its code stands for it
+        closed = program() if program else None
+    except Exception:  # not written in jax.numpy, or it needs leaves that are no numbers
+        closed = None
+    if closed is None:
         return {"text": text, "program": identity(value)}
     shown = strip_addresses(str(closed))
     constants = [_value_text(x) for x in [*closed.consts, *jax.tree.leaves(more)]]

@@ -13,6 +13,7 @@ After that the other store is not read any more.
 
 import json
 import warnings
+from collections.abc import Callable
 from functools import partial
 from typing import NamedTuple
 
@@ -63,8 +64,9 @@ def _require_whole(other: Files, spec: dict) -> None:
 def copy_members(old: Files, new: Files) -> None:
     """Copy the members that `old` has into `new`, of which nothing is done yet."""
     before, spec = old.spec(), new.spec()
-    grid, places = new.grid(spec), list(map(partial(_MatchingPlaces.between, old, new), before["axes"], spec["axes"]))
-    if not all(place.common for place in places):
+    matches = map(partial(_match_places, old, new), before["axes"], spec["axes"])
+    grid, places = new.grid(spec), [places_in for places_in in matches if places_in is not None]
+    if len(places) < len(spec["axes"]):
         warnings.warn(
             f"{old.path} has no member that is also in `over`, so that all are computed: compare the values of its "
             "axes, and the seeds and bounds of its designs. A latin hypercube cannot be extended.",
@@ -72,7 +74,7 @@ def copy_members(old: Files, new: Files) -> None:
         )
         return
     for unit in range(grid.units):
-        box = [place(part) for place, part in zip(places, grid.box(unit), strict=True)]
+        box = [places_in(part) for places_in, part in zip(places, grid.box(unit), strict=True)]
         inside = [np.flatnonzero(x >= 0) for x in box]
         if not all(len(x) for x in inside):
             continue
@@ -81,37 +83,29 @@ def copy_members(old: Files, new: Files) -> None:
         members = np.ravel_multi_index(np.ix_(*inside), grid.box_shape(unit)).ravel()[finished]
         values = {name: x[finished] for name, x in values.items()}
         if len(members) == grid.size(unit):
-            record = record_of(grid, unit, values[RESULT.name], spec["engine"]) | {"seconds": 0.0, "cpu_seconds": 0.0}
-            new.write_unit(spec, unit, values, record, b"")
+            record = record_of(grid, unit, values[RESULT.name], spec["engine"], {})
+            new.write_unit(spec, unit, values, record | {"seconds": 0.0, "cpu_seconds": 0.0}, b"")
         elif len(members):
             new.write_copied(unit, Copied(members, values, {}))
 
 
-class _MatchingPlaces(NamedTuple):
-    """The places in the old store with the values of those along an axis of the new one; −1 where there is none.
+def _match_places(old: Files, new: Files, old_axis: dict, new_axis: dict) -> Callable[[slice], np.ndarray] | None:
+    """The places in the old store with the values of a part of an axis of the new one; −1 where there is none.
 
-    `places` (size,) lists them; None where both have one rule, by which the first `common` ones are the same.
+    None where they have no value in common. Values are read where no one rule gives them.
     """
+    if old_axis | {"size": 0} == new_axis | {"size": 0} and old_axis["rule"] in GROWING:
 
-    common: int
-    places: np.ndarray | None
+        def same_places(part: slice) -> np.ndarray:
+            numbers = np.arange(part.start, part.stop)
+            return np.where(numbers < old_axis["size"], numbers, -1)
 
-    @classmethod
-    def between(cls, old: Files, new: Files, old_axis: dict, new_axis: dict) -> "_MatchingPlaces":
-        """Those of an axis. Values are read where no one rule gives them."""
-        if old_axis | {"size": 0} == new_axis | {"size": 0} and old_axis["rule"] in GROWING:
-            return cls(min(old_axis["size"], new_axis["size"]), None)
-        sides = [store.coordinates([x], (slice(None),))[0] for store, x in ((old, old_axis), (new, new_axis))]
-        before, now = (np.stack([side[name] for name in new_axis["names"]], axis=1) for side in sides)
-        place_of = {row.tobytes(): k for k, row in enumerate(before)}
-        places = np.array([place_of.get(row.tobytes(), -1) for row in now])
-        return cls(int(np.sum(places >= 0)), places)
-
-    def __call__(self, part: slice) -> np.ndarray:
-        if self.places is not None:
-            return self.places[part]
-        numbers = np.arange(part.start, part.stop)
-        return np.where(numbers < self.common, numbers, -1)
+        return same_places
+    sides = [store.coordinates([x], (slice(None),))[0] for store, x in ((old, old_axis), (new, new_axis))]
+    before, now = (np.stack([side[name] for name in new_axis["names"]], axis=1) for side in sides)
+    place_of = {row.tobytes(): k for k, row in enumerate(before)}
+    places = np.array([place_of.get(row.tobytes(), -1) for row in now])
+    return places.__getitem__ if np.any(places >= 0) else None
 
 
 def _read_members(old: Files, spec: dict, places: list[np.ndarray]) -> dict[str, np.ndarray]:

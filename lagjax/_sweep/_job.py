@@ -9,14 +9,13 @@ import platform
 import threading
 import time
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import lru_cache
 from importlib import metadata
 from pathlib import Path
-from types import MappingProxyType
 from typing import NamedTuple
 
 import jax
@@ -34,8 +33,6 @@ from lagjax._sweep._statistics import partial_of, to_bytes
 
 @dataclass(frozen=True)
 class Job:
-    """A store, its description, and what computes its members."""
-
     store: Files
     spec: dict
     grid: Grid
@@ -72,23 +69,21 @@ def precision(doubles: bool) -> Iterator[None]:
     within this context, where it is another one. Of several stores in one process the first to come decides on it.
     """
     with _precision_lock:
-        if not _active_precisions:
-            _process_precision.append(_doubles_in_process())
+        _doubles_before.append(_doubles_in_process())
+        if len(_doubles_before) == 1:
             _set_doubles_in_process(doubles)
-        _active_precisions.append(doubles)
     try:
         with jax.enable_x64(doubles):
             yield
     finally:
         with _precision_lock:
-            _active_precisions.remove(doubles)
-            if not _active_precisions:
-                _set_doubles_in_process(_process_precision.pop())
+            before = _doubles_before.pop()
+            if not _doubles_before:
+                _set_doubles_in_process(before)
 
 
 _precision_lock = threading.Lock()
-_active_precisions: list[bool] = []  # the precisions of all who are inside
-_process_precision: list[bool] = []  # that of the process before the first one came, as long as a thread is inside
+_doubles_before: list[bool] = []  # of all who are inside, whether the process had doubles when they came
 
 
 def _doubles_in_process() -> bool:
@@ -149,7 +144,6 @@ def require_versions(store: Files, spec: dict) -> None:
 
 # ---- a unit ----------------------------------------------------------------------------------------------------------
 
-NONE: Mapping[int, str] = MappingProxyType({})
 _NAMED = 100  # failures of a unit that are named in its record; the array `result` has them all
 
 
@@ -179,9 +173,7 @@ def unit_points(job: Job, unit: int) -> Callable[[np.ndarray], dict[str, np.ndar
     return lambda which: points_of(axes, shape, which) | {name: x[which] for name, x in starts.items()}
 
 
-def compute(
-    job: Job, unit: int, crashed: Mapping[int, str] = NONE, before_batch: Callable[[], None] = lambda: None
-) -> Unit:
+def compute(job: Job, unit: int, crashed: dict[int, str], before_batch: Callable[[], None] = lambda: None) -> Unit:
     """Compute a unit without members that are known to end their process."""
     began, spent = time.monotonic(), time.process_time()
     size, points, copied = job.grid.size(unit), unit_points(job, unit), job.store.copied(unit)
@@ -214,7 +206,7 @@ def compute(
     return Unit(values, record, to_bytes(reduced) if reduced else b"")
 
 
-def _replace_crashed(which: np.ndarray, crashed: Mapping[int, str]) -> np.ndarray:
+def _replace_crashed(which: np.ndarray, crashed: dict[int, str]) -> np.ndarray:
     """The members of a batch; a healthy one replaces each of those that `crashed`."""
     bad = np.isin(which, list(crashed))
     if bad.all():
@@ -222,17 +214,12 @@ def _replace_crashed(which: np.ndarray, crashed: Mapping[int, str]) -> np.ndarra
     return np.where(bad, which[~bad][0], which)
 
 
-def record_of(grid: Grid, unit: int, result: np.ndarray, engine: str, complaints: Mapping[int, str] = NONE) -> dict:
+def record_of(grid: Grid, unit: int, result: np.ndarray, engine: str, complaints: dict[int, str]) -> dict:
     """The record of a unit: its `result`s (m,) counted by name, and the first members that failed, with complaints."""
-    counts, failed = np.bincount(result), np.flatnonzero(~np.isin(result, ENDED_WELL))[:_NAMED]
+    codes, failed = np.unique(result, return_counts=True), np.flatnonzero(~np.isin(result, ENDED_WELL))[:_NAMED]
+    results = {label(int(code)): int(count) for code, count in zip(*codes, strict=True)}
+    rows = zip(grid.numbers(unit, failed), result[failed], failed, strict=True)
+    listed = [[int(number), label(int(code)), complaints.get(int(j), "")] for number, code, j in rows]
     return {
-        "unit": unit,
-        "members": len(result),
-        "engine": engine,
-        "slow": {},
-        "results": {label(int(code)): int(counts[code]) for code in np.flatnonzero(counts)},
-        "failed": [
-            [int(number), label(int(result[j])), complaints.get(int(j), "")]
-            for j, number in zip(failed, grid.numbers(unit, failed), strict=True)
-        ],
-    }
+        "unit": unit, "members": len(result), "engine": engine, "slow": {}, "results": results, "failed": listed,
+    }  # fmt: skip

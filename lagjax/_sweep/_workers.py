@@ -84,7 +84,7 @@ def work(job: Job, units: list[int], notify: Notify = lambda: None) -> int:
         for unit in units:
             if job.store.has_finished(unit):
                 continue
-            done = compute(job, unit)
+            done = compute(job, unit, {})
             if writing is not None:
                 writing.result()  # of two units in memory one is being written; raises what the disk refused
             writing = writer.submit(_write, job, unit, done, notify)
