@@ -59,16 +59,14 @@ class Design:
 
             kind = qmc.Sobol if self.kind == "sobol" else qmc.LatinHypercube  # the first scrambled, by default
             draw = kind(len(names), rng=np.random.default_rng(key)).random
+        low, high = np.array(self.low)[:, None], np.array(self.high)[:, None]
         most = SLICE if self.kind in GROWING else self.count
         for start in range(0, self.count, most):
             with warnings.catch_warnings():
                 warnings.simplefilter("ignore", UserWarning)  # that the count is no power of two: the user's choice
                 units = draw(min(most, self.count - start))
-            columns = np.empty(units.shape[::-1])  # one by one: a loop over so few names would be the inner one
-            for k, (low, high) in enumerate(zip(self.low, self.high, strict=True)):
-                np.multiply(units[:, k], high - low, out=columns[k])
-                columns[k] += low
-            yield columns.T
+            columns = np.ascontiguousarray(units.T)  # else the loop over so few names would be the inner one
+            yield (columns * (high - low) + low).T
 
 
 def random(count: int, seed: int = 0, low=0.0, high=1.0) -> Design:

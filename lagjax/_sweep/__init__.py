@@ -273,8 +273,7 @@ def sweep(
     settled = _as_store(store, arguments)
     settings = {name: getattr(settled, name) for name in ("rtol", "atol", "max_steps", "event", "solver")}
     if isinstance(system, Hybrid):
-        names = ("event", "crossings", "solver")
-        if given := [name for name in names if getattr(settled, name) is not None]:
+        if given := [name for name in ("event", "crossings", "solver") if getattr(settled, name) is not None]:
             raise ValueError(
                 f"{' and '.join(given)} of sweep: for the motion of one System. Transitions watch a hybrid motion, in "
                 "machine code; one without a reset notes where it is crossed, and `trajectory.transitions` tells when."

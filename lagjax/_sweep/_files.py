@@ -85,8 +85,6 @@ class Copied(NamedTuple):
 
 @dataclass(frozen=True)
 class Files:
-    """The files of one sweep."""
-
     path: Path
 
     @property
@@ -265,7 +263,6 @@ class Files:
         return (self.job / "done" / f"{unit}.npz").read_bytes()
 
     def copied(self, unit: int) -> Copied:
-        """The members and starts of a unit that were taken from another store."""
         file = self.job / "copied" / f"{unit}.npz"
         if not file.exists():
             return Copied(np.zeros(0, int), {}, {})
@@ -274,7 +271,6 @@ class Files:
             return Copied(arrays["members"], values, starts)
 
     def write_copied(self, unit: int, copied: Copied) -> None:
-        """Write down members and starts of a unit that another store has."""
         arrays = {f"of {name}": x for name, x in copied.values.items()}
         arrays |= {f"at {name}": x for name, x in copied.starts.items()}
         self.write(self.job / "copied" / f"{unit}.npz", arrays_as_bytes({"members": copied.members, **arrays}))

@@ -99,31 +99,25 @@ class Summary(NamedTuple):
 
 def partial_of(how: Statistics, values: np.ndarray, ok: np.ndarray, members: np.ndarray) -> Partial:
     """The statistics of a unit: `values` (m, …) of its members, whether they ended well, and their numbers (m,)."""
-    columns = values.reshape(len(values), -1).astype(float).T
-    rows = [
-        _summarize_column(how, c, x, ok & np.isfinite(x), members) for c, x in enumerate(np.ascontiguousarray(columns))
-    ]
+    columns = np.ascontiguousarray(values.reshape(len(values), -1).astype(float).T)
+    rows = [_summarize_column(how, c, x, ok & np.isfinite(x), members) for c, x in enumerate(columns)]
     *fields, sketches = zip(*rows, strict=True)
     return Partial._make([*map(np.array, fields), np.concatenate(sketches)])
 
 
 def _summarize_column(how: Statistics, c: int, x: np.ndarray, use: np.ndarray, members: np.ndarray) -> tuple:
     missing, x, members = int(np.sum(~use)), x[use], members[use]
-    bins = 0 if how.edges is None else len(how.edges) - 1
-    if not x.size:
-        none = (0, missing, 0.0, 0.0, np.inf, -1, -np.inf, -1)
-        return *none, np.zeros(bins, int), np.zeros(2, int), np.zeros((0, 3), int)
-    mean = np.sum(x) / len(x)
-    least, greatest = int(np.argmin(x)), int(np.argmax(x))
-    histogram, outside = np.zeros(0, int), np.zeros(2, int)
+    mean, ends = np.sum(x) / max(1, len(x)), (np.inf, -1, -np.inf, -1)
+    if x.size:
+        least, greatest = np.argmin(x), np.argmax(x)
+        ends = x[least], members[least], x[greatest], members[greatest]
+    histogram, outside, sketch = np.zeros(0, int), np.zeros(2, int), np.zeros((0, 3), int)
     if how.edges is not None:
         histogram = np.histogram(x, how.edges)[0]
         outside = np.array([np.sum(x < how.edges[0]), np.sum(x > how.edges[-1])])
-    sketch = np.zeros((0, 3), int)
     if how.quantiles:
         keys, counts = np.unique(_bin_indices(x), return_counts=True)
         sketch = np.stack([np.full(len(keys), c), keys, counts], axis=1)
-    ends = x[least], members[least], x[greatest], members[greatest]
     return len(x), missing, mean, np.sum((x - mean) ** 2), *ends, histogram, outside, sketch
 
 
@@ -192,13 +186,11 @@ def summary(how: Statistics, total: Partial, shape: tuple[int, ...]) -> Summary:
 
 def to_bytes(partials: dict[str, Partial]) -> bytes:
     """Statistics of a unit by the names of quantities, as one file."""
-    return arrays_as_bytes(
-        {f"{name}/{field}": x for name, part in partials.items() for field, x in part._asdict().items()}
-    )
+    rows = ((f"{name}/{field}", x) for name, part in partials.items() for field, x in part._asdict().items())
+    return arrays_as_bytes(dict(rows))
 
 
 def from_bytes(data: bytes) -> dict[str, Partial]:
-    """The value that `to_bytes` was given."""
     with np.load(io.BytesIO(data)) as file:
         names = dict.fromkeys(key.rsplit("/", 1)[0] for key in file)
         return {name: Partial(*(file[f"{name}/{field}"] for field in Partial._fields)) for name in names}

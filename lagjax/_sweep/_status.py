@@ -110,22 +110,18 @@ def status(store: Files) -> Status:
 
 
 def point(store: Files, spec: dict, member: int) -> dict[str, float]:
-    places = np.unravel_index(member, tuple(spec["shape"]))
-    return {
-        name: float(np.asarray(store.array(name)[int(i)]))
-        for i, axis in zip(places, spec["axes"], strict=True)
-        for name in axis["names"]
-    }
+    box = tuple(slice(int(i), int(i) + 1) for i in np.unravel_index(member, tuple(spec["shape"])))
+    return {name: float(x[0]) for side in store.coordinates(spec["axes"], box) for name, x in side.items()}
 
 
 def _rate(store: Files, done: list[int], records: list[dict]) -> float | None:
     """Members per second, from the times of the last files; the disk's clock is one for all workers."""
     if not records:
         return None
-    times = {unit: (store.job / "done" / f"{unit}.json").stat().st_mtime for unit in done}
-    recent = sorted(zip(done, records, strict=True), key=lambda pair: times[pair[0]])[-_RECENT:]
-    span = times[recent[-1][0]] - times[recent[0][0]]
-    first = recent[0][1]
+    times = [(store.job / "done" / f"{unit}.json").stat().st_mtime for unit in done]
+    recent = sorted(zip(times, records, strict=True), key=lambda pair: pair[0])[-_RECENT:]
+    (begun, first), (end, _) = recent[0], recent[-1]
+    span = end - begun
     if len(recent) < 2 or span <= 0:
         return first["members"] / max(first["seconds"], 1e-9)
     return sum(record["members"] for _, record in recent[1:]) / span
@@ -146,7 +142,6 @@ class Progress:
         self._begun, self._counted, self._results, self._last = None, set(), Counter(), 0.0
 
     def __call__(self) -> None:
-        """Look at the store, and print."""
         now = time.monotonic()
         if not self.shown or now - self._last < 0.2:
             return
