@@ -109,19 +109,18 @@ class Description:
     sections: Sections | None = None  # whose crossings keep gets
     starts: FinalStates | None = None  # of motions that continue those of another store, instead of q0 and qdot0
 
-    def evaluate_start(self, point: dict[str, Any]) -> tuple[PyTree, PyTree, PyTree]:
+    def evaluate_start(self, point: dict[str, Any]) -> tuple[PyTree, ...]:
         """(q0, qdot0, params) of the member at a point. Raises `ValueError` where they ask it for another name."""
         try:
-            q0, qdot0, params = (x(point) if callable(x) else x for x in (self.q0, self.qdot0, self.params))
+            return tuple(x(point) if callable(x) else x for x in (self.q0, self.qdot0, self.params))
         except KeyError as why:
             if why.args[:1] and why.args[0] in point:
                 raise
             raise ValueError(
                 f"q0, qdot0 or params asks for {why}: a point has the names of `over`, which are {', '.join(point)}."
             ) from why
-        return q0, qdot0, params
 
-    def shapes(self, names: list[str]) -> tuple[PyTree, PyTree, PyTree]:
+    def shapes(self, names: list[str]) -> tuple[PyTree, ...]:
         """(q0, qdot0, params) of a member whose point has these names: shapes, or numbers that are as good."""
         try:
             return jax.eval_shape(self.evaluate_start, {name: jnp.zeros(()) for name in names})

@@ -106,9 +106,10 @@ class Diffrax(AbstractEngine, eqx.Module):
         """The motion of one member, compiled once for all problems of its structure."""
         return _solve(self, problem)
 
+    @eqx.filter_jit
     def solve_batch(self, batch: Batch) -> Solution:
         """The motions of all members, which step together until the slowest has arrived."""
-        solution = _solve_batch(self, batch)
+        solution = batch.map_members(lambda problem: _solve(self, problem))
         steps = solution.accepted + solution.rejected
         return solution._replace(idle=steps.size * jnp.max(steps) - jnp.sum(steps))
 
@@ -162,11 +163,6 @@ def _norm_or_inf(error: PyTree) -> jax.Array:
     """Root mean square, with NaN as infinity: an undefined step is then rejected and shortened like any bad one."""
     norm = optx.rms_norm(error)
     return jnp.where(jnp.isnan(norm), jnp.inf, norm)
-
-
-@eqx.filter_jit
-def _solve_batch(engine: Diffrax, batch: Batch) -> Solution:
-    return batch.map_members(lambda problem: _solve(engine, problem))
 
 
 @eqx.filter_jit

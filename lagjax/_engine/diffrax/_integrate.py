@@ -78,7 +78,8 @@ def integrate(
 def _differentiable(moving, method: Method, adjoint, event) -> Solution:
     if adjoint is not None or event is not None:
         adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
-        if isinstance(adjoint, diffrax.BacksolveAdjoint) or not _may_jump(moving):
+        field, _, ts, y0, params = moving
+        if isinstance(adjoint, diffrax.BacksolveAdjoint) or not may_jump(field, ts[0], y0, params):
             return _call(moving, method, adjoint, event)[0]
         # It is not known here by what this will be differentiated: parameters count as fixed.
         solution, _, crossed = _call(moving, _note_jumps(moving, method, None), adjoint, event)
@@ -86,11 +87,6 @@ def _differentiable(moving, method: Method, adjoint, event) -> Solution:
         return solution._replace(path=path, y_end=y_end)
     # Tolerances and the smallest step follow from ts and the dtype; like all that sizes a step, they are data here.
     return _solve_and_record(moving, freeze(method))
-
-
-def _may_jump(moving) -> bool:
-    field, _, ts, y0, params = moving
-    return may_jump(field, ts[0], y0, params)
 
 
 def _note_jumps(moving, method: Method, varied) -> Method:
@@ -159,8 +155,8 @@ def _forward(perturbed, moving, method):
     record = diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: t)
     of_field, _, _, of_start, of_params = perturbed
     varied = of_field, of_params
-    moves = any(jax.tree.leaves((varied, of_start)))
-    if moves and _may_jump(moving):
+    field, _, ts, y0, params = moving
+    if any(jax.tree.leaves((varied, of_start))) and may_jump(field, ts[0], y0, params):
         method = _note_jumps(moving, method, varied)
     solution, (times,), crossed = _call(moving, method, diffrax.ForwardMode(), None, record)
     residuals = times, solution.t_end, solution.result, crossed

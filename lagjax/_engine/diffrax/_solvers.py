@@ -121,7 +121,6 @@ class FineOutput(_Around):
 
     solver: diffrax.AbstractERK
 
-    term_structure: ClassVar = diffrax.ODETerm
     interpolation_cls: ClassVar[Callable] = _Polynomial
 
     def __check_init__(self):
@@ -129,6 +128,11 @@ class FineOutput(_Around):
         tableau = self.solver.tableau if explicit else None
         if not isinstance(tableau, diffrax.ButcherTableau) or not tableau.fsal:
             raise TypeError(f"FineOutput takes an explicit FSAL Runge-Kutta solver of diffrax; got {self.solver!r}.")
+
+    @property
+    def term_structure(self):
+        """One term, of an ordinary differential equation."""
+        return diffrax.ODETerm
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """The solver's step, and the polynomial through it and through the slopes at four points inside it."""
