@@ -304,11 +304,11 @@ class Derivation:
             return None
         n, parts = self.layout.size, self.program("mass_matrix", "jacobian")
 
-        def of_arrays(values, qdot):
+        def scale_arrays(values, qdot):
             return velocity_scales(values[: n * n].reshape(n, n), values[n * n :].reshape(-1, n), qdot)
 
         def scales(*scalars):
-            return apply_function(of_arrays, parts.vector(*scalars), stack(scalars[n : 2 * n]))
+            return apply_function(scale_arrays, parts.vector(*scalars), stack(scalars[n : 2 * n]))
 
         return lower_formula(scales, *self.scalar_shapes, budget=OPERATION_BUDGET, graph=self._graph)
 

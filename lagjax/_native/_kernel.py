@@ -168,7 +168,7 @@ class Kernel:
 
     def _integrator(self, number: ir.Type = DOUBLE, for_gpus: bool = False) -> Integrator:
         given = self._parts, self._guards, self._error_groups
-        return _write(Integrator, *given, width=self.width, number=number, for_gpus=for_gpus)
+        return _build_module(Integrator, *given, width=self.width, number=number, for_gpus=for_gpus)
 
     def _gpu_programs(self, single: bool) -> "_gpu.GpuPrograms":
         """The programs for GPUs; those in `single` precision of a kernel that `allows_singles`."""
@@ -329,9 +329,9 @@ class Kernel:
         return kernel._tangents(False), min(kernel.threads(members * directions), -(-members // kernel.width))
 
     def _compile_tangents(self, side_by_side: bool) -> "_Compiled":
-        """The kernel of tangents, whose directions stand side by side or members do; compiled on first use."""
+        """The kernel of tangents: directions of one member in its lanes, or members; compiled on first use."""
         width = 1 if side_by_side else self.width
-        return _Compiled(_write(Tangent, self._derivative_parts, width=width, lanes=self.width), self._rounds)
+        return _Compiled(_build_module(Tangent, self._derivative_parts, width=width, lanes=self.width), self._rounds)
 
     def plan(self, rtol: float, atol: float, max_steps: int) -> Plan:
         """The plan by which a handler begins a run; it lives as long as this kernel."""
@@ -377,7 +377,7 @@ class Kernel:
         return _Compiled(self._adjoint(self.width), self._rounds)
 
     def _adjoint(self, width: int, number: ir.Type = DOUBLE) -> Adjoint:
-        return _write(Adjoint, self._derivative_parts, width=width, number=number)
+        return _build_module(Adjoint, self._derivative_parts, width=width, number=number)
 
     def _strides(self, ts, params) -> dict[str, int]:
         return dict(
@@ -388,8 +388,8 @@ class Kernel:
         return min(cores(), max(1, members // (VECTORS_PER_THREAD * self.width)))
 
 
-def _write(kind: Callable, *parts, **options):
-    """The module of a kernel, of this kind, written down."""
+def _build_module(kind: Callable, *parts, **options):
+    """An instance of `kind` (Integrator, Tangent, Adjoint), which writes its module; no garbage is collected meanwhile."""
     with pause_collections():
         return kind(*parts, **options)
 
@@ -480,5 +480,5 @@ def floor_of(rtol: float, atol: float) -> float:
 
 
 def cores() -> int:
-    """The cores that this process may use."""
+    """The number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1

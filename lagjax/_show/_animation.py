@@ -369,7 +369,7 @@ def _digits(times: np.ndarray) -> int:
 
 
 def _ffmpeg() -> str | None:
-    """The program that writes videos, of the system or of the package imageio-ffmpeg."""
+    """The path of ffmpeg, of the system or of the package imageio-ffmpeg; None without it."""
     if program := shutil.which("ffmpeg"):
         return program
     try:

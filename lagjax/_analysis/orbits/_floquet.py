@@ -31,7 +31,10 @@ class Reduced(NamedTuple):
 
 
 def reduce(growth: np.ndarray, null: np.ndarray, of_transpose: np.ndarray) -> Reduced:
-    """The arcs (K, 2n, 2n) of one closed chain on ker ℓ / W, from W = `null` and ℓ = `of_transpose` (K, 2n, k)."""
+    """The arcs `growth` (K, 2n, 2n) of a closed chain, restricted to ker ℓ / W; as they are where W is empty.
+
+    W = `null` and ℓ = `of_transpose`, both (K, 2n, k).
+    """
     count, states, _ = growth.shape
     if not null.shape[2]:
         return Reduced(growth, 0)

@@ -414,7 +414,7 @@ def _run_compiled(ts, y0, params, *, flow, tolerances, keep):
         of_rows = [jax.ShapeDtypeStruct((len(rows[1]), *x.shape[len(batch) :]), x.dtype) for x in shapes]
 
         def finish_run(ts, y0, params, *begun):
-            """On the host: go on with what the handler has begun; or from the beginning, for steps that are kept."""
+            """The outputs of a run, by Python: continued from `begun`; from the beginning where steps are kept."""
             more = (KEPT,) if keep else (None, None, Begun(*begun))
             return flow.run(ts, y0, params, tolerances, *more)[:_OUTPUTS]
 
@@ -491,7 +491,7 @@ def _jvp_for_gpus(ts, y0, params, *given, flow, tolerances):
 
 
 def _vjp_for_gpus(*args, flow, tolerances):
-    """`vjp`: back over the steps of the motion; of constraints, and where the steps do not do, by tangents."""
+    """Cotangents of starts and params, back over the steps; by tangents under constraints, or without a record."""
     settings = dict(flow=flow, tolerances=adapt_tolerances(flow, tolerances))
     with jax.enable_x64(True):
         rows, batch = _rows(args, (*_MOTIONS, 3, 2), library=jnp)

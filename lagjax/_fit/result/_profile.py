@@ -78,7 +78,7 @@ class _ProfileLine:
         self.places = [_Place(float(self.u[which]), others, 0.0)]
 
     def _minimise(self, residuals: Residuals, point: Point, trials: int) -> tuple[Point, float] | LostTrial:
-        """The point that a search ends in, and D there."""
+        """The point that a search ends in and its deviance, or the `LostTrial` it ended with."""
         done = minimise(residuals, point, KnownNoise(self.noise), _ENOUGH, trials)
         if isinstance(done, LostTrial):
             return done

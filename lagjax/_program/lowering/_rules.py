@@ -292,7 +292,7 @@ def _broadcast_in_dim(params, x):
 
 
 def _pad(params, x, value):
-    """Each axis is (before, after, between); a negative margin cuts off."""
+    """The padded array; `padding_config` is (before, after, between) for each axis, and a negative margin cuts off."""
     shape, source, target = [], [], []
     for size, (before, after, between) in zip(x.shape, params["padding_config"], strict=True):
         length = before + after + size + max(size - 1, 0) * between
