@@ -139,7 +139,6 @@ class Problem:
 
     @property
     def is_single(self) -> bool:
-        """True if its state is in float32."""
         return self.layout.dtype == SINGLE
 
     @functools.cached_property
@@ -206,7 +205,6 @@ class Batch(eqx.Module):
 
     @property
     def is_known(self) -> bool:
-        """True if nothing in it is being traced."""
         numbers = eqx.filter(self.params, eqx.is_array_like)
         return all(is_concrete(leaf) for leaf in jax.tree.leaves((self.member.ts, self.y0, numbers)))
 
@@ -333,7 +331,6 @@ def _shape_of_one(leaf, axis):
 
 @functools.lru_cache(maxsize=256)
 def _zeros(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
-    """One zero, seen as an array of this shape."""
     return np.broadcast_to(np.zeros((), dtype), shape)
 
 

@@ -93,7 +93,6 @@ class Adjoint:
         lane["output"] = frame.job("times") - 2
 
     def _take_member(self, frame: Frame, lane: Lane, member: Value) -> None:
-        """The cotangent of the end of a member's motion."""
         for i in self.motion.form.each(frame.code, self.motion.states):
             lane["state_ct", i] = frame.read("y_ct", member * self.motion.states + i)
         with frame.code.loop(self.motion.parameters) as i:

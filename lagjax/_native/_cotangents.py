@@ -55,5 +55,4 @@ class Cotangents:
 
 
 def add(frame: Frame, x, name: str, *indices: Index) -> None:
-    """Add to a vector of the memory."""
     frame[name, *indices] = frame[name, *indices] + x

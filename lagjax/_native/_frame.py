@@ -93,7 +93,6 @@ class Memory:
 
     @property
     def end(self) -> int:
-        """The place of the next field, in doubles."""
         return -(-self._doubles[0] // self.width) * self.width
 
     def extend_by(self, fields: Fields) -> None:
@@ -222,7 +221,6 @@ class Frame:
     # ---- the job ----
 
     def job(self, name: str) -> Value:
-        """A field of the job."""
         position, kind = list(self._fields).index(name), _KINDS[self._fields[name]]
         return self.code.load(self.code.element(self._job, position, INTEGER), kind)
 

@@ -69,7 +69,6 @@ class GpuPrograms:
         return form_for(entry, self._lane(), order_for(rtol))
 
     def motion(self, rtol: float) -> str:
-        """The motion of a member in PTX."""
         return self._motion(self.form(MOTION, rtol))
 
     def transpose(self, rtol: float) -> tuple[str, int]:
@@ -84,7 +83,6 @@ def form_for(entry: Entry, lane: OneLane, order: int) -> GpuForm:
 
 
 def grid(entry: Entry, members: int) -> tuple[int, int]:
-    """The blocks, and the threads of each, for this many members."""
     return min(MOST_BLOCKS[entry], max(1, -(-members // THREADS))), THREADS
 
 

@@ -135,7 +135,6 @@ class _Thread:
         }  # fmt: skip
 
     def finish(self) -> str:
-        """The text of the module."""
         self.code.function.calling_convention = "ptx_kernel"
         self.code.finish()
         return str(self.module)
@@ -144,11 +143,9 @@ class _Thread:
         return self.code.as_value(x, INTEGER)
 
     def words(self, count: int) -> Value:
-        """The address of this many words of the thread's own."""
         return self.code.stack(count)
 
     def memory(self, doubles: int) -> Value:
-        """The address of the memory of a motion."""
         return self.code.stack(doubles, align=8 * CACHE_LINE)
 
     def run(self, name: str, motion: OneLane, job: Value, memory: Value, *more: Value) -> None:
@@ -159,7 +156,6 @@ class _Thread:
         self._call(f"run{name}", job, memory, self.lanes, *more, self.whole(_ROUNDS), result=INTEGER)
 
     def _call(self, name: str, *arguments, result: ir.Type | None = None) -> Value:
-        """A function of another module, or one of LLVM's."""
         values = [getattr(x, "it", x) for x in arguments]
         function = self.module.globals.get(name)
         if function is None:
@@ -168,8 +164,6 @@ class _Thread:
         return Value(self.code, self.code.builder.call(function, values))
 
     def index(self) -> Value:
-        """The number of the thread among all of a launch."""
-
         def register(name):
             read = self._call(f"llvm.nvvm.read.ptx.sreg.{name}.x", result=_WORD)
             return Value(self.code, self.code.builder.zext(read.it, INTEGER))
@@ -211,7 +205,6 @@ class _Transpose(_Thread):
             self._transpose(member)
 
     def _transpose(self, member: Value) -> None:
-        """The results of a member."""
         code, numbers = self.code, self.numbers
 
         def member_address(name: str, stride: Value | int) -> Value:

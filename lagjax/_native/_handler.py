@@ -132,7 +132,6 @@ _INTEGERS = len(LANE) * lanes() + _OTHERS  # also where a kernel has fewer lanes
 
 
 def allocate_aligned(size: int) -> np.ndarray:
-    """Zeros on the boundary of a cache line, which vectors need."""
     memory = np.zeros(size + CACHE_LINE)
     return memory[(-memory.ctypes.data // 8) % CACHE_LINE :]
 
@@ -173,7 +172,6 @@ def make_once(make: Callable) -> Callable:
 
 @make_once
 def handler() -> Handler:
-    """The handler of this process, made at the first call."""
     return Handler()
 
 
@@ -217,7 +215,6 @@ def _tell_version(code: Code, extension: Value) -> None:
 
 
 def _address(base: Value, offset: int) -> Value:
-    """A place this many bytes behind another."""
     return base.code.element(base, offset, ir.IntType(8))
 
 
@@ -318,7 +315,6 @@ def job_of(code: Code, kind: type, fields: dict[str, Any]) -> Value:
 
 
 def call(code: Code, function: Value, result: ir.Type, *arguments: Value) -> Value:
-    """A function of a kernel, by its address."""
     kind = ir.FunctionType(result, [argument.it.type for argument in arguments])
     pointer = code.builder.inttoptr(function.it, kind.as_pointer())
     return Value(code, code.builder.call(pointer, [argument.it for argument in arguments]))

@@ -48,7 +48,6 @@ def _target() -> llvm.Target:
 
 @functools.cache
 def _link(name: str) -> None:
-    """Give LLVM the address of a function of the C library."""
     if os.name == "nt":
         library = ctypes.CDLL("ucrtbase")
     else:
@@ -98,7 +97,6 @@ def compile_module(module: ir.Module, functions: tuple[str, ...]) -> tuple[llvm.
 
 
 def _object(text: str, level: int) -> bytes:
-    """The object file of a module."""
     parsed, machine = llvm.parse_assembly(text), _machine(level)
     parsed.verify()
     builder = llvm.create_pass_builder(machine, llvm.create_pipeline_tuning_options(speed_level=2))
@@ -191,7 +189,6 @@ class Variable:
 
     @property
     def value(self) -> Value:
-        """The number or vector at this place of the code."""
         return self._place.code.load(self._place, self._kind)
 
     @value.setter
@@ -254,7 +251,6 @@ class Code:
         return ir.Constant(like, int(x) if isinstance(like, ir.IntType) else float(x))
 
     def _round(self, x: Value, number: ir.Type) -> Value:
-        """Floating-point numbers in another precision; others as they are."""
         kind, before = x.it.type, element_of(x.it.type)
         if before == number or not {before, number} <= {DOUBLE, FLOAT}:
             return x
@@ -298,7 +294,6 @@ class Code:
         return Value(self, self.builder.select(condition.it, yes.it, no.it))
 
     def flag(self, condition: Value) -> Value:
-        """1 where the condition holds, else 0."""
         return self.select(condition, 1.0, 0.0)
 
     def maximum(self, a, b) -> Value:
@@ -328,11 +323,9 @@ class Code:
         return Value(self, self.builder.sitofp(i.it, DOUBLE))
 
     def as_integer(self, x: Value) -> Value:
-        """A double that is a whole number, as an integer."""
         return Value(self, self.builder.fptosi(x.it, INTEGER))
 
     def bits(self, x: Value) -> Value:
-        """The bits of the code's numbers as integers."""
         return Value(self, self.builder.bitcast(x.it, self._words))
 
     def from_bits(self, x: Value) -> Value:
@@ -360,7 +353,6 @@ class Code:
         return Value(self, self.builder.load(address.it, typ=self.vector, align=8))
 
     def store_packed(self, x: Value, address: Value) -> None:
-        """Write a vector to wherever an address is."""
         self.builder.store(x.it, address.it, align=8)
 
     def offsets(self, words: Value) -> Value:
@@ -391,7 +383,6 @@ class Code:
         return function, eight, (ir.Constant(word, 8), every, nothing)
 
     def variable(self, start: Value) -> "Variable":
-        """A number or vector that changes, as it starts."""
         with self.builder.goto_entry_block():
             place = self.builder.alloca(start.it.type)
         place.align = self._alignment(start.it.type)
@@ -463,7 +454,6 @@ class Code:
     # ---- functions ----
 
     def intrinsic(self, name: str, *xs: Value) -> Value:
-        """One of LLVM's own functions, on scalars or on whole vectors."""
         xs = self._match_types(*xs) if len(xs) == 2 else xs
         kind = xs[0].it.type
         bits = "f32" if element_of(kind) == FLOAT else "f64"
@@ -492,6 +482,5 @@ class Code:
         return Value(self, self.builder.call(function, [x.it for x in xs]))
 
     def any_lane(self, bits: Value) -> Value:
-        """True if the bit is set in any lane."""
         each = (self.builder.extract_element(bits.it, ir.Constant(INTEGER, lane)) for lane in range(self.lanes))
         return functools.reduce(Value.__or__, [Value(self, bit) for bit in each])

@@ -158,7 +158,6 @@ class Kernel:
 
     @property
     def borders(self) -> Borders | None:
-        """The borders between the pieces of the motion."""
         return self._parts.borders
 
     @property
@@ -373,7 +372,6 @@ class Kernel:
 
     @functools.cached_property
     def _backward(self) -> "_Compiled":
-        """The transpose, compiled on first use."""
         return _Compiled(self._adjoint(self.width), self._rounds)
 
     def _adjoint(self, width: int, number: ir.Type = DOUBLE) -> Adjoint:
@@ -389,7 +387,7 @@ class Kernel:
 
 
 def _build_module(kind: Callable, *parts, **options):
-    """An instance of `kind` (Integrator, Tangent, Adjoint), which writes its module; no garbage is collected meanwhile."""
+    """An instance of `kind` (Integrator, Tangent, Adjoint), which writes its module, with collections paused."""
     with pause_collections():
         return kind(*parts, **options)
 

@@ -251,7 +251,6 @@ def _horner(z, coefficients):
 
 
 def sines_and_cosines(code: Code, sincos: Code, x: Value) -> tuple[Value, Value]:
-    """Sine and cosine of the angles x, as the code's numbers."""
     doubles = ir.VectorType(DOUBLE, code.lanes)
     x = code.as_value(x, doubles)
     with code.builder.goto_entry_block():

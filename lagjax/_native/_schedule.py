@@ -178,7 +178,6 @@ def _outputs(
 
 
 def _insert_copies(operations: list[ScheduledOperation], copies: list[ScheduledOperation]) -> list[ScheduledOperation]:
-    """The operations, each followed by the copies of its results."""
     of: dict[int, list[ScheduledOperation]] = {}
     for copy in copies:
         of.setdefault(copy.operands[0], []).append(copy)

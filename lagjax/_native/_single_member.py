@@ -51,7 +51,6 @@ class SingleMember(TaylorSeries):
         return Packed(self.function, self._wide, sincos_function(self.module, lanes()), lanes())
 
     def _wide(self, name: str, *kinds: ir.Type) -> Frame:
-        """A new function whose vectors have the lanes of the processor."""
         return Frame(self.module, Memory(lanes(), {}), self.job, name, *kinds)
 
     # ---- what lies where ----

@@ -41,7 +41,6 @@ class LookUps:
             code.finish()
 
     def __call__(self, frame: Frame, op: str, attribute: Table | Located, x: Value) -> Value:
-        """The result of a look-up, in every lane."""
         if op == "take":
             assert isinstance(attribute, Table)
             return self.take(frame, attribute, x)
@@ -56,7 +55,6 @@ class LookUps:
         return found
 
     def take(self, frame: Frame, table: Table, x: Value) -> Value:
-        """The entries with these numbers."""
         code, (base, first), found = frame.code, self._base(frame, table), frame.constant(0.0)
         for lane, place in enumerate(self._whole(code, self._clip(code, table, x) * float(table.stride) + first)):
             found = _insert_lane(code, found, lane, code.load(code.element(base, place), DOUBLE))
@@ -132,12 +130,10 @@ class LookUps:
 
 
 def _lanes(code: Code, x: Value) -> list[Value]:
-    """The numbers in the lanes of a vector."""
     return [lane_of(code, x, k) for k in range(code.lanes)]
 
 
 def lane_of(code: Code, x: Value, lane: int) -> Value:
-    """The number in one lane of a vector."""
     return Value(code, code.builder.extract_element(x.it, ir.Constant(INTEGER, lane)))
 
 

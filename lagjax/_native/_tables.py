@@ -127,21 +127,18 @@ class Tables:
     # ---- where numbers lie ----
 
     def _field(self, count: int) -> str:
-        """A new field of the memory, of this many vectors."""
         name = f"field{len(self._fields)}"
         self._fields.append(name)
         self._layout.extend_by({name: count})
         return name
 
     def _constant(self, number: float) -> int:
-        """The place of a constant."""
         key = struct.pack("d", number)  # 0.0 and -0.0 are equal but not the same
         if key not in self._constants:
             self._constants[key] = self._layout.place(self._field(1), 0)
         return self._constants[key]
 
     def _places(self, frame: Frame, inputs) -> list[int]:
-        """The place of every input; those without one are given one."""
         places: list[int] = []
         for values in inputs:
             if getattr(values, "place", None) is None or values.shift is not None:
@@ -220,6 +217,5 @@ class Tables:
 
 
 def word(code: Code, words: Value, index: int) -> Value:
-    """An entry of a table."""
     address = code.builder.gep(words.it, [ir.Constant(INTEGER, index)], source_etype=WORD)
     return Value(code, code.builder.zext(code.builder.load(address, typ=WORD, align=4), INTEGER))

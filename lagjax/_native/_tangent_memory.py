@@ -41,7 +41,6 @@ class Directions:
         )
 
     def function(self, name: str, *kinds: ir.Type, **options) -> Frame:
-        """A new function of the module, whose vectors are tangents."""
         return Frame(self.motion.module, self.layout, self.motion.job, f"tangent_{name}", *kinds, **options)
 
     # ---- numbers of the motion, in a function of its tangents ----
@@ -61,7 +60,6 @@ class Directions:
         return Vectors(count, read, None, where)
 
     def number_of(self, frame: Frame, name: str) -> Value:
-        """One vector of the motion."""
         return self.numbers_of(frame, name, 1)[0]
 
     def inputs(self, frame: Frame, state: Vectors, t: Value, tangents: Vectors) -> list:

@@ -95,7 +95,6 @@ class TaylorSeries:
         return Tables(self.function, sincos, look_up=self.look_up) if self.large else Lines(sincos, self.look_up)
 
     def function(self, name: str, *kinds: ir.Type, **options) -> Frame:
-        """A new function of the module."""
         return Frame(self.module, self.layout, self.job, name, *kinds, **options)
 
     def finish(self) -> None:
@@ -104,7 +103,6 @@ class TaylorSeries:
         self.look_up.finish()
 
     def place_of_number(self, code: Code, i: Index) -> Index:
-        """The place of parameter i among the numbers of a member."""
         if self._chosen is None:
             return i
         return code.load(code.element(Value(code, self._chosen), i, INTEGER), INTEGER)
@@ -113,7 +111,6 @@ class TaylorSeries:
 
     @property
     def places_of_sums(self) -> int:
-        """The number of sums of one order that have a place."""
         return len(self.series.cauchy_products)
 
     def sum_indices(self, i: Index, k: Index) -> tuple[Index, Index]:
@@ -187,15 +184,12 @@ class TaylorSeries:
         return frame.vectors_at("rows", self.series.rows, k)
 
     def followed_value(self, frame: Frame, j: Value) -> Value:
-        """The value of number j of those that are followed."""
         return frame["values", j + (self.series.values - self.series.followed)]
 
     def followed_coefficient(self, frame: Frame, j: Value, k: Index) -> Value:
-        """The coefficient of order k > 0 of followed number j."""
         return frame["rows", j + (self.series.rows - self.series.followed), k]
 
     def followed_degree(self, code: Code, order: Value) -> Value:
-        """The order of its last coefficient."""
         if self.pieces:  # see `coefficients`
             return code.select(order < MAX_ORDER - 1, order, MAX_ORDER - 1)
         return order - 1

@@ -107,17 +107,14 @@ def _are_single(numbers: PyTree) -> bool:
 
 
 def has_doubles() -> bool:
-    """True if JAX has float64 at present."""
     return jax.dtypes.canonicalize_dtype(DOUBLE) == DOUBLE
 
 
 def widen(tree: PyTree) -> PyTree:
-    """The arrays of a pytree in NumPy, floats in double precision."""
     return jax.tree.map(lambda x: _widen(x) if isinstance(x, jax.Array | np.ndarray | np.generic) else x, tree)
 
 
 def _widen(array) -> np.ndarray:
-    """The array in NumPy, floats in double precision."""
     return np.asarray(array, _WIDE.get(array.dtype, array.dtype))
 
 

@@ -323,7 +323,6 @@ class Program:
 
     @property
     def operations(self) -> int:
-        """The number of arithmetic operations of one evaluation."""
         return self.line.operations
 
     def constant(self, output: int) -> float | None:

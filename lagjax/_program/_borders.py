@@ -201,7 +201,6 @@ class Borders(NamedTuple):
 
     @property
     def followed(self) -> tuple[int, ...]:
-        """The nodes whose series are wanted."""
         return self.switches + self.arguments
 
     def kicks_in_time(self, states: int) -> list[int]:
@@ -557,7 +556,6 @@ class _Rewriting:
         return self._known[key]
 
     def _is_moving(self, x: int) -> bool:
-        """True if a number changes along a piece of the motion."""
         nodes, moves = self.graph.nodes, self._moves
         for op, operands, attribute in nodes[len(moves) :]:
             if op == "input":

@@ -227,7 +227,6 @@ class Derivatives:
         return self.graph.find_ancestors(outputs, as_derived=True)
 
     def size(self, outputs: Sequence[int]) -> int:
-        """The number of operations of some nodes together."""
         return sum(bool(self.graph.nodes[i][1]) for i in self.graph.find_ancestors(outputs))
 
     def _apply(self, op: str, *operands: int, attribute=None) -> int:

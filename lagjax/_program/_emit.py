@@ -93,7 +93,6 @@ class Rows(NamedTuple):
         return self.first[..., i] if i < m else self.pieces[i - m] if self.pieces else self.numbers[..., i - m]
 
     def entries(self, table: Table):
-        """The entries of a table of them, (…, count)."""
         first = table.first - (BESIDE if table.first >= BESIDE else self.first.shape[-1])
         return self.numbers[..., first : first + table.stride * (table.count - 1) + 1 : table.stride]
 

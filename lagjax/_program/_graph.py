@@ -136,7 +136,6 @@ class Graph:
         return self._bound(first, found)
 
     def finite_part(self, v: int) -> int:
-        """v, and 0 where it is huge."""
         huge, first = self.is_huge(v), len(self.nodes)
         return self._bound(first, self.apply("select", huge, v, self.constant(0.0, "float")))
 
@@ -265,11 +264,9 @@ class Graph:
         return self._append(key, ("constant", (), value), kind)
 
     def find(self, op: str, *operands: int) -> int | None:
-        """The id of this node if it exists already."""
         return self._ids.get((op, operands, None))
 
     def value(self, i: int):
-        """The number a constant node stands for, or None."""
         op, _, attribute = self.nodes[i]
         return attribute if op == "constant" else None
 
@@ -382,7 +379,6 @@ class Graph:
         return self._find_sum(terms, a, b, sign)
 
     def _add_terms(self, terms: dict[int, float]) -> int:
-        """The terms added one by one, positive ones first."""
         (base, coefficient), *rest = sorted(terms.items(), key=lambda term: term[1] < 0)
         total, done = self.scale(coefficient, base), {base: coefficient}
         for base, coefficient in rest:

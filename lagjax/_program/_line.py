@@ -45,7 +45,6 @@ class StraightLine:
     outputs: tuple[int, ...]
 
     def replace(self, **fields) -> "StraightLine":
-        """The line with other nodes, kinds or outputs."""
         return replace(self, **fields)
 
     def constant(self, output: int) -> float | None:
@@ -55,7 +54,6 @@ class StraightLine:
 
     @functools.cached_property
     def operations(self) -> int:
-        """The number of arithmetic operations of one evaluation."""
         return sum(op not in ("input", "constant") for op, _, _ in self.nodes)
 
     @functools.cached_property
@@ -121,7 +119,6 @@ class StraightLine:
 
     @functools.cached_property
     def groups(self) -> "Groups":
-        """Its alike operations side by side."""
         return Groups.from_line(self)
 
     @functools.cached_property
@@ -131,7 +128,6 @@ class StraightLine:
 
     @functools.cached_property
     def _inputs(self) -> dict[int, str]:
-        """The kinds of the inputs that it reads, by their positions."""
         kinds = {node[2]: kind for node, kind in zip(self.nodes, self.kinds, strict=True) if node[0] == "input"}
         for op, _, attribute in self.nodes if self.looks_up else ():
             if op in LOOK_UPS:
@@ -189,7 +185,6 @@ def _convert(x, dtype):
 
 
 def _values(steps: list, columns: Sequence) -> list:
-    """The value of every node; None for those that were dropped."""
     values: list = [None] * len(steps)
     for k, (function, operands, (is_input, attribute), dropped) in enumerate(steps):
         if function is None:
@@ -248,7 +243,6 @@ class Groups(NamedTuple):
 
     @classmethod
     def from_line(cls, line: StraightLine) -> "Groups":
-        """The groups of a straight line."""
         nodes, kinds, counts, each_row = line.nodes, line.kinds, {"float": 0}, []
         for kind in kinds:
             each_row.append(counts.get(kind, 0))

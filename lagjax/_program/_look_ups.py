@@ -40,7 +40,6 @@ class Table(NamedTuple):
 
     @property
     def positions(self) -> range:
-        """The inputs that the entries are; none for numbers."""
         if self.numbers is not None or self.tangents:
             return range(0)
         return range(self.first, self.first + self.stride * self.count, self.stride)

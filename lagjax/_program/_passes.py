@@ -81,7 +81,6 @@ def _square_first(graph, factors) -> int | None:
 
 
 def _common_factor(graph, op, a, b) -> int | None:
-    """x (y ± z) for x y ± x z."""
     if graph.nodes[a][0] not in ("mul", "neg") or graph.nodes[b][0] not in ("mul", "neg"):
         return None
     (m, first), (n, second) = graph.term(a), graph.term(b)

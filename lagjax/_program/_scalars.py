@@ -89,7 +89,6 @@ def fold(op: str, x):
 
 
 def concatenate(parts: Sequence):
-    """Vectors end to end, some of which may be of numbers."""
     scalars = _scalars(*parts)
     if scalars is None:
         return jnp.concatenate([jnp.asarray(part) for part in parts])
@@ -97,7 +96,6 @@ def concatenate(parts: Sequence):
 
 
 def replace_entries(x, index, values):
-    """A vector with other values at these places."""
     if not isinstance(x, Scalars):
         return jnp.asarray(x).at[index].set(values)
     ids = x.ids.copy()
@@ -124,7 +122,6 @@ def stack(parts: Sequence) -> Any:
 
 
 def apply_function(function: Callable, *arguments):
-    """A function of JAX arrays on arrays of scalars."""
     scalars = _scalars(*arguments)
     if scalars is None:
         return function(*arguments)

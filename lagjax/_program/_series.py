@@ -150,7 +150,6 @@ class _Recurrences:
     # ---- what the order recursion reads ----
 
     def value(self, node: int) -> int:
-        """The value of a node at order zero."""
         number = self.zeroth_order.value(node)
         if number is not None:
             return self.order_recursion.constant(number, "float")
@@ -174,7 +173,6 @@ class _Recurrences:
     # ---- the recurrences ----
 
     def coefficient(self, i: int) -> "int | _Unknown | None":
-        """The coefficient of order k of a node."""
         if i not in self._coefficients:
             self._find([i])
         return self._coefficients[i]

@@ -201,7 +201,6 @@ def select(graph, op, predicate, no, yes):
 
 
 def convert(graph, op, a, kind):
-    """Nothing to do where the kind is that already."""
     return a if graph.kinds[a] == kind else graph.node("convert", a, attribute=kind)
 
 

@@ -191,7 +191,6 @@ class _SlidingForces:
         return Sliding(line, range(len(self.line.nodes)), shares, linear, retraction, of_slides, release)
 
     def _group_rows(self, of_rows: Sequence) -> list[list]:
-        """The items of rows, border by border."""
         return [
             [x for row, x in zip(self.rows, of_rows, strict=True) if row.slide == k] for k in range(len(self.slides))
         ]
@@ -510,7 +509,6 @@ class _Held:
                 moved[i] = f("add", moved[i], f("select", pushed_of[k], self.zero, change))
 
     def _evaluate(self, nodes: Sequence[int]) -> list[int]:
-        """Nodes of the program at the state."""
         graph = self.graph
         line = eliminate_dead_code(graph, nodes)
         given = {node[2]: i for i, node in enumerate(graph.nodes) if node[0] == "input"} | self.state

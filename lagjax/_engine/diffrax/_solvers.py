@@ -131,7 +131,6 @@ class FineOutput(_Around):
 
     @property
     def term_structure(self):
-        """One term, of an ordinary differential equation."""
         return diffrax.ODETerm
 
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):

@@ -62,7 +62,6 @@ class Tolerances(NamedTuple):
 
     @property
     def floor(self) -> float:
-        """atol in units of rtol."""
         return _native.floor_of(self.rtol, self.atol)
 
     @property
@@ -152,7 +151,6 @@ class Flow:
 
     @property
     def states(self) -> int:
-        """Numbers in a state: q, then q̇."""
         return 2 * self.size
 
     def path_shape(self, times: int, notes: int) -> tuple[int, ...]:
@@ -168,7 +166,6 @@ class Flow:
 
     @property
     def borders(self):
-        """The borders of its program, where steps end; None without."""
         return self.kernel.borders
 
     # ---- forward ----

@@ -83,7 +83,6 @@ def transpose_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params, path_ct
 
 
 def _inputs(entry: gpu.Entry, ts, y0, params, flow: Flow, tolerances: Tolerances, **more: int) -> dict[str, Any]:
-    """The arrays that all entries have."""
     rtol, atol, max_steps, *_ = tolerances
     numbers = entry.words(
         members=len(y0), times=ts.shape[1], ts_stride=ts.shape[1] if len(ts) > 1 else 0,

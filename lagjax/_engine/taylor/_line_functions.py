@@ -96,7 +96,6 @@ class Line:
 
     @functools.cached_property
     def code(self) -> LineCode | None:
-        """Its machine code; None where it has none."""
         try:
             return None if NO_HANDLER is not None else LineCode(self.line, self.size)
         except Unlowerable:

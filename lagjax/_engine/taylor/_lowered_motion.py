@@ -45,7 +45,6 @@ class _LoweredConstraints(Constraints):
     residual, rates = map(_quantity, ("residual", "rates"))
 
     def f(self, q, t, params):
-        """The values of the constraints on positions."""
         return self.residual(q, jnp.zeros_like(q), t, params)[: self.derivation.position_count]
 
     def jacobian_and_gamma(self, q, qdot, t, params):

@@ -80,7 +80,6 @@ def _pieces(borders, rows: Rows, n: int) -> list[Any]:
 
 
 def _level(borders, guard, rows: Rows, piece):
-    """The level of a guard of this piece."""
     if guard.of_table:
         index = guard.level.slope * piece + guard.level.offset
         table = borders.tables[guard.piece].table

@@ -42,7 +42,6 @@ class GivenSystem(NamedTuple):
 
 
 def read_systems(system, records, params0: PyTree, observe, hold: str) -> list[GivenSystem]:
-    """The systems of a fit as the user gives them, checked."""
     found = []
     for name, one, own, shown in _systems_by_name(system, records, observe):
         with errors_of_system(name):

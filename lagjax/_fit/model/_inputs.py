@@ -67,11 +67,9 @@ class Form(NamedTuple):
 
     @property
     def size(self) -> int:
-        """I, the numbers of an input at one time."""
         return sum(int(np.prod(shape)) for shape in self.shapes)
 
     def restore(self, flat) -> PyTree:
-        """The user's structure of the numbers of an input, (…, I)."""
         sizes = [int(np.prod(shape)) for shape in self.shapes]
         parts = jnp.split(flat, np.cumsum(sizes)[:-1].tolist(), axis=-1)
         return jax.tree.unflatten(

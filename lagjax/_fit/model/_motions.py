@@ -50,11 +50,9 @@ class RecordMotion(NamedTuple):
 
     @property
     def ok(self) -> bool:
-        """True if all reached their last time."""
         return bool(np.isin(self.result, ENDED_WELL).all() and np.isfinite(self.tangents).all())
 
     def describe_failure(self, ts: np.ndarray, layout: Layout) -> tuple[int, str]:
-        """The first row that failed, and what became of it."""
         failed = ~np.isin(self.result, ENDED_WELL)
         if not failed.any():
             row = int(np.argmin(np.isfinite(self.tangents).all(axis=(1, 2, 3))))

@@ -241,7 +241,6 @@ def _sigma(scaled: np.ndarray, dof: float, least: float) -> float:
 
 
 def _cost(scaled: np.ndarray, sigma: float, dof: float) -> float:
-    """−log of the mean likelihood per sample."""
     constant = gammaln((dof + 1) / 2) - gammaln(dof / 2) - 0.5 * np.log(dof * np.pi)
     return np.log(sigma) - constant + 0.5 * (dof + 1) * float(np.mean(np.log1p((scaled / sigma) ** 2 / dof)))
 

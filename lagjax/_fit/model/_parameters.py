@@ -82,7 +82,6 @@ class Parameters:
 
     @functools.cached_property
     def _cuts(self) -> list[tuple[slice, slice, Part]]:
-        """The u and the free numbers that belong to each part."""
         cuts, begin, u_begin = [], 0, 0
         for part in self.parts:
             size = part.transform.count_unknowns(len(part.places))

@@ -147,7 +147,6 @@ class SystemResiduals:
         self.fits_on_constraints = self.manifold is not None and bool(self.fitted.any())
 
     def with_parameters(self, parameters: Parameters) -> "SystemResiduals":
-        """The same residuals where other parameters are free."""
         other = copy.copy(self)
         other.parameters = parameters
         return other
@@ -163,7 +162,6 @@ class SystemResiduals:
         )  # fmt: skip
 
     def columns(self, record: int) -> slice:
-        """The columns of the signals of a record among all."""
         first, last = self.frame.first, self.frame.first + len(self.signals.names)
         return slice(last, last + 1) if record in self.clocks else slice(first, last)
 
@@ -462,7 +460,6 @@ class Residuals:
         return Residuals(self.systems, pieces, fitted, self.watch)
 
     def with_parameters(self, parameters: Parameters) -> "Residuals":
-        """The same residuals where other parameters are free."""
         other = copy.copy(self)
         other.parameters = parameters
         other.systems, other.parts = (
@@ -585,11 +582,9 @@ class Residuals:
 
     @property
     def unknowns(self) -> int:
-        """The numbers of all starts that are fitted."""
         return sum(part.states * int(part.fitted.sum()) for part in self.parts)
 
     def columns(self, record: int) -> slice:
-        """The columns of the signals of a record."""
         part = self._owner(record)
         return part.columns(record - part.frame.records.start)
 
@@ -618,7 +613,6 @@ class Residuals:
 
     @property
     def firsts(self) -> list[int]:
-        """The place of the first piece of every record."""
         places = {piece.record: k for k, piece in reversed(list(enumerate(self.pieces)))}
         return [places[k] for k in range(len(self.records))]
 

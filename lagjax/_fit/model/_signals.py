@@ -71,7 +71,6 @@ class Delays:
         ]
 
     def refuses(self, delays: list[Delay]) -> str | None:
-        """Why a trial with these delays is none, as a sentence."""
         for one in delays:
             if not 0.0 <= one.value <= self.longest:
                 return f"A delay is {one.value:.4g}, but must lie between 0 and the longest one, {self.longest:g}."

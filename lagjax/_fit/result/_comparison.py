@@ -135,7 +135,6 @@ def _cross_validate(fit, folds: int) -> tuple[dict[str, float], np.ndarray]:
 
 
 def _select_pieces(residuals: Residuals, keep: np.ndarray) -> Residuals:
-    """The residuals of some of the pieces, without a watch."""
     part = residuals.with_pieces([p for p, k in zip(residuals.pieces, keep, strict=True) if k], residuals.fitted[keep])
     part.watch = None
     return part

@@ -44,7 +44,6 @@ def unseen_sentences(descent: Descent, known: Information) -> tuple[str, ...]:
 
 
 def _sentence_on_rounding(residuals: Residuals, trial: Trial, known: Information) -> tuple[str, ...]:
-    """The sentence for parameters whose columns are drowned where sensitivities grow."""
     if known.confirmed.shape[1] == known.null.shape[1]:
         return ()
     basis = np.linalg.qr(known.confirmed)[0]

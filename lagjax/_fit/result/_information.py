@@ -85,7 +85,6 @@ def require_level(level) -> None:
 
 
 def information(descent: Descent) -> Information:
-    """The information of the data where a search ended."""
     residuals, trial, noise = descent.residuals, descent.trial, descent.noise
     factors = residuals.fisher_factors(trial, noise)
     triangles = residuals.triangles(trial, factors)

@@ -52,7 +52,6 @@ def draw_waterfall(ax, misfits: np.ndarray) -> None:
 
 
 def draw_correlations(ax, matrix: np.ndarray, names: tuple[str, ...]) -> None:
-    """A covariance as correlations, with numbers where there is room."""
     deviation = np.sqrt(np.where(np.isfinite(np.diag(matrix)), np.diag(matrix), np.nan))
     with np.errstate(invalid="ignore", divide="ignore"):
         correlation = matrix / np.outer(deviation, deviation)
@@ -80,7 +79,6 @@ def draw_residuals(ax, residuals: np.ndarray, sigma: np.ndarray, names: tuple[st
 
 
 def style_axes(ax) -> None:
-    """A light grid behind the data and no box around it."""
     ax.grid(color="0.9", linewidth=0.8)
     ax.set_axisbelow(True)
     ax.spines[["top", "right"]].set_visible(False)
@@ -129,7 +127,6 @@ def _render_picture(size: tuple[float, float], draw: Callable[[Any], None]) -> s
 
 
 def _build_pictures(fit) -> dict[str, list[str]]:
-    """The pictures of a fit by their headings."""
     figures = {}
     for part in fit.residual_function.parts:
         of_one = "" if part.name is None else f"{part.name}: "

@@ -247,7 +247,6 @@ class Fit:
 
     @functools.cached_property
     def _point(self) -> Trial:
-        """The trial that the search ended at, computed anew."""
         trial = self.residual_function.evaluate(Point(self.u, self.states))
         assert isinstance(trial, Trial)  # it was computed before
         return trial

@@ -63,7 +63,6 @@ def choose_places(record: Record, count: int) -> np.ndarray:
 
 
 def _signals(record: Record) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Times and values of every signal, where it is not missing."""
     columns = record.matrix.T
     return [(record.ts[np.isfinite(column)], column[np.isfinite(column)]) for column in columns]
 

@@ -201,7 +201,6 @@ class Search:
         ]
 
     def _cut_records(self, u) -> list[list[Piece]]:
-        """The cuts of the records, from the shortest segments on."""
         pairs = zip(self.residuals.parts, self._time_scales(u), strict=True)
         scales = [scale for part, scale in pairs for _ in part.records]
         return levels([None if reader is None else reader.record for reader in self.readers], scales)

@@ -38,7 +38,6 @@ class Pair(NamedTuple):
 
     @property
     def is_real(self) -> bool:
-        """True if the imaginary part is zero whatever the numbers."""
         graph = self.im.expansion.graph
         return all(graph.value(i) == 0 for i in self.im.ids.ravel().tolist())
 
@@ -49,17 +48,14 @@ class Pair(NamedTuple):
 
     @property
     def angle(self) -> Scalars:
-        """The argument of z, between −π and π."""
         return self.im.map("atan2", self.im, self.re)
 
     @property
     def conjugate(self) -> "Pair":
-        """x − iy."""
         return Pair(self.re, -self.im)
 
     @property
     def multiply_by_i(self) -> "Pair":
-        """The product i z."""
         return Pair(-self.im, self.re)
 
     @property
@@ -68,11 +64,9 @@ class Pair(NamedTuple):
         return Pair(self.im, -self.re)
 
     def scale(self, factor) -> "Pair":
-        """The product with a real number."""
         return Pair(self.re * factor, self.im * factor)
 
     def shift(self, number: float) -> "Pair":
-        """The sum with a real number."""
         return Pair(self.re + number, self.im)
 
 

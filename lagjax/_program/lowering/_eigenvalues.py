@@ -176,7 +176,6 @@ def _order_eigenpairs(expansion: Expansion, a: np.ndarray) -> list[tuple[int, li
 
 
 def _fix_sign(expansion: Expansion, vector: list) -> np.ndarray:
-    """A vector as ids, with its sign."""
     if len(vector) == 1:
         return expansion.constants(np.array(vector))
     wrong = _dot(list(_DIRECTION[: len(vector)]), vector)

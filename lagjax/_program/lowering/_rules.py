@@ -79,7 +79,6 @@ class Expansion:
         return _ids([self.graph.constant(x, kind) for x in value.ravel().tolist()], value.shape)
 
     def pair(self, re: np.ndarray, im: np.ndarray) -> np.ndarray:
-        """The complex numbers with these parts."""
         first = PAIRS + len(self._pairs)
         self._pairs += zip(self.real(re).ravel().tolist(), self.real(im).ravel().tolist(), strict=True)
         self.work(re.size)
@@ -193,7 +192,6 @@ def _ids(ids: list[int], shape) -> np.ndarray:
 
 
 def live_equations(jaxpr) -> list:
-    """The equations of a jaxpr that something depends on, in order."""
     needed, equations = {v for v in jaxpr.outvars if isinstance(v, core.Var)}, []
     for equation in reversed(jaxpr.eqns):
         if needed.intersection(equation.outvars):
@@ -338,8 +336,6 @@ _PASSING_ON = frozenset(("gather", "dynamic_slice", "lagjax_locate", "convert_el
 
 
 def lowers(*names, table: dict = LOWER):
-    """The decorator of the function that lowers these primitives."""
-
     def register(rule):
         table.update(dict.fromkeys(names, rule))
         return rule
