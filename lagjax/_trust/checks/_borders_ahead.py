@@ -34,8 +34,7 @@ class _VariedInput(NamedTuple):
 
     @property
     def start(self) -> float:
-        here = self.scene.sample
-        return float([*here.q[0], *here.qdot[0], here.t][self.i])
+        return float(self.scene.point[self.i])
 
     def function(self, node: int) -> Callable[[np.ndarray], np.ndarray]:
         """A node of the program with pieces, (S,), where the input is (S,): on the pieces that belong there."""
@@ -57,10 +56,9 @@ class _VariedInput(NamedTuple):
         return self._sample(x).acceleration().T
 
     def _sample(self, x: np.ndarray) -> Sample:
-        n, here = self.scene.layout.size, self.scene.sample
-        y = np.tile([*here.q[0], *here.qdot[0], here.t], (len(x), 1))
-        y[:, self.i] = x
-        return self.scene.sample_at(y[:, :n], y[:, n:-1], y[:, -1])
+        points = np.tile(self.scene.point, (len(x), 1))
+        points[:, self.i] = x
+        return self.scene.sample_at(points)
 
 
 def findings(scene: CheckedScene) -> list[Finding]:

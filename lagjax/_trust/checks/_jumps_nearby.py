@@ -49,12 +49,10 @@ def findings(scene: CheckedScene) -> list[Finding]:
     pieces = pieces_of_motion(scene.motion, *scene.state)
     if not pieces:
         return []
-    *y, _ = scene.state
-    start = np.concatenate([np.ravel(x) for x in y])
     sides = _sides_of_states(scene)
     labels = [f"{name}{place}" for name, place, size in pieces for _ in range(size)]
     jumps = [
-        _first_jump(scene, sides, start, sign * vector, (name, size), labels)
+        _first_jump(scene, sides, scene.point, sign * vector, (name, size), labels)
         for name, size, vector in _directions(scene)
         for sign in (1, -1)
     ]
@@ -115,8 +113,8 @@ def _first_jump(scene: CheckedScene, sides: Callable, start, vector, axis, label
     place = int(np.argmax(there != here))
     # The change is compared with the size at the state, at the border and a little beyond: a force that sets in at zero
     # does not jump.
-    both_sides, n = displaced_states([inside if past else -beyond, beyond, 0.0, beyond + 0.1]), scene.layout.size
-    values_of = scene.sample_at(both_sides[:, :n], both_sides[:, n:-1], both_sides[:, -1]).quantities(*_COMPARED)
+    both_sides = displaced_states([inside if past else -beyond, beyond, 0.0, beyond + 0.1])
+    values_of = scene.sample_at(both_sides).quantities(*_COMPARED)
     for name, what in _COMPARED.items():
         one, other, *_ = values = values_of[name]
         if np.isfinite(one).all() and np.isfinite(other).all():

@@ -94,18 +94,23 @@ class CheckedScene(NamedTuple):
 
         `directions` (D, 2n + 1) are combinations of the coordinates, the velocities and the motion; `steps` (rungs, D).
         """
-        (q, v, t), n = (np.asarray(x) for x in self.state[:3]), self.layout.size
-        axes = np.eye(2 * n + 1, dtype=q.dtype)
-        axes[-1, :n] = v
+        here, n = self.point, self.layout.size
+        axes = np.eye(2 * n + 1, dtype=here.dtype)
+        axes[-1, :n] = here[n:-1]
         moves = np.stack([-steps, steps]).transpose(2, 0, 1)[..., None] * (directions @ axes)[:, None, None]
-        along = (np.concatenate([q, v, t[None]]) + moves).reshape(-1, 2 * n + 1).astype(q.dtype)
-        sides = self.sample_at(along[:, :n], along[:, n:-1], along[:, -1]).flat(*_COMPARED)
-        sides = sides.reshape(len(directions), 2, len(steps), -1)
+        along = (here + moves).reshape(-1, 2 * n + 1).astype(here.dtype)
+        sides = self.sample_at(along).flat(*_COMPARED).reshape(len(directions), 2, len(steps), -1)
         return sides[:, 0], sides[:, 1]
 
-    def sample_at(self, q: np.ndarray, qdot: np.ndarray, t: np.ndarray) -> Sample:
-        """The scene at S other states: q, q̇ (S, n) and t (S,)."""
-        return self.sample._replace(q=q, qdot=qdot, t=t)
+    @property
+    def point(self) -> np.ndarray:
+        """(q, q̇, t), (2n + 1,)."""
+        return np.concatenate([np.ravel(x) for x in self.state[:3]])
+
+    def sample_at(self, points: np.ndarray) -> Sample:
+        """The scene at S other points (q, q̇, t), (S, 2n + 1)."""
+        n = self.layout.size
+        return self.sample._replace(q=points[:, :n], qdot=points[:, n:-1], t=points[:, -1])
 
     @property
     def is_lowered(self) -> bool:
