@@ -57,7 +57,7 @@ class SaddleElimination:
     def __init__(self, zeros: tuple[np.ndarray, np.ndarray], dtype, augmented: bool, regular_only: bool):
         mass_zeros, row_zeros = zeros
         self.dtype, self.augmented, self.regular_only = dtype, augmented, regular_only
-        self.constraints, self.size = row_zeros.shape
+        self.size = row_zeros.shape[1]
         touched = ~row_zeros
         self.rows = [np.flatnonzero(row) for row in touched]
         self.entries = np.concatenate(
