@@ -66,6 +66,7 @@ def test_a_blow_beyond_its_wall_happens_where_the_motion_goes_on():
     assert run(0.5, [T("f", "f", lambda q, v: q, -1, lambda q, v: (q, v - 0.1), fires="beyond")]).result == ZENO
 
 
+@pytest.mark.slow
 def test_a_reset_that_carries_beyond_another_guard():
     """From x to 1, back by d, and beyond −1 at once: a fall from there on, with derivatives by all of it."""
     modes = {"f": FREE, "g": BALL}
@@ -186,6 +187,7 @@ def test_blows_at_one_instant_that_do_not_commute_are_said():
 # ---- releases at zero relative acceleration -------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_freewheel_and_a_block_let_go_where_nothing_moves_yet():
     def two(q, v):
         return 0.5 * v[0] ** 2 + v[1] ** 2
