@@ -66,7 +66,7 @@ class BorderControl:
             "touch": guards,  # the `Touch` of a guard where the step begins
             "stays": pieces,  # 1 for a piece that is not decided anew
             "at_knots": 1,  # the number of steps that ended at entries of tables
-            "beyond": 1,  # the piece beyond it
+            "beyond": 1,  # the piece beyond the guard that the step ends at
             "at_rest": 1,  # 1 if the motion would be at the guard in no time
             "planned_h": 1,  # the step without borders
             "cut": 1,  # the step with them

@@ -32,9 +32,8 @@ PARTS = 2  # the motion, and derivatives of it
 class StepControl:
     """The emitted code that chooses steps and checks them.
 
-    Coordinates of one of the `error_groups` are measured by the largest of them.
-
-    The first `base_size` coordinates are the motion, the others derivatives of it.
+    Coordinates of one of the `error_groups` are measured by the largest of them. The first `base_size`
+    coordinates are the motion, the others derivatives of it.
     """
 
     def __init__(
