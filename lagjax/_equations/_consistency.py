@@ -164,7 +164,8 @@ def _inconsistent(has_terms: bool, system, dtype, t, span, q0: PyTree, qdot0: Py
     state = layout.flatten(q0), layout.flatten(qdot0), t, eqx.filter(params, eqx.is_array_like)
     motion = system._motion(layout, params)
     terms = derivation_of(system, layout, params).term_sizes(*state) if has_terms else 0.0
-    return motion.constraints.inconsistent(motion.mass_matrix(*state), *state, span, dtype, terms)
+    unit = motion.unit(*state)
+    return motion.constraints.inconsistent(unit, motion.row_lengths(unit, *state), *state, span, dtype, terms)
 
 
 def _start(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree) -> _StartConditions:

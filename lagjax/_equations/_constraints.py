@@ -23,9 +23,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from lagjax._equations import _linear
-from lagjax._equations._linear import diagonal_scale
-
 PyTree = Any
 Vector = Float[Array, " n"]  # one number for each coordinate
 Row = Float[Array, " m"]  # one number for each constraint
@@ -66,48 +63,54 @@ class Constraints(eqx.Module):
         by_t = jax.jvp(lambda t: self.f(q, t, params), (t,), (jnp.ones_like(t),))[1]
         return jnp.concatenate([by_t, self.a(q, jnp.zeros_like(qdot), t, params)])
 
-    def jacobian_and_gamma(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Float[Array, "m n"], Row]:
-        """G and γ of G q̈ = γ. γ is minus all that the time derivatives of f and a contain besides G q̈."""
+    def jacobian(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Float[Array, "m n"]:
+        """G = (J; ∂a/∂q̇)."""
+        return jnp.concatenate([jax.jacfwd(self.f)(q, t, params), jax.jacfwd(self.a, argnums=1)(q, qdot, t, params)])
+
+    def gamma(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Row:
+        """γ of G q̈ = γ: minus all that the time derivatives of f and a contain besides G q̈."""
         forward = qdot, jnp.ones_like(t)
 
         def rate(function):
             return lambda q, t: jax.jvp(function, (q, t), forward)[1]
 
-        jacobian = [jax.jacfwd(self.f)(q, t, params), jax.jacfwd(self.a, argnums=1)(q, qdot, t, params)]
         rates = rate(rate(lambda q, t: self.f(q, t, params))), rate(lambda q, t: self.a(q, qdot, t, params))
-        return jnp.concatenate(jacobian), -jnp.concatenate([of(q, t) for of in rates])
+        return -jnp.concatenate([of(q, t) for of in rates])
+
+    def jacobian_and_gamma(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Float[Array, "m n"], Row]:
+        """G and γ of G q̈ = γ."""
+        return self.jacobian(q, qdot, t, params), self.gamma(q, qdot, t, params)
+
+    def products(self, q: Vector, qdot: Vector, t: Time, params: PyTree, positions=False) -> tuple[Callable, Callable]:
+        """x ↦ G x and λ ↦ Gᵀλ, of the constraints on `positions` alone where that is True."""
+        if positions:
+            _, push = jax.linearize(lambda q: self.f(q, t, params), q)
+        else:
+            by_q = jax.linearize(lambda q: self.f(q, t, params), q)[1]
+            by_qdot = jax.linearize(lambda qdot: self.a(q, qdot, t, params), qdot)[1]
+
+            def push(x):
+                return jnp.concatenate([by_q(x), by_qdot(x)])
+
+        pull = jax.linear_transpose(push, q)
+        return push, lambda y: pull(y)[0]
 
     def inconsistent(
-        self, matrix: Float[Array, "n n"], q: Vector, qdot: Vector, t: Time, params: PyTree, span: Time, dtype, terms
+        self, unit: Vector, lengths: Row, q: Vector, qdot: Vector, t: Time, params: PyTree, span: Time, dtype, terms
     ) -> Bool[Array, ""]:
         """True if no motion may start from a state: off a constraint, or one of them has no gradient.
 
-        Of a motion over this span of time, with the mass matrix M. Off is what is farther than `TOLERANCE` of the size
-        of the state and has a value of more than `ROUNDINGS` of the `terms` (2m,) of `residual` and of `rates` (see
-        `Derivation.term_sizes`), in a start of this dtype. A state that is not a number is inconsistent.
+        Of a motion over this span of time, with coordinates in their `unit` 1/√Mᵢᵢ and `lengths` (m,) of the rows of G
+        in it. Off is what is farther than `TOLERANCE` of the size of the state and has a value of more than `ROUNDINGS`
+        of the `terms` (2m,) of `residual` and of `rates` (see `Derivation.term_sizes`), in a start of this dtype. A
+        state that is not a number is inconsistent.
         """
-        state, unit = (q, qdot, t, params), diagonal_scale(matrix)
-        jacobian = self.jacobian_and_gamma(*state)[0]
+        state = q, qdot, t, params
         values, positions = jnp.stack([self.residual(*state), self.rates(*state)]), self.f(q, t, params).size
-        off = jnp.stack(distances(values[0], values[1], jacobian * unit, positions))
+        off = jnp.stack(distances(values[0], values[1], lengths, positions))
         near = off <= TOLERANCE[dtype] * jnp.stack(sizes(unit, q, qdot, span))[:, None]
         rounded = jnp.abs(values) <= ROUNDINGS * np.finfo(dtype).eps * rows_of_terms(terms, values.shape)
-        return ~jnp.all((near | rounded) & jacobian.any(axis=1))
-
-    # ---- one Newton step back to the constraints ----
-
-    def position_step(self, matrix: Float[Array, "n n"], q: Vector, t: Time, params: PyTree) -> Vector:
-        """δq of one Newton step to f = 0, the shortest in the metric of M: M δq = Jᵀμ, J δq = −f."""
-        jacobian = jax.jacfwd(self.f)(q, t, params)
-        return _linear.saddle(matrix, jnp.zeros_like(q), jacobian, -self.f(q, t, params))[0]
-
-    def velocity_step(self, matrix: Float[Array, "n n"], q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
-        """δq̇ to velocities that are consistent, the shortest in the metric of M: M δq̇ = Gᵀμ, G δq̇ = −rates.
-
-        One step arrives, as the rates are affine in q̇ for every f, and for every a that d'Alembert's principle is for.
-        """
-        jacobian, _ = self.jacobian_and_gamma(q, qdot, t, params)
-        return _linear.saddle(matrix, jnp.zeros_like(q), jacobian, -self.rates(q, qdot, t, params))[0]
+        return ~jnp.all((near | rounded) & (lengths > 0))
 
 
 # ---- how far a state is from its constraints -------------------------------------------------------------------------
@@ -134,16 +137,15 @@ def sizes(unit, q, qdot, span):
     return of_q, xp.maximum(of_qdot, of_q / span)
 
 
-def distances(residual, rates, jacobian, positions: int):
+def distances(residual, rates, lengths, positions: int):
     """The errors of positions and velocities in each constraint, two arrays (..., m).
 
     |fₖ|/|∂fₖ/∂q| has the units of a coordinate, which fₖ has not: it is, to first order, how far q has to move. The
-    rates divided by the lengths of the same rows are, likewise, velocities. Constraints on velocities ask nothing of q.
-    Takes `residual` and `rates` (..., m) and `jacobian` (..., m, n), of NumPy or JAX; the first `positions` of the m
-    are f. A constraint that holds is at distance zero, also where it has no gradient; otherwise that is infinitely far.
+    rates divided by the same `lengths` of the rows of G are, likewise, velocities. Constraints on velocities ask
+    nothing of q. Takes arrays (..., m) of NumPy or JAX; the first `positions` of the m are f. A constraint that holds
+    is at distance zero, also where it has no gradient; otherwise that is infinitely far.
     """
-    xp = jacobian.__array_namespace__()
-    lengths = xp.sqrt(xp.sum(jacobian**2, axis=-1))
+    xp = lengths.__array_namespace__()
     of_positions = xp.where(xp.arange(residual.shape[-1]) < positions, residual, 0)
     of_q, of_qdot = (xp.where(x == 0, 0, xp.abs(x) / xp.where(x == 0, 1, lengths)) for x in (of_positions, rates))
     return of_q, of_qdot
@@ -177,50 +179,36 @@ def _largest_term(terms, weights):
     return jnp.where(nonzero, largest / jnp.abs(jnp.where(nonzero, weights, 1.0)), jnp.inf)
 
 
-def rank_lost(schur_complement: Callable, start: tuple, end: tuple) -> Bool[Array, ""]:
-    """True if fewer constraints are independent at `end` than at `start`, both (q, q̇, t, params).
-
-    Counted are the independent rows of S = `schur_complement`(state), with every row of G in units of its length at the
-    start: a gradient that fades away on the way is lost as well.
-    """
-    first, last = (schur_complement(*jax.lax.stop_gradient(state)) for state in (start, end))
-    diagonal = jnp.diagonal(first)
-    scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
-    before, after = (_linear.rank(scale[:, None] * schur * scale) for schur in (first, last))
-    return jnp.isfinite(last).all() & (after < before)
-
-
 # ---- the way back ----------------------------------------------------------------------------------------------------
 
 
 # Newton's method doubles its digits from where it converges, and needs 4 to 8 steps from anywhere near; 300 times the
 # size of a circle away it takes 16. Doubled, this changes nothing but the time that is lost where there is no solution.
-_NEWTON_STEPS = 50
+NEWTON_STEPS = 50
 
 
 def nearest_consistent(
-    mass_matrix: Callable, constraints: Constraints, q: Vector, qdot: Vector, t: Time, params: PyTree, terms=0.0
+    motion: Any, q: Vector, qdot: Vector, t: Time, params: PyTree, terms=0.0
 ) -> tuple[Vector, Vector]:
-    """The consistent state nearest to (q, q̇), shape (n,) each; NaN where it is not found.
+    """The consistent state of a `Motion` nearest to (q, q̇), shape (n,) each; NaN where it is not found.
 
     q̂ minimises (q̂ − q)ᵀM(q̂ − q) with M = M(q, q̇) among all with f = 0, and then the velocities minimise the same form
     with M = M(q̂, q̇) among all that are consistent at q̂. The derivatives are those of that function, to every order:
     q̂ is a root of `_stationary`, and differentiated implicitly. A state that is not found has NaN for derivatives.
-    `terms` (2m,) are the sizes of the terms of `residual` and of `rates`, of which rounding is left. `mass_matrix`
-    takes (q, qdot, t, params).
+    `terms` (2m,) are the sizes of the terms of `residual` and of `rates`, of which rounding is left.
     """
+    constraints, given = motion.constraints, qdot
     of_f, of_rates = rows_of_terms(terms, (2, len(constraints.residual(q, qdot, t, params))))
     if constraints.on_positions is not None:
-        q = _nearest_positions(mass_matrix, constraints, q, qdot, t, params, of_f)
-    state, given = (q, qdot, t, params), qdot
-    matrix = mass_matrix(*state)
-    qdot = qdot + constraints.velocity_step(matrix, *state)
-    jacobian, _ = constraints.jacobian_and_gamma(q, qdot, t, params)
-    reached = _holds(constraints.rates(q, qdot, t, params), jacobian, of_rates, diagonal_scale(matrix), qdot, given)
+        q = _nearest_positions(motion, q, qdot, t, params, of_f)
+    unit = motion.unit(q, qdot, t, params)
+    qdot = qdot + motion.velocity_step(q, qdot, t, params)
+    rates, lengths = constraints.rates(q, qdot, t, params), motion.row_lengths(unit, q, qdot, t, params)
+    reached = _holds(rates, lengths, of_rates, unit, qdot, given)
     return q, qdot * jnp.where(reached, 1.0, jnp.nan)  # a product, so that derivatives are NaN as well
 
 
-def _nearest_positions(mass_matrix, constraints: Constraints, q0, qdot, t, params, terms) -> Vector:
+def _nearest_positions(motion: Any, q0, qdot, t, params, terms) -> Vector:
     """q with f = 0, nearest to q0 in the metric of M(q0, q̇), by Newton's method for M (q − q0) + Jᵀν = 0, f = 0.
 
     These are the conditions of the constrained minimum (sequential quadratic programming: Nocedal & Wright, *Numerical
@@ -234,12 +222,16 @@ def _nearest_positions(mass_matrix, constraints: Constraints, q0, qdot, t, param
     `throw=True`. Its test of convergence compares f and M (q − q0) with the tolerance for q: masses of 1e6 do not
     converge. And from some 44 radii beside a circle it does not arrive, without the first loop.
     """
-    matrix = mass_matrix(q0, qdot, t, params)
-    unit = jax.lax.stop_gradient(diagonal_scale(matrix))
-    jacobian = jax.lax.stop_gradient(jax.jacfwd(constraints.f)(q0, t, params)) * unit
-    terms = terms[: len(jacobian)]
+    constraints, start = motion.constraints, (q0, qdot, t, params)
+    multiply = motion.mass_product(*start)
+    unit = jax.lax.stop_gradient(motion.unit(*start))
+
+    def lengths(q):
+        return motion.row_lengths(unit, q, qdot, t, params, positions=True)
+
     # The size of the terms, as a distance: where q is smaller it is their rounding that moves it.
-    least = jnp.max(jnp.where(terms > 0, terms * jax.lax.rsqrt(jnp.sum(jacobian**2, axis=1)), 0.0), initial=0.0)
+    of_rows, terms = jax.lax.stop_gradient(lengths(q0)), terms[: constraints.f(q0, t, params).size]
+    least = jnp.max(jnp.where(terms > 0, terms / of_rows, 0.0), initial=0.0)
 
     def resolution(q):
         return _AT_REST * jnp.finfo(q.dtype).eps * jnp.maximum(_size(unit, q, q0), least)
@@ -250,39 +242,33 @@ def _nearest_positions(mass_matrix, constraints: Constraints, q0, qdot, t, param
     def stationary(place):
         q, nu = place
         f, pull_back = jax.vjp(lambda q: constraints.f(q, t, params), q)
-        return matrix @ (q - q0) + pull_back(nu)[0], f
+        return multiply(q - q0) + pull_back(nu)[0], f
+
+    def solve(linear, right):
+        return motion.solve_newton(linear, right, *start)
 
     def shortest_step(place):
         q, nu = place
-        return q + constraints.position_step(mass_matrix(q, qdot, t, params), q, t, params), nu
+        return q + motion.position_step(q, qdot, t, params), nu
 
     def newton_step(place):
         value, linear = jax.linearize(stationary, place)
-        return jax.tree.map(jnp.subtract, place, _solve_symmetric_saddle(linear, value))
+        return jax.tree.map(jnp.subtract, place, solve(linear, value))
 
     def find(_, start):
         nearby = _iterate_to_rest(shortest_step, start, is_at_rest)
         q, nu = _iterate_to_rest(newton_step, (nearby[0], start[1]), is_at_rest)
 
         def distance(q):
-            return jnp.sqrt((q - q0) @ matrix @ (q - q0))
+            return jnp.sqrt((q - q0) @ multiply(q - q0))
 
         # For a q0 that is consistent both distances are round-off.
         farther = distance(q) > 1.001 * distance(nearby[0]) + resolution(q) * q.size
-        holds = _holds(constraints.f(q, t, params), jax.jacfwd(constraints.f)(q, t, params), terms, unit, q, q0)
+        holds = _holds(constraints.f(q, t, params), lengths(q), terms, unit, q, q0)
         return jnp.where(holds & ~farther, q, jnp.nan), nu
 
-    start = q0, jnp.zeros_like(constraints.f(q0, t, params))
-    return jax.lax.custom_root(stationary, start, find, _solve_symmetric_saddle)[0]
-
-
-def _solve_symmetric_saddle(linear: Callable, right: tuple[Vector, Row]) -> tuple[Vector, Row]:
-    """(x, ν) with H x + Jᵀν = b, J x = c, where `linear` maps (x, ν) to the left-hand sides and `right` is (b, c)."""
-    b, c = right
-    columns = jax.vmap(lambda x: linear((x, jnp.zeros_like(c))), out_axes=1)
-    matrix, jacobian = columns(jnp.eye(b.size, dtype=b.dtype))
-    x, multipliers, _ = _linear.saddle(matrix, b, jacobian, c)
-    return x, -multipliers
+    begin = q0, jnp.zeros_like(constraints.f(q0, t, params))
+    return jax.lax.custom_root(stationary, begin, find, solve)[0]
 
 
 def _iterate_to_rest(step: Callable, start: tuple[Vector, Row], is_at_rest: Callable) -> tuple[Vector, Row]:
@@ -290,7 +276,7 @@ def _iterate_to_rest(step: Callable, start: tuple[Vector, Row], is_at_rest: Call
 
     def moves(carry):
         (q, _), moved, count = carry
-        return ~is_at_rest(q, moved) & (count < _NEWTON_STEPS)
+        return ~is_at_rest(q, moved) & (count < NEWTON_STEPS)
 
     def once(carry):
         place, _, count = carry
@@ -301,15 +287,16 @@ def _iterate_to_rest(step: Callable, start: tuple[Vector, Row], is_at_rest: Call
     return jnp.where(is_at_rest(q, moved), q, jnp.nan), nu
 
 
-def _holds(residual: Row, jacobian: Float[Array, "m n"], terms: Row, unit: Vector, *states: Vector) -> Bool[Array, ""]:
+def _holds(residual: Row, lengths: Row, terms: Row, unit: Vector, *states: Vector) -> Bool[Array, ""]:
     """True if constraints hold, in which case the steps did not just become small between some that contradict.
 
     A distance of √eps of the state is allowed: the last step of Newton's method was at the level of rounding, so that
     constraints which can hold do so far better, and those that contradict each other are off by far more. The second
     term is for a gradient that vanishes, where rounding of the others' size is the limit. Coordinates
-    are in their `unit` (n,), and as large as in any of the states (n,). Rounding of `terms` (m,) is allowed as well.
+    are in their `unit` (n,), and so are the `lengths` (m,) of the rows of G, and as large as in any of the states (n,).
+    Rounding of `terms` (m,) is allowed as well.
     """
-    lengths, eps = jnp.sqrt(jnp.sum((jacobian * unit) ** 2, axis=1)), jnp.finfo(residual.dtype).eps
+    eps = jnp.finfo(residual.dtype).eps
     allowed = jnp.sqrt(eps) * lengths + 100 * eps * jnp.max(lengths)
     return jnp.all(jnp.abs(residual) <= jnp.maximum(allowed * _size(unit, *states), ROUNDINGS * eps * terms))
 

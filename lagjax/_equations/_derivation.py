@@ -28,6 +28,7 @@ from lagjax._equations._motion import Motion
 from lagjax._equations._quantities import OwnRules, quantities
 from lagjax._equations._recursion import Recursion, RecursiveElimination
 from lagjax._equations._saddle import LARGEST_INDEFINITE, IndefiniteElimination, SaddleElimination, TwoCoordinates
+from lagjax._equations._structure import SparseMotion, structure_of
 from lagjax._interface import Layout, dtype_of, is_concrete
 from lagjax._native import Projection
 from lagjax._primitives import DOUBLE
@@ -112,14 +113,27 @@ class Derivation:
     """
 
     def __init__(
-        self, motion: Motion, layout: Layout, params: PyTree, refusal: str | None = None, unhashable: str | None = None
+        self,
+        motion: Motion,
+        layout: Layout,
+        params: PyTree,
+        refusal: str | None = None,
+        unhashable: str | None = None,
+        path: str = "auto",
     ):
         """`params` holds numbers or shapes of numbers; `refusal` says why a scene must not be lowered at all.
 
-        `unhashable` says why this derivation cannot be kept for the next time.
+        `unhashable` says why this derivation cannot be kept for the next time. On the `path` "auto" a large scene with
+        sparse matrices, whose functions are smooth, is not lowered: its motion is a `SparseMotion`.
         """
         self.motion, self.layout, self.refusal, self.unhashable = motion, layout, refusal, unhashable
         self.numbers = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), params)
+        self.structure = None if path == "scalar" else structure_of(motion, self.state_shapes, path == "array")
+        if self.structure is not None and path == "auto" and pieces_of_motion(motion, *self.state_shapes):
+            self.structure = None  # steps end at borders in machine code alone
+        if self.structure is not None:
+            self.motion = SparseMotion(*vars(motion).values(), structure=self.structure)
+            self.refusal = f"of {layout.size} coordinates, {self.structure}, which arrays suit better"
         self._made: dict[str, Any] = {}
         self._lock = threading.RLock()
         self._programs: dict[tuple[str, ...], Program] = {}
@@ -598,7 +612,7 @@ def derivation_of(system: Any, layout: Layout, params: PyTree) -> Derivation:
     if arrays:
         numbers = eqx.filter(params, eqx.is_array_like)
         reason = "the functions of the scene hold arrays of their own"
-        return Derivation(system._motion(layout, params), layout, numbers, reason)
+        return Derivation(system._motion(layout, params), layout, numbers, reason, path=system.path)
     leaves, tree = jax.tree.flatten(params)
     kept = (
         _Number(np.shape(x), np.dtype(dtype_of(x))) if type(x) is np.ndarray or eqx.is_array_like(x) else x
@@ -616,7 +630,8 @@ def _derived(key: _Structure, unhashable: str | None = None) -> Derivation:
     leaves = [np.zeros(*leaf) if isinstance(leaf, _Number) else leaf for leaf in key.leaves]
     params, system = jax.tree.unflatten(key.params, leaves), jax.tree.unflatten(key.system, [])
     numbers = eqx.filter(params, eqx.is_array_like)
-    return Derivation(system._motion(key.layout, params), key.layout, numbers, unhashable=unhashable)
+    motion = system._motion(key.layout, params)
+    return Derivation(motion, key.layout, numbers, unhashable=unhashable, path=system.path)
 
 
 _derived_once = functools.lru_cache(maxsize=64)(_derived)

@@ -22,6 +22,7 @@ from lagjax._equations._constraints import Constraints, Row, Time, Vector
 PyTree = Any
 Matrix = Float[Array, "n n"]
 Scalar = Float[Array, ""]
+Flag = Bool[Array, ""]
 
 
 class Motion(eqx.Module):
@@ -60,11 +61,20 @@ class Motion(eqx.Module):
         """∂L/∂q + Q, which is dp/dt along the motion of a scene without constraints."""
         return jax.grad(self.lagrangian)(q, qdot, t, params) + self.nonconservative_force(q, qdot, t, params)
 
-    def mass_matrix_and_force(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Matrix, Vector]:
-        """M and F = ∂L/∂q − (∂p/∂q) q̇ − ∂p/∂t + Q."""
+    def force(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
+        """F = ∂L/∂q − (∂p/∂q) q̇ − ∂p/∂t + Q."""
         # (∂p/∂q) q̇ + ∂p/∂t is how p changes while q moves and q̇ does not: one directional derivative.
         _, drift = jax.jvp(lambda q, t: self.momentum(q, qdot, t, params), (q, t), (qdot, jnp.ones_like(t)))
-        return self.mass_matrix(q, qdot, t, params), self.generalized_force(q, qdot, t, params) - drift
+        return self.generalized_force(q, qdot, t, params) - drift
+
+    def mass_matrix_and_force(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Matrix, Vector]:
+        """M and F."""
+        return self.mass_matrix(q, qdot, t, params), self.force(q, qdot, t, params)
+
+    def mass_product(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Callable[[Vector], Vector]:
+        """x ↦ M x."""
+        matrix = self.mass_matrix(q, qdot, t, params)
+        return lambda x: matrix @ x
 
     def energy(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Scalar:
         """h = p·q̇ − L, with dh/dt = −∂L/∂t + Q·q̇ along the motion."""
@@ -80,32 +90,74 @@ class Motion(eqx.Module):
         """q̈ of M q̈ = F + Gᵀλ, G q̈ = γ; NaN where their matrix is singular."""
         return self.solved_acceleration(q, qdot, t, params)[0]
 
-    def solved_acceleration(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Vector, Bool[Array, ""]]:
+    def solved_acceleration(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Vector, Flag]:
         """q̈, and whether the matrix that it was solved with is singular (q̈ is NaN where it is)."""
+        state = q, qdot, t, params
         if self.constrained:
-            acceleration, _, singular = self._solved(q, qdot, t, params)
+            acceleration, _, singular = self.saddle(self.force(*state), self.constraints.gamma(*state), *state)
             return acceleration, singular
-        matrix, force = self.mass_matrix_and_force(q, qdot, t, params)
+        matrix, force = self.mass_matrix_and_force(*state)
         mass = _linear.factorize(matrix)
         return mass.solve(force), mass.singular
 
     def multipliers(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Row:
         """λ, those of constraints on positions first. Of least norm where G is redundant."""
-        return self._solved(q, qdot, t, params)[1]
+        state = q, qdot, t, params
+        return self.saddle(self.force(*state), self.constraints.gamma(*state), *state)[1]
 
     def constraint_force(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
         """Gᵀλ, the generalised force that the constraints exert."""
-        return self.constraints.jacobian_and_gamma(q, qdot, t, params)[0].T @ self.multipliers(q, qdot, t, params)
-
-    def _solved(self, q, qdot, t, params) -> tuple[Vector, Row, Bool[Array, ""]]:
-        """q̈, λ and whether the saddle point of M and G is singular."""
-        matrix, force = self.mass_matrix_and_force(q, qdot, t, params)
-        return _linear.saddle(matrix, force, *self.constraints.jacobian_and_gamma(q, qdot, t, params))
+        _, pull = self.constraints.products(q, qdot, t, params)
+        return pull(self.multipliers(q, qdot, t, params))
 
     def schur_complement(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Float[Array, "m m"]:
         """G M⁻¹ Gᵀ, or G K⁻¹ Gᵀ of the same rank (see `_linear`): its rank is the number of independent constraints."""
-        jacobian, _ = self.constraints.jacobian_and_gamma(q, qdot, t, params)
+        jacobian = self.constraints.jacobian_and_gamma(q, qdot, t, params)[0]
         return _linear.schur_complement(self.mass_matrix(q, qdot, t, params), jacobian)
+
+    def rank_lost(self, start: tuple, end: tuple) -> Flag:
+        """True if fewer constraints are independent at `end` than at `start`, both (q, q̇, t, params).
+
+        Counted are the independent rows of S = G M⁻¹ Gᵀ, with every row of G in units of its length at the start: a
+        gradient that fades away on the way is lost as well.
+        """
+        first, last = (self.schur_complement(*jax.lax.stop_gradient(state)) for state in (start, end))
+        diagonal = jnp.diagonal(first)
+        scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))
+        before, after = (_linear.rank(scale[:, None] * schur * scale) for schur in (first, last))
+        return jnp.isfinite(last).all() & (after < before)
+
+    # ---- what the constraints ask of a state, in the metric of M ----
+
+    def unit(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
+        """The unit of each coordinate, 1/√Mᵢᵢ."""
+        return _linear.diagonal_scale(self.mass_matrix(q, qdot, t, params))
+
+    def row_lengths(self, unit: Vector, q: Vector, qdot: Vector, t: Time, params: PyTree, positions=False) -> Row:
+        """The lengths of the rows of G, or of ∂f/∂q for constraints on `positions`, in the `unit` of coordinates."""
+        jacobian = self._jacobian(positions, q, qdot, t, params)
+        return jnp.sqrt(jnp.sum((jacobian * unit) ** 2, axis=1))
+
+    def _jacobian(self, positions: bool, q, qdot, t, params) -> Float[Array, "m n"]:
+        of = self.constraints
+        return jax.jacfwd(of.f)(q, t, params) if positions else of.jacobian_and_gamma(q, qdot, t, params)[0]
+
+    def saddle(self, b: Vector, c: Row, q, qdot, t, params, positions=False) -> tuple[Vector, Row, Flag]:
+        """x, λ of M x − Gᵀλ = b, G x = c, and whether their matrix is singular; of f alone for `positions`."""
+        return _linear.saddle(self.mass_matrix(q, qdot, t, params), b, self._jacobian(positions, q, qdot, t, params), c)
+
+    def position_step(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
+        """δq of one Newton step to f = 0, the shortest in the metric of M: M δq = Jᵀμ, J δq = −f."""
+        residual = self.constraints.f(q, t, params)
+        return self.saddle(jnp.zeros_like(q), -residual, q, qdot, t, params, positions=True)[0]
+
+    def velocity_step(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
+        """δq̇ to velocities that are consistent, the shortest in the metric of M: M δq̇ = Gᵀμ, G δq̇ = −rates.
+
+        One step arrives, as the rates are affine in q̇ for every f, and for every a that d'Alembert's principle is for.
+        """
+        rates = self.constraints.rates(q, qdot, t, params)
+        return self.saddle(jnp.zeros_like(q), -rates, q, qdot, t, params)[0]
 
     def residual(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Row:
         """The values of the constraints: f, then a."""
@@ -117,12 +169,20 @@ class Motion(eqx.Module):
         That is enough after a step of an integration: close to the constraints Newton's method squares the distance.
         """
         if self.constraints.on_positions is not None:
-            q = q + self.constraints.position_step(self.mass_matrix(q, qdot, t, params), q, t, params)
-        return q, qdot + self.constraints.velocity_step(self.mass_matrix(q, qdot, t, params), q, qdot, t, params)
+            q = q + self.position_step(q, qdot, t, params)
+        return q, qdot + self.velocity_step(q, qdot, t, params)
 
     def nearest_consistent(self, q: Vector, qdot: Vector, t: Time, params: PyTree, terms=0.0) -> tuple[Vector, Vector]:
         """The consistent state that is nearest to (q, q̇) in the metric of M; NaN where it is not found."""
-        return _constraints.nearest_consistent(self.mass_matrix, self.constraints, q, qdot, t, params, terms)
+        return _constraints.nearest_consistent(self, q, qdot, t, params, terms)
+
+    def solve_newton(self, linear: Callable, right: tuple[Vector, Row], *_) -> tuple[Vector, Row]:
+        """(x, ν) with H x + Jᵀν = b, J x = c, where `linear` maps (x, ν) to the left-hand sides; `right` is (b, c)."""
+        b, c = right
+        columns = jax.vmap(lambda x: linear((x, jnp.zeros_like(c))), out_axes=1)
+        matrix, jacobian = columns(jnp.eye(b.size, dtype=b.dtype))
+        x, multipliers, _ = _linear.saddle(matrix, b, jacobian, c)
+        return x, -multipliers
 
     # ---- all of it ----
 

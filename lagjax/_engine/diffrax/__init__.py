@@ -33,7 +33,6 @@ from lagjax._engine.diffrax._equations import MotionEquations, form_of
 from lagjax._engine.diffrax._integrate import Jumps, Method, WithJumps, integrate
 from lagjax._engine.diffrax._jumps import freeze
 from lagjax._engine.diffrax._solvers import FineOutput, Projected
-from lagjax._equations import rank_lost
 from lagjax._interface import (
     ENDED_WELL,
     EVENT_OCCURRED,
@@ -179,8 +178,7 @@ def _solve(engine: Diffrax, problem: Problem) -> Solution:
     result = _explain_result(solution, form, start, ts, numbers)
     if derivation.motion.constrained:
         end = halves(solution.y_end)
-        schur = derivation.motion.schur_complement
-        lost = rank_lost(schur, (*halves(y0), given[0], numbers), (*end, solution.t_end, numbers))
+        lost = derivation.motion.rank_lost((*halves(y0), given[0], numbers), (*end, solution.t_end, numbers))
         failed = (result != RESULTS.successful) & (result != RESULTS.event_occurred)
         result = RESULTS.where(failed & lost, RESULTS.constraint_rank_lost, result)
         not_projected = solution.result == code_of(RESULTS.promote(Projected.FAILED))

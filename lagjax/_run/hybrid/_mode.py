@@ -200,7 +200,8 @@ class Mode(NamedTuple):
         t, y, numbers = jax.lax.stop_gradient((t, y, eqx.filter(params, eqx.is_array_like)))
         state, dtype = (*halves(y), t, numbers), SINGLE if self.problem.is_rounded else DOUBLE
         terms = self.problem.derivation.term_sizes(*state)
-        return motion.constraints.inconsistent(motion.mass_matrix(*state), *state, jnp.inf, dtype, terms)
+        unit = motion.unit(*state)
+        return motion.constraints.inconsistent(unit, motion.row_lengths(unit, *state), *state, jnp.inf, dtype, terms)
 
 
 @functools.lru_cache(maxsize=64)

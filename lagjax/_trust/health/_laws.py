@@ -154,7 +154,8 @@ class Law(NamedTuple):
 
         terms = xp.einsum("...i,...i->...", xp.abs(momentum), fast) + xp.abs(of["lagrangian"])
         is_energy = np.arange(1 + len(chosen)) == 0
-        off_q, off_qdot = distances(of["residual"], of["rates"], of["jacobian"], self.derivation.position_count)
+        lengths = xp.sqrt(xp.sum(of["jacobian"] ** 2, axis=-1))
+        off_q, off_qdot = distances(of["residual"], of["rates"], lengths, self.derivation.position_count)
         return Measurements(
             conserved=xp.concatenate([energy[..., None], momentum[..., chosen]], axis=-1),
             slopes=add_changes(rtol * far + atol, rtol * fast + atol),

@@ -1,0 +1,83 @@
+"""Which entries of a matrix of derivatives can differ from zero, whatever the state: found once per scene.
+
+asdex walks through the operations of a function and follows of which inputs each number is made (Hill, Dalle,
+Montoison, *An Illustrated Guide to Automatic Sparse Differentiation*, 2025). It comes with numba and is imported for
+large scenes alone. A pattern may hold entries that are zero, never lack one that is not.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from scipy.sparse import csr_array
+
+PyTree = Any
+
+# Entries that asdex visits one by one in Python, at some 10 µs each, to follow a product of matrices. Doubled, a
+# pattern takes up to 4 s.
+_VISITED = 200_000
+
+
+def hessian_pattern(function: Callable, shapes: tuple, by: int) -> csr_array | None:
+    """The pattern (n, n) of ∂²f/∂x², x being argument number `by` of f; None where to find it would take long.
+
+    `shapes` are those of all arguments, pytrees of them.
+    """
+    return jacobian_pattern(jax.grad(function, argnums=by), shapes, by)
+
+
+def jacobian_pattern(function: Callable, shapes: tuple, by: int) -> csr_array | None:
+    """The pattern (m, n) of ∂f/∂x, x being argument number `by` of f, f of shape (m,); arrays up to that one."""
+    import asdex
+
+    leaves, structure = jax.tree.flatten(shapes)
+    leaves = [np.broadcast_to(np.zeros((), x.dtype), x.shape) for x in leaves]  # asdex takes arrays, not their shapes
+
+    def flat(*leaves):
+        return function(*jax.tree.unflatten(structure, leaves))
+
+    try:
+        if _visited(jax.make_jaxpr(flat)(*leaves).jaxpr) > _VISITED:
+            return None
+        pattern = asdex.jacobian_sparsity(flat, *leaves, argnums=by)
+    except (NotImplementedError, jax.errors.TracerArrayConversionError):  # constants that are being traced
+        return None
+    entries = np.ones(len(pattern.rows), bool), (np.asarray(pattern.rows), np.asarray(pattern.cols))
+    return csr_array(entries, shape=pattern.shape)
+
+
+def count_operations(jaxpr) -> int:
+    """The scalar operations of a jaxpr: numbers that its equations compute, those of loops in every round."""
+    count = 0
+    for equation in jaxpr.eqns:
+        inner = [x for x in jax.tree.leaves(equation.params, is_leaf=_is_jaxpr) if _is_jaxpr(x)]
+        rounds = equation.params.get("length", 1) if equation.primitive.name == "scan" else 1
+        count += rounds * sum(count_operations(getattr(x, "jaxpr", x)) for x in inner)
+        count += 0 if inner else sum(int(np.prod(v.aval.shape, dtype=int)) for v in equation.outvars)
+    return count
+
+
+def _visited(jaxpr) -> int:
+    """The products of two numbers in products of matrices."""
+    count = 0
+    for equation in jaxpr.eqns:
+        for x in jax.tree.leaves(equation.params, is_leaf=_is_jaxpr):
+            count += _visited(getattr(x, "jaxpr", x)) if _is_jaxpr(x) else 0
+        if equation.primitive.name == "dot_general":
+            (contracted, _), _ = equation.params["dimension_numbers"]
+            shape = equation.invars[0].aval.shape
+            count += int(np.prod([shape[i] for i in contracted]) * np.prod(equation.outvars[0].aval.shape))
+    return count
+
+
+def _is_jaxpr(x) -> bool:
+    return isinstance(x, jax.extend.core.Jaxpr | jax.extend.core.ClosedJaxpr)
+
+
+def color_columns(pattern: csr_array) -> np.ndarray:
+    """A colour for each column of a pattern: columns of one colour share no row (Curtis, Powell & Reid 1974)."""
+    import asdex
+
+    entries = pattern.tocoo()
+    return np.asarray(asdex.color_cols(asdex.SparsityPattern.from_coo(entries.row, entries.col, pattern.shape))[0])

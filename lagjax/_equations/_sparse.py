@@ -1,0 +1,282 @@
+"""Symmetric matrices of which the pattern is known: read off by a few products, and solved by what the pattern allows.
+
+    diagonal            divide
+    blocks              the connected components of the pattern, each at most `LARGEST_BLOCK` large, in groups of a size
+    band                after reverse Cuthill–McKee: L D Lᵀ row by row, b² operations each
+    sparse              conjugate gradients with the entries
+    products            conjugate gradients with products alone, where no pattern is known, or one that is dense
+
+Columns that share no row are read off together: a form has a colour for each column, and the product of the matrix with
+the indicator of each colour gives all entries (Curtis, Powell & Reid, *On the estimation of sparse Jacobian matrices*,
+1974). No form holds n × n numbers. All are written in array operations, for the reason given in `_linear`.
+"""
+
+import abc
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from scipy.sparse import csr_array
+from scipy.sparse.csgraph import connected_components, reverse_cuthill_mckee
+
+from lagjax._equations._linear import factorize, least_norm, rank, rank_tolerance, singular_threshold
+from lagjax._equations._patterns import color_columns
+
+Vector = Float[Array, " n"]
+Product = Callable[[Vector], Vector]
+
+LARGEST_BLOCK = 16
+# Conjugate gradients take less than a band that is wider, for matrices of the condition that masses and links have: on
+# two cores a row of b entries takes b² / 2 ns, and so does it in every step of b²/10 steps.
+WIDEST_BAND = 8
+# Products that read off a sparse matrix; beyond that its own products are taken.
+MOST_COLORS = 64
+_MOST_ITERATIONS = 2000  # enough for a condition of 1e4: some 18 √κ of them reach round-off
+
+
+class Solver(NamedTuple):
+    """What solves A x = b at one state. `singular`: A is so to working precision; `rank` counts independent rows."""
+
+    solve: Product
+    singular: Bool[Array, ""]
+    rank: Int[Array, ""]
+
+
+class Form(abc.ABC):
+    """The pattern of a symmetric matrix (n, n), arranged for one way to solve with it."""
+
+    name: str
+    size: int
+
+    @abc.abstractmethod
+    def prepare(self, multiply: Product, dtype, dependent: bool = False) -> Solver:
+        """The solver of the matrix with these products.
+
+        A matrix with `dependent` rows is positive semi-definite, and b in its range: rows that are combinations of
+        others count as zero (`rank_tolerance`), and their unknowns are zero or small. Else a singular matrix gives NaN.
+        """
+
+    def diagonal(self, multiply: Product, dtype) -> Vector:
+        """The diagonal of the matrix with these products."""
+        raise NotImplementedError
+
+
+class _Entries(Form):
+    """A form that reads off the entries at `rows`, `columns` by products with the indicators of `colors`."""
+
+    def __init__(self, pattern: csr_array, colors: np.ndarray):
+        entries = pattern.tocoo()
+        self.size, self.rows, self.columns, self.colors = pattern.shape[0], entries.row, entries.col, colors
+        self.count = int(colors.max()) + 1
+        self.on_diagonal = np.flatnonzero(self.rows == self.columns)  # one for each row, as rows ascend
+
+    def read(self, multiply: Product, dtype) -> Float[Array, " entries"]:
+        if self.count == 1:
+            return multiply(jnp.ones(self.size, dtype))[self.rows]
+        seeds = jnp.asarray(self.colors == np.arange(self.count)[:, None], dtype)
+        return jax.vmap(multiply)(seeds)[self.colors[self.columns], self.rows]
+
+    def diagonal(self, multiply: Product, dtype) -> Vector:
+        return self.read(multiply, dtype)[self.on_diagonal]
+
+    def read_scaled(self, multiply: Product, dtype) -> tuple[Array, Vector]:
+        """The entries with both sides scaled to a unit diagonal, and the scale (n,), as `_linear.diagonal_scale`."""
+        entries = self.read(multiply, dtype)
+        diagonal = jnp.abs(entries[self.on_diagonal])
+        largest = jax.ops.segment_max(jnp.abs(entries), self.rows, self.size, indices_are_sorted=True)
+        size = jnp.where(diagonal > 0, diagonal, largest)
+        scale = 1 / jnp.sqrt(jnp.where(size > 0, size, 1))
+        return entries * scale[self.rows] * scale[self.columns], scale
+
+
+class Diagonal(_Entries):
+    """Every row has its diagonal entry alone."""
+
+    name = "diagonal"
+
+    def __init__(self, pattern: csr_array):
+        super().__init__(pattern, np.zeros(pattern.shape[0], int))
+
+    def prepare(self, multiply, dtype, dependent=False):
+        entries = self.read(multiply, dtype)
+        zero = entries == 0
+        inverse = jnp.where(zero, 0, 1) / jnp.where(zero, 1, entries)
+        return Solver(lambda b: inverse * b, jnp.any(zero) & (not dependent), jnp.sum(~zero))
+
+
+class Blocks(_Entries):
+    """Connected components: `groups` of those of one size, each an array (count, size) of rows."""
+
+    def __init__(self, pattern: csr_array, label: np.ndarray):
+        order, sizes = np.argsort(label, kind="stable"), np.bincount(label)
+        ends = np.cumsum(sizes)
+        place = np.empty(len(label), int)
+        place[order] = np.arange(len(label)) - np.repeat(ends - sizes, sizes)
+        super().__init__(pattern, place)
+        self.groups, self.where = [], []
+        for size in np.unique(sizes):
+            of_size = np.flatnonzero(sizes == size)
+            members = order[(ends - sizes)[of_size][:, None] + np.arange(size)]
+            block = np.full(len(sizes), -1)
+            block[of_size] = np.arange(len(of_size))
+            of_entry = block[label[self.rows]]
+            chosen = np.flatnonzero(of_entry >= 0)
+            self.groups.append(members)
+            self.where.append((chosen, of_entry[chosen], place[self.rows[chosen]], place[self.columns[chosen]]))
+        shown = ", ".join(f"{len(members)} of {members.shape[1]}" for members in self.groups[:4])
+        self.name = f"in blocks ({shown}{', …' if len(self.groups) > 4 else ''})"
+
+    def prepare(self, multiply, dtype, dependent=False):
+        entries, scale = self.read_scaled(multiply, dtype)
+        solvers, singular, independent = [], jnp.array(False), 0
+        for members, (chosen, block, row, column) in zip(self.groups, self.where, strict=True):
+            count, size = members.shape
+            matrices = jnp.zeros((count, size, size), dtype).at[block, row, column].set(entries[chosen])
+            if dependent:
+                solvers.append(lambda b, matrices=matrices: jax.vmap(least_norm)(matrices, b))
+                independent += jnp.sum(jax.vmap(rank)(matrices))
+            else:
+                factors = jax.vmap(factorize)(matrices)
+                solvers.append(lambda b, factors=factors: jax.vmap(lambda f, b: f.solve(b))(factors, b))
+                singular, independent = singular | jnp.any(factors.singular), independent + count * size
+
+        def solve(b):
+            b, x = scale * b, jnp.zeros_like(b)
+            for members, solver in zip(self.groups, solvers, strict=True):
+                x = x.at[members].set(solver(b[members]))
+            return scale * x
+
+        return Solver(solve, singular, jnp.asarray(independent))
+
+
+class Band(_Entries):
+    """A band of `width` entries on either side of the diagonal, in the `order` of reverse Cuthill–McKee."""
+
+    def __init__(self, pattern: csr_array, order: np.ndarray, width: int):
+        place = np.argsort(order)
+        super().__init__(pattern, place % (2 * width + 1))
+        self.order, self.width, self.name = order, width, f"a band of {width}"
+        row, distance = place[self.rows], place[self.columns] - place[self.rows]
+        self.upper = np.flatnonzero(distance >= 0)
+        # What joins the window of rows i … i + b when row i leaves it: column i + b + 1 from row i + 1 down.
+        self.leaving = (row + distance - width - 1)[self.upper], (width - distance)[self.upper]
+
+    def prepare(self, multiply, dtype, dependent=False):
+        b, n = self.width, self.size
+        entries, scale = self.read_scaled(multiply, dtype)
+        scale = scale[self.order]
+        # Rows before the first, and behind the last, are those of the unit matrix.
+        columns = jnp.zeros((n + b + 1, b + 1), dtype).at[:, b].set(1.0)
+        columns = columns.at[self.leaving[0] + b + 1, self.leaving[1]].set(entries[self.upper])
+        window = jnp.zeros((b + 1, b + 1), dtype) + jnp.eye(b + 1, dtype=dtype)
+        tolerance = rank_tolerance(dtype) if dependent else 0.0
+
+        def eliminate(window, column):
+            pivot, row = window[0, 0], window[0, 1:]
+            counts = ~(jnp.abs(pivot) <= tolerance)
+            factors = jnp.where(counts, row / jnp.where(counts, pivot, 1), 0)
+            inner = window[1:, 1:] - factors[:, None] * row
+            rows = jnp.concatenate([inner, column[None, :b]])
+            return jnp.concatenate([rows, column[:, None]], axis=1), (pivot, factors, counts)
+
+        _, (pivots, factors, counts) = jax.lax.scan(eliminate, window, columns)
+        pivots, factors, counts = pivots[b + 1 :], factors[b + 1 :], counts[b + 1 :]
+        inverse = jnp.where(counts, 1, 0) / jnp.where(counts, pivots, 1)
+        size = jnp.abs(pivots)
+        singular = jnp.min(size) <= singular_threshold(2 * b + 1, dtype) * jnp.max(size)
+
+        def solve(right):
+            def forward(pending, row):
+                factors, right = row
+                y = right - pending[0]
+                return jnp.append(pending[1:], 0) + factors * y, y
+
+            def back(behind, row):
+                factors, inverse, y = row
+                x = inverse * y - factors @ behind
+                return jnp.append(x, behind[:-1]), x
+
+            zero = jnp.zeros(b, dtype)
+            _, y = jax.lax.scan(forward, zero, (factors, scale * right[self.order]))
+            _, x = jax.lax.scan(back, zero, (factors, inverse, y), reverse=True)
+            return jnp.zeros_like(right).at[self.order].set(scale * x)
+
+        return Solver(solve, singular & (not dependent), jnp.sum(counts))
+
+
+class Sparse(_Entries):
+    """Entries in rows that are filled up to one length, for products; conjugate gradients solve with them."""
+
+    def __init__(self, pattern: csr_array, colors: np.ndarray):
+        super().__init__(pattern, colors)
+        self.name = f"sparse ({len(self.rows)} entries)"
+        length = np.diff(pattern.indptr)
+        inside = np.arange(length.max()) < length[:, None]
+        self.entry, self.column = np.full(inside.shape, len(self.rows)), np.zeros(inside.shape, int)
+        self.entry[inside], self.column[inside] = np.arange(len(self.rows)), self.columns
+
+    def prepare(self, multiply, dtype, dependent=False):
+        entries, scale = self.read_scaled(multiply, dtype)
+        padded = jnp.append(entries, 0)[self.entry]
+
+        def solve(b):
+            return scale * conjugate_gradients(lambda x: jnp.sum(padded * x[self.column], axis=1), scale * b)
+
+        return Solver(solve, jnp.array(False), jnp.array(self.size))
+
+
+@dataclass(frozen=True)
+class Products(Form):
+    """No pattern: conjugate gradients with products of the matrix."""
+
+    size: int
+    name = "dense, or of an unknown pattern"
+
+    def prepare(self, multiply, dtype, dependent=False):
+        return Solver(lambda b: conjugate_gradients(multiply, b), jnp.array(False), jnp.array(self.size))
+
+    def diagonal(self, multiply, dtype):
+        return jax.lax.map(lambda i: multiply(jnp.zeros(self.size, dtype).at[i].set(1.0))[i], jnp.arange(self.size))
+
+
+def conjugate_gradients(multiply: Product, b: Vector) -> Vector:
+    """x with A x = b for a positive (semi-)definite A, to round-off; NaN where it is not reached.
+
+    Each of two runs gains half of the digits, the second for what the first has left. Source: Hestenes & Stiefel 1952.
+    """
+    tolerance, limit = float(jnp.finfo(b.dtype).eps) ** 0.5, min(_MOST_ITERATIONS, 4 * b.size)
+
+    def run(b):
+        return jax.scipy.sparse.linalg.cg(multiply, b, tol=tolerance, maxiter=limit)[0]
+
+    x = run(b)
+    rest = b - multiply(x)
+    x = x + run(rest)
+    missing = jnp.max(jnp.abs(b - multiply(x)))
+    return jnp.where(missing <= rank_tolerance(b.dtype) * jnp.max(jnp.abs(b)), x, jnp.nan)
+
+
+def form_of(pattern: csr_array | None, size: int) -> Form:
+    """The form that suits the pattern of a symmetric matrix; None is an unknown one."""
+    if pattern is None:
+        return Products(size)
+    diagonal = csr_array((np.ones(size, bool), (np.arange(size), np.arange(size))), shape=(size, size))
+    pattern = csr_array(pattern + pattern.T + diagonal)
+    pattern.sort_indices()
+    if pattern.nnz == size:
+        return Diagonal(pattern)
+    _, label = connected_components(pattern, directed=False)
+    if np.bincount(label).max() <= LARGEST_BLOCK:
+        return Blocks(pattern, label)
+    order = reverse_cuthill_mckee(pattern, symmetric_mode=True)
+    place, entries = np.argsort(order), pattern.tocoo()
+    width = int(np.abs(place[entries.row] - place[entries.col]).max())
+    if width <= WIDEST_BAND:
+        return Band(pattern, order, width)
+    if np.diff(pattern.indptr).max() > MOST_COLORS:
+        return Products(size)
+    return Sparse(pattern, color_columns(pattern))
