@@ -10,6 +10,7 @@ from typing import Any
 
 import jax
 import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr
 from scipy.sparse import csr_array
 
 PyTree = Any
@@ -72,7 +73,7 @@ def _visited(jaxpr) -> int:
 
 
 def _is_jaxpr(x) -> bool:
-    return isinstance(x, jax.extend.core.Jaxpr | jax.extend.core.ClosedJaxpr)
+    return isinstance(x, Jaxpr | ClosedJaxpr)
 
 
 def color_columns(pattern: csr_array) -> np.ndarray:

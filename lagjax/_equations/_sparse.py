@@ -117,38 +117,38 @@ class Blocks(_Entries):
         place = np.empty(len(label), int)
         place[order] = np.arange(len(label)) - np.repeat(ends - sizes, sizes)
         super().__init__(pattern, place)
-        self.groups, self.where = [], []
+        self.groups, self.entries = [], []
         for size in np.unique(sizes):
             of_size = np.flatnonzero(sizes == size)
-            members = order[(ends - sizes)[of_size][:, None] + np.arange(size)]
             block = np.full(len(sizes), -1)
             block[of_size] = np.arange(len(of_size))
             of_entry = block[label[self.rows]]
             chosen = np.flatnonzero(of_entry >= 0)
-            self.groups.append(members)
-            self.where.append((chosen, of_entry[chosen], place[self.rows[chosen]], place[self.columns[chosen]]))
+            at = np.full((len(of_size), size, size), len(self.rows))  # behind the last entry: a zero
+            at[of_entry[chosen], place[self.rows[chosen]], place[self.columns[chosen]]] = chosen
+            self.groups.append(order[(ends - sizes)[of_size][:, None] + np.arange(size)])
+            self.entries.append(at)
+        self.back = np.argsort(np.concatenate([members.ravel() for members in self.groups]))
         shown = ", ".join(f"{len(members)} of {members.shape[1]}" for members in self.groups[:4])
         self.name = f"in blocks ({shown}{', …' if len(self.groups) > 4 else ''})"
 
     def prepare(self, multiply, dtype, dependent=False):
         entries, scale = self.read_scaled(multiply, dtype)
         solvers, singular, independent = [], jnp.array(False), 0
-        for members, (chosen, block, row, column) in zip(self.groups, self.where, strict=True):
-            count, size = members.shape
-            matrices = jnp.zeros((count, size, size), dtype).at[block, row, column].set(entries[chosen])
+        for at in self.entries:
+            matrices = jnp.append(entries, 0)[at]
             if dependent:
                 solvers.append(lambda b, matrices=matrices: jax.vmap(least_norm)(matrices, b))
                 independent += jnp.sum(jax.vmap(rank)(matrices))
             else:
                 factors = jax.vmap(factorize)(matrices)
                 solvers.append(lambda b, factors=factors: jax.vmap(lambda f, b: f.solve(b))(factors, b))
-                singular, independent = singular | jnp.any(factors.singular), independent + count * size
+                singular, independent = singular | jnp.any(factors.singular), independent + at.shape[0] * at.shape[1]
 
         def solve(b):
-            b, x = scale * b, jnp.zeros_like(b)
-            for members, solver in zip(self.groups, solvers, strict=True):
-                x = x.at[members].set(solver(b[members]))
-            return scale * x
+            b = scale * b
+            parts = [solver(b[members]).ravel() for members, solver in zip(self.groups, solvers, strict=True)]
+            return scale * jnp.concatenate(parts)[self.back]
 
         return Solver(solve, singular, jnp.asarray(independent))
 
@@ -161,21 +161,21 @@ class Band(_Entries):
         super().__init__(pattern, place % (2 * width + 1))
         self.order, self.width, self.name = order, width, f"a band of {width}"
         row, distance = place[self.rows], place[self.columns] - place[self.rows]
-        self.upper = np.flatnonzero(distance >= 0)
-        # What joins the window of rows i … i + b when row i leaves it: column i + b + 1 from row i + 1 down.
-        self.leaving = (row + distance - width - 1)[self.upper], (width - distance)[self.upper]
+        # Column j of the upper half, from row j − b down to j. Rows before the first, and behind the last, are those of
+        # the unit matrix: behind the last entry there are a zero and a one.
+        upper, zero = np.flatnonzero(distance >= 0), len(self.rows)
+        self.place, self.upper = place, np.full((self.size + width + 1, width + 1), zero)
+        self.upper[:, width] = zero + 1
+        self.upper[(row + distance)[upper], (width - distance)[upper]] = upper
 
     def prepare(self, multiply, dtype, dependent=False):
-        b, n = self.width, self.size
+        b = self.width
         entries, scale = self.read_scaled(multiply, dtype)
         scale = scale[self.order]
-        # Rows before the first, and behind the last, are those of the unit matrix.
-        columns = jnp.zeros((n + b + 1, b + 1), dtype).at[:, b].set(1.0)
-        columns = columns.at[self.leaving[0] + b + 1, self.leaving[1]].set(entries[self.upper])
-        window = jnp.zeros((b + 1, b + 1), dtype) + jnp.eye(b + 1, dtype=dtype)
+        columns = jnp.append(entries, jnp.array([0, 1], dtype))[self.upper]
         tolerance = rank_tolerance(dtype) if dependent else 0.0
 
-        def eliminate(window, column):
+        def eliminate(window, column):  # of rows i … i + b; column i + b + 1 joins where row i leaves
             pivot, row = window[0, 0], window[0, 1:]
             counts = ~(jnp.abs(pivot) <= tolerance)
             factors = jnp.where(counts, row / jnp.where(counts, pivot, 1), 0)
@@ -183,7 +183,7 @@ class Band(_Entries):
             rows = jnp.concatenate([inner, column[None, :b]])
             return jnp.concatenate([rows, column[:, None]], axis=1), (pivot, factors, counts)
 
-        _, (pivots, factors, counts) = jax.lax.scan(eliminate, window, columns)
+        _, (pivots, factors, counts) = jax.lax.scan(eliminate, jnp.eye(b + 1, dtype=dtype), columns)
         pivots, factors, counts = pivots[b + 1 :], factors[b + 1 :], counts[b + 1 :]
         inverse = jnp.where(counts, 1, 0) / jnp.where(counts, pivots, 1)
         size = jnp.abs(pivots)
@@ -203,7 +203,7 @@ class Band(_Entries):
             zero = jnp.zeros(b, dtype)
             _, y = jax.lax.scan(forward, zero, (factors, scale * right[self.order]))
             _, x = jax.lax.scan(back, zero, (factors, inverse, y), reverse=True)
-            return jnp.zeros_like(right).at[self.order].set(scale * x)
+            return (scale * x)[self.place]
 
         return Solver(solve, singular & (not dependent), jnp.sum(counts))
 

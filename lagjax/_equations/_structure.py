@@ -6,6 +6,7 @@ M is regular here: where constraints hold what L leaves open, machine code and d
 (`_linear`). Products with M, G and Gᵀ are derivatives along one direction.
 """
 
+import functools
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -19,6 +20,7 @@ from lagjax._equations._constraints import NEWTON_STEPS
 from lagjax._equations._motion import Flag, Motion, PyTree, Row, Time, Vector
 from lagjax._equations._patterns import count_operations, hessian_pattern, jacobian_pattern
 from lagjax._equations._sparse import Blocks, Diagonal, Form, Products, Solver, form_of
+from lagjax._interface import compiled_once
 
 # A scene is large by its coordinates and by the scalar operations of L (or where it has constraints, which cost machine
 # code m² n each): measured as first results on two cores, 3.5 s for a ring of 1000 (11 000 operations) by machine code,
@@ -115,27 +117,15 @@ class SparseMotion(Motion):
 
     def saddle(self, b: Vector, c: Row, q, qdot, t, params, positions=False) -> tuple[Vector, Row, Flag]:
         """x, λ of M x − Gᵀλ = b, G x = c, and whether M is singular; of f alone for `positions`."""
-        state = q, qdot, t, params
-        mass, _, eliminate = self._prepare(positions, *jax.lax.stop_gradient(state))
-        multiply, (push, pull) = self.mass_product(*state), self.constraints.products(*state, positions=positions)
-
-        def product(place):
-            x, nu = place
-            return multiply(x) + pull(nu), push(x)
-
-        def solve(_, right):
-            place = eliminate(*right)
-            return jax.tree.map(jnp.add, place, eliminate(*jax.tree.map(jnp.subtract, right, product(place))))
-
-        x, nu = jax.lax.custom_linear_solve(product, (b, c), solve, symmetric=True)
-        return jnp.where(mass.singular, jnp.nan, x), -nu, mass.singular
+        positions = positions and self.constraints.on_velocities is not None
+        return _saddle_of(self, positions)(b, c, q, qdot, t, params)
 
     def _prepare(self, positions: bool, *state, products=None) -> tuple[Solver, Solver, Callable]:
         """The solvers of M and of S, and (b, c) ↦ (x, −λ), of G with these `products`, x ↦ G x and λ ↦ Gᵀλ."""
         dtype = state[0].dtype
         push, pull = self.constraints.products(*state, positions=positions) if products is None else products
         mass = self.structure.mass.prepare(self.mass_product(*state), dtype)
-        form = self.structure.positions if positions else self.structure.schur
+        form = self._form(positions)
         schur = form.prepare(lambda y: push(mass.solve(pull(y))), dtype, dependent=True)
 
         def eliminate(b, c):
@@ -144,6 +134,12 @@ class SparseMotion(Motion):
             return free - mass.solve(pull(nu)), nu
 
         return mass, schur, eliminate
+
+    def _form(self, positions: bool) -> Form:
+        """The form of S, or of S for the constraints on `positions` alone."""
+        form = self.structure.positions if positions else self.structure.schur
+        assert form is not None
+        return form
 
     def rank_lost(self, start: tuple, end: tuple) -> Flag:
         """True if fewer constraints are independent at `end` than at `start`; where S is banded or in blocks."""
@@ -158,7 +154,7 @@ class SparseMotion(Motion):
     def row_lengths(self, unit, q, qdot, t, params, positions=False):
         """The lengths of the rows of G, or of ∂f/∂q for constraints on `positions`, in the `unit` of coordinates."""
         push, pull = self.constraints.products(q, qdot, t, params, positions=positions)
-        form = self.structure.positions if positions else self.structure.schur
+        form = self._form(positions)
         return jnp.sqrt(form.diagonal(lambda y: push(unit**2 * pull(y)), q.dtype))
 
     def solve_newton(self, linear: Callable, right: tuple[Vector, Row], *state) -> tuple[Vector, Row]:
@@ -182,3 +178,29 @@ class SparseMotion(Motion):
             return jax.lax.while_loop(goes_on, refine, (zero, right, 0))[0]
 
         return jax.lax.custom_linear_solve(linear, right, solve, symmetric=True)
+
+
+@functools.lru_cache(maxsize=64)
+def _saddle_of(motion: SparseMotion, positions: bool) -> Callable:
+    return compiled_once(functools.partial(_saddle, motion, positions))
+
+
+def _saddle(motion: SparseMotion, positions: bool, b: Vector, c: Row, *state):
+    """`SparseMotion.saddle`, in one step of refinement."""
+    mass, _, eliminate = motion._prepare(positions, *jax.lax.stop_gradient(state))
+    multiply, (push, pull) = motion.mass_product(*state), motion.constraints.products(*state, positions=positions)
+
+    def product(place):
+        x, nu = place
+        return multiply(x) + pull(nu), push(x)
+
+    def solve(_, right):
+        def refine(_, carry):
+            place, rest = carry
+            place = jax.tree.map(jnp.add, place, eliminate(*rest))
+            return place, jax.tree.map(jnp.subtract, right, product(place))
+
+        return jax.lax.fori_loop(0, 2, refine, (jax.tree.map(jnp.zeros_like, right), right))[0]
+
+    x, nu = jax.lax.custom_linear_solve(product, (b, c), solve, symmetric=True)
+    return jnp.where(mass.singular, jnp.nan, x), -nu, mass.singular

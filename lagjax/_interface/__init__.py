@@ -9,7 +9,14 @@ what to try, and the exception; `_platform` the kind of device that JAX computes
 
 from lagjax._interface._arguments import Function, ValueNotKnown, accept, find_params_expression, present
 from lagjax._interface._layout import Layout, describe_numbers, dtype_of, flatten_numbers, halves, labelled_leaves
-from lagjax._interface._platform import compile_for_one_call, default_platform, has_nvidia_gpu, is_known, numbers_at
+from lagjax._interface._platform import (
+    compile_for_one_call,
+    compiled_once,
+    default_platform,
+    has_nvidia_gpu,
+    is_known,
+    numbers_at,
+)
 from lagjax._interface._registered import PLACES, import_registered
 from lagjax._interface._results import (
     ENDED_WELL,

@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable
+from contextlib import nullcontext
 from typing import Any
 
 import equinox as eqx
@@ -9,6 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
+from jax.experimental.xla_metadata import set_xla_metadata
 
 
 def default_platform() -> str:
@@ -58,6 +60,24 @@ def compile_for_one_call(function: Callable) -> Callable:
     def call(*arguments):
         leaves = jnp.zeros(()), *jax.tree.leaves(arguments)  # what is made while something is traced is a tracer
         return (optimised if any(isinstance(x, Tracer) for x in leaves) else as_written())(*arguments)
+
+    return call
+
+
+def compiled_once(function: Callable) -> Callable:
+    """The jitted function, whose calls XLA does not inline on CPUs, in whose body it inlines all.
+
+    On a GPU a call of its own costs as much as the arithmetic of a step, and compiling ten of them is quick.
+    """
+
+    @jax.jit
+    def body(*arguments):
+        with set_xla_metadata(inlineable="true"):  # a call within, of `jnp.where` for one, would inherit "false"
+            return function(*arguments)
+
+    def call(*arguments):
+        with set_xla_metadata(inlineable="false") if default_platform() == "cpu" else nullcontext():
+            return body(*arguments)
 
     return call
 

@@ -7,17 +7,15 @@ scenes, `projected`: y after one Newton step of positions and of velocities back
 numbers alone.
 """
 
-from contextlib import nullcontext
 from typing import Any
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.experimental.xla_metadata import set_xla_metadata
 from jaxtyping import Array, Bool, Float
 
 from lagjax._equations import Derivation, Motion
-from lagjax._interface import default_platform
+from lagjax._interface import compiled_once
 from lagjax._program import Program, Unlowerable
 
 PyTree = Any
@@ -36,21 +34,23 @@ class ArrayEquations(eqx.Module):
 
     motion: Motion = eqx.field(static=True)
     accelerate: Any = eqx.field(static=True)
+    project: Any = eqx.field(static=True)
     reason: str = eqx.field(static=True)
 
     def __init__(self, motion: Motion, reason: str):
         self.motion, self.reason = motion, reason
-        self.accelerate = jax.jit(motion.solved_acceleration)  # traced once, however often it is called
+        # Traced once, however often they are called.
+        self.accelerate, self.project = compiled_once(motion.solved_acceleration), compiled_once(motion.projected)
 
     @property
     def constrained(self) -> bool:
         return self.motion.constrained
 
     def projected(self, t: Time, y: State, params: PyTree) -> State:
-        return self.motion.projected(*y, t, params)
+        return self.project(*y, t, params)
 
     def acceleration(self, t: Time, y: State, params: PyTree) -> Acceleration:
-        return _compiled_once(self.accelerate, *y, t, params)
+        return self.accelerate(*y, t, params)
 
 
 class ScalarEquations(eqx.Module):
@@ -65,19 +65,19 @@ class ScalarEquations(eqx.Module):
     project: Any = eqx.field(static=True)
 
     def __init__(self, program: Program, projection: Program | None = None):
-        self.program, self.projection, self.accelerate = program, projection, jax.jit(program.__call__)
-        self.project = None if projection is None else jax.jit(projection.__call__)
+        self.program, self.projection, self.accelerate = program, projection, compiled_once(program)
+        self.project = None if projection is None else compiled_once(projection)
 
     @property
     def constrained(self) -> bool:
         return self.projection is not None
 
     def projected(self, t: Time, y: State, params: PyTree) -> State:
-        state = _compiled_once(self.project, *y[0], *y[1], t, *_scalars(params))
+        state = self.project(*y[0], *y[1], t, *_scalars(params))
         return jnp.stack(state[: len(state) // 2]), jnp.stack(state[len(state) // 2 :])
 
     def acceleration(self, t: Time, y: State, params: PyTree) -> Acceleration:
-        *acceleration, singular = _compiled_once(self.accelerate, *y[0], *y[1], t, *_scalars(params))
+        *acceleration, singular = self.accelerate(*y[0], *y[1], t, *_scalars(params))
         return jnp.stack(acceleration), singular
 
 
@@ -108,12 +108,3 @@ def form_of(derivation: Derivation, path: str = "auto") -> MotionEquations:
 
 def _scalars(params: PyTree) -> list[jax.Array]:
     return [x for leaf in jax.tree.leaves(params) for x in ([leaf] if jnp.ndim(leaf) == 0 else jnp.ravel(leaf))]
-
-
-def _compiled_once(function, *arguments):
-    """Call a jitted function without XLA inlining it on CPUs: it is compiled once, however many places call it.
-
-    On a GPU a call of its own costs as much as the arithmetic of a step, and compiling ten of them is quick.
-    """
-    with set_xla_metadata(inlineable="false") if default_platform() == "cpu" else nullcontext():
-        return function(*arguments)

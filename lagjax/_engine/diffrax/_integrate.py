@@ -71,7 +71,8 @@ def integrate(
     project = eqx.filter_closure_convert(projected, ts[0], y0, params) if form.constrained else None
     solution = _differentiable((field, project, ts, y0, params), method, adjoint, event)
     if project is not None:
-        solution = solution._replace(path=jax.vmap(project, in_axes=(0, 0, None))(ts, solution.path, params))
+        path = jax.lax.map(lambda at: project(*at, params), (ts, solution.path))
+        solution = solution._replace(path=path)
     return solution
 
 
