@@ -203,6 +203,18 @@ class Batch(eqx.Module):
             self.y0, self.params
         )
 
+    def map_in_turn(self, solve: Callable[[Problem], "Solution"]) -> "Solution":
+        """`solve` of one member after the other."""
+        axes = jax.tree.unflatten(jax.tree.structure(self.params), self.axes)
+
+        def solve_member(i):
+            params = jax.tree.map(
+                lambda axis, x: x if axis is None else x[i], axes, self.params, is_leaf=lambda x: x is None
+            )
+            return solve(replace(self.member, y0=jnp.asarray(self.y0)[i], params=params))
+
+        return jax.lax.map(solve_member, jnp.arange(len(self)))
+
     @property
     def is_known(self) -> bool:
         numbers = eqx.filter(self.params, eqx.is_array_like)

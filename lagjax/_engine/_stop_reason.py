@@ -49,7 +49,9 @@ def what_stopped(acceleration: Callable, at: End, shrank, spent) -> tuple[jax.Ar
     `acceleration(t, y)` gives q̈, with a last axis of n. `shrank` are the members whose step became too small, `spent`
     those whose budget of steps is spent; others are not looked at.
     """
-    library, loop = (np, _loop) if isinstance(at.y, np.ndarray) else (jnp, jax.lax.while_loop)
+    library, loop, evaluate_each = (
+        (np, _loop, map) if isinstance(at.y, np.ndarray) else (jnp, jax.lax.while_loop, _map_compiled)
+    )
     n = at.y.shape[-1] // 2
     smallest = 4 * np.finfo(at.y.dtype).eps * library.maximum(abs(at.begin), abs(at.end))
     forward = library.where(at.end > at.begin, 1.0, -1.0) * smallest
@@ -58,12 +60,11 @@ def what_stopped(acceleration: Callable, at: End, shrank, spent) -> tuple[jax.Ar
     def acceleration_after(s):
         return acceleration(at.t + s, at.y + s[..., None] * rate)
 
-    defined = shrank
-    for steps in AHEAD:
-        defined = defined & library.isfinite(acceleration_after(steps * forward)).all(axis=-1)
-
     half = _half_width(library, at, smallest, shrank)
-    low, high = acceleration_after(-half), acceleration_after(half)
+    *ahead, low, high = evaluate_each(acceleration_after, [*(steps * forward for steps in AHEAD), -half, half])
+    defined = shrank
+    for value in ahead:
+        defined = defined & library.isfinite(value).all(axis=-1)
     size = library.abs(low) + library.abs(high)
 
     def variation(a, b):
@@ -96,6 +97,10 @@ def _half_width(library, at: End, smallest, shrank):
     fighting = at.rejected > FIGHTING * (at.accepted + at.rejected)
     wide = mean * library.where(fighting, FAR, NEAR)
     return library.where(shrank, NARROW * smallest, library.maximum(wide, NARROW * smallest))
+
+
+def _map_compiled(function: Callable, arguments: list) -> jax.Array:
+    return jax.lax.map(function, jnp.stack(arguments))
 
 
 def _loop(goes_on: Callable, body: Callable, carry):

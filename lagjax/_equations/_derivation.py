@@ -28,7 +28,7 @@ from lagjax._equations._motion import Motion
 from lagjax._equations._quantities import OwnRules, quantities
 from lagjax._equations._recursion import Recursion, RecursiveElimination
 from lagjax._equations._saddle import LARGEST_INDEFINITE, IndefiniteElimination, SaddleElimination, TwoCoordinates
-from lagjax._equations._structure import SparseMotion, structure_of
+from lagjax._equations._structure import LARGEST_LOWERED, SparseMotion, Structure, structure_of
 from lagjax._interface import Layout, dtype_of, is_concrete
 from lagjax._native import Projection
 from lagjax._primitives import DOUBLE
@@ -128,12 +128,10 @@ class Derivation:
         """
         self.motion, self.layout, self.refusal, self.unhashable = motion, layout, refusal, unhashable
         self.numbers = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), params)
-        self.structure = None if path == "scalar" else structure_of(motion, self.state_shapes, path == "array")
-        if self.structure is not None and path == "auto" and pieces_of_motion(motion, *self.state_shapes):
-            self.structure = None  # steps end at borders in machine code alone
+        self.structure = None if path == "scalar" else self._structure_of(motion, path == "array")
         if self.structure is not None:
             self.motion = SparseMotion(*vars(motion).values(), structure=self.structure)
-            self.refusal = f"of {layout.size} coordinates, {self.structure}, which arrays suit better"
+            self.refusal = f"of {layout.size} coordinates {self.structure}, which suits arrays better"
         self._made: dict[str, Any] = {}
         self._lock = threading.RLock()
         self._programs: dict[tuple[str, ...], Program] = {}
@@ -143,6 +141,23 @@ class Derivation:
         self._own_rules = False
         # Compiled functions are traced once for each of their derivatives, and all quantities share these.
         self._traced_once: Motion = jax.tree.map(jax.jit, motion)
+
+    def _structure_of(self, motion: Motion, insists: bool) -> Structure | None:
+        structure = structure_of(motion, self.state_shapes, insists)
+        if structure is None or insists or structure.operations > LARGEST_LOWERED:
+            return structure
+        return None if pieces_of_motion(motion, *self.state_shapes) else structure  # steps end at borders there alone
+
+    @functools.cached_property
+    def lowered(self) -> "Derivation":
+        """The derivation as scalar programs of a large scene too, as far as machine code takes it."""
+        if self.structure is None:
+            return self
+        motion = Motion(*list(vars(self.motion).values())[:4])
+        refusal = None
+        if self.structure.operations > LARGEST_LOWERED:
+            refusal = f"{self.structure.operations} operations of L would take minutes to compile"
+        return Derivation(motion, self.layout, self.numbers, refusal, self.unhashable, "scalar")
 
     # ---- quantities of a state ----
 

@@ -84,11 +84,9 @@ class _Entries(Form):
         return self.read(multiply, dtype)[self.on_diagonal]
 
     def read_scaled(self, multiply: Product, dtype) -> tuple[Array, Vector]:
-        """The entries with both sides scaled to a unit diagonal, and the scale (n,), as `_linear.diagonal_scale`."""
+        """The entries with both sides scaled to a unit diagonal, and the scale (n,); a zero there stays."""
         entries = self.read(multiply, dtype)
-        diagonal = jnp.abs(entries[self.on_diagonal])
-        largest = jax.ops.segment_max(jnp.abs(entries), self.rows, self.size, indices_are_sorted=True)
-        size = jnp.where(diagonal > 0, diagonal, largest)
+        size = jnp.abs(entries[self.on_diagonal])
         scale = 1 / jnp.sqrt(jnp.where(size > 0, size, 1))
         return entries * scale[self.rows] * scale[self.columns], scale
 

@@ -29,11 +29,18 @@ LEAST_COORDINATES = 100
 LEAST_OPERATIONS = 6000
 # Coordinates up to which a dense M is a matrix: elimination takes 1 ms there, and conjugate gradients seldom less.
 LARGEST_DENSE = 512
+# Operations of L up to which machine code takes a large scene that is asked of it, or has borders: a ring of 4000 (44 000
+# operations) compiles for 18 s, one of 10 000 for 340 s.
+LARGEST_LOWERED = 60_000
 
 
 class Structure(NamedTuple):
-    """The forms of M, of S = G M⁻¹ Gᵀ, and of S for the constraints on positions alone (None without any)."""
+    """The forms of M, of S = G M⁻¹ Gᵀ, and of S for the constraints on positions alone (None without any).
 
+    `operations` are the scalar ones of L.
+    """
+
+    operations: int
     mass: Form
     schur: Form | None
     positions: Form | None
@@ -60,7 +67,7 @@ def structure_of(motion: Motion, shapes: tuple, insists: bool = False) -> Struct
     if isinstance(mass, Products) and (n <= LARGEST_DENSE or not insists):
         return None
     if not motion.constrained:
-        return Structure(mass, None, None)
+        return Structure(operations, mass, None, None)
     constraints = motion.constraints
     count = jax.eval_shape(constraints.f, q, t, numbers).size
     rows = jacobian_pattern(lambda q, t, p: constraints.f(q, t, p), (q, t, numbers), by=0)
@@ -74,7 +81,7 @@ def structure_of(motion: Motion, shapes: tuple, insists: bool = False) -> Struct
         return form_of(None if inverse is None else csr_array((jacobian @ inverse @ jacobian.T) != 0), m)
 
     both = csr_array(_stack(rows, on_velocities))
-    return Structure(mass, schur(both), schur(rows) if count else None)
+    return Structure(operations, mass, schur(both), schur(rows) if count else None)
 
 
 def _stack(*patterns: csr_array) -> csr_array:

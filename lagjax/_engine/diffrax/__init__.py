@@ -107,7 +107,9 @@ class Diffrax(AbstractEngine, eqx.Module):
 
     @eqx.filter_jit
     def solve_batch(self, batch: Batch) -> Solution:
-        """The motions of all members, which step together until the slowest has arrived."""
+        """The motions of all members, which step together until the slowest has arrived; of large scenes in turn."""
+        if batch.member.derivation.structure is not None:  # one by one they are in the caches of a core
+            return batch.map_in_turn(lambda problem: _solve(self, problem))
         solution = batch.map_members(lambda problem: _solve(self, problem))
         steps = solution.accepted + solution.rejected
         return solution._replace(idle=steps.size * jnp.max(steps) - jnp.sum(steps))

@@ -17,6 +17,7 @@ import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 
 from lagjax._engine._problem import Solution
 from lagjax._engine.diffrax._equations import MotionEquations
@@ -179,13 +180,22 @@ def _backward(residuals, cotangents, perturbed, moving, method):
         # The last step ends at ts[-1] itself, which may be differentiated, not at its recorded value.
         controller = _RecordedSteps(jnp.where(times == t_end, jnp.inf, times), method.jumps)
         again = Method(method.solver, controller, None, method.max_steps, diffrax.NoProgressMeter())
-        solution, *_ = _call((field, project, ts, y0, params), again, diffrax.RecursiveCheckpointAdjoint())
+        solution, *_ = _call((field, project, ts, y0, params), again, _checkpoints(y0, method.max_steps))
         return solution[:3]
 
     replayed, pull_back = eqx.filter_vjp(replay, moving)
     filled = jax.tree.map(lambda x, c: jnp.zeros_like(x) if c is None else c, replayed, tuple(cotangents[:3]))
     filled = jax.tree.map(lambda c: jnp.where(crossed & (c != 0), jnp.nan, c), filled)
     return pull_back(filled)[0]
+
+
+_CHECKPOINT_BYTES = 2**28  # of states that a gradient keeps; half of it lets each step be taken once more, at most
+
+
+def _checkpoints(y0, max_steps: int) -> diffrax.RecursiveCheckpointAdjoint:
+    """Checkpoints as diffrax has them, some √(2 max_steps), but of a large state so many as fit."""
+    usual, fit = int(np.ceil(np.sqrt(2 * max_steps))), _CHECKPOINT_BYTES // (y0.size * y0.dtype.itemsize)
+    return diffrax.RecursiveCheckpointAdjoint(checkpoints=None if usual <= fit else max(fit, 2))
 
 
 class _RecordedSteps(diffrax.AbstractStepSizeController):

@@ -120,6 +120,8 @@ class MachineCode(AbstractEngine):
 
         An NVIDIA GPU is no reason where its threads can remember a motion.
         """
+        if problem.derivation.structure is not None and problem.guards is None:
+            return problem.derivation.refusal
         refusal = self.refuses(problem)
         if refusal is None or not has_nvidia_gpu() or self.lacks(problem) is not None:
             return refusal
@@ -235,7 +237,7 @@ def _unguarded_flow(problem: Problem) -> Flow:
 def _find_flow(problem: Problem) -> Flow:
     """The flow of a problem's scene in float64. Raises `Unlowerable` where it has none."""
     guards = problem.guards if problem.event is None else surfaces_of_event(problem).guards()
-    flow = _make_flow(problem.derivation, problem.system.path, guards)
+    flow = _make_flow(problem.derivation.lowered, problem.system.path, guards)
     if isinstance(flow, Unlowerable):
         raise Unlowerable(str(flow))
     return flow

@@ -84,7 +84,7 @@ def surfaces_of(problem: Problem, functions: tuple, directions: tuple[int, ...],
     """
     code, structure = jax.tree.flatten(eqx.filter(problem.params, eqx.is_array_like, inverse=True))
     given = directions, tuple(code), structure, what, problem.is_rounded
-    return _lower_surfaces(problem.derivation, functions, *given)
+    return _lower_surfaces(problem.derivation.lowered, functions, *given)
 
 
 @functools.lru_cache(maxsize=64)

@@ -138,7 +138,7 @@ class Mode(NamedTuple):
         try:
             if refusal := MachineCode().refuses(problem):
                 raise Unlowerable(refusal)
-            surfaces = _surfaces(problem.derivation, problem.system, leaving, tuple(code), structure)
+            surfaces = _surfaces(problem.derivation.lowered, problem.system, leaving, tuple(code), structure)
             surfaces = surfaces and surfaces._replace(is_rounded=problem.is_rounded)
             guarded = dataclasses.replace(problem, guards=surfaces and surfaces.guards(remembers=True))
             if refusal := MachineCode().refuses(guarded):
