@@ -205,12 +205,11 @@ class Batch(eqx.Module):
 
     def map_in_turn(self, solve: Callable[[Problem], "Solution"]) -> "Solution":
         """`solve` of one member after the other."""
-        axes = jax.tree.unflatten(jax.tree.structure(self.params), self.axes)
+        structure = jax.tree.structure(self.params)
 
         def solve_member(i):
-            params = jax.tree.map(
-                lambda axis, x: x if axis is None else x[i], axes, self.params, is_leaf=lambda x: x is None
-            )
+            leaves = zip(jax.tree.leaves(self.params), self.axes, strict=True)
+            params = structure.unflatten([x if axis is None else jnp.asarray(x)[i] for x, axis in leaves])
             return solve(replace(self.member, y0=jnp.asarray(self.y0)[i], params=params))
 
         return jax.lax.map(solve_member, jnp.arange(len(self)))

@@ -29,8 +29,8 @@ LEAST_COORDINATES = 100
 LEAST_OPERATIONS = 6000
 # Coordinates up to which a dense M is a matrix: elimination takes 1 ms there, and conjugate gradients seldom less.
 LARGEST_DENSE = 512
-# Operations of L up to which machine code takes a large scene that is asked of it, or has borders: a ring of 4000 (44 000
-# operations) compiles for 18 s, one of 10 000 for 340 s.
+# Operations of L up to which machine code takes a large scene that is asked of it, or has borders: a ring of 4000, with
+# 44 000 of them, compiles for 18 s, one of 10 000 for 340 s.
 LARGEST_LOWERED = 60_000
 
 
