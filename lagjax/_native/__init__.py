@@ -9,7 +9,6 @@ one Taylor series, of the order that the tolerance asks for.
     _ir                  LLVM's instructions, written like arithmetic;  _objects: machine code kept on disk
     _lanes               the operations of a program on vectors, one by one: the form of small kernels
     _tables              the form of large ones: operations are data that one loop walks along;  _schedule: their order
-    _packs, _packed      large kernels of one member, whose alike operations stand in the lanes;  _single_member
     _table_reads         entries of tables, read from where the numbers of a member lie
     _constants           every numerical choice, with its reason
     _frame               the memory of a thread, the lanes and the job, as a function of a kernel sees them

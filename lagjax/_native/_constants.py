@@ -86,20 +86,6 @@ MOST, WINDOW = 16, 4096
 # half of `OFTEN` the code is twice as long and runs no faster.
 LARGEST_TREE, OFTEN, ROUNDS = 10, 24, 12
 
-# For one member alone. Alike operations whose operands lie side by side are a run of their own from `LEAST_RUN` on; a
-# combination of how operands lie has code of its own where it is that of `OFTEN_PACKED` vectors, else its numbers
-# lie anywhere; products are sorted into runs of `LONG_RUN`.
-LEAST_RUN, OFTEN_PACKED, LONG_RUN = 5, 8, 8
-# Alike operations stand in the lanes of one member where they fill at least this share in the order recursion. Measured
-# with eight lanes: chains of pendulums fill a quarter, a beam 0.3, an arm of six joints 0.46, and run 0.87 to 1.1 times
-# as fast as without lanes; 20 charges on a sphere and 12 bodies fill 0.9 and run twice as fast, 50 bodies five times.
-LEAST_FILLED = 0.5
-# Members of a large scene whose alike operations fill the lanes are integrated one after the other where the series of
-# as many members as there are lanes take this many bytes: with all that is read beside them they leave a second cache
-# of 2 MiB. Measured there, lanes for members take 0.6 times as long at 1.7 MB (20 bodies), 0.85 times at 2.0 MB (20
-# charges on a sphere), 1.3 times at 2.5 MB (24 bodies), 1.8 times at 3.9 MB (30), 2.7 times at 11 MB (50 bodies).
-LARGEST_SHARED = 2**21
-
 # ---- tolerances ------------------------------------------------------------------------------------------------------
 
 # The absolute tolerance where none is given, in parts of rtol: for components that pass through zero. It is at most

@@ -28,7 +28,6 @@ from lagjax._native._motion_parts import MotionParts
 from lagjax._native._projection import Projector
 from lagjax._native._roots import Roots
 from lagjax._native._run_records import Output
-from lagjax._native._single_member import SingleMember, fills_lanes
 from lagjax._native._step import PARTS, StepControl
 from lagjax._native._taylor import TaylorSeries, double, integer, is_large
 
@@ -47,7 +46,7 @@ class Integrator:
 
     Coordinates of one of the `error_groups` are measured by the largest of them. The first coordinates of a `nesting`
     are the motion, the others derivatives of it, which follow where the projection takes it. The state is of the type
-    `number`. A thread `for_gpus` has no vector registers, in which alike operations of one member could stand.
+    `number`.
     """
 
     job = JOB
@@ -60,9 +59,8 @@ class Integrator:
         *,
         width: int,
         number: ir.Type = DOUBLE,
-        for_gpus: bool = False,
     ):
-        program, series, nesting, projection, borders, chosen = parts
+        program, series, nesting, projection, borders, _ = parts
         n = series.size
         self.base_size = nesting.base
         self.guards = 0 if guards is None else len(guards.directions)
@@ -80,10 +78,7 @@ class Integrator:
         jump = parts.jump
         more = [line for line in (jump and jump.line, borders and borders.retraction) if line]
         large = is_large(program, projection, guards, more=more)
-        has_pieces = borders is not None and borders.switches
-        alone = large and width == 1 and not has_pieces and chosen is None and not for_gpus
-        kind = SingleMember if alone and fills_lanes(series) else TaylorSeries
-        self.motion = motion = kind("motion", parts, JOB, fields, large, width, kept=self.guards, number=number)
+        self.motion = motion = TaylorSeries("motion", parts, JOB, fields, large, width, kept=self.guards, number=number)
         self.projector = projection and Projector(motion, projection.state, projection.velocity_scale, self.base_size)
         groups = tuple(range(n)) if error_groups is None else error_groups
         self.step = StepControl(motion, groups, self.projector, self.base_size)

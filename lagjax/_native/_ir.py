@@ -348,40 +348,6 @@ class Code:
     def store(self, x: Value, address: Value) -> None:
         self.builder.store(x.it, address.it, align=self._alignment(x.it.type))
 
-    def load_packed(self, address: Value) -> Value:
-        """The doubles from an address on, as many as a vector has lanes, wherever they begin."""
-        return Value(self, self.builder.load(address.it, typ=self.vector, align=8))
-
-    def store_packed(self, x: Value, address: Value) -> None:
-        self.builder.store(x.it, address.it, align=8)
-
-    def offsets(self, words: Value) -> Value:
-        """Distances in bytes, from as many numbers of doubles (32 bits each) as a vector has lanes."""
-        whole, (_, eight, _) = ir.VectorType(INTEGER, self.lanes), self._constants_of_a_gather
-        loaded = self.builder.load(words.it, typ=ir.VectorType(ir.IntType(32), self.lanes), align=4)
-        return Value(self, self.builder.mul(self.builder.zext(loaded, whole), eight))
-
-    def gather(self, base: Value, offsets: Value) -> Value:
-        """The doubles that lie this many bytes behind `base`, one for each lane."""
-        function, _, options = self._constants_of_a_gather
-        first = self.as_value(Value(self, self.builder.ptrtoint(base.it, INTEGER)), offsets.it.type)
-        pointers = ir.VectorType(POINTER, self.lanes)
-        addresses = self.builder.inttoptr(self.builder.add(first.it, offsets.it), pointers)
-        return Value(self, self.builder.call(function, [addresses, *options]))
-
-    @functools.cached_property
-    def _constants_of_a_gather(self) -> tuple:
-        """LLVM's function for it; the bytes of a double, in all lanes; alignment, which lanes, and what else."""
-        word, bits = ir.IntType(32), ir.VectorType(BIT, self.lanes)
-        name = f"llvm.masked.gather.v{self.lanes}f64.v{self.lanes}p0"
-        function = self.module.globals.get(name)
-        if function is None:
-            kind = ir.FunctionType(self.vector, [ir.VectorType(POINTER, self.lanes), word, bits, self.vector])
-            function = ir.Function(self.module, kind, name)
-        every, nothing = ir.Constant(bits, [True] * self.lanes), ir.Constant(self.vector, ir.Undefined)
-        eight = ir.Constant(ir.VectorType(INTEGER, self.lanes), [8] * self.lanes)
-        return function, eight, (ir.Constant(word, 8), every, nothing)
-
     def variable(self, start: Value) -> "Variable":
         with self.builder.goto_entry_block():
             place = self.builder.alloca(start.it.type)

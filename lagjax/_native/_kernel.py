@@ -15,8 +15,6 @@ from lagjax._native._adjoint import Adjoint
 from lagjax._native._constants import (
     ATOL_OVER_RTOL,
     DONE,
-    LARGEST_SHARED,
-    MAX_ORDER,
     MOTIONS_PER_ADJOINT,
     VECTORS_PER_THREAD,
 )
@@ -28,7 +26,6 @@ from lagjax._native._integrator import Integrator
 from lagjax._native._ir import DOUBLE, FLOAT, compile_module, lanes
 from lagjax._native._motion_parts import Chosen, MotionParts, Projection, choose_parameters
 from lagjax._native._run_records import RECORDED
-from lagjax._native._single_member import fills_lanes
 from lagjax._native._table_reads import SET_NUMBERS
 from lagjax._native._tangent import Tangent
 from lagjax._native._taylor import TaylorSeries, is_large, order_for, size_of_series
@@ -142,16 +139,6 @@ class Kernel:
         """The kernel for `members` members: that for a single one has no lanes, which would be idle."""
         return self._single_member_kernel if members == 1 < self.width else self
 
-    def select_kernel(self, members: int) -> "Kernel":
-        """The kernel that integrates `members` members: one after the other where lanes would not fit in a cache."""
-        return self.select_width(1 if self._runs_singles else members)
-
-    @functools.cached_property
-    def _runs_singles(self) -> bool:
-        series = self._parts.series
-        shared = series.rows * MAX_ORDER * self.width * 8 <= LARGEST_SHARED
-        return is_large(self._parts.program) and not shared and fills_lanes(series)
-
     @functools.cached_property
     def _single_member_kernel(self) -> "Kernel":
         return Kernel(**self._given, width=1)
@@ -165,9 +152,8 @@ class Kernel:
         """The numbers of a member that its programs compute with; None where these are all."""
         return self._parts.chosen
 
-    def _integrator(self, number: ir.Type = DOUBLE, for_gpus: bool = False) -> Integrator:
-        given = self._parts, self._guards, self._error_groups
-        return _build_module(Integrator, *given, width=self.width, number=number, for_gpus=for_gpus)
+    def _integrator(self, number: ir.Type = DOUBLE) -> Integrator:
+        return _build_module(Integrator, self._parts, self._guards, self._error_groups, width=self.width, number=number)
 
     def _gpu_programs(self, single: bool) -> "_gpu.GpuPrograms":
         """The programs for GPUs; those in `single` precision of a kernel that `allows_singles`."""
@@ -175,7 +161,7 @@ class Kernel:
 
         def motion() -> TaylorSeries:
             _gpu.require_room(size_of_series(self._parts.series))  # before what is larger than that is written down
-            return self.select_width(1)._integrator(number, for_gpus=True).motion
+            return self.select_width(1)._integrator(number).motion
 
         return _gpu.GpuPrograms(motion, lambda: self._adjoint(width=1, number=number).motion)
 

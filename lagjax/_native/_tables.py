@@ -33,13 +33,13 @@ class Tables:
     `function(name, *kinds)` makes a function of the kernel, with its frame.
     """
 
-    def __init__(self, function, sincos: Code, executing=None, look_up: Callable | None = None):
+    def __init__(self, function, sincos: Code, look_up: Callable):
         self._sincos, self._look_up = sincos, look_up
         self._kinds: dict[tuple[OperationKind, int], int] = {}
         self._constants: dict[bytes, int] = {}
         self._fields: list[str] = []
         self._schedules: dict[StraightLine, Schedule] = {}
-        self._execute: Frame = (executing or function)("execute", POINTER, INTEGER)
+        self._execute: Frame = function("execute", POINTER, INTEGER)
         self._prepare: Frame = function("prepare")
         self._module, self._layout = self._prepare.code.module, self._prepare.layout
         self._nowhere = self._layout.place(self._field(1), 0)  # for unused results
@@ -198,7 +198,6 @@ class Tables:
         if kind.op == "sincos":
             return sines_and_cosines(code, self._sincos, xs[0])
         if kind.op in LOOK_UPS:
-            assert self._look_up is not None
             return (self._look_up(self._execute, kind.op, kind.attribute, xs[0]),)
         xs = [code.compare("!=", x, 0.0) if of == "bool" else x for x, of in zip(xs, kind.kinds, strict=True)]
         result = apply(code, kind.op, xs, kind.attribute, kind.kinds, kind.result)

@@ -8,7 +8,7 @@
 
 import functools
 import math
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 
 import numpy as np
@@ -68,7 +68,8 @@ class TaylorSeries:
         self.layout = Memory(width, self._fields() | fields, number=number)
         self.width, self.vector = self.layout.width, ir.VectorType(number, self.layout.width)
         self.large = large
-        self.form = self._form()
+        sincos = sincos_function(self.module, self.width, number=self.layout.number)
+        self.form = Tables(self.function, sincos, self.look_up) if large else Lines(sincos, self.look_up)
         # The program whose first outputs are q̈. As a table the zeroth order is there already, and little longer.
         line = program.line
         self.acceleration = series.zeroth_order if large else line.replace(outputs=line.outputs[: self.n])
@@ -90,10 +91,6 @@ class TaylorSeries:
             "first_number": EXACT,  # where the numbers of a member begin: its parameters, and what tables are of
         }
 
-    def _form(self) -> Lines | Tables:
-        sincos = sincos_function(self.module, self.width, number=self.layout.number)
-        return Tables(self.function, sincos, look_up=self.look_up) if self.large else Lines(sincos, self.look_up)
-
     def function(self, name: str, *kinds: ir.Type, **options) -> Frame:
         return Frame(self.module, self.layout, self.job, name, *kinds, **options)
 
@@ -109,10 +106,6 @@ class TaylorSeries:
 
     # ---- the sums ----
 
-    @property
-    def places_of_sums(self) -> int:
-        return len(self.series.cauchy_products)
-
     def sum_indices(self, i: Index, k: Index) -> tuple[Index, Index]:
         """The place of product i at order k in `sums`."""
         return (k if self.keep_sums else 0), i
@@ -125,12 +118,16 @@ class TaylorSeries:
         squares = [(a,) for a, b in self.series.cauchy_products if a == b]
         kinds = [("mixed", mixed, 0, mixed_sum), ("squares", squares, len(mixed), square_sum)]
         tables = {name: self.table(pairs) for name, pairs, _, _ in kinds}
+
+        def read(row: Value, j: int) -> Value:
+            return code.load(code.element(row, j * self.width), code.vector)
+
         for order in code.cases(k, range(2, MAX_ORDER)):
             for name, pairs, first, total in kinds:
                 if pairs:
                     with code.loop(len(pairs)) as i:
                         rows = [self._row(frame, tables[name], i * len(pairs[0]) + j) for j in range(len(pairs[0]))]
-                        frame["sums", *self.sum_indices(i + first, k)] = total(order, self._reader(code), *rows)
+                        frame["sums", *self.sum_indices(i + first, k)] = total(order, read, *rows)
         return frame.finish()
 
     def table(self, pairs) -> ir.GlobalVariable:
@@ -143,23 +140,21 @@ class TaylorSeries:
         offset = code.load(code.element(Value(code, table), index, INTEGER), INTEGER)
         return code.element(frame.address("rows"), offset)
 
-    def _reader(self, code: Code) -> Callable[[Value, int], Value]:
-        return lambda row, j: code.load(code.element(row, j * self.width), code.vector)
-
     # ---- the coefficients ----
 
     def _coefficients_function(self) -> Code:
         """`(order)`: the series of the state, to that order, from its values."""
         frame = self.function("coefficients", INTEGER)
         code, (order,), series, n, form = frame.code, frame.arguments, self.series, self.n, self.form
-        out = form.run(frame, series.zeroth_order, *self.state_inputs(frame), to=self.values(frame))
+        values = frame.vectors("values", series.values)
+        out = form.run(frame, series.zeroth_order, *self.state_inputs(frame), to=values)
         frame["singular"] = out[n]
         for i in range(self.kept):
             frame["kept", i] = out[n + 1 + i]
         for i in form.each(code, n):
             frame["y", i, 1] = frame["y", i + n]
             frame["y", i + n, 1] = out[i]
-        for i in form.each(code, self.places_of_sums):
+        for i in form.each(code, len(series.cauchy_products)):
             frame["sums", *self.sum_indices(i, integer(code, 1))] = 0.0
 
         # Borders are located on the last order too.
@@ -167,21 +162,12 @@ class TaylorSeries:
             with code.only_if(k > 1):
                 frame.call(self._sums, k)
             inverse = 1.0 / code.as_number(k + 1)
-            out = form.run(frame, series.order_recursion, *self.recursion_inputs(frame, k), to=self.rows_at(frame, k))
+            inputs = self.recursion_inputs(frame, k)
+            out = form.run(frame, series.order_recursion, *inputs, to=frame.vectors_at("rows", series.rows, k))
             for i in form.each(code, n):
                 frame["y", i, k + 1] = frame["y", i + n, k] * inverse
                 frame["y", i + n, k + 1] = out[i] * inverse
         return frame.finish()
-
-    def values(self, frame: Frame) -> Vectors:
-        """The values of the zeroth order that the recursion of orders reads."""
-        return frame.vectors("values", self.series.values)
-
-    def sums(self, frame: Frame) -> Vectors:
-        return frame.vectors("sums", len(self.series.cauchy_products), lambda i: (0, i))
-
-    def rows_at(self, frame: Frame, k: Value) -> Vectors:
-        return frame.vectors_at("rows", self.series.rows, k)
 
     def followed_value(self, frame: Frame, j: Value) -> Value:
         return frame["values", j + (self.series.values - self.series.followed)]
@@ -206,13 +192,14 @@ class TaylorSeries:
         """The inputs of the order recursion: the coefficients of order k, k, 1/k, the values and the sums."""
         code, number, products = frame.code, frame.code.as_number(k), len(self.series.cauchy_products)
         time = code.select(code.compare("==", k, 1), number, 0.0)
-        sums = self.sums(frame)
         if self.keep_sums:
             sums = Vectors(products, lambda i: frame["sums", k, i])
+        else:
+            sums = frame.vectors("sums", products, lambda i: (0, i))
         return [
             Vectors(self.states, lambda i: frame["y", i, k]),
             [code.lanes_of(x) for x in (time, number, 1.0 / number)],
-            self.values(frame),
+            frame.vectors("values", self.series.values),
             sums,
         ]
 

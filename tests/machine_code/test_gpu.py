@@ -408,16 +408,6 @@ def test_every_second_ready_scene(make, on_the_ptx):
     agree(on_the_ptx(lambda q0: motion(scene, q0, scene.qdot0)[:4], scene.q0), function(scene.q0), 1e-8)
 
 
-@pytest.mark.slow
-def test_a_program_for_gpus_is_the_same_whatever_processor_writes_it_down(monkeypatch):
-    """Alike operations of a large scene would stand in the lanes of a processor that they fill; a thread has none."""
-    programs = []
-    for filled in True, False:
-        monkeypatch.setattr("lagjax._native._integrator.fills_lanes", lambda series, filled=filled: filled)
-        programs.append(program_of(scenes.andrews_squeezer()))
-    assert programs[0] == programs[1]
-
-
 ONE_OF_A_KIND = (
     scenes.chain, scenes.spherical_pendulum, scenes.driven_pendulum, scenes.fermi_pasta_ulam, scenes.kepler,
     scenes.cartesian_double_pendulum, scenes.rolling_disc, scenes.slider_crank, scenes.swinging_atwood,

@@ -9,7 +9,7 @@ import lagjax
 from lagjax import _native
 from lagjax._equations._derivation import derivation_of, numbers_of
 from lagjax._interface._layout import Layout
-from lagjax._native import _packs, _schedule, _taylor
+from lagjax._native import _schedule, _taylor
 from lagjax._native._integrator import Integrator
 from lagjax._native._motion_parts import MotionParts
 from lagjax._program import OPERATIONS, Unlowerable, lower
@@ -22,11 +22,10 @@ ROUND_OFF = 1e-11
 
 
 def in_all_forms(*parts, **options):
-    """A kernel written down operation by operation, one as tables, and one as tables with alike operations in lanes."""
+    """A kernel written down operation by operation, one as tables, and one as tables of a single lane."""
     for border, width in ((10**9, None), (-1, None), (-1, 1)):
         with pytest.MonkeyPatch.context() as patch:
             patch.setattr(_taylor, "LARGEST_LINE", border)
-            patch.setattr(_packs, "LEAST_FILLED", 0)
             kernel = _native.Kernel(*parts, **options, width=width)
             if width is None:
                 kernel._backward  # noqa: B018  (compiled in the same form)

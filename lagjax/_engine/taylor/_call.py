@@ -43,7 +43,7 @@ def call_host(host: Callable, shapes, *arrays) -> tuple:
 def begins_in_handler(flow: Flow, members: int) -> bool:
     """True if a run of this many members begins in the handler."""
     notes = flow.guards is not None and flow.guards.notes
-    return NO_HANDLER is None and not notes and flow.kernel.select_kernel(members).threads(members) == 1
+    return NO_HANDLER is None and not notes and flow.kernel.select_width(members).threads(members) == 1
 
 
 def derivatives_begin_in_handler(flow: Flow, members: int) -> bool:
@@ -62,7 +62,7 @@ def run_by_handler(
     """
     _register()
     members, states = y0.shape
-    kernel = flow.kernel.select_kernel(members)
+    kernel = flow.kernel.select_width(members)
     plan = kernel.plan(tolerances.rtol, tolerances.atol, tolerances.max_steps)
     plan.rounds = plan.rounds if rounds is None else rounds
     rows, size = (members,), (kernel.rest_size,)

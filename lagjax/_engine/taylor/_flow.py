@@ -199,7 +199,7 @@ class Flow:
         rtol, atol, max_steps, notes, order = *tolerances[:3], tolerances.notes, tolerances.order
         if store is not None and room is None:
             room = min(max_steps * len(y0), LARGEST_KEPT // (self.states + 4))
-        done = self.kernel.select_kernel(len(y0))(ts, y0, params, rtol, atol, max_steps, room or 0, begun, notes, order)
+        done = self.kernel.select_width(len(y0))(ts, y0, params, rtol, atol, max_steps, room or 0, begun, notes, order)
         result, event = RESULT_OF_CODE[np.minimum(done.code, _native.EVENT)], np.maximum(done.code - _native.EVENT, 0)
         ticket = np.full(len(y0), -1)
         if store is not None:
