@@ -78,12 +78,9 @@ OPERATIONS_PER_COORDINATE = 30
 # How many alike operations are written out for one step along a table. Measured: eight as well run as long, two at most
 # 7 % longer.
 TIMES = 4, 2, 1
-# `MOST` alike operations are taken together, of the next `WINDOW` ones: what they have made is to be read while it is
-# in the first two caches. Measured: either, halved or doubled, changes less than 5 %.
-MOST, WINDOW = 16, 4096
 # Operations are joined to one that reads at most `LARGEST_TREE` numbers, where the same two come together `OFTEN`; in
-# at most `ROUNDS` rounds of pairs of pairs. Measured: with 5 numbers chains run a fifth longer, with 20 as long; with
-# half of `OFTEN` the code is twice as long and runs no faster.
+# at most `ROUNDS` rounds of pairs of pairs. Measured: without, chains of 32 and 64 run 1.4 to 1.6 times as long;
+# with 5 numbers a fifth longer, with 20 as long; with half of `OFTEN` the code is twice as long and runs no faster.
 LARGEST_TREE, OFTEN, ROUNDS = 10, 24, 12
 
 # ---- tolerances ------------------------------------------------------------------------------------------------------

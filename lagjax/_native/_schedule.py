@@ -2,16 +2,17 @@
 
     operations   what the outputs need; sine and cosine of one angle are one operation with two results
     joined       operations that often come together are one: a product and the sum that reads it, and then larger trees
-    groups       an order that puts alike operations, none of which waits for another, next to each other
+    groups       alike operations that wait for equally many others, and so not for each other
     slots        where every result lies, from its making to its last use
 
 Nothing here knows LLVM.
 """
 
-from collections import Counter, defaultdict
+from collections import Counter
 from typing import NamedTuple
 
-from lagjax._native._constants import LARGEST_TREE, MOST, OFTEN, ROUNDS, TIMES, WINDOW
+from lagjax._native._constants import LARGEST_TREE, OFTEN, ROUNDS
+from lagjax._program._line import group_by_level
 from lagjax._program._passes import count_uses
 from lagjax._program._series import StraightLine
 
@@ -71,22 +72,18 @@ def schedule(line: StraightLine, stored: int) -> Schedule:
 
     The last outputs, this many, are `stored` somewhere else as soon as they are there.
     """
-    nodes, uses = line.nodes, count_uses(line.nodes, line.outputs)
-    kinds, operations = join_operations(line)
+    nodes, uses, kinds = line.nodes, count_uses(line.nodes, line.outputs), _Kinds()
+    operations = _join_pairs(_operations(line, uses, kinds), uses, kinds)
     staying = len(line.outputs) - stored
     outputs, copies = _outputs(line, operations, kinds, staying)
-    groups = _group_operations(_insert_copies(operations, copies))
+    operations += copies
+    alike = group_by_level(operations, len(nodes) + len(line.outputs))
+    groups = [[operations[k] for k in alike[level_and_kind]] for level_and_kind in sorted(alike)]
     slots, size = _slots(groups, outputs, staying, len(nodes))
     live = [i for i, count in enumerate(uses) if count]
     inputs = {i: nodes[i][2] for i in live if nodes[i][0] == "input"}
     constants = {i: float(nodes[i][2]) for i in live if nodes[i][0] == "constant"}
     return Schedule(kinds.all, groups, slots, staying, size, inputs, constants)
-
-
-def join_operations(line: StraightLine) -> "tuple[_Kinds, list[ScheduledOperation]]":
-    """The operations that the outputs of a program need, each after those that it reads, and their kinds."""
-    uses, kinds = count_uses(line.nodes, line.outputs), _Kinds()
-    return kinds, _join_pairs(_operations(line, uses, kinds), uses, kinds)
 
 
 # ---- operations ------------------------------------------------------------------------------------------------------
@@ -97,38 +94,16 @@ class _Kinds:
 
     def __init__(self):
         self.all: list[OperationKind] = []
-        self.operands: list[int] = []
         self._numbers: dict[OperationKind, int] = {}
-        self._joined: dict[tuple[int, int, int], int] = {}
 
-    def number(self, op: str, attribute: object, kinds: tuple[str, ...], result: str) -> int:
-        """The number of a kind that consists of one operation."""
-        return self._number(OperationKind(op, attribute, kinds, result, (None,) * len(kinds)))
-
-    def join(self, kind: int, place: int, part: int) -> int:
-        """The kind whose operand at this place, counted over all that it reads, is made by another."""
-        key = kind, place, part
-        if key not in self._joined:
-            self._joined[key] = self._number(_insert_part(self.all[kind], place, self.all[part]))
-        return self._joined[key]
-
-    def _number(self, kind: OperationKind) -> int:
+    def number(self, kind: OperationKind) -> int:
         number = self._numbers.setdefault(kind, len(self.all))
         if number == len(self.all):
             self.all.append(kind)
-            self.operands.append(kind.operands)
         return number
 
-
-def _insert_part(kind: OperationKind, place: int, part: OperationKind) -> OperationKind:
-    parts = list(kind.parts)
-    for k, inner in enumerate(parts):
-        width = 1 if inner is None else inner.operands
-        if place < width:
-            parts[k] = part if inner is None else _insert_part(inner, place, part)
-            break
-        place -= width
-    return kind._replace(parts=tuple(parts))
+    def is_joined(self, operation: ScheduledOperation) -> bool:
+        return self.all[operation.kind].op in _JOINED
 
 
 def _operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> list[ScheduledOperation]:
@@ -137,7 +112,7 @@ def _operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> list[Sche
     for i, (op, operands, _) in enumerate(line.nodes):
         if uses[i] and op in ("sin", "cos"):
             angles.setdefault(operands[0], [-1, -1])[op == "cos"] = i
-    operations, numbers = [], {}
+    operations = []
     for i, (op, operands, attribute) in enumerate(line.nodes):
         if not uses[i] or op in ("input", "constant"):
             continue
@@ -146,12 +121,9 @@ def _operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> list[Sche
             op, results = "sincos", tuple(angles[operands[0]])
             if i != min(x for x in results if x >= 0):
                 continue
-        key = (
-            (op, line.kinds[i]) if op in _JOINED else (op, attribute, *[line.kinds[x] for x in operands], line.kinds[i])
-        )
-        if key not in numbers:
-            numbers[key] = kinds.number(op, attribute, tuple(line.kinds[x] for x in operands), line.kinds[i])
-        operations.append(ScheduledOperation(numbers[key], operands, results))
+        of = tuple(line.kinds[x] for x in operands)
+        kind = kinds.number(OperationKind(op, attribute, of, line.kinds[i], (None,) * len(of)))
+        operations.append(ScheduledOperation(kind, operands, results))
     return operations
 
 
@@ -165,28 +137,16 @@ def _outputs(
     """
     made = {x for operation in operations for x in operation.results}
     outputs: dict[int, int] = {}
-    copies, copy, store = [], *(kinds.number(op, None, ("float",), "float") for op in ("copy", "store"))
+    copies = []
+    copy, store = (kinds.number(OperationKind(op, None, ("float",), "float", (None,))) for op in ("copy", "store"))
     for k, i in enumerate(line.outputs):
-        if k >= staying:
-            copies.append(ScheduledOperation(store, (i,), (len(line.nodes) + k,)))
-        elif i in made and i not in outputs:
+        if k < staying and i in made and i not in outputs:
             outputs[i] = k
-        else:
+            continue
+        if k < staying:
             outputs[len(line.nodes) + k] = k
-            copies.append(ScheduledOperation(copy, (i,), (len(line.nodes) + k,)))
+        copies.append(ScheduledOperation(copy if k < staying else store, (i,), (len(line.nodes) + k,)))
     return outputs, copies
-
-
-def _insert_copies(operations: list[ScheduledOperation], copies: list[ScheduledOperation]) -> list[ScheduledOperation]:
-    of: dict[int, list[ScheduledOperation]] = {}
-    for copy in copies:
-        of.setdefault(copy.operands[0], []).append(copy)
-    ordered = []
-    for operation in operations:
-        ordered.append(operation)
-        for x in operation.results:
-            ordered += of.pop(x, [])
-    return [copy for some in of.values() for copy in some] + ordered  # those of inputs and numbers first
 
 
 # ---- what often comes together ---------------------------------------------------------------------------------------
@@ -195,141 +155,56 @@ def _insert_copies(operations: list[ScheduledOperation], copies: list[ScheduledO
 def _join_pairs(operations: list[ScheduledOperation], uses: list[int], kinds: _Kinds) -> list[ScheduledOperation]:
     """The operations, with a result that only one other reads computed inside that one, where such a pair comes often.
 
-    Pairs of pairs come often too, and so on: byte-pair encoding, with trees for strings. A product that only one sum
-    reads always belongs to that sum, as the processor has it: in a straight line LLVM does the same.
+    Pairs of pairs come often too, and so on: byte-pair encoding, with trees for strings.
     """
-    work = _Work(operations, uses, kinds)
-    work.join_products()
+    made = {max(operation.results): operation for operation in operations}
+    joined = [i for i, operation in made.items() if kinds.is_joined(operation)]
+    once = {i for i in joined if uses[i] == 1}
     for _ in range(ROUNDS):
-        chosen = work.find_frequent_pairs()
-        if not chosen:
-            break
-        work.join(chosen)
-    return [operation for operation in work.by_node if operation is not None]
+        pairs = Counter(
+            (made[i].kind, place, made[x].kind)
+            for i in joined if i in made for place, x in enumerate(made[i].operands) if x in once
+        )  # fmt: skip
+        chosen = _frequent_pairs(pairs, kinds)
+        for i in joined:
+            if i in made and made[i].kind in chosen:
+                kind, operands, results = made[i]
+                place, part, tree = chosen[kind]
+                x = operands[place]
+                if x in once and made[x].kind == part:
+                    operands = operands[:place] + made.pop(x).operands + operands[place + 1 :]
+                    made[i] = ScheduledOperation(tree, operands, results)
+    return list(made.values())
 
 
-class _Work:
-    """Operations by the node that they make, in order; those that have become a part of another are None."""
+def _frequent_pairs(pairs: Counter, kinds: _Kinds) -> dict[int, tuple[int, int, int]]:
+    """The pairs that come most often: for kinds of operations the operand that is joined, its kind, and that of both.
 
-    def __init__(self, operations: list[ScheduledOperation], uses: list[int], kinds: _Kinds):
-        self.by_node: list[ScheduledOperation | None] = [None] * len(uses)
-        self._single, self._kinds = bytearray(len(uses)), kinds
-        for operation in operations:
-            first = max(operation.results) if min(operation.results) < 0 else min(operation.results)
-            self.by_node[first] = operation
-            # Whether only one other reads it, and it can be a part of that.
-            self._single[first] = uses[first] == 1 and kinds.all[operation.kind].op in _JOINED
-        # The nodes whose operation can have parts.
-        self._open = [i for i, x in enumerate(self.by_node) if x and kinds.all[x.kind].op in _JOINED]
-
-    def join_products(self) -> None:
-        """Every product that only one sum reads is computed with that sum; the first one, of two."""
-        for i in self._open:
-            operation = self.by_node[i]
-            assert operation is not None
-            kind = self._kinds.all[operation.kind]
-            if kind.op in ("add", "sub") and kind.result == "float":
-                for place, x in enumerate(operation.operands):
-                    if self._single[x] and self._kinds.all[self.by_node[x].kind].op == "mul":  # type: ignore[union-attr]
-                        if kind.op == "add" and place == 1:  # one kind less
-                            self.by_node[i], place = operation._replace(operands=operation.operands[::-1]), 0
-                        self._put(i, place)
-                        break
-
-    def find_frequent_pairs(self) -> dict[int, tuple[int, int]]:
-        """The pairs that come most often: for kinds of operations the operand that is joined, and its kind."""
-        pairs: Counter = Counter()
-        still = []
-        for i in self._open:
-            if (operation := self.by_node[i]) is not None:
-                single = [(place, x) for place, x in enumerate(operation.operands) if self._single[x]]
-                for place, x in single:
-                    pairs[operation.kind, place, self.by_node[x].kind] += 1  # type: ignore[union-attr]
-                if single:
-                    still.append(i)
-        self._open = still
-        chosen: dict[int, tuple[int, int]] = {}
-        inside: set[int] = set()
-        size = self._kinds.operands
-        for (kind, place, part), count in pairs.most_common():
-            if count < OFTEN:
-                break
-            free = kind not in chosen and kind not in inside and (part not in chosen or part == kind)
-            if free and size[kind] + size[part] <= LARGEST_TREE:
-                chosen[kind] = place, part
-                inside.add(part)
-        return chosen
-
-    def join(self, chosen: dict[int, tuple[int, int]]) -> None:
-        """Join the operations that are such pairs."""
-        for i in self._open:
-            operation = self.by_node[i]
-            if operation is not None and operation.kind in chosen:
-                place, part = chosen[operation.kind]
-                x = operation.operands[place]
-                if self._single[x] and self.by_node[x].kind == part:  # type: ignore[union-attr]
-                    self._put(i, place)
-
-    def _put(self, i: int, place: int) -> None:
-        """Compute the operand of the operation of node i at this place inside it."""
-        operation = self.by_node[i]
-        assert operation is not None
-        kind, operands, results = operation
-        x = operands[place]
-        inner = self.by_node[x]
-        assert inner is not None
-        self.by_node[x] = None
-        operands = operands[:place] + inner.operands + operands[place + 1 :]
-        self.by_node[i] = ScheduledOperation(self._kinds.join(kind, place, inner.kind), operands, results)
-
-
-# ---- order -----------------------------------------------------------------------------------------------------------
-
-
-def _group_operations(operations: list[ScheduledOperation]) -> list[list[ScheduledOperation]]:
-    """Operations of one kind that do not wait for each other, in an order that respects all others.
-
-    Of the next `WINDOW` operations, in the order in which the program has them, the kind goes first that fills a step
-    of the loop and became ready last, for its operands are near; among kinds that do not, the one that comes nearest.
+    No kind is joined to an operand and, in the same round, an operand of another one.
     """
-    users, waiting = _edges(operations)
-    ready: dict[int, list[int]] = defaultdict(list)
-    since: dict[int, int] = defaultdict(int)
-    groups, done, first, seen = [], bytearray(len(operations)), 0, 0
-    while first < len(operations):
-        while seen < min(len(operations), first + WINDOW):
-            if not waiting[seen]:
-                ready[operations[seen].kind].append(seen)
-            seen += 1
-        full = [kind for kind, some in ready.items() if len(some) >= TIMES[0]]
-        kind = max(full, key=since.__getitem__) if full else max(ready, key=lambda kind: len(ready[kind]))
-        count = min(MOST, len(ready[kind]) // TIMES[0] * TIMES[0]) or len(ready[kind])
-        group = ready[kind][-count:]
-        del ready[kind][-count:]
-        groups.append([operations[k] for k in group])
-        for k in group:
-            done[k] = True
-            for user in users[k]:
-                waiting[user] -= 1
-                if not waiting[user] and user < seen:
-                    ready[operations[user].kind].append(user)
-                    since[operations[user].kind] = len(groups)
-        while first < len(operations) and done[first]:
-            first += 1
-    return groups
+    chosen: dict[int, tuple[int, int, int]] = {}
+    parts: set[int] = set()
+    for (kind, place, part), count in pairs.most_common():
+        if count < OFTEN:
+            break
+        if kind not in chosen and kind not in parts and (part not in chosen or part == kind):
+            tree = _insert_part(kinds.all[kind], place, kinds.all[part])
+            if tree.operands <= LARGEST_TREE:
+                chosen[kind] = place, part, kinds.number(tree)
+                parts.add(part)
+    return chosen
 
 
-def _edges(operations: list[ScheduledOperation]) -> tuple[list[list[int]], list[int]]:
-    """The readers of every operation's results, as often as they read, and the number of operands it waits for."""
-    maker = {x: k for k, operation in enumerate(operations) for x in operation.results}
-    users: list[list[int]] = [[] for _ in operations]
-    waiting = [0] * len(operations)
-    for k, operation in enumerate(operations):
-        for x in operation.operands:
-            if x in maker:
-                users[maker[x]].append(k)
-                waiting[k] += 1
-    return users, waiting
+def _insert_part(kind: OperationKind, place: int, part: OperationKind) -> OperationKind:
+    """The kind whose operand at this place, counted over all that it reads, is made by another."""
+    parts = list(kind.parts)
+    for k, inner in enumerate(parts):
+        width = 1 if inner is None else inner.operands
+        if place < width:
+            parts[k] = part if inner is None else _insert_part(inner, place, part)
+            break
+        place -= width
+    return kind._replace(parts=tuple(parts))
 
 
 # ---- slots -----------------------------------------------------------------------------------------------------------
