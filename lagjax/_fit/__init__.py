@@ -26,7 +26,7 @@ from lagjax._fit.model._assembly import GivenSystem, assemble_residuals, read_sy
 from lagjax._fit.model._noise import AbstractNoise, Clipped, Gaussian, Quantised, StudentT
 from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._records import Guess, Record, require_untraced
-from lagjax._fit.model._residuals import LostTrial, Point, Residuals
+from lagjax._fit.model._residuals import LostMotion, Point, Residuals
 from lagjax._fit.model._sensors import Delayed, wrapped
 from lagjax._fit.model._timings import Timings
 from lagjax._fit.model._transforms import angle, between, inertia, positive, simplex
@@ -39,7 +39,7 @@ from lagjax._fit.result._report import draw_record, record_matrix
 from lagjax._fit.result._result import Fit
 from lagjax._fit.search._multistart import run_multistart
 from lagjax._fit.search._reader import TimeScales, first_starts, read_records, time_scales
-from lagjax._fit.search._search import Search, Unfollowed, search_again
+from lagjax._fit.search._search import Search, search_again
 from lagjax._fit.search._unexplained import Unexplained
 from lagjax._primitives import with_doubles
 from lagjax._run.hybrid import Scene
@@ -96,10 +96,10 @@ def fit(
     - `hold`: how the `inputs` of records continue between samples: "zero" keeps the last sample, as a D/A converter
       does; "linear", "cubic" and "band" interpolate as `lagjax.samples` does.
       "band" is for inputs below the Nyquist frequency, evenly sampled. Functions of the scene ask for `inputs` by name.
-    - `starts`: the number of parameter values from which to search, as one batch: `params0`, and random ones drawn with
-      `seed`: about a positive number with a decade as standard deviation, uniform between bounds, on a circle or a
-      simplex, and about any other number with its size as standard deviation. The best few go through the whole search,
-      and `params0` always does; `Fit.waterfall` tells where each of them ended.
+    - `starts`: the number of parameter values from which to search: `params0`, and random ones drawn with `seed`, about
+      a positive number with a decade as standard deviation, uniform between bounds, on a circle or a simplex, and about
+      any other number with its size as standard deviation. The best few go through the whole search, and `params0`
+      always does; `Fit.waterfall` tells where each of them ended.
     - `progress`: print a line for every trial to stderr.
     - `method`: "whole" begins with whole records. "segments" begins with short segments of them, each with a start of
       its own read off the data, and joins these step by step; for that the signals must have the structure of q. "auto"
@@ -154,10 +154,11 @@ def fit(
     begun = time.process_time()
     try:
         done, left = search.fit(given)
-    except Unfollowed as reason:
-        nothing = Unexplained([str(reason)], [], np.inf, True, list(range(len(given[0].records))))
+    except LostMotion as reason:
+        text = f"{reason} Begin nearer: other params0, or starts that are known."
+        nothing = Unexplained([text], [], np.inf, True, list(range(len(given[0].records))))
         more = search.find_mistake(given, nothing, time.process_time() - begun)
-        raise Unfollowed(" ".join([str(reason), *more])) from reason.__cause__
+        raise ValueError(" ".join([text, *more])) from None
     if not left.doubted:
         return done
     more = search.find_mistake(given, left, time.process_time() - begun)
@@ -176,8 +177,7 @@ class _FitSearch(NamedTuple):
     progress: bool
 
     def fit(self, given: list[GivenSystem]) -> tuple[Fit, Unexplained]:
-        """The fit of records that were checked, and what it leaves. Raises `Unfollowed` where the first trial cannot be
-        followed."""
+        """The fit of records that were checked, and what it leaves. Raises `LostMotion` where none can be followed."""
         residuals = assemble_residuals(given, self.parameters, self.law)
         self._require_one_beginning(residuals)
         readers = read_records(residuals)
@@ -241,8 +241,8 @@ def _print_trials(size: np.ndarray) -> Callable[[Any], None]:
     count = itertools.count(1)
 
     def tell(trial) -> None:
-        if isinstance(trial, LostTrial):
-            text = f"the motion failed. {trial.text.splitlines()[0]}"
+        if isinstance(trial, LostMotion):
+            text = str(trial).splitlines()[0]
         else:
             rms = np.sqrt(np.mean(trial.flat() ** 2, axis=0)) / size
             text = f"{len(trial.starts)} motions, residuals {np.exp(np.mean(np.log(rms))):.4g} of the signals"

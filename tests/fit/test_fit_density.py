@@ -47,22 +47,16 @@ def joint():
     return lagjax.fit({"one": SPRING, "two": PLANE}, records(), {"k": 3.8, "c": 1.4}, method="whole")
 
 
-def test_trials_of_one_batch_are_those_one_by_one_also_where_one_fails(joint):
-    residuals = joint.residual_function
-    u = joint.u + np.array([[0.0], [0.05], [np.nan], [-0.05]])
-    starts = joint.states + 0.01 * np.arange(4)[:, None, None]
-    trials = residuals.evaluate_trials(Point(u, starts))
-    assert [hasattr(trial, "text") for trial in trials] == [False, False, True, False]
-    for k in (0, 1, 3):
-        alone = residuals.evaluate(Point(u[k], starts[k]), notify=False)
-        for kind in ("residuals", "slopes"):
-            for mine, own in zip(getattr(trials[k], kind), getattr(alone, kind), strict=True):
-                np.testing.assert_allclose(mine, own, rtol=1e-12, atol=1e-12)
-    # And these are those of the closed form: of the spring, less the measurements, by its start and by k.
-    q, slope = (f(starts[1, 0, :2], u[1, 1]) for f in (swing, jax.jacfwd(swing, argnums=(0, 1))))
-    np.testing.assert_allclose(trials[1].residuals[0][0, :, 0], q - records()["one"].values, atol=1e-7)
-    np.testing.assert_allclose(trials[1].slopes[0][0, :, 0, :2], slope[0], atol=1e-7)
-    np.testing.assert_allclose(trials[1].slopes[0][0, :, 0, 5], slope[1], atol=1e-7)
+def test_a_trial_is_that_of_the_closed_form_and_one_that_is_not_finite_says_where(joint):
+    residuals, starts = joint.residual_function, joint.states + 0.01
+    trial = residuals.evaluate(Point(joint.u + 0.05, starts))
+    # Of the spring, less the measurements, by its start and by k.
+    q, slope = (f(starts[0, :2], joint.u[1] + 0.05) for f in (swing, jax.jacfwd(swing, argnums=(0, 1))))
+    np.testing.assert_allclose(trial.residuals[0][0, :, 0], q - records()["one"].values, atol=1e-7)
+    np.testing.assert_allclose(trial.slopes[0][0, :, 0, :2], slope[0], atol=1e-7)
+    np.testing.assert_allclose(trial.slopes[0][0, :, 0, 5], slope[1], atol=1e-7)
+    with pytest.raises(ValueError, match=r"motion of records\['one'\]\[0\] from t = 0 failed. A parameter is not"):
+        residuals.evaluate(Point(np.full(2, np.nan), starts))
 
 
 def by_hand(x, shares):

@@ -13,10 +13,9 @@ does not know of systems. Rows of all systems are made alike: a start has room f
 smaller system leaves the last ones without any influence, like those of a start that is known; and the signals of all
 systems stand side by side, with no weight where a record does not have them.
 
-**One evaluation.** `evaluate_trials` has an axis of trials: a search has one, multistart many, which are members of one
-batch of motions. `SystemResiduals.trace_residuals` is the same map for JAX, from which densities have their gradients:
-back over the steps of motions, where trials go forward along every unknown. Both take the same batches, sensors and
-clocks.
+`Residuals.evaluate` is the map for searches, and `SystemResiduals.trace_residuals` the same for JAX, from which
+densities have their gradients: back over the steps of motions, where trials go forward along every unknown. Both take
+the same batches, sensors and clocks.
 """
 
 import copy
@@ -47,10 +46,7 @@ from lagjax._scene import System
 
 
 class Point(NamedTuple):
-    """The unknowns of a fit: u (F,), which move the free parameters, and the starts (N, 2n) of the pieces of records.
-
-    The points of K trials are (K, F) and (K, N, 2n).
-    """
+    """The unknowns of a fit: u (F,), which move the parameters, and the starts (N, 2n) of the pieces of records."""
 
     u: np.ndarray
     starts: np.ndarray
@@ -78,11 +74,8 @@ class Trial(NamedTuple):
         return np.concatenate([r.reshape(-1, r.shape[-1]) for r in self.residuals])
 
 
-class LostTrial(NamedTuple):
-    """A trial whose motion could not be followed: the piece, and what became of it."""
-
-    piece: int
-    text: str
+class LostMotion(ValueError):
+    """A motion of a trial that could not be followed: of which record, from when, and what became of it."""
 
 
 class _SystemTrial(NamedTuple):
@@ -196,26 +189,34 @@ class SystemResiduals:
 
     # ---- the trials of a search ----
 
-    def append_residuals(self, trials: list[Trial]) -> list[LostTrial | None]:
-        """Append the residuals of this system to trials, whose starts move to where the motions begin.
+    def append_residuals(self, trial: Trial) -> None:
+        """Append the residuals of this system to a trial, whose starts move to where the motions begin.
 
-        For each trial None, or the first piece whose motion failed. The motions of all trials are one run for every
-        batch of pieces.
+        Raises `LostMotion` for the first piece whose motion fails.
         """
-        begun: list[Any] = [self._begin_trial(trial) for trial in trials]
+        begun = self._begin_trial(trial)
         for batch in self.batches:
-            going = [k for k, own in enumerate(begun) if isinstance(own, _SystemTrial)]
-            for k, shown in zip(going, self._evaluate_signals(batch, [begun[k] for k in going]), strict=True):
-                if isinstance(shown, LostTrial):
-                    begun[k] = shown
-                else:
-                    self._append_batch(batch, trials[k], *shown)
-        return [own if isinstance(own, LostTrial) else None for own in begun]
+            clock = self.clocks.get(self.pieces[batch.rows[0]].record)
+            if clock is not None:
+                shown = self._evaluate_times(clock, batch, begun)
+            elif self.signals.delays is not None:
+                shown = self._evaluate_delayed(batch, begun)
+            else:
+                motion, numbers_dot = self._follow(batch, batch.ts, begun), self._directions(batch, begun)[1]
+                shown = self.signals.evaluate(motion, batch.ts, batch.inputs, begun.numbers, numbers_dot)
+            self._require_finite(batch, *shown)
+            self._append_batch(batch, trial, *shown)
 
-    def _lost(self, row: Any, text: str) -> LostTrial:
-        return LostTrial(int(self.frame.rows[row]), text)
+    def label(self, record: int) -> str:
+        """The name by which the user reaches a record of this system: `records[0]`, or `records['name'][0]`."""
+        return f"records{'' if self.name is None else f'[{self.name!r}]'}[{record}]"
 
-    def _begin_trial(self, trial: Trial) -> _SystemTrial | LostTrial:
+    def lost(self, row: Any, text: str) -> LostMotion:
+        record, places = self.pieces[row]
+        begin = self.records[record].ts[places[0]]
+        return LostMotion(f"The motion of {self.label(record)} from t = {begin:g} failed. {text}")
+
+    def _begin_trial(self, trial: Trial) -> _SystemTrial:
         rows, states = self.frame.rows, self.states
         numbers, directions = self.parameters.numbers(trial.u), self.parameters.directions(trial.u)
         starts, starts_dot = self.origins.move(trial.starts[rows, :states], numbers, directions)
@@ -228,54 +229,21 @@ class SystemResiduals:
                 starts[some], t[some], numbers, directions
             )
             if (lost := ~np.isfinite(starts).all(axis=1)).any():
-                return self._lost(
-                    int(np.argmax(lost)), "No start near the one that was tried satisfies the constraints."
-                )
+                raise self.lost(np.argmax(lost), "No start near the one that was tried satisfies the constraints.")
             trial.across[rows, :states, :states] = np.eye(states) - tangents
         if not (np.isfinite(numbers).all() and np.isfinite(directions).all() and np.isfinite(starts).all()):
-            return self._lost(0, "A parameter is not finite.")
+            raise self.lost(0, "A parameter is not finite.")
         trial.starts[rows, :states] = starts
         return _SystemTrial(numbers, directions, starts, tangents, starts_dot)
 
-    def _evaluate_signals(
-        self, batch: Samples, trials: list[_SystemTrial]
-    ) -> list[tuple[np.ndarray, np.ndarray] | LostTrial]:
-        """The signals of each trial for a batch (N, T, S), and their tangents (N, T, S, D)."""
-        clock = self.clocks.get(self.pieces[batch.rows[0]].record)
-        if clock is not None:
-            return [self._evaluate_times(clock, batch, trial) for trial in trials]
-        if self.signals.delays is not None:
-            return [self._check_signals(batch, self._evaluate_delayed(batch, trial)) for trial in trials]
-        shown = [
-            motion
-            if isinstance(motion, LostTrial)
-            else self.signals.evaluate(motion, batch.ts, batch.inputs, trial.numbers, self._directions(batch, trial)[1])
-            for trial, motion in zip(trials, self._follow(batch, batch.ts, trials), strict=True)
-        ]
-        return [self._check_signals(batch, one) for one in shown]
-
-    def _follow(self, batch: Samples, ts: np.ndarray, trials: list[_SystemTrial]) -> list[RecordMotion | LostTrial]:
-        """The motions of each trial at the times `ts` (N, T) of the pieces of a batch, in one run of all."""
-        if not trials:
-            return []
-        count, members = len(trials), len(batch.rows)
-        tile = lambda x: np.tile(x, (count, *[1] * (x.ndim - 1)))  # noqa: E731
-        along = [self._directions(batch, trial) for trial in trials]
-        motion = self.motions.follow(
-            tile(ts), np.concatenate([trial.starts[batch.rows] for trial in trials]),
-            np.repeat(np.stack([trial.numbers for trial in trials]), members, axis=0),
-            np.concatenate([of_starts for of_starts, _ in along]),
-            np.repeat(np.stack([of_numbers for _, of_numbers in along]), members, axis=0),
-            None if batch.table is None else type(batch.table)(*map(tile, batch.table)),
-        )  # fmt: skip
-        found = []
-        for k in range(count):
-            part = RecordMotion(*(x[k * members : (k + 1) * members] for x in motion))
-            if not part.ok:
-                row, text = part.describe_failure(ts, self.layout)
-                part = self._lost(batch.rows[row], text)
-            found.append(part)
-        return found
+    def _follow(self, batch: Samples, ts: np.ndarray, trial: _SystemTrial) -> RecordMotion:
+        """The motions of a trial at the times `ts` (N, T) of the pieces of a batch."""
+        y0_dot, numbers_dot = self._directions(batch, trial)
+        motion = self.motions.follow(ts, trial.starts[batch.rows], trial.numbers, y0_dot, numbers_dot, batch.table)
+        if not motion.ok:
+            row, text = motion.describe_failure(ts, self.layout)
+            raise self.lost(batch.rows[row], text)
+        return motion
 
     def _directions(self, batch: Samples, trial: _SystemTrial) -> tuple[np.ndarray, np.ndarray]:
         """Directions of the starts (N, D, 2n) and of the parameters (D, P): D = 2n + F, or F where no start is free."""
@@ -287,21 +255,19 @@ class SystemResiduals:
         y0_dot[:, states:] = trial.starts_dot[batch.rows]
         return y0_dot, np.concatenate([np.zeros((states, directions.shape[1])), directions])
 
-    def _evaluate_delayed(self, batch: Samples, trial: _SystemTrial) -> tuple[np.ndarray, np.ndarray] | LostTrial:
+    def _evaluate_delayed(self, batch: Samples, trial: _SystemTrial) -> tuple[np.ndarray, np.ndarray]:
         """The signals of one trial, of each delay those that have it at earlier times, and their tangents."""
         delays, signals, numbers = self.signals.delays, self.signals, trial.numbers
         assert delays is not None
         numbers_dot = self._directions(batch, trial)[1]
         each = delays.evaluate(numbers)
         if text := delays.refuses(each):
-            return self._lost(batch.rows[0], text)
+            raise self.lost(batch.rows[0], text)
         values = np.zeros((*batch.ts.shape, len(signals.names)))
         slopes = np.zeros((*values.shape, len(numbers_dot)))
         for delay in each:
             ts = np.maximum(batch.ts - delay.value, batch.ts[:, :1])
-            [motion] = self._follow(batch, ts, [trial])
-            if isinstance(motion, LostTrial):
-                return motion
+            motion = self._follow(batch, ts, trial)
             inputs, rates = batch.inputs, np.zeros_like(batch.inputs)
             if batch.table is not None and signals.form is not None:
                 inputs, rates = map(np.asarray, inputs_at(batch.table, ts, signals.form.hold))
@@ -314,32 +280,28 @@ class SystemResiduals:
             values[..., delay.signals], slopes[..., delay.signals, :] = (x[:, :, delay.signals] for x in some)
         return values, slopes
 
-    def _check_signals(self, batch: Samples, shown: tuple[np.ndarray, np.ndarray] | LostTrial):
-        """The signals and their tangents; a failure where one that counts is not finite."""
-        if isinstance(shown, LostTrial):
-            return shown
-        values, by_unknowns = shown
+    def _require_finite(self, batch: Samples, values: np.ndarray, by_unknowns: np.ndarray) -> None:
+        """Raise `LostMotion` where a signal that counts, or its derivative, is not finite."""
         counted = batch.weights[..., self.columns(self.pieces[batch.rows[0]].record)] > 0
         bad = counted & ~(np.isfinite(values) & np.isfinite(by_unknowns).all(axis=-1))
         if bad.any():
             row, place, signal = np.argwhere(bad)[0]
             sample = self.pieces[batch.rows[row]].places[place]
-            return self._lost(
+            raise self.lost(
                 batch.rows[row],
                 f"What `observe` returns for {self.signals.names[signal]}, or its derivative, is not finite at sample "
                 f"{sample}, t = {batch.ts[row, place]:g}.",
             )
-        return shown
 
     def _evaluate_times(self, clock: Clock, batch: Samples, trial: _SystemTrial):
-        """The crossing times (1, M, 1) of a batch of one, and how they move (1, M, 1, D); or a failure."""
+        """The crossing times (1, M, 1) of a batch of one, and how they move (1, M, 1, D)."""
         y0, numbers = trial.starts[batch.rows[0]], trial.numbers
         y0_dot, numbers_dot = self._directions(batch, trial)
         times, slopes = map(np.asarray, clock.tangents(y0, numbers, y0_dot[0], numbers_dot))
         if not np.isfinite(times).all():
-            return self._lost(batch.rows[0], clock.describe_failure(y0, numbers))
+            raise self.lost(batch.rows[0], clock.describe_failure(y0, numbers))
         if not np.isfinite(slopes).all():
-            return self._lost(batch.rows[0], "The derivatives of its crossing times are not finite.")
+            raise self.lost(batch.rows[0], "The derivatives of its crossing times are not finite.")
         return times[None, :, None], slopes[None, :, None]
 
     def _append_batch(self, batch: Samples, trial: Trial, values: np.ndarray, by_unknowns: np.ndarray) -> None:
@@ -412,7 +374,7 @@ class Residuals:
         systems: Sequence[SystemResiduals],
         pieces: list[Piece] | None = None,
         fitted: np.ndarray | None = None,
-        watch: Callable[[Trial | LostTrial], None] | None = None,
+        watch: Callable[[Trial | LostMotion], None] | None = None,
     ):
         self.systems, self.watch, self.parameters = list(systems), watch, systems[0].parameters
         self.records = [record for system in systems for record in system.records]
@@ -469,26 +431,21 @@ class Residuals:
 
     # ---- trials ----
 
-    def evaluate(self, point: Point, notify: bool = True) -> Trial | LostTrial:
-        """The residuals at one point, or the first piece whose motion failed. With `notify` false `watch` is not
-        called."""
-        [trial] = self.evaluate_trials(Point(point.u[None], point.starts[None]))
-        if notify and self.watch is not None:
+    def evaluate(self, point: Point) -> Trial:
+        """The residuals at one point. Raises `LostMotion` for the first piece whose motion fails."""
+        constrained, square = any(part.fits_on_constraints for part in self.parts), (self.states, self.states)
+        across = np.zeros((len(point.starts), *square)) if constrained else None
+        trial = Trial(point.u, point.starts.copy(), [], [], across)
+        try:
+            for part in self.parts:
+                part.append_residuals(trial)
+        except LostMotion as reason:
+            if self.watch is not None:
+                self.watch(reason)
+            raise
+        if self.watch is not None:
             self.watch(trial)
         return trial
-
-    def evaluate_trials(self, points: Point) -> list[Trial | LostTrial]:
-        """The residuals at the points of K trials; of each the first piece whose motion failed."""
-        constrained, states = any(part.fits_on_constraints for part in self.parts), self.states
-        found: list[Any] = [
-            Trial(u, starts.copy(), [], [], np.zeros((len(starts), states, states)) if constrained else None)
-            for u, starts in zip(*points, strict=True)
-        ]
-        for part in self.parts:
-            going = [k for k, trial in enumerate(found) if isinstance(trial, Trial)]
-            for k, lost in zip(going, part.append_residuals([found[k] for k in going]), strict=True):
-                found[k] = found[k] if lost is None else lost
-        return found
 
     def noise_scale(self, point: Trial, noise: AbstractNoise) -> NoiseScale:
         return noise.estimate(point.flat(), self.weights, self.least, self.sides)
@@ -591,8 +548,7 @@ class Residuals:
     def label(self, record: int) -> str:
         """The name by which the user reaches a record: `records[0]`, or `records['name'][0]`."""
         place = next(k for k, own in enumerate(self._records) if record < own.stop)
-        name = self.systems[place].name
-        return f"records{'' if name is None else f'[{name!r}]'}[{record - self._records[place].start}]"
+        return self.systems[place].label(record - self._records[place].start)
 
     def find_part(self, name: str | None) -> SystemResiduals:
         """One of the systems by its name, or the only one. Raises `ValueError` for a name that there is not."""
@@ -605,11 +561,6 @@ class Residuals:
 
     def _owner(self, record: int) -> SystemResiduals:
         return next(part for part in self.parts if record < part.frame.records.stop)
-
-    def describe_failure(self, failure: LostTrial) -> str:
-        piece = self.pieces[failure.piece]
-        begin = self.records[piece.record].ts[piece.places[0]]
-        return f"The motion of {self.label(piece.record)} from t = {begin:g} failed. {failure.text}"
 
     @property
     def firsts(self) -> list[int]:

@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._fit.model._noise import KnownNoise, NoiseScale
-from lagjax._fit.model._residuals import LostTrial, Point, Residuals
+from lagjax._fit.model._residuals import LostMotion, Point, Residuals
 from lagjax._fit.search._descent import minimise
 
 _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT = 1e-2, 40  # a record left out is then known to a hundredth of its noise
@@ -59,7 +59,12 @@ def comparison(fits: dict[str, Any], folds: int) -> Comparison:
     bic = tuple(float(np.log(count) * k - 2 * log) for k, log in zip(free, logs, strict=True))
     names, best, left = tuple(fits), int(np.argmin(bic)), None
     if folds:
-        apart = [_cross_validate(fit, folds) for fit in fits.values()]
+        apart = []
+        for fit in fits.values():
+            try:
+                apart.append(_cross_validate(fit, folds))
+            except LostMotion:
+                apart.append((dict.fromkeys(fit.residual_function.names, np.inf), np.full(folds, np.inf)))
         left, best = tuple(rms for rms, _ in apart), _choose_simplest(free, np.array([scores for _, scores in apart]))
     rows = _table(names, free, logs, aic, bic, left)
     margin = np.partition(np.array(bic), 1)[1] - min(bic)
@@ -103,19 +108,15 @@ def _table(names, free, logs, aic, bic, left) -> list[str]:
 def _cross_validate(fit, folds: int) -> tuple[dict[str, float], np.ndarray]:
     """The root mean square residuals by signal of records that were left out, and for each group their mean logarithm.
 
-    Infinite where one cannot be followed. A signal that only the records left out have is as noisy as the fit of all
-    says.
+    A signal that only the records left out have is as noisy as the fit of all says. Raises `LostMotion` where a record
+    cannot be followed.
     """
-    residuals = fit.residual_function
-    failed = dict.fromkeys(residuals.names, np.inf), np.full(folds, np.inf)
-    scores = np.zeros(folds)
+    residuals, scores = fit.residual_function, np.zeros(folds)
     groups = np.array([piece.record for piece in residuals.pieces]) % folds
     squares, weights = dict.fromkeys(residuals.names, 0.0), dict.fromkeys(residuals.names, 0.0)
     for group in range(folds):
         rest = _select_pieces(residuals, groups != group)
         done = minimise(rest, Point(fit.u, fit.states[groups != group]), fit.law, _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
-        if isinstance(done, LostTrial):
-            return failed
         apart = _select_pieces(residuals, groups == group).with_parameters(residuals.parameters.fix(done.trial.u))
         known = {}
         for names, noise in ((residuals.names, fit.noise_scale), (rest.names, done.noise)):
@@ -123,8 +124,6 @@ def _cross_validate(fit, folds: int) -> tuple[dict[str, float], np.ndarray]:
         law = KnownNoise(NoiseScale(*(np.array(x) for x in zip(*(known[name] for name in apart.names), strict=True))))
         left_out = Point(np.zeros(0), fit.states[groups == group])
         end = minimise(apart, left_out, law, _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
-        if isinstance(end, LostTrial):
-            return failed
         square, weight = (apart.weights * end.trial.flat() ** 2).sum(axis=0), apart.weights.sum(axis=0)
         shown = weight > 0
         scores[group] = 0.5 * np.mean(np.log(np.maximum(square[shown] / weight[shown], apart.least[shown] ** 2)))

@@ -44,7 +44,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._fit.model._density import Density
-from lagjax._fit.model._residuals import LostTrial, Point, Trial, compress_rows
+from lagjax._fit.model._residuals import LostMotion, Point, Trial, compress_rows
 from lagjax._fit.model._transforms import AbstractSeparable
 
 # In σ: a centre nearer to a bound is moved to here, where φ′ = ½ (log 2), so that both sides of it are inside the set.
@@ -225,10 +225,10 @@ def _differentiate_twice(chart: Chart, states: int) -> tuple[Trial, list[np.ndar
     def evaluate(zeta: np.ndarray) -> tuple[Trial, list[np.ndarray]]:
         density, x = chart.density, chart.evaluate_unknowns(zeta)
         starts = np.where(density.start_places < len(x), np.append(x, 0.0)[density.start_places], density.point.starts)
-        trial = density.residuals.evaluate(Point(x[: len(density.point.u)], starts), notify=False)
-        if isinstance(trial, LostTrial):
-            text = density.residuals.describe_failure(trial)
-            raise Unexpanded(f"One standard deviation from the fit a motion fails. {text}")
+        try:
+            trial = density.residuals.evaluate(Point(x[: len(density.point.u)], starts))
+        except LostMotion as reason:
+            raise Unexpanded(f"One standard deviation from the fit a motion fails. {reason}") from None
         return trial, _jacobians(chart, trial, zeta, states)
 
     ways, columns = _directions(chart.density, states), []

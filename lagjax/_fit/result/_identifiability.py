@@ -6,6 +6,7 @@ another point, then only a product of powers enters, such as m·l. The same with
 Every other direction is given in numbers.
 """
 
+import contextlib
 import re
 from fractions import Fraction
 
@@ -13,7 +14,7 @@ import numpy as np
 
 from lagjax._equations import decide
 from lagjax._fit.model._parameters import Parameters
-from lagjax._fit.model._residuals import Point, Residuals, Trial
+from lagjax._fit.model._residuals import LostMotion, Point, Residuals, Trial
 from lagjax._fit.result._information import Information, confirmed_null, growth, null_space, row_sizes
 from lagjax._fit.search._descent import Descent
 
@@ -31,8 +32,8 @@ def unseen_sentences(descent: Descent, known: Information) -> tuple[str, ...]:
     spaces = [(parameters.jacobian(trial.u) @ null, parameters.values(trial.u))]
     # The null directions a few per cent away, too.
     near = trial.u + parameters.sizes(trial.u) * np.random.default_rng(0).uniform(0.02, 0.06, len(trial.u))
-    other = residuals.evaluate(Point(near, trial.starts))
-    if isinstance(other, Trial):
+    with contextlib.suppress(LostMotion):
+        other = residuals.evaluate(Point(near, trial.starts))
         factors = [np.sqrt(batch.weights) / descent.noise.sigma for batch in residuals.batches]
         there = confirmed_null(residuals, other, null_space(residuals.triangles(other, factors), residuals.states)[0])
         spaces.append((parameters.jacobian(near) @ there, parameters.values(near)))

@@ -22,7 +22,7 @@ from lagjax._fit.model._records import (
     require_records,
     restore_structure,
 )
-from lagjax._fit.model._residuals import LostTrial, Point, Residuals, SystemResiduals
+from lagjax._fit.model._residuals import Point, Residuals, SystemResiduals
 from lagjax._fit.model._sensors import wrap_residuals
 from lagjax._fit.result._comparison import effective_share
 from lagjax._fit.result._information import LEVEL, covariance_of_one_start, require_level, signal_deviations
@@ -88,13 +88,8 @@ def predict_record(fit, record: Record, system: str | None) -> Prediction:
         state = read_start(reader, record, part, "This record")
     fixed = part.with_records([record], np.array([is_fitted]), fit.parameters.fix(fit.u), part.manifold)
     residuals, point = Residuals([fixed]), Point(np.zeros(0), state[None])
-    if is_fitted:
-        done = minimise(residuals, point, KnownNoise(noise), enough=1e-3)
-        trial = done if isinstance(done, LostTrial) else done.trial
-    else:
-        trial = residuals.evaluate(point)
-    if isinstance(trial, LostTrial):
-        raise ValueError(residuals.describe_failure(trial))
+    known = KnownNoise(noise)
+    trial = minimise(residuals, point, known, 1e-3).trial if is_fitted else residuals.evaluate(point)
     state = trial.starts[0]
     start = layout.restore(state[:n]), layout.restore(state[n:])
     q0, qdot0, ts = jax.tree.map(lambda x: np.asarray(x, layout.dtype), (*start, record.ts))
@@ -120,8 +115,6 @@ def _follow_record(fit, system: SystemResiduals, record: Record, state: np.ndarr
     everywhere = replace(record, values=restore_structure(np.zeros_like(record.matrix), record), weights=None)
     residuals = Residuals([system.with_records([everywhere], np.array([True]), fit.parameters)])
     trial = residuals.evaluate(Point(fit.u, state[None]))
-    if isinstance(trial, LostTrial):
-        raise ValueError(residuals.describe_failure(trial))
     shown = np.where(residuals.weights.reshape(record.matrix.shape) > 0, trial.residuals[0][0], np.nan)  # of a delay
     return replace(record, values=restore_structure(shown, record)), trial.slopes[0][0]
 

@@ -12,6 +12,7 @@ Source: Chandler & Bate, *Inference for clustered data using the independence lo
 for κ; Raue et al., Bioinformatics 25 (2009) 1923, for what profiles say about identifiability.
 """
 
+import contextlib
 import itertools
 from collections.abc import Iterator
 from typing import NamedTuple, cast
@@ -20,7 +21,7 @@ import numpy as np
 from scipy.optimize import brentq
 
 from lagjax._fit.model._noise import KnownNoise
-from lagjax._fit.model._residuals import LostTrial, Point, Residuals
+from lagjax._fit.model._residuals import LostMotion, Point, Residuals
 from lagjax._fit.search._descent import minimise
 
 _STEP, _MOST = 0.5, 14  # of the reported half width, doubling where little changes; values on one side
@@ -69,19 +70,14 @@ class _ProfileLine:
         self.scale = white / reported if np.isfinite(reported) and reported > 0 else 1.0 / known.lost
         self.wide = min(float(np.sqrt(reported)), float(self.residuals.parameters.reach[which]))
         self.best = 0.0
-        done = self._minimise(self.residuals, Point(fit.u, fit.states), _TRIALS)
-        if isinstance(done, LostTrial):
-            raise ValueError(self.residuals.describe_failure(done))
-        self.u, lost = done[0].u, done[1]
-        self.best = -lost / (2.0 * self.scale)
-        others = done[0]._replace(u=np.delete(self.u, which))
+        point, lost = self._minimise(self.residuals, Point(fit.u, fit.states), _TRIALS)
+        self.u, self.best = point.u, -lost / (2.0 * self.scale)
+        others = point._replace(u=np.delete(self.u, which))
         self.places = [_Place(float(self.u[which]), others, 0.0)]
 
-    def _minimise(self, residuals: Residuals, point: Point, trials: int) -> tuple[Point, float] | LostTrial:
-        """The point that a search ends in and its deviance, or the `LostTrial` it ended with."""
+    def _minimise(self, residuals: Residuals, point: Point, trials: int) -> tuple[Point, float]:
+        """The point that a search ends in and its deviance. Raises `LostMotion` where that cannot begin."""
         done = minimise(residuals, point, KnownNoise(self.noise), _ENOUGH, trials)
-        if isinstance(done, LostTrial):
-            return done
         lost = self.best - residuals.log_likelihood(done.trial, self.noise)
         return done.trial.point, 2.0 * self.scale * lost
 
@@ -94,10 +90,9 @@ class _ProfileLine:
         u[self.which] = at
         residuals = self.residuals.with_parameters(self.residuals.parameters.fix(u, self.which))
         for guess in self._guesses(at):
-            done = self._minimise(residuals, guess, _TRIALS)
-            if not isinstance(done, LostTrial):
-                self.places.append(_Place(at, *done))
-                return done[1]
+            with contextlib.suppress(LostMotion):
+                self.places.append(_Place(at, *self._minimise(residuals, guess, _TRIALS)))
+                return self.places[-1].deviance
         return np.inf
 
     def _guesses(self, at: float) -> Iterator[Point]:
@@ -111,8 +106,11 @@ class _ProfileLine:
     def minimum(self, place: _Place) -> tuple[float, float] | None:
         """The minimum that a search from one place ends in: the unknown and D there."""
         begin = place.others._replace(u=np.insert(place.others.u, self.which, place.at))
-        done = self._minimise(self.residuals, begin, 2 * _TRIALS)
-        return None if isinstance(done, LostTrial) else (float(done[0].u[self.which]), done[1])
+        try:
+            point, deviance = self._minimise(self.residuals, begin, 2 * _TRIALS)
+        except LostMotion:
+            return None
+        return float(point.u[self.which]), deviance
 
 
 def profile(fit, name: str, level: float) -> Profile:

@@ -247,9 +247,7 @@ class Fit:
 
     @functools.cached_property
     def _point(self) -> Trial:
-        trial = self.residual_function.evaluate(Point(self.u, self.states))
-        assert isinstance(trial, Trial)  # it was computed before
-        return trial
+        return self.residual_function.evaluate(Point(self.u, self.states))
 
     def _ends(self, level: float) -> tuple[np.ndarray, np.ndarray]:
         wide = self.information.quantile(level) * np.sqrt(np.diag(self.covariance.matrix))

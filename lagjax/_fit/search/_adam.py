@@ -16,7 +16,7 @@ import numpy as np
 
 from lagjax._fit.model._density import Density
 from lagjax._fit.model._noise import AbstractNoise, NoiseScale
-from lagjax._fit.model._residuals import LostTrial, Point, Residuals, Trial
+from lagjax._fit.model._residuals import Point, Residuals, Trial
 
 _RATE, _WARM = 1e-2, 0.05  # the largest step, in units of each number; the share of steps over which it rises
 _PORTION = 100  # steps in one call: of them the best is kept
@@ -25,10 +25,10 @@ _STILL = 1.0  # what log L may gain over the last tenth of the steps where the d
 
 def descend_gradient(
     residuals: Residuals, point: Point, law: AbstractNoise, steps: int, notify: Callable[[str], None] | None = None
-) -> tuple[Point, bool] | LostTrial:
+) -> tuple[Point, bool]:
     """The point after this many steps, and whether log L has come to rest.
 
-    A `LostTrial` where the motion from the first trial cannot be followed; later ones are passed over.
+    Raises `LostMotion` where the motion from the first trial cannot be followed; later ones are passed over.
     """
     try:
         import optax
@@ -38,10 +38,9 @@ def descend_gradient(
     density = Density(residuals, law, Trial(*point, [], []), whole, np.ones(len(residuals.size)))
     first = density.first.copy()
     each = [np.asarray(r, float) for r in density.evaluate(density.unknowns(jnp.asarray(first, density.dtype)))]
-    for batch, r in zip(residuals.batches, each, strict=True):
+    for (part, batch), r in zip(((p, batch) for p in residuals.parts for batch in p.batches), each, strict=True):
         if (bad := ~np.isfinite(r).all(axis=(1, 2))).any():
-            piece = int(batch.rows[int(np.argmax(bad))])
-            return LostTrial(piece, "Its motion could not be followed from the first trial.")
+            raise part.lost(batch.rows[np.argmax(bad)], "Its motion could not be followed from the first trial.")
     flat = np.concatenate([r.reshape(-1, r.shape[-1]) for r in each])
     scatter = law.estimate(flat, residuals.weights, residuals.least, residuals.sides)
     first[density.noise_places] = np.log(scatter.sigma)
@@ -66,7 +65,7 @@ def descend_gradient(
         if notify is not None:
             notify(f"step {(k + 1) * _PORTION}: log likelihood {-costs[-1] * residuals.measured:.6g}")
     if not np.isfinite(costs[-1]):
-        return LostTrial(0, "The gradient is not finite at any trial.")
+        raise residuals.parts[0].lost(0, "The gradient is not finite at any trial.")
     x = np.asarray(first + scale * carry[2][1], float)
     rest = costs[-max(1, len(costs) // 10) - 1] if len(costs) > 1 else np.inf
     at = density.unknowns(jnp.asarray(x, scale.dtype))

@@ -19,6 +19,7 @@ Source: Moré, *The Levenberg–Marquardt algorithm: implementation and theory* 
 Nielsen & Tingleff, *Methods for non-linear least squares problems* (2004), §3.2, for λ; Bock (1987) for elimination.
 """
 
+import contextlib
 import functools
 from typing import NamedTuple
 
@@ -26,7 +27,7 @@ import numpy as np
 
 from lagjax._fit.model._autocorrelation import independent_share
 from lagjax._fit.model._noise import AbstractNoise, NoiseScale
-from lagjax._fit.model._residuals import LostTrial, Point, Residuals, Trial, compress_rows, qr_triangle
+from lagjax._fit.model._residuals import LostMotion, Point, Residuals, Trial, compress_rows, qr_triangle
 
 # Damping, relative to the squared norms of the columns. The first step is nearly that of Gauss and Newton; below the
 # least one, damping is below the round-off of derivatives and only keeps columns that nothing depends on from moving.
@@ -102,17 +103,15 @@ class _Model:
 
 def minimise(
     residuals: Residuals, point: Point, law: AbstractNoise, enough: float, limit: int = 60, anchor: Anchor | None = None
-) -> Descent | LostTrial:
+) -> Descent:
     """The unknowns that make the measurements likeliest, by a search from a point.
 
     It ends when a step without damping, within the reach of the transforms, promises to lower half the sum of squares,
     in units of the noise, by less than `enough`, correlated residuals counted for what they are worth: then no
     parameter is further than √(2 enough) standard deviations from the minimum.
-    A `LostTrial` is returned where the motion from the first trial cannot be followed.
+    Raises `LostMotion` where the motion from the first trial cannot be followed.
     """
     trial = residuals.evaluate(point)
-    if isinstance(trial, LostTrial):
-        return trial
     anchor = Anchor(point.u, np.zeros_like(point.u)) if anchor is None else anchor
     damping, trials, falls = _FIRST, 1, [(1, np.inf)]
     while True:
@@ -144,9 +143,9 @@ def _find_better_trial(model: _Model, damping: float, trials: int, limit: int) -
         step = model.step(damping)
         if step.gain <= _FLAT * model.cost or damping > _MOST:
             break
-        trial = residuals.evaluate(Point(residuals.parameters.take_step(at.u, step.u), at.starts + step.starts))
         trials += 1
-        if not isinstance(trial, LostTrial):
+        with contextlib.suppress(LostMotion):
+            trial = residuals.evaluate(Point(residuals.parameters.take_step(at.u, step.u), at.starts + step.starts))
             fall = model.cost - model.cost_of(trial)
             if fall > 0.0:
                 return trial, max(_LEAST, damping * max(0.1, 1.0 - (2.0 * fall / step.gain - 1.0) ** 3)), trials

@@ -2,9 +2,8 @@
 
 The first start is the user's `params0`, the others are drawn from what the transforms say: a decade about a positive
 number, all of an interval, of a circle or of a simplex, and about any other number as far as it is large. All of them
-take a few damped steps of Gauss and Newton at once: the members of one batch are starts × records, over a sample of the
-times of each record. A start whose motion fails costs the others nothing. The best few then go through the whole
-search.
+take a few damped steps of Gauss and Newton over a sample of the times of each record; the best few then go through the
+whole search.
 
 The waterfall is what all of them came to, in order: many that are equally good, then a cliff, are a minimum that can be
 trusted; a slope without a step is not.
@@ -18,13 +17,11 @@ import numpy as np
 
 from lagjax._fit.model._noise import Gaussian, NoiseScale
 from lagjax._fit.model._pieces import Piece
-from lagjax._fit.model._residuals import LostTrial, Point, Residuals
-from lagjax._fit.search._descent import Descent, column_norms, eliminate
+from lagjax._fit.model._residuals import LostMotion, Point, Residuals
+from lagjax._fit.search._descent import Descent, minimise
 
-_SHORT_STEPS = 8  # of the short search
+_SHORT_TRIALS, _ENOUGH = 9, 1e-2  # of the short search; the fall of half the sum of squares, per sample, that ends it
 _SHORT_SAMPLES = 200  # of each record, in it
-_ROOM = 2**24  # numbers of tangents at once
-_FIRST_DAMPING = 1e-2  # damping, relative to the squared norms of columns
 _BEST = 4  # of many starts go through the whole search
 _ALIKE = 0.02  # in the logarithm of the misfit: two starts in one minimum
 
@@ -49,41 +46,6 @@ class Waterfall(NamedTuple):
         return text + (f"; {failed} could not be followed." if failed else ".")
 
 
-class Trials(NamedTuple):
-    """K trials: u (K, F), the starts of their records (K, N, 2n), their misfits (K,), infinite where a motion failed,
-    and the weighted triangles (K, N, D + 1, D + 1) of all pieces."""
-
-    u: np.ndarray
-    starts: np.ndarray
-    misfits: np.ndarray
-    triangles: np.ndarray
-
-    @classmethod
-    def from_points(cls, residuals: Residuals, points: Point) -> "Trials":
-        """The trials at K points, a portion of them at once."""
-        u, starts = points
-        columns = residuals.states + u.shape[1] + 1
-        triangles = np.zeros((*starts.shape[:2], columns, columns))
-        found = cls(u.copy(), starts.copy(), np.full(len(u), np.inf), triangles)
-        largest = max(batch.ts.size for batch in residuals.batches) * residuals.states * columns
-        portion = max(1, _ROOM // largest)
-        for begin in range(0, len(u), portion):
-            some = slice(begin, begin + portion)
-            for k, trial in enumerate(residuals.evaluate_trials(Point(u[some], starts[some])), begin):
-                if not isinstance(trial, LostTrial):
-                    noise = residuals.noise_scale(trial, Gaussian())
-                    found.starts[k], found.misfits[k] = trial.starts, misfit(noise, residuals)
-                    triangles[k] = residuals.linearise(trial, noise)
-        return found
-
-    def take_step(self, residuals: Residuals, k: int, damping: float) -> Point:
-        """The point one damped step of Gauss and Newton from trial k."""
-        triangles, states, none = self.triangles[k], residuals.states, np.zeros(self.u.shape[1])
-        limits = residuals.parameters.limits(self.u[k])
-        step = eliminate(triangles, states, column_norms(triangles, states), damping, (none, none), limits)
-        return Point(residuals.parameters.take_step(self.u[k], step.u), self.starts[k] + step.starts)
-
-
 def misfit(noise: NoiseScale, residuals: Residuals) -> float:
     """The noise over the size of the signals of records, its geometric mean; of crossing times where there are no
     others."""
@@ -92,24 +54,14 @@ def misfit(noise: NoiseScale, residuals: Residuals) -> float:
     return float(np.exp(np.mean(np.log((noise.sigma / residuals.size)[keep]))))
 
 
-def _search_shortly(residuals: Residuals, points: Point) -> Trials:
-    """The trials that K points come to after a few steps, over a sample of the times of each record; in order."""
-    chosen = lambda count: np.unique(np.linspace(0, count - 1, _SHORT_SAMPLES).astype(int))  # noqa: E731
-    pieces = [Piece(piece.record, piece.places[chosen(len(piece.places))]) for piece in residuals.pieces]
-    part = residuals.with_pieces(pieces, residuals.fitted)
-    at, damping = Trials.from_points(part, points), np.full(len(points.u), _FIRST_DAMPING)
-    for _ in range(_SHORT_STEPS):
-        going = np.flatnonzero(np.isfinite(at.misfits))
-        if not len(going):
-            break
-        steps = [at.take_step(part, k, damping[k]) for k in going.tolist()]
-        trial = Trials.from_points(part, Point(*(np.stack(halves) for halves in zip(*steps, strict=True))))
-        better = trial.misfits < at.misfits[going]
-        damping[going] = np.where(better, 0.2 * damping[going], 10.0 * damping[going])
-        for mine, new in zip(at, trial, strict=True):
-            mine[going[better]] = new[better]
-    order = np.argsort(at.misfits, kind="stable")
-    return Trials(*(x[order] for x in at))
+def _search_shortly(residuals: Residuals, u: np.ndarray, starts: np.ndarray) -> tuple[float, Point]:
+    """The misfit and the point after a few steps, over a sample of the times of each record; infinite where its motion
+    cannot be followed."""
+    try:
+        done = minimise(residuals, Point(u, starts), Gaussian(), _ENOUGH * residuals.measured, _SHORT_TRIALS)
+    except LostMotion:
+        return np.inf, Point(u, starts)
+    return misfit(done.noise, residuals), done.trial.point
 
 
 def run_multistart(
@@ -120,13 +72,17 @@ def run_multistart(
         return search(point), None
     rng = np.random.default_rng(seed)
     u = np.stack([point.u, *(residuals.parameters.draw(point.u, rng) for _ in range(starts - 1))])
-    trials = _search_shortly(residuals, Point(u, np.repeat(point.starts[None], starts, axis=0)))
+    sample = lambda count: np.unique(np.linspace(0, count - 1, _SHORT_SAMPLES).astype(int))  # noqa: E731
+    pieces = [Piece(piece.record, piece.places[sample(len(piece.places))]) for piece in residuals.pieces]
+    short = residuals.with_pieces(pieces, residuals.fitted)
+    short.watch = None
+    trials = sorted((_search_shortly(short, one, point.starts) for one in u), key=lambda trial: trial[0])
+    misfits, done = np.array([trial[0] for trial in trials]), []
     chosen: list[int] = []  # the best that came to different misfits
-    for k in np.flatnonzero(np.isfinite(trials.misfits)).tolist():
-        if all(abs(np.log(trials.misfits[k] / trials.misfits[j])) > 1e-3 for j in chosen):
+    for k in np.flatnonzero(np.isfinite(misfits)).tolist():
+        if all(abs(np.log(misfits[k] / misfits[j])) > 1e-3 for j in chosen):
             chosen.append(k)
-    misfits, done = trials.misfits.copy(), []
-    begins = [(k, Point(trials.u[k], trials.starts[k])) for k in chosen[:_BEST]]
+    begins = [(k, trials[k][1]) for k in chosen[:_BEST]]
     for place, begin in [*begins, (None, point)]:
         try:
             done.append(search(begin))

@@ -14,15 +14,16 @@ Source: Bock, *Recent advances in parameter identification for ODE* (1983); Pisa
 (2004) 036122, for segments of chaotic signals.
 """
 
+import contextlib
 import functools
 import sys
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
 from lagjax._fit.model._noise import AbstractNoise
 from lagjax._fit.model._pieces import Piece
-from lagjax._fit.model._residuals import LostTrial, Point, Residuals, SystemResiduals
+from lagjax._fit.model._residuals import LostMotion, Point, Residuals, SystemResiduals
 from lagjax._fit.search._adam import descend_gradient
 from lagjax._fit.search._descent import Anchor, Descent, minimise
 from lagjax._fit.search._multistart import misfit
@@ -45,12 +46,6 @@ _WORSE = (
 _LOST = 2  # levels that may be lost: after one the next may find the motion again, with better parameters
 _LYAPUNOV = 5.0  # times 1/λ that a record is long: shorter ones are followed whole
 _GRADIENT_STEPS = 3000  # of a descent by gradients
-
-T = TypeVar("T")
-
-
-class Unfollowed(ValueError):
-    """Records whose motion cannot be followed from the first trial."""
 
 
 class Search:
@@ -80,21 +75,26 @@ class Search:
         good = _last_followed_level(levels_done)
         if len(levels_done) - good > _LOST:
             return self._search_pieces(levels_done[good], levels_done[-1])
-        done = minimise(self.residuals, point, self.law, _ENOUGH, _TRIALS)
-        lost = isinstance(done, LostTrial)
-        if levels_done and (lost or not done.converged or measure_unexplained(done).motion):
-            good = _last_followed_level([*levels_done, *([] if lost else [done])])
+        done, lost = None, LostMotion()
+        try:
+            done = minimise(self.residuals, point, self.law, _ENOUGH, _TRIALS)
+        except LostMotion as reason:
+            lost = reason
+        if levels_done and (done is None or not done.converged or measure_unexplained(done).motion):
+            good = _last_followed_level([*levels_done, *([] if done is None else [done])])
             if good < len(levels_done) and misfit(levels_done[good].noise, levels_done[good].residuals) < _COARSE:
                 return self._search_pieces(levels_done[good], done)
-        return require_success(self.residuals, done)
+        if done is None:
+            raise lost
+        return done
 
-    def _search_pieces(self, level: Descent, joined: Descent | LostTrial) -> Descent:
+    def _search_pieces(self, level: Descent, joined: Descent | None) -> Descent:
         """The search on the pieces of a level, with all samples of these and a start for each."""
         pieces = complete_pieces(level.residuals.pieces, self.residuals.records)
         part = self.residuals.with_pieces(pieces, level.residuals.fitted)
-        done = require_success(part, minimise(part, level.trial.point, self.law, _ENOUGH, _TRIALS))
+        done = minimise(part, level.trial.point, self.law, _ENOUGH, _TRIALS)
         worse = "fails"
-        if not isinstance(joined, LostTrial):
+        if joined is not None:
             ratio = misfit(joined.noise, joined.residuals) / misfit(done.noise, part)
             worse = f"leaves {ratio:.2g} times more"
         text = f"The records are followed in {len(pieces)} pieces, each with a start of its own: to join them {worse}"
@@ -121,8 +121,9 @@ class Search:
                 begun = min(begun, again, key=lambda one: one.misfit)
         u, best, levels_done = begun.u, begun.best, [] if begun.first is None else [begun.first]
         for pieces in begun.cuts[1:]:
-            done = self._fit_level(pieces, u, best, anchor)
-            if isinstance(done, LostTrial):
+            try:
+                done = self._fit_level(pieces, u, best, anchor)
+            except LostMotion:
                 break  # whole records then begin from the best so far, and say so if they fail as well
             u = done.trial.u
             levels_done.append(done)
@@ -140,8 +141,9 @@ class Search:
         best = {(k, 0): start for k, start in enumerate(point.starts)}
         if not cuts:
             return _ShortestSegments(u, cuts, best, -np.inf)
-        done = self._fit_level(cuts[0], u, best, anchor)
-        if isinstance(done, LostTrial):
+        try:
+            done = self._fit_level(cuts[0], u, best, anchor)
+        except LostMotion:
             return _ShortestSegments(u, cuts, best, np.inf)
         near = []
         for part in self.residuals.parts:
@@ -151,7 +153,7 @@ class Search:
         ratio = done.noise.sigma / np.concatenate(near)
         return _ShortestSegments(done.trial.u, cuts, best, float(np.mean(np.log(ratio))), done)
 
-    def _fit_level(self, pieces: list[Piece], u, best: dict, anchor: Anchor) -> Descent | LostTrial:
+    def _fit_level(self, pieces: list[Piece], u, best: dict, anchor: Anchor) -> Descent:
         """The search on one cut of the records. The states in `best`, by record and sample, begin it and take its
         end."""
         firsts = [(piece.record, int(piece.places[0])) for piece in pieces]
@@ -163,8 +165,7 @@ class Search:
         fitted = np.array([self.residuals.fitted[k] or place > 0 for k, place in firsts])
         part, point = self.residuals.with_pieces(pieces, fitted), Point(u, np.stack([best[first] for first in firsts]))
         done = minimise(part, point, self.law, _ENOUGH_OF_LEVEL * part.measured, _TRIALS_OF_LEVEL, anchor)
-        if not isinstance(done, LostTrial):
-            best |= dict(zip(firsts, done.trial.starts, strict=True))
+        best |= dict(zip(firsts, done.trial.starts, strict=True))
         return done
 
     def _fit_short_windows(self, u, anchor: Anchor) -> np.ndarray:
@@ -179,8 +180,9 @@ class Search:
             return u
         part = Residuals(short)
         point = Point(u, np.concatenate(states)[:, : part.states])
-        done = minimise(part, point, self.law, _ENOUGH_OF_WINDOWS, _TRIALS_OF_LEVEL, anchor)
-        return u if isinstance(done, LostTrial) else done.trial.u
+        with contextlib.suppress(LostMotion):
+            return minimise(part, point, self.law, _ENOUGH_OF_WINDOWS, _TRIALS_OF_LEVEL, anchor).trial.u
+        return u
 
     def start_by_weak_form(self, u: np.ndarray) -> np.ndarray:
         """The u that balances the weak form of Lagrange's equations, u itself where there is none."""
@@ -219,26 +221,20 @@ class Search:
                 reading = ((reader, piece.places[:1]) for piece in pieces if (reader := self.readers[piece.record]))
                 starts = np.stack([pad_states(one.states(place)[0], residuals.states) for one, place in reading])
                 part = residuals.with_pieces(pieces, np.ones(len(pieces), bool))
-                done = descend_gradient(part, Point(u, starts), self.law, 2 * _GRADIENT_STEPS // (3 * len(cuts)), tell)
-                u = u if isinstance(done, LostTrial) else done[0].u
+                of_cut = 2 * _GRADIENT_STEPS // (3 * len(cuts))
+                with contextlib.suppress(LostMotion):
+                    u = descend_gradient(part, Point(u, starts), self.law, of_cut, tell)[0].u
             point = point._replace(u=u)
-        done = require_success(residuals, descend_gradient(residuals, point, self.law, steps, tell))
-        trial = require_success(residuals, residuals.evaluate(done[0]))
+        end, at_rest = descend_gradient(residuals, point, self.law, steps, tell)
+        trial = residuals.evaluate(end)
         text = f"The descent by gradients came to rest within {_GRADIENT_STEPS} steps."
-        if not done[1]:
+        if not at_rest:
             text = (
                 f"The descent by gradients was stopped after {_GRADIENT_STEPS} steps, and the likelihood still grew: "
                 "go on from there, with fit.params in the place of params0."
             )
         noise = residuals.noise_scale(trial, self.law)
-        return Descent(residuals, trial, noise, done[1], _GRADIENT_STEPS, text)
-
-
-def require_success(residuals: Residuals, done: T | LostTrial) -> T:
-    """The result of a search. Raises `Unfollowed` where its motions could not be followed."""
-    if isinstance(done, LostTrial):
-        raise Unfollowed(residuals.describe_failure(done) + " Begin nearer: other params0, or starts that are known.")
-    return done
+        return Descent(residuals, trial, noise, at_rest, _GRADIENT_STEPS, text)
 
 
 def search_again(done: Descent, law: AbstractNoise) -> Descent:
@@ -249,7 +245,7 @@ def search_again(done: Descent, law: AbstractNoise) -> Descent:
     if np.isnan(done.residuals.sensor.step).all():
         return done
     residuals = done.residuals.count_runs_once(done.trial, done.noise)
-    again = require_success(residuals, minimise(residuals, done.trial.point, law, _ENOUGH, _TRIALS))
+    again = minimise(residuals, done.trial.point, law, _ENOUGH, _TRIALS)
     return done if not again.converged else again._replace(converged=done.converged, message=done.message)
 
 
