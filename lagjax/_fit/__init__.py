@@ -8,7 +8,7 @@
 Three rooms, each of which imports only from those before it:
 
     model/     records, parameters, sensors, noise, and the residuals of a trial
-    search/    descents, multiple shooting over segments that grow, weak form, multistart
+    search/    descents, multiple shooting over segments that grow, multistart
     result/    Fit: intervals, what is not seen, verdict, profile, draws, predictions, report
 """
 

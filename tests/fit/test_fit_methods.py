@@ -13,8 +13,7 @@ import lagjax
 from lagjax._fit.model import _transforms
 from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._transforms import Unbounded
-from lagjax._fit.search import _search, _weak_form
-from lagjax._fit.search._reader import Reader, time_scales
+from lagjax._fit.search import _search
 
 TS = np.linspace(0.0, 4.0, 101)
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -353,29 +352,16 @@ def test_a_report_is_one_file_with_everything(tmp_path):
     assert axes.shape == (2, 1) and axes[1][0].get_ylabel() == "residual"
 
 
-# ---- the weak form, and gradients ------------------------------------------------------------------------------------
+# ---- first values that are far off, and gradients --------------------------------------------------------------------
 
 
-def weak(fit, u):
-    readers = [Reader.from_record(record) for record in fit.records]
-    scale = min(time_scales(readers, fit.residual_function.systems[0].motions, fit.parameters.numbers(fit.u)))
-    return _weak_form.weak_form_residuals(fit.residual_function.systems[0], readers, scale), _weak_form.fit_weak_form(
-        [(fit.residual_function.systems[0], readers, scale)], u
-    )
-
-
-def test_the_weak_form_finds_parameters_from_anywhere_without_a_motion():
+@pytest.mark.parametrize("factor", [1e-3, 1e3])
+def test_accelerations_of_local_cubics_begin_where_parameters_are_far_off(factor):
     ts = np.linspace(0.0, 12.0, 241)
     q = np.asarray(lagjax.simulate(SPRING, 2.0, 0.0, ts, {"k": 4.0, "c": 0.3}).q)
     one = lagjax.Record(ts, q + 0.02 * np.random.default_rng(0).normal(size=q.shape))
-    fit = lagjax.fit(SPRING, one, {"k": 4.0, "c": 0.3}, transforms=lagjax.positive)
-    for factor in (1e-3, 1e3):
-        residuals, u = weak(fit, fit.u + np.log(factor))
-        c, k = fit.parameters.values(u)
-        assert k == pytest.approx(4.0, rel=0.1) and c == pytest.approx(0.3, rel=0.5)  # rates of noisy data are damped
-    slopes = jax.jacfwd(residuals)(fit.u)
-    central = [(residuals(fit.u + e) - residuals(fit.u - e)) / 2e-6 for e in 1e-6 * np.eye(2)]
-    np.testing.assert_allclose(slopes, np.transpose(central), atol=1e-7)
+    fit = lagjax.fit(SPRING, one, {"k": 4.0 * factor, "c": 0.3 * factor}, transforms=lagjax.positive)
+    assert fit.ok and fit.params["k"] == pytest.approx(4.0, rel=0.01) and fit.params["c"] == pytest.approx(0.3, rel=0.1)
 
 
 @pytest.mark.slow
@@ -412,7 +398,7 @@ def test_gradients_begin_once_and_need_optax(monkeypatch):
 
 
 @pytest.mark.slow
-def test_inputs_drive_the_density_the_weak_form_and_many_starts():
+def test_inputs_drive_the_density_and_many_starts():
     ts, rng = np.linspace(0.0, 6.0, 121), np.random.default_rng(0)
     push = np.sin(1.3 * ts) + 0.3 * rng.normal(size=len(ts))
     truth = lagjax.System(spring, forces=lambda q, v, t, params: lagjax.samples(ts, push)(t) - 0.3 * v)
@@ -425,7 +411,3 @@ def test_inputs_drive_the_density_the_weak_form_and_many_starts():
     value, x = jax.jit(density), density.first + 0.01 * rng.normal(size=len(density))
     central = [(value(x + step) - value(x - step)) / 2e-5 for step in 1e-5 * np.eye(len(x))]
     np.testing.assert_allclose(jax.jit(jax.grad(density))(x), central, rtol=1e-5, atol=1e-4)
-    readers = [Reader.from_record(one)]
-    scale = min(time_scales(readers, fit.residual_function.systems[0].motions, fit.parameters.numbers(fit.u)))
-    u = _weak_form.fit_weak_form([(fit.residual_function.systems[0], readers, scale)], fit.u + 2.0)
-    np.testing.assert_allclose(fit.parameters.values(u), [0.3, 4.0], rtol=0.1)

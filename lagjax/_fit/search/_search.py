@@ -15,7 +15,6 @@ Source: Bock, *Recent advances in parameter identification for ODE* (1983); Pisa
 """
 
 import contextlib
-import functools
 import sys
 from typing import NamedTuple
 
@@ -30,7 +29,6 @@ from lagjax._fit.search._multistart import misfit
 from lagjax._fit.search._reader import Reader, pad_states, short_windows, time_scales
 from lagjax._fit.search._segments import complete_pieces, levels
 from lagjax._fit.search._unexplained import measure_unexplained
-from lagjax._fit.search._weak_form import fit_weak_form
 from lagjax._run.hybrid import Hybrid
 
 # In units of half the sum of squares: the end of a search, where parameters are within 0.05 standard deviations of
@@ -115,10 +113,9 @@ class Search:
         reach = self.residuals.parameters.reach
         anchor = Anchor(point.u, np.where(np.isfinite(reach), 1.0 / _LOOSE, 0.0))
         begun = self._fit_shortest_segments(point, anchor)
-        for other in (self.start_by_weak_form, functools.partial(self._fit_short_windows, anchor=anchor)):
-            if begun.misfit > 0.0:  # the shortest segments were not fitted from here
-                again = self._fit_shortest_segments(point._replace(u=other(point.u)), anchor)
-                begun = min(begun, again, key=lambda one: one.misfit)
+        if begun.misfit > 0.0:  # the shortest segments were not fitted from here
+            again = self._fit_shortest_segments(point._replace(u=self._fit_short_windows(point.u, anchor)), anchor)
+            begun = min(begun, again, key=lambda one: one.misfit)
         u, best, levels_done = begun.u, begun.best, [] if begun.first is None else [begun.first]
         for pieces in begun.cuts[1:]:
             try:
@@ -184,12 +181,6 @@ class Search:
             return minimise(part, point, self.law, _ENOUGH_OF_WINDOWS, _TRIALS_OF_LEVEL, anchor).trial.u
         return u
 
-    def start_by_weak_form(self, u: np.ndarray) -> np.ndarray:
-        """The u that balances the weak form of Lagrange's equations, u itself where there is none."""
-        parts = self.residuals.parts
-        found = fit_weak_form(list(zip(parts, map(self._readers_of, parts), self._time_scales(u), strict=True)), u)
-        return u if found is None else found
-
     def _readers_of(self, part: SystemResiduals) -> list[Reader]:
         return [reader for reader in self.readers[part.frame.records] if reader is not None]
 
@@ -215,7 +206,7 @@ class Search:
         watch, residuals.watch = residuals.watch, None
         tell = None if watch is None else lambda text: print(text, file=sys.stderr, flush=True)
         if any(self.readers):
-            u, steps = self.start_by_weak_form(point.u), _GRADIENT_STEPS // 3
+            u, steps = point.u, _GRADIENT_STEPS // 3
             cuts = [] if any(part.clocks for part in residuals.parts) else self._cut_records(u)
             for pieces in cuts:
                 reading = ((reader, piece.places[:1]) for piece in pieces if (reader := self.readers[piece.record]))
