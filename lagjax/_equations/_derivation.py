@@ -34,7 +34,6 @@ from lagjax._native import Projection
 from lagjax._primitives import DOUBLE
 from lagjax._program import (
     Borders,
-    Graph,
     Program,
     StraightLine,
     Unlowerable,
@@ -90,7 +89,7 @@ def _lowered_once(make: Callable) -> property:
     @functools.wraps(make)
     def get(self):
         if name not in self._made:
-            with self._lock:  # programs of a large scene share one graph
+            with self._lock:
                 if name not in self._made:
                     try:
                         with pause_collections():
@@ -184,12 +183,6 @@ class Derivation:
         except OwnRules:
             self._own_rules = True
             return lower(trace_arrays, *leaves, budget=OPERATION_BUDGET)
-
-    @property
-    def _graph(self) -> Graph | None:
-        """The graph of all quantities, to which other programs are added, where it is too large to be copied."""
-        origin = self._whole.origin
-        return None if origin is None else origin.graph
 
     def program(self, *names: str) -> Program:
         """The program for these of `Motion.quantities`, end to end, each in C order."""
@@ -307,7 +300,7 @@ class Derivation:
             _, _, right, factors, _ = system(*scalars)
             return -solve(factors, right)[self.layout.size :]
 
-        return lower_formula(multipliers, *self.scalar_shapes, budget=OPERATION_BUDGET, graph=self._graph)
+        return lower_formula(multipliers, *self.scalar_shapes, budget=OPERATION_BUDGET)
 
     @_lowered_once
     def projected(self) -> Program | None:
@@ -324,7 +317,7 @@ class Derivation:
                 q = q + position.vector(*scalars)[:n]
             return concatenate([q, v + velocity.vector(*(q[i] for i in range(n)), *rest)[:n]])
 
-        return lower_formula(projected, *self.scalar_shapes, budget=OPERATION_BUDGET, graph=self._graph)
+        return lower_formula(projected, *self.scalar_shapes, budget=OPERATION_BUDGET)
 
     @_lowered_once
     def velocity_scales(self) -> Program | None:
@@ -339,7 +332,7 @@ class Derivation:
         def scales(*scalars):
             return apply_function(scale_arrays, parts.vector(*scalars), stack(scalars[n : 2 * n]))
 
-        return lower_formula(scales, *self.scalar_shapes, budget=OPERATION_BUDGET, graph=self._graph)
+        return lower_formula(scales, *self.scalar_shapes, budget=OPERATION_BUDGET)
 
     @_lowered_once
     def projection(self) -> Projection | None:
@@ -439,9 +432,7 @@ class Derivation:
     def _solution(self, saddle: _Saddle, regular_only: bool = False) -> Program:
         """x of a linear system, and then whether it is singular."""
         system, solve = self._system(saddle, regular_only)
-        return lower_solution(
-            system, solve, self.layout.size, *self.scalar_shapes, budget=OPERATION_BUDGET, graph=self._graph
-        )
+        return lower_solution(system, solve, self.layout.size, *self.scalar_shapes, budget=OPERATION_BUDGET)
 
     def _system(self, saddle: _Saddle, regular_only: bool = False) -> tuple[Callable, Callable]:
         """A z = r with z = (x, −λ), as two functions of scalars.
@@ -491,8 +482,7 @@ class Derivation:
         cut = functools.cache(lambda: self._whole.select_outputs(positions, solve_dense))
 
         def system(*scalars):
-            whole = self._whole.own_outputs(*scalars)
-            values = cut().vector(*scalars) if whole is None else whole[positions]
+            values = cut().vector(*scalars)
             right = scatter(values[count:], np.arange(n), n + 2 * elimination.velocities)
             return places, values[:count], right, *elimination.factors(values[:count])
 
@@ -501,7 +491,7 @@ class Derivation:
             _, _, right, factors, singular = dense(*scalars)
             return [*solve(factors, right), jnp.asarray(singular)]
 
-        options = {"budget": OPERATION_BUDGET, "graph": self._graph, "in_jax": solve_dense}
+        options = {"budget": OPERATION_BUDGET, "in_jax": solve_dense}
         program = lower_solution(system, elimination.solve, n, *self.scalar_shapes, **options)
         return program if self._agrees(program) else None
 
@@ -532,11 +522,7 @@ class Derivation:
 
         cut = functools.cache(lambda: self._select(positions, chosen))
 
-        def parts(*scalars):
-            whole = self._whole.own_outputs(*scalars)
-            return cut().vector(*scalars) if whole is None else whole[positions]
-
-        return parts
+        return lambda *scalars: cut().vector(*scalars)
 
     def _rows(self, saddle: _Saddle) -> int:
         return self.shape("jacobian")[0] if saddle.velocities else self.position_count

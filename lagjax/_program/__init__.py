@@ -37,7 +37,6 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -49,7 +48,7 @@ from lagjax._program import _scalars as scalar_algebra
 from lagjax._program._borders import BELOW, CLOCK, FLOOR, SIGN, TABLE, TRUNC, Borders, borders, distances, is_smooth
 from lagjax._program._differentiation import Derivatives, copy_nodes, pullback, pushforward, with_tangents
 from lagjax._program._emit import Rows, apply_in_jax, emit, emit_look_up, emit_rows, plain_elementary
-from lagjax._program._graph import MANY, Graph, Tape, Unlowerable, find_ancestors
+from lagjax._program._graph import Graph, Tape, Unlowerable, find_ancestors
 from lagjax._program._line import StraightLine
 from lagjax._program._look_ups import table_of
 from lagjax._program._memory import machine_memory, operations_that_fit, pause_collections
@@ -86,49 +85,33 @@ def _lower_leaves(function: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], 
 
 
 def lower_scalars(
-    scalars: Callable,
-    function: Callable,
-    shapes: tuple[jax.ShapeDtypeStruct, ...],
-    budget: int,
-    graph: Graph | None = None,
+    scalars: Callable, function: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], budget: int
 ) -> "Program":
     """The program of the id arrays that `scalars(expansion, arguments)` makes of those of its inputs.
 
-    `function` is the function in JAX that it stands for, of arrays of these `shapes`. Where a `graph` is given, that of
-    a program of the same inputs, the new one is added to it.
+    `function` is the function in JAX that it stands for, of arrays of these `shapes`.
     """
-    added = graph is not None
-    expansion = Expansion(graph if added else Graph(budget))
+    expansion = Expansion(Graph(budget))
     expansion.work(sum(math.prod(shape.shape) for shape in shapes))
     arguments = inputs_of(expansion.graph, shapes)
     with np.errstate(all="ignore"):
         results = scalars(expansion, arguments)
     outputs = [expansion.graph.real(i) for result in results for i in result.ravel().tolist()]
-    graph, places = expansion.graph, outputs
-    if not added:  # else what a new program consists of has been through this, and the rest would follow it
-        graph, places = sink_negations(*factor(graph, places))
-    origin = Origin(graph, tuple(places)) if len(graph.nodes) > MANY else None
-    line = eliminate_dead_code(graph, places)
-    return Program(line, expansion.traced_operations, function, shapes, budget, origin=origin)
+    line = eliminate_dead_code(*sink_negations(*factor(expansion.graph, outputs)))
+    return Program(line, expansion.traced_operations, function, shapes, budget)
 
 
-def lower_formula(formula: Callable, *shapes, budget: int, graph: Graph | None = None) -> "Program":
+def lower_formula(formula: Callable, *shapes, budget: int) -> "Program":
     """The program of a formula: a function of numbers, each a `Scalars` () or a JAX scalar, that gives a vector."""
 
     def scalars(expansion, arguments):
         return [formula(*(Scalars(expansion, x) for x in arguments)).ids]
 
-    return lower_scalars(scalars, lambda *xs: list(formula(*xs)), tuple(shapes), budget, graph)
+    return lower_scalars(scalars, lambda *xs: list(formula(*xs)), tuple(shapes), budget)
 
 
 def lower_solution(
-    system: Callable,
-    solve: Callable,
-    size: int,
-    *shapes,
-    budget: int,
-    graph: Graph | None = None,
-    in_jax: Callable | None = None,
+    system: Callable, solve: Callable, size: int, *shapes, budget: int, in_jax: Callable | None = None
 ) -> "Program":
     """The program of the first `size` components of z with A z = r, A symmetric, and of one more number.
 
@@ -152,7 +135,7 @@ def lower_solution(
         return [*solve(factors, right)[:size], jnp.asarray(number)]
 
     in_jax = in_jax or solve_system
-    program = lower_scalars(expand_system, in_jax, tuple(shapes), budget, graph)
+    program = lower_scalars(expand_system, in_jax, tuple(shapes), budget)
     places, (of_z, of_entries, of_right), of_factors, factors = counts[0]
     ends = np.cumsum([size, 1, of_z - size, of_entries, of_right])
     z, _, others, entries, right, leaves = np.split(np.array(program.line.outputs), ends)
@@ -170,7 +153,6 @@ def lower_solution(
     return replace(
         program,
         line=program.line.replace(outputs=program.line.outputs[: size + 1]),
-        origin=None,
         function=in_jax,
         linear=LinearSystem(
             z=(*z.tolist(), *others.tolist()),
@@ -180,13 +162,6 @@ def lower_solution(
             solve=functools.cache(lambda: lower_scalars(solution, solution_in_jax, tuple(vectors), budget).line),
         ),
     )
-
-
-class Origin(NamedTuple):
-    """The graph that a large program was cut out of, and where its outputs are: for programs that go on from it."""
-
-    graph: Graph
-    outputs: tuple[int, ...]
 
 
 @dataclass(frozen=True, eq=False)
@@ -207,7 +182,6 @@ class Program:
     budget: int
     otherwise: "Callable[[], Program] | None" = None
     linear: LinearSystem | None = None
-    origin: Origin | None = None
     mechanics: StraightLine | None = None
 
     @property
@@ -226,8 +200,6 @@ class Program:
         first = next((x for x in scalars if isinstance(x, Scalars)), None)
         if first is None:
             return jnp.stack(self(*scalars))
-        if (own := self.own_outputs(*scalars)) is not None:
-            return own
         graph, ids = first.expansion.graph, stack(scalars).ids.tolist()
         nodes = copy_nodes(graph, self.line, ids, [graph.position(i) for i in ids] if self.looks_up else None)
         first.expansion.traced_operations += self.operations
@@ -289,14 +261,6 @@ class Program:
         """
         return self.line.vjp(columns, cotangents)
 
-    def own_outputs(self, *scalars) -> Scalars | None:
-        """The outputs in the graph that the program was cut out of, where the scalars are its inputs there."""
-        first, origin = next((x for x in scalars if isinstance(x, Scalars)), None), self.origin
-        if origin is None or first is None or origin.graph is not first.expansion.graph:
-            return None
-        same = [origin.graph.position(i) for i in stack(scalars).ids.tolist()] == list(range(self.size))
-        return Scalars(first.expansion, np.array(origin.outputs, dtype=np.int64)) if same else None
-
     def append_inputs(self, count: int) -> "Program":
         """The program with `count` more floats after its inputs; it reads none of them."""
         more, other = jax.ShapeDtypeStruct((count,), jnp.result_type(float)), self.otherwise
@@ -310,8 +274,7 @@ class Program:
     def select_outputs(self, positions: Sequence[int], function: Callable) -> "Program":
         """The program of some of the outputs; `function` is the JAX function that gives just these, leaf by leaf."""
         line = eliminate_dead_code(self.line, [self.line.outputs[i] for i in positions])
-        origin = self.origin and self.origin._replace(outputs=tuple(self.origin.outputs[i] for i in positions))
-        return replace(self, line=line, function=function, otherwise=None, linear=None, origin=origin)
+        return replace(self, line=line, function=function, otherwise=None, linear=None)
 
     def rounding_of(self, positions: Sequence[int], moving: int) -> "Program":
         """The program of the running errors of some outputs (see `_rounding`); it has no derivatives."""
@@ -319,7 +282,7 @@ class Program:
         graph = Graph.from_line(line, 20 * self.budget)
         with np.errstate(all="ignore"):
             errors = rounding(graph, line, range(len(line.nodes)), moving)
-        return replace(self, line=eliminate_dead_code(graph, errors), otherwise=None, linear=None, origin=None)
+        return replace(self, line=eliminate_dead_code(graph, errors), otherwise=None, linear=None)
 
     @property
     def operations(self) -> int:
