@@ -7,7 +7,7 @@ shares together, from one linear system.
 
 Where pieces act on the right side alone of A z = r, each for itself, they are unknowns of that system: the piece
 p + μ instead of p, with A z − Σ μₖ ∂r/∂pₖ = r, and one row more for each, that of u̇ = 0, or μ = 0 where nothing slides.
-Its series needs no series of an elimination. Else the program is copied for each of them, a few at most.
+Its series needs no series of an elimination. Else, for a few pieces at most, that system is that of q̈ itself, z = q̈.
 
 What such equations leave is rounding, which a body at rest would gather to ½ ε t². So the acceleration of one
 coordinate of each border, its *pivot*, follows from u̇ = 0 itself: it is zero where u is a velocity alone. And a step
@@ -31,7 +31,7 @@ from lagjax._program._series import LinearSystem, StraightLine
 # Borders that act on each other, whose elimination takes a third of the cube; and borders in all, of which each solves
 # the linear system once more.
 MOST_COUPLED, MOST_SLIDING = 64, 512
-MOST_COPIES, LARGEST_COPIED = 4, 4000  # pieces for each of which a program is copied, and its operations
+MOST_COPIES, LARGEST_COPIED = 4, 4000  # pieces for which all of a program is done once more, and its operations
 # Borders that are not independent share what they hold as if they yielded by so much, relative; what that leaves is
 # mended this many times. The share of what no border holds alone is as exact as rounding, divided by it.
 SOFT, MENDED = 1e-9, 2
@@ -104,7 +104,15 @@ def with_sliding(
         return None
     if any(slide.order > 1 or slide.parts for slide in slides):
         return None
-    return _copy_for_slides(line, n, first, switches, slides)
+    done = _SlidingForces(line, n, first, switches, slides, _solved_system(line.outputs[:n])).build()
+    return done and done._replace(linear=None)
+
+
+def _solved_system(z: Sequence[int]) -> LinearSystem:
+    """The system z = z, on whose right side pieces act that act on more than the right side of another one."""
+    inputs = tuple(("input", (), i) for i in range(len(z)))
+    same = StraightLine(inputs, ("float",) * len(z), tuple(range(len(z))))
+    return LinearSystem(tuple(z), {}, tuple(z), (), lambda: same)
 
 
 # ---- as unknowns of the linear system --------------------------------------------------------------------------------
@@ -539,69 +547,6 @@ def _choose_pivots(rows: Sequence[dict[int, float | None]]) -> list[tuple[int, i
         behind.append(found)
         del left[found[0]]
     return [(k, i) for k, row in left.items() for i in row if len(row) == 1] + behind[::-1]
-
-
-# ---- with a copy for each of them ------------------------------------------------------------------------------------
-
-
-def _copy_for_slides(
-    line: StraightLine, n: int, first: int, switches: Sequence[int], slides: Sequence[Slide]
-) -> Sliding | None:
-    """a = a⁻ + Σ αₖ (aₖ⁺ − a⁻); what one piece does to a is not to depend on the others."""
-    graph, kinds = Graph(200 * len(line.nodes) + 10_000), line.kinds
-    f, number, pieces, count = graph.apply, lambda x: graph.constant(x, "float"), len(switches), len(slides)
-    given = [(node[2], kind) for node, kind in zip(line.nodes, kinds, strict=True) if node[0] == "input"]
-    inputs = {attribute: graph.input(attribute, kind) for attribute, kind in given}
-    flags = [f("gt", graph.input(first + pieces + k, "float"), number(0.5)) for k in range(count)]
-    zero, one = number(0.0), number(1.0)
-
-    def copy(upper: int | None) -> list[int]:
-        given = dict(inputs)
-        if upper is not None:
-            piece = graph.input(first + slides[upper].piece, "float")
-            above = f("add", piece, number(slides[upper].width))
-            given[first + slides[upper].piece] = f("select", flags[upper], piece, above)
-        size = max(given) + 1
-        return copy_nodes(graph, line, [given.get(i, zero) for i in range(size)])
-
-    base = copy(None)
-    a = [base[i] for i in line.outputs]
-    more = [
-        [f("sub", places[i], x) for i, x in zip(line.outputs[:n], a, strict=False)]
-        for places in map(copy, range(count))
-    ]
-    rates, effects, normals, ends = [], [], [], []
-    for slide in slides:
-        slopes = gradient_in(graph, line, base, switches[slide.piece], range(2 * n + 1))
-        velocity = [graph.input(n + i, "float") for i in range(n)]
-        drift = f("add", dot(graph, slopes[:n], velocity), slopes[2 * n])
-        normals.append(slopes[n : 2 * n])
-        ends.append(f("neg", drift))
-        rates.append(f("add", drift, dot(graph, normals[-1], a[:n])))
-        effects.append([dot(graph, normals[-1], of_one) for of_one in more])
-    # Borders that are not pushed onto are left.
-    held = [f("and", flags[k], f("lt", effects[k][k], zero)) for k in range(count)]
-    rows = [
-        [f("select", f("and", held[k], held[m]), one if k == m else zero, effects[k][m]) for m in range(count)]
-        for k in range(count)
-    ]
-    lower = eliminate(graph, rows)
-    shares = substitute(graph, rows, lower, [f("select", held[k], zero, f("neg", rates[k])) for k in range(count)])
-    for i in range(n):
-        for k in range(count):
-            a[i] = f("add", a[i], f("select", held[k], zero, f("mul", shares[k], more[k][i])))
-    hold = _Held(graph, n, held, normals, more, _choose_pivots([_constants(graph, d) for d in normals]))
-    a[:n] = hold.hold(a[:n], ends)
-    moves = [f("add", rates[k], dot(graph, shares, effects[k])) for k in range(count)]
-    left = [f("add", number(0.5), f("mul", number(FAR), x)) for x in moves]
-    of_sides = [f("select", held[k], f("select", flags[k], zero, left[k]), shares[k]) for k in range(count)]
-    done = StraightLine(tuple(graph.nodes), tuple(graph.kinds), tuple(a))
-    levels = [
-        f("sub", base[switches[slide.piece]], slide.level(graph, graph.input(first + slide.piece, "float")))
-        for slide in slides
-    ]
-    hold.put_back(n, range(count), levels, lambda left: substitute(graph, rows, lower, left), held)
-    return Sliding(done, base, of_sides, None, *hold.finish())
 
 
 # ---- a few linear equations ------------------------------------------------------------------------------------------

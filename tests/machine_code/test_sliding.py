@@ -53,6 +53,19 @@ def torques(q):
     return np.cumsum(weights[::-1])[::-1]
 
 
+def test_a_block_whose_mass_depends_on_its_speed_rests_where_its_energy_is_spent():
+    heavy = lagjax.System(
+        lambda q, v: 0.5 * v**2 + 0.3 * jnp.abs(v) ** 3 - 0.5 * q**2, forces=lambda q, v, params: -params * jnp.sign(v)
+    )
+
+    def end(mu):
+        return lagjax.simulate(heavy, 1.0, 0.0, np.array([0.0, 20.0]), mu).q[-1]
+
+    place, slope = jax.value_and_grad(end)(0.15)
+    assert abs(place - (6 * 0.15 - 1)) < 1e-8  # three swings, each of 2 mu less
+    assert abs(slope - 6) < 1e-8
+
+
 def test_twenty_blocks_stick_each_at_its_place():
     q0, ts = np.linspace(-3.0, 2.5, 20), np.array([0.0, 3.0, 7.0, 40.0])
     run = lagjax.simulate(springs(20), q0, np.zeros(20), ts, 0.3)
