@@ -37,6 +37,7 @@ import functools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -49,6 +50,7 @@ from lagjax._program._borders import BELOW, CLOCK, FLOOR, SIGN, TABLE, TRUNC, Bo
 from lagjax._program._differentiation import Derivatives, copy_nodes, pullback, pushforward, with_tangents
 from lagjax._program._emit import Rows, apply_in_jax, emit, emit_look_up, emit_rows, plain_elementary
 from lagjax._program._graph import Graph, Tape, Unlowerable, find_ancestors
+from lagjax._program._jump import row_places
 from lagjax._program._line import StraightLine
 from lagjax._program._look_ups import table_of
 from lagjax._program._memory import machine_memory, operations_that_fit, pause_collections
@@ -85,11 +87,12 @@ def _lower_leaves(function: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], 
 
 
 def lower_scalars(
-    scalars: Callable, function: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], budget: int
+    scalars: Callable, function: Callable | None, shapes: tuple[jax.ShapeDtypeStruct, ...], budget: int
 ) -> "Program":
     """The program of the id arrays that `scalars(expansion, arguments)` makes of those of its inputs.
 
-    `function` is the function in JAX that it stands for, of arrays of these `shapes`.
+    `function` is the function in JAX that it stands for, of arrays of these `shapes`; None where it is not
+    differentiated there.
     """
     expansion = Expansion(Graph(budget))
     expansion.work(sum(math.prod(shape.shape) for shape in shapes))
@@ -147,9 +150,6 @@ def lower_solution(
         *parts, b = (Scalars(expansion, x) for x in arguments)
         return [solve(jax.tree.unflatten(tree, parts), b).ids]
 
-    def solution_in_jax(*arguments):
-        return [solve(jax.tree.unflatten(tree, arguments[:-1]), arguments[-1])]
-
     return replace(
         program,
         line=program.line.replace(outputs=program.line.outputs[: size + 1]),
@@ -159,7 +159,7 @@ def lower_solution(
             entries=dict(zip(map(tuple, places.tolist()), entries.tolist(), strict=True)),
             right=tuple(right.tolist()),
             factors=tuple(leaves.tolist()),
-            solve=functools.cache(lambda: lower_scalars(solution, solution_in_jax, tuple(vectors), budget).line),
+            solve=functools.cache(lambda: lower_scalars(solution, None, tuple(vectors), budget).line),
         ),
     )
 
@@ -177,7 +177,7 @@ class Program:
 
     line: StraightLine
     traced_operations: int
-    function: Callable
+    function: Any
     shapes: tuple[jax.ShapeDtypeStruct, ...]
     budget: int
     otherwise: "Callable[[], Program] | None" = None

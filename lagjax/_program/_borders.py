@@ -210,8 +210,7 @@ class Borders(NamedTuple):
 
     def read_by(self, node: int) -> frozenset[int]:
         """The inputs that a node of the program depends on; pieces are the last ones."""
-        nodes = self.program.line.nodes
-        return frozenset(nodes[i][2] for i in _below(self.program.line, [node]) if nodes[i][0] == "input")
+        return _inputs_below(self.program.line, [node])
 
 
 def borders(program: Recurrent, size: int, slides: bool = True, watched: int = 0) -> Borders | None:
@@ -221,7 +220,7 @@ def borders(program: Recurrent, size: int, slides: bool = True, watched: int = 0
     are `watched` along the motion: what they decide on has borders too.
     """
     if (mechanics := getattr(program, "mechanics", None)) is not None:
-        whole = _append(program, mechanics)
+        whole = with_outputs(program, mechanics)
         with np.errstate(all="ignore"):
             rewriting = _Rewriting(whole, size, slides, watched + len(mechanics.outputs), len(mechanics.outputs))
             if rewriting.switches and (found := rewriting.build()).kicking:
@@ -235,16 +234,6 @@ def borders(program: Recurrent, size: int, slides: bool = True, watched: int = 0
 
 def is_smooth(line: StraightLine) -> bool:
     return _PIECEWISE.isdisjoint(op for op, *_ in line.nodes)
-
-
-def _append(program: Recurrent, more: StraightLine) -> Pieced:
-    """A program with the outputs of another line of the same inputs behind its own; what both compute is shared."""
-    graph = Graph.from_line(program.line, program.budget + _LARGEST * len(more.nodes) + 1000)
-    kinds = ["float" if np.issubdtype(dtype, np.floating) else np.dtype(dtype).name for dtype in program.dtypes]
-    places = copy_nodes(graph, more, [graph.input(i, kind) for i, kind in enumerate(kinds)])
-    outputs = (*program.line.outputs, *(places[i] for i in more.outputs))
-    line = StraightLine(tuple(graph.nodes), tuple(graph.kinds), outputs)
-    return Pieced(line, program.size, program.dtypes, program.linear, graph.budget)
 
 
 class _Rewriting:
@@ -478,11 +467,8 @@ class _Rewriting:
             return None if below is None else f("neg", below)
         if op == "round":
             return self._piece(FLOOR, f("add", of[0], number(0.5)))
-        if op == "mod":
-            whole = self._piece(FLOOR, f("div", *of))
-            return None if whole is None else f("sub", of[0], f("mul", whole, of[1]))
-        if op == "rem":
-            whole = self._piece(TRUNC, f("div", *of))
+        if op in ("mod", "rem"):
+            whole = self._piece(FLOOR if op == "mod" else TRUNC, f("div", *of))
             return None if whole is None else f("sub", of[0], f("mul", whole, of[1]))
         whole = self._piece(TRUNC, of[0])
         return whole if whole is None or op == "trunc" else f("convert", whole, attribute=attribute)
@@ -566,13 +552,9 @@ class _Rewriting:
 
     def _note_border(self, op: str, of: list[int]) -> None:
         """A border without a series beyond it, as a feature."""
-        u = None
-        if op in (*_COMPARISONS, "max", "min"):
-            u = self.graph.apply("sub", *of)
-        elif op in ("abs", "sign"):
-            u = of[0]
-        if u is not None:
-            self._note_feature(self.graph.term(u)[1], UP_TO, 1.0)
+        if op in (*_COMPARISONS, "max", "min", "abs", "sign"):
+            u = of[0] if op in ("abs", "sign") else self.graph.apply("sub", *of)
+            self._note_feature(self._base_of(u), UP_TO, 1.0)
 
     def _note_feature(self, u: int, kind: int, scale: float) -> None:
         """A function of u, as a feature if u moves."""
@@ -620,14 +602,13 @@ class _Rewriting:
         sliding, switches, arguments = self._sliding(line, kicking), list(self.switches), [u for u, _ in features]
         linear = program.linear and self._linear(program.linear)
         at_rest = [slide for slide in sliding if slide.order == 1]
-        for slides in (sliding, at_rest):
+        for slides in (sliding, at_rest, []):
             done = with_sliding(line, self.size, program.size, self.switches, slides, linear)
             if done is not None:
                 break
-        sliding, retraction, moved, release = slides if done is not None else [], None, (), StraightLine((), (), ())
-        if done is not None:
-            line, places, shares, linear, retraction, moved, release = done
-            switches, arguments = [places[i] for i in switches] + shares, [places[i] for i in arguments]
+        assert done is not None  # without slides there is one
+        line, places, shares, linear, retraction, moved, release = done
+        sliding, switches, arguments = slides, [places[i] for i in switches] + shares, [places[i] for i in arguments]
         count, kick = len(switches), None
         if self.mechanics:
             kick = self._kick(line, switches, kicking)
@@ -649,19 +630,16 @@ class _Rewriting:
         first, jumping = self.program.size, {}
         search = Jumping(line, self._decide(len(self.switches), ()), self.switches, n, first)
         for nodes in ([of.lagrangian, *of.momentum], of.rates):
-            read = {line.nodes[i][2] for i in _below(line, nodes) if line.nodes[i][0] == "input"}
+            read = _inputs_below(line, nodes)
             candidates = [j for j in range(len(self.switches)) if first + j in read]
             found = search.find(candidates, nodes, self._levels) if candidates else {}
             jumping |= {j: nodes is of.rates for j, jumps in found.items() if jumps}
         for j in sorted(jumping, reverse=True):  # beyond a piece that others are decided by, these may be other ones
-            below = (line.nodes[i] for i in _below(line, [self.switches[j]]))
-            decided_by = {a - first for op, _, a in below if op == "input" and a >= first}
+            decided_by = {i - first for i in _inputs_below(line, [self.switches[j]]) if i >= first}
             jumping |= {k: jumping[j] for k in decided_by if k not in jumping}
-        velocities = set(range(n, 2 * n))
 
         def reads_velocity(nodes):
-            below = _below(line, nodes)
-            return not velocities.isdisjoint(line.nodes[i][2] for i in below if line.nodes[i][0] == "input")
+            return not _inputs_below(line, nodes).isdisjoint(range(n, 2 * n))
 
         is_quadratic = not reads_velocity([*of.mass_matrix, *of.jacobian])
         reasons: dict[int, str | None] = {}
@@ -702,9 +680,7 @@ class _Rewriting:
         refused = tuple((j, reason) for j, reason in kicking.items() if reason is not None)
         if refused or not kicking:
             return Kick(StraightLine((), (), ()), tuple(kicking), refused)
-        below = [_below(line, [switches[j]]) for j in kicking]
-        reads = [{line.nodes[i][2] for i in nodes if line.nodes[i][0] == "input"} for nodes in below]
-        spatial = [j for j, read in zip(kicking, reads, strict=True) if not read.isdisjoint(range(n))]
+        spatial = [j for j in kicking if not _inputs_below(line, [switches[j]]).isdisjoint(range(n))]
         moves = any(t is not None and t.table.numbers is None for t in self.tables)
         return Kick(kick_line(line, of, switches, spatial, n, size, m if moves else 0), tuple(kicking))
 
@@ -728,7 +704,7 @@ class _Rewriting:
                 continue
             if kind == SIGN and self.pieces[j] not in self._jumping:
                 continue
-            read = {line.nodes[i][2] for i in _below(line, [self.switches[j]]) if line.nodes[i][0] == "input"}
+            read = _inputs_below(line, [self.switches[j]])
             if not read.isdisjoint(range(2 * n)):
                 orders[j] = 2 if read.isdisjoint(range(n, 2 * n)) else 1
         others = [j for j in orders if self.kinds[j] not in (SIGN, CONE)]
@@ -740,14 +716,9 @@ class _Rewriting:
             # Where other switching numbers jump, the pieces on the other side are not known.
             lost = [j for j, nodes in shaking.items() if nodes and search.find([j], nodes, self._levels)[j]]
             orders = {j: order for j, order in orders.items() if jumps.get(j, True) is not False and j not in lost}
+        widths = {SIGN: 2.0, CONE: 2.0}
         both = [
-            Slide(
-                j,
-                order,
-                2.0 if self.kinds[j] in (SIGN, CONE) else 1.0,
-                self._level_between(j),
-                self.parts.get(self.pieces[j], ()),
-            )
+            Slide(j, order, widths.get(self.kinds[j], 1.0), self._level_between(j), self.parts.get(self.pieces[j], ()))
             for j, order in sorted(orders.items(), key=lambda item: item[1])
         ]
         by_velocity = [slide for slide in both if slide.order == 1]
@@ -884,17 +855,23 @@ def _below(line: StraightLine, roots: Sequence[int], instead: Mapping[int, Seque
     return seen
 
 
-def with_outputs(program: Recurrent, more: StraightLine, moving: int) -> Pieced:
+def _inputs_below(line: StraightLine, roots: Sequence[int]) -> frozenset[int]:
+    """The inputs that some nodes depend on."""
+    return frozenset(line.nodes[i][2] for i in _below(line, roots) if line.nodes[i][0] == "input")
+
+
+def with_outputs(program: Recurrent, more: StraightLine, moving: int | None = None) -> Pieced:
     """A program with the outputs of another line of the same inputs behind its own; what both compute is shared.
 
-    Before these stands how far rounding may move each of them (`rounding`); zero for a line that is long.
+    Where its first inputs, so many, are `moving`, before these stands how far rounding may move each of them
+    (`rounding`); zero for a line that is long.
     """
     graph = Graph.from_line(program.line, program.budget + 2 * _LARGEST * len(more.nodes) + 1000)
     kinds = ["float" if np.issubdtype(dtype, np.floating) else np.dtype(dtype).name for dtype in program.dtypes]
     with np.errstate(all="ignore"):
         places = copy_nodes(graph, more, [graph.input(i, kind) for i, kind in enumerate(kinds)])
-        errors = [graph.constant(0.0, "float")] * len(more.outputs)
-        if len(more.nodes) <= LARGEST_WITH_ROUNDING:
+        errors = [] if moving is None else [graph.constant(0.0, "float")] * len(more.outputs)
+        if moving is not None and len(more.nodes) <= LARGEST_WITH_ROUNDING:
             errors = rounding(graph, more, places, moving)
     outputs = (*program.line.outputs, *errors, *(places[i] for i in more.outputs))
     line = StraightLine(tuple(graph.nodes), tuple(graph.kinds), outputs)
@@ -1030,8 +1007,8 @@ def _find_cones(line: StraightLine, size: int, linear: Any) -> dict[int, int]:
     for root in roots if linear is not None else ():
         for x in guarded(nodes[root][1][0]):
             parts = _squares(line, x)
-            reads = [{nodes[i][2] for i in _below(line, [u]) if nodes[i][0] == "input"} for u in parts or ()]
-            if parts and not any(read.isdisjoint(range(size, 2 * size)) for read in reads):
+            velocities = range(size, 2 * size)
+            if parts and not any(_inputs_below(line, [u]).isdisjoint(velocities) for u in parts):
                 squares[x] = cones[root] = x
     squares |= {i: x for i, x in cones.items() if nodes[i][0] == "sqrt"}
     for i, (op, operands, _) in enumerate(nodes):

@@ -148,7 +148,7 @@ def with_borders_of_tangents(borders: Borders, size: int, directions: int, membe
     program, pieces, n, rows = borders.program, len(borders.switches), size, 1 + directions
     numbers = program.size - 2 * n - 1 - pieces
     first_piece = rows * (2 * n + numbers) + 1
-    of_rows = [_places(n, numbers, rows, row) for row in range(rows)]
+    of_rows = [row_places(n, numbers, rows, row) for row in range(rows)]
     places = [*of_rows[0], *(first_piece + j for j in range(pieces))]
     moving = [{i: place for i, place in enumerate(row) if i != 2 * n} for row in of_rows[1:]]
     followed = list(borders.followed)
@@ -173,7 +173,7 @@ def with_borders_of_tangents(borders: Borders, size: int, directions: int, membe
     )  # fmt: skip
 
 
-def _places(n: int, numbers: int, rows: int, row: int) -> list[int]:
+def row_places(n: int, numbers: int, rows: int, row: int) -> list[int]:
     """The places of q, q̇, t and the numbers of a row among the inputs of a motion with rows."""
     first = 2 * rows * n + 1
     return [

@@ -81,7 +81,7 @@ class Sliding(NamedTuple):
     places: Sequence[int]
     shares: list[int]
     linear: LinearSystem | None
-    retraction: StraightLine
+    retraction: StraightLine | None
     moved: tuple[frozenset[int], ...]
     release: StraightLine = StraightLine((), (), ())
 
@@ -95,7 +95,7 @@ def with_sliding(
     too many operations.
     """
     if not slides:
-        return None
+        return Sliding(line, range(len(line.nodes)), [], linear, None, ())
     if linear is not None and len(slides) <= MOST_SLIDING:
         done = _SlidingForces(line, n, first, switches, slides, linear).build()
         if done is not None:
@@ -149,7 +149,8 @@ class _SlidingForces:
             return None
         slopes, rates, levels = zip(*map(self._rate, range(len(self.rows))), strict=True)
         responses, effects = self._effects(acts, slopes)
-        if self._largest_coupled(effects) > MOST_COUPLED:
+        _, groups = connected_components(np.array(effects) != self.zero, directed=False)
+        if np.bincount(groups).max() > MOST_COUPLED:
             return None
         pushed = [self.f("lt", row[k], self.zero) for k, row in enumerate(effects)]
         all_pushed = [functools.reduce(lambda a, b: self.f("and", a, b), of) for of in self._group_rows(pushed)]
@@ -232,11 +233,6 @@ class _SlidingForces:
             some = [i for i, x in enumerate(d) if x != self.zero]
             effects.append([dot(self.graph, [d[i] for i in some], [of[i] for i in some]) for of in responses])
         return responses, effects
-
-    def _largest_coupled(self, effects: list[list[int]]) -> int:
-        acts_on = np.array(effects).reshape(len(effects), -1) != self.zero
-        _, groups = connected_components(acts_on, directed=False)
-        return int(np.bincount(groups).max())
 
     def _unmask(self, numbers: Sequence[int]) -> list[int]:
         """Numbers that are zero where nothing slides, as they are where something does."""
@@ -329,11 +325,8 @@ class _SlidingForces:
         acts = []
         for m, (k, *_) in enumerate(self.rows):
             if self.slides[k].parts:
-                below, above, factor = (
-                    self._evaluate_cone(k, None),
-                    self._evaluate_cone(k, self.rows[m].offset),
-                    self.one,
-                )
+                below, above = self._evaluate_cone(k, None), self._evaluate_cone(k, self.rows[m].offset)
+                factor = self.one
             else:
                 below, above = ({x: of[k][side] for x, of in of_sides.items() if k in of} for side in range(2))
                 factor = self.number(0.5)
@@ -363,11 +356,13 @@ class _SlidingForces:
         if not pieces.keys().isdisjoint(graph.find_ancestors([*system.entries.values(), *system.factors])):
             return None
         sides: dict[int, dict[int, tuple[int, int]]] = {}
+        minus_one = self.number(-1.0)
         for i in graph.find_ancestors(system.right):
             if i in pieces and self.slides[pieces[i]].parts:
                 continue
             if i in pieces:
-                sides[i] = {pieces[i]: self._both_pieces(pieces[i])}
+                is_sign = self.slides[pieces[i]].width > 1
+                sides[i] = {pieces[i]: (minus_one, self.one) if is_sign else (i, self.f("add", i, self.one))}
                 continue
             op, operands, attribute = graph.nodes[i]
             among = sorted({k for x in operands for k in sides.get(x, ())})
@@ -379,11 +374,6 @@ class _SlidingForces:
             if values:
                 sides[i] = values
         return sides
-
-    def _both_pieces(self, k: int) -> tuple[int, int]:
-        if self.slides[k].width > 1:  # of a sign
-            return self.number(-1.0), self.one
-        return self.pieces[k], self.f("add", self.pieces[k], self.one)
 
     def _rate(self, k: int) -> tuple[list[int], int, int]:
         """∂w/∂q̇ and −∂w/∂q q̇ − ∂w/∂t of what is to stay zero, u or u̇; zeros where nothing slides. And w."""

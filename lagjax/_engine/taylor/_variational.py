@@ -8,15 +8,13 @@ Together with the motion they are a program like any other: a derivative is as a
 Nørsett & Wanner, *Solving Ordinary Differential Equations I*, §I.14.
 """
 
-from collections.abc import Callable
 from typing import cast
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
 from lagjax._native import Projection
-from lagjax._program import Program, with_tangents
+from lagjax._program import Program, row_places, with_tangents
 
 
 def from_rows(y):
@@ -41,53 +39,25 @@ def tangent_programs(
     """
     rows, numbers = 1 + directions, program.size - 2 * size - 1
     every = [None, *range(directions)]
-
-    def accelerations(q, v, t, p):
-        scalars = lambda q, v, p: jnp.stack(program(*q, *v, t, *p)[:size])  # noqa: E731
-        return _differentiate_rows(scalars, q, v, p), program(*q[0], *v[0], t, *p[0])[size]
-
     outputs = [(i, row) for row in every for i in range(size)] + [(size, None)]
-    larger = _build_tangent_program(program, size, rows, numbers, outputs, accelerations)
+    larger = _build_tangent_program(program, size, rows, numbers, outputs)
     if projection is None:
         return larger, None
     state, scale = cast(Program, projection.state), cast(Program, projection.velocity_scale)
-
-    def project_rows(q, v, t, p):
-        both = _differentiate_rows(lambda q, v, p: jnp.stack(state(*q, *v, t, *p)), q, v, p)
-        return both[:, :size], both[:, size:]
-
-    def velocity_scale(q, v, t, p):
-        return scale(*q[0], *v[0], t, *p[0])
-
     outputs = [(first + i, row) for first in (0, size) for row in every for i in range(size)]
     scales = [(i, None) for i in range(len(scale.line.outputs))]  # of the motion, also where it has tangents
     return larger, Projection(
-        _build_tangent_program(state, size, rows, numbers, outputs, project_rows),
-        _build_tangent_program(scale, size, rows, numbers, scales, velocity_scale),
+        _build_tangent_program(state, size, rows, numbers, outputs),
+        _build_tangent_program(scale, size, rows, numbers, scales),
     )
 
 
-def _build_tangent_program(program: Program, n: int, rows: int, numbers: int, outputs, function: Callable) -> Program:
-    """A program of (1 + D) rows of q, q̇ and params, which in JAX is `function`."""
-    first_of_params = 2 * rows * n + 1
-    of_rows = [
-        [*range(k * n, (k + 1) * n), *range((rows + k) * n, (rows + k + 1) * n), 2 * rows * n,
-         *range(first_of_params + k * numbers, first_of_params + (k + 1) * numbers)]
-        for k in range(rows)
-    ]  # fmt: skip
+def _build_tangent_program(program: Program, n: int, rows: int, numbers: int, outputs) -> Program:
+    """A program of (1 + D) rows of q, q̇ and params; it has no derivatives in JAX."""
+    of_rows = [row_places(n, numbers, rows, row) for row in range(rows)]
     directions = [{i: place for i, place in enumerate(row) if i != 2 * n} for row in of_rows[1:]]
     line = with_tangents(program.line, program.dtypes, of_rows[0], directions, outputs)
     shapes = ((rows, n), (rows, n), (), (rows, numbers))
     structs = tuple(jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes)
     budget = max(program.budget, len(line.nodes))
-    return Program(line, len(line.nodes), lambda *xs: jax.tree.leaves(function(*xs)), structs, budget)
-
-
-def _differentiate_rows(function: Callable, q, v, p):
-    """`function(q, v, p)` at the first rows, and its derivative along each of the others, in JAX."""
-
-    def derivative(*direction):
-        return jax.jvp(function, (q[0], v[0], p[0]), direction)[1]
-
-    tangents = jax.vmap(derivative)(q[1:], v[1:], p[1:])
-    return jnp.concatenate([function(q[0], v[0], p[0])[None], tangents])
+    return Program(line, len(line.nodes), None, structs, budget)
