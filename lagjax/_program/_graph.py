@@ -46,7 +46,6 @@ INPUTS, NUMBERS = 2**40, 2**50
 PAIRS = 2**60
 
 Node = tuple[str, tuple[int, ...], Any]
-_ARITHMETIC = frozenset(("add", "sub", "mul"))
 
 
 def find_ancestors(nodes: Sequence[Node], outputs: Iterable[int], powers: Mapping[int, tuple] = {}) -> list[int]:
@@ -73,7 +72,6 @@ class Graph:
     def __init__(self, budget: int):
         self.nodes: list[Node] = []
         self.kinds: list[str] = []
-        self.plain = bytearray()  # whether a node is a float that is no number, negation or multiple of another
         self.budget = budget
         self._operations = 0
         self._ids: dict = {}
@@ -92,18 +90,10 @@ class Graph:
     def from_line(cls, line, budget: int) -> "Graph":
         """A graph of the nodes of a straight line, which have their positions as ids."""
         graph = cls(budget)
-        graph.nodes, graph.kinds, ids = list(line.nodes), list(line.kinds), graph._ids
-        constants = bytearray(len(graph.nodes))
+        graph.nodes, graph.kinds = list(line.nodes), list(line.kinds)
         for i, (node, kind) in enumerate(zip(graph.nodes, graph.kinds, strict=True)):
-            op, operands, value = node
-            if op == "constant":
-                constants[i] = True
-                ids[kind, value, math.copysign(1.0, value)] = i
-                graph.plain.append(False)
-                continue
-            ids[node] = i
-            multiple = op == "neg" or (op == "mul" and (constants[operands[0]] or constants[operands[1]]))
-            graph.plain.append(kind == "float" and not multiple)
+            op, _, value = node
+            graph._ids[(kind, value, math.copysign(1.0, value)) if op == "constant" else node] = i
         graph._operations = len(graph.nodes)
         graph._require_room()
         return graph
@@ -157,44 +147,14 @@ class Graph:
 
     def apply(self, op: str, *operands: int, attribute=None) -> int:
         """The scalar `op(*operands)`, as simple as the rules below make it."""
-        nodes = self.nodes
-        if op in _ARITHMETIC and len(nodes) > MANY:
-            a, b = operands
-            if self.plain[a] and self.plain[b] and a != b:
-                i = self._plain_node((op, (b, a) if a > b and op != "sub" else (a, b), None))
-                self._require_room()
-                return i
         for i in operands:
-            if nodes[i][0] != "constant":
+            if self.nodes[i][0] != "constant":
                 break
         else:
             return self._fold(op, operands, attribute)
         if rule := OPERATIONS[op].simplify:
             return rule(self, op, *operands) if attribute is None else rule(self, op, *operands, attribute)
         return self.node(op, *operands, attribute=attribute)
-
-    def apply_all(self, op: str, *columns: list[int], attribute=None) -> list[int]:
-        """`apply` for many operands."""
-        if op not in _ARITHMETIC or len(self.nodes) <= MANY:
-            return [self.apply(op, *operands, attribute=attribute) for operands in zip(*columns, strict=True)]
-        plain, ordered, new, results = self.plain, op == "sub", self._plain_node, []
-        for a, b in zip(*columns, strict=True):
-            if plain[a] and plain[b] and a != b:
-                results.append(new((op, (b, a) if a > b and not ordered else (a, b), None)))
-            else:
-                results.append(self.apply(op, a, b))
-        self._require_room()
-        return results
-
-    def _plain_node(self, node: Node) -> int:
-        """The result of `node` for arithmetic of numbers that are `plain`."""
-        i = self._ids.setdefault(node, len(self.nodes))
-        if i == len(self.nodes):
-            self.nodes.append(node)
-            self.kinds.append("float")
-            self.plain.append(True)
-            self._operations += 1
-        return i
 
     def _require_room(self) -> None:
         if self._operations > self.budget:
@@ -275,12 +235,6 @@ class Graph:
         return self.nodes[i][1][0] if self.nodes[i][0] == op else None
 
     def _append(self, key, node: Node, kind: str) -> int:
-        op, operands, _ = node
-        self.plain.append(
-            kind == "float"
-            and op not in ("constant", "neg")
-            and not (op == "mul" and "constant" in (self.nodes[operands[0]][0], self.nodes[operands[1]][0]))
-        )
         self.nodes.append(node)
         self.kinds.append(kind)
         self._ids[key] = len(self.nodes) - 1
@@ -436,9 +390,6 @@ class Tape(Graph):
         if all(self.nodes[i][0] == "constant" for i in operands):
             return self._fold(op, operands, attribute)
         return self._append_operation(op, operands, attribute, self._kind(op, operands, attribute))
-
-    def apply_all(self, op: str, *columns: list[int], attribute=None) -> list[int]:
-        return [self.apply(op, *operands, attribute=attribute) for operands in zip(*columns, strict=True)]
 
     def power(self, a: int, exponent: int) -> int:
         """The scalar `a**exponent`, as one node."""

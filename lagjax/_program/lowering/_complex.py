@@ -9,13 +9,14 @@ Fourier transforms are sums: of a length that is even, of two halves (Cooley and
 
 import functools
 import math
+import operator
 from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
 
 from lagjax._program._scalars import Scalars
-from lagjax._program.lowering._rules import COMPLEX, Expansion, lowers
+from lagjax._program.lowering._rules import COMPLEX, Expansion, lowers, reduction
 
 
 class Pair(NamedTuple):
@@ -63,9 +64,6 @@ class Pair(NamedTuple):
         """The quotient z / i = −i z."""
         return Pair(self.im, -self.re)
 
-    def scale(self, factor) -> "Pair":
-        return Pair(self.re * factor, self.im * factor)
-
     def shift(self, number: float) -> "Pair":
         return Pair(self.re + number, self.im)
 
@@ -110,14 +108,6 @@ def _sign(z: Pair) -> Pair:
     return Pair(z.re / size, z.im / size)
 
 
-def _exponential(z: Pair) -> Pair:
-    return _polar(_f("exp", z.re), z.im)
-
-
-def _logarithm(z: Pair) -> Pair:
-    return Pair(0.5 * _f("log", z.square), z.angle)
-
-
 def _log1p(z: Pair) -> Pair:
     return Pair(0.5 * _f("log1p", z.re * (2.0 + z.re) + z.im * z.im), z.shift(1.0).angle)
 
@@ -155,9 +145,8 @@ def _power(z: Pair, exponent: Pair) -> Pair:
     size = _f("pow", z.square, 0.5 * exponent.re)
     if exponent.is_real:
         return _polar(size, z.angle * exponent.re)
-    logarithm = _logarithm(z)
-    size = size * _f("exp", -(exponent.im * logarithm.im))
-    return _polar(size, exponent.re * logarithm.im + exponent.im * logarithm.re)
+    size = size * _f("exp", -(exponent.im * z.angle))
+    return _polar(size, exponent.re * z.angle + exponent.im * (0.5 * _f("log", z.square)))
 
 
 def _sine(z: Pair) -> Pair:
@@ -193,8 +182,8 @@ def _inverse_hyperbolic_cosine(z: Pair) -> Pair:
 
 
 def _inverse_hyperbolic_tangent(z: Pair) -> Pair:
-    """½ (log(1 + z) − log(1 − z))."""
-    return (_log1p(z) - _log1p(-z)).scale(0.5)
+    difference = _log1p(z) - _log1p(-z)
+    return Pair(0.5 * difference.re, 0.5 * difference.im)
 
 
 def _derive_circular(function: Callable) -> Callable:
@@ -215,12 +204,12 @@ _FUNCTIONS: dict[str, Callable] = {
     "pow": _power,
     "sqrt": _square_root,
     "rsqrt": lambda z: _inverse(_square_root(z)),
-    "exp": _exponential,
-    "exp2": lambda z: _exponential(z.scale(math.log(2.0))),
+    "exp": lambda z: _polar(_f("exp", z.re), z.im),
+    "exp2": lambda z: _polar(_f("exp2", z.re), math.log(2.0) * z.im),
     "expm1": _expm1,
-    "log": _logarithm,
+    "log": lambda z: Pair(0.5 * _f("log", z.square), z.angle),
     "log1p": _log1p,
-    "logistic": lambda z: _inverse(_exponential(-z).shift(1.0)),
+    "logistic": lambda z: _inverse(_polar(_f("exp", -z.re), -z.im).shift(1.0)),
     "sin": _sine,
     "cos": _cosine,
     "tan": _tangent,
@@ -273,6 +262,13 @@ COMPLEX.update({name: _elementwise(function) for name, function in _FUNCTIONS.it
 COMPLEX.update({name: _partwise(name) for name in _PARTWISE})
 
 
+def _multiply_all(expansion, multiply: Callable, rows: np.ndarray) -> np.ndarray:
+    return functools.reduce(functools.partial(multiply, expansion, {}), rows)
+
+
+COMPLEX["reduce_prod"] = reduction(COMPLEX["mul"], 1.0 + 0.0j, _multiply_all)
+
+
 @lowers("complex", table=COMPLEX)
 def _complex(expansion, params, re, im):
     return expansion.pair(*np.broadcast_arrays(re, im))
@@ -281,26 +277,15 @@ def _complex(expansion, params, re, im):
 @lowers("convert_element_type", table=COMPLEX)
 def _convert_element_type(expansion, params, x):
     if np.issubdtype(params["new_dtype"], np.complexfloating):
-        return (
-            x
-            if expansion.has_pairs(x)
-            else expansion.pair(*expansion.parts(expansion.map("convert", x, attribute="float")))
-        )
+        if expansion.has_pairs(x):
+            return x
+        return expansion.pair(*expansion.parts(expansion.map("convert", x, attribute="float")))
     return expansion.lower_primitive("convert_element_type", params, [expansion.parts(x)[0]])
 
 
 @lowers("integer_pow", table=COMPLEX)
 def _integer_pow(expansion, params, x):
     return _ids_of(expansion, _whole_power(_pair_of(expansion, x), params["y"]))
-
-
-@lowers("reduce_prod", table=COMPLEX)
-def _product(expansion, params, x):
-    rows = np.moveaxis(x, params["axes"], range(len(params["axes"])))
-    rows = rows.reshape(-1, *rows.shape[len(params["axes"]) :])
-    if not len(rows):
-        return np.broadcast_to(expansion.constants(1.0 + 0.0j), rows.shape[1:])
-    return _ids_of(expansion, functools.reduce(lambda a, b: a * b, (_pair_of(expansion, row) for row in rows)))
 
 
 @lowers("dot_general", table=COMPLEX)
@@ -353,10 +338,8 @@ def _transform_rows(rows: list[Pair], turn: int) -> list[Pair]:
     """Σⱼ rowsⱼ e^(turn 2πi jk/n) for every k."""
     n = len(rows)
     if n % 2 or n == 0:
-        return [
-            functools.reduce(lambda a, b: a + b, (_rotate(x, turn, j * k, n) for j, x in enumerate(rows)))
-            for k in range(n)
-        ]
+        turned = [[_rotate(x, turn, j * k, n) for j, x in enumerate(rows)] for k in range(n)]
+        return [functools.reduce(operator.add, of_one) for of_one in turned]
     even, odd = _transform_rows(rows[::2], turn), _transform_rows(rows[1::2], turn)
     odd = [_rotate(x, turn, k, n) for k, x in enumerate(odd)]
     return [a + b for a, b in zip(even, odd, strict=True)] + [a - b for a, b in zip(even, odd, strict=True)]

@@ -165,14 +165,11 @@ def _order_eigenpairs(expansion: Expansion, a: np.ndarray) -> list[tuple[int, li
             vector[block] = _fix_sign(expansion, parts)
             values.append(value.ids)
             vectors.append(vector)
-    for end in range(n - 1 if len(blocks) > 1 else 0, 0, -1):
-        for k in range(end):
-            low, high = values[k], values[k + 1]
-            wrong = expansion.map("lt", high, low)
-            values[k], values[k + 1] = expansion.map("min", low, high), expansion.map("max", low, high)
-            pair = vectors[k], vectors[k + 1]
-            vectors[k], vectors[k + 1] = (expansion.map("select", wrong, *of) for of in (pair, pair[::-1]))
-    return [(int(value), vector.tolist()) for value, vector in zip(values, vectors, strict=True)]
+    if len(blocks) > 1:
+        given = np.array(values), *np.transpose(vectors)
+        values, *parts = expansion.lower_primitive("sort", {"num_keys": 1, "dimension": 0}, given)
+        vectors = np.transpose(parts)
+    return [(int(value), list(vector)) for value, vector in zip(values, vectors, strict=True)]
 
 
 def _fix_sign(expansion: Expansion, vector: list) -> np.ndarray:

@@ -101,15 +101,12 @@ class Expansion:
         shape, size = arrays[0].shape, arrays[0].size
         self.work(size)
         self.traced_operations += size
-        columns = (array.ravel().tolist() for array in arrays)
-        return _ids(self.graph.apply_all(op, *columns, attribute=attribute), shape)
+        columns = zip(*(array.ravel().tolist() for array in arrays), strict=True)
+        return _ids([self.graph.apply(op, *of, attribute=attribute) for of in columns], shape)
 
     def fold(self, op: str, array: np.ndarray) -> np.ndarray:
         """`op` along the first axis, from the left."""
-        total = array[0]
-        for row in array[1:]:
-            total = self.map(op, total, row)
-        return total
+        return functools.reduce(lambda total, row: self.map(op, total, row), array)
 
     def require_numbers(self, array: np.ndarray, what: str) -> np.ndarray:
         """The numbers behind an array of constants."""
@@ -492,23 +489,22 @@ def _dot_general(expansion, params, x, y):
     return expansion.fold("add", expansion.map("mul", left, right))
 
 
-def _reduction(op, empty):
+def reduction(op, empty, fold: Callable = Expansion.fold):
     def rule(expansion, params, x):
         rows = np.moveaxis(x, params["axes"], range(len(params["axes"])))
         shape = rows.shape[len(params["axes"]) :]
         rows = rows.reshape(math.prod(rows.shape[: len(params["axes"])]), *shape)
-        return expansion.fold(op, rows) if len(rows) else np.broadcast_to(expansion.constants(empty), shape)
+        return fold(expansion, op, rows) if len(rows) else np.broadcast_to(expansion.constants(empty), shape)
 
     return rule
 
 
 def _cumulation(op):
     def rule(expansion, params, x):
-        rows = list(np.moveaxis(x, params["axis"], 0))[:: -1 if params["reverse"] else 1]
-        for k in range(1, len(rows)):
-            rows[k] = expansion.map(op, rows[k - 1], rows[k])
-        rows = rows[:: -1 if params["reverse"] else 1]
-        return np.stack(rows, params["axis"]) if rows else x
+        way = slice(None, None, -1 if params["reverse"] else 1)
+        rows = np.moveaxis(x, params["axis"], 0)[way]
+        sums = list(itertools.accumulate(rows, functools.partial(expansion.map, op)))
+        return np.stack(sums[way], params["axis"]) if sums else x
 
     return rule
 
@@ -531,9 +527,9 @@ def _first_extreme(better):
 
 
 LOWER.update({
-    "reduce_sum": _reduction("add", 0.0), "reduce_prod": _reduction("mul", 1.0), "reduce_or": _reduction("or", False),
-    "reduce_max": _reduction("max", -np.inf), "reduce_min": _reduction("min", np.inf),
-    "reduce_and": _reduction("and", True), "reduce_xor": _reduction("xor", False),
+    "reduce_sum": reduction("add", 0.0), "reduce_prod": reduction("mul", 1.0), "reduce_or": reduction("or", False),
+    "reduce_max": reduction("max", -np.inf), "reduce_min": reduction("min", np.inf),
+    "reduce_and": reduction("and", True), "reduce_xor": reduction("xor", False),
     "cumsum": _cumulation("add"), "cumprod": _cumulation("mul"), "cummax": _cumulation("max"),
     "cummin": _cumulation("min"), "argmax": _first_extreme("gt"), "argmin": _first_extreme("lt"),
 })  # fmt: skip
