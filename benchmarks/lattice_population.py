@@ -3,8 +3,8 @@
     python -m benchmarks.lattice_population --scenes 100
     python -m benchmarks.lattice_population --scenes 100 --float32
 
-A lattice has one or two dimensions, is periodic or has free ends, and has springs with a quadratic and a quartic term and
-an on-site potential of φ⁴ or sine-Gordon. One mass may be a thousand times the others, one spring may be cut, the mass
+A lattice has one or two dimensions, is periodic or has free ends, and has springs with a quadratic and a quartic term
+and an on-site potential of φ⁴ or sine-Gordon. One mass may be a thousand times the others, one spring may be cut, the mass
 matrix is lumped (diagonal) or consistent (of linear elements along the rows: tridiagonal), a part may have masses that
 depend on their place, drag and drive. The reference is SciPy's DOP853 at 1e-12 with derivatives by hand. An end is
 *wrong* where it is off by more than 1000 tolerances times the growth of a small error of the start.
@@ -28,7 +28,7 @@ T, RTOL, SLACK = 2.0, 1e-9, 1e3
 
 
 class Lattice(NamedTuple):
-    """A lattice of rows × columns sites. `springs` (S, 3): both ends and the stiffness; the others are numbers or (N,)."""
+    """A lattice of `shape` N sites. `springs` (S, 3): both ends and the stiffness; `masses` (N,)."""
 
     shape: tuple[int, ...]
     springs: np.ndarray
