@@ -40,7 +40,6 @@ NAMES = {CRASHED: "crashed", KEEP_FAILED: "keep_failed"}
 MOST = 16_384  # members of a batch: more are no faster in machine code, and take more memory
 MOST_ON_DEVICES = 131_072
 PATH_BYTES = 64 * 2**20  # of the path of a batch
-_MOST_RAISE = 100  # members of a batch for which `keep` raises; each takes a dozen runs of `keep` to find
 _RAISED = re.compile(r"[\w.]+(Error|Exception|Warning|Interrupt): ")
 
 
@@ -76,7 +75,9 @@ class Batches:
             )
         self._starts = {role: self._map_start(role, f) if callable(f) else None for role, f in roles.items()}
         self._axes = tuple(0 if start else None for start in self._starts.values())
-        self._keep_all, self._tolerances = jax.jit(self._keep_vectorized), None
+        self._keep_all, self._keep_one = jax.jit(self._keep_vectorized), jax.jit(self._keep_member)
+        drift_of = lambda arrays, params: self._drift(self._trajectory(arrays[0], params))  # noqa: E731
+        self._drift_all, self._tolerances = jax.jit(jax.vmap(drift_of, in_axes=(0, self._axes[2]))), None
 
     def __call__(self, points: dict[str, np.ndarray]) -> KeptResults:
         """The kept values of the members at these points (B,)."""
@@ -116,13 +117,18 @@ class Batches:
         """The result of `keep` for each member, the change of its energy, and the members for which `keep` raised."""
         if "keep" not in self.slow:
             try:
-                return self._keep_compiled(motions)
+                kept, drift = self._keep_all(motions.arrays, motions.params)
+                return _arrays_by_name(kept), None if drift is None else np.asarray(drift), {}
             except NOT_TRACEABLE as why:
                 self.slow["keep"] = _first_line(why)
-        drift_of = jax.vmap(lambda arrays, params: self._drift(self._trajectory(arrays[0], params)), (0, self._axes[2]))
-        drift = jax.jit(drift_of)(motions.arrays, motions.params)
+            except jax.errors.JaxRuntimeError:  # of a callback, for some of them
+                pass
+        drift = self._drift_all(motions.arrays, motions.params)
         kept, complaints = self._keep_one_by_one(motions)
-        return kept, None if drift is None else np.asarray(drift), complaints
+        if drift is not None:
+            drift = np.asarray(drift).copy()
+            drift[list(complaints)] = np.nan
+        return kept, drift, complaints
 
     # ---- compiled for all members ----
 
@@ -140,51 +146,16 @@ class Batches:
 
         return start
 
-    def _keep_compiled(self, motions: "_BatchMotions") -> _Kept:
-        """The kept values of all members at once; blank, with a complaint, where `keep` raises while it runs."""
-        everyone = np.arange(len(motions.run.result._value))
-
-        def why_raised(members: np.ndarray) -> str | None:
-            try:
-                self._keep_members(motions, np.resize(members, len(everyone)))  # of one shape, which is compiled
-            except jax.errors.JaxRuntimeError as error:  # of a callback; its line stands in all that XLA says about it
-                lines = [line.strip() for line in str(error).split("\n")]
-                said = next((line for line in reversed(lines) if _RAISED.match(line)), lines[0])
-                return f"keep raised {said[:200]}"
-
-        try:
-            return *self._keep_members(motions, None), {}
-        except jax.errors.JaxRuntimeError:
-            complaints = find_failing(everyone, why_raised, _MOST_RAISE)
-            well = np.setdiff1d(everyone, list(complaints))
-            if not complaints or not well.size:  # too little memory; or it always raises
-                raise
-        bad = np.isin(everyone, list(complaints))
-        kept, drift = self._keep_members(motions, np.where(bad, well[0], everyone))
-        kept = {name: x.copy() for name, x in kept.items()}
-        for name, x in kept.items():
-            x[bad] = Quantity(name, x.shape[1:], x.dtype).filling
-        return kept, None if drift is None else np.where(bad, np.nan, drift), complaints
-
-    def _keep_members(self, motions: "_BatchMotions", which: np.ndarray | None) -> tuple[dict[str, np.ndarray], Any]:
-        """The kept values of these members (B,), by default of all in their order, and the change of their energy."""
-        arrays = motions.arrays, motions.params
-        if which is not None:
-            arrays = jax.tree.map(lambda x: np.asarray(x)[which], arrays)
-        kept, drift = self._keep_all(*arrays)
-        return _arrays_by_name(kept), None if drift is None else np.asarray(drift)
-
     def _keep_vectorized(self, arrays: tuple, params: PyTree) -> tuple:
         def keep_member(arrays, params):
-            run, crossings = arrays
-            trajectory = self._trajectory(run, params)
-            return self._keep_member(trajectory, crossings), self._drift(trajectory)
+            return self._keep_member(arrays, params), self._drift(self._trajectory(arrays[0], params))
 
         return jax.vmap(keep_member, in_axes=(0, self._axes[2]))(arrays, params)
 
-    def _keep_member(self, trajectory: Trajectory, crossings: Any) -> dict:
-        keep, extras = self.description.keep, {} if self.description.sections is None else {"crossings": crossings}
-        kept = keep(trajectory, **extras)
+    def _keep_member(self, arrays: tuple, params: PyTree) -> dict:
+        run, crossings = arrays
+        extras = {} if self.description.sections is None else {"crossings": crossings}
+        kept = self.description.keep(self._trajectory(run, params), **extras)
         _require_dict(kept)
         return kept
 
@@ -209,11 +180,11 @@ class Batches:
     # ---- member by member ----
 
     def _keep_one_by_one(self, motions: "_BatchMotions") -> tuple[dict[str, np.ndarray], dict[int, str]]:
-        """The result of `keep` for each member, called with numbers; and the complaints about these results."""
+        """The result of `keep` for each member, one after the other; and the complaints about these results."""
         rows, errors = self._rows(motions)
         if not self.quantities and not any(rows):
             raise errors[0]  # at the first look, of all members
-        complaints = {k: f"keep raised {type(error).__name__}: {_first_line(error)}" for k, error in errors.items()}
+        complaints = {k: f"keep raised {_describe_error(error)}" for k, error in errors.items()}
         expected = self.quantities or _common_quantities([row for row in rows if row])
         for k, row in enumerate(rows):
             if row is not None and (wrong := _misfit(expected, row)):
@@ -228,9 +199,11 @@ class Batches:
         """The result of `keep` for each member by name, None where it raised; and the exceptions."""
         of_all = jax.tree.map(np.asarray, (*motions.arrays, motions.params))
 
+        keep_member = self._keep_member if "keep" in self.slow else self._keep_one
+
         def keep(k: int) -> dict[str, np.ndarray]:
-            run, crossings, params = jax.tree.map(lambda x: x[k], of_all)
-            return _arrays_by_name(self._keep_member(self._trajectory(run, params), crossings))
+            *arrays, params = jax.tree.map(lambda x: x[k], of_all)
+            return _arrays_by_name(keep_member(tuple(arrays), params))
 
         return _call_each(keep, len(motions.run.result._value))
 
@@ -252,7 +225,7 @@ def _start_one_by_one(role: str, function: Callable, points: dict[str, np.ndarra
     rows, errors = _call_each(start, len(next(iter(points.values()))))
     if len(errors) == len(rows):
         raise errors[0]
-    complaints |= {k: f"{role} raised {type(error).__name__}: {_first_line(error)}" for k, error in errors.items()}
+    complaints |= {k: f"{role} raised {_describe_error(error)}" for k, error in errors.items()}
     well = next(row for k, row in enumerate(rows) if k not in errors)
     rows = [jax.tree.map(lambda x: np.full_like(x, np.nan), well) if k in errors else row for k, row in enumerate(rows)]
     return jax.tree.map(lambda *leaves: np.stack(leaves), *rows)
@@ -352,6 +325,13 @@ def names_of(kept: dict) -> dict:
 
 def _first_line(error: BaseException) -> str:
     return str(error).strip().split("\n")[0][:200]
+
+
+def _describe_error(error: Exception) -> str:
+    """The type and the first line of an error; of one that a callback raised, its line in all that XLA says."""
+    lines = (line.strip() for line in reversed(str(error).split("\n")))
+    said = next((line for line in lines if _RAISED.match(line)), None)
+    return f"{type(error).__name__}: {_first_line(error)}" if said is None else said[:200]
 
 
 # ---- motions of all members, with their crossings of sections on the way ---------------------------------------------
