@@ -33,6 +33,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from scipy.optimize import minimize_scalar
 from scipy.special import gammaln, log_ndtr
 
 from lagjax._fit.model._records import Record, real_numbers, spread_over_signals
@@ -199,22 +200,11 @@ class StudentT(AbstractNoise):
     def _fit_signal(self, scaled: np.ndarray, least: float) -> tuple[float, float]:
         if self.dof is not None:
             return _sigma(scaled, self.dof, least), float(self.dof)
-        # Golden section over log ν: the profile likelihood has one maximum there, or its end.
-        low, high = np.log(_NARROWEST), np.log(_WIDEST)
-        ratio = (np.sqrt(5.0) - 1) / 2
+        # The profile likelihood of log ν has one maximum, or its end.
         cost = lambda x: _cost(scaled, _sigma(scaled, np.exp(x), least), np.exp(x))  # noqa: E731
-        a, b = high - ratio * (high - low), low + ratio * (high - low)
-        at_a, at_b = cost(a), cost(b)
-        for _ in range(16):  # log ν to 0.003
-            if at_a < at_b:
-                high, b, at_b = b, a, at_a
-                a = high - ratio * (high - low)
-                at_a = cost(a)
-            else:
-                low, a, at_a = a, b, at_b
-                b = low + ratio * (high - low)
-                at_b = cost(b)
-        dof = float(np.exp((low + high) / 2))
+        ends = np.log(_NARROWEST), np.log(_WIDEST)
+        best: Any = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": 3e-3})
+        dof = float(np.exp(best.x))
         return _sigma(scaled, dof, least), dof
 
 

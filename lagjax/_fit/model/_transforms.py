@@ -14,10 +14,14 @@ together, and there may be fewer u than x. Intervals end inside the set, or at i
 """
 
 import abc
+import functools
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from scipy.linalg import helmert
 
 PyTree = Any
 
@@ -43,17 +47,17 @@ class AbstractTransform(abc.ABC):
         """m, how many u move a leaf of n = `count` numbers."""
         return count
 
-    @abc.abstractmethod
     def refuses(self, x: np.ndarray) -> str | None:
         """The condition on the values, as the end of a sentence, where `x` is outside the set; None where it is not."""
+        return None
 
     @abc.abstractmethod
     def value(self, u, xp: Any = np) -> Any:
         """x(u), (m,) → (n,)."""
 
-    @abc.abstractmethod
     def jacobian(self, u: np.ndarray) -> np.ndarray:
         """∂x/∂u, (n, m)."""
+        return np.asarray(_compile_jacobian(self)(u))
 
     @abc.abstractmethod
     def inverse(self, x: np.ndarray) -> np.ndarray:
@@ -133,9 +137,6 @@ class Unbounded(AbstractSeparable):
     def draw(self, u, rng):
         """Normal about u, as wide as it is large; as wide as one about zero."""
         return u + np.where(u != 0, np.abs(u), 1.0) * rng.normal(size=len(u))
-
-    def refuses(self, x):
-        return None
 
 
 @dataclass(frozen=True)
@@ -231,7 +232,7 @@ class Between(AbstractSeparable):
 
 
 @dataclass(frozen=True)
-class Angle(AbstractSeparable):
+class Angle(Unbounded):
     """x = u less whole turns, in (−π, π]: an angle. `lagjax.angle` is its instance.
 
     The search may go round; the scene must have the period 2π in x. An interval may end beyond ±π; one that is wider
@@ -250,12 +251,6 @@ class Angle(AbstractSeparable):
     def value(self, u, xp: Any = np):
         return u - 2 * np.pi * xp.ceil((u - np.pi) / (2 * np.pi))
 
-    def slope(self, u, xp: Any = np):
-        return xp.ones_like(u)
-
-    def inverse(self, x):
-        return x
-
     def draw(self, u, rng):
         return rng.uniform(-np.pi, np.pi, len(u))
 
@@ -263,9 +258,6 @@ class Angle(AbstractSeparable):
         """x ± spread, at most a turn in all."""
         half = np.minimum(spread, np.pi)
         return x - half, x + half
-
-    def refuses(self, x):
-        return None
 
     def __repr__(self) -> str:
         return "lagjax.angle"
@@ -301,17 +293,12 @@ class Simplex(AbstractTransform):
         return None
 
     def value(self, u, xp: Any = np):
-        logs = _helmert(u.shape[0] + 1) @ u
+        logs = helmert(u.shape[0] + 1).T @ u
         shares = xp.exp(logs - xp.max(logs))
         return self.total * shares / xp.sum(shares)
 
-    def jacobian(self, u):
-        """c (diag p − p pᵀ) H with the shares p."""
-        shares = self.value(u) / self.total
-        return self.total * (np.diag(shares) - np.outer(shares, shares)) @ _helmert(len(u) + 1)
-
     def inverse(self, x):
-        return _helmert(len(x)).T @ np.log(x)
+        return helmert(len(x)) @ np.log(x)
 
     def draw(self, u, rng):
         return self.inverse(rng.dirichlet(np.ones(len(u) + 1)))
@@ -374,41 +361,18 @@ class Inertia(AbstractTransform):
         moments = 0.5 * np.trace(inertia) * np.eye(3) - inertia
         return np.block([[moments, np.array([[hx], [hy], [hz]])], [np.array([[hx, hy, hz, m]])]])
 
-    def _numbers(self, pseudo, xp):
-        """The leaf of pseudo-inertias (..., 4, 4), (..., n)."""
-        if not self.vector:
-            return pseudo.reshape(*pseudo.shape[:-2], 16)
-        at = lambda i, j: pseudo[..., i, j]  # noqa: E731
-        return xp.stack(
-            [
-                at(3, 3), at(0, 3), at(1, 3), at(2, 3),
-                at(1, 1) + at(2, 2), at(0, 0) + at(2, 2), at(0, 0) + at(1, 1), -at(0, 1), -at(0, 2), -at(1, 2),
-            ],
-            axis=-1,
-        )  # fmt: skip
-
-    def _factor(self, u, xp):
-        """U, (4, 4)."""
+    def value(self, u, xp: Any = np):
         alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3 = u
         zero, one = xp.zeros_like(alpha), xp.ones_like(alpha)
         rows = [[xp.exp(d1), s12, s13, t1], [zero, xp.exp(d2), s23, t2], [zero, zero, xp.exp(d3), t3],
                 [zero, zero, zero, one]]  # fmt: skip
-        return xp.exp(alpha) * xp.stack([xp.stack(row) for row in rows])
-
-    def value(self, u, xp: Any = np):
-        factor = self._factor(u, xp)
-        return self._numbers(factor @ factor.T, xp)
-
-    def jacobian(self, u):
-        factor, size = self._factor(u, np), np.exp(u[0])
-        moves = np.zeros((10, 4, 4))
-        moves[0] = factor
-        for k in range(3):
-            moves[1 + k, k, k] = factor[k, k]
-        for k, place in enumerate(((0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3))):
-            moves[(4 + k, *place)] = size
-        products = moves @ factor.T
-        return self._numbers(products + products.swapaxes(1, 2), np).T
+        factor = xp.exp(alpha) * xp.stack([xp.stack(row) for row in rows])
+        pseudo = factor @ factor.T
+        if not self.vector:
+            return pseudo.ravel()
+        a, b, c = pseudo[0, 0], pseudo[1, 1], pseudo[2, 2]
+        products = -pseudo[0, 1], -pseudo[0, 2], -pseudo[1, 2]
+        return xp.stack([pseudo[3, 3], *pseudo[:3, 3], b + c, a + c, a + b, *products])
 
     def inverse(self, x):
         pseudo = self._pseudo(x) if self.vector else x.reshape(4, 4)
@@ -441,13 +405,9 @@ def _logistic(u, xp: Any = np):
     return xp.exp(-xp.logaddexp(0.0, -u))
 
 
-def _helmert(n: int) -> np.ndarray:
-    """Orthonormal columns (n, n − 1) of sum zero."""
-    matrix = np.zeros((n, n - 1))
-    for k in range(1, n):
-        matrix[:k, k - 1], matrix[k, k - 1] = 1.0 / k, -1.0
-        matrix[:, k - 1] *= np.sqrt(k / (k + 1))
-    return matrix
+@functools.lru_cache
+def _compile_jacobian(transform: AbstractTransform) -> Any:
+    return jax.jit(jax.jacfwd(lambda u: transform.value(u, jnp)))
 
 
 positive = Positive()
