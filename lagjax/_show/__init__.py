@@ -10,5 +10,5 @@ _export      a trajectory as an xarray.Dataset or a pandas.DataFrame, intervals 
 from lagjax._show._animation import Animation, make_animation, require_points
 from lagjax._show._course import course_of, courses_of, join_curve
 from lagjax._show._export import dataset, frame, intervals
-from lagjax._show._notebook import COLORS, cell, even_places, simplify_axes, trajectory_html
+from lagjax._show._notebook import COLORS, cell, even_places, render_picture, simplify_axes, trajectory_html
 from lagjax._show._summary import import_package, require_numbers, summary, times_of_members

@@ -25,18 +25,23 @@ _SIZE, _DPI = (5.2, 1.9), 144  # inches, and the dots of a fine screen
 def cell(text: str, draw: Callable[[Any], None], size: tuple[float, float] = _SIZE) -> str | None:
     """HTML of a text with the picture that `draw(figure)` makes beneath it; None where there is no picture."""
     try:
-        from matplotlib.figure import Figure
-
-        figure, file = Figure(figsize=size, dpi=_DPI, layout="constrained"), io.BytesIO()
-        draw(figure)
-        figure.savefig(file, format="png")
+        image = render_picture(size, draw)
     except Exception:  # no matplotlib, values that are no numbers, a font that is missing: the text says it all
         return None
-    image = base64.b64encode(file.getvalue()).decode()
     return (
         f'<div><pre style="margin:0;white-space:pre-wrap">{html.escape(text)}</pre><img alt="a small figure" '
         f'style="width:{96 * size[0]:.0f}px;max-width:100%" src="data:image/png;base64,{image}"></div>'
     )
+
+
+def render_picture(size: tuple[float, float], draw: Callable[[Any], None], dpi: int = _DPI) -> str:
+    """The picture that `draw(figure)` makes, a PNG in base 64."""
+    from matplotlib.figure import Figure
+
+    figure, file = Figure(figsize=size, dpi=dpi, layout="constrained"), io.BytesIO()
+    draw(figure)
+    figure.savefig(file, format="png", metadata={"Software": None})
+    return base64.b64encode(file.getvalue()).decode()
 
 
 def trajectory_html(trajectory) -> str | None:

@@ -27,6 +27,7 @@ import numpy as np
 
 from lagjax._interface import output_times, require_flag
 from lagjax._run.hybrid import Hybrid, Scene, require_scene
+from lagjax._show import import_package
 from lagjax._sweep._begin import begin, first_look, resume
 from lagjax._sweep._description import Description, Sections, uses_doubles
 from lagjax._sweep._files import NOT_DONE, RESULT, Files
@@ -136,10 +137,7 @@ class Sweep:
 
         Raises `ImportError` when xarray is not installed.
         """
-        try:
-            import xarray
-        except ImportError:
-            raise ImportError("Sweep.open() needs the package xarray: pip install xarray.") from None
+        xarray = import_package("Sweep.open()", "xarray", "xarray")
         store = Files(self.store)
         spec = store.spec()
         store.require_arrays(spec)

@@ -25,6 +25,7 @@ from lagjax._interface import accept, require_budget
 from lagjax._interface.reads import array_text, hash_of, identity, source, strip_addresses
 from lagjax._run import directions_of, sections_of
 from lagjax._run.hybrid import Hybrid, Scene
+from lagjax._show import import_package
 from lagjax._sweep._members import Axis, describe_axes
 from lagjax._sweep._statistics import Statistics
 
@@ -258,10 +259,7 @@ def differences(spec: dict, here: dict, entries: Iterable[str], roles: Iterable[
 
 def pack_description(description: Description) -> bytes:
     """The motions as bytes. Raises `ImportError` without cloudpickle, `TypeError` where a function cannot be packed."""
-    try:
-        import cloudpickle
-    except ImportError:
-        raise ImportError("sweep() needs the package cloudpickle: pip install cloudpickle.") from None
+    cloudpickle = import_package("sweep()", "cloudpickle", "cloudpickle")
     try:
         return cloudpickle.dumps(description)
     except Exception as why:

@@ -32,6 +32,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax import designs
+from lagjax._show import import_package
 from lagjax._sweep._members import Axis, Grid, hash_columns
 
 FORMAT = 5
@@ -416,9 +417,4 @@ def write_through(file: Path, data) -> None:
 
 def require_zarr():
     """The package zarr. Raises `ImportError`, with a sentence, where it is not installed."""
-    try:
-        import zarr
-        import zarr.codecs
-    except ImportError:
-        raise ImportError('sweep() needs the package zarr, version 3: pip install "zarr>=3".') from None
-    return zarr
+    return import_package("sweep()", "zarr", '"zarr>=3"', "codecs")

@@ -340,7 +340,7 @@ def test_a_report_is_one_file_with_everything(tmp_path):
     for part in (
         "params[&#x27;k&#x27;]",
         "converged",
-        "Noise",
+        "noise σ",
         "Data over fit",
         "Waterfall",
         "Correlations",

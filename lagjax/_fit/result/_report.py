@@ -5,11 +5,8 @@ It holds `lab_book` (what `print(fit)` shows), the functions that draw, and `ren
 The figures do without the state machine of matplotlib, and `lagjax.plot` draws them too.
 """
 
-import base64
 import html
-import io
 from collections import Counter
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -18,6 +15,7 @@ import numpy as np
 from lagjax._fit.model._records import Record
 from lagjax._fit.model._residuals import SystemResiduals
 from lagjax._fit.result._information import LEVEL
+from lagjax._show import even_places, import_package, render_picture, simplify_axes
 
 BLUE, RED, GREY = "#0072B2", "#D55E00", "0.55"
 _MOST = 4000  # samples in one curve: more do not show
@@ -25,7 +23,7 @@ _MOST = 4000  # samples in one curve: more do not show
 
 def draw_record(axes, record: Record, residuals: np.ndarray, names: tuple[str, ...], sigma: np.ndarray) -> None:
     """Data over fit in the first row of `axes` (2, S), residuals (T, S) with ±2σ below, a column for each signal."""
-    some = np.unique(np.linspace(0, len(record) - 1, _MOST).astype(int))
+    some = even_places(len(record), _MOST)
     ts, measured, left = record.ts[some], record.matrix[some], residuals[some]
     for s, name in enumerate(names):
         above, below = axes[0][s], axes[1][s]
@@ -36,7 +34,7 @@ def draw_record(axes, record: Record, residuals: np.ndarray, names: tuple[str, .
         above.set_title(name, fontsize="medium")
         below.set_xlabel("t")
         for ax in (above, below):
-            style_axes(ax)
+            simplify_axes(ax)
             ax.set_xlim(record.ts[0], record.ts[-1])
         above.tick_params(labelbottom=False)
     axes[0][0].set_ylabel("signal")
@@ -48,7 +46,7 @@ def draw_waterfall(ax, misfits: np.ndarray) -> None:
     known = np.isfinite(misfits)
     ax.plot(np.arange(1, len(misfits) + 1)[known], misfits[known], "o-", color=BLUE, markersize=3, linewidth=1)
     ax.set(yscale="log", xlabel="start, in order", ylabel="misfit / signals")
-    style_axes(ax)
+    simplify_axes(ax)
 
 
 def draw_correlations(ax, matrix: np.ndarray, names: tuple[str, ...]) -> None:
@@ -75,55 +73,29 @@ def draw_residuals(ax, residuals: np.ndarray, sigma: np.ndarray, names: tuple[st
     ax.plot(x, np.exp(-0.5 * x**2) / np.sqrt(2 * np.pi), color=GREY, linewidth=1, label="normal")
     ax.set(yscale="log", ylim=(1e-4, 2), xlabel="residual / σ", ylabel="density")
     ax.legend(frameon=False, fontsize="small")
-    style_axes(ax)
+    simplify_axes(ax)
 
 
-def style_axes(ax) -> None:
-    ax.grid(color="0.9", linewidth=0.8)
-    ax.set_axisbelow(True)
-    ax.spines[["top", "right"]].set_visible(False)
-    ax.spines[["left", "bottom"]].set_color(GREY)
-    ax.tick_params(color=GREY)
-
-
-_RECORDS, _SIGNALS = 6, 6  # that are drawn
+_RECORDS, _SIGNALS, _DPI = 6, 6, 110  # that are drawn; dots of an inch
 _STYLE = """
 body { font: 15px/1.5 system-ui, sans-serif; max-width: 62rem; margin: 2rem auto; padding: 0 1rem; color: #222 }
 h1 { font-size: 1.5rem } h2 { font-size: 1.15rem; margin-top: 2.2rem }
-table { border-collapse: collapse } td, th { padding: .2rem .9rem .2rem 0; text-align: right; font-weight: normal }
-th { border-bottom: 1px solid #999; color: #555 } td:first-child, th:first-child { text-align: left }
 img { max-width: 100% } pre { background: #f4f4f4; padding: .7rem; overflow-x: auto } .no { color: #a33 }
 """
 
 
 def render_page(fit, texts: dict[str, str]) -> str:
-    """The file of a fit: its verdict, what is not seen, tables, pictures, and texts by their headings."""
+    """The file of a fit: its verdict, lab book, pictures, and texts by their headings. Raises without matplotlib."""
+    import_package("Fit.report", "matplotlib", "lagjax[examples]")
     escaped, title = html.escape, build_title(fit)
     parts = [f"<h1>{escaped(title)}</h1>", f"<p{'' if fit.ok else ' class=no'}>{escaped(fit.message)}</p>"]
-    parts += [f'<p class="no">Not seen: {escaped(sentence)}</p>' for sentence in fit.unseen]
-    for heading, (head, *rows) in {"Parameters": _parameter_cells(fit), "Noise": _noise_cells(fit)}.items():
-        cells = "".join(f"<th>{escaped(cell)}</th>" for cell in head)
-        body = "".join("<tr>" + "".join(f"<td>{escaped(cell)}</td>" for cell in row) + "</tr>" for row in rows)
-        parts.append(f"<h2>{escaped(heading)}</h2><table><tr>{cells}</tr>{body}</table>")
-    for heading, text in texts.items():
+    for heading, text in {"Parameters and noise": lab_book(fit), **texts}.items():
         parts.append(f"<h2>{escaped(heading)}</h2><pre>{escaped(text)}</pre>")
     for heading, pictures in _build_pictures(fit).items():
         images = "".join(f'<p><img alt="{escaped(heading)}" src="data:image/png;base64,{one}"></p>' for one in pictures)
         parts.append(f"<h2>{escaped(heading)}</h2>{images}")
     head = f'<meta charset="utf-8"><title>{escaped(title)}</title><style>{_STYLE}</style>'
     return f"<!doctype html><html lang=en><head>{head}</head><body>{''.join(parts)}</body></html>\n"
-
-
-def _render_picture(size: tuple[float, float], draw: Callable[[Any], None]) -> str:
-    try:
-        import matplotlib.figure
-    except ImportError:
-        raise ImportError("Fit.report needs the package matplotlib: pip install lagjax[examples].") from None
-    figure = matplotlib.figure.Figure(figsize=size, layout="constrained", dpi=110)
-    draw(figure)
-    file = io.BytesIO()
-    figure.savefig(file, format="png", metadata={"Software": None})
-    return base64.b64encode(file.getvalue()).decode()
 
 
 def _build_pictures(fit) -> dict[str, list[str]]:
@@ -134,10 +106,10 @@ def _build_pictures(fit) -> dict[str, list[str]]:
     names, matrix = fit.covariance
     if names:
         side = min(3.2 + 0.45 * len(names), 12.0)
-        picture = _render_picture((side + 1.0, side), lambda f: draw_correlations(f.subplots(), matrix, names))
+        picture = render_picture((side + 1.0, side), lambda f: draw_correlations(f.subplots(), matrix, names), _DPI)
         figures["Correlations of the parameters"] = [picture]
     if fit.waterfall is not None:
-        picture = _render_picture((6.4, 3.2), lambda f: draw_waterfall(f.subplots(), fit.waterfall.misfits))
+        picture = render_picture((6.4, 3.2), lambda f: draw_waterfall(f.subplots(), fit.waterfall.misfits), _DPI)
         figures["Waterfall of the starts"] = [picture]
     return figures
 
@@ -162,14 +134,14 @@ def _draw_records(fit, part: SystemResiduals) -> dict[str, list[str]]:
             draw_record(axes, *pairs[k], names[:count], sigma)
             figure.suptitle(f"records[{k}]", fontsize="medium")
 
-        return _render_picture((max(6.4, 3.6 * count), 4.2), draw)
+        return render_picture((max(6.4, 3.6 * count), 4.2), draw, _DPI)
 
-    shown = np.unique(np.linspace(0, len(pairs) - 1, min(len(pairs), _RECORDS)).astype(int))
+    shown = even_places(len(pairs), _RECORDS)
     heading = "Data over fit, and residuals"
     if len(shown) < len(pairs) or count < len(names):
         heading += f" (records {', '.join(map(str, shown))} of {len(pairs)}; {count} of {len(names)} signals)"
     every = np.concatenate([r for _, r in pairs])
-    against = _render_picture((6.4, 3.6), lambda figure: draw_residuals(figure.subplots(), every, sigma, names))
+    against = render_picture((6.4, 3.6), lambda f: draw_residuals(f.subplots(), every, sigma, names), _DPI)
     return {heading: [draw_one(k) for k in shown], "Residuals against the normal distribution": [against]}
 
 

@@ -44,6 +44,7 @@ import numpy as np
 
 from lagjax._fit.model._density import Density
 from lagjax._fit.result._expansion import Chart, Surrogate, Unexpanded, expand_residuals
+from lagjax._show import import_package
 
 _ACCEPTED = 0.85  # the mean acceptance that steps are tuned for
 _ROUNDS = (400, 800, 3200)  # draws of all chains from π*: each round has the metric of the one before
@@ -357,19 +358,10 @@ def inference_data(density: Density, drawn: Draws) -> Any:
 
 
 def _blackjax() -> Any:
-    try:
-        import blackjax
-        import blackjax.adaptation.step_size
-    except ImportError:
-        raise ImportError("Fit.sample needs the packages blackjax and arviz: pip install lagjax[sample].") from None
-    return blackjax
+    return import_package("Fit.sample", "blackjax", "lagjax[sample]", "adaptation.step_size")
 
 
 def _arviz() -> Any:
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore", FutureWarning)  # arviz tells of its own next version
-            import arviz
-    except ImportError:
-        raise ImportError("Fit.sample needs the packages blackjax and arviz: pip install lagjax[sample].") from None
-    return arviz
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", FutureWarning)  # arviz tells of its own next version
+        return import_package("Fit.sample", "arviz", "lagjax[sample]")

@@ -17,6 +17,7 @@ import numpy as np
 from lagjax._fit.model._density import Density
 from lagjax._fit.model._noise import AbstractNoise, NoiseScale
 from lagjax._fit.model._residuals import Point, Residuals, Trial
+from lagjax._show import import_package
 
 _RATE, _WARM = 1e-2, 0.05  # the largest step, in units of each number; the share of steps over which it rises
 _PORTION = 100  # steps in one call: of them the best is kept
@@ -30,10 +31,7 @@ def descend_gradient(
 
     Raises `LostMotion` where the motion from the first trial cannot be followed; later ones are passed over.
     """
-    try:
-        import optax
-    except ImportError:
-        raise ImportError('method="gradient" needs the package optax: pip install lagjax[neural].') from None
+    optax = import_package('method="gradient"', "optax", "lagjax[neural]")
     whole = NoiseScale(residuals.size, np.full(len(residuals.size), np.inf))
     density = Density(residuals, law, Trial(*point, [], []), whole, np.ones(len(residuals.size)))
     first = density.first.copy()

@@ -19,6 +19,7 @@ from lagjax._fit.model._noise import Gaussian, NoiseScale
 from lagjax._fit.model._pieces import Piece
 from lagjax._fit.model._residuals import LostMotion, Point, Residuals
 from lagjax._fit.search._descent import Descent, minimise
+from lagjax._show import even_places
 
 _SHORT_TRIALS, _ENOUGH = 9, 1e-2  # of the short search; the fall of half the sum of squares, per sample, that ends it
 _SHORT_SAMPLES = 200  # of each record, in it
@@ -72,8 +73,7 @@ def run_multistart(
         return search(point), None
     rng = np.random.default_rng(seed)
     u = np.stack([point.u, *(residuals.parameters.draw(point.u, rng) for _ in range(starts - 1))])
-    sample = lambda count: np.unique(np.linspace(0, count - 1, _SHORT_SAMPLES).astype(int))  # noqa: E731
-    pieces = [Piece(piece.record, piece.places[sample(len(piece.places))]) for piece in residuals.pieces]
+    pieces = [Piece(k, places[even_places(len(places), _SHORT_SAMPLES)]) for k, places in residuals.pieces]
     short = residuals.with_pieces(pieces, residuals.fitted)
     short.watch = None
     trials = sorted((_search_shortly(short, one, point.starts) for one in u), key=lambda trial: trial[0])

@@ -10,15 +10,14 @@ from lagjax._fit.model._motions import AbstractMotions
 from lagjax._fit.model._records import Record, inputs_between, known_start, restore_structure
 from lagjax._fit.model._residuals import Residuals, SystemResiduals
 from lagjax._fit.model._sensors import UNCLEAR, unwrap_record
+from lagjax._show import even_places
 
 _DEGREE = 3  # of local polynomials: velocities without the bias that curvature gives to lines
 _WINDOWS = (7, 13, 25, 49, 97, 193)  # samples in one of them
 _PROBES = 32  # places of a record where its time scale is looked at
 _WORSE_WINDOW = 1.3  # what a window may leave, in units of what the shortest leaves
 _WINDOWS_IN_ALL = 256  # places of all records where curvature is looked at
-_QUARTER = (
-    0.25  # of a period, by which the motion over a segment may be wrong: beyond a half residuals have false minima
-)
+_QUARTER = 0.25  # of a period: motion over a segment may be wrong by it; beyond a half residuals have false minima
 
 
 class Reader(NamedTuple):
@@ -39,7 +38,7 @@ class Reader(NamedTuple):
 
         Beyond these they no longer follow the motion. They are tried at `probes` places.
         """
-        places = choose_places(record, probes)
+        places = even_places(len(record), probes)
         windows, scatter = zip(*(_window(record.ts[places], *signal) for signal in _signals(record)), strict=True)
         each = np.full(len(windows), np.inf) if periods is None else periods
         return cls(record, windows, scatter, tuple(each.tolist()))
@@ -55,11 +54,6 @@ class Reader(NamedTuple):
             _read_states(ts, *signal, window)
             for signal, window in zip(_signals(self.record), self.windows, strict=True)
         ]
-
-
-def choose_places(record: Record, count: int) -> np.ndarray:
-    """Places of samples from the first to the last, evenly chosen, `count` of them at most."""
-    return np.unique(np.linspace(0, len(record) - 1, count).astype(int))
 
 
 def _signals(record: Record) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -116,7 +110,7 @@ def short_windows(readers: list[Reader], length: float) -> tuple[list[Record], n
     """
     found, states = [], []
     for reader in readers:
-        places = choose_places(reader.record, max(4, _WINDOWS_IN_ALL // len(readers)))
+        places = even_places(len(reader.record), max(4, _WINDOWS_IN_ALL // len(readers)))
         offsets = np.linspace(0.0, length, 4)
         cubics = [
             _read_states(reader.record.ts[places], *s, w)[3]
@@ -146,7 +140,7 @@ def time_scales(readers: list[Reader], motions: AbstractMotions, numbers: np.nda
     the spread of the coordinates, in units of each, over the accelerations there. Where nothing moves, they are
     infinite.
     """
-    places = [choose_places(reader.record, _PROBES) for reader in readers]
+    places = [even_places(len(reader.record), _PROBES) for reader in readers]
     states = [reader.states(some) for reader, some in zip(readers, places, strict=True)]
     t = np.concatenate([reader.record.ts[some] for reader, some in zip(readers, places, strict=True)])
     y, n = np.concatenate(states), states[0].shape[1] // 2
