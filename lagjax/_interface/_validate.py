@@ -129,7 +129,6 @@ _FLOATS = (np.dtype("float64"), np.dtype("float32"))
 
 
 def all_finite(array) -> bool:
-    """True if no number of a concrete array is NaN or infinite."""
     return bool(np.isfinite(np.asarray(array)).all())
 
 

@@ -46,25 +46,19 @@ def raise_where_failed(tree, result, end, t_last, names: tuple[str, ...]):
     return jax.tree.map(checked, tree)
 
 
-def first_failed(result) -> tuple[int, ...] | None:
-    """The place of the first member that failed among results with any batch axes; None where all ended well."""
-    failed = np.argwhere(~np.isin(np.asarray(result), ENDED_WELL))
-    return tuple(failed[0].tolist()) if len(failed) else None
-
-
 def sentence(result, t_end, t_last, y_end, names: tuple[str, ...], why: str | None = None) -> str | None:
     """The first failure among members with any batch axes, its time and its state; None where all ended well.
 
     `why` stands for the advice on its result, where more is known.
     """
     result, t_end, t_last, y_end = map(np.asarray, (result, t_end, t_last, y_end))
-    member = first_failed(result)
-    if member is None:
+    failed = np.argwhere(~np.isin(result, ENDED_WELL)).tolist()
+    if not failed:
         return None
-    who = ""
+    who, member = "", tuple(failed[0])
     if member:
-        label, failed = member[0] if len(member) == 1 else member, int(np.sum(~np.isin(result, ENDED_WELL)))
-        others = f", the first of {failed} that failed" if failed > 1 else ""
+        label = member[0] if len(member) == 1 else member
+        others = f", the first of {len(failed)} that failed" if len(failed) > 1 else ""
         who = f" of member {label}{others} among {result.size},"
     if result[member] == code_of(RESULTS.derivatives_lost):
         return f"The motion{who} has no derivatives here. {advice(result_from(result[member]))}"

@@ -225,16 +225,10 @@ class Program:
 
     @property
     def size(self) -> int:
-        """The number of its inputs."""
-        return len(self._dtypes)
-
-    @property
-    def dtypes(self) -> tuple[np.dtype, ...]:
-        """The type of every scalar it takes."""
-        return self._dtypes
+        return len(self.dtypes)
 
     @functools.cached_property
-    def _dtypes(self) -> tuple[np.dtype, ...]:
+    def dtypes(self) -> tuple[np.dtype, ...]:
         return tuple(dtype for shape in self.shapes for dtype in [shape.dtype] * math.prod(shape.shape))
 
     def evaluate(self, *numbers) -> np.ndarray:
@@ -293,14 +287,12 @@ class Program:
         return self.line.constant(output)
 
     def find_inputs(self, outputs: Sequence[int]) -> frozenset[int]:
-        """The positions of the inputs that any of some outputs depends on."""
         nodes = self.line.nodes
         seen = [nodes[i] for i in find_ancestors(nodes, [self.line.outputs[k] for k in outputs])]
         tables = (table_of(attribute).positions for op, _, attribute in seen if op in LOOK_UPS)
         return frozenset({attribute for op, _, attribute in seen if op == "input"}.union(*tables))
 
     def depends(self, output: int) -> frozenset[int]:
-        """The positions of the inputs that an output depends on."""
         return self.find_inputs([output])
 
     # ---- derivatives: from the function, not from the emitted code ----

@@ -551,7 +551,6 @@ class _Rewriting:
         return moves[x]
 
     def _note_border(self, op: str, of: list[int]) -> None:
-        """A border without a series beyond it, as a feature."""
         if op in (*_COMPARISONS, "max", "min", "abs", "sign"):
             u = of[0] if op in ("abs", "sign") else self.graph.apply("sub", *of)
             self._note_feature(self._base_of(u), UP_TO, 1.0)

@@ -14,6 +14,7 @@ from the result to an operand and a tangent from an operand to the result.
 These are derivatives of the operations as they stand: `has_own_rules` in `_rules` finds functions with other ones.
 """
 
+import functools
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -136,7 +137,6 @@ class Derivatives:
         return [t.get(0, self._number(0.0)) for t in self.directional_derivatives(outputs, [direction])]
 
     def _tangents(self, i: int, tangents: dict[int, Tangents]) -> Tangents:
-        """The tangents of a node, from those of its operands."""
         (op, operands, attribute), result = self.node_to_differentiate(i), {}
         if op == "div" and all(x in tangents for x in operands):
             (u, v), found = operands, tangents
@@ -162,9 +162,6 @@ class Derivatives:
     def rules(self, w: int, op: str, operands: Sequence[int]) -> list[_Rule | None]:
         """The rules that take a cotangent, or a tangent, of each operand past w = op(operands); None: there is none."""
 
-        def bind_rule(rule):
-            return None if rule is None else lambda g: apply_rule(rule, g)
-
         def apply_rule(rule, g):
             result = rule(self._apply, self._number, g, w, *operands)
             grows = self.hides and self.graph.hides_growth and any(map(self.graph.grows, (w, *operands)))
@@ -177,7 +174,8 @@ class Derivatives:
                 result = self._zero_where(self.graph.vanishes(self.graph.apply("mul", slope, operands[0])), result)
             return self._mask_product(result, g, slope)
 
-        return [bind_rule(rule) for rule in OPERATIONS[op].transpose()] if operands else []
+        rules = OPERATIONS[op].transpose() if operands else ()
+        return [rule and functools.partial(apply_rule, rule) for rule in rules]
 
     def _mask_quotient(self, tangent: int, w: int, v: int) -> int:
         """A tangent, or a cotangent, of w = u/v: 0 where w is flat, as what has overflown gives no number."""
@@ -223,7 +221,6 @@ class Derivatives:
         return self.graph.nodes[i]
 
     def find_ancestors(self, outputs: Sequence[int]) -> list[int]:
-        """The nodes that some nodes are derived from, and these, in order."""
         return self.graph.find_ancestors(outputs, as_derived=True)
 
     def size(self, outputs: Sequence[int]) -> int:
@@ -489,6 +486,4 @@ def _tangents_of(table: Table, places: dict[int, int], beside: "TangentTable | N
         return None
     if table.first not in places:
         return None if beside is None else beside(table)
-    first = places[table.first]
-    stride = places[table.first + table.stride] - first if table.count > 1 else 1
-    return table._replace(first=first, stride=stride)
+    return table.moved(places)

@@ -94,7 +94,6 @@ def _reduce(x):
 
 
 def _sincos_kernel(x):
-    """(sin x, cos x) of any float64 x."""
     r, tail, quadrant = _reduce(x)
     z = r * r
     half = 0.5 * z
@@ -127,7 +126,3 @@ def sincos(x):
     weak = getattr(x, "weak_type", type(x) in (bool, int, float, complex))
     is_fast = not weak and jnp.result_type(x) == jnp.float64 and default_platform() == "cpu"
     return _sincos(jnp.asarray(x)) if is_fast else (jnp.sin(x), jnp.cos(x))
-
-
-# Keyed by the name of the JAX primitive each one stands in for.
-FAST = {"sin": lambda x: sincos(x)[0], "cos": lambda x: sincos(x)[1]}

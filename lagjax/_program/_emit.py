@@ -1,7 +1,6 @@
 """From a graph to JAX again: the operations of a program, one after the other, on scalars or on arrays of lanes."""
 
 import contextlib
-import functools
 import threading
 from collections.abc import Callable, Iterator, Sequence
 from typing import Any, NamedTuple
@@ -47,17 +46,13 @@ def emit(line: StraightLine, scalars: tuple) -> tuple:
 
 
 def _emit_outputs(line: StraightLine, scalars, shape: tuple[Any, ...], entries: Callable) -> tuple:
-    """The outputs, each broadcast to `shape`."""
     nodes, kinds = line.nodes, line.kinds
-    fast = frozenset() if getattr(_state, "plain", False) else _elementary.FAST.keys()
+    is_plain = getattr(_state, "plain", False)
     positions = [node[2] for node, kind in zip(nodes, kinds, strict=True) if node[0] == "input" and kind == "float"]
     precision = jnp.result_type(float, *(scalars[i] for i in positions))
     dtypes = [precision if kind == "float" else np.dtype(kind) for kind in kinds]
-    # The angles whose sine and cosine are both wanted.
-    sines, cosines = ({operands[0] for op, operands, _ in nodes if op == name} for name in ("sin", "cos"))
-    paired = sines & cosines if fast else frozenset()
     values: list = [None] * len(nodes)
-    pairs: dict[int, tuple] = {}
+    turns: dict[int, tuple] = {}  # sine and cosine of angles
 
     for i, (op, operands, attribute) in enumerate(nodes):
         if op == "constant":
@@ -68,13 +63,12 @@ def _emit_outputs(line: StraightLine, scalars, shape: tuple[Any, ...], entries: 
             values[i] = lax.convert_element_type(values[operands[0]], dtypes[i])
         elif op in LOOK_UPS:
             values[i] = emit_look_up(op, attribute, entries, precision, values[operands[0]])
-        elif op in ("sin", "cos") and operands[0] in paired:
-            if operands[0] not in pairs:
-                pairs[operands[0]] = _fast_function("sincos")(values[operands[0]])
-            values[i] = pairs[operands[0]][op == "cos"]
+        elif op in ("sin", "cos") and not is_plain:
+            if operands[0] not in turns:
+                turns[operands[0]] = _sincos(values[operands[0]])
+            values[i] = turns[operands[0]][op == "cos"]
         else:
-            xs = _align_shapes([values[operand] for operand in operands])
-            values[i] = _fast_function(op)(*xs) if op in fast else _apply(op, xs, attribute)
+            values[i] = _apply(op, _align_shapes([values[operand] for operand in operands]), attribute)
     return tuple(jnp.broadcast_to(jnp.asarray(values[i]), shape) for i in line.outputs)
 
 
@@ -141,44 +135,37 @@ def apply_in_jax(op: str, *xs, attribute=None) -> jax.Array:
     return _apply(op, _align_shapes([jnp.asarray(x, dtype) for x in xs]), attribute)
 
 
-@functools.cache
-def _fast_function(op: str) -> Callable:
-    """A fast elementary function, in the form that suits what it is given.
+# ---- sine and cosine -------------------------------------------------------------------------------------------------
+
+_compiled_sincos = jax.jit(_elementary.sincos)
+
+
+def _sincos(x) -> tuple:
+    """Sine and cosine, in the form that suits what they are of.
 
     For lanes: a body of its own. XLA's CPU backend fuses operations into one loop per output and repeats in each what
     they share, a polynomial of thirty operations many times over; a call it may not inline is evaluated once. For a
     single number such a call costs more than the C library's function, which stays in the loop.
     """
-    function = jax.jit(_elementary.sincos if op == "sincos" else _elementary.FAST[op])
+    if default_platform() != "cpu":
+        return _compiled_sincos(x)
+    return _sincos_of_lanes(x) if jnp.ndim(x) else _sincos_of_number(x)
 
-    def call_on_lanes(*xs):
-        with set_xla_metadata(inlineable="false"):
-            return function(*xs)
 
-    plain = (lambda x: (lax.sin(x), lax.cos(x))) if op == "sincos" else getattr(lax, op)
-    of_number = jax.custom_batching.custom_vmap(plain)
+def _sincos_of_lanes(x) -> tuple:
+    with set_xla_metadata(inlineable="false"):
+        return _compiled_sincos(x)
 
-    @of_number.def_vmap
-    def lanes_of(size, batched, *xs):
-        whole = [x if has else jnp.broadcast_to(x, (size, *jnp.shape(x))) for x, has in zip(xs, batched, strict=True)]
-        return call_on_lanes(*whole), (True, True) if op == "sincos" else True
 
-    # `custom_vmap` has no derivative of every order of its own.
-    single = jax.custom_jvp(of_number)
+_plain_sincos = jax.custom_batching.custom_vmap(lambda x: (lax.sin(x), lax.cos(x)))
+_plain_sincos.def_vmap(lambda size, batched, x: (_sincos_of_lanes(x), (True, True)))
+_sincos_of_number = jax.custom_jvp(_plain_sincos)  # as `custom_vmap` has no derivative of every order of its own
 
-    @single.defjvp
-    def slope(xs, moving):
-        if op == "sincos":
-            sine, cosine = single(*xs)
-            return (sine, cosine), (cosine * moving[0], -sine * moving[0])
-        return single(*xs), jax.jvp(plain, xs, moving)[1]
 
-    def call(*xs):
-        if default_platform() != "cpu":
-            return function(*xs)
-        return call_on_lanes(*xs) if any(jnp.ndim(x) for x in xs) else single(*xs)
-
-    return call
+@_sincos_of_number.defjvp
+def _derive_sincos(xs, moving):
+    sine, cosine = _sincos_of_number(*xs)
+    return (sine, cosine), (cosine * moving[0], -sine * moving[0])
 
 
 def _align_shapes(values: list) -> list:

@@ -130,7 +130,6 @@ class Graph:
         return self._bound(first, self.apply("select", huge, v, self.constant(0.0, "float")))
 
     def is_flat_quotient(self, w: int, v: int) -> int:
-        """True where w = u/v is zero to every digit, as v is huge."""
         return self.apply("and", self.is_huge(v), self.vanishes(w))
 
     def vanishes(self, x: int) -> int:

@@ -76,7 +76,6 @@ class Nesting(NamedTuple):
         return found
 
     def with_tangents(self, directions: int) -> "Nesting":
-        """The same with tangents of all of it along this many directions."""
         return self._replace(directions=(*self.directions, directions))
 
 
@@ -316,7 +315,6 @@ class _OverBorder:
         return [*place[self.n : 2 * self.n], *acceleration, one, *[none] * self.numbers]
 
     def _flow(self, place: list[Jet], pieces: Sequence[int], delay: Jet) -> list[Jet]:
-        """The state after the `delay`, on these pieces."""
         rates: list[list[Jet]] = []
         for weights in self.stages:
             here = place

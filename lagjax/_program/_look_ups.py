@@ -38,6 +38,12 @@ class Table(NamedTuple):
         numbers = np.frombuffer(self.numbers)
         return numbers[self.first : self.first + self.stride * (self.count - 1) + 1 : self.stride]
 
+    def moved(self, places: "Sequence[int] | dict[int, int]") -> "Table":
+        """The table of a program whose input `places[i]` is what input i was."""
+        first = places[self.first]
+        stride = places[self.first + self.stride] - first if self.count > 1 else 1
+        return self._replace(first=first, stride=stride)
+
     @property
     def positions(self) -> range:
         if self.numbers is not None or self.tangents:
@@ -74,9 +80,7 @@ def move_look_up(attribute: "Table | Located", places: Sequence[int]) -> "Table 
     table = table_of(attribute)
     if table.numbers is not None or table.first >= BESIDE:
         return attribute
-    first = places[table.first]
-    stride = places[table.first + table.stride] - first if table.count > 1 else 1
-    table = table._replace(first=first, stride=stride)
+    table = table.moved(places)
     return attribute._replace(table=table) if isinstance(attribute, Located) else table
 
 

@@ -4,7 +4,7 @@ import functools
 from collections import Counter
 from collections.abc import Callable, Sequence
 
-from lagjax._program._graph import LONGEST, MANY, Graph, Node, find_ancestors
+from lagjax._program._graph import LONGEST, Graph, Node, find_ancestors
 from lagjax._program._line import StraightLine
 
 
@@ -21,9 +21,9 @@ def factor(graph: Graph, outputs: list[int]) -> tuple[Graph, list[int]]:
         if graph.kinds[i] != "float":
             return None
         if op == "mul" and any([uses[x] == 1 and graph.nodes[x][0] == "mul" for x in operands]):
-            return _square_first(new, [moved(x, x) for x in _factors(graph, uses, i)])
+            return _square_first(new, [moved(x) for x in _factors(graph, uses, i)])
         if op in ("add", "sub") and (uses[operands[0]] == 1 or uses[operands[1]] == 1):
-            return _common_factor(new, op, *(moved(x, x) for x in operands))
+            return _common_factor(new, op, *(moved(x) for x in operands))
         return None
 
     return _rewritten(graph, outputs, uses, node_of, Graph.apply)
@@ -32,26 +32,21 @@ def factor(graph: Graph, outputs: list[int]) -> tuple[Graph, list[int]]:
 def _rewritten(graph, outputs, uses, node_of: Callable, make: Callable) -> tuple[Graph, list[int]]:
     """A graph with `node_of(new, i, moved)` in the place of every node i for which that is not None, and the outputs.
 
-    `moved(x, x)` says where a node before i is. The nodes that use others than before are made anew by `make`. A small
-    graph is made anew as a whole, so that everything in it is compared once more; to a large one nodes are added.
+    `moved(x)` says where a node before i is. The others are made anew by `make`, so that everything is compared once
+    more.
     """
-    many = len(uses) - uses.count(0) > MANY
-    new, places = graph if many else Graph(graph.budget), {}
+    new, places = Graph(graph.budget), {}
     new.budget += LONGEST * len(uses)  # what a pass writes anew and drops again is not what the budget is for
     for i in range(len(uses)):
         if not uses[i]:
             continue
         op, operands, attribute = graph.nodes[i]
         if op in ("input", "constant"):
-            if not many:
-                places[i] = getattr(new, op)(attribute, graph.kinds[i])
+            places[i] = getattr(new, op)(attribute, graph.kinds[i])
             continue
-        at = node_of(new, i, places.get)
-        if at is None and not (many and places.keys().isdisjoint(operands)):
-            at = make(new, op, *(places.get(x, x) for x in operands), attribute=attribute)
-        if at is not None:
-            places[i] = at
-    return new, [places.get(i, i) for i in outputs]
+        at = node_of(new, i, places.__getitem__)
+        places[i] = make(new, op, *[places[x] for x in operands], attribute=attribute) if at is None else at
+    return new, [places[i] for i in outputs]
 
 
 def _factors(graph, uses, i) -> list[int]:
@@ -100,7 +95,7 @@ def sink_negations(graph: Graph, outputs: list[int]) -> tuple[Graph, list[int]]:
 
     def node_of(new, i, moved):
         op, operands, _ = graph.nodes[i]
-        return _negative(new, moved(*operands * 2)) if op == "neg" and uses[operands[0]] == 1 else None
+        return _negative(new, moved(*operands)) if op == "neg" and uses[operands[0]] == 1 else None
 
     return _rewritten(graph, outputs, uses, node_of, Graph.node)
 

@@ -48,7 +48,6 @@ def find_powers(line: StraightLine, nodes: Iterable[int], guards: set[int], size
 
 
 def _is_product(line: StraightLine, i: int) -> bool:
-    """True if a node is a product, or a constant power, of others."""
     op, operands, _ = line.nodes[i]
     return op in _PRODUCTS or (op == "pow" and line.nodes[operands[1]][0] == "constant")
 

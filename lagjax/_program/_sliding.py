@@ -565,7 +565,6 @@ def _constants(graph: Graph, numbers: Sequence[int]) -> dict[int, float | None]:
 
 
 def dot(graph: Graph, xs: Sequence[int], ys: Sequence[int]) -> int:
-    """Σ xᵢ yᵢ."""
     total = zero = graph.constant(0.0, "float")
     for x, y in zip(xs, ys, strict=True):
         if zero not in (x, y):  # as nearly all are where many borders know nothing of each other

@@ -17,8 +17,6 @@ _SHARED = "shared"  # stands for the batch axis of what all members share
 
 
 class Members:
-    """The members of a trajectory of numbers along one axis."""
-
     def __init__(self, trajectory: Trajectory):
         self.batch = np.shape(trajectory.result._value)
         self.count, rank = math.prod(self.batch), len(self.batch)

@@ -202,8 +202,6 @@ def _run(problem: Problem, given: tuple) -> Solution:
 
 
 def _solve_in_doubles(solve: Callable, problem: Problem):
-    """The solution by `solve` in float64, in the precision of the problem."""
-
     def solve_numbers(ts, y0, params):
         return solve(dataclasses.replace(problem.double_precision, ts=ts, y0=y0, params=params))
 
@@ -287,7 +285,6 @@ def _require_increasing(program: Program, vector) -> None:
 
 
 def tolerances_of(problem: Problem) -> Tolerances:
-    """The numbers that say how exactly, and how long, a problem is integrated."""
     rtol, atol = MachineCode().rtol(problem), problem.tolerances[1]
     return Tolerances(
         float(rtol), 0.0 if atol is None else float(atol), problem.max_steps, allow_singles=problem.is_rounded

@@ -41,7 +41,6 @@ def call_host(host: Callable, shapes, *arrays) -> tuple:
 
 
 def begins_in_handler(flow: Flow, members: int) -> bool:
-    """True if a run of this many members begins in the handler."""
     notes = flow.guards is not None and flow.guards.notes
     return NO_HANDLER is None and not notes and flow.kernel.select_width(members).threads(members) == 1
 

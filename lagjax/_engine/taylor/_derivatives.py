@@ -43,7 +43,6 @@ class Motions(NamedTuple):
 
     @classmethod
     def from_solution(cls, ts, y0, params, solution: Solution) -> "Motions":
-        """The motions of a run and its solution."""
         return cls(ts, y0, params, solution.path, solution.result, solution.accepted, solution.ticket)
 
     def take(self, rows: np.ndarray) -> "Motions":

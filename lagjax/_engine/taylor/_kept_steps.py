@@ -33,7 +33,6 @@ class Steps(NamedTuple):
     complete: np.ndarray
 
     def record(self, members) -> StepRecord:
-        """The steps of some members, for a derivative."""
         return StepRecord(self.table, self.first[members], self.counts[members], self.order)
 
 

@@ -30,8 +30,6 @@ def lowered_motion(derivation: Derivation) -> Motion:
 
 
 def _quantity(name: str) -> Callable:
-    """The method that gives one of `Motion.quantities`."""
-
     def evaluate(self, q, qdot, t, params):
         return _evaluate(self.derivation, q, qdot, t, params, name)[0]
 
@@ -39,8 +37,6 @@ def _quantity(name: str) -> Callable:
 
 
 class _LoweredConstraints(Constraints):
-    """`Constraints` by programs."""
-
     derivation: Derivation = eqx.field(static=True, kw_only=True)
     residual, rates = map(_quantity, ("residual", "rates"))
 
@@ -53,8 +49,6 @@ class _LoweredConstraints(Constraints):
 
 
 class _LoweredMotion(Motion):
-    """`Motion` by programs."""
-
     derivation: Derivation = eqx.field(static=True, kw_only=True)
     momentum, mass_matrix, generalized_force = map(_quantity, ("momentum", "mass_matrix", "generalized_force"))
 
@@ -63,7 +57,6 @@ class _LoweredMotion(Motion):
         return tuple(_evaluate(self.derivation, q, qdot, t, params, "mass_matrix", "force"))
 
     def energy(self, q, qdot, t, params):
-        """h = p·q̇ − L."""
         momentum, value = _evaluate(self.derivation, q, qdot, t, params, "momentum", "lagrangian")
         return momentum @ qdot - value
 
@@ -78,7 +71,6 @@ class _LoweredMotion(Motion):
 
 
 def _evaluate(derivation: Derivation, q, qdot, t, params, *names: str) -> list[Array]:
-    """Some of `Motion.quantities`."""
     values = _outputs(derivation.program(*names), q, qdot, t, params)
     shapes = [derivation.shape(name) for name in names]
     parts = jnp.split(values, np.cumsum([derivation.count(name) for name in names])[:-1])

@@ -26,8 +26,6 @@ def rate(flow: Flow, t, y, params):
         chosen = params if flow.kernel.chosen is None else params[..., jnp.array(flow.kernel.chosen.positions, int)]
         rows = rows._replace(first=join_columns(rows.first, chosen))
         acceleration = _evaluate_pieces(borders, rows, _pieces(borders, rows, n))[0][:n]
-    elif program.looks_up:  # whose parameters may be too many to be taken apart
-        acceleration = program.compute_rows(rows.first, params)[:n]
     else:
         acceleration = jnp.moveaxis(outputs(program, n, rows.first, params), -1, 0)
     velocity = (y[..., n + i] for i in range(n))

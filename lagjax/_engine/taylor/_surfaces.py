@@ -163,7 +163,6 @@ def _borders_of(values: Program, n: int) -> StraightLine | None:
 
 
 def vector_of(numbers: PyTree) -> jax.Array:
-    """Every number of a pytree, (P,)."""
     leaves = [jnp.ravel(leaf) for leaf in jax.tree.leaves(numbers)]
     return jnp.concatenate(leaves) if leaves else jnp.zeros(0)
 

@@ -109,7 +109,6 @@ class _AxisExchange:
         return xp.where(self._is_third, with_third, xp.where(self._is_second, with_second, kept))
 
     def restore(self, vector: list) -> list:
-        """A vector with its components in their places."""
         x, y, z = vector
         return [self.pick(x, y, z), self.pick(y, x, y), self.pick(z, z, x)]
 

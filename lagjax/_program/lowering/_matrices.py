@@ -105,7 +105,6 @@ def row_weights(a):
 
 
 def _sum(rows):
-    """The sum of the rows of a matrix, or of a list."""
     rows = rows if isinstance(rows, list) else [rows[i] for i in range(rows.shape[0])]
     return functools.reduce(operator.add, rows)
 

@@ -96,7 +96,6 @@ class Expansion:
         return bool(array.size) and array.max() >= PAIRS
 
     def map(self, op: str, *arrays: np.ndarray, attribute=None) -> np.ndarray:
-        """`op` elementwise."""
         arrays = np.broadcast_arrays(*map(self.real, arrays))
         shape, size = arrays[0].shape, arrays[0].size
         self.work(size)
@@ -171,10 +170,6 @@ def inputs_of(graph: Graph, shapes) -> list[np.ndarray]:
     for shape in shapes:
         if (kind := kinds.get(shape.dtype)) is None:
             kind = kinds[shape.dtype] = kind_of(shape.dtype)
-        if many and kind == "float" and not shape.shape:
-            arguments.append(np.array(count + INPUTS))
-            count += 1
-            continue
         places = range(count, count + shape.size)
         if kind == "float" and (many or shape.size > LARGEST_UNFOLDED):
             arguments.append((np.array(places, dtype=np.int64) + INPUTS).reshape(shape.shape))
@@ -280,10 +275,8 @@ def _slice(params, x):
 
 
 def _broadcast_in_dim(params, x):
-    shape = [1] * len(params["shape"])
-    for axis, size in zip(params["broadcast_dimensions"], x.shape, strict=True):
-        shape[axis] = size
-    return np.broadcast_to(x.reshape(shape), params["shape"])
+    new = [axis for axis in range(len(params["shape"])) if axis not in params["broadcast_dimensions"]]
+    return np.broadcast_to(np.expand_dims(x, new), params["shape"])
 
 
 def _pad(params, x, value):
@@ -566,7 +559,6 @@ def _dynamic_slice(expansion, params, x, *starts):
 
 
 def _window(expansion, starts, shape, sizes) -> tuple[slice, ...]:
-    """The place of a window of these sizes, which fits into an array."""
     starts = expansion.require_numbers(starts, "the start of a slice")
     starts = np.clip(starts, 0, np.array(shape, np.int64) - np.array(sizes, np.int64)).tolist()
     return tuple(slice(start, start + size) for start, size in zip(starts, sizes, strict=True))

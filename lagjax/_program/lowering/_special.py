@@ -93,7 +93,6 @@ def polygamma(order: int, x: Scalars) -> Any:
 
 
 def _power(x: Any, n: int) -> Any:
-    """xⁿ, n ≥ 1."""
     return math.prod([x] * (n - 1), start=x)
 
 

@@ -206,19 +206,10 @@ def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, reco
         q_next=q_next, qdot_next=qdot_next,
     )  # fmt: skip
     return Trajectory(
-        ts=jnp.asarray(problem.ts),
-        q=q,
-        qdot=qdot,
-        result=result_from(ending.result),
-        end=State(ending.t, *end),
-        stats=step_counts(accepted, rejected),
-        system=dict(modes),
-        params=problem.params,
-        mode=ending.modes,
-        transitions=transitions,
-        mode_names=tuple(modes),
-        tolerances=MachineCode().tolerances(problem, problem.y0),
-    )
+        ts=jnp.asarray(problem.ts), q=q, qdot=qdot, result=result_from(ending.result), end=State(ending.t, *end),
+        stats=step_counts(accepted, rejected), system=dict(modes), params=problem.params, mode=ending.modes,
+        transitions=transitions, mode_names=tuple(modes), tolerances=MachineCode().tolerances(problem, problem.y0),
+    )  # fmt: skip
 
 
 def _raise_unless_ok(modes: dict[str, System], trajectory: Trajectory, layout: Layout, last) -> Trajectory:
@@ -320,10 +311,8 @@ def require_scene(scene: Any) -> Scene:
 
 
 def first_law(scene: Scene) -> System:
-    """The system that a motion begins in."""
     return scene.modes[scene.start] if isinstance(scene, Hybrid) else scene
 
 
 def laws(scene: Scene) -> tuple[System, ...]:
-    """The systems that a motion may be in."""
     return tuple(scene.modes.values()) if isinstance(scene, Hybrid) else (scene,)

@@ -21,6 +21,7 @@ import numpy as np
 
 from lagjax._engine import Problem, Solution
 from lagjax._engine.taylor import (
+    MOST_GUARDS,
     Guarded,
     MachineCode,
     Surfaces,
@@ -35,8 +36,6 @@ from lagjax._program import Unlowerable
 from lagjax._scene import System
 
 PyTree = Any
-
-MOST_GUARDS = 24  # two bits each in the code of an event, which the kernel keeps in a double of 53
 
 
 class Transition(eqx.Module):
@@ -148,7 +147,6 @@ class Mode(NamedTuple):
         return cls(problem, leaving, numbers, targets, surfaces, jnp.asarray(problem.vector))
 
     def with_params(self, params: PyTree, numbers, targets) -> "Mode":
-        """The mode of the same family that has these parameters, transition numbers and targets."""
         problem = dataclasses.replace(self.problem, params=params)
         return self._replace(problem=problem, numbers=numbers, targets=targets, vector=jnp.asarray(problem.vector))
 
@@ -164,7 +162,6 @@ class Mode(NamedTuple):
     # ---- along the mode ----
 
     def solve(self, ts, y0) -> Solution:
-        """The motion over the times `ts`, with its derivatives."""
         return MachineCode().solve(dataclasses.replace(self.problem, ts=ts, y0=y0))
 
     def solve_to_event(self, ts, y0, sides) -> Solution:

@@ -168,7 +168,6 @@ def _outline(system: System, leaving) -> tuple:
 
 
 def _few(traces: Sequence[list]) -> bool:
-    """True if few numbers differ between the modes of these traces."""
     columns = [column for column in zip(*traces, strict=True) if column[0] is not None]
     return sum(np.size(sites[0].value) for column in columns for sites in _different(column)) <= MOST_NUMBERS
 

@@ -271,19 +271,15 @@ class _Rounds(NamedTuple):
         sound = jnp.isfinite(jnp.where(event, exit.y_next, y_end)).all() & exit.guards_defined
         broken = here & ~sound & (event | (result == SUCCESSFUL))
         result = jnp.where(broken, NOT_FINITE, jnp.where(event & exit.inconsistent, INCONSISTENT, result))
+        let_out = _put(before.let_out, places, jnp.where(are_let_out & jnp.isnan(first_time), t_start, first_time))
         after = Ending(
-            t=jnp.where(event, exit.t, t_end),
-            y=jnp.where(event, exit.y_next, y_end),
-            mode=jnp.where(event, exit.target, before.mode),
-            going=event & ~exit.inconsistent & ~broken,
-            result=result,
+            *_select(event, (exit.t, exit.y_next, exit.target), (t_end, y_end, before.mode)),
+            going=event & ~exit.inconsistent & ~broken, result=result,
             path=jnp.where(covered[:, None], moved.path[1:-1], before.path),
             modes=jnp.where(covered, before.mode, before.modes),
             steps=before.steps + jnp.stack([located.accepted, located.rejected]),
-            latest=exit.number,
-            memory=memory,
-            let_out=_put(before.let_out, places, jnp.where(are_let_out & jnp.isnan(first_time), t_start, first_time)),
-        )
+            latest=exit.number, memory=memory, let_out=let_out,
+        )  # fmt: skip
         return after, event, TransitionRecord(exit.t, exit.y, exit.y_next, before.mode, exit.target, exit.order_matters)
 
     def _pass_transition(
