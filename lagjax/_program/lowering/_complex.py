@@ -266,12 +266,11 @@ def _multiply_all(expansion, multiply: Callable, rows: np.ndarray) -> np.ndarray
     return functools.reduce(functools.partial(multiply, expansion, {}), rows)
 
 
+COMPLEX["integer_pow"] = lambda expansion, params, x: _ids_of(
+    expansion, _whole_power(_pair_of(expansion, x), params["y"])
+)
 COMPLEX["reduce_prod"] = reduction(COMPLEX["mul"], 1.0 + 0.0j, _multiply_all)
-
-
-@lowers("complex", table=COMPLEX)
-def _complex(expansion, params, re, im):
-    return expansion.pair(*np.broadcast_arrays(re, im))
+COMPLEX["complex"] = lambda expansion, params, re, im: expansion.pair(*np.broadcast_arrays(re, im))
 
 
 @lowers("convert_element_type", table=COMPLEX)
@@ -281,11 +280,6 @@ def _convert_element_type(expansion, params, x):
             return x
         return expansion.pair(*expansion.parts(expansion.map("convert", x, attribute="float")))
     return expansion.lower_primitive("convert_element_type", params, [expansion.parts(x)[0]])
-
-
-@lowers("integer_pow", table=COMPLEX)
-def _integer_pow(expansion, params, x):
-    return _ids_of(expansion, _whole_power(_pair_of(expansion, x), params["y"]))
 
 
 @lowers("dot_general", table=COMPLEX)

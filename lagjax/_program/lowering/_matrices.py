@@ -31,7 +31,7 @@ from lagjax._program._differentiation import Derivatives, copy_nodes
 from lagjax._program._graph import Graph, Unlowerable
 from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._scalars import Scalars
-from lagjax._program.lowering._rules import Expansion, inputs_of, lowers
+from lagjax._program.lowering._rules import LOWER, Expansion, inputs_of, lowers
 
 # The rows of the largest matrix that is written out.
 LARGEST_MATRIX = 8
@@ -228,17 +228,18 @@ def _map_matrices(what: str, function: Callable, expansion: Expansion, *arrays: 
     return [np.stack([x.ids for x in of]).reshape((*batch, *of[0].shape)) for of in zip(*done, strict=True)]
 
 
+LOWER["cholesky"] = lambda expansion, params, a: _map_matrices(
+    "a Cholesky factor", lambda a: [cholesky(a)], expansion, a
+)[0]
+LOWER["det"] = lambda expansion, params, a: _map_matrices("a determinant", lambda a: [determinant(a)], expansion, a)
+
+
 @lowers("lu")
 def _lu(expansion, params, a):
     raise Unlowerable(
         "`lu` chooses rows by comparing numbers; `jnp.linalg.solve`, `inv`, `det` and `slogdet` are written out as "
         "scalars without a choice"
     )
-
-
-@lowers("cholesky")
-def _cholesky(expansion, params, a):
-    return _map_matrices("a Cholesky factor", lambda a: [cholesky(a)], expansion, a)[0]
 
 
 @lowers("triangular_solve")
@@ -249,11 +250,6 @@ def _triangular_solve(expansion, params, a, b):
     turned = b if params["left_side"] else np.swapaxes(b, -1, -2)
     (x,) = _map_matrices("a triangular system", lambda a, b: [substitute(a, b, lower, unit)], expansion, a, turned)
     return x if params["left_side"] else np.swapaxes(x, -1, -2)
-
-
-@lowers("det")
-def _determinant(expansion, params, a):
-    return _map_matrices("a determinant", lambda a: [determinant(a)], expansion, a)
 
 
 @lowers("slogdet")

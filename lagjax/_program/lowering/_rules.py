@@ -333,11 +333,18 @@ def lowers(*names, table: dict = LOWER):
     return register
 
 
-def _rename(op: str) -> Callable:
-    return lambda expansion, params, *xs: expansion.map(op, *xs)
-
-
-LOWER.update({"add_any": _rename("add"), "lt_to": _rename("lt"), "le_to": _rename("le")})
+LOWER.update({
+    "add_any": lambda expansion, params, x, y: expansion.map("add", x, y),
+    "lt_to": lambda expansion, params, x, y: expansion.map("lt", x, y),
+    "le_to": lambda expansion, params, x, y: expansion.map("le", x, y),
+    "pow": lambda expansion, params, x, y: expansion.map("pow", x, expansion.map("convert", y, attribute="float")),
+    "round": lambda expansion, params, x: expansion.map("round", x, attribute=int(params["rounding_method"])),
+    "signbit": lambda expansion, params, x: [expansion.map("lt", x, expansion.constants(0.0))],
+    "polynomial": lambda expansion, params, x, *coefficients: functools.reduce(  # Σ cₖ xᵏ, by Horner's rule
+        lambda total, c: expansion.map("add", expansion.map("mul", total, x), c), coefficients[::-1]
+    ),
+    "call_hi_primitive": lambda expansion, params, *xs: expansion.run_closed(expand_primitive(params["_prim"]), xs),
+})  # fmt: skip
 
 
 @lowers("square")
@@ -352,20 +359,6 @@ def _square(expansion, params, x):
 def _one_minus_square(expansion, params, x):
     one = expansion.constants(1.0)
     return expansion.map("mul", expansion.map("add", one, x), expansion.map("sub", one, x))
-
-
-@lowers("polynomial")
-def _polynomial(expansion, params, x, *coefficients):
-    """Σ cₖ xᵏ, by Horner's rule."""
-    total = coefficients[-1]
-    for c in reversed(coefficients[:-1]):
-        total = expansion.map("add", expansion.map("mul", total, x), c)
-    return total
-
-
-@lowers("signbit")
-def _signbit(expansion, params, x):
-    return [expansion.map("lt", x, expansion.constants(0.0))]
 
 
 @lowers("hypot")
@@ -389,16 +382,6 @@ def _integer_pow(expansion, params, x):
     base, half = (moduli, exponent // 2) if exponent % 2 == 0 else ({}, exponent)
     powers = (graph.power(base[i], half) if i in base else graph.power(i, exponent) for i in x.ravel().tolist())
     return _ids([*powers], x.shape)
-
-
-@lowers("pow")
-def _pow(expansion, params, x, y):
-    return expansion.map("pow", x, expansion.map("convert", y, attribute="float"))
-
-
-@lowers("round")
-def _round(expansion, params, x):
-    return expansion.map("round", x, attribute=int(params["rounding_method"]))
 
 
 @lowers("convert_element_type")
@@ -666,11 +649,6 @@ def _call(expansion, params, *arguments):
     if isinstance(body, core.ClosedJaxpr):
         return expansion.run_closed(body, arguments)
     return expansion.run(body, (), arguments)
-
-
-@lowers("call_hi_primitive")
-def _expand_primitive(expansion, params, *arguments):
-    return expansion.run_closed(expand_primitive(params["_prim"]), arguments)
 
 
 def expand_primitive(primitive) -> core.ClosedJaxpr:

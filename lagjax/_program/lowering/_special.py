@@ -26,7 +26,7 @@ import numpy as np
 from lagjax._program import _scalars as xp
 from lagjax._program._graph import Unlowerable
 from lagjax._program._scalars import Scalars
-from lagjax._program.lowering._rules import lowers
+from lagjax._program.lowering._rules import LOWER
 
 # Steps by which log Γ is shifted, and Bernoulli's numbers B₂ₖ: at y = 10 the next term of the series is 2e-18. With
 # twice the shift four of them would do, and the product would be twice as long.
@@ -163,15 +163,6 @@ def _fraction(x: Any, shift: float, numerator: Callable[[int], float], least: fl
     return cut(x, length)
 
 
-for _name, _formula in {
-    "lgamma": log_gamma,
-    "digamma": lambda x: polygamma(0, x),
-    "bessel_i0e": lambda x: scaled_bessel(0, x),
-    "bessel_i1e": lambda x: scaled_bessel(1, x),
-}.items():
-    lowers(_name)(lambda expansion, params, x, formula=_formula: formula(Scalars(expansion, x)).ids)
-
-
 def _order(expansion, order: np.ndarray, function: str, largest: int) -> int:
     """The order of a function of several, which must be one known number."""
     a = "an" if function[0] == "e" else "a"
@@ -181,30 +172,29 @@ def _order(expansion, order: np.ndarray, function: str, largest: int) -> int:
     return n
 
 
-@lowers("polygamma")
-def _polygamma(expansion, params, order: np.ndarray, x: np.ndarray) -> np.ndarray:
-    return polygamma(_order(expansion, order, "polygamma function", _MOST_DERIVATIVES), Scalars(expansion, x)).ids
+def _shape(expansion, shape: np.ndarray) -> float:
+    """The number a of an incomplete Γ function, which must be known."""
+    values = {expansion.graph.value(i) for i in shape.ravel().tolist()}
+    a = values.pop() if len(values) == 1 else None
+    if a is None or not 0 < a <= _LARGEST_SHAPE:
+        raise Unlowerable(
+            f"incomplete Γ functions are written out for one known a, 0 < a ≤ {_LARGEST_SHAPE:g}: it says how many "
+            "terms are needed"
+        )
+    return float(a)
 
 
-@lowers("expn")
-def _exponential_integral(expansion, params, order: np.ndarray, x: np.ndarray) -> list[np.ndarray]:
-    n = _order(expansion, order, "exponential integral", _LARGEST_ORDER)
-    return [exponential_integral(n, Scalars(expansion, x)).ids]
-
-
-def _incomplete(upper: bool) -> Callable:
-    def rule(expansion, params, shape: np.ndarray, x: np.ndarray) -> np.ndarray:
-        values = {expansion.graph.value(i) for i in shape.ravel().tolist()}
-        a = values.pop() if len(values) == 1 else None
-        if a is None or not 0 < a <= _LARGEST_SHAPE:
-            raise Unlowerable(
-                f"incomplete Γ functions are written out for one known a, 0 < a ≤ {_LARGEST_SHAPE:g}: it says how many "
-                "terms are needed"
-            )
-        return incomplete_gamma(float(a), Scalars(expansion, x))[upper].ids
-
-    return rule
-
-
-lowers("igamma")(_incomplete(False))
-lowers("igammac")(_incomplete(True))
+LOWER.update({
+    "lgamma": lambda e, params, x: log_gamma(Scalars(e, x)).ids,
+    "digamma": lambda e, params, x: polygamma(0, Scalars(e, x)).ids,
+    "polygamma": lambda e, params, n, x: polygamma(
+        _order(e, n, "polygamma function", _MOST_DERIVATIVES), Scalars(e, x)
+    ).ids,
+    "bessel_i0e": lambda e, params, x: scaled_bessel(0, Scalars(e, x)).ids,
+    "bessel_i1e": lambda e, params, x: scaled_bessel(1, Scalars(e, x)).ids,
+    "expn": lambda e, params, n, x: [
+        exponential_integral(_order(e, n, "exponential integral", _LARGEST_ORDER), Scalars(e, x)).ids
+    ],
+    "igamma": lambda e, params, a, x: incomplete_gamma(_shape(e, a), Scalars(e, x))[0].ids,
+    "igammac": lambda e, params, a, x: incomplete_gamma(_shape(e, a), Scalars(e, x))[1].ids,
+})  # fmt: skip
