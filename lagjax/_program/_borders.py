@@ -380,11 +380,10 @@ class _Rewriting:
         assert piece is not None
         self.parts[piece] = tuple(self.places[x] for x in _squares(self.program.line, self.cones[i]) or ())
         moves = f("gt", piece, number(0.0))
-        if op in ("sqrt", "rsqrt", "max"):
-            x = of[0] if op != "max" or self.graph.value(of[0]) is None else of[1]
-            if op != "max":
-                return f(op, f("select", moves, self._one, f("add", x, number(_NOTHING**2))))
-            return f("select", moves, self._one, x)
+        if op in ("sqrt", "rsqrt"):
+            return f(op, f("select", moves, self._one, f("add", of[0], number(_NOTHING**2))))
+        if op == "max":
+            return f("select", moves, self._one, of[0] if self.graph.value(of[0]) is None else of[1])
         is_first = self.graph.value(of[0]) is None
         says_moving = op == "ne" or op in (("gt", "ge") if is_first else ("lt", "le"))
         return moves if says_moving else f("not", moves)
@@ -1044,18 +1043,15 @@ def _copy_deciding(
     graph: Graph, line: StraightLine, first: int, switches, kinds, tables, decide: Callable[[int, int], int]
 ) -> list[int]:
     """The nodes of a line with pieces, its inputs from number `first` on, in a graph; piece j is `decide(j, piece)`."""
-    nodes: list[int] = []
-    for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):
-        if op == "input" and attribute >= first:
-            j = attribute - first
-            nodes.append(decide(j, _raw(graph, kinds[j], nodes[switches[j]], tables[j])))
-        elif op == "input":
-            nodes.append(graph.input(attribute, kind))
-        elif op == "constant":
-            nodes.append(graph.constant(attribute, kind))
-        else:
-            nodes.append(graph.apply(op, *(nodes[i] for i in operands), attribute=attribute))
-    return nodes
+    of_inputs = {node[2]: kind for node, kind in zip(line.nodes, line.kinds, strict=True) if node[0] == "input"}
+
+    def find_input(i: int, nodes: list[int]) -> int:
+        j = i - first
+        if j < 0:
+            return graph.input(i, of_inputs[i])
+        return decide(j, _raw(graph, kinds[j], nodes[switches[j]], tables[j]))
+
+    return copy_nodes(graph, line, find_input)
 
 
 def gradient(borders: Borders, by: Sequence[int]) -> StraightLine:

@@ -33,15 +33,18 @@ TangentTable = Callable[[Table], Table]  # the table of the tangents of the entr
 _LARGEST = 100  # operations of a derivative for one of a line: a bound for errors, three are usual
 
 
-def copy_nodes(graph: Graph, line, inputs: Sequence[int], places: Sequence[int] | None = None) -> list[int]:
+def copy_nodes(
+    graph: Graph, line, inputs: Sequence[int] | Callable[[int, list[int]], int], places: Sequence[int] | None = None
+) -> list[int]:
     """The nodes of a line, of a tape or of another graph in a graph, where `inputs` are its inputs.
 
-    Tables begin at other inputs where `places` says what input i has become.
+    These may follow from the nodes before: `inputs(i, nodes)`. Tables begin at other inputs where `places` says what
+    input i has become.
     """
     nodes: list[int] = []
     for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):
         if op == "input":
-            nodes.append(graph.real(inputs[attribute]))
+            nodes.append(inputs(attribute, nodes) if callable(inputs) else graph.real(inputs[attribute]))
         elif op == "constant":
             nodes.append(graph.constant(attribute, kind))
         elif op == "integer_pow":

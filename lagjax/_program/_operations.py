@@ -240,7 +240,8 @@ _ROWS = (
     ),
     Operation(
         "neg", 1, np.negative, lambda code, a: -a, simplify=_simplify.negate, exact=True,
-        recurrence=_recurrences.negate, cotangents=(lambda f, c, g, w, u: f("neg", g),),
+        recurrence=lambda r, i, operands, of: r.order_recursion.apply("neg", of[0]),
+        cotangents=(lambda f, c, g, w, u: f("neg", g),),
     ),
     Operation(
         "rem", 2, np.fmod, "fmod", exact=True, recurrence=_recurrences.remainder,

@@ -20,11 +20,6 @@ def add(r, i, operands, of):
     return r.order_recursion.apply(op, a, b)
 
 
-def negate(r, i, operands, of):
-    """wₖ = −uₖ."""
-    return r.order_recursion.apply("neg", of[0])
-
-
 def multiply(r, i, operands, of):
     """wₖ = u₀ vₖ + uₖ v₀ + Σ' uⱼ vₖ₋ⱼ."""
     (u, v), (a, b), apply = operands, of, r.order_recursion.apply
