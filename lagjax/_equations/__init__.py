@@ -34,6 +34,7 @@ from lagjax._equations._linear import (
 )
 from lagjax._equations._many_states import SADDLE, Sample, borders_of, is_lowered, map_in_chunks, solve_saddle
 from lagjax._equations._motion import Motion
+from lagjax._equations._patterns import jacobian_pattern
 from lagjax._equations._rank import Decided, decide, null_space, span_outside
 from lagjax._equations._scales import Scales
-from lagjax._equations._structure import SparseMotion
+from lagjax._equations._structure import SparseMotion, Structure

@@ -29,14 +29,15 @@ def require_consistent(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, pa
 
     That is: a constraint is not finite, or has no gradient; as many are independent as there are coordinates, so that
     nothing can move; two of them contradict each other; or q0 or qdot0 is farther from one than `TOLERANCE` of its
-    size, and the value of the constraint is more than `ROUNDINGS` of its own terms.
+    size, and the value of the constraint is more than `ROUNDINGS` of its own terms. What depends on which is not asked
+    in a large scene, where steps that do not arrive at the constraints end the motion.
     """
     if not has_constraints(system) or not _all_concrete((ts, q0, qdot0, params, system)):
         return
     names = system.constraint_names(layout, params)
     start = _start(system, layout, ts, q0, qdot0, params)
     _require_gradients(names, start)
-    dependent = dependent_rows(start.schur)
+    dependent = {} if start.schur is None else dependent_rows(start.schur)
     functions = system.constraints, system.velocity_constraints  # one that asks for the time may prescribe a motion
     if not (start.driven or any("t" in function.extras for function in functions if function is not None)):
         _require_room(names, start, layout.size, len(names) - len(dependent))
@@ -84,7 +85,7 @@ class _StartConditions(NamedTuple):
     rates: np.ndarray  # J q̇ + ∂f/∂t, then a, (m,)
     gamma: np.ndarray  # γ of G q̈ = γ, (m,)
     lengths: np.ndarray  # of the rows of G, (m,)
-    schur: np.ndarray  # the Schur complement, (m, m)
+    schur: np.ndarray | None  # the Schur complement, (m, m); None for a large scene
     driven: np.ndarray  # whether the constraints move what is at rest, ()
     scaled_lengths: np.ndarray  # the same with coordinates in units of 1/√Mᵢᵢ, (m,)
     size_q: np.ndarray  # the largest coordinate in these units, ()
@@ -93,7 +94,9 @@ class _StartConditions(NamedTuple):
 
 
 def _require_gradients(names: list[str], start: _StartConditions) -> None:
-    for name, value, rate, gamma, length in zip(names, *start[:4], strict=True):
+    bad = np.flatnonzero(~np.isfinite(start[:4]).all(axis=0) | (start.lengths == 0))
+    for k in bad[:1]:
+        name, (value, rate, gamma, length) = names[k], (x[k] for x in start[:4])
         if not np.isfinite([value, rate, gamma, length]).all():
             raise ValueError(
                 f"{name} is not finite at the initial state (value {value}, gradient {length}): start where it is "
@@ -113,7 +116,7 @@ def _require_gradients(names: list[str], start: _StartConditions) -> None:
 
 def _require_room(names: list[str], start: _StartConditions, coordinates: int, independent: int) -> None:
     """Raise where independent constraints, more than there are coordinates, leave nothing to move."""
-    if len(names) > coordinates <= independent and np.isfinite(start.schur).all():
+    if len(names) > coordinates <= independent and start.schur is not None and np.isfinite(start.schur).all():
         raise ValueError(
             f"There are {len(names)} constraints ({', '.join(names)}) for {coordinates} coordinates, and {independent} "
             "of them are independent at the initial state: nothing can move. Drop those that are not meant."
@@ -162,8 +165,8 @@ def inconsistent_members(system, layout: Layout, ts, values: dict, axes: dict) -
 def _inconsistent(has_terms: bool, system, dtype, t, span, q0: PyTree, qdot0: PyTree, params: PyTree) -> jax.Array:
     layout = Layout.from_state(q0, qdot0)
     state = layout.flatten(q0), layout.flatten(qdot0), t, eqx.filter(params, eqx.is_array_like)
-    motion = system._motion(layout, params)
-    terms = derivation_of(system, layout, params).term_sizes(*state) if has_terms else 0.0
+    derivation = derivation_of(system, layout, params)
+    motion, terms = derivation.motion, derivation.term_sizes(*state) if has_terms else 0.0
     unit = motion.unit(*state)
     return motion.constraints.inconsistent(unit, motion.row_lengths(unit, *state), *state, span, dtype, terms)
 
@@ -174,25 +177,31 @@ def _start(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree
     q, qdot = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(x)]) for x in (q0, qdot0))
     q, qdot, t = (np.asarray(x, layout.dtype) for x in (q, qdot, ts[0]))
     sample = Sample.from_scene(system, layout, q[None], qdot[None], t, params)
-    of = {name: value[0] for name, value in sample.quantities(*_ASKED).items()}
+    large = sample.derivation.structure is not None
+    of = {name: value[0] for name, value in sample.quantities(*_ASKED, *(_LENGTHS if large else _MATRICES)).items()}
     on_positions = np.arange(len(of["residual"])) < sample.derivation.position_count
-    unit = diagonal_scale(of["mass_matrix"])
-    size_q, size_qdot = sizes(unit, q, qdot, abs(float(ts[-1]) - float(t)) or np.inf)
+    if not large:
+        mass, jacobian, unit = of["mass_matrix"], of["jacobian"], diagonal_scale(of["mass_matrix"])
+        of |= {"unit": unit, "row_lengths": np.linalg.norm(jacobian, axis=1)}
+        of |= {"unit_lengths": np.linalg.norm(jacobian * unit, axis=1)}
+        of |= {"schur": schur_complements(mass[None], jacobian[None])[0]}
+    size_q, size_qdot = sizes(of["unit"], q, qdot, abs(float(ts[-1]) - float(t)) or np.inf)
     return _StartConditions(
         values=np.where(on_positions, of["residual"], 0),
         rates=of["rates"],
         gamma=of["gamma"],
-        lengths=np.linalg.norm(of["jacobian"], axis=1),
-        schur=schur_complements(of["mass_matrix"][None], of["jacobian"][None])[0],
+        lengths=of["row_lengths"],
+        schur=of.get("schur"),
         driven=(of["driving"] != 0).any(),
-        scaled_lengths=np.linalg.norm(of["jacobian"] * unit, axis=1),
+        scaled_lengths=of["unit_lengths"],
         size_q=size_q,
         size_qdot=size_qdot,
         sample=sample,
     )
 
 
-_ASKED = ("mass_matrix", "jacobian", "gamma", "residual", "rates", "driving")
+_ASKED, _MATRICES = ("gamma", "residual", "rates", "driving"), ("mass_matrix", "jacobian")
+_LENGTHS = ("unit", "row_lengths", "unit_lengths")
 
 
 def has_constraints(system) -> bool:

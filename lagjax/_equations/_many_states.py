@@ -131,7 +131,8 @@ def solve_saddle(of: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
 
 @eqx.filter_jit
 def _evaluate_compiled(names: tuple[str, ...], system: Any, layout: Layout, q, qdot, t, params) -> dict[str, jax.Array]:
-    motion, numbers = system._motion(layout, params), eqx.filter(params, eqx.is_array_like)
+    derivation, numbers = derivation_of(system, layout, params), eqx.filter(params, eqx.is_array_like)
+    motion = derivation.motion
 
     def quantities_at(q, qdot, t):
         values = motion.quantities(q, qdot, t, numbers)
@@ -139,7 +140,13 @@ def _evaluate_compiled(names: tuple[str, ...], system: Any, layout: Layout, q, q
 
     if len(q) == 1:
         return jax.tree.map(lambda x: x[None], quantities_at(q[0], qdot[0], jnp.ravel(t)[0]))
-    return map_in_chunks(quantities_at, (q, qdot, jnp.broadcast_to(t, len(q))), _AT_ONCE // layout.size**2)
+    size = numbers_of_state(derivation)
+    return map_in_chunks(quantities_at, (q, qdot, jnp.broadcast_to(t, len(q))), _AT_ONCE // size)
+
+
+def numbers_of_state(derivation: Derivation) -> int:
+    """The numbers that the quantities of one state hold together: those of M, where it is a matrix."""
+    return derivation.layout.size ** (2 if derivation.structure is None else 1)
 
 
 def map_in_chunks(function, arrays, size: int):

@@ -164,6 +164,38 @@ class SparseMotion(Motion):
         form = self._form(positions)
         return jnp.sqrt(form.diagonal(lambda y: push(unit**2 * pull(y)), q.dtype))
 
+    def quantities(self, q, qdot, t, params):
+        """Those of `Motion.quantities` without M and G, and what products with them give.
+
+        - `mass_diagonal` (n,) of M, `energy_by_qdot` (n,), M q̇, and `mass_by_some` (n,), M x for some x.
+        - `acceleration` (n,), `multipliers` (m,).
+        - `row_lengths` (m,) of G, and `unit_lengths` (m,) in the `unit` (n,) of coordinates; `jacobian_by_some` (m,),
+          G x, and `jacobian_columns` (n,), Gᵀλ for λ = 1.
+        """
+        state = q, qdot, t, params
+        values, multiply = super().quantities(*state), self.mass_product(*state)
+        unit, some = self.unit(*state), jnp.cos(jnp.arange(1.0, q.size + 1, dtype=q.dtype))  # no symmetry moves so
+        values |= {
+            "mass_diagonal": self.structure.mass.diagonal(multiply, q.dtype),
+            "energy_by_qdot": multiply(qdot),
+            "mass_by_some": multiply(some),
+            "unit": unit,
+            "acceleration": self.acceleration(*state),
+        }
+        if self.constrained:
+            push, pull = self.constraints.products(*state)
+            values |= {
+                "multipliers": self.multipliers(*state),
+                "row_lengths": self.row_lengths(jnp.ones_like(q), *state),
+                "unit_lengths": self.row_lengths(unit, *state),
+                "jacobian_by_some": push(some),
+                "jacobian_columns": pull(jnp.ones_like(values["gamma"])),
+            }
+        else:
+            none = ("multipliers", "row_lengths", "unit_lengths", "jacobian_by_some")
+            values |= dict.fromkeys(none, values["gamma"]) | {"jacobian_columns": jnp.zeros_like(q)}
+        return {name: value for name, value in values.items() if name not in ("mass_matrix", "jacobian")}
+
     def solve_newton(self, linear: Callable, right: tuple[Vector, Row], *state) -> tuple[Vector, Row]:
         """(x, ν) with H x + Jᵀν = b, J x = c, by solves with M in the place of H, which differs little near f = 0."""
         zero = jax.tree.map(jnp.zeros_like, right)

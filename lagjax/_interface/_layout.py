@@ -5,6 +5,7 @@ scalar coordinate, such as `q['theta']` or `q.r` or `q[1]`, by which error messa
 """
 
 import dataclasses
+import functools
 import math
 from dataclasses import dataclass
 from typing import Any
@@ -49,7 +50,7 @@ class Layout:
     def size(self) -> int:
         return sum(math.prod(shape) for shape in self.shapes)
 
-    @property
+    @functools.cached_property
     def names(self) -> tuple[str, ...]:
         """The name of each of the n coordinates, in the order of the flat vector."""
         return tuple(

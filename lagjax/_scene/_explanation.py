@@ -8,11 +8,14 @@ a(q, q̇) is zero at rest. Only the dependence of constraints on each other is d
 from dataclasses import dataclass, field, replace
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+from jax.interpreters.partial_eval import dce_jaxpr
 
 from lagjax._engine import Problem, choose
 from lagjax._engine.diffrax import ArrayEquations, form_of
-from lagjax._equations import dependent_rows, pieces_of_motion
+from lagjax._equations import Derivation, Structure, dependent_rows, jacobian_pattern, pieces_of_motion
 from lagjax._interface import join_names, show_str
 from lagjax._native import Nesting, is_large, pieces_of
 from lagjax._program import CLOCK, FLOOR, SIGN, TABLE, TRUNC, Program, Unlowerable
@@ -22,16 +25,21 @@ _PIECES = {
     TABLE: "a table by",
 }  # fmt: skip
 _LISTED = 12  # names that a row of an explanation lists
+_GROUPED = 100  # names of which the first and the last are shown alone
 
 
 @dataclass(frozen=True)
 class Explanation:
     """The facts about a scene; `print` shows them as a table. A fact that could not be determined is None.
 
+    Of a large scene that runs on arrays (`path`, `reason`) facts are read off operations, also where terms cancel, and
+    none is about the state.
+
     - `coordinates`: the name of every scalar coordinate; `cyclic`: those that L does not depend on, whose momenta are
       conserved where no force and no constraint force acts.
-    - `mass_matrix`: "constant" or "varying", then "diagonal", "block-diagonal" or "dense"; `mass_matrix_depends_on`:
-      the coordinates, velocities (`d` before the name) and `t` that it reads.
+    - `mass_matrix`: "constant" or "varying", then "diagonal", "block-diagonal" or "dense", or the form of a large
+      one; `mass_matrix_depends_on`: the coordinates, velocities (`d` before the name) and `t` that it reads, of a large
+      scene "q" and "dq" for any of them.
     - `velocity_terms`: whether forces depend on the velocities; `explicit_time`: whether anything depends on `t`.
     - `energy_conserved`: whether h = p·q̇ − L is constant along every motion.
     - `borders`: where the accelerations are piecewise: the operation (a sign, a whole part) and what it reads; on the
@@ -82,15 +90,18 @@ class Explanation:
     _repr_pretty_ = show_str
 
     def __str__(self) -> str:
-        rows = [("coordinates", f"{len(self.coordinates)}: {join_names(self.coordinates, _LISTED)}")]
-        if self.cyclic is not None:
-            reads = join_names(self.mass_matrix_depends_on or (), _LISTED) or "none"
+        rows = [("coordinates", f"{len(self.coordinates)}: {_list_names(self.coordinates, counts=False)}")]
+        if self.mass_matrix is not None:
+            answers = {True: "yes", False: "no", None: "not known"}
             rows += [
-                ("cyclic", join_names(self.cyclic, _LISTED) or "none"),
-                ("mass matrix", f"{self.mass_matrix}; depends on {reads}"),
-                ("velocity terms", "yes" if self.velocity_terms else "no"),
-                ("explicit time", "yes" if self.explicit_time else "no"),
-                ("energy conserved", "yes" if self.energy_conserved else "no"),
+                ("cyclic", "not known" if self.cyclic is None else _list_names(self.cyclic) or "none"),
+                (
+                    "mass matrix",
+                    f"{self.mass_matrix}; depends on {_list_names(self.mass_matrix_depends_on or ()) or 'none'}",
+                ),
+                ("velocity terms", answers[self.velocity_terms]),
+                ("explicit time", answers[self.explicit_time]),
+                ("energy conserved", answers[self.energy_conserved]),
             ]
         if self.borders:
             how = "steps end there" if self.borders_located else "not located: steps of diffrax go across"
@@ -98,7 +109,7 @@ class Explanation:
         if self.narrow:
             rows.append(("narrow features", _count_names(self.narrow)))
         if self.constraints:
-            rows.append(("constraints", f"{len(self.constraints)}: {join_names(self.constraints, _LISTED)}"))
+            rows.append(("constraints", f"{len(self.constraints)}: {_list_names(self.constraints, counts=False)}"))
         for name, others in (self.dependent_constraints or {}).items():
             rows.append(("dependent", f"{name} on {join_names(others, _LISTED)}"))
         if self.operations is not None:
@@ -115,6 +126,8 @@ def explain(problem: Problem) -> Explanation:
     derivation = problem.derivation
     names, n, motion = derivation.layout.names, derivation.layout.size, derivation.motion
     known = {"coordinates": names, **_engine(problem)}
+    if derivation.structure is not None:
+        return Explanation(**known, **_borders_in_lines(problem), **_facts_of_arrays(derivation, derivation.structure))
     try:
         matrix, force = derivation.program("mass_matrix"), derivation.reads("force")
     except Unlowerable:
@@ -137,6 +150,35 @@ def explain(problem: Problem) -> Explanation:
         energy_conserved=not derivation.works and motion.forces is None and motion.dissipation is None,
         traced_operations=derivation.traced_operations,
     )
+
+
+def _facts_of_arrays(derivation: Derivation, structure: Structure) -> dict[str, Any]:
+    """The facts about a large scene, from what the operations of its functions read, whether or not it cancels."""
+    motion, of_q = (
+        derivation.motion,
+        jacobian_pattern(lambda *state: jnp.ravel(derivation.motion.lagrangian(*state)), derivation.state_shapes, by=0),
+    )
+    names, inputs = derivation.layout.names, ("q", "dq", "t")
+
+    def reads(function) -> set[str]:
+        jaxpr = jax.make_jaxpr(function)(*derivation.state_shapes).jaxpr
+        _, used = dce_jaxpr(jaxpr, [True] * len(jaxpr.outvars))
+        return {name for name, is_used in zip(inputs, used, strict=False) if is_used}
+
+    mass = reads(lambda *state: motion.mass_product(*state)(jnp.ones_like(state[0])))
+    of_constraints = reads(motion.residual) if motion.constrained else set()
+    timed = "t" in reads(motion.lagrangian) | of_constraints
+    works = timed or motion.forces is not None or motion.dissipation is not None
+    return {
+        "cyclic": None
+        if of_q is None
+        else tuple(name for name, is_read in zip(names, of_q.sum(axis=0), strict=True) if not is_read),
+        "mass_matrix": f"{'varying' if mass else 'constant'}, {structure.mass.name}",
+        "mass_matrix_depends_on": tuple(name for name in inputs if name in mass),
+        "velocity_terms": "dq" in reads(motion.force),
+        "explicit_time": timed or "t" in reads(motion.force),
+        "energy_conserved": None if motion.constraints.on_velocities and not works else not works,
+    }
 
 
 def _engine(problem: Problem) -> dict[str, Any]:
@@ -185,6 +227,13 @@ def _borders_in_lines(problem: Problem) -> dict[str, Any]:
     pieces = pieces_of_motion(problem.derivation.motion, *state)
     names = tuple(f"{name}{place}" for name, place, size in pieces for _ in range(size))
     return {"borders": names, "borders_located": not names}
+
+
+def _list_names(names: tuple[str, ...], counts: bool = True) -> str:
+    """Names, or of a large group the first and the last of them, and their number where `counts` says so."""
+    if len(names) <= _GROUPED:
+        return join_names(names, _LISTED)
+    return f"{f'{len(names)}: ' if counts else ''}{names[0]} … {names[-1]}"
 
 
 def _count_names(names: tuple[str, ...]) -> str:
