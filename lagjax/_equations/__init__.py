@@ -32,9 +32,17 @@ from lagjax._equations._linear import (
     singular_threshold,
     unit_diagonal,
 )
-from lagjax._equations._many_states import SADDLE, Sample, borders_of, is_lowered, map_in_chunks, solve_saddle
+from lagjax._equations._many_states import (
+    SADDLE,
+    Sample,
+    borders_of,
+    is_lowered,
+    map_in_chunks,
+    numbers_of_state,
+    solve_saddle,
+)
 from lagjax._equations._motion import Motion
-from lagjax._equations._patterns import jacobian_pattern
 from lagjax._equations._rank import Decided, decide, null_space, span_outside
 from lagjax._equations._scales import Scales
+from lagjax._equations._sparse import Diagonal
 from lagjax._equations._structure import SparseMotion, Structure

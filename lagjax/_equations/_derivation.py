@@ -25,6 +25,7 @@ from lagjax._equations._blame import pieces_of_motion
 from lagjax._equations._constraints import velocity_scales
 from lagjax._equations._linear import eigen, solve_many
 from lagjax._equations._motion import Motion
+from lagjax._equations._patterns import jacobian_pattern
 from lagjax._equations._quantities import OwnRules, quantities
 from lagjax._equations._recursion import Recursion, RecursiveElimination
 from lagjax._equations._saddle import LARGEST_INDEFINITE, IndefiniteElimination, SaddleElimination, TwoCoordinates
@@ -365,6 +366,12 @@ class Derivation:
         """The coordinates whose momenta are constant: neither L, nor a force, nor a constraint acts on them."""
         untouched = self.absent("generalized_force") & self.absent("jacobian").all(axis=0)
         return tuple(np.flatnonzero(untouched).tolist())
+
+    @functools.cached_property
+    def cyclic(self) -> tuple[int, ...] | None:
+        """The coordinates that no operation of L reads, of a scene on arrays; None where a look takes long."""
+        pattern = jacobian_pattern(lambda *state: jnp.ravel(self.motion.lagrangian(*state)), self.state_shapes, by=0)
+        return None if pattern is None else tuple(np.flatnonzero(pattern.sum(axis=0) == 0).tolist())
 
     @_lowered_once
     def borders(self) -> Borders | None:

@@ -15,7 +15,7 @@ from jax.interpreters.partial_eval import dce_jaxpr
 
 from lagjax._engine import Problem, choose
 from lagjax._engine.diffrax import ArrayEquations, form_of
-from lagjax._equations import Derivation, Structure, dependent_rows, jacobian_pattern, pieces_of_motion
+from lagjax._equations import Derivation, Structure, dependent_rows, pieces_of_motion
 from lagjax._interface import join_names, show_str
 from lagjax._native import Nesting, is_large, pieces_of
 from lagjax._program import CLOCK, FLOOR, SIGN, TABLE, TRUNC, Program, Unlowerable
@@ -154,10 +154,7 @@ def explain(problem: Problem) -> Explanation:
 
 def _facts_of_arrays(derivation: Derivation, structure: Structure) -> dict[str, Any]:
     """The facts about a large scene, from what the operations of its functions read, whether or not it cancels."""
-    motion, of_q = (
-        derivation.motion,
-        jacobian_pattern(lambda *state: jnp.ravel(derivation.motion.lagrangian(*state)), derivation.state_shapes, by=0),
-    )
+    motion, cyclic = derivation.motion, derivation.cyclic
     names, inputs = derivation.layout.names, ("q", "dq", "t")
 
     def reads(function) -> set[str]:
@@ -170,9 +167,7 @@ def _facts_of_arrays(derivation: Derivation, structure: Structure) -> dict[str, 
     timed = "t" in reads(motion.lagrangian) | of_constraints
     works = timed or motion.forces is not None or motion.dissipation is not None
     return {
-        "cyclic": None
-        if of_q is None
-        else tuple(name for name, is_read in zip(names, of_q.sum(axis=0), strict=True) if not is_read),
+        "cyclic": None if cyclic is None else tuple(names[i] for i in cyclic),
         "mass_matrix": f"{'varying' if mass else 'constant'}, {structure.mass.name}",
         "mass_matrix_depends_on": tuple(name for name in inputs if name in mass),
         "velocity_terms": "dq" in reads(motion.force),

@@ -168,9 +168,9 @@ class Health(eqx.Module):
     constraint_distance: Extreme  # each field (*batch, m)
     constraint_rate: Extreme  # each field (*batch, m)
     constraint_allowed: Float[Array, "*batch 2"]
-    smallest_eigenvalue: Extreme
-    condition: Extreme
-    scaled_condition: Extreme
+    smallest_eigenvalue: Extreme | None
+    condition: Extreme | None
+    scaled_condition: Extreme | None
     scaled_condition_allowed: Float[Array, "*batch"]
     gradients_finite: Bool[Array, "*batch"]
     gradients_time: Float[Array, "*batch"]
@@ -213,7 +213,6 @@ class Health(eqx.Module):
                 "momentum": _exceeds(xp, of.momentum, of.momentum_allowed).any(axis=-1),
                 "constraints": _exceeds(xp, of.constraint_distance, of.constraint_allowed[..., :1]).any(axis=-1)
                 | _exceeds(xp, of.constraint_rate, of.constraint_allowed[..., 1:]).any(axis=-1),
-                "mass_matrix": _exceeds(xp, of.scaled_condition, of.scaled_condition_allowed),
                 "gradients": ~of.gradients_finite,
                 "steps": of.rejected_steps > xp.maximum(UNSTEADY * tries, 20),
             }
@@ -225,6 +224,8 @@ class Health(eqx.Module):
                 flags["borders"] = of.accepted_steps >= 0
             if of.guards is not None:
                 flags["order"], flags["let_out"] = of.guards
+            if of.scaled_condition is not None:
+                flags["mass_matrix"] = _exceeds(xp, of.scaled_condition, of.scaled_condition_allowed)
             if of.global_error is not None:
                 flags["global_error"] = _exceeds(xp, of.global_error, VISIBLE)
         return flags, xp
@@ -281,13 +282,16 @@ class Health(eqx.Module):
         for k, (what, off) in enumerate((("q", self.constraint_distance), ("qdot", self.constraint_rate))):
             allowed = np.broadcast_to(np.asarray(self.constraint_allowed)[..., k, None], off.value.shape)
             rows += _worst_row(f"constraints, {what}", self.constraint_names, off, allowed)
-        smallest = Extreme(-np.asarray(self.smallest_eigenvalue.value), self.smallest_eigenvalue.t)
-        rows += [
-            ("mass matrix", f"smallest eigenvalue {_worst(smallest, sign=-1)}"),
-            ("", f"condition {_worst(self.condition)}"),
-            ("", f"scaled to a unit diagonal {_worst(self.scaled_condition, self.scaled_condition_allowed)}"),
-            ("gradients", "finite" if np.all(self.gradients_finite) else "not finite"),
-        ]
+        if self.smallest_eigenvalue is None or self.condition is None or self.scaled_condition is None:
+            rows.append(("mass matrix", "eigenvalues are not computed: the scene is large"))
+        else:
+            smallest = Extreme(-np.asarray(self.smallest_eigenvalue.value), self.smallest_eigenvalue.t)
+            rows += [
+                ("mass matrix", f"smallest eigenvalue {_worst(smallest, sign=-1)}"),
+                ("", f"condition {_worst(self.condition)}"),
+                ("", f"scaled to a unit diagonal {_worst(self.scaled_condition, self.scaled_condition_allowed)}"),
+            ]
+        rows.append(("gradients", "finite" if np.all(self.gradients_finite) else "not finite"))
         if self.global_error is not None:
             rows.append(("global error", f"{_worst(self.global_error, VISIBLE)}, in units of the largest |y|"))
         verdict = self.findings() or ("nothing suspicious",)

@@ -16,6 +16,7 @@ import numpy as np
 from lagjax._equations import (
     SADDLE,
     Derivation,
+    Diagonal,
     Motion,
     Sample,
     derivation_of,
@@ -31,6 +32,7 @@ from lagjax._scene import System
 
 _CHUNK = 2**21  # numbers that programs return together, 16 MB
 _STORED = 2**20  # values that a transposed derivative stores between its two passes, 8 MB
+_MOMENTA = 16  # conserved ones of a large scene that are looked at: each takes n numbers at every output
 _DERIVATIVE_BUDGET = 20_000  # operations of the program that computes a doubtful derivative a second time
 
 
@@ -44,7 +46,7 @@ class Measurements(NamedTuple):
     acceleration: Any  # q̈, (n,); zero where nothing does work
     distances: Any  # of q from the constraints, (m,)
     rates: Any  # the distances of q̇ from consistent ones, (m,)
-    mass: Any  # smallest eigenvalue of M, its condition, its condition after scaling, (3,)
+    mass: Any  # smallest eigenvalue of M, its condition, its condition after scaling, (3,); NaN where not known
     finite: Any  # whether the derivatives of the acceleration are finite, ()
 
 
@@ -59,6 +61,12 @@ class Law(NamedTuple):
     @property
     def motion(self) -> Motion:
         return self.derivation.motion
+
+    @property
+    def knows_mass(self) -> bool:
+        """True if the eigenvalues of M are known: not of a large scene, unless M is diagonal."""
+        structure = self.derivation.structure
+        return structure is None or isinstance(structure.mass, Diagonal)
 
     @classmethod
     def from_system(cls, system: System, layout: Layout, params, mode: str) -> "Law":
@@ -129,7 +137,12 @@ class Law(NamedTuple):
         motion, state, chosen = self.motion, (q, qdot, t, params), jnp.asarray(momenta, int)
         by_q = jax.jacrev(lambda *state: motion.momentum(*state)[chosen])(*state)
         finite = jnp.all(jnp.stack([jnp.isfinite(leaf).all() for leaf in _slopes_of_all(motion, *state)]))
-        return self._measure(momenta, tolerances, q, qdot, motion.quantities(*state), by_q, finite)
+        of = motion.quantities(*state)
+        if self.derivation.structure is not None:
+            units = jnp.zeros((len(momenta), q.size), q.dtype).at[np.arange(len(momenta)), chosen].set(1.0)
+            mass = _conditions_of_diagonal(of["mass_diagonal"]) if self.knows_mass else jnp.full(3, jnp.nan, q.dtype)
+            of |= {"momenta_by_qdot": jax.vmap(motion.mass_product(*state))(units), "mass": mass}
+        return self._measure(momenta, tolerances, q, qdot, of, by_q, finite)
 
     def power_at(self, q, qdot, t, params) -> jax.Array:
         return self._power(self.motion.quantities(q, qdot, t, params), qdot)
@@ -143,19 +156,18 @@ class Law(NamedTuple):
         Arrays of NumPy have an axis of states, those of JAX none.
         """
         xp, (rtol, atol), chosen = qdot.__array_namespace__(), tolerances, np.array(momenta, int)
-        momentum, mass, far, fast = of["momentum"], of["mass_matrix"], xp.abs(q), xp.abs(qdot)
+        of = of if "mass_matrix" not in of else of | _products(xp, of["mass_matrix"], of["jacobian"], qdot, chosen)
+        momentum, far, fast = of["momentum"], xp.abs(q), xp.abs(qdot)
         energy = xp.einsum("...i,...i->...", momentum, qdot) - of["lagrangian"]
         by_q = xp.abs(xp.concatenate([of["energy_by_q"][..., None, :], momenta_by_q], axis=-2))
-        of_energy = xp.einsum("...ij,...j->...i", mass, qdot)[..., None, :]
-        by_qdot = xp.abs(xp.concatenate([of_energy, mass[..., chosen, :]], axis=-2))
+        by_qdot = xp.abs(xp.concatenate([of["energy_by_qdot"][..., None, :], of["momenta_by_qdot"]], axis=-2))
 
         def add_changes(of_q, of_qdot):
             return xp.einsum("...ki,...i->...k", by_q, of_q) + xp.einsum("...ki,...i->...k", by_qdot, of_qdot)
 
         terms = xp.einsum("...i,...i->...", xp.abs(momentum), fast) + xp.abs(of["lagrangian"])
         is_energy = np.arange(1 + len(chosen)) == 0
-        lengths = xp.sqrt(xp.sum(of["jacobian"] ** 2, axis=-1))
-        off_q, off_qdot = distances(of["residual"], of["rates"], lengths, self.derivation.position_count)
+        off_q, off_qdot = distances(of["residual"], of["rates"], of["row_lengths"], self.derivation.position_count)
         return Measurements(
             conserved=xp.concatenate([energy[..., None], momentum[..., chosen]], axis=-1),
             slopes=add_changes(rtol * far + atol, rtol * fast + atol),
@@ -164,7 +176,7 @@ class Law(NamedTuple):
             acceleration=_solve(of)[0] if self.works else xp.zeros_like(q),
             distances=off_q,
             rates=off_qdot,
-            mass=_conditions(mass),
+            mass=of["mass"],
             finite=finite,
         )
 
@@ -184,12 +196,30 @@ _QUANTITIES = ("lagrangian", "momentum", "energy_by_q", "residual", "rates", *SA
 
 @np.errstate(all="ignore")
 def _solve(of: dict[str, Any]) -> tuple[Any, Any]:
-    """q̈ and λ from the quantities `SADDLE` of states in NumPy, or of one state in JAX."""
+    """q̈ and λ from the quantities `SADDLE` of states in NumPy, or of one state in JAX; of a large scene its own."""
+    if "mass_matrix" not in of:
+        return of["acceleration"], of["multipliers"]
     if isinstance(of["force"], np.ndarray):
         return solve_saddle(of)
     if not of["gamma"].size:
         return factorize(of["mass_matrix"]).solve(of["force"]), of["gamma"]
     return saddle(*(of[name] for name in SADDLE))[:2]
+
+
+def _products(xp, mass, jacobian, qdot, chosen) -> dict[str, Any]:
+    """M q̇, the rows of M of the `chosen` coordinates, the lengths of the rows of G and what `_conditions` gives."""
+    return {
+        "energy_by_qdot": xp.einsum("...ij,...j->...i", mass, qdot),
+        "momenta_by_qdot": mass[..., chosen, :],
+        "row_lengths": xp.sqrt(xp.sum(jacobian**2, axis=-1)),
+        "mass": _conditions(mass),
+    }
+
+
+def _conditions_of_diagonal(values):
+    """`_conditions` of a diagonal matrix, from its diagonal (n,)."""
+    size = jnp.abs(values)
+    return jnp.stack([jnp.min(values), jnp.max(size) / jnp.min(size), jnp.where(jnp.min(size) > 0, 1.0, jnp.inf)])
 
 
 def _conditions(matrix):
@@ -232,7 +262,9 @@ def _constants(system: System, derivation: Derivation) -> tuple[bool, tuple[int,
         could_work = any("t" in function.extras for function in functions if function is not None) or any(
             part is not None for part in (motion.forces, motion.dissipation, motion.constraints.on_velocities)
         )
-        return could_work, None
+        free = derivation.structure is not None and not (could_work or motion.constrained)
+        cyclic = derivation.cyclic if free else None
+        return could_work, None if cyclic is None else cyclic[:_MOMENTA]
 
 
 def _slopes_of_all(motion: Motion, q, qdot, t, params) -> list[jax.Array]:
@@ -240,9 +272,9 @@ def _slopes_of_all(motion: Motion, q, qdot, t, params) -> list[jax.Array]:
     floats, others = eqx.partition(params, lambda leaf: jnp.issubdtype(jnp.result_type(leaf), jnp.inexact))
 
     def total(q, qdot, t, floats):
-        state = q, qdot, t, eqx.combine(floats, others)
-        parts = motion.mass_matrix_and_force(*state)
-        parts += motion.constraints.jacobian_and_gamma(*state)
+        state, ones = (q, qdot, t, eqx.combine(floats, others)), jnp.ones_like(q)
+        parts = motion.mass_product(*state)(ones), motion.force(*state)
+        parts += motion.constraints.products(*state)[0](ones), motion.constraints.gamma(*state)
         return sum(jnp.sum(part) for part in parts)
 
     return jax.tree.leaves(jax.grad(total, argnums=(0, 1, 2, 3))(q, qdot, t, floats))

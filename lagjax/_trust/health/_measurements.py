@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._equations import Sample, borders_of, is_lowered, map_in_chunks
+from lagjax._equations import Sample, borders_of, is_lowered, map_in_chunks, numbers_of_state
 from lagjax._interface import Layout, is_concrete
 from lagjax._primitives import DOUBLE, widen, with_doubles
 from lagjax._run import Members
@@ -212,7 +212,7 @@ def _measure_traced(trajectory, axes, tree, steps):
         path = _join_states(jnp, outputs, more, steps, tolerances, precision)
         momenta, numbers = _conserved(laws) or (), eqx.filter(params, eqx.is_array)
         tolerances = (0.0, 0.0) if path.tolerances is None else path.tolerances
-        size = _CHUNK // (members * layout.size**2)
+        size = _CHUNK // (members * max(numbers_of_state(law.derivation) for law in laws))
 
         def evaluate_in_chunks(function):
             return lambda *states: map_in_chunks(partial(_evaluate_mode, laws, function), states, size)
@@ -295,7 +295,7 @@ def _report(path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample
     may_be_singular = any(law.motion.constrained for law in laws)  # the constraints may hold what M does not
     finest = max(math.sqrt(eps), SLACK * eps) if fixed else SLACK * path.tolerances[0]
     all_fine, none = xp.all(here.finite | ~on_path, axis=axis), xp.zeros(path.ts.shape[:-1], dtype)
-    energy = most(drifts[..., 0], on_path)
+    energy, knows_mass = most(drifts[..., 0], on_path), all(law.knows_mass for law in laws)
     return {
         "energy": energy,
         "energy_allowed": limits[..., 0],
@@ -308,9 +308,9 @@ def _report(path: SampledPath, laws: list[Law], momenta: tuple[int, ...], sample
         "constraint_distance": most(here.distances, in_force),
         "constraint_rate": most(here.rates, in_force),
         "constraint_allowed": near * xp.stack(spans, axis=-1),
-        "smallest_eigenvalue": most(here.mass[..., 0], on_path, largest=False),
-        "condition": most(here.mass[..., 1], on_path),
-        "scaled_condition": most(here.mass[..., 2], on_path),
+        "smallest_eigenvalue": most(here.mass[..., 0], on_path, largest=False) if knows_mass else None,
+        "condition": most(here.mass[..., 1], on_path) if knows_mass else None,
+        "scaled_condition": most(here.mass[..., 2], on_path) if knows_mass else None,
         "scaled_condition_allowed": none + (math.inf if may_be_singular else finest / np.finfo(path.precision).eps),
         "gradients_finite": all_fine,
         "gradients_time": xp.where(all_fine, math.nan, most(1.0 - here.finite, on_path).t),
