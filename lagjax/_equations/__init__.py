@@ -40,6 +40,7 @@ from lagjax._equations._many_states import (
     map_in_chunks,
     numbers_of_state,
     solve_saddle,
+    sparse_spectrum,
 )
 from lagjax._equations._motion import Motion
 from lagjax._equations._rank import Decided, decide, null_space, span_outside

@@ -65,7 +65,7 @@ class Form(abc.ABC):
         raise NotImplementedError
 
 
-class _Entries(Form):
+class Entries(Form):
     """A form that reads off the entries at `rows`, `columns` by products with the indicators of `colors`."""
 
     def __init__(self, pattern: csr_array, colors: np.ndarray):
@@ -91,7 +91,7 @@ class _Entries(Form):
         return entries * scale[self.rows] * scale[self.columns], scale
 
 
-class Diagonal(_Entries):
+class Diagonal(Entries):
     """Every row has its diagonal entry alone."""
 
     name = "diagonal"
@@ -106,7 +106,7 @@ class Diagonal(_Entries):
         return Solver(lambda b: inverse * b, jnp.any(zero) & (not dependent), jnp.sum(~zero))
 
 
-class Blocks(_Entries):
+class Blocks(Entries):
     """Connected components: `groups` of those of one size, each an array (count, size) of rows."""
 
     def __init__(self, pattern: csr_array, label: np.ndarray):
@@ -151,7 +151,7 @@ class Blocks(_Entries):
         return Solver(solve, singular, jnp.asarray(independent))
 
 
-class Band(_Entries):
+class Band(Entries):
     """A band of `width` entries on either side of the diagonal, in the `order` of reverse Cuthill–McKee."""
 
     def __init__(self, pattern: csr_array, order: np.ndarray, width: int):
@@ -206,7 +206,7 @@ class Band(_Entries):
         return Solver(solve, singular & (not dependent), jnp.sum(counts))
 
 
-class Sparse(_Entries):
+class Sparse(Entries):
     """Entries in rows that are filled up to one length, for products; conjugate gradients solve with them."""
 
     def __init__(self, pattern: csr_array, colors: np.ndarray):

@@ -80,23 +80,30 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
     reported = _inputs(layout, q, qdot, t, params)
     if any(finding.level == "error" for finding in reported):
         return Findings.sort(reported)
-    return Findings.sort([*reported, *_scene_findings(system, q, qdot, t, params)])
+    found, omitted = _scene_findings(system, q, qdot, t, params)
+    return Findings.sort([*reported, *found], omitted)
 
 
 @accepts_singles(("q", "qdot"), ("t", "params"))
-def _scene_findings(system, q, qdot, t, params) -> list[Finding]:
+def _scene_findings(system, q, qdot, t, params) -> tuple[list[Finding], str]:
     scene = CheckedScene.from_state(system, Layout.from_state(q, qdot), q, qdot, t, params)
     reported = _derivative_checks.findings(scene)
     reported += _dissipation(scene)
     reported += _constraint_checks.findings(scene)
     reported += _mass.findings(scene)
+    if scene.is_large:
+        reported += [] if any(finding.level == "error" for finding in reported) else _acceleration(scene)
+        return [*reported, *_time(scene)], (
+            f"Not looked at: time scales, jumps nearby, which constraints follow from others, and derivatives one by "
+            f"one. This scene of {scene.layout.size} coordinates runs on arrays ({scene.derivation.structure})."
+        )
     if not any(finding.level == "error" for finding in reported):
         known = {finding.where for finding in reported if finding.kind == "kink"}  # one finding for each direction
         nearby = [finding for finding in _jumps_nearby.findings(scene) if finding.where not in known]
         known |= {finding.where for finding in nearby}
         ahead = [finding for finding in _borders_ahead.findings(scene) if finding.where not in known]
         reported += [*_acceleration(scene), *nearby, *ahead, *_stiffness.findings(scene)]
-    return [*reported, *_time(scene)]
+    return [*reported, *_time(scene)], ""
 
 
 # ---- the arguments ---------------------------------------------------------------------------------------------------

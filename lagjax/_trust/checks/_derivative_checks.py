@@ -20,6 +20,8 @@ _RANDOM = 8
 def findings(scene: CheckedScene) -> list[Finding]:
     if reported := _values(scene) or _not_finite(scene):
         return reported
+    if scene.is_large:
+        return _compare_along_lines(scene)
     if scene.layout.size > _ALL_AT_ONCE and scene.is_lowered and _agree(scene):
         return []
     sides = scene.sides()
@@ -47,7 +49,7 @@ def _not_finite(scene: CheckedScene) -> list[Finding]:
     m, n, names = scene.measured, scene.layout.size, scene.names
     first = ~np.isfinite(np.concatenate([m.by_q, m.momentum[0]]))
     drag = ~np.isfinite(m.by_v_of_dissipation)
-    second = ~np.isfinite(m.mass[0]).all(axis=0) | ~np.isfinite(scene.drift) & ~drag
+    second = ~np.isfinite(m.mass[0]).all(axis=1) | ~np.isfinite(scene.drift) & ~drag
     reported = []
     if first.any():
         reported.append(
@@ -172,34 +174,103 @@ def _compare_derivatives(
     derivative, wrong = derivative.value, differ(derivative, both, dtype) & ~kinks
     names, reported = [names[i] for i in directions], []
     for i, k in list(zip(*np.nonzero(kinks), strict=True))[:_SHOWN]:
-        slope = (
-            f"The slope of {name} along {names[i]} is {behind.value[i, k]:.6g} below this state and "
-            f"{ahead.value[i, k]:.6g} above it"
-        )
-        if role in ("lagrangian", "dissipation"):
-            pieces = describe_pieces([getattr(scene.motion, role)], scene.state)
-            slope += f" (the function is pieced together by {pieces})" if pieces else ""
-        of_force = role == "dissipation" or (role == "lagrangian" and not (name == "L" and directions[i] >= n))
-        if of_force:
-            rest = (
-                ": the acceleration jumps here. At this very state `acceleration` and derivatives are those of one "
-                f"side, or between them, by the slope {derivative[i, k]:.6g}. {OF_FORCE}"
-            )
-        else:
-            rest = (
-                f": a kink, where automatic differentiation says {derivative[i, k]:.6g}. No force shows the kick that "
-                "it gives to velocities. Smooth it (sqrt(x**2 + w**2) for abs(x)), or make two modes of it with a "
-                "Transition for lagjax.simulate_hybrid."
-            )
-        reported.append(Finding("kink", "advice" if of_force else "error", (names[i],), slope + rest))
+        of_velocity = name == "L" and directions[i] >= n
+        values = behind.value[i, k], ahead.value[i, k], derivative[i, k]
+        reported.append(_kink(scene, name, role, names[i], values, of_velocity))
     for i, k in list(zip(*np.nonzero(wrong), strict=True))[:_SHOWN]:
-        message = (
-            f"The derivative of {name} along {names[i]} is {derivative[i, k]:.6g} by automatic differentiation, and "
-            f"{both.value[i, k]:.6g} ± {both.error[i, k]:.0e} by finite differences: a custom derivative is wrong, or "
-            "stop_gradient, a round or a cast to integers hides a dependence."
-        )
-        reported.append(Finding("wrong_derivative", "error", (names[i],), message))
+        reported.append(_wrong(name, names[i], derivative[i, k], both.value[i, k], both.error[i, k]))
     return reported
+
+
+def _kink(scene: CheckedScene, name: str, role: str, along: str, values, of_velocity: bool) -> Finding:
+    """The finding for slopes below and above the state that differ; `values` are these and the derivative."""
+    below, above, derivative = values
+    slope = f"The slope of {name} along {along} is {below:.6g} below this state and {above:.6g} above it"
+    if role in ("lagrangian", "dissipation"):
+        pieces = describe_pieces([getattr(scene.motion, role)], scene.state)
+        slope += f" (the function is pieced together by {pieces})" if pieces else ""
+    of_force = role == "dissipation" or (role == "lagrangian" and not of_velocity)
+    if of_force:
+        rest = (
+            ": the acceleration jumps here. At this very state `acceleration` and derivatives are those of one "
+            f"side, or between them, by the slope {derivative:.6g}. {OF_FORCE}"
+        )
+    else:
+        rest = (
+            f": a kink, where automatic differentiation says {derivative:.6g}. No force shows the kick that "
+            "it gives to velocities. Smooth it (sqrt(x**2 + w**2) for abs(x)), or make two modes of it with a "
+            "Transition for lagjax.simulate_hybrid."
+        )
+    return Finding("kink", "advice" if of_force else "error", (along,), slope + rest)
+
+
+def _wrong(name: str, along: str, derivative: float, slope: float, error: float) -> Finding:
+    message = (
+        f"The derivative of {name} along {along} is {derivative:.6g} by automatic differentiation, and "
+        f"{slope:.6g} ± {error:.0e} by finite differences: a custom derivative is wrong, or "
+        "stop_gradient, a round or a cast to integers hides a dependence."
+    )
+    return Finding("wrong_derivative", "error", (along,), message)
+
+
+# ---- of a large scene ------------------------------------------------------------------------------------------------
+
+_LINES = 2  # random directions of q, as many of q̇, and the motion: half a thousand evaluations of L and p
+_OF_LINES = (
+    ("L", "lagrangian"), ("p = dL/dqdot", "lagrangian"), ("D", "dissipation"), ("a constraint", "constraints"),
+    ("a velocity constraint", "velocity_constraints"),
+)  # fmt: skip
+
+
+def _compare_along_lines(scene: CheckedScene) -> list[Finding]:
+    """Findings where derivatives are not the slopes along random directions of all coordinates or velocities.
+
+    The coordinate to blame is looked for by halves. What is compared is a sum over all outputs of a function.
+    """
+    n, reported = scene.layout.size, {}
+    directions = np.zeros((2 * _LINES + 1, 2 * n + 1))
+    random = np.random.default_rng(0).standard_normal((2, _LINES, n)) * scene.sizes[:-1].reshape(2, 1, n)
+    directions[:_LINES, :n], directions[_LINES:-1, n:-1] = random
+    directions[-1, -1] = 1.0
+    for direction in directions:
+        for k in np.flatnonzero(_off_line(scene, direction)[0].any(axis=0)):
+            part = np.flatnonzero(direction)
+            while len(part) > 1:
+                half = part[: len(part) // 2], part[len(part) // 2 :]
+                part = next((of for of in half if _off_line(scene, _only(direction, of))[0][:, k].any()), part[:0])
+            if not len(part):
+                continue  # a difference of the sum alone is rounding
+            (kinks, _), both, ahead, behind, derivative = _off_line(scene, _only(direction, part))
+            size, along, (name, role) = direction[part[0]], scene.names[part[0]], _OF_LINES[k]
+            sides = (behind, ahead) if size > 0 else (ahead, behind)
+            values = (*(of.value[0, k] / size for of in sides), derivative[k] / size)
+            if kinks[k]:
+                found = _kink(scene, name, role, along, values, name == "L" and part[0] >= n)
+            else:
+                found = _wrong(name, along, values[-1], both.value[0, k] / size, both.error[0, k] / abs(size))
+            reported.setdefault((found.kind, name), found)
+    return list(reported.values())
+
+
+def _only(direction: np.ndarray, part: np.ndarray) -> np.ndarray:
+    alone = np.zeros_like(direction)
+    alone[part] = direction[part]
+    return alone
+
+
+def _off_line(scene: CheckedScene, direction: np.ndarray) -> tuple[np.ndarray, Slopes, Slopes, Slopes, np.ndarray]:
+    """Flags (2, 5) of kinks and wrong derivatives along a direction, slopes on both and on each side, derivatives."""
+    n, dtype = scene.layout.size, scene.layout.dtype
+    steps = ladder(np.array([scene.sizes[-1] if direction[-1] else 1.0]), dtype)
+    line, eps = scene.line(direction, steps[:, 0]), float(np.finfo(dtype).eps)
+    place = np.abs(direction) @ (_places(scene) / scene.sizes**2)
+    sides = slopes(line.minus[None], line.here, line.plus[None], steps, np.array([place]), eps, 4 * eps * line.terms)
+    both, ahead, behind = sides
+    kinks = differ(ahead, behind, dtype)[0]
+    wrong = differ(Slopes(line.derivative[None], 0 * line.derivative[None]), both, dtype)[0] & ~kinks
+    if direction[:n].any() or direction[-1]:
+        kinks[2] = wrong[2] = False  # of D only the slope by velocities counts
+    return np.stack([kinks, wrong]), both, ahead, behind, line.derivative
 
 
 def _places(scene: CheckedScene) -> np.ndarray:

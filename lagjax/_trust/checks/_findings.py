@@ -39,15 +39,17 @@ class Finding:
 class Findings:
     """The findings of `lagjax.check`, errors first: iterate over it, or print it.
 
-    `ok` is True without an error; `kinds` are the kinds that were found.
+    `ok` is True without an error; `kinds` are the kinds that were found; `omitted` says what was not looked at, in a
+    large scene, and is empty elsewhere.
     """
 
     found: tuple[Finding, ...]
+    omitted: str = ""
 
     @classmethod
-    def sort(cls, found: list[Finding]) -> "Findings":
+    def sort(cls, found: list[Finding], omitted: str = "") -> "Findings":
         """The findings by level, those of one level in the order of `found`."""
-        return cls(tuple(sorted(found, key=lambda finding: _ORDER[finding.level])))
+        return cls(tuple(sorted(found, key=lambda finding: _ORDER[finding.level])), omitted)
 
     @property
     def ok(self) -> bool:
@@ -68,7 +70,6 @@ class Findings:
     _repr_pretty_ = show_str
 
     def __str__(self) -> str:
-        if not self.found:
-            return "Nothing found."
         more = len(self.found) - _SHOWN
-        return "\n".join([*map(str, self.found[:_SHOWN]), *([f"… and {more} more"] if more > 0 else [])])
+        lines = [*map(str, self.found[:_SHOWN]), *([f"… and {more} more"] if more > 0 else [])] or ["Nothing found."]
+        return "\n".join(lines + textwrap.wrap(self.omitted, _WIDTH))

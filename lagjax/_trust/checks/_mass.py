@@ -17,7 +17,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from lagjax._engine import DEFAULT_RTOL
-from lagjax._equations import eigen, null_directions, null_space, singular_threshold, unit_diagonal
+from lagjax._equations import eigen, null_directions, null_space, singular_threshold, sparse_spectrum, unit_diagonal
 from lagjax._interface import join_names
 from lagjax._trust.checks._findings import Finding
 from lagjax._trust.checks._scene_at_start import CheckedScene
@@ -25,6 +25,8 @@ from lagjax._trust.checks._scene_at_start import CheckedScene
 
 def findings(scene: CheckedScene) -> list[Finding]:
     m, names = scene.measured, scene.layout.names
+    if scene.is_large:
+        return _of_large(scene, names)
     augmented = scene.augmented
     usable = [k for k in range(1, len(augmented)) if np.isfinite(augmented[k]).all()]
     if not np.isfinite(augmented[0]).all():
@@ -50,6 +52,11 @@ def _rounding(matrix: np.ndarray) -> float:
     return 32 * singular_threshold(len(matrix), matrix.dtype)
 
 
+_NO_ENERGY = (
+    "L has no kinetic energy along this combination of velocities. Add it (a missing mass?), or use fewer coordinates."
+)
+
+
 # ---- singular --------------------------------------------------------------------------------------------------------
 
 
@@ -57,7 +64,8 @@ def _singular(scene: CheckedScene, augmented: np.ndarray, usable: list[int]) -> 
     """Findings for K (states, n, n) that is singular at the state; `usable` are the states nearby where K is finite."""
     names, constrained = scene.layout.names, scene.motion.constrained
     empty = [i for i in range(len(names)) if all(not augmented[k][i].any() for k in [0, *usable])]
-    empty_rows = [_empty(i, scene.measured.momentum[[0, *usable], i], names[i], constrained) for i in empty]
+    momenta = scene.measured.momentum[[0, *usable]]
+    empty_rows = [_empty((names[i],), bool(momenta[:, i].any()), constrained) for i in empty]
     rest = [i for i in range(len(names)) if i not in empty]
 
     def among_rest(k):
@@ -72,17 +80,18 @@ def _singular(scene: CheckedScene, augmented: np.ndarray, usable: list[int]) -> 
     return [*empty_rows, Finding(kind, "error", where, f"{what} is singular along {combinations}, {why}")]
 
 
-def _empty(i: int, momenta: np.ndarray, name: str, constrained: bool) -> Finding:
-    linear = bool(np.any(momenta != 0))
-    kind = "linear_in_velocity" if linear else "velocity_unused"
-    what = f"L is linear in d{name}" if linear else f"L does not contain the velocity d{name}"
+def _empty(where: tuple[str, ...], linear: bool, constrained: bool) -> Finding:
+    """The finding for coordinates of which M has zero rows, and whether L is linear in their velocities."""
+    kind, name = "linear_in_velocity" if linear else "velocity_unused", join_names(where)
+    velocity = join_names([f"d{name}" for name in where])
+    what = f"L is linear in {velocity}" if linear else f"L does not contain the velocity {velocity}"
     nor = ", and no constraint holds it" if constrained else ""
     message = (
         f"{what}{nor}: the mass matrix has a zero row, and nothing determines the acceleration of {name}. Add its "
         f"kinetic energy, or take {name} out of q"
         + (": an equation of first order is not one of motion." if linear else " and give it as a parameter.")
     )
-    return Finding(kind, "error", (name,), message)
+    return Finding(kind, "error", where, message)
 
 
 def _classify(scene: CheckedScene, here: np.ndarray, nearby: dict[int, np.ndarray]) -> tuple[str, str]:
@@ -110,10 +119,7 @@ def _classify(scene: CheckedScene, here: np.ndarray, nearby: dict[int, np.ndarra
             "good as another. Take one of the coordinates as t, or, where L is a length alone, integrate its square."
         )
     if nearby and all(_spans(here, directions) for directions in nearby.values()):
-        return "velocity_combination", (
-            "here and nearby: L has no kinetic energy along this combination of velocities. Add it (a missing mass?), "
-            "or use fewer coordinates."
-        )
+        return "velocity_combination", f"here and nearby: {_NO_ENERGY}"
     return "gauge", (
         "and nearby along directions that change with the state: a part of the motion is left free. Fix it by a "
         "constraint, or use fewer coordinates."
@@ -181,28 +187,59 @@ def _signs(mass: np.ndarray, rows: np.ndarray, names) -> list[Finding]:
     negative = values < -_rounding(mass) * np.abs(values).max()
     if not negative.any():
         return []
-    direction = scale * (free @ vectors[:, 0])
+    return [_indefinite(scale * (free @ vectors[:, 0]), bool(negative.all()), names)]
+
+
+def _indefinite(direction: np.ndarray, everywhere: bool, names) -> Finding:
     combination = describe_direction(direction, names)
     where = tuple(name for name, c in zip(names, direction, strict=True) if abs(c) > 1e-6 * np.abs(direction).max())
-    whole = "negative definite" if negative.all() else "indefinite"
-    return [Finding(
+    whole = "negative definite" if everywhere else "indefinite"
+    return Finding(
         "indefinite_mass_matrix", "warning", where,
         f"The mass matrix is {whole}: d2L is negative along {combination}. The motion is that of L all the same, but "
         "if L is meant to be T - U, a sign is wrong, or a mass is negative.",
-    )]  # fmt: skip
+    )  # fmt: skip
 
 
 def _condition(matrix: np.ndarray, names, default_rtol: float) -> list[Finding]:
     values, vectors = eigen(unit_diagonal(matrix)[0])
     with np.errstate(divide="ignore"):
         condition, raw = (np.abs(x).max() / np.abs(x).min() for x in (values, eigen(matrix)[0]))
-    lost = condition * np.finfo(matrix.dtype).eps
+    return _ill_conditioned(condition, f" ({raw:.1e} before)", vectors[:, 0], names, default_rtol)
+
+
+def _ill_conditioned(condition: float, more: str, direction: np.ndarray, names, default_rtol: float) -> list[Finding]:
+    lost = condition * np.finfo(direction.dtype).eps
     if lost <= default_rtol:
         return []
-    where = tuple(name for name, c in zip(names, vectors[:, 0], strict=True) if abs(c) > 0.1)
+    where = tuple(name for name, c in zip(names, direction, strict=True) if abs(c) > 0.1)
     message = (
-        f"The mass matrix has the condition {condition:.1e} after scaling each coordinate ({raw:.1e} before): "
+        f"The mass matrix has the condition {condition:.1e} after scaling each coordinate{more}: "
         f"accelerations are good to {lost:.0e} only, through {join_names(where)}. Use coordinates that are less "
         "coupled (absolute angles instead of joint angles), masses less far apart, or do not ask for a tighter rtol."
     )
     return [Finding("ill_conditioned", "advice", where, message)]
+
+
+# ---- of a large scene ------------------------------------------------------------------------------------------------
+
+
+def _of_large(scene: CheckedScene, names) -> list[Finding]:
+    """Findings about M, regular also where constraints hold, from its entries where their places are known."""
+    m = scene.measured
+    empty = np.isfinite(m.mass[0]).all() and ~m.mass.any(axis=(0, 2))
+    if np.any(empty):
+        linear = m.momentum.any(axis=0)
+        groups = [(np.flatnonzero(empty & (linear == kind)), kind) for kind in (True, False)]
+        return [_empty(tuple(names[i] for i in of), kind, False) for of, kind in groups if len(of)]
+    spectrum = sparse_spectrum(scene.derivation, scene.state)
+    if spectrum is None:
+        return []
+    (smallest, null), (lowest, downward), largest = spectrum
+    if np.abs(smallest) <= 32 * singular_threshold(2, null.dtype) * np.abs(largest):
+        where = tuple(name for name, c in zip(names, null, strict=True) if abs(c) > 1e-6 * np.abs(null).max())
+        message = f"The mass matrix d2L/dqdot2 is singular along {describe_direction(null, names)}: {_NO_ENERGY}"
+        return [Finding("velocity_combination", "error", where, message)]
+    condition = abs(largest / smallest)
+    reported = [_indefinite(downward, False, names)] if lowest < 0 else []
+    return reported + _ill_conditioned(condition, "", null, names, DEFAULT_RTOL)

@@ -17,6 +17,7 @@ from lagjax._equations import (
     Scales,
     augment,
     decide,
+    derivation_of,
     is_lowered,
     numbers_of,
     rank_tolerance,
@@ -117,6 +118,19 @@ class CheckedScene(NamedTuple):
         return is_lowered(self.derivation)
 
     @property
+    def is_large(self) -> bool:
+        """True if M and G are known by products alone: `Measured` holds those with one vector, (…, 1)."""
+        return self.derivation.structure is not None
+
+    def line(self, direction: np.ndarray, steps: np.ndarray) -> "Line":
+        """The scene along a `direction` (2n + 1,) of the coordinates, the velocities and the time of the motion."""
+        q, qdot, t, params = self.arguments
+        n, here = self.layout.size, self.point
+        moved = direction + direction[-1] * np.concatenate([here[n:-1], np.zeros(n + 1)])
+        values = _evaluate_line(self.system, q, qdot, t, params, moved.astype(here.dtype), steps)
+        return Line(*(np.asarray(x, float) for x in values))
+
+    @property
     def lagrangian(self) -> np.ndarray:
         return self.measured.here[0]
 
@@ -142,8 +156,10 @@ class CheckedScene(NamedTuple):
         return augment(self.measured.mass, self.measured.jacobian)[0]
 
     def solve_saddle(self) -> tuple[np.ndarray, np.ndarray]:
-        """q̈ (n,) and λ (m,) at the state."""
+        """q̈ (n,) and λ (m,) at the state; of a large scene q̈ alone."""
         m, n = self.measured, self.layout.size
+        if m.acceleration is not None:
+            return m.acceleration, np.zeros(0)
         x = self._solve(np.concatenate([m.force, m.gamma])[:, None])[:, 0]
         return x[:n], x[n:]
 
@@ -190,6 +206,17 @@ class Measured(NamedTuple):
     velocity: Any  # (states, n)
     power: Any  # Σ q̇ᵢ ∂D/∂q̇ᵢ, which D takes out of the motion, and Σ |q̇ᵢ ∂D/∂q̇ᵢ|, (states, 2)
     here: Any  # the outputs L, p, D (if there is one), f and a at the state, (outputs,)
+    acceleration: Any = None  # q̈ of a large scene, (n,)
+
+
+class Line(NamedTuple):
+    """L, p, D, f and a along a line through the state, a weighted sum of each, (5,)."""
+
+    here: Any
+    terms: Any  # the sum of the sizes of what they consist of
+    derivative: Any  # by automatic differentiation; of D by q̇ alone
+    minus: Any  # at steps back, (rungs, 5)
+    plus: Any  # at steps ahead, (rungs, 5)
 
 
 class Sides(NamedTuple):
@@ -251,8 +278,9 @@ def _offsets(sizes: np.ndarray, scales: Scales, dtype) -> np.ndarray:
 
 _COMPARED = ("lagrangian", "momentum", "dissipation", "residual")
 _NEARBY_QUANTITIES = (
-    "momentum", "mass_matrix", "jacobian", "lagrangian_by_q", "force", "given_force", "gamma", "dissipation_by_qdot",
+    "mass_matrix", "jacobian", "momentum", "lagrangian_by_q", "force", "given_force", "gamma", "dissipation_by_qdot",
 )  # fmt: skip
+_PRODUCTS = ("mass_by_some", "jacobian_by_some", "acceleration")  # in the place of M and G
 _DERIVED = ("lagrangian_by_q", "momentum", "mass_matrix", "given_force", "dissipation_by_qdot", "force", "jacobian")
 
 
@@ -261,7 +289,13 @@ def _measure(here: Sample, offsets: np.ndarray) -> Measured:
     n = here.derivation.layout.size
     velocity = here.qdot + offsets[:, n:]
     near = here._replace(q=here.q + offsets[:, :n], qdot=velocity)
-    of, power = near.quantities(*_NEARBY_QUANTITIES), np.zeros((len(offsets), 2))
+    names, acceleration, power = _NEARBY_QUANTITIES, None, np.zeros((len(offsets), 2))
+    if here.derivation.structure is not None:
+        of = near.quantities(*names[2:], *_PRODUCTS)
+        acceleration = of["acceleration"][0]
+        of |= {"mass_matrix": of["mass_by_some"][..., None], "jacobian": of["jacobian_by_some"][..., None]}
+    else:
+        of = near.quantities(*names)
     if here.derivation.motion.dissipation is not None:
         damping = near._replace(q=here.q + 0 * offsets[:, :n]).quantities("dissipation_by_qdot")
         terms = damping["dissipation_by_qdot"] * velocity
@@ -278,7 +312,49 @@ def _measure(here: Sample, offsets: np.ndarray) -> Measured:
         velocity=velocity,
         power=power,
         here=here.flat(*_COMPARED)[0],
+        acceleration=acceleration,
     )
+
+
+@eqx.filter_jit
+def _evaluate_line(system: System, q, qdot, t, params, direction, steps):
+    layout = Layout.from_state(q, qdot)
+    motion, n = derivation_of(system, layout, params).motion, layout.size
+    numbers, along = eqx.filter(params, eqx.is_array_like), (direction[:n], direction[n:-1], direction[-1])
+    state = layout.flatten(q), layout.flatten(qdot), t
+
+    def weighted(x):  # no symmetry makes terms cancel
+        return jnp.sum(x * (weights := jnp.cos(jnp.arange(1.0, x.size + 1)))), jnp.sum(jnp.abs(x * weights))
+
+    def values(q, v, t):
+        of = (
+            motion.momentum(q, v, t, numbers),
+            motion.constraints.f(q, t, numbers),
+            motion.constraints.a(q, v, t, numbers),
+        )
+        return list(map(weighted, of))
+
+    def dissipation(*state):
+        return jnp.zeros((), q0.dtype) if motion.dissipation is None else motion.dissipation(*state, numbers)
+
+    def outputs(*state):
+        p, f, a = (value for value, _ in values(*state))
+        return jnp.stack([motion.lagrangian(*state, numbers), p, dissipation(*state), f, a])
+
+    q0, v0, _ = state
+    slopes = jax.grad(motion.lagrangian, argnums=(0, 1, 2))(*state, numbers)
+    drag = jax.grad(dissipation, argnums=1)(*state)
+    p, f, a = jax.jvp(lambda *state: [value for value, _ in values(*state)], state, along)[1]
+    derivative = jnp.stack([sum(jnp.sum(x * d) for x, d in zip(slopes, along, strict=True)), p, drag @ along[1], f, a])
+    here = outputs(*state)
+    of_p, of_f, of_a = (terms for _, terms in values(*state))
+    of_l = jnp.abs(here[0]) + jnp.sum(jnp.abs(q0 * slopes[0])) + jnp.sum(jnp.abs(v0 * slopes[1]))
+    terms = jnp.stack([of_l, of_p, jnp.abs(here[2]) + jnp.sum(jnp.abs(v0 * drag)), of_f, of_a])
+
+    def moved(step):
+        return outputs(*(x + step * d for x, d in zip(state, along, strict=True)))
+
+    return here, terms, derivative, jax.lax.map(moved, -steps), jax.lax.map(moved, steps)
 
 
 def _program_variation(derivation: Derivation, state, acceleration, multipliers) -> np.ndarray:
