@@ -172,7 +172,7 @@ def _solve(engine: Diffrax, problem: Problem) -> Solution:
     form, y0 = form_of(derivation, problem.system.path), jnp.asarray(problem.y0)
 
     # A member that cannot start is given no time to integrate over: it costs nothing, and the others do not wait.
-    start = _state_result(y0, *form.acceleration(given[0], halves(y0), numbers))
+    start = _state_result(y0, *form.acceleration(*freeze((given[0], halves(y0), numbers))))
     ts = jnp.where(start == RESULTS.successful, given, given[0])
     event, is_located = (None, True) if problem.event is None else _flatten_event(problem, ts, y0, numbers)
     method = engine.method(problem)
@@ -213,6 +213,8 @@ def _state_result(y, acceleration, singular) -> RESULTS:
 
 def _explain_result(solution: Solution, form: MotionEquations, start: RESULTS, ts, numbers) -> RESULTS:
     """The most telling of what diffrax reports, of the first and the last state, and of what the motion ran into."""
+    # A name has no derivative, and the search for it is a loop that reverse mode could not go back through.
+    ts, solution, numbers = freeze((ts, solution, numbers))
     last = halves(solution.y_end)
     end = _state_result(solution.y_end, *form.acceleration(solution.t_end, last, numbers))
     result = result_from(solution.result)
@@ -221,9 +223,7 @@ def _explain_result(solution: Solution, form: MotionEquations, start: RESULTS, t
     result = RESULTS.where(unhealthy, end, result)
     result = RESULTS.where(start == RESULTS.successful, result, start)
 
-    field = eqx.filter_closure_convert(form.acceleration, ts[0], last, numbers)
-    # A name has no derivative, and the search for it is a loop that reverse mode could not go back through.
-    field, ts, solution, numbers = freeze((field, ts, solution, numbers))
+    field = freeze(eqx.filter_closure_convert(form.acceleration, ts[0], last, numbers))
 
     def acceleration(t, y):
         return field(t, halves(y), numbers)[0]

@@ -59,13 +59,15 @@ class ScalarEquations(eqx.Module):
     `program` gives q̈ and whether its matrix is singular, `projection` (q, q̇) after a step back to the constraints.
     """
 
+    motion: Motion = eqx.field(static=True)
     program: Program = eqx.field(static=True)
     projection: Program | None = eqx.field(static=True)
     accelerate: Any = eqx.field(static=True)
     project: Any = eqx.field(static=True)
 
-    def __init__(self, program: Program, projection: Program | None = None):
-        self.program, self.projection, self.accelerate = program, projection, compiled_once(program)
+    def __init__(self, motion: Motion, program: Program, projection: Program | None = None):
+        self.motion, self.program, self.projection = motion, program, projection
+        self.accelerate = compiled_once(program)
         self.project = None if projection is None else compiled_once(projection)
 
     @property
@@ -103,7 +105,7 @@ def form_of(derivation: Derivation, path: str = "auto") -> MotionEquations:
     if path == "auto" and program.operations > LARGEST_XLA_PROGRAM:
         reason = f"{program.operations} operations are more than the {LARGEST_XLA_PROGRAM} that XLA compiles quickly"
         return ArrayEquations(motion, reason)
-    return ScalarEquations(program, derivation.projected)
+    return ScalarEquations(motion, program, derivation.projected)
 
 
 def _scalars(params: PyTree) -> list[jax.Array]:

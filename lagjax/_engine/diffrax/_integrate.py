@@ -11,6 +11,8 @@ first ones, differ from them in the last digit, and then accept or reject otherw
 a word. This is the only module that calls diffrax's integrator.
 """
 
+import functools
+from collections.abc import Callable
 from typing import Any
 
 import diffrax
@@ -70,25 +72,26 @@ def integrate(
 
     field = eqx.filter_closure_convert(vector_field, ts[0], y0, params)
     project = eqx.filter_closure_convert(projected, ts[0], y0, params) if form.constrained else None
-    solution = _differentiable((field, project, ts, y0, params), method, adjoint, event)
+    jumps = functools.partial(may_jump, form.motion)
+    solution = _differentiable((field, project, ts, y0, params), method, jumps, adjoint, event)
     if project is not None:
         path = jax.lax.map(lambda at: project(*at, params), (ts, solution.path))
         solution = solution._replace(path=path)
     return solution
 
 
-def _differentiable(moving, method: Method, adjoint, event) -> Solution:
+def _differentiable(moving, method: Method, jumps: Callable, adjoint, event) -> Solution:
     if adjoint is not None or event is not None:
         adjoint = diffrax.RecursiveCheckpointAdjoint() if adjoint is None else adjoint
-        field, _, ts, y0, params = moving
-        if isinstance(adjoint, diffrax.BacksolveAdjoint) or not may_jump(field, ts[0], y0, params):
+        _, _, ts, y0, params = moving
+        if isinstance(adjoint, diffrax.BacksolveAdjoint) or not jumps(ts[0], y0, params):
             return _call(moving, method, adjoint, event)[0]
         # It is not known here by what this will be differentiated: parameters count as fixed.
         solution, _, crossed = _call(moving, _note_jumps(moving, method, None), adjoint, event)
         y_end, path = (differentiable_where(~crossed, x) for x in (solution.y_end, solution.path))
         return solution._replace(path=path, y_end=y_end)
     # Tolerances and the smallest step follow from ts and the dtype; like all that sizes a step, they are data here.
-    return _solve_and_record(moving, freeze(method))
+    return _solve_and_record(moving, freeze(method), jumps)
 
 
 def _note_jumps(moving, method: Method, varied) -> Method:
@@ -147,18 +150,18 @@ def _set_stage_loop(solver, adjoint):
 
 
 @eqx.filter_custom_vjp
-def _solve_and_record(moving, method):
+def _solve_and_record(moving, method, jumps):
     """The solution by the plain loop, `diffrax.ForwardMode`, which keeps nothing; reverse mode replays its steps."""
     return _call(moving, method, diffrax.ForwardMode())[0]
 
 
 @_solve_and_record.def_fwd
-def _forward(perturbed, moving, method):
+def _forward(perturbed, moving, method, jumps):
     record = diffrax.SubSaveAt(steps=True, fn=lambda t, y, args: t)
     of_field, _, _, of_start, of_params = perturbed
     varied = of_field, of_params
-    field, _, ts, y0, params = moving
-    if any(jax.tree.leaves((varied, of_start))) and may_jump(field, ts[0], y0, params):
+    _, _, ts, y0, params = moving
+    if any(jax.tree.leaves((varied, of_start))) and jumps(ts[0], y0, params):
         method = _note_jumps(moving, method, varied)
     solution, (times,), crossed = _call(moving, method, diffrax.ForwardMode(), None, record)
     residuals = times, solution.t_end, solution.result, crossed
@@ -168,7 +171,7 @@ def _forward(perturbed, moving, method):
 
 
 @_solve_and_record.def_bwd
-def _backward(residuals, cotangents, perturbed, moving, method):
+def _backward(residuals, cotangents, perturbed, moving, method, jumps):
     times, t_end, result, crossed = residuals
 
     def replay(moving):

@@ -19,6 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend import core
 
+from lagjax._equations import Motion
+from lagjax._interface import halves
 from lagjax._program import OPERATIONS
 
 # On double numbers a bracket is 1e-9 of a step after 30 halvings, and 1e-6 of the largest acceleration is a jump: what
@@ -39,9 +41,10 @@ def freeze(tree):
     return jax.tree.map(lambda x: jax.lax.stop_gradient(x) if eqx.is_array(x) else x, tree)
 
 
-def may_jump(field, *arguments) -> bool:
-    """True if a function has operations in it that decide on something."""
-    return _decides(jax.make_jaxpr(lambda *xs: field(*xs))(*arguments).jaxpr)
+def may_jump(motion: Motion, t, y, params) -> bool:
+    """True if F or γ has operations in it that decide on something; those of an elimination leave q̈ smooth."""
+    parts = [motion.force, *([motion.constraints.gamma] if motion.constrained else [])]
+    return any(_decides(jax.make_jaxpr(part)(*halves(y), t, params).jaxpr) for part in parts)
 
 
 def _decides(jaxpr) -> bool:
@@ -57,8 +60,8 @@ def crosses(field, varied, begin, end, params) -> jax.Array:
     (t0, y0), (t1, y1), dtype = begin, end, begin[1].dtype
     n = y0.size // 2
 
-    def acceleration_at(s, moved: Any = 0.0):
-        return field(t0 + s * (t1 - t0), y0 + s * (y1 - y0) + moved, params)[n:]
+    def acceleration_at(s):
+        return field(t0 + s * (t1 - t0), y0 + s * (y1 - y0), params)[n:]
 
     def halve(_, bracket):
         low, high, of_low, of_high = bracket
@@ -68,22 +71,28 @@ def crosses(field, varied, begin, end, params) -> jax.Array:
         earlier, later = (low, middle, of_low, of_middle), (middle, high, of_middle, of_high)
         return jax.tree.map(lambda a, b: jnp.where(first, a, b), earlier, later)
 
-    ends = jnp.zeros((), dtype), jnp.ones((), dtype)
-    whole = (*ends, acceleration_at(ends[0]), acceleration_at(ends[1]))
+    # XLA compiles each call of the field anew: there is one for both ends, one inside, and one for all states beside.
+    ends = jnp.array([0, 1], dtype)
+    whole = (*ends, *jax.lax.map(acceleration_at, ends))
     low, _, of_low, of_high = jax.lax.fori_loop(0, _HALVINGS[dtype], halve, whole)
     change = jnp.abs(of_high - of_low).max()
     jumps = change > _JUMPS[dtype] * jnp.maximum(jnp.abs(whole[2]), jnp.abs(whole[3])).max()
+    t, y = t0 + low * (t1 - t0), y0 + low * (y1 - y0)
     size = _MOVED[dtype] * (jnp.abs(y0) + jnp.abs(y1 - y0) + 1e-3 * jnp.abs(y0).max())
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (_DRAWS, y0.size))
-    beside = [acceleration_at(low, jnp.asarray(s, dtype) * size) for s in (*signs, *-signs)]
-    t, y = t0 + low * (t1 - t0), y0 + low * (y1 - y0)
-    for s in (1, -1):
-        other, numbers = _perturb((field, params), varied, s * _MOVED[dtype])
-        beside.append(other(t, y, numbers)[n:])
-    return jumps & (jnp.abs(jnp.stack(beside) - of_low).max(axis=1) > 0.5 * change).any()
+
+    def beside(at):
+        signs, by = at
+        other, numbers = _perturb((field, params), varied, by)
+        return other(t, y + signs * size, numbers)[n:]
+
+    signs = jnp.asarray(np.concatenate([signs, -signs, np.zeros((2, y0.size))]), dtype)
+    by = jnp.asarray([*[0.0] * 2 * _DRAWS, _MOVED[dtype], -_MOVED[dtype]], dtype)
+    around = jax.lax.map(beside, (signs, by))
+    return jumps & (jnp.abs(around - of_low).max(axis=1) > 0.5 * change).any()
 
 
-def _perturb(tree, varied, by: float):
+def _perturb(tree, varied, by):
     """The tree with the floats of its varied leaves a little larger or smaller, by different amounts."""
     draws = np.random.default_rng(1)
 

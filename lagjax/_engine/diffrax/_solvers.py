@@ -143,13 +143,15 @@ class FineOutput(_Around):
             slope = terms.vf_prod(t, interpolant.evaluate(t), args, span)
             return jax.tree.map(lambda leaf, like: leaf.astype(like.dtype), slope, y0)
 
-        def correction(y0, y1, k, *inside):
-            cubic = (_hermite_slope(place, y1 - y0, k[0], k[-1]) for place in _INSIDE)
-            residuals = [slope - of_cubic for slope, of_cubic in zip(inside, cubic, strict=True)]
-            return jnp.tensordot(jnp.asarray(_CORRECTION, y0.dtype), jnp.stack(residuals), axes=1)
+        def correction(y0, y1, k, inside):
+            places = jnp.asarray(_INSIDE, y0.dtype).reshape(-1, *[1] * y0.ndim)
+            residuals = inside - _hermite_slope(places, y1 - y0, k[0], k[-1])
+            return jnp.tensordot(jnp.asarray(_CORRECTION, y0.dtype), residuals, axes=1)
 
+        # A loop, as XLA compiles each call of the equations anew.
+        inside = jax.lax.map(increment, jnp.asarray(_INSIDE, jnp.result_type(t0)))
         first, last = (jax.tree.map(lambda k, i=i: k[i], dense["k"]) for i in (0, -1))
-        polynomial = jax.tree.map(correction, y0, y1, dense["k"], *map(increment, _INSIDE))
+        polynomial = jax.tree.map(correction, y0, y1, dense["k"], inside)
         coefficients = {"y0": y0, "y1": y1, "first": first, "last": last, "correction": polynomial}
         return y1, error, coefficients, state, result
 
@@ -180,8 +182,12 @@ class Projected(_Around):
     def step(self, terms, t0, t1, y0, args, solver_state, made_jump):
         """The solver's step, then two Newton steps. No FSAL: the last slope is not that of the new state."""
         y1, error, dense, state, result = self.solver.step(terms, t0, t1, y0, args, solver_state, True)
-        near = self.project(t1, y1, args)
-        nearer = self.project(t1, near, args)
+
+        def take_newton_step(y, _):
+            y = self.project(t1, y, args)
+            return y, y
+
+        _, (near, nearer) = jax.lax.scan(take_newton_step, y1, length=2)
         failed = ~_contracts(y1, near, nearer)
         if error is not None:
             error = jnp.abs(error) + jnp.abs(near - y1)
