@@ -150,8 +150,10 @@ class SparseMotion(Motion):
 
     def rank_lost(self, start: tuple, end: tuple) -> Flag:
         """True if fewer constraints are independent at `end` than at `start`; where S is banded or in blocks."""
-        first, last = (self._prepare(False, *jax.lax.stop_gradient(state))[1] for state in (start, end))
-        return last.rank < first.rank
+        (t0, t1), numbers = (jnp.asarray(state[2]) for state in (start, end)), start[3]
+        states = jax.lax.stop_gradient(jax.tree.map(lambda *x: jnp.stack(x), (*start[:2], t0), (*end[:2], t1)))
+        before, after = jax.lax.map(lambda y: self._prepare(False, *y, numbers)[1].rank, states)
+        return after < before
 
     def unit(self, q, qdot, t, params):
         """The unit of each coordinate, 1/√Mᵢᵢ."""
