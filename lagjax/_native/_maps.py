@@ -153,7 +153,7 @@ class CauchyProducts:
         """s = Σ' aⱼ bₖ₋ⱼ at orders k + 1, …: its cotangent times b is one of a, and times a one of b."""
         code, width, products = frame.code, self.motion.width, len(self.motion.series.cauchy_products)
         # The cotangents of higher orders lie where the sums themselves were.
-        cotangents = frame.address("sums", *self.motion.sum_indices(i + first, k))
+        cotangents = frame.address("sums", k, i + first)
         offsets = [code.load(code.element(Value(code, table), i * 2 + which, INTEGER), INTEGER) for which in range(2)]
         rows = [code.element(frame.address("rows"), offset) for offset in offsets]
         totals: list = [None, None]

@@ -41,6 +41,9 @@ class OperationKind(NamedTuple):
         return 2 if self.op == "sincos" else 1
 
 
+_Kinds = dict[OperationKind, int]  # the kinds of the operations of a program, numbered as they come
+
+
 class ScheduledOperation(NamedTuple):
     """An operation: its kind, as a number, the nodes that it reads, and those that it makes (-1: unused)."""
 
@@ -72,7 +75,8 @@ def schedule(line: StraightLine, stored: int) -> Schedule:
 
     The last outputs, this many, are `stored` somewhere else as soon as they are there.
     """
-    nodes, uses, kinds = line.nodes, count_uses(line.nodes, line.outputs), _Kinds()
+    nodes, uses = line.nodes, count_uses(line.nodes, line.outputs)
+    kinds: _Kinds = {}
     operations = _join_pairs(_operations(line, uses, kinds), uses, kinds)
     staying = len(line.outputs) - stored
     outputs, copies = _outputs(line, operations, kinds, staying)
@@ -83,27 +87,14 @@ def schedule(line: StraightLine, stored: int) -> Schedule:
     live = [i for i, count in enumerate(uses) if count]
     inputs = {i: nodes[i][2] for i in live if nodes[i][0] == "input"}
     constants = {i: float(nodes[i][2]) for i in live if nodes[i][0] == "constant"}
-    return Schedule(kinds.all, groups, slots, staying, size, inputs, constants)
+    return Schedule(list(kinds), groups, slots, staying, size, inputs, constants)
 
 
 # ---- operations ------------------------------------------------------------------------------------------------------
 
 
-class _Kinds:
-    """The kinds of the operations of a program, numbered as they come."""
-
-    def __init__(self):
-        self.all: list[OperationKind] = []
-        self._numbers: dict[OperationKind, int] = {}
-
-    def number(self, kind: OperationKind) -> int:
-        number = self._numbers.setdefault(kind, len(self.all))
-        if number == len(self.all):
-            self.all.append(kind)
-        return number
-
-    def is_joined(self, operation: ScheduledOperation) -> bool:
-        return self.all[operation.kind].op in _JOINED
+def _number(kinds: _Kinds, kind: OperationKind) -> int:
+    return kinds.setdefault(kind, len(kinds))
 
 
 def _operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> list[ScheduledOperation]:
@@ -122,7 +113,7 @@ def _operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> list[Sche
             if i != min(x for x in results if x >= 0):
                 continue
         of = tuple(line.kinds[x] for x in operands)
-        kind = kinds.number(OperationKind(op, attribute, of, line.kinds[i], (None,) * len(of)))
+        kind = _number(kinds, OperationKind(op, attribute, of, line.kinds[i], (None,) * len(of)))
         operations.append(ScheduledOperation(kind, operands, results))
     return operations
 
@@ -138,7 +129,7 @@ def _outputs(
     made = {x for operation in operations for x in operation.results}
     outputs: dict[int, int] = {}
     copies = []
-    copy, store = (kinds.number(OperationKind(op, None, ("float",), "float", (None,))) for op in ("copy", "store"))
+    copy, store = (_number(kinds, OperationKind(op, None, ("float",), "float", (None,))) for op in ("copy", "store"))
     for k, i in enumerate(line.outputs):
         if k < staying and i in made and i not in outputs:
             outputs[i] = k
@@ -158,14 +149,16 @@ def _join_pairs(operations: list[ScheduledOperation], uses: list[int], kinds: _K
     Pairs of pairs come often too, and so on: byte-pair encoding, with trees for strings.
     """
     made = {max(operation.results): operation for operation in operations}
-    joined = [i for i, operation in made.items() if kinds.is_joined(operation)]
+    ops = [kind.op for kind in kinds]
+    joined = [i for i, operation in made.items() if ops[operation.kind] in _JOINED]
     once = {i for i in joined if uses[i] == 1}
     for _ in range(ROUNDS):
         pairs = Counter(
             (made[i].kind, place, made[x].kind)
             for i in joined if i in made for place, x in enumerate(made[i].operands) if x in once
         )  # fmt: skip
-        chosen = _frequent_pairs(pairs, kinds)
+        if not (chosen := _frequent_pairs(pairs, kinds)):
+            break
         for i in joined:
             if i in made and made[i].kind in chosen:
                 kind, operands, results = made[i]
@@ -180,17 +173,17 @@ def _join_pairs(operations: list[ScheduledOperation], uses: list[int], kinds: _K
 def _frequent_pairs(pairs: Counter, kinds: _Kinds) -> dict[int, tuple[int, int, int]]:
     """The pairs that come most often: for kinds of operations the operand that is joined, its kind, and that of both.
 
-    No kind is joined to an operand and, in the same round, an operand of another one.
+    In one round a kind takes an operand in or is taken in by others, but for chains of one kind.
     """
     chosen: dict[int, tuple[int, int, int]] = {}
-    parts: set[int] = set()
+    parts, numbered = set(), list(kinds)
     for (kind, place, part), count in pairs.most_common():
         if count < OFTEN:
             break
         if kind not in chosen and kind not in parts and (part not in chosen or part == kind):
-            tree = _insert_part(kinds.all[kind], place, kinds.all[part])
+            tree = _insert_part(numbered[kind], place, numbered[part])
             if tree.operands <= LARGEST_TREE:
-                chosen[kind] = place, part, kinds.number(tree)
+                chosen[kind] = place, part, _number(kinds, tree)
                 parts.add(part)
     return chosen
 

@@ -37,7 +37,7 @@ class Tables:
         self._sincos, self._look_up = sincos, look_up
         self._kinds: dict[tuple[OperationKind, int], int] = {}
         self._constants: dict[bytes, int] = {}
-        self._fields: list[str] = []
+        self._fields = 0
         self._schedules: dict[StraightLine, Schedule] = {}
         self._execute: Frame = function("execute", POINTER, INTEGER)
         self._prepare: Frame = function("prepare")
@@ -127,8 +127,8 @@ class Tables:
     # ---- where numbers lie ----
 
     def _field(self, count: int) -> str:
-        name = f"field{len(self._fields)}"
-        self._fields.append(name)
+        name = f"field{self._fields}"
+        self._fields += 1
         self._layout.extend_by({name: count})
         return name
 

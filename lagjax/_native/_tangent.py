@@ -57,16 +57,14 @@ class Tangent:
             steps.insert(4, self.projected_end.push(directions))
         self._run(steps)
         self._begin()
-        if self.form is not motion.form:
-            self.form.finish()
+        self.form.finish()
         motion.finish()
 
     # ---- rounds ----
 
     def _begin(self) -> None:
         frame = self.motion.function("begin", public=True)
-        if self.form is not self.motion.form:
-            self.form.prepare(frame)
+        self.form.prepare(frame)
         self.motion.begin(frame, self.start_next)
         frame.finish()
 

@@ -106,10 +106,6 @@ class TaylorSeries:
 
     # ---- the sums ----
 
-    def sum_indices(self, i: Index, k: Index) -> tuple[Index, Index]:
-        """The place of product i at order k in `sums`."""
-        return (k if self.keep_sums else 0), i
-
     def _sums_function(self) -> Code:
         """`(k)`: Σ' aⱼ bₖ₋ⱼ for every product, 0 < j < k."""
         frame = self.function("sums", INTEGER)
@@ -127,7 +123,7 @@ class TaylorSeries:
                 if pairs:
                     with code.loop(len(pairs)) as i:
                         rows = [self._row(frame, tables[name], i * len(pairs[0]) + j) for j in range(len(pairs[0]))]
-                        frame["sums", *self.sum_indices(i + first, k)] = total(order, read, *rows)
+                        frame["sums", k if self.keep_sums else 0, i + first] = total(order, read, *rows)
         return frame.finish()
 
     def table(self, pairs) -> ir.GlobalVariable:
@@ -155,7 +151,7 @@ class TaylorSeries:
             frame["y", i, 1] = frame["y", i + n]
             frame["y", i + n, 1] = out[i]
         for i in form.each(code, len(series.cauchy_products)):
-            frame["sums", *self.sum_indices(i, integer(code, 1))] = 0.0
+            frame["sums", integer(code, 1) if self.keep_sums else 0, i] = 0.0
 
         # Borders are located on the last order too.
         with code.loop(self._last_order(code, order) if self.pieces else order, start=1) as k:
