@@ -215,15 +215,6 @@ class Origins:
         return starts, moved
 
 
-class ProjectedStarts(NamedTuple):
-    """N starts (N, 2n) on the constraints; how they move with the unknown states, (N, 2n, 2n), and along F directions
-    of the parameters, (N, F, 2n)."""
-
-    starts: np.ndarray
-    tangents: np.ndarray
-    moved: np.ndarray
-
-
 class Manifold:
     """The states that satisfy the constraints of a scene: by the projection of its machine code, else by `project`.
 
@@ -240,24 +231,21 @@ class Manifold:
         def project_with_derivatives(y, t, numbers):
             return project(y, t, numbers), *jax.jacfwd(project, argnums=(0, 2))(y, t, numbers)
 
-        self._project = jax.jit(
-            project_with_derivatives
-        )  # one by one: it takes seconds to compile for a number of rows
+        self._project = jax.jit(project_with_derivatives)  # one by one: compilation for many rows takes seconds
         self.projection, self.dtype = projection, layout.dtype
 
-    def project(self, y: np.ndarray, t: np.ndarray, numbers: np.ndarray, directions: np.ndarray) -> ProjectedStarts:
-        """Consistent states near `y` (N, 2n) at the times `t` (N,); NaN where there is none."""
+    def project(self, y: np.ndarray, t: np.ndarray, numbers: np.ndarray, directions: np.ndarray) -> tuple:
+        """Consistent states near `y` (N, 2n) at the times `t` (N,), NaN where there is none; how they move with y,
+        (N, 2n, 2n), and along F directions of the parameters, (N, F, 2n)."""
         if self.projection is not None:
             return _project_by_newton(self.projection, y, t, numbers, directions)
         y, t, numbers = (np.asarray(x, self.dtype) for x in (y, t, numbers))
         rows = [self._project(y[k], t[k], numbers) for k in range(len(y))]
         starts, by_y, by_numbers = (np.stack([np.asarray(x, float) for x in part]) for part in zip(*rows, strict=True))
-        return ProjectedStarts(starts, by_y, np.einsum("nip,fp->nfi", by_numbers, directions))
+        return starts, by_y, np.einsum("nip,fp->nfi", by_numbers, directions)
 
 
-def _project_by_newton(
-    projection: Projection, y: np.ndarray, t: np.ndarray, numbers: np.ndarray, directions
-) -> ProjectedStarts:
+def _project_by_newton(projection: Projection, y: np.ndarray, t: np.ndarray, numbers: np.ndarray, directions) -> tuple:
     count, states = y.shape
     rows = np.broadcast_to(numbers, (count, len(numbers)))
     before = np.full_like(y, np.inf)
@@ -272,4 +260,4 @@ def _project_by_newton(
     moved = project_start_tangents(
         projection, t[:, None], y, rows, along[0], np.broadcast_to(along[1], (count, *along[1].shape))
     )
-    return ProjectedStarts(y, moved[:, :states].swapaxes(1, 2), moved[:, states:])
+    return y, moved[:, :states].swapaxes(1, 2), moved[:, states:]

@@ -14,6 +14,7 @@ from lagjax._interface import Layout, labelled_leaves, require_concrete
 from lagjax._scene import unevenly_spaced
 
 PyTree = Any
+_NO_PREFIX = "{} must be one number, or a prefix of the structure and shapes of values."
 
 
 class Guess(NamedTuple):
@@ -96,7 +97,7 @@ class Record(MeasuredSignal):
             leaves = [_input(leaf, label, len(self.sampled_at)) for label, leaf in zip(labels, leaves, strict=True)]
             object.__setattr__(self, "inputs", tree.unflatten(leaves))
         require_start(self.start)
-        _matrix_of_weights(self)
+        assert self.weight_matrix is not None  # which raises for weights that cannot be right
 
     def __len__(self) -> int:
         return len(self.ts)
@@ -158,8 +159,20 @@ class Record(MeasuredSignal):
 
     @property
     def weight_matrix(self) -> np.ndarray:
-        """The weight of every sample (T, S), zero where it is missing."""
-        return _matrix_of_weights(self)
+        """The weight of every sample (T, S), zero where it is missing.
+
+        Raises `ValueError` for weights that fit no structure, or are negative.
+        """
+        leaves, columns = jax.tree.leaves(self.values), []
+        weights = spread_prefix(1.0 if self.weights is None else self.weights, self.values, "weights")
+        for weight, leaf in zip(weights, leaves, strict=True):
+            weight = real_numbers(weight, "weights", "real numbers")
+            weight = weight.reshape(weight.shape + (1,) * (leaf.ndim - weight.ndim)) if weight.ndim else weight
+            columns.append(_broadcast(weight, leaf.shape, "weights").reshape(len(leaf), -1))
+        matrix = np.concatenate(columns, axis=1)
+        if not (np.isfinite(matrix).all() and (matrix >= 0).all()):
+            raise ValueError("weights must be finite and not negative.")
+        return np.where(np.isnan(self.matrix), 0.0, matrix)
 
 
 def _times(ts, name: str = "ts") -> np.ndarray:
@@ -264,25 +277,6 @@ def require_start(start) -> None:
         )
 
 
-def _matrix_of_weights(record: Record) -> np.ndarray:
-    """The weights (T, S) of a record. Raises `ValueError` for what fits no structure, or is negative."""
-    leaves, tree = jax.tree.flatten(record.values)
-    weights = 1.0 if record.weights is None else record.weights
-    try:
-        spread = tree.flatten_up_to(jax.tree.broadcast(weights, record.values))
-        columns = []
-        for weight, leaf in zip(spread, leaves, strict=True):
-            weight = real_numbers(weight, "weights", "real numbers")
-            weight = weight.reshape(weight.shape + (1,) * (leaf.ndim - weight.ndim)) if weight.ndim else weight
-            columns.append(np.broadcast_to(weight, leaf.shape).reshape(len(leaf), -1))
-    except ValueError:
-        raise ValueError("weights must be one number, or a prefix of the structure and shapes of values.") from None
-    matrix = np.concatenate(columns, axis=1)
-    if not (np.isfinite(matrix).all() and (matrix >= 0).all()):
-        raise ValueError("weights must be finite and not negative.")
-    return np.where(np.isnan(record.matrix), 0.0, matrix)
-
-
 def restore_structure(matrix: np.ndarray, record) -> PyTree:
     """Signals (T, S) in the structure of a record's values, or times (M, 1) in that of its times."""
     if not isinstance(record, Record):
@@ -290,16 +284,26 @@ def restore_structure(matrix: np.ndarray, record) -> PyTree:
     return _split_columns(matrix, record.structure)
 
 
+def spread_prefix(prefix: PyTree, values: PyTree, what: str) -> list:
+    """The leaves of a prefix of the structure of values, one for each of theirs. Raises `ValueError` for others."""
+    try:
+        return jax.tree.structure(values).flatten_up_to(jax.tree.broadcast(prefix, values))
+    except ValueError:
+        raise ValueError(_NO_PREFIX.format(what)) from None
+
+
+def _broadcast(number: Any, shape: tuple[int, ...], what: str) -> np.ndarray:
+    try:
+        return np.broadcast_to(number, shape)
+    except ValueError:
+        raise ValueError(_NO_PREFIX.format(what)) from None
+
+
 def spread_over_signals(given: PyTree, record: Record, what: str) -> np.ndarray:
     """The number of each signal (S,) of a record from a prefix of the structure of its values; NaN for None."""
-    leaves, tree = jax.tree.flatten(record.values)
     given = jax.tree.map(lambda x: np.nan if x is None else x, given, is_leaf=lambda x: x is None)
-    try:
-        spread = tree.flatten_up_to(jax.tree.broadcast(given, record.values))
-        each = [np.broadcast_to(one, leaf.shape[1:]).ravel() for one, leaf in zip(spread, leaves, strict=True)]
-    except ValueError:
-        raise ValueError(f"{what} must be one number, or a prefix of the structure and shapes of values.") from None
-    return np.concatenate(each).astype(float)
+    pairs = zip(spread_prefix(given, record.values, what), jax.tree.leaves(record.values), strict=True)
+    return np.concatenate([_broadcast(one, leaf.shape[1:], what).ravel() for one, leaf in pairs]).astype(float)
 
 
 def inputs_between(record: Record, ts: np.ndarray) -> PyTree:

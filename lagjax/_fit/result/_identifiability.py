@@ -11,6 +11,7 @@ import re
 from fractions import Fraction
 
 import numpy as np
+from scipy.sparse.csgraph import connected_components
 
 from lagjax._equations import decide
 from lagjax._fit.model._parameters import Parameters
@@ -67,15 +68,10 @@ def _sentence_on_rounding(residuals: Residuals, trial: Trial, known: Information
 
 def _blocks(null: np.ndarray) -> list[np.ndarray]:
     """The parameters of the null directions in sets, of which each is free by itself: rows that are not zero."""
-    reduced = _reduce_rows(null.T)
-    sets: list[set[int]] = []
-    for row in reduced:
-        own = set(np.flatnonzero(np.abs(row) > 1e-5 * np.abs(row).max()).tolist())
-        for other in [s for s in sets if s & own]:
-            sets.remove(other)
-            own |= other
-        sets.append(own)
-    return [np.array(sorted(s)) for s in sets]
+    reduced = np.abs(_reduce_rows(null.T))
+    moved = (reduced > 1e-5 * reduced.max(axis=1, keepdims=True)).astype(int)
+    _, component = connected_components(moved.T @ moved)
+    return [np.flatnonzero(component == k) for k in dict.fromkeys(component[moved.any(axis=0)].tolist())]
 
 
 def _reduce_rows(rows: np.ndarray) -> np.ndarray:

@@ -39,6 +39,11 @@ def possible_mistakes(
     """The mistakes that may be in the records, the likeliest first, where the data move `slower` times slower than the
     scene does, and `worst` has the places of the records in the order of what is left of them."""
     count, some = len(names), range(min(len(names), _MOST))
+
+    def change(columns: list[int], function: Callable[[np.ndarray], np.ndarray]) -> list[Any]:
+        mine = np.isin(np.arange(count), columns)
+        return _change_signals(records, lambda matrix: np.where(mine, function(matrix), matrix))
+
     by_time = [
         replace(r, ts=r.ts / 1e3, input_ts=None if r.input_ts is None else r.input_ts / 1e3)
         if isinstance(r, Record) else r
@@ -48,7 +53,7 @@ def possible_mistakes(
     ranges = [max(np.ptp(present_samples(r, k)) for r in records if isinstance(r, Record)) for k in range(count)]
     wide = [k for k in range(count) if ranges[k] > _WIDE]
     degrees = [
-        PossibleMistake(f"with {_list_names(names, turned)} in degrees", _change_signals(records, turned, np.radians))
+        PossibleMistake(f"with {_list_names(names, turned)} in degrees", change(turned, np.radians))
         for turned in ([wide] if wide else []) + [[k] for k in wide[:_MOST] if len(wide) > 1]
     ]
     yield from milliseconds if slower > _SLOW else []
@@ -57,16 +62,18 @@ def possible_mistakes(
     for i, j in itertools.combinations(some, 2):
         order = np.arange(count)
         order[[i, j]] = j, i
-        swaps.append(PossibleMistake(f"with {names[i]} and {names[j]} swapped", _reorder_signals(records, order)))
+        swaps.append(
+            PossibleMistake(f"with {names[i]} and {names[j]} swapped", _change_signals(records, np.asarray, order))
+        )
     yield from swaps if len(swaps) == 1 else []  # one try tells
     for place in worst[:_MOST] if len(records) > 2 else []:
         yield PossibleMistake(f"without records[{place}]", [*records[:place], *records[place + 1 :]])
     yield from swaps if len(swaps) > 1 else []
     for k in some:
-        yield PossibleMistake(f"with the other sign of {names[k]}", _change_signals(records, [k], np.negative))
+        yield PossibleMistake(f"with the other sign of {names[k]}", change([k], np.negative))
     for turned in [list(some)] + [[k] for k in some if count > 1]:
         text = f"with {_list_names(names, turned)} counted from the opposite direction, π further"
-        yield PossibleMistake(text, _change_signals(records, turned, lambda x: x + np.pi))
+        yield PossibleMistake(text, change(turned, lambda x: x + np.pi))
     yield from degrees if max(ranges) <= _WIDEST else []
     yield from milliseconds if slower <= _SLOW else []
 
@@ -96,22 +103,14 @@ def _list_names(names: tuple[str, ...], which: list[int]) -> str:
     return " and ".join(names[k] for k in which) if len(which) < len(names) or len(names) == 1 else "all signals"
 
 
-def _reorder_signals(records: list[Any], order: np.ndarray) -> list[Any]:
+def _change_signals(
+    records: list[Any], change: Callable[[np.ndarray], np.ndarray], order: Any = slice(None)
+) -> list[Any]:
+    """The records with other values (T, S), and with their weights in another order of the signals."""
     found = []
     for record in records:
         if isinstance(record, Record):
             weights = None if record.weights is None else restore_structure(record.weight_matrix[:, order], record)
-            record = replace(record, values=restore_structure(record.matrix[:, order], record), weights=weights)
-        found.append(record)
-    return found
-
-
-def _change_signals(records: list[Any], columns: list[int], change: Callable[[np.ndarray], np.ndarray]) -> list[Any]:
-    found = []
-    for record in records:
-        if isinstance(record, Record):
-            matrix = record.matrix
-            matrix[:, columns] = change(matrix[:, columns])
-            record = replace(record, values=restore_structure(matrix, record))
+            record = replace(record, values=restore_structure(change(record.matrix[:, order]), record), weights=weights)
         found.append(record)
     return found

@@ -112,10 +112,7 @@ def short_windows(readers: list[Reader], length: float) -> tuple[list[Record], n
     for reader in readers:
         places = even_places(len(reader.record), max(4, _WINDOWS_IN_ALL // len(readers)))
         offsets = np.linspace(0.0, length, 4)
-        cubics = [
-            _read_states(reader.record.ts[places], *s, w)[3]
-            for s, w in zip(_signals(reader.record), reader.windows, strict=True)
-        ]
+        cubics = [one[3] for one in reader.read(places)]
         values = np.stack([np.polynomial.polynomial.polyval(offsets, c.T) for c in cubics], axis=-1)
         structured = [restore_structure(v, reader.record) for v in values]
         found += [
