@@ -82,12 +82,7 @@ class LinearMap(VaryingPrimitive):
     multiple_results = True
 
     def __init__(
-        self,
-        name: str,
-        shapes: Callable,
-        vary: Callable,
-        linear: int | Callable = 0,
-        transpose: Callable | None = None,
+        self, name: str, shapes: Callable, vary: Callable, linear: int | Callable = 0, transpose: Callable | None = None
     ):
         super().__init__(name)
         self.def_abstract_eval(shapes)

@@ -29,16 +29,7 @@ from jax.interpreters import mlir
 from lagjax._engine.taylor._call import NO_HANDLER, call_host, capsule
 from lagjax._native import LARGEST_LINE, LineCode, line_handler, make_once
 from lagjax._primitives import LinearMap, compute_on_host
-from lagjax._program import (
-    Graph,
-    Program,
-    StraightLine,
-    Unlowerable,
-    copy_nodes,
-    emit,
-    pullback,
-    pushforward,
-)
+from lagjax._program import Graph, Program, StraightLine, Unlowerable, copy_nodes, emit, pullback, pushforward
 
 _TARGET = "lagjax_line"
 # Operations of a line on a GPU that XLA compiles; NumPy on the host evaluates a longer one. Twice as many would cost
