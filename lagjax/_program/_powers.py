@@ -47,11 +47,6 @@ def find_powers(line: StraightLine, nodes: Iterable[int], guards: set[int], size
     return [Power(base, e if grows else -e) for (base, grows), e in sorted(found.items())]
 
 
-def _is_product(line: StraightLine, i: int) -> bool:
-    op, operands, _ = line.nodes[i]
-    return op in _PRODUCTS or (op == "pow" and line.nodes[operands[1]][0] == "constant")
-
-
 class _Products:
     """The numbers of a program as products: what they are products of, of what moves; and what uses whole products.
 
@@ -71,7 +66,7 @@ class _Products:
                 if op == "input" and value <= 2 * size:
                     self._moving.add(i)
                 continue
-            is_product = _is_product(line, i)
+            is_product = op in _PRODUCTS or (op == "pow" and line.nodes[operands[1]][0] == "constant")
             if not is_product:
                 for x in operands:
                     self.users.setdefault(x, []).append(i)

@@ -280,8 +280,7 @@ def _require_modes(modes, transitions, start, max_transitions) -> None:
         if not isinstance(transition, Transition):
             raise TypeError(f"transitions must be lagjax.Transition; got {transition!r}.")
         for role in ("source", "target"):
-            if getattr(transition, role) not in modes:
-                name = getattr(transition, role)
+            if (name := getattr(transition, role)) not in modes:
                 raise ValueError(f"A transition has the {role} {name!r}, which is no mode: the modes are {known}.")
     if jax.tree.leaves((modes, transitions)):
         raise ValueError("A function of a mode or a transition holds arrays of its own: pass these in `params`.")

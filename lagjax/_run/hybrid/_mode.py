@@ -114,14 +114,14 @@ class Mode(NamedTuple):
     """One mode, or one of a family: a problem that lacks a state and times, and the transitions that leave it.
 
     Their `numbers` (K,) are their places among all transitions, their `targets` (K,) those of the modes that they lead
-    to. `surfaces` is None where none leaves.
+    to. `surfaces` are their guards, a `Surfaces`; None where none leaves.
     """
 
     problem: Problem
     leaving: tuple[Transition, ...]
     numbers: Any
     targets: Any
-    surfaces: Surfaces | None
+    surfaces: Any
     vector: jax.Array  # every number in params, (P,)
     widths: tuple = ()  # of the first (q, q̇, t), and of params: their rounding, where the start came in float32
 
@@ -154,11 +154,6 @@ class Mode(NamedTuple):
     def layout(self) -> Layout:
         return self.problem.layout
 
-    @property
-    def _surfaces(self) -> Surfaces:
-        assert self.surfaces is not None, "no transition leaves this mode"
-        return self.surfaces
-
     # ---- along the mode ----
 
     def solve(self, ts, y0) -> Solution:
@@ -179,15 +174,14 @@ class Mode(NamedTuple):
         """The guards at a state, without derivatives, of a run that ends at `latest`."""
         of_state, of_params = self.widths
         of_numbers = jnp.pad(of_params, (0, self.vector.size - of_params.size))  # what modes differ by is exact
-        return self._surfaces.evaluate_guards(t, y, self.vector, latest, (of_state, of_numbers))
+        return self.surfaces.evaluate_guards(t, y, self.vector, latest, (of_state, of_numbers))
 
     def crossing(self, k, taken, t, y, numbers) -> tuple:
         """(t, y): the state at t, where guard k is zero and stays so as what went in varies, if it is `taken`.
 
         See `taylor.crossing_variation`.
         """
-        moved = crossing_variation(self._surfaces)
-        return attach_derivative(moved, (t, y), k, taken, t, y, numbers)
+        return attach_derivative(crossing_variation(self.surfaces), (t, y), k, taken, t, y, numbers)
 
     def is_inconsistent(self, t, y):
         system, params = self.problem.system, self.problem.params
