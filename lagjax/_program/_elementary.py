@@ -3,10 +3,8 @@
 Why.  XLA's CPU backend turns `+ * / sqrt exp` into SIMD code, but calls a scalar routine, one element at a time, for
 float64 `sin` and `cos`: 4 to 19 ns an element where SIMD needs 2.  The functions here are straight-line arithmetic, so
 that XLA fuses them with their surroundings and LLVM vectorises the whole.  They serve scalar programs that diffrax
-integrates on the CPU: a batch of 1024 chains of 4 pendulums by Tsit5 takes 2.1 times as long with XLA's own.  Scenes
-made of log, log1p, expm1, pow, tan, asin, acos, atan, atan2, sinh or cosh were measured in the same way, with forms
-like these: with XLA's own they take 0.5 (tan), 0.65 (log), 0.7 to 1 (the rest) and 1.1 to 1.2 (atan) times as long, and
-expm1 0.96 by the clock but 1.4 in processor time, once.  So those are XLA's.
+integrates on the CPU: a batch of 1024 chains of 4 pendulums by Tsit5 takes 2 to 3 times as long with XLA's own.  Scenes
+made of other functions, measured in the same way with forms like these, take 0.5 to 1.2 times as long with XLA's own.
 
 How.  Cody & Waite's plan (*Software Manual for the Elementary Functions*, 1980; fdlibm, Sun Microsystems, 1993;
 Muller, *Elementary Functions*, 2016):
