@@ -4,7 +4,7 @@
     python -m benchmarks.lattice_population --scenes 100 --float32
 
 A lattice has one or two dimensions, is periodic or has free ends, and has springs with a quadratic and a quartic term
-and an on-site potential of φ⁴ or sine-Gordon. One mass may be a thousand times the others, one spring may be cut, the mass
+and an on-site potential of φ⁴ or sine-Gordon. One mass may be a thousand times the others, one spring be cut, the mass
 matrix is lumped (diagonal) or consistent (of linear elements along the rows: tridiagonal), a part may have masses that
 depend on their place, drag and drive. The reference is SciPy's DOP853 at 1e-12 with derivatives by hand. An end is
 *wrong* where it is off by more than 1000 tolerances times the growth of a small error of the start.
