@@ -78,7 +78,9 @@ class Sample(NamedTuple):
         return np.broadcast_to(outputs, (len(outputs), len(self.q))).T
 
     def acceleration(self) -> np.ndarray:
-        """q̈ (S, n) by the program with which a motion is followed. Raises `Unlowerable`."""
+        """q̈ (S, n) by the program, or the arrays, with which a motion is followed. Raises `Unlowerable`."""
+        if self.derivation.structure is not None:
+            return self.quantities("acceleration")["acceleration"]
         return self.evaluate(self.derivation.acceleration)[:, : self.derivation.layout.size]
 
     def momenta_by_q(self, momenta: tuple[int, ...]) -> np.ndarray:

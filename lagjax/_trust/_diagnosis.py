@@ -6,8 +6,8 @@ comes from, a pole that was reached, a mass matrix that has become singular, an 
 finds at the last state: a kink, a jump, stiff terms.
 
 All but the line and `check` is read off the scene's programs in NumPy, which compiles nothing. Looking for lines stops
-at scenes whose functions are longer than `LONGEST`, and `check` is called up to `LARGEST` coordinates: a failure
-must not cost more than a motion does.
+at scenes whose functions are longer than `LONGEST`, and `check` is called up to `LARGEST` coordinates or where it goes
+without matrices: a failure must not cost more than a motion does.
 """
 
 from collections.abc import Callable
@@ -30,6 +30,7 @@ from lagjax._equations import (
     numbers_of,
     offenders,
     poles,
+    sparse_spectrum,
 )
 from lagjax._interface import RESULTS, Layout, code_of, halves, join_names, not_finite, numbers_at
 from lagjax._primitives import sentence
@@ -72,6 +73,11 @@ class Ended(NamedTuple):
     steps: int
     numbers: np.ndarray
     by_resets: bool = False  # whether the states of a hybrid motion are reset on the way
+    scene: tuple | None = None  # a large scene and its parameters, which XLA evaluates
+
+    def sample(self, derivation: Derivation, y: np.ndarray, t) -> Sample:
+        """The scene at other states y (S, 2n)."""
+        return Sample.from_states(derivation, y, t, self.numbers)._replace(scene=self.scene)
 
 
 def describe_failure(trajectory: Trajectory, layout: Layout, why: str | None) -> str:
@@ -81,10 +87,21 @@ def describe_failure(trajectory: Trajectory, layout: Layout, why: str | None) ->
     message = sentence(trajectory.result._value, end.t, trajectory.ts[-1], y_end, layout.names, why) or ""
     if not isinstance(system, System):
         return message
+    ended, params = motion_end(trajectory, layout), trajectory.params
     if trajectory.result == RESULTS.mass_matrix_singular:
-        mass = np.asarray(system.mass_matrix(end.q, end.qdot, end.t, trajectory.params))
-        message += f"\n{_describe_null(mass, layout.names)}"
-    return message + diagnosis(system, layout, trajectory.params, motion_end(trajectory, layout))
+        derivation = derivation_of(system, layout, params)
+        if derivation.structure is None:
+            mass = np.asarray(system.mass_matrix(end.q, end.qdot, end.t, params))
+            unused = [name for name, row in zip(layout.names, mass, strict=True) if not row.any()]
+            directions = [] if unused else null_directions(mass)
+        else:
+            rows = Sample.from_scene(system, layout, *halves(ended.y[None]), ended.t, params).quantities("mass_by_some")
+            unused = [layout.names[i] for i in np.flatnonzero(rows["mass_by_some"][0] == 0)]
+            state = *halves(ended.y), ended.t, eqx.filter(params, eqx.is_array_like)
+            spectrum = None if unused else sparse_spectrum(derivation, state)
+            directions = [] if spectrum is None else [spectrum[0][1]]
+        message += f"\n{_describe_null(unused, directions, layout.names)}"
+    return message + diagnosis(system, layout, params, ended)
 
 
 def diagnosis(system: System, layout: Layout, params, ended: Ended) -> str:
@@ -97,6 +114,8 @@ def diagnosis(system: System, layout: Layout, params, ended: Ended) -> str:
 
 def _find_cause(system: System, layout: Layout, params, ended: Ended) -> str:
     derivation = derivation_of(system, layout, params)
+    if derivation.structure is not None:
+        ended = ended._replace(scene=(system, params))
     q0, qdot0 = map(layout.restore, halves(ended.y_first))
     if bad := not_finite(params, "params") + not_finite(q0, "q0") + not_finite(qdot0, "qdot0"):
         where, value = bad[0]
@@ -127,6 +146,7 @@ _QUANTITIES = (
     ("force", "the right-hand side of the equation of", "lagrangian"),
     ("jacobian", "the gradient of a constraint by", "constraints"),
 )
+_OF_LARGE = {"mass_matrix": "mass_by_some", "jacobian": "jacobian_columns"}  # sums over the rows, or columns
 
 
 def _states_ahead(ended: Ended, rate: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -144,8 +164,9 @@ def _quantities_ahead(derivation: Derivation, numbers, ended: Ended) -> tuple[np
     (_, v), motion, values = halves(ended.y), derivation.motion, {}
     try:
         y, t = _states_ahead(ended, np.concatenate([v, _acceleration(derivation, ended)]))
-        names = [name for name, *_ in _QUANTITIES]
-        return y, t, Sample.from_states(derivation, y, t, ended.numbers).quantities(*names)
+        names = {name: name if ended.scene is None else _OF_LARGE.get(name, name) for name, *_ in _QUANTITIES}
+        of = ended.sample(derivation, y, t).quantities(*names.values())
+        return y, t, {name: of[there] for name, there in names.items()}
     except Unlowerable:
         y, t = _states_ahead(ended, np.concatenate([v, np.zeros(len(v))]))
     for name, function in (("given_force", motion.forces), ("lagrangian_by_q", jax.grad(motion.lagrangian))):
@@ -218,19 +239,25 @@ def _singular_mass(derivation: Derivation, ended: Ended) -> str:
         return ""
     try:
         y, t = np.stack([ended.y_first, ended.y]), np.array([ended.t_first, ended.t])
-        first, last = Sample.from_states(derivation, y, t, ended.numbers).quantities("mass_matrix")["mass_matrix"]
+        name = "mass_matrix" if ended.scene is None else "mass_diagonal"
+        first, last = ended.sample(derivation, y, t).quantities(name)[name]
     except Unlowerable:
         return ""
     if not np.isfinite([first, last]).all():
         return ""
-    (before, _), (after, vectors) = eigen(first), eigen(last)
-    place = int(np.argmin(np.abs(after)))
-    usual, left = np.abs(before).min(), np.abs(after[place])
+    if ended.scene is not None:
+        place = int(np.argmin(np.abs(last / first)))
+        direction, usual = np.arange(len(last)) == place, np.abs(first[place])
+        left = np.abs(last[place])
+    else:
+        (before, _), (after, vectors) = eigen(first), eigen(last)
+        place = int(np.argmin(np.abs(after)))
+        direction, usual, left = vectors[:, place], np.abs(before).min(), np.abs(after[place])
     # A mass matrix of which all has shrunk is a change of units on the way, and no pole.
     if not left < SINGULAR * usual or (len(last) > 1 and np.abs(last).max() < SINGULAR * np.abs(first).max()):
         return ""
     names = derivation.layout.names
-    along = [f"d{name}" for name, c in zip(names, vectors[:, place], strict=True) if abs(c) > 0.1]
+    along = [f"d{name}" for name, c in zip(names, direction, strict=True) if abs(c) > 0.1]
     return (
         f"The mass matrix is nearly singular there: along {join_names(along)} it has come down from {usual:.1e} to "
         f"{left:.1e}. The coordinates are singular where the motion went (polar ones at r = 0, spherical ones and "
@@ -238,15 +265,14 @@ def _singular_mass(derivation: Derivation, ended: Ended) -> str:
     )
 
 
-def _describe_null(mass: np.ndarray, names: tuple[str, ...]) -> str:
+def _describe_null(unused: list[str], directions, names: tuple[str, ...]) -> str:
     """The coordinates, or their combinations, that carry no kinetic energy."""
-    unused = [name for name, row in zip(names, mass, strict=True) if not row.any()]
     if unused:
         return (
-            f"Singular there: L has no kinetic energy in the velocity of {', '.join(unused)} (absent from L, or linear "
-            "in it)."
+            f"Singular there: L has no kinetic energy in the velocity of {join_names(unused)} (absent from L, or "
+            "linear in it)."
         )
-    combinations = [describe_direction(direction, names) for direction in null_directions(mass)]
+    combinations = [describe_direction(direction, names) for direction in directions]
     if not combinations:
         return (
             "It is regular there, but not positive definite, and more than two coordinates are solved for without "
@@ -310,7 +336,7 @@ _EXPLAIN = (
 
 def _run_check(system: System, derivation: Derivation, params, ended: Ended) -> str:
     """The first finding of `check` at the end that explains the failure."""
-    if derivation.layout.size > (LARGEST if is_lowered(derivation) else 16):
+    if ended.scene is None and derivation.layout.size > (LARGEST if is_lowered(derivation) else 16):
         return ""
     q, qdot = map(derivation.layout.restore, halves(ended.y))
     found = {finding.kind: finding for finding in reversed(list(check(system, q, qdot, ended.t, params)))}
@@ -340,7 +366,7 @@ def _budget(ended: Ended) -> str:
 
 def _acceleration(derivation: Derivation, ended: Ended) -> np.ndarray:
     """q̈ (n,) at the end."""
-    return Sample.from_states(derivation, ended.y[None], ended.t, ended.numbers).acceleration()[0]
+    return ended.sample(derivation, ended.y[None], ended.t).acceleration()[0]
 
 
 # ---- of a trajectory -------------------------------------------------------------------------------------------------
