@@ -63,7 +63,7 @@ from lagjax._native._kernel import (
     floor_of,
 )
 from lagjax._native._line_handler import LineCode, line_handler
-from lagjax._native._motion_parts import Projection, pieces_of, require_recurrences
+from lagjax._native._motion_parts import Projection, pieces_of, recurrences
 from lagjax._native._saltation import Crossed
 from lagjax._native._taylor import is_large, order_for
 from lagjax._native._threads import map_in_threads

@@ -192,22 +192,6 @@ def choose_parameters(
     )
 
 
-# Their rules add nothing but each other, and what is constant between jumps: a program of these alone has a series.
-_ARITHMETIC = frozenset(
-    "input constant add sub mul div neg sqrt abs max min select is_finite eq ne lt le gt ge and or not".split()
-)
-
-
-def require_recurrences(program: Recurrent, size: int) -> None:
-    """Raise `Unlowerable` where the lanes of a kernel cannot run a program, or an operation has no series.
-
-    Of arithmetic that is known from the operations alone, without making the series, which may be as large again.
-    """
-    require_lanes(program.line)
-    if not _ARITHMETIC.issuperset(op for op, _, _ in program.line.nodes):
-        recurrences(program, size)
-
-
 @functools.lru_cache(maxsize=16)  # used where the engine is chosen, and where it is compiled
 def recurrences(program: Recurrent, size: int) -> Series:
     """The Taylor series of the motion. Raises `Unlowerable` where the lanes of a kernel cannot run it."""

@@ -74,7 +74,7 @@ class Recurrent(Protocol):
 
 
 class Series(NamedTuple):
-    """The recurrences of the first `size` outputs of a program, along a motion of its first `moving` inputs.
+    """The recurrences of the first `size` outputs of a program, along a motion of its first inputs.
 
     `zeroth_order` takes the inputs of the program and gives all its outputs, and `values` numbers more.
     `order_recursion` takes the coefficients of order k of the moving inputs, then k and 1/k, these values, and one sum
@@ -84,7 +84,6 @@ class Series(NamedTuple):
     """
 
     size: int
-    moving: int
     zeroth_order: StraightLine
     order_recursion: StraightLine
     values: int
@@ -300,7 +299,6 @@ class _Recurrences:
         values += self.followed
         return Series(
             self.size,
-            self.moving,
             eliminate_dead_code(*sink_negations(self.zeroth_order, self.outputs + values)),
             eliminate_dead_code(*sink_negations(self.order_recursion, rates + kept)),
             len(values),

@@ -14,7 +14,6 @@ from jax import lax
 from lagjax import scenes
 from lagjax._equations._derivation import derivation_of
 from lagjax._interface._layout import Layout
-from lagjax._native import _motion_parts as _parts
 from lagjax._program import (
     OPERATIONS,
     Unlowerable,
@@ -460,17 +459,3 @@ def test_pullback_is_the_transposed_derivative():
     value = function(*inputs)
     again = jax.vjp(lambda x, y: function(x, y, inputs[2])[::2], *inputs[:2])[1](bars)
     np.testing.assert_allclose(emit(known, (*inputs, *bars, value[0])), again, rtol=1e-14)
-
-
-def test_arithmetic_is_known_to_have_a_series_without_making_it():
-    # The rules of these operations write no other ones: so a program of them alone need not be tried.
-    closed = _parts._ARITHMETIC - {"input", "constant"}
-    assert all(OPERATIONS[op].recurrence or OPERATIONS[op].is_step for op in closed)
-
-    def each(q, v, t):
-        parts = [q * v, q / (1 + v * v), jnp.sqrt(1 + q * q), jnp.abs(q), jnp.maximum(q, v), jnp.minimum(q, t)]
-        return sum(parts) - jnp.where((q > 0) & (v < 1), -q, v)
-
-    program, found = recurrences(each, [0.3], [0.4], 0.1)
-    for line in (program.line, found.zeroth_order, found.order_recursion):
-        assert {op for op, _, _ in line.nodes} <= _parts._ARITHMETIC

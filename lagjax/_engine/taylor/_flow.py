@@ -77,7 +77,7 @@ def require_fit(program: Program, size: int) -> None:
             f"its acceleration takes {program.operations} operations, more than the {LARGEST_PROGRAM} whose kernel and "
             f"derivatives fit into half of this machine's {machine_memory() / 1e9:.0f} GB of memory"
         )
-    _native.require_recurrences(program, size)
+    _native.recurrences(program, size)  # raises where an operation has none
 
 
 # ---- flows -----------------------------------------------------------------------------------------------------------
