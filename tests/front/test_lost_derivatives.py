@@ -101,3 +101,14 @@ def test_a_guard_that_only_jumps_varies_as_its_border_does():
     np.testing.assert_allclose(time(0.5), np.arccos(0.5), rtol=1e-9)
     for slope in (jax.grad(time)(0.5), jax.jvp(time, (0.5,), (1.0,))[1]):
         np.testing.assert_allclose(slope, -1.0 / np.sqrt(0.75), rtol=1e-9)
+
+
+def test_only_what_decides_is_searched_for_jumps():
+    """A bracket about a jump is halved thirty times; an elimination, which compares pivots, does not jump."""
+
+    def searches(force):
+        system = lagjax.System(lagrangians.free_particle, forces=lambda q, qdot: force(q) - q, path="array")
+        run = lambda v: lagjax.simulate(system, 0.3, v, TS, **HEUN).q[-1]
+        return "length=30" in str(jax.make_jaxpr(lambda v: jax.vjp(run, v)[0])(1.0))
+
+    assert searches(lambda q: jnp.where(q > 0.5, 1.0, 0.0)) and not searches(jnp.sin)
