@@ -195,7 +195,6 @@ class _FitSearch(NamedTuple):
         return Fit.from_descent(descent, self.law, waterfall)
 
     def _require_one_beginning(self, residuals: Residuals) -> None:
-        """Raise `ValueError` where many starts, or a descent by gradients, are chosen and cannot be."""
         if not len(self.parameters) and (self.method == "gradient" or self.starts > 1):
             raise ValueError(
                 "No parameter is free, so there is one place to begin: leave `starts` at 1, and `method` at 'auto', "
@@ -237,7 +236,6 @@ class _FitSearch(NamedTuple):
 
 
 def _print_trials(size: np.ndarray) -> Callable[[Any], None]:
-    """A function that prints a line for every trial, of signals of this size (S,)."""
     count = itertools.count(1)
 
     def tell(trial) -> None:

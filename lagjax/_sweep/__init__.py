@@ -315,7 +315,6 @@ def _folder(path: Any, name: str) -> Files:
 
 
 def _times(ts) -> np.ndarray:
-    """The output times, which all members share. Raises `TypeError` or `ValueError` where they are none."""
     if callable(ts):
         raise TypeError(
             "ts must be an array of output times, which all members share; got a function. For ends of their own take "

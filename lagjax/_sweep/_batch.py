@@ -100,7 +100,6 @@ class Batches:
             return sum(x.nbytes for x in (row or {}).values())
 
     def _compute_motions(self, points: dict[str, np.ndarray]) -> tuple["_BatchMotions", dict[int, str]]:
-        """The motions of these members; and of members for which q0, q̇0 or params raised, why."""
         description, ts, complaints = self.description, jnp.asarray(self.description.ts), {}
         values = {
             role: start(points, complaints) if start else getattr(description, role)
@@ -196,7 +195,6 @@ class Batches:
         return kept, complaints
 
     def _rows(self, motions: "_BatchMotions") -> tuple[list[dict[str, np.ndarray] | None], dict[int, Exception]]:
-        """The result of `keep` for each member by name, None where it raised; and the exceptions."""
         of_all = jax.tree.map(np.asarray, (*motions.arrays, motions.params))
 
         keep_member = self._keep_member if "keep" in self.slow else self._keep_one
@@ -283,7 +281,6 @@ def _arrays(run: Trajectory) -> dict[str, Any]:
 
 
 def _misfit(expected: list[Quantity], row: dict[str, np.ndarray]) -> str | None:
-    """The difference of a result of `keep` from those for other members."""
     names = [q.name for q in expected]
     if names != list(row):
         return f"keep returned {list(row)}, of other members {names}"
@@ -296,7 +293,6 @@ def _misfit(expected: list[Quantity], row: dict[str, np.ndarray]) -> str | None:
 
 
 def _require_dict(kept: Any) -> None:
-    """Raise `TypeError` or `ValueError` where `keep` returns no dict of numbers, each under a name of its own."""
     if not isinstance(kept, dict) or not jax.tree.leaves(kept):
         raise TypeError(
             "keep must return a dict that is not empty: names with numbers or arrays, such as {'angle': "
@@ -313,7 +309,6 @@ def _require_dict(kept: Any) -> None:
 
 
 def _arrays_by_name(kept: dict) -> dict[str, np.ndarray]:
-    """The leaves of what `keep` returns by names, those of inner trees with points: 'end.theta'."""
     return dict(zip(jax.tree.leaves(names_of(kept)), map(np.asarray, jax.tree.leaves(kept)), strict=True))
 
 

@@ -128,7 +128,6 @@ def _members_in_memory(description: Description, points: dict[str, np.ndarray]) 
 
 
 def _require_names(quantities: list[Quantity], axes: tuple[Axis, ...], reduce: dict) -> None:
-    """Raise `ValueError` where what `keep` returns cannot stand in a store under its name, or not be reduced."""
     names = [q.name for q in quantities]
     taken = {*RESERVED, *(a.dimension for a in axes), *(n for a in axes for n in a.names)}
     inner = {dimension: q.name for q in quantities for dimension in q.dimensions}

@@ -129,7 +129,6 @@ class Description:
             return self.evaluate_start({name: 0.5 for name in names})
 
     def described(self) -> dict:
-        """The numbers among it, by name, for the store."""
         ts, solver, watched = self.ts, self.settings["solver"], self.sections
         return {
             "ts": {"ends": [float(ts[0]), float(ts[-1])], "outputs": len(ts), "sha256": hash_of(ts)},
@@ -258,7 +257,6 @@ def differences(spec: dict, here: dict, entries: Iterable[str], roles: Iterable[
 
 
 def pack_description(description: Description) -> bytes:
-    """The motions as bytes. Raises `ImportError` without cloudpickle, `TypeError` where a function cannot be packed."""
     cloudpickle = import_package("sweep()", "cloudpickle", "cloudpickle")
     try:
         return cloudpickle.dumps(description)

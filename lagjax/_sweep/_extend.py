@@ -35,7 +35,6 @@ _EXTENSIBLE = ("x64", "engine", "ts", "rtol", "atol", "max_steps", "solver", "cr
 
 
 def require_extensible(old: Files, now: dict) -> None:
-    """Raise `ValueError`, with the difference, where the members of `old` are not those of the new store."""
     spec, now = old.spec(), json.loads(json.dumps(now))
     _require_whole(old, spec)
     lines = differences(spec, now, _EXTENSIBLE)
@@ -55,7 +54,6 @@ def require_extensible(old: Files, now: dict) -> None:
 
 
 def _require_whole(other: Files, spec: dict) -> None:
-    """Raise `ValueError` where this process is of another version than a store, or some of its chunks are not there."""
     require_versions(other, spec)
     if damaged := other.find_damage(spec, other.finished_units()):
         raise ValueError(f"{other.path}: {next(iter(damaged.values()))}. Run that sweep again: it computes it again.")
@@ -109,7 +107,6 @@ def _match_places(old: Files, new: Files, old_axis: dict, new_axis: dict) -> Cal
 
 
 def _read_members(old: Files, spec: dict, places: list[np.ndarray]) -> dict[str, np.ndarray]:
-    """The stored values of a product of members, (members, …) by name."""
     runs = [slice(int(x[0]), int(x[-1]) + 1) if np.all(np.diff(x) == 1) else x for x in places]  # read as they lie
     read = {q: np.asarray(old.array(q.name).oindex[(*runs, *map(slice, q.shape))]) for q in old.quantities(spec)}
     return {q.name: values.reshape(-1, *q.shape) for q, values in read.items()}
@@ -144,7 +141,6 @@ class LaterEnd(NamedTuple):
 
 
 def continues(other: Files, description: Description) -> bool:
-    """True if the output times of these motions begin at the last one of a store."""
     return float(description.ts[0]) == other.spec()["ts"]["ends"][1]
 
 

@@ -164,7 +164,6 @@ class Files:
         return Grid(tuple(spec["shape"]), tuple(spec["chunk"]))
 
     def quantities(self, spec: dict) -> list[Quantity]:
-        """The quantities that are stored of each member, `result` last."""
         kept = [Quantity(x["name"], tuple(x["shape"]), np.dtype(x["dtype"])) for x in spec["kept"]]
         return [*(q for q in kept if q.name not in spec["reduce"]), RESULT]
 
@@ -196,7 +195,6 @@ class Files:
                 shutil.rmtree(aside.path, ignore_errors=True)
 
     def create(self, spec: dict, scene: bytes, axes: tuple[Axis, ...], title: str, codes: dict[int, str]) -> None:
-        """Make the store with empty arrays and the coordinates."""
         zarr = require_zarr()
         for folder in ("done", "aside", "copied"):
             (self.job / folder).mkdir(parents=True)
@@ -416,5 +414,4 @@ def write_through(file: Path, data) -> None:
 
 
 def require_zarr():
-    """The package zarr. Raises `ImportError`, with a sentence, where it is not installed."""
     return import_package("sweep()", "zarr", '"zarr>=3"', "codecs")

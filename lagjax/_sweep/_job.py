@@ -53,7 +53,6 @@ class Job:
         return cls(store, spec, store.grid(spec), description, batches)
 
     def require_engine(self, kept: KeptResults) -> None:
-        """Raise `ValueError` where another engine integrates here than where the store was begun."""
         if kept.engine != self.spec["engine"]:
             raise ValueError(
                 f"{self.store.path} was begun with the engine {self.spec['engine']}, here {kept.engine} integrates: "
@@ -167,7 +166,6 @@ def parts(job: Job, unit: int) -> list[tuple[np.ndarray, int]]:
 
 
 def unit_points(job: Job, unit: int) -> Callable[[np.ndarray], dict[str, np.ndarray]]:
-    """The points of members of a unit, as a function of their places in it."""
     axes, shape = job.store.coordinates(job.spec["axes"], job.grid.box(unit)), job.grid.box_shape(unit)
     starts = job.store.copied(unit).starts
     return lambda which: points_of(axes, shape, which) | {name: x[which] for name, x in starts.items()}

@@ -48,7 +48,6 @@ class Axis:
 
 
 def hash_columns(columns) -> str:
-    """The hash of the values along an axis, by which they are known."""
     return hashlib.sha256(b"".join(np.ascontiguousarray(x).tobytes() for x in columns)).hexdigest()
 
 

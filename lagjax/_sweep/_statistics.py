@@ -185,7 +185,6 @@ def summary(how: Statistics, total: Partial, shape: tuple[int, ...]) -> Summary:
 
 
 def to_bytes(partials: dict[str, Partial]) -> bytes:
-    """Statistics of a unit by the names of quantities, as one file."""
     rows = ((f"{name}/{field}", x) for name, part in partials.items() for field, x in part._asdict().items())
     return arrays_as_bytes(dict(rows))
 

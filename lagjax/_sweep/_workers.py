@@ -114,7 +114,6 @@ _POLL = 0.2  # seconds between two looks at tasks that are no futures
 
 
 def submit(job: Job, units: list[int], executor: Any, notify: Notify) -> None:
-    """Compute these units by an executor, some at a time."""
     path, remaining, running = str(job.store.path.resolve()), iter(units), set()
     try:
         while True:
@@ -147,7 +146,6 @@ def _wait_for_first(running: set[Any]) -> set[Any]:
 
 
 def require_executor(executor: Any) -> None:
-    """Raise `TypeError` or `ValueError` for what is no executor, or forks a process in which JAX has threads."""
     if not isinstance(executor, Executor) and not hasattr(executor, "submit"):
         raise TypeError(
             f"executor must be a concurrent.futures.Executor, such as dask's client.get_executor(); got {executor!r}."
@@ -284,7 +282,6 @@ def _set_alarm(limit: float) -> None:
 
 
 def _compute_units(path: str, units: list[int], crashed: dict[int, str], limit: float, shown: bool) -> None:
-    """Compute these units, each without the members that are known to end their process."""
     job = _open_here(path)
     show = Progress(job.store, job.spec, shown)
     for unit in units:

@@ -113,7 +113,6 @@ def _require_motion(given: GivenSystem, recordings: list[Record], signals: Signa
 
 
 def _read_form(system: Scene, records: list[Record], hold: str) -> Form | None:
-    """The structure of the inputs. Raises `ValueError` where the scene asks for some, and there are none."""
     asking = input_functions(system)
     if asking and isinstance(system, Hybrid):
         raise ValueError(f"{asking[0]} asks for `inputs`, which hybrid motion has none of: make it a function of `t`.")

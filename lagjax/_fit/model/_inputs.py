@@ -37,7 +37,6 @@ class SampleTable(NamedTuple):
 
     @property
     def room(self) -> int:
-        """K, for which a program is made."""
         return self.knots.shape[1]
 
     def rows(self, numbers: np.ndarray) -> np.ndarray:
@@ -112,13 +111,11 @@ class _FunctionOfInputs(eqx.Module):
 
 
 def input_functions(scene: Scene) -> list[str]:
-    """The functions of a scene that ask for `inputs`."""
     functions = ((name, getattr(law, name)) for law in laws(scene) for name in _FUNCTIONS)
     return [name for name, function in functions if function is not None and "inputs" in function.extras]
 
 
 def table_length(count: int) -> int:
-    """The length of a table that is to hold `count` samples and one more."""
     room = _LEAST_ROOM
     while room <= count:
         room *= _GROWTH

@@ -86,7 +86,6 @@ class AbstractMotions(abc.ABC):
 def choose_motions(
     system: Scene, layout: Layout, parameters: Parameters, rtol, atol, form: Form | None = None
 ) -> AbstractMotions:
-    """Followers of the motions of a scene: machine code where it has that, else diffrax. `form` is of its inputs."""
     if isinstance(system, Hybrid):
         return _JaxMotions(system, layout, parameters, {"rtol": rtol, "atol": atol})
     form = form if input_functions(system) else None  # inputs that only sensors ask for, or nothing

@@ -153,7 +153,6 @@ class Parameters:
         return sum(part.transform.log_volume(u[own], xp) for own, _, part in self._cuts)
 
     def draw(self, u: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-        """Another u (F,) to begin a search from."""
         return np.concatenate([u[:0], *(part.transform.draw(u[own], rng) for own, _, part in self._cuts)])
 
     @property
@@ -178,7 +177,6 @@ class Parameters:
 
     @property
     def maps(self) -> tuple[AbstractTransform, ...]:
-        """The transform of each unknown (F,)."""
         return tuple(part.transform for own, _, part in self._cuts for _ in range(own.stop - own.start))
 
     @property
@@ -244,7 +242,6 @@ class Parameters:
         return replace(at, parts=tuple(parts), names=tuple(names))
 
     def restore(self, numbers) -> PyTree:
-        """The user's pytree of all numbers (P,)."""
         leaves, begin = [], 0
         for leaf in self.leaves:
             if eqx.is_array_like(leaf):
@@ -256,7 +253,6 @@ class Parameters:
 
 
 def _broadcast_prefix(prefix: PyTree, tree, leaves: list, name: str) -> list:
-    """A prefix of the parameters spread over every leaf. Raises `ValueError` where it is no prefix."""
     whole = jax.tree.unflatten(tree, leaves)
     try:
         spread = jax.tree.broadcast(prefix, whole, is_leaf=lambda leaf: leaf is None)

@@ -115,7 +115,6 @@ class Record(MeasuredSignal):
 
     @property
     def sampled_at(self) -> np.ndarray:
-        """The times of the samples of inputs, (K,)."""
         return self.ts if self.input_ts is None else self.input_ts
 
     @property
@@ -234,7 +233,6 @@ def _signal(leaf, label: str, times: int) -> np.ndarray:
 
 
 def _require_input_times(record: Record) -> None:
-    """Raise `ValueError` for times of inputs without inputs, or that begin after the record."""
     times, begin = record.sampled_at, record.ts[0]
     if record.inputs is None:
         raise ValueError("input_ts are the times of `inputs`, and there are none: give both.")
@@ -246,7 +244,6 @@ def _require_input_times(record: Record) -> None:
 
 
 def require_interpolation(record: MeasuredSignal, hold: str, name: str) -> None:
-    """Raise `ValueError` where the inputs of a record cannot go on between samples as `hold` says."""
     if not isinstance(record, Record) or record.inputs is None or hold == "zero":
         return
     times, end = record.sampled_at, record.ts[-1]
@@ -269,7 +266,6 @@ def _input(leaf, label: str, times: int) -> np.ndarray:
 
 
 def require_start(start) -> None:
-    """Raise `TypeError` for what is neither a start, nor a function of the parameters that gives one."""
     if start is not None and not callable(start) and not (isinstance(start, tuple) and len(start) == 2):
         raise TypeError(
             "start must be (q0, qdot0), lagjax.Guess(q0, qdot0), a function of the parameters that returns "
@@ -390,7 +386,6 @@ def start_pair(start, params: PyTree) -> tuple[PyTree, PyTree]:
 
 
 def _convert_to_float(number):
-    """A number or an array of a start: whole numbers too mean real ones."""
     if not eqx.is_array_like(number) or jnp.issubdtype(kind := jnp.result_type(number), jnp.complexfloating):
         raise TypeError(f"A start must hold real numbers; got {number!r}.")
     return number if jnp.issubdtype(kind, jnp.floating) else jnp.asarray(number, float)

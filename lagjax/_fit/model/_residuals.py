@@ -281,7 +281,6 @@ class SystemResiduals:
         return values, slopes
 
     def _require_finite(self, batch: Samples, values: np.ndarray, by_unknowns: np.ndarray) -> None:
-        """Raise `LostMotion` where a signal that counts, or its derivative, is not finite."""
         counted = batch.weights[..., self.columns(self.pieces[batch.rows[0]].record)] > 0
         bad = counted & ~(np.isfinite(values) & np.isfinite(by_unknowns).all(axis=-1))
         if bad.any():
@@ -305,7 +304,6 @@ class SystemResiduals:
         return times[None, :, None], slopes[None, :, None]
 
     def _append_batch(self, batch: Samples, trial: Trial, values: np.ndarray, by_unknowns: np.ndarray) -> None:
-        """Append the residuals of one batch and their derivatives, with a column for every signal and unknown."""
         counted, columns = batch.weights > 0, self.columns(self.pieces[batch.rows[0]].record)
         free = len(self.parameters)
         states = by_unknowns.shape[-1] - free  # none where no start is free
@@ -458,7 +456,6 @@ class Residuals:
         ]
 
     def log_likelihood(self, point: Trial, noise: NoiseScale) -> float:
-        """The logarithm of the likelihood of the residuals of a trial, as if all samples were independent."""
         return log_likelihood(noise, point.flat(), self.weights, self.sides)
 
     def fisher_factors(self, point: Trial, noise: NoiseScale) -> list[np.ndarray]:
@@ -489,7 +486,6 @@ class Residuals:
         return total
 
     def linearise(self, point: Trial, noise: NoiseScale) -> np.ndarray:
-        """The triangles of the least squares about a trial."""
         return self.triangles(self.working_trial(point, noise), self.factors(point, noise))
 
     def triangles(self, point: Trial, factors: list[np.ndarray]) -> np.ndarray:
@@ -584,7 +580,6 @@ class Residuals:
 
 
 def qr_triangle(rows: np.ndarray) -> np.ndarray:
-    """R of the factorisation QR of matrices (..., M, D)."""
     return np.asarray(np.linalg.qr(rows, mode="r"))
 
 
