@@ -23,9 +23,7 @@ PyTree = Any
 _CLEAR = 0.35  # of a period between neighbours: at a half the way round is ambiguous; noise takes the rest
 _UNCLEAR = 0.05  # share of steps that may be longer, over gaps and glitches: states are read well where most are not
 _SHARP = 3.0  # times the steps beside it that a jump is large: a tent of noise is 2, and a period of 6 samples is 5
-_NEAR = (
-    1.5  # times these steps that it may differ from a period: acceleration changes them by less from one to the next
-)
+_NEAR = 1.5  # times these steps that it may differ from a period: acceleration changes them by less in one sample
 _ENOUGH = 20  # samples of which one jump by a whole turn is no chance; of shorter records, and other periods, two
 _TURNS = {2 * np.pi: "2π", 360.0: "360"}  # whole turns: a signal may jump by one wherever it is
 _PERIODS = {**_TURNS, np.pi: "π", 180.0: "180", 1.0: "1"}  # of a signal that stays within one of them

@@ -9,23 +9,18 @@ then one exact density decides. The chain goes to y with the probability
     min(1, π(y) π*(x) / [π(x) π*(y)])
 
 and else stays at x. Its draws are those of π itself, whatever π* is, because the inner steps are reversible for π*: a
-poor expansion makes a slow chain, not a wrong one. Nothing of π* is changed after warming. How well it does is
-measured before, on independent pairs of its draws, and after: where less than `_LEAST` of them would be accepted, where
-the weights π/π* have no variance because π* is too narrow, and where chains are worth few independent draws, the
-sampler follows π itself, with gradients through the motions at every step.
+poor expansion makes a slow chain, not a wrong one. Nothing of π* is changed after warming. Where less than `_LEAST` of
+the draws are accepted, where the weights π/π* have no variance because π* is too narrow, and where chains are worth few
+independent draws, the sampler follows π itself, with gradients through the motions at every step.
 
 All chains go side by side in one batch of motions. The effective number of draws comes with them, and a warning where
 it is small.
 
-Which library: blackjax, whose kernels are plain functions of a log density, so that chains, the loop and what is kept
-are a few lines here; arviz for what draws are worth. numpyro does the same behind a language for models, of which
-nothing is needed. The warming (`_tune_sampler`) is not `blackjax.window_adaptation`: its chains share one step and one
-metric, where a window adaptation has one of each for every chain and does not say how many draws are worth an
-independent one. Measured along the expansions of two posteriors of 7 and 11 unknowns, four chains, two seeds, with
-compilation: the rounds here take 12 to 16 s of a core, and then 4.5 to 5.5 steps of trajectories make an independent
-draw; windows of 500 steps a chain take 7 to 8 s, and 4.9 to 5.9; of 150 steps, 7 to 9 s, and 14 to 32. So along the
-expansion windows would warm in half the time; along the exact density, where a step is a batch of motions and 350 of a
-chain are what is spent, they were not measured.
+Which library: blackjax, whose kernels are plain functions of a log density; arviz for what draws are worth. numpyro
+does the same behind a language for models, of which nothing is needed. The warming (`_tune_sampler`) is not
+`blackjax.window_adaptation`, which has a step and a metric for every chain and does not say how many draws are worth an
+independent one. Along expansions of 7 and 11 unknowns windows of 500 steps take half the time, with compilation, of the
+rounds here, to as good a metric; along exact densities they were not measured.
 
 Source: Hoffman & Gelman, *The No-U-Turn sampler*, JMLR 15 (2014) 1593; Christen & Fox, *MCMC using an approximation*,
 J. Comput. Graph. Stat. 14 (2005) 795; Vehtari et al., Bayesian Analysis 16 (2021) 667, for dispersed chains, r-hat and
@@ -51,8 +46,7 @@ _ROUNDS = (400, 800, 3200)  # draws of all chains from π*: each round has the m
 _ROUNDS_OF_MOTIONS = (200, 400, 800)  # of π, where each costs as many motions as draws do later
 _FEWEST = 50  # of them of one chain: its step needs this many
 _MOST_INNER = 64  # steps of the sampler along π* for one draw: a motion is waited for no longer than that
-_PILOT = 64  # draws of π* that are weighed with π before the first draw
-_LEAST = 0.2  # of them are accepted, or π* is given up: fewer, and a chain may stay where π* is too small
+_LEAST = 0.2  # of draws of π* are accepted, or π* is given up: fewer, and a chain may stay where π* is too small
 
 # π* is too narrow where weights π/π* have a Pareto tail of this shape: means of them do not settle then (Vehtari et
 # al., J. Mach. Learn. Res. 25 (2024) 72). The shape means nothing where nearly all draws are accepted.
@@ -95,23 +89,22 @@ def draw(density: Density, draws: int, chains: int, seed: int) -> Draws:
 def _sample_expansion(chart: Chart, draws: int, chains: int, seed: int) -> Draws:
     """Draws that the exact density accepts or refuses. Raises `Unexpanded` where the expansion is not good enough."""
     surrogate = expand_residuals(chart)
-    warming, weighing, going = jax.random.split(jax.random.key(seed), 3)
+    warming, going = jax.random.split(jax.random.key(seed))
     sampler, state, many = _tune_sampler(surrogate, chart, _ROUNDS, chains, warming)
     if math.isinf(many):
         raise Unexpanded("Along the expansion of its residuals to second order the chains did not move.")
     sampler = sampler._replace(inner=min(max(math.ceil(many), 1), _MOST_INNER))
     exact = jax.jit(jax.vmap(chart.log_density))
-    share, start = _weigh_expansion(sampler, exact, state, weighing)
-    if share < _LEAST:
+    drawn, tail = _correct_draws(surrogate, sampler, exact, Chains.from_state(state, exact), draws, going)
+    if (share := drawn.acceptance.mean()) < _LEAST:
         raise Unexpanded(
             f"Of draws of the expansion of its residuals to second order the exact density accepts {share:.2f}."
         )
-    drawn, tail = _correct_draws(surrogate, sampler, exact, start, draws, going)
     if drawn.acceptance.mean() < _NEARLY_ALL and tail > _HEAVY:
         raise Unexpanded(
             f"The expansion of its residuals to second order is too narrow: π/π* has a Pareto tail of {tail:.2f}."
         )
-    if (worth := agreement(drawn.x).effective.min()) < _WORTH * draws * chains:
+    if (worth := agreement(drawn.x)[0].min()) < _WORTH * draws * chains:
         raise Unexpanded(
             f"Of {draws * chains} draws along the expansion of its residuals {worth:.0f} were independent."
         )
@@ -216,25 +209,6 @@ class Chains(NamedTuple):
         return Chains(state, log_exact, ratio)
 
 
-def _weigh_expansion(sampler: Sampler, exact: Callable, state, key) -> tuple[float, Chains]:
-    """The share of independent pairs of draws of π* that is accepted, and the chains then.
-
-    Starts chosen by weight would not be better ones: the few largest weights are where π* is too small, and a chain
-    stays there for as long as the weight is large.
-    """
-    pilot = []
-    for k in range(max(2, math.ceil(_PILOT / len(state.position)))):
-        state, *_ = sampler.draw(jax.random.fold_in(key, k), state)
-        pilot.append(Chains.from_state(state, exact))
-    ratio = np.concatenate([at.ratio for at in pilot])
-    if not np.isfinite(ratio).any():
-        return 0.0, pilot[-1]
-    weights = np.exp(ratio - ratio.max())
-    above = np.sort(weights[weights > 0])  # of pairs i, j the mean of min(1, wᵢ/wⱼ), without a table of all of them
-    share = np.sum(np.cumsum(above) / above + np.arange(len(above))[::-1]) / len(weights) ** 2
-    return float(share), pilot[-1]
-
-
 def _correct_draws(
     surrogate: Surrogate, sampler: Sampler, exact: Callable, at: Chains, draws: int, key
 ) -> tuple[Draws, float]:
@@ -280,35 +254,27 @@ def _unknowns(chart: Chart, z: np.ndarray, log_density: np.ndarray) -> tuple[np.
     return np.asarray(x), log_density - np.asarray(volume)
 
 
-class Agreement(NamedTuple):
-    """The effective number of draws of each unknown (D,), and r-hat, the disagreement of chains.
+def agreement(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The effective number of draws (C, K, D) of each unknown, for the bulk or the tails; r-hat, that chains disagree.
 
-    `effective` is the smaller of the numbers for the bulk and for the tails of the density. NaN where draws are too few
-    to tell, r-hat also for a single chain.
+    NaN where draws are too few to tell, r-hat also for a single chain.
     """
-
-    effective: np.ndarray
-    r_hat: np.ndarray
-
-
-def agreement(x: np.ndarray) -> Agreement:
     arviz = _arviz()
     if x.shape[1] < _FEWEST_TO_TELL:
-        return Agreement(*np.full((2, x.shape[2]), np.nan))
+        return np.full(x.shape[2], np.nan), np.full(x.shape[2], np.nan)
     ranked = arviz.convert_to_dataset(x)
     bulk, tail = (np.asarray(arviz.ess(ranked, method=method).x) for method in ("bulk", "tail"))
-    r_hat = np.asarray(arviz.rhat(ranked).x) if len(x) > 1 else np.full(x.shape[2], np.nan)
-    return Agreement(np.minimum(bulk, tail), r_hat)
+    return np.minimum(bulk, tail), np.asarray(arviz.rhat(ranked).x) if len(x) > 1 else np.full(x.shape[2], np.nan)
 
 
 def _check_agreement(density: Density, drawn: Draws) -> dict[str, float]:
     """The worst of the agreement of chains, by name; a warning where that is too little to read quantiles off draws."""
-    found = agreement(drawn.x)
-    worst, apart = int(np.argmin(found.effective)), float(np.max(found.r_hat))
-    effective = float(found.effective[worst])
+    each, r_hat = agreement(drawn.x)
+    worst, apart = int(np.argmin(each)), float(np.max(r_hat))
+    effective = float(each[worst])
     count = drawn.x.shape[0] * drawn.x.shape[1]
     if not effective >= _RELIABLE or apart > _APART:
-        at = density.names[worst if not effective >= _RELIABLE else int(np.argmax(found.r_hat))]
+        at = density.names[worst if not effective >= _RELIABLE else int(np.argmax(r_hat))]
         warnings.warn(
             f"The {count} draws of {at} are worth {effective:.0f} independent ones, and r-hat is {apart:.2f}: do not "
             f"read intervals off them. {_RELIABLE} and r-hat below {_APART} are the least; ask for more draws.",

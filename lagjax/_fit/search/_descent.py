@@ -7,13 +7,10 @@ these rests are a problem of F columns. That is the Schur complement of the norm
 which would square the condition; the cost is linear in the number of pieces.
 
 Which library: none, for this step. `scipy.optimize.least_squares` (trf) factors one dense Jacobian of F + 2nN columns,
-which is cubic in the number of pieces, or takes inexact steps by LSMR on a sparse one. Measured from the same start to
-the same end, for a pendulum with friction (F = 2, 41 samples in a piece) in ms of a core, trials included: 10 pieces 6
-here, 13 dense, 18 sparse; 40 pieces 14, 40, 26; 160 pieces 30, 695, 82. SciPy's times hold the assembly of its Jacobian
-and twice as many trials, 33 ms at 160 pieces, as it asks for residuals and for slopes. optimistix has neither blocks
-nor bounds and compiles its loop anew for every shape; it was not timed. What is kept of them is the rest: bounds are
-transforms, robust losses are weights (`_noise`), and the tests hold the end point to that of
-`scipy.optimize.least_squares`.
+which is cubic in the number of pieces, or takes inexact steps by LSMR on a sparse one: from the same start to the same
+end of 160 pieces, 695 and 82 ms where this takes 30. optimistix has neither blocks nor bounds and compiles its loop
+anew for every shape. Bounds are transforms, robust losses are weights (`_noise`), and the tests hold the end point to
+that of `scipy.optimize.least_squares`.
 
 Source: Moré, *The Levenberg–Marquardt algorithm: implementation and theory* (1978), for scaling by columns; Madsen,
 Nielsen & Tingleff, *Methods for non-linear least squares problems* (2004), §3.2, for λ; Bock (1987) for elimination.
@@ -32,9 +29,7 @@ from lagjax._fit.model._residuals import LostMotion, Point, Residuals, Trial, co
 # Damping, relative to the squared norms of the columns. The first step is nearly that of Gauss and Newton; below the
 # least one, damping is below the round-off of derivatives and only keeps columns that nothing depends on from moving.
 _FIRST, _LEAST, _MOST = 1e-4, 1e-14, 1e12
-_PATIENCE = (
-    12  # trials that lowered the sum of squares by less than what ends a search, while derivatives promised more
-)
+_PATIENCE = 12  # trials that lowered the sum of squares by less than ends a search, while derivatives promised more
 _NEAR = 1e-3  # per sample: where it pays to look at how much the residuals are correlated
 _FLAT = 1e-13  # relative: half the sum of squares is itself rounded to so much
 _KINK = (

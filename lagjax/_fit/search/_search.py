@@ -38,9 +38,7 @@ _ENOUGH_OF_WINDOWS = 0.1
 _POOR, _COARSE = 2.0, 0.02  # times scatter or size of signals: beyond, the shortest segments were not fitted
 _LOOSE = 3.0  # standard deviations of u about its first value on these levels, where u is a logarithm or the like
 _TRIALS, _TRIALS_OF_LEVEL = 60, 20
-_WORSE = (
-    5.0  # times more that a join may leave; measured: 3 where friction was left out, 10 and more beyond the horizon
-)
+_WORSE = 5.0  # times more that a join may leave: without friction it was 3, beyond the horizon 10 and more
 _LOST = 2  # levels that may be lost: after one the next may find the motion again, with better parameters
 _LYAPUNOV = 5.0  # times 1/λ that a record is long: shorter ones are followed whole
 _GRADIENT_STEPS = 3000  # of a descent by gradients
