@@ -69,7 +69,9 @@ class Density:
         self.start_places = np.full(moves.shape, len(self.first))
         self.start_places[moves] = np.arange(free, free + len(starts))
         self.noise_places = slice(free + len(starts), free + len(starts) + len(noise.sigma))
-        self.names = (*residuals.parameters.labels, *self._start_names(), *self._noise_names())
+        of_noise = [f"log σ of {name}" for name in residuals.names]
+        of_noise += [f"ν of {name}" for name in residuals.names] * self.moves_dof
+        self.names = (*residuals.parameters.labels, *self._start_names(), *of_noise)
 
     def _start_names(self) -> list[str]:
         residuals = self.residuals
@@ -80,10 +82,6 @@ class Density:
             for half in ("q", "qdot")
             for name in layouts[row].names
         ]
-
-    def _noise_names(self) -> list[str]:
-        names = self.residuals.names
-        return [f"log σ of {name}" for name in names] + [f"ν of {name}" for name in names] * self.moves_dof
 
     def __len__(self) -> int:
         return len(self.first)

@@ -139,11 +139,6 @@ class SystemResiduals:
         self.origins = Origins(starts, self.layout, self.parameters)
         self.fits_on_constraints = self.manifold is not None and bool(self.fitted.any())
 
-    def with_parameters(self, parameters: Parameters) -> "SystemResiduals":
-        other = copy.copy(self)
-        other.parameters = parameters
-        return other
-
     def with_records(
         self, records: list[Any], fitted: np.ndarray, parameters: Parameters | None = None,
         manifold: Manifold | None = None,
@@ -260,12 +255,12 @@ class SystemResiduals:
         delays, signals, numbers = self.signals.delays, self.signals, trial.numbers
         assert delays is not None
         numbers_dot = self._directions(batch, trial)[1]
-        each = delays.evaluate(numbers)
-        if text := delays.refuses(each):
-            raise self.lost(batch.rows[0], text)
         values = np.zeros((*batch.ts.shape, len(signals.names)))
         slopes = np.zeros((*values.shape, len(numbers_dot)))
-        for delay in each:
+        for delay in delays.evaluate(numbers):
+            if not 0.0 <= delay.value <= delays.longest:
+                text = f"A delay is {delay.value:.4g}, but must lie between 0 and the longest one, {delays.longest:g}."
+                raise self.lost(batch.rows[0], text)
             ts = np.maximum(batch.ts - delay.value, batch.ts[:, :1])
             motion = self._follow(batch, ts, trial)
             inputs, rates = batch.inputs, np.zeros_like(batch.inputs)
@@ -422,9 +417,9 @@ class Residuals:
     def with_parameters(self, parameters: Parameters) -> "Residuals":
         other = copy.copy(self)
         other.parameters = parameters
-        other.systems, other.parts = (
-            [system.with_parameters(parameters) for system in some] for some in (self.systems, self.parts)
-        )
+        other.systems, other.parts = ([copy.copy(one) for one in some] for some in (self.systems, self.parts))
+        for one in (*other.systems, *other.parts):
+            one.parameters = parameters
         return other
 
     # ---- trials ----

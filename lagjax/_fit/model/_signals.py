@@ -70,12 +70,6 @@ class Delays:
             for k, row in enumerate(rows)
         ]
 
-    def refuses(self, delays: list[Delay]) -> str | None:
-        for one in delays:
-            if not 0.0 <= one.value <= self.longest:
-                return f"A delay is {one.value:.4g}, but must lie between 0 and the longest one, {self.longest:g}."
-        return None
-
 
 _AT_ONCE = 2048  # samples in one call of the compiled sensors: one program for records of any length
 _NEWTON, _CLOSE = 8, 1e-6  # steps from what sensors show to positions, and the last of them: noise is larger

@@ -26,13 +26,10 @@ With the coordinates ζ of `Chart`, in which the covariance of the fit is one, e
     r(ζ) ≈ r(0) + J ζ + ½ ζᵀ H ζ,        H eᵢ = [J(h eᵢ) − J(−h eᵢ)] / (2 h),   h ≤ 1,
 
 with exact Jacobians J: central differences over one standard deviation, or as far as a bound lets them, take along what
-bends at the scale of the posterior. The prior, the volumes of the transforms and the law of the noise are kept as they
-are. A value and its gradient then cost products of matrices and no motion. Where the posterior bends mildly, the two
-densities differ by tenths; `_sample` corrects for what is left with the exact density.
-
-A residual depends on the parameters and on the start of its own record. The root L of the covariance keeps that: given
-the parameters, starts are independent, so that all of them are moved in one trial, and 2 (F + 2n) trials do for any
-number of records.
+bends at the scale of the posterior. Prior, volumes and the law of the noise are kept as they are. A value and its
+gradient cost products of matrices and no motion; `_sample` corrects for what is left with the exact density. Given the
+parameters, starts are independent, so that all of them move in one trial, and 2 (F + 2n) trials do for any number of
+records.
 
 Source: Christen & Fox, J. Comput. Graph. Stat. 14 (2005) 795, for approximations inside of a chain that is exact.
 """
