@@ -164,10 +164,6 @@ class Flow:
         parts = self.program, self.size, self.projection, self.guards, self.groups, self.nesting
         return _native.Kernel(*parts, motion=self._motion_program())
 
-    @property
-    def borders(self):
-        return self.kernel.borders
-
     # ---- forward ----
 
     def run(

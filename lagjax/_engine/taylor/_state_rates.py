@@ -20,7 +20,7 @@ INSTANT = 1e-9  # of the time; what a border is off by while a motion slides alo
 
 def rate(flow: Flow, t, y, params):
     """(q̇, q̈) at states y (…, 2n), t (…), params (…, P); zero where it is not finite: there the motion has ended."""
-    n, borders, program = flow.size, flow.borders, flow.general_program
+    n, borders, program = flow.size, flow.kernel.borders, flow.general_program
     rows = Rows(join_columns(y, t[..., None]), params)
     if borders is not None and any(guard.slide >= 0 for guard in borders.guards):
         chosen = params if flow.kernel.chosen is None else params[..., jnp.array(flow.kernel.chosen.positions, int)]
