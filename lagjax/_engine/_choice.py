@@ -43,8 +43,11 @@ def requested_engine(
 _MACHINE_CODE = MachineCode()
 
 
-def choose(problem: Problem, requested: AbstractEngine | None = None) -> Choice:
-    """The engine for a problem. Raises `ValueError` where the `requested` one, or without it every one, refuses it."""
+def choose(problem: Problem, requested: AbstractEngine | None = None, members: int = 1) -> Choice:
+    """The engine for a problem, or for `members` like it.
+
+    Raises `ValueError` where the `requested` one, or without it every one, refuses it.
+    """
     if isinstance(requested, Diffrax):
         choice = Choice(requested, "diffrax was asked for")
     else:
@@ -54,7 +57,7 @@ def choose(problem: Problem, requested: AbstractEngine | None = None) -> Choice:
         if requested is not None:
             raise ValueError(_refusal(refusal))
         choice = Choice(Diffrax(), refusal)
-    if refusal := choice.engine.refuses(problem):
+    if refusal := choice.engine.refuses(problem) or choice.engine.lacks_memory(problem, members):
         raise ValueError(f"{refusal}.")
     return choice
 

@@ -46,4 +46,4 @@ from lagjax._equations._motion import Motion
 from lagjax._equations._rank import Decided, decide, null_space, span_outside
 from lagjax._equations._scales import Scales
 from lagjax._equations._sparse import Diagonal
-from lagjax._equations._structure import SparseMotion, Structure
+from lagjax._equations._structure import LEAST_COORDINATES, SparseMotion, Structure

@@ -25,11 +25,11 @@ from lagjax._equations._blame import pieces_of_motion
 from lagjax._equations._constraints import velocity_scales
 from lagjax._equations._linear import eigen, solve_many
 from lagjax._equations._motion import Motion
-from lagjax._equations._patterns import jacobian_pattern
+from lagjax._equations._patterns import gradient_memory, jacobian_pattern
 from lagjax._equations._quantities import OwnRules, quantities
 from lagjax._equations._recursion import Recursion, RecursiveElimination
 from lagjax._equations._saddle import LARGEST_INDEFINITE, IndefiniteElimination, SaddleElimination, TwoCoordinates
-from lagjax._equations._structure import LARGEST_LOWERED, SparseMotion, Structure, structure_of
+from lagjax._equations._structure import LARGEST_LOWERED, LEAST_COORDINATES, SparseMotion, Structure, structure_of
 from lagjax._interface import Layout, dtype_of, is_concrete
 from lagjax._native import Projection
 from lagjax._primitives import DOUBLE
@@ -42,6 +42,7 @@ from lagjax._program import (
     borders,
     concatenate,
     is_smooth,
+    lack_of_memory,
     lower,
     lower_formula,
     lower_scalars,
@@ -61,6 +62,9 @@ OPERATION_BUDGET = operations_that_fit(2000)
 # those of arrays 2 s for what is vectorised, as 60 bodies are (39 000: 4 s), and 13 s for an arm that is written joint
 # by joint (7600: 1 s). Doubled, the first kind loses 3 s more; halved, arms of 12 joints compile for half a minute.
 LARGEST_DIFFERENTIATED = 30_000
+
+# Operations of L up to which the coordinates that it reads are looked for, at 1 to 3 µs and up to 1 kB each.
+_FOLLOWED = 1_500_000
 
 # The order of coordinates of states far away, where a force between bodies is weak: its square is then a millionth.
 _FAR = 1e3
@@ -128,6 +132,13 @@ class Derivation:
         """
         self.motion, self.layout, self.refusal, self.unhashable = motion, layout, refusal, unhashable
         self.numbers = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), params)
+        is_large = layout.size >= LEAST_COORDINATES and path != "scalar"
+        self.memory = gradient_memory(motion.lagrangian, self.state_shapes) if is_large else 0
+        if lack := lack_of_memory(self.memory):
+            raise ValueError(
+                f"The gradient of this L, of {layout.size} coordinates, {lack}: sum over fewer terms (neighbours, a "
+                "cut-off), or over parts of them by jax.lax.map with jax.checkpoint."
+            )
         self.structure = None if path == "scalar" else self._structure_of(motion, path == "array")
         if self.structure is not None:
             self.motion = SparseMotion(*vars(motion).values(), structure=self.structure)
@@ -370,6 +381,8 @@ class Derivation:
     @functools.cached_property
     def cyclic(self) -> tuple[int, ...] | None:
         """The coordinates that no operation of L reads, of a scene on arrays; None where a look takes long."""
+        if self.structure is not None and self.structure.operations > _FOLLOWED:
+            return None
         pattern = jacobian_pattern(lambda *state: jnp.ravel(self.motion.lagrangian(*state)), self.state_shapes, by=0)
         return None if pattern is None else tuple(np.flatnonzero(pattern.sum(axis=0) == 0).tolist())
 

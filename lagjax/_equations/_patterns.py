@@ -5,6 +5,7 @@ Montoison, *An Illustrated Guide to Automatic Sparse Differentiation*, 2025). It
 large scenes alone. A pattern may hold entries that are zero, never lack one that is not.
 """
 
+import math
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +13,8 @@ import jax
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr
 from scipy.sparse import csr_array
+
+from lagjax._program import lack_of_memory
 
 PyTree = Any
 
@@ -46,6 +49,30 @@ def jacobian_pattern(function: Callable, shapes: tuple, by: int) -> csr_array | 
         return None
     entries = np.ones(len(pattern.rows), bool), (np.asarray(pattern.rows), np.asarray(pattern.cols))
     return csr_array(entries, shape=pattern.shape)
+
+
+def gradient_memory(function: Callable, shapes: tuple) -> int:
+    """The bytes that the gradient of f by its first two arguments takes besides its result.
+
+    It is about twice the largest array among its operations: 1.7 times for the distances of all pairs. Where that does
+    not fit into memory XLA is asked, which compiles it in less than a second and may never form that array.
+    """
+    gradient = jax.grad(function, argnums=(0, 1))
+    needed = 2 * _largest_array(jax.make_jaxpr(gradient)(*shapes).jaxpr)
+    if lack_of_memory(needed) is None:
+        return needed
+    return jax.jit(gradient).lower(*shapes).compile().memory_analysis().temp_size_in_bytes
+
+
+def _largest_array(jaxpr) -> int:
+    """The bytes of the largest array that an operation of a jaxpr gives."""
+    largest = 0
+    for equation in jaxpr.eqns:
+        inner = [x for x in jax.tree.leaves(equation.params, is_leaf=_is_jaxpr) if _is_jaxpr(x)]
+        arrays = [v.aval for v in equation.outvars]
+        sizes = (math.prod(x.shape) * x.dtype.itemsize for x in arrays if hasattr(x, "shape"))
+        largest = max(largest, *sizes, *(_largest_array(getattr(x, "jaxpr", x)) for x in inner), 0)
+    return largest
 
 
 def count_operations(jaxpr) -> int:

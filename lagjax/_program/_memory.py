@@ -28,6 +28,14 @@ def operations_that_fit(bytes_each: int) -> int:
     return int(SHARE * machine_memory() / bytes_each)
 
 
+def lack_of_memory(needed: float) -> str | None:
+    """The end of a sentence where so many bytes do not fit into the `SHARE` of a scene, else None."""
+    there = machine_memory()
+    if needed <= SHARE * there:
+        return None
+    return f"would take some {needed / 2**30:.3g} GiB of memory at once, and this machine has {there / 2**30:.3g}"
+
+
 @contextlib.contextmanager
 def pause_collections() -> Iterator[None]:
     """A context in which Python does not look for cycles of references.

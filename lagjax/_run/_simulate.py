@@ -211,7 +211,7 @@ def simulate_batch(
     given = Batch.from_values(system, values, axes, size, ts, rtol, atol, max_steps, event)
     try:
         batch = lift_batch(given)
-        engine = choose(batch.member, requested).engine
+        engine = choose(batch.member, requested, size).engine
     except (IndexError, TypeError) as reason:
         reason.add_note(
             f"By batch_axes this is a batch of {size} members: it says for (q0, qdot0, params) which axis runs over "

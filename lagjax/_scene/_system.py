@@ -29,7 +29,7 @@ from lagjax._equations import (
 )
 from lagjax._interface import Function, Layout, ValueNotKnown, accept, as_arrays, is_concrete, present, require_number
 from lagjax._primitives import SINGLE, compute_in_doubles
-from lagjax._program import Unlowerable
+from lagjax._program import Unlowerable, lack_of_memory
 from lagjax._scene._explanation import Explanation, explain
 
 PyTree = Any
@@ -139,7 +139,12 @@ class System(eqx.Module):
         """M = ∂²L/∂q̇², in the order in which the leaves of `q` lie end to end.
 
         The entry of two coordinates a and b has units energy·time²/({a}{b}).
+
+        **Raises** `ValueError` where so many numbers do not fit into memory.
         """
+        layout = Layout.from_state(q, qdot)
+        if lack := lack_of_memory(4 * layout.size**2 * layout.dtype.itemsize):
+            raise ValueError(f"The mass matrix of {layout.size} coordinates {lack}.")
         return self._evaluate_quantity(Motion.mass_matrix, q, qdot, t, params)
 
     def momentum(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> PyTree:

@@ -33,6 +33,7 @@ from lagjax._engine.diffrax._equations import MotionEquations, form_of
 from lagjax._engine.diffrax._integrate import Jumps, Method, WithJumps, integrate
 from lagjax._engine.diffrax._jumps import freeze
 from lagjax._engine.diffrax._solvers import FineOutput, Projected
+from lagjax._equations import LEAST_COORDINATES
 from lagjax._interface import (
     ENDED_WELL,
     EVENT_OCCURRED,
@@ -45,7 +46,7 @@ from lagjax._interface import (
     result_from,
 )
 from lagjax._primitives import DOUBLE, SINGLE, differentiable_where, lost_unless
-from lagjax._program import CLOCK, Unlowerable, table_of
+from lagjax._program import CLOCK, Unlowerable, lack_of_memory, table_of
 
 # Solvers reject steps for the round-off of their error estimate where rtol is below some ten units of it.
 LEAST_RTOL = 10
@@ -101,6 +102,20 @@ class Diffrax(AbstractEngine, eqx.Module):
             return None
         return f"dt={self.dt} needs {needed:.0f} steps, more than max_steps={problem.max_steps}: raise one of them"
 
+    def lacks_memory(self, problem: Problem, members: int = 1) -> str | None:
+        """The memory that a large scene, or `members` like it, takes, as the end of a sentence; None where it is there.
+
+        That are the arrays of L and its gradient, those of M where it is a matrix, some states of a step, and outputs.
+        """
+        derivation, n, count = problem.derivation, problem.layout.size, jnp.size(problem.ts)
+        if n < LEAST_COORDINATES:
+            return None
+        size, in_turn = problem.layout.dtype.itemsize, derivation.structure is not None  # one member after the other
+        at_once = derivation.memory + size * (2 * n * _STATES + (0 if in_turn else 3 * n * n))
+        lack = lack_of_memory((1 if in_turn else members) * at_once + members * size * 2 * n * count)
+        batch = f"{members} members of " if members > 1 else ""
+        return lack and f"A motion of {batch}{n} coordinates with {count} outputs {lack}"
+
     def solve(self, problem: Problem) -> Solution:
         """The motion of one member, compiled once for all problems of its structure."""
         return _solve(self, problem)
@@ -132,6 +147,8 @@ class Diffrax(AbstractEngine, eqx.Module):
             controller = WithJumps(controller, jumps)
         return Method(solver, controller, None, problem.max_steps, self.progress, jumps)
 
+
+_STATES = 20  # that a step of Dopri8 holds: its stages, their sums, and errors
 
 _AT_END = 256  # diffrax lets a step that ends up to 100 roundings before the end of the motion end there
 
