@@ -60,7 +60,7 @@ def structure_of(motion: Motion, shapes: tuple, insists: bool = False) -> Struct
     if n < LEAST_COORDINATES:
         return None
     operations = count_operations(jax.make_jaxpr(motion.lagrangian)(*shapes).jaxpr)
-    if operations < LEAST_OPERATIONS and not motion.constrained:
+    if operations < LEAST_OPERATIONS and not (motion.constrained or insists):
         return None
     pattern = hessian_pattern(motion.lagrangian, shapes, by=1)
     mass = form_of(pattern, n)
