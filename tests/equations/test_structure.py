@@ -100,6 +100,7 @@ def test_both_forms_give_the_same_accelerations(name):
         np.testing.assert_allclose(sparse.constraint_force(q, v, 0.7, params), force, atol=1e-11 * np.abs(force).max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", ["band", "rods"])
 def test_accelerations_have_derivatives_in_both_modes(name):
     sparse, scalar = both_forms(name)

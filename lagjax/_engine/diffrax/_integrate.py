@@ -75,7 +75,7 @@ def integrate(
     jumps = functools.partial(may_jump, form.motion)
     solution = _differentiable((field, project, ts, y0, params), method, jumps, adjoint, event)
     if project is not None:
-        path = jax.lax.map(lambda at: project(*at, params), (ts, solution.path))
+        path = jax.lax.map(lambda at: project(at[0], at[1], params), (ts, solution.path))
         solution = solution._replace(path=path)
     return solution
 
@@ -110,7 +110,9 @@ def _call(moving, method: Method, adjoint, event=None, *more: diffrax.SubSaveAt)
     """
     field, project, ts, y0, params = moving
     solver = method.solver if project is None else Projected(method.solver, project)
-    saved = [diffrax.SubSaveAt(ts=ts), diffrax.SubSaveAt(t1=True), *more]
+    # Of the ends alone there is nothing to interpolate, and no test of `ts` by a call back to the host.
+    outputs = diffrax.SubSaveAt(t0=True, t1=True) if len(ts) == 2 else diffrax.SubSaveAt(ts=ts)
+    saved = [outputs, diffrax.SubSaveAt(t1=True), *more]
     notes = isinstance(method.controller, Noting)
     done: Any = diffrax.diffeqsolve(
         diffrax.ODETerm(field),
@@ -131,7 +133,10 @@ def _call(moving, method: Method, adjoint, event=None, *more: diffrax.SubSaveAt)
     accepted, rejected = (done.stats[f"num_{kind}_steps"] for kind in ("accepted", "rejected"))
     result = RESULTS.promote(done.result)._value
     crossed = done.controller_state[1] if notes else jnp.array(False)
-    return Solution(done.ys[0], done.ys[1][0], done.ts[1][0], result, accepted, rejected), done.ys[2:], crossed
+    path, y_end, t_end = done.ys[0], done.ys[1][0], done.ts[1][0]
+    if len(ts) == 2:  # infinite where it was not reached, as the others are
+        path = jnp.stack([path[0], jnp.where(t_end == ts[-1], path[1], jnp.inf)])
+    return Solution(path, y_end, t_end, result, accepted, rejected), done.ys[2:], crossed
 
 
 def _set_stage_loop(solver, adjoint):
