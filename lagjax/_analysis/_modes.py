@@ -7,23 +7,27 @@ all forces have a potential and L is even in the velocities, s² = −ω² are t
 Otherwise s are those of the first-order equations of motion.
 """
 
-from typing import Any
+from collections.abc import Callable
+from typing import Any, cast
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
+from scipy.sparse import csr_array, diags_array
 
 from lagjax._analysis._eigen import exponents_and_modes, null_space, symmetric_modes
 from lagjax._analysis._equilibrium import require_steady
 from lagjax._analysis._linearize import steady_matrices
+from lagjax._analysis._lowest_modes import NO_MODES, lowest_modes, lowest_shift, needs_all
 from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._smoothness import is_smooth, require_smooth
 from lagjax._analysis._solve import shortest_solution
-from lagjax._equations import dependent_rows, diagonal_scale, factorize, least_norm, schur_complement
+from lagjax._analysis._sparse_balance import balance_of
+from lagjax._equations import SparseMotion, dependent_rows, diagonal_scale, factorize, least_norm, schur_complement
 from lagjax._equations import rank as rank_of
-from lagjax._interface import compile_for_one_call, is_concrete, show_str
+from lagjax._interface import Layout, compile_for_one_call, is_concrete, show_str
 from lagjax._primitives import accepts_singles, nan_unless
 from lagjax._scene import System
 
@@ -86,7 +90,9 @@ def _grows_beyond(size):
 
 
 @accepts_singles(("q", "qdot"), ("params",))
-def normal_modes(system: System, q: PyTree, params: PyTree = None, *, qdot: PyTree = None) -> Modes:
+def normal_modes(
+    system: System, q: PyTree, params: PyTree = None, *, qdot: PyTree = None, count: int | None = None
+) -> Modes:
     r"""The small oscillations of `system` about its equilibrium `q`.
 
         (s² M + s (C + G) + K) x = 0,   q(t) = q + Re(x e^{st}),   s = ±iω where nothing damps and nothing turns
@@ -96,6 +102,9 @@ def normal_modes(system: System, q: PyTree, params: PyTree = None, *, qdot: PyTr
     - `q`: an equilibrium, as `equilibrium` finds it.
     - `qdot`: for a steady motion, its velocities, as `equilibrium` takes them. The modes are then the oscillations
       about that motion at constant momenta of the cyclic coordinates, in coordinates that move with it.
+    - `count`: how many modes to give, the lowest ones; by default all of them. `stable` is about all of them. A large
+      scene with sparse matrices (see `System.explain`) needs it: of 10⁴ coordinates, the 50 lowest take seconds. There
+      constraints have to be independent, nothing may damp or turn, and the call cannot be traced.
 
     With constraints, the modes are those of the deviations that the constraints allow, as many as there are degrees of
     freedom, and the constraint forces contribute (a pendulum is held by its rod). Works under `jit`, `vmap` and `grad`,
@@ -120,13 +129,18 @@ def normal_modes(system: System, q: PyTree, params: PyTree = None, *, qdot: PyTr
     print(lagjax.normal_modes(pendulum, 0.0))  # sqrt(9.81)
     ```
     """
-    scene = SceneState.from_state(system, q, qdot, params)
+    if count is not None and (type(count) is not int or count < 1):
+        raise ValueError(f"count must be a positive integer, or None for all modes; got {count!r}.")
+    scene = SceneState.from_state(system, q, qdot, params, sparse=True)
     scene.require_autonomous("A normal mode")
-    require_steady(scene)
-    require_smooth(scene, "A normal mode")
-    cyclic, rank = scene.conserved, _rank(scene)
-    reversible = scene.reversible and qdot is None
-    modes, residual = _modes(cyclic, rank, reversible, *scene.arguments)
+    if scene.large:
+        modes, residual = _large_modes(scene, qdot, count)
+    else:
+        require_steady(scene)
+        require_smooth(scene, "A normal mode")
+        cyclic, rank = scene.conserved, _rank(scene)
+        reversible = scene.reversible and qdot is None
+        modes, residual = _modes(cyclic, rank, reversible, *scene.arguments)
     if scene.concrete and not residual <= _BALANCED:
         made = f" that a deviation of {float(residual):.2g} of q's size would make" if np.isfinite(residual) else ""
         raise ValueError(
@@ -134,11 +148,11 @@ def normal_modes(system: System, q: PyTree, params: PyTree = None, *, qdot: PyTr
             "q = lagjax.equilibrium(system, q, params).q."
         )
     if scene.concrete and not np.isfinite(np.asarray(modes.exponents)).all():
-        raise ValueError(
-            "There are no modes: the mass matrix is singular or not positive definite at q, so that small motions are "
-            "no oscillations there. lagjax.check(system, q, qdot) tells which velocity has no kinetic energy."
-        )
-    return modes
+        raise ValueError(NO_MODES)
+    lowest = (x[:count] for x in (modes.frequencies, modes.exponents, modes.damping_ratios))
+    frequencies, exponents, ratios = lowest
+    shapes = jax.tree.map(lambda x: x[:count], modes.shapes)
+    return Modes(frequencies, shapes, modes.stable, exponents, ratios)
 
 
 # How far from an equilibrium modes are still those of it, in units of the size of q. Linear in that are their errors.
@@ -171,7 +185,11 @@ def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> 
     unit = jax.lax.stop_gradient(diagonal_scale(matrices[0]))
     mass, rates, stiffness = (unit[:, None] * x * unit for x in matrices[:3])
     jacobian = matrices[3] * unit
-    residual = _distance(scene, unit, jacobian, matrices[4] * unit, stiffness)
+    slopes = jnp.sqrt(jnp.sum(jnp.concatenate([stiffness, jacobian]) ** 2, axis=1))
+    rows = scene.motion.constraints.residual(q, scene.qdot, jnp.zeros((), q.dtype), scene.numbers)
+    force = None if scene.constrained else lambda place: scene.force(unit * place, scene.qdot) * unit
+    values = jnp.concatenate([matrices[4] * unit, rows])
+    residual = jax.lax.stop_gradient(_distance(values, slopes, q / unit, stiffness, shortest_solution, force))
     residual = residual + jnp.where(_rank_is(jacobian, rank), 0, jnp.nan)
     keep = np.array([i for i in range(len(q)) if i not in cyclic], int)
     gone = np.array(cyclic, int)
@@ -191,17 +209,78 @@ def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> 
         own = jnp.eye(len(q), dtype=shapes.dtype)[gone]
         exponents = jnp.concatenate([jnp.zeros((len(gone), 2), exponents.dtype), exponents])
         shapes = jnp.concatenate([own, shapes])
-    order = jnp.argsort(jax.lax.stop_gradient(exponents[:, 0].imag), stable=True)
-    shapes = _normalise(shapes[order], mass) * unit
     balanced = (residual <= _BALANCED) & is_smooth(scene)
+    return _restore(scene.layout, exponents, shapes, shapes @ mass.T.astype(shapes.dtype), unit, balanced), residual
+
+
+@compile_for_one_call
+def _restore(layout: Layout, exponents: Array, shapes: Array, weighted: Array, unit: Vector, balanced) -> Modes:
+    """The modes of exponents (k, 2) and shapes (k, n) in the `unit` (n,) of each coordinate; NaN if not `balanced`.
+
+    `weighted` (k, n) are the M x of the shapes x.
+    """
+    shapes = _normalise(shapes, weighted)
+    order = jnp.argsort(jax.lax.stop_gradient(exponents[:, 0].imag), stable=True)
+    shapes = shapes[order] * unit
     exponents = jax.lax.complex(*(nan_unless(balanced, x) for x in (exponents.real, exponents.imag)))[order]
-    shapes = scene.layout.restore(jnp.where(balanced, shapes, jnp.nan))
+    shapes = layout.restore(jnp.where(balanced, shapes, jnp.nan))
     size = jnp.max(jnp.abs(exponents), initial=0)
     stable = jnp.all(exponents.real <= _grows_beyond(size)) & jnp.all(jnp.isfinite(exponents))
     first = exponents[:, 0]
     length = jnp.abs(jnp.where(first == 0, 1, first))
     ratios = jnp.where(first.real == 0, 0, -first.real / length)
-    return Modes(first.imag, shapes, stable, exponents, ratios), residual
+    return Modes(first.imag, shapes, stable, exponents, ratios)
+
+
+def _large_modes(scene: SceneState, qdot: PyTree, count: int | None) -> tuple[Modes, Array]:
+    """The `count` lowest modes of a large scene, all of them for None, and how far q is from an equilibrium."""
+    n, motion = scene.layout.size, scene.motion
+    state = scene.q, scene.qdot, jnp.zeros((), scene.q.dtype), scene.numbers
+    freedoms = n - jax.eval_shape(motion.residual, *state).size
+    if needs_all(count, freedoms) and n > _MOST_MODES:
+        raise ValueError(
+            f"{count or freedoms} modes of {n} coordinates take {8 * n * n / 2**30:.2g} GB of shapes, and more on the "
+            f"way: ask for the lowest ones, normal_modes(…, count=50), up to {freedoms // 4}."
+        )
+    if qdot is not None:
+        raise ValueError(
+            f"Modes about a steady motion are not tried for {n} coordinates: leave qdot out, or give less."
+        )
+    of = balance_of(scene, "A normal mode")
+    z, x = np.concatenate([scene.q, of.multipliers]), np.random.default_rng(0).normal(size=n)
+    entries, unit, rate = map(np.asarray, _mass_and_rate(motion, jnp.asarray(x), *state))
+    form = cast(Any, motion).structure.mass
+    scale, whole = diags_array(unit), of.jacobian(z)
+    mass = scale @ csr_array((entries, (form.rows, form.columns))) @ scale
+    forces, jacobian = scale @ whole[:n, :n] @ scale, whole[n:, :n] @ scale
+    size, small = float(abs(forces).sum(axis=1).max()), np.finfo(float).eps ** 0.6
+    if np.abs(rate).max() > small * size**0.5 or abs(forces - forces.T).max() > small * size:
+        raise ValueError(
+            f"Of {n} coordinates, modes are found where all forces have a potential: some of these damp, turn (as in a "
+            "rotating frame or a magnetic field), or have a curl. Leave them out, or simulate and look at the motion."
+        )
+    stiffness, mass = -0.5 * (forces + forces.T), 0.5 * (mass + mass.T)
+    slopes = np.sqrt(np.concatenate([(stiffness**2).sum(axis=1), (jacobian**2).sum(axis=1)]))
+    values, units = of.residual(z), np.append(unit, np.ones(len(z) - n))
+    force = None if scene.constrained else lambda place: unit * of.residual(unit * place)
+    solve = lambda _, b: lowest_shift(stiffness, mass)[1].solve(b)  # noqa: E731
+    residual = _distance(units * values, slopes, scene.q / unit, stiffness, solve, force)
+    squares, shapes = lowest_modes(stiffness, mass, jacobian, count)
+    exponents = _exponents(squares, _UNITS * n**0.5 * np.finfo(float).eps * size)
+    weighted = (mass @ shapes).T
+    return _restore(scene.layout, exponents, shapes.T, weighted, unit, residual <= _BALANCED), residual
+
+
+@compile_for_one_call
+def _mass_and_rate(motion: SparseMotion, x: Vector, *state) -> tuple[Array, Vector, Vector]:
+    """The entries of M, the unit (n,) of each coordinate, and ∂F/∂q̇ x in these units."""
+    (q, qdot, t, numbers), form = state, cast(Any, motion.structure.mass)
+    entries, unit = form.read(motion.mass_product(*state), q.dtype), motion.unit(*state)
+    return entries, unit, unit * jax.jvp(lambda v: motion.force(q, v, t, numbers), (qdot,), (unit * x,))[1]
+
+
+# Modes that are given where all are asked for: 2000 shapes of 2000 numbers are 32 MB, and take LAPACK half a minute.
+_MOST_MODES = 2000
 
 
 def _rank_is(jacobian: Float[Array, "m n"], rank: int) -> Bool[Array, ""]:
@@ -213,31 +292,28 @@ def _rank_is(jacobian: Float[Array, "m n"], rank: int) -> Bool[Array, ""]:
     return rank_of(unit @ unit.T) == rank
 
 
-def _distance(
-    scene: SceneState, unit: Vector, jacobian: Float[Array, "m n"], left: Vector, stiffness: Matrix
-) -> Float[Array, ""]:
-    """The distance of q from an equilibrium, in units of its size: by the forces that are left, and by the constraints.
+def _distance(values: Any, slopes: Any, place: Any, stiffness: Any, solve: Callable, force: Callable | None):
+    """The distance of q from an equilibrium, in units of its size, by `values` (n + m,) of forces and constraints.
 
-    All are given in the `unit` (n,) of each coordinate. Zero also where the distance changes no mode: where the forces
-    are linear up to a thousand times as far.
+    All are given in the unit of each coordinate, q being `place`; `slopes` (n + m,) are the lengths of the rows of K
+    and of J, `solve(K, b)` a solution x of K x = b. Zero also where the distance changes no mode: where without
+    constraints the `force`, a function of the place, is linear up to a thousand times as far. Takes arrays of NumPy or
+    JAX.
     """
-    q, t = scene.q / unit, jnp.zeros((), scene.q.dtype)
-    rows = scene.motion.constraints.residual(scene.q, scene.qdot, t, scene.numbers)
-    values, gradients = jnp.concatenate([left, rows]), jnp.concatenate([stiffness, jacobian])
-    slopes = jnp.sqrt(jnp.sum(gradients**2, axis=1))
+    xp = slopes.__array_namespace__()
     # A row without any gradient may be left with the rounding of the others.
-    slopes = jnp.where(slopes > 0, slopes, jnp.max(slopes, initial=0) * 1e-6)
-    allowed = slopes * jnp.max(jnp.abs(q), initial=0)
-    off = jnp.max(jnp.where(values == 0, 0, jnp.abs(values) / jnp.where(allowed > 0, allowed, 0)), initial=0)
-    if not scene.constrained:
-        step = shortest_solution(stiffness, left)
-        further = scene.force(scene.q + _FURTHER * unit * step, scene.qdot) * unit
-        expected = left - _FURTHER * stiffness @ step
-        size = jnp.max(jnp.abs(left), initial=0)
-        balances = jnp.max(jnp.abs(stiffness @ step - left), initial=0) <= 1e-3 * size
-        bends = jnp.max(jnp.abs(further - expected), initial=0) > _BENT * _FURTHER * size
-        off = jnp.where(balances & ~bends, 0, off)
-    return jax.lax.stop_gradient(off)
+    slopes = xp.where(slopes > 0, slopes, xp.max(slopes, initial=0) * 1e-6)
+    allowed = slopes * xp.max(xp.abs(place), initial=0)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        off = xp.max(xp.where(values == 0, 0, xp.abs(values) / xp.where(allowed > 0, allowed, 0)), initial=0)
+    if force is not None:
+        step = solve(stiffness, values)
+        expected = values - _FURTHER * stiffness @ step
+        size = xp.max(xp.abs(values), initial=0)
+        balances = xp.max(xp.abs(stiffness @ step - values), initial=0) <= 1e-3 * size
+        bends = xp.max(xp.abs(force(place + _FURTHER * step) - expected), initial=0) > _BENT * _FURTHER * size
+        off = xp.where(balances & ~bends, 0, off)
+    return off
 
 
 # How many times as far as an equilibrium is forces are looked at, and by which part they may differ from linear ones
@@ -285,11 +361,17 @@ def _reversible_modes(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[A
     squares, shapes = symmetric_modes(stiffness, mass)
     size = jnp.max(jnp.abs(squares))
     zero = _UNITS * len(mass) * jnp.finfo(size.dtype).eps * jax.lax.stop_gradient(size)
+    ignored = jnp.max(jnp.abs(shapes.T @ rates @ shapes)) <= jnp.finfo(size.dtype).eps ** 0.6 * jnp.sqrt(size)
+    return _exponents(squares, zero, ignored), shapes
+
+
+@compile_for_one_call
+def _exponents(squares: Array, zero, ok=True) -> Array:
+    """s = iω, −iω, or κ, −κ, (k, 2), of the squares ω² (k,), of which those up to `zero` are none; NaN if not `ok`."""
     rate = jnp.sqrt(jnp.where(jnp.abs(squares) > zero, jnp.abs(squares), 1))
     frequency, growth = jnp.where(squares > zero, rate, 0), jnp.where(squares < -zero, rate, 0)
-    ignored = jnp.max(jnp.abs(shapes.T @ rates @ shapes)) <= jnp.finfo(size.dtype).eps ** 0.6 * jnp.sqrt(size)
-    frequency, growth = nan_unless(ignored, frequency), nan_unless(ignored, growth)
-    return jnp.stack([jax.lax.complex(growth, frequency), jax.lax.complex(-growth, -frequency)], axis=1), shapes
+    frequency, growth = nan_unless(ok, frequency), nan_unless(ok, growth)
+    return jnp.stack([jax.lax.complex(growth, frequency), jax.lax.complex(-growth, -frequency)], axis=1)
 
 
 def _general_modes(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Array, Array]:
@@ -307,9 +389,9 @@ def _general_modes(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Arra
     return jnp.stack([values[:k], values[k:]], axis=1), vectors[:k, :k]
 
 
-def _normalise(shapes: Array, mass: Matrix) -> Array:
-    """Shapes (k, n) with xᴴM x = 1 and the largest entry positive."""
-    size = jnp.sum(shapes.conj() * (shapes @ mass.T.astype(shapes.dtype)), axis=1).real
+def _normalise(shapes: Array, weighted: Array) -> Array:
+    """Shapes x (k, n) with xᴴM x = 1 and the largest entry positive; `weighted` (k, n) are the M x."""
+    size = jnp.sum(shapes.conj() * weighted, axis=1).real
     shapes = shapes / jnp.sqrt(size)[:, None].astype(shapes.dtype)
     sizes = jnp.abs(jax.lax.stop_gradient(shapes))
     # The first of those that are equal but for rounding: a symmetric shape has its sign by no accident.

@@ -9,13 +9,27 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lagjax._engine.taylor import lowered_motion
-from lagjax._equations import Derivation, Motion, Sample, Scales, borders_of, derivation_of, has_constraints
+from lagjax._equations import (
+    Derivation,
+    Motion,
+    Products,
+    Sample,
+    Scales,
+    borders_of,
+    derivation_of,
+    has_constraints,
+    pieces_of_motion,
+)
 from lagjax._interface import Layout, as_arrays, is_concrete, require_finite
 from lagjax._program import Unlowerable
-from lagjax._scene import ROLES, System, require_system
+from lagjax._scene import ROLES, System, replace_functions, require_system
 
 PyTree = Any
 Vector = Float[Array, " n"]
+
+# Coordinates up to which sparse matrices are treated as dense ones: eigenvalues and roots take 5 s there, and ten times
+# as long for twice as many.
+_LARGEST_DENSE = 200
 
 
 class SceneState(NamedTuple):
@@ -31,8 +45,10 @@ class SceneState(NamedTuple):
     numbers: PyTree  # the numbers among them
 
     @classmethod
-    def from_state(cls, system: System, q: PyTree, qdot: PyTree | None, params: PyTree) -> "SceneState":
-        """A scene at the state (q, qdot), at rest where `qdot` is None.
+    def from_state(
+        cls, system: System, q: PyTree, qdot: PyTree | None, params: PyTree, sparse: bool = False
+    ) -> "SceneState":
+        """A scene at the state (q, qdot), at rest where `qdot` is None; on arrays if it is `sparse` and large.
 
         Raises `TypeError` or `ValueError`, with a sentence, for arguments that cannot be right.
         """
@@ -42,9 +58,13 @@ class SceneState(NamedTuple):
         require_finite(q, "q")
         require_finite(rest, "qdot")
         _require_no_velocities(system, q, params)
-        return cls.from_arguments(
-            system, layout, layout.flatten(q), layout.flatten(rest), as_arrays(params, layout.dtype)
-        )
+        state = layout, layout.flatten(q), layout.flatten(rest), as_arrays(params, layout.dtype)
+        if sparse and layout.size > _LARGEST_DENSE and system.path == "auto":
+            functions = {role: getattr(system, role) for role in ROLES}
+            scene = cls.from_arguments(replace_functions(system, functions, "array"), *state)
+            if scene.large:
+                return scene
+        return cls.from_arguments(system, *state)
 
     @classmethod
     def from_arguments(cls, system: System, layout: Layout, q: Vector, qdot: Vector, params: PyTree) -> "SceneState":
@@ -60,6 +80,14 @@ class SceneState(NamedTuple):
     @property
     def concrete(self) -> bool:
         return all(is_concrete(leaf) for leaf in jax.tree.leaves((self.system, self.q, self.qdot, self.numbers)))
+
+    @property
+    def large(self) -> bool:
+        """True if matrices of n × n numbers are not written down, as those of the scene are sparse."""
+        structure = self.derivation.structure
+        if structure is None or isinstance(structure.mass, Products) or self.layout.size <= _LARGEST_DENSE:
+            return False
+        return not pieces_of_motion(self.motion, *self.derivation.state_shapes)
 
     @property
     def constrained(self) -> bool:
@@ -133,6 +161,8 @@ class SceneState(NamedTuple):
 
     def force(self, q: Vector, qdot: Vector) -> Vector:
         """F of M q̈ = F + Gᵀλ, (n,)."""
+        if self.large:
+            return self.motion.force(q, qdot, jnp.zeros((), q.dtype), self.numbers)
         return self.motion.mass_matrix_and_force(q, qdot, jnp.zeros((), q.dtype), self.numbers)[1]
 
     def mass_matrix(self, q: Vector, qdot: Vector) -> Float[Array, "n n"]:

@@ -402,10 +402,10 @@ def present_system(system: System) -> System:
     return replace_functions(system, dict(zip(ROLES, now, strict=True)))
 
 
-def replace_functions(system: System, functions: dict[str, Function | None]) -> System:
+def replace_functions(system: System, functions: dict[str, Function | None], path: str | None = None) -> System:
     """The scene with other functions, by their roles, without the constructor: to read signatures takes long."""
     other = object.__new__(type(system))
-    for name, value in (functions | {"path": system.path}).items():
+    for name, value in (functions | {"path": path or system.path}).items():
         object.__setattr__(other, name, value)
     return other
 

@@ -1,0 +1,159 @@
+"""The lowest modes K x = λ M x of sparse matrices, on the tangent space G x = 0 of constraints.
+
+Lanczos's method with the inverse (K − σM)⁻¹ M, where σ lies below all eigenvalues: those next to it are the lowest, and
+zero ones are as good as others. Constraints border the matrix that is inverted, so that no basis of their tangent space
+is written down. Lanczos's method may take a multiple eigenvalue for a single one; so the lowest one of what is
+orthogonal to the modes at hand is sought, until that is higher than all of them.
+
+Source: Ericsson & Ruhe, *The spectral transformation Lanczos method*, Math. Comp. 35 (1980) 1251.
+"""
+
+import numpy as np
+from jaxtyping import Float
+from scipy.sparse import block_array, csc_array, csr_array
+from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, SuperLU, eigsh, splu
+
+from lagjax._analysis._eigen import symmetric_modes
+from lagjax._equations import decide
+
+# The first shift, in parts of the largest entries of K: far above rounding, below the lowest mode of 10⁵ links, 1e-9.
+# Closer to zero by a factor of ten, zero modes would cost other shapes a digit.
+_SHIFT = 1e-9
+# Trials to come closer; a failure costs as much as a success, which gains a factor of two to eight of the distance.
+_TRIALS = 24
+# How stiff constraints are beside K where it is asked if K − σM is positive on their tangent space. Softer ones only
+# make the shift lower than need be.
+_STIFF = 1e6
+# What a shape may be off, in parts of its length. The error of its eigenvalue is the square of that.
+_OFF = 1e-6
+
+
+def needs_all(count: int | None, freedoms: int) -> bool:
+    """True if all modes are to be found where `count` are asked for: Lanczos's method takes twice as many vectors."""
+    return count is None or count > freedoms // 4
+
+
+NO_MODES = (
+    "There are no modes: the mass matrix is singular or not positive definite at q, so that small motions are no "
+    "oscillations there. lagjax.check(system, q, qdot) tells which velocity has no kinetic energy."
+)
+
+
+def lowest_modes(
+    stiffness: csr_array, mass: csr_array, jacobian: csr_array, count: int | None
+) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "n k"]]:
+    """λ (k,), ascending, and X (n, k), a vector a column, of at least `count` of the lowest modes, with Xᵀ M X = 1.
+
+    K and M are symmetric with diagonals of the order of one. Raises `ValueError` where M is not positive definite, or
+    constraints depend on each other.
+    """
+    if factorize_positive(mass) is None:
+        raise ValueError(NO_MODES)
+    n, rows = mass.shape[0], jacobian.shape[0]
+    if needs_all(count, n - rows):
+        return _dense_modes(stiffness, mass, jacobian)
+    shift, factors = lowest_shift(stiffness, mass, jacobian)
+    if rows:
+        bordered = block_array([[stiffness - shift * mass, jacobian.T], [jacobian, None]], format="csc")
+        factors = factorize_regular(bordered)
+        if factors is None:
+            raise ValueError(
+                f"The {rows} constraints depend on each other at q, or nearly: of so many coordinates modes are found "
+                "with independent ones. Drop those that follow from others."
+            )
+
+    def invert(b):
+        return factors.solve(np.concatenate([b, np.zeros(rows)]))[:n]
+
+    def nearest(modes: int, against: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The modes next to the shift, of what is orthogonal to the vectors `against` (n, j)."""
+        weighted = mass @ against
+
+        def project_inverse(b):
+            x = invert(b - weighted @ (against.T @ b))
+            return x - against @ (weighted.T @ x)
+
+        start = project_inverse(mass @ np.random.default_rng(0).normal(size=n))
+        return eigsh(
+            stiffness, modes, mass, shift, OPinv=LinearOperator((n, n), project_inverse, dtype=float), v0=start
+        )
+
+    try:
+        values, shapes = nearest(count, np.zeros((n, 0)))
+        while shapes.shape[1] < n - rows:
+            value, more = nearest(1, shapes)
+            if value[0] >= np.sort(values)[count - 1]:
+                break
+            values, shapes = np.append(values, value), np.column_stack([shapes, more])
+    except ArpackNoConvergence as error:
+        raise ValueError(f"The {count} lowest modes were not found: {error}. Ask for fewer.") from None
+    turned = symmetric_modes(shapes.T @ (stiffness @ shapes), shapes.T @ (mass @ shapes))
+    values, turn = map(np.asarray, turned)
+    values, shapes = values[:count], shapes @ turn[:, :count]
+    again = np.column_stack([invert(x) for x in (mass @ shapes).T]) * (values - shift)
+    off = np.linalg.norm(again - shapes, axis=0) / np.linalg.norm(shapes, axis=0)
+    if not off.max() <= _OFF:
+        raise ValueError(
+            f"Mode {int(np.argmax(off))} was not found: its shape is off by {off.max():.1g} of its length."
+        )
+    return values, shapes
+
+
+def _dense_modes(stiffness: csr_array, mass: csr_array, jacobian: csr_array):
+    """λ and X of all modes."""
+    basis = decide(jacobian.toarray()).null if jacobian.shape[0] else np.eye(mass.shape[0])
+    values, shapes = symmetric_modes(basis.T @ (stiffness @ basis), basis.T @ (mass @ basis))
+    return np.asarray(values), basis @ np.asarray(shapes)
+
+
+def lowest_shift(stiffness: csr_array, mass: csr_array, jacobian: csr_array | None = None) -> tuple[float, SuperLU]:
+    """σ just below all eigenvalues, and the factors of K − σM, with stiff springs for constraints; M positive definite.
+
+    How fast Lanczos's method converges depends on how far σ is below the lowest eigenvalue, beside how far these are
+    apart. Rayleigh quotients are bounds from above, factors that are positive such from below.
+    """
+    size = float(abs(stiffness).sum(axis=1).max()) or 1.0
+    shift, held = -_SHIFT * size, stiffness
+    if jacobian is not None and jacobian.shape[0]:
+        held = stiffness + _STIFF * size / float(jacobian.power(2).sum(axis=1).max()) * (jacobian.T @ jacobian)
+    while (factors := factorize_positive(held - shift * mass)) is None:
+        shift *= 4
+    x, near = np.random.default_rng(0).normal(size=mass.shape[0]), 0.125
+    for _ in range(_TRIALS):
+        for _ in range(4):
+            x = factors.solve(mass @ x)
+            x /= np.sqrt(x @ (mass @ x))
+        gap = x @ (held @ x) - shift
+        if gap <= 4 * _SHIFT * size:
+            break
+        trial = shift + (1 - near) * gap
+        closer = factorize_positive(held - trial * mass)
+        near = 0.5 if closer is None else 0.125
+        if closer is not None:
+            shift, factors = trial, closer
+    return shift, factors
+
+
+def factorize_positive(matrix: csr_array) -> SuperLU | None:
+    """The factors of a positive definite matrix, by elimination without pivoting; None where it is none."""
+    options = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+    try:
+        factors = splu(csc_array(matrix), **options)
+    except RuntimeError:  # a zero pivot
+        return None
+    in_order = np.array_equal(factors.perm_r, factors.perm_c)
+    return factors if in_order and (factors.U.diagonal() > 0).all() else None
+
+
+def factorize_regular(matrix: csr_array) -> SuperLU | None:
+    """The factors of a matrix, by elimination with pivoting; None where it is singular to working precision."""
+    try:
+        factors = splu(csc_array(matrix))
+    except RuntimeError:
+        return None
+    pivots = np.abs(factors.U.diagonal())
+    return factors if pivots.min() > _SINGULAR * pivots.max() else None
+
+
+# Pivots below this part of the largest are rounding: some hundred roundings of sums.
+_SINGULAR = 1e-14
