@@ -1,4 +1,4 @@
-"""Which entries of a matrix of derivatives can differ from zero, whatever the state: found once per scene.
+"""Patterns of matrices of derivatives: the entries that can differ from zero at some state, found once per scene.
 
 asdex walks through the operations of a function and follows of which inputs each number is made (Hill, Dalle,
 Montoison, *An Illustrated Guide to Automatic Sparse Differentiation*, 2025). It comes with numba and is imported for

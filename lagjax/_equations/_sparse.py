@@ -46,7 +46,7 @@ class Solver(NamedTuple):
     rank: Int[Array, ""]
 
 
-class Form(abc.ABC):
+class MatrixForm(abc.ABC):
     """The pattern of a symmetric matrix (n, n), arranged for one way to solve with it."""
 
     name: str
@@ -65,7 +65,7 @@ class Form(abc.ABC):
         raise NotImplementedError
 
 
-class Entries(Form):
+class Entries(MatrixForm):
     """A form that reads off the entries at `rows`, `columns` by products with the indicators of `colors`."""
 
     def __init__(self, pattern: csr_array, colors: np.ndarray):
@@ -228,7 +228,7 @@ class Sparse(Entries):
 
 
 @dataclass(frozen=True)
-class Products(Form):
+class Products(MatrixForm):
     """No pattern: conjugate gradients with products of the matrix."""
 
     size: int
@@ -258,7 +258,7 @@ def conjugate_gradients(multiply: Product, b: Vector) -> Vector:
     return jnp.where(missing <= rank_tolerance(b.dtype) * jnp.max(jnp.abs(b)), x, jnp.nan)
 
 
-def form_of(pattern: csr_array | None, size: int) -> Form:
+def form_of(pattern: csr_array | None, size: int) -> MatrixForm:
     """The form that suits the pattern of a symmetric matrix; None is an unknown one."""
     if pattern is None:
         return Products(size)

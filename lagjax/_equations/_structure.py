@@ -19,7 +19,7 @@ from scipy.sparse import csr_array
 from lagjax._equations._constraints import NEWTON_STEPS
 from lagjax._equations._motion import Flag, Motion, PyTree, Row, Time, Vector
 from lagjax._equations._patterns import count_operations, hessian_pattern, jacobian_pattern
-from lagjax._equations._sparse import Blocks, Diagonal, Form, Products, Solver, form_of
+from lagjax._equations._sparse import Blocks, Diagonal, MatrixForm, Products, Solver, form_of
 from lagjax._interface import compiled_once
 
 # A scene is large by its coordinates and by the scalar operations of L (or where it has constraints, which cost machine
@@ -41,9 +41,9 @@ class Structure(NamedTuple):
     """
 
     operations: int
-    mass: Form
-    schur: Form | None
-    positions: Form | None
+    mass: MatrixForm
+    schur: MatrixForm | None
+    positions: MatrixForm | None
 
     def __str__(self) -> str:
         linked = "" if self.schur is None else f", G M⁻¹ Gᵀ is {self.schur.name}"
@@ -76,7 +76,7 @@ def structure_of(motion: Motion, shapes: tuple, insists: bool = False) -> Struct
         return None
     inverse = _pattern_of_inverse(mass)
 
-    def schur(jacobian: csr_array) -> Form:
+    def schur(jacobian: csr_array) -> MatrixForm:
         m = jacobian.shape[0]
         return form_of(None if inverse is None else csr_array((jacobian @ inverse @ jacobian.T) != 0), m)
 
@@ -90,7 +90,7 @@ def _stack(*patterns: csr_array) -> csr_array:
     return csr_array(vstack([pattern.astype(np.int32) for pattern in patterns]))
 
 
-def _pattern_of_inverse(form: Form) -> csr_array | None:
+def _pattern_of_inverse(form: MatrixForm) -> csr_array | None:
     """The pattern of M⁻¹ where it is sparse: diagonal, or full blocks."""
     n = form.size
     if isinstance(form, Diagonal):
@@ -142,7 +142,7 @@ class SparseMotion(Motion):
 
         return mass, schur, eliminate
 
-    def _form(self, positions: bool) -> Form:
+    def _form(self, positions: bool) -> MatrixForm:
         """The form of S, or of S for the constraints on `positions` alone."""
         form = self.structure.positions if positions else self.structure.schur
         assert form is not None
