@@ -19,7 +19,7 @@ from scipy.sparse import csr_array
 from lagjax._equations._constraints import NEWTON_STEPS
 from lagjax._equations._motion import Flag, Motion, PyTree, Row, Time, Vector
 from lagjax._equations._patterns import count_operations, hessian_pattern, jacobian_pattern
-from lagjax._equations._sparse import Blocks, Diagonal, MatrixForm, Products, Solver, form_of
+from lagjax._equations._sparse import Blocks, Diagonal, MatrixForm, Products, Solver, form_of, refine
 from lagjax._interface import compiled_once
 
 # A scene is large by its coordinates and by the scalar operations of L (or where it has constraints, which cost machine
@@ -117,9 +117,12 @@ class SparseMotion(Motion):
         if self.constrained:
             return super().solved_acceleration(*state)
         mass = self.structure.mass.prepare(self.mass_product(*jax.lax.stop_gradient(state)), q.dtype)
-        x = jax.lax.custom_linear_solve(
-            self.mass_product(*state), self.force(*state), lambda _, b: mass.solve(b), symmetric=True
-        )
+        product = self.mass_product(*state)
+
+        def solve(_, b):
+            return refine(product, mass.solve, b) if self.structure.mass.iterative else mass.solve(b)
+
+        x = jax.lax.custom_linear_solve(product, self.force(*state), solve, symmetric=True)
         return jnp.where(mass.singular, jnp.nan, x), mass.singular
 
     def saddle(self, b: Vector, c: Row, q, qdot, t, params, positions=False) -> tuple[Vector, Row, Flag]:
@@ -227,7 +230,7 @@ def _saddle_of(motion: SparseMotion, positions: bool) -> Callable:
 
 
 def _saddle(motion: SparseMotion, positions: bool, b: Vector, c: Row, *state):
-    """`SparseMotion.saddle`, in one step of refinement."""
+    """`SparseMotion.saddle`, in two rounds."""
     mass, _, eliminate = motion._prepare(positions, *jax.lax.stop_gradient(state))
     multiply, (push, pull) = motion.mass_product(*state), motion.constraints.products(*state, positions=positions)
 
@@ -236,12 +239,7 @@ def _saddle(motion: SparseMotion, positions: bool, b: Vector, c: Row, *state):
         return multiply(x) + pull(nu), push(x)
 
     def solve(_, right):
-        def refine(_, carry):
-            place, rest = carry
-            place = jax.tree.map(jnp.add, place, eliminate(*rest))
-            return place, jax.tree.map(jnp.subtract, right, product(place))
-
-        return jax.lax.fori_loop(0, 2, refine, (jax.tree.map(jnp.zeros_like, right), right))[0]
+        return refine(product, lambda rest: eliminate(*rest), right)
 
     x, nu = jax.lax.custom_linear_solve(product, (b, c), solve, symmetric=True)
     return jnp.where(mass.singular, jnp.nan, x), -nu, mass.singular
