@@ -16,10 +16,11 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from lagjax._engine import DEFAULT_RTOL
+from lagjax._equations import LARGEST_DENSE, derivation_of
 from lagjax._interface import Layout, is_concrete, join_names, not_finite, require_number
 from lagjax._native import ATOL_OVER_MOTION, ATOL_OVER_RTOL
 from lagjax._primitives import accepts_singles
-from lagjax._scene import ROLES, System, require_system
+from lagjax._scene import ROLES, System, replace_functions, require_system
 from lagjax._trust.checks import (
     _borders_ahead,
     _constraint_checks,
@@ -86,7 +87,10 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
 
 @accepts_singles(("q", "qdot"), ("t", "params"))
 def _scene_findings(system, q, qdot, t, params) -> tuple[list[Finding], str]:
-    scene = CheckedScene.from_state(system, Layout.from_state(q, qdot), q, qdot, t, params)
+    layout = Layout.from_state(q, qdot)
+    if layout.size > LARGEST_DENSE and derivation_of(system, layout, params).structure is None:
+        system = replace_functions(system, {role: getattr(system, role) for role in ROLES}, "array")
+    scene = CheckedScene.from_state(system, layout, q, qdot, t, params)
     reported = _derivative_checks.findings(scene)
     reported += _dissipation(scene)
     reported += _constraint_checks.findings(scene)
@@ -95,7 +99,7 @@ def _scene_findings(system, q, qdot, t, params) -> tuple[list[Finding], str]:
         reported += [] if any(finding.level == "error" for finding in reported) else _acceleration(scene)
         return [*reported, *_time(scene)], (
             f"Not looked at: time scales, jumps nearby, which constraints follow from others, and derivatives one by "
-            f"one. This scene of {scene.layout.size} coordinates runs on arrays ({scene.derivation.structure})."
+            f"one. That would take long for {layout.size} coordinates ({scene.derivation.structure})."
         )
     if not any(finding.level == "error" for finding in reported):
         known = {finding.where for finding in reported if finding.kind == "kink"}  # one finding for each direction
