@@ -256,8 +256,8 @@ class System(eqx.Module):
 
             return function and flat
 
-        def concatenate(tree: PyTree) -> jax.Array:
-            return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(tree)])
+        def concatenate(tree: PyTree) -> jax.Array:  # of float64, as constants may be, in a scene in float32
+            return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(tree)]).astype(layout.dtype)
 
         return Motion(
             lagrangian=flatten_function(self.lagrangian, lambda value: value),
