@@ -43,8 +43,9 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
     r"""Check `system` at the state (q, qdot): what is wrong with it, or worth knowing before it is integrated.
 
     Derivatives are compared with finite differences, [L(x + hᵢ) − L(x − hᵢ)]/2hᵢ and those of higher order, with steps
-    over many scales, centred and one-sided. Where the mass matrix M = ∂²L/∂q̇² is singular, it is examined in the
-    neighbourhood as well, to find the reason. The arguments are those of `System.acceleration`: numbers, not batches.
+    over many scales, centred and one-sided; in large scenes along random lines, and what is not looked at stands in
+    `Findings.omitted`. Where the mass matrix M = ∂²L/∂q̇² is singular, it is examined in the neighbourhood as well, to
+    find the reason. The arguments are those of `System.acceleration`: numbers, not batches.
 
     **Kinds** of findings, by level (`Finding.level` may be lower for a mild case):
 

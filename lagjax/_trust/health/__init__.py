@@ -134,7 +134,8 @@ class Health(eqx.Module):
       f = 0, zero for a velocity constraint; `constraint_rate`: the same for velocities, |Gq̇ + ∂f/∂t| / |G|.
       `constraint_allowed`: for these two (a last axis).
     - `smallest_eigenvalue` of M = ∂²L/∂q̇² (negative where M is indefinite); `condition`: the largest max|λ| / min|λ|;
-      `scaled_condition`: the same after scaling M to a unit diagonal, which decides the accuracy of accelerations.
+      `scaled_condition`: the same after scaling M to a unit diagonal, which decides the accuracy of accelerations. All
+      three are None in a large scene whose M is not diagonal.
       `scaled_condition_allowed`: where round-off in q̈ reaches `SLACK` rtol; infinite with constraints, which may make
       up for a singular M.
     - `gradients_finite`: whether all terms of the equations of motion have finite derivatives with respect to the
