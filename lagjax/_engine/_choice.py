@@ -49,17 +49,17 @@ def choose(problem: Problem, requested: AbstractEngine | None = None, members: i
     Raises `ValueError` where the `requested` one, or without it every one, refuses it.
     """
     if isinstance(requested, Diffrax):
-        choice = Choice(requested, "diffrax was asked for")
+        engine, refusal = requested, "diffrax was asked for"
     else:
         refusal = _MACHINE_CODE.declines(problem) if requested is None else _MACHINE_CODE.lacks(problem)
         if refusal is None:
             return Choice(_MACHINE_CODE, None)
         if requested is not None:
             raise ValueError(_refusal(refusal))
-        choice = Choice(Diffrax(), refusal)
-    if refusal := choice.engine.refuses(problem) or choice.engine.lacks_memory(problem, members):
-        raise ValueError(f"{refusal}.")
-    return choice
+        engine = Diffrax()
+    if sentence := engine.refuses(problem) or engine.lacks_memory(problem, members):
+        raise ValueError(f"{sentence}.")
+    return Choice(engine, refusal)
 
 
 def _refusal(reason: str) -> str:

@@ -181,17 +181,15 @@ def sparse_spectrum(derivation: Derivation, state: tuple) -> tuple | None:
     entries = np.asarray(_entries_of(derivation.motion, form, *state))
     diagonal = np.abs(entries[form.on_diagonal])
     scale = 1 / np.sqrt(np.where(diagonal > 0, diagonal, np.abs(entries).max(initial=0) or 1))
-    scaled = csc_array((scale[form.rows] * entries * scale[form.columns], (form.rows, form.columns)))
+    scaled: Any = csc_array((scale[form.rows] * entries * scale[form.columns], (form.rows, form.columns)))
     if isinstance(form, Diagonal):
         values = scaled.diagonal()
         i, k = np.argmin(np.abs(values)), np.argmin(values)
         unit = np.eye(1, len(values))[0]
         return (values[i], np.roll(unit, i)), (values[k], np.roll(unit, k)), np.abs(values).max()
     start, size = np.cos(np.arange(1.0, len(diagonal) + 1)), np.abs(scaled).sum(axis=0).max()
-    shifted = csc_array(
-        scaled + np.finfo(float).eps * size * eye_array(len(diagonal))
-    )  # an LU of what is singular raises
-    inverse = LinearOperator(scaled.shape, splu(shifted).solve, dtype=float)
+    regular = csc_array(scaled + np.finfo(float).eps * size * eye_array(len(diagonal)))  # to rounding, where M is not
+    inverse = LinearOperator(scaled.shape, splu(regular).solve)
     options = {"k": 1, "v0": start, "tol": 1e-2}
     try:
         near, lowest = eigsh(scaled, sigma=0.0, OPinv=inverse, **options), eigsh(scaled, which="SA", **options)

@@ -63,7 +63,8 @@ def gradient_memory(function: Callable, shapes: tuple) -> int:
     needed = 2 * _largest_array(jax.make_jaxpr(gradient)(*shapes).jaxpr)
     if lack_of_memory(needed) is None:
         return needed
-    return jax.jit(gradient).lower(*shapes).compile().memory_analysis().temp_size_in_bytes
+    known = jax.jit(gradient).lower(*shapes).compile().memory_analysis()
+    return needed if known is None else known.temp_size_in_bytes
 
 
 def _largest_array(jaxpr) -> int:

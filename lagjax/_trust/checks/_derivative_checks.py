@@ -204,7 +204,7 @@ def _kink(scene: CheckedScene, name: str, role: str, along: str, values, of_velo
     return Finding("kink", "advice" if of_force else "error", (along,), slope + rest)
 
 
-def _wrong(name: str, along: str, derivative: float, slope: float, error: float) -> Finding:
+def _wrong(name: str, along: str, derivative, slope, error) -> Finding:
     message = (
         f"The derivative of {name} along {along} is {derivative:.6g} by automatic differentiation, and "
         f"{slope:.6g} ± {error:.0e} by finite differences: a custom derivative is wrong, or "

@@ -26,7 +26,7 @@ from lagjax._trust.checks._scene_at_start import CheckedScene
 def findings(scene: CheckedScene) -> list[Finding]:
     m, names = scene.measured, scene.layout.names
     if scene.is_large:
-        return _of_large(scene, names)
+        return _large_findings(scene, names)
     augmented = scene.augmented
     usable = [k for k in range(1, len(augmented)) if np.isfinite(augmented[k]).all()]
     if not np.isfinite(augmented[0]).all():
@@ -224,7 +224,7 @@ def _ill_conditioned(condition: float, more: str, direction: np.ndarray, names, 
 # ---- of a large scene ------------------------------------------------------------------------------------------------
 
 
-def _of_large(scene: CheckedScene, names) -> list[Finding]:
+def _large_findings(scene: CheckedScene, names) -> list[Finding]:
     """Findings about M, regular also where constraints hold, from its entries where their places are known."""
     m = scene.measured
     empty = np.isfinite(m.mass[0]).all() and ~m.mass.any(axis=(0, 2))

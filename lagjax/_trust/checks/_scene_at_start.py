@@ -122,13 +122,13 @@ class CheckedScene(NamedTuple):
         """True if M and G are known by products alone: `Measured` holds those with one vector, (…, 1)."""
         return self.derivation.structure is not None
 
-    def line(self, direction: np.ndarray, steps: np.ndarray) -> "Line":
+    def line(self, direction: np.ndarray, steps: np.ndarray) -> "LineValues":
         """The scene along a `direction` (2n + 1,) of the coordinates, the velocities and the time of the motion."""
         q, qdot, t, params = self.arguments
         n, here = self.layout.size, self.point
         moved = direction + direction[-1] * np.concatenate([here[n:-1], np.zeros(n + 1)])
         values = _evaluate_line(self.system, q, qdot, t, params, moved.astype(here.dtype), steps)
-        return Line(*(np.asarray(x, float) for x in values))
+        return LineValues(*(np.asarray(x, float) for x in values))
 
     @property
     def lagrangian(self) -> np.ndarray:
@@ -209,7 +209,7 @@ class Measured(NamedTuple):
     acceleration: Any = None  # q̈ of a large scene, (n,)
 
 
-class Line(NamedTuple):
+class LineValues(NamedTuple):
     """L, p, D, f and a along a line through the state, a weighted sum of each, (5,)."""
 
     here: Any
