@@ -55,12 +55,12 @@ def count_borders(members: Members) -> tuple[bool, Met[np.ndarray] | None]:
     rtol, atol = (float(np.max(x)) for x in trajectory.tolerances)
     system, layout = trajectory.system, members.layout
     flow = flow_of(Problem.from_system(system, layout, members.params, ts=ts[0], rtol=rtol, atol=atol))
-    if flow.borders is None:  # one without a series
+    if flow.kernel.borders is None:  # one without a series
         return False, None
     columns = [np.broadcast_to(x, members.count) for x in members.numbers]
     params = np.stack(columns, axis=1) if columns else np.zeros((members.count, 0))
     moved = np.flatnonzero(np.isfinite(start).all(axis=1) & (ts[:, 1] != ts[:, 0]) & (steps > 0))
-    for some in portions(moved, steps * (flow.states + 5 + len(flow.borders.switches)), LARGEST_PORTION):
+    for some in portions(moved, steps * (flow.states + 5 + len(flow.kernel.borders.switches)), LARGEST_PORTION):
         tolerances = Tolerances(rtol, atol, 2 * int(steps[some].max()) + 100)
         _count(flow, ts[some], start[some], params[some], tolerances, steps[some], some, nothing)
     return True, nothing
@@ -78,7 +78,7 @@ def is_piecewise(system: System, layout: Layout, params) -> bool:
 
 def _count(flow: Flow, ts, y0, params, tolerances: Tolerances, steps, places, into: Met[np.ndarray]) -> None:
     """Follow some motions, and add what they met `into` the counts at their places."""
-    store, borders = StepStore(), flow.borders
+    store, borders = StepStore(), flow.kernel.borders
     assert borders is not None  # without a series there are none, and none are counted
     again = flow.follow(ts, y0, params, tolerances, store, 2 * int(steps.sum()) + len(places))
     guards, pieces = borders.guards, len(borders.switches)
