@@ -6,9 +6,19 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+from scipy.sparse import diags_array
 
+from lagjax._analysis._lowest_modes import Sparse
 from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._solve import is_root, levenberg_marquardt, newton, shortest_preimage
+from lagjax._analysis._sparse_balance import (
+    balance_of,
+    falls,
+    find_root,
+    is_balanced,
+    multipliers_at_rest,
+    singular_direction,
+)
 from lagjax._analysis._state_of_rest import settle
 from lagjax._equations import ROUNDINGS, least_norm
 from lagjax._interface import compile_for_one_call, describe_numbers, is_known, require_flag, show_str
@@ -70,7 +80,8 @@ def equilibrium(
     form a family (along a coordinate that no force acts on), the result is the member that minimum-norm Newton steps
     reach, and its derivatives are those of the nearest member. Far from an equilibrium the steps are damped
     (Levenberg–Marquardt). The result is differentiated implicitly with respect to `params`, to every order. The
-    function works under `jit`, `vmap` and `grad`.
+    function works under `jit`, `vmap` and `grad`; for large scenes with sparse matrices, where SuperLU finds the steps
+    on the host, on numbers alone.
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, a scene that depends on the time, a
     velocity of a coordinate that is not cyclic, or where no equilibrium is found.
@@ -86,16 +97,22 @@ def equilibrium(
     """
     require_flag(throw, "throw")
     require_flag(stable, "stable")
-    scene = SceneState.from_state(system, q, qdot, params)
+    scene = SceneState.from_state(system, q, qdot, params, sparse=True)
     scene.require_autonomous("An equilibrium")
-    require_steady(scene)
-    if stable:
-        scene = _settled_scene(scene, qdot)
-    place, multipliers, ok = _solve_balance(False, *scene.arguments)
-    if scene.concrete and not ok:  # again, with the rounding of terms, whose program is compiled where it may matter
-        place, multipliers, ok = _solve_balance(True, *scene.arguments)
-    if throw and scene.concrete and not ok:
-        raise ValueError(_sentence(scene))
+    if scene.large:
+        place, multipliers, ok, why = _solve_large(scene, qdot, stable)
+    else:
+        require_steady(scene)
+        if stable:
+            scene = _settled_scene(scene, qdot)
+        place, multipliers, ok = _solve_balance(False, *scene.arguments)
+        if (
+            scene.concrete and not ok
+        ):  # again, with the rounding of terms, whose program is compiled where it may matter
+            place, multipliers, ok = _solve_balance(True, *scene.arguments)
+        why = "" if not throw or not scene.concrete or ok else _sentence(scene)
+    if throw and why:
+        raise ValueError(why)
     of_user = None
     if scene.constrained:
         of_user = scene.system._split_by_constraint(multipliers, scene.layout, scene.params)
@@ -195,15 +212,55 @@ def least_multipliers(jacobian: Float[Array, "m n"], force: Vector) -> Array:
     return -least_norm(jacobian @ jacobian.T, jacobian @ force) if len(jacobian) else jnp.zeros(0, force.dtype)
 
 
-def _sentence(scene: SceneState) -> str:
-    force = scene.force(scene.q, scene.qdot)
-    gradient = jax.jacfwd(scene.force)(scene.q, scene.qdot)
-    names = scene.layout.names
-    pushed = [names[i] for i in np.flatnonzero((np.asarray(force) != 0) & ~np.asarray(gradient).any(axis=1))]
+# ---- large scenes ----------------------------------------------------------------------------------------------------
+
+
+def _solve_large(scene: SceneState, qdot: PyTree, stable: bool) -> tuple[Vector, Array, Bool[Array, ""], str]:
+    """q (n,), λ (m,), whether they are an equilibrium, and why not."""
+    n, state = scene.layout.size, (scene.q, scene.qdot, jnp.zeros((), scene.q.dtype), scene.numbers)
+    if qdot is not None:
+        raise ValueError(
+            f"Steady motions of {n} coordinates are not sought: leave qdot out, or give fewer coordinates."
+        )
+    of = balance_of(scene, "An equilibrium")
+    if stable:
+        scene = _settled_scene(scene, None)
+        of = of._replace(multipliers=multipliers_at_rest(scene))
+    start = np.concatenate([scene.q, of.multipliers])
+    unit, jacobian = np.asarray(jax.jit(scene.motion.unit)(*state)), of.jacobian(start)
+    columns = abs(diags_array(unit) @ jacobian[:n]).max(axis=0).toarray().ravel()
+    of_q = (unit * columns[:n]).max()
+    unit = np.concatenate([unit, np.where(columns[n:] > 0, of_q / np.where(columns[n:] > 0, columns[n:], 1), 1)])
+    least = np.abs(start)
+    least[n:] = np.maximum(least[n:], _TINY * unit[n:] * (least / unit)[n:].max(initial=0))
+    z = find_root(of, start, least, unit)
+    z = np.where(np.abs(z) < np.finfo(float).eps ** 3 * np.abs(start), 0.0, z)
+    why = "" if is_balanced(of, z, least) else _sentence(scene, jacobian)
+    if not why and stable and falls(of, z, unit[:n]):
+        why = "With friction the scene came to rest where it does not stay: at a saddle. Begin farther from it."
+    ok = jnp.asarray(not why)
+    return nan_unless(ok, jnp.asarray(z[:n])), nan_unless(ok, jnp.asarray(z[n:])), ok, why
+
+
+def _sentence(scene: SceneState, gradient: Sparse | None = None) -> str:
+    """Why no equilibrium is found; the sparse `gradient` is that of the forces by z at the guess, of a large scene."""
+    force, names = np.asarray(scene.force(scene.q, scene.qdot)), scene.layout.names
+    if gradient is None:
+        slopes = np.abs(jax.jacfwd(scene.force)(scene.q, scene.qdot)).sum(axis=1)
+    else:
+        slopes = abs(gradient).sum(axis=1)[: len(names)]
+    pushed = [names[i] for i in np.flatnonzero((force != 0) & (slopes == 0))]
     if pushed and not scene.constrained:
         return (
             f"There is no equilibrium near the guess: the force of {', '.join(pushed)} is not zero, and no coordinate "
             "changes it. What keeps it there is missing from L: a spring, a support, a constraint."
+        )
+    if gradient is not None and (direction := singular_direction(gradient)) is not None:
+        largest = np.argsort(-np.abs(direction[: len(names)]))[:3]
+        return (
+            "No equilibrium was found: the derivative of the forces is singular at the guess, along a deviation of "
+            f"{', '.join(names[i] for i in largest)} and more. What keeps these there is missing from L, or "
+            "constraints depend on each other, or the guess is too far away."
         )
     shown = ", ".join(f"{name} = {value:.6g}" for name, value in zip(names[:8], np.asarray(scene.q)[:8], strict=False))
     return (

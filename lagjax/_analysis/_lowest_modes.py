@@ -8,13 +8,17 @@ orthogonal to the modes at hand is sought, until that is higher than all of them
 Source: Ericsson & Ruhe, *The spectral transformation Lanczos method*, Math. Comp. 35 (1980) 1251.
 """
 
+from typing import Any
+
 import numpy as np
 from jaxtyping import Float
-from scipy.sparse import block_array, csc_array, csr_array
+from scipy.sparse import block_array, csc_array
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, SuperLU, eigsh, splu
 
 from lagjax._analysis._eigen import symmetric_modes
 from lagjax._equations import decide
+
+Sparse = Any  # an array of scipy.sparse, of which type checkers do not know that it has two axes
 
 # The first shift, in parts of the largest entries of K: far above rounding, below the lowest mode of 10⁵ links, 1e-9.
 # Closer to zero by a factor of ten, zero modes would cost other shapes a digit.
@@ -40,7 +44,7 @@ NO_MODES = (
 
 
 def lowest_modes(
-    stiffness: csr_array, mass: csr_array, jacobian: csr_array, count: int | None
+    stiffness: Sparse, mass: Sparse, jacobian: Sparse, count: int | None
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "n k"]]:
     """λ (k,), ascending, and X (n, k), a vector a column, of at least `count` of the lowest modes, with Xᵀ M X = 1.
 
@@ -50,7 +54,7 @@ def lowest_modes(
     if factorize_positive(mass) is None:
         raise ValueError(NO_MODES)
     n, rows = mass.shape[0], jacobian.shape[0]
-    if needs_all(count, n - rows):
+    if count is None or needs_all(count, n - rows):
         return _dense_modes(stiffness, mass, jacobian)
     shift, factors = lowest_shift(stiffness, mass, jacobian)
     if rows:
@@ -74,9 +78,8 @@ def lowest_modes(
             return x - against @ (weighted.T @ x)
 
         start = project_inverse(mass @ np.random.default_rng(0).normal(size=n))
-        return eigsh(
-            stiffness, modes, mass, shift, OPinv=LinearOperator((n, n), project_inverse, dtype=float), v0=start
-        )
+        inverse: Any = LinearOperator((n, n), project_inverse, dtype=float)  # pyright: ignore[reportCallIssue]
+        return eigsh(stiffness, modes, mass, shift, OPinv=inverse, v0=start)  # pyright: ignore[reportReturnType]
 
     try:
         values, shapes = nearest(count, np.zeros((n, 0)))
@@ -99,14 +102,14 @@ def lowest_modes(
     return values, shapes
 
 
-def _dense_modes(stiffness: csr_array, mass: csr_array, jacobian: csr_array):
+def _dense_modes(stiffness: Sparse, mass: Sparse, jacobian: Sparse):
     """λ and X of all modes."""
     basis = decide(jacobian.toarray()).null if jacobian.shape[0] else np.eye(mass.shape[0])
     values, shapes = symmetric_modes(basis.T @ (stiffness @ basis), basis.T @ (mass @ basis))
     return np.asarray(values), basis @ np.asarray(shapes)
 
 
-def lowest_shift(stiffness: csr_array, mass: csr_array, jacobian: csr_array | None = None) -> tuple[float, SuperLU]:
+def lowest_shift(stiffness: Sparse, mass: Sparse, jacobian: Sparse = None) -> tuple[float, SuperLU]:
     """σ just below all eigenvalues, and the factors of K − σM, with stiff springs for constraints; M positive definite.
 
     How fast Lanczos's method converges depends on how far σ is below the lowest eigenvalue, beside how far these are
@@ -134,7 +137,7 @@ def lowest_shift(stiffness: csr_array, mass: csr_array, jacobian: csr_array | No
     return shift, factors
 
 
-def factorize_positive(matrix: csr_array) -> SuperLU | None:
+def factorize_positive(matrix: Sparse) -> SuperLU | None:
     """The factors of a positive definite matrix, by elimination without pivoting; None where it is none."""
     options = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
     try:
@@ -145,7 +148,7 @@ def factorize_positive(matrix: csr_array) -> SuperLU | None:
     return factors if in_order and (factors.U.diagonal() > 0).all() else None
 
 
-def factorize_regular(matrix: csr_array) -> SuperLU | None:
+def factorize_regular(matrix: Sparse) -> SuperLU | None:
     """The factors of a matrix, by elimination with pivoting; None where it is singular to working precision."""
     try:
         factors = splu(csc_array(matrix))

@@ -153,6 +153,9 @@ class SceneState(NamedTuple):
         """The sizes of coordinates, velocities and the time, of a scene of numbers."""
 
         def evaluated(name, q, qdot):
+            if name == "mass_matrix" and self.derivation.structure is not None:  # of which the diagonal alone is read
+                n, state = self.layout.size, (self.q, self.qdot, jnp.zeros((), self.q.dtype), self.numbers)
+                return np.broadcast_to(1 / np.asarray(jax.jit(self.motion.unit)(*state)) ** 2, (1, n, n))
             return Sample.from_scene(self.system, self.layout, q, qdot, 0.0, self.params).quantities(name)[name]
 
         return Scales.from_quantities(evaluated, np.asarray(self.q), np.asarray(self.qdot))

@@ -63,7 +63,7 @@ def newton(f: Callable[[Vector], Vector], start: Vector, unit: Vector | float = 
 
     def moves(carry):
         _, moved, count = carry
-        return (moved > _AT_REST) & (count < _STEPS)
+        return (moved > _AT_REST) & (count < STEPS)
 
     def once(carry):
         x, _, count = carry
@@ -106,7 +106,7 @@ def levenberg_marquardt(f: Callable, start: Vector, least: Vector, unit: Vector)
 
     def moves(carry):
         _, value, moved, _, _, count = carry
-        return (moved > _NO_STEP) & (count < _DAMPED_STEPS) & (jnp.max(jnp.abs(value)) > 0)
+        return (moved > NO_STEP) & (count < DAMPED_STEPS) & (jnp.max(jnp.abs(value)) > 0)
 
     def once(carry):
         z, value, moved, damping, scale, count = carry
@@ -125,7 +125,7 @@ def levenberg_marquardt(f: Callable, start: Vector, least: Vector, unit: Vector)
         better = (gain > 0) & jnp.all(jnp.isfinite(new))
         damping = jnp.where(ratio > 0.75, damping / 4, jnp.where((ratio < 0.25) | ~better, damping * 4, damping))
         length = relative_size(jacobian, step, z, least)
-        stuck = ~better & ((length < _NO_STEP) | ~jnp.isfinite(length))
+        stuck = ~better & ((length < NO_STEP) | ~jnp.isfinite(length))
         moved = jnp.where(better, length, jnp.where(stuck, 0.0, moved))
         return jnp.where(better, z + step, z), jnp.where(better, new, value), moved, damping, scale, count + 1
 
@@ -143,7 +143,7 @@ def relative_size(jacobian: Float[Array, "m n"], step: Vector, z: Vector, least:
 
 # A step that is nothing, in parts of the numbers of z. Damped steps: 10 to 30 are usual, and twice as many change
 # nothing where there is a solution.
-_NO_STEP, _DAMPED_STEPS = 1e-10, 200
+NO_STEP, DAMPED_STEPS = 1e-10, 200
 
 
 def _shorten_step(f: Callable, x: Vector, value: Vector, step: Vector) -> Vector:
@@ -151,7 +151,7 @@ def _shorten_step(f: Callable, x: Vector, value: Vector, step: Vector) -> Vector
 
     def fails(carry):
         step, count = carry
-        return ~(jnp.sum(f(x - step) ** 2) <= size) & (count < _HALVINGS)
+        return ~(jnp.sum(f(x - step) ** 2) <= size) & (count < HALVINGS)
 
     return jax.lax.while_loop(fails, lambda carry: (0.5 * carry[0], carry[1] + 1), (step, 0))[0]
 
@@ -159,7 +159,7 @@ def _shorten_step(f: Callable, x: Vector, value: Vector, step: Vector) -> Vector
 _AT_REST = 1e-14  # of the size of x: some tens of roundings, the square of which is left
 # Newton steps: one where f is linear, five to new coordinates of a state, ten to a velocity in relativity. Halvings of
 # one that leads out of where f is defined, as beyond the velocity of light.
-_STEPS, _HALVINGS = 50, 30
+STEPS, HALVINGS = 50, 30
 
 
 def _scales(matrix: Matrix) -> tuple[Vector, Vector]:

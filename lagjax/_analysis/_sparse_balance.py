@@ -1,7 +1,8 @@
 """The balance of forces of a large scene at rest, F + Gᵀλ and f, its sparse derivative by z = (q, λ), and its roots.
 
 It is for scenes with a `Structure`. Derivatives are read off by products (`sparse_jacobian`) and solved by SuperLU on
-the host, so that nothing here is traced.
+the host, so that nothing here is traced. The steps are those of `_solve`: damped ones until they are small, then those
+of Newton's method; but a step along which the derivative is singular is that of the least damping.
 """
 
 from collections.abc import Callable
@@ -11,9 +12,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
-from scipy.sparse import csr_array
+from scipy.sparse import block_array, diags_array, eye_array
+from scipy.sparse.linalg import splu
 
+from lagjax._analysis._lowest_modes import Sparse, factorize_regular, lowest_shift
 from lagjax._analysis._scene_state import SceneState
+from lagjax._analysis._solve import DAMPED_STEPS, HALVINGS, NO_STEP, STEPS
 from lagjax._equations import sparse_jacobian
 
 Unknowns = Float[np.ndarray, " n+m"]
@@ -23,7 +27,7 @@ class SparseBalance(NamedTuple):
     """`residual(z)` (n + m,): F + Gᵀλ, then f; `jacobian(z)`, sparse; `multipliers` (m,) at the state of the scene."""
 
     residual: Callable[[Unknowns], Unknowns]
-    jacobian: Callable[[Unknowns], csr_array]
+    jacobian: Callable[[Unknowns], Sparse]
     multipliers: np.ndarray
 
 
@@ -43,9 +47,7 @@ def balance_of(scene: SceneState, what: str) -> SparseBalance:
         _, pull = motion.constraints.products(*state)
         return jnp.concatenate([motion.force(*state) + pull(z[n:]), motion.constraints.residual(*state)])
 
-    multipliers = np.zeros(0)
-    if scene.constrained:
-        multipliers = np.asarray(jax.jit(motion.multipliers)(scene.q, rest, t, scene.numbers))
+    multipliers = multipliers_at_rest(scene)
     shape = jax.ShapeDtypeStruct((n + len(multipliers),), scene.q.dtype)
     jacobian = sparse_jacobian(residual, (shape, scene.numbers))
     if jacobian is None:
@@ -57,3 +59,125 @@ def balance_of(scene: SceneState, what: str) -> SparseBalance:
     return SparseBalance(
         lambda z: np.asarray(residual(z, numbers)), lambda z: jacobian(jnp.asarray(z), numbers), multipliers
     )
+
+
+def multipliers_at_rest(scene: SceneState) -> np.ndarray:
+    """λ (m,) of a scene at rest at q, as the motion from there has it."""
+    if not scene.constrained:
+        return np.zeros(0)
+    state = scene.q, jnp.zeros_like(scene.q), jnp.zeros((), scene.q.dtype), scene.numbers
+    return np.asarray(jax.jit(scene.motion.multipliers)(*state))
+
+
+# ---- roots -----------------------------------------------------------------------------------------------------------
+
+
+def find_root(of: SparseBalance, start: Unknowns, least: Unknowns, unit: Unknowns) -> Unknowns:
+    """z that damped steps from `start` lead to, and Newton's method from there; `least` and `unit` as in `_solve`."""
+    z = descend(of.residual, of.jacobian, start, least, unit)
+    return _polish(of, z, of.residual(z), of.jacobian(z))
+
+
+def constraints_nearby(scene: SceneState, place: np.ndarray, unit: np.ndarray) -> np.ndarray:
+    """q (n,) on, or nearer to, the constraints f of a large scene than a `place` (n,)."""
+    function = jax.jit(scene.position_constraints)
+    if (jacobian := sparse_jacobian(function, (scene.q,))) is None:
+        return place
+    return descend(function, jacobian, place, np.abs(place), unit)
+
+
+def descend(residual: Callable, jacobian_at: Callable, start: Unknowns, least: Unknowns, unit: Unknowns) -> Unknowns:
+    """z (n,) after damped steps from `start` for the least |f(z)|², f (m,), as in `_solve`."""
+    z, value, jacobian = start, np.asarray(residual(start)), jacobian_at(start)
+    weights = _reciprocal(_lengths(jacobian @ diags_array(unit), 1))
+    damping, scale = 0.1, np.zeros(len(z))
+    for _ in range(DAMPED_STEPS):
+        weighted, error = diags_array(weights) @ jacobian, weights * value
+        if not error.any():
+            break
+        scale = np.maximum(scale, _lengths(weighted, 0))
+        d = np.where(scale > 0, scale, unit)
+        scaled, size = weighted @ diags_array(1 / d), np.linalg.norm(error)
+        part = size / (size + (abs(weighted) @ np.maximum(least, np.abs(z))).max())
+        step = -_damped_solution(scaled, error, damping * part + 1e-15)
+        new = np.asarray(residual(z + step / d))
+        gain = size**2 - np.linalg.norm(weights * new) ** 2
+        expected = size**2 - np.linalg.norm(error + scaled @ step) ** 2
+        ratio, better = gain / expected if expected > 0 else 0.0, gain > 0 and np.isfinite(new).all()
+        damping *= 0.25 if ratio > 0.75 else 4.0 if ratio < 0.25 or not better else 1.0
+        change, sizes = abs(weighted) @ np.abs(step / d), np.maximum(np.abs(z), np.abs(step / d))
+        length = np.max(change * _reciprocal(abs(weighted) @ np.maximum(least, sizes)))
+        if better:
+            z, value = z + step / d, new
+            jacobian = jacobian_at(z)
+        if not length >= NO_STEP:
+            break
+    return z
+
+
+def _polish(of: SparseBalance, z: Unknowns, value: Unknowns, jacobian: Sparse) -> Unknowns:
+    """z after Newton's steps, until the forces do not become less than half."""
+    for _ in range(STEPS):
+        rows = _reciprocal(abs(jacobian).max(axis=1).toarray().ravel())
+        columns = _reciprocal(abs(diags_array(rows) @ jacobian).max(axis=0).toarray().ravel())
+        scaled = diags_array(rows) @ jacobian @ diags_array(columns)
+        factors, error = factorize_regular(scaled), rows * value
+        step = _damped_solution(scaled, error, 1e-15) if factors is None else factors.solve(error)
+        size, step = np.linalg.norm(error), columns * step
+        for _ in range(HALVINGS):
+            new = of.residual(z - step)
+            if np.linalg.norm(rows * new) <= size:
+                break
+            step = 0.5 * step
+        else:
+            break
+        z, value, jacobian = z - step, new, of.jacobian(z - step)
+        if not np.linalg.norm(rows * new) < 0.5 * size:
+            break
+    return z
+
+
+def is_balanced(of: SparseBalance, z: Unknowns, least: Unknowns) -> bool:
+    """True if z is a root, each number within half of the digits of what the numbers of z make of it."""
+    size = abs(of.jacobian(z)) @ np.maximum(least, np.abs(z))
+    return bool((np.abs(of.residual(z)) <= np.finfo(float).eps ** 0.5 * size).all())
+
+
+def falls(of: SparseBalance, z: Unknowns, unit: np.ndarray) -> bool:
+    """True if an equilibrium is no minimum of the potential on the constraints, with coordinates in their `unit`."""
+    whole, n = of.jacobian(z), len(unit)
+    scale = diags_array(unit)
+    forces, jacobian = scale @ whole[:n, :n] @ scale, whole[n:, :n] @ scale
+    shift = lowest_shift(-0.5 * (forces + forces.T), eye_array(n), jacobian)[0]
+    return shift < -_FALLS * abs(forces).sum(axis=1).max()
+
+
+# The lowest eigenvalue that is none, in parts of the largest: ten times how near its bound comes.
+_FALLS = 1e-7
+
+
+def _damped_solution(matrix: Sparse, b: np.ndarray, damping: float) -> np.ndarray:
+    """x of the least |A x − b|² + `damping` |x|²; A is not multiplied by itself."""
+    m, n = matrix.shape
+    above, below = (damping**0.5 * eye_array(k) for k in (m, n))
+    bordered = block_array([[above, matrix], [matrix.T, -below]], format="csc")
+    return splu(bordered).solve(np.concatenate([b, np.zeros(n)]))[m:]
+
+
+def _lengths(matrix: Sparse, axis: int) -> np.ndarray:
+    return np.sqrt((matrix**2).sum(axis=axis))
+
+
+def _reciprocal(x: np.ndarray) -> np.ndarray:
+    return np.where(x > 0, 1 / np.where(x > 0, x, 1), 1)
+
+
+def singular_direction(matrix: Sparse) -> np.ndarray | None:
+    """x of unit length with A x = 0 to working precision, for a square A; None where A is regular."""
+    if factorize_regular(matrix) is not None:
+        return None
+    x = np.random.default_rng(0).normal(size=matrix.shape[0])
+    for _ in range(3):
+        x = _damped_solution(matrix / abs(matrix).max(), x, 1e-15)
+        x /= np.linalg.norm(x)
+    return x

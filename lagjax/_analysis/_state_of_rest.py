@@ -13,6 +13,7 @@ import numpy as np
 from lagjax._analysis._coordinates import restrict_signature
 from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._solve import levenberg_marquardt
+from lagjax._analysis._sparse_balance import constraints_nearby
 from lagjax._interface import SimulationError
 from lagjax._run import simulate
 from lagjax._scene import ROLES, System
@@ -30,7 +31,9 @@ _RTOL = 1e-6
 def settle(scene: SceneState) -> PyTree:
     """q where the scene comes to rest with friction, in the user's pytree. Raises `ValueError` where it does not."""
     scales, layout = scene.scales, scene.layout
-    aside = np.asarray(scene.q) + _ASIDE * scales.q * np.cos(np.arange(1.0, layout.size + 1))
+    # Links between neighbours are short beside a large scene.
+    off = _ASIDE / layout.size if scene.large and scene.constrained else _ASIDE
+    aside = np.asarray(scene.q) + off * scales.q * np.cos(np.arange(1.0, layout.size + 1))
     q, qdot = layout.restore(jnp.asarray(aside, layout.dtype)), layout.restore(jnp.zeros(layout.size, layout.dtype))
     system = _add_friction(scene.system)
     for stage in range(_STAGES):
@@ -39,7 +42,10 @@ def settle(scene: SceneState) -> PyTree:
         if scene.constrained:
             # By damped least squares towards the constraints first: the projection converges only near them.
             place, unit = layout.flatten(q), jnp.asarray(scales.q, layout.dtype)
-            near = levenberg_marquardt(scene.position_constraints, place, jnp.abs(place), unit)
+            if scene.large:
+                near = jnp.asarray(constraints_nearby(scene, np.asarray(place), scales.q))
+            else:
+                near = levenberg_marquardt(scene.position_constraints, place, jnp.abs(place), unit)
             q, qdot = system.project(layout.restore(near), qdot, 0.0, params)
         try:
             run = simulate(system, q, qdot, jnp.array([0.0, _TIMES / rate], layout.dtype), params, rtol=_RTOL)

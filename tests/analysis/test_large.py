@@ -53,6 +53,52 @@ def test_modes_of_a_hanging_chain_with_constraints():
     np.testing.assert_allclose(up.exponents[0, 0], np.sqrt(np.linalg.eigvalsh(sideways)[-1]), rtol=1e-12)
 
 
+def phi4(q, v):
+    return ring(q, v) - 0.25 * jnp.sum((q**2 - 1) ** 2)
+
+
+PHI4 = lagjax.System(phi4)
+
+
+def test_equilibrium_of_a_ring():
+    start = 1 + 0.15 * np.random.default_rng(0).normal(size=1000)
+    np.testing.assert_allclose(lagjax.equilibrium(PHI4, jnp.asarray(start)).q, 1.0, rtol=1e-14)
+    narrow = lagjax.equilibrium(PHI4, np.float32(start[:300]))
+    assert narrow.ok and narrow.q.dtype == np.float32
+
+
+def test_a_family_of_equilibria_is_met_where_it_is_nearest():
+    train = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * jnp.sum((jnp.diff(q) - 1) ** 2))
+    rest = lagjax.equilibrium(train, 1.1 * jnp.arange(300.0)).q
+    np.testing.assert_allclose(rest, 0.05 * 299 + jnp.arange(300.0), rtol=1e-12)
+
+
+def test_equilibrium_of_a_chain_between_two_points():
+    n, span = 150, 0.8
+
+    def links_between(q):
+        joints = jnp.concatenate([jnp.zeros((1, 2)), q, jnp.array([[span * n, 0.0]])])
+        return 0.5 * (jnp.sum(jnp.diff(joints, axis=0) ** 2, axis=1) - 1)
+
+    part = np.arange(1, n) / n
+    guess = np.stack([span * n * part, -1.2 * n * part * (1 - part)], axis=1)
+    rest = lagjax.equilibrium(lagjax.System(weights, constraints=links_between), jnp.asarray(guess))
+    steps = np.diff(np.concatenate([np.zeros((1, 2)), rest.q, [[span * n, 0.0]]]), axis=0)
+    np.testing.assert_allclose(np.hypot(*steps.T), 1.0, rtol=1e-12)
+    # A weight at each joint, and the same tension to the side in all links: slopes are an arithmetic sequence.
+    slopes = steps[:, 1] / steps[:, 0]
+    np.testing.assert_allclose(np.diff(slopes), slopes[1] - slopes[0], rtol=1e-9)
+    np.testing.assert_allclose(rest.multipliers * steps[:, 0], rest.multipliers[0] * steps[0, 0], rtol=1e-9)
+
+
+@pytest.mark.slow
+def test_a_ring_falls_from_its_unstable_equilibrium():
+    assert np.asarray(lagjax.equilibrium(PHI4, jnp.zeros(300)).q == 0).all()
+    stable = lagjax.equilibrium(PHI4, jnp.zeros(300), stable=True)
+    modes = lagjax.normal_modes(PHI4, stable.q, count=3)
+    assert modes.stable and np.abs(stable.q).max() > 0.9
+
+
 def test_few_modes_of_a_small_scene():
     pendulums = lagjax.System(lambda q, v: 0.5 * v @ v + jnp.sum(jnp.cos(q)) - 0.5 * jnp.sum(jnp.diff(q) ** 2))
     all_modes, two = (lagjax.normal_modes(pendulums, jnp.zeros(4), count=count) for count in (None, 2))
@@ -72,6 +118,11 @@ def test_few_modes_of_a_small_scene():
             ),
             "have a potential: some of these damp",
         ),
+        (
+            lambda: lagjax.equilibrium(lagjax.System(lambda q, v: ring(q, v) - jnp.sum(q)), jnp.zeros(300)),
+            "the derivative of the forces is singular at the guess",
+        ),
+        (lambda: jax.grad(lambda q: jnp.sum(lagjax.equilibrium(PHI4, q).q))(jnp.ones(300)), "outside of jit"),
     ],
 )
 def test_what_is_not_tried_is_said(make, sentence):
