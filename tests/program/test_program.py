@@ -156,13 +156,6 @@ FAMILIES = {
         lambda a, p: (jsp.i0(30 * a), jsp.i1(3 * a), jsp.i0e(3 * a), jsp.i1e(30 * a), jsp.gammaln(p), jsp.digamma(a)),
         A, P,
     ),
-    "Fourier transforms": (
-        lambda m: both(
-            jnp.fft.fft(m), jnp.fft.fft2(m), jnp.fft.ifft(m.T), jnp.fft.rfft(m), jnp.fft.rfft(m[0, :3]),
-            jnp.fft.irfft(m + 1j * m[::-1]), jnp.fft.irfft(m + 1j * m[::-1], 5), jnp.fft.irfft2(m[:2] * 1j),
-        ),
-        M,
-    ),
     "norms": (lambda a: (jnp.linalg.norm(a), jnp.hypot(a[0], a[1]), jnp.logaddexp(a[0], a[1]), jnp.sinc(a)), A),
     "gather": (
         lambda m: (m[jnp.array([0, 2, 0])], m[:, jnp.array([[1, 3]])], m[jnp.triu_indices(3)], m.at[5, 0].get()), M,

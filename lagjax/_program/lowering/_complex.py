@@ -4,12 +4,11 @@ A pair has an id of its own (`Expansion.pair`), so that what only moves numbers 
 them apart: a function of z = x + iy becomes two of x and y. Logarithms, roots and powers have their branch cut on the
 negative real axis, as in JAX: it is that of atan2, a border.
 
-Fourier transforms are sums: of a length that is even, of two halves (Cooley and Tukey, Math. Comp. 19 (1965) 297).
+Fourier transforms are left to XLA.
 """
 
 import functools
 import math
-import operator
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -290,61 +289,3 @@ def _dot_general(expansion, params, x, y):
     return expansion.pair(
         expansion.map("sub", products[0, 0], products[1, 1]), expansion.map("add", products[0, 1], products[1, 0])
     )
-
-
-# ---- Fourier transforms ---------------------------------------------------------------------------------------------
-
-
-@lowers("fft", table=COMPLEX)
-def _fourier(expansion, params, x):
-    """Sums Σ xⱼ e^(∓2πi jk/n) along the last axes, of which that of a real transform is the last one."""
-    kind, lengths = params["fft_type"].name, params["fft_lengths"]
-    axes, turn = [x.ndim - len(lengths) + k for k in range(len(lengths))], 1 if kind.startswith("I") else -1
-    if kind == "RFFT":
-        x = _map_rows(expansion, x, axes[-1], lambda rows: _transform_rows(rows, turn)[: lengths[-1] // 2 + 1])
-        axes = axes[:-1]
-    for axis in axes[:-1] if kind == "IRFFT" else axes:
-        x = _map_rows(expansion, x, axis, lambda rows: _transform_rows(rows, turn))
-    if kind == "IRFFT":
-        whole = lambda rows: _transform_rows(_complete_spectrum(rows, lengths[-1]), turn)  # noqa: E731
-        x = expansion.parts(_map_rows(expansion, x, axes[-1], whole))[0]
-    if turn < 0:
-        return x
-    number = expansion.constants(1.0 / math.prod(lengths))
-    parts = [expansion.map("mul", number, part) for part in expansion.parts(x)]
-    return parts[0] if kind == "IRFFT" else expansion.pair(*parts)
-
-
-def _map_rows(expansion: Expansion, x: np.ndarray, axis: int, transform: Callable) -> np.ndarray:
-    rows = transform([_pair_of(expansion, row) for row in np.moveaxis(x, axis, 0)])
-    return np.stack([_ids_of(expansion, row) for row in rows], axis)
-
-
-def _complete_spectrum(rows: list[Pair], n: int) -> list[Pair]:
-    """All n coefficients of a real function, from those of frequencies that are not negative."""
-    half = list(rows)
-    for k in (0, n // 2) if n % 2 == 0 else (0,):  # these are real
-        half[k] = Pair(rows[k].re, 0.0 * rows[k].im)
-    return half + [half[n - k].conjugate for k in range(len(half), n)]
-
-
-def _transform_rows(rows: list[Pair], turn: int) -> list[Pair]:
-    """Σⱼ rowsⱼ e^(turn 2πi jk/n) for every k."""
-    n = len(rows)
-    if n % 2 or n == 0:
-        turned = [[_rotate(x, turn, j * k, n) for j, x in enumerate(rows)] for k in range(n)]
-        return [functools.reduce(operator.add, of_one) for of_one in turned]
-    even, odd = _transform_rows(rows[::2], turn), _transform_rows(rows[1::2], turn)
-    odd = [_rotate(x, turn, k, n) for k, x in enumerate(odd)]
-    return [a + b for a, b in zip(even, odd, strict=True)] + [a - b for a, b in zip(even, odd, strict=True)]
-
-
-def _rotate(z: Pair, turn: int, k: int, n: int) -> Pair:
-    """z e^(turn 2πi k/n)."""
-    k %= n
-    if 4 * k % n == 0:
-        quarter = turn * (4 * k // n) % 4
-        return (z, z.multiply_by_i, -z, z.divide_by_i)[quarter]
-    angle = 2 * math.pi * k / n
-    cosine, sine = math.cos(angle), turn * math.sin(angle)
-    return Pair(z.re * cosine - z.im * sine, z.re * sine + z.im * cosine)

@@ -201,7 +201,7 @@ def find_variables(equation) -> list:
 
 
 def formula_of(equation) -> str | None:
-    """The name of the function of JAX that a call is, if that has a formula here ("det", "expn", "hypot" …); or None.
+    """The name of the function of JAX that a call is, if that has a formula here ("det", "hypot" …); or None.
 
     JAX has rules of its own for their derivatives, which agree with those of any formula for them.
     """
@@ -209,7 +209,7 @@ def formula_of(equation) -> str | None:
     if name in ("jit", "pjit"):
         called, floats = equation.params["name"], [jnp.issubdtype(x.dtype, jnp.floating) for x in operands]
         reads_bits = any(e.primitive.name == "bitcast_convert_type" for e in equation.params["jaxpr"].eqns)
-        found = {"expn": [False, True], "signbit": [True] if reads_bits else None, "hypot": [True, True]}
+        found = {"signbit": [True] if reads_bits else None, "hypot": [True, True]}
         if found.get(called) != floats:
             return None
         own = called != "hypot" or str(equation.params["jaxpr"]) == _hypot(*((x.shape, x.dtype) for x in operands))

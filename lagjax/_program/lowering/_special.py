@@ -1,23 +1,19 @@
-"""Functions of one number that are series: log Γ and its derivatives, the modified Bessel functions I₀ and I₁, the
-exponential integrals and the incomplete Γ functions.
+"""Functions of one number that are series: log Γ and its derivatives, the modified Bessel functions I₀ and I₁.
 
 log Γ obeys no differential equation from which a Taylor series would follow, and the others would need the powers of
 their argument anyway. So all are written out in operations that are there already, to rounding:
 
     log Γ(x), x > 0    Stirling's series at y = x + 10, less log x(x + 1) … (x + 9)
     Iₙ(x)              the power series up to |x| = 25, whose terms have one sign, and the asymptotic series beyond
-    Eₙ(x), x > 0       the power series up to x = 1.5, and a continued fraction beyond
-    P(a, x), x ≥ 0     a series whose terms have one sign up to x = a + 1, and 1 − Q with a continued fraction beyond
 
-Where one of two such forms takes over they agree to rounding, and that is no border. Of Eₙ and P the number n or a has
-to be known: it says how many terms are needed.
+Where one of two such forms takes over they agree to rounding, and that is no border. The incomplete Γ functions and the
+exponential integrals are left to XLA.
 
-Abramowitz & Stegun, *Handbook of Mathematical Functions* (1964), 5.1.12, 5.1.22, 6.1.40, 6.1.17, 6.4.6, 6.4.7, 6.4.11,
-6.5.29, 6.5.31, 9.6.10 and 9.7.1; the fractions in their even forms: Press et al., *Numerical Recipes* (1992), §6.2–3.
+Abramowitz & Stegun, *Handbook of Mathematical Functions* (1964), 6.1.40, 6.1.17, 6.4.6, 6.4.7, 6.4.11, 9.6.10, 9.7.1.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from fractions import Fraction
 from typing import Any
 
@@ -112,89 +108,21 @@ def scaled_bessel(order: int, x: Scalars) -> Any:
     return xp.where(is_small, small, large)
 
 
-# Where the series of Eₙ gives way to the fraction: of E₁, the smallest, two digits cancel there. That of P(a, x) does
-# so at a + 1, where both take about as many terms; for small a the fraction would be long there.
-_CHANGE_OF_INTEGRAL, _LEAST_CHANGE_OF_GAMMA = 2.0, 2.0
-_LARGEST_ORDER, _LARGEST_SHAPE = 20, 100.0  # n of Eₙ, a of P(a, x): their formulas have up to a hundred terms
-
-
-def exponential_integral(n: int, x: Scalars) -> Any:
-    """Eₙ(x) = ∫₁^∞ e^(−x t) t⁻ⁿ dt for x > 0 and n ≥ 0, to 1e-14; for x < 0 it is NaN."""
-    if n == 0:
-        return xp.where(xp.prefers(0.0, x), float("nan"), xp.exponential(-x) / x)
-    is_small = xp.prefers(_CHANGE_OF_INTEGRAL, x)
-    near, far = xp.where(is_small, x, 1.0), xp.where(is_small, _CHANGE_OF_INTEGRAL, x)
-    psi = -float(np.euler_gamma) + sum(1.0 / k for k in range(1, n))
-    powers = [0.0 if k == n - 1 else -((-1.0) ** k) / ((k - n + 1) * math.factorial(k)) for k in range(26 + n)]
-    small = psi - xp.logarithm(xp.where(xp.equal(near, 0.0), 1.0, near) if n > 1 else near)
-    if n > 1:
-        small = (-1.0) ** (n - 1) / math.factorial(n - 1) * _power(near, n - 1) * small
-    large = xp.exponential(-far) * _fraction(far, float(n), lambda k: float(k * (n - 1 + k)), _CHANGE_OF_INTEGRAL)
-    return xp.where(is_small, small + _polynomial(powers, near), large)
-
-
-def incomplete_gamma(a: float, x: Scalars) -> tuple[Any, Any]:
-    """P(a, x) = ∫₀ˣ tᵃ⁻¹ e⁻ᵗ dt / Γ(a) for a > 0 and x ≥ 0, and Q = 1 − P, to 1e-14; for x < 0 they are NaN."""
-    change = max(a + 1.0, _LEAST_CHANGE_OF_GAMMA)
-    is_small = xp.prefers(change, x)
-    near: Any = xp.where(is_small, x, 1.0)
-    far = xp.where(is_small, change, x)
-    terms = [1.0]
-    while terms[-1] * change ** (len(terms) - 1) > 2.0**-56:
-        terms.append(terms[-1] / (a + len(terms)))
-    power = near.map("pow", near, a) * math.exp(-math.lgamma(a + 1.0))
-    small = power * xp.exponential(-near) * _polynomial(terms, near)
-    size = xp.exponential(a * xp.logarithm(far) - far - math.lgamma(a))
-    large = size * _fraction(far, 1.0 - a, lambda k: k * (k - a), change)
-    small = xp.where(xp.prefers(0.0, x), float("nan"), small)
-    return xp.where(is_small, small, 1.0 - large), xp.where(is_small, 1.0 - small, large)
-
-
-def _fraction(x: Any, shift: float, numerator: Callable[[int], float], least: float) -> Any:
-    """1 / (b − c₁ / (b + 2 − c₂ / (b + 4 − …))) with b = x + s, as long as it takes at the least x."""
-
-    def cut(x, length):
-        total = (x + shift) + 2.0 * length
-        for k in reversed(range(length)):
-            total = (x + shift) + 2.0 * k - numerator(k + 1) / total
-        return 1.0 / total
-
-    length = next(n for n in range(1, 200) if abs(cut(least, n) / cut(least, 2 * n + 50) - 1.0) < 2.0**-52)
-    return cut(x, length)
-
-
-def _order(expansion, order: np.ndarray, function: str, largest: int) -> int:
-    """The order of a function of several, which must be one known number."""
-    a = "an" if function[0] == "e" else "a"
-    orders = set(expansion.require_numbers(order, f"the order of {a} {function}").ravel().tolist())
-    if len(orders) != 1 or not 0 <= (n := orders.pop()) <= largest:
-        raise Unlowerable(f"{function}s of several orders, or of one beyond {largest}, are not written out")
-    return n
-
-
-def _shape(expansion, shape: np.ndarray) -> float:
-    """The number a of an incomplete Γ function, which must be known."""
-    values = {expansion.graph.value(i) for i in shape.ravel().tolist()}
-    a = values.pop() if len(values) == 1 else None
-    if a is None or not 0 < a <= _LARGEST_SHAPE:
+def _lower_polygamma(expansion, params, order: np.ndarray, x: np.ndarray):
+    orders = set(expansion.require_numbers(order, "the order of a polygamma function").ravel().tolist())
+    if len(orders) != 1 or not 0 <= (n := orders.pop()) <= _MOST_DERIVATIVES:
         raise Unlowerable(
-            f"incomplete Γ functions are written out for one known a, 0 < a ≤ {_LARGEST_SHAPE:g}: it says how many "
-            "terms are needed"
+            f"polygamma functions of several orders, or of one beyond {_MOST_DERIVATIVES}, are not written out"
         )
-    return float(a)
+    return polygamma(n, Scalars(expansion, x)).ids
 
 
-LOWER.update({
-    "lgamma": lambda e, params, x: log_gamma(Scalars(e, x)).ids,
-    "digamma": lambda e, params, x: polygamma(0, Scalars(e, x)).ids,
-    "polygamma": lambda e, params, n, x: polygamma(
-        _order(e, n, "polygamma function", _MOST_DERIVATIVES), Scalars(e, x)
-    ).ids,
-    "bessel_i0e": lambda e, params, x: scaled_bessel(0, Scalars(e, x)).ids,
-    "bessel_i1e": lambda e, params, x: scaled_bessel(1, Scalars(e, x)).ids,
-    "expn": lambda e, params, n, x: [
-        exponential_integral(_order(e, n, "exponential integral", _LARGEST_ORDER), Scalars(e, x)).ids
-    ],
-    "igamma": lambda e, params, a, x: incomplete_gamma(_shape(e, a), Scalars(e, x))[0].ids,
-    "igammac": lambda e, params, a, x: incomplete_gamma(_shape(e, a), Scalars(e, x))[1].ids,
-})  # fmt: skip
+LOWER.update(
+    {
+        "lgamma": lambda e, params, x: log_gamma(Scalars(e, x)).ids,
+        "digamma": lambda e, params, x: polygamma(0, Scalars(e, x)).ids,
+        "polygamma": _lower_polygamma,
+        "bessel_i0e": lambda e, params, x: scaled_bessel(0, Scalars(e, x)).ids,
+        "bessel_i1e": lambda e, params, x: scaled_bessel(1, Scalars(e, x)).ids,
+    }
+)
