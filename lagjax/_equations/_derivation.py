@@ -48,7 +48,6 @@ from lagjax._program import (
     lower_scalars,
     lower_solution,
     operations_that_fit,
-    pause_collections,
     scatter,
     stack,
 )
@@ -97,8 +96,7 @@ def _lowered_once(make: Callable) -> property:
             with self._lock:
                 if name not in self._made:
                     try:
-                        with pause_collections():
-                            self._made[name] = make(self)
+                        self._made[name] = make(self)
                     except Unlowerable as reason:
                         self._made[name] = reason
         made = self._made[name]

@@ -6,7 +6,6 @@ from typing import NamedTuple
 from lagjax._native._lanes import INTEGERS
 from lagjax._program._borders import Borders, borders, with_outputs
 from lagjax._program._graph import Unlowerable
-from lagjax._program._memory import pause_collections
 from lagjax._program._series import Recurrent, Series, StraightLine, series
 
 
@@ -52,16 +51,15 @@ class Watched(NamedTuple):
 @functools.lru_cache(maxsize=32)
 def append_guards(program: Recurrent, size: int, values: Recurrent, slides: bool) -> Watched:
     """A program of q̈ with guards behind it. Raises `Unlowerable` where one of them has no series."""
-    with pause_collections():
-        count = len(values.line.outputs)
-        whole = with_outputs(program, values.line, 2 * size + 1)
-        require_lanes(whole.line)
-        try:
-            if (found := borders(whole, size, slides, count)) is not None:
-                return Watched(found.program, _series_of_guards(found.program, size, found.followed, count), found)
-        except Unlowerable:  # a switching number without a series, or more operations than that takes
-            pass
-        return Watched(whole, _series_of_guards(whole, size, (), count), None)
+    count = len(values.line.outputs)
+    whole = with_outputs(program, values.line, 2 * size + 1)
+    require_lanes(whole.line)
+    try:
+        if (found := borders(whole, size, slides, count)) is not None:
+            return Watched(found.program, _series_of_guards(found.program, size, found.followed, count), found)
+    except Unlowerable:  # a switching number without a series, or more operations than that takes
+        pass
+    return Watched(whole, _series_of_guards(whole, size, (), count), None)
 
 
 def drop_guards(found: Borders, size: int) -> tuple[Recurrent, Series]:

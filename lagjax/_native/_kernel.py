@@ -4,7 +4,7 @@ import ctypes
 import functools
 import itertools
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -32,7 +32,6 @@ from lagjax._native._taylor import TaylorSeries, is_large, order_for, size_of_se
 from lagjax._native._threads import SLICE, run_in_slices, run_on_threads
 from lagjax._program._borders import Borders
 from lagjax._program._jump import Nesting
-from lagjax._program._memory import pause_collections
 from lagjax._program._series import Recurrent
 
 # What a round takes for each operation of the acceleration: 0.03 to 0.1 µs, more where members go back over steps.
@@ -153,7 +152,7 @@ class Kernel:
         return self._parts.chosen
 
     def _integrator(self, number: ir.Type = DOUBLE) -> Integrator:
-        return _build_module(Integrator, self._parts, self._guards, self._error_groups, width=self.width, number=number)
+        return Integrator(self._parts, self._guards, self._error_groups, width=self.width, number=number)
 
     def _gpu_programs(self, single: bool) -> "_gpu.GpuPrograms":
         """The programs for GPUs; those in `single` precision of a kernel that `allows_singles`."""
@@ -316,7 +315,7 @@ class Kernel:
     def _compile_tangents(self, side_by_side: bool) -> "_Compiled":
         """The kernel of tangents: directions of one member in its lanes, or members; compiled on first use."""
         width = 1 if side_by_side else self.width
-        return _Compiled(_build_module(Tangent, self._derivative_parts, width=width, lanes=self.width), self._rounds)
+        return _Compiled(Tangent(self._derivative_parts, width=width, lanes=self.width), self._rounds)
 
     def plan(self, rtol: float, atol: float, max_steps: int) -> Plan:
         """The plan by which a handler begins a run; it lives as long as this kernel."""
@@ -361,7 +360,7 @@ class Kernel:
         return _Compiled(self._adjoint(self.width), self._rounds)
 
     def _adjoint(self, width: int, number: ir.Type = DOUBLE) -> Adjoint:
-        return _build_module(Adjoint, self._derivative_parts, width=width, number=number)
+        return Adjoint(self._derivative_parts, width=width, number=number)
 
     def _strides(self, ts, params) -> dict[str, int]:
         return dict(
@@ -370,12 +369,6 @@ class Kernel:
 
     def threads(self, members: int) -> int:
         return min(cores(), max(1, members // (VECTORS_PER_THREAD * self.width)))
-
-
-def _build_module(kind: Callable, *parts, **options):
-    """An instance of `kind` (Integrator, Tangent, Adjoint), which writes its module, with collections paused."""
-    with pause_collections():
-        return kind(*parts, **options)
 
 
 class _Compiled:

@@ -9,7 +9,6 @@ from lagjax._program._borders import Borders, borders
 from lagjax._program._graph import Unlowerable
 from lagjax._program._jump import Jump, Nesting, jump_at_border, with_borders_of_tangents
 from lagjax._program._look_ups import BESIDE, shift_look_up
-from lagjax._program._memory import pause_collections
 from lagjax._program._operations import LOOK_UPS
 from lagjax._program._series import Recurrent, Series, StraightLine, series
 
@@ -196,8 +195,7 @@ def choose_parameters(
 def recurrences(program: Recurrent, size: int) -> Series:
     """The Taylor series of the motion. Raises `Unlowerable` where the lanes of a kernel cannot run it."""
     require_lanes(program.line)
-    with pause_collections():
-        return series(program, size, moving=2 * size + 1)
+    return series(program, size, moving=2 * size + 1)
 
 
 @functools.lru_cache(maxsize=16)
@@ -217,12 +215,10 @@ def pieces_of(
         found = of_motion[0]
         for inner, directions in nesting.levels:
             found = with_borders_of_tangents(found, inner, directions, member * (inner // nesting.base))
-        with pause_collections():
-            return found, series(found.program, size, moving=2 * size + 1, followed=found.followed)
+        return found, series(found.program, size, moving=2 * size + 1, followed=found.followed)
     try:
         if (found := borders(program, size)) is not None:
-            with pause_collections():
-                return found, series(found.program, size, moving=2 * size + 1, followed=found.followed)
+            return found, series(found.program, size, moving=2 * size + 1, followed=found.followed)
     except Unlowerable:  # a switching number without a series, or more operations than that takes
         pass
     return None

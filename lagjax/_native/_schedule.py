@@ -12,7 +12,6 @@ from collections import Counter
 from typing import NamedTuple
 
 from lagjax._native._constants import LARGEST_TREE, OFTEN, ROUNDS
-from lagjax._program._line import group_by_level
 from lagjax._program._passes import count_uses
 from lagjax._program._series import StraightLine
 
@@ -81,8 +80,7 @@ def schedule(line: StraightLine, stored: int) -> Schedule:
     staying = len(line.outputs) - stored
     outputs, copies = _outputs(line, operations, kinds, staying)
     operations += copies
-    alike = group_by_level(operations, len(nodes) + len(line.outputs))
-    groups = [[operations[k] for k in alike[level_and_kind]] for level_and_kind in sorted(alike)]
+    groups = _group_by_level(operations, len(nodes) + len(line.outputs))
     slots, size = _slots(groups, outputs, staying, len(nodes))
     live = [i for i, count in enumerate(uses) if count]
     inputs = {i: nodes[i][2] for i in live if nodes[i][0] == "input"}
@@ -198,6 +196,20 @@ def _insert_part(kind: OperationKind, place: int, part: OperationKind) -> Operat
             break
         place -= width
     return kind._replace(parts=tuple(parts))
+
+
+# ---- groups ----------------------------------------------------------------------------------------------------------
+
+
+def _group_by_level(operations: list[ScheduledOperation], nodes: int) -> list[list[ScheduledOperation]]:
+    """Operations of one kind that wait for equally many others, and so not for each other; in order."""
+    levels, alike = [-1] * (nodes + 1), {}  # the last one is that of results that are unused
+    for operation in operations:
+        level = 1 + max([levels[i] for i in operation.operands], default=-1)
+        for i in operation.results:
+            levels[i] = level
+        alike.setdefault((level, operation.kind), []).append(operation)
+    return [alike[level_and_kind] for level_and_kind in sorted(alike)]
 
 
 # ---- slots -----------------------------------------------------------------------------------------------------------

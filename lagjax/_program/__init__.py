@@ -53,7 +53,7 @@ from lagjax._program._graph import Graph, Tape, Unlowerable, find_ancestors
 from lagjax._program._jump import row_places
 from lagjax._program._line import StraightLine
 from lagjax._program._look_ups import table_of
-from lagjax._program._memory import lack_of_memory, machine_memory, operations_that_fit, pause_collections
+from lagjax._program._memory import lack_of_memory, machine_memory, operations_that_fit
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, sink_negations
 from lagjax._program._rounding import rounding

@@ -30,7 +30,6 @@ from lagjax._program._differentiation import copy_nodes, gradient_in, pullback
 from lagjax._program._graph import Graph
 from lagjax._program._kick import Jumping, Kick, Mechanics, kick_line
 from lagjax._program._look_ups import Located, Table
-from lagjax._program._memory import pause_collections
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._powers import find_powers
@@ -227,7 +226,7 @@ def borders(program: Recurrent, size: int, slides: bool = True, watched: int = 0
                 return found
     if _WITHOUT_ANY.issuperset(op for op, *_ in program.line.nodes):
         return None
-    with np.errstate(all="ignore"), pause_collections():
+    with np.errstate(all="ignore"):
         rewriting = _Rewriting(program, size, slides, watched)
         return rewriting.build() if rewriting.switches or rewriting.features else None
 

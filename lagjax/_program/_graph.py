@@ -35,9 +35,6 @@ class Unlowerable(Exception):
 
 
 LONGEST = 16  # terms of a sum, or factors of a product, that are compared with others
-# Nodes of a graph beyond which sums and products are no longer compared, but for equal operands: in a larger graph the
-# comparison takes most of the time and saves less than a hundredth of the operations.
-MANY = 20_000
 
 # Ids from here on are inputs by their positions, and those from `NUMBERS` on numbers of long arrays, as long as nothing
 # computes with them: of an array that is only looked up in, no entry becomes a node.
@@ -289,8 +286,6 @@ class Graph:
 
     def product(self, a: int, b: int) -> int:
         """`a * b`, or an earlier product of the same factors."""
-        if len(self.nodes) > MANY:
-            return self.node("mul", a, b)
         factors = tuple(sorted(self._factors.get(a, (a,)) + self._factors.get(b, (b,))))
         if len(factors) > LONGEST:
             return self.node("mul", a, b)
@@ -312,9 +307,6 @@ class Graph:
 
     def sum(self, a: int, b: int, sign: int) -> int:
         """`a + sign*b` with like terms collected, or an earlier sum of the same terms."""
-        if len(self.nodes) > MANY:
-            (m, x), (n, y) = self.term(a), self.term(b)
-            return self.scale(m + sign * n, x) if x == y else self._signed_sum(a, b, sign)
         left, right = self.terms(a), self.terms(b)
         terms = dict(left)
         for base, coefficient in right.items():

@@ -2,15 +2,12 @@
 
 Every node becomes one NumPy operation on a vector of states. That costs a microsecond a node and about a nanosecond a
 node and state: less than XLA or LLVM take to compile a program, as long as it is not evaluated millions of times.
-
-The forces of 200 bodies on one another are 440 000 nodes of some ten kinds. Nodes of one operation whose operands come
-from earlier groups do not depend on each other: such a group is one NumPy operation on arrays of its rows.
 """
 
 import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 
@@ -22,13 +19,9 @@ from lagjax._program._operations import LOOK_UPS, OPERATIONS, apply_in_numpy
 # States looked at together. A value of 2048 states has 16 KB, so that some tens of live values stay in a core's second
 # cache, and the microsecond that NumPy takes to begin an operation is no more than what the operation takes itself.
 CHUNK = 2048
-# Nodes from which groups are tried, and how many times fewer groups there must be: one costs as much as ten nodes.
-_LEAST, _FEWER = 2000, 20
-# States beyond which the values of single nodes are arrays that are long enough.
-MOST_STATES = 256
-# Numbers that groups hold at a time, 16 MB: more states are taken in parts.
-MOST_HELD = 2**21
-_NONE = np.empty(0, np.intp), np.empty(0, np.intp)
+# Values of all nodes that are kept for a derivative at a time, 128 MB: more states are taken in parts. Doubled, nothing
+# is faster: a part of a line of 10 000 nodes has 1700 states.
+_MOST_KEPT = 2**24
 
 
 @dataclass(frozen=True, eq=False)
@@ -65,22 +58,16 @@ class StraightLine:
         """The outputs at many states, shape (outputs, S). Values are dropped as soon as nothing needs them."""
         columns, precision, count = self._prepare_columns(columns)
         results = np.empty((len(self.outputs), count), precision)
-        if len(self.nodes) >= _LEAST and count <= MOST_STATES and _FEWER * len(self.groups.each) <= len(self.nodes):
-            for part in self.groups.parts(count):
-                values = self.groups.values([_cut(x, part) for x in columns], precision, part.stop - part.start)
-                for kind, (rows, positions) in self.groups.outputs.items():
-                    results[positions, part] = values[kind][rows]
-            return results
-        if precision not in self._steps:
-            self._steps[precision] = _steps_of(self, precision)
+        steps = self._steps(precision)
         with np.errstate(all="ignore"):
             for start in range(0, count, CHUNK):
                 part = columns if count <= CHUNK else [_cut(x, slice(start, start + CHUNK)) for x in columns]
-                values = _values(self._steps[precision], part)
+                values = _values(steps, part)
                 for row, i in enumerate(self.outputs):
                     results[row, start : start + CHUNK] = values[i]
         return results
 
+    @np.errstate(all="ignore")
     def round_off(self, columns: Sequence) -> np.ndarray:
         """The rounding error of every output, to first order, shape (outputs, S); the inputs count as exact.
 
@@ -88,13 +75,22 @@ class StraightLine:
         cancel leave theirs behind. Source: Higham, *Accuracy and Stability of Numerical Algorithms*, §3.3.
         """
         columns, precision, count = self._prepare_columns(columns)
-        results = np.zeros((len(self.outputs), count), precision)
-        rows, positions = self.groups.outputs.get("float", _NONE)
-        for part in self.groups.parts(count):
-            values = self.groups.values([_cut(x, part) for x in columns], precision, part.stop - part.start)
-            results[positions, part] = self.groups.round_off(values, float(np.finfo(precision).eps))[rows]
+        results, eps = np.zeros((len(self.outputs), count), precision), float(np.finfo(precision).eps)
+        for part in self._parts(count):
+            values = _values(self._steps(precision), [_cut(x, part) for x in columns], keep=True)
+            errors: list = [0.0] * len(values)
+            for k, (op, operands, _) in enumerate(self.nodes):
+                if self.kinds[k] != "float" or not operands:
+                    continue
+                errors[k] = 0.0 if OPERATIONS[op].exact else eps * np.abs(values[k])
+                for i, partial in self._partials(k, values):
+                    if np.any(errors[i]):
+                        errors[k] = errors[k] + np.where(errors[i] == 0, 0.0, np.abs(partial(errors[i])))
+            for row, i in enumerate(self.outputs):
+                results[row, part] = errors[i]
         return results
 
+    @np.errstate(all="ignore")
     def vjp(self, columns: Sequence, cotangents: Sequence) -> list:
         """Σ cotangentₖ ∂outputₖ/∂input for every input, each of shape (S,); None where nothing flows there.
 
@@ -105,26 +101,45 @@ class StraightLine:
         columns, precision, count = self._prepare_columns(columns)
         states = max([count, *[np.size(x) for x in cotangents]])
         inputs: list = [None] * len(columns)
-        for part in self.groups.parts(states):
-            size, here = part.stop - part.start, [_cut(x, part) for x in columns]
-            values = self.groups.values(here, precision, size if count > 1 else 1)
-            flows = self.groups.transpose(values, [_cut(x, part) for x in cotangents], size)
-            for i, flow in flows.items():
-                if inputs[i] is None:
-                    inputs[i] = np.zeros(states, precision)
-                inputs[i][part] = flow
+        for part in self._parts(states):
+            values = _values(self._steps(precision), [_cut(x, part) for x in columns], keep=True)
+            flows: dict[int, Any] = {}
+            for i, cotangent in zip(self.outputs, cotangents, strict=True):
+                if cotangent is not None and self.kinds[i] == "float":
+                    flows[i] = flows.get(i, 0.0) + np.broadcast_to(_cut(cotangent, part), part.stop - part.start)
+            for k in range(len(self.nodes) - 1, -1, -1):
+                (op, operands, attribute), flow = self.nodes[k], flows.pop(k, None)
+                if flow is None:
+                    continue
+                here = {attribute: flow} if op == "input" else {}
+                if op == "take":
+                    here = cotangents_of_entries(attribute, values[operands[0]], flow)
+                for i, x in here.items():
+                    if inputs[i] is None:
+                        inputs[i] = np.zeros(states, precision)
+                    inputs[i][part] += x
+                for i, partial in self._partials(k, values):
+                    flows[i] = flows.get(i, 0.0) + partial(flow)
         return inputs
+
+    def _partials(self, k: int, values: Sequence) -> Iterator[tuple[int, Callable]]:
+        """The float operands of node k that are no constants, each with x ↦ x ∂node/∂operand at these values."""
+        op, operands, _ = self.nodes[k]
+        of = [values[i] for i in operands]
+        for i, partial in zip(operands, OPERATIONS[op].transpose() if operands else (), strict=False):
+            if partial is not None and self.kinds[i] == "float" and self.nodes[i][0] != "constant":
+                yield i, lambda x, partial=partial: partial(apply_in_numpy, float, x, values[k], *of)
+
+    def _parts(self, states: int) -> list[slice]:
+        size = max(1, min(CHUNK, _MOST_KEPT // (1 + len(self.nodes))))
+        return [slice(start, min(start + size, states)) for start in range(0, states, size)]
 
     # ---- what is derived from it ----
 
     @functools.cached_property
-    def groups(self) -> "Groups":
-        return Groups.from_line(self)
-
-    @functools.cached_property
-    def _steps(self) -> dict[np.dtype, list]:
+    def _steps(self) -> Callable[[np.dtype], list]:
         """Its calls of NumPy one after the other, by precision: they take longer to write down than to do."""
-        return {}
+        return functools.cache(functools.partial(_steps_of, self))
 
     @functools.cached_property
     def _inputs(self) -> dict[int, str]:
@@ -145,7 +160,7 @@ class StraightLine:
         return typed, precision, max(sizes, default=1)
 
 
-def _cut(x, part: slice):
+def _cut(x, part: slice) -> Any:
     """The numbers of some states; one that is shared by all states stays."""
     return x if x is None or np.size(x) == 1 else x[part]
 
@@ -184,7 +199,7 @@ def _convert(x, dtype):
     return np.asarray(x).astype(dtype)
 
 
-def _values(steps: list, columns: Sequence) -> list:
+def _values(steps: list, columns: Sequence, keep: bool = False) -> list:
     values: list = [None] * len(steps)
     for k, (function, operands, (is_input, attribute), dropped) in enumerate(steps):
         if function is None:
@@ -195,164 +210,6 @@ def _values(steps: list, columns: Sequence) -> list:
             values[k] = function(*[values[i] for i in operands])
         else:
             values[k] = function(*[values[i] for i in operands], attribute)
-        for i in dropped:
+        for i in () if keep else dropped:
             values[i] = None
     return values
-
-
-# ---- group by group --------------------------------------------------------------------------------------------------
-
-
-def group_by_level(operations: Iterable[tuple[Any, Sequence, Sequence]], nodes: int) -> dict[tuple, list[int]]:
-    """Operations by (level, kind): those of one kind that wait for equally many others, and so not for each other.
-
-    They are given by their kinds, the nodes that they read and those that they make (-1: none), of this many `nodes`.
-    """
-    levels, alike = [-1] * (nodes + 1), {}
-    for k, (kind, operands, results) in enumerate(operations):
-        level = 1 + max([levels[i] for i in operands], default=-1)
-        for i in results:
-            levels[i] = level
-        alike.setdefault((level, kind), []).append(k)
-    return alike
-
-
-class NodeGroup(NamedTuple):
-    """Nodes of one operation and one kind: their rows among the values of that kind, and those of each operand."""
-
-    op: str
-    attribute: Any
-    kind: str
-    rows: np.ndarray
-    operands: tuple[tuple[str, np.ndarray], ...]
-
-
-class Groups(NamedTuple):
-    """A straight line in groups, `each` in an order in which they can be evaluated.
-
-    - `counts`: how many nodes each kind has.
-    - `constants`: the rows of constants of each kind, and their values; `inputs`: the same with positions of inputs.
-    - `outputs`: the rows of outputs of each kind, and their positions.
-    """
-
-    counts: dict[str, int]
-    constants: dict[str, tuple[np.ndarray, np.ndarray]]
-    inputs: dict[str, tuple[np.ndarray, np.ndarray]]
-    each: tuple[NodeGroup, ...]
-    outputs: dict[str, tuple[np.ndarray, np.ndarray]]
-
-    @classmethod
-    def from_line(cls, line: StraightLine) -> "Groups":
-        nodes, kinds, counts, each_row = line.nodes, line.kinds, {"float": 0}, []
-        for kind in kinds:
-            each_row.append(counts.get(kind, 0))
-            counts[kind] = each_row[-1] + 1
-        rows, leaves, groups = np.array(each_row, np.intp), {"constant": {}, "input": {}}, []
-        alike = group_by_level(
-            (
-                ((op, attribute if operands else None, kinds[k], *[kinds[i] for i in operands]), operands, (k,))
-                for k, (op, operands, attribute) in enumerate(nodes)
-            ),
-            len(nodes),
-        )
-        for level, key in sorted(alike, key=lambda key: key[0]):
-            (op, attribute, kind, *of_operands), members = key, alike[level, key]
-            if op in leaves:
-                leaves[op][kind] = rows[members], np.array([nodes[k][2] for k in members])
-                continue
-            operands = np.array([nodes[k][1] for k in members], dtype=np.intp)
-            each = tuple((of, rows[operands[:, j]]) for j, of in enumerate(of_operands))
-            groups.append(NodeGroup(op, attribute, kind, rows[members], each))
-        positions: dict[str, list[int]] = {}
-        for position, i in enumerate(line.outputs):
-            positions.setdefault(kinds[i], []).append(position)
-        ends = {kind: (rows[[line.outputs[k] for k in of]], np.array(of)) for kind, of in positions.items()}
-        return cls(counts, leaves["constant"], leaves["input"], tuple(groups), ends)
-
-    def parts(self, count: int) -> list[slice]:
-        """The states that are looked at together."""
-        size = max(1, MOST_HELD // (1 + sum(self.counts.values())))
-        return [slice(start, min(start + size, count)) for start in range(0, count, size)]
-
-    @np.errstate(all="ignore")
-    def values(self, columns: Sequence, precision: np.dtype, states: int) -> dict[str, np.ndarray]:
-        """The values of all nodes, (count, S) for each kind."""
-        values = {kind: np.empty((count, states), _dtype(kind, precision)) for kind, count in self.counts.items()}
-        for kind, (rows, numbers) in self.constants.items():
-            values[kind][rows] = numbers[:, None]
-        for kind, (rows, positions) in self.inputs.items():
-            for row, position in zip(rows.tolist(), positions.tolist(), strict=True):
-                values[kind][row] = columns[position]
-        for op, attribute, kind, rows, of in self.each:
-            operands = [values[of_operand][x] for of_operand, x in of]
-            if op in LOOK_UPS:
-                found = np.stack([look_up(op, attribute, columns, x) for x in operands[0]])
-            elif op == "convert":
-                found = operands[0]
-            elif attribute is None:
-                found = OPERATIONS[op].value(*operands)
-            else:
-                found = OPERATIONS[op].value(*operands, attribute)
-            values[kind][rows] = found
-        return values
-
-    @np.errstate(all="ignore")
-    def round_off(self, values: dict[str, np.ndarray], eps: float) -> np.ndarray:
-        """The rounding errors of all floats with these values, (count, S)."""
-        errors = np.zeros_like(values["float"])
-        for op, _, kind, rows, of in self.each:
-            if kind == "float":
-                value, operands = values["float"][rows], [values[of_operand][x] for of_operand, x in of]
-                error = np.zeros_like(value) if OPERATIONS[op].exact else eps * np.abs(value)
-                for (of_operand, x), partial in zip(of, OPERATIONS[op].transpose(), strict=False):
-                    if partial is not None and of_operand == "float" and (given := errors[x]).any():
-                        moved = np.abs(partial(apply_in_numpy, float, given, value, *operands))
-                        error += np.where(given == 0, 0.0, moved)
-                errors[rows] = error
-        return errors
-
-    @np.errstate(all="ignore")
-    def transpose(self, values: dict[str, np.ndarray], cotangents: Sequence, states: int) -> dict[int, np.ndarray]:
-        """The cotangents of the inputs to which anything flows from those of the outputs, (states,), by position.
-
-        The values are those of all the states, or of one that has as many cotangents.
-        """
-        flows, still = np.zeros((2, self.counts["float"]), bool)
-        found, results = np.zeros((len(flows), states), values["float"].dtype), {}
-        still[self.constants.get("float", _NONE)[0]] = True  # nothing flows on from constants
-        for row, position in zip(*(x.tolist() for x in self.outputs.get("float", _NONE)), strict=True):
-            if not still[row] and cotangents[position] is not None:
-                found[row] += cotangents[position]
-                flows[row] = True
-        for op, attribute, kind, rows, of in reversed(self.each):
-            if kind != "float" or not flows[rows].any():
-                continue
-            # Where nothing flows there is no derivative: zero times an infinite one would be NaN.
-            some = slice(None) if flows[rows].all() else flows[rows]
-            rows = rows[some]
-            operands = [values[of_operand][x[some]] for of_operand, x in of]
-            here, value = found[rows], values["float"][rows]
-            if op == "take":
-                for index, g in zip(operands[0], here, strict=True):
-                    for i, flow in cotangents_of_entries(attribute, index, g).items():
-                        results[i] = results.get(i, 0.0) + flow
-            for (of_operand, x), partial in zip(of, OPERATIONS[op].transpose(), strict=False):
-                if partial is not None and of_operand == "float" and not still[x[some]].all():
-                    part = partial(apply_in_numpy, float, here, value, *operands)
-                    _add_rows(found, x[some], np.broadcast_to(part, here.shape))
-                    flows[x[some]] = True
-            flows[still] = False
-        for row, position in zip(*(x.tolist() for x in self.inputs.get("float", _NONE)), strict=True):
-            if flows[row]:
-                results[position] = results.get(position, 0.0) + found[row]
-        return results
-
-
-def _add_rows(found: np.ndarray, rows: np.ndarray, parts: np.ndarray) -> None:
-    """Add to rows, some of which may be there more than once."""
-    order = np.argsort(rows, kind="stable")
-    first = np.flatnonzero(np.diff(rows[order], prepend=-1))
-    if len(first) == len(rows):
-        found[rows] += parts
-    else:
-        found[rows[order][first]] += np.add.reduceat(parts[order], first, axis=0)

@@ -1,9 +1,6 @@
-"""Memory while graphs of millions of nodes grow: what they may take of it, and who looks through it."""
+"""Memory while graphs of millions of nodes grow: what they may take of it."""
 
-import contextlib
-import gc
 import os
-from collections.abc import Iterator
 from pathlib import Path
 
 SHARE = 0.5  # of the machine's memory, that one scene may take; JAX, other scenes and results have the rest
@@ -34,19 +31,3 @@ def lack_of_memory(needed: float) -> str | None:
     if needed <= SHARE * there:
         return None
     return f"would take some {needed / 2**30:.3g} GiB of memory at once, and this machine has {there / 2**30:.3g}"
-
-
-@contextlib.contextmanager
-def pause_collections() -> Iterator[None]:
-    """A context in which Python does not look for cycles of references.
-
-    A graph consists of tuples, none of which is part of a cycle. To walk over all of them again and again while they
-    become more takes a third of the time of a lowering. Whoever stopped it lets it go on, also among several threads.
-    """
-    enabled = gc.isenabled()
-    gc.disable()
-    try:
-        yield
-    finally:
-        if enabled:
-            gc.enable()

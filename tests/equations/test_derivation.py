@@ -10,7 +10,7 @@ import pytest
 from jax import lax
 
 import lagjax
-from lagjax import _program, scenes
+from lagjax import scenes
 from lagjax._engine import diffrax as _diffrax
 from lagjax._engine import taylor as _machine_code
 from lagjax._equations import _derivation
@@ -159,29 +159,6 @@ def test_quantities_are_those_of_the_motion(make):
     program = derivation.acceleration.complete if singular else derivation.acceleration
     expected = jax.jit(motion.acceleration)(*state)
     np.testing.assert_allclose(program.evaluate(*scalars)[:-1], expected, rtol=1e-10, atol=1e-11)
-
-
-@pytest.mark.parametrize("make", [scenes.cartesian_chain, scenes.figure_eight, lambda: scenes.chain(6)])
-def test_large_graphs_are_those_of_small_scenes(make, monkeypatch):
-    # What a graph does beyond so many nodes, as if that were few: it compares less.
-    def programs(derivation):
-        return (
-            derivation.acceleration.complete,
-            derivation.projected,
-            derivation.multipliers,
-            derivation.velocity_scales,
-        )
-
-    scene = make()
-    derivation = of(scene.system, scene.q0, scene.qdot0, scene.params)
-    small = programs(derivation)
-    monkeypatch.setattr(_program._graph, "MANY", 20)
-    large = programs(Derivation(derivation.motion, derivation.layout, scene.params))
-    x = np.random.default_rng(0).uniform(0.4, 0.9, (3, len(derivation.scalar_shapes))).T
-    for a, b in zip(small, large, strict=True):
-        if a is not None:
-            exact, found = a.evaluate_many(x), b.evaluate_many(x)
-            np.testing.assert_allclose(found, exact, rtol=1e-11, atol=1e-12 * np.abs(exact).max())
 
 
 def test_a_mass_matrix_in_blocks_costs_what_its_blocks_cost():
