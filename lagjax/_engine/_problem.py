@@ -138,6 +138,12 @@ class Problem:
         return all(map(is_concrete, (self.ts, self.y0, self.vector)))
 
     @property
+    def varies(self) -> bool:
+        """True if an input is of the type that `jax.shard_map` gives by default to what differs between devices."""
+        inputs = self.ts, self.y0, *jax.tree.leaves(self.numbers)
+        return any(isinstance(x, jax.core.Tracer) and bool(jax.typeof(x).mat.varying) for x in inputs)
+
+    @property
     def is_single(self) -> bool:
         return self.layout.dtype == SINGLE
 

@@ -30,7 +30,7 @@ from lagjax._engine._problem import (
 from lagjax._engine._stop_reason import End, what_stopped
 from lagjax._engine.diffrax._equations import ArrayEquations as ArrayEquations
 from lagjax._engine.diffrax._equations import MotionEquations, form_of
-from lagjax._engine.diffrax._integrate import Jumps, Method, WithJumps, integrate
+from lagjax._engine.diffrax._integrate import Converted, Jumps, Method, WithJumps, integrate
 from lagjax._engine.diffrax._jumps import freeze
 from lagjax._engine.diffrax._solvers import FineOutput, Projected
 from lagjax._equations import LEAST_COORDINATES
@@ -92,6 +92,8 @@ class Diffrax(AbstractEngine, eqx.Module):
                 "(`System.explain` says why a scene is not for it). Or round the jump off over a width that steps "
                 "resolve, 0.5 * (1 + jnp.tanh(x / w)) for x > 0, hold='cubic' for samples"
             )
+        if problem.varies:
+            return "diffrax does not know the types of jax.shard_map: give it check_vma=False"
         if self.dt is None:
             return too_tight(self.rtol(problem), problem.layout.dtype, LEAST_RTOL)
         if not (is_concrete(self.dt) and is_concrete(problem.ts)):
@@ -240,7 +242,7 @@ def _explain_result(solution: Solution, form: MotionEquations, start: RESULTS, t
     result = RESULTS.where(unhealthy, end, result)
     result = RESULTS.where(start == RESULTS.successful, result, start)
 
-    field = freeze(eqx.filter_closure_convert(form.acceleration, ts[0], last, numbers))
+    field = freeze(Converted.from_function(form.acceleration, ts[0], last, numbers))
 
     def acceleration(t, y):
         return field(t, halves(y), numbers)[0]

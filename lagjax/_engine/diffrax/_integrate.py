@@ -20,13 +20,14 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend import core
 
 from lagjax._engine._problem import Solution
 from lagjax._engine.diffrax._equations import MotionEquations
 from lagjax._engine.diffrax._jumps import AdaptiveWrapper, Noting, NotingAdaptive, freeze, may_jump
 from lagjax._engine.diffrax._solvers import Projected
 from lagjax._interface import ENDED_WELL, RESULTS, SUCCESSFUL, code_of, halves
-from lagjax._primitives import differentiable_where
+from lagjax._primitives import differentiable_where, vary_alike
 
 PyTree = Any
 
@@ -43,6 +44,27 @@ class Method(eqx.Module):
     max_steps: int = eqx.field(static=True)
     progress: diffrax.AbstractProgressMeter
     jumps: "Jumps | None" = None
+
+
+class Converted(eqx.Module):
+    """A function whose closed-over arrays, `constants`, are its leaves.
+
+    `equinox.filter_closure_convert` insists on arguments that vary along the same axes of a mesh as the examples: under
+    `jax.shard_map` a start that all members share does not, and a state on the way does.
+    """
+
+    constants: list
+    jaxpr: Any = eqx.field(static=True)
+    structure: Any = eqx.field(static=True)
+
+    @classmethod
+    def from_function(cls, function: Callable, *examples: PyTree) -> "Converted":
+        closed, shapes = jax.make_jaxpr(function, return_shape=True)(*examples)
+        return cls(closed.consts, closed.jaxpr, jax.tree.structure(shapes))
+
+    def __call__(self, *arguments: PyTree) -> PyTree:
+        results = core.jaxpr_as_fun(core.ClosedJaxpr(self.jaxpr, self.constants))(*jax.tree.leaves(arguments))
+        return jax.tree.unflatten(self.structure, results)
 
 
 def integrate(
@@ -70,8 +92,10 @@ def integrate(
     def projected(t, y, params):
         return jnp.concatenate(form.projected(t, halves(y), params))
 
-    field = eqx.filter_closure_convert(vector_field, ts[0], y0, params)
-    project = eqx.filter_closure_convert(projected, ts[0], y0, params) if form.constrained else None
+    leaves, structure = jax.tree.flatten((ts, y0, params))
+    ts, y0, params = structure.unflatten(vary_alike(leaves))
+    field = Converted.from_function(vector_field, ts[0], y0, params)
+    project = Converted.from_function(projected, ts[0], y0, params) if form.constrained else None
     jumps = functools.partial(may_jump, form.motion)
     solution = _differentiable((field, project, ts, y0, params), method, jumps, adjoint, event)
     if project is not None:
