@@ -81,14 +81,14 @@ def crosses(field, varied, begin, end, params) -> jax.Array:
     size = _MOVED[dtype] * (jnp.abs(y0) + jnp.abs(y1 - y0) + 1e-3 * jnp.abs(y0).max())
     signs = np.random.default_rng(0).choice([-1.0, 1.0], (_DRAWS, y0.size))
 
-    def beside(at):
+    def accelerate_nearby(at):
         signs, by = at
         other, numbers = _perturb((field, params), varied, by)
         return other(t, y + signs * size, numbers)[n:]
 
     signs = jnp.asarray(np.concatenate([signs, -signs, np.zeros((2, y0.size))]), dtype)
     by = jnp.asarray([*[0.0] * 2 * _DRAWS, _MOVED[dtype], -_MOVED[dtype]], dtype)
-    around = jax.lax.map(beside, (signs, by))
+    around = jax.lax.map(accelerate_nearby, (signs, by))
     return jumps & (jnp.abs(around - of_low).max(axis=1) > 0.5 * change).any()
 
 
