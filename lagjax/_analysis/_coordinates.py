@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 
+from lagjax._analysis._scene_state import require_matrices
 from lagjax._analysis._solve import is_root, newton, shortest_preimage, shortest_solution
 from lagjax._interface import Function, Layout, accept, present
 from lagjax._primitives import nan_unless
@@ -127,6 +128,7 @@ def _new_state(place: Function, q: PyTree, qdot: PyTree, guess: PyTree, t, param
             f"There are {new.size} new coordinates for {old.size} old ones: a state has new coordinates where both are "
             "as many. Where the old ones are constrained, compute the new ones by hand."
         )
+    require_matrices(old.size, "A change to new coordinates", "Write the inverse function yourself, and its jax.jvp.")
     t, wanted = jnp.asarray(t, old.dtype), old.flatten(q)
 
     def residual(x, t):

@@ -13,8 +13,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from lagjax._analysis._scene_state import SceneState
-from lagjax._analysis._solve import is_root, newton, shortest_preimage
-from lagjax._equations import has_constraints
+from lagjax._analysis._solve import STEPS, is_root, newton, shortest_preimage
+from lagjax._equations import SparseMotion, has_constraints
 from lagjax._interface import Layout, as_arrays, compile_for_one_call
 from lagjax._primitives import nan_unless
 from lagjax._run import simulate
@@ -117,7 +117,35 @@ def _transform_flat(t, *arguments) -> tuple[Vector, Vector, Array]:
     def residual(v):
         return motion.momentum(q, v, t, scene.numbers) - p
 
-    v = jax.lax.custom_root(residual, jnp.zeros_like(p), newton, shortest_preimage)
-    v = nan_unless(jax.lax.stop_gradient(is_root(residual, v, p)), v)
+    rest = jnp.zeros_like(p)
+    if isinstance(motion, SparseMotion):
+        v = jax.lax.custom_root(residual, rest, *_sparse_newton(motion, q, t, scene.numbers))
+        size = jnp.max(jnp.abs(p), initial=0) + jnp.max(jnp.abs(residual(rest)), initial=0)
+        found = jnp.max(jnp.abs(residual(v)), initial=0) <= jnp.finfo(p.dtype).eps ** 0.6 * size
+    else:
+        v = jax.lax.custom_root(residual, rest, newton, shortest_preimage)
+        found = is_root(residual, v, p)
+    v = nan_unless(jax.lax.stop_gradient(found), v)
     at = q, v, t, scene.numbers
     return v, motion.generalized_force(*at), motion.energy(*at) - residual(v) @ v
+
+
+def _sparse_newton(motion: SparseMotion, q: Vector, t, numbers: PyTree) -> tuple[Callable, Callable]:
+    """How to find a root of p(q, v) by v, and to solve with its derivative M, for `jax.lax.custom_root`: by pattern."""
+
+    def solve(multiply, right):
+        mass = motion.structure.mass.prepare(multiply, q.dtype)
+        return jax.lax.custom_linear_solve(multiply, right, lambda _, b: mass.solve(b), symmetric=True)
+
+    def find(residual, v):
+        def once(carry):
+            v, _, count = carry
+            step = solve(motion.mass_product(q, v, t, numbers), residual(v))
+            return v - step, jnp.max(jnp.abs(step), initial=0) / jnp.max(jnp.abs(v - step), initial=1e-300), count + 1
+
+        def moves(carry):
+            return (carry[1] > 1e-14) & (carry[2] < STEPS)
+
+        return jax.lax.while_loop(moves, once, (v, jnp.ones((), q.dtype), 0))[0]
+
+    return find, solve

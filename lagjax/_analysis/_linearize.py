@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lagjax._analysis._equilibrium import least_multipliers
-from lagjax._analysis._scene_state import SceneState
+from lagjax._analysis._scene_state import SceneState, require_matrices
 from lagjax._analysis._smoothness import is_smooth, require_smooth
 from lagjax._equations import diagonal_scale, factorize, saddle
 from lagjax._interface import compile_for_one_call, is_known, show_str
@@ -78,6 +78,12 @@ def linearize(system: System, q: PyTree, qdot: PyTree = None, params: PyTree = N
     print(lagjax.linearize(pendulum, 0.0).A)  # [[0, 1], [-9.81, 0]]
     ```
     """
+    require_matrices(
+        sum(map(np.size, jax.tree.leaves(q))),
+        "A linearization",
+        "The lowest modes are normal_modes(system, q, params, count=50); jax.jvp of system.acceleration gives the "
+        "acceleration of one deviation.",
+    )
     scene = SceneState.from_state(system, q, qdot, params)
     scene.require_autonomous("A linearization")
     require_smooth(scene, "A linearization")

@@ -28,9 +28,10 @@ Vector = Float[Array, " n"]
 def cyclic_coordinates(system: System, q: PyTree, qdot: PyTree, params: PyTree = None) -> tuple[str, ...]:
     r"""The names of the coordinates that L does not depend on, as `q['phi']`.
 
-    They are read off the scalar program of L, in which no operation uses them: the answer holds for every state, time
-    and parameter. The momentum of a cyclic coordinate is conserved where no force, and no constraint force, acts on it;
-    `conserved_quantities` tells which are. Of q and qdot only the structure matters.
+    They are read off the scalar program of L, or its pattern where that is large, in which no operation uses them: the
+    answer holds for every state, time and parameter. The momentum of a cyclic coordinate is conserved where no force,
+    and no constraint force, acts on it; `conserved_quantities` tells which are. Of q and qdot only the structure
+    matters.
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, or where L has no scalar program.
 
@@ -44,6 +45,8 @@ def cyclic_coordinates(system: System, q: PyTree, qdot: PyTree, params: PyTree =
     ```
     """
     scene = SceneState.from_state(system, q, qdot, params)
+    if scene.derivation.structure is not None:
+        return tuple(scene.layout.names[i] for i in scene.unread)
     try:
         read = scene.derivation.reads("lagrangian")
     except Unlowerable as reason:

@@ -74,7 +74,8 @@ def routhian(system: System, q: PyTree, qdot: PyTree, params: PyTree = None) -> 
     left = np.array([i for i in range(layout.size) if i not in gone], int)
     if not len(gone) or not len(left):
         what = "every coordinate is" if len(gone) else "no coordinate is"
-        raise ValueError(f"There is nothing to reduce: {what} cyclic ({', '.join(layout.names)}).")
+        more = ", …" if layout.size > 8 else ""
+        raise ValueError(f"There is nothing to reduce: {what} cyclic ({', '.join(layout.names[:8])}{more}).")
     whole = _CyclicSplit(scene.system, layout, left, gone)
     extras = {*system.lagrangian.extras, "params"}
     reduced = System(restrict_signature(whole.routh, extras), path=system.path)  # pyright: ignore[reportArgumentType]

@@ -18,6 +18,7 @@ from lagjax._equations import (
     borders_of,
     derivation_of,
     has_constraints,
+    jacobian_pattern,
     pieces_of_motion,
 )
 from lagjax._interface import Layout, as_arrays, is_concrete, require_finite
@@ -30,6 +31,18 @@ Vector = Float[Array, " n"]
 # Coordinates up to which sparse matrices are treated as dense ones: eigenvalues and roots take 5 s there, and ten times
 # as long for twice as many.
 _LARGEST_DENSE = 200
+# Coordinates beyond which nothing is begun that takes n × n numbers, 8 MB a matrix, of which there may be a hundred,
+# and n³ operations, which take a minute. Doubled, ten.
+_LARGEST_MATRIX = 1000
+
+
+def require_matrices(size: int, what: str, advice: str) -> None:
+    """Raise `ValueError`, with the `advice`, where `what` takes matrices that are too large for so many coordinates."""
+    if size > _LARGEST_MATRIX:
+        raise ValueError(
+            f"{what}: not tried for {size} coordinates, which takes matrices of n × n numbers, {8e-9 * size**2:.2g} GB "
+            f"each, and some n³ operations. {advice}"
+        )
 
 
 class SceneState(NamedTuple):
@@ -120,8 +133,18 @@ class SceneState(NamedTuple):
             )
 
     @property
+    def unread(self) -> tuple[int, ...]:
+        """The coordinates that L does not depend on, of a scene with a `Structure`: by its pattern."""
+        lagrangian, shapes = self.derivation.motion.lagrangian, self.derivation.state_shapes
+        pattern = jacobian_pattern(lambda *state: lagrangian(*state)[None], shapes, by=0)
+        return () if pattern is None else tuple(np.setdiff1d(np.arange(self.layout.size), pattern.indices).tolist())
+
+    @property
     def conserved(self) -> tuple[int, ...]:
         """The coordinates that nothing depends on and nothing acts on, read off the scene's programs."""
+        if self.derivation.structure is not None:
+            acts = self.constrained or self.motion.forces is not None or self.motion.dissipation is not None
+            return () if acts else self.unread
         if self.lowered is None:
             return ()
         names = "lagrangian", "nonconservative_force", "residual"

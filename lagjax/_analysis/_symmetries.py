@@ -20,7 +20,7 @@ from lagjax._analysis._gauge import changes_of, gauge_of, is_right
 from lagjax._analysis._noether import FlatState, charge_at, euler_lagrange, flat_generator, variation
 from lagjax._analysis._potential import absorb_potential_forces
 from lagjax._analysis._random_states import perturb_last_digits, random_states
-from lagjax._analysis._scene_state import SceneState
+from lagjax._analysis._scene_state import SceneState, require_matrices
 from lagjax._analysis._transformations import Fields, fields_of, textbook_symmetries
 from lagjax._equations import decide, span_outside
 from lagjax._interface import Layout, accept, compile_for_one_call, show_str
@@ -146,6 +146,12 @@ def conserved_quantities(
     print(lagjax.conserved_quantities(kepler, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.2])))  # energy, angular momentum
     ```
     """
+    require_matrices(
+        sum(map(np.size, jax.tree.leaves(q))),
+        "A search for symmetries",
+        "Which coordinates are cyclic, cyclic_coordinates(system, q, qdot, params) tells; of a symmetry that you know, "
+        "noether_charge(system, generator) is what it conserves, as the total momentum by a generator of ones.",
+    )
     scene = SceneState.from_state(system, q, qdot, params)
     if not scene.concrete:
         raise ValueError("conserved_quantities looks at numbers: call it outside of jit, vmap and grad, on one state.")

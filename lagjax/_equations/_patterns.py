@@ -21,6 +21,8 @@ PyTree = Any
 # Entries that asdex visits one by one in Python, at some 10 µs each, to follow a product of matrices. Doubled, a
 # pattern takes up to 4 s.
 _VISITED = 200_000
+# Operations of which each number depends on all others of a row.
+_READS_ALL = "cumsum", "cumprod", "cummax", "cummin", "cumlogsumexp", "fft"
 # Products that read off a sparse matrix, some 0.2 ms each at 10⁴ coordinates. More is a matrix that is dense in places.
 _MOST_PRODUCTS = 1000
 
@@ -115,7 +117,7 @@ def count_operations(jaxpr) -> int:
 
 
 def _visited(jaxpr) -> int:
-    """The products of two numbers in products of matrices."""
+    """The products of two numbers in products of matrices, and the numbers that running sums and transforms read."""
     count = 0
     for equation in jaxpr.eqns:
         for x in jax.tree.leaves(equation.params, is_leaf=_is_jaxpr):
@@ -124,6 +126,9 @@ def _visited(jaxpr) -> int:
             (contracted, _), _ = equation.params["dimension_numbers"]
             shape = equation.invars[0].aval.shape
             count += int(np.prod([shape[i] for i in contracted]) * np.prod(equation.outvars[0].aval.shape))
+        elif equation.primitive.name in _READS_ALL:
+            x = equation.invars[0].aval
+            count += x.size * x.shape[equation.params.get("axis", -1)]
     return count
 
 

@@ -99,6 +99,32 @@ def test_a_ring_falls_from_its_unstable_equilibrium():
     assert modes.stable and np.abs(stable.q).max() > 0.9
 
 
+def test_other_forms_of_a_large_scene():
+    n = 4000
+    q, v = jnp.asarray(np.random.default_rng(0).normal(size=(2, n)))
+    loose = lagjax.System(lambda q, v: PHI4.lagrangian(q[1:], v[1:]) + 0.5 * v[0] ** 2 * (1 + q[1] ** 2))
+    assert lagjax.cyclic_coordinates(loose, q, v) == ("q[0]",)
+    canonical = lagjax.hamiltonian(loose)
+    p = canonical.momentum(q, v)
+    np.testing.assert_allclose(canonical.velocity(q, p), v, rtol=1e-12)
+    np.testing.assert_allclose(canonical.energy(q, p), loose.energy(q, v), rtol=1e-12)
+    assert lagjax.same_motion(PHI4, lagjax.System(lambda q, v: 3 * phi4(q, v)), q, v)
+    total = lagjax.noether_charge(RING, jnp.ones_like)
+    np.testing.assert_allclose(total(q, v), jnp.sum(v), rtol=1e-12)
+
+
+def test_advice_for_large_scenes():
+    n, q = 4000, jnp.ones(4000)
+    along = jnp.cos(jnp.arange(n))
+    _, change = jax.jvp(lambda q: PHI4.acceleration(q, jnp.zeros(n)), (q,), (along,))
+    by_hand = jnp.roll(along, 1) + jnp.roll(along, -1) - 4 * along
+    np.testing.assert_allclose(change, by_hand, atol=1e-12)
+    ends = [lagjax.simulate(PHI4, q + x * along, jnp.zeros(n), jnp.array([0.0, 1.0])).q[-1] for x in (0.0, 1e-8)]
+    part = (ends[1] - ends[0]) / 1e-8
+    waves = 2 + 2 * (1 - np.cos(1.0))  # of cos(i), but for the seam of the ring
+    np.testing.assert_allclose(part[100:-100], along[100:-100] * np.cos(np.sqrt(waves)), atol=1e-5)
+
+
 def test_few_modes_of_a_small_scene():
     pendulums = lagjax.System(lambda q, v: 0.5 * v @ v + jnp.sum(jnp.cos(q)) - 0.5 * jnp.sum(jnp.diff(q) ** 2))
     all_modes, two = (lagjax.normal_modes(pendulums, jnp.zeros(4), count=count) for count in (None, 2))
@@ -122,6 +148,11 @@ def test_few_modes_of_a_small_scene():
             lambda: lagjax.equilibrium(lagjax.System(lambda q, v: ring(q, v) - jnp.sum(q)), jnp.zeros(300)),
             "the derivative of the forces is singular at the guess",
         ),
+        (lambda: lagjax.linearize(RING, jnp.zeros(4000)), r"not tried for 4000 coordinates.*0.13 GB.*normal_modes"),
+        (lambda: lagjax.conserved_quantities(RING, *jnp.zeros((2, 4000))), "search for symmetries.*noether_charge"),
+        (lambda: lagjax.periodic_orbit(RING, *jnp.zeros((2, 4000)), 1.0), "Periodic orbits: not tried.*two runs"),
+        (lambda: lagjax.find_path(RING, *jnp.zeros((2, 4000)), 0.0, 1.0), "Paths: not tried"),
+        (lambda: lagjax.routhian(PHI4, *jnp.ones((2, 4000))), "no coordinate is cyclic"),
         (lambda: jax.grad(lambda q: jnp.sum(lagjax.equilibrium(PHI4, q).q))(jnp.ones(300)), "outside of jit"),
     ],
 )

@@ -11,6 +11,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lagjax._analysis._scene_state import require_matrices
 from lagjax._analysis.orbits._flat_starts import require_untraced
 from lagjax._engine import Problem
 from lagjax._engine.taylor import KEPT, MachineCode, Motions, flow_of, jvp, tolerances_of
@@ -92,6 +93,12 @@ class Arcs:
                 f"{what} cannot be found with constraints yet: give the scene coordinates that need none, angles of "
                 "links instead of positions of their ends."
             )
+        require_matrices(
+            layout.size,
+            what,
+            "simulate follows such motions, and two runs of it that begin 1e-8 apart tell how fast motions part; give "
+            "fewer coordinates for more.",
+        )
         problem = Problem.from_system(system, layout, params, rtol=rtol, max_steps=_BUDGET)
         if refusal := MachineCode().refuses(problem):
             raise ValueError(f"{what} are found with machine code, and there is none for this scene: {refusal}.")
