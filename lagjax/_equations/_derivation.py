@@ -140,7 +140,7 @@ class Derivation:
         self.structure = None if path == "scalar" else self._structure_of(motion, path == "array")
         if self.structure is not None:
             self.motion = SparseMotion(*vars(motion).values(), structure=self.structure)
-            self.refusal = f"of {layout.size} coordinates {self.structure}, which suits arrays better"
+            self.refusal = f"it has {layout.size} coordinates, {self.structure}, and arrays suit that better"
         self._made: dict[str, Any] = {}
         self._lock = threading.RLock()
         self._programs: dict[tuple[str, ...], Program] = {}

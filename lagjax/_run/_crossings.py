@@ -216,7 +216,10 @@ def surfaces_in(problem: Problem, functions, directions, names) -> Surfaces:
         if refusal := MachineCode().refuses_crossings(problem, surfaces):
             raise Unlowerable(refusal)
     except Unlowerable as reason:
-        text = f"crossings are found with machine code, and there is none for this scene: {reason}."
+        text = (
+            f"crossings are found with machine code, and there is none for this scene: {reason}. simulate(..., event=…) "
+            "stops at one, also in a large scene; it goes on from there."
+        )
         raise ValueError(text) from None
     for k in range(len(functions)):
         if not surfaces.values.depends(k) & set(range(2 * problem.layout.size + 1)):
