@@ -245,7 +245,7 @@ class Derivation:
 
     def round_off(self, names: Sequence[str], columns: Sequence) -> dict[str, np.ndarray]:
         """The rounding errors of these quantities at S states, each of shape (S, …)."""
-        return self._split_outputs(names, self.program(*names).round_off_many(columns))
+        return self._split_outputs(names, self.program(*names).line.round_off(columns))
 
     def _split_outputs(self, names: Sequence[str], outputs: np.ndarray) -> dict[str, np.ndarray]:
         rows, values, start = outputs.T, {}, 0

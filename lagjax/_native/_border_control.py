@@ -24,6 +24,7 @@ from lagjax._native._taylor import TaylorSeries, integer
 from lagjax._program import _borders
 from lagjax._program._borders import BELOW, FALLS, GROWS, SQUARED, UP_TO, Feature
 from lagjax._program._jump import Jump, Nesting
+from lagjax._program._passes import eliminate_dead_code
 
 NOWHERE = 1e300  # a level that no switching number comes to
 _AT_END = 16.0  # roundings of the time by which the end of a motion may miss an instant and is still taken to be there
@@ -339,7 +340,8 @@ class BorderControl:
 
         A motion that slides along another border, or touches it, does so no more where that jumps.
         """
-        shaken, line, code = self.borders.shaken, self.borders.switching, frame.code
+        shaken, code = self.borders.shaken, frame.code
+        line = eliminate_dead_code(self.borders.program.line, [self.borders.switches[j] for j in shaken])
         before = self.motion.evaluate_now(frame, line) if shaken else []
         before = [code.variable(before[k]) for k in range(len(shaken))]
         self._go_beyond(frame)

@@ -21,7 +21,7 @@ from lagjax._native._roots import Roots, Touch
 from lagjax._native._run_records import Output
 from lagjax._native._step import StepControl
 from lagjax._native._taylor import TaylorSeries, double
-from lagjax._program._borders import reads_inputs
+from lagjax._program._borders import inputs_below
 
 
 class Change(IntEnum):
@@ -40,7 +40,8 @@ class Events:
         self.first = motion.series.followed - self.count
         program = motion.program
         outputs = program.line.outputs[len(program.line.outputs) - self.count :]
-        piecewise = reads_inputs(program.line, outputs, program.size - motion.pieces)
+        first_piece = program.size - motion.pieces
+        piecewise = [max(inputs_below(program.line, [i]), default=-1) >= first_piece for i in outputs]
         self.can_jump = any(piecewise)
         self.table = integers(motion.module, np.array(list(zip(guards.directions, piecewise, strict=True)), np.int64))
         self.guard = self._guard()

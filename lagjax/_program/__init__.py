@@ -204,28 +204,20 @@ class Program:
         return self.line.looks_up
 
     def compute_outputs(self, first, numbers) -> tuple:
-        """The outputs at inputs `first` (m,), then `numbers` (P,), which stay one array where they are many."""
-        if self.looks_up or self.size > LARGEST_UNFOLDED:
-            return self.compute_rows(first, numbers)
-        return self(*first, *numbers)
+        """The outputs at inputs `first` (m,), then `numbers` (P,), which stay one array where they are many.
 
-    def compute_rows(self, first, numbers) -> tuple:
-        """The outputs at the inputs `first` (…, m), then `numbers` (…, P), most of which are only looked up.
-
-        Its derivatives are those of the operations as they stand.
+        There derivatives are those of the operations as they stand.
         """
-        return emit_rows(self.line, Rows(first, numbers))
+        if self.looks_up or self.size > LARGEST_UNFOLDED:
+            return emit_rows(self.line, Rows(first, numbers))
+        return self(*first, *numbers)
 
     @property
     def size(self) -> int:
         return len(self.dtypes)
 
-    @property
-    def dtypes(self) -> tuple[np.dtype, ...]:
-        return self._dtypes
-
     @functools.cached_property
-    def _dtypes(self) -> tuple[np.dtype, ...]:
+    def dtypes(self) -> tuple[np.dtype, ...]:
         return tuple(dtype for shape in self.shapes for dtype in [shape.dtype] * math.prod(shape.shape))
 
     def evaluate(self, *numbers) -> np.ndarray:
@@ -239,18 +231,6 @@ class Program:
         columns.
         """
         return self.line.evaluate(columns)
-
-    def round_off_many(self, columns) -> np.ndarray:
-        """The rounding error of every output at S states, shape (outputs, S), to first order."""
-        return self.line.round_off(columns)
-
-    def vjp_many(self, columns, cotangents) -> list:
-        """Σₖ cotangentₖ ∂outputₖ/∂input for every input, in NumPy; None where nothing flows to an input.
-
-        Of the operations as they stand here, without the user's own rules for derivatives. All of the values are kept
-        in between: some hundred states at once are enough.
-        """
-        return self.line.vjp(columns, cotangents)
 
     def append_inputs(self, count: int) -> "Program":
         """The program with `count` more floats after its inputs; it reads none of them."""

@@ -163,11 +163,8 @@ class Borders(NamedTuple):
 
     @property
     def releases(self) -> list[int]:
-        return [
-            g
-            for g, guard in enumerate(self.guards)
-            if guard.on >= 0 and self.kinds[self.guards[guard.on].piece] == CONE
-        ]
+        kinds = {g: self.kinds[self.guards[guard.on].piece] for g, guard in enumerate(self.guards) if guard.on >= 0}
+        return [g for g, kind in kinds.items() if kind == CONE]
 
     @property
     def clocks(self) -> tuple[int, ...]:
@@ -194,11 +191,6 @@ class Borders(NamedTuple):
         return tuple(shaken)
 
     @property
-    def switching(self) -> StraightLine:
-        nodes = [self.switches[j] for j in self.shaken]
-        return eliminate_dead_code(self.program.line, nodes)
-
-    @property
     def followed(self) -> tuple[int, ...]:
         return self.switches + self.arguments
 
@@ -209,7 +201,7 @@ class Borders(NamedTuple):
 
     def read_by(self, node: int) -> frozenset[int]:
         """The inputs that a node of the program depends on; pieces are the last ones."""
-        return _inputs_below(self.program.line, [node])
+        return inputs_below(self.program.line, [node])
 
 
 def borders(program: Recurrent, size: int, slides: bool = True, watched: int = 0) -> Borders | None:
@@ -627,16 +619,16 @@ class _Rewriting:
         first, jumping = self.program.size, {}
         search = Jumping(line, self._decide(len(self.switches), ()), self.switches, n, first)
         for nodes in ([of.lagrangian, *of.momentum], of.rates):
-            read = _inputs_below(line, nodes)
+            read = inputs_below(line, nodes)
             candidates = [j for j in range(len(self.switches)) if first + j in read]
             found = search.find(candidates, nodes, self._levels) if candidates else {}
             jumping |= {j: nodes is of.rates for j, jumps in found.items() if jumps}
         for j in sorted(jumping, reverse=True):  # beyond a piece that others are decided by, these may be other ones
-            decided_by = {i - first for i in _inputs_below(line, [self.switches[j]]) if i >= first}
+            decided_by = {i - first for i in inputs_below(line, [self.switches[j]]) if i >= first}
             jumping |= {k: jumping[j] for k in decided_by if k not in jumping}
 
         def reads_velocity(nodes):
-            return not _inputs_below(line, nodes).isdisjoint(range(n, 2 * n))
+            return not inputs_below(line, nodes).isdisjoint(range(n, 2 * n))
 
         is_quadratic = not reads_velocity([*of.mass_matrix, *of.jacobian])
         reasons: dict[int, str | None] = {}
@@ -677,7 +669,7 @@ class _Rewriting:
         refused = tuple((j, reason) for j, reason in kicking.items() if reason is not None)
         if refused or not kicking:
             return Kick(StraightLine((), (), ()), tuple(kicking), refused)
-        spatial = [j for j in kicking if not _inputs_below(line, [switches[j]]).isdisjoint(range(n))]
+        spatial = [j for j in kicking if not inputs_below(line, [switches[j]]).isdisjoint(range(n))]
         moves = any(t is not None and t.table.numbers is None for t in self.tables)
         return Kick(kick_line(line, of, switches, spatial, n, size, m if moves else 0), tuple(kicking))
 
@@ -701,7 +693,7 @@ class _Rewriting:
                 continue
             if kind == SIGN and self.pieces[j] not in self._jumping:
                 continue
-            read = _inputs_below(line, [self.switches[j]])
+            read = inputs_below(line, [self.switches[j]])
             if not read.isdisjoint(range(2 * n)):
                 orders[j] = 2 if read.isdisjoint(range(n, 2 * n)) else 1
         others = [j for j in orders if self.kinds[j] not in (SIGN, CONE)]
@@ -852,7 +844,7 @@ def _below(line: StraightLine, roots: Sequence[int], instead: Mapping[int, Seque
     return seen
 
 
-def _inputs_below(line: StraightLine, roots: Sequence[int]) -> frozenset[int]:
+def inputs_below(line: StraightLine, roots: Sequence[int]) -> frozenset[int]:
     """The inputs that some nodes depend on."""
     return frozenset(line.nodes[i][2] for i in _below(line, roots) if line.nodes[i][0] == "input")
 
@@ -874,14 +866,6 @@ def with_outputs(program: Recurrent, more: StraightLine, moving: int | None = No
     line = StraightLine(tuple(graph.nodes), tuple(graph.kinds), outputs)
     mechanics = getattr(program, "mechanics", None)
     return Pieced(line, program.size, program.dtypes, program.linear, graph.budget, mechanics)
-
-
-def reads_inputs(line: StraightLine, nodes: Sequence[int], first: int) -> tuple[bool, ...]:
-    """True for each of these nodes that reads an input from number `first` on."""
-    reads: list[bool] = []
-    for op, operands, attribute in line.nodes:
-        reads.append(attribute >= first if op == "input" else any(reads[i] for i in operands))
-    return tuple(reads[i] for i in nodes)
 
 
 def _moduli(line: StraightLine) -> dict[int, tuple[int, int]]:
@@ -1005,7 +989,7 @@ def _find_cones(line: StraightLine, size: int, linear: Any) -> dict[int, int]:
         for x in guarded(nodes[root][1][0]):
             parts = _squares(line, x)
             velocities = range(size, 2 * size)
-            if parts and not any(_inputs_below(line, [u]).isdisjoint(velocities) for u in parts):
+            if parts and not any(inputs_below(line, [u]).isdisjoint(velocities) for u in parts):
                 squares[x] = cones[root] = x
     squares |= {i: x for i, x in cones.items() if nodes[i][0] == "sqrt"}
     for i, (op, operands, _) in enumerate(nodes):

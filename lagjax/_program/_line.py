@@ -95,8 +95,8 @@ class StraightLine:
         """Σ cotangentₖ ∂outputₖ/∂input for every input, each of shape (S,); None where nothing flows there.
 
         It is the derivative of this straight line of operations, in reverse as JAX would take it: NaN where a branch
-        that `select` does not take has no derivative. A cotangent is a number, an array that broadcasts with the
-        columns, or None.
+        that `select` does not take has no derivative. The user's own rules do not count. A cotangent is a number, an
+        array that broadcasts with the columns, or None.
         """
         columns, precision, count = self._prepare_columns(columns)
         states = max([count, *[np.size(x) for x in cotangents]])

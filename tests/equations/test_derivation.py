@@ -55,14 +55,14 @@ def test_every_operation_for_many_states_at_once_and_its_transpose():
     )
 
     weights = np.linspace(-1.0, 1.0, len(values))
-    pulled = program.vjp_many(x, weights)
+    pulled = program.line.vjp(x, weights)
     exact = jax.jit(jax.vmap(jax.grad(lambda x, y: weights @ everything(x, y), argnums=(0, 1))))(*x)
     np.testing.assert_allclose(pulled, exact, rtol=1e-12, atol=1e-13)
     # As a straight line of its own.
     transposed = pullback(program.line, program.dtypes, [0, 1], range(len(weights)))
     np.testing.assert_allclose(transposed.evaluate([*x, *weights]), exact, rtol=1e-12, atol=1e-13)
     # Of many outputs at one state: cotangents side by side.
-    rows = program.vjp_many(x[:, 3], np.eye(len(weights)))
+    rows = program.line.vjp(x[:, 3], np.eye(len(weights)))
     np.testing.assert_allclose(np.stack(rows) @ weights, [column[3] for column in pulled], rtol=1e-12, atol=1e-13)
 
 
@@ -72,7 +72,7 @@ def test_round_off_is_bounded_and_seen_where_terms_cancel():
 
     program, x = lower(function, 1.0, 1.0), np.random.default_rng(1).uniform(1.0, 2.0, (2, 500)).astype(np.float32)
     single, double = program.evaluate_many(x), program.evaluate_many(x.astype(float))
-    bound = program.round_off_many(x)
+    bound = program.line.round_off(x)
     assert single.dtype == np.float32 and (np.abs(single - double) <= bound).all()
     # One unit in the last place for every operation, and not many times more.
     assert (bound[2] < 4 * np.finfo(np.float32).eps * np.abs(double[2])).all() and (bound[0] > 1e-7).all()

@@ -66,7 +66,7 @@ def test_a_new_operation_is_one_row(monkeypatch):
     np.testing.assert_allclose(program.evaluate_many([x, y])[0], function(x, y), rtol=1e-12)
     np.testing.assert_allclose(jax.jit(program.__call__)(x, y)[0], function(x, y), rtol=1e-12)
     exact = jax.vmap(jax.grad(function, (0, 1)))(x, y)
-    np.testing.assert_allclose(program.vjp_many([x, y], [1.0]), exact, rtol=1e-11)
+    np.testing.assert_allclose(program.line.vjp([x, y], [1.0]), exact, rtol=1e-11)
     # Its Taylor series in machine code: q = erf(s t) solves q̈ = −2 s² erf⁻¹(q) q̇ / s.
     s = 0.8
     motion = lower(lambda q, v, t: (-2 * s * lax.erf_inv(q[0]) * v[0], False), jnp.ones(1), jnp.ones(1), 0.0)

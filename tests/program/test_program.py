@@ -641,7 +641,7 @@ def test_derivatives_in_numpy_are_those_of_the_transposed_program(monkeypatch, k
     one, many = [*x[:, 0], np.asarray(2)], [x[k] for k in range(44)]
     for at, cotangents in [(columns, [1.0, -2.0] * 22), (columns, [None, x[0], *[None] * 42]), (one, many)]:
         bars = [np.zeros(7) if x is None else np.broadcast_to(x, 7) for x in cotangents]
-        *found, of_integer = program.vjp_many(at, cotangents)
+        *found, of_integer = program.line.vjp(at, cotangents)
         assert of_integer is None
         for part, other in zip(found, transposed.evaluate([*at, *bars]), strict=True):
             np.testing.assert_allclose(0.0 if part is None else part, other, rtol=1e-11, atol=1e-12)

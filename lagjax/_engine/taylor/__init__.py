@@ -146,7 +146,8 @@ class MachineCode(AbstractEngine):
         ts, y0, params = map(jnp.asarray, (problem.ts, problem.y0, problem.vector))
         if problem.event is None:
             return _primitives.run(flow, tolerances, ts, y0, params)
-        return motion_to_event(flow, _unguarded_flow(problem), surfaces_of_event(problem), tolerances)(ts, y0, params)
+        given = flow, _unguarded_flow(problem), surfaces_of_event(problem), tolerances
+        return _primitives.compile_once(motion_to_event, *given)(ts, y0, params)
 
     def solve_to_event(self, problem: Problem, sides) -> Solution:
         """The motion of one member to the first change of its guards; it remembers `sides` (see `Guards`).
@@ -175,14 +176,15 @@ class MachineCode(AbstractEngine):
             solution = Solution._make([*(x[0] for x in solution[:-1]), None])
             return solution, Noted.read(solution.path, len(surfaces.directions))
         ts, y0, params = map(jnp.asarray, (problem.ts, problem.y0, problem.vector))
-        return motion_with_crossings(noting, flow, surfaces, tolerances)(ts, y0, params)
+        given = noting, flow, surfaces, tolerances
+        return _primitives.compile_once(motion_with_crossings, *given)(ts, y0, params)
 
     def crossing_tangents(self, problem: Problem, surfaces: Surfaces, room: int, slack: float, dy0, dparams):
         """The times of the crossings (G, room), and their tangents (D, G, room), of a problem in float64.
 
         They are along the directions `dy0` (D, 2n) of the start and `dparams` (D, P) of the parameters.
         """
-        tangents = crossing_tangents(*_flows_to_crossings(problem, surfaces, room, slack))
+        tangents = _primitives.compile_once(crossing_tangents, *_flows_to_crossings(problem, surfaces, room, slack))
         return tangents(problem.ts, problem.y0, problem.vector, dy0, dparams)
 
     def solve_batch(self, batch: Batch) -> Solution:

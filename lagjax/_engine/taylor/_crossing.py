@@ -9,7 +9,6 @@ surface itself, the state, its rate and its derivatives are then all those befor
 """
 
 import functools
-from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -108,16 +107,8 @@ def _lower_surfaces(derivation: Derivation, functions, directions, code, structu
 # ---- to the first event ----------------------------------------------------------------------------------------------
 
 
-@functools.lru_cache(maxsize=64)
-def motion_to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances) -> Callable[..., Solution]:
-    """`(ts, y0, params)` → the motion to its event, or to the last of `ts` (T,), with first and second derivatives.
-
-    As one program of XLA: a derivative outside of `jit` then compiles as one, not operation by operation.
-    """
-    return jax.jit(functools.partial(_run_to_event, guarded, flow, surfaces, tolerances))
-
-
-def _run_to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances, ts, y0, params) -> Solution:
+def motion_to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances, ts, y0, params) -> Solution:
+    """The motion to its event, or to the last of `ts` (T,), with first and second derivatives."""
     still = jax.lax.stop_gradient
     solution = jax.tree.map(still, _primitives.run(guarded, tolerances, still(ts), still(y0), still(params)))
     reached = jnp.isfinite(solution.path).all(axis=1)
@@ -158,37 +149,27 @@ def _event_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
 # ---- all crossings ---------------------------------------------------------------------------------------------------
 
 
-@functools.lru_cache(maxsize=64)
-def motion_with_crossings(
-    noting: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances
-) -> Callable[..., tuple[Solution, Noted]]:
-    """`(ts, y0, params)` → the motion to the last of `ts`, and its crossings, with first and second derivatives."""
-    return jax.jit(functools.partial(_run_with_crossings, noting, flow, surfaces, tolerances))
-
-
-@functools.lru_cache(maxsize=64)
-def crossing_tangents(noting: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances) -> Callable:
-    """`(ts, y0, params, dy0, dparams)` → the times of crossings, (G, room), and their tangents, (D, G, room).
+def crossing_tangents(
+    noting: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances, ts, y0, params, dy0, dparams
+):
+    """The times of crossings, (G, room), and their tangents, (D, G, room).
 
     These are along D directions of the start, `dy0` (D, 2n), and of the parameters, `dparams` (D, P).
     """
 
-    @jax.jit
-    def tangents(ts, y0, params, dy0, dparams):
-        def times(y0, params):
-            return _run_with_crossings(noting, flow, surfaces, tolerances, ts, y0, params)[1].t
+    def times(y0, params):
+        return motion_with_crossings(noting, flow, surfaces, tolerances, ts, y0, params)[1].t
 
-        def differentiate_times(*direction):
-            return jax.jvp(times, (y0, params), direction)
+    def differentiate_times(*direction):
+        return jax.jvp(times, (y0, params), direction)
 
-        return jax.vmap(differentiate_times, out_axes=(None, 0))(dy0, dparams)
-
-    return tangents
+    return jax.vmap(differentiate_times, out_axes=(None, 0))(dy0, dparams)
 
 
-def _run_with_crossings(
+def motion_with_crossings(
     noting: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances, ts, y0, params
 ) -> tuple[Solution, Noted]:
+    """The motion to the last of `ts`, and its crossings, with first and second derivatives."""
     still = jax.lax.stop_gradient
     solution = jax.tree.map(still, _primitives.run(noting, tolerances, still(ts), still(y0), still(params)))
     noted = Noted.read(solution.path, len(surfaces.directions))

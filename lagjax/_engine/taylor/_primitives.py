@@ -73,7 +73,10 @@ def run(flow: Flow, tolerances: Tolerances, ts, y0, params) -> Solution:
 
 @functools.lru_cache(maxsize=64)
 def compile_once(function, *first, **settings):
-    """A function of arrays, behind a flow or with one, as one program of XLA: what the host does not compute alone."""
+    """A function of arrays, behind what comes `first`, as one program of XLA: what the host does not compute alone.
+
+    A derivative outside of `jit` then compiles as one, too, and not operation by operation.
+    """
     return jax.jit(functools.partial(function, *first, **settings))
 
 
@@ -169,12 +172,11 @@ def _curvature_composed(ts, y0, params, path_ct, end_ct, dy0, dparams, *, flow, 
 
 
 def _jvp_composed(ts, y0, params, dy0, dparams, *, flow, tolerances):
-    """`jvp` along one direction, (…, 2n) and (…, P), by the run of the tangent flow: for its own derivatives."""
+    """`jvp` along one direction, (…, 2n) and (…, P), by the run of the tangent flow, and the result of that."""
     given, length = _tangent_inputs(flow, ts, y0, params, dy0, dparams)
-    larger = flow.tangent(1)
-    solution = _run(*given, flow=larger, tolerances=tolerances.with_larger_budget, keep=False)
+    solution = _run(*given, flow=flow.tangent(1), tolerances=tolerances.with_larger_budget, keep=False)
     path, end = (to_rows(y, flow.size)[..., 1, :] for y in (solution.path, solution.y_end))
-    return path * length[..., None], end * length
+    return path * length[..., None], end * length, solution.result
 
 
 def _tangent_inputs(flow: Flow, ts, y0, params, dy0, dparams):
@@ -246,7 +248,7 @@ def _vary_jvp(primals, tangents, _, **settings):
 
     def compose_jvp(*moving):
         ts, y0, params = (x[..., None, :] for x in moving)
-        return _jvp_composed(ts, y0, params, dy0, dparams, **settings)
+        return _jvp_composed(ts, y0, params, dy0, dparams, **settings)[:2]
 
     return jax.jvp(compose_jvp, primals[:3], tuple(map(ad.instantiate_zeros, tangents[:3])))[1]
 
@@ -314,7 +316,7 @@ def _curvature_transpose(cotangents, *args, **settings):
         return [None] * 5 + list(map(cotangent_of, direction, second))
     ts, *state = given
     state, moving = zip(*(jnp.broadcast_arrays(x, m) for x, m in zip(state, moving, strict=True)), strict=True)
-    second = jax.jvp(lambda *state: _jvp_composed(ts, *state, *direction, **settings), state, moving)[1]
+    second = jax.jvp(lambda *state: _jvp_composed(ts, *state, *direction, **settings)[:2], state, moving)[1]
     return [None] * 3 + list(map(cotangent_of, cts, second)) + [None] * 2
 
 
@@ -478,12 +480,8 @@ def _jvp_for_gpus(ts, y0, params, *given, flow, tolerances):
     """`jvp`: a member of the tangent flow for each direction, NaN where that was not followed to its end."""
     with jax.enable_x64(True):
         ts, y0, params = (x[..., None, :] for x in (ts, y0, params))
-        inputs, length = _tangent_inputs(flow, ts, y0, params, *given[-2:])
-        larger = flow.tangent(1)
-        solution = _run(*inputs, flow=larger, tolerances=tolerances.with_larger_budget, keep=False)
-        path, end = (to_rows(y, flow.size)[..., 1, :] for y in (solution.path, solution.y_end))
-        done = (solution.result == SUCCESSFUL)[..., None]
-        return [path * length[..., None], jnp.where(done, end * length, jnp.nan)]
+        path, end, result = _jvp_composed(ts, y0, params, *given[-2:], flow=flow, tolerances=tolerances)
+        return [path, jnp.where((result == SUCCESSFUL)[..., None], end, jnp.nan)]
 
 
 def _vjp_for_gpus(*args, flow, tolerances):

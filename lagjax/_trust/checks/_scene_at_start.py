@@ -81,7 +81,7 @@ class CheckedScene(NamedTuple):
             by_v = here.by_v_of_dissipation
             of_terms = (here.by_q,), (here.momentum[0],), (here.mass[0],), drift.values(), (by_v,), (here.jacobian[0],)
             return Sides(minus, plus, np.zeros_like(here.here), tuple(_rounding(*terms) for terms in of_terms))
-        noise = self.derivation.program(*_COMPARED).round_off_many(one.columns)[:, 0]
+        noise = self.derivation.program(*_COMPARED).line.round_off(one.columns)[:, 0]
         lost = {name: value[0] for name, value in one.round_off(*_DERIVED).items()}
         of_drift = sum(lost[name] + np.finfo(self.layout.dtype).eps * abs(value) for name, value in drift.items())
         round_off = (
@@ -375,7 +375,7 @@ def _program_variation(derivation: Derivation, state, acceleration, multipliers)
         for i in range(n)
     ]
     cotangents += [-unit[i] for i in range(n + m)]
-    derivatives = program.vjp_many([*q, *v, t, *numbers], cotangents)[: 2 * n]
+    derivatives = program.line.vjp([*q, *v, t, *numbers], cotangents)[: 2 * n]
     return np.stack([np.zeros(n + m) if bar is None else np.broadcast_to(bar, n + m) for bar in derivatives], axis=1)
 
 

@@ -112,7 +112,7 @@ class Law(NamedTuple):
         program = self.derivation.program(*SADDLE)
 
         def finite_at(part: Sample):
-            bars = program.vjp_many(part.columns, [1.0] * len(program.line.outputs))
+            bars = program.line.vjp(part.columns, [1.0] * len(program.line.outputs))
             flags = [np.isfinite(np.broadcast_to(bar, len(part.q))) for bar in bars if bar is not None]
             return np.broadcast_to(np.all(flags, axis=0), len(part.q))
 
