@@ -188,9 +188,8 @@ def _check_range(code: Code, x: Value, kind: str) -> Value:
 def sincos_function(module: ir.Module, lanes: int, name: str = "sincos", number: ir.Type = DOUBLE) -> Code:
     """`(x, address)`: sin x and cos x of doubles, stored one after the other as numbers of this type.
 
-    By Cody and Waite's reduction (*Software Manual for the Elementary Functions*, 1980) and fdlibm's polynomials; 1
-    ulp. A vector with an angle beyond `LARGEST_ANGLE` asks the C library as well; in single precision its sine and
-    cosine are NaN.
+    The method is that of `_elementary`: Cody and Waite's reduction, fdlibm's polynomials; 1 ulp. A vector with an angle
+    beyond `LARGEST_ANGLE` asks the C library as well; in single precision its sine and cosine are NaN.
     """
     code = Code(module, name, [ir.VectorType(DOUBLE, lanes), POINTER], lanes, number=number)
     x, address = code.arguments

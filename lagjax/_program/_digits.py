@@ -1,4 +1,4 @@
-"""Constants of sine and cosine in machine code: π/2 in parts, and the polynomials of fdlibm.
+"""Constants of sine and cosine, for XLA and for machine code: π/2 in parts, and the polynomials of fdlibm.
 
 A tuple of parts sums to its constant; all but the last part are short, as noted.
 """
