@@ -243,7 +243,7 @@ def _solve_large(scene: SceneState, qdot: PyTree, stable: bool) -> tuple[Vector,
 
 
 def _sentence(scene: SceneState, gradient: Sparse | None = None) -> str:
-    """Why no equilibrium is found; the sparse `gradient` is that of the forces by z at the guess, of a large scene."""
+    """The reason why no equilibrium is found; a large scene has the sparse `gradient` of forces at the guess."""
     force, names = np.asarray(scene.force(scene.q, scene.qdot)), scene.layout.names
     if gradient is None:
         slopes = np.abs(jax.jacfwd(scene.force)(scene.q, scene.qdot)).sum(axis=1)

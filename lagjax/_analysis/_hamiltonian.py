@@ -131,7 +131,7 @@ def _transform_flat(t, *arguments) -> tuple[Vector, Vector, Array]:
 
 
 def _sparse_newton(motion: SparseMotion, q: Vector, t, numbers: PyTree) -> tuple[Callable, Callable]:
-    """How to find a root of p(q, v) by v, and to solve with its derivative M, for `jax.lax.custom_root`: by pattern."""
+    """Functions that find a root of p(q, v) by v, and solve with its derivative M, by pattern: for `custom_root`."""
 
     def solve(multiply, right):
         mass = motion.structure.mass.prepare(multiply, q.dtype)
