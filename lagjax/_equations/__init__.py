@@ -27,6 +27,7 @@ from lagjax._equations._linear import (
     rank,
     rank_tolerance,
     saddle,
+    saddle_many,
     schur_complement,
     schur_complements,
     singular_threshold,

@@ -349,28 +349,27 @@ def solve_many(matrix: Matrices, b: np.ndarray) -> np.ndarray:
     """X (S, n, k) with M X = b for S symmetric matrices M, as `Factorization.solve`: NaN where M is singular."""
     if matrix.shape[1] == 1:
         return b / np.where(matrix == 0, np.nan, matrix)
-    matrix = 0.5 * (matrix + np.swapaxes(matrix, 1, 2))
-    scaled, scale = unit_diagonal(matrix)
-    scaled, finite = _or_unit(scaled)
-    sizes = np.abs(np.linalg.eigvalsh(scaled))
+    scaled, scale = unit_diagonal(0.5 * (matrix + np.swapaxes(matrix, 1, 2)))
+    sizes = np.abs(np.linalg.eigvalsh(np.where(_finite(scaled), scaled, 0)))
     regular = sizes.min(axis=1) > singular_threshold(matrix.shape[1], matrix.dtype) * sizes.max(axis=1)
-    scaled = np.where(regular[:, None, None], scaled, np.eye(matrix.shape[1], dtype=matrix.dtype))
-    x = scale[:, :, None] * np.linalg.solve(scaled, scale[:, :, None] * b)
-    return np.where((finite & regular)[:, None, None], x, np.nan)
+    regular, unit = regular[:, None, None], np.eye(matrix.shape[1], dtype=matrix.dtype)
+    x = np.linalg.solve(np.where(regular, scaled, unit), scale[:, :, None] * b)
+    return np.where(regular, scale[:, :, None] * x, np.nan)
 
 
 def saddle_many(matrix: Matrices, b, jacobian, c) -> tuple[np.ndarray, np.ndarray]:
-    """x (S, n) and λ (S, m), of least norm, of S saddle points, as `saddle`; `jacobian` (S, m, n) may have no rows."""
+    """X (S, n, k) and Λ (S, m, k), of least norm, of S saddle points, as `saddle`; `jacobian` (S, m, n) may be empty.
+
+    Their right-hand sides are `b` (S, n, k) and `c` (S, m, k).
+    """
     if not jacobian.shape[1]:
-        return solve_many(matrix, b[:, :, None])[:, :, 0], np.zeros((len(b), 0), b.dtype)
+        return solve_many(matrix, b), c
     augmented, weighted = augment(matrix, jacobian)
-    transposed = np.swapaxes(jacobian, 1, 2)
-    right = b + np.einsum("skn,sk->sn", weighted, c)
-    solutions = solve_many(augmented, np.concatenate([right[:, :, None], transposed], axis=2))
-    free, responses = solutions[:, :, 0], solutions[:, :, 1:]
-    missing = c - np.einsum("skn,sn->sk", jacobian, free)
-    multipliers = _least_norm_many(jacobian @ responses, missing[:, :, None])[:, :, 0]
-    return free + np.einsum("snk,sk->sn", responses, multipliers), multipliers
+    right = b + np.swapaxes(weighted, 1, 2) @ c
+    solutions = solve_many(augmented, np.concatenate([right, np.swapaxes(jacobian, 1, 2)], axis=2))
+    free, responses = np.split(solutions, [b.shape[2]], axis=2)
+    multipliers = _least_norm_many(jacobian @ responses, c - jacobian @ free)
+    return free + responses @ multipliers, multipliers
 
 
 def schur_complements(matrix: Matrices, jacobian: np.ndarray) -> np.ndarray:
@@ -381,20 +380,19 @@ def schur_complements(matrix: Matrices, jacobian: np.ndarray) -> np.ndarray:
 def _least_norm_many(matrix: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The shortest X (S, m, k) with S X = b, as `least_norm`, for S symmetric matrices (S, m, m) of any rank."""
     scaled, scale = unit_diagonal(matrix)
-    scaled, finite = _or_unit(scaled)
-    values, vectors = np.linalg.eigh(scaled)
+    finite, scale = _finite(scaled), scale[:, :, None]
+    values, vectors = np.linalg.eigh(np.where(finite, scaled, np.eye(matrix.shape[1], dtype=matrix.dtype)))
     in_range = np.abs(values) > rank_tolerance(matrix.dtype)
     inverse = np.where(in_range, 1 / np.where(in_range, values, 1), 0)[:, :, None]
-    x = scale[:, :, None] * (vectors @ (inverse * (np.swapaxes(vectors, 1, 2) @ (scale[:, :, None] * b))))
+    x = scale * (vectors @ (inverse * (np.swapaxes(vectors, 1, 2) @ (scale * b))))
     if not in_range.all():  # the part of x in the kernel of S is removed: the kernel of the scaled matrix, scaled back
-        kernel = np.where(in_range[:, None, :], 0, scale[:, :, None] * vectors)
+        kernel = np.where(in_range[:, None, :], 0, scale * vectors)
         transposed = np.swapaxes(kernel, 1, 2)
         gram = transposed @ kernel + in_range[:, :, None] * np.eye(matrix.shape[1], dtype=matrix.dtype)
         x = x - kernel @ np.linalg.solve(gram, transposed @ x)
-    return np.where(finite[:, None, None], x, np.nan)
+    return np.where(finite, x, np.nan)
 
 
-def _or_unit(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Matrices (S, n, n) with the unit matrix for those that hold a NaN, at which LAPACK raises; which are finite."""
-    finite = np.asarray(np.isfinite(matrix).all(axis=(1, 2)))
-    return np.where(finite[:, None, None], matrix, np.eye(matrix.shape[1], dtype=matrix.dtype)), finite
+def _finite(matrix: np.ndarray) -> np.ndarray:
+    """True for each of S matrices (S, n, n) without a NaN, at which LAPACK raises, (S, 1, 1)."""
+    return np.isfinite(matrix).all(axis=(1, 2), keepdims=True)

@@ -131,7 +131,8 @@ def borders_of(derivation: Derivation):
 
 def solve_saddle(of: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """q̈ (S, n) and λ (S, m) from the quantities `SADDLE`."""
-    return saddle_many(of["mass_matrix"], of["force"], of["jacobian"], of["gamma"])
+    x, multipliers = saddle_many(of["mass_matrix"], of["force"][:, :, None], of["jacobian"], of["gamma"][:, :, None])
+    return x[:, :, 0], multipliers[:, :, 0]
 
 
 @eqx.filter_jit

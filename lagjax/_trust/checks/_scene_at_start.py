@@ -16,11 +16,10 @@ from lagjax._equations import (
     Sample,
     Scales,
     augment,
-    decide,
     derivation_of,
     is_lowered,
     numbers_of,
-    rank_tolerance,
+    saddle_many,
 )
 from lagjax._interface import Layout, as_arrays
 from lagjax._program import Unlowerable
@@ -174,22 +173,9 @@ class CheckedScene(NamedTuple):
         return self._solve(-varied)[: self.layout.size]
 
     def _solve(self, b: np.ndarray) -> np.ndarray:
-        """(q̈, λ) of the saddle point M q̈ − Gᵀλ = b₁, G q̈ = b₂ for columns b (n + m, k), by least squares.
-
-        The matrix is scaled to K with a unit diagonal and rows of unit length. Where constraints are redundant λ is one
-        of many.
-        """
-        mass, rows = self.measured.mass[0], self.measured.jacobian[0]
-        diagonal = np.sqrt(np.abs(np.diagonal(self.augmented[0])))
-        units = np.concatenate([1 / np.where(diagonal > 0, diagonal, 1), np.ones(len(rows))])
-        units[len(mass) :] = 1 / np.maximum(np.linalg.norm(rows * units[: len(mass)], axis=1), 1e-300)
-        matrix = np.block([[mass, -rows.T], [rows, np.zeros((len(rows), len(rows)))]])
-        scaled = units[:, None] * matrix * units
-        if not (np.isfinite(scaled).all() and np.isfinite(b).all()):
-            return np.full_like(b, np.nan)
-        if not len(rows):
-            return units[:, None] * np.linalg.solve(scaled, units[:, None] * b)
-        return units[:, None] * decide(scaled, rank_tolerance(matrix.dtype)).least_norm((units[:, None] * b).T).T
+        """(q̈, λ) of the saddle point M q̈ − Gᵀλ = b₁, G q̈ = b₂ for columns b (n + m, k); NaN where it is singular."""
+        above, below = np.split(b[None], [self.layout.size], axis=1)
+        return np.concatenate(saddle_many(self.measured.mass[:1], above, self.measured.jacobian[:1], below), axis=1)[0]
 
 
 class Measured(NamedTuple):
