@@ -96,7 +96,8 @@ def _linearize(*arguments) -> tuple:
     n, state = scene.layout.size, (scene.q, scene.qdot, jnp.zeros((), scene.q.dtype), scene.numbers)
     zero, one = jnp.zeros((n, n), scene.q.dtype), jnp.eye(n, dtype=scene.q.dtype)
     mass, force = scene.motion.mass_matrix_and_force(*state)
-    jacobian, gamma = scene.motion.constraints.jacobian_and_gamma(*state)
+    constraints = scene.motion.constraints
+    jacobian, gamma = constraints.jacobian(*state), constraints.gamma(*state)
     if scene.constrained:
         solve = jax.vmap(lambda b, c: saddle(mass, b, jacobian, c)[0], in_axes=1, out_axes=1)
         acceleration, multipliers, _ = saddle(mass, force, jacobian, gamma)
@@ -110,7 +111,7 @@ def _linearize(*arguments) -> tuple:
     def balance(q, qdot):
         """F + Gᵀλ − M q̈ and γ − G q̈ at fixed q̈ and λ."""
         mass, force = scene.motion.mass_matrix_and_force(q, qdot, *state[2:])
-        jacobian, gamma = scene.motion.constraints.jacobian_and_gamma(q, qdot, *state[2:])
+        jacobian, gamma = (of(q, qdot, *state[2:]) for of in (constraints.jacobian, constraints.gamma))
         return force + jacobian.T @ multipliers - mass @ acceleration, gamma - jacobian @ acceleration
 
     smooth = is_smooth(scene)

@@ -196,7 +196,7 @@ class SceneState(NamedTuple):
 
     def jacobian(self, q: Vector, qdot: Vector) -> Float[Array, "m n"]:
         """G, (m, n), of m constraints or none."""
-        return self.motion.constraints.jacobian_and_gamma(q, qdot, jnp.zeros((), q.dtype), self.numbers)[0]
+        return self.motion.constraints.jacobian(q, qdot, jnp.zeros((), q.dtype), self.numbers)
 
     def position_constraints(self, q: Vector) -> Float[Array, " k"]:
         """f of the constraints f = 0, (k,)."""

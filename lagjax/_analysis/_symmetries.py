@@ -22,7 +22,7 @@ from lagjax._analysis._potential import absorb_potential_forces
 from lagjax._analysis._random_states import perturb_last_digits, random_states
 from lagjax._analysis._scene_state import SceneState, require_matrices
 from lagjax._analysis._transformations import Fields, fields_of, textbook_symmetries
-from lagjax._equations import decide, span_outside
+from lagjax._equations import decide, echelon_form, span_outside
 from lagjax._interface import Layout, accept, compile_for_one_call, show_str
 from lagjax._primitives import accepts_singles
 from lagjax._run import Trajectory
@@ -269,7 +269,7 @@ def _work(scene: SceneState, transform: Callable, state: FlatState) -> Array:
     if scene.motion.forces is not None or scene.motion.dissipation is not None:
         rows.append((scene.motion.nonconservative_force(*place) @ moved)[None])
     if scene.constrained:
-        rows.append(scene.motion.constraints.jacobian_and_gamma(*place)[0] @ moved)
+        rows.append(scene.motion.constraints.jacobian(*place) @ moved)
     return jnp.concatenate(rows)
 
 
@@ -302,19 +302,7 @@ def _choose_basis(
             taken = np.column_stack([taken, new / np.linalg.norm(new)])
             chosen.append((name, weights))
     rest = span_outside(space, taken)
-    return chosen + [(_describe_combination(row, fields, names), row) for row in _echelon_form(rest.T)]
-
-
-def _echelon_form(rows: np.ndarray) -> np.ndarray:
-    """The reduced echelon form of rows (d, K), pivots the largest of each row, each row with a largest entry of 1."""
-    rows = rows.copy()
-    for k in range(len(rows)):
-        pivot = int(np.argmax(np.abs(rows[k])))
-        rows[k] /= rows[k, pivot]
-        others = np.arange(len(rows)) != k
-        rows[others] -= np.outer(rows[others, pivot], rows[k])
-    rows[np.abs(rows) < 1e-9] = 0
-    return rows
+    return chosen + [(_describe_combination(row, fields, names), row) for row in echelon_form(rest.T)]
 
 
 def _readable(weights: np.ndarray, fields: Fields) -> np.ndarray:

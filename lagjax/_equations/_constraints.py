@@ -77,10 +77,6 @@ class Constraints(eqx.Module):
         rates = rate(rate(lambda q, t: self.f(q, t, params))), rate(lambda q, t: self.a(q, qdot, t, params))
         return -jnp.concatenate([of(q, t) for of in rates])
 
-    def jacobian_and_gamma(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Float[Array, "m n"], Row]:
-        """G and γ of G q̈ = γ."""
-        return self.jacobian(q, qdot, t, params), self.gamma(q, qdot, t, params)
-
     def products(self, q: Vector, qdot: Vector, t: Time, params: PyTree, positions=False) -> tuple[Callable, Callable]:
         """x ↦ G x and λ ↦ Gᵀλ, of the constraints on `positions` alone where that is True."""
         if positions:

@@ -112,7 +112,7 @@ class Motion(eqx.Module):
 
     def schur_complement(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Float[Array, "m m"]:
         """G M⁻¹ Gᵀ, or G K⁻¹ Gᵀ of the same rank (see `_linear`): its rank is the number of independent constraints."""
-        jacobian = self.constraints.jacobian_and_gamma(q, qdot, t, params)[0]
+        jacobian = self.constraints.jacobian(q, qdot, t, params)
         return _linear.schur_complement(self.mass_matrix(q, qdot, t, params), jacobian)
 
     def rank_lost(self, start: tuple, end: tuple) -> Flag:
@@ -140,7 +140,7 @@ class Motion(eqx.Module):
 
     def _jacobian(self, positions: bool, q, qdot, t, params) -> Float[Array, "m n"]:
         of = self.constraints
-        return jax.jacfwd(of.f)(q, t, params) if positions else of.jacobian_and_gamma(q, qdot, t, params)[0]
+        return jax.jacfwd(of.f)(q, t, params) if positions else of.jacobian(q, qdot, t, params)
 
     def saddle(self, b: Vector, c: Row, q, qdot, t, params, positions=False) -> tuple[Vector, Row, Flag]:
         """x, λ of M x − Gᵀλ = b, G x = c, and whether their matrix is singular; of f alone for `positions`."""
@@ -206,7 +206,6 @@ class Motion(eqx.Module):
         drift = jvp(qdot, no_change, jnp.ones_like(t))[1]
         damping = Motion(self.lagrangian, None, self.dissipation)
         nonconservative = self.nonconservative_force(*state)
-        jacobian, gamma = self.constraints.jacobian_and_gamma(*state)
         return {
             "lagrangian": value,
             "momentum": momentum,
@@ -220,8 +219,8 @@ class Motion(eqx.Module):
             "dissipation_by_qdot": -damping.nonconservative_force(*state),
             "nonconservative_force": nonconservative,
             "generalized_force": by_q + nonconservative,
-            "jacobian": jacobian,
-            "gamma": gamma,
+            "jacobian": self.constraints.jacobian(*state),
+            "gamma": self.constraints.gamma(*state),
             "residual": self.constraints.residual(*state),
             "rates": self.constraints.rates(*state),
             "driving": self.constraints.driving(*state),

@@ -72,3 +72,19 @@ def span_outside(basis: np.ndarray, known: np.ndarray) -> np.ndarray:
     """
     left, sines, _ = np.linalg.svd(basis - known @ (known.T @ basis), full_matrices=False)
     return left[:, sines > 0.5]
+
+
+def echelon_form(rows: np.ndarray) -> np.ndarray:
+    """The reduced row echelon form of independent rows, with the largest pivots."""
+    rows = np.array(rows, float)
+    for i in range(len(rows)):
+        rest = np.abs(rows[i:])
+        k, column = np.unravel_index(np.argmax(rest), rest.shape)
+        if not rest[k, column] > 0:  # a direction along which numbers at the end of their sets no longer change
+            rows = rows[:i]
+            break
+        rows[[i, i + k]] = rows[[i + k, i]]
+        rows[i] /= rows[i, column]
+        others = np.arange(len(rows)) != i
+        rows[others] -= np.outer(rows[others, column], rows[i])
+    return np.where(np.abs(rows) > 1e-9, rows, 0.0)

@@ -93,7 +93,12 @@ def action(system: System, path: Trajectory | Callable, t_start=None, t_end=None
     else:
         ts, states = _function_states(path, t_start, t_end)
     halved = np.sort(np.concatenate([ts, (ts[1:] + ts[:-1]) / 2]))[:: 1 if ts[-1] > ts[0] else -1]
-    coarse, fine = (_integral(system, states, edges, params) for edges in (ts, halved))
+
+    def lagrangians(times):
+        q, qdot = states(times := jnp.asarray(times))
+        return jax.vmap(lambda q, qdot, t: system.lagrangian(q, qdot, t=t, params=params))(q, qdot, times)
+
+    coarse, fine = (_integral(lagrangians, edges) for edges in (ts, halved))
     if not abs(float(coarse[0] - fine[0])) <= _RESOLVED * abs(float(fine[1])):
         raise ValueError(
             f"The action is not resolved: {float(coarse[0]):.9g} and, on parts half as long, {float(fine[0]):.9g}. The "
@@ -127,17 +132,12 @@ def _function_states(path, t_start, t_end) -> tuple[np.ndarray, Callable]:
     return np.linspace(float(t_start), float(t_end), _PANELS + 1), states
 
 
-def _integral(system: System, states: Callable, edges: np.ndarray, params) -> tuple[jax.Array, jax.Array]:
-    """∫ L dt and ∫ |L| dt over panels between these edges."""
-    half = np.diff(edges) / 2
-    times = (edges[:-1] + half)[:, None] + half[:, None] * _NODES
-    q, qdot = states(jnp.asarray(times.ravel()))
-
-    def lagrangian(q, qdot, t):
-        return system.lagrangian(q, qdot, t=t, params=params)
-
-    values = jax.vmap(lagrangian)(q, qdot, jnp.asarray(times.ravel())).reshape(times.shape) * half[:, None]
-    return jnp.sum(values @ _WEIGHTS), jnp.sum(jnp.abs(values) @ _WEIGHTS)
+def _integral(lagrangians: Callable, edges: np.ndarray) -> tuple[Any, Any]:
+    """∫ L dt and ∫ |L| dt over panels between these edges; `lagrangians` are L at times (T,)."""
+    half = np.diff(edges)[:, None] / 2
+    times = edges[:-1, None] + half * (1 + _NODES)
+    values = lagrangians(times.ravel()).reshape(times.shape) * half
+    return (values @ _WEIGHTS).sum(), (abs(values) @ _WEIGHTS).sum()
 
 
 @accepts_singles(("q_start", "q_end"), ("params",))
@@ -260,9 +260,9 @@ def _build_path(system: System, arcs: Arcs, chain: Chain, q_start: np.ndarray, t
 
 def _arc_action(arcs: Arcs, y, t_first, t_last) -> float:
     """∫ L dt along one arc, on eight panels."""
-    edges = np.linspace(t_first, t_last, 9)
-    half = np.diff(edges) / 2
-    times = ((edges[:-1] + half)[:, None] + half[:, None] * _NODES).ravel()
-    path = arcs.ends(np.append(t_first, times)[None], y[None]).path[0, 1:]
-    values = arcs.sample(times, path).quantities("lagrangian")["lagrangian"].reshape(len(half), -1)
-    return float(half @ values @ _WEIGHTS)
+
+    def lagrangians(times):
+        path = arcs.ends(np.append(t_first, times)[None], y[None]).path[0, 1:]
+        return arcs.sample(times, path).quantities("lagrangian")["lagrangian"]
+
+    return float(_integral(lagrangians, np.linspace(t_first, t_last, 9))[0])

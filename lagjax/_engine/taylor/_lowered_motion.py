@@ -38,14 +38,10 @@ def _quantity(name: str) -> Callable:
 
 class _LoweredConstraints(Constraints):
     derivation: Derivation = eqx.field(static=True, kw_only=True)
-    residual, rates = map(_quantity, ("residual", "rates"))
+    residual, rates, jacobian, gamma = map(_quantity, ("residual", "rates", "jacobian", "gamma"))
 
     def f(self, q, t, params):
         return self.residual(q, jnp.zeros_like(q), t, params)[: self.derivation.position_count]
-
-    def jacobian_and_gamma(self, q, qdot, t, params):
-        """G and γ of G q̈ = γ."""
-        return tuple(_evaluate(self.derivation, q, qdot, t, params, "jacobian", "gamma"))
 
 
 class _LoweredMotion(Motion):

@@ -13,7 +13,7 @@ from fractions import Fraction
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
-from lagjax._equations import decide
+from lagjax._equations import decide, echelon_form
 from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._residuals import LostMotion, Point, Residuals, Trial
 from lagjax._fit.result._information import Information, confirmed_null, growth, null_space, row_sizes
@@ -68,26 +68,10 @@ def _sentence_on_rounding(residuals: Residuals, trial: Trial, known: Information
 
 def _blocks(null: np.ndarray) -> list[np.ndarray]:
     """The parameters of the null directions in sets, of which each is free by itself: rows that are not zero."""
-    reduced = np.abs(_reduce_rows(null.T))
+    reduced = np.abs(echelon_form(null.T))
     moved = (reduced > 1e-5 * reduced.max(axis=1, keepdims=True)).astype(int)
     _, component = connected_components(moved.T @ moved)
     return [np.flatnonzero(component == k) for k in dict.fromkeys(component[moved.any(axis=0)].tolist())]
-
-
-def _reduce_rows(rows: np.ndarray) -> np.ndarray:
-    """The reduced row echelon form of independent rows, with the largest pivots."""
-    rows = np.array(rows, float)
-    for i in range(len(rows)):
-        rest = np.abs(rows[i:])
-        k, column = np.unravel_index(np.argmax(rest), rest.shape)
-        if not rest[k, column] > 0:  # a direction along which numbers at the end of their sets no longer change
-            rows = rows[:i]
-            break
-        rows[[i, i + k]] = rows[[i + k, i]]
-        rows[i] /= rows[i, column]
-        others = np.arange(len(rows)) != i
-        rows[others] -= np.outer(rows[others, column], rows[i])
-    return np.where(np.abs(rows) > 1e-9, rows, 0.0)
 
 
 def _sentence(parameters: Parameters, block: np.ndarray, spaces) -> str:
@@ -131,7 +115,7 @@ def _whole_numbers(spaces: list[np.ndarray]) -> list[list[int]] | None:
     if not orthogonal.size:
         return None
     rows = []
-    for row in _reduce_rows(orthogonal.T):
+    for row in echelon_form(orthogonal.T):
         fractions = [Fraction(float(x)).limit_denominator(_LARGEST_EXPONENT) for x in row]
         common = np.lcm.reduce([f.denominator for f in fractions])
         whole = [int(f * int(common)) for f in fractions]

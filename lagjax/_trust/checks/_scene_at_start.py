@@ -384,7 +384,7 @@ def _variation(system: System, q, qdot, t, params, acceleration, multipliers):
     def balance(y):
         q, qdot = jnp.split(y, 2)
         matrix, force = motion.mass_matrix_and_force(q, qdot, t, numbers)
-        jacobian, gamma = motion.constraints.jacobian_and_gamma(q, qdot, t, numbers)
+        jacobian, gamma = (of(q, qdot, t, numbers) for of in (motion.constraints.jacobian, motion.constraints.gamma))
         left = matrix @ acceleration - jacobian.T @ multipliers - force
         return jnp.concatenate([left, jacobian @ acceleration - gamma])
 
