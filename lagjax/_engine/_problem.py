@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
+from jax.core import Tracer
 from jax.extend import core
 from jaxtyping import Array, Float, Int
 
@@ -43,7 +44,7 @@ from lagjax._interface import (
 )
 from lagjax._interface.reads import Edition
 from lagjax._native import ATOL_OVER_MOTION, ATOL_OVER_RTOL
-from lagjax._primitives import DOUBLE, SINGLE
+from lagjax._primitives import DOUBLE, SINGLE, compute_in_doubles
 
 PyTree = Any
 Numbers = Array | np.ndarray
@@ -141,7 +142,7 @@ class Problem:
     def varies(self) -> bool:
         """True if an input is of the type that `jax.shard_map` gives by default to what differs between devices."""
         inputs = self.ts, self.y0, *jax.tree.leaves(self.numbers)
-        return any(isinstance(x, jax.core.Tracer) and bool(jax.typeof(x).mat.varying) for x in inputs)
+        return any(isinstance(x, Tracer) and bool(jax.typeof(x).mat.varying) for x in inputs)
 
     @property
     def is_single(self) -> bool:
@@ -159,6 +160,15 @@ class Problem:
         params, ts, y0 = jax.tree.map(wide, (self.params, self.ts, self.y0))
         layout = replace(self.layout, dtype=DOUBLE)
         return replace(self, layout=layout, params=params, ts=ts, y0=y0, is_rounded=True)
+
+
+def solve_in_doubles(solve: Callable, problem: Problem):
+    """The solution by `solve` in float64, in the precision of the problem."""
+
+    def solve_numbers(ts, y0, params):
+        return solve(replace(problem.double_precision, ts=ts, y0=y0, params=params))
+
+    return compute_in_doubles(solve_numbers, problem.ts, problem.y0, problem.params)
 
 
 class Batch(eqx.Module):

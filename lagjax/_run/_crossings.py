@@ -217,8 +217,8 @@ def surfaces_in(problem: Problem, functions, directions, names) -> Surfaces:
             raise Unlowerable(refusal)
     except Unlowerable as reason:
         text = (
-            f"crossings are found with machine code, and there is none for this scene: {reason}. simulate(..., event=…) "
-            "stops at one, also in a large scene; it goes on from there."
+            f"crossings are found with machine code, and there is none for this scene: {reason}. In a large scene "
+            "simulate(..., event=…) stops at one, and goes on from there."
         )
         raise ValueError(text) from None
     for k in range(len(functions)):

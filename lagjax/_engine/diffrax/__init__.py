@@ -25,6 +25,7 @@ from lagjax._engine._problem import (
     evaluate_condition,
     flat_condition,
     signs_of_event,
+    solve_in_doubles,
     too_tight,
 )
 from lagjax._engine._stop_reason import End, what_stopped
@@ -120,13 +121,16 @@ class Diffrax(AbstractEngine, eqx.Module):
 
     def solve(self, problem: Problem) -> Solution:
         """The motion of one member, compiled once for all problems of its structure."""
+        motion = problem.derivation.motion
+        if problem.is_single and motion.constrained and problem.derivation.structure is not None:
+            return solve_in_doubles(self.solve, problem)  # many links are as large as the roundings of float32
         return _solve(self, problem)
 
     @eqx.filter_jit
     def solve_batch(self, batch: Batch) -> Solution:
         """The motions of all members, which step together until the slowest has arrived; of large scenes in turn."""
         if batch.member.derivation.structure is not None:  # one by one they are in the caches of a core
-            return batch.map_in_turn(lambda problem: _solve(self, problem))
+            return batch.map_in_turn(self.solve)
         solution = batch.map_members(lambda problem: _solve(self, problem))
         steps = solution.accepted + solution.rejected
         return solution._replace(idle=steps.size * jnp.max(steps) - jnp.sum(steps))
@@ -195,6 +199,8 @@ def _solve(engine: Diffrax, problem: Problem) -> Solution:
     ts = jnp.where(start == RESULTS.successful, given, given[0])
     event, is_located = (None, True) if problem.event is None else _flatten_event(problem, ts, y0, numbers)
     method = engine.method(problem)
+    if form.constrained:  # a start that was typed, or is rounded to float32; the way to it is no error of a step
+        y0 = jnp.concatenate(form.projected(given[0], halves(y0), numbers))
     solution = integrate(form, method, engine.adjoint, event, ts, y0, numbers)
     result = _explain_result(solution, form, start, ts, numbers)
     if derivation.motion.constrained:

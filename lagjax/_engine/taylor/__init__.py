@@ -18,7 +18,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._engine._problem import AbstractEngine, Batch, Problem, Solution
+from lagjax._engine._problem import AbstractEngine, Batch, Problem, Solution, solve_in_doubles
 from lagjax._engine.taylor import _primitives
 from lagjax._engine.taylor._crossing import (
     MOST_GUARDS,
@@ -137,7 +137,7 @@ class MachineCode(AbstractEngine):
     def solve(self, problem: Problem) -> Solution:
         """The motion of one member, under every transformation of JAX. The problem is one that is not refused."""
         if problem.is_single:
-            return _solve_in_doubles(self.solve, problem)
+            return solve_in_doubles(self.solve, problem)
         flow, tolerances = flow_of(problem), tolerances_of(problem)
         if problem.is_known and default_platform() == "cpu":
             _require_increasing(flow.program, problem.vector)
@@ -168,7 +168,7 @@ class MachineCode(AbstractEngine):
         Derivatives are those of a tolerance that is `slack` times as large.
         """
         if problem.is_single:
-            return _solve_in_doubles(lambda problem: self.crossings(problem, surfaces, room, slack), problem)
+            return solve_in_doubles(lambda problem: self.crossings(problem, surfaces, room, slack), problem)
         noting, flow, surfaces, tolerances = _flows_to_crossings(problem, surfaces, room, slack)
         if problem.is_known:
             ts, y0, params = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
@@ -201,13 +201,6 @@ class MachineCode(AbstractEngine):
 def _run(problem: Problem, given: tuple) -> Solution:
     ts, y0, params = given
     return flow_of(problem).run(ts, y0, params, tolerances_of(problem))
-
-
-def _solve_in_doubles(solve: Callable, problem: Problem):
-    def solve_numbers(ts, y0, params):
-        return solve(dataclasses.replace(problem.double_precision, ts=ts, y0=y0, params=params))
-
-    return compute_in_doubles(solve_numbers, problem.ts, problem.y0, problem.params)
 
 
 def flow_of(problem: Problem) -> Flow:
