@@ -96,7 +96,7 @@ def with_sliding(
     """
     if not slides:
         return Sliding(line, range(len(line.nodes)), [], linear, None, ())
-    if linear is not None and len(slides) <= MOST_SLIDING:
+    if linear is not None:
         done = _SlidingForces(line, n, first, switches, slides, linear).build()
         if done is not None:
             return done
@@ -389,7 +389,7 @@ class _SlidingForces:
         line = StraightLine(tuple(self.graph.nodes), tuple(self.graph.kinds), ())
         return gradient_in(self.graph, line, list(range(len(line.nodes))), node, range(2 * self.n + 1))
 
-    def _system(self, z, unknown, acts, slopes, rates, equations, pivots) -> LinearSystem:
+    def _system(self, z, unknown, acts, slopes, rates, of_unknowns, pivots) -> LinearSystem:
         system, count = self.linear, len(self.linear.right)
         others = {(i, count + k): self.f("neg", c) for k, act in enumerate(acts) for i, c in act.items()}
         others |= {
@@ -399,7 +399,7 @@ class _SlidingForces:
             if self.graph.value(d) != 0
         }
         # What `solve` needs besides: the entries, and the elimination of the unknowns.
-        own = [*others.values(), *(x for table in equations for row in table for x in row)]
+        own = [*others.values(), *(x for table in of_unknowns for row in table for x in row)]
         own += [x for _, _, *numbers in pivots for x in numbers]
         known = {x: self.graph.value(x) for x in own}
         read = list(dict.fromkeys(x for x in own if known[x] is None))
@@ -411,35 +411,31 @@ class _SlidingForces:
             at = {x: inputs[len(system.factors) + i] for i, x in enumerate(read)}
             at |= {x: graph.constant(value, "float") for x, value in known.items() if value is not None}
             right, ends = inputs[len(factors) : len(factors) + count], inputs[len(factors) + count :]
-            left = list(ends)
+            equations = _Equations(*([[at[x] for x in row] for row in table] for table in of_unknowns))
             inner = system.solve()
 
             def apply_inverse(right):
                 nodes = copy_nodes(graph, inner, [*inputs[: len(system.factors)], *right])
                 return [nodes[i] for i in inner.outputs]
 
-            y = apply_inverse(right)
-            for (row, column), d in others.items():
-                if row >= count:
-                    ends[row - count] = graph.apply("sub", ends[row - count], graph.apply("mul", at[d], y[column]))
-            mu = _Equations(*([[at[x] for x in row] for row in table] for table in equations)).solve(graph, ends)
-            for (row, column), c in others.items():
-                if column >= count:
-                    right[row] = graph.apply("sub", right[row], graph.apply("mul", at[c], mu[column - count]))
-            z = apply_inverse(right)
-            if len(pivots) < len(acts):
-                end, rest = list(left), [graph.constant(0.0, "float")] * count
+            def subtract(b, x, of_rates: bool):
+                """The rows b of A z = r, or those `of_rates`, less the other entries there times x."""
+                b = list(b)
                 for (row, column), d in others.items():
-                    if row >= count:
-                        end[row - count] = graph.apply("sub", end[row - count], graph.apply("mul", at[d], z[column]))
-                more = _Equations(*([[at[x] for x in row] for row in table] for table in equations)).solve(graph, end)
-                for (row, column), c in others.items():
-                    if column >= count:
-                        rest[row] = graph.apply("sub", rest[row], graph.apply("mul", at[c], more[column - count]))
-                z = [graph.apply("add", *pair) for pair in zip(z, apply_inverse(rest), strict=True)]
+                    if (row >= count) == of_rates:
+                        row, column = (row - count, column) if of_rates else (row, column - count)
+                        b[row] = graph.apply("sub", b[row], graph.apply("mul", at[d], x[column]))
+                return b
+
+            mu = equations.solve(graph, subtract(ends, apply_inverse(right), True))
+            z = apply_inverse(subtract(right, mu, False))
+            if len(pivots) < len(acts):
+                more = equations.solve(graph, subtract(ends, z, True))
+                rest = apply_inverse(subtract([graph.constant(0.0, "float")] * count, more, False))
+                z = [graph.apply("add", *pair) for pair in zip(z, rest, strict=True)]
                 mu = [graph.apply("add", *pair) for pair in zip(mu, more, strict=True)]
             for k, i, free, inverse in pivots:
-                end = left[k]
+                end = ends[k]
                 for (row, j), d in others.items():
                     if row == count + k and j != i:
                         end = graph.apply("sub", end, graph.apply("mul", at[d], z[j]))
@@ -447,9 +443,7 @@ class _SlidingForces:
             outputs = (*z, *mu)
             return StraightLine(tuple(graph.nodes), tuple(graph.kinds), outputs)
 
-        return LinearSystem(
-            (*z, *unknown), system.entries, (*system.right, *rates), factors, solve, others
-        )  # fmt: skip
+        return LinearSystem((*z, *unknown), system.entries, (*system.right, *rates), factors, solve, others)
 
 
 # ---- what stays on borders ----
