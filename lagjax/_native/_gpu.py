@@ -62,8 +62,8 @@ class GpuPrograms:
     def __init__(self, motion: Callable[[], TaylorSeries], adjoint: Callable[[], TaylorSeries]):
         self._lane = functools.cache(lambda: one_lane(motion()))
         self._lane_back = functools.cache(lambda: one_lane(adjoint()))
-        self._motion = functools.cache(lambda form: motion_for_gpus(self._lane(), form))
-        self._transpose = functools.cache(lambda form: transpose_for_gpus(self._lane(), self._lane_back(), form))
+        self._motion = functools.cache(self._assemble_motion)
+        self._transpose = functools.cache(self._assemble_transpose)
 
     def form(self, entry: Entry, rtol: float) -> GpuForm:
         return form_for(entry, self._lane(), order_for(rtol))
@@ -74,6 +74,20 @@ class GpuPrograms:
     def transpose(self, rtol: float) -> tuple[str, int]:
         """The motion of a member and back in PTX, and the doubles that are written down of a step."""
         return self._transpose(self.form(TRANSPOSE, rtol)), self._lane().row
+
+    def _assemble_motion(self, form: GpuForm) -> str:
+        with _lock:
+            return _assembly(motion_entry(self._lane(), form.order), [_parse(self._lane(), form)])
+
+    def _assemble_transpose(self, form: GpuForm) -> str:
+        """The PTX of an integrator and of its adjoint, one after the other in one thread."""
+        lane, back = self._lane(), self._lane_back()
+        require_room(lane.size + back.size if form.unrolled else max(lane.size, back.size))
+        with _lock:
+            there_and_back = [_parse(lane, form), _parse(back, form)]
+            for name in ("begin", "run"):
+                there_and_back[1].get_function(name).name = f"{name}_back"
+            return _assembly(transpose_entry(lane, back, form), there_and_back)
 
 
 def form_for(entry: Entry, lane: OneLane, order: int) -> GpuForm:
@@ -102,28 +116,6 @@ def one_lane(motion: TaylorSeries) -> OneLane:
     if motion.look_up.numbers is not None:
         raise Unlowerable("its tables of numbers (samples, jnp.interp, …) are not brought to a GPU; make them params")
     return OneLane.from_motion(motion)
-
-
-def motion_for_gpus(lane: OneLane, form: GpuForm) -> str:
-    """The PTX of the entry `MOTION` of an integrator, in a form.
-
-    Raises `Unlowerable` where its functions need libdevice, and that is missing.
-    """
-    with _lock:
-        return _assembly(motion_entry(lane, form.order), [_parse(lane, form)])
-
-
-def transpose_for_gpus(lane: OneLane, back: OneLane, form: GpuForm) -> str:
-    """The PTX of the entry `TRANSPOSE` of an integrator and of its adjoint, in a form.
-
-    Raises `Unlowerable` where that takes too much memory, or libdevice.
-    """
-    require_room(lane.size + back.size if form.unrolled else max(lane.size, back.size))
-    with _lock:
-        there_and_back = [_parse(lane, form), _parse(back, form)]
-        for name in ("begin", "run"):
-            there_and_back[1].get_function(name).name = f"{name}_back"
-        return _assembly(transpose_entry(lane, back, form), there_and_back)
 
 
 def _parse(lane: OneLane, form: GpuForm) -> llvm.ModuleRef:

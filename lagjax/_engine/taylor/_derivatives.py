@@ -97,19 +97,9 @@ def start_outputs(ts, dy0, path_dot, library: Any = np):
 
 
 def _groups_of_directions(members: int, m: int) -> int:
-    """Into how many rows the m directions of each member go.
-
-    Of one member alone, one row a thread. Of more members than lanes, two where fewer lanes are then idle: twenty
-    members fill three vectors of eight badly, forty rows fill five. A row costs its directions and the motion itself.
-    """
+    """Into how many rows the m directions of each member go: those of a few members on all threads."""
     lanes = _native.lanes()
-    if members < lanes:
-        return max(1, min(_native.cores() // members, math.ceil(m / lanes)))
-
-    def work(groups: int) -> int:
-        return math.ceil(groups * members / lanes) * (1 + math.ceil(m / groups))
-
-    return 2 if work(2) < work(1) else 1
+    return max(1, min(_native.cores() // members, math.ceil(m / lanes))) if members < lanes else 1
 
 
 def _jvp_over_steps(flow: Flow, motions: Motions, dots, tolerances) -> tuple[np.ndarray, np.ndarray]:
