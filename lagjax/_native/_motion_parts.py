@@ -126,7 +126,6 @@ class _ChosenProgram:
     size: int
     dtypes: tuple
     linear: Any
-    budget: int
     mechanics: StraightLine | None = None
 
 
@@ -177,7 +176,7 @@ def choose_parameters(
         dtypes = (*one.dtypes[:first], *(kinds[i] for i in positions))
         mechanics = getattr(one, "mechanics", None)
         return _ChosenProgram(
-            reduce_line(one.line), first + len(positions), dtypes, one.linear, one.budget,
+            reduce_line(one.line), first + len(positions), dtypes, one.linear,
             None if mechanics is None else reduce_line(mechanics),
         )  # fmt: skip
 

@@ -125,7 +125,6 @@ class Pieced(NamedTuple):
     size: int
     dtypes: Sequence[np.dtype]
     linear: Any
-    budget: int
     mechanics: StraightLine | None = None
 
 
@@ -603,7 +602,7 @@ class _Rewriting:
             kick = self._kick(line, switches, kicking)
             line = line.replace(outputs=line.outputs[: -self.mechanics])
         dtypes = (*program.dtypes, *[np.dtype(float)] * count)
-        pieced = Pieced(line, program.size + count, dtypes, linear, _LARGEST * program.budget)
+        pieced = Pieced(line, program.size + count, dtypes, linear)
         kinds = (*self.kinds, *[SLIDE] * len(sliding))
         return Borders(
             pieced, tuple(switches), kinds, self._decide(count, sliding), _guards(kinds, sliding), nested,
@@ -855,7 +854,7 @@ def with_outputs(program: Recurrent, more: StraightLine, moving: int | None = No
     Where its first inputs, so many, are `moving`, before these stands how far rounding may move each of them
     (`rounding`); zero for a line that is long.
     """
-    graph = Graph.from_line(program.line, program.budget + 2 * _LARGEST * len(more.nodes) + 1000)
+    graph = Graph.from_line(program.line, len(program.line.nodes) + 2 * _LARGEST * len(more.nodes) + 1000)
     kinds = ["float" if np.issubdtype(dtype, np.floating) else np.dtype(dtype).name for dtype in program.dtypes]
     with np.errstate(all="ignore"):
         places = copy_nodes(graph, more, [graph.input(i, kind) for i, kind in enumerate(kinds)])
@@ -865,7 +864,7 @@ def with_outputs(program: Recurrent, more: StraightLine, moving: int | None = No
     outputs = (*program.line.outputs, *errors, *(places[i] for i in more.outputs))
     line = StraightLine(tuple(graph.nodes), tuple(graph.kinds), outputs)
     mechanics = getattr(program, "mechanics", None)
-    return Pieced(line, program.size, program.dtypes, program.linear, graph.budget, mechanics)
+    return Pieced(line, program.size, program.dtypes, program.linear, mechanics)
 
 
 def _moduli(line: StraightLine) -> dict[int, tuple[int, int]]:

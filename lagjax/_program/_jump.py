@@ -166,7 +166,7 @@ def with_borders_of_tangents(borders: Borders, size: int, directions: int, membe
     decided |= {program.size + j: first_piece + pieces + j for j in range(pieces)}
     line = line.replace(outputs=line.outputs[: rows * n + 1])
     return borders._replace(
-        program=Pieced(line, len(dtypes), dtypes, None, max(program.budget, len(line.nodes))),
+        program=Pieced(line, len(dtypes), dtypes, None),
         switches=switches[:pieces], arguments=switches[pieces:], decide=_renumber_inputs(borders.decide, decided),
         motion=borders.motion or borders, retraction=retraction, release=_renumber_inputs(borders.release, decided),
     )  # fmt: skip

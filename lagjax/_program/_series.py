@@ -38,6 +38,8 @@ from lagjax._program._operations import OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, sink_negations
 from lagjax._program._recurrences import choose, finite
 
+_LARGEST = 100  # operations that the series of one may take: a bound for errors, ten are usual
+
 
 class LinearSystem(NamedTuple):
     """A z = r, of which the outputs of a program are the solution: nodes of that program.
@@ -58,7 +60,7 @@ class Recurrent(Protocol):
     """The part of a program that Taylor series and machine code read: `Program` without JAX.
 
     `dtypes` has the type of every input, `size` their number. Where the outputs are the solution of a linear system,
-    `linear` is that (see `LinearSystem`). `budget` bounds the operations.
+    `linear` is that (see `LinearSystem`).
     """
 
     @property
@@ -69,8 +71,6 @@ class Recurrent(Protocol):
     def dtypes(self) -> Sequence[np.dtype]: ...
     @property
     def linear(self) -> Any: ...
-    @property
-    def budget(self) -> int: ...
 
 
 class Series(NamedTuple):
@@ -112,8 +112,8 @@ class _Recurrences:
 
     def __init__(self, program: Recurrent, size: int, moving: int, followed: tuple[int, ...]):
         self.size, self.moving, self.followed = size, moving, followed
-        self.zeroth_order = Graph.from_line(program.line, 10 * program.budget)
-        self.order_recursion = Graph(20 * program.budget)
+        budget = _LARGEST * len(program.line.nodes) + 1000
+        self.zeroth_order, self.order_recursion = Graph.from_line(program.line, budget), Graph(budget)
         # What overflows where it no longer matters has no coefficients there: infinite ones would be no numbers.
         self.hides_growth = self.zeroth_order.hides_growth
         self.outputs = list(program.line.outputs)
