@@ -180,7 +180,7 @@ def _largest_term(terms, weights):
 
 # Newton's method doubles its digits from where it converges, and needs 4 to 8 steps from anywhere near; 300 times the
 # size of a circle away it takes 16. Doubled, this changes nothing but the time that is lost where there is no solution.
-NEWTON_STEPS = 50
+_NEWTON_STEPS = 50
 
 
 def nearest_consistent(
@@ -272,7 +272,7 @@ def _iterate_to_rest(step: Callable, start: tuple[Vector, Row], is_at_rest: Call
 
     def moves(carry):
         (q, _), moved, count = carry
-        return ~is_at_rest(q, moved) & (count < NEWTON_STEPS)
+        return ~is_at_rest(q, moved) & (count < _NEWTON_STEPS)
 
     def once(carry):
         place, _, count = carry

@@ -16,17 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.sparse import csr_array
 
-from lagjax._equations._constraints import NEWTON_STEPS
 from lagjax._equations._motion import Flag, Motion, PyTree, Row, Time, Vector
 from lagjax._equations._patterns import count_operations, hessian_pattern, jacobian_pattern
 from lagjax._equations._sparse import Blocks, Diagonal, MatrixForm, Products, Solver, form_of, refine
 from lagjax._interface import compiled_once
 
-# A scene is large by its coordinates and by the scalar operations of L (or where it has constraints, which cost machine
-# code m² n each): measured as first results on two cores, 3.5 s for a ring of 1000 (11 000 operations) by machine code,
-# 1.6 s by arrays. A batch of 256 rings of 300 is 30 times faster in machine code.
+# Coordinates from which arrays look for patterns, and the scalar operations of L from which a scene of so many runs on
+# arrays: a ring of 1000 (11 000 operations) takes 3.5 s to a first result by machine code, 2 s by arrays, whose time
+# hardly grows; a batch of 256 rings of 300 is 30 times faster in machine code. With constraints it is coordinates that
+# count: 100 rods (200) take machine code 4 s and 500 more than 240, arrays 8 s either way.
 LEAST_COORDINATES = 100
-LEAST_OPERATIONS = 6000
+LEAST_OPERATIONS, LEAST_LINKED = 6000, 300
 # Coordinates up to which a dense M is a matrix: elimination takes 1 ms there, and conjugate gradients seldom less.
 LARGEST_DENSE = 512
 # Operations of L up to which machine code takes a large scene that is asked of it, or has borders: a ring of 4000, with
@@ -60,7 +60,7 @@ def structure_of(motion: Motion, shapes: tuple, insists: bool = False) -> Struct
     if n < LEAST_COORDINATES:
         return None
     operations = count_operations(jax.make_jaxpr(motion.lagrangian)(*shapes).jaxpr)
-    if operations < LEAST_OPERATIONS and not (motion.constrained or insists):
+    if not insists and not (operations >= LEAST_OPERATIONS or (motion.constrained and n >= LEAST_LINKED)):
         return None
     pattern = hessian_pattern(motion.lagrangian, shapes, by=1)
     mass = form_of(pattern, n)
@@ -202,24 +202,17 @@ class SparseMotion(Motion):
         return {name: value for name, value in values.items() if name not in ("mass_matrix", "jacobian")}
 
     def solve_newton(self, linear: Callable, right: tuple[Vector, Row], *state) -> tuple[Vector, Row]:
-        """(x, ν) with H x + Jᵀν = b, J x = c, by solves with M in the place of H, which differs little near f = 0."""
+        """(x, ν) with H x + Jᵀν = b, J x = c, by GMRES, preconditioned by solves with M in the place of H."""
         zero = jax.tree.map(jnp.zeros_like, right)
         products = lambda x: linear((x, zero[1]))[1], lambda nu: linear((zero[0], nu))[0]
         eliminate = self._prepare(True, *jax.lax.stop_gradient(state), products=products)[2]
 
         def solve(_, right):
-            size = jnp.finfo(state[0].dtype).eps * jnp.max(jnp.abs(jnp.concatenate(right)))
-
-            def goes_on(carry):
-                _, rest, count = carry
-                return (jnp.max(jnp.abs(jnp.concatenate(rest))) > size) & (count < NEWTON_STEPS)
-
-            def refine(carry):
-                place, rest, count = carry
-                place = jax.tree.map(jnp.add, place, eliminate(*rest))
-                return place, jax.tree.map(jnp.subtract, right, linear(place)), count + 1
-
-            return jax.lax.while_loop(goes_on, refine, (zero, right, 0))[0]
+            options = {"tol": 10 * float(jnp.finfo(state[0].dtype).eps), "restart": 30, "maxiter": 10}
+            preconditioner = lambda rest: eliminate(*rest)  # noqa: E731
+            return jax.scipy.sparse.linalg.gmres(
+                linear, right, M=preconditioner, solve_method="incremental", **options
+            )[0]
 
         return jax.lax.custom_linear_solve(linear, right, solve, symmetric=True)
 

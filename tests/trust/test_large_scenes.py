@@ -67,7 +67,7 @@ def test_products_are_those_of_the_matrices():
     def links(q):
         return jnp.sum(jnp.diff(q, axis=0) ** 2, axis=1) - 2.0
 
-    system, layout = lagjax.System(kinetic, constraints=links), Layout.from_state(q, v)
+    system, layout = lagjax.System(kinetic, constraints=links, path="array"), Layout.from_state(q, v)
     derivation = derivation_of(system, layout, None)
     assert derivation.structure is not None
     state = q.ravel(), v.ravel(), np.zeros(()), None
