@@ -195,10 +195,11 @@ def expand_residuals(chart: Chart) -> Surrogate:
     density = chart.density
     residuals, free = density.residuals, len(density.point.u)
     states = residuals.states if residuals.fitted.any() else 0
-    unknowns = states + free
-    size = sum(batch.weights.size for batch in residuals.batches) * (1 + unknowns + unknowns * (unknowns + 1) // 2)
-    plain = not np.isfinite(density.noise.dof).any() and residuals.sides is None
-    if size > _LARGEST and not plain:
+    columns = (states + free + 1) * (states + free + 2) // 2
+    plain = not np.isfinite(density.noise.dof).any() and residuals.sides is None  # rows are then compressed
+    shapes = [batch.weights.shape for batch in residuals.batches]
+    size = columns * sum(n * s * (min(t, columns) if plain else t) for n, t, s in shapes)
+    if size > _LARGEST:
         raise Unexpanded(
             f"The expansion of its residuals to second order would hold {size} numbers, more than {_LARGEST}."
         )
@@ -211,8 +212,6 @@ def expand_residuals(chart: Chart) -> Surrogate:
             rows = np.stack([compress_rows(rows[:, :, s]) for s in range(rows.shape[2])], axis=2)
             counts = np.ones(rows.shape[:3], bool)
         blocks.append(Block(rows, counts, _places(density, states)[batch.rows], batch.sides))
-    if (size := sum(block.rows.size for block in blocks)) > _LARGEST:
-        raise Unexpanded(f"The expansion of its residuals to second order holds {size} numbers, more than {_LARGEST}.")
     return Surrogate(chart, blocks)
 
 
