@@ -25,7 +25,7 @@ from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._smoothness import is_smooth, require_smooth
 from lagjax._analysis._solve import shortest_solution
 from lagjax._analysis._sparse_balance import balance_of
-from lagjax._equations import SparseMotion, dependent_rows, diagonal_scale, factorize, least_norm, schur_complement
+from lagjax._equations import SparseMotion, dependent_rows, diagonal_scale, factorize, least_norm, schur_complements
 from lagjax._equations import rank as rank_of
 from lagjax._interface import Layout, compile_for_one_call, is_concrete, show_str
 from lagjax._primitives import accepts_singles, nan_unless
@@ -172,8 +172,8 @@ def _rank(scene: SceneState) -> int:
                 "oscillate if they are independent, as they count inside jit, vmap and grad. Drop the redundant ones."
             )
         return len(jacobian)
-    schur = schur_complement(scene.mass_matrix(scene.q, scene.qdot), jacobian)
-    return len(jacobian) - len(dependent_rows(np.asarray(schur)))
+    mass = scene.mass_matrix(scene.q, scene.qdot)
+    return len(jacobian) - len(dependent_rows(schur_complements(*(np.asarray(x)[None] for x in (mass, jacobian)))[0]))
 
 
 @compile_for_one_call

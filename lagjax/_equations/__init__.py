@@ -28,7 +28,6 @@ from lagjax._equations._linear import (
     rank_tolerance,
     saddle,
     saddle_many,
-    schur_complement,
     schur_complements,
     singular_threshold,
     unit_diagonal,

@@ -218,11 +218,6 @@ def saddle(matrix: Matrix, b: Vector, jacobian: Rows, c: Float[Array, " m"]) -> 
     return free + responses @ multipliers, multipliers, factorization.singular
 
 
-def schur_complement(matrix: Matrix, jacobian: Rows) -> Float[Array, "m m"]:
-    """S = G K⁻¹ Gᵀ of `saddle`, whose rank is the number of independent constraints."""
-    return jacobian @ factorize(augment(matrix, jacobian)[0]).solve_columns(jacobian.T)
-
-
 def augment(matrix, jacobian):
     """K = M + GᵀW G (..., n, n) and W G (..., m, n), with weights that make every row of G as heavy as M.
 
@@ -373,7 +368,7 @@ def saddle_many(matrix: Matrices, b, jacobian, c) -> tuple[np.ndarray, np.ndarra
 
 
 def schur_complements(matrix: Matrices, jacobian: np.ndarray) -> np.ndarray:
-    """S = G K⁻¹ Gᵀ (S, m, m), as `schur_complement`, of S states."""
+    """S = G K⁻¹ Gᵀ (S, m, m) of S states, as `Motion.schur_complement` of one."""
     return jacobian @ solve_many(augment(matrix, jacobian)[0], np.swapaxes(jacobian, 1, 2))
 
 

@@ -113,7 +113,8 @@ class Motion(eqx.Module):
     def schur_complement(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Float[Array, "m m"]:
         """G M⁻¹ Gᵀ, or G K⁻¹ Gᵀ of the same rank (see `_linear`): its rank is the number of independent constraints."""
         jacobian = self.constraints.jacobian(q, qdot, t, params)
-        return _linear.schur_complement(self.mass_matrix(q, qdot, t, params), jacobian)
+        augmented, _ = _linear.augment(self.mass_matrix(q, qdot, t, params), jacobian)
+        return jacobian @ _linear.factorize(augmented).solve_columns(jacobian.T)
 
     def rank_lost(self, start: tuple, end: tuple) -> Flag:
         """True if fewer constraints are independent at `end` than at `start`, both (q, q̇, t, params).
