@@ -25,7 +25,6 @@ from lagjax._equations._linear import (
     least_norm,
     null_directions,
     rank,
-    rank_tolerance,
     saddle,
     saddle_many,
     schur_complements,

@@ -11,7 +11,6 @@ a motion meets a surface: `_surfaces`, `_crossing`.
 
 import dataclasses
 import functools
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import jax
