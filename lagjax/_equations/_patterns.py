@@ -140,5 +140,5 @@ def color_columns(pattern: csr_array) -> np.ndarray:
     """A colour for each column of a pattern: columns of one colour share no row (Curtis, Powell & Reid 1974)."""
     import asdex
 
-    entries = pattern.tocoo()
-    return np.asarray(asdex.color_cols(asdex.SparsityPattern.from_coo(entries.row, entries.col, pattern.shape))[0])
+    entries, m, n = pattern.tocoo(), len(pattern.indptr) - 1, int(pattern.indices.max(initial=-1)) + 1
+    return np.asarray(asdex.color_cols(asdex.SparsityPattern.from_coo(entries.row, entries.col, (m, n)))[0])

@@ -77,8 +77,8 @@ def structure_of(motion: Motion, shapes: tuple, insists: bool = False) -> Struct
     inverse = _pattern_of_inverse(mass)
 
     def schur(jacobian: csr_array) -> MatrixForm:
-        m = jacobian.shape[0]
-        return form_of(None if inverse is None else csr_array((jacobian @ inverse @ jacobian.T) != 0), m)
+        pattern = None if inverse is None else csr_array((jacobian @ inverse @ jacobian.T) != 0)
+        return form_of(pattern, len(jacobian.indptr) - 1)
 
     both = csr_array(_stack(rows, on_velocities))
     return Structure(operations, mass, schur(both), schur(rows) if count else None)
