@@ -23,6 +23,10 @@ NAMES = (
     "restricted_three_body",
     "driven_pendulum",
     "mercury_perihelion",
+    "fput",
+    "sine_gordon",
+    "membrane",
+    "net",
 )
 
 

@@ -159,3 +159,33 @@ def test_the_first_hour(tmp_path, monkeypatch, capsys):
     params = scope["fit"].params
     np.testing.assert_allclose(params["l"], 0.62, rtol=2e-3)
     np.testing.assert_allclose(params["c"], 0.02, rtol=2e-2)
+
+
+@pytest.mark.slow
+def test_a_chain_of_springs_returns(tmp_path, monkeypatch):
+    scope = run("fput", tmp_path, monkeypatch, SPRINGS=64, MODE=2)
+    # Zabusky's formula is a fit with one digit or two.
+    np.testing.assert_allclose(scope["back"], scope["book"], rtol=0.15)
+    assert scope["shares"][scope["back"], 1] > 0.8 and scope["shares"][:, 1].min() < 0.05
+    assert scope["drift"] < 1e-5  # steps of 1e-7, some 10⁴ of them
+
+
+@pytest.mark.slow
+def test_kinks_and_breathers(tmp_path, monkeypatch):
+    scope = run("sine_gordon", tmp_path, monkeypatch, SITES=(512, 1024))
+    # The error is c h² + O(h⁴), at h = 3/32 and 3/64: the exponent is off by some 15 h² of a breather.
+    assert abs(scope["orders"][0] - 2) < 0.2 and scope["errors"][1] < 0.02
+
+
+@pytest.mark.slow
+def test_a_membrane_is_struck(tmp_path, monkeypatch):
+    scope = run("membrane", tmp_path, monkeypatch, SIDE=16, DURATION=200)
+    np.testing.assert_allclose(scope["motion"].q[-1], scope["exact"], atol=1e-7)  # 1e-9 a step, some hundred of them
+    np.testing.assert_allclose(scope["ours"], scope["lowest"], rtol=1e-12)
+
+
+@pytest.mark.slow
+def test_a_net_falls(tmp_path, monkeypatch):
+    scope = run("net", tmp_path, monkeypatch, KNOTS=6, DURATION=0.3)
+    assert scope["stretch"] < 1e-10
+    np.testing.assert_allclose(scope["energy"], scope["energy"][0], atol=1e-5 * scope["fallen"])
