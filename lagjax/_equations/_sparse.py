@@ -233,7 +233,9 @@ class Sparse(Entries):
         def product(x):  # term by term XLA takes a third of the time of a sum over an axis
             return functools.reduce(lambda y, of: y + of[0] * x[of[1]], by_place, jnp.zeros_like(x))
 
-        return Solver(lambda b: scale * conjugate_gradients(product, scale * b), jnp.array(False), jnp.array(self.size))
+        empty = sum(jnp.abs(entry) for entry, _ in by_place) == 0  # rows, which b in the range of A would hide
+        singular = jnp.any(empty) & (not dependent)
+        return Solver(lambda b: scale * conjugate_gradients(product, scale * b), singular, jnp.sum(~empty))
 
 
 @dataclass(frozen=True)

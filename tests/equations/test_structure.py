@@ -202,3 +202,17 @@ def test_a_dense_mass_of_many_coordinates_is_solved_by_products():
     assert isinstance(structure.mass, Products)
     force = np.sin(q)
     np.testing.assert_allclose(system.acceleration(q, 0 * q), force - u * (u @ force) / (1 + u @ u), rtol=0, atol=1e-14)
+
+
+def test_a_coordinate_without_any_energy_makes_a_sparse_mass_singular():
+    """Conjugate gradients would leave it at rest: its force is zero as well."""
+    counts = np.ones(N)
+    counts[34] = 0
+
+    def lagrangian(q, qdot):
+        return plate(counts * q, counts * qdot, 0.0, {"m": 1.0})
+
+    system, (q, v) = lagjax.System(lagrangian, path="array"), start("sparse")
+    structure = derivation_of(system, Layout.from_state(q, v), None).structure
+    assert isinstance(structure.mass, Sparse)
+    assert np.isnan(system.acceleration(q, v)).all()
