@@ -189,10 +189,10 @@ class Derivation:
 
         leaves, structure = jax.tree.flatten(self.state_shapes)
         try:
-            return lower_scalars(trace_scalars, trace_arrays, tuple(leaves), OPERATION_BUDGET)
+            return lower_scalars(trace_scalars, trace_arrays, tuple(leaves), OPERATION_BUDGET, 2 * self.layout.size + 1)
         except OwnRules:
             self._own_rules = True
-            return lower(trace_arrays, *leaves, budget=OPERATION_BUDGET)
+            return lower(trace_arrays, *leaves, budget=OPERATION_BUDGET, moving=2 * self.layout.size + 1)
 
     def program(self, *names: str) -> Program:
         """The program for these of `Motion.quantities`, end to end, each in C order."""
@@ -260,7 +260,9 @@ class Derivation:
         key = "momenta_by_q", *map(str, momenta)
         if key not in self._programs:
             chosen = jax.jacrev(lambda *state: self._traced_once.momentum(*state)[jnp.asarray(momenta, int)])
-            self._programs[key] = lower(chosen, *self.state_shapes, budget=OPERATION_BUDGET)
+            self._programs[key] = lower(
+                chosen, *self.state_shapes, budget=OPERATION_BUDGET, moving=2 * self.layout.size + 1
+            )
         return self._programs[key]
 
     # ---- what is solved for ----

@@ -59,7 +59,7 @@ class _ScalarState:
 
     def taped(self, function: Callable) -> "_Taped":
         """A function of (q, q̇, t, params) with one value, as it is written."""
-        tape = Tape(self.expansion.graph.budget)
+        tape = Tape(self.expansion.graph.budget, self.expansion.graph.moving)
         written = Expansion(tape)
         inputs = [i for leaf in jax.tree.leaves(list(self.ids.values())) for i in leaf.ravel().tolist()]
         arguments = inputs_of(tape, jax.tree.leaves(list(self.shapes.values())))

@@ -64,15 +64,18 @@ from lagjax._program.lowering._matrices import orthogonalize, row_weights, solve
 from lagjax._program.lowering._rules import LARGEST_UNFOLDED, Expansion, expand_primitive, has_own_rules, inputs_of
 
 
-def lower(function: Callable, *examples, budget: int = 20_000) -> "Program":
+def lower(function: Callable, *examples, budget: int = 20_000, moving: int = 0) -> "Program":
     """The scalar program of `function` at arguments like `examples` (arrays, `ShapeDtypeStruct`s, or pytrees of them).
 
+    The first `moving` numbers among the inputs are those of the motion (`Graph`).
     Raises `Unlowerable`, with a sentence, for a primitive without a scalar form, for indices and loops that depend on
     the values of the inputs, and for more than `budget` scalar operations; the last without doing the work first.
     """
     leaves, structure = jax.tree.flatten(examples)
     shapes = tuple(jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
-    return _lower_leaves(lambda *xs: jax.tree.leaves(function(*jax.tree.unflatten(structure, xs))), shapes, budget)
+    return _lower_leaves(
+        lambda *xs: jax.tree.leaves(function(*jax.tree.unflatten(structure, xs))), shapes, budget, moving
+    )
 
 
 def trace_jaxpr(function: Callable, *shapes) -> core.ClosedJaxpr:
@@ -81,20 +84,30 @@ def trace_jaxpr(function: Callable, *shapes) -> core.ClosedJaxpr:
         return jax.make_jaxpr(function)(*shapes)
 
 
-def _lower_leaves(function: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], budget: int) -> "Program":
+def _lower_leaves(
+    function: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], budget: int, moving: int = 0
+) -> "Program":
     jaxpr = trace_jaxpr(function, *shapes)
-    return lower_scalars(lambda expansion, arguments: expansion.run_closed(jaxpr, arguments), function, shapes, budget)
+
+    def scalars(expansion, arguments):
+        return expansion.run_closed(jaxpr, arguments)
+
+    return lower_scalars(scalars, function, shapes, budget, moving)
 
 
 def lower_scalars(
-    scalars: Callable, function: Callable | None, shapes: tuple[jax.ShapeDtypeStruct, ...], budget: int
+    scalars: Callable,
+    function: Callable | None,
+    shapes: tuple[jax.ShapeDtypeStruct, ...],
+    budget: int,
+    moving: int = 0,
 ) -> "Program":
     """The program of the id arrays that `scalars(expansion, arguments)` makes of those of its inputs.
 
     `function` is the function in JAX that it stands for, of arrays of these `shapes`; None where it is not
     differentiated there.
     """
-    expansion = Expansion(Graph(budget))
+    expansion = Expansion(Graph(budget, moving))
     expansion.work(sum(math.prod(shape.shape) for shape in shapes))
     arguments = inputs_of(expansion.graph, shapes)
     with np.errstate(all="ignore"):

@@ -63,10 +63,12 @@ def find_ancestors(nodes: Sequence[Node], outputs: Iterable[int], powers: Mappin
 class Graph:
     """Scalars under construction. `apply` is the one door: it folds, simplifies and shares before it adds a node.
 
-    `budget` is the largest number of operations; one more raises `Unlowerable`.
+    `budget` is the largest number of operations; one more raises `Unlowerable`. The first `moving` numbers among the
+    inputs vary along a motion and are differentiated by: no look-up reads them as a table, which has no slope.
     """
 
-    def __init__(self, budget: int):
+    def __init__(self, budget: int, moving: int = 0):
+        self.moving = moving
         self.nodes: list[Node] = []
         self.kinds: list[str] = []
         self.budget = budget

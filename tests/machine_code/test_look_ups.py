@@ -243,3 +243,24 @@ def test_a_table_of_any_length_is_looked_up(where):
     scene = lagjax.System(free_particle, forces=force)
     run = lagjax.simulate(scene, 0.0, 0.0, END, params, solver=MACHINE)
     np.testing.assert_allclose(run.q[-1], 1.2**3 / 6, rtol=1e-12)
+
+
+@pytest.mark.parametrize("place", [0, 2])
+def test_a_coordinate_that_params_choose_is_differentiated_by(place):
+    """Σ q[i]² and a product of two such entries: a look-up into the state itself has a slope by what it reads."""
+    i, j, q = np.array([place, 1]), np.array([4, 3]), np.array([0.3, -0.7, 1.1, 0.4, -0.2])
+
+    def lagrangian(q, qdot, params):
+        chosen = q[params["i"]]
+        return 0.5 * jnp.sum(qdot**2) - 0.5 * jnp.sum(chosen**2) - 0.2 * jnp.sum(chosen * q[params["j"]])
+
+    stiffness = np.zeros((5, 5))
+    np.add.at(stiffness, (i, i), 1.0)
+    np.add.at(stiffness, (i, j), 0.2)
+    np.add.at(stiffness, (j, i), 0.2)
+    scene, params = lagjax.System(lagrangian), {"i": i, "j": j}
+    np.testing.assert_allclose(scene.acceleration(q, 0 * q, 0.0, params), -stiffness @ q, rtol=0, atol=1e-15)
+    run = lagjax.simulate(scene, q, 0 * q, END, params, solver=MACHINE)
+    values, modes = np.linalg.eigh(stiffness)
+    end = modes @ (np.cos(np.sqrt(values + 0j) * END[-1]).real * (modes.T @ q))
+    np.testing.assert_allclose(run.q[-1], end, rtol=0, atol=1e-9)

@@ -132,7 +132,7 @@ class Surfaces(NamedTuple):
 
         y = jax.ShapeDtypeStruct((2 * n + 1,), derivation.layout.dtype)
         numbers = derivation.numbers
-        lowered = lower(values, y, numbers)
+        lowered = lower(values, y, numbers, moving=2 * n + 1)
         pieces = _borders_of(lowered, n)
 
         def followed(y, numbers):
@@ -143,8 +143,8 @@ class Surfaces(NamedTuple):
             rate = rate_of(y, numbers)
             return *jax.jvp(away, (y,), (rate,)), rate[:-1]
 
-        follow = functools.cache(lambda: lower(followed, y, numbers))
-        return cls(lowered, lower(complete, y, numbers), follow, directions, is_rounded, pieces)
+        follow = functools.cache(lambda: lower(followed, y, numbers, moving=2 * n + 1))
+        return cls(lowered, lower(complete, y, numbers, moving=2 * n + 1), follow, directions, is_rounded, pieces)
 
 
 @functools.lru_cache(maxsize=64)

@@ -184,8 +184,14 @@ def _compare_floats(graph: Graph, i: int) -> int:
 
 
 def _table(expansion: Any, x: Ids) -> Table | None:
-    """The table whose entries are those of an array, in C order; None where there is none."""
-    graph, ids = expansion.graph, x.ravel()
+    """The table whose entries are those of an array, in C order; None where there is none, or its entries move."""
+    table = _table_of_ids(expansion.graph, x.ravel())
+    return (
+        None if table is not None and table.numbers is None and min(table.positions) < expansion.graph.moving else table
+    )
+
+
+def _table_of_ids(graph: Graph, ids: Ids) -> Table | None:
     steps = np.diff(ids)
     stride = int(steps[0]) if steps.size else 1
     if ids.min() >= INPUTS and stride and (steps == stride).all():  # without a look at each of them
