@@ -114,14 +114,15 @@ def _run_on_host(ts, y0, params, *, flow, tolerances, keep):
     return _restore_batch(flow.run(*rows, tolerances, KEPT if keep else None)[:_OUTPUTS], batch)
 
 
-def _derive_on_host(derive, inner, *args, flow, tolerances, **_):
+def _derive_on_host(name, inner, *args, flow, tolerances, **_):
     """`_derivatives.jvp` or `vjp`, whose last arguments have these `inner` axes."""
     rows, batch = _rows(args, (*_MOTIONS, *inner))
+    derive = getattr(_derivatives, name)
     return _restore_batch(derive(flow, Motions(*rows[:_GIVEN]), *rows[_GIVEN:], tolerances), batch)
 
 
-_jvp_on_host = functools.partial(_derive_on_host, _derivatives.jvp, (2, 2))
-_vjp_on_host = functools.partial(_derive_on_host, _derivatives.vjp, (3, 2))
+_jvp_on_host = functools.partial(_derive_on_host, "jvp", (2, 2))
+_vjp_on_host = functools.partial(_derive_on_host, "vjp", (3, 2))
 
 
 # ---- primitives ------------------------------------------------------------------------------------------------------
