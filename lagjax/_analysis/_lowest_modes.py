@@ -57,34 +57,25 @@ def lowest_modes(
     if count is None or needs_all(count, n - rows):
         return _dense_modes(stiffness, mass, jacobian)
     shift, factors = lowest_shift(stiffness, mass, jacobian)
+    slices = [(shift, factors, count, "LM")]
     if rows:
         bordered = block_array([[stiffness - shift * mass, jacobian.T], [jacobian, None]], format="csc")
-        factors = factorize_regular(bordered)
-        if factors is None:
+        slices = [(shift, factorize_regular(bordered), count, "LM")]
+        if slices[0][1] is None:
             raise ValueError(
                 f"The {rows} constraints depend on each other at q, or nearly: of so many coordinates modes are found "
                 "with independent ones. Drop those that follow from others."
             )
-
-    def invert(b):
-        return factors.solve(np.concatenate([b, np.zeros(rows)]))[:n]
-
-    def nearest(modes: int, against: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The modes next to the shift, of what is orthogonal to the vectors `against` (n, j)."""
-        weighted = mass @ against
-
-        def project_inverse(b):
-            x = invert(b - weighted @ (against.T @ b))
-            return x - against @ (weighted.T @ x)
-
-        start = project_inverse(mass @ np.random.default_rng(0).normal(size=n))
-        inverse: Any = LinearOperator((n, n), project_inverse, dtype=float)  # pyright: ignore[reportCallIssue]
-        return eigsh(stiffness, modes, mass, shift, OPinv=inverse, v0=start)  # pyright: ignore[reportReturnType]
-
+    counted = [] if rows else _slices(stiffness, mass, shift, factors, count)
+    values, shapes = np.zeros(0), np.zeros((n, 0))
     try:
-        values, shapes = nearest(count, np.zeros((n, 0)))
-        while shapes.shape[1] < n - rows:
-            value, more = nearest(1, shapes)
+        for of_slice in counted or slices:
+            more = _modes_of(stiffness, mass, shapes, *of_slice)
+            values, shapes = np.append(values, more[0]), np.column_stack([shapes, more[1]])
+        if counted and values.max() > counted[-1][0]:  # instead of a copy of a multiple one another was taken
+            counted, (values, shapes) = [], _modes_of(stiffness, mass, np.zeros((n, 0)), *slices[0])
+        while not counted and shapes.shape[1] < n - rows:
+            value, more = _modes_of(stiffness, mass, shapes, *slices[0][:2], 1, "LM")
             if value[0] >= np.sort(values)[count - 1]:
                 break
             values, shapes = np.append(values, value), np.column_stack([shapes, more])
@@ -93,13 +84,65 @@ def lowest_modes(
     turned = symmetric_modes(shapes.T @ (stiffness @ shapes), shapes.T @ (mass @ shapes))
     values, turn = map(np.asarray, turned)
     values, shapes = values[:count], shapes @ turn[:, :count]
-    again = np.column_stack([invert(x) for x in (mass @ shapes).T]) * (values - shift)
+    shift, factors = slices[0][:2]
+    again = np.column_stack([_invert(factors, x) for x in (mass @ shapes).T]) * (values - shift)
     off = np.linalg.norm(again - shapes, axis=0) / np.linalg.norm(shapes, axis=0)
     if not off.max() <= _OFF:
         raise ValueError(
             f"Mode {int(np.argmax(off))} was not found: its shape is off by {off.max():.1g} of its length."
         )
     return values, shapes
+
+
+def _invert(factors: SuperLU, b: np.ndarray) -> np.ndarray:
+    """x (n,) of (K − σM) x = b, by factors that may be bordered by constraints."""
+    return factors.solve(np.append(b, np.zeros(factors.shape[0] - len(b))))[: len(b)]
+
+
+def _modes_of(stiffness: Sparse, mass: Sparse, against: np.ndarray, shift: float, factors, modes: int, which: str):
+    """λ and X of modes next to the shift, with `which` "SA" below it, orthogonal to the vectors `against` (n, j)."""
+    n, weighted = len(against), mass @ against
+
+    def project_inverse(b):
+        x = _invert(factors, b - weighted @ (against.T @ b))
+        return x - against @ (weighted.T @ x)
+
+    start = project_inverse(mass @ np.random.default_rng(0).normal(size=n))
+    inverse: Any = LinearOperator((n, n), project_inverse, dtype=float)  # pyright: ignore[reportCallIssue]
+    return eigsh(stiffness, modes, mass, shift, which, start, OPinv=inverse)  # pyright: ignore
+
+
+def _slices(stiffness: Sparse, mass: Sparse, low: float, factors: SuperLU, count: int) -> list[tuple]:
+    """Shifts, factors and numbers of modes that together are the lowest `count` to twice as many; none if not found.
+
+    Where some modes lie far below a dense band, as that of a heavy mass does, Lanczos's method takes thousands of
+    steps to tell those of the band apart by a shift below all. So one shift lies inside, and those few are found by
+    themselves. By Sylvester's law of inertia K − σM has a negative pivot for each eigenvalue below σ.
+    """
+    far, high, width = (low, factors, 0, "LM"), np.inf, 4 * _SHIFT * (float(abs(stiffness).sum(axis=1).max()) or 1.0)
+    for _ in range(2 * _TRIALS):
+        trial = low + width if np.isinf(high) else 0.5 * (low + high)
+        if (found := _eliminate(stiffness - trial * mass)) is None:
+            return []
+        below = int(np.sum(found.U.diagonal() < 0))
+        if count <= below <= 2 * count:
+            few = far[2] if 0 < far[2] <= count // 2 else 0
+            return [*([far] if few else []), (trial, found, below - few, "SA")]
+        if below < count:
+            low, width, far = trial, 8 * width, (*far[:2], below, "LM")
+        else:
+            high = trial
+    return []
+
+
+def _eliminate(matrix: Sparse) -> SuperLU | None:
+    """The factors of a symmetric matrix without pivoting; None where that meets a zero."""
+    options = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
+    try:
+        factors = splu(csc_array(matrix), **options)
+    except RuntimeError:
+        return None
+    return factors if np.array_equal(factors.perm_r, factors.perm_c) else None
 
 
 def _dense_modes(stiffness: Sparse, mass: Sparse, jacobian: Sparse):
@@ -139,13 +182,8 @@ def lowest_shift(stiffness: Sparse, mass: Sparse, jacobian: Sparse = None) -> tu
 
 def factorize_positive(matrix: Sparse) -> SuperLU | None:
     """The factors of a positive definite matrix, by elimination without pivoting; None where it is none."""
-    options = {"permc_spec": "MMD_AT_PLUS_A", "diag_pivot_thresh": 0.0, "options": {"SymmetricMode": True}}
-    try:
-        factors = splu(csc_array(matrix), **options)
-    except RuntimeError:  # a zero pivot
-        return None
-    in_order = np.array_equal(factors.perm_r, factors.perm_c)
-    return factors if in_order and (factors.U.diagonal() > 0).all() else None
+    factors = _eliminate(matrix)
+    return factors if factors is not None and (factors.U.diagonal() > 0).all() else None
 
 
 def factorize_regular(matrix: Sparse) -> SuperLU | None:
