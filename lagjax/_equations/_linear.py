@@ -390,4 +390,4 @@ def _least_norm_many(matrix: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 def _finite(matrix: np.ndarray) -> np.ndarray:
     """True for each of S matrices (S, n, n) without a NaN, at which LAPACK raises, (S, 1, 1)."""
-    return np.isfinite(matrix).all(axis=(1, 2), keepdims=True)
+    return np.asarray(np.isfinite(matrix).all(axis=(1, 2), keepdims=True))
