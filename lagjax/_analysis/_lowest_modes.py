@@ -57,7 +57,7 @@ def lowest_modes(
     if count is None or needs_all(count, n - rows):
         return _dense_modes(stiffness, mass, jacobian)
     shift, factors = lowest_shift(stiffness, mass, jacobian)
-    slices = [(shift, factors, count, "LM")]
+    slices: list[tuple[float, Any, int, str]] = [(shift, factors, count, "LM")]
     if rows:
         bordered = block_array([[stiffness - shift * mass, jacobian.T], [jacobian, None]], format="csc")
         slices = [(shift, factorize_regular(bordered), count, "LM")]
@@ -112,7 +112,9 @@ def _modes_of(stiffness: Sparse, mass: Sparse, against: np.ndarray, shift: float
     return eigsh(stiffness, modes, mass, shift, which, start, OPinv=inverse)  # pyright: ignore
 
 
-def _slices(stiffness: Sparse, mass: Sparse, low: float, factors: SuperLU, count: int) -> list[tuple]:
+def _slices(
+    stiffness: Sparse, mass: Sparse, low: float, factors: SuperLU, count: int
+) -> list[tuple[float, Any, int, str]]:
     """Shifts, factors and numbers of modes that together are the lowest `count` to twice as many; none if not found.
 
     Where some modes lie far below a dense band, as that of a heavy mass does, Lanczos's method takes thousands of
