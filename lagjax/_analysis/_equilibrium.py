@@ -106,9 +106,7 @@ def equilibrium(
         if stable:
             scene = _settled_scene(scene, qdot)
         place, multipliers, ok = _solve_balance(False, *scene.arguments)
-        if (
-            scene.concrete and not ok
-        ):  # again, with the rounding of terms, whose program is compiled where it may matter
+        if scene.concrete and not ok:  # with the rounding of terms, whose program is compiled where it may matter
             place, multipliers, ok = _solve_balance(True, *scene.arguments)
         why = "" if not throw or not scene.concrete or ok else _sentence(scene)
     if throw and why:

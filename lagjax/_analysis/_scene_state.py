@@ -11,8 +11,8 @@ from jaxtyping import Array, Float
 from lagjax._engine.taylor import lowered_motion
 from lagjax._equations import (
     Derivation,
+    MatrixFree,
     Motion,
-    Products,
     Sample,
     Scales,
     borders_of,
@@ -98,7 +98,7 @@ class SceneState(NamedTuple):
     def large(self) -> bool:
         """True if matrices of n × n numbers are not written down, as those of the scene are sparse."""
         structure = self.derivation.structure
-        if structure is None or isinstance(structure.mass, Products) or self.layout.size <= _LARGEST_DENSE:
+        if structure is None or isinstance(structure.mass, MatrixFree) or self.layout.size <= _LARGEST_DENSE:
             return False
         return not pieces_of_motion(self.motion, *self.derivation.state_shapes)
 
@@ -134,7 +134,7 @@ class SceneState(NamedTuple):
 
     @property
     def unread(self) -> tuple[int, ...]:
-        """The coordinates that L does not depend on, of a scene with a `Structure`: by its pattern."""
+        """The coordinates that L does not depend on, of a scene with a `SparseStructure`: by its pattern."""
         lagrangian, shapes = self.derivation.motion.lagrangian, self.derivation.state_shapes
         pattern = jacobian_pattern(lambda *state: lagrangian(*state)[None], shapes, by=0)
         return () if pattern is None else tuple(np.setdiff1d(np.arange(self.layout.size), pattern.indices).tolist())

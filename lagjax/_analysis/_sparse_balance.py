@@ -1,8 +1,8 @@
 """The balance of forces of a large scene at rest, F + Gᵀλ and f, its sparse derivative by z = (q, λ), and its roots.
 
-It is for scenes with a `Structure`. Derivatives are read off by products (`sparse_jacobian`) and solved by SuperLU on
-the host, so that nothing here is traced. The steps are those of `_solve`: damped ones until they are small, then those
-of Newton's method; but a step along which the derivative is singular is that of the least damping.
+It is for scenes with a `SparseStructure`. Derivatives are read off by products (`sparse_jacobian`) and solved by
+SuperLU on the host, so that nothing here is traced. The steps are those of `_solve`: damped ones until they are small,
+then those of Newton's method; but a step along which the derivative is singular is that of the least damping.
 """
 
 from collections.abc import Callable

@@ -29,7 +29,7 @@ from lagjax._equations._patterns import gradient_memory, jacobian_pattern
 from lagjax._equations._quantities import OwnRules, quantities
 from lagjax._equations._recursion import Recursion, RecursiveElimination
 from lagjax._equations._saddle import LARGEST_INDEFINITE, IndefiniteElimination, SaddleElimination, TwoCoordinates
-from lagjax._equations._structure import LARGEST_LOWERED, LEAST_COORDINATES, SparseMotion, Structure, structure_of
+from lagjax._equations._structure import LARGEST_LOWERED, LEAST_COORDINATES, SparseMotion, SparseStructure, structure_of
 from lagjax._interface import Layout, dtype_of, is_concrete
 from lagjax._native import Projection
 from lagjax._primitives import DOUBLE
@@ -151,7 +151,7 @@ class Derivation:
         # Compiled functions are traced once for each of their derivatives, and all quantities share these.
         self._traced_once: Motion = jax.tree.map(jax.jit, motion)
 
-    def _structure_of(self, motion: Motion, insists: bool) -> Structure | None:
+    def _structure_of(self, motion: Motion, insists: bool) -> SparseStructure | None:
         structure = structure_of(motion, self.state_shapes, insists)
         if structure is None or insists or structure.operations > LARGEST_LOWERED:
             return structure

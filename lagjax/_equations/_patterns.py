@@ -73,10 +73,9 @@ def _largest_array(jaxpr) -> int:
     """The bytes of the largest array that an operation of a jaxpr gives."""
     largest = 0
     for equation in jaxpr.eqns:
-        inner = [x for x in jax.tree.leaves(equation.params, is_leaf=_is_jaxpr) if _is_jaxpr(x)]
         arrays = [v.aval for v in equation.outvars]
         sizes = (math.prod(x.shape) * x.dtype.itemsize for x in arrays if hasattr(x, "shape"))
-        largest = max(largest, *sizes, *(_largest_array(getattr(x, "jaxpr", x)) for x in inner), 0)
+        largest = max(largest, *sizes, *map(_largest_array, _inner_jaxprs(equation)), 0)
     return largest
 
 
@@ -109,9 +108,9 @@ def count_operations(jaxpr) -> int:
     """The scalar operations of a jaxpr: numbers that its equations compute, those of loops in every round."""
     count = 0
     for equation in jaxpr.eqns:
-        inner = [x for x in jax.tree.leaves(equation.params, is_leaf=_is_jaxpr) if _is_jaxpr(x)]
+        inner = _inner_jaxprs(equation)
         rounds = equation.params.get("length", 1) if equation.primitive.name == "scan" else 1
-        count += rounds * sum(count_operations(getattr(x, "jaxpr", x)) for x in inner)
+        count += rounds * sum(map(count_operations, inner))
         count += 0 if inner else sum(int(np.prod(v.aval.shape, dtype=int)) for v in equation.outvars)
     return count
 
@@ -120,8 +119,7 @@ def _visited(jaxpr) -> int:
     """The products of two numbers in products of matrices, and the numbers that running sums and transforms read."""
     count = 0
     for equation in jaxpr.eqns:
-        for x in jax.tree.leaves(equation.params, is_leaf=_is_jaxpr):
-            count += _visited(getattr(x, "jaxpr", x)) if _is_jaxpr(x) else 0
+        count += sum(map(_visited, _inner_jaxprs(equation)))
         if equation.primitive.name == "dot_general":
             (contracted, _), _ = equation.params["dimension_numbers"]
             shape = equation.invars[0].aval.shape
@@ -132,8 +130,10 @@ def _visited(jaxpr) -> int:
     return count
 
 
-def _is_jaxpr(x) -> bool:
-    return isinstance(x, Jaxpr | ClosedJaxpr)
+def _inner_jaxprs(equation) -> list[Jaxpr]:
+    """The jaxprs that an equation calls, as loops and branches do."""
+    inner = jax.tree.leaves(equation.params, is_leaf=lambda x: isinstance(x, Jaxpr | ClosedJaxpr))
+    return [x.jaxpr if isinstance(x, ClosedJaxpr) else x for x in inner if isinstance(x, Jaxpr | ClosedJaxpr)]
 
 
 def color_columns(pattern: csr_array) -> np.ndarray:

@@ -239,7 +239,7 @@ class Sparse(Entries):
 
 
 @dataclass(frozen=True)
-class Products(MatrixForm):
+class MatrixFree(MatrixForm):
     """No pattern: conjugate gradients with products of the matrix."""
 
     iterative = True
@@ -278,7 +278,7 @@ def refine(product: Callable, solve: Callable, right):
 def form_of(pattern: csr_array | None, size: int) -> MatrixForm:
     """The form that suits the pattern of a symmetric matrix; None is an unknown one."""
     if pattern is None:
-        return Products(size)
+        return MatrixFree(size)
     diagonal = csr_array((np.ones(size, bool), (np.arange(size), np.arange(size))), shape=(size, size))
     pattern = csr_array(pattern + pattern.T + diagonal)
     pattern.sort_indices()
@@ -293,5 +293,5 @@ def form_of(pattern: csr_array | None, size: int) -> MatrixForm:
     if width <= WIDEST_BAND:
         return Band(pattern, order, width)
     if np.diff(pattern.indptr).max() > MOST_COLORS:
-        return Products(size)
+        return MatrixFree(size)
     return Sparse(pattern, color_columns(pattern))

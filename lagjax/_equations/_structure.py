@@ -14,11 +14,11 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, vstack
 
 from lagjax._equations._motion import Flag, Motion, PyTree, Row, Time, Vector
 from lagjax._equations._patterns import count_operations, hessian_pattern, jacobian_pattern
-from lagjax._equations._sparse import Blocks, Diagonal, MatrixForm, Products, Solver, form_of, refine
+from lagjax._equations._sparse import Blocks, Diagonal, MatrixForm, MatrixFree, Solver, form_of, refine
 from lagjax._interface import compiled_once
 
 # Coordinates from which arrays look for patterns, and the scalar operations of L from which a scene of so many runs on
@@ -34,7 +34,7 @@ LARGEST_DENSE = 512
 LARGEST_LOWERED = 60_000
 
 
-class Structure(NamedTuple):
+class SparseStructure(NamedTuple):
     """The forms of M, of S = G M⁻¹ Gᵀ, and of S for the constraints on positions alone (None without any).
 
     `operations` are the scalar ones of L.
@@ -50,7 +50,7 @@ class Structure(NamedTuple):
         return f"its mass matrix is {self.mass.name}{linked}"
 
 
-def structure_of(motion: Motion, shapes: tuple, insists: bool = False) -> Structure | None:
+def structure_of(motion: Motion, shapes: tuple, insists: bool = False) -> SparseStructure | None:
     """The structure of a large scene; None where it is small, or coupled so that machine code or dense arrays suit it.
 
     `shapes` are those of (q, q̇, t, params). With `insists`, arrays were asked for, and size alone decides.
@@ -64,10 +64,10 @@ def structure_of(motion: Motion, shapes: tuple, insists: bool = False) -> Struct
         return None
     pattern = hessian_pattern(motion.lagrangian, shapes, by=1)
     mass = form_of(pattern, n)
-    if isinstance(mass, Products) and (n <= LARGEST_DENSE or not insists):
+    if isinstance(mass, MatrixFree) and (n <= LARGEST_DENSE or not insists):
         return None
     if not motion.constrained:
-        return Structure(operations, mass, None, None)
+        return SparseStructure(operations, mass, None, None)
     constraints = motion.constraints
     count = jax.eval_shape(constraints.f, q, t, numbers).size
     rows = jacobian_pattern(lambda q, t, p: constraints.f(q, t, p), (q, t, numbers), by=0)
@@ -80,14 +80,8 @@ def structure_of(motion: Motion, shapes: tuple, insists: bool = False) -> Struct
         pattern = None if inverse is None else csr_array((jacobian @ inverse @ jacobian.T) != 0)
         return form_of(pattern, len(jacobian.indptr) - 1)
 
-    both = csr_array(_stack(rows, on_velocities))
-    return Structure(operations, mass, schur(both), schur(rows) if count else None)
-
-
-def _stack(*patterns: csr_array) -> csr_array:
-    from scipy.sparse import vstack
-
-    return csr_array(vstack([pattern.astype(np.int32) for pattern in patterns]))
+    both = csr_array(vstack([pattern.astype(np.int32) for pattern in (rows, on_velocities)]))
+    return SparseStructure(operations, mass, schur(both), schur(rows) if count else None)
 
 
 def _pattern_of_inverse(form: MatrixForm) -> csr_array | None:
@@ -103,9 +97,9 @@ def _pattern_of_inverse(form: MatrixForm) -> csr_array | None:
 
 
 class SparseMotion(Motion):
-    """`Motion` by the `Structure` of its scene."""
+    """`Motion` by the `SparseStructure` of its scene."""
 
-    structure: Structure = eqx.field(static=True, kw_only=True)
+    structure: SparseStructure = eqx.field(static=True, kw_only=True)
 
     def mass_product(self, q, qdot, t, params):
         """x ↦ M x."""

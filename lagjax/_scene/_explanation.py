@@ -15,7 +15,7 @@ from jax.interpreters.partial_eval import dce_jaxpr
 
 from lagjax._engine import Problem, choose
 from lagjax._engine.diffrax import ArrayEquations, form_of
-from lagjax._equations import Derivation, Structure, dependent_rows, pieces_of_motion
+from lagjax._equations import Derivation, SparseStructure, dependent_rows, pieces_of_motion
 from lagjax._interface import join_names, show_str
 from lagjax._native import Nesting, is_large, pieces_of
 from lagjax._program import CLOCK, FLOOR, SIGN, TABLE, TRUNC, Program, Unlowerable
@@ -152,7 +152,7 @@ def explain(problem: Problem) -> Explanation:
     )
 
 
-def _facts_of_arrays(derivation: Derivation, structure: Structure) -> dict[str, Any]:
+def _facts_of_arrays(derivation: Derivation, structure: SparseStructure) -> dict[str, Any]:
     """The facts about a large scene, from what the operations of its functions read, whether or not it cancels."""
     motion, cyclic = derivation.motion, derivation.cyclic
     names, inputs = derivation.layout.names, ("q", "dq", "t")

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array
 
-from lagjax._equations._sparse import Band, Blocks, Diagonal, Products, Sparse, form_of, refine
+from lagjax._equations._sparse import Band, Blocks, Diagonal, MatrixFree, Sparse, form_of, refine
 
 SIZE = 60
 
@@ -38,7 +38,7 @@ def positive_matrix(pattern: np.ndarray, spread: float) -> np.ndarray:
     return matrix * units[:, None] * units
 
 
-KINDS = {"diagonal": Diagonal, "blocks": Blocks, "band": Band, "sparse": Sparse, "dense": Products}
+KINDS = {"diagonal": Diagonal, "blocks": Blocks, "band": Band, "sparse": Sparse, "dense": MatrixFree}
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -46,7 +46,7 @@ def test_each_form_solves_with_its_matrix(kind):
     pattern = random_pattern(kind)
     form = form_of(csr_array(pattern) if kind != "dense" else None, SIZE)
     if kind == "dense":
-        form = Products(SIZE)
+        form = MatrixFree(SIZE)
     assert isinstance(form, KINDS[kind])
     matrix, b = positive_matrix(pattern, 0 if kind == "dense" else 3), np.random.default_rng(5).normal(size=SIZE)
 

@@ -13,7 +13,6 @@ import lagjax
 from lagjax._fit.model import _transforms
 from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._transforms import Unbounded
-from lagjax._fit.search import _search
 
 TS = np.linspace(0.0, 4.0, 101)
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -378,13 +377,11 @@ def test_gradients_come_to_the_same_as_gauss_and_newton():
 
 
 @pytest.mark.slow
-def test_a_network_learns_the_potential_of_its_recordings(monkeypatch):
-    monkeypatch.setattr(_search, "_GRADIENT_STEPS", 1500)  # half of them: enough for what is asked here
+def test_a_network_learns_the_potential_of_its_recordings():
     example = importlib.import_module("learned_potential")
     values, exact, starts = example.recordings()
     fit = example.learned(values[:9])
-    # The descent is cut off on its way: where to depends on rounding.
-    assert fit.rms["q"] < 1.2 * example.SIGMA and fit.params["c"] == pytest.approx(example.FRICTION, rel=0.2)
+    assert fit.rms["q"] < 1.1 * example.SIGMA and fit.params["c"] == pytest.approx(example.FRICTION, rel=0.2)
     assert max(example.held_out_errors(fit, exact[9:], starts[9:])) < 3 * example.SIGMA
     assert any("layers[2].bias[0]" in sentence for sentence in fit.unseen)
     assert "144 numbers" in str(fit) and len(str(fit).splitlines()) < 30
