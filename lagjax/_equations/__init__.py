@@ -29,6 +29,7 @@ from lagjax._equations._linear import (
     saddle_many,
     schur_complements,
     singular_threshold,
+    solve_general,
     unit_diagonal,
 )
 from lagjax._equations._many_states import (

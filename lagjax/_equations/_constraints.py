@@ -9,7 +9,8 @@ Both are differentiated by the time until the acceleration appears linearly, f t
     J q̇ + ∂f/∂t = 0,  J = ∂f/∂q                      the rate of f
     G q̈ = γ,          G = (J; ∂a/∂q̇), shape (m, n)   the constraint Jacobian and the acceleration-level right-hand side
 
-A scene without constraints has m = 0 rows here, not another kind of object. Nothing here knows a Lagrangian: the mass
+A scene without constraints has m = 0 rows here, not another kind of object. Rows may be held or released by numbers in
+params, as contacts are: the row of G and γ of one that is released are zero, and its multiplier is. Nothing here knows a Lagrangian: the mass
 matrix M, by which distances between states are measured, is an argument.
 """
 
@@ -32,11 +33,15 @@ Time = Float[Array, ""]
 class Constraints(eqx.Module):
     """The constraint functions of a scene: f(q, t, params) → (k,) and a(q, qdot, t, params) → (m − k,), or None.
 
-    q and qdot have shape (n,). Every result lists the constraints on positions first.
+    q and qdot have shape (n,). Every result lists the constraints on positions first. `held(params)` (m,) is 1 for each
+    row that holds and 0 for one that is released, whose value is then zero whatever the state. `drag(q, qdot, t,
+    params)` (n, m) is the force that comes with each multiplier beside Gᵀλ, as friction does.
     """
 
     on_positions: Callable | None = None
     on_velocities: Callable | None = None
+    held: Callable | None = None
+    drag: Callable | None = None
 
     @property
     def exist(self) -> bool:

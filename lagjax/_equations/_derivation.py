@@ -28,7 +28,13 @@ from lagjax._equations._motion import Motion
 from lagjax._equations._patterns import gradient_memory, jacobian_pattern
 from lagjax._equations._quantities import OwnRules, quantities
 from lagjax._equations._recursion import Recursion, RecursiveElimination
-from lagjax._equations._saddle import LARGEST_INDEFINITE, IndefiniteElimination, SaddleElimination, TwoCoordinates
+from lagjax._equations._saddle import (
+    LARGEST_INDEFINITE,
+    DraggedElimination,
+    IndefiniteElimination,
+    SaddleElimination,
+    TwoCoordinates,
+)
 from lagjax._equations._structure import LARGEST_LOWERED, LEAST_COORDINATES, SparseMotion, SparseStructure, structure_of
 from lagjax._interface import Layout, dtype_of, is_concrete
 from lagjax._native import Projection
@@ -283,7 +289,8 @@ class Derivation:
         mechanics = self._mechanics
         if (variant := self._recursive_acceleration()) is not None:
             return replace(variant, otherwise=lambda: self._general_acceleration, mechanics=mechanics)
-        if not self.motion.constrained or self._constant_mass or not self._regular(_ACCELERATION):
+        usual = self.motion.constrained and not self.motion.constraints.held
+        if not usual or self._constant_mass or not self._regular(_ACCELERATION):
             return self._general_acceleration
         variant = self._solution(_ACCELERATION, regular_only=True)
         return replace(variant, otherwise=lambda: self._general_acceleration, mechanics=mechanics)
@@ -454,6 +461,9 @@ class Derivation:
         system, solve = self._system(saddle, regular_only)
         return lower_solution(system, solve, self.layout.size, *self.scalar_shapes, budget=OPERATION_BUDGET)
 
+    def _is_dragged(self, saddle: _Saddle) -> bool:
+        return saddle.b is not None and not self.absent("drag").all()
+
     def _system(self, saddle: _Saddle, regular_only: bool = False) -> tuple[Callable, Callable]:
         """A z = r with z = (x, −λ), as two functions of scalars.
 
@@ -465,19 +475,22 @@ class Derivation:
         if regular is None and (self.motion.constrained or n > LARGEST_INDEFINITE):
             raise Unlowerable("its mass matrix is not positive definite and needs pivoting")
         zeros = self.absent("mass_matrix"), self.absent("jacobian")[:m]
-        augmented = self.motion.constrained and not (regular_only or (self._constant_mass and regular))
+        released = self.motion.constraints.held is not None
+        augmented = self.motion.constrained and not (regular_only or ((self._constant_mass or released) and regular))
         if n == 2 and not self.motion.constrained:
             elimination = TwoCoordinates(zeros[0], self.layout.dtype)
         elif regular is None:
             elimination = IndefiniteElimination(zeros[0], self.layout.dtype)
         else:
-            elimination = SaddleElimination(zeros, self.layout.dtype, augmented, regular_only)
+            elimination = SaddleElimination(zeros, self.layout.dtype, augmented, regular_only, released)
+            if self._is_dragged(saddle):
+                elimination = DraggedElimination(elimination, self.absent("drag"))
         if elimination.operations > OPERATION_BUDGET:
             raise Unlowerable(
                 f"to solve for the accelerations takes some {elimination.operations} operations, more than the "
                 f"{OPERATION_BUDGET} that are expected to fit in memory"
             )
-        parts = self._parts(saddle, elimination.entries, m)
+        parts = self._parts(saddle, elimination, m)
         count, places = len(elimination.entries), elimination.entries
 
         def system(*scalars):
@@ -525,20 +538,26 @@ class Derivation:
         error = np.abs(np.array(found).T - exact)[usable]
         return not singular[usable].any() and bool((error <= 1e-6 * np.abs(exact[usable]).max(initial=0)).all())
 
-    def _parts(self, saddle: _Saddle, entries: np.ndarray, constraints: int) -> Callable:
-        """A formula for these entries of M and G, the `constraints` numbers of c, and b, end to end."""
+    def _parts(self, saddle: _Saddle, elimination, constraints: int) -> Callable:
+        """A formula for the entries of an elimination, the `constraints` numbers of c, and b, end to end."""
         n, starts = self.layout.size, self._starts
-        row, column = entries.T
-        of_mass = starts["mass_matrix"] + n * row + column
-        positions = np.where(row < n, of_mass, starts["jacobian"] + n * (row - n) + column).tolist()
+        row, column = elimination.entries.T
+        names = "mass_matrix", "jacobian", "release", "drag"
+        table = [np.array(self._positions(name), int).reshape(self.shape(name)) for name in names]
+        ends = np.cumsum([0, *(x.size for x in table)])
+        rows = self.shape("jacobian")[0]
+        place = np.select(
+            [column < n, row >= n], [n * row + column, ends[2] + row - n], ends[3] + rows * row + column - n
+        )
+        positions = np.concatenate([x.ravel() for x in table])[place].tolist()
         positions += range(starts[saddle.c], starts[saddle.c] + constraints)
         if saddle.b is not None:
             positions += range(starts[saddle.b], starts[saddle.b] + n)
 
         def chosen(values):
-            table = jnp.concatenate([values["mass_matrix"], values["jacobian"]])
             right = [] if saddle.b is None else [values[saddle.b]]
-            return [table[row, column], values[saddle.c][:constraints], *right]
+            flat = jnp.concatenate([values[name].ravel() for name in names])
+            return [flat[place], values[saddle.c][:constraints], *right]
 
         cut = functools.cache(lambda: self._select(positions, chosen))
 

@@ -161,6 +161,33 @@ def invert(matrix: Matrix) -> tuple[Matrix, Int[Array, " n"], Vector]:
     return _permute_rows(a, order[:n])[:, :n], order[:n], pivots[:n]
 
 
+def solve_general(matrix: Matrix, b: Array) -> Array:
+    """X with A X = B, for B (n,) or (n, k); A need not be symmetric. NaN where it is singular.
+
+    Differentiated implicitly: one more solve with the same inverse.
+    """
+    if b.ndim > 1:
+        return jax.vmap(lambda column: solve_general(matrix, column), in_axes=1, out_axes=1)(b)
+    scale = jax.lax.stop_gradient(1 / jnp.max(jnp.abs(matrix), axis=1))
+    scaled = scale[:, None] * matrix
+    columns, order, pivots = invert(jax.lax.stop_gradient(scaled))
+    inverse = jnp.zeros_like(columns).at[:, order].set(columns)
+    lost = jnp.min(jnp.abs(pivots)) <= singular_threshold(len(matrix), matrix.dtype) * jnp.max(jnp.abs(pivots))
+
+    def refine(times, inverse, b):
+        x = inverse @ b
+        return x + inverse @ (b - times(x))
+
+    def solve(times, b):
+        return refine(times, inverse, b)
+
+    def solve_transpose(times, b):
+        return refine(times, inverse.T, b)
+
+    x = jax.lax.custom_linear_solve(lambda y: scaled @ y, scale * b, solve, solve_transpose)
+    return jnp.where(lost, jnp.nan, x)
+
+
 def _eliminate(panel: Array, free: Array) -> tuple[Array, Array, Array, Array]:
     """A panel of columns (size, width) after elimination, which rows are still free, the pivots' rows, the pivots."""
 

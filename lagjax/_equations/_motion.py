@@ -197,6 +197,7 @@ class Motion(eqx.Module):
           `nonconservative_force` (n,) = forces − ∂D/∂q̇; `generalized_force` (n,) = ∂L/∂q + forces − ∂D/∂q̇.
         - `jacobian` G (m, n) and `gamma` γ (m,) of G q̈ = γ; `residual` (m,): f, a; `rates` (m,): J q̇ + ∂f/∂t, a;
           `driving` (m,): ∂f/∂t, a(q, 0, t), by which constraints do work. m is zero without constraints.
+        - `release` (m,): −1 for a row that is released, else 0; `drag` (n, m). Both are empty where no row ever is.
         """
         state, n = (q, qdot, t, params), q.size
         value, (by_q, momentum, by_t) = jax.value_and_grad(self.lagrangian, argnums=(0, 1, 2))(*state)
@@ -225,4 +226,6 @@ class Motion(eqx.Module):
             "residual": self.constraints.residual(*state),
             "rates": self.constraints.rates(*state),
             "driving": self.constraints.driving(*state),
+            "release": jnp.zeros(0, q.dtype) if self.constraints.held is None else self.constraints.held(params) - 1.0,
+            "drag": jnp.zeros((0, 0), q.dtype) if self.constraints.drag is None else self.constraints.drag(*state),
         }

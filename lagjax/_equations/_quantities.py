@@ -234,10 +234,18 @@ def _constraint_quantities(constraints: Constraints, state: _ScalarState, rates:
         a = state.evaluate(constraints.on_velocities, "q", "qdot", "t", "params")
         at_rest = state.evaluate(constraints.on_velocities, "q", "qdot", "t", "params", at_rest=True)
     rate = state.rate(f, **rates)
+    release, drag = state.zeros(0), state.zeros((0, 0))
+    if constraints.held is not None:
+        held = constraints.held
+        release = state.evaluate(lambda params: held(params) - 1.0, "params")
+    if constraints.drag is not None:
+        drag = state.evaluate(constraints.drag, "q", "qdot", "t", "params")
     return {
         "jacobian": np.concatenate([state.jacobian(f, "q"), state.jacobian(a, "qdot")]),
         "gamma": state.expansion.map("neg", np.concatenate([state.rate(rate, **rates), state.rate(a, **rates)])),
         "residual": np.concatenate([f, a]),
         "rates": np.concatenate([rate, a]),
         "driving": np.concatenate([state.rate(f, t=True), at_rest]),
+        "release": release,
+        "drag": drag,
     }

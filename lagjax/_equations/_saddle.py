@@ -50,19 +50,27 @@ class SaddleElimination:
     `REGULAR` of singular. That is the regular-M variant, which takes a third of the arithmetic and leaves the rest of
     the states to the general one.
 
-    `entries` lists the row and column of what may not be zero in M, on and below its diagonal, and then in G, whose
-    rows are numbered from n: the vectors that `factors` takes are in that order.
+    Where rows may be `released`, −1 stands on the diagonal of one that is, beside a row of G that is zero: its λ is.
+
+    `entries` lists the row and column of what may not be zero in M, on and below its diagonal, then in G, whose rows
+    are numbered from n, and then the diagonal of rows that may be released: the vectors that `factors` takes are in
+    that order.
     """
 
-    def __init__(self, zeros: tuple[np.ndarray, np.ndarray], dtype, augmented: bool, regular_only: bool):
+    def __init__(
+        self, zeros: tuple[np.ndarray, np.ndarray], dtype, augmented: bool, regular_only: bool, released: bool = False
+    ):
         mass_zeros, row_zeros = zeros
-        self.dtype, self.augmented, self.regular_only = dtype, augmented, regular_only
+        self.dtype, self.augmented, self.regular_only, self.released = dtype, augmented, regular_only, released
         self.size = row_zeros.shape[1]
         touched = ~row_zeros
         self.rows = [np.flatnonzero(row) for row in touched]
         self.entries = np.concatenate(
             [np.argwhere(np.tril(~mass_zeros | ~mass_zeros.T)), np.argwhere(touched) + [self.size, 0]]
         )
+        if released:
+            diagonal = np.arange(self.size, self.size + len(touched))
+            self.entries = np.concatenate([self.entries, np.stack([diagonal, diagonal], axis=1)])
         mass = ~mass_zeros
         if augmented:
             mass = mass | ((touched.T.astype(float) @ touched.astype(float)) > 0)
@@ -119,7 +127,8 @@ class SaddleElimination:
             if j < n:
                 lost, inverse[j] = self._mass_pivot(j, a[j], of_coordinates + of_constraints)
             else:
-                lost, inverse[j] = self._constraint_pivot(of_coordinates, of_constraints)
+                own = [-a[j], *of_coordinates] if self.released else of_coordinates
+                lost, inverse[j] = self._constraint_pivot(own, of_constraints)
             if j < n or self.regular_only:
                 losses.append(lost)
             if not len(rows):
@@ -207,6 +216,52 @@ class SaddleElimination:
                 columns[i].append(j)
         for i in self.order:
             yield (before := np.array(columns[i], int)), self.slots[i, before] - total
+
+
+class DraggedElimination:
+    """A z = r + (Bλ, 0) with z = (x, −λ): each multiplier brings a force of its own, a column of B (n, m).
+
+    With z₀ = A⁻¹ r and Z = A⁻¹ (B, 0), z = z₀ + Z λ, where (1 − P) λ = λ₀ and −P are the last rows of Z. `zeros` (n, m)
+    marks what is zero in B whatever the state. What is left of c − G x is solved for once more: of bodies at rest it is
+    rounding of large forces, by which they would creep, and behind that of their accelerations alone.
+    """
+
+    def __init__(self, elimination: SaddleElimination, zeros: np.ndarray):
+        self.saddle, self.zeros, self.operations = elimination, zeros, 3 * elimination.operations
+        self.dragged = np.flatnonzero(~zeros.all(axis=0))
+        self.own = len(elimination.entries)
+        self.entries = np.concatenate([elimination.entries, np.argwhere(~zeros) + [0, elimination.size]])
+
+    def factors(self, values) -> tuple[Any, Any]:
+        n, saddle = self.saddle.size, self.saddle
+        factors, singular = saddle.factors(values[: self.own])
+        rows = self.saddle.entries[:, 0] >= n
+        rows &= self.saddle.entries[:, 1] < n
+        of_rows, forces = values[np.flatnonzero(rows)], values[self.own :]
+        places, columns = np.argwhere(~self.zeros), []
+        for j in self.dragged:
+            column = np.flatnonzero(places[:, 1] == j)
+            force = xp.scatter(forces[column], places[column, 0], n + len(saddle.rows))
+            columns.append(saddle.solve(factors, force))
+        coupling = xp.stack([xp.stack([z[n + i] for z in columns]) for i in self.dragged])
+        matrix = coupling + np.eye(len(self.dragged))
+        return (factors, of_rows, xp.stack(columns), orthogonalize(matrix)), singular
+
+    def solve(self, factors, right):
+        """x and then −λ, linear in `right`: b and then c."""
+        of_saddle, of_rows, columns, coupling = factors
+        n, saddle = self.saddle.size, self.saddle
+        z = saddle.solve(of_saddle, right)
+        multipliers = solve_orthogonalized(coupling, -xp.stack([z[n + j] for j in self.dragged]))
+        for k in range(len(self.dragged)):
+            z = z + columns[k] * multipliers[k]
+        gaps, start = right[n:], 0
+        for k, touching in enumerate(saddle.rows):
+            if len(touching):
+                row = of_rows[start : start + len(touching)]
+                gaps = xp.replace_entries(gaps, np.array([k]), gaps[k : k + 1] - xp.fold("add", row * z[touching]))
+                start += len(touching)
+        return z + saddle.solve(of_saddle, xp.scatter(gaps, np.arange(n, n + len(saddle.rows)), n + len(saddle.rows)))
 
 
 class TwoCoordinates:

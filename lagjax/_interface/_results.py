@@ -57,6 +57,11 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         'fires="crossing" of one that is to wait until it changes sign. What both sides push towards, as a relay does '
         "that rests on its switching line, is one System with sign or where, which slides along it."
     )
+    contact_undecided = (
+        "The law of contacts has no continuation there, or more than one: with much friction none of open, sliding and "
+        "sticking is possible, or several are (Painleve's paradox), or contacts take turns at one instant without end. "
+        "Less friction, a contact that gives way (a spring in its place), or other impacts=... decides it."
+    )
     inconsistent_start = (
         "The initial state does not satisfy the constraints, or that behind a transition those of its mode. Put it "
         "there first: system.project(q0, qdot0, t, params), or give the transition a reset."

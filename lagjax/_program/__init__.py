@@ -129,10 +129,11 @@ def lower_formula(formula: Callable, *shapes, budget: int) -> "Program":
 def lower_solution(
     system: Callable, solve: Callable, size: int, *shapes, budget: int, in_jax: Callable | None = None
 ) -> "Program":
-    """The program of the first `size` components of z with A z = r, A symmetric, and of one more number.
+    """The program of the first `size` components of z with A z = r, and of one more number.
 
-    Both functions are formulas (see `lower_formula`) on numbers of these `shapes`. `system(*numbers)` gives the rows
-    and columns (k, 2) of entries of A on and below its diagonal, these entries (k,), r, what `solve` needs of A, a tree
+    A is symmetric, but for entries above its diagonal that are added to those. Both functions are formulas (see
+    `lower_formula`) on numbers of these `shapes`. `system(*numbers)` gives the rows and columns (k, 2) of entries of A
+    on and below its diagonal, and of those added, these entries (k,), r, what `solve` needs of A, a tree
     of vectors, and that number; `solve(factors, r)` gives z, and is linear in r. `in_jax` is the function in JAX where
     that is to be another one than these two.
     """
@@ -156,7 +157,7 @@ def lower_solution(
     ends = np.cumsum([size, 1, of_z - size, of_entries, of_right])
     z, _, others, entries, right, leaves = np.split(np.array(program.line.outputs), ends)
     scalar = jnp.result_type(float)
-    tree = jax.tree.structure(factors)
+    tree, nodes = jax.tree.structure(factors), dict(zip(map(tuple, places.tolist()), entries.tolist(), strict=True))
     vectors = [jax.ShapeDtypeStruct(shape, scalar) for shape in (*of_factors, (of_right,))]
 
     def solution(expansion, arguments):
@@ -169,7 +170,8 @@ def lower_solution(
         function=in_jax,
         linear=LinearSystem(
             z=(*z.tolist(), *others.tolist()),
-            entries=dict(zip(map(tuple, places.tolist()), entries.tolist(), strict=True)),
+            entries={(i, j): node for (i, j), node in nodes.items() if i >= j},
+            others={(i, j): node for (i, j), node in nodes.items() if i < j},
             right=tuple(right.tolist()),
             factors=tuple(leaves.tolist()),
             solve=functools.cache(lambda: lower_scalars(solution, None, tuple(vectors), budget).line),

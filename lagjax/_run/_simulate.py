@@ -19,21 +19,10 @@ from lagjax._engine import AbstractEngine, Batch, Problem, Solution, axes_per_le
 from lagjax._engine.diffrax import Diffrax
 from lagjax._engine.taylor import MachineCode
 from lagjax._equations import has_constraints, inconsistent_members, require_consistent
-from lagjax._interface import (
-    ENDED_WELL,
-    RESULTS,
-    Layout,
-    SimulationError,
-    advice,
-    as_arrays,
-    halves,
-    import_registered,
-    is_concrete,
-    require_flag,
-    result_from,
-)
-from lagjax._primitives import marks_absent, raise_where_failed
-from lagjax._run._trajectory import State, Trajectory
+from lagjax._interface import ENDED_WELL, RESULTS, Layout, advice, as_arrays, halves, require_flag, result_from
+from lagjax._primitives import marks_absent
+from lagjax._run._trajectory import State, Trajectory, raise_unless_ok, step_counts
+from lagjax._run.contacts import follow_contacts, follow_contacts_batch
 from lagjax._scene import System, lift_batch, lift_problem, require_system
 
 PyTree = Any
@@ -52,6 +41,7 @@ def simulate(
     atol: float | None = None,
     dt: float | None = None,
     max_steps: int = 65_536,
+    max_transitions: int = 1024,
     event: Callable | diffrax.Event | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     throw: bool = True,
@@ -150,12 +140,17 @@ def simulate(
         if given := [name for name, value in others.items() if value is not None]:
             raise TypeError(f"simulate takes no {', '.join(given)} for a lagjax.Hybrid, which runs in machine code.")
         return system.follow(q0, qdot0, ts, params, rtol=rtol, atol=atol, max_steps=max_steps, throw=throw)
-    system = require_system(system)
+    system = require_system(system, contacts=True)
+    if system.touches:
+        _refuse_options(solver=solver, dt=dt, event=event, adjoint=adjoint, progress=progress or None)
     require_flag(throw, "throw")
     layout = Layout.from_state(q0, qdot0)
     requested = requested_engine(solver, dt, adjoint, progress, rtol, atol)
     given = Problem.from_arguments(system, layout, q0, qdot0, ts, params, rtol, atol, max_steps, event)
     problem = lift_problem(given)
+    if system.touches:
+        trajectory = follow_contacts(given, problem, max_transitions)
+        return raise_unless_ok(trajectory, layout, lambda: advice(trajectory.result)) if throw else trajectory
     if has_constraints(system):
         q0, qdot0 = as_arrays((q0, qdot0), layout.dtype, "state")
         require_consistent(problem.system, layout, problem.ts, q0, qdot0, problem.params)
@@ -182,6 +177,7 @@ def simulate_batch(
     atol: float | None = None,
     dt: float | None = None,
     max_steps: int = 65_536,
+    max_transitions: int = 1024,
     event: Callable | diffrax.Event | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     progress: bool | diffrax.AbstractProgressMeter = False,
@@ -204,14 +200,16 @@ def simulate_batch(
     assert trajectory.q.shape == (1000, 101) and trajectory.ok.all()
     ```
     """
-    system = require_system(system)
+    system = require_system(system, contacts=True)
+    if system.touches:
+        _refuse_options(solver=solver, dt=dt, event=event, adjoint=adjoint, progress=progress or None)
     requested = requested_engine(solver, dt, adjoint, progress, rtol, atol)
     values = {"q0": q0, "qdot0": qdot0, "params": params}
     axes, size = axes_per_leaf(values, batch_axes)
     given = Batch.from_values(system, values, axes, size, ts, rtol, atol, max_steps, event)
     try:
         batch = lift_batch(given)
-        engine = choose(batch.member, requested, size).engine
+        engine = None if system.touches else choose(batch.member, requested, size).engine
     except (IndexError, TypeError) as reason:
         reason.add_note(
             f"By batch_axes this is a batch of {size} members: it says for (q0, qdot0, params) which axis runs over "
@@ -220,6 +218,9 @@ def simulate_batch(
         raise
     values = {name: as_arrays(value, batch.member.layout.dtype, name) for name, value in values.items()}
     inconsistent = inconsistent_members(system, batch.member.layout, batch.member.ts, values, axes)
+    if engine is None:
+        trajectory = follow_contacts_batch(given, batch, max_transitions, values["params"], batch_axes[2])
+        return trajectory if inconsistent is None else _mask_inconsistent(trajectory, inconsistent)
     solution = engine.solve_batch(batch)
     trajectory = trajectory_of(given.member, engine, solution, given.y0, values["params"], batch_axes[2])
     return trajectory if inconsistent is None else _mask_inconsistent(trajectory, inconsistent)
@@ -255,7 +256,16 @@ def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, 
         mode_names=(),
         tolerances=None if fixed_steps else engine.tolerances(problem, y0),
         engine=type(engine).__name__,
+        impacts=None,
+        contacts=None,
     )
+
+
+def _refuse_options(**options) -> None:
+    if given := [name for name, value in options.items() if value is not None]:
+        raise TypeError(
+            f"A scene with contacts takes no {', '.join(given)}: its rounds run in machine code, to each event of its own."
+        )
 
 
 def _device_arrays(arrays: tuple) -> tuple:
@@ -273,10 +283,6 @@ _PROCESS = os.getpid()
 _as_they_are = jax.jit(lambda *arrays: arrays)
 
 
-def step_counts(accepted, rejected) -> dict:
-    return {"num_steps": accepted + rejected, "num_accepted_steps": accepted, "num_rejected_steps": rejected}
-
-
 def _mask_inconsistent(trajectory: Trajectory, inconsistent: jax.Array) -> Trajectory:
     """The trajectory in which members that did not start on their constraints are NaN, with a result that says so."""
 
@@ -286,20 +292,3 @@ def _mask_inconsistent(trajectory: Trajectory, inconsistent: jax.Array) -> Traje
     result = result_from(jnp.where(inconsistent, RESULTS.inconsistent_start._value, trajectory.result._value))
     q, qdot = jax.tree.map(masked, (trajectory.q, trajectory.qdot))
     return eqx.tree_at(lambda t: (t.q, t.qdot, t.result), trajectory, (q, qdot, result))
-
-
-def raise_unless_ok(trajectory: Trajectory, layout: Layout, why: Callable[[], str | None]) -> Trajectory:
-    """Raise `SimulationError` for a trajectory that did not reach its end; at run time when it is being traced.
-
-    `why()` are the words for what stopped it, where they are known better than by the result.
-    """
-    end, code = trajectory.end, trajectory.result._value
-    if is_concrete(code) and int(code) in ENDED_WELL:
-        return trajectory
-    t_last = trajectory.ts[-1]
-    if not all(is_concrete(leaf) for leaf in jax.tree.leaves((end, code, t_last))):
-        y_end = jnp.concatenate([layout.flatten(end.q), layout.flatten(end.qdot)])
-        states = trajectory.q, trajectory.qdot, end
-        states = raise_where_failed(states, code, (end.t, y_end), t_last, layout.names)
-        return eqx.tree_at(lambda t: (t.q, t.qdot, t.end), trajectory, states)
-    raise SimulationError(import_registered("describe_failure")(trajectory, layout, why()), trajectory)

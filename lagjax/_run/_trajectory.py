@@ -14,8 +14,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._interface import RESULTS, Layout, import_registered, is_known, show_str
-from lagjax._primitives import marks_absent
+from lagjax._interface import (
+    ENDED_WELL,
+    RESULTS,
+    Layout,
+    SimulationError,
+    import_registered,
+    is_concrete,
+    is_known,
+    show_str,
+)
+from lagjax._primitives import marks_absent, raise_where_failed
 from lagjax._scene import System
 
 if TYPE_CHECKING:
@@ -68,6 +77,32 @@ class Transitions(NamedTuple):
         return f"{count} transitions between places in mode_names: {listed}{more}" if count else "no transitions"
 
 
+class Impacts(NamedTuple):
+    """The impacts of a motion with contacts, in order: NaN beyond the last of `count`.
+
+    `t` (N,) are their times. `impulse`: the normal impulses, in the structure that `contacts` returns with an axis of N
+    in front, zero of a contact that took no part. `energy_lost` (N,): the kinetic energy that each took away. Bounces
+    that accumulate end in one impact, with all that they would still have given; its time is that of their limit.
+    """
+
+    t: jax.Array
+    impulse: PyTree
+    energy_lost: jax.Array
+    count: jax.Array
+
+    _repr_pretty_ = show_str
+
+    def __str__(self) -> str:
+        if not all(map(is_known, (self.t, self.count))):
+            return repr(self)
+        count = np.asarray(self.count)
+        if count.ndim:
+            return f"{count.sum()} impacts of {' × '.join(map(str, count.shape))} motions"
+        times = ", ".join(f"{t:.6g}" for t in np.asarray(self.t)[: min(count, 10)])
+        more = f", … ({count - 10} more)" if count > 10 else ""
+        return f"{count} impacts, at t = {times}{more}" if count else "no impacts"
+
+
 class Trajectory(eqx.Module):
     """The motion of a system at the times `ts`, one trajectory or a batch of them.
 
@@ -84,6 +119,8 @@ class Trajectory(eqx.Module):
     - `mode`, `transitions`: for a hybrid motion (`simulate_hybrid`) the mode at every output time and its
       `Transitions`; otherwise None. `system` is then the dict of modes, and quantities are those of the mode at every
       time, NaN where the mode is −1. A mode is a place in `mode_names`, because the dict loses its order in `jax.jit`.
+    - `impacts`: of a scene with contacts its `Impacts`, otherwise None; `contacts`: what its contacts did at every
+      output time, from which `contact_forces` follow.
     """
 
     ts: jax.Array
@@ -100,6 +137,8 @@ class Trajectory(eqx.Module):
     mode_names: tuple[str, ...] = eqx.field(static=True, default=())
     tolerances: tuple[Number, Number] | None = None
     engine: str = eqx.field(static=True, default="")
+    impacts: "Impacts | None" = None
+    contacts: Any = None
 
     @classmethod
     def from_fields(cls, **fields) -> "Trajectory":
@@ -139,6 +178,17 @@ class Trajectory(eqx.Module):
     def multipliers(self) -> PyTree:
         """λ at every output time, in the structure that the constraint functions return."""
         return self._map_outputs("multipliers")
+
+    @property
+    def contact_forces(self) -> PyTree:
+        """The normal forces λ ≥ 0 at every output time, in the structure that `contacts` returns; zero of open ones.
+
+        The gradient of its gap times λ is the force that a contact exerts. Raises `ValueError` without contacts.
+        """
+        if self.contacts is None:
+            raise ValueError("This motion has no contacts: give contacts=... or one_way=... to its System.")
+        self._require_present()
+        return import_registered("contact_forces")(self)
 
     def constraint_force(self) -> PyTree:
         """(∂f/∂q)ᵀλ + (∂a/∂q̇)ᵀμ at every output time, in the structure of `q`."""
@@ -305,3 +355,39 @@ def constant_unless(varies, tree: PyTree) -> PyTree:
         return still if varies is False else jnp.where(varies, x, still)
 
     return jax.tree.map(constant, tree)
+
+
+def vary_with(first, *inputs, varying: tuple[str, ...] = ("t", "y", "path")):
+    """The state before the first round as it is, with derivatives, a batch and mesh axes where later ones have them.
+
+    Else JAX writes the rounds down once more for numbers that get these in a round. The derivatives of a sine vary with
+    the inputs, too, in every order.
+    """
+    moving = jnp.sin(sum(x.ravel()[0] for x in inputs if x.size))
+    still = jax.lax.stop_gradient(moving)
+
+    def vary(x, like=still):
+        return jnp.where(False, like.astype(jnp.asarray(x).dtype), x)
+
+    return jax.tree.map(vary, first)._replace(**{name: vary(getattr(first, name), moving) for name in varying})
+
+
+def step_counts(accepted, rejected) -> dict:
+    return {"num_steps": accepted + rejected, "num_accepted_steps": accepted, "num_rejected_steps": rejected}
+
+
+def raise_unless_ok(trajectory: Trajectory, layout: Layout, why: Callable[[], str | None]) -> Trajectory:
+    """Raise `SimulationError` for a trajectory that did not reach its end; at run time when it is being traced.
+
+    `why()` are the words for what stopped it, where they are known better than by the result.
+    """
+    end, code = trajectory.end, trajectory.result._value
+    if is_concrete(code) and int(code) in ENDED_WELL:
+        return trajectory
+    t_last = trajectory.ts[-1]
+    if not all(is_concrete(leaf) for leaf in jax.tree.leaves((end, code, t_last))):
+        y_end = jnp.concatenate([layout.flatten(end.q), layout.flatten(end.qdot)])
+        states = trajectory.q, trajectory.qdot, end
+        states = raise_where_failed(states, code, (end.t, y_end), t_last, layout.names)
+        return eqx.tree_at(lambda t: (t.q, t.qdot, t.end), trajectory, states)
+    raise SimulationError(import_registered("describe_failure")(trajectory, layout, why()), trajectory)

@@ -1,11 +1,12 @@
 """The scene as its author describes it.
 
 `_system` holds `System`; `_samples` inputs that were measured, as functions of time; `_explanation` what a scene
-contains, what was left out, and which engine takes it; `_closed_over` takes numbers that functions close over while
-they are traced, and makes them parameters.
+contains, what was left out, and which engine takes it; `_contacts` the contacts of a scene in flat coordinates;
+`_closed_over` takes numbers that functions close over while they are traced, and makes them parameters.
 """
 
 from lagjax._scene._closed_over import Lifted, Unchanged, function_from_trace, lift_batch, lift_problem, open_jaxpr
+from lagjax._scene._contacts import Contacts, ContactScene, Flat, InContact, Shapes
 from lagjax._scene._explanation import Explanation
 from lagjax._scene._samples import HOLDS, MARGINS, continued, samples, unevenly_spaced
 from lagjax._scene._system import ROLES, System, present_system, replace_functions, require_system

@@ -19,7 +19,7 @@ from jax.extend import core
 from lagjax._engine import Batch, Problem
 from lagjax._interface import Function
 from lagjax._interface.reads import Edition, place_in
-from lagjax._scene._system import ROLES, replace_functions
+from lagjax._scene._system import ARGUMENTS, ROLES, replace_functions
 
 PyTree = Any
 
@@ -82,7 +82,7 @@ def lift_problem(problem: Problem) -> Problem:
     def lift(function: Any, roles: int = 2) -> Any:
         return _lift_function(function, roles, problem, values) if isinstance(function, Function) else function
 
-    functions = {role: lift(fields[role], 1 if role == "constraints" else 2) for role in ROLES}
+    functions = {role: lift(fields[role], len(ARGUMENTS[role])) for role in ROLES}
     system = replace_functions(problem.system, functions)
     event = problem.event
     if event is not None:

@@ -33,7 +33,13 @@ from lagjax._program import Unlowerable, lack_of_memory
 from lagjax._scene._explanation import Explanation, explain
 
 PyTree = Any
-ROLES = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
+ROLES = (
+    "lagrangian", "forces", "dissipation", "constraints", "velocity_constraints",
+    "contacts", "one_way", "restitution", "friction", "slip",
+)  # fmt: skip
+# The arguments of a function of each role that come by position.
+ARGUMENTS = dict.fromkeys(ROLES, ("q", "qdot")) | dict.fromkeys(("constraints", "contacts"), ("q",))
+ARGUMENTS |= {"restitution": (), "friction": ()}
 Time = Float[ArrayLike, ""]  # a number, or an array of shape ()
 
 
@@ -91,6 +97,12 @@ class System(eqx.Module):
     dissipation: Function | None
     constraints: Function | None
     velocity_constraints: Function | None
+    contacts: Function | None
+    one_way: Function | None
+    restitution: Function | None
+    friction: Function | None
+    slip: Function | None
+    impacts: str = eqx.field(static=True)
     path: str = eqx.field(static=True)
 
     def __init__(
@@ -101,15 +113,28 @@ class System(eqx.Module):
         dissipation: Callable | None = None,
         constraints: Callable | None = None,
         velocity_constraints: Callable | None = None,
+        contacts: Callable | None = None,
+        one_way: Callable | None = None,
+        restitution: Any = 0.0,
+        friction: Any = 0.0,
+        slip: Callable | None = None,
+        impacts: Literal["simultaneous", "sequential"] = "simultaneous",
         path: Literal["auto", "scalar", "array"] = "auto",
     ):
         if not isinstance(path, str) or path not in ("auto", "scalar", "array"):
             raise ValueError(f"path must be 'auto', 'scalar' or 'array'; got {path!r}.")
-        self.path = path
-        functions = lagrangian, forces, dissipation, constraints, velocity_constraints
+        if impacts not in ("simultaneous", "sequential"):
+            raise ValueError(f"impacts must be 'simultaneous' or 'sequential'; got {impacts!r}.")
+        self.path, self.impacts = path, impacts
+        restitution, friction = _coefficients(contacts, one_way, restitution, friction, slip)
+        functions = (
+            lagrangian, forces, dissipation, constraints, velocity_constraints,
+            contacts, one_way, restitution, friction, slip,
+        )  # fmt: skip
         for role, function in zip(ROLES, functions, strict=True):
-            roles, absent = ("q",) if role == "constraints" else ("q", "qdot"), function is None and role != ROLES[0]
-            accepted = None if absent else accept(cast(Callable, function), role, roles, ("t", "params", "inputs"))
+            absent, extras = function is None and role != ROLES[0], ("t", "params", "inputs")
+            extras = extras if ARGUMENTS[role] else ("params",)
+            accepted = None if absent else accept(cast(Callable, function), role, ARGUMENTS[role], extras)
             setattr(self, role, accepted)
 
     def __repr__(self) -> str:
@@ -118,6 +143,11 @@ class System(eqx.Module):
         # Mapped to another pytree (axes, filters), a scene is no longer made of functions.
         shown = [f"{role}={getattr(f, 'name', f)}" for role, f in functions if f is not None]
         return f"System({', '.join(shown)}, path={self.path!r})"
+
+    @property
+    def touches(self) -> bool:
+        """True if the scene has contacts or one-way velocities."""
+        return self.contacts is not None or self.one_way is not None
 
     def _require_present(self) -> None:
         """Raise `ValueError` where something that a function of the scene reads has changed since this one was made."""
@@ -369,17 +399,45 @@ class System(eqx.Module):
     def _output_shapes(self, role: str, layout: Layout, params: PyTree) -> PyTree:
         """The shapes that the function of a role returns, traced on shapes alone."""
         numbers, code = eqx.partition(params, eqx.is_array_like)
-        function, count = getattr(self, role), 1 if role == "constraints" else 2
+        function, count = getattr(self, role), len(ARGUMENTS[role])
         state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
         return jax.eval_shape(
             lambda q, t, p: function(*[q] * count, t=t, params=eqx.combine(p, code)), state, t, numbers
         )
 
 
-def require_system(system: Any) -> System:
+def _coefficients(contacts, one_way, restitution, friction, slip) -> tuple:
+    """Restitution and friction as functions of params; None without contacts. Raises `ValueError`."""
+    given = {"restitution": restitution, "friction": friction}
+    if contacts is None:
+        some = [name for name, x in given.items() if callable(x) or jax.tree.leaves(x) != [0.0]]
+        if slip is not None or some:
+            raise ValueError(f"{(some or ['slip'])[0]} is that of contacts: give contacts=..., the gaps, to the System.")
+        return (None, None) if one_way is None else (lambda: 0.0, lambda: 0.0)
+    for name, value in given.items():
+        if callable(value):
+            continue
+        for leaf in jax.tree.leaves(value):
+            known = is_concrete(leaf) and np.ndim(leaf) < 2
+            least = np.min(leaf, initial=0.0) if known else 0.0
+            if known and not (np.isfinite(leaf).all() and least >= 0.0):
+                raise ValueError(f"{name} must be a number that is not negative; got {leaf}.")
+            if name == "restitution" and known and np.max(leaf, initial=0.0) > 1.0:
+                raise ValueError(f"restitution must be between 0 and 1: more would add energy; got {leaf}.")
+    rubs = callable(friction) or any(not is_concrete(x) or np.any(x) for x in jax.tree.leaves(friction))
+    if rubs and slip is None:
+        raise ValueError(
+            "friction needs the sliding velocity at every contact: give slip=lambda q, qdot: ... in the structure of "
+            "the gaps."
+        )
+    return tuple(x if callable(x) else (lambda x=x: x) for x in given.values())
+
+
+def require_system(system: Any, contacts: bool = False) -> System:
     """The scene with its functions as they are now (`Function.now`): what every public function begins with.
 
-    Raises `TypeError` for anything else in its place, a bare Lagrangian most often.
+    Raises `TypeError` for anything else in its place, a bare Lagrangian most often; and for a scene with contacts,
+    where these would be left out.
     """
     if not isinstance(system, System):
         kind = type(system).__name__
@@ -389,6 +447,11 @@ def require_system(system: Any) -> System:
             )
         name = getattr(system, "__name__", kind) if callable(system) else kind
         raise TypeError(f"system must be a lagjax.System, as lagjax.System(lagrangian) is; got {name}.")
+    if system.touches and not contacts:
+        raise TypeError(
+            "This is for scenes without contacts, which it would leave out: simulate and simulate_batch follow motions "
+            "with contacts. For the motion while none is closed, build the System without contacts=... and one_way=...."
+        )
     return present_system(system)
 
 
@@ -405,7 +468,7 @@ def present_system(system: System) -> System:
 def replace_functions(system: System, functions: dict[str, Function | None], path: str | None = None) -> System:
     """The scene with other functions, by their roles, without the constructor: to read signatures takes long."""
     other = object.__new__(type(system))
-    for name, value in (functions | {"path": path or system.path}).items():
+    for name, value in (functions | {"path": path or system.path, "impacts": system.impacts}).items():
         object.__setattr__(other, name, value)
     return other
 

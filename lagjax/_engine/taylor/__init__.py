@@ -32,6 +32,7 @@ from lagjax._engine.taylor._derivatives import Motions, jvp, portions, project_s
 from lagjax._engine.taylor._flow import Flow, Tolerances, require_fit
 from lagjax._engine.taylor._gpu_launch import adapt_tolerances
 from lagjax._engine.taylor._kept_steps import KEPT, StepStore
+from lagjax._engine.taylor._line_functions import line_of
 from lagjax._engine.taylor._lowered_motion import lowered_motion
 from lagjax._engine.taylor._surfaces import Guarded, Surfaces, crossing_variation, require_one_number, vector_of
 from lagjax._equations import Derivation

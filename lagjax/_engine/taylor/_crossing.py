@@ -90,18 +90,16 @@ def surfaces_of(problem: Problem, functions: tuple, directions: tuple[int, ...],
 def _lower_surfaces(derivation: Derivation, functions, directions, code, structure, what, is_rounded) -> Surfaces:
     restore = derivation.layout.restore
 
-    def value(function):
-        def evaluate_guard(y, params):
-            def call(y, params):
-                return function(*map(restore, halves(y[:-1])), t=y[-1], params=params)
+    def values_at(y, params):
+        def call(function, y, params):
+            return function(*map(restore, halves(y[:-1])), t=y[-1], params=params)
 
-            given = evaluate_condition(call, y, params)[0] if what == "An event" else call(y, params)
-            return require_one_number(given, what)
+        calls = [functools.partial(call, function) for function in functions]
+        if what == "An event":
+            return jnp.stack([require_one_number(evaluate_condition(of, y, params)[0], what) for of in calls])
+        return jnp.stack([require_one_number(of(y, params), what) for of in calls])
 
-        return evaluate_guard
-
-    values = [value(function) for function in functions]
-    return Surfaces.from_functions(derivation, values, directions, code, structure, is_rounded)
+    return Surfaces.from_function(derivation, values_at, directions, code, structure, is_rounded)
 
 
 # ---- to the first event ----------------------------------------------------------------------------------------------

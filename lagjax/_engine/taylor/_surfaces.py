@@ -9,7 +9,7 @@ and the same to second order (`crossing_variation`).
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -95,16 +95,16 @@ class Surfaces(NamedTuple):
         return Guarded(values, rates, rounding, jnp.abs(rates) * instant, rate_rounding)
 
     @classmethod
-    def from_functions(
+    def from_function(
         cls,
         derivation: Derivation,
-        functions: Sequence[Callable],
+        function: Callable,
         directions: tuple[int, ...],
         code: tuple,
         structure,
         is_rounded: bool = False,
     ) -> "Surfaces":
-        """The surfaces of functions of y = (q, q̇, t), (2n + 1,), and params; each gives one number.
+        """The surfaces of a function of y = (q, q̇, t), (2n + 1,), and params, which gives all g (G,).
 
         `code` and `structure` are what params hold that is not a number. Raises `Unlowerable`.
         """
@@ -112,7 +112,7 @@ class Surfaces(NamedTuple):
 
         def values(y, numbers):
             params = eqx.combine(numbers, structure.unflatten(code))
-            return jnp.stack([function(y, params) for function in functions])
+            return function(y, params)
 
         def rate_of(y, numbers):
             acceleration = jnp.stack(program.complete.compute_outputs(y, vector_of(numbers))[:n])

@@ -34,8 +34,7 @@ from lagjax._interface import (
     result_from,
 )
 from lagjax._primitives import DOUBLE, compute_in_doubles, marks_absent
-from lagjax._run._simulate import raise_unless_ok, step_counts
-from lagjax._run._trajectory import State, Trajectory, Transitions
+from lagjax._run._trajectory import State, Trajectory, Transitions, raise_unless_ok, step_counts
 from lagjax._run.hybrid._mode import Transition
 from lagjax._run.hybrid._transition_rounds import IN_ONE_PLACE, Ending, RoundPlan, TransitionRecord, hybrid_motion
 from lagjax._scene import System, present_system, require_system

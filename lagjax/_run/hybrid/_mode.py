@@ -207,22 +207,20 @@ def _surfaces(
         return None
     layout, multipliers = derivation.layout, derivation.multipliers
 
-    def value(guard: Function):
-        if "multipliers" in guard.extras and multipliers is None:
-            raise ValueError("A guard asks for `multipliers`, but its mode has no constraints.")
+    guards = [transition.guard for transition in leaving]
+    if multipliers is None and any("multipliers" in guard.extras for guard in guards):
+        raise ValueError("A guard asks for `multipliers`, but its mode has no constraints.")
 
-        def value_at(y, params):
-            extras = {"t": y[-1], "params": params}
-            if multipliers is not None:
-                flat = jnp.stack(multipliers.compute_outputs(y, vector_of(eqx.filter(params, eqx.is_array_like))))
-                extras["multipliers"] = system._split_by_constraint(flat, layout, params)
-            return require_one_number(guard(*map(layout.restore, halves(y[:-1])), **extras), "A guard")
+    def values_at(y, params):
+        extras = {"t": y[-1], "params": params}
+        if multipliers is not None:
+            flat = jnp.stack(multipliers.compute_outputs(y, vector_of(eqx.filter(params, eqx.is_array_like))))
+            extras["multipliers"] = system._split_by_constraint(flat, layout, params)
+        state = [*map(layout.restore, halves(y[:-1]))]
+        return jnp.stack([require_one_number(guard(*state, **extras), "A guard") for guard in guards])
 
-        return value_at
-
-    functions = [value(transition.guard) for transition in leaving]
     directions = tuple(transition.direction for transition in leaving)
-    return Surfaces.from_functions(derivation, functions, directions, code, structure)
+    return Surfaces.from_function(derivation, values_at, directions, code, structure)
 
 
 def state_after(transition: Transition, layout: Layout, t, y, params) -> jax.Array:

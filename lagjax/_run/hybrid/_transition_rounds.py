@@ -19,7 +19,7 @@ from lagjax._engine.taylor import Guarded, vector_of
 from lagjax._interface import RESULTS, SUCCESSFUL, Layout, code_of
 from lagjax._native import SINGLE_NOISE
 from lagjax._primitives import lost_unless
-from lagjax._run._trajectory import constant_unless
+from lagjax._run._trajectory import constant_unless, vary_with
 from lagjax._run.hybrid._mode import Mode, Transition, state_after
 from lagjax._run.hybrid._mode_families import SystemFamily, families
 from lagjax._scene import Lifted, System
@@ -186,7 +186,7 @@ def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree) -> tu
         modes=jnp.full(ts.size, -1), steps=jnp.zeros(2, int), latest=jnp.asarray(-1), memory=rounds.no_memory(0.0, 0.0),
         let_out=jnp.full(len(plan.transitions), jnp.nan),
     )  # fmt: skip
-    first = _vary_with(first, ts, y0, rounds.groups[0].first.vector)
+    first = vary_with(first, ts, y0, rounds.groups[0].first.vector)
     ending, record = jax.lax.scan(rounds.run_round, first, jnp.arange(plan.max_transitions + 1))
     record = jax.tree.map(lambda x: x[: plan.max_transitions], record)
     still = jax.lax.stop_gradient(record)
@@ -453,23 +453,6 @@ class _Rounds(NamedTuple):
     def _places_of(self, mode: Mode):
         """The places of a mode's transitions among all, (K of the mode, K) of bool."""
         return mode.numbers[:, None] == np.arange(len(self.plan.transitions))
-
-
-def _vary_with(first: Ending, *inputs) -> Ending:
-    """The state before the first round as it is, with derivatives, a batch and mesh axes where later ones have them.
-
-    Else JAX writes the rounds down once more for numbers that get these in a round. The derivatives of a sine vary with
-    the inputs, too, in every order.
-    """
-    moving = jnp.sin(sum(x.ravel()[0] for x in inputs if x.size))
-    still = jax.lax.stop_gradient(moving)
-
-    def vary(x, like=still):
-        return jnp.where(False, like.astype(jnp.asarray(x).dtype), x)
-
-    return jax.tree.map(vary, first)._replace(
-        t=vary(first.t, moving), y=vary(first.y, moving), path=vary(first.path, moving)
-    )
 
 
 def _select(condition, new: PyTree, old: PyTree) -> PyTree:

@@ -1,0 +1,256 @@
+"""Contacts of a scene in flat coordinates: gaps and velocities that stay ≥ 0, their friction, and what is closed.
+
+Which contacts are closed, and which of them stick, is data of one program (`InContact`): with g the gaps, γ the one-way
+velocities and s the slips,
+
+    closed: g = 0, γ = 0       open: λ = 0       sticks: s = 0       slides: f = −μ λ c,  c the direction of s
+
+are rows of one matrix, each held or released by a number.
+"""
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._equations import Constraints, Motion
+from lagjax._interface import Layout
+from lagjax._scene._system import System
+
+PyTree = Any
+
+
+class Contacts(NamedTuple):
+    """What contacts do, of k contacts, of which r have friction in d directions.
+
+    - `closed` (k,): 1 where the contact is closed, else 0; `sticks` (r,): 1 where it does not slide.
+    - `direction` (r, d): the direction of a slip that begins; in a plane its sign. In space its length is a velocity
+      far below those of the motion, which is added to the slip: its direction is then defined at rest, too.
+    """
+
+    closed: Any
+    sticks: Any
+    direction: Any
+
+
+class InContact(NamedTuple):
+    """The parameters of the user, and what the contacts do."""
+
+    params: PyTree
+    contacts: Contacts
+
+
+class ContactScene(eqx.Module):
+    """A system with contacts, as machine code follows it: a scene whose parameters are `InContact`."""
+
+    system: System
+    path: str = eqx.field(static=True, default="auto")
+
+    def shapes(self, layout: Layout, params: PyTree) -> "Shapes":
+        return Shapes.from_system(self.system, layout, params)
+
+    def _motion(self, layout: Layout, params: InContact) -> Motion:
+        """The motion while the contacts are as `params` say."""
+        free, flat = self.system._motion(layout, params.params), Flat.from_system(self.system, layout, params.params)
+
+        def of_user(function: Callable | None):
+            return function and (lambda *arguments: function(*arguments[:-1], arguments[-1].params))
+
+        def on_positions(q, t, p):
+            own = free.constraints.f(q, t, p.params)
+            return jnp.concatenate([own, p.contacts.closed[: flat.of_gaps] * flat.gaps(q, t, p.params)])
+
+        def on_velocities(q, qdot, t, p):
+            one_way = p.contacts.closed[flat.of_gaps :] * flat.one_way(q, qdot, t, p.params)
+            slips = flat.held_slips(p.contacts) * flat.slips(q, qdot, t, p.params).ravel()
+            return jnp.concatenate([free.constraints.a(q, qdot, t, p.params), one_way, slips])
+
+        def counts(p):
+            q, t = jnp.zeros(layout.size, layout.dtype), jnp.zeros((), layout.dtype)
+            f = jax.eval_shape(free.constraints.f, q, t, p.params).size
+            return f, jax.eval_shape(free.constraints.a, q, q, t, p.params).size
+
+        def held(p):
+            (f, a), closed = counts(p), p.contacts.closed
+            ones = jnp.ones_like
+            rows = ones(closed, shape=f), closed[: flat.of_gaps], ones(closed, shape=a), closed[flat.of_gaps :]
+            return jnp.concatenate([*rows, flat.held_slips(p.contacts)])
+
+        def drag(q, qdot, t, p):
+            (f, _), slides = counts(p), flat.friction(p.params) * (1.0 - p.contacts.sticks)
+            along = flat.slip_direction(q, qdot, t, p)
+            slopes = jax.jacfwd(flat.slips, argnums=1)(q, qdot, t, p.params)  # (r, d, n)
+            forces = -slides[:, None] * jnp.einsum("rd,rdn->rn", along, slopes)
+            return jnp.zeros((layout.size, held(p).size), q.dtype).at[:, f + flat.rough].set(forces.T)
+
+        constraints = Constraints(on_positions, on_velocities, held, drag if flat.rough.size else None)
+        return Motion(*map(of_user, (free.lagrangian, free.forces, free.dissipation)), constraints)
+
+
+class Flat(NamedTuple):
+    """The functions of contacts in flat coordinates: each takes (q, [qdot,] t, params) with the numbers of params."""
+
+    shapes: "Shapes"
+    gaps: Callable
+    one_way: Callable
+    slips: Callable  # (r, d)
+    restitution: Callable  # (k,) of params
+    friction: Callable  # (r,) of params
+
+    @property
+    def of_gaps(self) -> int:
+        return self.shapes.of_gaps
+
+    @property
+    def rough(self) -> np.ndarray:
+        return self.shapes.rough
+
+    @classmethod
+    def from_system(cls, system: System, layout: Layout, params: PyTree) -> "Flat":
+        code, shapes = eqx.filter(params, eqx.is_array_like, inverse=True), Shapes.from_system(system, layout, params)
+
+        def call(role: str, vectors, t, numbers):
+            function, whole = getattr(system, role), eqx.combine(numbers, code)
+            return function(*map(layout.restore, vectors), t=t, params=whole)
+
+        def numbers_of(tree):
+            leaves = [jnp.ravel(leaf) for leaf in jax.tree.leaves(tree)]
+            return jnp.concatenate(leaves).astype(layout.dtype) if leaves else jnp.zeros(0, layout.dtype)
+
+        def gaps(q, t, p):
+            return numbers_of(() if system.contacts is None else call("contacts", (q,), t, p))
+
+        def one_way(q, qdot, t, p):
+            return numbers_of(() if system.one_way is None else call("one_way", (q, qdot), t, p))
+
+        def slips(q, qdot, t, p):
+            if not shapes.rough.size:
+                return jnp.zeros((0, shapes.directions), layout.dtype)
+            return numbers_of(call("slip", (q, qdot), t, p)).reshape(-1, shapes.directions)
+
+        def coefficient(role: str):
+            def of_contacts(p):
+                value = call(role, (), jnp.zeros((), layout.dtype), p)
+                return shapes.spread(value, role).astype(layout.dtype)
+
+            return of_contacts
+
+        friction = coefficient("friction")
+        return cls(shapes, gaps, one_way, slips, coefficient("restitution"), lambda p: friction(p)[shapes.rough])
+
+    def held_slips(self, contacts: Contacts):
+        """1 for every slip that stays zero, (r d,)."""
+        return jnp.repeat(contacts.closed[self.rough] * contacts.sticks, self.shapes.directions)
+
+    def slip_direction(self, q, qdot, t, p: InContact):
+        """The unit vectors (r, d) along the slips."""
+        given = p.contacts.direction
+        if self.shapes.directions == 1:
+            return given
+        moving = self.slips(q, qdot, t, p.params) + given
+        return moving / jnp.sqrt((moving * moving).sum(1, keepdims=True))
+
+
+class Shapes(NamedTuple):
+    """The structure of the contacts of a system: k of them, `of_gaps` with a gap, then those of one-way velocities.
+
+    `rough` (r,) are the places of those with friction, in so many `directions`; `names` (k,) are those of all.
+    """
+
+    trees: tuple  # the structures that `contacts` and `one_way` return, None without any
+    of_gaps: int
+    count: int
+    rough: np.ndarray
+    directions: int
+    names: tuple[str, ...]
+
+    @classmethod
+    def from_system(cls, system: System, layout: Layout, params: PyTree) -> "Shapes":
+        """Raises `TypeError` or `ValueError` where a function does not return what its role asks for."""
+        trees, names, counts = [], [], []
+        for role in ("contacts", "one_way"):
+            tree = None if getattr(system, role) is None else system._output_shapes(role, layout, params)
+            own = _names(tree, role)
+            trees, names, counts = [*trees, tree], [*names, *own], [*counts, len(own)]
+        rough, directions = _rough(system, layout, params, trees[0])
+        shapes = cls(tuple(trees), counts[0], sum(counts), rough, directions, tuple(names))
+        numbers, code = eqx.partition(params, eqx.is_array_like)
+        for role in ("restitution", "friction"):
+            function = getattr(system, role)
+            jax.eval_shape(lambda p, of=function, role=role: shapes.spread(of(params=eqx.combine(p, code)), role), numbers)
+        return shapes
+
+    def spread(self, value: PyTree, role: str):
+        """A coefficient of each contact, (k,): of one number for all, or a dict by name; 0 for one-way velocities."""
+        tree, none = self.trees[0], jnp.zeros(self.count - self.of_gaps)
+        if tree is None:
+            return none
+        if isinstance(value, dict) and isinstance(tree, dict):
+            if unknown := [name for name in value if name not in tree]:
+                raise ValueError(f"{role} names {unknown[0]!r}, and the contacts are {', '.join(map(repr, tree))}.")
+            parts = [jnp.broadcast_to(value.get(name, 0.0), leaf.shape).ravel() for name, leaf in sorted(tree.items())]
+            return jnp.concatenate([*parts, none])
+        if len(jax.tree.leaves(value)) != 1:
+            raise TypeError(f"{role} must be a number for all contacts, or a dict by the names of the contacts.")
+        (leaf,) = jax.tree.leaves(value)
+        flat = jnp.broadcast_to(leaf, (self.of_gaps,)) if jnp.ndim(leaf) < 2 else jnp.ravel(leaf)
+        return jnp.concatenate([flat, none])
+
+    def by_name(self, numbers, axis: int = -1) -> PyTree:
+        """Numbers of all contacts, along their `axis`, in the structure that the user's functions return."""
+        numbers, parts, start = jnp.moveaxis(numbers, axis, -1), [], 0
+        for tree in self.trees:
+            leaves, structure = jax.tree.flatten(tree)
+            own = []
+            for leaf in leaves:
+                own.append(numbers[..., start : start + leaf.size].reshape(*numbers.shape[:-1], *leaf.shape))
+                start += leaf.size
+            parts += [] if tree is None else [jax.tree.unflatten(structure, own)]
+        if len(parts) == 1:
+            return parts[0]
+        return {**parts[0], **parts[1]} if all(isinstance(part, dict) for part in parts) else tuple(parts)
+
+
+def _names(tree: PyTree, role: str) -> list[str]:
+    names = []
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        if not jnp.issubdtype(leaf.dtype, jnp.floating):
+            raise TypeError(f"{role} must return real numbers; got {leaf.dtype}.")
+        label = role + jax.tree_util.keystr(path)
+        names += [label + (str(list(index)) if leaf.shape else "") for index in np.ndindex(leaf.shape)]
+    return names
+
+
+def _rough(system: System, layout: Layout, params: PyTree, tree: PyTree) -> tuple[np.ndarray, int]:
+    """The places of contacts with friction, and the directions in which each slips."""
+    if system.slip is None:
+        return np.zeros(0, int), 1
+    slip = system._output_shapes("slip", layout, params)
+    numbers = np.arange(sum(leaf.size for leaf in jax.tree.leaves(tree)))
+    leaves, structure = jax.tree.flatten(tree)
+    ends = np.cumsum([leaf.size for leaf in leaves])[:-1]
+    places = jax.tree.unflatten(structure, np.split(numbers, ends))
+    pairs = _pair_by_name(slip, tree, places)
+    kinds = {leaf.shape[len(gap.shape) :] for leaf, gap, _ in pairs}
+    alike = all(leaf.shape[: len(gap.shape)] == gap.shape for leaf, gap, _ in pairs)
+    if not alike or len(kinds) > 1 or not kinds <= {(), (1,), (2,)}:
+        found = ", ".join(str(leaf.shape) for leaf, _, _ in pairs)
+        raise ValueError(
+            "slip must return, in the structure of the contacts, a number for each of them (in a plane), or an array "
+            f"of two for each (in space); got shapes {found}."
+        )
+    return np.concatenate([place for _, _, place in pairs]), int(np.prod(kinds.pop(), dtype=int))
+
+
+def _pair_by_name(slip: PyTree, tree: PyTree, places: PyTree) -> list[tuple]:
+    """(slip, gap, places) of every contact that slips; a dict may leave out contacts without friction."""
+    if isinstance(slip, dict) and isinstance(tree, dict):
+        if unknown := [name for name in slip if name not in tree]:
+            raise ValueError(f"slip names {unknown[0]!r}, and the contacts are {', '.join(map(repr, tree))}.")
+        return [(slip[name], tree[name], places[name]) for name in sorted(slip)]
+    if jax.tree.structure(slip) != jax.tree.structure(tree):
+        raise ValueError("slip must return the structure that contacts returns.")
+    return list(zip(*map(jax.tree.leaves, (slip, tree, places)), strict=True))
