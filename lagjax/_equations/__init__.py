@@ -21,6 +21,7 @@ from lagjax._equations._linear import (
     diagonal_scale,
     eigen,
     factorize,
+    factorize_general,
     invert,
     least_norm,
     null_directions,
@@ -29,7 +30,6 @@ from lagjax._equations._linear import (
     saddle_many,
     schur_complements,
     singular_threshold,
-    solve_general,
     unit_diagonal,
 )
 from lagjax._equations._many_states import (

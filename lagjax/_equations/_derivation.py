@@ -47,6 +47,7 @@ from lagjax._program import (
     apply_function,
     borders,
     concatenate,
+    fold,
     is_smooth,
     lack_of_memory,
     lower,
@@ -320,6 +321,34 @@ class Derivation:
             return -solve(factors, right)[self.layout.size :]
 
         return lower_formula(multipliers, *self.scalar_shapes, budget=OPERATION_BUDGET)
+
+    def impact_response(self, rows: tuple[int, ...], states: int) -> Program:
+        """What impulses at some `rows` of G (K) do: G (K, n), G M⁻¹ (K, n), G M⁻¹ Gᵀ (K, K), the rates (K,), G q̈ − γ (K,).
+
+        The last `states` parameters say what is held. G is that where everything is, q̈ that where nothing is; M⁻¹ leaves
+        the other constraints as they are.
+        """
+        key = "impact_response", *map(str, rows)
+        if key in self._programs:
+            return self._programs[key]
+        system, solve = self._system(_VELOCITY_STEP)
+        n, m = self.layout.size, self.shape("jacobian")[0]
+        parts, acceleration = self.program("jacobian", "rates", "gamma"), self.acceleration
+
+        def response(*scalars):
+            first = scalars[: len(scalars) - states]
+            held, free = (*first, *[0.0 * scalars[0] + 1.0] * states), (*first, *[0.0 * scalars[0]] * states)
+            values, factors = parts.vector(*held), system(*free)[3]
+            gradients = [values[n * i : n * (i + 1)] for i in rows]
+            moved = [solve(factors, scatter(row, np.arange(n), n + m))[:n] for row in gradients]
+            free = acceleration.vector(*free)[:n]
+            couplings = [fold("add", row * x) for row in gradients for x in moved]
+            rates = [values[n * m + i] for i in rows]
+            bends = [fold("add", row * free) - values[n * m + m + i] for row, i in zip(gradients, rows, strict=True)]
+            return concatenate([*gradients, *moved, stack([*couplings, *rates, *bends])])
+
+        self._programs[key] = lower_formula(response, *self.scalar_shapes, budget=OPERATION_BUDGET)
+        return self._programs[key]
 
     @_lowered_once
     def projected(self) -> Program | None:

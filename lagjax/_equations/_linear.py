@@ -19,6 +19,8 @@ is `vmap`ped is for the caller to decide, so all of it is written in array opera
 fast as LAPACK in a batch of up to about 12 coordinates; a single matrix of 128 takes four times as long, under 1 ms.
 """
 
+from collections.abc import Callable
+
 import equinox as eqx
 import jax
 import jax.numpy as jnp
@@ -161,31 +163,33 @@ def invert(matrix: Matrix) -> tuple[Matrix, Int[Array, " n"], Vector]:
     return _permute_rows(a, order[:n])[:, :n], order[:n], pivots[:n]
 
 
-def solve_general(matrix: Matrix, b: Array) -> Array:
-    """X with A X = B, for B (n,) or (n, k); A need not be symmetric. NaN where it is singular.
+def factorize_general(matrix: Matrix) -> Callable[[Vector], Vector]:
+    """b ↦ x with A x = b, for an A that need not be symmetric. NaN where it is singular.
 
     Differentiated implicitly: one more solve with the same inverse.
     """
-    if b.ndim > 1:
-        return jax.vmap(lambda column: solve_general(matrix, column), in_axes=1, out_axes=1)(b)
+    if len(matrix) == 1:
+        return lambda b: b / jnp.where(matrix[0] == 0, jnp.nan, matrix[0])
     scale = jax.lax.stop_gradient(1 / jnp.max(jnp.abs(matrix), axis=1))
     scaled = scale[:, None] * matrix
     columns, order, pivots = invert(jax.lax.stop_gradient(scaled))
-    inverse = jnp.zeros_like(columns).at[:, order].set(columns)
-    lost = jnp.min(jnp.abs(pivots)) <= singular_threshold(len(matrix), matrix.dtype) * jnp.max(jnp.abs(pivots))
+    inverse, pivots = jnp.zeros_like(columns).at[:, order].set(columns), jnp.abs(pivots)
+    lost = jnp.min(pivots) <= singular_threshold(len(matrix), matrix.dtype) * jnp.max(pivots)
 
-    def refine(times, inverse, b):
-        x = inverse @ b
-        return x + inverse @ (b - times(x))
+    def solve_by(inverse):
+        def solve(times, b):
+            x = inverse @ b
+            return x + inverse @ (b - times(x))  # one step of refinement, as in `Factorization`
 
-    def solve(times, b):
-        return refine(times, inverse, b)
+        return solve
 
-    def solve_transpose(times, b):
-        return refine(times, inverse.T, b)
+    def solve(b):
+        x = jax.lax.custom_linear_solve(
+            lambda y: scaled @ y, scale * b, solve_by(inverse), transpose_solve=solve_by(inverse.T)
+        )
+        return jnp.where(lost, jnp.nan, x)
 
-    x = jax.lax.custom_linear_solve(lambda y: scaled @ y, scale * b, solve, solve_transpose)
-    return jnp.where(lost, jnp.nan, x)
+    return solve
 
 
 def _eliminate(panel: Array, free: Array) -> tuple[Array, Array, Array, Array]:

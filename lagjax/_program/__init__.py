@@ -57,7 +57,7 @@ from lagjax._program._memory import lack_of_memory, machine_memory, operations_t
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, sink_negations
 from lagjax._program._rounding import rounding
-from lagjax._program._scalars import Scalars, apply_function, concatenate, scatter, stack
+from lagjax._program._scalars import Scalars, apply_function, concatenate, fold, scatter, stack
 from lagjax._program._series import LinearSystem, series
 from lagjax._program.lowering import _complex, _eigenvalues, _special
 from lagjax._program.lowering._matrices import orthogonalize, row_weights, solve_orthogonalized

@@ -17,6 +17,7 @@ Bounces that accumulate end at a closed form of their limit (`_end_of_bounces`).
 
 import dataclasses
 import functools
+import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -30,7 +31,15 @@ from lagjax._interface import RESULTS, SUCCESSFUL, Layout, code_of, halves
 from lagjax._native import SINGLE_NOISE
 from lagjax._primitives import attach_derivative, differentiable_where, lost_unless
 from lagjax._run._trajectory import vary_with
-from lagjax._run.contacts._impact_law import Pattern, Rows, change_velocities, find_pattern, responses, sliding_coupling
+from lagjax._run.contacts._impact_law import (
+    Friction,
+    Pattern,
+    Rows,
+    find_pattern,
+    impulses_of,
+    reached,
+    sliding_margin,
+)
 from lagjax._scene import Contacts, ContactScene, Flat, InContact
 
 PyTree = Any
@@ -43,6 +52,8 @@ BLOCK = 8  # rounds that run before it is asked whether any motion goes on
 # The time that bounces still take, in parts of a step of the motion between them, below which they end in closed form,
 # and what that leaves out: twice as long, heights of 4e-9 of those of a step are left out.
 SHORT, LEFT_OUT = 1e-4, 1e-14
+# What sliding leaves of a contact's response at which it is lost: a paradox, to rounding.
+PARADOX = 1e-12
 # The slip in space that has no direction of its own, in parts of the largest one.
 NO_SLIP = 1e-11
 _LEAST = 1e-300  # a side that is exactly zero still has a sign
@@ -99,8 +110,9 @@ def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) ->
         return jax.lax.scan(rounds.run_round, carry, counts)
 
     def idle(carry, counts):
-        empty = jax.eval_shape(rounds.run_round, carry, counts[0])[1]
-        return carry, jax.tree.map(lambda x: _absent((BLOCK, *x.shape), x.dtype), empty)
+        nothing = jnp.full(BLOCK, jnp.nan)
+        impulse = jnp.full((BLOCK, rounds.count), jnp.nan)
+        return carry, ImpactRecord(nothing, impulse, nothing, jnp.zeros(BLOCK, bool))
 
     def step(carry, counts):
         return jax.lax.cond(any_member(carry.going), run_block, idle, carry, counts)
@@ -118,10 +130,6 @@ def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) ->
     return ending._replace(path=path), ImpactRecord(t, impulse, lost, record.happened)
 
 
-def _absent(shape, dtype):
-    return jnp.zeros(shape, bool) if dtype == bool else jnp.full(shape, jnp.nan, dtype)
-
-
 @jax.custom_batching.custom_vmap
 def any_member(going):
     """Whether a motion, or any of those that `jax.vmap` runs beside it, goes on."""
@@ -134,13 +142,14 @@ def _(size, batched, going):
 
 
 class ContactRounds(NamedTuple):
+    """All that the rounds of a run share: the lines of its scene, the user's parameters, and the output times."""
+
     plan: ContactPlan
-    problem: Problem  # without a state and times; its params are those of the user
+    problem: Problem  # without a state and times
     flat: Flat
     surfaces: Surfaces
-    rows: "RowPlaces"
-    quantities: Any  # the line of M, G, γ and the rates
-    acceleration: Any
+    places: "RowPlaces"
+    response: Any  # the line of `Rows`
     multipliers: Any
     params: PyTree
     vector: jax.Array
@@ -151,30 +160,35 @@ class ContactRounds(NamedTuple):
     def from_plan(cls, plan: ContactPlan, layout: Layout, ts, y0, params) -> "ContactRounds":
         flat = Flat.from_system(plan.scene.system, layout, params)
         limits = {"rtol": plan.rtol, "atol": plan.atol, "max_steps": plan.max_steps}
-        inside = InContact(params, _resting(flat, 0.0))
+        inside = InContact(params, opened(flat))
         problem = Problem.from_system(plan.scene, layout, inside, **limits)
         problem = dataclasses.replace(problem, is_rounded=plan.is_single)
         derivation = problem.derivation.lowered
         code, structure = jax.tree.flatten(eqx.filter(inside, eqx.is_array_like, inverse=True))
         surfaces = _watches(derivation, plan.scene, tuple(code), structure)._replace(is_rounded=plan.is_single)
-        lines = [
-            line_of(derivation.program("mass_matrix", "jacobian", "gamma", "rates")),
-            line_of(derivation.acceleration.complete, layout.size),
-            line_of(derivation.multipliers),
-        ]
-        numbers = vector_of(eqx.filter(params, eqx.is_array_like))
-        given = jnp.append(y0, ts[0]), numbers
-        widths = tuple(SINGLE_NOISE * jnp.abs(jax.lax.stop_gradient(x)) for x in given)
         places = RowPlaces.from_derivation(derivation, flat)
+        states = sum(x.size for x in opened(flat))
+        lines = line_of(derivation.impact_response(places.all, states)), line_of(derivation.multipliers)
+        numbers = vector_of(eqx.filter(params, eqx.is_array_like))
+        widths = tuple(SINGLE_NOISE * jnp.abs(jax.lax.stop_gradient(x)) for x in (jnp.append(y0, ts[0]), numbers))
         return cls(plan, problem, flat, surfaces, places, *lines, params, numbers, widths, ts)
-
-    @property
-    def layout(self) -> Layout:
-        return self.problem.layout
 
     @property
     def count(self) -> int:
         return self.flat.shapes.count
+
+    @property
+    def rubs(self) -> bool:
+        return self.flat.rough.size > 0
+
+    @property
+    def has_gap(self) -> np.ndarray:
+        return np.arange(self.count) < self.flat.of_gaps
+
+    @property
+    def friction(self) -> Friction:
+        coefficients = self.flat.friction(eqx.filter(self.params, eqx.is_array_like))
+        return Friction(self.flat.rough, self.flat.shapes.directions, coefficients)
 
     def numbers_in(self, contacts: Contacts):
         return jnp.concatenate([self.vector, *map(jnp.ravel, contacts)])
@@ -185,34 +199,31 @@ class ContactRounds(NamedTuple):
     # ---- a round ----
 
     def begin(self, y0) -> Carry:
-        """The start: contacts that touch and do not move are closed, those that move inwards fall at once."""
-        t, guards = self.ts[0], self.count + self.flat.rough.size
-        opened = _resting(self.flat, 0.0)
-        guarded = self.watch(t, y0, opened)
-        touches, rates, noise = self.touching(guarded, t, y0, opened)
-        inside = (guarded.values[: self.count] < -guarded.rounding[: self.count]) & self.has_gap
-        closed = touches & (jnp.abs(rates) <= noise)
-        slip, still = self.slip_at(t, y0, jnp.zeros(self.flat.rough.size))
-        contacts = self.along_slips(closed, slip, still, jnp.max(jnp.abs(slip), axis=1, initial=0.0))
-        none = jax.tree.map(lambda x: jnp.full((self.ts.size, *x.shape), -1.0), contacts)
-        inconsistent, zero = inside.any(), jnp.zeros((2, guards))
+        """The start, with all contacts open: those that touch and do not move apart fall at once."""
+        contacts, guards = opened(self.flat), self.count + self.flat.rough.size
+        guarded = self.watch(self.ts[0], y0, contacts)
+        inside = (guarded.values < -guarded.rounding)[: self.count] & self.has_gap
         return Carry(
-            t, self.hold(t, y0, contacts), contacts, jnp.ones(guards, bool), ~inconsistent,
-            jnp.where(inconsistent, INCONSISTENT, SUCCESSFUL), jnp.zeros(2, int), jnp.zeros(()), jnp.zeros((), int),
-            zero, zero, jnp.max(jnp.abs(slip), axis=1, initial=0.0),
-            jnp.full((self.ts.size, y0.size), jnp.nan), none,
+            t=self.ts[0], y=y0, contacts=contacts, fresh=jnp.ones(guards, bool), going=~inside.any(),
+            result=jnp.where(inside.any(), INCONSISTENT, SUCCESSFUL), steps=jnp.zeros(2, int), longest=jnp.zeros(()),
+            turns=jnp.zeros((), int), rounding=jnp.zeros((2, guards)), rate_rounding=jnp.zeros((2, guards)),
+            slip=jnp.zeros(self.flat.rough.size), path=jnp.full((self.ts.size, y0.size), jnp.nan),
+            of_path=jax.tree.map(lambda x: jnp.full((self.ts.size, *x.shape), -1.0), contacts),
         )  # fmt: skip
 
     def run_round(self, before: Carry, count) -> tuple[Carry, ImpactRecord]:
         """One round: to the next watch that falls, through what happens there; of a motion that is going."""
         here, contacts, t_start = before.going, before.contacts, jax.lax.stop_gradient(before.t)
-        guarded, kinds = self.watch(before.t, before.y, contacts), self.kinds(contacts)
-        before = self.note_rounding(before, guarded, kinds)
+        guarded, kinds = self.watch(before.t, before.y, contacts), jnp.concatenate([contacts.closed, contacts.sticks])
+        before = _note_rounding(before, guarded, kinds, 0.0)
         rounding = jnp.maximum(_of_kind(before.rounding, kinds), guarded.of_time)
         beyond = guarded.values < -rounding
         sides = jnp.where(beyond, jnp.inf, jnp.maximum(rounding, _LEAST))
         horizon = jnp.where(here, self.ts[-1], t_start)
-        located = self.locate(contacts, t_start, horizon, before.y, sides, _of_kind(before.rate_rounding, kinds))
+        problem = self.problem_in(contacts, jnp.stack([t_start, horizon]), before.y)
+        problem = dataclasses.replace(problem, guards=self.surfaces.guards(remembers=True))
+        noted = jnp.concatenate([sides, _of_kind(before.rate_rounding, kinds)])
+        located = MachineCode().solve_to_event(problem, noted)
         fell = (jnp.where(here, located.event, 0) >> (2 * np.arange(kinds.size))) & 3 > 0
         t_end = jnp.where(here & (located.result == SUCCESSFUL), self.ts[-1], located.t_end)
 
@@ -224,263 +235,202 @@ class ContactRounds(NamedTuple):
         moved = MachineCode().solve(self.problem_in(contacts, times, before.y))
         y_end = located.y_end + jnp.where(here, moved.y_end - jax.lax.stop_gradient(moved.y_end), 0.0)
 
-        happens, k = fell.any(), jnp.argmax(fell)
-        at_once = t_end == t_start
-        crosses = happens & ~(at_once & (before.fresh | beyond)[k])
-        numbers = self.numbers_in(contacts)
-        t, y = self.cross(k, crosses, t_end, y_end, numbers)
-        t, y = (jnp.where(crosses, new, old) for new, old in zip((t, y), (t_end, y_end), strict=True))
+        happens, k, at_once = fell.any(), jnp.argmax(fell), t_end == t_start
+        crosses = happens & ~(at_once & _pick(before.fresh | beyond, k))
+        crossed = self.cross(k, crosses, t_end, y_end, self.numbers_in(contacts))
+        t, y = (jnp.where(crosses, new, old) for new, old in zip(crossed, (t_end, y_end), strict=True))
         turns = jnp.where(at_once, before.turns + 1, 0)
         step = jnp.where(at_once, 0.0, (t_end - t_start) / jnp.maximum(located.accepted, 1))
-        before = before._replace(longest=jnp.maximum(before.longest, step))
-        before = self.note_rounding(before, self.watch(t, y, contacts), kinds, t_end - t_start)
-        before = before._replace(fresh=before.fresh & at_once)
-        decided, record = self.decide(before, t, y, k, happens, fell)
-
-        sound = jnp.isfinite(jnp.where(happens, decided.y, y_end)).all()
-        result = jnp.where(here & ~happens, located.result, before.result)
-        result = jnp.where(here & happens, decided.result, result)
-        result = jnp.where(here & happens & (turns > 16 + 8 * kinds.size), UNDECIDED, result)
-        result = jnp.where(here & ~sound & (result == SUCCESSFUL), NOT_FINITE, result)
-        spent = here & happens & (result == SUCCESSFUL) & (count + 1 >= self.plan.max_transitions)
-        result = jnp.where(spent, TOO_MANY, result)
-        path = jnp.where(covered[:, None], moved.path[1:-1], before.path)
-        of_path = jax.tree.map(
-            lambda old, new: jnp.where(covered[:, *[None] * new.ndim], new, old), before.of_path, contacts
+        before = _note_rounding(before, guarded, kinds, t_end - t_start)._replace(
+            fresh=before.fresh & at_once, longest=jnp.maximum(before.longest, step)
         )
+        decided, record = self.decide(before, t, y, k)
+
+        result = jnp.where(happens, decided.result, located.result)
+        result = jnp.where(happens & (turns > 16 + 8 * kinds.size), UNDECIDED, result)
+        sound = jnp.isfinite(jnp.where(happens, decided.y, y_end)).all()
+        result = jnp.where(~sound & (result == SUCCESSFUL), NOT_FINITE, result)
+        going = happens & (result == SUCCESSFUL)
+        spent = going & (count + 1 >= self.plan.max_transitions)
+        cover = lambda old, new: jnp.where(covered[:, *[None] * new.ndim], new, old)  # noqa: E731
         after = decided._replace(
-            t=jnp.where(happens, t, t_end), y=jnp.where(happens, decided.y, y_end), going=here & happens & (result == SUCCESSFUL),
-            result=result, steps=before.steps + jnp.stack([located.accepted, located.rejected]), turns=turns, path=path,
-            of_path=of_path,
+            t=jnp.where(happens, t, t_end), y=jnp.where(happens, decided.y, y_end), going=going & ~spent,
+            contacts=jax.tree.map(lambda new, old: jnp.where(happens, new, old), decided.contacts, contacts),
+            result=jnp.where(spent, TOO_MANY, result), turns=turns,
+            steps=before.steps + jnp.stack([located.accepted, located.rejected]),
+            path=jnp.where(covered[:, None], moved.path[1:-1], before.path),
+            of_path=jax.tree.map(cover, before.of_path, contacts),
         )  # fmt: skip
         after = jax.tree.map(lambda new, old: jnp.where(here, new, old), after, before)
-        happened = record.happened & here
+        happened = record.happened & happens & here
         t, impulse, lost = (jnp.where(happened, x, jnp.nan) for x in record[:3])
         return after, ImpactRecord(t, impulse, lost, happened)
-
-    def locate(self, contacts, t_start, horizon, y, sides, rate_rounding):
-        problem = self.problem_in(contacts, jnp.stack([t_start, horizon]), y)
-        problem = dataclasses.replace(problem, guards=self.surfaces.guards(remembers=True))
-        return MachineCode().solve_to_event(problem, jnp.concatenate([sides, rate_rounding]))
 
     def cross(self, k, taken, t, y, numbers):
         return attach_derivative(crossing_variation(self.surfaces), (t, y), k, taken, t, y, numbers)
 
-    # ---- what is known at a state, without derivatives ----
+    # ---- what is known at a state ----
 
     def watch(self, t, y, contacts: Contacts) -> Guarded:
+        """The watches at a state, without derivatives."""
         of_state, of_params = self.widths
         numbers = self.numbers_in(contacts)
         exact = jnp.pad(of_params, (0, numbers.size - of_params.size))
         return self.surfaces.evaluate_guards(t, y, numbers, self.ts[-1], (of_state, exact))
 
-    def kinds(self, contacts: Contacts):
-        """1 for a watch of a contact that is closed, or sticks, else 0, (G,)."""
-        return jnp.concatenate([contacts.closed, contacts.sticks])
+    def rows_at(self, t, y) -> Rows:
+        size, n = len(self.places.all), y.size // 2
+        values = self.response(jnp.concatenate([y, t[None], self.numbers_in(opened(self.flat))]))
+        shapes = (size, n), (size, n), (size, size), (size,), (size,)
+        parts = jnp.split(values, np.cumsum([math.prod(shape) for shape in shapes])[:-1])
+        return Rows(*(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))
 
-    @property
-    def has_gap(self) -> np.ndarray:
-        return np.arange(self.count) < self.flat.of_gaps
+    def slips(self, rows: Rows, v, largest) -> tuple:
+        """The slips (r, d), and whether each is rounding, beside the `largest` so far."""
+        slips = rows.rates[self.count :].reshape(-1, self.flat.shapes.directions)
+        terms = (jnp.abs(rows.gradients[self.count :]) @ jnp.abs(v)).reshape(slips.shape).max(axis=1)
+        return slips, _length(slips) <= jnp.maximum(1e-12 * terms, 1e-13 * largest)
 
-    def note_rounding(self, carry: Carry, guarded: Guarded, kinds, duration=0.0) -> Carry:
-        """The carry with the largest rounding of its watches: of one that went away and came back that between them."""
-        finite = [jnp.where(jnp.isfinite(x), x, 0.0) for x in (guarded.rounding, guarded.rate_rounding)]
-        here = jnp.stack([1.0 - kinds, kinds])
-        rounding = jnp.maximum(finite[0], finite[1] * duration) * here
-        return carry._replace(
-            rounding=jnp.maximum(carry.rounding, rounding),
-            rate_rounding=jnp.maximum(carry.rate_rounding, finite[1] * here),
-        )
-
-    def touching(self, guarded: Guarded, t, y, contacts: Contacts) -> tuple:
-        """Which contacts touch (k,), how fast they move apart, and the rounding of that; watched while `contacts` are open."""
-        k = self.count
+    def touching(self, t, y) -> tuple:
+        """Which contacts touch (k,), how fast they move apart, and the rounding of that, without derivatives."""
+        guarded, k = self.watch(t, y, opened(self.flat)), self.count
         values, noise = guarded.values[:k], guarded.rounding[:k] + guarded.of_time[:k]
         rates = jnp.where(self.has_gap, guarded.rates[:k], values)
         of_rates = jnp.where(self.has_gap, guarded.rate_rounding[:k], noise)
         return jnp.where(self.has_gap, jnp.abs(values) <= noise, values <= noise), rates, of_rates
 
-    def slip_at(self, t, y, largest) -> tuple:
-        """The slips (r, d), and whether each is rounding, beside the `largest` so far."""
-        rows = self.rows_at(t, y)
-        slips = jax.lax.stop_gradient(rows.rates[rows.tangential])
-        terms = jnp.abs(rows.jacobian[rows.tangential]) @ jnp.abs(halves(y)[1])
-        noise = jax.lax.stop_gradient(jnp.maximum(1e-12 * jnp.max(terms, axis=1, initial=0.0), 1e-13 * largest))
-        return slips, jnp.sqrt(jnp.sum(slips**2, axis=1)) <= noise
-
-    def along_slips(self, closed, slips, still, largest) -> Contacts:
-        """Contacts of which these are `closed`: they stick where they are `still`, and else slide along their slips."""
-        size = jnp.sqrt(jnp.sum(slips**2, axis=1, keepdims=True))
-        direction = slips / jnp.where(size > 0, size, 1.0)
-        return Contacts(closed.astype(float), still.astype(float), self.scale_direction(direction, largest))
-
-    def scale_direction(self, direction, largest):
-        if self.flat.shapes.directions == 1:
-            return jnp.where(direction < 0, -1.0, 1.0)
-        return direction * NO_SLIP * jnp.where(largest > 0, largest, 1.0)[:, None]
-
-    def rows_at(self, t, y) -> Rows:
-        """The rows of all constraints and contacts at a state."""
-        n, m = self.layout.size, self.rows.count
-        closed = self.numbers_in(_resting(self.flat, 1.0))
-        values = self.quantities(jnp.concatenate([y, t[None], closed]))
-        mass, jacobian, _, rates = jnp.split(values, np.cumsum([n * n, m * n, m]))
-        return Rows(mass.reshape(n, n), jacobian.reshape(m, n), rates, *self.rows[1:], self.flat.rough)
-
     # ---- what happens at a watch that fell ----
 
-    def decide(self, before: Carry, t, y, k, happens, fell) -> tuple[Carry, ImpactRecord]:
-        """The state and the contacts behind watch k, which fell."""
-        count, rough, contacts = self.count, self.flat.rough, before.contacts
-        fell_first = np.arange(count + rough.size) == k
+    def decide(self, before: Carry, t, y, k) -> tuple[Carry, ImpactRecord]:
+        """The state and the contacts behind watch k, which fell at (t, y)."""
+        first, count, contacts = np.arange(self.count + self.flat.rough.size) == k, self.count, before.contacts
         was_closed, was_stuck = contacts.closed > 0, contacts.sticks > 0
-        meets, opens = fell_first[:count] & ~was_closed, fell_first[:count] & was_closed
-        stops, breaks = fell_first[count:] & ~was_stuck, fell_first[count:] & was_stuck
-        impact = self.meet(before, t, y, meets, fell)
+        meets, opens = first[:count] & ~was_closed, first[:count] & was_closed
+        rows, (_, v), friction = self.rows_at(t, y), halves(y), self.friction
+        quiet = jax.lax.stop_gradient(rows)
+        impact = self.meet(before, rows, t, y, meets)
         closed = jnp.where(impact.happened, impact.closed, (was_closed | meets) & ~opens)
-        y_after = jnp.where(impact.happened, impact.y, y)
-        slips, still = self.slip_at(t, y_after, before.slip)
-        largest = jnp.maximum(before.slip, jnp.sqrt(jnp.sum(slips**2, axis=1)))
-        new = self.along_slips(closed, slips, still, largest)
-        renew = impact.happened | (closed != was_closed)[rough]
-        force = self.friction_force(t, y, contacts)
-        against = -force / jnp.where(jnp.any(force != 0, axis=1, keepdims=True), jnp.linalg.norm(force, axis=1, keepdims=True), 1.0)
-        broken = self.scale_direction(against, largest)
-        sticks = jnp.where(renew, new.sticks > 0, (was_stuck | stops) & ~breaks)
-        turned = jnp.where(breaks[:, None], broken, jnp.where(renew[:, None] | (np.array(self.flat.shapes.directions > 1) & ~still[:, None]), new.direction, contacts.direction))
-        after = Contacts(closed.astype(float), sticks.astype(float), turned)
-        changed = jnp.concatenate([(closed != was_closed) | impact.happened, (sticks != was_stuck) | renew | breaks])
-        held = self.hold(t, y_after, after)
-        friction = jax.lax.stop_gradient(self.flat.friction(eqx.filter(self.params, eqx.is_array_like)))
-        coupling = sliding_coupling(self.rows_at(t, held).still, after._replace(direction=_unit(turned)), friction)
-        undecided = (happens & ~impact.sound) | (coupling <= 1e-12).any()
+        changed = (closed != was_closed) | impact.happened
+        sticks, direction, renewed, largest = was_stuck, contacts.direction, changed[:0], before.slip
+        if self.rubs:
+            slide = quiet._replace(rates=quiet.rates + jnp.where(impact.happened, quiet.coupling @ impact.impulses, 0.0))
+            sticks, direction, renewed, largest = self.rub(before, t, y, slide, first[count:], changed)
+        after = Contacts(closed.astype(float), sticks.astype(float), direction)
+        # Behind an impact the impulses are known; else velocities are those that what is closed allows.
+        held = Pattern(*after)
+        pattern = jax.tree.map(lambda a, b: jnp.where(impact.happened, a, b), impact.pattern, held)
+        targets = jnp.where(impact.happened, impact.targets, 0.0)
+        smooth = friction._replace(coefficients=jnp.where(impact.happened, friction.coefficients, 0.0))
+        impulses = impulses_of(rows, pattern, smooth, targets)
+        y_next = y + jnp.concatenate([jnp.zeros_like(v), impulses @ rows.responses])
+        y_next = differentiable_where(~impact.tied, y_next)
+        undecided = impact.happened & ~impact.sound
+        if self.rubs:
+            along = held._replace(direction=_unit(direction))
+            undecided |= (sliding_margin(quiet, along, friction.still) <= PARADOX).any()
+        # Of the work of impulses only what moves q is kinetic energy: gaps may move by themselves.
+        before_after = rows.gradients @ (v + 0.5 * (impulses @ rows.responses))
         decided = before._replace(
-            y=held, contacts=after, fresh=before.fresh | changed, slip=largest,
+            y=y_next, contacts=after, fresh=before.fresh | jnp.concatenate([changed, renewed]), slip=largest,
             result=jnp.where(undecided, UNDECIDED, before.result),
         )  # fmt: skip
-        record = ImpactRecord(impact.t, impact.impulse, impact.energy_lost, impact.happened & happens)
-        return decided, record
+        return decided, ImpactRecord(impact.t, impulses[:count], -impulses @ before_after, impact.happened)
 
-    def meet(self, before: Carry, t, y, meets, fell) -> "Impact":
-        """The impact of contacts that meet, (k,), with all that touch."""
-        still, count = jax.lax.stop_gradient, self.count
-        opened = _resting(self.flat, 0.0)
-        guarded = self.watch(t, y, opened)
-        touches, rates, noise = self.touching(guarded, t, y, opened)
-        was_closed = before.contacts.closed > 0
+    def rub(self, before: Carry, t, y, rows: Rows, fell, changed) -> tuple:
+        """Which contacts stick, and the directions in which they slide, behind watches of friction that `fell` (r,).
+
+        Also which of them are others than before, and the largest slips so far.
+        """
+        contacts, rough = before.contacts, self.flat.rough
+        was_stuck, (slips, still) = contacts.sticks > 0, self.slips(rows, halves(y)[1], before.slip)
+        largest = jnp.maximum(before.slip, _length(slips))
+        numbers = jnp.concatenate([y, t[None], self.numbers_in(contacts)])
+        force = jax.lax.stop_gradient(self.multipliers(numbers))[self.places.tangential]
+        breaks, renew = fell & was_stuck, changed[rough]
+        sticks = jnp.where(renew, still, (was_stuck | fell) & ~breaks)
+        moving = jnp.where(breaks[:, None], -force, slips)
+        moving = _unit(moving) * NO_SLIP * jnp.where(largest > 0, largest, 1.0)[:, None]
+        if self.flat.shapes.directions == 1:
+            moving = jnp.where(moving < 0, -1.0, 1.0)
+        takes = breaks | ((renew | (self.flat.shapes.directions > 1)) & ~still)
+        direction = jnp.where(takes[:, None], moving, contacts.direction)
+        return sticks, direction, renew | (sticks != was_stuck), largest
+
+    def meet(self, before: Carry, rows: Rows, t, y, meets) -> "Impact":
+        """What the impact of contacts that meet, (k,), is, with all that touch."""
+        still, numbers = jax.lax.stop_gradient, eqx.filter(self.params, eqx.is_array_like)
+        was_closed, quiet = before.contacts.closed > 0, still(rows)
+        touches, rates, noise = self.touching(t, y)
         touches = touches | meets | was_closed | ~self.has_gap
-        noise = jnp.maximum(noise, 0.01 * before.rate_rounding[0, :count])
-        rows = self.rows_at(t, y)
-        numbers = eqx.filter(self.params, eqx.is_array_like)
-        restitution, friction = self.flat.restitution(numbers), self.flat.friction(numbers)
+        noise = jnp.maximum(noise, 0.01 * before.rate_rounding[0, : self.count])
+        restitution, friction = self.flat.restitution(numbers), self.friction
         hits = (meets & (rates < -noise)).any()
-        quiet = rows.still
-        if self.plan.scene.system.impacts == "sequential":
-            involved = meets
-        else:
-            involved = touches & _reached(quiet, meets, touches)
-        pattern, sound = find_pattern(quiet, involved, still(restitution), still(friction))
-        pattern = jax.tree.map(still, pattern)
-
-        def blow(restitution):
-            held, targets = self.held_in(pattern, rows, restitution)
-            return change_velocities(rows, held, targets, pattern, friction)
-
-        bounced = jnp.where(pattern.push > 0, -restitution * rows.rates[rows.normal], 0.0)
-        change, _ = blow(restitution)
-        bouncing = y + jnp.pad(change, (change.size, 0))
-        ends, left = self.end_of_bounces(before, t, bouncing, bounced, restitution)
-        ends = ends & hits & (pattern.push > 0)
-        change, impulses = blow(jnp.where(ends, 0.0, restitution))
-        change = jnp.where(hits, change, 0.0)
-        q, v = halves(y)
-        after = jnp.concatenate([q, v + change])
-        lost = -0.5 * (2 * v + change) @ (rows.mass @ change)
-        separating = still(rows.rates + rows.jacobian @ change)[rows.normal]
-        quick = jnp.maximum(noise, 1e-12 * jnp.max(jnp.abs(rates), initial=0.0))
-        closed = touches & (jnp.abs(separating) <= quick) & (self.has_gap | (separating <= quick))
+        together = self.plan.scene.system.impacts == "simultaneous"
+        involved = reached(quiet, meets, touches, friction) if together else meets
+        pattern, sound = find_pattern(quiet, involved, still(restitution), friction.still)
+        targets = -restitution * rows.rates[: self.count]
+        ends, left = self.end_of_bounces(before, rows, t, y, impulses_of(rows, pattern, friction, targets), targets, restitution)
+        ends = ends & (pattern.push > 0)
+        targets = jnp.where(ends, 0.0, targets)
+        impulses = still(impulses_of(rows, pattern, friction, targets))
+        apart = quiet.rates[: self.count] + (quiet.coupling @ impulses)[: self.count]
+        quick = jnp.maximum(noise, 1e-12 * jnp.max(jnp.abs(rates)))
+        closed = touches & (jnp.abs(apart) <= quick)
+        others = involved & ~meets & ~was_closed & (rates < -noise) & ~before.fresh[: self.count]
         time = t + jnp.sum(jnp.where(ends, left, 0.0))
-        tied = self.tied(rows, meets, involved, rates < -noise, before)
-        after = differentiable_where(~(tied & hits), after)
-        return Impact(hits, sound | ~hits, after, closed, time, impulses[rows.normal], lost)
+        return Impact(hits, sound, pattern, targets, impulses, closed, time, hits & others.any())
 
-    def tied(self, rows: Rows, meets, involved, inwards, before: Carry):
-        """True if other contacts close at this instant, by themselves, that share the impact."""
-        was_closed = before.contacts.closed > 0
-        others = involved & ~meets & ~was_closed & inwards & self.has_gap & ~before.fresh[: self.count]
-        return jax.lax.stop_gradient(others.any())
-
-    def held_in(self, pattern: Pattern, rows: Rows, restitution) -> tuple:
-        """The rows that are held in an impact (m,), and the rates they get."""
-        held = jnp.ones(self.rows.count).at[rows.normal].set(pattern.push)
-        targets = jnp.zeros(self.rows.count).at[rows.normal].set(-restitution * rows.rates[rows.normal])
-        if rows.rough.size:
-            sticks = jnp.repeat(pattern.push[rows.rough] * pattern.sticks, rows.tangential.shape[1])
-            held = held.at[rows.tangential.ravel()].set(sticks)
-        return held, targets
-
-    def hold(self, t, y, contacts: Contacts):
-        """The state with velocities that closed contacts and sticking ones allow, in the metric of M."""
-        rows, (q, v) = self.rows_at(t, y), halves(y)
-        still = Pattern(contacts.closed, contacts.sticks, jnp.zeros_like(contacts.direction))
-        held, targets = self.held_in(still, rows, jnp.zeros(self.count))
-        change, _ = change_velocities(rows, held, targets, still, jnp.zeros(self.flat.rough.size))
-        return jnp.concatenate([q, v + change])
-
-    def friction_force(self, t, y, contacts: Contacts):
-        """The forces (r, d) that hold what sticks."""
-        numbers = jax.lax.stop_gradient(jnp.concatenate([y, t[None], self.numbers_in(contacts)]))
-        return self.multipliers(numbers)[self.rows.tangential]
-
-    def end_of_bounces(self, before: Carry, t, y, bounced, restitution) -> tuple:
+    def end_of_bounces(self, before: Carry, rows: Rows, t, y, impulses, bounced, restitution) -> tuple:
         """Which contacts that bounce with these velocities (k,) come to rest at once, and after which time.
 
         With gap″ = −b − b′ s the bounces take 2u/(b (1 − e)) (1 − ⅔ k), k = b′ u / b² (1 − e), up to k².
         """
-        opened = _resting(self.flat, 0.0)
+        n, k = y.size // 2, self.count
+        y = y + jnp.concatenate([jnp.zeros(n), impulses @ rows.responses])
+        numbers = self.numbers_in(opened(self.flat))
+        acceleration = self.acceleration_at(t, y, numbers)
 
         def falls(t, y):
-            numbers = self.numbers_in(opened)
-            acceleration = self.acceleration(jnp.concatenate([y, t[None], numbers]))
-            closed = self.numbers_in(_resting(self.flat, 1.0))
-            values = self.quantities(jnp.concatenate([y, t[None], closed]))
-            n, m = self.layout.size, self.rows.count
-            _, jacobian, gamma, _ = jnp.split(values, np.cumsum([n * n, m * n, m]))
-            bend = jacobian.reshape(m, n) @ acceleration - gamma
-            return -bend[self.rows.normal], jnp.concatenate([halves(y)[1], acceleration])
+            return -self.rows_at(t, y).bends[:k]
 
-        slope = falls(t, y)[1]
-        b, later = jax.jvp(lambda t, y: falls(t, y)[0], (t, y), (jnp.ones_like(t), slope))
-        falling = b > 0
-        safe, rest = jnp.where(falling, b, 1.0), jnp.where(restitution < 1, 1 - restitution, 1.0)
+        b, later = jax.jvp(falls, (t, y), (jnp.ones_like(t), jnp.concatenate([halves(y)[1], acceleration])))
+        safe, rest = jnp.where(b > 0, b, 1.0), jnp.where(restitution < 1, 1 - restitution, 1.0)
         uneven = later * bounced / (safe**2 * rest)
         left = 2 * bounced / (safe * rest) * (1 - 2 / 3 * uneven)
-        ends = falling & (restitution < 1) & (left >= 0) & (left <= SHORT * before.longest)
-        ends = ends & (uneven**2 * left <= LEFT_OUT * (1 + jnp.abs(t))) & self.has_gap
-        return jax.lax.stop_gradient(ends), left
+        ends = (b > 0) & (restitution < 1) & (left >= 0) & (left <= SHORT * before.longest) & self.has_gap
+        return jax.lax.stop_gradient(ends & (uneven**2 * left <= LEFT_OUT * (1 + jnp.abs(t)))), left
+
+    def acceleration_at(self, t, y, numbers):
+        program = self.problem.derivation.lowered.acceleration
+        return line_of(program, y.size // 2)(jnp.concatenate([y, t[None], numbers]))
 
 
 class Impact(NamedTuple):
-    """What an impact leads to, if it `happened`: a state, which contacts are closed behind it, and its record.
+    """What an impact is, if it `happened`: a `pattern` and `targets` (k,) of the rates, which contacts it closes.
 
-    `t` is the time at which bounces that it begins have ended, where they end there.
+    `t` is the time at which bounces that it begins have ended, where they end there; it is `tied` where contacts that
+    share it close at this instant by themselves.
     """
 
     happened: Any
     sound: Any
-    y: Any
+    pattern: Pattern
+    targets: Any
+    impulses: Any
     closed: Any
     t: Any
-    impulse: Any
-    energy_lost: Any
+    tied: Any
 
 
 class RowPlaces(NamedTuple):
-    """Where the rows of contacts stand among all: their count, those of the normals (k,) and of the slips (r, d)."""
+    """Where the rows of contacts stand among all: those of the normals (k,) and of the slips (r, d)."""
 
-    count: int
     normal: np.ndarray
     tangential: np.ndarray
+
+    @property
+    def all(self) -> tuple[int, ...]:
+        return (*self.normal.tolist(), *self.tangential.ravel().tolist())
 
     @classmethod
     def from_derivation(cls, derivation, flat: Flat) -> "RowPlaces":
@@ -488,43 +438,39 @@ class RowPlaces(NamedTuple):
         gaps_end, slips = derivation.position_count, total - r * d
         one_way = flat.shapes.count - flat.of_gaps
         normal = [*range(gaps_end - flat.of_gaps, gaps_end), *range(slips - one_way, slips)]
-        return cls(total, np.array(normal, int), slips + np.arange(r * d).reshape(r, d))
+        return cls(np.array(normal, int), slips + np.arange(r * d).reshape(r, d))
 
 
-def _resting(flat: Flat, closed: float) -> Contacts:
-    """Contacts that are all open (0), or closed and at rest (1)."""
+def _note_rounding(carry: Carry, guarded: Guarded, kinds, duration) -> Carry:
+    """The carry with the largest rounding of its watches: of one that went away and came back that between them."""
+    finite = [jnp.where(jnp.isfinite(x), x, 0.0) for x in (guarded.rounding, guarded.rate_rounding)]
+    here = jnp.stack([1.0 - kinds, kinds])
+    return carry._replace(
+        rounding=jnp.maximum(carry.rounding, jnp.maximum(finite[0], finite[1] * duration) * here),
+        rate_rounding=jnp.maximum(carry.rate_rounding, finite[1] * here),
+    )
+
+
+def opened(flat: Flat) -> Contacts:
     r, d = flat.rough.size, flat.shapes.directions
-    return Contacts(jnp.full(flat.shapes.count, closed), jnp.ones(r), jnp.ones((r, d)))
+    return Contacts(jnp.zeros(flat.shapes.count), jnp.ones(r), jnp.ones((r, d)))
 
 
 def _of_kind(values, kinds):
     return jnp.where(kinds > 0, values[1], values[0])
 
 
-def _unit(direction):
-    length = jnp.sqrt(jnp.sum(direction**2, axis=1, keepdims=True))
-    return direction / jnp.where(length > 0, length, 1.0)
+def _pick(x, k):
+    return jnp.where(np.arange(x.size) == k, x, False).any()
 
 
-def _reached(rows: Rows, meets, touches):
-    """The contacts that touch (k,) and that an impulse at those that meet reaches, one through the other."""
-    schur = rows.jacobian @ responses(rows)
-    of_contacts, k, r = rows.contact_rows, len(rows.normal), len(rows.rough)
-    linked = jnp.abs(schur) > 1e-14 * jnp.sqrt(jnp.abs(jnp.outer(jnp.diagonal(schur), jnp.diagonal(schur))))
-    contact = np.zeros((len(rows.rates), k))
-    contact[rows.normal, np.arange(k)] = 1
-    for j in range(r):
-        contact[rows.tangential[j], rows.rough[j]] = 1
-    own = np.setdiff1d(np.arange(len(rows.rates)), of_contacts)
-    reach = linked.astype(float)
-    if own.size:  # a constraint hands an impulse on
-        for _ in range(max(1, int(np.ceil(np.log2(own.size + 1))))):
-            reach = jnp.minimum(reach + reach[:, own] @ reach[own], 1.0)
-    pairs = ((contact.T @ reach @ contact) > 0) & touches[:, None] & touches
-    found = meets
-    for _ in range(k):
-        found = found | (pairs & found).any(axis=1)
-    return found
+def _length(vectors):
+    return jnp.sqrt(jnp.sum(vectors**2, axis=1))
+
+
+def _unit(vectors):
+    length = _length(vectors)
+    return vectors / jnp.where(length > 0, length, 1.0)[:, None]
 
 
 @functools.lru_cache(maxsize=64)
