@@ -323,7 +323,7 @@ class Derivation:
         return lower_formula(multipliers, *self.scalar_shapes, budget=OPERATION_BUDGET)
 
     def impact_response(self, rows: tuple[int, ...], states: int) -> Program:
-        """What impulses at some `rows` of G (K) do: G (K, n), G M⁻¹ (K, n), G M⁻¹ Gᵀ (K, K), the rates (K,), G q̈ − γ (K,).
+        """What impulses at some `rows` of G (K) do: G, G M⁻¹ (K, n), G M⁻¹ Gᵀ (K, K), values, rates, and G q̈ − γ (K,).
 
         The last `states` parameters say what is held. G is that where everything is, q̈ that where nothing is; M⁻¹ leaves
         the other constraints as they are.
@@ -333,7 +333,7 @@ class Derivation:
             return self._programs[key]
         system, solve = self._system(_VELOCITY_STEP)
         n, m = self.layout.size, self.shape("jacobian")[0]
-        parts, acceleration = self.program("jacobian", "rates", "gamma"), self.acceleration
+        parts, acceleration = self.program("jacobian", "residual", "rates", "gamma"), self.acceleration
 
         def response(*scalars):
             first = scalars[: len(scalars) - states]
@@ -343,9 +343,9 @@ class Derivation:
             moved = [solve(factors, scatter(row, np.arange(n), n + m))[:n] for row in gradients]
             free = acceleration.vector(*free)[:n]
             couplings = [fold("add", row * x) for row in gradients for x in moved]
-            rates = [values[n * m + i] for i in rows]
-            bends = [fold("add", row * free) - values[n * m + m + i] for row, i in zip(gradients, rows, strict=True)]
-            return concatenate([*gradients, *moved, stack([*couplings, *rates, *bends])])
+            residuals, rates, gammas = ([values[(n + part) * m + i] for i in rows] for part in range(3))
+            bends = [fold("add", row * free) - gamma for row, gamma in zip(gradients, gammas, strict=True)]
+            return concatenate([*gradients, *moved, stack([*couplings, *residuals, *rates, *bends])])
 
         self._programs[key] = lower_formula(response, *self.scalar_shapes, budget=OPERATION_BUDGET)
         return self._programs[key]

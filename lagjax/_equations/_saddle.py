@@ -243,17 +243,30 @@ class DraggedElimination:
             column = np.flatnonzero(places[:, 1] == j)
             force = xp.scatter(forces[column], places[column, 0], n + len(saddle.rows))
             columns.append(saddle.solve(factors, force))
-        coupling = xp.stack([xp.stack([z[n + i] for z in columns]) for i in self.dragged])
-        matrix = coupling + np.eye(len(self.dragged))
-        return (factors, of_rows, xp.stack(columns), orthogonalize(matrix)), singular
+        # 1 − P, by elimination without pivots: the parts that are left are those of fewer contacts that slide.
+        size = len(self.dragged)
+        matrix = [[columns[j][n + i] + float(k == j) for j in range(size)] for k, i in enumerate(self.dragged)]
+        for k in range(size):
+            for row in matrix[k + 1 :]:
+                row[k] = row[k] / matrix[k][k]
+                for j in range(k + 1, size):
+                    row[j] = row[j] - row[k] * matrix[k][j]
+        return (factors, of_rows, xp.stack(columns), xp.stack([x for row in matrix for x in row])), singular
 
     def solve(self, factors, right):
         """x and then −λ, linear in `right`: b and then c."""
         of_saddle, of_rows, columns, coupling = factors
         n, saddle = self.saddle.size, self.saddle
         z = saddle.solve(of_saddle, right)
-        multipliers = solve_orthogonalized(coupling, -xp.stack([z[n + j] for j in self.dragged]))
-        for k in range(len(self.dragged)):
+        size, multipliers = len(self.dragged), [-z[n + j] for j in self.dragged]
+        for k in range(size):
+            for j in range(k):
+                multipliers[k] = multipliers[k] - coupling[size * k + j] * multipliers[j]
+        for k in reversed(range(size)):
+            for j in range(k + 1, size):
+                multipliers[k] = multipliers[k] - coupling[size * k + j] * multipliers[j]
+            multipliers[k] = multipliers[k] / coupling[size * k + k]
+        for k in range(size):
             z = z + columns[k] * multipliers[k]
         gaps, start = right[n:], 0
         for k, touching in enumerate(saddle.rows):

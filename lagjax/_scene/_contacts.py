@@ -143,7 +143,8 @@ class Flat(NamedTuple):
 
     def held_slips(self, contacts: Contacts):
         """1 for every slip that stays zero, (r d,)."""
-        return jnp.repeat(contacts.closed[self.rough] * contacts.sticks, self.shapes.directions)
+        held = contacts.closed[self.rough] * contacts.sticks
+        return jnp.broadcast_to(held[:, None], (held.size, self.shapes.directions)).ravel()
 
     def slip_direction(self, q, qdot, t, p: InContact):
         """The unit vectors (r, d) along the slips."""

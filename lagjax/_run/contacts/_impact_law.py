@@ -31,13 +31,15 @@ DEPENDENT = float(np.finfo(float).eps) ** (2 / 3)
 class Rows(NamedTuple):
     """The rows of contacts at a state: those of the k normals, then those of the slips, d for each of r contacts.
 
-    `gradients` G (K, n), `responses` G M⁻¹ (K, n), `coupling` G M⁻¹ Gᵀ (K, K), `rates` at the velocities q̇ (K,), and
-    `bends` (K,): how they change while no contact is closed.
+    `gradients` G (K, n), `responses` G M⁻¹ (K, n), `coupling` G M⁻¹ Gᵀ (K, K), the `values` of gaps, one-way velocities
+    and slips (K,), the `rates` that impulses change: those of gaps, and the other values; and `bends` (K,), how these
+    change while no contact is closed.
     """
 
     gradients: Any
     responses: Any
     coupling: Any
+    values: Any
     rates: Any
     bends: Any
 
