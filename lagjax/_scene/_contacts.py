@@ -151,8 +151,10 @@ class Flat(NamedTuple):
         given = p.contacts.direction
         if self.shapes.directions == 1:
             return given
-        moving = self.slips(q, qdot, t, p.params) + given
-        return moving / jnp.sqrt((moving * moving).sum(1, keepdims=True))
+        slips, length = self.slips(q, qdot, t, p.params), jnp.sqrt((given * given).sum(1))
+        along, across = given / length[:, None], jnp.stack([-given[:, 1], given[:, 0]], axis=1) / length[:, None]
+        turn = (slips * across).sum(1) / ((slips * along).sum(1) + length)
+        return (along + turn[:, None] * across) / jnp.sqrt(1.0 + turn * turn)[:, None]
 
 
 class Shapes(NamedTuple):

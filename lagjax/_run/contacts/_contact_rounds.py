@@ -36,7 +36,7 @@ from lagjax._run.contacts._impact_law import (
     Pattern,
     Rows,
     find_pattern,
-    impulses_of,
+    impulse_solver,
     reached,
     sliding_margin,
 )
@@ -52,10 +52,14 @@ BLOCK = 8  # rounds that run before it is asked whether any motion goes on
 # The time that bounces still take, in parts of a step of the motion between them, below which they end in closed form,
 # and what that leaves out: twice as long, heights of 4e-9 of those of a step are left out.
 SHORT, LEFT_OUT = 1e-4, 1e-14
+# Forces that are none, in parts of those that stop the bodies within a step: some fifty roundings.
+FORCELESS = 1e-14
 # What sliding leaves of a contact's response at which it is lost: a paradox, to rounding.
 PARADOX = 1e-12
-# The slip in space that has no direction of its own, in parts of the largest one.
-NO_SLIP = 1e-11
+# The slip in space that has no direction of its own, in parts of the largest one; and in parts of what a force that
+# breaks away brings about in a step. Half of that takes √2 times the steps, of some ten thousand: at rest friction
+# turns a slip at once, and steps are as short as that takes.
+NO_SLIP, AT_REST = 1e-11, 1e-8
 _LEAST = 1e-300  # a side that is exactly zero still has a sign
 
 
@@ -304,84 +308,89 @@ class ContactRounds(NamedTuple):
 
     def decide(self, before: Carry, t, y, k) -> tuple[Carry, ImpactRecord]:
         """The state and the contacts behind watch k, which fell at (t, y)."""
-        first, count, contacts = np.arange(self.count + self.flat.rough.size) == k, self.count, before.contacts
-        was_closed, was_stuck = contacts.closed > 0, contacts.sticks > 0
-        meets, opens = first[:count] & ~was_closed, first[:count] & was_closed
+        still, numbers, count = jax.lax.stop_gradient, eqx.filter(self.params, eqx.is_array_like), self.count
+        first, contacts = np.arange(count + self.flat.rough.size) == k, before.contacts
+        was_closed, meets = contacts.closed > 0, first[:count] & ~(contacts.closed > 0)
         rows, (_, v), friction = self.rows_at(t, y), halves(y), self.friction
-        quiet = jax.lax.stop_gradient(rows)
-        impact = self.meet(before, rows, t, y, meets)
-        closed = jnp.where(impact.happened, impact.closed, (was_closed | meets) & ~opens)
-        changed = (closed != was_closed) | impact.happened
-        sticks, direction, renewed, largest = was_stuck, contacts.direction, changed[:0], before.slip
+        restitution, quiet = self.flat.restitution(numbers), still(rows)
+        meeting = self.meet(before, quiet, t, y, meets, still(restitution))
+        hits = meeting.happened
+        slips = self.slips(quiet, v, before.slip)
+        closed = (was_closed & ~first[:count]) | meets
+        sticks = self.sticks(contacts, slips, first[count:], (closed != was_closed)[self.flat.rough])
+
+        # Behind an impact impulses follow its law; else velocities become those that what is closed allows.
+        held = Pattern(closed.astype(float), sticks.astype(float), jnp.zeros_like(contacts.direction))
+        pattern = jax.tree.map(lambda a, b: jnp.where(hits, a, b), meeting.pattern, held)
+        acting = friction._replace(coefficients=jnp.where(hits, friction.coefficients, 0.0))
+        solve, bounced = impulse_solver(rows, pattern, acting), jnp.where(hits, -restitution * rows.rates[:count], 0.0)
+        ends, left = self.end_of_bounces(before, rows, t, y, solve(bounced), bounced, restitution)
+        ends = ends & hits & (pattern.push > 0)
+        impulses = solve(jnp.where(ends, 0.0, bounced))
+        change = impulses @ rows.responses
+
+        apart = quiet.rates + quiet.coupling @ still(impulses)
+        closed = jnp.where(hits, meeting.touches & (jnp.abs(apart[:count]) <= meeting.noise), closed)
+        changed, undecided, slip = (closed != was_closed) | hits, hits & ~meeting.sound, before.slip
+        direction, turned = contacts.direction, changed[:0]
         if self.rubs:
-            slide = quiet._replace(rates=quiet.rates + jnp.where(impact.happened, quiet.coupling @ impact.impulses, 0.0))
-            sticks, direction, renewed, largest = self.rub(before, t, y, slide, first[count:], changed)
-        after = Contacts(closed.astype(float), sticks.astype(float), direction)
-        # Behind an impact the impulses are known; else velocities are those that what is closed allows.
-        held = Pattern(*after)
-        pattern = jax.tree.map(lambda a, b: jnp.where(impact.happened, a, b), impact.pattern, held)
-        targets = jnp.where(impact.happened, impact.targets, 0.0)
-        smooth = friction._replace(coefficients=jnp.where(impact.happened, friction.coefficients, 0.0))
-        impulses = impulses_of(rows, pattern, smooth, targets)
+            behind = self.slips(quiet._replace(rates=apart), v + still(change), slip)
+            renewed = changed[self.flat.rough]
+            sticks = jnp.where(hits & renewed, behind[1], sticks)
+            breaks, slip = first[count:] & (contacts.sticks > 0), jnp.maximum(slip, _length(slips[0]))
+            direction = self.directions(before, quiet, t, y, behind, breaks, renewed)
+            turned = renewed | (sticks != (contacts.sticks > 0))
+            along = Pattern(closed.astype(float), sticks.astype(float), _unit(direction))
+            undecided |= (sliding_margin(quiet, along, friction.still) <= PARADOX).any()
         # The gap that closes is zero, also as what went in varies: what rounding left of it would grow with each bounce.
         back = jnp.where(meets & self.has_gap, -rows.values[:count] / jnp.diagonal(rows.coupling)[:count], 0.0)
-        y_next = y + jnp.concatenate([back @ rows.responses[:count], impulses @ rows.responses])
-        y_next = differentiable_where(~impact.tied, y_next)
-        undecided = impact.happened & ~impact.sound
-        if self.rubs:
-            along = held._replace(direction=_unit(direction))
-            undecided |= (sliding_margin(quiet, along, friction.still) <= PARADOX).any()
-        # Of the work of impulses only what moves q is kinetic energy: gaps may move by themselves.
-        before_after = rows.gradients @ (v + 0.5 * (impulses @ rows.responses))
+        y_next = y + jnp.concatenate([back @ rows.responses[:count], change])
+        fast = jnp.abs(rows.gradients[:count]) @ jnp.maximum(jnp.abs(v), jnp.abs(v + change))
+        before = _note_forces(before, still(fast / jnp.diagonal(rows.coupling)[:count]))
         decided = before._replace(
-            y=y_next, contacts=after, fresh=before.fresh | jnp.concatenate([changed, renewed]), slip=largest,
+            y=differentiable_where(~(hits & meeting.tied), y_next), slip=slip,
+            contacts=Contacts(closed.astype(float), sticks.astype(float), direction),
+            fresh=before.fresh | jnp.concatenate([changed, turned]),
             result=jnp.where(undecided, UNDECIDED, before.result),
         )  # fmt: skip
-        return decided, ImpactRecord(impact.t, impulses[:count], -impulses @ before_after, impact.happened)
+        # Of the work of impulses only what moves q is kinetic energy: gaps may move by themselves.
+        lost = -impulses @ (rows.gradients @ (v + 0.5 * change))
+        rest = t + jnp.sum(jnp.where(ends, left, 0.0))
+        return decided, ImpactRecord(rest, impulses[:count], lost, hits)
 
-    def rub(self, before: Carry, t, y, rows: Rows, fell, changed) -> tuple:
-        """Which contacts stick, and the directions in which they slide, behind watches of friction that `fell` (r,).
+    def sticks(self, contacts: Contacts, slips: tuple, fell, renewed):
+        """Which contacts stick (r,) behind watches of friction that `fell`, where there is no impact."""
+        was_stuck = contacts.sticks > 0
+        return jnp.where(renewed, slips[1], (was_stuck | fell) & ~(fell & was_stuck))
 
-        Also which of them are others than before, and the largest slips so far.
-        """
-        contacts, rough = before.contacts, self.flat.rough
-        was_stuck, (slips, still) = contacts.sticks > 0, self.slips(rows, halves(y)[1], before.slip)
-        largest = jnp.maximum(before.slip, _length(slips))
-        numbers = jnp.concatenate([y, t[None], self.numbers_in(contacts)])
-        force = jax.lax.stop_gradient(self.multipliers(numbers))[self.places.tangential]
-        breaks, renew = fell & was_stuck, changed[rough]
-        sticks = jnp.where(renew, still, (was_stuck | fell) & ~breaks)
+    def directions(self, before: Carry, rows: Rows, t, y, slips: tuple, breaks, renewed):
+        """The directions in which contacts slide (r, d): against what held those that break away, else along the slip."""
+        numbers = jnp.concatenate([y, t[None], self.numbers_in(before.contacts)])
+        force, (slips, still) = jax.lax.stop_gradient(self.multipliers(numbers))[self.places.tangential], slips
         moving = jnp.where(breaks[:, None], -force, slips)
-        moving = _unit(moving) * NO_SLIP * jnp.where(largest > 0, largest, 1.0)[:, None]
         if self.flat.shapes.directions == 1:
             moving = jnp.where(moving < 0, -1.0, 1.0)
-        takes = breaks | ((renew | (self.flat.shapes.directions > 1)) & ~still)
-        direction = jnp.where(takes[:, None], moving, contacts.direction)
-        return sticks, direction, renew | (sticks != was_stuck), largest
+        else:
+            places = self.friction.places(self.count)
+            lasts = jnp.where(before.longest > 0, before.longest, self.ts[-1] - self.ts[0])
+            soon = _length(force) * jnp.diagonal(rows.coupling)[places].max(axis=1) * lasts
+            length = jnp.where(breaks, AT_REST * jnp.maximum(before.slip, soon), NO_SLIP * _length(slips))
+            moving = _unit(moving) * jnp.where(length > 0, length, _LEAST)[:, None]
+        takes = breaks | ((renewed | (self.flat.shapes.directions > 1)) & ~still)
+        return jnp.where(takes[:, None], moving, before.contacts.direction)
 
-    def meet(self, before: Carry, rows: Rows, t, y, meets) -> "Impact":
-        """What the impact of contacts that meet, (k,), is, with all that touch."""
-        still, numbers = jax.lax.stop_gradient, eqx.filter(self.params, eqx.is_array_like)
-        was_closed, quiet = before.contacts.closed > 0, still(rows)
+    def meet(self, before: Carry, rows: Rows, t, y, meets, restitution) -> "Meeting":
+        """Which contacts take part where some meet, (k,), and what they do."""
+        was_closed = before.contacts.closed > 0
         touches, rates, noise = self.touching(t, y)
         touches = touches | meets | was_closed | ~self.has_gap
         noise = jnp.maximum(noise, 0.01 * before.rate_rounding[0, : self.count])
-        restitution, friction = self.flat.restitution(numbers), self.friction
-        hits = (meets & (rates < -noise)).any()
-        together = self.plan.scene.system.impacts == "simultaneous"
-        involved = reached(quiet, meets, touches, friction) if together else meets
-        pattern, sound = find_pattern(quiet, involved, still(restitution), friction.still)
-        targets = -restitution * rows.rates[: self.count]
-        ends, left = self.end_of_bounces(before, rows, t, y, impulses_of(rows, pattern, friction, targets), targets, restitution)
-        ends = ends & (pattern.push > 0)
-        targets = jnp.where(ends, 0.0, targets)
-        impulses = still(impulses_of(rows, pattern, friction, targets))
-        apart = quiet.rates[: self.count] + (quiet.coupling @ impulses)[: self.count]
-        quick = jnp.maximum(noise, 1e-12 * jnp.max(jnp.abs(rates)))
-        closed = touches & (jnp.abs(apart) <= quick)
+        together, friction = self.plan.scene.system.impacts == "simultaneous", self.friction.still
+        involved = reached(rows, meets, touches, friction) if together else meets
+        pattern, sound = find_pattern(rows, involved, restitution, friction)
         others = involved & ~meets & ~was_closed & (rates < -noise) & ~before.fresh[: self.count]
-        time = t + jnp.sum(jnp.where(ends, left, 0.0))
-        return Impact(hits, sound, pattern, targets, impulses, closed, time, hits & others.any())
+        noise_behind = jnp.maximum(noise, 1e-12 * jnp.max(jnp.abs(rates)))
+        return Meeting((meets & (rates < -noise)).any(), sound, pattern, touches, noise_behind, others.any())
 
     def end_of_bounces(self, before: Carry, rows: Rows, t, y, impulses, bounced, restitution) -> tuple:
         """Which contacts that bounce with these velocities (k,) come to rest at once, and after which time.
@@ -408,20 +417,18 @@ class ContactRounds(NamedTuple):
         return line_of(program, y.size // 2)(jnp.concatenate([y, t[None], numbers]))
 
 
-class Impact(NamedTuple):
-    """What an impact is, if it `happened`: a `pattern` and `targets` (k,) of the rates, which contacts it closes.
+class Meeting(NamedTuple):
+    """Contacts that meet: whether an impact `happened`, its `pattern`, and whether that is a solution of its law.
 
-    `t` is the time at which bounces that it begins have ended, where they end there; it is `tied` where contacts that
-    share it close at this instant by themselves.
+    And which contacts touch (k,), below which rate they stay closed, and whether others that share the impact close at
+    this instant by themselves: then the instants of both are `tied`.
     """
 
     happened: Any
     sound: Any
     pattern: Pattern
-    targets: Any
-    impulses: Any
-    closed: Any
-    t: Any
+    touches: Any
+    noise: Any
     tied: Any
 
 
@@ -451,6 +458,19 @@ def _note_rounding(carry: Carry, guarded: Guarded, kinds, duration) -> Carry:
     return carry._replace(
         rounding=jnp.maximum(carry.rounding, jnp.maximum(finite[0], finite[1] * duration) * here),
         rate_rounding=jnp.maximum(carry.rate_rounding, finite[1] * here),
+    )
+
+
+def _note_forces(carry: Carry, impulses) -> Carry:
+    """The carry with the rounding of forces that brought about such `impulses` (k,) within a step.
+
+    Forces between bodies at rest have no other scale: what is left of them at zero is rounding.
+    """
+    moves, k = carry.longest > 0, impulses.size
+    least = jnp.where(moves, FORCELESS * impulses / jnp.where(moves, carry.longest, 1.0), 0.0)
+    of_rates = jnp.where(moves, least / jnp.where(moves, carry.longest, 1.0), 0.0)
+    return carry._replace(
+        rounding=carry.rounding.at[1, :k].max(least), rate_rounding=carry.rate_rounding.at[1, :k].max(of_rates)
     )
 
 

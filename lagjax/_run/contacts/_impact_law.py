@@ -6,11 +6,12 @@ contacts that touch at once, asks for
 
     ġ⁺ + e ġ⁻ ≥ 0  ⟂  Λ ≥ 0        |F| ≤ μ Λ,  F = −μ Λ s⁺/|s⁺| where s⁺ ≠ 0
 
-`find_pattern` finds which contacts push and stick, by relaxation; `impulses_of` solves for what they do, and has
+`find_pattern` finds which contacts push and stick, by relaxation; `impulse_solver` solves for what they do, and has
 derivatives. Source: Moreau, in *Nonsmooth Mechanics and Applications* (1988), §11; Glocker, *Set-Valued Force Laws*
 (2001), ch. 9; Jean, Comput. Methods Appl. Mech. Engrg. 177 (1999) 235 (relaxation).
 """
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -68,31 +69,35 @@ class Friction(NamedTuple):
         return count + np.arange(len(self.rough) * self.directions).reshape(-1, self.directions)
 
 
-def impulses_of(rows: Rows, pattern: Pattern, friction: Friction, targets):
-    """The impulses (K,) by which the rates of contacts that push become their `targets` (k,), and slips that stick 0.
+def impulse_solver(rows: Rows, pattern: Pattern, friction: Friction) -> Callable:
+    """The function of `targets` (k,) that gives the impulses (K,) by which rates become these, and slips that stick 0.
 
-    Rows that depend on those before them add nothing. The impulse of a row that is free is zero, that of a contact that
-    slides brings its friction.
+    Rates of contacts that push do. Rows that depend on those before them add nothing. The impulse of a row that is free
+    is zero, that of a contact that slides brings its friction.
     """
-    count, places = len(targets), friction.places(len(targets))
-    push, rough = pattern.push, friction.rough
-    held = jnp.concatenate([push, jnp.repeat(push[rough] * pattern.sticks, friction.directions)])
-    wanted = jnp.concatenate([targets, jnp.zeros(places.size)])
+    count, rough, push = len(pattern.push), friction.rough, pattern.push
+    places = friction.places(count)
+    held = jnp.concatenate([push, jnp.broadcast_to((push[rough] * pattern.sticks)[:, None], places.shape).ravel()])
     if len(held) > 1:
         held = held * jax.lax.stop_gradient(_independent(rows.coupling, held))
     slides = friction.coefficients * push[rough] * (1.0 - pattern.sticks)
 
-    def impulses_along(direction):
+    def solver_along(direction):
         mixed = jnp.eye(len(held))
         if rough.size:
             mixed = mixed.at[places, rough[:, None]].add(-slides[:, None] * direction)
-        matrix = held[:, None] * (rows.coupling @ mixed) + jnp.diag(1.0 - held)
-        return mixed @ factorize_general(matrix)(held * (wanted - rows.rates))
+        solve = factorize_general(held[:, None] * (rows.coupling @ mixed) + jnp.diag(1.0 - held))
+        return lambda targets: mixed @ solve(held * (jnp.pad(targets, (0, places.size)) - rows.rates))
 
-    direction = pattern.direction
-    if friction.directions == 2 and rough.size:
-        direction = _turn_directions(rows, impulses_along, direction, slides > 0, places)
-    return impulses_along(direction)
+    if friction.directions == 1 or not rough.size:
+        return solver_along(pattern.direction)
+
+    def solve_in_space(targets):
+        impulses_along = lambda direction: solver_along(direction)(targets)  # noqa: E731
+        direction = _turn_directions(rows, impulses_along, pattern.direction, slides > 0, places)
+        return impulses_along(direction)
+
+    return solve_in_space
 
 
 def _turn_directions(rows: Rows, impulses_along, direction, slides, places):
