@@ -40,7 +40,7 @@ def no_numbers(q, *_):
 
 
 class Scene(NamedTuple):
-    """What a scene is made of, of vectors: q and v of n numbers, gaps and one-way velocities of k, slips of k."""
+    """The functions of a scene, of vectors: q and v of n numbers, gaps and one-way velocities of k, slips of k."""
 
     lagrangian: Callable  # (q, v, t, p)
     gaps: Callable = no_numbers  # (q, t, p)
@@ -67,7 +67,7 @@ class Terms(NamedTuple):
 
 
 class Event(NamedTuple):
-    """What happened: when, the state before and after, which contact's watch fell, and the impulses."""
+    """An event: its time, the state before and after, the contact whose watch fell, and the impulses."""
 
     t: float
     before: np.ndarray

@@ -224,8 +224,8 @@ def cradle(impacts: str) -> Row:
         return x[5] * jnp.array(after)
 
     return Row(
-        f"cradle of 5 touching balls, {impacts}", CRADLE._replace(impacts=impacts), [0] * 5, [1, 0, 0, 0, 0], [0.0], 1.0,
-        exact, (5,), measure=lambda z: z[5:],
+        f"cradle of 5 touching balls, {impacts}", CRADLE._replace(impacts=impacts), [-0.3, 0, 0, 0, 0],
+        [1, 0, 0, 0, 0], [0.0], 1.0, exact, (5,), measure=lambda z: z[5:],
     )  # fmt: skip
 
 

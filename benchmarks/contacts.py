@@ -1,0 +1,252 @@
+"""Contacts: errors of motions, of their first and second derivatives, impacts and seconds, against closed forms.
+
+    python -m benchmarks.contacts                       # all parts, benchmarks/results/contacts.json
+    python -m benchmarks.contacts --only rows "puck"    # the rows of one part whose names begin so
+    python -m benchmarks.contacts --peers peers.json    # stores what `python benchmarks/_contact_peers.py` printed
+
+*First* is a motion as a user waits for it, with its compilation; *again* the same once more. Errors of derivatives are
+in parts of the largest. *Rows* are motions in closed form, *many* random ones of one scene, *sizes* long motions, large
+batches and many contacts; what these are measured against stands in their own docstrings.
+"""
+
+import argparse
+import json
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+import lagjax
+from benchmarks import _report
+from benchmarks._contacts import (
+    BRAX,
+    BRAX_RADIUS,
+    BRAX_SPEED,
+    FALL,
+    G,
+    MANY,
+    ROWS,
+    end_of,
+    rest_time,
+    swinging,
+    system_of,
+)
+from benchmarks._measure import seconds
+
+STORE = Path(__file__).parent / "results" / "contacts.json"
+
+
+def _timed(run: Callable) -> tuple[float, float, Any]:
+    """Seconds of the first and of a later call, and the value."""
+    ready = lambda: jax.block_until_ready(run())
+    (first, _), (again, value) = seconds(ready), min((seconds(ready) for _ in range(3)), key=lambda x: x[0])
+    return first, again, value
+
+
+def _off(found, right) -> float:
+    """The largest difference, in parts of the largest number above 1; infinite where one is NaN."""
+    found, right = np.asarray(found), np.asarray(right)
+    error = np.abs(found - right).max(initial=0.0) / max(1.0, np.abs(right).max(initial=0.0))
+    return float(np.nan_to_num(error, nan=np.inf))
+
+
+def rows(begins: str) -> Iterator[dict[str, Any]]:
+    """Every row: its motion, its gradient in forward and reverse mode, its Hessian."""
+    for row in ROWS.values():
+        if row.name.startswith(begins):
+            yield {"scene": row.name} | _attempt(lambda row=row: _row(row))
+
+
+def _row(row) -> dict[str, Any]:
+    system, x, columns = system_of(row.scene), jnp.asarray(row.x), jnp.array(row.columns, int)
+    ts = jnp.array([0.0, row.duration])
+
+    def run():
+        return lagjax.simulate(system, x[: row.n], x[row.n : 2 * row.n], ts, x[2 * row.n :])
+
+    first, again, motion = _timed(run)
+    end = end_of(system, row.n, row.duration)
+    measured = lambda y: row.measure(end(x.at[columns].set(y)))
+    exact = lambda y: jnp.asarray(row.exact(x.at[columns].set(y)))
+    line = {
+        "value": float(np.abs(measured(x[columns]) - exact(x[columns])).max()), "slopes": None, "reverse": None,
+        "second": None, "impacts": int(motion.impacts.count), "first s": first, "again s": again,
+    }  # fmt: skip
+    if row.columns:
+        slopes = jax.jacfwd(exact)(x[columns])
+        line["slopes"] = _off(jax.jit(jax.jacfwd(measured))(x[columns]), slopes)
+        line["reverse"] = _off(jax.jit(jax.jacrev(measured))(x[columns]), slopes)
+    if row.columns and row.second:
+        line["second"] = _off(jax.jit(jax.hessian(measured))(x[columns]), jax.hessian(exact)(x[columns]))
+    return line
+
+
+def many(begins: str) -> Iterator[dict[str, Any]]:
+    """Random motions of one scene, in one batch."""
+    for case in MANY.values():
+        if case.name.startswith(begins):
+            yield {"scene": case.name, "members": case.count} | _attempt(lambda case=case: _many(case))
+
+
+def _many(case) -> dict[str, Any]:
+    q, v, p, right = case.drawn()
+    system, ts = system_of(case.scene), np.array([0.0, case.duration])
+    first, again, batch = _timed(lambda: lagjax.simulate_batch(system, q, v, ts, p, batch_axes=(0, 0, 0)))
+    errors = np.nan_to_num(np.abs(batch.qdot[:, -1] - right).max(axis=1), nan=np.inf)
+    named = ~np.asarray(batch.ok)
+    return {
+        "worst": float(errors[~named].max(initial=0.0)), "named": int(named.sum()),
+        "wrong": int((errors[~named] > 1e-9).sum()), "first s": first, "again s": again,
+    }  # fmt: skip
+
+
+# ---- sizes -----------------------------------------------------------------------------------------------------------
+
+
+def time_of_rest() -> dict[str, Any]:
+    """A ball of e = 0.5 … 0.95, 64 of them: the time of rest and its gradient and Hessian."""
+    system = system_of(FALL)
+
+    def last(x):
+        impacts = lagjax.simulate(system, x[:1], x[1:2], jnp.array([0.0, 50.0]), x[2:]).impacts
+        return impacts.t[impacts.count - 1]
+
+    x = jnp.stack([jnp.array([1.0, 0.1, G, e]) for e in np.linspace(0.5, 0.95, 64)])
+    right = jax.vmap(rest_time)(x), jax.vmap(jax.grad(rest_time))(x), jax.vmap(jax.hessian(rest_time))(x)
+    first, again, value = _timed(lambda: jax.vmap(last)(x))
+    return {
+        "value": _off(value, right[0]), "slopes": _off(jax.jit(jax.vmap(jax.grad(last)))(x), right[1]),
+        "second": _off(jax.jit(jax.vmap(jax.hessian(last)))(x), right[2]), "first s": first, "again s": again,
+    }  # fmt: skip
+
+
+def brax_drop() -> dict[str, Any]:
+    """Brax 317: 10⁴ heights of a ball that comes down without gravity, and the slopes of all ends."""
+    system, h, ts = system_of(BRAX), jnp.linspace(2.9, 3.0, 10_000)[:, None], jnp.array([0.0, 1.0])
+    v = jnp.full_like(h, -BRAX_SPEED)
+    first, again, batch = _timed(lambda: lagjax.simulate_batch(system, h, v, ts, jnp.zeros(0)))
+    ends = lambda h: lagjax.simulate_batch(system, h, v, ts, jnp.zeros(0)).q[:, -1].sum()
+    slopes = jax.jit(jax.grad(ends))(h)
+    right = 2 * BRAX_RADIUS + BRAX_SPEED - h
+    return {"value": _off(batch.q[:, -1], right), "slopes": _off(slopes, -1.0), "first s": first, "again s": again}
+
+
+def cradle() -> dict[str, Any]:
+    """Newton's cradle of five touching balls on strings, e = 1: 1000 impacts one after the other; energy too."""
+    row = swinging(500)
+    system, x, ts = system_of(row.scene), row.x, jnp.array([0.0, row.duration])
+    run = lambda: lagjax.simulate(system, x[:5], x[5:10], ts, x[10:], max_transitions=1100)
+    first, again, motion = _timed(run)
+    end = np.concatenate([motion.q[-1], motion.qdot[-1]])
+    energy = lambda z: 0.5 * (z[5:] @ z[5:] + x[10] * z[:5] @ z[:5])
+    return {
+        "value": _off(end, row.exact(x)), "energy": float(abs(energy(end) / energy(x[:10]) - 1)),
+        "impacts": int(motion.impacts.count), "first s": first, "again s": again,
+    }  # fmt: skip
+
+
+def twelve_contacts() -> dict[str, Any]:
+    """Thirteen balls of radius 0.1 on a line, with 12 gaps, e = 0.9; momentum is what is known."""
+    system = lagjax.System(
+        lambda q, v: 0.5 * v @ v, contacts=lambda q: q[1:] - q[:-1] - 0.2, restitution=0.9
+    )  # fmt: skip
+    q, v = np.arange(13.0), np.random.default_rng(0).normal(size=13)
+    first, again, motion = _timed(lambda: lagjax.simulate(system, q, v, jnp.array([0.0, 5.0])))
+    lost = np.nansum(motion.impacts.energy_lost)
+    return {
+        "value": float(abs(motion.qdot[-1].sum() - v.sum())),
+        "energy": float(abs(0.5 * v @ v - 0.5 * motion.qdot[-1] @ motion.qdot[-1] - lost)),
+        "impacts": int(motion.impacts.count), "first s": first, "again s": again,
+    }  # fmt: skip
+
+
+def _arms(floor: float | None) -> lagjax.System:
+    def lagrangian(q, v):
+        both = 2 * v[0] ** 2 + v[1] ** 2 + 2 * v[0] * v[1] * jnp.cos(q[0] - q[1])
+        return 0.5 * both + G * (2 * jnp.cos(q[0]) + jnp.cos(q[1]))
+
+    if floor is None:
+        return lagjax.System(lagrangian)
+    return lagjax.System(
+        lagrangian, contacts=lambda q: {"floor": floor - jnp.cos(q[0]) - jnp.cos(q[1])}, restitution=0.7, friction=0.3,
+        slip=lambda q, v: {"floor": v[0] * jnp.cos(q[0]) + v[1] * jnp.cos(q[1])},
+    )  # fmt: skip
+
+
+def batches() -> Iterator[tuple[str, dict[str, Any]]]:
+    """4096 double pendulums without a floor, over one that is too low, and over one that they hit."""
+    rng, ts = np.random.default_rng(0), jnp.array([0.0, 2.0])
+    q, v = rng.uniform(0.5, 1.2, (4096, 2)), np.zeros((4096, 2))
+    for name, floor in (("no floor", None), ("a floor too low", 2.1), ("a floor", 1.95)):
+        yield f"4096 double pendulums, {name}", _attempt(lambda floor=floor: _batch(_arms(floor), q, v, ts))
+
+
+def _batch(system, q, v, ts) -> dict[str, Any]:
+    first, again, batch = _timed(lambda: lagjax.simulate_batch(system, q, v, ts))
+    steps = int(np.sum(batch.stats["num_steps"]))
+    return {
+        "ok": int(batch.ok.sum()), "steps": steps, "µs a step": 1e6 * again / steps,
+        "impacts": int(batch.impacts.count.sum()) if system.contacts is not None else 0, "first s": first,
+        "again s": again,
+    }  # fmt: skip
+
+
+def sizes(begins: str) -> Iterator[dict[str, Any]]:
+    """Long motions, large batches, many contacts."""
+    alone = {
+        "time of rest, 64 restitutions": time_of_rest, "brax 317, 10000 members": brax_drop,
+        "cradle, 1000 impacts": cradle, "twelve contacts": twelve_contacts,
+    }  # fmt: skip
+    for name, call in alone.items():
+        if name.startswith(begins):
+            yield {"scene": name} | _attempt(call)
+    if begins in ("", "4096"):
+        for name, line in batches():
+            yield {"scene": name} | line
+
+
+def _attempt(call: Callable) -> dict[str, Any]:
+    """The row, or its error in a line: one that fails does not hide the others."""
+    start = time.perf_counter()
+    try:
+        return call()
+    except Exception as error:
+        text = next(iter(str(error).strip().splitlines()), "")
+        return {"failed": f"{type(error).__name__}: {text[:160]}", "first s": time.perf_counter() - start}
+
+
+PARTS = {"rows": rows, "many": many, "sizes": sizes}
+
+
+def main() -> None:
+    """Print the rows and store them."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("begins", nargs="?", default="", help="scenes whose names begin so")
+    parser.add_argument("--only", nargs="+", choices=tuple(PARTS), default=tuple(PARTS))
+    parser.add_argument("--peers", type=Path, help="what `_contact_peers.py` printed; nothing else is run")
+    options = parser.parse_args()
+    jax.config.update("jax_enable_x64", True)
+    jax.block_until_ready(jax.jit(lambda x: x @ x)(jnp.ones(3)))  # XLA is there
+    record = _report.read_json(STORE)
+    if options.peers:
+        _report.write_json(STORE, record | {"peers": json.loads(options.peers.read_text())})
+        return
+    for part in options.only:
+        found = []
+        for line in PARTS[part](options.begins):
+            found.append(line)
+            print(json.dumps({k: float(f"{v:.3g}") if isinstance(v, float) else v for k, v in line.items()}), flush=True)
+        names = [line["scene"] for line in found]
+        others = [line for line in record.get(part, {}).get("rows", []) if line["scene"] not in names]
+        record[part] = {"circumstances": _report.circumstances(), "rows": [*others, *found]}
+        _report.write_json(STORE, record)
+        print(_report.table(record[part]["rows"]), file=sys.stderr)
+
+
+if __name__ == "__main__":
+    main()

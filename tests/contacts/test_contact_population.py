@@ -1,0 +1,39 @@
+"""Random scenes with gaps, friction and joints: a few of every family by default, all of a benchmark when slow."""
+
+import sys
+from pathlib import Path
+
+import jax
+import pytest
+
+pytest.importorskip("scipy", reason="the references are computed with it")
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+from benchmarks import contact_population  # noqa: E402
+
+
+@pytest.fixture(autouse=True)
+def double_precision():
+    yield
+    jax.config.update("jax_enable_x64", True)
+
+
+def assert_none_wrong(*arguments):
+    counts = contact_population.main(list(arguments))
+    assert counts["wrong"] == counts["wrong derivative"] == 0 and counts["right"] > 0, dict(counts)
+
+
+def test_none_of_a_few_is_wrong():
+    assert_none_wrong("--scenes", "4", "--families", "disc", "--first", "100")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", contact_population.FAMILIES)
+def test_none_of_a_family_is_wrong(family):
+    assert_none_wrong("--scenes", "12", "--families", family)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("family", ["box", "tables"])
+def test_none_of_a_family_is_wrong_in_single_precision(family):
+    assert_none_wrong("--scenes", "12", "--families", family, "--float32")

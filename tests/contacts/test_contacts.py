@@ -1,0 +1,292 @@
+"""Contacts as a user writes them, by name: what a trajectory tells of them, what is refused, how they transform."""
+
+import subprocess
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from lagrangians import ball_in_gravity
+
+pytest.importorskip("scipy", reason="the references are computed with it")
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+import lagjax  # noqa: E402
+from benchmarks._contact_reference import Reference, Scene  # noqa: E402
+from benchmarks._contacts import SHAKEN, SHAKEN_REST, TIP, system_of, tip  # noqa: E402
+
+G = 9.81
+
+
+def planar(q, v):
+    """½ (ẋ² + ẏ²) − g y, by name"""
+    return 0.5 * (v["x"] ** 2 + v["y"] ** 2) - G * q["y"]
+
+
+BOX = lagjax.System(
+    planar, contacts=lambda q: {"floor": q["y"] - 0.1, "wall": 0.9 - q["x"]}, restitution={"floor": 0.8, "wall": 0.5}
+)
+BALL = lagjax.System(ball_in_gravity, contacts=lambda q: q, restitution=lambda params: params["e"])
+BLOCK = lagjax.System(
+    lambda q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - G * (jnp.sin(params["a"]) * q["x"] + jnp.cos(params["a"]) * q["y"]),
+    contacts=lambda q: {"floor": q["y"]}, friction=lambda params: params["mu"], slip=lambda q, v: {"floor": v["x"]},
+)  # fmt: skip
+
+
+def state(**values):
+    return {name: jnp.asarray(value, float) for name, value in values.items()}
+
+
+def test_what_a_trajectory_tells_of_its_impacts():
+    u = np.sqrt(2 * G)  # a fall by 1, with 1 to the wall at 0.8
+    ts = jnp.array([0.0, 0.6, 1.0])
+    run = lagjax.simulate(BOX, state(x=0.0, y=1.1), state(x=1.0, y=0.0), ts)
+    impacts = run.impacts
+    assert int(impacts.count) == 2 and set(impacts.impulse) == {"floor", "wall"}
+    np.testing.assert_allclose(impacts.t[:2], [u / G, 0.9], rtol=1e-14)
+    np.testing.assert_allclose(impacts.impulse["floor"][:2], [1.8 * u, 0.0], atol=1e-13)
+    np.testing.assert_allclose(impacts.impulse["wall"][:2], [0.0, 1.5], atol=1e-13)
+    np.testing.assert_allclose(impacts.energy_lost[:2], [0.36 * u * u / 2, 0.75 / 2], atol=1e-13)
+    for values in (impacts.t, impacts.impulse["floor"], impacts.impulse["wall"], impacts.energy_lost):
+        assert np.isnan(values[2:]).all()
+    left = 1.0 - u / G
+    np.testing.assert_allclose(
+        [run.q["x"][-1], run.q["y"][-1]], [0.9 - 0.05, 0.1 + 0.8 * u * left - G * left**2 / 2], rtol=1e-13
+    )
+    np.testing.assert_array_equal(run.contact_forces["floor"], np.zeros(3))
+
+
+def test_forces_of_contacts_that_last():
+    a = 0.3
+    held = lagjax.simulate(
+        BLOCK, state(x=0.0, y=0.0), state(x=0.0, y=0.0), jnp.linspace(0.0, 1e6, 5), {"a": a, "mu": 0.5}
+    )  # fmt: skip
+    np.testing.assert_allclose(held.contact_forces["floor"], np.full(5, G * np.cos(a)), rtol=1e-14)
+    for values in (*held.q.values(), *held.qdot.values()):  # rest is rest
+        np.testing.assert_array_equal(values, np.zeros(5))
+    slides = lagjax.simulate(
+        BLOCK, state(x=0.0, y=0.0), state(x=0.0, y=0.0), jnp.linspace(0.0, 1.0, 5), {"a": a, "mu": 0.2}
+    )  # fmt: skip
+    np.testing.assert_allclose(slides.qdot["x"], -G * (np.sin(a) - 0.2 * np.cos(a)) * slides.ts, atol=1e-13)
+
+
+def test_a_particle_rests_in_a_corner_of_three_walls():
+    force = jnp.array([1.0, 2.0, 3.0])
+    system = lagjax.System(lambda q, v: 0.5 * v @ v - force @ q, contacts=lambda q: q, restitution=0.5)
+    run = lagjax.simulate(system, jnp.zeros(3), jnp.zeros(3), jnp.array([0.0, 5.0]))
+    np.testing.assert_allclose(run.contact_forces[-1], force, rtol=1e-14)
+    np.testing.assert_array_equal(run.q[-1], np.zeros(3))
+
+
+def test_a_ball_on_a_shaken_table_comes_to_rest():
+    run = lagjax.simulate(system_of(SHAKEN), jnp.array([0.3]), jnp.zeros(1), jnp.array([0.0, 2.5]), jnp.array([G, 0.6, 0.05, 10.0]))
+    np.testing.assert_allclose(run.impacts.t[run.impacts.count - 1], SHAKEN_REST, atol=1e-11)
+    np.testing.assert_allclose(run.q[-1], 0.05 * np.sin(25.0), atol=1e-12)
+
+
+# ---- what is refused -------------------------------------------------------------------------------------------------
+
+
+def test_a_start_inside_a_wall_is_named():
+    with pytest.raises(ValueError, match="wall"):
+        lagjax.simulate(BOX, state(x=1.0, y=1.1), state(x=0.0, y=0.0), jnp.array([0.0, 1.0]))
+    assert "wall" in str(lagjax.check(BOX, state(x=1.0, y=1.1), state(x=0.0, y=0.0)))
+
+
+def test_a_closed_gap_that_moves_inwards_is_named():
+    with pytest.raises(ValueError, match="floor"):
+        lagjax.simulate(BOX, state(x=0.0, y=0.1), state(x=0.0, y=-1.0), jnp.array([0.0, 1.0]))
+    assert "floor" in str(lagjax.check(BOX, state(x=0.0, y=0.1), state(x=0.0, y=-1.0)))
+
+
+@pytest.mark.parametrize("mu, turning", [(2, 0), (2, 8)])
+def test_painleves_rod_is_a_named_end(mu, turning):
+    q, v, p = (jnp.array(part, float) for part in tip(mu, turning))
+    with pytest.raises(lagjax.SimulationError, match="Painlev"):
+        lagjax.simulate(system_of(TIP), q, v, jnp.array([0.0, 1e-3]), p)
+
+
+def test_painleves_rod_with_less_friction_slides_on():
+    q, v, p = (jnp.array(part, float) for part in tip(1, 0))
+    run = lagjax.simulate(system_of(TIP), q, v, jnp.array([0.0, 1e-3]), p)
+    right = Reference(TIP, q, p).run(np.asarray(q), np.asarray(v), 1e-3, np.asarray(p)).z
+    np.testing.assert_allclose(np.concatenate([run.q[-1], run.qdot[-1]]), right, atol=1e-11)
+
+
+def test_the_budget_of_events_is_named():
+    with pytest.raises(lagjax.SimulationError, match="max_transitions"):
+        lagjax.simulate(BALL, 1.0, 0.0, jnp.array([0.0, 2.0]), {"g": G, "e": 0.9}, max_transitions=3)
+
+
+@pytest.mark.parametrize(
+    ("options", "sentence"),
+    [
+        ({"friction": 0.3}, "slip"),
+        ({"friction": 0.3, "slip": lambda q, v: {"ground": v["x"]}}, "slip"),
+        ({"restitution": {"ground": 0.5}}, "ground"),
+        ({"restitution": 1.5}, "restitution"),
+        ({"friction": -0.1, "slip": lambda q, v: {"floor": v["x"]}}, "friction"),
+        ({"impacts": "at once"}, "sequential"),
+    ],
+)
+def test_what_cannot_be_a_contact(options, sentence):
+    with pytest.raises((ValueError, TypeError), match=sentence):
+        system = lagjax.System(planar, contacts=lambda q: {"floor": q["y"]}, **options)
+        lagjax.simulate(system, state(x=0.0, y=1.0), state(x=0.0, y=0.0), jnp.array([0.0, 0.1]))
+
+
+# ---- how they transform ----------------------------------------------------------------------------------------------
+
+
+def test_members_have_their_own_impacts():
+    """One, batched, under vmap, and of float32: bounces of six heights, up to rest."""
+    h, ts, params = jnp.array([0.2, 0.5, 1.0, 1.5, 2.0, 30.0]), jnp.array([0.0, 1.0, 2.0]), {"g": G, "e": 0.5}
+    batch = lagjax.simulate_batch(BALL, h, jnp.zeros(6), ts, params)
+    assert batch.ok.all() and int(batch.impacts.count[-1]) == 0
+    counts = np.asarray(batch.impacts.count)
+    assert (np.diff(counts) <= 0).all() and counts[0] > 3
+    mapped = jax.jit(jax.vmap(lambda h: lagjax.simulate(BALL, h, jnp.zeros_like(h), ts, params)))(h)
+    np.testing.assert_allclose(mapped.q, batch.q, atol=1e-14)
+    for k in (0, 3):
+        np.testing.assert_allclose(lagjax.simulate(BALL, h[k], 0.0, ts, params).q, batch.q[k], atol=1e-14)
+    single = lagjax.simulate_batch(BALL, *jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (h, jnp.zeros(6), ts, params)))
+    assert single.q.dtype == single.impacts.t.dtype == jnp.float32
+    np.testing.assert_allclose(single.q, batch.q, atol=3e-6)
+
+
+WITHOUT_SWITCH = """
+import jax, jax.numpy as jnp, lagjax
+ball = lagjax.System(lambda q, v, p: 0.5 * v**2 - p["g"] * q, contacts=lambda q: q, restitution=lambda p: p["e"])
+run = lambda h: lagjax.simulate(ball, h, 0.0, jnp.array([0.0, 0.8]), {"g": 9.81, "e": 0.5})
+t = lambda h: (2 * h / 9.81) ** 0.5
+def exact(h):
+    left = 0.8 - t(h)
+    return 0.5 * 9.81 * t(h) * left - 9.81 * left**2 / 2
+h = jnp.float32(1.0)
+assert run(h).q.dtype == jnp.float32 and run(h).ok
+assert abs(run(h).q[-1] - exact(1.0)) < 1e-6
+assert abs(jax.grad(lambda h: run(h).q[-1])(h) - jax.grad(exact)(1.0)) < 1e-5
+at_rest = lagjax.simulate(ball, h, 0.0, jnp.array([0.0, 9.0]), {"g": 9.81, "e": 0.5})
+assert at_rest.q[-1] == 0 and at_rest.qdot[-1] == 0 and at_rest.ok
+"""
+
+
+@pytest.mark.slow
+def test_without_the_switch_for_double_precision():
+    done = subprocess.run([sys.executable, "-c", WITHOUT_SWITCH], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.slow
+def test_a_scan_over_pieces_is_the_whole():
+    """Calls of 0.05 each, some of which begin at rest on the floor, or in the middle of bounces."""
+    params, n = {"g": G, "e": 0.5}, 40
+
+    def piece(carry, _):
+        q, v = carry
+        run = lagjax.simulate(BALL, q, v, jnp.array([0.0, 0.05]), params)
+        return (run.q[-1], run.qdot[-1]), run.q[-1]
+
+    _, pieces = jax.jit(lambda h: jax.lax.scan(piece, (h, jnp.zeros_like(h)), None, n))(jnp.array(1.0))
+    whole = lagjax.simulate(BALL, 1.0, 0.0, 0.05 * jnp.arange(n + 1), params)
+    np.testing.assert_allclose(pieces, whole.q[1:], atol=1e-12)
+
+
+@pytest.mark.slow
+def test_an_event_of_the_user_beside_contacts():
+    run = lagjax.simulate(BALL, 1.0, 0.0, jnp.array([0.0, 5.0]), {"g": G, "e": 0.5}, event=lambda q, v, t: t - 0.7)
+    u = np.sqrt(2 * G)
+    left = 0.7 - u / G
+    np.testing.assert_allclose(run.end.q, 0.5 * u * left - G * left**2 / 2, rtol=1e-12)
+
+
+# ---- scenes with a history -------------------------------------------------------------------------------------------
+
+R, A = 1.0, 0.25
+
+
+@pytest.mark.parametrize("alpha", [0.5, 1.0])
+def test_the_chapters_cylinder_flies_off_by_itself(alpha):
+    """It rolls by a constraint, and leaves where cos θ₁ = 2 cos θ₁⁰/(3 + α)."""
+    start, end = 0.3, 1.2
+    cylinder = lagjax.System(
+        lambda q, v, params: 0.5 * (v["r"] ** 2 + (q["r"] * v["one"]) ** 2) + 0.5 * params * A**2 * v["two"] ** 2
+        - G * q["r"] * jnp.cos(q["one"]),
+        constraints=lambda q: R * q["one"] - A * (q["two"] - q["one"]),
+        contacts=lambda q: {"normal": q["r"] - R - A},
+    )  # fmt: skip
+    q, ts = state(r=R + A, one=start, two=(R + A) / A * start), jnp.linspace(0.0, end, 7)
+    run = lagjax.simulate(cylinder, q, jax.tree.map(jnp.zeros_like, q), ts, alpha)
+    reduced = Scene(
+        lambda q, v, t, p: 0.5 * (v[0] ** 2 + (q[0] ** 2 + p[0] * (R + A) ** 2) * v[1] ** 2) - G * q[0] * jnp.cos(q[1]),
+        gaps=lambda q, t, p: q[:1] - R - A,
+    )
+    right = Reference(reduced, np.ones(2), [alpha]).run([R + A, start], [0.0, 0.0], end, [alpha])
+    np.testing.assert_allclose(np.cos(right.events[0].z[1]), 2 * np.cos(start) / (3 + alpha), atol=1e-12)
+    ours = [run.q["r"][-1], run.q["one"][-1], run.qdot["r"][-1], run.qdot["one"][-1]]
+    np.testing.assert_allclose(ours, right.z, atol=1e-10)
+    pressed = ts < right.events[0].t
+    closed = ((3 + alpha) * np.cos(run.q["one"]) - 2 * np.cos(start)) * G / (1 + alpha)
+    np.testing.assert_allclose(run.contact_forces["normal"], np.where(pressed, closed, 0.0), atol=1e-10)
+
+
+@pytest.mark.slow
+def test_housners_block_loses_what_he_says():
+    """A block that rocks from one foot to the other keeps 1 − 3/2 sin²α of its angular velocity (Housner 1963)."""
+    b, h, tilt = 0.2, 0.6, 0.1
+    half, alpha = np.hypot(b, h), np.arctan2(b, h)
+    feet = lambda q: jnp.stack([q[:2] + side * b * jnp.stack([jnp.cos(q[2]), jnp.sin(q[2])])
+                                - h * jnp.stack([-jnp.sin(q[2]), jnp.cos(q[2])]) for side in (-1, 1)])  # fmt: skip
+    block = Scene(
+        lambda q, v, t, p: 0.5 * (v[:2] @ v[:2] + half**2 / 3 * v[2] ** 2) - G * q[1],
+        gaps=lambda q, t, p: feet(q)[:, 1], slip=lambda q, v, t, p: jax.jvp(feet, (q,), (v,))[1][:, 0],
+        friction=lambda p: p[0],
+    )  # fmt: skip
+    corner = np.array([np.cos(tilt) * b - np.sin(tilt) * h, np.sin(tilt) * b + np.cos(tilt) * h])  # over its left foot
+    q, v, p, T = np.array([*corner, tilt]), np.zeros(3), np.array([2.0]), 0.8
+    right = Reference(block, q, p).run(q, v, T, p)
+    (event,) = [e for e in right.events if e.impulse.any()]
+    ratio = 1 - 1.5 * np.sin(alpha) ** 2
+    np.testing.assert_allclose(event.z[5] / event.before[5], ratio, rtol=1e-9)
+    run = lagjax.simulate(system_of(block), q, v, jnp.array([0.0, T]), p)
+    lost = (1 - ratio**2) * G * half * (np.cos(alpha - tilt) - np.cos(alpha))
+    np.testing.assert_allclose(run.impacts.energy_lost[0], lost, rtol=1e-10)
+    np.testing.assert_allclose(np.concatenate([run.q[-1], run.qdot[-1]]), right.z, atol=1e-9)
+
+
+def test_a_fallen_rod_has_no_derivative_by_what_turns_it():
+    system = lagjax.System(
+        lambda q, v: (v[0] ** 2 + v[1] ** 2 / 12) / 2 - G * q[0],
+        contacts=lambda q: q[0] + jnp.array([-0.5, 0.5]) * jnp.sin(q[1]), restitution=0.5,
+    )  # fmt: skip
+    end = lambda q: lagjax.simulate(system, q, jnp.zeros(2), jnp.array([0.0, 0.6])).q[-1, 0]
+    q = jnp.array([1.0, 0.0])
+    by_height, by_angle = (jax.jvp(end, (q,), (direction,))[1] for direction in jnp.eye(2))
+    assert np.isfinite(by_height) and np.isnan(by_angle)
+
+
+@pytest.mark.slow
+def test_contacts_in_a_text_about_the_system():
+    assert "floor" in BOX.explain(state(x=0.0, y=1.0), state(x=0.0, y=0.0))
+
+
+@pytest.mark.slow
+def test_restitution_and_friction_are_fitted():
+    """Ten noisy tosses along a rough floor."""
+    toss = lagjax.System(
+        planar, contacts=lambda q: {"floor": q["y"]}, restitution=lambda params: params["e"],
+        friction=lambda params: params["mu"], slip=lambda q, v: {"floor": v["x"]},
+    )  # fmt: skip
+    truth, ts, rng = {"e": 0.7, "mu": 0.25}, np.linspace(0.0, 1.2, 61), np.random.default_rng(0)
+    records = []
+    for h in np.linspace(0.4, 1.2, 10):
+        start = state(x=0.0, y=h), state(x=3.0, y=0.0)
+        run = lagjax.simulate(toss, *start, ts, truth)
+        seen = {name: np.asarray(values) + 1e-3 * rng.normal(size=61) for name, values in run.q.items()}
+        records.append(lagjax.Record(ts, seen, start=start))
+    fit = lagjax.fit(toss, records, {"e": 0.5, "mu": 0.1})
+    low, high = fit.intervals(0.999)
+    for name, value in truth.items():
+        assert low[name] <= value <= high[name] and high[name] - low[name] < 1e-2

@@ -1,0 +1,147 @@
+"""Every row of `benchmarks/_contacts.py`: motion, gradient and Hessian through contacts against the closed form."""
+
+import sys
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from sweeps import sweep
+
+pytest.importorskip("scipy", reason="the references are computed with it")
+sys.path.insert(0, str(Path(__file__).parents[2]))
+
+import lagjax  # noqa: E402
+from benchmarks._contact_reference import Reference  # noqa: E402
+from benchmarks._contacts import MANY, ROWS, end_of, rest_time, system_of, two_balls  # noqa: E402
+
+# One of every law: a blow, rest after bounces, blows at one instant, opening, a freewheel, rest and slips.
+FAST = (
+    "two balls, m = 1, 3, e = 0.5", "bouncing ball at rest, e = 0.8", "rod falls flat", "cradle", "spinning ball",
+    "ball on a table", "ball leaves", "one-way clutch", "block slides", "puck",
+)  # fmt: skip
+
+
+def by_columns(row):
+    """The measured numbers as a function of those that the row differentiates by."""
+    end, columns = end_of(system_of(row.scene), row.n, row.duration), jnp.array(row.columns, int)
+    return (lambda y: row.measure(end(jnp.asarray(row.x).at[columns].set(y)))), jnp.asarray(row.x)[columns]
+
+
+def exact_by_columns(row):
+    columns = jnp.array(row.columns, int)
+    return lambda y: jnp.asarray(row.exact(jnp.asarray(row.x).at[columns].set(y)))
+
+
+@pytest.mark.parametrize("row", sweep(ROWS.values(), kept=lambda row: row.name.startswith(FAST)), ids=lambda row: row.name)
+def test_motion_and_first_derivatives(row):
+    measured, y = by_columns(row)
+    exact = exact_by_columns(row)
+    np.testing.assert_allclose(jax.jit(measured)(y), exact(y), atol=row.value)
+    if row.columns:
+        slopes = jax.jacfwd(exact)(y)
+        scale = max(1.0, float(jnp.abs(slopes).max()))
+        np.testing.assert_allclose(jax.jit(jax.jacfwd(measured))(y) / scale, slopes / scale, atol=row.slopes)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", [row for row in ROWS.values() if row.columns], ids=lambda row: row.name)
+def test_reverse_mode(row):
+    measured, y = by_columns(row)
+    slopes = jax.jacfwd(exact_by_columns(row))(y)
+    scale = max(1.0, float(jnp.abs(slopes).max()))
+    np.testing.assert_allclose(jax.jit(jax.jacrev(measured))(y) / scale, slopes / scale, atol=row.slopes)
+
+
+def _assert_hessian(row):
+    measured, y = by_columns(row)
+    second = jax.hessian(exact_by_columns(row))(y)
+    scale = max(1.0, float(jnp.abs(second).max()))
+    np.testing.assert_allclose(jax.jit(jax.hessian(measured))(y) / scale, second / scale, atol=row.second)
+
+
+def test_hessian_of_two_balls():
+    _assert_hessian(two_balls(3, 0.5))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", [row for row in ROWS.values() if row.columns and row.second], ids=lambda row: row.name)
+def test_hessian(row):
+    _assert_hessian(row)
+
+
+def test_two_equal_balls_exchange_their_velocities():
+    row = two_balls(1, 1)
+    end = end_of(system_of(row.scene), 2, 1.0)
+    slopes = jax.jit(jax.grad(lambda x: end(x)[1]))(jnp.asarray(row.x))
+    np.testing.assert_allclose(slopes[:4], [1.0, 0.0, 1.0, 0.0], atol=1e-14)
+
+
+def test_the_time_of_rest_and_its_derivatives():
+    """The last impact is the point of accumulation, for e = 0.5, 0.8 and 0.95 in one batch."""
+    system = system_of(ROWS["bouncing ball at rest, e = 0.5"].scene)
+
+    def last(x):
+        impacts = lagjax.simulate(system, x[:1], x[1:2], jnp.array([0.0, 50.0]), x[2:]).impacts
+        return impacts.t[impacts.count - 1]
+
+    x = jnp.array([[1.0, 0.0, 9.81, e] for e in (0.5, 0.8, 0.95)])
+    t, slopes = jax.jit(jax.vmap(jax.value_and_grad(last)))(x)
+    exact, right = jax.vmap(jax.value_and_grad(rest_time))(x)
+    np.testing.assert_allclose(t, exact, atol=1e-12)
+    np.testing.assert_allclose(slopes, right, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.slow
+def test_second_derivatives_of_the_time_of_rest():
+    system = system_of(ROWS["bouncing ball at rest, e = 0.5"].scene)
+
+    def last(x):
+        impacts = lagjax.simulate(system, x[:1], x[1:2], jnp.array([0.0, 50.0]), x[2:]).impacts
+        return impacts.t[impacts.count - 1]
+
+    x = jnp.array([1.0, 0.1, 9.81, 0.8])
+    np.testing.assert_allclose(jax.jit(jax.hessian(last))(x), jax.hessian(rest_time)(x), rtol=1e-10, atol=1e-10)
+
+
+def _members(many, count):
+    q, v, p, right = many.drawn(count)
+    batch = lagjax.simulate_batch(
+        system_of(many.scene), q, v, np.array([0.0, many.duration]), p, batch_axes=(0, 0, 0)
+    )  # fmt: skip
+    assert batch.ok.all()
+    np.testing.assert_allclose(batch.qdot[:, -1], right, atol=many.value)
+
+
+@pytest.mark.parametrize("many", MANY.values(), ids=lambda many: many.name)
+def test_a_few_of_many(many):
+    _members(many, 6)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("many", MANY.values(), ids=lambda many: many.name)
+def test_all_of_many(many):
+    _members(many, many.count)
+
+
+# ---- the closed forms themselves, by a reference that enumerates modes ----------------------------------------------
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("row", [row for row in ROWS.values() if not row.name.startswith("puck")], ids=lambda row: row.name)
+def test_closed_forms_are_those_of_a_reference_that_enumerates_modes(row):
+    q, v, p = np.split(row.x, [row.n, 2 * row.n])
+    duration = min(row.duration, 40.0)  # DOP853 takes long to rest for a million
+    motion = Reference(row.scene, q, p).run(q, v, duration, p)
+    np.testing.assert_allclose(row.measure(motion.z), row.exact(row.x), atol=1e-11)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("many", MANY.values(), ids=lambda many: many.name)
+def test_piecewise_closed_forms_are_those_of_a_reference_that_enumerates_modes(many):
+    q, v, p, right = many.drawn(4)
+    reference = Reference(many.scene, q[0], p[0])
+    for member in zip(q, v, p, right, strict=True):
+        motion = reference.run(member[0], member[1], many.duration, member[2])
+        np.testing.assert_allclose(motion.z[reference.n :], member[3], atol=1e-11)
