@@ -1,7 +1,7 @@
 """Three scenes of contacts in differentiable engines: MuJoCo's MJX and Brax (positional and spring), double precision.
 
     pip install mujoco-mjx brax     # in an environment of their own
-    python _contact_peers.py
+    python _contact_peers.py [step]     # of time, 1e-3
 
 It prints one row a scene and engine, as JSON: values and slopes of it, and those of the closed form.
 """
@@ -16,11 +16,12 @@ import jax.numpy as jnp
 import numpy as np
 
 jax.config.update("jax_enable_x64", True)
-STEP, GRAVITY = 1e-3, 9.81
+STEP = float(sys.argv[1]) if len(sys.argv) > 1 else 1e-3
+GRAVITY = 9.81
 # An elastic spring in the contact; half a period of it is 31 steps, over which MuJoCo's integrators keep the energy.
 ELASTIC = 'solref="-10000 0" solimp="0.9999 0.9999 0.001 0.5 2"'
-# A damper beside it, so that e = exp(-pi b / sqrt(4 k - b^2)) = 0.5.
-HALF = 'solref="-10000 -43.1" solimp="0.9999 0.9999 0.001 0.5 2"'
+# A damper beside it, so that e = 0.5 where the force, which only pushes, has fallen to zero.
+HALF = 'solref="-10000 -51.05512753176456" solimp="0.9999 0.9999 0.001 0.5 2"'
 
 
 def scene(bodies: str, contact: str, elasticity: float, gravity: float = 0.0) -> str:
@@ -95,14 +96,17 @@ def two_balls(engine) -> dict:
 
 
 def drop(engine) -> dict:
-    """Brax 317: a ball at -5 without gravity from 2.9 to 3 above a floor, e = 1: the height after 1, 1001 of them."""
+    """Brax 317: a ball at -5 without gravity from 2.9 to 3 above a floor, e = 1: the height after 1, 101 of them."""
     end = engine(scene(FLOOR + ball("0 0 1"), ELASTIC, 1.0))
     h = jnp.linspace(2.9, 3.0, 101)
     final = jax.jit(jax.vmap(jax.value_and_grad(lambda h: end(h[None], jnp.full(1, -5.0), round(1 / STEP))[0])))
     try:
         values, slopes = final(h)
     except Exception:  # a loop of unknown length has no reverse mode
-        f = lambda h: end(h[None], jnp.full(1, -5.0), round(1 / STEP))[0]
+
+        def f(h):
+            return end(h[None], jnp.full(1, -5.0), round(1 / STEP))[0]
+
         values, slopes = jax.jit(jax.vmap(lambda h: jax.jvp(f, (h,), (1.0,))))(h)
     values, slopes = np.asarray(values), np.asarray(slopes)
     exact = 5.0 - h + 0.2
@@ -144,7 +148,7 @@ def main() -> None:
             rows.append({"scene": call.__name__, "engine": name, "first s": time.perf_counter() - start} | row)
             print(json.dumps(rows[-1]), file=sys.stderr, flush=True)
     versions = {x: importlib.metadata.version(x) for x in ("mujoco", "mujoco-mjx", "brax", "jax")}
-    print(json.dumps({"versions": versions, "rows": rows}))
+    print(json.dumps({"versions": versions, "step": STEP, "rows": rows}))
 
 
 if __name__ == "__main__":

@@ -33,7 +33,6 @@ class Ambiguous(Exception):
     """A motion that the law does not settle, or that rounding decides."""
 
 
-
 def no_numbers(q, *_):
     """No gaps, or no one-way velocities."""
     return jnp.zeros(0)
@@ -209,7 +208,10 @@ class Reference:
         x = self.terms(z, t)
         if self.scene.impacts == "sequential":
             touching = np.arange(self.k) == np.where(touching, x.rates, np.inf).argmin()
-        rough = lambda i: self.scene.slip is not None and self.mu[i] > 0
+
+        def rough(i):
+            return self.scene.slip is not None and self.mu[i] > 0
+
         choices = [
             ([STICKS, (1, 1), (1, -1), OPEN] if rough(i) else [SLIDES, OPEN]) if touching[i] else [OPEN]
             for i in range(self.k)
@@ -220,7 +222,11 @@ class Reference:
             after, slips = x.rates + x.W @ dv, x.slips + x.T @ dv
             kind = np.array([m[0] for m in mode])
             c = np.array([m[1] for m in mode])
-            good = np.isfinite(dv).all() and (normal >= -small).all() and (after + self.e * x.rates >= -small)[touching].all()
+            good = (
+                np.isfinite(dv).all()
+                and (normal >= -small).all()
+                and (after + self.e * x.rates >= -small)[touching].all()
+            )
             good = good and (np.abs(f) <= self.mu * normal + small)[kind == 2].all()
             if good and (c * slips >= -small)[kind == 1].all():
                 found.append((dv, normal))
@@ -248,7 +254,8 @@ class Reference:
         if rests:
             e = self.e
             self.e = np.where(np.isin(np.arange(self.k), [i for _, i in rests]), 0.0, e)
-            held = [SLIDES if i in [j for _, j in rests] else OPEN for i in range(self.k)]
+            # The bounces that are left rub too: one that slides goes on, one that does not sticks.
+            held = [self._choices(i, x.slips[i])[0] if i in [j for _, j in rests] else OPEN for i in range(self.k)]
             dv, normal, _ = self.solve(x, held, np.zeros(self.n), -x.rates, -x.slips)
             z, self.e, total = np.concatenate([z[: self.n], z[self.n :] + dv]), e, total + normal
             mode = self.decide(z, t, touching)
@@ -259,7 +266,9 @@ class Reference:
     def run(self, q, v, T, p) -> Motion:
         """The motion from t = 0 to T."""
         self.p = np.asarray(p, float)
-        self.mu, self.e = (np.asarray(f(self.p)) * np.ones(self.k) for f in (self.scene.friction, self.scene.restitution))
+        self.mu, self.e = (
+            np.asarray(f(self.p)) * np.ones(self.k) for f in (self.scene.friction, self.scene.restitution)
+        )
         z, t, events, rests = np.concatenate([q, v]).astype(float), 0.0, [], []
         free = self.terms(z, t).free
         if (free[self.is_gap] < -STILL).any():
@@ -286,7 +295,10 @@ class Reference:
         b = np.abs(x.W @ self.accelerations(x, mode)[0] + x.w)
         flights = [2 * r / c for r, c, (kind, _) in zip(x.rates, b, mode, strict=True) if kind == 0 and r > 0 and c > 0]
         first = min([1e-4, T - t, *(flight / 20 for flight in flights if flight > 0)])
-        flow = lambda t, z: self.flow(z, t, mode)
+
+        def flow(t, z):
+            return self.flow(z, t, mode)
+
         solver = DOP853(flow, t, z, T, rtol=1e-13, atol=1e-14, max_step=LONGEST, first_step=first)
         last = self.watches(z, t, mode)
         armed = last > ARMED

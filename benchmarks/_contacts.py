@@ -134,7 +134,14 @@ def bounces(count: int, e: float = 0.7) -> Row:
 def rest(e: float, duration: float = 50.0) -> Row:
     """A ball that bounces to rest: nothing of its start is left."""
     return Row(
-        f"bouncing ball at rest, e = {e}", FALL, [1], [0], [G, e], duration, lambda x: jnp.zeros(2) * x[:2], (0, 1, 2, 3)
+        f"bouncing ball at rest, e = {e}",
+        FALL,
+        [1],
+        [0],
+        [G, e],
+        duration,
+        lambda x: jnp.zeros(2) * x[:2],
+        (0, 1, 2, 3),
     )
 
 
@@ -192,14 +199,16 @@ def flat_rod() -> Row:
         r = 0.6 - (v + u) / g
         return jnp.stack([e * u * r - g * r * r / 2, 0 * y, e * u - g * r, 0 * y])
 
-    return Row("rod falls flat on two feet, e = 0.5", ROD, [1, 0], [0, 0], [G, 0.5], 0.6, exact, (0, 2, 4, 5), second=None)
+    return Row(
+        "rod falls flat on two feet, e = 0.5", ROD, [1, 0], [0, 0], [G, 0.5], 0.6, exact, (0, 2, 4, 5), second=None
+    )
 
 
 CORNER = Scene(lambda q, v, t, p: 0.5 * v @ v, gaps=lambda q, t, p: q, restitution=lambda p: p)
 
 
 def corner() -> Row:
-    """A particle that meets three walls at one instant, each of another restitution; they know nothing of each other."""
+    """A particle that meets three walls at one instant, which know nothing of each other."""
 
     def exact(x):
         q, v, e = x[:3], x[3:6], x[6:]
@@ -230,7 +239,7 @@ def cradle(impacts: str) -> Row:
 
 
 def swinging(swings: float) -> Row:
-    """The cradle on strings: the first and the last ball in turn, for so many whole swings and a quarter of a radian."""
+    """The cradle on strings: the first and the last ball in turn, for so many whole swings and an eighth of one."""
     w = np.pi
     duration = 2.0 * swings + 0.25
 
@@ -346,8 +355,8 @@ def hemisphere(angle: float = 0.1) -> Row:
     )  # fmt: skip
 
 
-# The chapter's last example: q = (x, y, turn) of a cylinder's axis, on a half-cylinder of radius 1. The first is without
-# friction; the second sticks, then slides for a moment, then flies.
+# The chapter's last example: q = (x, y, turn) of a cylinder's axis, on a half-cylinder of radius 1. With friction it
+# sticks, then slides for a moment, then flies.
 RADIUS = 0.25
 CYLINDER = Scene(
     lambda q, v, t, p: 0.5 * (v[:2] @ v[:2] + p[1] * RADIUS**2 * v[2] ** 2) - p[0] * q[1],
@@ -408,7 +417,9 @@ def incline() -> Row:
         y = x[0] + x[2] ** 2 / (2 * x[4] * (jnp.sin(x[6]) + x[5] * jnp.cos(x[6])))
         return jnp.stack([y, 0 * y, 0 * y, 0 * y])
 
-    return Row("block slides up an incline, rests to 1e6", INCLINE, [0, 0], [3, 0], [G, 0.5, 0.3], 1e6, exact, (0, 2, 4, 5, 6))
+    return Row(
+        "block slides up an incline, rests to 1e6", INCLINE, [0, 0], [3, 0], [G, 0.5, 0.3], 1e6, exact, (0, 2, 4, 5, 6)
+    )
 
 
 PUCK = SLIDE._replace(
@@ -488,11 +499,11 @@ class Many(NamedTuple):
         return q, v, p, np.array([self.reference(x, self.duration) for x in p])
 
 
-def _first(f, t, T):
+def _first(f, t, T) -> float | None:
     """Where f falls through zero on [t, T], or None."""
     grid = np.linspace(t, T, 20001)
     i = np.flatnonzero((f(grid[:-1]) > 0) & (f(grid[1:]) <= 0))
-    return brentq(f, grid[i[0]], grid[i[0] + 1], xtol=1e-15) if len(i) else None
+    return float(brentq(f, grid[i[0]], grid[i[0] + 1], xtol=1e-15)) if len(i) else None  # pyright: ignore
 
 
 def _on_table(p, T):
@@ -518,10 +529,16 @@ def _draw_table(rng):
 
 def _of_freewheel(p, T):
     """A drive of inertia 1 and a load of inertia 2: one body while the load is positive, else two."""
-    whole = lambda t: p[0] * np.sin(p[1] * t) / p[1] - p[2] * np.cos(p[3] * t) / p[3] + p[4] * t
+
+    def whole(t):
+        return p[0] * np.sin(p[1] * t) / p[1] - p[2] * np.cos(p[3] * t) / p[3] + p[4] * t
+
     t, v, locked = 0.0, np.zeros(2), _load(p, 0.0, np) > 0
     while True:
-        apart = lambda r, v=v, t=t: v[1] - v[0] - whole(r) + whole(t)
+
+        def apart(r, v=v, t=t):
+            return v[1] - v[0] - whole(r) + whole(t)
+
         end = _first((lambda r: _load(p, r, np)) if locked else apart, t + 1e-9, T)
         gain = whole(end or T) - whole(t)
         v = v + (gain / 3 if locked else np.array([gain, 0]))
@@ -535,8 +552,13 @@ def _of_shaken_block(p, T):
     g, mu, A, w = p
     F, P, t, v, side = lambda t: A * np.sin(w * t), lambda t: -A * np.cos(w * t) / w, 0.0, 0.0, 0.0
     while True:
-        later = lambda r, v=v, t=t, side=side: v + P(r) - P(t) - side * mu * g * (r - t)
-        slides = lambda r, side=side, later=later: side * later(r)
+
+        def later(r, v=v, t=t, side=side):
+            return v + P(r) - P(t) - side * mu * g * (r - t)
+
+        def slides(r, side=side, later=later):
+            return side * later(r)
+
         end = _first(slides if side else (lambda r: mu * g - abs(F(r))), t + 1e-6, T)
         if end is None:
             return np.array([later(T) if side else 0.0, 0.0])

@@ -11,7 +11,8 @@ corners are hit, and a third of the motions begin in contact, at rest or sliding
 The reference (`_contact_reference.py`) enumerates all modes and follows every event by DOP853. A scene that the law
 does not settle there, or whose sequence of events changes with a millionth of its numbers, is drawn again. A motion is
 *right* whose end is that of the reference, within 1e-9 times how much it grows, and whose derivative along a random
-direction is that of differences; *named* where it ends in an error that says so, or its derivative is NaN; else *wrong*.
+direction is that of differences; *named* where it ends in an error that says so, or its derivative is NaN; else it is
+*wrong*.
 With `--float32` start and parameters come in float32, without the x64 switch.
 """
 
@@ -76,7 +77,9 @@ def touches(rng) -> bool:
 
 def laws(rng, k: int, most: float = 0.6):
     """Restitutions and frictions of k contacts."""
-    return rng.choice([0.0, 0.3, 0.5, 0.8, 1.0], k, p=[0.2, 0.2, 0.3, 0.2, 0.1]), np.minimum(tenths(rng, 0, 0.6, k), most)
+    return rng.choice([0.0, 0.3, 0.5, 0.8, 1.0], k, p=[0.2, 0.2, 0.3, 0.2, 0.1]), np.minimum(
+        tenths(rng, 0, 0.6, k), most
+    )
 
 
 # ---- the families ----------------------------------------------------------------------------------------------------
@@ -131,7 +134,9 @@ def rod() -> Family:
     """A rod of length 1 that falls on its ends, beside a wall or not. p: g, where the wall is, e, mu."""
 
     def ends(q):
-        return jnp.stack([q[:2], q[:2]]) + 0.5 * jnp.stack([jnp.ones(1), -jnp.ones(1)]) * jnp.stack([jnp.cos(q[2]), jnp.sin(q[2])])
+        return jnp.stack([q[:2], q[:2]]) + 0.5 * jnp.stack([jnp.ones(1), -jnp.ones(1)]) * jnp.stack(
+            [jnp.cos(q[2]), jnp.sin(q[2])]
+        )
 
     def speeds(q, v):
         across = 0.5 * v[2] * jnp.stack([-jnp.sin(q[2]), jnp.cos(q[2])])
@@ -329,7 +334,8 @@ def _followed(name, x, n, duration, direction) -> Member | None:
     run = reference(name)
     try:
         middle, above, below = (
-            run.run(y[:n], y[n : 2 * n], duration, y[2 * n :]) for y in (x, x + NEARBY * direction, x - NEARBY * direction)
+            run.run(y[:n], y[n : 2 * n], duration, y[2 * n :])
+            for y in (x, x + NEARBY * direction, x - NEARBY * direction)
         )
     except Ambiguous:
         return None
@@ -380,7 +386,9 @@ def judged(member: Member, z, slope, ok, tolerance) -> tuple[str, float, float]:
 
 def main(arguments: list[str] | None = None) -> collections.Counter:
     """Compare so many scenes, print those that are not right, and count them."""
-    parser = argparse.ArgumentParser(prog="python -m benchmarks.contact_population", description=__doc__.splitlines()[0])
+    parser = argparse.ArgumentParser(
+        prog="python -m benchmarks.contact_population", description=(__doc__ or "").splitlines()[0]
+    )
     parser.add_argument("--scenes", type=int, default=300)
     parser.add_argument("--first", type=int, default=0, help="the seed of the first one")
     parser.add_argument("--families", nargs="+", choices=tuple(FAMILIES), default=tuple(FAMILIES))
@@ -403,7 +411,9 @@ def main(arguments: list[str] | None = None) -> collections.Counter:
         x = np.stack([np.concatenate([m.q, m.v, m.p]) for m in some.values()]).astype(dtype)
         along, T = np.stack([m.direction for m in some.values()]), np.array([m.duration for m in some.values()])
         done = runs(name, len(next(iter(some.values())).q))(x, along.astype(dtype), T.astype(dtype))
-        for (seed, member), (z, slope, ok, count) in zip(some.items(), zip(*map(np.asarray, done), strict=True), strict=True):
+        for (seed, member), (z, slope, ok, count) in zip(
+            some.items(), zip(*map(np.asarray, done), strict=True), strict=True
+        ):
             verdict, error, off = judged(member, z, slope, ok, tolerance)
             counts[verdict] += 1
             worst = np.maximum(worst, [error, off] if verdict == "right" else 0.0)
@@ -413,7 +423,10 @@ def main(arguments: list[str] | None = None) -> collections.Counter:
                     f"{z} for {member.end} ({error:.1e}), slopes {off:.1e}, {count} impacts, {member.events} events",
                     flush=True,
                 )  # fmt: skip
-    print(f"{dict(counts)}; the largest errors of a right one {worst[0]:.1e}, of its slope {worst[1]:.1e}", file=sys.stderr)
+    print(
+        f"{dict(counts)}; the largest errors of a right one {worst[0]:.1e}, of its slope {worst[1]:.1e}",
+        file=sys.stderr,
+    )
     return counts
 
 

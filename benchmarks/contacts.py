@@ -1,7 +1,7 @@
 """Contacts: errors of motions, of their first and second derivatives, impacts and seconds, against closed forms.
 
     python -m benchmarks.contacts                       # all parts, benchmarks/results/contacts.json
-    python -m benchmarks.contacts --only rows "puck"    # the rows of one part whose names begin so
+    python -m benchmarks.contacts puck --only rows      # of one part what begins so
     python -m benchmarks.contacts --peers peers.json    # stores what `python benchmarks/_contact_peers.py` printed
 
 *First* is a motion as a user waits for it, with its compilation; *again* the same once more. Errors of derivatives are
@@ -28,9 +28,9 @@ from benchmarks._contacts import (
     BRAX_RADIUS,
     BRAX_SPEED,
     FALL,
-    G,
     MANY,
     ROWS,
+    G,
     end_of,
     rest_time,
     swinging,
@@ -43,7 +43,10 @@ STORE = Path(__file__).parent / "results" / "contacts.json"
 
 def _timed(run: Callable) -> tuple[float, float, Any]:
     """Seconds of the first and of a later call, and the value."""
-    ready = lambda: jax.block_until_ready(run())
+
+    def ready():
+        return jax.block_until_ready(run())
+
     (first, _), (again, value) = seconds(ready), min((seconds(ready) for _ in range(3)), key=lambda x: x[0])
     return first, again, value
 
@@ -71,8 +74,13 @@ def _row(row) -> dict[str, Any]:
 
     first, again, motion = _timed(run)
     end = end_of(system, row.n, row.duration)
-    measured = lambda y: row.measure(end(x.at[columns].set(y)))
-    exact = lambda y: jnp.asarray(row.exact(x.at[columns].set(y)))
+
+    def measured(y):
+        return row.measure(end(x.at[columns].set(y)))
+
+    def exact(y):
+        return jnp.asarray(row.exact(x.at[columns].set(y)))
+
     line = {
         "value": float(np.abs(measured(x[columns]) - exact(x[columns])).max()), "slopes": None, "reverse": None,
         "second": None, "impacts": int(motion.impacts.count), "first s": first, "again s": again,
@@ -130,7 +138,10 @@ def brax_drop() -> dict[str, Any]:
     system, h, ts = system_of(BRAX), jnp.linspace(2.9, 3.0, 10_000)[:, None], jnp.array([0.0, 1.0])
     v = jnp.full_like(h, -BRAX_SPEED)
     first, again, batch = _timed(lambda: lagjax.simulate_batch(system, h, v, ts, jnp.zeros(0)))
-    ends = lambda h: lagjax.simulate_batch(system, h, v, ts, jnp.zeros(0)).q[:, -1].sum()
+
+    def ends(h):
+        return lagjax.simulate_batch(system, h, v, ts, jnp.zeros(0)).q[:, -1].sum()
+
     slopes = jax.jit(jax.grad(ends))(h)
     right = 2 * BRAX_RADIUS + BRAX_SPEED - h
     return {"value": _off(batch.q[:, -1], right), "slopes": _off(slopes, -1.0), "first s": first, "again s": again}
@@ -140,10 +151,16 @@ def cradle() -> dict[str, Any]:
     """Newton's cradle of five touching balls on strings, e = 1: 1000 impacts one after the other; energy too."""
     row = swinging(500)
     system, x, ts = system_of(row.scene), row.x, jnp.array([0.0, row.duration])
-    run = lambda: lagjax.simulate(system, x[:5], x[5:10], ts, x[10:], max_transitions=1100)
+
+    def run():
+        return lagjax.simulate(system, x[:5], x[5:10], ts, x[10:], max_transitions=1100)
+
     first, again, motion = _timed(run)
     end = np.concatenate([motion.q[-1], motion.qdot[-1]])
-    energy = lambda z: 0.5 * (z[5:] @ z[5:] + x[10] * z[:5] @ z[:5])
+
+    def energy(z):
+        return 0.5 * (z[5:] @ z[5:] + x[10] * z[:5] @ z[:5])
+
     return {
         "value": _off(end, row.exact(x)), "energy": float(abs(energy(end) / energy(x[:10]) - 1)),
         "impacts": int(motion.impacts.count), "first s": first, "again s": again,
@@ -240,7 +257,9 @@ def main() -> None:
         found = []
         for line in PARTS[part](options.begins):
             found.append(line)
-            print(json.dumps({k: float(f"{v:.3g}") if isinstance(v, float) else v for k, v in line.items()}), flush=True)
+            print(
+                json.dumps({k: float(f"{v:.3g}") if isinstance(v, float) else v for k, v in line.items()}), flush=True
+            )
         names = [line["scene"] for line in found]
         others = [line for line in record.get(part, {}).get("rows", []) if line["scene"] not in names]
         record[part] = {"circumstances": _report.circumstances(), "rows": [*others, *found]}

@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("scipy", reason="the references are computed with it")
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from benchmarks import contact_population  # noqa: E402
+from benchmarks import contact_population
 
 
 @pytest.fixture(autouse=True)

@@ -13,9 +13,9 @@ from lagrangians import ball_in_gravity
 pytest.importorskip("scipy", reason="the references are computed with it")
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-import lagjax  # noqa: E402
-from benchmarks._contact_reference import Reference, Scene  # noqa: E402
-from benchmarks._contacts import SHAKEN, SHAKEN_REST, TIP, system_of, tip  # noqa: E402
+import lagjax
+from benchmarks._contact_reference import Reference, Scene
+from benchmarks._contacts import SHAKEN, SHAKEN_REST, TIP, system_of, tip
 
 G = 9.81
 
@@ -30,7 +30,8 @@ BOX = lagjax.System(
 )
 BALL = lagjax.System(ball_in_gravity, contacts=lambda q: q, restitution=lambda params: params["e"])
 BLOCK = lagjax.System(
-    lambda q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - G * (jnp.sin(params["a"]) * q["x"] + jnp.cos(params["a"]) * q["y"]),
+    lambda q, v, params: 0.5 * (v["x"] ** 2 + v["y"] ** 2)
+    - G * (jnp.sin(params["a"]) * q["x"] + jnp.cos(params["a"]) * q["y"]),
     contacts=lambda q: {"floor": q["y"]}, friction=lambda params: params["mu"], slip=lambda q, v: {"floor": v["x"]},
 )  # fmt: skip
 
@@ -81,7 +82,9 @@ def test_a_particle_rests_in_a_corner_of_three_walls():
 
 
 def test_a_ball_on_a_shaken_table_comes_to_rest():
-    run = lagjax.simulate(system_of(SHAKEN), jnp.array([0.3]), jnp.zeros(1), jnp.array([0.0, 2.5]), jnp.array([G, 0.6, 0.05, 10.0]))
+    run = lagjax.simulate(
+        system_of(SHAKEN), jnp.array([0.3]), jnp.zeros(1), jnp.array([0.0, 2.5]), jnp.array([G, 0.6, 0.05, 10.0])
+    )
     np.testing.assert_allclose(run.impacts.t[run.impacts.count - 1], SHAKEN_REST, atol=1e-11)
     np.testing.assert_allclose(run.q[-1], 0.05 * np.sin(25.0), atol=1e-12)
 
@@ -151,7 +154,9 @@ def test_members_have_their_own_impacts():
     np.testing.assert_allclose(mapped.q, batch.q, atol=1e-14)
     for k in (0, 3):
         np.testing.assert_allclose(lagjax.simulate(BALL, h[k], 0.0, ts, params).q, batch.q[k], atol=1e-14)
-    single = lagjax.simulate_batch(BALL, *jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (h, jnp.zeros(6), ts, params)))
+    single = lagjax.simulate_batch(
+        BALL, *jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (h, jnp.zeros(6), ts, params))
+    )
     assert single.q.dtype == single.impacts.t.dtype == jnp.float32
     np.testing.assert_allclose(single.q, batch.q, atol=3e-6)
 

@@ -12,9 +12,9 @@ from sweeps import sweep
 pytest.importorskip("scipy", reason="the references are computed with it")
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-import lagjax  # noqa: E402
-from benchmarks._contact_reference import Reference  # noqa: E402
-from benchmarks._contacts import MANY, ROWS, end_of, rest_time, system_of, two_balls  # noqa: E402
+import lagjax
+from benchmarks._contact_reference import Reference
+from benchmarks._contacts import MANY, ROWS, end_of, rest_time, system_of, two_balls
 
 # One of every law: a blow, rest after bounces, blows at one instant, opening, a freewheel, rest and slips.
 FAST = (
@@ -34,7 +34,9 @@ def exact_by_columns(row):
     return lambda y: jnp.asarray(row.exact(jnp.asarray(row.x).at[columns].set(y)))
 
 
-@pytest.mark.parametrize("row", sweep(ROWS.values(), kept=lambda row: row.name.startswith(FAST)), ids=lambda row: row.name)
+@pytest.mark.parametrize(
+    "row", sweep(ROWS.values(), kept=lambda row: row.name.startswith(FAST)), ids=lambda row: row.name
+)
 def test_motion_and_first_derivatives(row):
     measured, y = by_columns(row)
     exact = exact_by_columns(row)
@@ -129,7 +131,9 @@ def test_all_of_many(many):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("row", [row for row in ROWS.values() if not row.name.startswith("puck")], ids=lambda row: row.name)
+@pytest.mark.parametrize(
+    "row", [row for row in ROWS.values() if not row.name.startswith("puck")], ids=lambda row: row.name
+)
 def test_closed_forms_are_those_of_a_reference_that_enumerates_modes(row):
     q, v, p = np.split(row.x, [row.n, 2 * row.n])
     duration = min(row.duration, 40.0)  # DOP853 takes long to rest for a million
