@@ -5,7 +5,8 @@ numbers of a motion are x = (q0, v0, params).
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
@@ -47,7 +48,8 @@ def end_of(system: lagjax.System, n: int, duration: float, **options) -> Callabl
     return end
 
 
-class Row(NamedTuple):
+@dataclass(frozen=True)
+class Row:
     """A motion and what is known of it: `measure((q, v) at the end)` is `exact(x)`, with derivatives by `columns`."""
 
     name: str
@@ -481,7 +483,8 @@ ROWS = {
 # ---- many motions of one scene, against piecewise closed forms ------------------------------------------------------
 
 
-class Many(NamedTuple):
+@dataclass(frozen=True)
+class Many:
     """Random motions of a scene; `reference(params, T)` is the velocity at the end."""
 
     name: str

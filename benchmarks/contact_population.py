@@ -314,7 +314,7 @@ def drawn(name: str, rng, dtype) -> Member:
     for _ in range(MOST_DRAWS):
         q, v, p, free = FAMILIES[name].draw(rng)
         q, v, p = (_singles.rounded(part, dtype) for part in (q, v, p))
-        n, duration = len(q), float(rng.choice([0.5, 1.0, 1.5]))
+        n, duration = len(q), float(rng.choice([0.5, 1.0, 1.5]) * (5 if name == "shafts" else 1))
         # A start in contact stays there: it moves along with its parameters alone. Others move with their start too.
         touching = (np.abs(np.asarray(FAMILIES[name].scene.gaps(q, 0.0, p))) < 1e-6).any()
         direction = np.zeros(2 * n + len(p))

@@ -148,8 +148,7 @@ def test_members_have_their_own_impacts():
     h, ts, params = jnp.array([0.2, 0.5, 1.0, 1.5, 2.0, 30.0]), jnp.array([0.0, 1.0, 2.0]), {"g": G, "e": 0.5}
     batch = lagjax.simulate_batch(BALL, h, jnp.zeros(6), ts, params)
     assert batch.ok.all() and int(batch.impacts.count[-1]) == 0
-    counts = np.asarray(batch.impacts.count)
-    assert (np.diff(counts) <= 0).all() and counts[0] > 3
+    assert (batch.impacts.count[:-1] > 3).all()
     mapped = jax.jit(jax.vmap(lambda h: lagjax.simulate(BALL, h, jnp.zeros_like(h), ts, params)))(h)
     np.testing.assert_allclose(mapped.q, batch.q, atol=1e-14)
     for k in (0, 3):
@@ -158,7 +157,7 @@ def test_members_have_their_own_impacts():
         BALL, *jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (h, jnp.zeros(6), ts, params))
     )
     assert single.q.dtype == single.impacts.t.dtype == jnp.float32
-    np.testing.assert_allclose(single.q, batch.q, atol=3e-6)
+    np.testing.assert_allclose(single.q, batch.q, rtol=1e-5, atol=3e-6)
 
 
 WITHOUT_SWITCH = """
@@ -229,7 +228,7 @@ def test_the_chapters_cylinder_flies_off_by_itself(alpha):
         gaps=lambda q, t, p: q[:1] - R - A,
     )
     right = Reference(reduced, np.ones(2), [alpha]).run([R + A, start], [0.0, 0.0], end, [alpha])
-    np.testing.assert_allclose(np.cos(right.events[0].z[1]), 2 * np.cos(start) / (3 + alpha), atol=1e-12)
+    np.testing.assert_allclose(np.cos(right.events[0].after[1]), 2 * np.cos(start) / (3 + alpha), atol=1e-12)
     ours = [run.q["r"][-1], run.q["one"][-1], run.qdot["r"][-1], run.qdot["one"][-1]]
     np.testing.assert_allclose(ours, right.z, atol=1e-10)
     pressed = ts < right.events[0].t
@@ -250,11 +249,11 @@ def test_housners_block_loses_what_he_says():
         friction=lambda p: p[0],
     )  # fmt: skip
     corner = np.array([np.cos(tilt) * b - np.sin(tilt) * h, np.sin(tilt) * b + np.cos(tilt) * h])  # over its left foot
-    q, v, p, T = np.array([*corner, tilt]), np.zeros(3), np.array([2.0]), 0.8
+    q, v, p, T = np.array([*corner, tilt]), np.zeros(3), np.array([2.0]), 0.5  # between the first two blows
     right = Reference(block, q, p).run(q, v, T, p)
     (event,) = [e for e in right.events if e.impulse.any()]
     ratio = 1 - 1.5 * np.sin(alpha) ** 2
-    np.testing.assert_allclose(event.z[5] / event.before[5], ratio, rtol=1e-9)
+    np.testing.assert_allclose(event.after[5] / event.before[5], ratio, rtol=1e-9)
     run = lagjax.simulate(system_of(block), q, v, jnp.array([0.0, T]), p)
     lost = (1 - ratio**2) * G * half * (np.cos(alpha - tilt) - np.cos(alpha))
     np.testing.assert_allclose(run.impacts.energy_lost[0], lost, rtol=1e-10)
