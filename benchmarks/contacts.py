@@ -6,7 +6,7 @@
 
 *First* is a motion as a user waits for it, with its compilation; *again* the same once more. Errors of derivatives are
 in parts of the largest. *Rows* are motions in closed form, *many* random ones of one scene, *sizes* long motions, large
-batches and many contacts; what these are measured against stands in their own docstrings.
+batches and many contacts, *by_hand* the same scenes as modes and guards; what these are measured against stands in their own docstrings.
 """
 
 import argparse
@@ -23,6 +23,7 @@ import numpy as np
 
 import lagjax
 from benchmarks import _report
+from benchmarks._contact_by_hand import PAIRS, lines
 from benchmarks._contacts import (
     BRAX,
     BRAX_RADIUS,
@@ -227,6 +228,21 @@ def sizes(begins: str) -> Iterator[dict[str, Any]]:
             yield {"scene": name} | line
 
 
+def by_hand(begins: str) -> Iterator[dict[str, Any]]:
+    """The same scenes as modes and guards, and as contacts."""
+    for name, pair in PAIRS.items():
+        if name.startswith(begins):
+            yield {"scene": name} | _attempt(lambda pair=pair: _pair(*pair))
+
+
+def _pair(old: Callable, new: Callable) -> dict[str, Any]:
+    (first_old, again_old, right), (first, again, found) = _timed(old), _timed(new)
+    return {
+        "lines by hand": lines(old), "lines": lines(new), "differ": _off(found, right), "first by hand s": first_old,
+        "first s": first, "again by hand s": again_old, "again s": again,
+    }  # fmt: skip
+
+
 def _attempt(call: Callable) -> dict[str, Any]:
     """The row, or its error in a line: one that fails does not hide the others."""
     start = time.perf_counter()
@@ -237,7 +253,7 @@ def _attempt(call: Callable) -> dict[str, Any]:
         return {"failed": f"{type(error).__name__}: {text[:160]}", "first s": time.perf_counter() - start}
 
 
-PARTS = {"rows": rows, "many": many, "sizes": sizes}
+PARTS = {"rows": rows, "many": many, "sizes": sizes, "by_hand": by_hand}
 
 
 def main() -> None:
