@@ -6,8 +6,8 @@
 
 *First* is a motion as a user waits for it, with its compilation; *again* the same once more. Errors of derivatives are
 in parts of the largest. *Rows* are motions in closed form, *many* random ones of one scene, *sizes* long motions, large
-batches and many contacts, *by_hand* the same scenes as modes and guards; what these are measured against stands in their
-own docstrings.
+batches and many contacts, *by_hand* the same scenes as modes and guards. Their docstrings say what they are measured
+against.
 """
 
 import argparse
