@@ -16,9 +16,10 @@ one Taylor series, of the order that the tolerance asks for.
     _taylor              the coefficients of a motion, and what is read off them along a step
     _projection          the way back to the constraints;  _rank_drops: where these become dependent
     _step                step control
-    _border_control      the borders of a piecewise program: a step ends at the first one
-    _guards              functions of the state that are watched;  _events: where they change sign
-    _roots               the zeros of a polynomial: borders and guards have series
+    _watch               numbers that are followed against a level, and what is remembered of each
+    _roots               the search along a step: the zeros of a polynomial
+    _border_control      the action of borders: a step ends at the first one, and the next begins on the piece beyond
+    _guards              functions of the state that are watched;  _events: their actions, to stop the motion or to note
     _run_records         the outputs, and the record of steps
     _integrator          all of these, round by round
     _maps                what a step is composed of, each map with its pushforward and its pullback
@@ -64,7 +65,7 @@ from lagjax._native._kernel import (
 )
 from lagjax._native._line_handler import LineCode, line_handler
 from lagjax._native._motion_parts import Projection, pieces_of, recurrences
-from lagjax._native._saltation import Crossed
 from lagjax._native._taylor import is_large, order_for
 from lagjax._native._threads import map_in_threads
+from lagjax._native._watch import Crossed
 from lagjax._program._jump import Nesting

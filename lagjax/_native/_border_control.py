@@ -6,21 +6,24 @@
     settle    a border counts only where the step was not shortened further
     cross     the piece beyond; its guard is zero there, and its slope tells whether the motion stays
 
-What a piece is, and a guard, `_program._borders` says. That a border has been crossed is remembered, so that rounding
-does not decide on which side the next step begins.
+What a piece is, and a guard, `_program._borders` says. That a border has been crossed is remembered (`_watch`), so that
+rounding does not decide on which side the next step begins.
 """
 
+import functools
 import itertools
 import math
+from collections.abc import Container
 
 from lagjax._native import _constants as limits
 from lagjax._native._frame import Fields, Frame, Lane
 from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._retraction import Retraction
-from lagjax._native._roots import Roots, Touch
-from lagjax._native._saltation import Crossed, GuardTable, Saltation
+from lagjax._native._roots import Roots
+from lagjax._native._saltation import Saltation
 from lagjax._native._step import absolute_tolerance
 from lagjax._native._taylor import TaylorSeries, integer
+from lagjax._native._watch import Border, Crossed, GuardTable, Touch
 from lagjax._program import _borders
 from lagjax._program._borders import BELOW, FALLS, GROWS, SQUARED, UP_TO, Feature
 from lagjax._program._jump import Jump, Nesting
@@ -40,7 +43,7 @@ class BorderControl:
     def __init__(
         self, motion: TaylorSeries, borders: _borders.Borders, nesting: Nesting, returns: bool, jump: Jump | None
     ):
-        self.returns, base = returns, nesting.base
+        self.forgotten, base = {"h_before": 0.0} if returns else {}, nesting.base
         self.motion, self.borders, self.guards = motion, borders, borders.guards
         self.pieces, self.roots = motion.pieces, Roots(motion)
         if not self.pieces:
@@ -69,13 +72,9 @@ class BorderControl:
             "at_knots": 1,  # the number of steps that ended at entries of tables
             "beyond": 1,  # the piece beyond the guard that the step ends at
             "at_rest": 1,  # 1 if the motion would be at the guard in no time
-            "planned_h": 1,  # the step without borders
-            "cut": 1,  # the step with them
-            "nearest": 1,  # the end of the step, as a part of it
             "undecided": 1,  # 1 in a lane whose pieces are to be decided
             "idle_crossings": 1,  # the number of borders since the last step that had a length
             "stepped": 1,  # 1 if the step has one
-            "part": 1,  # see `Roots.fields`
             "approach": 1,  # the step from which on others ended before a border without a series; 0 if that is over
             "next_approach": 1,  # the same behind this step
             "slides": 1,  # 1 if the motion slides along any border
@@ -106,11 +105,7 @@ class BorderControl:
         with frame.code.loop(len(self.guards)) as g:
             lane["touch", g] = Touch.NONE
         with frame.code.loop(self.pieces) as j:
-            lane["stays", j] = 0.0
-            lane["params", j + self.motion.parameters] = 0.0
-
-    def _piece(self, frame: Frame, j: Value) -> Value:
-        return frame["params", j + self.motion.parameters]
+            lane["stays", j], lane["params", j + self.motion.parameters] = 0.0, 0.0
 
     # ---- where a member begins ----
 
@@ -122,18 +117,19 @@ class BorderControl:
             inputs = [*self.motion.state_inputs(frame), frame.vectors("stays", self.pieces)]
             pieces = self.motion.form.run(frame, self.borders.decide, *inputs)
             for j in self.motion.form.each(code, self.pieces):
-                place = j + self.motion.parameters
-                with frame.where(undecided):
-                    frame["params", place] = pieces[j]
-                    frame["stays", j] = 0.0
+                frame.assign(undecided, j + self.motion.parameters, params=pieces[j])
+                frame.assign(undecided, j, stays=0.0)
             with code.loop(len(self.guards)) as g:
-                slide = self.table.place(code, g, "slide")
-                with code.only_if((slide >= 0) & code.compare("==", g, self.table.place(code, g, "rest"))):
-                    slides = undecided & (self._piece(frame, slide) > 0.0)
-                    with frame.where(slides):
-                        frame["touch", g] = Touch.SLIDING
+                border = Border(self.table, frame, g)
+                slide = border["slide"]
+                with code.only_if((slide >= 0) & code.compare("==", g, border["rest"])):
+                    frame.assign(undecided & (self.table.piece(frame, slide) > 0.0), g, touch=Touch.SLIDING)
             frame["undecided"] = 0.0
         return frame.finish()
+
+    def _decide_again(self, frame: Frame, where: Value) -> None:
+        frame.assign(where, undecided=1)
+        frame.call(self.decide)
 
     # ---- the first border along the step ----
 
@@ -142,21 +138,20 @@ class BorderControl:
         frame = self.motion.function("stop_at_border", INTEGER)
         code, (order,), h = frame.code, frame.arguments, frame["h"]
         degree = self.motion.followed_degree(code, order)
-        frame["planned_h"], frame["nearest"] = h, 1.0
+        frame["planned"], frame["nearest"] = h, 1.0
         frame["crossed"], frame["crossed_number"], frame["beyond"] = Crossed.NOTHING, 0.0, 0.0
         if self.pieces:
-            clocks = sorted(enumerate(self.borders.clocks), key=lambda clock: clock[1] not in self.borders.kicking)
-            for c, j in clocks:
+            for c, j in sorted(enumerate(self.borders.clocks), key=lambda clock: clock[1] not in self.borders.kicking):
                 self._look_at_clock(frame, c, j, h)
             if self.table.movable and len(self.borders.clocks) > 1:
                 self._note_coincidence(frame, h)
             self._note_levels(frame)
             if self.slides:
                 frame["slides"] = 0.0
-                with code.loop(len(self.guards)) as g, frame.where(frame["touch", g] >= Touch.SLIDING):
-                    frame["slides"] = 1
+                with code.loop(len(self.guards)) as g:
+                    frame.assign(frame["touch", g] >= Touch.SLIDING, slides=1)
             with code.loop(len(self.guards)) as g:
-                self._look(frame, g, degree, h)
+                self._look(frame, Border(self.table, frame, g), degree, h)
         frame["next_approach"] = 0.0
         first = 0
         for feature, row in itertools.groupby(self.borders.features):  # which shares its code: as of a chain's bonds
@@ -169,95 +164,113 @@ class BorderControl:
         if self.borders.kicking:
             self._look_at_end(frame, degree, h)
             cut = cut | self.table.kicks(frame)
-        frame["h"] = code.select(cut, frame["nearest"] * h, h)
-        frame["cut"] = frame["h"]
-        with frame.where(cut):
-            frame["last"] = 0.0
-            if self.returns:
-                frame["h_before"] = 0.0
+        frame["h"] = self._end(frame)
+        frame.assign(cut, last=0.0, **self.forgotten)
         return frame.finish()
 
-    def _look(self, frame: Frame, g: Value, degree: Value, h: Value) -> None:
-        """Note where guard g is crossed, if that is sooner than what was noted before."""
-        code = frame.code
-        j = self.table.place(code, g, "piece")
-        piece = self._piece(frame, j)
-        side, level, beyond = (self.table.rule(code, g, name) for name in ("side", "level", "beyond"))
-        level = level(piece, lambda where, x: code.select(where, code.lanes_of(x), 0.0))
-        if any(guard.of_table for guard in self.guards):
-            is_table = code.lanes_of(code.as_double(self.table.place(code, g, "of_table"))) > 0.0
-            level = code.select(is_table, frame["level", g], level)
-        side, beyond = side(piece), beyond(piece)
-        is_share = code.lanes_of(code.flag(self.table.place(code, g, "on") >= 0)) > 0.0
-        undecided = code.compare("==", side, 0.0)
+    def _end(self, frame: Frame) -> Value:
+        """The step up to the border."""
+        return frame["nearest"] * frame["planned"]
+
+    def reaches(self, frame: Frame) -> Value:
+        """True if the step goes as far as to the border."""
+        return frame.code.compare("==", frame["h"], self._end(frame))
+
+    def _look(self, frame: Frame, border: Border, degree: Value, h: Value) -> None:
+        """Note where a guard is crossed, if that is sooner than what was noted before."""
+        code, piece = frame.code, border.piece
+        side, level, beyond = border.rule("side")(piece), border.level(piece), border.rule("beyond")(piece)
+        is_share, undecided = border.has("on"), code.compare("==", side, 0.0)
         # Nothing is looked for along the border that the motion slides on, or in the share of one that does not.
-        idle = (frame["touch", g] >= Touch.SLIDING) | (undecided & is_share)
+        idle = (border.touch >= Touch.SLIDING) | (undecided & is_share)
         with code.only_if(code.any_lane(~idle)):
-            self.roots.polynomial(frame, j, degree, h, code.select(undecided, 1.0, side), level)
+            self.roots.polynomial(frame, border["piece"], degree, h, code.select(undecided, 1.0, side), level)
             at_limit = (code.intrinsic("fabs", frame["poly", 0]) <= limits.JUMP_NOISE) & (frame["steps"] > 0.0)
             if self.borders.releases:
-                self._limit_growth(frame, g, level)
-            comes = ~undecided & (~is_share | at_limit) & (frame["touch", g] <= Touch.NONE)
-            self._look_along(frame, g, degree, h, undecided, beyond, idle, comes)
+                self._limit_growth(frame, border, level)
+            comes = ~undecided & (~is_share | at_limit) & (border.touch <= Touch.NONE)
+            leads = self.roots.leading_sign(frame, degree)
+            self._divide(frame, border, degree)
+            idle = idle | (self._is_rounding(frame, border, degree) & ~undecided)
+            tolerances = limits.SWITCH_TOLERANCES * frame.job("rtol"), absolute_tolerance(frame)
+            self.roots.shorten_to(frame, degree, *tolerances, limits.RESOLVED)
+            frame.call(self.roots.first_root, degree)
+            self._look_closer(frame, degree)
+            self._note_first(frame, border, h, (undecided, beyond, leads), comes, idle)
 
-    def _limit_growth(self, frame: Frame, g: Value, level: Value) -> None:
+    def _limit_growth(self, frame: Frame, border: Border, level: Value) -> None:
         """The step ends where the length of a cone's vector, whose polynomial is in `poly`, has grown by a part of it.
 
         Tangents across it change at a rate that falls as it grows: from rest on without a bound.
         """
-        code = frame.code
-        is_cone = self._is_cone(frame, g) & (code.lanes_of(code.as_double(self.table.place(code, g, "on"))) < 0.0)
         length, rate = frame["poly", 0] + level, frame["poly", 1]
         part = limits.GROWTH_OF_LENGTH * length / rate
-        sooner = is_cone & (rate > 0.0) & (length > level) & (part < frame["nearest"])
-        with frame.where(sooner):
-            frame["nearest"] = part
-            frame["crossed"] = Crossed.NOTHING
+        sooner = border.is_cone & ~border.has("on") & (rate > 0.0) & (length > level) & (part < frame["nearest"])
+        frame.assign(sooner, nearest=part, crossed=Crossed.NOTHING)
 
-    def _look_along(self, frame: Frame, g: Value, degree: Value, h: Value, undecided, beyond, idle, comes) -> None:
-        """The first root of guard g, whose polynomial is in `poly`; `beyond` it is that piece.
+    def _is_rounding(self, frame: Frame, border: Border, degree: Value) -> Value:
+        """True if a guard whose polynomial is in `poly` leaves a border that the motion touches by rounding alone.
 
-        A border that it `comes` to where another one has been met is met in a step of its own: each shifts tangents.
+        A move of less than a part of atol does not count. Where borders hold together what moves by rounding, they are
+        left and met in turn at one instant: then more is rounding.
         """
-        code, leads = frame.code, frame.code.variable(frame.constant(0.0))
-        with code.loop(degree) as i:  # the sign of the first coefficient behind c₀ that is not zero
-            c = frame["poly", degree - i]
-            leads.value = code.select(code.compare("!=", c, 0.0), code.select(c > 0.0, 1, -1.0), leads.value)
-        leads = leads.value
-        self._divide(frame, g, degree)
-        # A move of less than a part of atol does not count as leaving a border that the motion touches. Where borders
-        # hold together what moves by rounding, they are left and met in turn at one instant: then more is rounding.
+        code = frame.code
         turns = 1.0 + code.maximum(frame["idle_crossings"] - float(len(self.guards)), frame.constant(0.0))
         turns = code.select(turns < limits.MOST_TURNS, turns, limits.MOST_TURNS)
         patience = (turns * turns) * (turns * turns) * turns
-        atol = absolute_tolerance(frame)
-        nothing = self.roots.size(frame, degree) <= limits.NEGLIGIBLE * code.lanes_of(atol) * patience
-        touches = frame["touch", g] > Touch.NONE
+        atol = code.lanes_of(absolute_tolerance(frame))
+        nothing = self.roots.size(frame, degree) <= limits.NEGLIGIBLE * atol * patience
+        touches = border.touch > Touch.NONE
         if self.slides:  # along u = 0 another border of |u| is there by rounding
             touches = touches | (frame["slides"] > 0.0)
         first = [code.intrinsic("fabs", frame["poly", k]) for k in range(3)]  # the last ones may have become zero
-        idle = idle | (((nothing & touches) | (first[0] + first[1] + first[2] < frame.digits.tiny)) & ~undecided)
-        self._shorten(frame, degree, limits.SWITCH_TOLERANCES * frame.job("rtol"), atol, limits.RESOLVED)
-        frame.call(self.roots.first_root, degree)
-        self._look_closer(frame, degree)
+        return (nothing & touches) | (first[0] + first[1] + first[2] < frame.digits.tiny)
+
+    def _note_first(self, frame: Frame, border: Border, h: Value, piece: tuple, comes: Value, idle: Value) -> None:
+        """Note the root of a guard if it is the first: `beyond` it is that `piece`, or one that is `undecided`.
+
+        A border that it `comes` to where another one has been met is met in a step of its own: each shifts tangents.
+        """
+        code, (undecided, beyond, leads) = frame.code, piece
         # At rest but for what it gains in so little time: u̇ is of the size of ü t.
         gain = 4.0 * (code.intrinsic("fabs", frame["poly", 2]) * frame["root"])
-        at_rest = (frame["touch", g] > Touch.NONE) | (code.intrinsic("fabs", frame["poly", 1]) <= gain)
+        at_rest = (border.touch > Touch.NONE) | (code.intrinsic("fabs", frame["poly", 1]) <= gain)
         # A number that is zero leaves zero as its first coefficient says, or stays.
         leaves = undecided & code.compare("!=", leads, 0.0)
-        root = code.select(undecided, code.select(leaves, 0.0, 2.0), self._place(frame))
+        root = code.select(undecided, code.select(leaves, 0.0, 2.0), self.roots.place(frame, 2.0))
         instant = limits.NO_TIME * frame["smallest"] / code.intrinsic("fabs", h)
         root = code.select(comes & (root < instant) & (instant < 1.0), instant, root)
-        is_root = leaves | (~undecided & (frame["is_root"] > 0.0) & (frame["root"] < 1.0))
+        is_root = leaves | (~undecided & self.roots.is_found(frame))
         # Of two at one instant that of the piece on which the other one depends, which comes first, is crossed.
         apart = code.select(frame["crossed"] > 0.0, 1.0 - limits.AT_ONCE, 1.0) if self.borders.nested else 1.0
         sooner = (root < frame["nearest"] * apart) & code.compare("!=", h, 0.0) & ~idle
-        with frame.where(sooner):
-            frame["nearest"] = root
-            frame["at_rest"] = at_rest
-            frame["crossed"] = code.select(is_root, Crossed.GUARD, Crossed.NOTHING)
-            frame["crossed_number"] = code.as_double(g)
-            frame["beyond"] = code.select(undecided, leads, beyond)
+        crossed = code.select(is_root, Crossed.GUARD, Crossed.NOTHING)
+        frame.assign(sooner, nearest=root, at_rest=at_rest, crossed=crossed, crossed_number=code.as_double(border.g))
+        frame.assign(sooner, beyond=code.select(undecided, leads, beyond))
+
+    def _look_closer(self, frame: Frame, degree: Value) -> None:
+        """A root that comes early is as exact as what lies before it allows, and not the whole step."""
+        code = frame.code
+
+        def early():
+            is_root = (frame["is_root"] > 0.0) & (frame["poly", 0] > 0.0)
+            return is_root & (frame["root"] < limits.EARLY)
+
+        with code.repeat_while(lambda: code.any_lane(early()), at_most=limits.MOST_LOOKS):
+            straight = 0.0 - 4.0 * frame["poly", 0] / frame["poly", 1]  # for a root that is zero to rounding
+            reach = code.select(frame["root"] > 0.0, 2.0 * frame["root"], straight)
+            self.roots.stretch(frame, degree, code.select(early() & (reach > 0.0) & (reach < 1.0), reach, 1.0))
+            frame.call(self.roots.first_root, degree)
+
+    def _divide(self, frame: Frame, border: Border, degree: Value) -> None:
+        """Divide the polynomial of a guard, where it begins at zero, by as many powers as vanish."""
+        code, touch = frame.code, border.touch
+        divided = touch > Touch.NONE
+        for power in range(3):
+            with code.only_if(code.any_lane(divided)), code.loop(degree + 1) as k:
+                frame.assign(divided, k, poly=frame["poly", k + 1])
+            vanishes = code.compare("==", frame["poly", 0], 0.0)
+            divided = divided & (vanishes | (touch > float(power + Touch.VALUE)))
 
     # ---- tables: borders at their entries ----
 
@@ -271,8 +284,7 @@ class BorderControl:
     def _time_to_next_knot(self, frame: Frame, j: int) -> tuple[Value, Value]:
         """The time to the next entry of the table that the time is on, and the lanes where there is one."""
         code, forward = frame.code, frame["forward"]
-        index = self._piece(frame, integer(code, j)) + code.flag(forward > 0.0)
-        knot, inside = self._knot(frame, j, index)
+        knot, inside = self._knot(frame, j, self.table.piece(frame, j) + code.flag(forward > 0.0))
         return ((knot - frame["t"]) - frame["t_low"]) * forward, inside
 
     def _look_at_clock(self, frame: Frame, c: int, j: int, h: Value) -> None:
@@ -288,26 +300,22 @@ class BorderControl:
         if j in self.borders.kicking:  # also at the end of the motion, where the velocities are those behind it
             located = self.borders.tables[j]
             assert located is not None
-            is_inner = self._piece(frame, integer(code, j)) < float(located.table.count - 1 - located.closed)
+            is_inner = self.table.piece(frame, j) < float(located.table.count - 1 - located.closed)
             at_end = (frame["forward"] > 0.0) & is_inner & code.compare("==", left, nearest) & (size > 0.0)
             sooner = sooner | (inside & at_end & code.compare("==", frame["crossed"], 0.0))
-        with frame.where(sooner):
-            frame["nearest"] = left / size
-            frame["crossed"], frame["crossed_number"] = Crossed.KNOT, float(c)
+        frame.assign(sooner, nearest=left / size, crossed=Crossed.KNOT, crossed_number=float(c))
 
     def _note_coincidence(self, frame: Frame, h: Value) -> None:
         """Entries of several tables at one instant, one of which may be moved."""
-        code, size = frame.code, frame.code.intrinsic("fabs", h)
+        code, end = frame.code, frame["nearest"] * frame.code.intrinsic("fabs", h)
         count, moves = frame.constant(0.0), frame.constant(0.0)
         for j in self.borders.clocks:
             left, inside = self._time_to_next_knot(frame, j)
-            distance = code.intrinsic("fabs", left - frame["nearest"] * size)
-            at_once = inside & (frame["crossed"] > 0.0) & (distance <= self._instant(frame))
+            at_once = inside & (frame["crossed"] > 0.0) & (code.intrinsic("fabs", left - end) <= self._instant(frame))
             count = count + code.flag(at_once)
             if j in self.table.movable:
                 moves = moves + code.flag(at_once)
-        with frame.where((count > 1.0) & (moves > 0.0)):
-            frame["crossed"] = Crossed.KNOTS
+        frame.assign((count > 1.0) & (moves > 0.0), crossed=Crossed.KNOTS)
 
     def _instant(self, frame: Frame) -> Value:
         """The largest difference of two times that count as the same."""
@@ -318,15 +326,15 @@ class BorderControl:
         code = frame.code
         for g, guard in enumerate(self.guards):
             if self.borders.kinds[guard.piece] == _borders.CONE:
-                rate = self.motion.followed_coefficient(frame, integer(code, guard.piece), integer(code, 1))
-                fall = (0.0 - rate) * frame["forward"]
+                j = integer(code, guard.piece)
+                fall = (0.0 - self.motion.followed_coefficient(frame, j, integer(code, 1))) * frame["forward"]
                 last = fall * (limits.LAST_STEPS * frame["smallest"])  # what is gone in the shortest steps
                 unit = code.lanes_of(absolute_tolerance(frame))
-                far = self.motion.followed_value(frame, integer(code, guard.piece)) > limits.AT_REST * unit
+                far = self.motion.followed_value(frame, j) > limits.AT_REST * unit
                 least = unit * code.select(far, limits.AT_REST, limits.SETS_OUT)
                 frame["level", g] = code.select(last > least, last, least)
             if self.borders.kinds[guard.piece] == _borders.TABLE:
-                index = self._piece(frame, integer(code, guard.piece)) + guard.level.offset
+                index = self.table.piece(frame, guard.piece) + guard.level.offset
                 knot, inside = self._knot(frame, guard.piece, index)
                 frame["level", g] = code.select(inside, knot, NOWHERE if guard.level.offset else -NOWHERE)
 
@@ -335,57 +343,7 @@ class BorderControl:
         """True if the motion may slide along a border that other switching numbers depend on."""
         return _borders.SLIDE in self.borders.kinds
 
-    def _go_on(self, frame: Frame, going: Value) -> None:
-        """Past borders, and entries of tables.
-
-        A motion that slides along another border, or touches it, does so no more where that jumps.
-        """
-        shaken, code = self.borders.shaken, frame.code
-        line = eliminate_dead_code(self.borders.program.line, [self.borders.switches[j] for j in shaken])
-        before = self.motion.evaluate_now(frame, line) if shaken else []
-        before = [code.variable(before[k]) for k in range(len(shaken))]
-        self._go_beyond(frame)
-        if self.borders.clocks:
-            self._pass_knots(frame, going)
-        self._decide_others(frame, going)
-        after = self.motion.evaluate_now(frame, line) if shaken else []
-        for k, j in enumerate(shaken):
-            jump = code.intrinsic("fabs", after[k] - before[k].value)
-            least = code.intrinsic("fabs", after[k]) * frame.digits.round_off + code.lanes_of(absolute_tolerance(frame))
-            jumps = going & (jump > least)
-            with frame.where(jumps):
-                for g, guard in enumerate(self.guards):
-                    if guard.piece == j:
-                        frame["touch", g] = Touch.NONE
-                        if guard.slide >= 0:
-                            frame["params", self.motion.parameters + guard.slide] = 0.0
-        if shaken:
-            self._decide_others(frame, going)
-
-    def _decide_others(self, frame: Frame, going: Value) -> None:
-        """Decide the pieces anew that touch no border, where one is crossed on which others depend."""
-        code = frame.code
-        if not self.borders.nested:
-            return
-        with code.loop(self.pieces) as j:
-            frame["stays", j] = 0.0
-        for j in self.borders.clocks:
-            frame["stays", j] = 1.0
-        with code.loop(len(self.guards)) as g:
-            with frame.where(frame["touch", g] > Touch.NONE):
-                frame["stays", self.table.place(code, g, "piece")] = 1
-        with frame.where(going):
-            frame["undecided"] = 1
-        frame.call(self.decide)
-
-    def _pass_knots(self, frame: Frame, going: Value) -> None:
-        """The pieces of tables whose next entry the time has come to: all that are there at one instant."""
-        for j in self.borders.clocks:
-            left, inside = self._time_to_next_knot(frame, j)
-            passes = going & inside & (left <= self._instant(frame))
-            with frame.where(passes):
-                place = self.motion.parameters + j
-                frame["params", place] = frame["params", place] + frame["forward"]
+    # ---- narrow features ----
 
     def _look_ahead(self, frame: Frame, i: Value, feature: Feature, degree: Value, h: Value) -> None:
         """The step ends where the argument of feature number i has come as near as one step may bring it."""
@@ -420,128 +378,79 @@ class BorderControl:
 
     def _find_feature(self, frame: Frame, j: Value, feature: Feature, degree: Value, h: Value) -> None:
         """With its argument u: where α + β u is zero, the step ends."""
-        code, scale = frame.code, feature.scale
+        code, kind, scale = frame.code, feature.kind, feature.scale
         u = self.motion.followed_value(frame, j)
         rise = code.lanes_of(code.as_double(degree)) * limits.RISE
         side = code.select(u < 0.0, -1.0, 1.0)
+        matters, slope = code.compare("!=", u, 0.0), side
         of_size, absolute = frame.constant(0.0), frame.constant(limits.ARGUMENT)
-        if feature.kind == UP_TO:
-            matters, slope, start = code.compare("!=", u, 0.0), side, side * u
-            of_size, absolute = frame.constant(limits.ABRUPT), frame.constant(0.0)
-        elif feature.kind == FALLS:
+        if kind == UP_TO:
+            start, of_size, absolute = side * u, frame.constant(limits.ABRUPT), frame.constant(0.0)
+        elif kind == FALLS:
             fall = code.maximum(code.library("exp", rise * (-1.0 / scale)), frame.constant(limits.LARGEST_FALL))
-            matters, slope, start = code.compare("!=", u, 0.0), side, side * (u - fall * u)
-            absolute = limits.ARGUMENT * (fall * (side * u))
-        elif feature.kind == GROWS:
-            level = code.maximum(
-                code.library("exp", rise * (1.0 / scale)) * u, frame.constant(math.exp(-limits.FAINT / scale))
-            )
+            start, absolute = side * (u - fall * u), limits.ARGUMENT * (fall * (side * u))
+        elif kind == GROWS:
+            faint = frame.constant(math.exp(-limits.FAINT / scale))
+            level = code.maximum(code.library("exp", rise * (1.0 / scale)) * u, faint)
             matters, slope, start = level > 0.0, frame.constant(-1.0), level - u
             absolute = limits.ARGUMENT * level
-        elif feature.kind == SQUARED:
+        elif kind == SQUARED:
             near = code.maximum(u * u - rise, 0.0)
             level = code.intrinsic("sqrt", code.select(near > limits.FAINT, limits.FAINT, near))
-            matters, slope, start = near > 0.0, side, side * u - level
+            matters, start = near > 0.0, side * u - level
         else:
-            slope = frame.constant(-scale) if feature.kind == BELOW else scale * side
+            slope = frame.constant(-scale) if kind == BELOW else scale * side
             level = code.maximum(rise - slope * u, -limits.FAINT)
-            matters = level < (float("inf") if feature.kind == BELOW else 0.0)
+            matters = level < (float("inf") if kind == BELOW else 0.0)
             start = level + slope * u
-            if feature.kind == BELOW:  # from above it comes to where there is a series again, and then is told in parts
+            if kind == BELOW:  # from above it comes to where there is a series again, and then is told in parts
                 above, falls = u * scale - limits.BEYOND, self.motion.followed_coefficient(frame, j, 1) * h < 0.0
                 high = (above > 0.0) | ((u * scale > limits.STEEP) & falls)
                 slope = code.select(high, scale, slope)
                 start = code.select(high, code.maximum(above, rise), start)
-        if feature.kind <= SQUARED:
+        if kind <= SQUARED:
             far = start > limits.FAR
             start = code.select(far, (1.0 - limits.LARGEST_FALL) * start, start)
             of_size = code.select(far, limits.ARGUMENT * limits.LARGEST_FALL, of_size)
         self.roots.polynomial(frame, j, degree, h, slope, u - start / slope)
-        if feature.kind == FALLS:  # one that rises is told by fewer terms
+        if kind == FALLS:  # one that rises is told by fewer terms
             self.roots.sum_up(frame, degree)
             rises = frame["falls"] < start
             size = start + frame["rises"]
             matters = matters & ~(rises & (self.roots.last_terms(frame, degree) < limits.ARGUMENT * size))
-        self._shorten(frame, degree, of_size, absolute)
+        self.roots.shorten_to(frame, degree, of_size, absolute)
         frame.call(self.roots.first_root, degree)
-        root = self._place(frame)
-        if feature.kind in (UP_TO, FALLS):
-            nearby = limits.NEARBY if feature.kind == UP_TO else limits.NARROWEST
-            way, whole = frame["root"] * frame["part"], code.intrinsic("fabs", h)
-            whole = code.maximum(whole, frame["approach"])
-            far = way * code.intrinsic("fabs", h) > nearby * whole
-            found = (frame["root"] < 1.0) & (frame["is_root"] > 0.0)
-            comes = matters & far & found
-            with frame.where(comes):
-                frame["next_approach"] = whole
-            if feature.kind == UP_TO:
-                past = code.select(far, way * limits.SHORT_OF, way * limits.PAST + limits.NEARBY)
-                root = code.select(found, past, root)
-            else:
-                matters = matters & (far | ~found)
+        root = self.roots.place(frame, 2.0)
+        if kind in (UP_TO, FALLS):
+            matters, root = self._approach(frame, kind, h, matters, root)
         sooner = matters & (root > 0.0) & (root < frame["nearest"]) & code.compare("!=", h, 0.0)
-        with frame.where(sooner):
-            frame["nearest"] = root
-            frame["crossed"] = Crossed.NOTHING
+        frame.assign(sooner, nearest=root, crossed=Crossed.NOTHING)
 
-    def _shorten(self, frame: Frame, degree: Value, rtol: Value, atol: Value, share: float = math.inf) -> None:
-        """Halve the interval until the last terms are below atol, or a `share` of Σ |cₖ|, + rtol Σ |cₖ|."""
-
-        def is_long():
-            size, least = self.roots.size(frame, degree), frame.code.lanes_of(atol)
-            if share < math.inf:
-                least = frame.code.select(share * size < least, share * size, least)
-            return self.roots.last_terms(frame, degree) > size * rtol + least
-
-        self.roots.shorten(frame, degree, is_long)
-
-    def _look_closer(self, frame: Frame, degree: Value) -> None:
-        """A root that comes early is as exact as what lies before it allows, and not the whole step."""
-        code = frame.code
-
-        def early():
-            is_root = (frame["is_root"] > 0.0) & (frame["poly", 0] > 0.0)
-            return is_root & (frame["root"] < limits.EARLY)
-
-        with code.repeat_while(lambda: code.any_lane(early()), at_most=limits.MOST_LOOKS):
-            straight = 0.0 - 4.0 * frame["poly", 0] / frame["poly", 1]  # for a root that is zero to rounding
-            reach = code.select(frame["root"] > 0.0, 2.0 * frame["root"], straight)
-            self.roots.stretch(frame, degree, code.select(early() & (reach > 0.0) & (reach < 1.0), reach, 1.0))
-            frame.call(self.roots.first_root, degree)
-
-    def _place(self, frame: Frame) -> Value:
-        """The first root in parts of the step; or how far was looked, or 2 where there is none in all of it."""
-        code, root, part = frame.code, frame["root"], frame["part"]
-        return code.select(root < 1.0, root * part, code.select(part < 1.0, part, 2.0))
-
-    def _divide(self, frame: Frame, g: Value, degree: Value) -> None:
-        """Divide the polynomial of guard g, where it begins at zero, by as many powers as vanish."""
-        code = frame.code
-        touch = frame["touch", g]
-        divided = touch > Touch.NONE
-        for power in range(3):
-            with code.only_if(code.any_lane(divided)), code.loop(degree + 1) as k:
-                with frame.where(divided):
-                    frame["poly", k] = frame["poly", k + 1]
-            vanishes = code.compare("==", frame["poly", 0], 0.0)
-            divided = divided & (vanishes | (touch > float(power + Touch.VALUE)))
+    def _approach(self, frame: Frame, kind: int, h: Value, matters: Value, root: Value) -> tuple[Value, Value]:
+        """Steps end ever nearer to where no series begins, until that is near; and then beyond it, where one does."""
+        code, found = frame.code, self.roots.is_found(frame)
+        way, whole = frame["root"] * frame["part"], code.intrinsic("fabs", h)
+        nearby = (limits.NEARBY if kind == UP_TO else limits.NARROWEST) * code.maximum(whole, frame["approach"])
+        far = way * whole > nearby
+        frame.assign(matters & far & found, next_approach=code.maximum(whole, frame["approach"]))
+        if kind == FALLS:
+            return matters & (far | ~found), root
+        past = code.select(far, way * limits.SHORT_OF, way * limits.PAST + limits.NEARBY)
+        return matters, code.select(found, past, root)
 
     # ---- beyond it ----
 
     def settle(self, frame: Frame) -> None:
         """A step that has become shorter than planned does not reach its border."""
         code = frame.code
-        reached = code.compare("==", frame["h"], frame["cut"])
-        frame["crossed"] = code.select(reached, frame["crossed"], Crossed.NOTHING)
+        frame["crossed"] = code.select(self.reaches(frame), frame["crossed"], Crossed.NOTHING)
         frame["stepped"] = stepped = code.compare("!=", frame["h"], 0.0)
         if self.borders.kicking:  # steps that are recorded: those of no length, too, where a kick begins or ends them
             stepped = stepped | (self.table.kicks(frame) & ~self._begins_behind(frame))
             frame["counts"] = stepped | (frame["last"] > 0.0)
         at_knot = (frame["stepped"] > 0.0) & (frame["crossed"] > Crossed.GUARD)
         frame["at_knots"] = frame["at_knots"] + code.flag(at_knot)
-        for name in ("is_hit", "grazes", "stops"):
-            with frame.where(stepped):
-                frame[name] = 0.0
+        frame.assign(stepped, is_hit=0.0, grazes=0.0, stops=0.0)
         frame.call(self.graze)
 
     def _graze(self, base: int) -> Code:
@@ -570,46 +479,32 @@ class BorderControl:
             rate, bend = self._rates(frame, order)
             is_hit = ends & (frame["is_hit"] > 0.0)
             for name, by in (("grazes", error.value), ("stops", rounding.value)):
-                near = is_hit & (rate * rate <= 2.0 * (code.intrinsic("fabs", bend) * by))
-                with frame.where(near):
-                    frame[name] = 1
+                frame.assign(is_hit & (rate * rate <= 2.0 * (code.intrinsic("fabs", bend) * by)), **{name: 1})
         return frame.finish()
 
     def _rates(self, frame: Frame, order: Value) -> tuple[Value, Value]:
         """u̇ and ü at the end of the step, of the switching number that is `hit`."""
-        code, h = frame.code, frame["h"]
-        degree = code.select(order < limits.MAX_ORDER, order, limits.MAX_ORDER - 1)
-        first = self.motion.series.rows - self.motion.series.followed
-        rate, bend = (code.variable(frame.constant(0.0)) for _ in range(2))
-        with code.loop(degree, start=0) as i:
-            k = code.lanes_of(code.as_double(degree - i))
+        code, degree = frame.code, self.motion.followed_degree(frame.code, order)
+        with code.loop(degree) as i:
             c = code.variable(frame.constant(0.0))
             with code.loop(self.pieces) as j:
-                c.value = c.value + frame["hit", j] * frame["rows", j + first, degree - i]
-            term = c.value * k
-            bend.value = bend.value * h + rate.value
-            rate.value = rate.value * h + term
-        return rate.value, bend.value
+                c.value = c.value + frame["hit", j] * self.motion.followed_coefficient(frame, j, i + 1)
+            frame["poly", i] = c.value * code.lanes_of(code.as_double(i + 1))
+        return self.roots.value_and_slope(frame, degree - 1, frame["h"])
 
     def _cross(self) -> Code:
         """`()`: after the step, the pieces beyond the borders that were reached."""
         frame = self.motion.function("cross")
         code = frame.code
-        stepped, crosses = frame["stepped"] > 0.0, frame["crossed"] > Crossed.NOTHING
-        was_cut = code.compare("!=", frame["cut"], frame["planned_h"])
+        stepped, crosses, was_cut = frame["stepped"] > 0.0, frame["crossed"] > Crossed.NOTHING, frame["nearest"] < 1.0
         if self.retraction is not None:  # borders that are left before the step begins do not take the state
             self.retraction.undo(frame, ~stepped)
         with code.loop(len(self.guards)) as g:
-            ends = stepped & (frame["touch", g] < Touch.SLIDING)
-            with frame.where(ends):
-                frame["touch", g] = Touch.NONE
+            frame.assign(stepped & (frame["touch", g] < Touch.SLIDING), g, touch=Touch.NONE)
         with code.only_if(code.any_lane(crosses | was_cut)):
             # What a cut step was to be says more about the next one than what it became.
-            planned = code.intrinsic("fabs", frame["planned_h"])
-            reached = was_cut & code.compare("==", frame["h"], frame["cut"])
-            with frame.where(reached):
-                frame["longest"] = limits.GROWTH * planned
-                frame["h"] = frame["planned_h"]
+            longest = limits.GROWTH * code.intrinsic("fabs", frame["planned"])
+            frame.assign(was_cut & self.reaches(frame), longest=longest, h=frame["planned"])
             if self.note is not None:
                 frame.call(self.note)
             if self.borders.release.outputs:
@@ -617,79 +512,145 @@ class BorderControl:
             if self.kick is not None:
                 self._note_kick(frame)
             self._go_on(frame, crosses)
-            with frame.where(crosses):
-                if self.returns:
-                    frame["h_before"] = 0.0
+            frame.assign(crosses, **self.forgotten)
             if self.kick is not None:
                 self._kick_or_reflect(frame, self.kick, crosses)
             if self.jump is not None:
                 frame.call(self.jump)
             # A border at which a step of no length ends, too, whether it is crossed or only met.
             idle = code.select(stepped, 0.0, frame["idle_crossings"] + 1.0)
-            with frame.where(stepped | crosses | was_cut):
-                frame["idle_crossings"] = idle
+            frame.assign(stepped | crosses | was_cut, idle_crossings=idle)
             most = float(limits.MOST_CROSSINGS * (len(self.guards) + len(self.borders.clocks)))
-            with frame.where(frame["idle_crossings"] > most):
-                frame["code"] = limits.DISCONTINUOUS
+            frame.assign(frame["idle_crossings"] > most, code=limits.DISCONTINUOUS)
         return frame.finish()
 
-    def _go_beyond(self, frame: Frame) -> None:
-        """The pieces beyond the borders, which touch them; a piece that touches one is not decided anew.
+    def _go_on(self, frame: Frame, going: Value) -> None:
+        """Past borders, and entries of tables.
+
+        A motion that slides along another border, or touches it, does so no more where that jumps.
+        """
+        shaken, code = self.borders.shaken, frame.code
+        line = eliminate_dead_code(self.borders.program.line, [self.borders.switches[j] for j in shaken])
+        before = self.motion.evaluate_now(frame, line) if shaken else []
+        before = [code.variable(before[k]) for k in range(len(shaken))]
+        with code.loop(len(self.guards)) as g:
+            self._take_beyond(frame, Border(self.table, frame, g))
+        for j in self.borders.clocks:  # all whose next entry the time has come to, at one instant
+            left, inside = self._time_to_next_knot(frame, j)
+            passes = going & inside & (left <= self._instant(frame))
+            frame.assign(passes, self.motion.parameters + j, params=self.table.piece(frame, j) + frame["forward"])
+        self._decide_others(frame, going)
+        after = self.motion.evaluate_now(frame, line) if shaken else []
+        for k, j in enumerate(shaken):
+            jump = code.intrinsic("fabs", after[k] - before[k].value)
+            least = code.intrinsic("fabs", after[k]) * frame.digits.round_off + code.lanes_of(absolute_tolerance(frame))
+            self._let_go(frame, going & (jump > least), [j])
+        if shaken:
+            self._decide_others(frame, going)
+
+    def _let_go(self, frame: Frame, where: Value, pieces: Container[int]) -> None:
+        """The motion touches the borders of some pieces no more, and slides along none of them."""
+        for g, guard in enumerate(self.guards):
+            if guard.piece in pieces:
+                frame.assign(where, g, touch=Touch.NONE)
+                if guard.slide >= 0:
+                    frame.assign(where, self.motion.parameters + guard.slide, params=0.0)
+
+    def _decide_others(self, frame: Frame, going: Value) -> None:
+        """Decide the pieces anew that touch no border, where one is crossed on which others depend."""
+        code = frame.code
+        if not self.borders.nested:
+            return
+        with code.loop(self.pieces) as j:
+            frame["stays", j] = 0.0
+        for j in self.borders.clocks:
+            frame["stays", j] = 1.0
+        with code.loop(len(self.guards)) as g:
+            border = Border(self.table, frame, g)
+            frame.assign(border.touch > Touch.NONE, border["piece"], stays=1)
+        self._decide_again(frame, going)
+
+    def _take_beyond(self, frame: Frame, border: Border) -> None:
+        """Take the piece beyond a border, which touches it; a piece that touches one is not decided anew.
 
         A motion that would go back over the border at once is pushed onto it from both sides: it slides. So does one
         that has come back in no measurable time, or not to rounding: it bounces off the border, less and less, and
         comes to rest.
         """
-        code, again = frame.code, frame["stepped"] <= 0.0
-        no_time = ~again & (code.intrinsic("fabs", frame["cut"]) <= limits.NO_TIME * frame["smallest"])
+        code, hit, again = frame.code, border.is_hit, frame["stepped"] <= 0.0
+        no_time = ~again & (code.intrinsic("fabs", self._end(frame)) <= limits.NO_TIME * frame["smallest"])
         no_time = (no_time | (~again & (frame["stops"] > 0.0))) & (frame["at_rest"] > 0.0)
-        with code.loop(len(self.guards)) as g:
-            hit = self.table.crosses(frame, Crossed.GUARD, g)
-            j, back, slide = (self.table.place(code, g, name) for name in ("piece", "back", "slide"))
-            place = j + self.motion.parameters
-            by_position = code.lanes_of(code.flag(self.table.place(code, g, "order") > 1)) > 0.0
-            bounces = no_time & by_position
-            slides = hit & (bounces | (again & (frame["touch", g] > Touch.NONE)))
-            if self.borders.releases:
-                slides = slides | (hit & self._is_cone(frame, g))
-            slides = slides & (code.lanes_of(code.as_double(slide)) >= 0.0)
-            with frame.where(hit & ~slides):
-                frame["params", place] = frame["beyond"]
-            # A share jumps to where it is: it need not touch the border that it had crossed before.
-            is_share = code.lanes_of(code.flag(self.table.place(code, g, "on") >= 0)) > 0.0
-            with frame.where(hit):
-                frame["touch", back] = code.select(is_share, Touch.NONE, Touch.VALUE)
-            with code.only_if(slide >= 0):
-                below = code.select(self._piece(frame, j) < frame["beyond"], self._piece(frame, j), frame["beyond"])
-                is_sign = code.lanes_of(self.table.rule(code, g, "beyond").slope) <= 0.0
-                with frame.where(slides):
-                    frame["params", place] = code.select(is_sign, -1.0, below)
-                    frame["params", slide + self.motion.parameters] = 1
-                    frame["touch", g] = frame["touch", back] = Touch.NONE
-                    frame["touch", self.table.place(code, g, "rest")] = Touch.SLIDING
-            self._leave(frame, g, hit, again)
+        place, back, slide = border["piece"] + self.motion.parameters, border["back"], border["slide"]
+        bounces = no_time & border.has("order", 2)  # by position
+        slides = bounces | (again & (border.touch > Touch.NONE))
+        if self.borders.releases:
+            slides = slides | border.is_cone
+        slides = hit & slides & border.has("slide")
+        frame.assign(hit & ~slides, place, params=frame["beyond"])
+        # A share jumps to where it is: it need not touch the border that it had crossed before.
+        frame.assign(hit, back, touch=code.select(border.has("on"), Touch.NONE, Touch.VALUE))
+        with code.only_if(slide >= 0):
+            below = code.select(border.piece < frame["beyond"], border.piece, frame["beyond"])
+            is_sign = code.lanes_of(border.rule("beyond").slope) <= 0.0
+            frame.assign(slides, place, params=code.select(is_sign, -1.0, below))
+            frame.assign(slides, slide + self.motion.parameters, params=1)
+            for g, touch in ((border.g, Touch.NONE), (back, Touch.NONE), (border["rest"], Touch.SLIDING)):
+                frame.assign(slides, g, touch=touch)
+        self._leave(frame, border, hit, again)
+
+    def _leave(self, frame: Frame, border: Border, hit: Value, again: Value) -> None:
+        """Let a sliding motion go on along one side, where its share of that side comes to 0 or 1.
+
+        The rate of u that was kept at zero is zero there after a slide, and not where it did not slide at all.
+        """
+        code, on = frame.code, Border(self.table, frame, border["on"])
+        with code.only_if(on.g >= 0):
+            order = code.lanes_of(code.as_double(on["order"]))
+            gains = code.as_double(border["gains"])
+            frame.assign(hit, on["piece"] + self.motion.parameters, params=on.piece + gains)
+            frame.assign(hit, border["rest"], touch=Touch.NONE)
+            frame.assign(hit, on.g, touch=code.select(again, order, order + Touch.VALUE))
+            if self.borders.releases:  # the vector of a cone has been given a length beyond its level
+                frame.assign(hit & on.is_cone, on.g, touch=Touch.NONE)
+
+    def _release(self, frame: Frame) -> None:
+        """Let the vectors of cones that hold no longer set out, with a speed that is twice what counts as none."""
+        code, motion, n = frame.code, self.motion, len(self.borders.release.outputs)
+        shares = self.borders.releases
+        hits = [self.table.crosses(frame, Crossed.GUARD, g) for g in shares]
+        base = n // (2 * len(shares))
+        with code.only_if(code.any_lane(functools.reduce(Value.__or__, hits))):
+            out = motion.evaluate_now(frame, self.borders.release)
+            speed = code.lanes_of(2.0 * limits.SETS_OUT * absolute_tolerance(frame))
+            for k, hit in enumerate(hits):
+                for i in range(base):
+                    places = 2 * k * base + i, (2 * k + 1) * base + i
+                    if any(self.borders.release.constant(place) != 0.0 for place in places):
+                        y = frame["y", i + motion.n, 0] + (speed * out[places[0]] - out[places[1]])
+                        frame.assign(hit, i + motion.n, 0, y=y)
+                        frame.assign(hit, i + motion.n, low=0.0)
 
     # ---- where L jumps ----
 
     def _note_kick(self, frame: Frame) -> None:
         """Note the pieces before the border, and which switching number is zero there."""
-        code = frame.code
-        with code.loop(self.pieces) as j:
-            frame["kick_before", j] = self._piece(frame, j)
-            frame["kick_hit", j] = 0.0
-        with code.loop(len(self.guards)) as g:
-            with frame.where(self.table.crosses(frame, Crossed.GUARD, g)):
-                frame["kick_hit", self.table.place(code, g, "piece")] = 1.0
+        with frame.code.loop(self.pieces) as j:
+            frame["kick_before", j], frame["kick_hit", j] = self.table.piece(frame, j), 0.0
+        with frame.code.loop(len(self.guards)) as g:
+            border = Border(self.table, frame, g)
+            frame.assign(border.is_hit, border["piece"], kick_hit=1.0)
 
     def _begins_behind(self, frame: Frame) -> Value:
         """True where a motion begins at an instant at which L jumps: with the velocities behind it, in time's order."""
-        code = frame.code
         begins = (frame["steps"] <= 0.0) & (frame["forward"] > 0.0)
         found = frame.constant(0.0) > 0.0
         for g, guard in enumerate(self.guards):
-            if guard.piece in self.kicks_in_time and self.borders.kinds[guard.piece] == _borders.SIGN:
+            if self._kicks_by_sign(guard.piece):
                 found = found | self.table.crosses(frame, Crossed.GUARD, g)
-        return begins & found & code.compare("==", frame["h"], 0.0)
+        return begins & found & frame.code.compare("==", frame["h"], 0.0)
+
+    def _kicks_by_sign(self, j: int) -> bool:
+        return j in self.kicks_in_time and self.borders.kinds[j] == _borders.SIGN
 
     def _look_at_end(self, frame: Frame, degree: Value, h: Value) -> None:
         """The step ends at an instant at which L jumps also where that is the end of the motion, to rounding.
@@ -697,25 +658,18 @@ class BorderControl:
         The velocities are those behind it there, in the order of time.
         """
         code, one = frame.code, frame.constant(1.0)
+        ends = (frame["last"] > 0.0) & (frame["forward"] > 0.0) & code.compare("!=", h, 0.0)
         for g, guard in enumerate(self.guards):
             if guard.piece not in self.kicks_in_time:
                 continue
-            piece = self._piece(frame, integer(code, guard.piece))
-            side, level = guard.side(piece), guard.level(piece, lambda where, x: code.select(where, x, 0.0))
-            level = frame["level", g] if guard.of_table else level
-            self.roots.polynomial(frame, integer(code, guard.piece), degree, h, side, level)
-            end, slope = code.variable(frame.constant(0.0)), code.variable(frame.constant(0.0))
-            with code.loop(degree + 1) as k:
-                c = frame["poly", k]
-                end.value = end.value + c
-                slope.value = slope.value + c * code.lanes_of(code.as_double(k))
-            noise = _AT_END * limits.EPS * code.intrinsic("fabs", frame["t_end"] / h * slope.value)
-            there = (
-                (frame["last"] > 0.0) & (frame["forward"] > 0.0) & code.compare("!=", side, 0.0) & (end.value <= noise)
-            )
-            with frame.where(there & code.compare("==", frame["nearest"], one) & code.compare("!=", h, 0.0)):
-                frame["crossed"], frame["crossed_number"] = Crossed.GUARD, float(g)
-                frame["beyond"] = guard.beyond(piece)
+            border = Border(self.table, frame, integer(code, g))
+            side = guard.side(border.piece)
+            self.roots.polynomial(frame, border["piece"], degree, h, side, border.level(border.piece))
+            end, slope = self.roots.value_and_slope(frame, degree, one)
+            noise = _AT_END * limits.EPS * code.intrinsic("fabs", frame["t_end"] / h * slope)
+            there = ends & code.compare("!=", side, 0.0) & (end <= noise) & code.compare("==", frame["nearest"], one)
+            beyond = guard.beyond(border.piece)
+            frame.assign(there, crossed=Crossed.GUARD, crossed_number=float(g), beyond=beyond)
 
     def _kick(self, base: int) -> Code:
         """`()`: the velocities behind the border, in the lanes that are to `kicks`; 2 there if they do not pass it."""
@@ -735,22 +689,20 @@ class BorderControl:
             out = motion.form.run(frame, kick.line, *inputs)
             passes = out[base] > 0.0
             for i in motion.form.each(code, base):
-                with frame.where(kicks & passes):
-                    frame["y", i + n, 0] = out[i]
-                    frame["low", i + n] = 0.0
-            with frame.where(kicks & ~passes):
-                frame["kicks"] = 2.0
+                frame.assign(kicks & passes, i + n, 0, y=out[i])
+                frame.assign(kicks & passes, i + n, low=0.0)
+            frame.assign(kicks & ~passes, kicks=2.0)
         return frame.finish()
 
     def _kick_or_reflect(self, frame: Frame, kick: Code, crosses: Value) -> None:
         """Give the motion the velocities that it has where L jumps: behind the border, or before it once more."""
         code, kicks = frame.code, frame.constant(0.0)
         for j in self.borders.kicking:
-            piece = self._piece(frame, integer(code, j))
-            if j in self.kicks_in_time and self.borders.kinds[j] == _borders.SIGN:
+            piece = self.table.piece(frame, j)
+            if self._kicks_by_sign(j):
                 begins = code.compare("==", frame["kick_before", j], 0.0) & (frame["steps"] <= 1.0)
-                with frame.where(crosses & begins & (frame["forward"] < 0.0)):  # back from behind it
-                    frame["kick_before", j] = 0.0 - piece
+                back = crosses & begins & (frame["forward"] < 0.0)  # from behind it
+                frame.assign(back, j, kick_before=0.0 - piece)
             jumps = crosses & (frame["counts"] > 0.0) & code.compare("!=", piece, frame["kick_before", j])
             kicks = code.select(jumps, 1.0, kicks)
         frame["kicks"] = kicks
@@ -758,12 +710,10 @@ class BorderControl:
         reflected = frame["kicks"] > 1.0
         with code.only_if(code.any_lane(reflected)):
             with code.loop(self.pieces) as j:
-                with frame.where(reflected):
-                    frame["params", j + self.motion.parameters] = frame["kick_before", j]
+                frame.assign(reflected, j + self.motion.parameters, params=frame["kick_before", j])
             with code.loop(len(self.guards)) as g:
                 at_border = self.table.crosses(frame, Crossed.GUARD, g)
-                with frame.where(reflected):
-                    frame["touch", g] = code.select(at_border, Touch.VALUE, Touch.NONE)
+                frame.assign(reflected, g, touch=code.select(at_border, Touch.VALUE, Touch.NONE))
             frame["kicks"] = code.select(reflected, 1.0, 0.0)
             frame.call(kick)
         self._decide_by_velocity(frame, kicks > 0.0)
@@ -776,62 +726,8 @@ class BorderControl:
             for j, node in enumerate(self.borders.switches)
             if self.borders.kinds[j] != _borders.SLIDE and not self.borders.read_by(node).isdisjoint(velocities)
         ]
-        if not by_velocity:
-            return
-        for j in range(self.pieces):
-            with frame.where(kicked):
-                frame["stays", j] = 0.0 if j in by_velocity else 1.0
-        for g, guard in enumerate(self.guards):
-            if guard.piece in by_velocity:
-                with frame.where(kicked):
-                    frame["touch", g] = Touch.NONE
-                    if guard.slide >= 0:
-                        frame["params", self.motion.parameters + guard.slide] = 0.0
-        with frame.where(kicked):
-            frame["undecided"] = 1.0
-        frame.call(self.decide)
-
-    def _leave(self, frame: Frame, g: Value, hit: Value, again: Value) -> None:
-        """Let a sliding motion go on along one side, where its share of that side comes to 0 or 1.
-
-        The rate of u that was kept at zero is zero there after a slide, and not where it did not slide at all.
-        """
-        code = frame.code
-        on = self.table.place(code, g, "on")
-        with code.only_if(on >= 0):
-            place = self.table.place(code, on, "piece") + self.motion.parameters
-            order = code.lanes_of(code.as_double(self.table.place(code, on, "order")))
-            with frame.where(hit):
-                frame["params", place] = frame["params", place] + code.as_double(self.table.place(code, g, "gains"))
-                frame["touch", self.table.place(code, g, "rest")] = Touch.NONE
-                frame["touch", on] = code.select(again, order, order + Touch.VALUE)
-            if self.borders.releases:  # the vector of a cone has been given a length beyond its level
-                of_cone = hit & self._is_cone(frame, on)
-                with frame.where(of_cone):
-                    frame["touch", on] = Touch.NONE
-
-    def _is_cone(self, frame: Frame, g: Value) -> Value:
-        """True in all lanes if guard g is that of a cone, or a share."""
-        code = frame.code
-        return code.lanes_of(code.flag(code.compare("==", self.table.rule(code, g, "beyond").slope, 0.0))) > 0.0
-
-    def _release(self, frame: Frame) -> None:
-        """Let the vectors of cones that hold no longer set out, with a speed that is twice what counts as none."""
-        code, motion, n = frame.code, self.motion, len(self.borders.release.outputs)
-        shares = self.borders.releases
-        base, leaves = n // (2 * len(shares)), frame.constant(0.0) > 0.0
-        for g in shares:
-            leaves = leaves | self.table.crosses(frame, Crossed.GUARD, g)
-        with code.only_if(code.any_lane(leaves)):
-            out = motion.evaluate_now(frame, self.borders.release)
-            speed = 2.0 * limits.SETS_OUT * absolute_tolerance(frame)
-            for k, g in enumerate(shares):
-                hit = self.table.crosses(frame, Crossed.GUARD, g)
-                for i in range(base):
-                    places = 2 * k * base + i, (2 * k + 1) * base + i
-                    if all(self.borders.release.constant(place) == 0.0 for place in places):
-                        continue
-                    change = code.lanes_of(speed) * out[places[0]] - out[places[1]]
-                    with frame.where(hit):
-                        frame["y", i + motion.n, 0] = frame["y", i + motion.n, 0] + change
-                        frame["low", i + motion.n] = 0.0
+        if by_velocity:
+            for j in range(self.pieces):
+                frame.assign(kicked, j, stays=0.0 if j in by_velocity else 1.0)
+            self._let_go(frame, kicked, by_velocity)
+            self._decide_again(frame, kicked)

@@ -14,13 +14,14 @@ from enum import IntEnum
 import numpy as np
 
 from lagjax._native import _constants as limits
-from lagjax._native._frame import EXACT, Fields, Frame, Lane, integers
+from lagjax._native._frame import Fields, Frame, Lane, integers
 from lagjax._native._guards import Guards
 from lagjax._native._ir import INTEGER, Code, Value, Variable
-from lagjax._native._roots import Roots, Touch
+from lagjax._native._roots import Roots
 from lagjax._native._run_records import Output
 from lagjax._native._step import StepControl
 from lagjax._native._taylor import TaylorSeries, double
+from lagjax._native._watch import END_OF_STEP, Touch
 from lagjax._program._borders import inputs_below
 
 
@@ -67,11 +68,7 @@ class Events:
             "noise": guards,  # the rounding of its leading term, where a motion begins
             "lead": guards,  # its first term behind its rate that is more than rounding
             "lead_order": guards,  # the order of that
-            "planned": 1,  # the step before it was cut
-            "seen": 1,  # up to which part of the step all can be seen
-            "is_cut": 1,  # 1 if the step ends there
-            "first_at": 1,  # how far from the beginning of the step the first change is
-            "event": EXACT,  # the event's code; −1 without any
+            **END_OF_STEP,
         }
 
     def begin(self, frame: Frame, lane: Lane) -> None:
@@ -207,7 +204,7 @@ class Events:
         """Look along the step. It ends at the earliest change of all guards, or as far as these can be seen."""
         code = frame.code
         frame.call(self.begin_sides, order)
-        frame["planned"], frame["is_cut"] = frame["h"], 0.0
+        planned = frame["h"]
         with code.loop(self.count) as g:
             frame["side_begin", g], frame["noted_begin", g] = frame["side", g], frame["noted", g]
             frame["waited", g], frame["waits", g] = frame["waits", g], 0.0
@@ -217,7 +214,6 @@ class Events:
         with code.only_if(code.any_lane(cut)):
             least = limits.INSTANT * frame["smallest"]
             after = code.maximum(frame["seen"] * size, code.select(least < size, least, size))
-            frame["is_cut"] = cut
             with frame.where(cut):
                 frame["h"] = after * frame["forward"]
                 frame["last"] = 0.0
@@ -226,7 +222,7 @@ class Events:
             frame.call(self.look, order)
         if not self.notes:
             self._end_at_first(frame)
-        with code.only_if(code.any_lane(code.compare("!=", frame["h"], frame["planned"]))):
+        with code.only_if(code.any_lane(code.compare("!=", frame["h"], planned))):
             frame.call(self.step.defect, order, double(code, 1.0))  # leaves the increment of the new step
             if self.step.projector is not None:
                 frame.call(self.step.projector.project)
@@ -367,7 +363,7 @@ class Events:
 
     def _see(self, frame: Frame, where: Value, seen: Value) -> None:
         """Note, in some lanes, that a guard is seen only up to a part of the step, the first time it is looked at."""
-        less = where & (seen < frame["seen"]) & ~(frame["is_cut"] > 0.0)
+        less = where & (seen < frame["seen"])
         with frame.where(less):
             frame["seen"] = seen
 
@@ -377,7 +373,7 @@ class Events:
         if not self.can_jump:
             return frame.constant(0.0) > 1.0
         piecewise = code.load(code.element(Value(code, self.table), g * 2 + 1, INTEGER), INTEGER)
-        at_border = (frame["crossed"] > 0.0) & code.compare("==", frame["h"], frame["cut"])
+        at_border = (frame["crossed"] > 0.0) & code.compare("==", frame["h"], frame["nearest"] * frame["planned"])
         left = (1.0 - frame["root"] * frame["part"]) * code.intrinsic("fabs", frame["slope"])
         at_border = at_border & (frame["root"] > 0.0)  # else it has jumped already
         return (left <= 8.0 * frame["error"]) & at_border & (code.lanes_of(code.as_double(piecewise)) > 0.0)

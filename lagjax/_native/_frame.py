@@ -175,6 +175,12 @@ class Frame:
         yield
         self._mask = before
 
+    def assign(self, mask: Value, *indices: Index, **values: "Value | float") -> None:
+        """Set fields by name, each at the same indices, in the lanes of a mask."""
+        with self.where(mask):
+            for name, value in values.items():
+                self[(name, *indices)] = value
+
     def address(self, name: str, *indices: Index) -> Value:
         return self.code.element(self._memory, self.layout.place(name, *indices))
 

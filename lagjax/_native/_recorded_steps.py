@@ -15,8 +15,9 @@ from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._motion_parts import MotionParts
 from lagjax._native._retraction import Retraction
 from lagjax._native._run_records import RECORDED
-from lagjax._native._saltation import GuardTable, Saltation
+from lagjax._native._saltation import Saltation
 from lagjax._native._taylor import AT_BORDER, TaylorSeries, is_large
+from lagjax._native._watch import GuardTable
 
 
 class Replay:

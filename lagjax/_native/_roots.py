@@ -10,27 +10,13 @@ them. Where P comes so near to zero without going through, that cannot be decide
 there, and a step that ends there, too, has a series that knows.
 """
 
+import math
 from collections.abc import Callable
-from enum import IntEnum
 
 from lagjax._native._constants import EPS, MOST_HALVINGS, MOST_MOVES, ROOT_NOISE
 from lagjax._native._frame import Fields, Frame
 from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._taylor import TaylorSeries, integer
-
-
-class Touch(IntEnum):
-    """The contact of a watched number with zero where a step begins: none, of its value, of its rates too, for good.
-
-    Numbers between count the rates that are zero, and one for the value. A root that is there already is none to be
-    found, and rounding must not make one of it.
-    """
-
-    NONE = 0
-    VALUE = 1
-    RATE = 2
-    SECOND_RATE = 3
-    SLIDING = 4
 
 
 class Roots:
@@ -100,6 +86,17 @@ class Roots:
                 again.value = 1
                 self.stretch(frame, degree, code.select(long, 0.5, 1.0))
 
+    def shorten_to(self, frame: Frame, degree: Value, rtol: Value, atol: Value, share: float = math.inf) -> None:
+        """Halve the interval until the last terms are below atol, or a `share` of Σ |cₖ|, + rtol Σ |cₖ|."""
+
+        def is_long():
+            size, least = self.size(frame, degree), frame.code.lanes_of(atol)
+            if share < math.inf:
+                least = frame.code.select(share * size < least, share * size, least)
+            return self.last_terms(frame, degree) > size * rtol + least
+
+        self.shorten(frame, degree, is_long)
+
     def stretch(self, frame: Frame, degree: Value, part: "Value | float", times: "Value | float" = 1.0) -> None:
         """The polynomial over a part of its interval, `times` as large."""
         code = frame.code
@@ -109,7 +106,23 @@ class Roots:
             frame["poly", k] = frame["poly", k] * power.value
             power.value = power.value * part
 
+    def leading_sign(self, frame: Frame, degree: Value) -> Value:
+        """The sign of the first coefficient behind c₀ that is not zero; 0 without any."""
+        code, sign = frame.code, frame.code.variable(frame.constant(0.0))
+        with code.loop(degree) as i:
+            c = frame["poly", degree - i]
+            sign.value = code.select(code.compare("!=", c, 0.0), code.select(c > 0.0, 1, -1.0), sign.value)
+        return sign.value
+
     # ---- its roots ----
+
+    def is_found(self, frame: Frame) -> Value:
+        return (frame["is_root"] > 0.0) & (frame["root"] < 1.0)
+
+    def place(self, frame: Frame, otherwise: float) -> Value:
+        """The root, or else how far was looked, in parts of the step; `otherwise` if that was all of it."""
+        code, root, part = frame.code, frame["root"], frame["part"]
+        return code.select(root < 1.0, root * part, code.select(part < 1.0, part, otherwise))
 
     def _first_root(self) -> Code:
         frame = self.motion.function("first_root", INTEGER)
@@ -179,7 +192,7 @@ class Roots:
 
         with code.repeat_while(lambda: code.any_lane(active()), at_most=MOST_MOVES):
             here, now = x.value, active()
-            value, slope = self._value_and_slope(frame, degree, here)
+            value, slope = self.value_and_slope(frame, degree, here)
             noise, left_out = at_start + along * here, frame["doubt"] * self._power(here)
             error = noise + left_out
             # A slope that what is not known, and the bend, cannot undo.
@@ -228,7 +241,7 @@ class Roots:
         square = x * x
         return (square * square) * (square * square)
 
-    def _value_and_slope(self, frame: Frame, degree: Value, x: Value) -> tuple[Value, Value]:
+    def value_and_slope(self, frame: Frame, degree: Value, x: Value) -> tuple[Value, Value]:
         code = frame.code
         value, slope = code.variable(frame["poly", degree]), code.variable(frame.constant(0.0))
         with code.loop(degree + 1, start=1) as k:

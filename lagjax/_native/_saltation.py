@@ -6,149 +6,18 @@ derivative does. Where the border is grazed, so that a change of the state withi
 crossed, none of this exists: derivatives are NaN there, but for first ones where the acceleration is continuous.
 """
 
-import functools
-import math
 from collections.abc import Callable
-from enum import IntEnum
-from typing import Any
-
-import numpy as np
 
 from lagjax._native._constants import JUMP_NOISE
 from lagjax._native._cotangents import Cotangents, add
-from lagjax._native._frame import Fields, Frame, Index, Numbers, Vectors, integers
-from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
+from lagjax._native._frame import Fields, Frame, Index, Numbers, Vectors
+from lagjax._native._ir import Code, Value
 from lagjax._native._tangent_memory import Directions
 from lagjax._native._taylor import TaylorSeries
-from lagjax._program._borders import Affine, Borders, Level
+from lagjax._native._watch import Crossed, GuardTable, Hit
+from lagjax._program._borders import Borders
 from lagjax._program._jump import Jump
 from lagjax._program._look_ups import Table
-
-# The rules of a guard by name, each with the place of its first number among those of the guard.
-_RULES, _NUMBERS = {"side": (0, Affine), "level": (2, Level), "beyond": (6, Affine)}, 8
-_PLACES = ("piece", "back", "slide", "on", "order", "rest", "gains", "of_table")
-
-
-class Hit(IntEnum):
-    """The borders that a step ends at: none whose instant varies, one, or several at one instant."""
-
-    NONE = 0
-    BORDER = 1
-    SEVERAL = 2
-
-
-class Crossed(IntEnum):
-    """The border at the end of a step: none, a guard, a knot of a clock, or knots of several at one instant."""
-
-    NOTHING = 0
-    GUARD = 1
-    KNOT = 2
-    KNOTS = 3
-
-
-class GuardTable:
-    """The guards of all pieces (`_program._borders.Guard`) as constants of a kernel, for loops over them; and `knots`.
-
-    A knot is an entry of a table of parameters that the time is on, or one at which L jumps; another one of a table of
-    numbers neither varies nor matters to tangents. There are no derivatives by knots of several tables that coincide:
-    the acceleration between them is not known.
-    """
-
-    def __init__(self, motion: TaylorSeries, borders: Borders):
-        self.motion, self.borders = motion, borders
-        rules = [[x for name in _RULES for x in getattr(guard, name)] for guard in borders.guards] or [[0.0]]
-        self._rules = integers(motion.module, np.array(rules, float).view(np.int64))
-        self._places = integers(
-            motion.module,
-            np.array([[getattr(g, name) for name in _PLACES] for g in borders.guards] or [[0]], np.int64),
-        )
-        self.guards = len(borders.guards)
-        moves = {j: borders.moving_table(j) is not None for j in borders.clocks}
-        # The number and the piece of each clock that has knots.
-        self.knots = [(c, j) for c, j in enumerate(borders.clocks) if moves[j] or j in borders.kicking]
-        self.movable = [j for _, j in self.knots if moves[j]]
-
-    def rule(self, code: Code, g: Value, name: str) -> Any:
-        """The `side`, the `level` or the piece `beyond` of guard g, as functions of its piece."""
-        (first, kind), row = _RULES[name], Value(code, self._rules)
-        places = range(first, first + len(kind._fields))
-        return kind(*(code.load(code.element(row, g * _NUMBERS + k), DOUBLE) for k in places))
-
-    def place(self, code: Code, g: Value, name: str) -> Value:
-        """A number of another guard, or of a piece; −1 where there is none."""
-        place = g * len(_PLACES) + _PLACES.index(name)
-        return code.load(code.element(Value(code, self._places), place, INTEGER), INTEGER)
-
-    def crosses(self, frame: Frame, kind: Crossed, number: Index | None = None) -> Value:
-        """True if a step ends at a guard, or at knots: at any of them, or at that with this number."""
-        code, crosses = frame.code, frame.code.compare("==", frame["crossed"], float(kind))
-        if number is None:
-            return crosses
-        at = code.as_double(number) if isinstance(number, Value) else float(number)
-        return crosses & code.compare("==", frame["crossed_number"], code.lanes_of(at))
-
-    def crosses_knot(self, frame: Frame) -> Value:
-        """True if a step ends at knots that are parameters."""
-        at_knots = [self.crosses(frame, Crossed.KNOT, c) for c, _ in self.knots]
-        return functools.reduce(Value.__or__, at_knots, self.crosses(frame, Crossed.KNOTS))
-
-    def kicks(self, frame: Frame) -> Value:
-        """True if a step ends at a border at which L jumps."""
-        kicking, crosses = self.borders.kicking, functools.partial(self.crosses, frame)
-        ends = [crosses(Crossed.GUARD, g) for g, guard in enumerate(self.borders.guards) if guard.piece in kicking]
-        ends += [crosses(Crossed.KNOT, c) for c, j in enumerate(self.borders.clocks) if j in kicking]
-        return functools.reduce(Value.__or__, [*ends, *([crosses(Crossed.KNOTS)] if self.movable else [])])
-
-    def note_hit(self, frame: Frame, where: Value | None = None) -> None:
-        """The pieces, and which switching number the guard `crossed` has; none where a motion begins on the border.
-
-        In the lanes `where` a step ends at one, which are all of them by default.
-        """
-        motion, code = self.motion, frame.code
-        where = frame.constant(0.0) <= 0.0 if where is None else where
-        self._note_pieces(frame, where)
-        with code.loop(self.guards) as g:
-            j = self.place(code, g, "piece")
-            side = self.rule(code, g, "side")(frame["pieces_before", j])
-            hit = where & self.crosses(frame, Crossed.GUARD, g)
-            decided = code.compare("!=", side, 0.0)
-            if self.borders.kicking:  # where L jumps, a motion that begins on the border comes from what L is there
-                decided = decided | self.kicks(frame)
-            hit = hit & decided
-            with frame.where(hit):
-                frame["hit", j] = 1
-                frame["is_hit"] = Hit.BORDER
-                if self.borders.levels_move:
-                    frame["entry", j] = frame["params", j + motion.parameters] + self.rule(code, g, "level").offset
-
-    def note_knot(self, frame: Frame, where: Value) -> None:
-        """The same of knots that are parameters."""
-        if not self.knots:
-            return
-        code = frame.code
-        where = where & self.crosses_knot(frame)
-        with code.only_if(code.any_lane(where)):
-            self._note_pieces(frame, where)
-            both = where & self.crosses(frame, Crossed.KNOTS)
-            for k, (c, j) in enumerate(self.knots):
-                with frame.where(both | (where & self.crosses(frame, Crossed.KNOT, c))):
-                    # Where several coincide no rational directions of theirs cancel, to a jump of nothing.
-                    frame["hit", j] = math.exp(k)
-                    if self.borders.levels_move:
-                        entry = frame["params", j + self.motion.parameters] + code.flag(frame["h"] > 0.0)
-                        frame["entry", j] = entry
-                    frame["is_hit"] = Hit.BORDER
-            with frame.where(both):
-                frame["is_hit"] = Hit.SEVERAL
-
-    def _note_pieces(self, frame: Frame, where: Value) -> None:
-        with frame.where(where):
-            frame["is_hit"] = Hit.NONE
-            with frame.code.loop(self.motion.pieces) as j:
-                frame["hit", j] = 0.0
-                frame["pieces_before", j] = frame["params", j + self.motion.parameters]
-                if self.borders.levels_move:
-                    frame["entry", j] = 0.0
 
 
 class Saltation:
@@ -176,58 +45,48 @@ class Saltation:
 
     # ---- what jumps ----
 
-    def _sets_out(self, frame: Frame, hit: Vectors, behind: Numbers) -> Value | None:
-        """True if a cone is left at the border that is `hit`; None where there are none.
+    def _sets_out(self, frame: Frame, hit: Vectors, behind: Numbers) -> Value:
+        """True if a cone is left at the border that is `hit`.
 
         From there tangents across it follow its direction at a rate without a bound: they are not known.
         """
-        leaves = None
+        leaves, guards = frame.constant(0.0) > 0.0, self.table.borders.guards
         for share in self.table.borders.releases:
-            guard = self.table.borders.guards[share]
-            cone = self.table.borders.guards[guard.on].piece
-            here = [frame.code.compare("!=", hit[j], 0.0) for j in (guard.piece, cone)]
-            here = (here[0] | here[1]) & (behind[cone] > 0.0)
-            leaves = here if leaves is None else leaves | here
+            cone = guards[guards[share].on].piece
+            here = [frame.code.compare("!=", hit[j], 0.0) for j in (guards[share].piece, cone)]
+            leaves = leaves | ((here[0] | here[1]) & (behind[cone] > 0.0))
         return leaves
 
-    def _jumps(self, code: Code, before: Numbers, behind: Numbers, lost: Value | None) -> Callable[[Index], Value]:
+    def _jumps(self, code: Code, before: Numbers, behind: Numbers, lost: Value) -> Callable[[Index], Value]:
         """`(i)`: true if acceleration i jumps by more than rounding, or its tangents are `lost`."""
 
         def jumps(i):
             larger = code.maximum(code.intrinsic("fabs", before[i]), code.intrinsic("fabs", behind[i]))
-            differs = code.intrinsic("fabs", before[i] - behind[i]) > JUMP_NOISE * larger
-            return differs if lost is None else differs | lost
+            return lost | (code.intrinsic("fabs", before[i] - behind[i]) > JUMP_NOISE * larger)
 
         return jumps
 
-    def _kicks(self, frame: Frame, hit: Vectors) -> Value | None:
-        """True if L jumps at the border that is `hit`; None where it does nowhere."""
-        kicks = None
+    def _kicks(self, frame: Frame, hit: Vectors) -> Value:
+        """True if L jumps at the border that is `hit`."""
+        kicks = frame.constant(0.0) > 0.0
         for j in self.table.borders.kicking:
-            here = frame.code.compare("!=", hit[j], 0.0)
-            kicks = here if kicks is None else kicks | here
+            kicks = kicks | frame.code.compare("!=", hit[j], 0.0)
         return kicks
 
     def _tangent_jumps(
-        self, frame: Frame, out: Numbers, hit: Value, grazes: Value, kicks: Value | None, lost: Value | None
+        self, frame: Frame, out: Numbers, hit: Value, grazes: Value, kicks: Value, lost: Value
     ) -> Callable:
         """`(row, i, part)`: the number that is added to coordinate i of a row (part 0), or to its velocity (part 1)."""
         code, n = frame.code, self.base
         first = (len(self.jump.orders) - 1) * 2 * n
         before, behind = (_some(out, first + k * n, n) for k in range(2))
         jumps = self._jumps(code, before, behind, lost)
-        is_hit, nowhere = hit > 0.0, grazes > 0.0 if lost is None else (grazes > 0.0) | lost
-        jump_or_nan = self._jump_or_nan(code, hit, nowhere)
+        is_hit, jump_or_nan = hit > 0.0, self._jump_or_nan(code, hit, (grazes > 0.0) | lost)
 
         def added(row: int, i: Index, part: int) -> Value:
             step, moves = jump_or_nan(out[i + ((row - 1) * 2 + part) * n]), is_hit
             if self.jump.orders[row] == 1:
-                if kicks is not None:
-                    moves = is_hit & (kicks | jumps(i)) if part else is_hit & kicks
-                elif part:
-                    moves = is_hit & jumps(i)
-                else:
-                    return frame.constant(0.0)
+                moves = is_hit & (kicks | jumps(i)) if part else is_hit & kicks
             return code.select(moves, step, 0.0)
 
         return added
@@ -388,17 +247,14 @@ class Saltation:
             for part in range(2):
                 for i in motion.form.each(code, n):
                     ct = frame["state_ct", i + (part * motion.n + row * n)]
-                    if row == 0 and kicks is not None:
+                    if row == 0:
                         ct = code.select(kicks | jumps(i) if part else kicks, ct, 0.0)
-                    elif row == 0:
-                        ct = code.select(jumps(i), ct, 0.0) if part else frame.constant(0.0)
                     cotangents[i + (2 * row + part) * n] = ct
                     sum.value += code.intrinsic("fabs", ct)
         line, tables = self.jump.transposed(n, self.parameters)
         gains = motion.form.run(frame, line, *inputs, cotangents)
         moves = (frame["is_hit"] > 0.0) & ~(sum.value <= 0.0)
-        nowhere = frame["grazes"] > 0.0 if lost is None else (frame["grazes"] > 0.0) | lost
-        jump_or_nan = self._jump_or_nan(code, frame["is_hit"], nowhere)
+        jump_or_nan = self._jump_or_nan(code, frame["is_hit"], (frame["grazes"] > 0.0) | lost)
 
         def gain_at(place: Index) -> Value:
             return code.select(moves, jump_or_nan(gains[place]), 0.0)

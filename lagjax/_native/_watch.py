@@ -1,0 +1,220 @@
+"""Watches: numbers that are followed along a step against a level, and what is remembered of each.
+
+A watch looks for the instant at which its number comes to the level from its side. Where a motion begins on the level,
+or moves along it, that is remembered as a `Touch`: rounding must not decide on which side the next step begins. What
+happens at the instant is one of three things: the motion takes the piece beyond (`Border`, `_border_control`), it stops
+there, or a note is made and it continues (`_events`).
+"""
+
+import functools
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from enum import IntEnum
+from typing import Any
+
+import numpy as np
+from llvmlite import ir
+
+from lagjax._native._frame import EXACT, Fields, Frame, Index, integers
+from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
+from lagjax._native._taylor import TaylorSeries
+from lagjax._program._borders import Affine, Borders, Level
+
+# The fields of a thread's memory that say where watches end a step.
+END_OF_STEP: Fields = {
+    "planned": 1,  # the step without borders
+    "nearest": 1,  # the first border, as a part of it
+    "seen": 1,  # up to which part of the step all guards can be seen
+    "first_at": 1,  # how far from the beginning of the step the first change of a guard is
+    "event": EXACT,  # the event's code; −1 without any
+}
+
+
+class Touch(IntEnum):
+    """The contact of a number with its level where a step begins: none, of its value, of its rates too, for good.
+
+    Numbers between count the rates that are zero, and one for the value. A root that is there already is none to be
+    found, and rounding must not make one of it. A guard that `CONTINUES` was zero at the end of the last step, and is
+    so still if it has not jumped.
+    """
+
+    CONTINUES = -1
+    NONE = 0
+    VALUE = 1
+    RATE = 2
+    SECOND_RATE = 3
+    SLIDING = 4
+
+
+class Crossed(IntEnum):
+    """The border at the end of a step: none, a guard, a knot of a clock, or knots of several at one instant."""
+
+    NOTHING = 0
+    GUARD = 1
+    KNOT = 2
+    KNOTS = 3
+
+
+class Hit(IntEnum):
+    """The borders that a step ends at: none whose instant varies, one, or several at one instant."""
+
+    NONE = 0
+    BORDER = 1
+    SEVERAL = 2
+
+
+class Columns:
+    """Rows of integers as constants of a kernel, for loops over them; columns have names."""
+
+    def __init__(self, module: ir.Module, names: Sequence[str], rows: Sequence[Sequence[int]]):
+        self._names, self._data = names, integers(module, np.array(rows or [[0]], np.int64))
+
+    def read(self, code: Code, row: Value, name: str) -> Value:
+        place = row * len(self._names) + self._names.index(name)
+        return code.load(code.element(Value(code, self._data), place, INTEGER), INTEGER)
+
+
+# The rules of a guard by name, each with the place of its first number among those of the guard.
+_RULES, _NUMBERS = {"side": (0, Affine), "level": (2, Level), "beyond": (6, Affine)}, 8
+_PLACES = ("piece", "back", "slide", "on", "order", "rest", "gains", "of_table")
+
+
+@dataclass(frozen=True, eq=False)
+class Border:
+    """The watch of guard `g` of a table, in a function under construction (`_program._borders.Guard`)."""
+
+    table: "GuardTable"
+    frame: Frame
+    g: Value
+
+    def __getitem__(self, name: str) -> Value:
+        """A number of another guard, or of a piece; −1 where there is none."""
+        return self.table.places.read(self.frame.code, self.g, name)
+
+    def has(self, name: str, least: int = 0) -> Value:
+        """True, in all lanes, if a number is there, or at `least` this."""
+        code = self.frame.code
+        return code.lanes_of(code.as_double(self[name])) >= float(least)
+
+    @property
+    def touch(self) -> Value:
+        return self.frame["touch", self.g]
+
+    @property
+    def piece(self) -> Value:
+        return self.table.piece(self.frame, self["piece"])
+
+    @property
+    def is_hit(self) -> Value:
+        """True in the lanes whose step ends at this border."""
+        return self.table.crosses(self.frame, Crossed.GUARD, self.g)
+
+    @property
+    def is_cone(self) -> Value:
+        """True, in all lanes, if this is the guard of a cone, or a share."""
+        code = self.frame.code
+        return code.lanes_of(code.flag(code.compare("==", self.rule("beyond").slope, 0.0))) > 0.0
+
+    def rule(self, name: str) -> Any:
+        """The `side`, the `level` or the piece `beyond`, as functions of the piece."""
+        code, (first, kind) = self.frame.code, _RULES[name]
+        row, places = Value(code, self.table.rules), range(first, first + len(kind._fields))
+        return kind(*(code.load(code.element(row, self.g * _NUMBERS + k), DOUBLE) for k in places))
+
+    def level(self, piece: Value) -> Value:
+        code = self.frame.code
+        level = self.rule("level")(piece, lambda where, x: code.select(where, code.lanes_of(x), 0.0))
+        if any(guard.of_table for guard in self.table.borders.guards):
+            level = code.select(self.has("of_table", 1), self.frame["level", self.g], level)
+        return level
+
+
+class GuardTable:
+    """The guards of all pieces as constants of a kernel; and `knots`.
+
+    A knot is an entry of a table of parameters that the time is on, or one at which L jumps; another one of a table of
+    numbers neither varies nor matters to tangents. There are no derivatives by knots of several tables that coincide:
+    the acceleration between them is not known.
+    """
+
+    def __init__(self, motion: TaylorSeries, borders: Borders):
+        self.motion, self.borders, self.guards = motion, borders, len(borders.guards)
+        rules = [[x for name in _RULES for x in getattr(guard, name)] for guard in borders.guards] or [[0.0]]
+        self.rules = integers(motion.module, np.array(rules, float).view(np.int64))
+        self.places = Columns(motion.module, _PLACES, [[getattr(g, name) for name in _PLACES] for g in borders.guards])
+        moves = {j: borders.moving_table(j) is not None for j in borders.clocks}
+        # The number and the piece of each clock that has knots.
+        self.knots = [(c, j) for c, j in enumerate(borders.clocks) if moves[j] or j in borders.kicking]
+        self.movable = [j for _, j in self.knots if moves[j]]
+
+    def piece(self, frame: Frame, j: Index) -> Value:
+        return frame["params", j + self.motion.parameters]
+
+    def crosses(self, frame: Frame, kind: Crossed, number: Index | None = None) -> Value:
+        """True if a step ends at a guard, or at knots: at any of them, or at that with this number."""
+        code, crosses = frame.code, frame.code.compare("==", frame["crossed"], float(kind))
+        if number is None:
+            return crosses
+        at = code.as_double(number) if isinstance(number, Value) else float(number)
+        return crosses & code.compare("==", frame["crossed_number"], code.lanes_of(at))
+
+    def crosses_knot(self, frame: Frame) -> Value:
+        """True if a step ends at knots that are parameters."""
+        at_knots = [self.crosses(frame, Crossed.KNOT, c) for c, _ in self.knots]
+        return functools.reduce(Value.__or__, at_knots, self.crosses(frame, Crossed.KNOTS))
+
+    def kicks(self, frame: Frame) -> Value:
+        """True if a step ends at a border at which L jumps."""
+        kicking, crosses = self.borders.kicking, functools.partial(self.crosses, frame)
+        ends = [crosses(Crossed.GUARD, g) for g, guard in enumerate(self.borders.guards) if guard.piece in kicking]
+        ends += [crosses(Crossed.KNOT, c) for c, j in enumerate(self.borders.clocks) if j in kicking]
+        return functools.reduce(Value.__or__, [*ends, *([crosses(Crossed.KNOTS)] if self.movable else [])])
+
+    # ---- what a step ends at ----
+
+    def note_hit(self, frame: Frame, where: Value | None = None) -> None:
+        """The pieces, and which switching number the guard `crossed` has; none where a motion begins on the border.
+
+        In the lanes `where` a step ends at one, which are all of them by default.
+        """
+        code = frame.code
+        where = frame.constant(0.0) <= 0.0 if where is None else where
+        self._note_pieces(frame, where)
+        with code.loop(self.guards) as g:
+            border = Border(self, frame, g)
+            j = border["piece"]
+            decided = code.compare("!=", border.rule("side")(frame["pieces_before", j]), 0.0)
+            if self.borders.kicking:  # where L jumps, a motion that begins on the border comes from what L is there
+                decided = decided | self.kicks(frame)
+            with frame.where(where & border.is_hit & decided):
+                frame["hit", j] = 1
+                frame["is_hit"] = Hit.BORDER
+                if self.borders.levels_move:
+                    frame["entry", j] = border.piece + border.rule("level").offset
+
+    def note_knot(self, frame: Frame, where: Value) -> None:
+        """The same of knots that are parameters."""
+        if not self.knots:
+            return
+        code = frame.code
+        where = where & self.crosses_knot(frame)
+        with code.only_if(code.any_lane(where)):
+            self._note_pieces(frame, where)
+            both = where & self.crosses(frame, Crossed.KNOTS)
+            for k, (c, j) in enumerate(self.knots):
+                with frame.where(both | (where & self.crosses(frame, Crossed.KNOT, c))):
+                    # Where several coincide no rational directions of theirs cancel, to a jump of nothing.
+                    frame["hit", j] = math.exp(k)
+                    if self.borders.levels_move:
+                        frame["entry", j] = self.piece(frame, j) + code.flag(frame["h"] > 0.0)
+                    frame["is_hit"] = Hit.BORDER
+            frame.assign(both, is_hit=Hit.SEVERAL)
+
+    def _note_pieces(self, frame: Frame, where: Value) -> None:
+        with frame.where(where):
+            frame["is_hit"] = Hit.NONE
+            with frame.code.loop(self.motion.pieces) as j:
+                frame["hit", j], frame["pieces_before", j] = 0.0, self.piece(frame, j)
+                if self.borders.levels_move:
+                    frame["entry", j] = 0.0
