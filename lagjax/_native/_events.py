@@ -11,17 +11,15 @@ what is zero, the step is short, and its end is looked at.
 
 from enum import IntEnum
 
-import numpy as np
-
 from lagjax._native import _constants as limits
-from lagjax._native._frame import Fields, Frame, Lane, integers
+from lagjax._native._frame import Fields, Frame, Lane
 from lagjax._native._guards import Guards
 from lagjax._native._ir import INTEGER, Code, Value, Variable
 from lagjax._native._roots import Roots
 from lagjax._native._run_records import Output
 from lagjax._native._step import StepControl
 from lagjax._native._taylor import TaylorSeries, double
-from lagjax._native._watch import END_OF_STEP, Touch
+from lagjax._native._watch import END_OF_STEP, Columns, Touch
 from lagjax._program._borders import inputs_below
 
 
@@ -30,6 +28,9 @@ class Change(IntEnum):
 
     FALLS = 1
     RISES = 2
+
+
+MEMORY = ("side", "contact", "noted")  # of each guard from step to step
 
 
 class Events:
@@ -43,8 +44,10 @@ class Events:
         outputs = program.line.outputs[len(program.line.outputs) - self.count :]
         first_piece = program.size - motion.pieces
         piecewise = [max(inputs_below(program.line, [i]), default=-1) >= first_piece for i in outputs]
+        holds = [*guards.holds, *[False] * self.count]
         self.can_jump = any(piecewise)
-        self.table = integers(motion.module, np.array(list(zip(guards.directions, piecewise, strict=True)), np.int64))
+        rows = list(zip(guards.directions, piecewise, holds, strict=False))
+        self.table = Columns(motion.module, ("direction", "piecewise", "holds"), rows)
         self.guard = self._guard()
         self.begin_sides = self._begin_sides()
         self.note = self._note() if self.notes else None
@@ -54,27 +57,21 @@ class Events:
     def fields(guards: int) -> Fields:
         return {
             "guard": guards,  # its value
-            "side": guards,  # its sign at the end of the step
-            "side_begin": guards,  # and at the beginning
-            "contact": guards,  # a `Touch`, where a motion begins
+            "measured": (guards, 5),  # where a motion begins, the outputs of the program of `Guards`
+            "zero": guards,  # the value that counts as zero
+            "side": guards,  # its sign where the step begins
+            "contact": guards,  # a `Touch` there
+            "noted": guards,  # how often it has been noted before
+            **{f"{name}_end": guards for name in MEMORY},  # these three where the step ends
             "met": guards,  # the `Change` at the start; 0 without any
             "root_at": guards,  # how far from the beginning of the step it changes
             "change": guards,  # the `Change` there
-            "noted": guards,  # how often it has been noted
-            "noted_begin": guards,  # how often at the beginning of the step
-            "passed_at": guards,  # when the motion last went through its surface
-            "waits": guards,  # 1 if the next step decides what it does at a border
-            "waited": guards,  # 1 if the step before left that to this one
-            "noise": guards,  # the rounding of its leading term, where a motion begins
-            "lead": guards,  # its first term behind its rate that is more than rounding
-            "lead_order": guards,  # the order of that
             **END_OF_STEP,
         }
 
     def begin(self, frame: Frame, lane: Lane) -> None:
         with frame.code.loop(self.count) as g:
-            lane["passed_at", g] = float("inf")
-            for name in ("noted", "contact", "met", "waits", *(["zero"] if self.guards.is_rounded else [])):
+            for name in ("noted", "contact", "met", "zero"):
                 lane[name, g] = 0.0
 
     # ---- the guards ----
@@ -86,7 +83,7 @@ class Events:
         moved = self.motion.move_state(frame, self.motion.increments(frame, order, s)[0])
         guards = self.motion.evaluate(frame, self.guards.values.line, moved, s)
         for i in range(self.count):
-            frame["guard", i] = guards[i] - frame["zero", i] if self.guards.is_rounded else guards[i]
+            frame["guard", i] = guards[i] - frame["zero", i]
         return frame.finish()
 
     def _guard_value(self, frame: Frame, order: Value, g: Value, s: Value) -> Value:
@@ -96,11 +93,13 @@ class Events:
     def _begin_sides(self) -> Code:
         """`(order)`: for lanes at the start of a run, the side of each surface they are on, into `side`.
 
-        On the surface, to rounding, that is the side from which the motion comes. Where it goes to the other side, and
-        does so in the direction of the guard, that is a change at the start, into `met`. Otherwise, and where nobody
-        knows from where it comes, it is the side that the motion goes to. Where it goes its rate says or, where that is
-        zero to rounding too, the first term of its series that is not. The rounding of a start is that of the numbers
-        that came in.
+        On the surface, to rounding, that is the side from which the motion comes: what is remembered, as large as
+        rounding may have made the guard before it came near zero, or else that from which it can change in the
+        direction of the guard. To note what changes, it begins here. Where it goes to the other side, and does so in
+        the direction of the guard, that is a change at the start, into `met`. Otherwise, and where nobody knows from
+        where it comes, it is the side that the motion goes to. Where it goes its rate says or, where that is zero to
+        rounding too, the first term of its series that is not. The rounding of a start is that of the numbers that came
+        in.
 
         A motion that remembers may begin beyond the surface, on the other side than it comes from. Where it goes on
         that is a change at the start, too, and where the side is infinite it is one wherever the motion goes.
@@ -109,90 +108,74 @@ class Events:
         code, (order,), count = frame.code, frame.arguments, self.count
         fresh = code.compare("==", frame["steps"], 0.0)
         with code.loop(count) as g:
-            frame["contact", g] = frame["met", g] = 0.0
+            frame["met", g] = 0.0
         with code.only_if(code.any_lane(fresh)):
             frame.call(self.guard, order, limits.LITTLE * frame["h"])
-            instant = limits.INSTANT * frame["smallest"]
             out = self.motion.evaluate_now(frame, self.guards.program.line)
-            rate_noises = [self._rate_noise(frame, i, out[i + 3 * count]) for i in range(count)]
-            for i in range(count):
-                of_rate = code.intrinsic("fabs", frame["h"]) * rate_noises[i]
-                frame["noise", i] = limits.GUARD_NOISE * out[i + 2 * count] + of_rate
+            for k in range(len(self.guards.program.line.outputs) // count):
+                for i in self.motion.form.each(code, count):
+                    frame["measured", i, k] = out[i + k * count]
             with code.loop(count) as g:
-                self._note_lead(frame, order, g)
-            for i in range(count):
-                before, (value, rate, size) = self._side_before(frame, i), (out[i + k * count] for k in range(3))
-                moved, later, noise = code.intrinsic("fabs", rate), frame["guard", i], limits.GUARD_NOISE * size
-                from_there = code.intrinsic("fabs", before)
-                on_it = code.intrinsic("fabs", value) <= noise + moved * instant
-                if self.guards.remembers:
-                    on_it = on_it | (code.intrinsic("fabs", value) <= from_there)
-                elif self.guards.is_rounded:
-                    on_it = on_it | (code.intrinsic("fabs", value) <= out[i + 4 * count])
-                leaves, order_of_zero = moved > rate_noises[i], frame["lead_order", i]
-                sound = order_of_zero > 0.0
-                turn = code.select(sound, frame["lead", i], later - value)
-                bends = code.intrinsic("fabs", turn) > code.select(sound, 0.0, noise)
-                before = self._sign(frame, before)
-                unclear = code.select(code.compare("!=", before, 0.0), 0.0, turn if self.guards.is_rounded else later)
-                going = code.select(leaves, rate * frame["forward"], code.select(bends, turn, unclear))
-                there = on_it | (value * before < 0.0) if self.guards.remembers else on_it
-                goes_on = (going * before < 0.0) | ~(from_there < float("inf"))
-                met = fresh & there & goes_on & (before * float(self.guards.directions[i]) <= 0.0)
-                if any(self.guards.holds[i : i + 1]):
-                    met = met | (fresh & ~on_it & (value * float(self.guards.directions[i]) > 0.0))
-                kind = code.select(before > 0.0, Change.FALLS, Change.RISES)
-                frame["met", i] = code.select(met, kind, 0.0)
-                stays = met | code.compare("==", going, 0.0)
-                side = code.select(on_it, code.select(stays, before, going), value)
-                with frame.where(fresh):
-                    frame["side", i] = self._sign(frame, side)
-                    if self.guards.is_rounded:
-                        frame["zero", i] = code.select(on_it, value, 0.0)
-                zeros = code.select(leaves, Touch.VALUE, code.select(sound, order_of_zero, Touch.RATE))
-                frame["contact", i] = code.select(fresh & on_it, zeros, Touch.NONE)
+                self._begin_side(frame, order, g, fresh)
         return frame.finish()
 
-    def _note_lead(self, frame: Frame, order: Value, g: Value) -> None:
-        """The first term of guard g behind its rate that is more than its `noise`, and its order, for a whole step.
+    def _begin_side(self, frame: Frame, order: Value, g: Value, fresh: Value) -> None:
+        """The side of guard g, whether it changes at the start, and its contact there."""
+        code, direction, is_rounded = frame.code, self._column(frame, g, "direction"), self.guards.is_rounded
+        value, rate, size, rate_size = (frame["measured", g, k] for k in range(4))
+        later, noise, rate_noise = frame["guard", g], limits.GUARD_NOISE * size, limits.GUARD_NOISE * rate_size
+        before = frame.constant(0.0) if self.notes else 0.0 - direction  # from where it can change in its direction
+        if self.guards.remembers:
+            first = self.motion.parameters + g - 2 * self.count
+            before, rate_noise = frame["params", first], frame["params", first + self.count]
+        of_rate = code.intrinsic("fabs", frame["h"]) * rate_noise
+        lead, order_of_zero = self._lead(frame, order, g, limits.GUARD_NOISE * size + of_rate)
+        away, from_there, moved = (code.intrinsic("fabs", x) for x in (value, before, rate))
+        on_it = away <= noise + moved * (limits.INSTANT * frame["smallest"])
+        if self.guards.remembers:
+            on_it = on_it | (away <= from_there)
+        elif is_rounded:
+            on_it = on_it | (away <= frame["measured", g, 4])
+        leaves, sound = moved > rate_noise, order_of_zero > 0.0
+        turn = code.select(sound, lead, later - value)
+        bends = code.intrinsic("fabs", turn) > code.select(sound, 0.0, noise)
+        before = self._sign(frame, before)
+        unclear = code.select(code.compare("!=", before, 0.0), 0.0, turn if is_rounded else later)
+        going = code.select(leaves, rate * frame["forward"], code.select(bends, turn, unclear))
+        there = on_it | (value * before < 0.0) if self.guards.remembers else on_it
+        goes_on = (going * before < 0.0) | ~(from_there < float("inf"))
+        met = fresh & there & goes_on & (before * direction <= 0.0)
+        if any(self.guards.holds):
+            met = met | (fresh & ~on_it & (value * direction * self._column(frame, g, "holds") > 0.0))
+        frame["met", g] = code.select(met, code.select(before > 0.0, Change.FALLS, Change.RISES), 0.0)
+        side = code.select(on_it, code.select(met | code.compare("==", going, 0.0), before, going), value)
+        zeros = code.select(leaves, Touch.VALUE, code.select(sound, order_of_zero, Touch.RATE))
+        frame.assign(fresh, g, side=self._sign(frame, side), contact=code.select(on_it, zeros, Touch.NONE))
+        if is_rounded:
+            frame.assign(fresh, g, zero=code.select(on_it, value, 0.0))
+
+    def _lead(self, frame: Frame, order: Value, g: Value, noise: Value) -> tuple[Value, Value]:
+        """The first term of guard g behind its rate that is more than noise, and its order, for a whole step.
 
         The order is one more than the last one where all terms are rounding, and 0 where there is no series.
         """
-        code, degree, j = frame.code, self.motion.followed_degree(frame.code, order), g + self.first
-
-        def power_after(k: Value) -> Value:
-            return self.motion.followed_coefficient(frame, j, k) * power.value
-
-        power, size = code.variable(frame["h"]), code.variable(frame.constant(0.0))
+        code, degree = frame.code, self.motion.followed_degree(frame.code, order)
+        self.roots.polynomial(frame, g + self.first, degree, frame["h"], frame.constant(1.0), 0.0)
+        size, lead = (code.variable(frame.constant(0.0)) for _ in range(2))
         with code.loop(degree + 1, start=1) as k:
-            size.value += code.intrinsic("fabs", power_after(k))
-            power.value = power.value * frame["h"]
-        noise, power = frame["noise", g] + limits.GUARD_NOISE * size.value, code.variable(frame["h"])
-        last = code.select(noise < float("inf"), code.lanes_of(code.as_number(degree + 1)), 0.0)
-        frame["lead", g], frame["lead_order", g] = 0.0, last
+            size.value += code.intrinsic("fabs", frame["poly", k])
+        noise = noise + limits.GUARD_NOISE * size.value
+        at = code.variable(code.select(noise < float("inf"), code.lanes_of(code.as_number(degree + 1)), 0.0))
         with code.loop(degree + 1, start=2) as k:
-            power.value = power.value * frame["h"]
-            term = power_after(k)
-            is_first = code.compare("==", frame["lead", g], 0.0) & (code.intrinsic("fabs", term) > noise)
-            with frame.where(is_first):
-                frame["lead", g] = term
-                frame["lead_order", g] = code.lanes_of(code.as_number(k))
+            term = frame["poly", k]
+            is_first = code.compare("==", lead.value, 0.0) & (code.intrinsic("fabs", term) > noise)
+            lead.value = code.select(is_first, term, lead.value)
+            at.value = code.select(is_first, code.lanes_of(code.as_number(k)), at.value)
+        return lead.value, at.value
 
-    def _rate_noise(self, frame: Frame, i: int, size: Value) -> Value:
-        """The rounding of the rate of surface i, whose terms have this size; or what is remembered of it."""
-        if self.guards.remembers:
-            return frame["params", self.motion.parameters - self.count + i]
-        return limits.GUARD_NOISE * size
-
-    def _side_before(self, frame: Frame, i: int) -> Value:
-        """The side of surface i from which a motion comes that begins on it, as a sign; 0 where that is unknown.
-
-        It comes from where it can change in the direction of the guard. To note what changes, it begins here. What is
-        remembered is as large as rounding may have made the guard, before it came near zero.
-        """
-        if self.guards.remembers:
-            return frame["params", self.motion.parameters - 2 * self.count + i]
-        return frame.constant(0.0 if self.notes else -float(self.guards.directions[i]))
+    def _column(self, frame: Frame, g: Value, name: str) -> Value:
+        code = frame.code
+        return code.lanes_of(code.as_double(self.table.read(code, g, name)))
 
     def _sign(self, frame: Frame, x: Value) -> Value:
         code = frame.code
@@ -202,26 +185,21 @@ class Events:
 
     def stop(self, frame: Frame, order: Value) -> None:
         """Look along the step. It ends at the earliest change of all guards, or as far as these can be seen."""
-        code = frame.code
+        code, planned = frame.code, frame["h"]
         frame.call(self.begin_sides, order)
-        planned = frame["h"]
-        with code.loop(self.count) as g:
-            frame["side_begin", g], frame["noted_begin", g] = frame["side", g], frame["noted", g]
-            frame["waited", g], frame["waits", g] = frame["waits", g], 0.0
         frame.call(self.look, order)
-        size = code.intrinsic("fabs", frame["h"])
+        size = code.intrinsic("fabs", frame["h"])  # 0 where a guard has no value
         cut = (frame["seen"] < 1.0) & (frame["seen"] * size < frame["first_at"])
         with code.only_if(code.any_lane(cut)):
             least = limits.INSTANT * frame["smallest"]
             after = code.maximum(frame["seen"] * size, code.select(least < size, least, size))
-            with frame.where(cut):
-                frame["h"] = after * frame["forward"]
-                frame["last"] = 0.0
-            with code.loop(self.count) as g:
-                frame["side", g], frame["noted", g] = frame["side_begin", g], frame["noted_begin", g]
+            frame.assign(cut, h=after * frame["forward"], last=0.0)
             frame.call(self.look, order)
         if not self.notes:
             self._end_at_first(frame)
+        with code.loop(self.count) as g:
+            for name in MEMORY:
+                frame[name, g] = frame[f"{name}_end", g]
         with code.only_if(code.any_lane(code.compare("!=", frame["h"], planned))):
             frame.call(self.step.defect, order, double(code, 1.0))  # leaves the increment of the new step
             if self.step.projector is not None:
@@ -230,18 +208,13 @@ class Events:
     def _end_at_first(self, frame: Frame) -> None:
         """The step ends at the earliest change, and the motion there; `event` tells of all at that instant."""
         code, event = frame.code, frame.code.variable(frame.constant(0.0))
-        happens = frame["first_at"] < float("inf")
-        latest, power = frame["first_at"] + frame["smallest"], code.variable(frame.constant(1.0))
+        happens, power = frame["first_at"] < float("inf"), code.variable(frame.constant(1.0))
         with code.loop(self.count) as g:
-            of = power.value
-            now = happens & (frame["root_at", g] <= latest)
-            more = code.select(now, frame["change", g] * of, 0.0)
-            event.value += more
-            power.value = 4.0 * of
+            now = happens & (frame["root_at", g] <= frame["first_at"] + frame["smallest"])
+            event.value += code.select(now, frame["change", g] * power.value, 0.0)
+            power.value = 4.0 * power.value
         frame["event"] = code.select(happens, event.value, -1.0)
-        with frame.where(happens):
-            frame["last"] = 0.0
-            frame["h"] = frame["first_at"] * frame["forward"]
+        frame.assign(happens, last=0.0, h=frame["first_at"] * frame["forward"])
 
     def _look(self) -> Code:
         """`(order)`: the changes of all guards along the step."""
@@ -249,26 +222,24 @@ class Events:
         code, (order,) = frame.code, frame.arguments
         frame["seen"], frame["first_at"] = 1.0, float("inf")
         with code.loop(self.count) as g:
-            met = frame["met", g]
-            at = code.select(met > 0.0, 0.0, float("inf"))
-            frame["root_at", g], frame["change", g] = at, met
-            with frame.where(met > 0.0):
-                frame["first_at"] = 0.0
-        with code.loop(self.count) as g:
             self._look_at(frame, order, g)
         return frame.finish()
 
     def _look_at(self, frame: Frame, order: Value, g: Value) -> None:
-        code, roots, h = frame.code, self.roots, frame["h"]
-        degree, j = self.motion.followed_degree(code, order), g + self.first
-        moving, value = code.compare("!=", h, 0.0) & (frame["met", g] <= 0.0), self.motion.followed_value(frame, j)
-        side, zero = frame["side", g], frame["zero", g] if self.guards.is_rounded else 0.0
-        value = value - zero if self.guards.is_rounded else value
-        side = code.select(code.compare("==", side, 0.0), self._sign(frame, value), side)
-        roots.polynomial(frame, j, degree, h, side, zero)
-        clear = self._is_clear(frame, degree)
-        with code.only_if(code.any_lane(moving & ~clear)):
-            self._look_closely(frame, order, g, degree, side)
+        code, h, met, side = frame.code, frame["h"], frame["met", g], frame["side", g]
+        moving, happened = code.compare("!=", h, 0.0), met > 0.0
+        frame["change", g], frame["root_at", g] = met, code.select(happened, 0.0, float("inf"))
+        frame.assign(happened, first_at=0.0)
+        frame["side_end", g], frame["noted_end", g] = side, frame["noted", g]
+        frame["contact_end", g] = code.select(moving, Touch.NONE, frame["contact", g])
+        degree, j, zero = self.motion.followed_degree(code, order), g + self.first, frame["zero", g]
+        side = code.select(
+            code.compare("==", side, 0.0), self._sign(frame, self.motion.followed_value(frame, j) - zero), side
+        )
+        self.roots.polynomial(frame, j, degree, h, side, zero)
+        moving = moving & ~happened
+        with code.only_if(code.any_lane(moving & ~self._is_clear(frame, degree))):
+            self._look_closely(frame, order, g, degree, side, moving)
 
     def _is_clear(self, frame: Frame, degree: Value) -> Value:
         """The lanes whose polynomial has no root, as its coefficients alone tell; most often that is all."""
@@ -284,16 +255,12 @@ class Events:
         size = start + falls + rises
         return (start > falls + last) & ~self._is_long(last, before, size)
 
-    def _look_closely(self, frame: Frame, order: Value, g: Value, degree: Value, side: Value) -> None:
+    def _look_closely(self, frame: Frame, order: Value, g: Value, degree: Value, side: Value, moving: Value) -> None:
         code, roots, h = frame.code, self.roots, frame["h"]
         size, value = roots.size(frame, degree), frame["poly", 0]
         self._leave_surface(frame, g, degree, size)
-        moving = code.compare("!=", h, 0.0) & (frame["met", g] <= 0.0)
         unknown = moving & ~(code.intrinsic("fabs", value) < float("inf"))
-        with frame.where(unknown):
-            frame["code"] = float(limits.NOT_FINITE)
-            frame["last"] = 0.0
-        frame["h"] = code.select(unknown, 0.0, h)
+        frame.assign(unknown, code=float(limits.NOT_FINITE), last=0.0, h=0.0)
         sound, moving = size < float("inf"), moving & ~unknown
 
         def is_long():
@@ -313,8 +280,7 @@ class Events:
         ahead = code.variable(side)
         self._follow_roots(frame, order, g, degree, ahead, moving & sound)
         self._bisect_change(frame, order, g, ahead, moving & ~sound)
-        with frame.where(moving):
-            frame["side", g] = ahead.value
+        frame.assign(moving, g, side_end=ahead.value)
 
     def _is_long(self, last: Value, before: Value, size: Value) -> Value:
         """The lanes whose last terms are large, or do not fall: the polynomial may leave out as much as they are."""
@@ -323,11 +289,8 @@ class Events:
     def _leave_surface(self, frame: Frame, g: Value, degree: Value, size: Value) -> None:
         """A motion that begins on the surface, or has just gone through it, is not to do so by rounding."""
         code, contact = frame.code, frame["contact", g]
-        since = code.intrinsic("fabs", frame["t"] - frame["passed_at", g])
-        known = (since <= limits.INSTANT * frame["smallest"]) | (frame["waited", g] > 0.0)
-        on = (contact > Touch.NONE) | (known & (code.intrinsic("fabs", frame["poly", 0]) <= limits.CONTINUOUS * size))
-        with frame.where(on):
-            frame["poly", 0] = 0.0
+        near = code.intrinsic("fabs", frame["poly", 0]) <= limits.CONTINUOUS * size
+        frame.assign((contact > Touch.NONE) | ((contact < Touch.NONE) & near), 0, poly=0.0)
         with code.only_if(code.any_lane(contact > Touch.VALUE)), code.loop(degree + 1, start=1) as k:
             c, is_zero = frame["poly", k], contact > code.lanes_of(code.as_number(k))
             frame["poly", k] = code.select(is_zero & (c < 0.0), 0.0, c)
@@ -342,41 +305,35 @@ class Events:
 
         with code.repeat_while(lambda: code.any_lane(searching()), at_most=limits.MOST_CHANGES):
             frame.call(self.roots.next_root, degree)
-            root, part = frame["root"], frame["part"]
-            is_root = searching() & (root < 1.0) & (frame["is_root"] > 0.0)
-            seen = code.select(root < 1.0, root * part, code.select(part < 1.0, part, 1.0))
-            self._see(frame, searching() & ~is_root, seen)
+            root = frame["root"]
+            is_root = searching() & self.roots.is_found(frame)
+            self._see(frame, searching() & ~is_root, self.roots.place(frame, 1.0))
             waits = is_root & self._waits(frame, g)
-            with frame.where(waits):
-                frame["waits", g] = 1
+            frame.assign(waits, g, contact_end=Touch.CONTINUES)
             changes = is_root & ~waits
             with code.only_if(code.any_lane(changes)):
                 s = self._exact(frame, order, g, changes, ahead.value)
                 inside = code.intrinsic("fabs", s) <= code.intrinsic("fabs", frame["h"])  # else of the next step
                 goes_on = self._take(frame, order, g, changes & inside, s, ahead)
                 self.roots.turn(frame, degree, goes_on)
-                with frame.where(goes_on):
-                    frame["begin"] = root
+                frame.assign(goes_on, begin=root)
                 looking.value = code.flag(goes_on)
             looking.value = code.select(changes, looking.value, 0.0)
         self._see(frame, searching(), frame["begin"] * frame["part"])
 
     def _see(self, frame: Frame, where: Value, seen: Value) -> None:
-        """Note, in some lanes, that a guard is seen only up to a part of the step, the first time it is looked at."""
-        less = where & (seen < frame["seen"])
-        with frame.where(less):
-            frame["seen"] = seen
+        """Note, in some lanes, that a guard is seen only up to a part of the step."""
+        frame.assign(where & (seen < frame["seen"]), seen=seen)
 
     def _waits(self, frame: Frame, g: Value) -> Value:
         """True if the next step decides what guard g does: this step ends at the guard's own border."""
         code = frame.code
         if not self.can_jump:
             return frame.constant(0.0) > 1.0
-        piecewise = code.load(code.element(Value(code, self.table), g * 2 + 1, INTEGER), INTEGER)
         at_border = (frame["crossed"] > 0.0) & code.compare("==", frame["h"], frame["nearest"] * frame["planned"])
         left = (1.0 - frame["root"] * frame["part"]) * code.intrinsic("fabs", frame["slope"])
         at_border = at_border & (frame["root"] > 0.0)  # else it has jumped already
-        return (left <= 8.0 * frame["error"]) & at_border & (code.lanes_of(code.as_double(piecewise)) > 0.0)
+        return (left <= 8.0 * frame["error"]) & at_border & (self._column(frame, g, "piecewise") > 0.0)
 
     def _exact(self, frame: Frame, order: Value, g: Value, where: Value, side: Value) -> Value:
         """The time of a root, by Newton's steps on the guard itself; a root at 0 is where it has jumped."""
@@ -405,9 +362,8 @@ class Events:
     def _take(self, frame: Frame, order: Value, g: Value, changes: Value, s: Value, ahead: Variable) -> Value:
         """Changes at the times s: the event, or a note, where they are in the direction; which lanes go on beyond."""
         code, side = frame.code, ahead.value
-        direction = code.load(code.element(Value(code, self.table), g * 2, INTEGER), INTEGER)
-        direction = code.lanes_of(code.as_double(direction))
-        counts = changes & ~(side * direction > 0.0)
+        size = code.intrinsic("fabs", s)
+        counts = changes & ~(side * self._column(frame, g, "direction") > 0.0)
         if self.notes:
             assert self.note is not None
             frame["is_due"] = counts
@@ -415,18 +371,12 @@ class Events:
                 frame.call(self.note, order, g, s)
             goes_on = changes
         else:
-            size = code.intrinsic("fabs", s)
-            with frame.where(counts):
-                frame["root_at", g] = size
-                frame["change", g] = code.select(side > 0.0, Change.FALLS, Change.RISES)
-            sooner = counts & (size < frame["first_at"])
-            with frame.where(sooner):
-                frame["first_at"] = size
+            frame.assign(counts, g, root_at=size, change=code.select(side > 0.0, Change.FALLS, Change.RISES))
+            frame.assign(counts & (size < frame["first_at"]), first_at=size)
             goes_on = changes & ~counts
         ahead.value = code.select(goes_on, 0.0 - side, side)
-        now = frame["t"] + (frame["t_low"] + s)
-        with frame.where(goes_on):
-            frame["passed_at", g] = now
+        left = code.intrinsic("fabs", frame["h"]) - size
+        frame.assign(goes_on & (left <= limits.INSTANT * frame["smallest"]), g, contact_end=Touch.CONTINUES)
         return goes_on
 
     def _bisect_change(self, frame: Frame, order: Value, g: Value, ahead: Variable, where: Value) -> None:
@@ -454,8 +404,8 @@ class Events:
         with code.loop(self.motion.width) as k:
             lane = frame.lane(k)
             with code.only_if(lane["is_due"] > 0.0):
-                number = lane["noted", g]
-                lane["noted", g] = number + 1.0
+                number = lane["noted_end", g]
+                lane["noted_end", g] = number + 1.0
                 with code.only_if(number < code.as_double(frame.job("room_of_notes"))):
                     row = self._row(frame, lane["member"], g, code.as_integer(number))
                     frame.write("path", row, lane["reached"])

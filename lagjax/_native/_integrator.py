@@ -71,8 +71,6 @@ class Integrator:
             fields |= Projector.fields(n) | _rank_drops.fields(n, self.guards)
         if guards is not None:
             fields |= Roots.fields(MAX_ORDER + 2)
-            if guards.is_rounded:
-                fields["zero"] = self.guards  # the value of a guard that counts as zero
         if borders is not None:
             fields |= BorderControl.fields(borders)
         jump = parts.jump

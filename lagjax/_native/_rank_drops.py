@@ -18,6 +18,7 @@ def fields(n: int, guards: int) -> Fields:
         "y_before": 2 * n,
         "low_before": 2 * n,
         "side_before": guards,
+        "contact_before": guards,
         "noted_before": guards,
         "t_before": EXACT,
         "t_low_before": EXACT,
@@ -57,7 +58,7 @@ def retry_last_long_step(frame: Frame, form: Lines | Tables, states: int, guards
 
 def _beginnings(frame: Frame, form: Lines | Tables, states: int, guards: int) -> Iterator[tuple[tuple, tuple]]:
     """The fields that a step begins with, each with the one that keeps it of the last long step."""
-    fields = dict.fromkeys(("y", "low"), states) | dict.fromkeys(("side", "noted"), guards)
+    fields = dict.fromkeys(("y", "low"), states) | dict.fromkeys(("side", "contact", "noted"), guards)
     for name, count in (fields | dict.fromkeys(("t", "t_low", "steps"), 1)).items():
         for i in form.each(frame.code, count):
             yield (name, i), (name + "_before", i)
