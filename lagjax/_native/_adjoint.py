@@ -133,18 +133,15 @@ class Adjoint:
         """The bound of the last terms of the series of a tangent, from the transpose of the last order."""
         frame = self.motion.function("measured")
         code, form, n, order = frame.code, self.motion.form, self.motion.n, frame.job("order")
-        h, p = code.lanes_of(code.intrinsic("fabs", frame["h"])), code.as_number(frame.job("order"))
-
-        def size(x):
-            return code.intrinsic("fabs", x)
+        h, p = code.lanes_of(abs(frame["h"])), code.as_number(frame.job("order"))
 
         def change(i):
             return frame["y_ct", i, order - 1] - frame["before", i]
 
         # The Jacobian of the acceleration, times the cotangents: a frequency squared, and a rate of decay.
-        velocities = form.largest(code, lambda i: size(frame["y_ct", i + n, order]), n)
-        squared = form.largest(code, lambda i: size(change(i)), n)
-        decay = form.largest(code, lambda i: size(change(i + n) - frame["y_ct", i, order] / p), n)
+        velocities = form.largest(code, lambda i: abs(frame["y_ct", i + n, order]), n)
+        squared = form.largest(code, lambda i: abs(change(i)), n)
+        decay = form.largest(code, lambda i: abs(change(i + n) - frame["y_ct", i, order] / p), n)
         rate = p * decay / velocities + code.intrinsic("sqrt", p * squared / velocities)
         rate = code.select(velocities > 0.0, rate, 0.0)
         term, power = code.variable(frame.constant(1.0)), code.variable(frame.constant(1.0))
@@ -155,10 +152,10 @@ class Adjoint:
         # The last coefficient of the rows, beside the first two, which may both be near a zero.
         last, first, rows = code.lanes_of(0.0), code.lanes_of(0.0), self.motion.series.rows
         if rows:
-            last = form.largest(code, lambda i: size(frame["rows", i, order - 1]), rows)
+            last = form.largest(code, lambda i: abs(frame["rows", i, order - 1]), rows)
             first = form.largest(
                 code,
-                lambda i: code.maximum(size(frame["rows", i, 1]), size(frame["rows", i, 2]) * h),
+                lambda i: code.maximum(abs(frame["rows", i, 1]), abs(frame["rows", i, 2]) * h),
                 self.motion.series.rows,
             )
         tail = code.select(first > 0.0, NEAR_ZERO * last * power.value / first, 0.0)

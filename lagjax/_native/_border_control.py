@@ -23,7 +23,7 @@ from lagjax._native._roots import Roots
 from lagjax._native._saltation import Saltation
 from lagjax._native._step import absolute_tolerance
 from lagjax._native._taylor import TaylorSeries, integer
-from lagjax._native._watch import Border, Crossed, GuardTable, Touch
+from lagjax._native._watch import Border, Crossed, GuardTable, Touch, end_at_border, reaches_border
 from lagjax._program import _borders
 from lagjax._program._borders import BELOW, FALLS, GROWS, SQUARED, UP_TO, Feature
 from lagjax._program._jump import Jump, Nesting
@@ -119,11 +119,10 @@ class BorderControl:
             for j in self.motion.form.each(code, self.pieces):
                 frame.assign(undecided, j + self.motion.parameters, params=pieces[j])
                 frame.assign(undecided, j, stays=0.0)
-            with code.loop(len(self.guards)) as g:
-                border = Border(self.table, frame, g)
+            for border in self.table.each(frame):
                 slide = border["slide"]
-                with code.only_if((slide >= 0) & code.compare("==", g, border["rest"])):
-                    frame.assign(undecided & (self.table.piece(frame, slide) > 0.0), g, touch=Touch.SLIDING)
+                with code.only_if((slide >= 0) & code.compare("==", border.g, border["rest"])):
+                    frame.assign(undecided & (self.table.piece(frame, slide) > 0.0), border.g, touch=Touch.SLIDING)
             frame["undecided"] = 0.0
         return frame.finish()
 
@@ -148,10 +147,10 @@ class BorderControl:
             self._note_levels(frame)
             if self.slides:
                 frame["slides"] = 0.0
-                with code.loop(len(self.guards)) as g:
-                    frame.assign(frame["touch", g] >= Touch.SLIDING, slides=1)
-            with code.loop(len(self.guards)) as g:
-                self._look(frame, Border(self.table, frame, g), degree, h)
+                for border in self.table.each(frame):
+                    frame.assign(border.touch >= Touch.SLIDING, slides=1)
+            for border in self.table.each(frame):
+                self._look(frame, border, degree, h)
         frame["next_approach"] = 0.0
         first = 0
         for feature, row in itertools.groupby(self.borders.features):  # which shares its code: as of a chain's bonds
@@ -164,17 +163,9 @@ class BorderControl:
         if self.borders.kicking:
             self._look_at_end(frame, degree, h)
             cut = cut | self.table.kicks(frame)
-        frame["h"] = self._end(frame)
+        frame["h"] = end_at_border(frame)
         frame.assign(cut, last=0.0, **self.forgotten)
         return frame.finish()
-
-    def _end(self, frame: Frame) -> Value:
-        """The step up to the border."""
-        return frame["nearest"] * frame["planned"]
-
-    def reaches(self, frame: Frame) -> Value:
-        """True if the step goes as far as to the border."""
-        return frame.code.compare("==", frame["h"], self._end(frame))
 
     def _look(self, frame: Frame, border: Border, degree: Value, h: Value) -> None:
         """Note where a guard is crossed, if that is sooner than what was noted before."""
@@ -185,7 +176,7 @@ class BorderControl:
         idle = (border.touch >= Touch.SLIDING) | (undecided & is_share)
         with code.only_if(code.any_lane(~idle)):
             self.roots.polynomial(frame, border["piece"], degree, h, code.select(undecided, 1.0, side), level)
-            at_limit = (code.intrinsic("fabs", frame["poly", 0]) <= limits.JUMP_NOISE) & (frame["steps"] > 0.0)
+            at_limit = (abs(frame["poly", 0]) <= limits.JUMP_NOISE) & (frame["steps"] > 0.0)
             if self.borders.releases:
                 self._limit_growth(frame, border, level)
             comes = ~undecided & (~is_share | at_limit) & (border.touch <= Touch.NONE)
@@ -223,7 +214,7 @@ class BorderControl:
         touches = border.touch > Touch.NONE
         if self.slides:  # along u = 0 another border of |u| is there by rounding
             touches = touches | (frame["slides"] > 0.0)
-        first = [code.intrinsic("fabs", frame["poly", k]) for k in range(3)]  # the last ones may have become zero
+        first = [abs(frame["poly", k]) for k in range(3)]  # the last ones may have become zero
         return (nothing & touches) | (first[0] + first[1] + first[2] < frame.digits.tiny)
 
     def _note_first(self, frame: Frame, border: Border, h: Value, piece: tuple, comes: Value, idle: Value) -> None:
@@ -233,12 +224,12 @@ class BorderControl:
         """
         code, (undecided, beyond, leads) = frame.code, piece
         # At rest but for what it gains in so little time: u̇ is of the size of ü t.
-        gain = 4.0 * (code.intrinsic("fabs", frame["poly", 2]) * frame["root"])
-        at_rest = (border.touch > Touch.NONE) | (code.intrinsic("fabs", frame["poly", 1]) <= gain)
+        gain = 4.0 * (abs(frame["poly", 2]) * frame["root"])
+        at_rest = (border.touch > Touch.NONE) | (abs(frame["poly", 1]) <= gain)
         # A number that is zero leaves zero as its first coefficient says, or stays.
         leaves = undecided & code.compare("!=", leads, 0.0)
         root = code.select(undecided, code.select(leaves, 0.0, 2.0), self.roots.place(frame, 2.0))
-        instant = limits.NO_TIME * frame["smallest"] / code.intrinsic("fabs", h)
+        instant = limits.NO_TIME * frame["smallest"] / abs(h)
         root = code.select(comes & (root < instant) & (instant < 1.0), instant, root)
         is_root = leaves | (~undecided & self.roots.is_found(frame))
         # Of two at one instant that of the piece on which the other one depends, which comes first, is crossed.
@@ -253,8 +244,7 @@ class BorderControl:
         code = frame.code
 
         def early():
-            is_root = (frame["is_root"] > 0.0) & (frame["poly", 0] > 0.0)
-            return is_root & (frame["root"] < limits.EARLY)
+            return (frame["is_root"] > 0.0) & (frame["poly", 0] > 0.0) & (frame["root"] < limits.EARLY)
 
         with code.repeat_while(lambda: code.any_lane(early()), at_most=limits.MOST_LOOKS):
             straight = 0.0 - 4.0 * frame["poly", 0] / frame["poly", 1]  # for a root that is zero to rounding
@@ -291,8 +281,7 @@ class BorderControl:
         """The step ends at the next entry of a table that the time is on, which is known."""
         code = frame.code
         left, inside = self._time_to_next_knot(frame, j)
-        left = code.maximum(left, frame.constant(0.0))
-        size = code.intrinsic("fabs", h)
+        left, size = code.maximum(left, frame.constant(0.0)), abs(h)
         nearest = frame["nearest"] * size
         if self.borders.kicking and j not in self.borders.kicking:  # of several at one instant a kick counts
             nearest = nearest - self._instant(frame)
@@ -307,11 +296,11 @@ class BorderControl:
 
     def _note_coincidence(self, frame: Frame, h: Value) -> None:
         """Entries of several tables at one instant, one of which may be moved."""
-        code, end = frame.code, frame["nearest"] * frame.code.intrinsic("fabs", h)
+        code, end = frame.code, frame["nearest"] * abs(h)
         count, moves = frame.constant(0.0), frame.constant(0.0)
         for j in self.borders.clocks:
             left, inside = self._time_to_next_knot(frame, j)
-            at_once = inside & (frame["crossed"] > 0.0) & (code.intrinsic("fabs", left - end) <= self._instant(frame))
+            at_once = inside & (frame["crossed"] > 0.0) & (abs(left - end) <= self._instant(frame))
             count = count + code.flag(at_once)
             if j in self.table.movable:
                 moves = moves + code.flag(at_once)
@@ -319,7 +308,7 @@ class BorderControl:
 
     def _instant(self, frame: Frame) -> Value:
         """The largest difference of two times that count as the same."""
-        return frame.code.maximum(frame.code.intrinsic("fabs", frame["t"]), frame["smallest"]) * (4.0 * limits.EPS)
+        return frame.code.maximum(abs(frame["t"]), frame["smallest"]) * (4.0 * limits.EPS)
 
     def _note_levels(self, frame: Frame) -> None:
         """The levels of guards that change: entries on both sides of the pieces of tables, and the speeds of cones."""
@@ -352,7 +341,7 @@ class BorderControl:
         rise = code.lanes_of(code.as_double(degree)) * (limits.RISE / feature.scale)
         near = ~((moves < rise) & (last < limits.ARGUMENT))
         if feature.kind == FALLS:
-            size = code.intrinsic("fabs", self.motion.followed_value(frame, j))
+            size = abs(self.motion.followed_value(frame, j))
             # The base of the power may fall by this in a step of the least order.
             fall = max(math.exp(-limits.RISE * (limits.LEAST_ORDER - 1) / feature.scale), limits.LARGEST_FALL)
             near = ~(moves < (1.0 - fall) * size)
@@ -363,10 +352,10 @@ class BorderControl:
 
     def _moves(self, frame: Frame, j: Value, degree: Value, h: Value) -> tuple[Value, Value]:
         """The largest change of a number along the step, Σ |cₖ| for k > 0, and the last of these terms."""
-        code, size, sum = frame.code, frame.code.intrinsic("fabs", h), frame.constant(0.0)
+        code, size, sum = frame.code, abs(h), frame.constant(0.0)
 
         def coefficient(k: Value) -> Value:
-            return code.intrinsic("fabs", self.motion.followed_coefficient(frame, j, k))
+            return abs(self.motion.followed_coefficient(frame, j, k))
 
         for i in range(3):
             sum = (sum + coefficient(degree - i)) * size
@@ -429,7 +418,7 @@ class BorderControl:
     def _approach(self, frame: Frame, kind: int, h: Value, matters: Value, root: Value) -> tuple[Value, Value]:
         """Steps end ever nearer to where no series begins, until that is near; and then beyond it, where one does."""
         code, found = frame.code, self.roots.is_found(frame)
-        way, whole = frame["root"] * frame["part"], code.intrinsic("fabs", h)
+        way, whole = frame["root"] * frame["part"], abs(h)
         nearby = (limits.NEARBY if kind == UP_TO else limits.NARROWEST) * code.maximum(whole, frame["approach"])
         far = way * whole > nearby
         frame.assign(matters & far & found, next_approach=code.maximum(whole, frame["approach"]))
@@ -443,7 +432,7 @@ class BorderControl:
     def settle(self, frame: Frame) -> None:
         """A step that has become shorter than planned does not reach its border."""
         code = frame.code
-        frame["crossed"] = code.select(self.reaches(frame), frame["crossed"], Crossed.NOTHING)
+        frame["crossed"] = code.select(reaches_border(frame), frame["crossed"], Crossed.NOTHING)
         frame["stepped"] = stepped = code.compare("!=", frame["h"], 0.0)
         if self.borders.kicking:  # steps that are recorded: those of no length, too, where a kick begins or ends them
             stepped = stepped | (self.table.kicks(frame) & ~self._begins_behind(frame))
@@ -472,14 +461,14 @@ class BorderControl:
             error, rounding = (code.variable(frame.constant(0.0)) for _ in range(2))
             for part in range(2):
                 for i in motion.form.each(code, base):
-                    slope = code.intrinsic("fabs", slopes[i + part * base])
-                    size = slope * code.intrinsic("fabs", state[i + part * n])
+                    slope = abs(slopes[i + part * base])
+                    size = slope * abs(state[i + part * n])
                     rounding.value += size * limits.EPS
                     error.value += rtol * size + slope * code.lanes_of(atol)
             rate, bend = self._rates(frame, order)
             is_hit = ends & (frame["is_hit"] > 0.0)
             for name, by in (("grazes", error.value), ("stops", rounding.value)):
-                frame.assign(is_hit & (rate * rate <= 2.0 * (code.intrinsic("fabs", bend) * by)), **{name: 1})
+                frame.assign(is_hit & (rate * rate <= 2.0 * (abs(bend) * by)), **{name: 1})
         return frame.finish()
 
     def _rates(self, frame: Frame, order: Value) -> tuple[Value, Value]:
@@ -499,12 +488,12 @@ class BorderControl:
         stepped, crosses, was_cut = frame["stepped"] > 0.0, frame["crossed"] > Crossed.NOTHING, frame["nearest"] < 1.0
         if self.retraction is not None:  # borders that are left before the step begins do not take the state
             self.retraction.undo(frame, ~stepped)
-        with code.loop(len(self.guards)) as g:
-            frame.assign(stepped & (frame["touch", g] < Touch.SLIDING), g, touch=Touch.NONE)
+        for border in self.table.each(frame):
+            frame.assign(stepped & (border.touch < Touch.SLIDING), border.g, touch=Touch.NONE)
         with code.only_if(code.any_lane(crosses | was_cut)):
             # What a cut step was to be says more about the next one than what it became.
-            longest = limits.GROWTH * code.intrinsic("fabs", frame["planned"])
-            frame.assign(was_cut & self.reaches(frame), longest=longest, h=frame["planned"])
+            longest = limits.GROWTH * abs(frame["planned"])
+            frame.assign(was_cut & reaches_border(frame), longest=longest, h=frame["planned"])
             if self.note is not None:
                 frame.call(self.note)
             if self.borders.release.outputs:
@@ -533,8 +522,8 @@ class BorderControl:
         line = eliminate_dead_code(self.borders.program.line, [self.borders.switches[j] for j in shaken])
         before = self.motion.evaluate_now(frame, line) if shaken else []
         before = [code.variable(before[k]) for k in range(len(shaken))]
-        with code.loop(len(self.guards)) as g:
-            self._take_beyond(frame, Border(self.table, frame, g))
+        for border in self.table.each(frame):
+            self._take_beyond(frame, border)
         for j in self.borders.clocks:  # all whose next entry the time has come to, at one instant
             left, inside = self._time_to_next_knot(frame, j)
             passes = going & inside & (left <= self._instant(frame))
@@ -542,8 +531,8 @@ class BorderControl:
         self._decide_others(frame, going)
         after = self.motion.evaluate_now(frame, line) if shaken else []
         for k, j in enumerate(shaken):
-            jump = code.intrinsic("fabs", after[k] - before[k].value)
-            least = code.intrinsic("fabs", after[k]) * frame.digits.round_off + code.lanes_of(absolute_tolerance(frame))
+            jump = abs(after[k] - before[k].value)
+            least = abs(after[k]) * frame.digits.round_off + code.lanes_of(absolute_tolerance(frame))
             self._let_go(frame, going & (jump > least), [j])
         if shaken:
             self._decide_others(frame, going)
@@ -558,15 +547,13 @@ class BorderControl:
 
     def _decide_others(self, frame: Frame, going: Value) -> None:
         """Decide the pieces anew that touch no border, where one is crossed on which others depend."""
-        code = frame.code
         if not self.borders.nested:
             return
-        with code.loop(self.pieces) as j:
+        with frame.code.loop(self.pieces) as j:
             frame["stays", j] = 0.0
         for j in self.borders.clocks:
             frame["stays", j] = 1.0
-        with code.loop(len(self.guards)) as g:
-            border = Border(self.table, frame, g)
+        for border in self.table.each(frame):
             frame.assign(border.touch > Touch.NONE, border["piece"], stays=1)
         self._decide_again(frame, going)
 
@@ -578,7 +565,7 @@ class BorderControl:
         comes to rest.
         """
         code, hit, again = frame.code, border.is_hit, frame["stepped"] <= 0.0
-        no_time = ~again & (code.intrinsic("fabs", self._end(frame)) <= limits.NO_TIME * frame["smallest"])
+        no_time = ~again & (abs(end_at_border(frame)) <= limits.NO_TIME * frame["smallest"])
         no_time = (no_time | (~again & (frame["stops"] > 0.0))) & (frame["at_rest"] > 0.0)
         place, back, slide = border["piece"] + self.motion.parameters, border["back"], border["slide"]
         bounces = no_time & border.has("order", 2)  # by position
@@ -636,8 +623,7 @@ class BorderControl:
         """Note the pieces before the border, and which switching number is zero there."""
         with frame.code.loop(self.pieces) as j:
             frame["kick_before", j], frame["kick_hit", j] = self.table.piece(frame, j), 0.0
-        with frame.code.loop(len(self.guards)) as g:
-            border = Border(self.table, frame, g)
+        for border in self.table.each(frame):
             frame.assign(border.is_hit, border["piece"], kick_hit=1.0)
 
     def _begins_behind(self, frame: Frame) -> Value:
@@ -666,7 +652,7 @@ class BorderControl:
             side = guard.side(border.piece)
             self.roots.polynomial(frame, border["piece"], degree, h, side, border.level(border.piece))
             end, slope = self.roots.value_and_slope(frame, degree, one)
-            noise = _AT_END * limits.EPS * code.intrinsic("fabs", frame["t_end"] / h * slope)
+            noise = _AT_END * limits.EPS * abs(frame["t_end"] / h * slope)
             there = ends & code.compare("!=", side, 0.0) & (end <= noise) & code.compare("==", frame["nearest"], one)
             beyond = guard.beyond(border.piece)
             frame.assign(there, crossed=Crossed.GUARD, crossed_number=float(g), beyond=beyond)
@@ -711,9 +697,8 @@ class BorderControl:
         with code.only_if(code.any_lane(reflected)):
             with code.loop(self.pieces) as j:
                 frame.assign(reflected, j + self.motion.parameters, params=frame["kick_before", j])
-            with code.loop(len(self.guards)) as g:
-                at_border = self.table.crosses(frame, Crossed.GUARD, g)
-                frame.assign(reflected, g, touch=code.select(at_border, Touch.VALUE, Touch.NONE))
+            for border in self.table.each(frame):
+                frame.assign(reflected, border.g, touch=code.select(border.is_hit, Touch.VALUE, Touch.NONE))
             frame["kicks"] = code.select(reflected, 1.0, 0.0)
             frame.call(kick)
         self._decide_by_velocity(frame, kicks > 0.0)

@@ -19,7 +19,7 @@ from lagjax._native._roots import Roots
 from lagjax._native._run_records import Output
 from lagjax._native._step import StepControl
 from lagjax._native._taylor import TaylorSeries, double
-from lagjax._native._watch import END_OF_STEP, Columns, Touch
+from lagjax._native._watch import END_OF_STEP, Columns, Touch, reaches_border
 from lagjax._program._borders import inputs_below
 
 
@@ -128,9 +128,9 @@ class Events:
         if self.guards.remembers:
             first = self.motion.parameters + g - 2 * self.count
             before, rate_noise = frame["params", first], frame["params", first + self.count]
-        of_rate = code.intrinsic("fabs", frame["h"]) * rate_noise
+        of_rate = abs(frame["h"]) * rate_noise
         lead, order_of_zero = self._lead(frame, order, g, limits.GUARD_NOISE * size + of_rate)
-        away, from_there, moved = (code.intrinsic("fabs", x) for x in (value, before, rate))
+        away, from_there, moved = (abs(x) for x in (value, before, rate))
         on_it = away <= noise + moved * (limits.INSTANT * frame["smallest"])
         if self.guards.remembers:
             on_it = on_it | (away <= from_there)
@@ -138,7 +138,7 @@ class Events:
             on_it = on_it | (away <= frame["measured", g, 4])
         leaves, sound = moved > rate_noise, order_of_zero > 0.0
         turn = code.select(sound, lead, later - value)
-        bends = code.intrinsic("fabs", turn) > code.select(sound, 0.0, noise)
+        bends = abs(turn) > code.select(sound, 0.0, noise)
         before = self._sign(frame, before)
         unclear = code.select(code.compare("!=", before, 0.0), 0.0, turn if is_rounded else later)
         going = code.select(leaves, rate * frame["forward"], code.select(bends, turn, unclear))
@@ -163,19 +163,18 @@ class Events:
         self.roots.polynomial(frame, g + self.first, degree, frame["h"], frame.constant(1.0), 0.0)
         size, lead = (code.variable(frame.constant(0.0)) for _ in range(2))
         with code.loop(degree + 1, start=1) as k:
-            size.value += code.intrinsic("fabs", frame["poly", k])
+            size.value += abs(frame["poly", k])
         noise = noise + limits.GUARD_NOISE * size.value
         at = code.variable(code.select(noise < float("inf"), code.lanes_of(code.as_number(degree + 1)), 0.0))
         with code.loop(degree + 1, start=2) as k:
             term = frame["poly", k]
-            is_first = code.compare("==", lead.value, 0.0) & (code.intrinsic("fabs", term) > noise)
+            is_first = code.compare("==", lead.value, 0.0) & (abs(term) > noise)
             lead.value = code.select(is_first, term, lead.value)
             at.value = code.select(is_first, code.lanes_of(code.as_number(k)), at.value)
         return lead.value, at.value
 
     def _column(self, frame: Frame, g: Value, name: str) -> Value:
-        code = frame.code
-        return code.lanes_of(code.as_double(self.table.read(code, g, name)))
+        return self.table.read_lanes(frame.code, g, name)
 
     def _sign(self, frame: Frame, x: Value) -> Value:
         code = frame.code
@@ -188,7 +187,7 @@ class Events:
         code, planned = frame.code, frame["h"]
         frame.call(self.begin_sides, order)
         frame.call(self.look, order)
-        size = code.intrinsic("fabs", frame["h"])  # 0 where a guard has no value
+        size = abs(frame["h"])  # 0 where a guard has no value
         cut = (frame["seen"] < 1.0) & (frame["seen"] * size < frame["first_at"])
         with code.only_if(code.any_lane(cut)):
             least = limits.INSTANT * frame["smallest"]
@@ -233,9 +232,8 @@ class Events:
         frame["side_end", g], frame["noted_end", g] = side, frame["noted", g]
         frame["contact_end", g] = code.select(moving, Touch.NONE, frame["contact", g])
         degree, j, zero = self.motion.followed_degree(code, order), g + self.first, frame["zero", g]
-        side = code.select(
-            code.compare("==", side, 0.0), self._sign(frame, self.motion.followed_value(frame, j) - zero), side
-        )
+        here = self._sign(frame, self.motion.followed_value(frame, j) - zero)
+        side = code.select(code.compare("==", side, 0.0), here, side)
         self.roots.polynomial(frame, j, degree, h, side, zero)
         moving = moving & ~happened
         with code.only_if(code.any_lane(moving & ~self._is_clear(frame, degree))):
@@ -257,9 +255,9 @@ class Events:
 
     def _look_closely(self, frame: Frame, order: Value, g: Value, degree: Value, side: Value, moving: Value) -> None:
         code, roots, h = frame.code, self.roots, frame["h"]
-        size, value = roots.size(frame, degree), frame["poly", 0]
+        size = roots.size(frame, degree)
+        unknown = moving & ~(abs(frame["poly", 0]) < float("inf"))
         self._leave_surface(frame, g, degree, size)
-        unknown = moving & ~(code.intrinsic("fabs", value) < float("inf"))
         frame.assign(unknown, code=float(limits.NOT_FINITE), last=0.0, h=0.0)
         sound, moving = size < float("inf"), moving & ~unknown
 
@@ -270,13 +268,11 @@ class Events:
         roots.shorten(frame, degree, is_long)
         roots.sum_up(frame, degree)
         frame["doubt"], frame["begin"] = roots.last_terms(frame, degree), 0.0
-        instant = 0.25 * frame["smallest"]  # no time is known better than this
-        frame["instant"] = instant / (code.intrinsic("fabs", h) * frame["part"])
+        frame["instant"] = 0.25 * frame["smallest"] / (abs(h) * frame["part"])  # no time is known better than this
         rounding = (limits.ROOT_NOISE * limits.EPS) * frame["kept", g]
-        rounding = code.select(
-            (rounding < float("inf")) & code.compare("!=", frame["contact", g], Touch.VALUE), rounding, 0.0
-        )
-        frame["unsure"] = code.intrinsic("fabs", frame["poly", 1]) * frame["instant"] + rounding
+        matters = (rounding < float("inf")) & code.compare("!=", frame["contact", g], Touch.VALUE)
+        rounding = code.select(matters, rounding, 0.0)
+        frame["unsure"] = abs(frame["poly", 1]) * frame["instant"] + rounding
         ahead = code.variable(side)
         self._follow_roots(frame, order, g, degree, ahead, moving & sound)
         self._bisect_change(frame, order, g, ahead, moving & ~sound)
@@ -289,7 +285,7 @@ class Events:
     def _leave_surface(self, frame: Frame, g: Value, degree: Value, size: Value) -> None:
         """A motion that begins on the surface, or has just gone through it, is not to do so by rounding."""
         code, contact = frame.code, frame["contact", g]
-        near = code.intrinsic("fabs", frame["poly", 0]) <= limits.CONTINUOUS * size
+        near = abs(frame["poly", 0]) <= limits.CONTINUOUS * size
         frame.assign((contact > Touch.NONE) | ((contact < Touch.NONE) & near), 0, poly=0.0)
         with code.only_if(code.any_lane(contact > Touch.VALUE)), code.loop(degree + 1, start=1) as k:
             c, is_zero = frame["poly", k], contact > code.lanes_of(code.as_number(k))
@@ -313,7 +309,7 @@ class Events:
             changes = is_root & ~waits
             with code.only_if(code.any_lane(changes)):
                 s = self._exact(frame, order, g, changes, ahead.value)
-                inside = code.intrinsic("fabs", s) <= code.intrinsic("fabs", frame["h"])  # else of the next step
+                inside = abs(s) <= abs(frame["h"])  # else of the next step
                 goes_on = self._take(frame, order, g, changes & inside, s, ahead)
                 self.roots.turn(frame, degree, goes_on)
                 frame.assign(goes_on, begin=root)
@@ -327,11 +323,10 @@ class Events:
 
     def _waits(self, frame: Frame, g: Value) -> Value:
         """True if the next step decides what guard g does: this step ends at the guard's own border."""
-        code = frame.code
         if not self.can_jump:
             return frame.constant(0.0) > 1.0
-        at_border = (frame["crossed"] > 0.0) & code.compare("==", frame["h"], frame["nearest"] * frame["planned"])
-        left = (1.0 - frame["root"] * frame["part"]) * code.intrinsic("fabs", frame["slope"])
+        at_border = (frame["crossed"] > 0.0) & reaches_border(frame)
+        left = (1.0 - frame["root"] * frame["part"]) * abs(frame["slope"])
         at_border = at_border & (frame["root"] > 0.0)  # else it has jumped already
         return (left <= 8.0 * frame["error"]) & at_border & (self._column(frame, g, "piecewise") > 0.0)
 
@@ -349,20 +344,20 @@ class Events:
         with code.repeat_while(lambda: code.any_lane(moves()), at_most=limits.MOST_CORRECTIONS):
             here = at.value
             after = here - side * self._guard_value(frame, order, g, here) / rate
-            near = code.intrinsic("fabs", after - start) <= 0.1 * code.intrinsic("fabs", scale)
+            near = abs(after - start) <= 0.1 * abs(scale)
             after = code.select(moves() & near, after, here)
             after = code.select(after * frame["forward"] > 0.0, after, 0.0)
             at.value = after
-            far = code.intrinsic("fabs", after - here) > limits.INSTANT * frame["smallest"]
+            far = abs(after - here) > limits.INSTANT * frame["smallest"]
             going.value = code.flag(far & moves())
         at = at.value
-        lost = (frame["contact", g] > 0.0) & (code.intrinsic("fabs", at) <= 0.25 * limits.INSTANT * frame["smallest"])
+        lost = (frame["contact", g] > 0.0) & (abs(at) <= 0.25 * limits.INSTANT * frame["smallest"])
         return code.select(lost, 0.0, at)  # time does not move
 
     def _take(self, frame: Frame, order: Value, g: Value, changes: Value, s: Value, ahead: Variable) -> Value:
         """Changes at the times s: the event, or a note, where they are in the direction; which lanes go on beyond."""
         code, side = frame.code, ahead.value
-        size = code.intrinsic("fabs", s)
+        size = abs(s)
         counts = changes & ~(side * self._column(frame, g, "direction") > 0.0)
         if self.notes:
             assert self.note is not None
@@ -375,7 +370,7 @@ class Events:
             frame.assign(counts & (size < frame["first_at"]), first_at=size)
             goes_on = changes & ~counts
         ahead.value = code.select(goes_on, 0.0 - side, side)
-        left = code.intrinsic("fabs", frame["h"]) - size
+        left = abs(frame["h"]) - size
         frame.assign(goes_on & (left <= limits.INSTANT * frame["smallest"]), g, contact_end=Touch.CONTINUES)
         return goes_on
 

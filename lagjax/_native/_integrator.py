@@ -114,9 +114,9 @@ class Integrator:
         begin, end = (frame.time(member, i) for i in (0, frame.job("times") - 1))
         lane["t"], lane["t_end"] = begin, end
         lane["forward"] = code.select(end < begin, double(code, -1.0), 1.0)
-        largest = code.maximum(code.intrinsic("fabs", begin), code.intrinsic("fabs", end))
+        largest = code.maximum(abs(begin), abs(end))
         lane["smallest"] = code.maximum(SMALLEST_STEP * largest, double(code, LEAST))
-        lane["longest"] = code.maximum(code.intrinsic("fabs", end - begin) * FIRST_STEP, lane["smallest"])
+        lane["longest"] = code.maximum(abs(end - begin) * FIRST_STEP, lane["smallest"])
         self.output.await_next(frame, lane, integer(code, 1))
         for i in motion.form.each(code, self.base_size if self.projector else 0):
             lane["velocity_scale", i] = 0.0

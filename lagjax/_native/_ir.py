@@ -156,6 +156,9 @@ class Value:
     def __rtruediv__(self, other):
         return self.code.arithmetic("div", other, self)
 
+    def __abs__(self):
+        return self.code.intrinsic("fabs", self)
+
     def __neg__(self):
         return Value(self.code, self.code.builder.fneg(self.it))
 

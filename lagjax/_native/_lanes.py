@@ -193,7 +193,7 @@ def sincos_function(module: ir.Module, lanes: int, name: str = "sincos", number:
     """
     code = Code(module, name, [ir.VectorType(DOUBLE, lanes), POINTER], lanes, number=number)
     x, address = code.arguments
-    near = code.intrinsic("fabs", x) <= LARGEST_ANGLE
+    near = abs(x) <= LARGEST_ANGLE
     if number == FLOAT:
         for place, turn in enumerate(_short_polynomials(code, x)):
             code.store(code.select(near, turn, float("nan")), code.element(address, place * lanes))

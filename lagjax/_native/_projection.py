@@ -45,8 +45,8 @@ class Projector:
         projected, farthest = self.motion.evaluate(frame, self.state, values, s), code.variable(frame.constant(0.0))
         first = code.compare("==", frame["steps"], 0.0)
         for i in (i + half for half in (0, n) for i in self.motion.form.each(code, self.base_size)):
-            far = code.intrinsic("fabs", projected[i] - values[i])
-            size = code.intrinsic("fabs", projected[i]) + code.intrinsic("fabs", increments[i])
+            far = abs(projected[i] - values[i])
+            size = abs(projected[i]) + abs(increments[i])
             error = (far - frame.digits.round_off * size) * frame["scale", i] * (1 / PROJECTION_TOLERANCES)
             # A start may be off by more, as much as is taken for consistent.
             error = code.select(first, far / (START * (1.0 + size)), error)

@@ -35,21 +35,19 @@ AT_FIRST_ZERO = ("h_before", "returns", "returned")  # for every new member
 def retry_last_long_step(frame: Frame, form: Lines | Tables, states: int, guards: int) -> None:
     """Return to where the last long step began, if steps have become too short since; or remember this beginning."""
     code = frame.code
-    size, long = (code.intrinsic("fabs", frame[name]) for name in ("h", "h_before"))
+    size, long = (abs(frame[name]) for name in ("h", "h_before"))
     returns, steps = frame["returns"], frame["steps"]
     active, last, returned = (frame[name] > 0.0 for name in ("active", "last", "returned"))
     back = (size < SHORTER * long) & active & ~last & (returns < float(MOST_RETURNS))
     forth = (size > 0.0) & ~back
-    away = code.intrinsic("fabs", frame["t"] - frame["t_before"])
+    away = abs(frame["t"] - frame["t_before"])
     new = forth & ~returned & ((size >= 0.5 * long) | (away > 2.0 * long))
     undone = steps - frame["steps_before"]
     frame["h_before"] = code.select(new, size, long)
     frame["returns"] = code.select(back, returns + 1.0, code.select(new, 0.0, returns))
     frame["returned"] = back
     frame["rejected"] = frame["rejected"] + code.select(back, undone + 1.0, 0.0)
-    with frame.where(back):
-        frame["code"] = float(RUNNING)
-        frame["h"] = 0.0
+    frame.assign(back, code=float(RUNNING), h=0.0)
     for now, then in _beginnings(frame, form, states, guards):
         here, there = frame[now], frame[then]
         frame[now] = code.select(back, there, here)
@@ -71,5 +69,4 @@ def shorten(frame: Frame) -> None:
     for k in range(1, MOST_RETURNS + 1):
         size = code.select(returns >= float(k), RETAKEN * size, size)
     for name in ("h", "longest"):
-        with frame.where(returned):
-            frame[name] = size
+        frame.assign(returned, **{name: size})

@@ -89,7 +89,7 @@ class Retraction:
             limit = frame.constant(0.0) > 0.0
             for j in (self.shares[k] for k in borders):
                 share = motion.followed_value(frame, integer(code, j))
-                near = code.intrinsic("fabs", share * (1.0 - share)) <= JUMP_NOISE
+                near = abs(share * (1.0 - share)) <= JUMP_NOISE
                 limit = limit | ((frame["params", j + motion.parameters] > 0.0) & near)
             for i in coordinates:
                 frame["at_limit", i] = limit & (frame["begins"] > 0.0)
@@ -153,7 +153,7 @@ class Retraction:
             for i in form.each(code, motion.states):
                 gains[i] = gains[i] - lost[i]
             for i in form.each(code, len(added)):
-                is_lost = code.intrinsic("fabs", gains[i]) > JUMP_NOISE
+                is_lost = abs(gains[i]) > JUMP_NOISE
                 gains[i] = code.select(is_lost, float("nan"), 0.0)
             with frame.where(begins):
                 cotangents.store(frame, gains, state_ct)
@@ -166,7 +166,7 @@ class Retraction:
 
         def is_wanted(row: int, i: Index) -> Value:
             parts = [frame["state_ct", self._place(row, i, part)] for part in range(2)]
-            return ~(code.intrinsic("fabs", parts[0]) + code.intrinsic("fabs", parts[1]) <= 0.0)
+            return ~(abs(parts[0]) + abs(parts[1]) <= 0.0)
 
         for i in form.each(code, self.motion.states):
             frame["lost", i] = 0.0
@@ -201,8 +201,8 @@ class Retraction:
             for part in range(2):
                 for i in form.each(code, self.base):
                     place = self._place(row, i, part)
-                    sums[0].value += code.intrinsic("fabs", before(place))
-                    sums[1].value += code.intrinsic("fabs", after(place) - before(place))
+                    sums[0].value += abs(before(place))
+                    sums[1].value += abs(after(place) - before(place))
 
             def moved(i: Index) -> Value:
                 places = [self._place(row, i, part) for part in range(2)]

@@ -66,12 +66,12 @@ class Roots:
         """Σ |cₖ|."""
         code, size = frame.code, frame.code.variable(frame.constant(0.0))
         with code.loop(degree + 1) as k:
-            size.value += code.intrinsic("fabs", frame["poly", k])
+            size.value += abs(frame["poly", k])
         return size.value
 
     def last_terms(self, frame: Frame, degree: Value, first: int = 0) -> Value:
         """The size of the last three, or of those before: one may have been divided away, one be zero by symmetry."""
-        last = [frame.code.intrinsic("fabs", frame["poly", degree - (first + k)]) for k in range(3)]
+        last = [abs(frame["poly", degree - (first + k)]) for k in range(3)]
         return last[0] + last[1] + last[2]
 
     def shorten(self, frame: Frame, degree: Value, is_long: Callable[[], Value]) -> None:
@@ -131,7 +131,7 @@ class Roots:
         self.sum_up(frame, *frame.arguments)
 
         def size():
-            return code.intrinsic("fabs", frame["poly", 0]) + frame["falls"] + frame["rises"]
+            return abs(frame["poly", 0]) + frame["falls"] + frame["rises"]
 
         least, largest = size() < small, size() > 1 / small
         with code.only_if(code.any_lane(least | largest)):
@@ -145,21 +145,16 @@ class Roots:
     def sum_up(self, frame: Frame, degree: Value) -> None:
         """The largest falls and rises of P, and its largest bends down and up: for `next_root`."""
         code, zero = frame.code, frame.constant(0.0)
-        sums = {name: code.variable(zero) for name in ("falls", "rises", "down", "up")}
-
-        def add(name: str, x: Value) -> None:
-            sums[name].value += x
-
+        falls, rises, down, up = (code.variable(zero) for _ in range(4))
         with code.loop(degree + 1, start=1) as k:
             c, number = frame["poly", k], code.as_double(k)
             negative, bend = code.select(c < 0.0, c, zero), number * (number - 1.0)
             positive = c - negative
-            add("falls", 0.0 - negative)
-            add("rises", positive)
-            add("down", negative * (0.0 - bend))
-            add("up", positive * bend)
-        for name, sum in sums.items():
-            frame[name] = sum.value
+            falls.value += 0.0 - negative
+            rises.value += positive
+            down.value += negative * (0.0 - bend)
+            up.value += positive * bend
+        frame["falls"], frame["rises"], frame["down"], frame["up"] = falls.value, rises.value, down.value, up.value
 
     def turn(self, frame: Frame, degree: Value, where: Value) -> None:
         code = frame.code
@@ -183,7 +178,7 @@ class Roots:
         """March to the first root from `begin` on, by the bounds `down` of −P″ and `up` of P″."""
         code, down = frame.code, frame["down"]
         bend = code.maximum(down, frame["up"])
-        at_start = (ROOT_NOISE * EPS) * code.intrinsic("fabs", frame["poly", 0]) + frame["unsure"]
+        at_start = (ROOT_NOISE * EPS) * abs(frame["poly", 0]) + frame["unsure"]
         along = (ROOT_NOISE * EPS) * (frame["falls"] + frame["rises"])
         x, going = (code.variable(y) for y in (frame["begin"], code.flag(searching)))
 
@@ -210,14 +205,10 @@ class Roots:
             )
             after = code.variable(here + numerator / denominator)
             with code.only_if(code.any_lane(open)):
-                hop = here + self._hop(frame, error, bend)
-                after.value = code.select(open, hop, after.value)
-            after = after.value
-            x.value = code.select(now, after, here)
-            going.value = code.flag(now & ~ends & (after < 1.0))
-        with frame.where(active()):
-            frame["is_root"] = 0.0
-            frame["root"] = x.value
+                after.value = code.select(open, here + self._hop(frame, error, bend), after.value)
+            x.value = code.select(now, after.value, here)
+            going.value = code.flag(now & ~ends & (after.value < 1.0))
+        frame.assign(active(), is_root=0.0, root=x.value)
 
     def _note_root(self, frame: Frame, here: Value, known: tuple[Value, ...], is_root: Value, ends: Value) -> None:
         """The place of a root, or where the search ends; near it one step of Newton's more, and not a long one."""
@@ -225,11 +216,7 @@ class Roots:
         hop, back = self._hop(frame, error, bend), value / slope
         back = code.select((slope < 0.0) & (here > frame["begin"]), code.select(back < hop, back, hop), 0.0)
         place = code.select(is_root, code.maximum(here - back, frame["begin"]), here)
-        of_root = (("root", place), ("is_root", code.flag(is_root)),
-                   ("slope", slope), ("error", error))  # fmt: skip
-        for name, number in of_root:
-            with frame.where(ends):
-                frame[name] = number
+        frame.assign(ends, root=place, is_root=is_root, slope=slope, error=error)
 
     def _hop(self, frame: Frame, error: Value, bend: Value) -> Value:
         """The distance on which P, from zero, cannot exceed its error by its bend alone."""

@@ -12,7 +12,7 @@ RECORDED = 4  # numbers of a step that are written down before its state: time, 
 
 def instant_about(code: Code, t: Value) -> Value:
     """The largest difference of a time from `t` that counts as none."""
-    return _INSTANT * code.intrinsic("fabs", t)
+    return _INSTANT * abs(t)
 
 
 class Output:

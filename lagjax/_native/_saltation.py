@@ -45,48 +45,43 @@ class Saltation:
 
     # ---- what jumps ----
 
-    def _sets_out(self, frame: Frame, hit: Vectors, behind: Numbers) -> Value:
-        """True if a cone is left at the border that is `hit`.
+    def _what_jumps(
+        self, frame: Frame, hit: Vectors, pieces: Numbers, before: Numbers, behind: Numbers
+    ) -> tuple[Callable, Value]:
+        """`(i, part)`: true if the first tangents of coordinate i (part 0), or of its velocity, jump at what is `hit`.
 
-        From there tangents across it follow its direction at a rate without a bound: they are not known.
+        Both do where L jumps, those of a velocity where its acceleration does by more than rounding. Then, where a cone
+        is left: from there tangents across it follow its direction at a rate without a bound, they are not known.
         """
-        leaves, guards = frame.constant(0.0) > 0.0, self.table.borders.guards
+        code, guards = frame.code, self.table.borders.guards
+        kicks = lost = frame.constant(0.0) > 0.0
+        for j in self.table.borders.kicking:
+            kicks = kicks | code.compare("!=", hit[j], 0.0)
         for share in self.table.borders.releases:
             cone = guards[guards[share].on].piece
-            here = [frame.code.compare("!=", hit[j], 0.0) for j in (guards[share].piece, cone)]
-            leaves = leaves | ((here[0] | here[1]) & (behind[cone] > 0.0))
-        return leaves
+            here = [code.compare("!=", hit[j], 0.0) for j in (guards[share].piece, cone)]
+            lost = lost | ((here[0] | here[1]) & (pieces[cone] > 0.0))
 
-    def _jumps(self, code: Code, before: Numbers, behind: Numbers, lost: Value) -> Callable[[Index], Value]:
-        """`(i)`: true if acceleration i jumps by more than rounding, or its tangents are `lost`."""
+        def jumps(i: Index, part: int) -> Value:
+            if not part:
+                return kicks
+            larger = code.maximum(abs(before[i]), abs(behind[i]))
+            return kicks | lost | (abs(before[i] - behind[i]) > JUMP_NOISE * larger)
 
-        def jumps(i):
-            larger = code.maximum(code.intrinsic("fabs", before[i]), code.intrinsic("fabs", behind[i]))
-            return lost | (code.intrinsic("fabs", before[i] - behind[i]) > JUMP_NOISE * larger)
-
-        return jumps
-
-    def _kicks(self, frame: Frame, hit: Vectors) -> Value:
-        """True if L jumps at the border that is `hit`."""
-        kicks = frame.constant(0.0) > 0.0
-        for j in self.table.borders.kicking:
-            kicks = kicks | frame.code.compare("!=", hit[j], 0.0)
-        return kicks
+        return jumps, lost
 
     def _tangent_jumps(
-        self, frame: Frame, out: Numbers, hit: Value, grazes: Value, kicks: Value, lost: Value
+        self, frame: Frame, out: Numbers, hit: Vectors, pieces: Numbers, is_hit: Value, grazes: Value
     ) -> Callable:
         """`(row, i, part)`: the number that is added to coordinate i of a row (part 0), or to its velocity (part 1)."""
-        code, n = frame.code, self.base
-        first = (len(self.jump.orders) - 1) * 2 * n
-        before, behind = (_some(out, first + k * n, n) for k in range(2))
-        jumps = self._jumps(code, before, behind, lost)
-        is_hit, jump_or_nan = hit > 0.0, self._jump_or_nan(code, hit, (grazes > 0.0) | lost)
+        code, n, first = frame.code, self.base, (len(self.jump.orders) - 1) * 2 * self.base
+        jumps, lost = self._what_jumps(frame, hit, pieces, *(_some(out, first + k * n, n) for k in range(2)))
+        jump_or_nan = self._jump_or_nan(code, is_hit, (grazes > 0.0) | lost)
 
         def added(row: int, i: Index, part: int) -> Value:
-            step, moves = jump_or_nan(out[i + ((row - 1) * 2 + part) * n]), is_hit
+            step, moves = jump_or_nan(out[i + ((row - 1) * 2 + part) * n]), is_hit > 0.0
             if self.jump.orders[row] == 1:
-                moves = is_hit & (kicks | jumps(i)) if part else is_hit & kicks
+                moves = moves & jumps(i, part)
             return code.select(moves, step, 0.0)
 
         return added
@@ -110,8 +105,7 @@ class Saltation:
         stepped = frame["counts" if self.table.borders.kicking else "stepped"] > 0.0
         self.table.note_knot(frame, stepped)
         for i in self.motion.form.each(frame.code, self.motion.states):
-            with frame.where(stepped):
-                frame["edge", i] = frame["y", i]
+            frame.assign(stepped, i, edge=frame["y", i])
         return frame.finish()
 
     def apply(self) -> Code:
@@ -130,15 +124,12 @@ class Saltation:
             ]  # fmt: skip
             out = motion.form.run(frame, self.jump.line, *parts)
             hit = frame.vectors("hit", self.pieces)
-            lost = self._sets_out(frame, hit, parts[5])
-            added = self._tangent_jumps(frame, out, frame["is_hit"], frame["grazes"], self._kicks(frame, hit), lost)
+            added = self._tangent_jumps(frame, out, hit, parts[5], frame["is_hit"], frame["grazes"])
             for row in range(1, len(self.jump.orders)):
                 for part in range(2):
                     for i in motion.form.each(code, base):
                         place = i + (part * n + row * base)
-                        beyond = frame["edge", place] + added(row, i, part)
-                        with frame.where(is_hit):
-                            frame["y", place] = beyond
+                        frame.assign(is_hit, place, y=frame["edge", place] + added(row, i, part))
         return frame.finish()
 
     # ---- over steps that have been taken ----
@@ -196,9 +187,7 @@ class Saltation:
         inputs = self._edge_inputs(numbers, pieces)
         out = form.run(frame, jump.line, *inputs, *tangents, frame.vectors("dparams", directions.numbers))
         is_hit, grazes = (directions.number_of(frame, name) for name in ("is_hit", "grazes"))
-        hit = numbers("hit", self.pieces)
-        lost = self._sets_out(frame, hit, pieces)
-        added = self._tangent_jumps(frame, out, is_hit, grazes, self._kicks(frame, hit), lost)
+        added = self._tangent_jumps(frame, out, numbers("hit", self.pieces), pieces, is_hit, grazes)
         for row in range(jump.lower):
             for part in range(2):
                 for i in form.each(frame.code, self.base):
@@ -240,17 +229,16 @@ class Saltation:
         inputs = self._edge_inputs(lambda name, count: frame.vectors(name, count), behind)
         out = motion.form.run(frame, self.jump.accelerations(n), *inputs)
         hit = frame.vectors("hit", self.pieces)
-        lost, kicks = self._sets_out(frame, hit, behind), self._kicks(frame, hit)
-        jumps = self._jumps(code, _some(out, 0, n), _some(out, n, n), lost)
+        jumps, lost = self._what_jumps(frame, hit, behind, _some(out, 0, n), _some(out, n, n))
         cotangents, sum = motion.form.room(frame, rows * 2 * n), code.variable(frame.constant(0.0))
         for row in range(rows):
             for part in range(2):
                 for i in motion.form.each(code, n):
                     ct = frame["state_ct", i + (part * motion.n + row * n)]
                     if row == 0:
-                        ct = code.select(kicks | jumps(i) if part else kicks, ct, 0.0)
+                        ct = code.select(jumps(i, part), ct, 0.0)
                     cotangents[i + (2 * row + part) * n] = ct
-                    sum.value += code.intrinsic("fabs", ct)
+                    sum.value += abs(ct)
         line, tables = self.jump.transposed(n, self.parameters)
         gains = motion.form.run(frame, line, *inputs, cotangents)
         moves = (frame["is_hit"] > 0.0) & ~(sum.value <= 0.0)

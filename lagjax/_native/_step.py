@@ -100,11 +100,11 @@ class StepControl:
                 floor = self._floor(frame, half, part, sizes)
                 for j in self.motion.form.each(code, count):
                     i = first + j
-                    rate = code.intrinsic("fabs", frame["y", i + half * n, 1])
+                    rate = abs(frame["y", i + half * n, 1])
                     scale = 1.0 / (floor + rtol * sizes[i])
                     frame["scale", i + half * n] = scale
                     for k in range(2):
-                        error = code.intrinsic("fabs", frame["y", i + half * n, order - k]) * scale
+                        error = abs(frame["y", i + half * n, order - k]) * scale
                         errors[k].value = code.largest_or_nan(errors[k].value, error)
                     # An infinite slope may leave no trace in the last coefficients.
                     sound = code.select(rate < float("inf"), errors[0].value, float("nan"))
@@ -116,14 +116,14 @@ class StepControl:
         code, form, (first, count), place = frame.code, self.motion.form, self.parts[part], 2 * part + half
         given, rtol = (code.lanes_of(frame.job(name)) for name in ("atol", "rtol"))
         largest = form.largest(code, lambda i: sizes[first + i], count)
-        step = code.intrinsic("fabs", frame["h"])
+        step = abs(frame["h"])
         step = code.lanes_of(code.select(step > 0.0, step, frame["longest"]))  # before the first step
         if half:
             frame["reach", place] = largest = code.maximum(frame["reach", place], largest)
             by_position = frame["reach", 2 * part] / step
             largest = code.select(by_position < largest, largest, by_position)
         else:
-            speed = form.largest(code, lambda i: code.intrinsic("fabs", frame["y", first + i, 1]), count)
+            speed = form.largest(code, lambda i: abs(frame["y", first + i, 1]), count)
             at_rest = code.compare("==", frame["steps"], 0.0) & code.compare("==", code.maximum(largest, speed), 0.0)
             # From rest at zero, where nothing tells a size, what moves first may be rounding.
             frame["reach", place] = largest = code.select(
@@ -138,11 +138,11 @@ class StepControl:
     def _sizes(self, frame: Frame, half: int) -> Numbers:
         """The size over the step of every coordinate, or of every velocity (half 1); the largest one of a group."""
         code, first = frame.code, half * self.motion.n
-        before = code.lanes_of(code.intrinsic("fabs", frame["h"]))
+        before = code.lanes_of(abs(frame["h"]))
 
         def largest(i):
             # A component that passes through zero is as large as it will be a step away.
-            y, rate = (code.intrinsic("fabs", frame["y", i + first, k]) for k in range(2))
+            y, rate = (abs(frame["y", i + first, k]) for k in range(2))
             if self.projector is not None and self.projector.scales(i):
                 scale = frame["velocity_scale", i]
                 y, rate = (code.maximum(y, scale), rate) if half else (y, code.maximum(rate, scale))
@@ -167,11 +167,11 @@ class StepControl:
         moved = motion.move_state(frame, increments)
         acceleration = motion.evaluate(frame, motion.acceleration, moved, s)
         noise = self._noise(frame, acceleration, increments, moved)
-        defect, size = code.variable(frame["defect"]), code.lanes_of(code.intrinsic("fabs", h))
+        defect, size = code.variable(frame["defect"]), code.lanes_of(abs(h))
         weight = size / code.as_number(order + 1)
         for i in motion.form.each(code, n):
             # What rounding leaves of an acceleration is not a defect of the series.
-            excess = code.intrinsic("fabs", acceleration[i] - slopes[i]) - noise(i)
+            excess = abs(acceleration[i] - slopes[i]) - noise(i)
             error = weight * excess * frame["scale", i + n]
             defect.value = code.largest_or_nan(defect.value, error)
         frame["defect"] = defect.value
@@ -182,7 +182,7 @@ class StepControl:
         code, n, form, digits = frame.code, self.motion.n, self.motion.form, frame.digits
 
         def size_of(numbers):
-            return lambda i: code.intrinsic("fabs", numbers[i])
+            return lambda i: abs(numbers[i])
 
         size = form.largest_by_group(frame, size_of(acceleration), self.error_groups)
         # Half a unit in the last place of q moves an acceleration by what it varies along the step, in proportion.
@@ -191,7 +191,7 @@ class StepControl:
         unit = code.select(unit < digits.largest_unit, unit, 0.0)  # what hardly moves is not what makes it vary
 
         def noise(i):
-            change = code.intrinsic("fabs", acceleration[i] - frame["y", i + n, 1])
+            change = abs(acceleration[i] - frame["y", i + n, 1])
             return digits.round_off * size[i] + unit * change
 
         return noise
@@ -212,7 +212,7 @@ class StepControl:
             with code.only_if(code.any_lane(bad)):
                 again.value = 1
                 half = 0.5 * frame["h"]
-                small = bad & (code.intrinsic("fabs", half) < frame["smallest"])
+                small = bad & (abs(half) < frame["smallest"])
                 frame["h"] = code.select(small, 0.0, code.select(bad, half, frame["h"]))
                 with frame.where(small):
                     frame["code"] = self._reason(frame)
@@ -246,10 +246,8 @@ class StepControl:
         """
         code, h = frame.code, frame["h"]
         moving = frame["counts"] > 0.0 if kicks else code.compare("!=", h, 0.0)
-        with frame.where(moving):
-            frame["t"] = after
-            frame["t_low"] = rest
-        frame["longest"] = code.intrinsic("fabs", h) * frame["growth"]
+        frame.assign(moving, t=after, t_low=rest)
+        frame["longest"] = abs(h) * frame["growth"]
         for i in self.motion.form.each(code, self.motion.states):
             total, rest = end_of_step(frame, i)
             if self.projector is not None:
@@ -268,9 +266,7 @@ def absolute_tolerance(frame: Frame) -> Value:
 
 def note_halved(frame: Frame, where: Value) -> None:
     """Note that the step of some lanes has become shorter: it is not the last one any more, and the next grows less."""
-    with frame.where(where):
-        frame["last"] = 0.0
-        frame["growth"] = limits.GROWTH_AFTER_REJECTION
+    frame.assign(where, last=0.0, growth=limits.GROWTH_AFTER_REJECTION)
 
 
 def _power(code: Code, x: Value, exponent: Value) -> Value:

@@ -176,7 +176,7 @@ class Tangent:
         order, powers = frame.job("order"), [frame["power_before"], frame["power"]]
 
         def size(x):
-            return code.intrinsic("fabs", x)
+            return abs(x)
 
         def last_terms(first):
             return lambda i: code.maximum(

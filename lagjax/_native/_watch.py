@@ -8,7 +8,7 @@ there, or a note is made and it continues (`_events`).
 
 import functools
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from enum import IntEnum
 from typing import Any
@@ -29,6 +29,16 @@ END_OF_STEP: Fields = {
     "first_at": 1,  # how far from the beginning of the step the first change of a guard is
     "event": EXACT,  # the event's code; −1 without any
 }
+
+
+def end_at_border(frame: Frame) -> Value:
+    """The step up to the first border."""
+    return frame["nearest"] * frame["planned"]
+
+
+def reaches_border(frame: Frame) -> Value:
+    """True if the step goes as far as to the first border."""
+    return frame.code.compare("==", frame["h"], end_at_border(frame))
 
 
 class Touch(IntEnum):
@@ -65,18 +75,22 @@ class Hit(IntEnum):
 
 
 class Columns:
-    """Rows of integers as constants of a kernel, for loops over them; columns have names."""
+    """Rows of integers, or of doubles, as constants of a kernel, for loops over them; columns have names."""
 
-    def __init__(self, module: ir.Module, names: Sequence[str], rows: Sequence[Sequence[int]]):
-        self._names, self._data = names, integers(module, np.array(rows or [[0]], np.int64))
+    def __init__(self, module: ir.Module, names: Sequence[str], rows: Sequence, kind: ir.Type = INTEGER):
+        numbers = np.array(rows or [[0]], np.int64 if kind == INTEGER else float)
+        self._names, self._kind, self._data = names, kind, integers(module, numbers.view(np.int64))
 
     def read(self, code: Code, row: Value, name: str) -> Value:
         place = row * len(self._names) + self._names.index(name)
-        return code.load(code.element(Value(code, self._data), place, INTEGER), INTEGER)
+        return code.load(code.element(Value(code, self._data), place, self._kind), self._kind)
+
+    def read_lanes(self, code: Code, row: Value, name: str) -> Value:
+        """The same as a number in all lanes."""
+        return code.lanes_of(code.as_double(self.read(code, row, name)))
 
 
-# The rules of a guard by name, each with the place of its first number among those of the guard.
-_RULES, _NUMBERS = {"side": (0, Affine), "level": (2, Level), "beyond": (6, Affine)}, 8
+_RULES = {"side": Affine, "level": Level, "beyond": Affine}
 _PLACES = ("piece", "back", "slide", "on", "order", "rest", "gains", "of_table")
 
 
@@ -94,8 +108,7 @@ class Border:
 
     def has(self, name: str, least: int = 0) -> Value:
         """True, in all lanes, if a number is there, or at `least` this."""
-        code = self.frame.code
-        return code.lanes_of(code.as_double(self[name])) >= float(least)
+        return self.table.places.read_lanes(self.frame.code, self.g, name) >= float(least)
 
     @property
     def touch(self) -> Value:
@@ -118,9 +131,8 @@ class Border:
 
     def rule(self, name: str) -> Any:
         """The `side`, the `level` or the piece `beyond`, as functions of the piece."""
-        code, (first, kind) = self.frame.code, _RULES[name]
-        row, places = Value(code, self.table.rules), range(first, first + len(kind._fields))
-        return kind(*(code.load(code.element(row, self.g * _NUMBERS + k), DOUBLE) for k in places))
+        rules, kind = self.table.rules, _RULES[name]
+        return kind(*(rules.read(self.frame.code, self.g, f"{name}.{of}") for of in kind._fields))
 
     def level(self, piece: Value) -> Value:
         code = self.frame.code
@@ -140,13 +152,19 @@ class GuardTable:
 
     def __init__(self, motion: TaylorSeries, borders: Borders):
         self.motion, self.borders, self.guards = motion, borders, len(borders.guards)
-        rules = [[x for name in _RULES for x in getattr(guard, name)] for guard in borders.guards] or [[0.0]]
-        self.rules = integers(motion.module, np.array(rules, float).view(np.int64))
+        names = [f"{name}.{of}" for name, kind in _RULES.items() for of in kind._fields]
+        rules = [[x for name in _RULES for x in getattr(guard, name)] for guard in borders.guards]
+        self.rules = Columns(motion.module, names, rules, DOUBLE)
         self.places = Columns(motion.module, _PLACES, [[getattr(g, name) for name in _PLACES] for g in borders.guards])
         moves = {j: borders.moving_table(j) is not None for j in borders.clocks}
         # The number and the piece of each clock that has knots.
         self.knots = [(c, j) for c, j in enumerate(borders.clocks) if moves[j] or j in borders.kicking]
         self.movable = [j for _, j in self.knots if moves[j]]
+
+    def each(self, frame: Frame) -> Iterator[Border]:
+        """The borders, one after the other, for a body that is written down once, in a loop."""
+        with frame.code.loop(self.guards) as g:
+            yield Border(self, frame, g)
 
     def piece(self, frame: Frame, j: Index) -> Value:
         return frame["params", j + self.motion.parameters]
@@ -181,8 +199,7 @@ class GuardTable:
         code = frame.code
         where = frame.constant(0.0) <= 0.0 if where is None else where
         self._note_pieces(frame, where)
-        with code.loop(self.guards) as g:
-            border = Border(self, frame, g)
+        for border in self.each(frame):
             j = border["piece"]
             decided = code.compare("!=", border.rule("side")(frame["pieces_before", j]), 0.0)
             if self.borders.kicking:  # where L jumps, a motion that begins on the border comes from what L is there
