@@ -84,7 +84,6 @@ class BorderControl:
         if borders.kicking:
             fields |= {
                 "kick_before": pieces,  # the pieces before the border
-                "kick_hit": pieces,  # 1 for the piece whose switching number is zero there
                 "kicks": 1,  # 1 to kick the motion; 2 if it does not pass the border
                 "counts": 1,  # 1 if the step is one that is recorded, be it of no length
             }
@@ -451,9 +450,11 @@ class BorderControl:
         frame, motion, n = self.motion.function("graze"), self.motion, self.motion.n
         code, order, by = frame.code, frame.job("order"), [*range(base), *range(n, n + base)]
         line = _borders.gradient(self.borders, by)
-        ends = self.table.crosses(frame, Crossed.GUARD) & (frame["counts" if self.borders.kicking else "stepped"] > 0.0)
+        counts = self.table.counts(frame)
+        noted, ends = self.table.crosses_any(frame) & counts, self.table.crosses(frame, Crossed.GUARD) & counts
+        with code.only_if(code.any_lane(noted)):
+            self.table.note_hit(frame, noted)
         with code.only_if(code.any_lane(ends)):
-            self.table.note_hit(frame, ends)
             state = motion.move_state(frame, motion.increments(frame, order, frame["h"])[0])
             inputs = state, [frame["t"] + frame["h"]], frame.vectors("params", motion.numbers)
             slopes = motion.form.run(frame, line, *inputs, frame.vectors("hit", self.pieces))
@@ -499,7 +500,8 @@ class BorderControl:
             if self.borders.release.outputs:
                 self._release(frame)
             if self.kick is not None:
-                self._note_kick(frame)
+                with code.loop(self.pieces) as j:
+                    frame["kick_before", j] = self.table.piece(frame, j)
             self._go_on(frame, crosses)
             frame.assign(crosses, **self.forgotten)
             if self.kick is not None:
@@ -619,13 +621,6 @@ class BorderControl:
 
     # ---- where L jumps ----
 
-    def _note_kick(self, frame: Frame) -> None:
-        """Note the pieces before the border, and which switching number is zero there."""
-        with frame.code.loop(self.pieces) as j:
-            frame["kick_before", j], frame["kick_hit", j] = self.table.piece(frame, j), 0.0
-        for border in self.table.each(frame):
-            frame.assign(border.is_hit, border["piece"], kick_hit=1.0)
-
     def _begins_behind(self, frame: Frame) -> Value:
         """True where a motion begins at an instant at which L jumps: with the velocities behind it, in time's order."""
         begins = (frame["steps"] <= 0.0) & (frame["forward"] > 0.0)
@@ -668,10 +663,10 @@ class BorderControl:
                 frame.vectors("y", base, lambda i: (i, 0)), frame.vectors("y", base, lambda i: (i + n, 0)),
                 frame.vectors("t", 1), frame.vectors("params", parameters), frame.vectors("kick_before", self.pieces),
                 frame.vectors("params", self.pieces, lambda i: (i + motion.parameters,)),
-                frame.vectors("kick_hit", self.pieces),
+                frame.vectors("hit", self.pieces),
             ]  # fmt: skip
             if self.borders.levels_move:  # which do not matter to slopes
-                inputs.append(frame.vectors("kick_hit", self.pieces))
+                inputs.append(frame.vectors("hit", self.pieces))
             out = motion.form.run(frame, kick.line, *inputs)
             passes = out[base] > 0.0
             for i in motion.form.each(code, base):

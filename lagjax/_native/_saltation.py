@@ -102,8 +102,7 @@ class Saltation:
     def note(self) -> Code:
         """`()`: the state at the border that a step ends at. Several may be crossed there, one after the other."""
         frame = self.motion.function("note_before")
-        stepped = frame["counts" if self.table.borders.kicking else "stepped"] > 0.0
-        self.table.note_knot(frame, stepped)
+        stepped = self.table.counts(frame)
         for i in self.motion.form.each(frame.code, self.motion.states):
             frame.assign(stepped, i, edge=frame["y", i])
         return frame.finish()
@@ -140,8 +139,7 @@ class Saltation:
     def _note_edge(self, frame: Frame) -> None:
         """The state at the end of a step, and what is to be known of the border there."""
         motion, code = self.motion, frame.code
-        self.table.note_hit(frame)
-        self.table.note_knot(frame, frame["crossed"] > 0.0)
+        self.table.note_hit(frame, frame.constant(0.0) <= 0.0)
         moved = motion.move_state(frame, motion.increments(frame, frame.job("order"), frame["h"])[0])
         for i in motion.form.each(code, motion.states):
             frame["edge", i] = moved[i]
@@ -151,13 +149,9 @@ class Saltation:
         """`()`: note the state at the border that a step ends at, for tangents at the beginning of the next one."""
         frame = self.motion.function("note_end")
         frame["is_hit"] = Hit.NONE
-        with frame.code.only_if(frame.code.any_lane(self._crosses(frame))):
+        with frame.code.only_if(frame.code.any_lane(self.table.crosses_any(frame))):
             self._note_edge(frame)
         return frame.finish()
-
-    def _crosses(self, frame: Frame) -> Value:
-        crosses = self.table.crosses(frame, Crossed.GUARD)
-        return crosses | self.table.crosses_knot(frame) if self.table.knots else crosses
 
     def _choice(self, numbers: Callable) -> list:
         """The numbers that choose the switching number, as inputs of the jump."""
@@ -200,7 +194,7 @@ class Saltation:
         frame = motion.function("back_border")
         code = frame.code
         frame["crossed"] = code.select(frame["has_after"] > 0.0, frame["crossed"], Crossed.NOTHING)
-        with code.only_if(code.any_lane(self._crosses(frame))):
+        with code.only_if(code.any_lane(self.table.crosses_any(frame))):
             self._note_edge(frame)
             gain, tables, entries = self._cotangent_jumps(frame, frame.vectors("pieces_after", motion.pieces))
             for row in range(self.jump.lower):

@@ -177,10 +177,15 @@ class GuardTable:
         at = code.as_double(number) if isinstance(number, Value) else float(number)
         return crosses & code.compare("==", frame["crossed_number"], code.lanes_of(at))
 
-    def crosses_knot(self, frame: Frame) -> Value:
-        """True if a step ends at knots that are parameters."""
+    def crosses_any(self, frame: Frame) -> Value:
+        """True if a step ends at a guard, or at knots that are parameters."""
+        kinds = (Crossed.GUARD, *((Crossed.KNOTS,) if self.knots else ()))
         at_knots = [self.crosses(frame, Crossed.KNOT, c) for c, _ in self.knots]
-        return functools.reduce(Value.__or__, at_knots, self.crosses(frame, Crossed.KNOTS))
+        return functools.reduce(Value.__or__, at_knots + [self.crosses(frame, kind) for kind in kinds])
+
+    def counts(self, frame: Frame) -> Value:
+        """True if a step is one that is recorded: it has a length, or velocities that jump at its end."""
+        return frame["counts" if self.borders.kicking else "stepped"] > 0.0
 
     def kicks(self, frame: Frame) -> Value:
         """True if a step ends at a border at which L jumps."""
@@ -191,47 +196,31 @@ class GuardTable:
 
     # ---- what a step ends at ----
 
-    def note_hit(self, frame: Frame, where: Value | None = None) -> None:
-        """The pieces, and which switching number the guard `crossed` has; none where a motion begins on the border.
+    def note_hit(self, frame: Frame, where: Value) -> None:
+        """Note, in some lanes, the pieces, and which switching numbers are zero at the border that a step ends at.
 
-        In the lanes `where` a step ends at one, which are all of them by default.
+        That is no guard where a motion begins on it, and a knot only if it is a parameter.
         """
-        code = frame.code
-        where = frame.constant(0.0) <= 0.0 if where is None else where
-        self._note_pieces(frame, where)
+        code, moves = frame.code, self.borders.levels_move
+        with frame.where(where):
+            frame["is_hit"] = Hit.NONE
+            with code.loop(self.motion.pieces) as j:
+                frame["hit", j], frame["pieces_before", j] = 0.0, self.piece(frame, j)
+                if moves:
+                    frame["entry", j] = 0.0
         for border in self.each(frame):
             j = border["piece"]
             decided = code.compare("!=", border.rule("side")(frame["pieces_before", j]), 0.0)
             if self.borders.kicking:  # where L jumps, a motion that begins on the border comes from what L is there
                 decided = decided | self.kicks(frame)
             with frame.where(where & border.is_hit & decided):
-                frame["hit", j] = 1
-                frame["is_hit"] = Hit.BORDER
-                if self.borders.levels_move:
+                frame["hit", j], frame["is_hit"] = 1, Hit.BORDER
+                if moves:
                     frame["entry", j] = border.piece + border.rule("level").offset
-
-    def note_knot(self, frame: Frame, where: Value) -> None:
-        """The same of knots that are parameters."""
-        if not self.knots:
-            return
-        code = frame.code
-        where = where & self.crosses_knot(frame)
-        with code.only_if(code.any_lane(where)):
-            self._note_pieces(frame, where)
-            both = where & self.crosses(frame, Crossed.KNOTS)
-            for k, (c, j) in enumerate(self.knots):
-                with frame.where(both | (where & self.crosses(frame, Crossed.KNOT, c))):
-                    # Where several coincide no rational directions of theirs cancel, to a jump of nothing.
-                    frame["hit", j] = math.exp(k)
-                    if self.borders.levels_move:
-                        frame["entry", j] = self.piece(frame, j) + code.flag(frame["h"] > 0.0)
-                    frame["is_hit"] = Hit.BORDER
-            frame.assign(both, is_hit=Hit.SEVERAL)
-
-    def _note_pieces(self, frame: Frame, where: Value) -> None:
-        with frame.where(where):
-            frame["is_hit"] = Hit.NONE
-            with frame.code.loop(self.motion.pieces) as j:
-                frame["hit", j], frame["pieces_before", j] = 0.0, self.piece(frame, j)
-                if self.borders.levels_move:
-                    frame["entry", j] = 0.0
+        for k, (c, j) in enumerate(self.knots):
+            several = where & self.crosses(frame, Crossed.KNOTS)
+            with frame.where(several | (where & self.crosses(frame, Crossed.KNOT, c))):
+                # Where several coincide no rational directions of theirs cancel, to a jump of nothing.
+                frame["hit", j], frame["is_hit"] = math.exp(k), code.select(several, Hit.SEVERAL, Hit.BORDER)
+                if moves:
+                    frame["entry", j] = self.piece(frame, j) + code.flag(frame["h"] > 0.0)
