@@ -6,7 +6,7 @@ derivative does. Where the border is grazed, so that a change of the state withi
 crossed, none of this exists: derivatives are NaN there, but for first ones where the acceleration is continuous.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 from lagjax._native._constants import JUMP_NOISE
 from lagjax._native._cotangents import Cotangents, add
@@ -25,7 +25,7 @@ class Saltation:
 
     def __init__(self, motion: TaylorSeries, table: GuardTable, base: int, jump: Jump):
         self.motion, self.base, self.pieces, self.jump = motion, base, motion.pieces, jump
-        self.table, self.several = table, len(table.movable) > 0 and len(table.borders.clocks) > 1
+        self.table = table
         self.chosen = jump.fixed - 2 * self.pieces
         self.parameters = motion.parameters * self.base // motion.n  # of the motion alone
 
@@ -70,6 +70,13 @@ class Saltation:
 
         return jumps, lost
 
+    def _each(self, frame: Frame, form, rows: range) -> Iterator[tuple[int, Index, int, Index]]:
+        """Row, coordinate, part (1 for its velocity) and place in the state of all numbers of some rows."""
+        for row in rows:
+            for part in range(2):
+                for i in form.each(frame.code, self.base):
+                    yield row, i, part, i + (part * self.motion.n + row * self.base)
+
     def _tangent_jumps(
         self, frame: Frame, out: Numbers, hit: Vectors, pieces: Numbers, is_hit: Value, grazes: Value
     ) -> Callable:
@@ -88,12 +95,10 @@ class Saltation:
 
     def _jump_or_nan(self, code: Code, hit: Value, grazes: Value) -> Callable[[Value], Value]:
         """`(jump)`: the jump, or NaN where there is none: at a border that is grazed, and where knots coincide."""
-        several = hit > float(Hit.BORDER) if self.several else None
+        several = hit > float(Hit.BORDER)
 
         def jump_or_nan(jump: Value) -> Value:
-            if several is not None:
-                jump = code.select(several & code.compare("!=", jump, 0.0), float("nan"), jump)
-            return code.select(grazes, float("nan"), jump)
+            return code.select(grazes | (several & code.compare("!=", jump, 0.0)), float("nan"), jump)
 
         return jump_or_nan
 
@@ -124,11 +129,8 @@ class Saltation:
             out = motion.form.run(frame, self.jump.line, *parts)
             hit = frame.vectors("hit", self.pieces)
             added = self._tangent_jumps(frame, out, hit, parts[5], frame["is_hit"], frame["grazes"])
-            for row in range(1, len(self.jump.orders)):
-                for part in range(2):
-                    for i in motion.form.each(code, base):
-                        place = i + (part * n + row * base)
-                        frame.assign(is_hit, place, y=frame["edge", place] + added(row, i, part))
+            for row, i, part, place in self._each(frame, motion.form, range(1, len(self.jump.orders))):
+                frame.assign(is_hit, place, y=frame["edge", place] + added(row, i, part))
         return frame.finish()
 
     # ---- over steps that have been taken ----
@@ -182,27 +184,22 @@ class Saltation:
         out = form.run(frame, jump.line, *inputs, *tangents, frame.vectors("dparams", directions.numbers))
         is_hit, grazes = (directions.number_of(frame, name) for name in ("is_hit", "grazes"))
         added = self._tangent_jumps(frame, out, numbers("hit", self.pieces), pieces, is_hit, grazes)
-        for row in range(jump.lower):
-            for part in range(2):
-                for i in form.each(frame.code, self.base):
-                    place = i + (part * n + row * self.base)
-                    frame["dy", place, 0] = frame["dy", place, 0] + added(jump.lower + row, i, part)
+        for row, i, part, place in self._each(frame, form, range(jump.lower)):
+            frame["dy", place, 0] = frame["dy", place, 0] + added(jump.lower + row, i, part)
 
     def pull(self, cotangents: Cotangents) -> Code:
         """`()`: from the state beyond the border that a step ends at to that before it, and to the parameters."""
-        motion, base = self.motion, self.base
-        frame = motion.function("back_border")
+        motion, frame = self.motion, self.motion.function("back_border")
         code = frame.code
         frame["crossed"] = code.select(frame["has_after"] > 0.0, frame["crossed"], Crossed.NOTHING)
         with code.only_if(code.any_lane(self.table.crosses_any(frame))):
             self._note_edge(frame)
             gain, tables, entries = self._cotangent_jumps(frame, frame.vectors("pieces_after", motion.pieces))
+            for row, i, part, place in self._each(frame, motion.form, range(self.jump.lower)):
+                add(frame, gain(row, i + part * self.base), "state_ct", place)
             for row in range(self.jump.lower):
-                for part in range(2):
-                    for i in motion.form.each(code, base):
-                        add(frame, gain(row, i + part * base), "state_ct", i + (part * motion.n + row * base))
                 for k in motion.form.each(code, self.parameters):
-                    add(frame, gain(row, k + 2 * base), "params_ct", k + row * self.parameters)
+                    add(frame, gain(row, k + 2 * self.base), "params_ct", k + row * self.parameters)
             cotangents.store_entries(frame, tables, entries, 0)
         return frame.finish()
 
@@ -225,14 +222,12 @@ class Saltation:
         hit = frame.vectors("hit", self.pieces)
         jumps, lost = self._what_jumps(frame, hit, behind, _some(out, 0, n), _some(out, n, n))
         cotangents, sum = motion.form.room(frame, rows * 2 * n), code.variable(frame.constant(0.0))
-        for row in range(rows):
-            for part in range(2):
-                for i in motion.form.each(code, n):
-                    ct = frame["state_ct", i + (part * motion.n + row * n)]
-                    if row == 0:
-                        ct = code.select(jumps(i, part), ct, 0.0)
-                    cotangents[i + (2 * row + part) * n] = ct
-                    sum.value += abs(ct)
+        for row, i, part, place in self._each(frame, motion.form, range(rows)):
+            ct = frame["state_ct", place]
+            if row == 0:
+                ct = code.select(jumps(i, part), ct, 0.0)
+            cotangents[i + (2 * row + part) * n] = ct
+            sum.value += abs(ct)
         line, tables = self.jump.transposed(n, self.parameters)
         gains = motion.form.run(frame, line, *inputs, cotangents)
         moves = (frame["is_hit"] > 0.0) & ~(sum.value <= 0.0)
