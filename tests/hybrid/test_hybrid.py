@@ -10,8 +10,6 @@ from lagrangians import ball_in_gravity, free_particle, oscillator
 from sweeps import sweep
 
 import lagjax
-from lagjax._interface._layout import Layout
-from lagjax._run.hybrid._mode_families import families
 
 G = 9.81
 BALL = lagjax.System(ball_in_gravity)
@@ -914,19 +912,15 @@ def down_the_stairs(g, modes, v=0.2):
     return jnp.stack(times)
 
 
-def test_modes_that_differ_by_numbers_are_one_program():
+def test_modes_that_differ_by_numbers():
     modes, edges = {f"{n}": stair(n) for n in range(STAIRS)}, [edge(n) for n in range(STAIRS - 1)]
-    leaving = [tuple(e for e in edges if e.source == name) for name in modes]
-    found = families(list(modes.values()), leaving, Layout.from_state(0.0, 0.2), 1.0)
-    assert [family.modes for family in found] == [(0, 1, 2, 3), (4,)]  # nothing leaves the last one
-
     run = hybrid(modes, edges, v0=0.2, ts=(0.0, 4.0), params=1.3, rtol=1e-12)
     assert run.transitions.source[:5].tolist() == [0, 1, 2, 3, -1] and run.mode.tolist() == [0, 4]
     np.testing.assert_allclose(times(run), down_the_stairs(1.3, range(4)), rtol=1e-12)
 
 
 @pytest.mark.slow
-def test_derivatives_through_modes_of_one_program():
+def test_derivatives_through_modes_that_differ_by_numbers():
     modes, edges = {f"{n}": stair(n) for n in range(STAIRS)}, [edge(n) for n in range(STAIRS - 1)]
 
     def at_edges(g):
@@ -940,7 +934,7 @@ def test_derivatives_through_modes_of_one_program():
     np.testing.assert_allclose(jax.vmap(at_edges)(many), jax.vmap(exact)(many), rtol=1e-12)
 
 
-def test_modes_of_a_family_keep_their_targets_and_constraints():
+def test_modes_of_a_ladder_keep_their_targets_and_constraints():
     modes = {"0": stair(0), "1": stair(1), "2": stair(2), "3": stair(3)}
     edges = [edge(0, target=2), edge(2, target=3), edge(1, target=0)]
     modes |= {"line": lagjax.System(free_particle, constraints=lambda q: q - 2.5)}
@@ -953,19 +947,3 @@ def test_modes_of_a_family_keep_their_targets_and_constraints():
     said = r"Behind the transition '3' → 'line' .* the constraints of 'line': qdot does not .* rate of change is 1.59 "
     with pytest.raises(lagjax.SimulationError, match=said + ".* reset=lambda q, v: "):
         hybrid(modes, edges, v0=0.2, ts=(0.0, 1.0, 6.0), params=1.3, rtol=1e-12)
-
-
-@pytest.mark.parametrize(
-    "other",
-    [
-        lambda q, v: 0.5 * v**2 - q**3,  # another operation
-        lambda q, v: 0.5 * v**2 - q**2 - jnp.abs(q) ** 1.5,  # an exponent
-        lambda q, v: 0.5 * v**2 - v * q,  # another variable
-        lambda q, v: 0.5 * v**2 - q**2 * (1 if q.shape else 2.0) + 0.1 * q,
-    ],
-)
-def test_modes_that_differ_otherwise_are_programs_of_their_own(other):
-    systems = [lagjax.System(lambda q, v: 0.5 * v**2 - q**2 - jnp.abs(q) ** 2.5), OSCILLATOR, lagjax.System(other)]
-    found = families(systems, [(), (), ()], Layout.from_state(0.0, 0.0), None)
-    assert [family.modes for family in found] == [(0,), (1,), (2,)]
-    assert found[2].system is systems[2]

@@ -1,7 +1,6 @@
 """Motion that changes its laws: modes, each a `System` of its own, and transitions between them.
 
     Transition, modes ─► Plan ─► _transition_rounds: a scan, round after round ─► Ending, Record ─► Trajectory
-                          ├─ _mode_families: modes that differ by numbers alone are one program
                           └─ _mode: the problem of one mode, its guards, the crossing of a guard, the reset
 
 Source: Aizerman & Gantmakher, Q. J. Mech. Appl. Math. 11 (1958) 225; Hiskens & Pai, IEEE Trans. Circuits Syst. I 47
@@ -145,9 +144,6 @@ def simulate_hybrid(
     happened: where resets do not commute, or the start touches a guard, derivatives from the other side are others. The
     time at which a guard jumps through zero is not varied, nor is that of a transition whose guard is beyond zero where
     its mode begins, against that beginning.
-
-    Modes whose functions differ by numbers alone, as those of a loop do, share one program where these stand in sums,
-    products, comparisons and results: a ladder of many is compiled as fast as one of few.
 
     A guard is examined along the whole of every step, and a step is shortened until the guard is smooth there: a guard
     that touches zero, or crosses it and comes back between two steps, is resolved. A reset to a state off the

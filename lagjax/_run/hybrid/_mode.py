@@ -111,7 +111,7 @@ class Transition(eqx.Module):
 
 
 class Mode(NamedTuple):
-    """One mode, or one of a family: a problem that lacks a state and times, and the transitions that leave it.
+    """One mode: a problem that lacks a state and times, and the transitions that leave it.
 
     Their `numbers` (K,) are their places among all transitions, their `targets` (K,) those of the modes that they lead
     to. `surfaces` are their guards, a `Surfaces`; None where none leaves.
@@ -119,8 +119,8 @@ class Mode(NamedTuple):
 
     problem: Problem
     leaving: tuple[Transition, ...]
-    numbers: Any
-    targets: Any
+    numbers: np.ndarray
+    targets: np.ndarray
     surfaces: Any
     vector: jax.Array  # every number in params, (P,)
     widths: tuple = ()  # of the first (q, q̇, t), and of params: their rounding, where the start came in float32
@@ -146,9 +146,10 @@ class Mode(NamedTuple):
             raise ValueError(f"The mode {name!r} has no machine code: {why}.") from None
         return cls(problem, leaving, numbers, targets, surfaces, jnp.asarray(problem.vector))
 
-    def with_params(self, params: PyTree, numbers, targets) -> "Mode":
-        problem = dataclasses.replace(self.problem, params=params)
-        return self._replace(problem=problem, numbers=numbers, targets=targets, vector=jnp.asarray(problem.vector))
+    def blows(self, place: int) -> tuple[np.ndarray, np.ndarray]:
+        """The transitions that lead back into this mode, of this `place`, with a direction and a reset; and these."""
+        own = [k for k, x in enumerate(self.leaving) if self.targets[k] == place and x.reset and x.direction]
+        return np.array(own, int), np.array([self.leaving[k].direction for k in own])
 
     @property
     def layout(self) -> Layout:
@@ -172,9 +173,7 @@ class Mode(NamedTuple):
 
     def guards_at(self, t, y, latest) -> Guarded:
         """The guards at a state, without derivatives, of a run that ends at `latest`."""
-        of_state, of_params = self.widths
-        of_numbers = jnp.pad(of_params, (0, self.vector.size - of_params.size))  # what modes differ by is exact
-        return self.surfaces.evaluate_guards(t, y, self.vector, latest, (of_state, of_numbers))
+        return self.surfaces.evaluate_guards(t, y, self.vector, latest, self.widths)
 
     def crossing(self, k, taken, t, y, numbers) -> tuple:
         """(t, y): the state at t, where guard k is zero and stays so as what went in varies, if it is `taken`.

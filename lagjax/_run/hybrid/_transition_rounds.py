@@ -21,8 +21,7 @@ from lagjax._native import SINGLE_NOISE
 from lagjax._primitives import lost_unless
 from lagjax._run._trajectory import constant_unless, vary_with
 from lagjax._run.hybrid._mode import Mode, Transition, state_after
-from lagjax._run.hybrid._mode_families import SystemFamily, families
-from lagjax._scene import Lifted, System
+from lagjax._scene import System
 
 PyTree = Any
 
@@ -58,47 +57,19 @@ class RoundPlan(eqx.Module):
     max_steps: int = eqx.field(static=True)
     is_single: bool = eqx.field(static=True)  # whether the start came in float32
 
-    def groups(self, layout: Layout, params: PyTree, widths: tuple) -> list["ModeGroup"]:
-        """The modes with the transitions that leave them; those that differ by numbers alone are one group."""
-        numbers = [tuple(k for k, t in enumerate(self.transitions) if t.source == name) for name in self.names]
-        leaving = [tuple(self.transitions[k] for k in of_mode) for of_mode in numbers]
+    def modes(self, layout: Layout, params: PyTree, widths: tuple) -> list[Mode]:
+        """The modes, each with the transitions that leave it."""
         target_of = np.array([self.names.index(t.target) for t in self.transitions], int)
         limits = {"rtol": self.rtol, "atol": self.atol, "max_steps": self.max_steps}
-        groups = []
-        for family in families(self.systems, leaving, layout, params):
-            first, own = family.modes[0], params
-            if len(family.modes) > 1:
-                own = Lifted(params, tuple(row[0] for row in family.rows))
-            table = np.array([numbers[k] for k in family.modes], int).reshape(len(family.modes), -1)
-            targets = target_of[table]
-            problem = Problem.from_system(family.system, layout, own, **limits)
+        modes = []
+        for name, system in zip(self.names, self.systems, strict=True):
+            numbers = np.array([k for k, t in enumerate(self.transitions) if t.source == name], int)
+            leaving = tuple(self.transitions[k] for k in numbers)
+            problem = Problem.from_system(system, layout, params, **limits)
             problem = dataclasses.replace(problem, is_rounded=self.is_single)
-            mode = Mode.from_problem(self.names[first], problem, family.leaving, table[0], targets[0])
-            groups.append(ModeGroup(family, mode._replace(widths=widths), table, targets))
-        return groups
-
-
-class ModeGroup(NamedTuple):
-    """The modes of a family: the first of them, and for each the places (modes, K) of its transitions and targets."""
-
-    family: SystemFamily
-    first: Mode
-    numbers: np.ndarray
-    targets: np.ndarray
-
-    @property
-    def blows(self) -> tuple[np.ndarray, np.ndarray]:
-        """The places of transitions that may lead back into their own mode, with a direction and a reset; and these."""
-        own = (self.targets == np.array(self.family.modes)[:, None]).any(0)
-        some = [k for k, x in enumerate(self.first.leaving) if own[k] and x.reset and x.direction]
-        return np.array(some, int), np.array([self.first.leaving[k].direction for k in some])
-
-    def mode(self, row) -> Mode:
-        if len(self.family.modes) == 1:
-            return self.first
-        tables = self.family.rows, self.numbers, self.targets
-        values, numbers, targets = jax.tree.map(lambda table: jnp.asarray(table)[row], tables)
-        return self.first.with_params(Lifted(self.first.problem.params.params, values), numbers, targets)
+            mode = Mode.from_problem(name, problem, leaving, numbers, target_of[numbers])
+            modes.append(mode._replace(widths=widths))
+        return modes
 
 
 class Ending(NamedTuple):
@@ -178,7 +149,7 @@ def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree) -> tu
     ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
     given = jnp.append(y0, ts[0]), vector_of(eqx.filter(params, eqx.is_array_like))
     widths = tuple(SINGLE_NOISE * jnp.abs(jax.lax.stop_gradient(x)) for x in given)
-    rounds, start = _Rounds.from_plan(plan, plan.groups(layout, params, widths), ts), plan.names.index(plan.start)
+    rounds, start = _Rounds(plan, plan.modes(layout, params, widths), ts), plan.names.index(plan.start)
     inconsistent = rounds.is_inconsistent(start, ts[0], y0, [start])
     first = Ending(
         t=ts[0], y=y0, mode=jnp.asarray(start), going=~inconsistent,
@@ -186,14 +157,14 @@ def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree) -> tu
         modes=jnp.full(ts.size, -1), steps=jnp.zeros(2, int), latest=jnp.asarray(-1), memory=rounds.no_memory(0.0, 0.0),
         let_out=jnp.full(len(plan.transitions), jnp.nan),
     )  # fmt: skip
-    first = vary_with(first, ts, y0, rounds.groups[0].first.vector)
+    first = vary_with(first, ts, y0, rounds.modes[0].vector)
     ending, record = jax.lax.scan(rounds.run_round, first, jnp.arange(plan.max_transitions + 1))
     record = jax.tree.map(lambda x: x[: plan.max_transitions], record)
     still = jax.lax.stop_gradient(record)
     named = jnp.where(_go_in_turn(still), IN_TURN, jnp.where(_pile_up(still.t, ts[-1]), ZENO, TOO_MANY))
     ending = ending._replace(result=jnp.where(ending.result == TOO_MANY, named, ending.result))
     # Derivatives of outputs that were not reached, and of absent transitions, are NaN.
-    inputs = ts, y0, rounds.groups[0].first.vector
+    inputs = ts, y0, rounds.modes[0].vector
     happened = record.source >= 0
     t, y, y_next = (lost_unless(happened[:, *[None] * (x.ndim - 1)], x, inputs) for x in record[:3])
     path = lost_unless((ending.modes >= 0)[:, None], ending.path, inputs)
@@ -202,29 +173,19 @@ def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree) -> tu
 
 class _Rounds(NamedTuple):
     plan: RoundPlan
-    groups: list[ModeGroup]
-    places: np.ndarray  # (modes, 2): of each mode its group, and which of that group it is
+    modes: list[Mode]
     ts: jax.Array
 
-    @classmethod
-    def from_plan(cls, plan: RoundPlan, groups: list[ModeGroup], ts) -> "_Rounds":
-        places = np.zeros((len(plan.names), 2), int)
-        for index, group in enumerate(groups):
-            places[list(group.family.modes)] = [(index, row) for row in range(len(group.family.modes))]
-        return cls(plan, groups, places, ts)
-
     def run_round(self, before: Ending, count) -> tuple[Ending, TransitionRecord]:
-        """One round: every group runs the members that are in its modes; the others are given no time."""
+        """One round: every mode runs the members that are in it; the others are given no time."""
         after, fired = before, jnp.asarray(False)
         nowhere, none = jnp.full_like(before.y, jnp.nan), jnp.asarray(-1)
         record = TransitionRecord(jnp.asarray(jnp.nan), nowhere, nowhere, none, none, fired)
-        place, row = jnp.asarray(self.places)[before.mode]
-        modes = [group.mode(jnp.where(place == index, row, 0)) for index, group in enumerate(self.groups)]
-        guards = [mode.guards_at(before.t, before.y, self.ts[-1]) if mode.leaving else None for mode in modes]
-        before = before._replace(memory=self._note_rounding(before, modes, guards))
-        for index, group in enumerate(self.groups):
-            here = before.going & (place == index)
-            ending, event, recorded = self._run_mode(group, modes[index], guards[index], before, here)
+        guards = [mode.guards_at(before.t, before.y, self.ts[-1]) if mode.leaving else None for mode in self.modes]
+        before = before._replace(memory=self._note_rounding(before, guards))
+        for place in range(len(self.modes)):
+            here = before.going & (before.mode == place)
+            ending, event, recorded = self._run_mode(place, guards[place], before, here)
             after, record = _select(here, ending, after), _select(here & event, recorded, record)
             fired = fired | (here & event)
         spent = fired & (count == self.plan.max_transitions)
@@ -233,18 +194,17 @@ class _Rounds(NamedTuple):
 
     def is_inconsistent(self, mode, t, y, among: Sequence[int]) -> jax.Array:
         """True if a state is off the constraints of a mode, which is one `among` these."""
-        (place, row), off = jnp.asarray(self.places)[mode], jnp.asarray(False)
-        for index in np.unique(self.places[list(among), 0]).tolist():
-            this = place == index
-            off = off | (this & self.groups[index].mode(jnp.where(this, row, 0)).is_inconsistent(t, y))
+        off = jnp.asarray(False)
+        for place in among:
+            off = off | ((mode == place) & self.modes[place].is_inconsistent(t, y))
         return off
 
     def _run_mode(
-        self, group: ModeGroup, mode: Mode, guarded: Guarded | None, before: Ending, here
+        self, place: int, guarded: Guarded | None, before: Ending, here
     ) -> tuple[Ending, jax.Array, TransitionRecord]:
-        """One round in this mode of a group for members that are `here`, and whether it ended with a transition."""
-        t_start, memory = jax.lax.stop_gradient(before.t), before.memory
-        outset = self._outset(group, mode, guarded, before)
+        """One round in the mode of this `place` for members that are `here`, and whether a transition ended it."""
+        mode, t_start, memory = self.modes[place], jax.lax.stop_gradient(before.t), before.memory
+        outset = self._outset(place, guarded, before)
         horizon = jnp.where(here, self.ts[-1], t_start)
         noted = jnp.concatenate([outset.sides, _pick(memory.rate_rounding, self._places_of(mode))])
         located = mode.solve_to_event(jnp.stack([t_start, horizon]), before.y, noted)
@@ -262,7 +222,7 @@ class _Rounds(NamedTuple):
         kinds = (changes >> jnp.arange(0, 2 * len(mode.leaving), 2)) & 3
         put = outset.beyond & at_once
         known = before.memory, outset.sides, t_end <= outset.lasting
-        exit, memory = self._pass_transition(group, mode, before, kinds, at_once, put, t_end, y_end, known)
+        exit, memory = self._pass_transition(place, before, kinds, at_once, put, t_end, y_end, known)
         places = self._places_of(mode)
         are_let_out, first_time = here & outset.blows & ~((kinds > 0) & at_once), _pick(before.let_out, places)
         event = (changes > 0) & ~exit.piled_up
@@ -283,15 +243,15 @@ class _Rounds(NamedTuple):
         return after, event, TransitionRecord(exit.t, exit.y, exit.y_next, before.mode, exit.target, exit.order_matters)
 
     def _pass_transition(
-        self, group: ModeGroup, mode: Mode, before: Ending, kinds, at_once, put, t, y, known
+        self, place: int, before: Ending, kinds, at_once, put, t, y, known
     ) -> tuple[Exit, GuardMemory]:
         """The state behind the first transition of those whose guard falls (1) or rises (2), as `kinds` (K,) say.
 
         One that the motion was `put` beyond is no crossing: it happens when the mode begins, however that varies.
         """
-        no, place = jnp.asarray(False), before.mode
+        no, mode = jnp.asarray(False), self.modes[place]
         if not mode.leaving:
-            none = Exit(t, y, y, place, jnp.asarray(-1), no, no, jnp.asarray(True), no)
+            none = Exit(t, y, y, before.mode, jnp.asarray(-1), no, no, jnp.asarray(True), no)
             return none, self.no_memory(known[0].rounding, known[0].rate_rounding)
         happens, k = (kinds > 0).any(), jnp.argmax(kinds > 0)
         first, places = np.arange(len(mode.leaving)) == k, self._places_of(mode)
@@ -312,28 +272,29 @@ class _Rounds(NamedTuple):
                 y_next = jnp.where(taken, moved, y_next)
         target, number = (
             jnp.where(happens, _pick(jnp.asarray(x), first), other)
-            for x, other in ((mode.targets, place), (mode.numbers, -1))
+            for x, other in ((mode.targets, before.mode), (mode.numbers, -1))
         )
-        inconsistent = happens & self.is_inconsistent(target, t_zero, y_next, np.unique(group.targets).tolist())
+        inconsistent = happens & self.is_inconsistent(target, t_zero, y_next, np.unique(mode.targets).tolist())
         memory = self._memory(mode, guarded, rates, kinds, *known)
         there = (kinds > 0) | (jnp.abs(guarded.values) <= _pick(memory.rounding, places) + guarded.of_time)
-        order_matters = self._order_matters(group, mode, place, t, y, rates, there & (kinds > 0).any())
+        order_matters = self._order_matters(place, t, y, rates, there & (kinds > 0).any())
         defined = ~jnp.isnan(guarded.values).any()
         return Exit(t_zero, y_zero, y_next, target, number, against, inconsistent, defined, order_matters), memory
 
-    def _order_matters(self, group: ModeGroup, mode: Mode, place, t, y, rates, there) -> jax.Array:
+    def _order_matters(self, place: int, t, y, rates, there) -> jax.Array:
         """True if blows of guards that are `there`, (K,), lead elsewhere when the list is read from its end.
 
         Blows lead back into their own mode. They are followed in both orders, each as long as its guard goes on in its
         direction, once before it has been turned.
         """
-        some, ways = group.blows
+        mode = self.modes[place]
+        some, ways = mode.blows(place)
         if some.size < 2:
             return jnp.asarray(False)
         # A loop that closes over numbers that vary cannot be transposed.
         t, y, params, vector, latest = constant_unless(False, (t, y, mode.problem.params, mode.vector, self.ts[-1]))
         mode = mode._replace(vector=vector)
-        there = (there & (mode.targets == place))[some]
+        there = there[some]
         resets = [functools.partial(state_after, mode.leaving[k], mode.layout, t, params=params) for k in some]
         orders = jnp.stack([jnp.arange(some.size, 0, -1), jnp.arange(1, some.size + 1)])
 
@@ -385,16 +346,16 @@ class _Rounds(NamedTuple):
         new = guarded.values, here, rounding, jnp.maximum(_pick(before.rate_rounding, places), guarded.rate_rounding)
         return GuardMemory(*(_put(x, places, of_mode) for x, of_mode in zip(nothing, new, strict=True)))
 
-    def _note_rounding(self, before: Ending, modes: list[Mode], guards: list[Guarded | None]) -> GuardMemory:
+    def _note_rounding(self, before: Ending, guards: list[Guarded | None]) -> GuardMemory:
         """The memory with the rounding of the guards where a round begins: of its mode, and of other modes.
 
         A guard of another mode may be the same function. What is computed with that mode's equations says nothing here.
         """
-        memory, place = before.memory, jnp.asarray(self.places)[before.mode][0]
-        for index, (mode, guarded) in enumerate(zip(modes, guards, strict=True)):
+        memory = before.memory
+        for place, (mode, guarded) in enumerate(zip(self.modes, guards, strict=True)):
             if guarded is None:
                 continue
-            here, back = place == index, self._places_of(mode).T
+            here, back = before.mode == place, self._places_of(mode).T
             alike = np.array(["multipliers" not in transition.guard.extras for transition in mode.leaving])
             values = jnp.where((here | alike) & jnp.isfinite(guarded.rounding), guarded.rounding, 0.0)
             rates = jnp.where(here & jnp.isfinite(guarded.rate_rounding), guarded.rate_rounding, 0.0)
@@ -404,8 +365,9 @@ class _Rounds(NamedTuple):
             )
         return memory
 
-    def _outset(self, group: ModeGroup, mode: Mode, guarded: Guarded | None, before: Ending) -> Outset:
+    def _outset(self, place: int, guarded: Guarded | None, before: Ending) -> Outset:
         """The guards of a mode where a motion begins in it; for those beyond zero see `Transition`."""
+        mode = self.modes[place]
         if guarded is None or mode.surfaces is None:
             return Outset(*jnp.zeros((2, 0)), *jnp.zeros((2, 0), bool))
         last_values, last_sides, rounding, largest = (_pick(x, self._places_of(mode)) for x in before.memory)
@@ -423,22 +385,23 @@ class _Rounds(NamedTuple):
         unmoved = (jnp.abs(guarded.values - last_values) <= rounding) & (last_sides != 0)
         sides = jnp.where(unmoved, jnp.where(fired_last, fired_to, last_sides), sides)
 
-        back, beyond_zero = mode.targets == before.mode, guarded.values * directions > noise
+        back, beyond_zero = mode.targets == place, guarded.values * directions > noise
         always = np.array([transition.fires == "beyond" for transition in mode.leaving])
         by_target = np.array([transition.fires is None for transition in mode.leaving])
         at_once = beyond_zero & (always | (by_target & ~back))
-        blows = beyond_zero & by_target & back & self._are_blows(group, mode, guarded, rates, before)
+        blows = beyond_zero & by_target & back & self._are_blows(place, guarded, rates, before)
         from_behind = jnp.where(blows, -directions, sides) * jnp.maximum(noise, _LEAST)
         sides = jnp.where(at_once, np.copysign(np.inf, -directions), from_behind)
         lasting = jnp.where(rates == 0, before.t, before.t + 2.0 * noise / jnp.abs(rates))
         return Outset(sides, jax.lax.stop_gradient(lasting), at_once | blows, blows)
 
-    def _are_blows(self, group: ModeGroup, mode: Mode, guarded: Guarded, rates, before: Ending) -> jax.Array:
+    def _are_blows(self, place: int, guarded: Guarded, rates, before: Ending) -> jax.Array:
         """True for every guard, (K,), whose reset keeps it off its surface: turns it round, or puts it back.
 
         A kick that leaves it to go on does not, nor does a section without a reset.
         """
-        some, ways = group.blows
+        mode = self.modes[place]
+        some, ways = mode.blows(place)
         are_blows = jnp.zeros(len(mode.leaving), bool)
         if not some.size:
             return are_blows
