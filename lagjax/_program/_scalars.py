@@ -70,9 +70,8 @@ def _function(op: str, in_jax: Callable) -> Callable:
 
 
 binade = _function("binade", lambda x: apply_in_jax("binade", x))
-prefers, equal = _function("prefers", jnp.greater), _function("eq", jnp.equal)
-exponential, logarithm, root = _function("exp", jnp.exp), _function("log", jnp.log), _function("sqrt", jnp.sqrt)
-minimum, maximum, absolute = _function("min", jnp.minimum), _function("max", jnp.maximum), _function("abs", jnp.abs)
+prefers, logarithm, root = _function("prefers", jnp.greater), _function("log", jnp.log), _function("sqrt", jnp.sqrt)
+maximum, absolute = _function("max", jnp.maximum), _function("abs", jnp.abs)
 
 
 def where(condition, yes, no):

@@ -178,78 +178,6 @@ def test_weights_jump_without_a_border():
         assert OPERATIONS["binade"].value(np.float64(x)) == apply_in_jax("binade", x) == expected
 
 
-# ---- eigenvalues ----------------------------------------------------------------------------------------------------
-
-
-def matrices(n, seed):
-    """Symmetric matrices of all scales, every third with two eigenvalues that are equal to some digits, or to all."""
-    rng = np.random.default_rng(seed)
-    for trial in range(60):
-        values = rng.normal(size=n) * 10.0 ** rng.integers(-8, 9, size=n if trial % 2 else 1)
-        if n > 1 and trial % 3 == 0:
-            values[1] = values[0] * (1 + 10.0 ** -rng.integers(1, 17))
-        axes = np.linalg.qr(rng.normal(size=(n, n)))[0]
-        yield (axes * values) @ axes.T
-    yield from (np.zeros((n, n)), np.eye(n), np.diag(np.arange(n, 0.0, -1.0)))
-
-
-@pytest.mark.parametrize("n", [1, 2, 3])
-def test_eigenvalues_are_as_exact_as_those_of_lapack(n):
-    program = lower(jnp.linalg.eigvalsh, np.eye(n))
-    for a in matrices(n, seed=n):
-        expected = np.linalg.eigvalsh(a, UPLO="L")
-        found = np.array(program.evaluate(*a.ravel()))
-        assert np.abs(found - expected).max() <= 20 * np.finfo(float).eps * np.abs(expected).max(initial=0.0)
-
-
-@pytest.mark.parametrize("n", [2, 3])
-def test_eigenvectors_are_orthogonal_and_diagonalise(n):
-    program, eps = lower(lambda a: jnp.linalg.eigh(a), np.eye(n)), np.finfo(float).eps
-    for a in matrices(n, seed=10 + n):
-        found = np.array(program.evaluate(*a.ravel()))
-        values, vectors = found[:n], found[n:].reshape(n, n)
-        if np.isnan(vectors).any():  # of equal eigenvalues there are none
-            assert np.diff(values).min() <= 4 * eps * np.abs(values).max()
-            continue
-        np.testing.assert_allclose(vectors.T @ vectors, np.eye(n), atol=50 * eps)
-        assert np.abs(a @ vectors - vectors * values).max() <= 50 * eps * np.abs(values).max()
-
-
-@pytest.mark.slow
-def test_a_strained_cube_by_its_principal_stretches():
-    # tr f(C) by the eigenvalues of C, and by its powers; through states where one principal stretch overtakes another.
-    mass = jnp.array([1.0, 1.2, 0.8, 1.0, 0.9, 1.1])
-    by_stretches = lambda q, v: 0.5 * mass @ v**2 - jnp.sum(jnp.linalg.eigvalsh(symmetric(q)) ** 4)
-    by_powers = lambda q, v: 0.5 * mass @ v**2 - jnp.trace(jnp.linalg.matrix_power(symmetric(q), 4))
-    one, other = lagjax.System(by_stretches), lagjax.System(by_powers)
-    assert in_machine_code(one, Q, V) and one.explain(Q, V).borders == ()
-    ts = jnp.linspace(0.0, 3.0, 7)
-    paths = [lagjax.simulate(system, Q, V, ts, rtol=1e-12) for system in (one, other)]
-    np.testing.assert_allclose(paths[0].q, paths[1].q, rtol=1e-9, atol=1e-9)
-    slopes = [
-        jax.jacfwd(lambda v, of=of: lagjax.simulate(of, Q, v, ts[:3], rtol=1e-12).q[-1])(V) for of in (one, other)
-    ]
-    np.testing.assert_allclose(slopes[0], slopes[1], rtol=1e-8, atol=1e-8)
-
-
-def test_eigenvalues_of_parts_that_cross_change_their_order_at_a_border():
-    # diag(q, −q) has the eigenvalues ±|q|.
-    system = lagjax.System(lambda q, v: 0.5 * v**2 - jnp.linalg.eigvalsh(jnp.diag(jnp.stack([q, -q])))[1])
-    path = lagjax.simulate(system, 0.5, 0.0, jnp.array([0.0, 1.0, 2.0]), rtol=1e-12)
-    np.testing.assert_allclose(path.q, [0.5, 0.0, -0.5], atol=1e-12)
-
-
-def test_eigenvalues_without_a_formula_are_left_to_diffrax():
-    def lagrangian(q, v, size):
-        return 0.5 * v @ v - jnp.linalg.eigvalsh(jnp.eye(size) + 0.1 * jnp.outer(q, q))[-1]
-
-    facts = lagjax.System(lambda q, v: lagrangian(q, v, 4)).explain(jnp.ones(4), jnp.zeros(4))
-    assert "eigenvalues of a symmetric matrix of 4 rows have no formula" in facts.solver
-    hermitian = lambda q, v: 0.5 * v**2 - jnp.linalg.eigvalsh(jnp.array([[1.0, 1j * q], [-1j * q, 1.0]]))[1]
-    facts = lagjax.System(hermitian).explain(0.3, 0.0)
-    assert not facts.solver.startswith("Taylor series in machine code")
-
-
 # ---- complex numbers ------------------------------------------------------------------------------------------------
 
 
@@ -313,32 +241,18 @@ def test_complex_functions_have_the_digits_of_real_ones(name):
         assert abs(found - exact) <= 1e-14 * max(abs(exact), 1.0 if name in ("log", "acos", "acosh") else 0.0), z
 
 
-# ---- functions that are series --------------------------------------------------------------------------------------
-
-ARGUMENTS = (1e-8, 0.3, 1.0, 1.5, 2.0, 7.7, 24.9, 25.1, 90.0, 400.0, -0.3, -3.7, -26.0)
-SERIES = {
-    "i0": lambda x: mpmath.besseli(0, x),
-    "i1": lambda x: mpmath.besseli(1, x),
-    "i0e": lambda x: mpmath.besseli(0, x) * mpmath.exp(-abs(x)),
-    "i1e": lambda x: mpmath.besseli(1, x) * mpmath.exp(-abs(x)),
-    "gammaln": lambda x: mpmath.log(abs(mpmath.gamma(x))),
-    "digamma": mpmath.digamma,
-}
-
-
-@pytest.mark.parametrize("name", SERIES)
-def test_series_hold_everywhere(name):
-    of_gamma = name in ("gammaln", "digamma")
-    program = lower(getattr(jax.scipy.special, name), 0.5)
-    for x in ARGUMENTS[:-1] if of_gamma else ARGUMENTS:  # −26 is a pole
-        with mpmath.workdps(40):
-            exact = float(SERIES[name](mpmath.mpf(x)))
-        # Functions of Γ have zeros, next to which rounding is that of terms of order one.
-        assert abs(float(program.evaluate(x)[0]) - exact) <= 1e-14 * max(abs(exact), float(of_gamma)), x
-
+# ---- functions that are left to XLA ----------------------------------------------------------------------------------
 
 special = jax.scipy.special
 LEFT_TO_XLA = {  # potentials V of one coordinate with V', and what their sentence names
+    "log Γ": (special.gammaln, lambda x: float(mpmath.digamma(x)), "`lgamma`"),
+    "Bessel functions": (special.i0, lambda x: float(mpmath.besseli(1, x)), "`bessel_i0e`"),
+    "eigenvalues": (
+        lambda x: jnp.linalg.eigvalsh(jnp.array([[x, 1.0], [1.0, -x]]))[1], lambda x: x / math.hypot(x, 1.0), "`eigh`",
+    ),
+    "Hermitian eigenvalues": (
+        lambda x: jnp.linalg.eigvalsh(jnp.array([[1.0, 1j * x], [-1j * x, 1.0]]))[1], lambda x: 1.0, "`eigh`",
+    ),
     "exponential integrals": (
         special.exp1, lambda x: -math.exp(-x) / x, "depends on the values of the inputs",
     ),
@@ -361,26 +275,3 @@ def test_functions_that_xla_has_run_on_arrays(name):
     path = lagjax.simulate(system, 1.5, 0.0, jnp.linspace(0.0, 0.5, 3), rtol=1e-10, atol=1e-12)
     energy = 0.5 * path.qdot**2 + jax.vmap(potential)(path.q)
     np.testing.assert_allclose(energy, energy[0], rtol=1e-8)
-
-
-@pytest.mark.parametrize("order", [1, 2, 6])
-def test_derivatives_of_digamma(order):
-    program = lower(lambda x: jax.scipy.special.polygamma(order, x), 0.5)
-    for x in (1e-3, 0.3, 1.0, 7.7, 90.0, -0.3, -3.7):
-        with mpmath.workdps(40):
-            exact = float(mpmath.polygamma(order, mpmath.mpf(x)))
-            # Beside a pole rounding of x counts: its derivative is the next function.
-            condition = abs(float(mpmath.polygamma(order + 1, mpmath.mpf(x)) * x))
-        assert abs(float(program.evaluate(x)[0]) - exact) <= 1e-14 * max(abs(exact), condition), x
-
-
-def test_a_motion_between_functions_of_gamma():
-    # Rather than a closed form, its energy, and ψ = (log Γ)' by differences of values.
-    system = lagjax.System(lambda q, v: 0.5 * v**2 - jax.scipy.special.gammaln(q) - jax.scipy.special.i0(q - 1.5))
-    assert in_machine_code(system, 0.7, 0.5)
-    path = lagjax.simulate(system, 0.7, 0.5, jnp.linspace(0.0, 5.0, 6), rtol=1e-12)
-    assert path.q.max() > 1.5 > path.q.min()  # through the border that i0 = e^|x| (e^-|x| i0) is written with
-    energy = [0.5 * v**2 + float(mpmath.loggamma(float(q)) + mpmath.besseli(0, float(q) - 1.5))
-              for q, v in zip(path.q, path.qdot, strict=True)]  # fmt: skip
-    np.testing.assert_allclose(energy, energy[0], rtol=1e-10)  # some tens of steps at a tolerance of 1e-12
-    np.testing.assert_allclose(system.acceleration(2.0, 0.0), -float(mpmath.digamma(2)) - float(mpmath.besseli(1, 0.5)))
