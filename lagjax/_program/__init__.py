@@ -46,7 +46,7 @@ from jax.custom_derivatives import SymbolicZero
 from jax.extend import core
 
 from lagjax._program import _scalars as scalar_algebra
-from lagjax._program._borders import BELOW, CLOCK, FLOOR, SIGN, TABLE, TRUNC, Borders, borders, distances, is_smooth
+from lagjax._program._borders import CLOCK, FLOOR, SIGN, TABLE, TRUNC, Borders, borders, distances, is_smooth
 from lagjax._program._differentiation import Derivatives, copy_nodes, pullback, pushforward, with_tangents
 from lagjax._program._emit import Rows, apply_in_jax, emit, emit_look_up, emit_rows, plain_elementary
 from lagjax._program._graph import Graph, Tape, Unlowerable, find_ancestors

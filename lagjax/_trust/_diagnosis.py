@@ -340,15 +340,11 @@ def _run_check(system: System, derivation: Derivation, params, ended: Ended) -> 
         return ""
     q, qdot = map(derivation.layout.restore, halves(ended.y))
     found = {finding.kind: finding for finding in reversed(list(check(system, q, qdot, ended.t, params)))}
-    kinds = (*_EXPLAIN, "border") if _CODES[ended.code] == "acceleration_discontinuous" else _EXPLAIN
-    kind = next((kind for kind in kinds if kind in found), None)
-    if kind is None:
-        return ""
-    where = ""
-    if kind == "border":
-        pieces = describe_pieces(*_short_functions(derivation, params, ended))
-        where = f" The scene is pieced together by {pieces}." if pieces else ""
-    return f"\nThere check says: {found[kind].message}{where}{_budget(ended)}"
+    if (kind := next((kind for kind in _EXPLAIN if kind in found), None)) is not None:
+        return f"\nThere check says: {found[kind].message}{_budget(ended)}"
+    jumps = _CODES[ended.code] == "acceleration_discontinuous"
+    pieces = describe_pieces(*_short_functions(derivation, params, ended)) if jumps else ""
+    return f"\nThe scene is pieced together by {pieces}.{_budget(ended)}" if pieces else ""
 
 
 def _budget(ended: Ended) -> str:

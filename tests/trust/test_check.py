@@ -1,6 +1,5 @@
 """`check`: silent about every ready scene, and right about each thing that can be wrong, by kind and by name."""
 
-import functools
 from typing import NamedTuple
 
 import jax
@@ -123,7 +122,7 @@ BROKEN = {
         lambda q, v: 0.5 * jnp.sum(v**2) + jnp.sum(jnp.abs(v) ** 1.5),
         jnp.ones(2), jnp.array([0.0, 1.0]), "derivative_not_finite", "dq[0]", "pow",
     ),
-    "division by zero": (lambda q, v: 0.5 * v**2 + 1 / q, 0.0, 1.0, "value_not_finite", None, "div(1, 0)"),
+    "division by zero": (lambda q, v: v**2 + 1 / q, 0.0, 1.0, "value_not_finite", None, "div(1, 0)"),
     "root of a negative number": (
         lambda q, v: -jnp.sqrt(1 - v**2), 0.0, 2.0, "value_not_finite", None, "sqrt(-3)",
     ),
@@ -297,38 +296,6 @@ def test_discontinuities_are_found_where_they_are():
     assert "the motion is reflected" in finding.message
     smooth = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * jnp.maximum(q - 1.25, 0.0) ** 2)
     assert not lagjax.check(smooth, 1.0, 0.5).found
-
-
-def in_potential(q, v, potential):
-    return 0.5 * v**2 - potential(q)
-
-
-def test_what_lies_ahead_is_named_with_its_place():
-    def only_of(kind, forces=None, potential=lambda q: 0.0):
-        system = lagjax.System(functools.partial(in_potential, potential=potential), forces=forces)
-        (finding,) = [f for f in lagjax.check(system, 0.0, 1.0) if f.kind == kind]
-        assert finding.level == "advice"
-        return finding
-
-    pulse = only_of("border", lambda q, v, t: jnp.where(jnp.abs(t - 5) < 0.1, 1.0, 0.0))
-    assert pulse.where == ("t",) and "t = 4.9, 5.1." in pulse.message
-    switched = only_of("border", lambda q, v, t: 0.3 * jnp.sign(jnp.sin(2 * np.pi * t) - 0.5))
-    assert "t = 0.0833333, 0.416667" in switched.message and "and more" in switched.message  # and none in the past
-    assert "q = 7." in only_of("border", potential=lambda q: jnp.abs(q - 7)).message
-    # exp(−(x/w)²) is half of its height at x = w √ln 2.
-    bump = only_of("narrow_feature", lambda q, v, t: jnp.exp(-(((t - 5) / 0.01) ** 2)))
-    assert f"t = 5, {2 * 0.01 * np.log(2) ** 0.5:.2g} wide" in bump.message
-    assert "q = 3, " in only_of("narrow_feature", potential=lambda q: jnp.exp(-(((q - 3) / 0.1) ** 2))).message
-    # Neither a kink of the force, nor an exponential that reaches the state, nor what two numbers decide together.
-    for harmless in (
-        lambda q: jnp.maximum(q - 2, 0.0) ** 2,
-        lambda q: (1 - jnp.exp(1 - q)) ** 2,
-        lambda q: jnp.exp(-(q**2)),
-    ):
-        system = lagjax.System(functools.partial(in_potential, potential=harmless))
-        assert not lagjax.check(system, 0.0, 1.0).found
-    many = lagjax.System(free, forces=lambda q, v: jnp.where(q > 5, 1.0, 0.0))
-    assert only(lagjax.check(many, jnp.zeros(20), jnp.ones(20))).where == tuple(f"q[{i}]" for i in range(20))
 
 
 # ---- constraints -----------------------------------------------------------------------------------------------------

@@ -3,7 +3,7 @@
 Everything is computed once, by the programs of the scene: values, derivatives, their finite differences, the mass
 matrix at states nearby, the linearised motion. What follows is NumPy and sentences, each file for one question.
 `_scene_at_start` is what they all look at, `_findings` what they return. In their order: `_derivative_checks` (by
-`_differences`), `_constraint_checks`, `_mass`, `_jumps_nearby`, `_borders_ahead`, `_stiffness`.
+`_differences`), `_constraint_checks`, `_mass`, `_jumps_nearby`, `_stiffness`.
 """
 
 from typing import Any
@@ -22,7 +22,6 @@ from lagjax._native import ATOL_OVER_MOTION, ATOL_OVER_RTOL
 from lagjax._primitives import accepts_singles
 from lagjax._scene import ROLES, System, replace_functions, require_system
 from lagjax._trust.checks import (
-    _borders_ahead,
     _constraint_checks,
     _derivative_checks,
     _jumps_nearby,
@@ -57,7 +56,7 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
     - warning: `creates_energy` (a dissipation function of the wrong sign), `indefinite_mass_matrix`,
       `near_coordinate_singularity`, `velocity_constraint_not_affine`, `discontinuity`.
     - advice: `single_precision`, `integer_parameter`, `small_state`, `ill_conditioned`, `dependent_constraints`,
-      `stiff`, `explicit_time`, `border` and `narrow_feature` (what lies ahead: a force switched on at t = 5).
+      `stiff`, `explicit_time`.
 
     **Raises** `TypeError` or `ValueError`, with the messages of `simulate`, for a state or functions with which no
     motion can begin; `ValueError` inside `jit`, where there are no numbers.
@@ -105,9 +104,7 @@ def _scene_findings(system, q, qdot, t, params) -> tuple[list[Finding], str]:
     if not any(finding.level == "error" for finding in reported):
         known = {finding.where for finding in reported if finding.kind == "kink"}  # one finding for each direction
         nearby = [finding for finding in _jumps_nearby.findings(scene) if finding.where not in known]
-        known |= {finding.where for finding in nearby}
-        ahead = [finding for finding in _borders_ahead.findings(scene) if finding.where not in known]
-        reported += [*_acceleration(scene), *nearby, *ahead, *_stiffness.findings(scene)]
+        reported += [*_acceleration(scene), *nearby, *_stiffness.findings(scene)]
     return [*reported, *_time(scene)], ""
 
 
