@@ -15,7 +15,7 @@ from lagjax._equations._constraints import Constraints
 from lagjax._equations._motion import Motion
 from lagjax._equations._recursion import Recursion, RecursiveElimination, recursion_of
 from lagjax._equations._saddle import SaddleElimination
-from lagjax._program import Derivatives, Expansion, Tape, copy_nodes, has_own_rules, inputs_of, trace_jaxpr
+from lagjax._program import Derivatives, Expansion, Tape, copy_nodes, has_own_rules, inputs_of
 
 PyTree = Any
 Ids = np.ndarray  # scalars of a graph, in the shape of the array that they stand for
@@ -79,7 +79,7 @@ class _ScalarState:
         return [part.reshape(ids.shape) for part, ids in zip(np.split(flat, ends), inputs, strict=True)]
 
     def _traced(self, function: Callable, *arguments: str):
-        jaxpr = trace_jaxpr(function, *(self.shapes[name] for name in arguments))
+        jaxpr = jax.make_jaxpr(function)(*(self.shapes[name] for name in arguments))
         if has_own_rules(jaxpr.jaxpr):
             raise OwnRules
         return jaxpr

@@ -9,7 +9,6 @@ from llvmlite import ir
 from lagjax._native._constants import LARGEST_ANGLE
 from lagjax._native._frame import Frame, Numbers, Vectors
 from lagjax._native._ir import BIT, DOUBLE, FLOAT, POINTER, Code, Value, element_of
-from lagjax._program._digits import COS, PI_2, PI_2_ROUNDED, SIN
 from lagjax._program._graph import Unlowerable
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._series import StraightLine
@@ -185,11 +184,23 @@ def _check_range(code: Code, x: Value, kind: str) -> Value:
     return code.select((x >= float(low)) & (x <= float(high)), x, float("nan"))
 
 
+# π/2 in parts that sum to it, of which all but the last are so short that k times a part is exact.
+PI_2 = (1.5707963267341256, 6.077100506303966e-11, 2.0222662487111665e-21, 8.4784276603689e-32)  # 32 bits each
+PI_2_ROUNDED = (1.5707963267948966, 6.123233995736766e-17)
+# fmt: off
+# fdlibm k_sin.c, k_cos.c: sin r = r + r^3 S(r^2), cos r = 1 - r^2/2 + r^4 C(r^2), |r| <= pi/4.
+SIN = (-1.66666666666666324348e-01, 8.33333333332248946124e-03, -1.98412698298579493134e-04,
+       2.75573137070700676789e-06, -2.50507602534068634195e-08, 1.58969099521155010221e-10)
+COS = (4.16666666666666019037e-02, -1.38888888888741095749e-03, 2.48015872894767294178e-05,
+       -2.75573143513906633035e-07, 2.08757232129817482790e-09, -1.13596475577881948265e-11)
+# fmt: on
+
+
 def sincos_function(module: ir.Module, lanes: int, name: str = "sincos", number: ir.Type = DOUBLE) -> Code:
     """`(x, address)`: sin x and cos x of doubles, stored one after the other as numbers of this type.
 
-    The method is that of `_elementary`: Cody and Waite's reduction, fdlibm's polynomials; 1 ulp. A vector with an angle
-    beyond `LARGEST_ANGLE` asks the C library as well; in single precision its sine and cosine are NaN.
+    Cody and Waite's reduction (*Software Manual for the Elementary Functions*, 1980), fdlibm's polynomials; 1 ulp. A
+    vector with an angle beyond `LARGEST_ANGLE` asks the C library as well; in single precision these are NaN.
     """
     code = Code(module, name, [ir.VectorType(DOUBLE, lanes), POINTER], lanes, number=number)
     x, address = code.arguments

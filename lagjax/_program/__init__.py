@@ -28,9 +28,8 @@ function and lowered in turn, on first use.
 folds; `_scalars` writes formulas on it, `_passes` finish it; `_differentiation` differentiates it. Series: `_series`,
 with `_recurrences` for operations that have one of their own. Pieces: `_borders` (where they meet), `_sliding` (along
 them), `_jump` and `_kick` (over them), `_powers` (where no series helps), `_look_ups` (tables). A program
-consists of a `_line`, with its values in NumPy; `_emit` is for JAX, `_rounding` for their error, `_elementary` and
-`_digits` are sine and cosine for CPUs. `_memory` bounds what a graph may take. `lowering/` turns JAX's operations into
-scalars.
+consists of a `_line`, with its values in NumPy; `_emit` is for JAX, `_rounding` for their error. `_memory` bounds what
+a graph may take. `lowering/` turns JAX's operations into scalars.
 """
 
 import functools
@@ -48,7 +47,7 @@ from jax.extend import core
 from lagjax._program import _scalars as scalar_algebra
 from lagjax._program._borders import CLOCK, FLOOR, SIGN, TABLE, TRUNC, Borders, borders, distances, is_smooth
 from lagjax._program._differentiation import Derivatives, copy_nodes, pullback, pushforward, with_tangents
-from lagjax._program._emit import Rows, apply_in_jax, emit, emit_look_up, emit_rows, plain_elementary
+from lagjax._program._emit import Rows, apply_in_jax, emit, emit_look_up, emit_rows
 from lagjax._program._graph import Graph, Tape, Unlowerable, find_ancestors
 from lagjax._program._jump import row_places
 from lagjax._program._line import StraightLine
@@ -78,16 +77,10 @@ def lower(function: Callable, *examples, budget: int = 20_000, moving: int = 0) 
     )
 
 
-def trace_jaxpr(function: Callable, *shapes) -> core.ClosedJaxpr:
-    """The jaxpr of a function, with programs in it as they are to be lowered."""
-    with plain_elementary():
-        return jax.make_jaxpr(function)(*shapes)
-
-
 def _lower_leaves(
     function: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], budget: int, moving: int = 0
 ) -> "Program":
-    jaxpr = trace_jaxpr(function, *shapes)
+    jaxpr = jax.make_jaxpr(function)(*shapes)
 
     def scalars(expansion, arguments):
         return expansion.run_closed(jaxpr, arguments)

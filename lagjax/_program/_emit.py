@@ -1,38 +1,17 @@
 """From a graph to JAX again: the operations of a program, one after the other, on scalars or on arrays of lanes."""
 
-import contextlib
-import threading
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
-from jax.experimental.xla_metadata import set_xla_metadata
 
-from lagjax._interface import default_platform
-from lagjax._program import _elementary
+from lagjax._interface import compiled_once
 from lagjax._program._line import StraightLine
 from lagjax._program._look_ups import BESIDE, Table, table_of
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
-
-_state = threading.local()
-
-
-@contextlib.contextmanager
-def plain_elementary() -> Iterator[None]:
-    """Inside, programs emit `sin` itself and not the polynomial behind it, so that they can be lowered again.
-
-    The metadata is for `jit`: it keeps what is traced here apart, in its cache, from what is traced elsewhere.
-    """
-    before = getattr(_state, "plain", False)
-    _state.plain = True
-    try:
-        with set_xla_metadata(lagjax="lowering"):
-            yield
-    finally:
-        _state.plain = before
 
 
 def emit(line: StraightLine, scalars: tuple) -> tuple:
@@ -47,7 +26,6 @@ def emit(line: StraightLine, scalars: tuple) -> tuple:
 
 def _emit_outputs(line: StraightLine, scalars, shape: tuple[Any, ...], entries: Callable) -> tuple:
     nodes, kinds = line.nodes, line.kinds
-    is_plain = getattr(_state, "plain", False)
     positions = [node[2] for node, kind in zip(nodes, kinds, strict=True) if node[0] == "input" and kind == "float"]
     precision = jnp.result_type(float, *(scalars[i] for i in positions))
     dtypes = [precision if kind == "float" else np.dtype(kind) for kind in kinds]
@@ -63,7 +41,7 @@ def _emit_outputs(line: StraightLine, scalars, shape: tuple[Any, ...], entries: 
             values[i] = lax.convert_element_type(values[operands[0]], dtypes[i])
         elif op in LOOK_UPS:
             values[i] = emit_look_up(op, attribute, entries, precision, values[operands[0]])
-        elif op in ("sin", "cos") and not is_plain:
+        elif op in ("sin", "cos"):
             if operands[0] not in turns:
                 turns[operands[0]] = _sincos(values[operands[0]])
             values[i] = turns[operands[0]][op == "cos"]
@@ -135,36 +113,17 @@ def apply_in_jax(op: str, *xs, attribute=None) -> jax.Array:
     return _apply(op, _align_shapes([jnp.asarray(x, dtype) for x in xs]), attribute)
 
 
-# ---- sine and cosine -------------------------------------------------------------------------------------------------
-
-_compiled_sincos = jax.jit(_elementary.sincos)
-
-
+@jax.custom_jvp
+@compiled_once
 def _sincos(x) -> tuple:
-    """Sine and cosine, in the form that suits what they are of.
-
-    For lanes: a body of its own. XLA's CPU backend fuses operations into one loop per output and repeats in each what
-    they share, a polynomial of thirty operations many times over; a call it may not inline is evaluated once. For a
-    single number such a call costs more than the C library's function, which stays in the loop.
-    """
-    if default_platform() != "cpu":
-        return _compiled_sincos(x)
-    return _sincos_of_lanes(x) if jnp.ndim(x) else _sincos_of_number(x)
+    """Sine and cosine, once: XLA's CPU backend fuses operations into one loop for each output, and repeats in each what
+    they share."""
+    return lax.sin(x), lax.cos(x)
 
 
-def _sincos_of_lanes(x) -> tuple:
-    with set_xla_metadata(inlineable="false"):
-        return _compiled_sincos(x)
-
-
-_plain_sincos = jax.custom_batching.custom_vmap(lambda x: (lax.sin(x), lax.cos(x)))
-_plain_sincos.def_vmap(lambda size, batched, x: (_sincos_of_lanes(x), (True, True)))
-_sincos_of_number = jax.custom_jvp(_plain_sincos)  # as `custom_vmap` has no derivative of every order of its own
-
-
-@_sincos_of_number.defjvp
+@_sincos.defjvp
 def _derive_sincos(xs, moving):
-    sine, cosine = _sincos_of_number(*xs)
+    sine, cosine = _sincos(*xs)
     return (sine, cosine), (cosine * moving[0], -sine * moving[0])
 
 

@@ -18,8 +18,7 @@ applies an operation, `c(x)` makes a number, `w` is the result and `u`, `v` (or 
 
 Two operations carry an attribute: `round` (1: ties to even, 0: away from zero) and `convert` (the kind of the result).
 `convert` has no code here because it depends on both kinds. Sine and cosine of one angle are computed together by
-`_native._lanes` and by `_emit`, for XLA on CPUs as `_elementary` has them. What is looked up in a table is no
-elementwise operation: see `_look_ups`.
+`_native._lanes` and by `_emit`. What is looked up in a table is no elementwise operation: see `_look_ups`.
 """
 
 import math
