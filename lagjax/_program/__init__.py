@@ -42,7 +42,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.custom_derivatives import SymbolicZero
-from jax.extend import core
 
 from lagjax._program import _scalars as scalar_algebra
 from lagjax._program._borders import CLOCK, FLOOR, SIGN, TABLE, TRUNC, Borders, borders, distances, is_smooth

@@ -5,7 +5,7 @@ contains, what was left out, and which engine takes it; `_contacts` the contacts
 `_closed_over` takes numbers that functions close over while they are traced, and makes them parameters.
 """
 
-from lagjax._scene._closed_over import Lifted, Unchanged, function_from_trace, lift_batch, lift_problem, open_jaxpr
+from lagjax._scene._closed_over import lift_batch, lift_problem
 from lagjax._scene._contacts import Contacts, ContactScene, Flat, InContact, Shapes
 from lagjax._scene._explanation import Explanation
 from lagjax._scene._samples import HOLDS, MARGINS, continued, samples, unevenly_spaced

@@ -118,22 +118,9 @@ def _lift_function(function: Function, roles: int, problem: Problem, values: lis
     closed, shapes = jax.make_jaxpr(call_with_numbers, return_shape=True)((state,) * roles, t, numbers)
     places = tuple(place_in(values, c) if isinstance(c, Tracer) else None for c in closed.consts)
     constants = tuple(None if isinstance(c, Tracer) else c for c in closed.consts)
-    jaxpr, structure, how = open_jaxpr(closed), jax.tree.structure(shapes), f"{places} {closed.in_avals}"
-    return function_from_trace(function, jaxpr, constants, places, structure, how)
-
-
-def open_jaxpr(closed: core.ClosedJaxpr, more=(), **changes) -> core.Jaxpr:
-    """A trace whose first arguments are what it took from outside and `more` variables; and with other `changes`."""
-    jaxpr = closed.jaxpr
-    return jaxpr.replace(constvars=[], invars=[*jaxpr.constvars, *more, *jaxpr.invars], **changes)
-
-
-def function_from_trace(function: Function, jaxpr, constants: tuple, places: tuple, structure, how: str) -> Function:
-    """A function as its trace, for parameters that are `Lifted`: the constants that have `places` are values there.
-
-    The first arguments of the jaxpr are these constants. `how` says where the values stand in it, so that equal
-    functions with equal places are one edition.
-    """
-    trace = _Trace(function.name, jaxpr, constants, places, structure)
+    # The first arguments of the trace are what it took from outside. An edition also says where the
+    # values stand in it, so that equal functions with equal places are one.
+    jaxpr = closed.jaxpr.replace(constvars=[], invars=[*closed.jaxpr.constvars, *closed.jaxpr.invars])
+    trace = _Trace(function.name, jaxpr, constants, places, jax.tree.structure(shapes))
     extras = tuple(dict.fromkeys((*function.extras, "params")))
-    return Function(None, function.code.trace_edition(trace, how), extras)
+    return Function(None, function.code.trace_edition(trace, f"{places} {closed.in_avals}"), extras)
