@@ -82,7 +82,6 @@ class Run(NamedTuple):
     rtol: float = RTOL
     atol: float | None = None
     starts: tuple | None = None
-    dtype: type = np.float64
 
     def given(self, members: int) -> tuple:
         """(q0, qdot0, params) of a few members."""
@@ -91,11 +90,11 @@ class Run(NamedTuple):
             scales = jnp.linspace(0.9, 1.1, members)
             q0 = jax.tree.map(lambda x: jnp.broadcast_to(x, (members, *jnp.shape(x))), scene.q0)
             starts = q0, jax.tree.map(lambda x: jnp.multiply.outer(scales, x), scene.qdot0)
-        return jax.tree.map(lambda x: jnp.asarray(x, self.dtype), (*starts, scene.params))
+        return jax.tree.map(jnp.asarray, (*starts, scene.params))
 
     def motions(self, q0, v0, params, solver=None):
         """The trajectories, to their ends."""
-        ts = jnp.array([0.0, self.duration], self.dtype)
+        ts = jnp.array([0.0, self.duration])
         how = dict(rtol=self.rtol, atol=self.atol, solver=solver)
         return lagjax.simulate_batch(self.scene.system, q0, v0, ts, params, **how)
 
@@ -125,7 +124,7 @@ class Counted(NamedTuple):
 
 
 def counted(run: Run, form=as_chosen, result=end_of, members=MEMBERS) -> Counted:
-    """The instructions of a `result`, in a form; in float32 on a GPU whose float64 is slow."""
+    """The instructions of a `result`, in a form."""
     launched = []
 
     def launch(entry, program, members, arrays, shapes):
@@ -143,15 +142,15 @@ def counted(run: Run, form=as_chosen, result=end_of, members=MEMBERS) -> Counted
         for primitive, rule in zip((_primitives.run_p, _primitives.vjp_p), rules, strict=True):
             mlir.register_lowering(primitive, rule, platform="cpu")
 
-    kept = _gpu_launch.launch, _gpu_launch.has_slow_doubles, gpu.form_for
-    _gpu_launch.launch, _gpu_launch.has_slow_doubles, gpu.form_for = launch, lambda: True, form
+    kept = _gpu_launch.launch, gpu.form_for
+    _gpu_launch.launch, gpu.form_for = launch, form
     try:  # the rule of GPUs on the CPU
         of_gpus = _primitives._run_for_gpus, _primitives._vjp_for_gpus
         lower_by(mlir.lower_fun(rule, multiple_results=True) for rule in of_gpus)
         jax.block_until_ready(jax.jit(lambda given: result(run, *given))(run.given(members)))
     finally:
         lower_by(map(_primitives._lowering_rule, (_primitives._run_compiled, _primitives._vjp_compiled)))
-        _gpu_launch.launch, _gpu_launch.has_slow_doubles, gpu.form_for = kept
+        _gpu_launch.launch, gpu.form_for = kept
         jax.clear_caches()
     assert len(launched) <= 2, "a gradient that needs tangents, too, is not counted"
     of_entry = {entry: (program, counts, results) for entry, program, counts, results in launched}
@@ -228,10 +227,8 @@ def main() -> None:
     driven = SimpleNamespace(system=basin.pendulum(), params=None)
     published = Run(driven, basin.DURATION, basin.RTOL, basin.ATOL, tuple(basin.starts(16)))
     estimate("driven pendulum, T = 1000", published, members=16)
-    for dtype in (np.float64, np.float32):
-        estimate(f"double pendulum, {dtype.__name__}", Run(double, dtype=dtype), on=RTX_4090)
-        name = f"double pendulum, {dtype.__name__}, transposed"
-        estimate(name, Run(double, dtype=dtype), form_of_transpose, gradient_of, on=RTX_4090)
+    estimate("double pendulum", Run(double), on=RTX_4090)
+    estimate("double pendulum, transposed", Run(double), form_of_transpose, gradient_of, on=RTX_4090)
     print(_report.table(rows))
     note = "an estimate from counted instructions; not run on a GPU"
     _report.write_json(STORE, {**_report.circumstances(), "note": note, "duration": DURATION, "scenes": rows})

@@ -14,12 +14,10 @@ diffrax, their sizes are not differentiated. `excess` estimates whether they sui
 what the transpose has at hand: the rates of the tangents, and the series that are multiplied.
 """
 
-from llvmlite import ir
-
 from lagjax._native._constants import NEAR_ZERO
 from lagjax._native._cotangents import Cotangents
 from lagjax._native._frame import Frame, Lane, job
-from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
+from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._maps import CauchyProducts, OrderRecursion, ProjectedEnd, SeriesSum, ZerothOrder
 from lagjax._native._motion_parts import MotionParts
 from lagjax._native._recorded_steps import Replay
@@ -37,10 +35,10 @@ class Adjoint:
 
     job = JOB
 
-    def __init__(self, parts: MotionParts, *, width: int, number: ir.Type = DOUBLE):
+    def __init__(self, parts: MotionParts, *, width: int):
         fields = Cotangents.fields(parts) | {"before": 2 * parts.series.size, "active": 1, "excess": 1}
         at_borders = {"pieces_after": parts.pieces, "has_after": 1}
-        self.replay = Replay("adjoint", parts, JOB, fields, at_borders, width, jumps=2, number=number)
+        self.replay = Replay("adjoint", parts, JOB, fields, at_borders, width, jumps=2)
         self.motion = motion = self.replay.motion
         self.start_next = self.replay.start_next(self._begin_lane, self._take_member)
         cotangents = Cotangents(motion, parts)

@@ -40,9 +40,7 @@ class Digits(NamedTuple):
         return cls(eps, 256 * eps, 16 * eps, largest_unit, small, tiny)
 
 
-# In single precision q may move by a ten-thousandth of itself in a step and still be what varies an acceleration.
 DIGITS = Digits.from_rounding(EPS, 1e-6, 2.0**-400, 2.0**-960)
-SINGLE_DIGITS = Digits.from_rounding(2.0**-23, 2e-2, 2.0**-50, 2.0**-110)
 
 # ---- how a member ended ----------------------------------------------------------------------------------------------
 

@@ -12,10 +12,6 @@ these like dictionaries:
 
 Every function takes three pointers, to the job, the memory and the integers of the lanes, and then what it is called
 with.
-
-The numbers of a state may be of single precision, in one lane; times, lengths of steps and counts are doubles all the
-same, and so are the arrays of the job. A number of single precision has the room of a double: of what a GPU keeps of a
-thread in memory, words that are not touched cost nothing but their room.
 """
 
 import copy
@@ -28,8 +24,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from llvmlite import ir
 
-from lagjax._native._constants import DIGITS, SINGLE_DIGITS, Digits
-from lagjax._native._ir import BIT, DOUBLE, FLOAT, INTEGER, POINTER, Code, Value, element_of
+from lagjax._native._constants import DIGITS, Digits
+from lagjax._native._ir import BIT, DOUBLE, INTEGER, POINTER, Code, Value, element_of
 
 Index = int | Value
 Numbers = Any  # vectors by their numbers: a list of values whose indices are known, or `Vectors`
@@ -60,29 +56,25 @@ def integers(module: ir.Module, numbers: np.ndarray) -> ir.GlobalVariable:
 
 
 class Field(NamedTuple):
-    """Vectors of a thread's memory, in rows and columns, whose elements have a `kind`: None is that of a state."""
+    """Vectors of a thread's memory, in rows and columns."""
 
     rows: int = 1
     columns: int = 1
-    kind: ir.Type | None = None
 
 
 # The fields of a thread's memory by name: a number of vectors, rows and columns of them, or a `Field`.
 Fields = dict[str, Any]
-# One vector of doubles, in whatever precision the state is: times, lengths of steps, counts and codes.
-EXACT = Field(kind=DOUBLE)
+EXACT = 1  # one vector
 
 
 class Memory:
     """The places of the `fields` of a thread.
 
-    `width` is the lanes of a vector, `number` the type of the numbers of a state. A layout `beside` another one has
-    vectors of another width in the same memory.
+    `width` is the lanes of a vector. A layout `beside` another one has vectors of another width in the same memory.
     """
 
-    def __init__(self, width: int, fields: Fields, beside: "Memory | None" = None, number: ir.Type = DOUBLE):
-        assert number == DOUBLE or width == 1, "lanes of single precision would not lie side by side"
-        self.width, self.number, self._fields, self._offsets = width, number, {}, {}
+    def __init__(self, width: int, fields: Fields, beside: "Memory | None" = None):
+        self.width, self._fields, self._offsets = width, {}, {}
         self._doubles = [0] if beside is None else beside._doubles  # of all that share the memory
         self.extend_by(fields)
 
@@ -100,9 +92,6 @@ class Memory:
             field = Field(shape) if isinstance(shape, int) else Field(*shape)
             self._fields[name], self._offsets[name] = field, self.end
             self._doubles[0] = self.end + field.rows * field.columns * self.width
-
-    def type_of(self, name: str) -> ir.Type:
-        return self._fields[name].kind or self.number
 
     def place(self, name: str, *indices: Index) -> Any:
         """The first element of a vector, counted in doubles: `name`, `name[i]` or `name[i, k]`."""
@@ -141,7 +130,7 @@ class Frame:
     """A function of a kernel under construction, with named access to all that it sees."""
 
     def __init__(self, module: ir.Module, layout: Memory, job: type, name: str, *kinds: ir.Type, **options):
-        self.code = Code(module, name, [POINTER] * 3 + list(kinds), layout.width, number=layout.number, **options)
+        self.code = Code(module, name, [POINTER] * 3 + list(kinds), layout.width, **options)
         self.layout, self.width, self.vector = layout, layout.width, self.code.vector
         self._fields = dict(job._fields_)
         self._job, self._memory, self._integers, *self.arguments = self.code.arguments
@@ -151,22 +140,19 @@ class Frame:
 
     @property
     def digits(self) -> Digits:
-        return SINGLE_DIGITS if self.layout.number == FLOAT else DIGITS
+        return DIGITS
 
     def __getitem__(self, key: "str | tuple") -> Value:
         name, *indices = _parts(key)
-        return self.code.load(self.address(name, *indices), self._vector_of(name))
+        return self.code.load(self.address(name, *indices), ir.VectorType(DOUBLE, self.width))
 
     def __setitem__(self, key: "str | tuple", value: "Value | float") -> None:
         if isinstance(value, Value) and element_of(value.it.type) == BIT:
             value = self.code.flag(value)
-        value = self.code.as_value(value, self._vector_of(_parts(key)[0]))
+        value = self.code.as_value(value, ir.VectorType(DOUBLE, self.width))
         if self._mask is not None:
             value = self.code.select(self._mask, value, self[key])
         self.code.store(value, self.address(*_parts(key)))
-
-    def _vector_of(self, name: str) -> ir.Type:
-        return ir.VectorType(self.layout.type_of(name), self.width)
 
     @contextmanager
     def where(self, mask: Value) -> Iterator[None]:
@@ -234,8 +220,6 @@ class Frame:
         return self.code.load(self.code.element(self.job(name), index, kind), kind)
 
     def write(self, name: str, index: Index, value: Value) -> None:
-        if element_of(value.it.type) == FLOAT:
-            value = self.code.as_value(value, DOUBLE)
         self.code.store(value, self.code.element(self.job(name), index))
 
     def next(self, name: str) -> Value:
@@ -275,7 +259,7 @@ class Lane:
         self._frame.code.store(value, self.address(name, *indices))
 
     def _type_of(self, name: str) -> ir.Type:
-        return INTEGER if name in LANE else self._frame.layout.type_of(name)
+        return INTEGER if name in LANE else DOUBLE
 
     def address(self, name: str, *indices: Index) -> Value:
         frame = self._frame

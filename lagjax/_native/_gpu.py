@@ -92,7 +92,7 @@ class GpuPrograms:
 
 def form_for(entry: Entry, lane: OneLane, order: int) -> GpuForm:
     """The form of a motion that should take the least time, where a CPU takes series of this `order`."""
-    fitting = MOST_COEFFICIENTS[entry] * (2 if lane.single else 1) // lane.series  # a register has 32 bits
+    fitting = MOST_COEFFICIENTS[entry] // lane.series
     return GpuForm(order, False) if lane.large or fitting < LEAST_ORDER else GpuForm(min(order, fitting), True)
 
 

@@ -17,7 +17,7 @@ from llvmlite import ir
 from lagjax._native import _adjoint, _integrator
 from lagjax._native._frame import CACHE_LINE, LANE
 from lagjax._native._handler import job_of
-from lagjax._native._ir import BIT, DOUBLE, FLOAT, INTEGER, POINTER, Code, Value, unroll_loops
+from lagjax._native._ir import BIT, DOUBLE, INTEGER, POINTER, Code, Value, unroll_loops
 from lagjax._native._run_records import RECORDED
 from lagjax._native._taylor import TaylorSeries
 
@@ -73,8 +73,7 @@ class OneLane(NamedTuple):
 
     A thread remembers `size` doubles. The motion has this many `states` (2n) and `numbers` of a member, `row` doubles
     are written down of a step, and its series have this many rows, those of the state among them. Of a `large` motion,
-    which is in tables, no loop can be unrolled; of another one the text `unrolled` asks for that. The series may be of
-    `single` precision.
+    which is in tables, no loop can be unrolled; of another one the text `unrolled` asks for that.
     """
 
     text: str
@@ -84,7 +83,6 @@ class OneLane(NamedTuple):
     row: int
     series: int
     large: bool
-    single: bool = False
     unrolled: str = ""
 
     @classmethod
@@ -92,10 +90,9 @@ class OneLane(NamedTuple):
         """The module of an integrator or of an adjoint, whose motion is finished."""
         states, text = motion.states, str(motion.module)
         row, series = states + RECORDED + motion.recorded_pieces, states + motion.series.rows
-        single = motion.layout.number == FLOAT
         if not motion.large:
             unroll_loops(motion.module)
-        form = text, motion.layout.size, states, motion.member_stride, row, series, motion.large, single
+        form = text, motion.layout.size, states, motion.member_stride, row, series, motion.large
         return cls(*form, "" if motion.large else str(motion.module))
 
 

@@ -15,15 +15,13 @@ Every lane of a vector carries one member. A round takes one step in each lane:
 so that no lane waits for another. Several threads may do so at once: they share the counter that hands out the members.
 """
 
-from llvmlite import ir
-
 from lagjax._native import _rank_drops
 from lagjax._native._border_control import BorderControl
 from lagjax._native._constants import DONE, EVENT, FIRST_STEP, LEAST, MAX_ORDER, OUT_OF_STEPS, RUNNING, SMALLEST_STEP
 from lagjax._native._events import Events
 from lagjax._native._frame import Frame, Lane, job
 from lagjax._native._guards import Guards
-from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value
+from lagjax._native._ir import INTEGER, POINTER, Code, Value
 from lagjax._native._motion_parts import MotionParts
 from lagjax._native._projection import Projector
 from lagjax._native._roots import Roots
@@ -45,8 +43,7 @@ class Integrator:
     """Builds the module, whose public functions are `begin` and `run`.
 
     Coordinates of one of the `error_groups` are measured by the largest of them. The first coordinates of a `nesting`
-    are the motion, the others derivatives of it, which follow where the projection takes it. The state is of the type
-    `number`.
+    are the motion, the others derivatives of it, which follow where the projection takes it.
     """
 
     job = JOB
@@ -58,7 +55,6 @@ class Integrator:
         error_groups: tuple[int, ...] | None = None,
         *,
         width: int,
-        number: ir.Type = DOUBLE,
     ):
         program, series, nesting, projection, borders, _ = parts
         n = series.size
@@ -76,7 +72,7 @@ class Integrator:
         jump = parts.jump
         more = [line for line in (jump and jump.line, borders and borders.retraction) if line]
         large = is_large(program, projection, guards, more=more)
-        self.motion = motion = TaylorSeries("motion", parts, JOB, fields, large, width, kept=self.guards, number=number)
+        self.motion = motion = TaylorSeries("motion", parts, JOB, fields, large, width, kept=self.guards)
         self.projector = projection and Projector(motion, projection.state, projection.velocity_scale, self.base_size)
         groups = tuple(range(n)) if error_groups is None else error_groups
         self.step = StepControl(motion, groups, self.projector, self.base_size)

@@ -8,10 +8,6 @@
 
 emits the loop. A number is a double, an integer (64 bits) or a vector of doubles, one for each lane. A sum of products
 may be contracted to fused multiply-adds; nothing else about the arithmetic is loosened.
-
-The vectors of a `Code` may be of single precision instead. As everywhere in C and NumPy a vector of doubles makes the
-result one of doubles, while a scalar takes the precision of the vector that it meets; what is stored is rounded to the
-type of its place.
 """
 
 import ctypes
@@ -29,7 +25,7 @@ from llvmlite import ir
 
 from lagjax._native._objects import load_or_make
 
-DOUBLE, FLOAT, INTEGER, BIT, POINTER = ir.DoubleType(), ir.FloatType(), ir.IntType(64), ir.IntType(1), ir.PointerType()
+DOUBLE, INTEGER, BIT, POINTER = ir.DoubleType(), ir.IntType(64), ir.IntType(1), ir.PointerType()
 COUNTED = "counted"  # the name of the blocks at which counted loops begin
 _CONTRACT = ("contract",)
 # What LLVM itself calls for an intrinsic that the processor has no instruction for.
@@ -213,7 +209,7 @@ def _splat(kind: ir.Type, lanes: int) -> tuple[ir.Constant, ...]:
 
 
 class Code:
-    """The body of one function, growing at its end; the type of its numbers is `DOUBLE` or `FLOAT`."""
+    """The body of one function, growing at its end."""
 
     def __init__(
         self,
@@ -223,9 +219,8 @@ class Code:
         lanes: int,
         result=None,
         public=False,
-        number: ir.Type = DOUBLE,
     ):
-        self.lanes, self.number, self.vector = lanes, number, ir.VectorType(number, lanes)
+        self.lanes, self.vector = lanes, ir.VectorType(DOUBLE, lanes)
         self.module = module
         function = ir.Function(module, ir.FunctionType(result or ir.VoidType(), arguments), name)
         if not public:
@@ -240,7 +235,6 @@ class Code:
         """A Python number, or a value, in the type `like`; a scalar becomes a vector of equal lanes."""
         if not isinstance(x, Value):
             return Value(self, self._constant(x, like))
-        x = self._round(x, element_of(like))
         if isinstance(like, ir.VectorType) and not isinstance(x.it.type, ir.VectorType):
             undefined, begin, zeros = _splat(x.it.type, self.lanes)
             first = self.builder.insert_element(undefined, x.it, begin)
@@ -252,13 +246,6 @@ class Code:
             scalar = bool if like.element == BIT else float
             return ir.Constant(like, [ir.Constant(like.element, scalar(x))] * like.count)
         return ir.Constant(like, int(x) if isinstance(like, ir.IntType) else float(x))
-
-    def _round(self, x: Value, number: ir.Type) -> Value:
-        kind, before = x.it.type, element_of(x.it.type)
-        if before == number or not {before, number} <= {DOUBLE, FLOAT}:
-            return x
-        kind = ir.VectorType(number, self.lanes) if isinstance(kind, ir.VectorType) else number
-        return Value(self, (self.builder.fptrunc if number == FLOAT else self.builder.fpext)(x.it, kind))
 
     def lanes_of(self, x) -> Value:
         """A vector of the code's numbers, with one number in every lane or with those of another vector."""
@@ -284,8 +271,7 @@ class Code:
 
     def _match_types(self, a, b) -> tuple[Value, Value]:
         types = [x.it.type for x in (a, b) if isinstance(x, Value)]
-        types = [t for t in types if isinstance(t, ir.VectorType)] or types
-        like = next((t for t in types if element_of(t) == DOUBLE), types[0])
+        like = next((t for t in types if isinstance(t, ir.VectorType)), types[0])
         return self.as_value(a, like), self.as_value(b, like)
 
     def select(self, condition: Value, yes, no) -> Value:
@@ -320,7 +306,7 @@ class Code:
         if isinstance(i.it.type, ir.VectorType):
             convert = self.builder.uitofp if i.it.type.element == BIT else self.builder.sitofp
             return Value(self, convert(i.it, self.vector))
-        return Value(self, self.builder.sitofp(i.it, self.number))
+        return self.as_double(i)
 
     def as_double(self, i: Value) -> Value:
         return Value(self, self.builder.sitofp(i.it, DOUBLE))
@@ -329,14 +315,11 @@ class Code:
         return Value(self, self.builder.fptosi(x.it, INTEGER))
 
     def bits(self, x: Value) -> Value:
-        return Value(self, self.builder.bitcast(x.it, self._words))
+        return Value(self, self.builder.bitcast(x.it, ir.VectorType(INTEGER, self.lanes)))
 
     def from_bits(self, x: Value) -> Value:
-        return Value(self, self.builder.bitcast(self.builder.fptosi(x.it, self._words), self.vector))
-
-    @property
-    def _words(self) -> ir.Type:
-        return ir.VectorType(INTEGER if self.number == DOUBLE else ir.IntType(32), self.lanes)
+        whole = self.builder.fptosi(x.it, ir.VectorType(INTEGER, self.lanes))
+        return Value(self, self.builder.bitcast(whole, self.vector))
 
     # ---- memory ----
 
@@ -425,15 +408,13 @@ class Code:
     def intrinsic(self, name: str, *xs: Value) -> Value:
         xs = self._match_types(*xs) if len(xs) == 2 else xs
         kind = xs[0].it.type
-        bits = "f32" if element_of(kind) == FLOAT else "f64"
-        full = f"llvm.{name}." + (f"v{self.lanes}{bits}" if isinstance(kind, ir.VectorType) else bits)
+        full = f"llvm.{name}." + (f"v{self.lanes}f64" if isinstance(kind, ir.VectorType) else "f64")
         return self._call_by_name(full, kind, xs)
 
     def library(self, name: str, *xs: Value) -> Value:
         """A function of the C library, on scalars or lane by lane: one evaluation a step serves all orders."""
         xs = self._match_types(*xs) if len(xs) == 2 else xs
         kind, number = xs[0].it.type, element_of(xs[0].it.type)
-        name += "f" if number == FLOAT else ""
         _link(name)
         if not isinstance(kind, ir.VectorType):
             return self._call_by_name(name, number, xs)

@@ -8,7 +8,6 @@ from collections.abc import Mapping
 from typing import Any, NamedTuple
 
 import numpy as np
-from llvmlite import ir
 
 from lagjax._native import _gpu
 from lagjax._native._adjoint import Adjoint
@@ -23,12 +22,12 @@ from lagjax._native._frame import LANE
 from lagjax._native._guards import Guards
 from lagjax._native._handler import Plan, Rest, allocate_aligned, handler
 from lagjax._native._integrator import Integrator
-from lagjax._native._ir import DOUBLE, FLOAT, compile_module, lanes
+from lagjax._native._ir import compile_module, lanes
 from lagjax._native._motion_parts import Chosen, MotionParts, Projection, choose_parameters
 from lagjax._native._run_records import RECORDED
 from lagjax._native._table_reads import SET_NUMBERS
 from lagjax._native._tangent import Tangent
-from lagjax._native._taylor import TaylorSeries, is_large, order_for, size_of_series
+from lagjax._native._taylor import TaylorSeries, order_for, size_of_series
 from lagjax._native._threads import SLICE, run_in_slices, run_on_threads
 from lagjax._program._borders import Borders
 from lagjax._program._jump import Nesting
@@ -131,7 +130,6 @@ class Kernel:
         self._error_groups = error_groups
         self.width = lanes() if width is None else width
         self._tangents = functools.cache(self._compile_tangents)
-        self.for_gpus = functools.cache(self._gpu_programs)
         self._rounds = max(1, int(SLICE / (_SECONDS_AN_OPERATION * len(program.line.nodes))))
 
     def select_width(self, members: int) -> "Kernel":
@@ -151,27 +149,16 @@ class Kernel:
         """The numbers of a member that its programs compute with; None where these are all."""
         return self._parts.chosen
 
-    def _integrator(self, number: ir.Type = DOUBLE) -> Integrator:
-        return Integrator(self._parts, self._guards, self._error_groups, width=self.width, number=number)
+    def _integrator(self) -> Integrator:
+        return Integrator(self._parts, self._guards, self._error_groups, width=self.width)
 
-    def _gpu_programs(self, single: bool) -> "_gpu.GpuPrograms":
-        """The programs for GPUs; those in `single` precision of a kernel that `allows_singles`."""
-        number = FLOAT if single else DOUBLE
-
+    @functools.cached_property
+    def gpu_programs(self) -> "_gpu.GpuPrograms":
         def motion() -> TaylorSeries:
             _gpu.require_room(size_of_series(self._parts.series))  # before what is larger than that is written down
-            return self.select_width(1)._integrator(number).motion
+            return self.select_width(1)._integrator().motion
 
-        return _gpu.GpuPrograms(motion, lambda: self._adjoint(width=1, number=number).motion)
-
-    @property
-    def allows_singles(self) -> bool:
-        """True if a GPU may compute it in single precision: straight lines without borders and guards.
-
-        What decides about these is known to the digits of doubles.
-        """
-        large = is_large(self._parts.program, self._parts.projection)
-        return self.borders is None and self._guards is None and not large
+        return _gpu.GpuPrograms(motion, lambda: self._adjoint(width=1).motion)
 
     @functools.cached_property
     def _forward(self) -> "_Compiled":
@@ -359,8 +346,8 @@ class Kernel:
     def _backward(self) -> "_Compiled":
         return _Compiled(self._adjoint(self.width), self._rounds)
 
-    def _adjoint(self, width: int, number: ir.Type = DOUBLE) -> Adjoint:
-        return Adjoint(self._derivative_parts, width=width, number=number)
+    def _adjoint(self, width: int) -> Adjoint:
+        return Adjoint(self._derivative_parts, width=width)
 
     def _strides(self, ts, params) -> dict[str, int]:
         return dict(

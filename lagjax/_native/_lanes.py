@@ -8,7 +8,7 @@ from llvmlite import ir
 
 from lagjax._native._constants import LARGEST_ANGLE
 from lagjax._native._frame import Frame, Numbers, Vectors
-from lagjax._native._ir import BIT, DOUBLE, FLOAT, POINTER, Code, Value, element_of
+from lagjax._native._ir import BIT, DOUBLE, POINTER, Code, Value
 from lagjax._program._graph import Unlowerable
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._series import StraightLine
@@ -81,24 +81,18 @@ def emit(
 ) -> list[Value]:
     """The outputs of a straight line; `inputs(i)` is its i-th input, as a vector. Integers are doubles here.
 
-    `look_up(op, attribute, x)` reads tables, where the line does. In single precision an input that is a double is the
-    time, and doubles are what is computed from it alone.
+    `look_up(op, attribute, x)` reads tables, where the line does.
     """
     values: list[Value] = []
     turns: dict[int, tuple[Value, Value]] = {}
-    exact = frozenset()
-    if code.number == FLOAT:
-        inputs = functools.cache(inputs)  # each is read once, for its type and for its value
-        exact = _doubles_in(line, inputs)
-    for k, ((op, operands, attribute), kind) in enumerate(zip(line.nodes, line.kinds, strict=True)):
-        vector = ir.VectorType(DOUBLE, code.lanes) if k in exact else code.vector
-        xs = [values[i] if line.kinds[i] == "bool" else code.as_value(values[i], vector) for i in operands]
+    for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):
+        xs = [values[i] for i in operands]
         if op == "input":
-            value = code.as_value(inputs(attribute), vector)
+            value = code.lanes_of(inputs(attribute))
             if kind == "bool":
                 value = code.compare("!=", value, 0.0)
         elif op == "constant":
-            value = code.as_value(attribute, vector if kind != "bool" else ir.VectorType(BIT, code.lanes))
+            value = code.as_value(attribute, code.vector if kind != "bool" else ir.VectorType(BIT, code.lanes))
         elif op in LOOK_UPS:
             assert look_up is not None
             value = look_up(op, attribute, xs[0])
@@ -110,25 +104,6 @@ def emit(
             value = apply(code, op, xs, attribute, [line.kinds[i] for i in operands], kind)
         values.append(value)
     return [values[i] for i in line.outputs]
-
-
-def _doubles_in(line: StraightLine, inputs: Callable[[int], Value]) -> frozenset[int]:
-    """The nodes of a line in single precision that are doubles: the time, and what is computed from it and parameters.
-
-    After a thousand turns of a drive the time has four digits left in single precision, but its sine has all of them.
-    """
-    places = {i: place for i, (op, _, place) in enumerate(line.nodes) if op == "input"}
-    of_time = {i for i, place in places.items() if element_of(inputs(place).it.type) == DOUBLE}
-    time = min((places[i] for i in of_time), default=0)
-    varying = {i for i, place in places.items() if place < time}  # the parameters follow the time
-    for i, (op, operands, _) in enumerate(line.nodes):
-        if not varying.isdisjoint(operands):
-            varying.add(i)
-        elif op not in ("sin", "cos") and not of_time.isdisjoint(operands):
-            of_time.add(i)
-    for i in reversed(range(len(line.nodes))):
-        of_time.update(line.nodes[i][1] if i in of_time else ())
-    return frozenset(of_time)
 
 
 def apply(code: Code, op: str, xs: list[Value], attribute, kinds: Sequence[str], kind: str) -> Value:
@@ -196,19 +171,15 @@ COS = (4.16666666666666019037e-02, -1.38888888888741095749e-03, 2.48015872894767
 # fmt: on
 
 
-def sincos_function(module: ir.Module, lanes: int, name: str = "sincos", number: ir.Type = DOUBLE) -> Code:
-    """`(x, address)`: sin x and cos x of doubles, stored one after the other as numbers of this type.
+def sincos_function(module: ir.Module, lanes: int, name: str = "sincos") -> Code:
+    """`(x, address)`: sin x and cos x, stored one after the other.
 
     Cody and Waite's reduction (*Software Manual for the Elementary Functions*, 1980), fdlibm's polynomials; 1 ulp. A
-    vector with an angle beyond `LARGEST_ANGLE` asks the C library as well; in single precision these are NaN.
+    vector with an angle beyond `LARGEST_ANGLE` asks the C library as well.
     """
-    code = Code(module, name, [ir.VectorType(DOUBLE, lanes), POINTER], lanes, number=number)
+    code = Code(module, name, [ir.VectorType(DOUBLE, lanes), POINTER], lanes)
     x, address = code.arguments
     near = abs(x) <= LARGEST_ANGLE
-    if number == FLOAT:
-        for place, turn in enumerate(_short_polynomials(code, x)):
-            code.store(code.select(near, turn, float("nan")), code.element(address, place * lanes))
-        return code.finish()
     sine, cosine = _polynomials(code, code.select(near, x, 0.0))
     code.store(sine, address)
     code.store(cosine, code.element(address, lanes))
@@ -237,14 +208,6 @@ def _polynomials(code: Code, x: Value) -> tuple[Value, Value]:
     return _rotate_quarters(code, k, sine, cosine)
 
 
-def _short_polynomials(code: Code, x: Value) -> tuple[Value, Value]:
-    """Sine and cosine in single precision: what is left of the angle by doubles, and four terms of each polynomial."""
-    k = code.intrinsic("rint", x * (1 / PI_2_ROUNDED[0]))
-    r, k = code.lanes_of((x - k * PI_2[0]) - k * PI_2[1]), code.lanes_of(k)
-    z = r * r
-    return _rotate_quarters(code, k, r + r * z * _horner(z, SIN[:4]), 1.0 - (0.5 * z - z * z * _horner(z, COS[:4])))
-
-
 def _rotate_quarters(code: Code, k: Value, sine: Value, cosine: Value) -> tuple[Value, Value]:
     """Sine and cosine of an angle that is k quarters of a turn larger."""
     quadrant = k - 4.0 * code.intrinsic("floor", 0.25 * k)  # 0, 1, 2, 3
@@ -262,10 +225,8 @@ def _horner(z, coefficients):
 
 
 def sines_and_cosines(code: Code, sincos: Code, x: Value) -> tuple[Value, Value]:
-    doubles = ir.VectorType(DOUBLE, code.lanes)
-    x = code.as_value(x, doubles)
     with code.builder.goto_entry_block():
-        place = code.builder.alloca(ir.ArrayType(doubles, 2))
+        place = code.builder.alloca(ir.ArrayType(code.vector, 2))
     place.align = 8 * code.lanes
     address = Value(code, place)
     code.call(sincos, x, address)

@@ -7,7 +7,7 @@ none gets through. The last long one is then taken once more, a little shorter.
 from collections.abc import Iterator
 
 from lagjax._native._constants import MOST_RETURNS, RETAKEN, RUNNING, SHORTER
-from lagjax._native._frame import EXACT, Fields, Frame
+from lagjax._native._frame import Fields, Frame
 from lagjax._native._lanes import Lines
 from lagjax._native._tables import Tables
 
@@ -20,10 +20,10 @@ def fields(n: int, guards: int) -> Fields:
         "side_before": guards,
         "contact_before": guards,
         "noted_before": guards,
-        "t_before": EXACT,
-        "t_low_before": EXACT,
-        "steps_before": EXACT,
-        "h_before": EXACT,  # the size of that step; 0 without any
+        "t_before": 1,
+        "t_low_before": 1,
+        "steps_before": 1,
+        "h_before": 1,  # the size of that step; 0 without any
         "returns": 1,  # the number of returns to it
         "returned": 1,  # 1 if the motion has just returned
     }

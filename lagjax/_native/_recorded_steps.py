@@ -8,10 +8,8 @@ takes the next member that has any.
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
-from llvmlite import ir
-
 from lagjax._native._frame import Frame, Lane
-from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
+from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._motion_parts import MotionParts
 from lagjax._native._retraction import Retraction
 from lagjax._native._run_records import RECORDED
@@ -36,7 +34,6 @@ class Replay:
         at_borders: dict,
         width: int,
         jumps: int,
-        number: ir.Type = DOUBLE,
     ):
         self.parts, self._jump = parts, parts.jump_over_steps
         more = [] if self._jump is None else [self._jump.line] * jumps
@@ -44,9 +41,8 @@ class Replay:
         large = is_large(parts.program, parts.projection, times=2, more=more)
         if parts.borders is not None:
             fields = fields | Saltation.fields(parts.borders) | at_borders
-        number = DOUBLE if large else number  # tables do not tell the time from the state
         self.motion = motion = TaylorSeries(
-            name, parts, job, fields, large, width, keep_sums=True, number=number
+            name, parts, job, fields, large, width, keep_sums=True
         )  # fmt: skip
         borders = parts.borders
         self.retraction = borders and borders.retraction and Retraction(motion, borders, parts.nesting)

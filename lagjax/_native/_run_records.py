@@ -1,7 +1,7 @@
 """The records of a run: the states at the output times, the steps for a transpose, and how each member ended."""
 
 from lagjax._native._constants import DONE, EPS
-from lagjax._native._frame import EXACT, Fields, Frame, Index, Lane
+from lagjax._native._frame import Fields, Frame, Index, Lane
 from lagjax._native._ir import Code, Value
 from lagjax._native._projection import Projector
 from lagjax._native._taylor import AT_BORDER, TaylorSeries
@@ -26,9 +26,9 @@ class Output:
         """The fields of a thread's memory; times are in the direction of time."""
         return {
             "between": 2 * n,  # the state at an output time
-            "due": EXACT,  # the next output time
-            "reached": EXACT,  # the end of the step, or the instant of a note
-            "is_due": EXACT,  # 1 in a lane that has an output, or a note, to write down
+            "due": 1,  # the next output time
+            "reached": 1,  # the end of the step, or the instant of a note
+            "is_due": 1,  # 1 in a lane that has an output, or a note, to write down
         }
 
     # ---- states at output times ----

@@ -21,7 +21,7 @@ coordinates of two arrays and of one.
 from collections.abc import Callable
 
 from lagjax._native import _constants as limits
-from lagjax._native._frame import EXACT, Fields, Frame, Index, Numbers
+from lagjax._native._frame import Fields, Frame, Index, Numbers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._projection import Projector, end_of_step
 from lagjax._native._taylor import TaylorSeries, double, integer
@@ -51,18 +51,18 @@ class StepControl:
             "scale": 2 * n,  # 1 / (floor + rtol·size)
             "reach": 2 * PARTS,  # the largest coordinate, and the largest velocity, so far
             "increment": 2 * n,  # P(h) − y
-            "t_low": EXACT,  # what rounding took from the time
-            "t_end": EXACT,  # the last output time
-            "forward": EXACT,  # the direction of time, ±1
-            "smallest": EXACT,  # the shortest step that may be taken
-            "longest": EXACT,  # the longest step that may be tried next
+            "t_low": 1,  # what rounding took from the time
+            "t_end": 1,  # the last output time
+            "forward": 1,  # the direction of time, ±1
+            "smallest": 1,  # the shortest step that may be taken
+            "longest": 1,  # the longest step that may be tried next
             "growth": 1,  # by which factor the next step may be longer
-            "last": EXACT,  # 1 if the step ends at `t_end`
+            "last": 1,  # 1 if the step ends at `t_end`
             "defect": 1,  # the largest scaled defect of the step, of its series and its projection
             "series_defect": 1,  # that of the series alone
-            "code": EXACT,  # how the member has ended (`_constants`), or `RUNNING`
-            "steps": EXACT,  # the number of steps taken
-            "rejected": EXACT,  # the number of steps refused
+            "code": 1,  # how the member has ended (`_constants`), or `RUNNING`
+            "steps": 1,  # the number of steps taken
+            "rejected": 1,  # the number of steps refused
         }
 
     # ---- the size of a step ----
@@ -274,7 +274,7 @@ def _power(code: Code, x: Value, exponent: Value) -> Value:
 
     The bits of a number, read as an integer, are nearly its logarithm; the parabolas mend the fractional part.
     """
-    unit, bias = (2.0**52, 1023.0) if code.number == DOUBLE else (2.0**23, 127.0)
+    unit, bias = 2.0**52, 1023.0
     bits = code.as_number(code.bits(x)) / unit - bias
     whole = code.intrinsic("floor", bits)
     part = bits - whole

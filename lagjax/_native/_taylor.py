@@ -15,7 +15,7 @@ import numpy as np
 from llvmlite import ir
 
 from lagjax._native._constants import LARGEST_LINE, LEAST_ORDER, MAX_ORDER, OPERATIONS_PER_COORDINATE
-from lagjax._native._frame import EXACT, Fields, Frame, Index, Lane, Memory, Numbers, Vectors, integers
+from lagjax._native._frame import Fields, Frame, Index, Lane, Memory, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._lanes import Lines, sincos_function
 from lagjax._native._motion_parts import MotionParts
@@ -36,10 +36,9 @@ class TaylorSeries:
 
     The program gives q̈ and whether the mass matrix is singular; n is the number of coordinates, `states` = 2n. `fields`
     names what else a thread remembers (see `Memory`), `job` the structure that all threads share. `large` kernels are
-    written as tables (see `is_large`). Vectors have `width` lanes; the state and its series are of the type `number`.
-    The last of the numbers of the program are its `pieces`, the others the `chosen` ones of a member, or all. Of its
-    outputs this many are `kept`, behind the first ones. With `keep_sums` the sums of every order stay in memory, not
-    only those of the last.
+    written as tables (see `is_large`). Vectors have `width` lanes. The last of the numbers of the program are its
+    `pieces`, the others the `chosen` ones of a member, or all. Of its outputs this many are `kept`, behind the first
+    ones. With `keep_sums` the sums of every order stay in memory, not only those of the last.
     """
 
     def __init__(
@@ -52,7 +51,6 @@ class TaylorSeries:
         width: int,
         keep_sums: bool = False,
         kept: int = 0,
-        number: ir.Type = DOUBLE,
     ):
         program, series, pieces, chosen = parts.program, parts.series, parts.pieces, parts.chosen
         self.program, self.series, self.n, self.states = program, series, series.size, 2 * series.size
@@ -65,10 +63,10 @@ class TaylorSeries:
         self.look_up = LookUps(self.module)
         self.member_stride = self.parameters if chosen is None else chosen.of
         self._chosen = None if chosen is None else integers(self.module, np.array(chosen.positions, np.int64))
-        self.layout = Memory(width, self._fields() | fields, number=number)
-        self.width, self.vector = self.layout.width, ir.VectorType(number, self.layout.width)
+        self.layout = Memory(width, self._fields() | fields)
+        self.width, self.vector = self.layout.width, ir.VectorType(DOUBLE, self.layout.width)
         self.large = large
-        sincos = sincos_function(self.module, self.width, number=self.layout.number)
+        sincos = sincos_function(self.module, self.width)
         self.form = Tables(self.function, sincos, self.look_up) if large else Lines(sincos, self.look_up)
         # The program whose first outputs are q̈. As a table the zeroth order is there already, and little longer.
         line = program.line
@@ -85,10 +83,10 @@ class TaylorSeries:
             "values": series.values,  # what the order recursion reads of the zeroth order
             "params": self.numbers,  # parameters, and pieces
             "kept": self.kept,  # outputs of the program that others read
-            "t": EXACT,  # the time
-            "h": EXACT,  # the step
+            "t": 1,  # the time
+            "h": 1,  # the step
             "singular": 1,  # 1 if the mass matrix is
-            "first_number": EXACT,  # where the numbers of a member begin: its parameters, and what tables are of
+            "first_number": 1,  # where the numbers of a member begin: its parameters, and what tables are of
         }
 
     def function(self, name: str, *kinds: ir.Type, **options) -> Frame:

@@ -289,48 +289,18 @@ def test_single_precision(on_the_ptx):
     agree(here, there, 1e-6)
 
 
-@pytest.fixture
-def slow_doubles(monkeypatch):
-    """A GPU whose float64 is slow, in the place of none; what was compiled for another one is forgotten."""
-    monkeypatch.setattr(_gpu_launch, "has_slow_doubles", lambda: True)
-    transforms_are_new()
-    yield
-    transforms_are_new()
-
-
 def singles(tree):
     return jax.tree.map(lambda x: jnp.asarray(x, np.float32), tree)
 
 
 def in_single(scene, q0, ts=TS, **how):
-    """A motion of float32: its states, its result, the steps taken, and those refused."""
+    """A motion of float32: its states, and its result."""
     q0, qdot0, ts, params = singles((q0, scene.qdot0, ts, scene.params))
     run = lagjax.simulate(scene.system, q0, qdot0, ts, params, solver=MACHINE_CODE, throw=False, **how)
-    return run.q, run.qdot, run.result._value, run.stats["num_accepted_steps"], run.stats["num_rejected_steps"]
+    return run.q, run.qdot, run.result._value
 
 
-@pytest.mark.parametrize("form", [None, GpuForm(10, unrolled=False)])
-def test_states_of_single_precision(on_the_ptx, slow_doubles, monkeypatch, form):
-    """Within a few units in the last place of float32, in as many steps of 1e-6 as doubles take."""
-    scene, q0 = scenes.double_pendulum(), singles(np.random.default_rng(1).uniform(-1.0, 1.0, (3, 2)))
-    if form is not None:
-        monkeypatch.setattr("lagjax._native._gpu.form_for", lambda entry, lane, order: form)
-    *here, result, steps, rejected = on_the_ptx(jax.vmap(lambda q0: in_single(scene, q0)), q0)
-    *there, _, of_doubles, _ = jax.jit(jax.vmap(lambda q0: in_single(scene, q0, rtol=1e-6)))(q0)
-    agree(here, there, 20 * 2.0**-24)
-    assert here[0].dtype == np.float32 and not result.any() and not rejected.any()
-    assert (steps <= of_doubles + 2).all()
-
-
-def test_the_arithmetic_of_single_precision_is_single(slow_doubles):
-    """Doubles are the time, the control of the step, and what is left of two angles and their difference."""
-    lines = program_of(scenes.double_pendulum(), dtype=np.float32).splitlines()
-    counts = {kind: sum(bool(re.search(rf"(add|sub|mul|fma|div)\.[\w.]*{kind}", line)) for line in lines)
-              for kind in ("f64", "f32")}  # fmt: skip
-    assert 20 < counts["f64"] < counts["f32"] / 10
-
-
-def test_the_time_of_single_precision_is_a_double(on_the_ptx, slow_doubles):
+def test_the_time_of_single_precision_is_a_double(on_the_ptx):
     """After a thousand turns of the drive it has four digits as a float: the force would be wrong by a hundredth."""
     system = lagjax.System(lambda q, qdot, t, params: 0.5 * qdot**2 + q * jnp.cos(params["w"] * t))
     scene = SimpleNamespace(system=system, qdot0=0.0, params={"w": 3.7})
@@ -342,7 +312,7 @@ def test_the_time_of_single_precision_is_a_double(on_the_ptx, slow_doubles):
 
 
 @pytest.mark.slow
-def test_derivatives_of_single_precision(on_the_ptx, slow_doubles):
+def test_derivatives_of_single_precision(on_the_ptx):
     scene = scenes.pendulum()
 
     def end(q0):
@@ -355,7 +325,7 @@ def test_derivatives_of_single_precision(on_the_ptx, slow_doubles):
 
 
 @pytest.mark.slow
-def test_borders_and_events_are_found_in_doubles(on_the_ptx, slow_doubles):
+def test_borders_and_events_are_found_in_doubles(on_the_ptx):
     wedge = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q))
     wedge = SimpleNamespace(system=wedge, qdot0=0.0, params=None)
 
@@ -368,8 +338,8 @@ def test_borders_and_events_are_found_in_doubles(on_the_ptx, slow_doubles):
         agree(on_the_ptx(function, np.float32(1.0)), jax.jit(function)(np.float32(1.0)), 2.0**-23)
 
 
-def program_of(scene, monkeypatch=None, unrolled=None, dtype=np.float64):
-    """The PTX of a scene's motion, of numbers of this type. Skips the test where libdevice is needed and not here."""
+def program_of(scene, monkeypatch=None, unrolled=None):
+    """The PTX of a scene's motion. Skips the test where libdevice is needed and not here."""
     programs = []
     if monkeypatch is not None:
         monkeypatch.setattr("lagjax._native._gpu.form_for", lambda entry, lane, order: GpuForm(order, unrolled))
@@ -382,9 +352,7 @@ def program_of(scene, monkeypatch=None, unrolled=None, dtype=np.float64):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_gpu_launch, "launch", launch)
         try:
-            q0, qdot0, ts, params = jax.tree.map(
-                lambda x: jnp.asarray(x, dtype), (scene.q0, scene.qdot0, TS, scene.params)
-            )  # fmt: skip
+            q0, qdot0, ts, params = jax.tree.map(jnp.asarray, (scene.q0, scene.qdot0, TS, scene.params))
             jax.jit(lambda q0: motion(scene, q0, qdot0, ts, params)[0]).trace(q0).lower(lowering_platforms=("cuda",))
         except ValueError as reason:
             if "a CPU is the better choice" in str(reason):
@@ -413,18 +381,6 @@ ONE_OF_A_KIND = (
     scenes.cartesian_double_pendulum, scenes.rolling_disc, scenes.slider_crank, scenes.swinging_atwood,
     scenes.relativistic_charge_in_electric_field,
 )  # fmt: skip
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("make", ONE_OF_A_KIND, ids=lambda make: make.__name__)
-def test_scenes_in_single_precision(make, on_the_ptx, slow_doubles):
-    """The pendulum that is driven into chaos multiplies a rounding by a hundred."""
-    scene = make()
-
-    def states(q0):
-        return in_single(scene, q0)[:3]
-
-    agree(on_the_ptx(states, singles(scene.q0)), jax.jit(states)(singles(scene.q0)), 1e-4)
 
 
 # ---- the lowering ----------------------------------------------------------------------------------------------------
@@ -531,13 +487,6 @@ def assembled(program, folder):
 @pytest.mark.parametrize("make", (*ONE_OF_A_KIND, scenes.andrews_squeezer), ids=lambda make: make.__name__)
 def test_ptxas_assembles_a_scene_of_every_kind(make, tmp_path):
     assert all(stack <= STACK and spills <= SPILLS for stack, spills in assembled(program_of(make()), tmp_path))
-
-
-@pytest.mark.slow
-@pytest.mark.skipif(ptxas() is None, reason="there is no ptxas: the extra `ptxas` has it")
-@pytest.mark.parametrize("make", [scenes.double_pendulum, scenes.spherical_pendulum, scenes.cartesian_pendulum])
-def test_in_single_precision_series_fit_into_registers(make, tmp_path, slow_doubles):
-    assert all(spills == 0 for _, spills in assembled(program_of(make(), dtype=np.float32), tmp_path))
 
 
 PRELUDE = """

@@ -30,7 +30,6 @@ from lagjax._engine.taylor._crossing import (
 )
 from lagjax._engine.taylor._derivatives import Motions, jvp, portions, project_start_tangents, vjp
 from lagjax._engine.taylor._flow import Flow, Tolerances, require_fit
-from lagjax._engine.taylor._gpu_launch import adapt_tolerances
 from lagjax._engine.taylor._kept_steps import KEPT, StepStore
 from lagjax._engine.taylor._line_functions import line_of
 from lagjax._engine.taylor._lowered_motion import lowered_motion
@@ -60,19 +59,17 @@ class MachineCode(AbstractEngine):
     with the coefficients (q̈)ₖ by recurrences through the scalar operations of the acceleration. Four or eight members
     of a batch stand side by side in the vector registers of every core.
 
-    It computes in float64, also for a state in float32, whose results it rounds once; but see below for GPUs.
+    It computes in float64, also for a state in float32, whose results it rounds once.
 
     On an NVIDIA GPU one thread follows a member; `MachineCode()` is lowered for CUDA as for CPUs, by `jax.export` too.
     On an H100 it is 30 times as fast as diffrax for a double pendulum, whose series stay in registers, 1.2 times for a
     chain of four links and 4 times for one of eight, with smaller errors (`python -m benchmarks.gpu`); the 16 cores
-    beside it are as fast for that chain. Where a GPU is at hand whose float64 is slow (all but those of data centres;
-    none of these has been tried), the series of a state in float32 are in float32 too, the time and the control of
-    steps in float64, with an rtol of 1e-6 at least; a run with borders or events computes in float64 there as well. On
-    a GPU members that fail are not tried once more by another variant of the equations, and an angle beyond 2²⁰ ends a
-    motion. A first derivative in forward mode takes a motion with its tangents for every direction; one in reverse mode
-    goes back over the steps, as on a CPU, and takes such tangents for every number with constraints alone, or where a
-    member's steps are too many or do not suit its derivatives. Higher ones are composed of these. Crossings and hybrid
-    motion require a CPU.
+    beside it are as fast for that chain. GPUs that are not for data centres have 1/64 of that float64; none of these
+    has been tried. On a GPU members that fail are not tried once more by another variant of the equations, and an angle
+    beyond 2²⁰ ends a motion. A first derivative in forward mode takes a motion with its tangents for every direction;
+    one in reverse mode goes back over the steps, as on a CPU, and takes such tangents for every number with constraints
+    alone, or where a member's steps are too many or do not suit its derivatives. Higher ones are composed of these.
+    Crossings and hybrid motion require a CPU.
 
     Machine code requires a CPU or such a GPU, a scene whose acceleration is a scalar program of smooth or piecewise
     smooth operations and whose kernel fits into half of the machine's memory, adaptive steps, and real-valued events;
@@ -127,9 +124,8 @@ class MachineCode(AbstractEngine):
             return refusal
         with jax.enable_x64(True):
             flow = flow_of(problem.double_precision if problem.is_single else problem)
-            tolerances = adapt_tolerances(flow, tolerances_of(problem))
             try:
-                flow.kernel.for_gpus(tolerances.allow_singles).motion(tolerances.rtol)
+                flow.kernel.gpu_programs.motion(tolerances_of(problem).rtol)
             except Unlowerable as reason:
                 return str(reason)
         return None
@@ -281,6 +277,4 @@ def _require_increasing(program: Program, vector) -> None:
 
 def tolerances_of(problem: Problem) -> Tolerances:
     rtol, atol = MachineCode().rtol(problem), problem.tolerances[1]
-    return Tolerances(
-        float(rtol), 0.0 if atol is None else float(atol), problem.max_steps, allow_singles=problem.is_rounded
-    )  # fmt: skip
+    return Tolerances(float(rtol), 0.0 if atol is None else float(atol), problem.max_steps)

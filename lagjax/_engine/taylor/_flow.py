@@ -37,8 +37,7 @@ class Tolerances(NamedTuple):
     """The local error of a step, what a run may cost, and how often each guard may be noted on the way.
 
     An atol of 0 stands for none given: it follows the size of the motion. Derivatives need not suit the steps of a
-    motion better than those of an rtol that is `slack` times as large. Results that are rounded to float32 in the
-    end `allow_singles`, on a device that is much slower in float64. An order of 0 is that which suits rtol.
+    motion better than those of an rtol that is `slack` times as large. An order of 0 is that which suits rtol.
     """
 
     rtol: float
@@ -46,7 +45,6 @@ class Tolerances(NamedTuple):
     max_steps: int
     tries: int = 4
     notes: int = 0
-    allow_singles: bool = False
     slack: float = 1.0
     order: int = 0
 

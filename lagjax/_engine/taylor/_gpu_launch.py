@@ -18,44 +18,16 @@ from lagjax._native import gpu
 from lagjax._program import Unlowerable
 
 _TARGET = "__gpu$xla.gpu.ptx"
-# Compute capabilities of NVIDIA's processors whose float64 runs at half the rate of float32: P100, V100, A100, H100 and
-# B200. That of all others runs at 1/32 or 1/64.
-_FAST_DOUBLES = frozenset(("6.0", "7.0", "8.0", "9.0", "10.0"))
-# The local error of a step in single precision, at least: eight units in the last place. With half of that a chain of
-# eight links has half of its steps refused for what rounding leaves of an acceleration; the results are as exact.
-_LEAST_RTOL = 2.0**-20
-
-
-def adapt_tolerances(flow: Flow, tolerances: Tolerances) -> Tolerances:
-    """The tolerances on the GPU at hand: they allow single precision where it computes in that.
-
-    That is where the caller's numbers are of float32, float64 is slow, and single precision decides about nothing
-    (`Kernel.allows_singles`).
-    """
-    if not (tolerances.allow_singles and has_slow_doubles() and flow.kernel.allows_singles):
-        return tolerances._replace(allow_singles=False)
-    return tolerances._replace(rtol=max(tolerances.rtol, _LEAST_RTOL))
-
-
-def has_slow_doubles() -> bool:
-    """True if there is a GPU, and its float64 runs at 1/32 of the rate of float32 or less."""
-    try:
-        devices = jax.devices("cuda")
-    except RuntimeError:
-        return False
-    return getattr(devices[0], "compute_capability", None) not in _FAST_DOUBLES
 
 
 def run_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params) -> tuple:
     """The motions of N members, `ts` (1 or N, T), `y0` (N, 2n), `params` (1 or N, P): a `Solution` without `idle`.
 
-    The tolerances are those for the device (`adapt_tolerances`).
-
     Raises `ValueError` where the scene cannot go to a GPU, saying why.
     """
     notes = tolerances.notes
     try:
-        program = flow.kernel.for_gpus(tolerances.allow_singles).motion(tolerances.rtol)
+        program = flow.kernel.gpu_programs.motion(tolerances.rtol)
     except Unlowerable as reason:
         raise ValueError(f"solver=lagjax.MachineCode() cannot integrate this scene on a GPU: {reason}.") from None
     members, path = len(y0), jnp.full((len(y0), *flow.path_shape(ts.shape[1], notes)), jnp.nan)
@@ -72,7 +44,7 @@ def transpose_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params, path_ct
 
     Raises `Unlowerable` where a GPU cannot go back over the steps of this scene.
     """
-    program, row = flow.kernel.for_gpus(tolerances.allow_singles).transpose(tolerances.rtol)
+    program, row = flow.kernel.gpu_programs.transpose(tolerances.rtol)
     members, threads = len(y0), math.prod(gpu.grid(gpu.TRANSPOSE, len(y0)))
     room = min(tolerances.max_steps, gpu.LARGEST_RECORD // (threads * row))
     arrays = _inputs(gpu.TRANSPOSE, ts, y0, params, flow, tolerances, room=room)

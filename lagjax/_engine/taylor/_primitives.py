@@ -42,7 +42,7 @@ from lagjax._engine.taylor._call import (
 )
 from lagjax._engine.taylor._derivatives import Motions
 from lagjax._engine.taylor._flow import Flow, Tolerances
-from lagjax._engine.taylor._gpu_launch import adapt_tolerances, run_on_gpu, transpose_on_gpu
+from lagjax._engine.taylor._gpu_launch import run_on_gpu, transpose_on_gpu
 from lagjax._engine.taylor._kept_steps import KEPT
 from lagjax._engine.taylor._line_functions import outputs
 from lagjax._engine.taylor._state_rates import rate
@@ -474,7 +474,7 @@ def _vjp_compiled(*args, **settings):
 def _run_for_gpus(ts, y0, params, *, flow, tolerances, **_):
     rows, batch = _rows((ts, y0, params), _RUN, library=jnp)
     with jax.enable_x64(True):  # whatever was set where this is lowered
-        return _restore_batch(run_on_gpu(flow, adapt_tolerances(flow, tolerances), *rows), batch)
+        return _restore_batch(run_on_gpu(flow, tolerances, *rows), batch)
 
 
 def _jvp_for_gpus(ts, y0, params, *given, flow, tolerances):
@@ -487,7 +487,7 @@ def _jvp_for_gpus(ts, y0, params, *given, flow, tolerances):
 
 def _vjp_for_gpus(*args, flow, tolerances):
     """Cotangents of starts and params, back over the steps; by tangents under constraints, or without a record."""
-    settings = dict(flow=flow, tolerances=adapt_tolerances(flow, tolerances))
+    settings = dict(flow=flow, tolerances=tolerances)
     with jax.enable_x64(True):
         rows, batch = _rows(args, (*_MOTIONS, 3, 2), library=jnp)
         motions, (path_ct, end_ct) = Motions(*rows[:_GIVEN]), rows[_GIVEN:]
