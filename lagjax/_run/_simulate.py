@@ -258,6 +258,8 @@ def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, 
         engine=type(engine).__name__,
         impacts=None,
         contacts=None,
+        contact_changes=None,
+        contact_names=(),
     )
 
 

@@ -103,6 +103,22 @@ class Impacts(NamedTuple):
         return f"{count} impacts, at t = {times}{more}" if count else "no impacts"
 
 
+class ContactChanges(NamedTuple):
+    """What contacts did along a motion, in order: NaN and −1 beyond the last of `count`.
+
+    `t` (N,), `q`, `qdot` are those just behind it; `contact` is its place in `Trajectory.contact_names`, and `change`
+    is 0 where it closes, 1 where it opens, 2 where it bounces, 3 where it sticks, 4 where it slides. Several at one
+    instant lead from one guess to the next.
+    """
+
+    t: jax.Array
+    q: PyTree
+    qdot: PyTree
+    contact: jax.Array
+    change: jax.Array
+    count: jax.Array
+
+
 class Trajectory(eqx.Module):
     """The motion of a system at the times `ts`, one trajectory or a batch of them.
 
@@ -119,8 +135,8 @@ class Trajectory(eqx.Module):
     - `mode`, `transitions`: for a hybrid motion (`simulate_hybrid`) the mode at every output time and its
       `Transitions`; otherwise None. `system` is then the dict of modes, and quantities are those of the mode at every
       time, NaN where the mode is −1. A mode is a place in `mode_names`, because the dict loses its order in `jax.jit`.
-    - `impacts`: of a scene with contacts its `Impacts`, otherwise None; `contacts`: what its contacts did at every
-      output time, from which `contact_forces` follow.
+    - `impacts`, `contact_changes`: of a scene with contacts its `Impacts` and all `ContactChanges`, otherwise None;
+      `contact_names` names the contacts. `contacts` holds what they did at every output time.
     """
 
     ts: jax.Array
@@ -139,6 +155,8 @@ class Trajectory(eqx.Module):
     engine: str = eqx.field(static=True, default="")
     impacts: "Impacts | None" = None
     contacts: Any = None
+    contact_changes: "ContactChanges | None" = None
+    contact_names: tuple[str, ...] = eqx.field(static=True, default=())
 
     @classmethod
     def from_fields(cls, **fields) -> "Trajectory":

@@ -1,6 +1,6 @@
 """Motions with contacts: gaps and velocities that stay ≥ 0, impacts, rest and friction.
 
-    System(contacts=…) ─► ContactPlan ─► _contact_rounds: round after round ─► Carry, ImpactRecord ─► Trajectory
+    System(contacts=…) ─► ContactPlan ─► _contact_rounds: round after round ─► Carry, RoundRecord ─► Trajectory
                                           └─ _impact_law: what impulses do to velocities at an instant
 
 Source: Moreau, *Unilateral contact and dry friction* (1988); Brogliato, *Nonsmooth Mechanics* (2016).
@@ -19,8 +19,8 @@ from lagjax._equations import derivation_of, require_consistent
 from lagjax._interface import Layout, as_arrays, halves, is_concrete, join_names, require_budget, result_from
 from lagjax._primitives import DOUBLE, compute_in_doubles
 from lagjax._program import Unlowerable
-from lagjax._run._trajectory import Impacts, State, Trajectory, step_counts
-from lagjax._run.contacts._contact_rounds import Carry, ContactPlan, ImpactRecord, RowPlaces, contact_motion
+from lagjax._run._trajectory import ContactChanges, Impacts, State, Trajectory, step_counts
+from lagjax._run.contacts._contact_rounds import Carry, ContactPlan, RoundRecord, RowPlaces, contact_motion
 from lagjax._scene import ContactScene, Contacts, Flat, InContact, System
 
 
@@ -89,7 +89,7 @@ def _require_open(problem: Problem) -> None:
         )
 
 
-def _motion(plan: ContactPlan, problem: Problem) -> tuple[Carry, ImpactRecord]:
+def _motion(plan: ContactPlan, problem: Problem) -> tuple[Carry, RoundRecord]:
     """The rounds of a problem, in float64, in its own precision."""
     given = problem.ts, problem.y0, problem.params
     if not problem.is_single:
@@ -98,19 +98,25 @@ def _motion(plan: ContactPlan, problem: Problem) -> tuple[Carry, ImpactRecord]:
     return compute_in_doubles(lambda *given: contact_motion(plan, layout, *given), *given)
 
 
-def _trajectory(given: Problem, problem: Problem, ending: Carry, record: ImpactRecord, params, axes=None) -> Trajectory:
+def _trajectory(given: Problem, problem: Problem, ending: Carry, record: RoundRecord, params, axes=None) -> Trajectory:
     flat = Flat.from_system(problem.system, problem.layout, problem.params)
     (q, qdot), end = (map(problem.layout.restore, halves(y)) for y in (ending.path, ending.y))
-    impacts = Impacts(
-        t=record.t, impulse=flat.shapes.by_name(record.impulse), energy_lost=record.energy_lost,
-        count=jnp.sum(record.happened, axis=-1),
+    order = jnp.argsort(~record.hits, axis=-1, stable=True)  # impacts in front
+    t, impulse, lost = (
+        jnp.take_along_axis(x, order.reshape(*order.shape, *[1] * (x.ndim - order.ndim)), order.ndim - 1)
+        for x in record[-3:]
+    )
+    impacts = Impacts(t, flat.shapes.by_name(impulse), lost, jnp.sum(record.hits, axis=-1))
+    at_change = map(problem.layout.restore, halves(record.y))
+    changes = ContactChanges(
+        record.t, *at_change, record.contact, record.change, jnp.sum(record.happened, axis=-1)
     )  # fmt: skip
     accepted, rejected = ending.steps[..., 0], ending.steps[..., 1]
     return Trajectory(
         ts=jnp.asarray(given.ts), q=q, qdot=qdot, result=result_from(ending.result), end=State(ending.t, *end),
         stats=step_counts(accepted, rejected), system=given.system, params=params, params_axes=axes,
         tolerances=MachineCode().tolerances(problem, problem.y0), engine="MachineCode", impacts=impacts,
-        contacts=ending.of_path,
+        contacts=ending.of_path, contact_changes=changes, contact_names=flat.shapes.names,
     )  # fmt: skip
 
 

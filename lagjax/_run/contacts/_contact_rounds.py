@@ -48,6 +48,8 @@ TOO_MANY, UNDECIDED, NOT_FINITE, INCONSISTENT = map(
     code_of,
     (RESULTS.max_transitions_reached, RESULTS.contact_undecided, RESULTS.nonfinite_state, RESULTS.inconsistent_start),
 )
+CHANGES = ("closes", "opens", "bounces", "sticks", "slides")
+CLOSES, OPENS, BOUNCES, STICKS, SLIDES = range(5)
 BLOCK = 8  # rounds that run before it is asked whether any motion goes on
 # The time that bounces still take, in parts of a step of the motion between them, below which they end in closed form,
 # and what that leaves out: twice as long, heights of 4e-9 of those of a step are left out.
@@ -93,18 +95,31 @@ class Carry(NamedTuple):
     of_path: Contacts  # what the contacts did at the outputs
 
 
-class ImpactRecord(NamedTuple):
-    """One round's impact: its time, the normal impulses (k,), the energy that was lost; NaN without any."""
+class RoundRecord(NamedTuple):
+    """What a round came to, if it `happened`: the time and the state behind it, the contact, and its `CHANGES`.
 
+    And its impact, if there is one: `t_impact`, the normal impulses (k,), the energy that was lost. Else NaN and −1.
+    """
+
+    happened: jax.Array
     t: jax.Array
+    y: jax.Array
+    contact: jax.Array
+    change: jax.Array
+    hits: jax.Array
+    t_impact: jax.Array
     impulse: jax.Array
     energy_lost: jax.Array
-    happened: jax.Array
+
+    @classmethod
+    def absent(cls, states: int, contacts: int) -> "RoundRecord":
+        no, none, nan = jnp.asarray(False), jnp.asarray(-1), jnp.asarray(jnp.nan)
+        return cls(no, nan, jnp.full(states, jnp.nan), none, none, no, nan, jnp.full(contacts, jnp.nan), nan)
 
 
 @eqx.filter_jit
-def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) -> tuple[Carry, ImpactRecord]:
-    """The motion from y0 (2n,) at ts[0], and its impacts, of which there may be `max_transitions`."""
+def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) -> tuple[Carry, RoundRecord]:
+    """The motion from y0 (2n,) at ts[0], and its rounds, of which there may be `max_transitions`."""
     ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
     rounds = ContactRounds.from_plan(plan, layout, ts, y0, params)
     first = vary_with(rounds.begin(y0), ts, y0, rounds.vector, varying=("t", "y", "path"))
@@ -114,9 +129,8 @@ def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) ->
         return jax.lax.scan(rounds.run_round, carry, counts)
 
     def idle(carry, counts):
-        nothing = jnp.full(BLOCK, jnp.nan)
-        impulse = jnp.full((BLOCK, rounds.count), jnp.nan)
-        return carry, ImpactRecord(nothing, impulse, nothing, jnp.zeros(BLOCK, bool))
+        absent = RoundRecord.absent(y0.size, rounds.count)
+        return carry, jax.tree.map(lambda x: jnp.broadcast_to(x, (BLOCK, *x.shape)), absent)
 
     def step(carry, counts):
         return jax.lax.cond(any_member(carry.going), run_block, idle, carry, counts)
@@ -124,14 +138,16 @@ def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) ->
     counts = jnp.arange(blocks * BLOCK).reshape(blocks, BLOCK)
     ending, record = jax.lax.scan(step, first, counts)
     record = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: plan.max_transitions], record)
-    order = jnp.argsort(~record.happened, stable=True)
-    record = jax.tree.map(lambda x: x[order], record)
     inputs = ts, y0, rounds.vector
-    t, impulse, lost = (
-        lost_unless(record.happened[:, *[None] * (x.ndim - 1)], x, inputs) for x in record[:3]
-    )
+
+    def lost(there, *numbers):
+        return (lost_unless(there[:, *[None] * (x.ndim - 1)], x, inputs) for x in numbers)
+
+    t, y = lost(record.happened, record.t, record.y)
+    t_impact, impulse, energy_lost = lost(record.hits, *record[-3:])
     path = lost_unless((ending.of_path.closed >= 0).all(axis=1)[:, None], ending.path, inputs)
-    return ending._replace(path=path), ImpactRecord(t, impulse, lost, record.happened)
+    record = record._replace(t=t, y=y, t_impact=t_impact, impulse=impulse, energy_lost=energy_lost)
+    return ending._replace(path=path), record
 
 
 @jax.custom_batching.custom_vmap
@@ -207,15 +223,23 @@ class ContactRounds(NamedTuple):
         contacts, guards = opened(self.flat), self.count + self.flat.rough.size
         guarded = self.watch(self.ts[0], y0, contacts)
         inside = (guarded.values < -guarded.rounding)[: self.count] & self.has_gap
+        result = jnp.where(inside.any(), INCONSISTENT, SUCCESSFUL)
+        if self.rubs:  # one that slides and touches may stay or leave
+            touches, rates, noise = self.touching(self.ts[0], y0)
+            rows = jax.lax.stop_gradient(self.rows_at(self.ts[0], y0))
+            slips, still = self.slips(rows, halves(y0)[1], 0.0)
+            along = Pattern((touches & (jnp.abs(rates) <= noise)).astype(float), still.astype(float), _unit(slips))
+            undecided = (sliding_margin(rows, along, self.friction.still) <= PARADOX).any()
+            result = jnp.where(undecided & (result == SUCCESSFUL), UNDECIDED, result)
         return Carry(
-            t=self.ts[0], y=y0, contacts=contacts, fresh=jnp.ones(guards, bool), going=~inside.any(),
-            result=jnp.where(inside.any(), INCONSISTENT, SUCCESSFUL), steps=jnp.zeros(2, int), longest=jnp.zeros(()),
+            t=self.ts[0], y=y0, contacts=contacts, fresh=jnp.ones(guards, bool), going=result == SUCCESSFUL,
+            result=result, steps=jnp.zeros(2, int), longest=jnp.zeros(()),
             turns=jnp.zeros((), int), rounding=jnp.zeros((2, guards)), rate_rounding=jnp.zeros((2, guards)),
             slip=jnp.zeros(self.flat.rough.size), path=jnp.full((self.ts.size, y0.size), jnp.nan),
             of_path=jax.tree.map(lambda x: jnp.full((self.ts.size, *x.shape), -1.0), contacts),
         )  # fmt: skip
 
-    def run_round(self, before: Carry, count) -> tuple[Carry, ImpactRecord]:
+    def run_round(self, before: Carry, count) -> tuple[Carry, RoundRecord]:
         """One round: to the next watch that falls, through what happens there; of a motion that is going."""
         here, contacts, t_start = before.going, before.contacts, jax.lax.stop_gradient(before.t)
         guarded, kinds = self.watch(before.t, before.y, contacts), jnp.concatenate([contacts.closed, contacts.sticks])
@@ -267,9 +291,12 @@ class ContactRounds(NamedTuple):
             of_path=jax.tree.map(cover, before.of_path, contacts),
         )  # fmt: skip
         after = jax.tree.map(lambda new, old: jnp.where(here, new, old), after, before)
-        happened = record.happened & happens & here
-        t, impulse, lost = (jnp.where(happened, x, jnp.nan) for x in record[:3])
-        return after, ImpactRecord(t, impulse, lost, happened)
+        absent, happened = RoundRecord.absent(before.y.size, self.count), happens & here
+        hits = record.hits & happened
+        kept = (happened,) * 5 + (hits,) * 4
+        return after, RoundRecord(
+            *(jnp.where(is_kept, new, old) for is_kept, new, old in zip(kept, record, absent, strict=True))
+        )
 
     def cross(self, k, taken, t, y, numbers):
         return attach_derivative(crossing_variation(self.surfaces), (t, y), k, taken, t, y, numbers)
@@ -306,7 +333,7 @@ class ContactRounds(NamedTuple):
 
     # ---- what happens at a watch that fell ----
 
-    def decide(self, before: Carry, t, y, k) -> tuple[Carry, ImpactRecord]:
+    def decide(self, before: Carry, t, y, k) -> tuple[Carry, RoundRecord]:
         """The state and the contacts behind watch k, which fell at (t, y)."""
         still, numbers, count = jax.lax.stop_gradient, eqx.filter(self.params, eqx.is_array_like), self.count
         first, contacts = np.arange(count + self.flat.rough.size) == k, before.contacts
@@ -356,7 +383,15 @@ class ContactRounds(NamedTuple):
         # Of the work of impulses only what moves q is kinetic energy: gaps may move by themselves.
         lost = -impulses @ (rows.gradients @ (v + 0.5 * change))
         rest = t + jnp.sum(jnp.where(ends, left, 0.0))
-        return decided, ImpactRecord(rest, impulses[:count], lost, hits)
+        contact = jnp.asarray(np.concatenate([np.arange(count), self.flat.rough]))[k]
+        normal = jnp.where(closed[contact], CLOSES, jnp.where(hits, BOUNCES, OPENS))
+        change = normal
+        if self.rubs:
+            stuck = jnp.asarray(np.concatenate([np.zeros(count, int), np.arange(self.flat.rough.size)]))[k]
+            change = jnp.where(k < count, normal, jnp.where(sticks[stuck], STICKS, SLIDES))
+        return decided, RoundRecord(
+            jnp.asarray(True), t, decided.y, contact, change, hits, rest, impulses[:count], lost
+        )  # fmt: skip
 
     def sticks(self, contacts: Contacts, slips: tuple, fell, renewed):
         """Which contacts stick (r,) behind watches of friction that `fell`, where there is no impact."""
