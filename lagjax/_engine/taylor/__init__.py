@@ -25,6 +25,7 @@ from lagjax._engine.taylor._crossing import (
     crossing_tangents,
     motion_to_event,
     motion_with_crossings,
+    stretch_variation,
     surfaces_of,
     surfaces_of_event,
 )
@@ -37,7 +38,7 @@ from lagjax._engine.taylor._surfaces import Guarded, Surfaces, crossing_variatio
 from lagjax._equations import Derivation
 from lagjax._interface import default_platform, has_nvidia_gpu, is_concrete
 from lagjax._native import Guards, Nesting, append_guards, pieces_of
-from lagjax._primitives import compute_in_doubles
+from lagjax._primitives import attach_derivative, compute_in_doubles
 from lagjax._program import Program, Unlowerable
 
 
@@ -153,6 +154,18 @@ class MachineCode(AbstractEngine):
         ts, y0, numbers = map(jax.lax.stop_gradient, (problem.ts, problem.y0, problem.vector))
         numbers = jnp.concatenate([numbers, jnp.asarray(sides, float)])
         return _primitives.run(flow_of(problem), tolerances_of(problem), ts, y0, numbers)
+
+    def vary_to_event(self, problem: Problem, surfaces: Surfaces, located: Solution, k, crosses) -> tuple:
+        """(path, t, y): what `solve_to_event` has `located`, of the same problem, with first and second derivatives.
+
+        They are those of outputs up to the event, and of the event, where surface k is zero if it `crosses`; else the
+        time at which the motion ended does not vary.
+        """
+        flow, tolerances = _unguarded_flow(problem), tolerances_of(problem)
+        values, given = (located.path, located.t_end, located.y_end), (problem.ts, problem.y0, problem.vector)
+        return attach_derivative(
+            stretch_variation(flow, surfaces, tolerances), values, *given, located.t_end, k, crosses
+        )  # fmt: skip
 
     def refuses_crossings(self, problem: Problem, surfaces: Surfaces) -> str | None:
         """Why it cannot find the crossings of these surfaces, as the end of a sentence; None where it can."""

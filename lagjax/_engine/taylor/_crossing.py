@@ -144,6 +144,26 @@ def _event_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
     return run_unguarded
 
 
+@functools.lru_cache(maxsize=64)
+def stretch_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
+    """`(ts, y0, params, t_end, k, crosses)` → path, t, y, for the sake of their derivatives.
+
+    The run goes to the rounded time of the event, and its state there is the one whose crossing varies: so the rates of
+    short motions between late events cancel to the last digit.
+    """
+    move_to_zero = crossing_variation(surfaces)
+
+    @jax.jit
+    def run_unguarded(ts, y0, params, t_end, k, crosses):
+        still = jax.lax.stop_gradient
+        reached = jnp.where(ts <= t_end, ts, still(jnp.clip(ts, ts[0], t_end)))
+        times = jnp.concatenate([ts[:1], reached[1:-1], t_end[None]])
+        solution = _primitives.run(flow, tolerances, times, y0, params)
+        return solution.path, *move_to_zero(k, crosses, t_end, solution.y_end, params)
+
+    return run_unguarded
+
+
 # ---- all crossings ---------------------------------------------------------------------------------------------------
 
 

@@ -26,10 +26,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine import Problem
-from lagjax._engine.taylor import Guarded, MachineCode, Surfaces, crossing_variation, line_of, vector_of
+from lagjax._engine.taylor import Guarded, MachineCode, Surfaces, line_of, vector_of
 from lagjax._interface import RESULTS, SUCCESSFUL, Layout, code_of, halves
 from lagjax._native import SINGLE_NOISE
-from lagjax._primitives import attach_derivative, differentiable_where, lost_unless
+from lagjax._primitives import differentiable_where, lost_unless
 from lagjax._run._trajectory import vary_with
 from lagjax._run.contacts._impact_law import (
     Friction,
@@ -247,27 +247,21 @@ class ContactRounds(NamedTuple):
         rounding = jnp.maximum(_of_kind(before.rounding, kinds), guarded.of_time)
         beyond = guarded.values < -rounding
         sides = jnp.where(beyond, jnp.inf, jnp.maximum(rounding, _LEAST))
+        ahead = here & ((self.ts > t_start) | (self.ts == jnp.where(t_start == self.ts[0], t_start, jnp.nan)))
         horizon = jnp.where(here, self.ts[-1], t_start)
-        problem = self.problem_in(contacts, jnp.stack([t_start, horizon]), before.y)
+        times = jnp.concatenate([before.t[None], jnp.where(ahead, self.ts, t_start), horizon[None]])
+        problem = self.problem_in(contacts, times, before.y)
         problem = dataclasses.replace(problem, guards=self.surfaces.guards(remembers=True))
         noted = jnp.concatenate([sides, _of_kind(before.rate_rounding, kinds)])
         located = MachineCode().solve_to_event(problem, noted)
         fell = (jnp.where(here, located.event, 0) >> (2 * np.arange(kinds.size))) & 3 > 0
         t_end = jnp.where(here & (located.result == SUCCESSFUL), self.ts[-1], located.t_end)
-
-        # The same stretch once more, with derivatives and outputs, to the rounded time of the event: what it gives there
-        # agrees with its derivatives to the last digit, as short flights need.
-        covered = here & ((self.ts > t_start) | (self.ts == jnp.where(t_start == self.ts[0], t_start, jnp.nan)))
-        covered = covered & (self.ts <= t_end)
-        inside = jnp.where(covered, self.ts, jax.lax.stop_gradient(jnp.clip(self.ts, t_start, t_end)))
-        times = jnp.concatenate([before.t[None], inside, t_end[None]])
-        moved = MachineCode().solve(self.problem_in(contacts, times, before.y))
-        y_end = moved.y_end
+        covered = ahead & (self.ts <= t_end)
 
         happens, k, at_once = fell.any(), jnp.argmax(fell), t_end == t_start
         crosses = happens & ~(at_once & _pick(before.fresh | beyond, k))
-        crossed = self.cross(k, crosses, t_end, y_end, self.numbers_in(contacts))
-        t, y = (jnp.where(crosses, new, old) for new, old in zip(crossed, (t_end, y_end), strict=True))
+        located = located._replace(t_end=t_end)
+        path, t, y = MachineCode().vary_to_event(problem, self.surfaces, located, k, crosses)
         turns = jnp.where(at_once, before.turns + 1, 0)
         step = jnp.where(at_once, 0.0, (t_end - t_start) / jnp.maximum(located.accepted, 1))
         before = _note_rounding(before, guarded, kinds, t_end - t_start)._replace(
@@ -277,17 +271,17 @@ class ContactRounds(NamedTuple):
 
         result = jnp.where(happens, decided.result, located.result)
         result = jnp.where(happens & (turns > 16 + 8 * kinds.size), UNDECIDED, result)
-        sound = jnp.isfinite(jnp.where(happens, decided.y, y_end)).all()
+        sound = jnp.isfinite(jnp.where(happens, decided.y, y)).all()
         result = jnp.where(~sound & (result == SUCCESSFUL), NOT_FINITE, result)
         going = happens & (result == SUCCESSFUL)
         spent = going & (count + 1 >= self.plan.max_transitions)
         cover = lambda old, new: jnp.where(covered[:, *[None] * new.ndim], new, old)  # noqa: E731
         after = decided._replace(
-            t=jnp.where(happens, t, t_end), y=jnp.where(happens, decided.y, y_end), going=going & ~spent,
+            t=t, y=jnp.where(happens, decided.y, y), going=going & ~spent,
             contacts=jax.tree.map(lambda new, old: jnp.where(happens, new, old), decided.contacts, contacts),
             result=jnp.where(spent, TOO_MANY, result), turns=turns,
             steps=before.steps + jnp.stack([located.accepted, located.rejected]),
-            path=jnp.where(covered[:, None], moved.path[1:-1], before.path),
+            path=jnp.where(covered[:, None], path[1:-1], before.path),
             of_path=jax.tree.map(cover, before.of_path, contacts),
         )  # fmt: skip
         after = jax.tree.map(lambda new, old: jnp.where(here, new, old), after, before)
@@ -297,9 +291,6 @@ class ContactRounds(NamedTuple):
         return after, RoundRecord(
             *(jnp.where(is_kept, new, old) for is_kept, new, old in zip(kept, record, absent, strict=True))
         )
-
-    def cross(self, k, taken, t, y, numbers):
-        return attach_derivative(crossing_variation(self.surfaces), (t, y), k, taken, t, y, numbers)
 
     # ---- what is known at a state ----
 
