@@ -106,14 +106,16 @@ class Impacts(NamedTuple):
 class ContactChanges(NamedTuple):
     """What contacts did along a motion, in order: NaN and −1 beyond the last of `count`.
 
-    `t` (N,), `q`, `qdot` are those just behind it; `contact` is its place in `Trajectory.contact_names`, and `change`
-    is 0 where it closes, 1 where it opens, 2 where it bounces, 3 where it sticks, 4 where it slides. Several at one
-    instant lead from one guess to the next.
+    `t` (N,), `q`, `qdot` are those just before it, `q_next`, `qdot_next` just behind it; `contact` is its place in
+    `Trajectory.contact_names`, and `change` is 0 where it closes, 1 where it opens, 2 where it bounces, 3 where it
+    sticks, 4 where it slides. Several at one instant lead from one guess to the next.
     """
 
     t: jax.Array
     q: PyTree
     qdot: PyTree
+    q_next: PyTree
+    qdot_next: PyTree
     contact: jax.Array
     change: jax.Array
     count: jax.Array

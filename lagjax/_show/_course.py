@@ -86,7 +86,7 @@ def course_of(trajectory) -> tuple[Layout, Course]:
 
 def course_of_member(members: Members, k: int) -> Course:
     trajectory, place = members.trajectory, np.unravel_index(k, members.batch) if members.batch else ()
-    changes, end = trajectory.transitions, trajectory.end
+    changes, end = trajectory.transitions or trajectory.contact_changes, trajectory.end
 
     def flatten_member(tree, rows: int) -> np.ndarray:
         leaves = [numbers_at(leaf, place).reshape(rows, -1) for leaf in jax.tree.leaves(tree)]

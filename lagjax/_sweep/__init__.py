@@ -26,7 +26,7 @@ import jax
 import numpy as np
 
 from lagjax._interface import output_times, require_flag
-from lagjax._run.hybrid import Hybrid, Scene, require_scene
+from lagjax._run.hybrid import Hybrid, Scene, jumps, require_scene
 from lagjax._show import import_package
 from lagjax._sweep._begin import begin, first_look, resume
 from lagjax._sweep._description import Description, Sections, uses_doubles
@@ -270,10 +270,10 @@ def sweep(
     require_flag(progress, "progress")
     settled = _as_store(store, arguments)
     settings = {name: getattr(settled, name) for name in ("rtol", "atol", "max_steps", "event", "solver")}
-    if isinstance(system, Hybrid):
+    if jumps(system):
         if given := [name for name in ("event", "crossings", "solver") if getattr(settled, name) is not None]:
             raise ValueError(
-                f"{' and '.join(given)} of sweep: for the motion of one System. Transitions watch a hybrid motion, in "
+                f"{' and '.join(given)} of sweep: for the motion of one System without contacts. Transitions watch a hybrid motion, in "
                 "machine code; one without a reset notes where it is crossed, and `trajectory.transitions` tells when."
             )
     if not callable(keep):

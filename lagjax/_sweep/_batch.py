@@ -29,7 +29,7 @@ from lagjax._run import (
     surfaces_in,
     trajectory_of,
 )
-from lagjax._run.hybrid import Hybrid, Scene
+from lagjax._run.hybrid import Hybrid, Scene, jumps
 from lagjax._sweep._description import NOT_TRACEABLE, Description, Sections
 from lagjax._sweep._files import RESULT, Quantity
 
@@ -108,7 +108,7 @@ class Batches:
         run, crossings = run_batch(
             description.system, values, ts, self._axes, description.settings, description.sections
         )
-        self._tolerances = None if isinstance(description.system, Hybrid) else run.tolerances
+        self._tolerances = None if jumps(description.system) else run.tolerances
         for_members = values["params"] if self._axes[2] == 0 else None
         return _BatchMotions(run, (_arrays(run), crossings), for_members), complaints
 
@@ -165,12 +165,13 @@ class Batches:
             **{name: x for name, x in arrays.items() if name != "code"}, result=result_from(code), engine="",
             ts=jnp.asarray(self.description.ts), tolerances=self._tolerances, system=modes or scene, params_axes=None,
             params=self.description.params if self._axes[2] is None else params, mode_names=tuple(modes or ()),
+            contact_names=(),
         )  # fmt: skip
 
     def _drift(self, run: Trajectory):
         """|h − h₀| from the first output to the end."""
         scene = self.description.system
-        if not self.conserves or isinstance(scene, Hybrid):
+        if not self.conserves or jumps(scene):
             return None
         q, qdot = jax.tree.map(lambda x: x[0], (run.q, run.qdot))
         energy, end = scene.energy, run.end
@@ -275,8 +276,11 @@ def _common_quantities(rows: list[dict[str, np.ndarray]]) -> list[Quantity]:
     return common
 
 
+_KEPT = ("q", "qdot", "end", "mode", "transitions", "impacts", "contacts", "contact_changes")
+
+
 def _arrays(run: Trajectory) -> dict[str, Any]:
-    fields = {name: getattr(run, name) for name in ("q", "qdot", "end", "mode", "transitions")}
+    fields = {name: getattr(run, name) for name in _KEPT}
     return fields | {"code": run.result._value, "stats": {k: x for k, x in run.stats.items() if jnp.ndim(x)}}
 
 
@@ -350,7 +354,7 @@ def run_batch(
     crossings has the members in front.
     """
     q0, qdot0, params = values.values()
-    if isinstance(system, Hybrid):
+    if jumps(system):
         tolerances = {name: settings[name] for name in ("rtol", "atol", "max_steps")}
         return _hybrid_batch(system, axes, **tolerances)(q0, qdot0, ts, params), None
     if sections is None:

@@ -25,12 +25,12 @@ from lagjax._interface import accept, require_budget
 from lagjax._interface.reads import array_text, hash_of, identity, source, strip_addresses
 from lagjax._run import directions_of, sections_of
 from lagjax._run.hybrid import Hybrid, Scene
+from lagjax._scene import ARGUMENTS, ROLES
 from lagjax._show import import_package
 from lagjax._sweep._members import Axis, describe_axes
 from lagjax._sweep._statistics import Statistics
 
 PyTree = Any
-ROLES = ("lagrangian", "forces", "dissipation", "constraints", "velocity_constraints")
 MOTION = (*ROLES, "q0", "qdot0", "params")  # what a motion depends on, besides its tolerances
 NOT_TRACEABLE = (jax.errors.JAXTypeError, jax.errors.JAXIndexError)
 _OF_EVENTS = ("direction", "root_finder")  # what a diffrax.Event has besides its condition
@@ -152,7 +152,7 @@ def texts(description: Description, names: list[str]) -> dict[str, dict[str, str
     q, qdot, params = description.shapes(names)
     entries = {}
     for name, function in _functions(description.system).items():
-        arguments = (q,) if name.split()[0] == "constraints" else (q, qdot)
+        arguments = (q, qdot)[: len(ARGUMENTS.get(name.split()[0], (q, qdot)))]
         entries[name] = _entry(function.code.function, _defer_trace(function, arguments, params), function.arrays)
     if isinstance(scene := description.system, Hybrid):  # its modes and transitions without their functions
         arrows = [(t.source, t.target, t.direction) for t in scene.transitions]

@@ -24,7 +24,7 @@ from lagjax._fit.model._signals import Signals
 from lagjax._fit.model._timings import Timings, build_clock
 from lagjax._interface import Layout, find_params_expression
 from lagjax._primitives import DOUBLE
-from lagjax._run.hybrid import Hybrid, Scene, first_law, require_scene
+from lagjax._run.hybrid import Scene, first_law, jumps, require_scene
 
 PyTree = Any
 
@@ -85,11 +85,11 @@ def _assemble_system(given: GivenSystem, parameters: Parameters, law: AbstractNo
         sensor = Sensor(*(np.append(x, np.nan) for x in sensor))
     fitted = np.array([record.start is None or isinstance(record.start, Guess) for record in records])
     manifold = None
-    if isinstance(system, Hybrid):
+    if jumps(system):
         if fitted.any() and has_constraints(first_law(system)):
-            raise ValueError("A start on constraints of hybrid motion cannot be fitted: give start=(q0, qdot0).")
+            raise ValueError("A start on constraints of hybrid motion, or with contacts, cannot be fitted: give start=(q0, qdot0).")
         if isinstance(observe, Delayed):
-            raise ValueError("Sensors of hybrid motion cannot be lagjax.Delayed: keep the delay, and shift the times.")
+            raise ValueError("Sensors of hybrid motion, or with contacts, cannot be lagjax.Delayed: keep the delay, and shift the times.")
     elif has_constraints(system) and not input_functions(system):
         manifold = Manifold(system, layout, parameters, motions.projection)
     elif has_constraints(system) and fitted.any():
@@ -105,7 +105,7 @@ def _require_motion(given: GivenSystem, recordings: list[Record], signals: Signa
     signal of any record ever changes. Hybrid motion may jump."""
     of_state, wrap = sensors(given.observe)
     for place, record in enumerate(given.records):
-        if isinstance(record, Record) and not isinstance(given.system, Hybrid) and wrap is None:
+        if isinstance(record, Record) and not jumps(given.system) and wrap is None:
             require_no_jumps(record, f"records[{place}]", signals.names, of_state is None)
     still = constant_signals(recordings, signals.names)
     if len(still) == len(signals.names) * len(given.records) > 0 and all(one.start is None for one in given.records):
@@ -114,8 +114,8 @@ def _require_motion(given: GivenSystem, recordings: list[Record], signals: Signa
 
 def _read_form(system: Scene, records: list[Record], hold: str) -> Form | None:
     asking = input_functions(system)
-    if asking and isinstance(system, Hybrid):
-        raise ValueError(f"{asking[0]} asks for `inputs`, which hybrid motion has none of: make it a function of `t`.")
+    if asking and jumps(system):
+        raise ValueError(f"{asking[0]} asks for `inputs`, which hybrid motion and contacts have none of: make it a function of `t`.")
     for place, record in enumerate(records):
         if asking and (not isinstance(record, Record) or record.input_structure is None):
             raise ValueError(

@@ -33,7 +33,7 @@ from lagjax._interface import ENDED_WELL, Layout, halves
 from lagjax._native import Projection
 from lagjax._primitives import sentence
 from lagjax._run import simulate
-from lagjax._run.hybrid import Hybrid, Scene, first_law
+from lagjax._run.hybrid import Scene, first_law, jumps
 from lagjax._scene import System
 
 PyTree = Any
@@ -86,7 +86,7 @@ class AbstractMotions(abc.ABC):
 def choose_motions(
     system: Scene, layout: Layout, parameters: Parameters, rtol, atol, form: Form | None = None
 ) -> AbstractMotions:
-    if isinstance(system, Hybrid):
+    if jumps(system):
         return _JaxMotions(system, layout, parameters, {"rtol": rtol, "atol": atol})
     form = form if input_functions(system) else None  # inputs that only sensors ask for, or nothing
     scene = system if form is None else form.drive_scene(system)

@@ -29,7 +29,7 @@ from lagjax._fit.search._multistart import misfit
 from lagjax._fit.search._reader import Reader, pad_states, short_windows, time_scales
 from lagjax._fit.search._segments import complete_pieces, levels
 from lagjax._fit.search._unexplained import measure_unexplained
-from lagjax._run.hybrid import Hybrid
+from lagjax._run.hybrid import jumps
 
 # In units of half the sum of squares: the end of a search, where parameters are within 0.05 standard deviations of
 # independent noise, and, per sample, that of a level of growing segments, whose answer is only where the next begins.
@@ -53,7 +53,7 @@ class Search:
 
     def __init__(self, residuals: Residuals, law: AbstractNoise, method: str, readers: list[Reader | None]):
         self.residuals, self.law, self.method = residuals, law, method
-        hybrid = [isinstance(part.scene, Hybrid) for part in residuals.parts for _ in part.records]
+        hybrid = [jumps(part.scene) for part in residuals.parts for _ in part.records]
         if method == "segments" and all(hybrid):
             raise ValueError(
                 'method="segments" cannot cut hybrid motion, whose mode is known at its start alone: leave it.'

@@ -107,9 +107,12 @@ def _trajectory(given: Problem, problem: Problem, ending: Carry, record: RoundRe
         for x in record[-3:]
     )
     impacts = Impacts(t, flat.shapes.by_name(impulse), lost, jnp.sum(record.hits, axis=-1))
-    at_change = map(problem.layout.restore, halves(record.y))
+    (q_before, qdot_before), (q_next, qdot_next) = (
+        map(problem.layout.restore, halves(y)) for y in (record.y, record.y_next)
+    )
+    count = jnp.sum(record.happened, axis=-1)
     changes = ContactChanges(
-        record.t, *at_change, record.contact, record.change, jnp.sum(record.happened, axis=-1)
+        record.t, q_before, qdot_before, q_next, qdot_next, record.contact, record.change, count
     )  # fmt: skip
     accepted, rejected = ending.steps[..., 0], ending.steps[..., 1]
     return Trajectory(

@@ -96,7 +96,7 @@ class Carry(NamedTuple):
 
 
 class RoundRecord(NamedTuple):
-    """What a round came to, if it `happened`: the time and the state behind it, the contact, and its `CHANGES`.
+    """What a round came to, if it `happened`: the time, the states before and behind it, the contact, its `CHANGES`.
 
     And its impact, if there is one: `t_impact`, the normal impulses (k,), the energy that was lost. Else NaN and −1.
     """
@@ -104,6 +104,7 @@ class RoundRecord(NamedTuple):
     happened: jax.Array
     t: jax.Array
     y: jax.Array
+    y_next: jax.Array
     contact: jax.Array
     change: jax.Array
     hits: jax.Array
@@ -113,8 +114,8 @@ class RoundRecord(NamedTuple):
 
     @classmethod
     def absent(cls, states: int, contacts: int) -> "RoundRecord":
-        no, none, nan = jnp.asarray(False), jnp.asarray(-1), jnp.asarray(jnp.nan)
-        return cls(no, nan, jnp.full(states, jnp.nan), none, none, no, nan, jnp.full(contacts, jnp.nan), nan)
+        no, none, nan, y = jnp.asarray(False), jnp.asarray(-1), jnp.asarray(jnp.nan), jnp.full(states, jnp.nan)
+        return cls(no, nan, y, y, none, none, no, nan, jnp.full(contacts, jnp.nan), nan)
 
 
 @eqx.filter_jit
@@ -143,10 +144,10 @@ def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) ->
     def lost(there, *numbers):
         return (lost_unless(there[:, *[None] * (x.ndim - 1)], x, inputs) for x in numbers)
 
-    t, y = lost(record.happened, record.t, record.y)
+    t, y, y_next = lost(record.happened, record.t, record.y, record.y_next)
     t_impact, impulse, energy_lost = lost(record.hits, *record[-3:])
     path = lost_unless((ending.of_path.closed >= 0).all(axis=1)[:, None], ending.path, inputs)
-    record = record._replace(t=t, y=y, t_impact=t_impact, impulse=impulse, energy_lost=energy_lost)
+    record = record._replace(t=t, y=y, y_next=y_next, t_impact=t_impact, impulse=impulse, energy_lost=energy_lost)
     return ending._replace(path=path), record
 
 
@@ -287,7 +288,7 @@ class ContactRounds(NamedTuple):
         after = jax.tree.map(lambda new, old: jnp.where(here, new, old), after, before)
         absent, happened = RoundRecord.absent(before.y.size, self.count), happens & here
         hits = record.hits & happened
-        kept = (happened,) * 5 + (hits,) * 4
+        kept = (happened,) * 6 + (hits,) * 4
         return after, RoundRecord(
             *(jnp.where(is_kept, new, old) for is_kept, new, old in zip(kept, record, absent, strict=True))
         )
@@ -350,12 +351,14 @@ class ContactRounds(NamedTuple):
         apart = quiet.rates + quiet.coupling @ still(impulses)
         closed = jnp.where(hits, meeting.touches & (jnp.abs(apart[:count]) <= meeting.noise), closed)
         changed, undecided, slip = (closed != was_closed) | hits, hits & ~meeting.sound, before.slip
-        direction, turned = contacts.direction, changed[:0]
+        direction, turned, leaves_rest = contacts.direction, changed[:0], jnp.asarray(False)
         if self.rubs:
             behind = self.slips(quiet._replace(rates=apart), v + still(change), slip)
             renewed = changed[self.flat.rough]
             sticks = jnp.where(hits & renewed, behind[1], sticks)
             breaks, slip = first[count:] & (contacts.sticks > 0), jnp.maximum(slip, _length(slips[0]))
+            # In space what varies across a slip that begins from rest decays so fast that steps do not follow it.
+            leaves_rest = (breaks & (self.flat.shapes.directions > 1)).any()
             direction = self.directions(before, quiet, t, y, behind, breaks, renewed)
             turned = renewed | (sticks != (contacts.sticks > 0))
             along = Pattern(closed.astype(float), sticks.astype(float), _unit(direction))
@@ -366,7 +369,7 @@ class ContactRounds(NamedTuple):
         fast = jnp.abs(rows.gradients[:count]) @ jnp.maximum(jnp.abs(v), jnp.abs(v + change))
         before = _note_forces(before, still(fast / jnp.diagonal(rows.coupling)[:count]))
         decided = before._replace(
-            y=differentiable_where(~(hits & meeting.tied), y_next), slip=slip,
+            y=differentiable_where(~((hits & meeting.tied) | leaves_rest), y_next, t, y), slip=slip,
             contacts=Contacts(closed.astype(float), sticks.astype(float), direction),
             fresh=before.fresh | jnp.concatenate([changed, turned]),
             result=jnp.where(undecided, UNDECIDED, before.result),
@@ -381,7 +384,7 @@ class ContactRounds(NamedTuple):
             stuck = jnp.asarray(np.concatenate([np.zeros(count, int), np.arange(self.flat.rough.size)]))[k]
             change = jnp.where(k < count, normal, jnp.where(sticks[stuck], STICKS, SLIDES))
         return decided, RoundRecord(
-            jnp.asarray(True), t, decided.y, contact, change, hits, rest, impulses[:count], lost
+            jnp.asarray(True), t, y, decided.y, contact, change, hits, rest, impulses[:count], lost
         )  # fmt: skip
 
     def sticks(self, contacts: Contacts, slips: tuple, fell, renewed):

@@ -301,7 +301,12 @@ def require_scene(scene: Any) -> Scene:
 
     Raises `TypeError` for what is neither a `System` nor a `Hybrid`.
     """
-    return scene._now() if isinstance(scene, Hybrid) else require_system(scene)
+    return scene._now() if isinstance(scene, Hybrid) else require_system(scene, contacts=True)
+
+
+def jumps(scene: Scene) -> bool:
+    """True if the motion of a scene may jump, in rounds of its own: a hybrid one, or one with contacts."""
+    return isinstance(scene, Hybrid) or scene.touches
 
 
 def first_law(scene: Scene) -> System:
