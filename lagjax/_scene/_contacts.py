@@ -173,13 +173,16 @@ class Shapes(NamedTuple):
     @classmethod
     def from_system(cls, system: System, layout: Layout, params: PyTree) -> "Shapes":
         """Raises `TypeError` or `ValueError` where a function does not return what its role asks for."""
-        trees, names, counts = [], [], []
-        for role in ("contacts", "one_way"):
-            tree = None if getattr(system, role) is None else system._output_shapes(role, layout, params)
-            own = _names(tree, role)
-            trees, names, counts = [*trees, tree], [*names, *own], [*counts, len(own)]
+        trees = [
+            None if getattr(system, role) is None else system._output_shapes(role, layout, params)
+            for role in ("contacts", "one_way")
+        ]
+        for role, tree in zip(("contacts", "one_way"), trees, strict=True):
+            if any(not jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(tree)):
+                raise TypeError(f"{role} must return real numbers, the gaps or velocities that stay >= 0.")
+        counts, names = [sum(x.size for x in jax.tree.leaves(tree)) for tree in trees], system.contact_names(layout, params)
         rough, directions = _rough(system, layout, params, trees[0])
-        shapes = cls(tuple(trees), counts[0], sum(counts), rough, directions, tuple(names))
+        shapes = cls(tuple(trees), counts[0], sum(counts), rough, directions, names)
         numbers, code = eqx.partition(params, eqx.is_array_like)
         for role in ("restitution", "friction"):
             function = getattr(system, role)
@@ -215,16 +218,6 @@ class Shapes(NamedTuple):
         if len(parts) == 1:
             return parts[0]
         return {**parts[0], **parts[1]} if all(isinstance(part, dict) for part in parts) else tuple(parts)
-
-
-def _names(tree: PyTree, role: str) -> list[str]:
-    names = []
-    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-        if not jnp.issubdtype(leaf.dtype, jnp.floating):
-            raise TypeError(f"{role} must return real numbers; got {leaf.dtype}.")
-        label = role + jax.tree_util.keystr(path)
-        names += [label + (str(list(index)) if leaf.shape else "") for index in np.ndindex(leaf.shape)]
-    return names
 
 
 def _rough(system: System, layout: Layout, params: PyTree, tree: PyTree) -> tuple[np.ndarray, int]:

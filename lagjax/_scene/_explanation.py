@@ -52,6 +52,8 @@ class Explanation:
     - `constraints`: the name of every number that is to be zero; `dependent_constraints`: those that, at the state in
       question, are combinations of earlier ones, and of which (to eps^(2/3) of the squared gradient). They change
       nothing but the multipliers.
+    - `contacts`: the names of gaps and one-way velocities that stay positive; all other facts are those of the motion
+      while none is closed.
     - `projection_operations`: scalar operations of one projection onto the constraints, which follows every step.
     - `path`: "scalar" or "array"; `reason`: why not "scalar".
     - `solver`: the default engine, and why not machine code where it is not; for machine code also whether operations
@@ -76,6 +78,7 @@ class Explanation:
     constraints: tuple[str, ...] = ()
     dependent_constraints: dict[str, tuple[str, ...]] | None = field(default_factory=dict)
     projection_operations: int | None = None
+    contacts: tuple[str, ...] = ()
 
     def with_constraints(self, names: list[str], schur_complement: np.ndarray | None) -> "Explanation":
         """The explanation with the names of constraints; where G M⁻¹ Gᵀ is known, with the dependent ones."""
@@ -110,6 +113,8 @@ class Explanation:
             rows.append(("narrow features", _count_names(self.narrow)))
         if self.constraints:
             rows.append(("constraints", f"{len(self.constraints)}: {_list_names(self.constraints, counts=False)}"))
+        if self.contacts:
+            rows.append(("contacts", f"{len(self.contacts)}: {_list_names(self.contacts, counts=False)}"))
         for name, others in (self.dependent_constraints or {}).items():
             rows.append(("dependent", f"{name} on {join_names(others, _LISTED)}"))
         if self.operations is not None:

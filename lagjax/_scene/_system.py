@@ -4,6 +4,7 @@ A `System` holds the user's functions, checked for their signatures when it is b
 first meet a state. `System._motion(layout)` is the same scene in flat coordinates, as an integration takes it.
 """
 
+import dataclasses
 import operator
 from collections.abc import Callable
 from typing import Any, Literal, cast
@@ -259,6 +260,8 @@ class System(eqx.Module):
         require_number(t, "t")
         self, layout = present_system(self), Layout.from_state(q, qdot)
         facts = explain(Problem.from_system(self, layout, params))
+        if self.touches:
+            facts = dataclasses.replace(facts, contacts=self.contact_names(layout, params), energy_conserved=None)
         if not self._constraint_roles:
             return facts
         names = self.constraint_names(layout, params)
@@ -330,10 +333,16 @@ class System(eqx.Module):
         """A name for each of the m constraints, such as constraints['rod'] or velocity_constraints[1]."""
         names = []
         for role, part in zip(self._constraint_roles, self._constraint_structure(layout, params), strict=True):
-            for path, leaf in jax.tree_util.tree_leaves_with_path(part):
-                label = role + jax.tree_util.keystr(path)
-                names += [label + (str(list(index)) if leaf.shape else "") for index in np.ndindex(leaf.shape)]
+            names += _names_of(part, role)
         return names
+
+    def contact_names(self, layout: Layout, params: PyTree) -> tuple[str, ...]:
+        """A name for each gap and one-way velocity, such as contacts['floor'] or one_way[1]."""
+        names = []
+        for role in ("contacts", "one_way"):
+            if getattr(self, role) is not None:
+                names += _names_of(self._output_shapes(role, layout, params), role)
+        return tuple(names)
 
     def _evaluate_quantity(self, quantity: Callable, q, qdot, t, params, restore: bool = False):
         """One of `Motion`'s functions at a state in the user's pytree, back in that pytree where `restore` says so."""
@@ -404,6 +413,14 @@ class System(eqx.Module):
         return jax.eval_shape(
             lambda q, t, p: function(*[q] * count, t=t, params=eqx.combine(p, code)), state, t, numbers
         )
+
+
+def _names_of(tree: PyTree, role: str) -> list[str]:
+    names = []
+    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
+        label = role + jax.tree_util.keystr(path)
+        names += [label + (str(list(index)) if leaf.shape else "") for index in np.ndindex(leaf.shape)]
+    return names
 
 
 def _coefficients(contacts, one_way, restitution, friction, slip) -> tuple:

@@ -3,7 +3,7 @@
 Everything is computed once, by the programs of the scene: values, derivatives, their finite differences, the mass
 matrix at states nearby, the linearised motion. What follows is NumPy and sentences, each file for one question.
 `_scene_at_start` is what they all look at, `_findings` what they return. In their order: `_derivative_checks` (by
-`_differences`), `_constraint_checks`, `_mass`, `_jumps_nearby`, `_stiffness`.
+`_differences`), `_constraint_checks`, `_contact_checks`, `_mass`, `_jumps_nearby`, `_stiffness`.
 """
 
 from typing import Any
@@ -23,6 +23,7 @@ from lagjax._primitives import accepts_singles
 from lagjax._scene import ROLES, System, replace_functions, require_system
 from lagjax._trust.checks import (
     _constraint_checks,
+    _contact_checks,
     _derivative_checks,
     _jumps_nearby,
     _mass,
@@ -52,11 +53,12 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
       by a velocity, or of a constraint, at this state; where the acceleration jumps it is advice), `wrong_derivative`
       (of a custom rule), `constraint_not_finite`, `constraint_zero_gradient`, `inconsistent_start`; for a singular mass
       matrix `velocity_unused`, `linear_in_velocity`, `velocity_combination`, `gauge`, `coordinate_singularity`,
-      `singular_at_velocity`, `singular_saddle_point`; `acceleration_not_finite`.
+      `singular_at_velocity`, `singular_saddle_point`; `acceleration_not_finite`; `contact_inside` (a negative gap),
+      `contact_zero_gradient`.
     - warning: `creates_energy` (a dissipation function of the wrong sign), `indefinite_mass_matrix`,
       `near_coordinate_singularity`, `velocity_constraint_not_affine`, `discontinuity`.
     - advice: `single_precision`, `integer_parameter`, `small_state`, `ill_conditioned`, `dependent_constraints`,
-      `stiff`, `explicit_time`.
+      `stiff`, `explicit_time`, `contact_inwards` (a closed gap that moves inwards).
 
     **Raises** `TypeError` or `ValueError`, with the messages of `simulate`, for a state or functions with which no
     motion can begin; `ValueError` inside `jit`, where there are no numbers.
@@ -73,7 +75,7 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
     assert not findings.ok
     ```
     """
-    system = require_system(system)
+    system = require_system(system, contacts=True)
     layout = Layout.from_state(q, qdot)
     require_number(t, "t")
     if not all(is_concrete(leaf) for leaf in jax.tree.leaves((q, qdot, t, params))):
@@ -93,7 +95,7 @@ def _scene_findings(system, q, qdot, t, params) -> tuple[list[Finding], str]:
     scene = CheckedScene.from_state(system, layout, q, qdot, t, params)
     reported = _derivative_checks.findings(scene)
     reported += _dissipation(scene)
-    reported += _constraint_checks.findings(scene)
+    reported += _constraint_checks.findings(scene) + _contact_checks.findings(scene)
     reported += _mass.findings(scene)
     if scene.is_large:
         reported += [] if any(finding.level == "error" for finding in reported) else _acceleration(scene)

@@ -51,6 +51,10 @@ UNSTEADY = 0.5
 def examine(trajectory, reference=None) -> "Health":
     """The `Health` of a trajectory, with its global error if there is a reference; see `Trajectory.health`."""
     fields, names = measure_trajectory(trajectory)
+    impacts = None
+    if trajectory.impacts is not None:  # impacts and friction take energy: no balance of it is at hand
+        impacts = trajectory.impacts.count, jnp.nansum(trajectory.impacts.energy_lost, axis=-1)
+        fields["energy_allowed"] = jnp.full_like(jnp.asarray(fields["energy_allowed"]), jnp.inf)
     located, counts = _borders(trajectory)
     return Health(
         result=trajectory.result,
@@ -62,6 +66,7 @@ def examine(trajectory, reference=None) -> "Health":
         borders=counts,
         borders_located=located,
         guards=_guards(trajectory.transitions),
+        impacts=impacts,
         outputs=trajectory.ts.shape[-1],
         diagnosis=_diagnosis(trajectory),
         works=names.works,
@@ -149,6 +154,8 @@ class Health(eqx.Module):
       stepped across the borders.
     - `guards`: in a hybrid motion, whether blows met at one instant that do not commute, and whether a guard was let
       out that was beyond zero where a mode began (`Transitions`); else None.
+    - `impacts`: in a scene with contacts, how many there were and the energy that they took; else None. The balance of
+      energy and momenta are not judged there.
     - `global_error`: with a reference, the largest |yᵢ − reference| over the components of q and q̇, in units of the
       largest |yᵢ| along the path (and atol/rtol more, as in the tolerances); else None.
     """
@@ -178,6 +185,7 @@ class Health(eqx.Module):
     global_error: Extreme | None
     borders: Met[Array] | None
     guards: tuple[Bool[Array, "*batch"], Bool[Array, "*batch"]] | None
+    impacts: tuple[Int[Array, "*batch"], Float[Array, "*batch"]] | None
     borders_located: bool = eqx.field(static=True)
     outputs: int = eqx.field(static=True)
     diagnosis: str = eqx.field(static=True)
@@ -274,7 +282,11 @@ class Health(eqx.Module):
         error = np.max(np.nan_to_num(np.asarray(self.work_error, float), nan=-np.inf))
         known = f"; the work between outputs is known to {error:.1e}" if self.works else ""
         law = "power balance" if self.works else "energy"
-        rows.append((law, f"off by {_worst(self.energy, self._energy_limit)}{known}"))
+        if self.impacts is None:
+            rows.append((law, f"off by {_worst(self.energy, self._energy_limit)}{known}"))
+        else:
+            count, lost = (np.asarray(x) for x in self.impacts)
+            rows.append(("impacts", f"{count.sum()}, which took {np.sum(lost):.3g} of the energy; its balance is not judged"))
         if self.momentum_names is None:
             rows.append(("momenta", "not known which are conserved: the scene has no scalar program"))
         if text := self._border_contacts():

@@ -73,7 +73,7 @@ class Law(NamedTuple):
         """The law of a system; `mode`, where it is not empty, is a prefix of the names of constraints."""
         derivation = derivation_of(system, layout, params)
         names = system.constraint_names(layout, params) if derivation.motion.constrained else []
-        works, conserved = _constants(system, derivation)
+        works, conserved = (True, ()) if system.touches else _constants(system, derivation)
         return cls(derivation, works, conserved, tuple((f"{mode}: " if mode else "") + name for name in names))
 
     # ---- many states, by programs ----
