@@ -121,7 +121,7 @@ class BorderControl:
             for border in self.table.each(frame):
                 slide = border["slide"]
                 with code.only_if((slide >= 0) & code.compare("==", border.g, border["rest"])):
-                    frame.assign(undecided & (self.table.piece(frame, slide) > 0.0), border.g, touch=Touch.SLIDING)
+                    border.remember(undecided & (self.table.piece(frame, slide) > 0.0), touch=Touch.SLIDING)
             frame["undecided"] = 0.0
         return frame.finish()
 
@@ -490,7 +490,7 @@ class BorderControl:
         if self.retraction is not None:  # borders that are left before the step begins do not take the state
             self.retraction.undo(frame, ~stepped)
         for border in self.table.each(frame):
-            frame.assign(stepped & (border.touch < Touch.SLIDING), border.g, touch=Touch.NONE)
+            border.remember(stepped & (border.touch < Touch.SLIDING), touch=Touch.NONE)
         with code.only_if(code.any_lane(crosses | was_cut)):
             # What a cut step was to be says more about the next one than what it became.
             longest = limits.GROWTH * abs(frame["planned"])
@@ -592,15 +592,15 @@ class BorderControl:
 
         The rate of u that was kept at zero is zero there after a slide, and not where it did not slide at all.
         """
-        code, on = frame.code, Border(self.table, frame, border["on"])
+        code, on = frame.code, Border(frame, self.table, border["on"])
         with code.only_if(on.g >= 0):
             order = code.lanes_of(code.as_double(on["order"]))
             gains = code.as_double(border["gains"])
             frame.assign(hit, on["piece"] + self.motion.parameters, params=on.piece + gains)
             frame.assign(hit, border["rest"], touch=Touch.NONE)
-            frame.assign(hit, on.g, touch=code.select(again, order, order + Touch.VALUE))
+            on.remember(hit, touch=code.select(again, order, order + Touch.VALUE))
             if self.borders.releases:  # the vector of a cone has been given a length beyond its level
-                frame.assign(hit & on.is_cone, on.g, touch=Touch.NONE)
+                on.remember(hit & on.is_cone, touch=Touch.NONE)
 
     def _release(self, frame: Frame) -> None:
         """Let the vectors of cones that hold no longer set out, with a speed that is twice what counts as none."""
@@ -643,7 +643,7 @@ class BorderControl:
         for g, guard in enumerate(self.guards):
             if guard.piece not in self.kicks_in_time:
                 continue
-            border = Border(self.table, frame, integer(code, g))
+            border = Border(frame, self.table, integer(code, g))
             side = guard.side(border.piece)
             self.roots.polynomial(frame, border["piece"], degree, h, side, border.level(border.piece))
             end, slope = self.roots.value_and_slope(frame, degree, one)
@@ -693,7 +693,7 @@ class BorderControl:
             with code.loop(self.pieces) as j:
                 frame.assign(reflected, j + self.motion.parameters, params=frame["kick_before", j])
             for border in self.table.each(frame):
-                frame.assign(reflected, border.g, touch=code.select(border.is_hit, Touch.VALUE, Touch.NONE))
+                border.remember(reflected, touch=code.select(border.is_hit, Touch.VALUE, Touch.NONE))
             frame["kicks"] = code.select(reflected, 1.0, 0.0)
             frame.call(kick)
         self._decide_by_velocity(frame, kicks > 0.0)

@@ -19,7 +19,7 @@ from lagjax._native._roots import Roots
 from lagjax._native._run_records import Output
 from lagjax._native._step import StepControl
 from lagjax._native._taylor import TaylorSeries, double
-from lagjax._native._watch import END_OF_STEP, Columns, Touch, reaches_border
+from lagjax._native._watch import END_OF_STEP, Columns, Touch, Watch, reaches_border
 from lagjax._program._borders import inputs_below
 
 
@@ -86,9 +86,9 @@ class Events:
             frame["guard", i] = guards[i] - frame["zero", i]
         return frame.finish()
 
-    def _guard_value(self, frame: Frame, order: Value, g: Value, s: Value) -> Value:
-        frame.call(self.guard, order, s)
-        return frame["guard", g]
+    def _guard_value(self, watch: Watch, order: Value, s: Value) -> Value:
+        watch.frame.call(self.guard, order, s)
+        return watch.recall("guard")
 
     def _begin_sides(self) -> Code:
         """`(order)`: for lanes at the start of a run, the side of each surface they are on, into `side`.
@@ -115,21 +115,22 @@ class Events:
             for k in range(len(self.guards.program.line.outputs) // count):
                 for i in self.motion.form.each(code, count):
                     frame["measured", i, k] = out[i + k * count]
-            with code.loop(count) as g:
-                self._begin_side(frame, order, g, fresh)
+            for watch in self.table.each(frame):
+                self._begin_side(watch, order, fresh)
         return frame.finish()
 
-    def _begin_side(self, frame: Frame, order: Value, g: Value, fresh: Value) -> None:
-        """The side of guard g, whether it changes at the start, and its contact there."""
-        code, direction, is_rounded = frame.code, self._column(frame, g, "direction"), self.guards.is_rounded
+    def _begin_side(self, watch: Watch, order: Value, fresh: Value) -> None:
+        """The side of a guard, whether it changes at the start, and its contact there."""
+        frame, code, g = watch.frame, watch.code, watch.g
+        direction, is_rounded = watch.number("direction"), self.guards.is_rounded
         value, rate, size, rate_size = (frame["measured", g, k] for k in range(4))
-        later, noise, rate_noise = frame["guard", g], limits.GUARD_NOISE * size, limits.GUARD_NOISE * rate_size
+        later, noise, rate_noise = watch.recall("guard"), limits.GUARD_NOISE * size, limits.GUARD_NOISE * rate_size
         before = frame.constant(0.0) if self.notes else 0.0 - direction  # from where it can change in its direction
         if self.guards.remembers:
             first = self.motion.parameters + g - 2 * self.count
             before, rate_noise = frame["params", first], frame["params", first + self.count]
         of_rate = abs(frame["h"]) * rate_noise
-        lead, order_of_zero = self._lead(frame, order, g, limits.GUARD_NOISE * size + of_rate)
+        lead, order_of_zero = self._lead(watch, order, limits.GUARD_NOISE * size + of_rate)
         away, from_there, moved = (abs(x) for x in (value, before, rate))
         on_it = away <= noise + moved * (limits.INSTANT * frame["smallest"])
         if self.guards.remembers:
@@ -146,21 +147,21 @@ class Events:
         goes_on = (going * before < 0.0) | ~(from_there < float("inf"))
         met = fresh & there & goes_on & (before * direction <= 0.0)
         if any(self.guards.holds):
-            met = met | (fresh & ~on_it & (value * direction * self._column(frame, g, "holds") > 0.0))
+            met = met | (fresh & ~on_it & (value * direction * watch.number("holds") > 0.0))
         frame["met", g] = code.select(met, code.select(before > 0.0, Change.FALLS, Change.RISES), 0.0)
         side = code.select(on_it, code.select(met | code.compare("==", going, 0.0), before, going), value)
         zeros = code.select(leaves, Touch.VALUE, code.select(sound, order_of_zero, Touch.RATE))
-        frame.assign(fresh, g, side=self._sign(frame, side), contact=code.select(on_it, zeros, Touch.NONE))
+        watch.remember(fresh, side=self._sign(frame, side), contact=code.select(on_it, zeros, Touch.NONE))
         if is_rounded:
-            frame.assign(fresh, g, zero=code.select(on_it, value, 0.0))
+            watch.remember(fresh, zero=code.select(on_it, value, 0.0))
 
-    def _lead(self, frame: Frame, order: Value, g: Value, noise: Value) -> tuple[Value, Value]:
-        """The first term of guard g behind its rate that is more than noise, and its order, for a whole step.
+    def _lead(self, watch: Watch, order: Value, noise: Value) -> tuple[Value, Value]:
+        """The first term of a guard behind its rate that is more than noise, and its order, for a whole step.
 
         The order is one more than the last one where all terms are rounding, and 0 where there is no series.
         """
-        code, degree = frame.code, self.motion.followed_degree(frame.code, order)
-        self.roots.polynomial(frame, g + self.first, degree, frame["h"], frame.constant(1.0), 0.0)
+        frame, code, degree = watch.frame, watch.code, self.motion.followed_degree(watch.code, order)
+        self.roots.polynomial(frame, watch.g + self.first, degree, frame["h"], frame.constant(1.0), 0.0)
         size, lead = (code.variable(frame.constant(0.0)) for _ in range(2))
         with code.loop(degree + 1, start=1) as k:
             size.value += abs(frame["poly", k])
@@ -172,9 +173,6 @@ class Events:
             lead.value = code.select(is_first, term, lead.value)
             at.value = code.select(is_first, code.lanes_of(code.as_number(k)), at.value)
         return lead.value, at.value
-
-    def _column(self, frame: Frame, g: Value, name: str) -> Value:
-        return self.table.read_lanes(frame.code, g, name)
 
     def _sign(self, frame: Frame, x: Value) -> Value:
         code = frame.code
@@ -218,14 +216,14 @@ class Events:
     def _look(self) -> Code:
         """`(order)`: the changes of all guards along the step."""
         frame = self.motion.function("look_at_guards", INTEGER)
-        code, (order,) = frame.code, frame.arguments
         frame["seen"], frame["first_at"] = 1.0, float("inf")
-        with code.loop(self.count) as g:
-            self._look_at(frame, order, g)
+        for watch in self.table.each(frame):
+            self._look_at(watch, *frame.arguments)
         return frame.finish()
 
-    def _look_at(self, frame: Frame, order: Value, g: Value) -> None:
-        code, h, met, side = frame.code, frame["h"], frame["met", g], frame["side", g]
+    def _look_at(self, watch: Watch, order: Value) -> None:
+        frame, code, g, h = watch.frame, watch.code, watch.g, watch.frame["h"]
+        met, side = watch.recall("met"), watch.recall("side")
         moving, happened = code.compare("!=", h, 0.0), met > 0.0
         frame["change", g], frame["root_at", g] = met, code.select(happened, 0.0, float("inf"))
         frame.assign(happened, first_at=0.0)
@@ -237,7 +235,7 @@ class Events:
         self.roots.polynomial(frame, j, degree, h, side, zero)
         moving = moving & ~happened
         with code.only_if(code.any_lane(moving & ~self._is_clear(frame, degree))):
-            self._look_closely(frame, order, g, degree, side, moving)
+            self._look_closely(watch, order, degree, side, moving)
 
     def _is_clear(self, frame: Frame, degree: Value) -> Value:
         """The lanes whose polynomial has no root, as its coefficients alone tell; most often that is all."""
@@ -253,11 +251,11 @@ class Events:
         size = start + falls + rises
         return (start > falls + last) & ~self._is_long(last, before, size)
 
-    def _look_closely(self, frame: Frame, order: Value, g: Value, degree: Value, side: Value, moving: Value) -> None:
-        code, roots, h = frame.code, self.roots, frame["h"]
+    def _look_closely(self, watch: Watch, order: Value, degree: Value, side: Value, moving: Value) -> None:
+        frame, code, roots, h = watch.frame, watch.code, self.roots, watch.frame["h"]
         size = roots.size(frame, degree)
         unknown = moving & ~(abs(frame["poly", 0]) < float("inf"))
-        self._leave_surface(frame, g, degree, size)
+        self._leave_surface(watch, degree, size)
         frame.assign(unknown, code=float(limits.NOT_FINITE), last=0.0, h=0.0)
         sound, moving = size < float("inf"), moving & ~unknown
 
@@ -269,31 +267,31 @@ class Events:
         roots.sum_up(frame, degree)
         frame["doubt"], frame["begin"] = roots.last_terms(frame, degree), 0.0
         frame["instant"] = 0.25 * frame["smallest"] / (abs(h) * frame["part"])  # no time is known better than this
-        rounding = (limits.ROOT_NOISE * limits.EPS) * frame["kept", g]
-        matters = (rounding < float("inf")) & code.compare("!=", frame["contact", g], Touch.VALUE)
+        rounding = (limits.ROOT_NOISE * limits.EPS) * watch.recall("kept")
+        matters = (rounding < float("inf")) & code.compare("!=", watch.recall("contact"), Touch.VALUE)
         rounding = code.select(matters, rounding, 0.0)
         frame["unsure"] = abs(frame["poly", 1]) * frame["instant"] + rounding
         ahead = code.variable(side)
-        self._follow_roots(frame, order, g, degree, ahead, moving & sound)
-        self._bisect_change(frame, order, g, ahead, moving & ~sound)
-        frame.assign(moving, g, side_end=ahead.value)
+        self._follow_roots(watch, order, degree, ahead, moving & sound)
+        self._bisect_change(watch, order, ahead, moving & ~sound)
+        watch.remember(moving, side_end=ahead.value)
 
     def _is_long(self, last: Value, before: Value, size: Value) -> Value:
         """The lanes whose last terms are large, or do not fall: the polynomial may leave out as much as they are."""
         return (last > limits.GUARD_TERMS * size) | ((last > limits.FALL * before) & (last > limits.SEEN * size))
 
-    def _leave_surface(self, frame: Frame, g: Value, degree: Value, size: Value) -> None:
+    def _leave_surface(self, watch: Watch, degree: Value, size: Value) -> None:
         """A motion that begins on the surface, or has just gone through it, is not to do so by rounding."""
-        code, contact = frame.code, frame["contact", g]
+        frame, code, contact = watch.frame, watch.code, watch.recall("contact")
         near = abs(frame["poly", 0]) <= limits.CONTINUOUS * size
         frame.assign((contact > Touch.NONE) | ((contact < Touch.NONE) & near), 0, poly=0.0)
         with code.only_if(code.any_lane(contact > Touch.VALUE)), code.loop(degree + 1, start=1) as k:
             c, is_zero = frame["poly", k], contact > code.lanes_of(code.as_number(k))
             frame["poly", k] = code.select(is_zero & (c < 0.0), 0.0, c)
 
-    def _follow_roots(self, frame: Frame, order: Value, g: Value, degree: Value, ahead: Variable, where: Value) -> None:
+    def _follow_roots(self, watch: Watch, order: Value, degree: Value, ahead: Variable, where: Value) -> None:
         """The roots of the polynomial, one after the other, as long as none ends the motion."""
-        code = frame.code
+        frame, code = watch.frame, watch.code
         looking = code.variable(code.flag(where))
 
         def searching():
@@ -304,13 +302,13 @@ class Events:
             root = frame["root"]
             is_root = searching() & self.roots.is_found(frame)
             self._see(frame, searching() & ~is_root, self.roots.place(frame, 1.0))
-            waits = is_root & self._waits(frame, g)
-            frame.assign(waits, g, contact_end=Touch.CONTINUES)
+            waits = is_root & self._waits(watch)
+            watch.remember(waits, contact_end=Touch.CONTINUES)
             changes = is_root & ~waits
             with code.only_if(code.any_lane(changes)):
-                s = self._exact(frame, order, g, changes, ahead.value)
+                s = self._exact(watch, order, changes, ahead.value)
                 inside = abs(s) <= abs(frame["h"])  # else of the next step
-                goes_on = self._take(frame, order, g, changes & inside, s, ahead)
+                goes_on = self._take(watch, order, changes & inside, s, ahead)
                 self.roots.turn(frame, degree, goes_on)
                 frame.assign(goes_on, begin=root)
                 looking.value = code.flag(goes_on)
@@ -321,18 +319,19 @@ class Events:
         """Note, in some lanes, that a guard is seen only up to a part of the step."""
         frame.assign(where & (seen < frame["seen"]), seen=seen)
 
-    def _waits(self, frame: Frame, g: Value) -> Value:
-        """True if the next step decides what guard g does: this step ends at the guard's own border."""
+    def _waits(self, watch: Watch) -> Value:
+        """True if the next step decides what a guard does: this step ends at the guard's own border."""
+        frame = watch.frame
         if not self.can_jump:
             return frame.constant(0.0) > 1.0
         at_border = (frame["crossed"] > 0.0) & reaches_border(frame)
         left = (1.0 - frame["root"] * frame["part"]) * abs(frame["slope"])
         at_border = at_border & (frame["root"] > 0.0)  # else it has jumped already
-        return (left <= 8.0 * frame["error"]) & at_border & (self._column(frame, g, "piecewise") > 0.0)
+        return (left <= 8.0 * frame["error"]) & at_border & (watch.number("piecewise") > 0.0)
 
-    def _exact(self, frame: Frame, order: Value, g: Value, where: Value, side: Value) -> Value:
+    def _exact(self, watch: Watch, order: Value, where: Value, side: Value) -> Value:
         """The time of a root, by Newton's steps on the guard itself; a root at 0 is where it has jumped."""
-        code, root = frame.code, frame["root"]
+        frame, code, root = watch.frame, watch.code, watch.frame["root"]
         scale = frame["part"] * frame["h"]
         start, rate = root * scale, frame["slope"] / scale
         moving = code.flag(where & (root > 0.0))
@@ -343,7 +342,7 @@ class Events:
 
         with code.repeat_while(lambda: code.any_lane(moves()), at_most=limits.MOST_CORRECTIONS):
             here = at.value
-            after = here - side * self._guard_value(frame, order, g, here) / rate
+            after = here - side * self._guard_value(watch, order, here) / rate
             near = abs(after - start) <= 0.1 * abs(scale)
             after = code.select(moves() & near, after, here)
             after = code.select(after * frame["forward"] > 0.0, after, 0.0)
@@ -351,42 +350,41 @@ class Events:
             far = abs(after - here) > limits.INSTANT * frame["smallest"]
             going.value = code.flag(far & moves())
         at = at.value
-        lost = (frame["contact", g] > 0.0) & (abs(at) <= 0.25 * limits.INSTANT * frame["smallest"])
+        lost = (watch.recall("contact") > 0.0) & (abs(at) <= 0.25 * limits.INSTANT * frame["smallest"])
         return code.select(lost, 0.0, at)  # time does not move
 
-    def _take(self, frame: Frame, order: Value, g: Value, changes: Value, s: Value, ahead: Variable) -> Value:
+    def _take(self, watch: Watch, order: Value, changes: Value, s: Value, ahead: Variable) -> Value:
         """Changes at the times s: the event, or a note, where they are in the direction; which lanes go on beyond."""
-        code, side = frame.code, ahead.value
-        size = abs(s)
-        counts = changes & ~(side * self._column(frame, g, "direction") > 0.0)
+        frame, code, side, size = watch.frame, watch.code, ahead.value, abs(s)
+        counts = changes & ~(side * watch.number("direction") > 0.0)
         if self.notes:
             assert self.note is not None
             frame["is_due"] = counts
             with code.only_if(code.any_lane(counts)):
-                frame.call(self.note, order, g, s)
+                frame.call(self.note, order, watch.g, s)
             goes_on = changes
         else:
-            frame.assign(counts, g, root_at=size, change=code.select(side > 0.0, Change.FALLS, Change.RISES))
+            watch.remember(counts, root_at=size, change=code.select(side > 0.0, Change.FALLS, Change.RISES))
             frame.assign(counts & (size < frame["first_at"]), first_at=size)
             goes_on = changes & ~counts
         ahead.value = code.select(goes_on, 0.0 - side, side)
         left = abs(frame["h"]) - size
-        frame.assign(goes_on & (left <= limits.INSTANT * frame["smallest"]), g, contact_end=Touch.CONTINUES)
+        watch.remember(goes_on & (left <= limits.INSTANT * frame["smallest"]), contact_end=Touch.CONTINUES)
         return goes_on
 
-    def _bisect_change(self, frame: Frame, order: Value, g: Value, ahead: Variable, where: Value) -> None:
+    def _bisect_change(self, watch: Watch, order: Value, ahead: Variable, where: Value) -> None:
         """A part of the step, at whose end the guard is looked at; a change before that is found by bisection."""
-        code, side, h = frame.code, ahead.value, frame["h"]
+        frame, code, side, h = watch.frame, watch.code, ahead.value, watch.frame["h"]
         with code.only_if(code.any_lane(where)):
             self._see(frame, where, frame.constant(limits.WITHOUT_SERIES))
-            changes = where & (side * self._guard_value(frame, order, g, h) < 0.0)
+            changes = where & (side * self._guard_value(watch, order, h) < 0.0)
             low, high = code.variable(frame.constant(0.0)), code.variable(h)
             with code.loop(limits.BISECTIONS):
                 middle = 0.5 * (low.value + high.value)
-                same = side * self._guard_value(frame, order, g, middle) > 0.0
+                same = side * self._guard_value(watch, order, middle) > 0.0
                 for end, here in ((low, same), (high, ~same)):
                     end.value = code.select(here, middle, end.value)
-            self._take(frame, order, g, changes, high.value, ahead)
+            self._take(watch, order, changes, high.value, ahead)
 
     # ---- what is noted ----
 

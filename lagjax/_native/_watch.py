@@ -74,10 +74,47 @@ class Hit(IntEnum):
     SEVERAL = 2
 
 
+_RULES = {"side": Affine, "level": Level, "beyond": Affine}
+_PLACES = ("piece", "back", "slide", "on", "order", "rest", "gains", "of_table")
+
+
+@dataclass(frozen=True, eq=False)
+class Watch:
+    """A number that is followed, in a function under construction: row `g` of a `table` of constants.
+
+    Its memory is in the fields of the frame that have a row for each number of the table.
+    """
+
+    frame: Frame
+    table: Any
+    g: Value
+
+    @property
+    def code(self) -> Code:
+        return self.frame.code
+
+    def __getitem__(self, name: str) -> Value:
+        """A constant, an integer."""
+        return self.table.read(self.code, self.g, name)
+
+    def number(self, name: str) -> Value:
+        """A constant as a number, in all lanes."""
+        return self.code.lanes_of(self.code.as_double(self[name]))
+
+    def recall(self, name: str) -> Value:
+        return self.frame[name, self.g]
+
+    def remember(self, where: Value, **values: "Value | float") -> None:
+        self.frame.assign(where, self.g, **values)
+
+
 class Columns:
     """Rows of integers, or of doubles, as constants of a kernel, for loops over them; columns have names."""
 
+    watch: type = Watch
+
     def __init__(self, module: ir.Module, names: Sequence[str], rows: Sequence, kind: ir.Type = INTEGER):
+        self.count = len(rows)
         numbers = np.array(rows or [[0]], np.int64 if kind == INTEGER else float)
         self._names, self._kind, self._data = names, kind, integers(module, numbers.view(np.int64))
 
@@ -85,34 +122,22 @@ class Columns:
         place = row * len(self._names) + self._names.index(name)
         return code.load(code.element(Value(code, self._data), place, self._kind), self._kind)
 
-    def read_lanes(self, code: Code, row: Value, name: str) -> Value:
-        """The same as a number in all lanes."""
-        return code.lanes_of(code.as_double(self.read(code, row, name)))
+    def each(self, frame: Frame) -> Iterator[Any]:
+        """The watches of all rows, one after the other, for a body that is written down once, in a loop."""
+        with frame.code.loop(self.count) as g:
+            yield self.watch(frame, self, g)
 
 
-_RULES = {"side": Affine, "level": Level, "beyond": Affine}
-_PLACES = ("piece", "back", "slide", "on", "order", "rest", "gains", "of_table")
-
-
-@dataclass(frozen=True, eq=False)
-class Border:
-    """The watch of guard `g` of a table, in a function under construction (`_program._borders.Guard`)."""
-
-    table: "GuardTable"
-    frame: Frame
-    g: Value
-
-    def __getitem__(self, name: str) -> Value:
-        """A number of another guard, or of a piece; −1 where there is none."""
-        return self.table.places.read(self.frame.code, self.g, name)
-
-    def has(self, name: str, least: int = 0) -> Value:
-        """True, in all lanes, if a number is there, or at `least` this."""
-        return self.table.places.read_lanes(self.frame.code, self.g, name) >= float(least)
+class Border(Watch):
+    """The watch of a guard of a piece (`_program._borders.Guard`); numbers that are −1 are not there."""
 
     @property
     def touch(self) -> Value:
-        return self.frame["touch", self.g]
+        return self.recall("touch")
+
+    def has(self, name: str, least: int = 0) -> Value:
+        """True, in all lanes, if a number is there, or at `least` this."""
+        return self.number(name) >= float(least)
 
     @property
     def piece(self) -> Value:
@@ -126,23 +151,23 @@ class Border:
     @property
     def is_cone(self) -> Value:
         """True, in all lanes, if this is the guard of a cone, or a share."""
-        code = self.frame.code
+        code = self.code
         return code.lanes_of(code.flag(code.compare("==", self.rule("beyond").slope, 0.0))) > 0.0
 
     def rule(self, name: str) -> Any:
         """The `side`, the `level` or the piece `beyond`, as functions of the piece."""
         rules, kind = self.table.rules, _RULES[name]
-        return kind(*(rules.read(self.frame.code, self.g, f"{name}.{of}") for of in kind._fields))
+        return kind(*(rules.read(self.code, self.g, f"{name}.{of}") for of in kind._fields))
 
     def level(self, piece: Value) -> Value:
-        code = self.frame.code
+        code = self.code
         level = self.rule("level")(piece, lambda where, x: code.select(where, code.lanes_of(x), 0.0))
         if any(guard.of_table for guard in self.table.borders.guards):
-            level = code.select(self.has("of_table", 1), self.frame["level", self.g], level)
+            level = code.select(self.has("of_table", 1), self.recall("level"), level)
         return level
 
 
-class GuardTable:
+class GuardTable(Columns):
     """The guards of all pieces as constants of a kernel; and `knots`.
 
     A knot is an entry of a table of parameters that the time is on, or one at which L jumps; another one of a table of
@@ -150,21 +175,18 @@ class GuardTable:
     the acceleration between them is not known.
     """
 
+    watch = Border
+
     def __init__(self, motion: TaylorSeries, borders: Borders):
-        self.motion, self.borders, self.guards = motion, borders, len(borders.guards)
+        self.motion, self.borders = motion, borders
         names = [f"{name}.{of}" for name, kind in _RULES.items() for of in kind._fields]
         rules = [[x for name in _RULES for x in getattr(guard, name)] for guard in borders.guards]
         self.rules = Columns(motion.module, names, rules, DOUBLE)
-        self.places = Columns(motion.module, _PLACES, [[getattr(g, name) for name in _PLACES] for g in borders.guards])
+        super().__init__(motion.module, _PLACES, [[getattr(g, name) for name in _PLACES] for g in borders.guards])
         moves = {j: borders.moving_table(j) is not None for j in borders.clocks}
         # The number and the piece of each clock that has knots.
         self.knots = [(c, j) for c, j in enumerate(borders.clocks) if moves[j] or j in borders.kicking]
         self.movable = [j for _, j in self.knots if moves[j]]
-
-    def each(self, frame: Frame) -> Iterator[Border]:
-        """The borders, one after the other, for a body that is written down once, in a loop."""
-        with frame.code.loop(self.guards) as g:
-            yield Border(self, frame, g)
 
     def piece(self, frame: Frame, j: Index) -> Value:
         return frame["params", j + self.motion.parameters]
