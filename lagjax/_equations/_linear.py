@@ -170,6 +170,12 @@ def factorize_general(matrix: Matrix) -> Callable[[Vector], Vector]:
     """
     if len(matrix) == 1:
         return lambda b: b / jnp.where(matrix[0] == 0, jnp.nan, matrix[0])
+    if len(matrix) == 2:  # XLA compiles loops for as long as all else around them
+        (a, b), (c, d) = matrix
+        ad, bc = a * d, b * c
+        lost = jnp.abs(ad - bc) <= singular_threshold(2, matrix.dtype) * (jnp.abs(ad) + jnp.abs(bc))
+        inverse = 1 / jnp.where(lost, jnp.nan, ad - bc)
+        return lambda y: jnp.stack([(d * y[0] - b * y[1]) * inverse, (a * y[1] - c * y[0]) * inverse])
     scale = jax.lax.stop_gradient(1 / jnp.max(jnp.abs(matrix), axis=1))
     scaled = scale[:, None] * matrix
     columns, order, pivots = invert(jax.lax.stop_gradient(scaled))

@@ -123,6 +123,10 @@ def _turn_directions(rows: Rows, impulses_along, direction, slides, places):
 
 def _independent(coupling, held):
     """1 for each of the rows `held` (K,) that does not depend on those before it, by elimination without pivots."""
+    if len(held) == 2:
+        first, second = jnp.diagonal(coupling)
+        left = second - held[0] * coupling[1, 0] ** 2 / jnp.where(first > 0, first, 1.0)
+        return jnp.stack([held[0], jnp.where(left > DEPENDENT * second, held[1], 0.0)])
 
     def eliminate(i, carry):
         matrix, kept = carry
@@ -142,6 +146,8 @@ def find_pattern(rows: Rows, touches, restitution, friction: Friction) -> tuple[
     if count == 1 and not rough.size:
         pushes = (touches & (rates < 0)).astype(float)
         return Pattern(pushes, jnp.zeros(0), jnp.zeros((0, friction.directions))), jnp.asarray(True)
+    if count == 1 and friction.directions == 1:
+        return _pattern_of_one(rows, towards, friction.coefficients)
     own = jnp.diagonal(coupling)
     own = jnp.concatenate([own[:count], jnp.repeat(jnp.max(own[places], axis=1, initial=0.0), friction.directions)])
     step = jnp.where(own > 0, 1.0 / jnp.where(own > 0, own, 1.0), 0.0)
@@ -179,6 +185,16 @@ def find_pattern(rows: Rows, touches, restitution, friction: Friction) -> tuple[
     after = rates + coupling @ impulses
     misses = jnp.max(jnp.where(touches, -(after[:count] + restitution * rates[:count]), 0.0))
     return pattern, misses <= MISSES * jnp.max(jnp.abs(towards))
+
+
+def _pattern_of_one(rows: Rows, towards, coefficients) -> tuple[Pattern, Any]:
+    """What one contact in a plane does: it sticks, if friction suffices for that, or slides against what it would take."""
+    pushed, rubbed = factorize_general(rows.coupling)(-towards)
+    sticks = jnp.abs(rubbed) <= coefficients[0] * pushed
+    direction = jnp.where(rubbed > 0, -1.0, 1.0)
+    own = rows.coupling[0, 0] - coefficients[0] * direction * rows.coupling[0, 1]
+    one = jnp.ones(1)
+    return Pattern(one, sticks * one, (direction * one)[:, None]), sticks | (own > 0)
 
 
 def sliding_margin(rows: Rows, pattern: Pattern, friction: Friction):
