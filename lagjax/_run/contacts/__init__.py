@@ -15,81 +15,81 @@ import numpy as np
 
 from lagjax._engine import Batch, Problem
 from lagjax._engine.taylor import MachineCode, line_of
-from lagjax._equations import derivation_of, require_consistent
-from lagjax._interface import Layout, as_arrays, halves, is_concrete, join_names, require_budget, result_from
+from lagjax._equations import ROUNDINGS, derivation_of, has_constraints, require_consistent
+from lagjax._interface import Layout, halves, is_concrete, require_budget, result_from
 from lagjax._primitives import DOUBLE, compute_in_doubles
-from lagjax._program import Unlowerable
 from lagjax._run._trajectory import ContactChanges, Impacts, State, Trajectory, step_counts
 from lagjax._run.contacts._contact_rounds import Carry, ContactPlan, RoundRecord, RowPlaces, contact_motion
-from lagjax._scene import ContactScene, Contacts, Flat, InContact, System
+from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes, System
 
 
 def follow_contacts(given: Problem, problem: Problem, max_transitions: int) -> Trajectory:
     """The motion of a problem whose system has contacts; `problem` is `given` with the tracers it closes over lifted."""
-    plan = _plan(problem, max_transitions)
-    _require_open(problem)
-    q0, qdot0 = map(problem.layout.restore, halves(jnp.asarray(problem.y0)))
-    q0, qdot0 = as_arrays((q0, qdot0), problem.layout.dtype, "state")
-    require_consistent(problem.system, problem.layout, problem.ts, q0, qdot0, problem.params)
+    plan, closed = _plan(problem, max_transitions)
+    _require_open(problem, closed)
+    if has_constraints(problem.system):
+        q0, qdot0 = map(problem.layout.restore, halves(jnp.asarray(problem.y0)))
+        require_consistent(problem.system, problem.layout, problem.ts, q0, qdot0, problem.params)
     return _trajectory(given, problem, *_motion(plan, problem), given.params)
 
 
 def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int, params, params_axes) -> Trajectory:
     """The motions of a batch whose system has contacts."""
-    plan = _plan(batch.member, max_transitions)
-    ending, record = batch.map_members(lambda problem: _motion(plan, problem))
-    return _trajectory(given.member, batch.member, ending, record, params, params_axes)
+    plan, _ = _plan(batch.member, max_transitions)
+    solved = batch.map_members(lambda problem: _motion(plan, problem))
+    return _trajectory(given.member, batch.member, *solved, params, params_axes)
 
 
-def _plan(problem: Problem, max_transitions: int) -> ContactPlan:
-    """Raises `ValueError` where the scene has no machine code, or the motion goes back in time."""
+def _plan(problem: Problem, max_transitions: int) -> tuple[ContactPlan, Problem]:
+    """The plan, and the problem of machine code with all contacts closed, in float64.
+
+    Raises `ValueError` where the scene has no machine code, or the motion goes back in time.
+    """
     require_budget(max_transitions, "max_transitions")
     if not all(map(is_concrete, problem.tolerances)):
         raise ValueError("rtol and atol of a scene with contacts must be numbers: they decide the order of the method.")
     if is_concrete(problem.ts) and np.asarray(problem.ts)[-1] < np.asarray(problem.ts)[0]:
         raise ValueError("A scene with contacts goes forward in time: an impact cannot be undone; ts must increase.")
-    rtol, atol = float(MachineCode().rtol(problem.double_precision)), problem.tolerances[1]
+    wide = problem.double_precision if problem.is_single else problem
+    rtol, atol = float(MachineCode().rtol(wide)), problem.tolerances[1]
     limits = rtol, None if atol is None else float(atol), problem.max_steps, max_transitions, problem.is_single
     plan = ContactPlan(ContactScene(problem.system, problem.system.path), *limits)
-    wide = problem.double_precision if problem.is_single else problem
     with jax.enable_x64(True):
-        flat = Flat.from_system(problem.system, wide.layout, wide.params)
-        r, d = flat.rough.size, flat.shapes.directions
-        contacts = Contacts(np.zeros(flat.shapes.count), np.zeros(r), np.zeros((r, d)))
-        inside = Problem.from_system(plan.scene, wide.layout, InContact(wide.params, contacts))
-        try:
-            if refusal := MachineCode().refuses(inside):
-                raise Unlowerable(refusal)
-        except Unlowerable as why:
-            raise ValueError(f"A scene with contacts needs machine code, and has none: {why}.") from None
-    return plan
+        shapes = Shapes.from_system(problem.system, wide.layout, wide.params)
+        r, d = shapes.rough.size, shapes.directions
+        contacts = Contacts(np.ones(shapes.count), np.ones(r), np.ones((r, d)))
+        closed = Problem.from_system(plan.scene, wide.layout, InContact(wide.params, contacts))
+        if refusal := MachineCode().refuses(closed):
+            raise ValueError(f"A scene with contacts needs machine code, and has none: {refusal}.")
+    return plan, dataclasses.replace(closed, ts=wide.ts, y0=wide.y0)
 
 
-def _require_open(problem: Problem) -> None:
+def _require_open(problem: Problem, closed: Problem) -> None:
     """Raise `ValueError` where the motion starts with a negative gap, beyond the rounding of its numbers."""
-    numbers = eqx.filter(problem.params, eqx.is_array_like)
-    if not all(is_concrete(x) for x in jax.tree.leaves((problem.y0, problem.ts, numbers))):
+    if not problem.is_known:
         return
-    flat = Flat.from_system(problem.system, problem.layout, problem.params)
-    q, t = jnp.asarray(halves(problem.y0)[0]), jnp.asarray(problem.ts)[0]
-    gaps = np.asarray(flat.gaps(q, t, numbers))
-    slopes, by_t = jax.jacfwd(lambda q, t: flat.gaps(q, t, numbers), (0, 1))(q, t)
-    noise = 40 * np.finfo(problem.layout.dtype).eps * (np.abs(slopes) @ np.abs(q) + np.abs(by_t * t) + np.abs(gaps))
-    still = (np.abs(slopes).max(axis=1, initial=0.0) == 0) & (np.abs(gaps) <= noise)
-    if still.any():
-        name = flat.shapes.names[int(np.flatnonzero(still)[0])]
-        raise ValueError(
-            f"The gap {name} is zero at the start, and so is its gradient there: it has no direction in which it pushes. "
-            "Write it as a distance, q, not as its square."
-        )
-    if (inside := np.flatnonzero(gaps < -np.maximum(noise, 1e-9 * np.abs(slopes) @ np.abs(q)))).size:
-        named = [f"{flat.shapes.names[i]} = {gaps[i]:.6g}" for i in inside]
-        raise ValueError(
-            f"The motion starts inside: {join_names(named, 6)}, and gaps stay >= 0. Start where they are not negative."
-        )
+    derivation, n = closed.derivation.lowered, problem.layout.size
+    shapes = Shapes.from_system(problem.system, problem.layout, problem.params)
+    y0, numbers = np.asarray(closed.y0, float), np.asarray(closed.vector, float)
+    columns = np.concatenate([y0, np.asarray(closed.ts, float)[:1], numbers])
+    of = derivation.evaluate(["residual", "jacobian"], columns)
+    rows = range(derivation.position_count - shapes.of_gaps, derivation.position_count)
+    gaps, slopes = of["residual"][0, rows], of["jacobian"][0, rows]
+    terms = derivation.term_sizes(*np.split(y0, 2), columns[2 * n], closed.numbers, names=("residual",))
+    noise = ROUNDINGS * np.finfo(problem.layout.dtype).eps * (np.asarray(terms)[rows] + np.abs(slopes) @ np.abs(y0[:n]))
+    for name, gap, slope, near in zip(shapes.names, gaps, slopes, noise, strict=False):
+        if gap < -near:
+            raise ValueError(
+                f"The motion starts inside: {name} = {gap:.6g}, and gaps stay >= 0. Start where it is not negative."
+            )
+        if not slope.any() and gap <= near:
+            raise ValueError(
+                f"The gap {name} is zero at the start, and so is its gradient there: it has no direction in which it "
+                "pushes. Write it as a distance, q, not as its square."
+            )
 
 
-def _motion(plan: ContactPlan, problem: Problem) -> tuple[Carry, RoundRecord]:
+def _motion(plan: ContactPlan, problem: Problem) -> tuple[Carry, RoundRecord, tuple]:
     """The rounds of a problem, in float64, in its own precision."""
     given = problem.ts, problem.y0, problem.params
     if not problem.is_single:
@@ -98,28 +98,20 @@ def _motion(plan: ContactPlan, problem: Problem) -> tuple[Carry, RoundRecord]:
     return compute_in_doubles(lambda *given: contact_motion(plan, layout, *given), *given)
 
 
-def _trajectory(given: Problem, problem: Problem, ending: Carry, record: RoundRecord, params, axes=None) -> Trajectory:
-    flat = Flat.from_system(problem.system, problem.layout, problem.params)
+def _trajectory(given: Problem, problem: Problem, ending: Carry, record: RoundRecord, impacts, params, axes=None) -> Trajectory:
     (q, qdot), end = (map(problem.layout.restore, halves(y)) for y in (ending.path, ending.y))
-    order = jnp.argsort(~record.hits, axis=-1, stable=True)  # impacts in front
-    t, impulse, lost = (
-        jnp.take_along_axis(x, order.reshape(*order.shape, *[1] * (x.ndim - order.ndim)), order.ndim - 1)
-        for x in record[-3:]
-    )
-    impacts = Impacts(t, flat.shapes.by_name(impulse), lost, jnp.sum(record.hits, axis=-1))
     (q_before, qdot_before), (q_next, qdot_next) = (
         map(problem.layout.restore, halves(y)) for y in (record.y, record.y_next)
     )
-    count = jnp.sum(record.happened, axis=-1)
     changes = ContactChanges(
-        record.t, q_before, qdot_before, q_next, qdot_next, record.contact, record.change, count
+        record.t, q_before, qdot_before, q_next, qdot_next, record.contact, record.change, ending.rounds
     )  # fmt: skip
-    accepted, rejected = ending.steps[..., 0], ending.steps[..., 1]
+    names = problem.system.contact_names(problem.layout, problem.params)
     return Trajectory(
         ts=jnp.asarray(given.ts), q=q, qdot=qdot, result=result_from(ending.result), end=State(ending.t, *end),
-        stats=step_counts(accepted, rejected), system=given.system, params=params, params_axes=axes,
-        tolerances=MachineCode().tolerances(problem, problem.y0), engine="MachineCode", impacts=impacts,
-        contacts=ending.of_path, contact_changes=changes, contact_names=flat.shapes.names,
+        stats=step_counts(*ending.steps), system=given.system, params=params, params_axes=axes,
+        tolerances=MachineCode().tolerances(problem, problem.y0), engine="MachineCode", impacts=Impacts(*impacts),
+        contacts=ending.of_path, contact_changes=changes, contact_names=names,
     )  # fmt: skip
 
 

@@ -85,7 +85,8 @@ class Carry(NamedTuple):
     fresh: jax.Array  # (G,), whether what a watch follows has begun at this instant
     going: jax.Array
     result: jax.Array
-    steps: jax.Array  # accepted, rejected
+    steps: tuple[jax.Array, jax.Array]  # accepted, rejected
+    rounds: jax.Array  # how many there were
     longest: jax.Array  # the longest step of the motion
     turns: jax.Array  # how many decisions there were at this instant
     rounding: jax.Array  # (2, G), the largest of a watch of an open or sliding contact, and of a closed or sticking one
@@ -119,8 +120,11 @@ class RoundRecord(NamedTuple):
 
 
 @eqx.filter_jit
-def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) -> tuple[Carry, RoundRecord]:
-    """The motion from y0 (2n,) at ts[0], and its rounds, of which there may be `max_transitions`."""
+def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) -> tuple[Carry, RoundRecord, tuple]:
+    """The motion from y0 (2n,) at ts[0], its rounds, of which there may be `max_transitions`, and its impacts.
+
+    Those are their times, the normal impulses, the energy that was lost, and their count.
+    """
     ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
     rounds = ContactRounds.from_plan(plan, layout, ts, y0, params)
     first = vary_with(rounds.begin(y0), ts, y0, rounds.vector, varying=("t", "y", "path"))
@@ -147,8 +151,10 @@ def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) ->
     t, y, y_next = lost(record.happened, record.t, record.y, record.y_next)
     t_impact, impulse, energy_lost = lost(record.hits, *record[-3:])
     path = lost_unless((ending.of_path.closed >= 0).all(axis=1)[:, None], ending.path, inputs)
-    record = record._replace(t=t, y=y, y_next=y_next, t_impact=t_impact, impulse=impulse, energy_lost=energy_lost)
-    return ending._replace(path=path), record
+    order = jnp.argsort(~record.hits, stable=True)  # impacts in front
+    t_impact, impulse, energy_lost = (x[order] for x in (t_impact, impulse, energy_lost))
+    impacts = t_impact, rounds.flat.shapes.by_name(impulse), energy_lost, jnp.sum(record.hits)
+    return ending._replace(path=path), record._replace(t=t, y=y, y_next=y_next), impacts
 
 
 @jax.custom_batching.custom_vmap
@@ -234,7 +240,7 @@ class ContactRounds(NamedTuple):
             result = jnp.where(undecided & (result == SUCCESSFUL), UNDECIDED, result)
         return Carry(
             t=self.ts[0], y=y0, contacts=contacts, fresh=jnp.ones(guards, bool), going=result == SUCCESSFUL,
-            result=result, steps=jnp.zeros(2, int), longest=jnp.zeros(()),
+            result=result, steps=(jnp.zeros((), int), jnp.zeros((), int)), rounds=jnp.zeros((), int), longest=jnp.zeros(()),
             turns=jnp.zeros((), int), rounding=jnp.zeros((2, guards)), rate_rounding=jnp.zeros((2, guards)),
             slip=jnp.zeros(self.flat.rough.size), path=jnp.full((self.ts.size, y0.size), jnp.nan),
             of_path=jax.tree.map(lambda x: jnp.full((self.ts.size, *x.shape), -1.0), contacts),
@@ -281,7 +287,8 @@ class ContactRounds(NamedTuple):
             t=t, y=jnp.where(happens, decided.y, y), going=going & ~spent,
             contacts=jax.tree.map(lambda new, old: jnp.where(happens, new, old), decided.contacts, contacts),
             result=jnp.where(spent, TOO_MANY, result), turns=turns,
-            steps=before.steps + jnp.stack([located.accepted, located.rejected]),
+            steps=(before.steps[0] + located.accepted, before.steps[1] + located.rejected),
+            rounds=before.rounds + happens,
             path=jnp.where(covered[:, None], path[1:-1], before.path),
             of_path=jax.tree.map(cover, before.of_path, contacts),
         )  # fmt: skip
