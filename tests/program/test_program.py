@@ -143,14 +143,13 @@ FAMILIES = {
     "complex functions": (
         lambda a, b: both(
             *(f(a + 1j * b) for f in (
-                jnp.exp, jnp.log, jnp.sqrt, jnp.sin, jnp.cos, jnp.tan, jnp.sinh, jnp.cosh, jnp.tanh, jnp.asin, jnp.acos,
-                jnp.atan, jnp.asinh, jnp.atanh, jnp.expm1, jnp.log1p, jnp.exp2, jax.nn.sigmoid, lax.rsqrt,
+                jnp.exp, jnp.log, jnp.sqrt, jnp.sin, jnp.cos, jnp.tan, jnp.sinh, jnp.cosh, jnp.tanh, lax.rsqrt,
             )),
             (a + 1j * b) ** 2.5, (a + 1j * b) ** (1 - 2j), 2.0 ** (a + 1j * b),
         ),
         A, B,
     ),
-    "complex sign and acosh": (lambda a, b: both(jnp.sign(a + 1j * b), jnp.acosh(a + 1j * b)), A, B),
+    "complex sign": (lambda a, b: both(jnp.sign(a + 1j * b)), A, B),
     "norms": (lambda a: (jnp.linalg.norm(a), jnp.hypot(a[0], a[1]), jnp.logaddexp(a[0], a[1]), jnp.sinc(a)), A),
     "gather": (
         lambda m: (m[jnp.array([0, 2, 0])], m[:, jnp.array([[1, 3]])], m[jnp.triu_indices(3)], m.at[5, 0].get()), M,
@@ -220,14 +219,14 @@ def test_each_family_in_jax(family):
 @pytest.mark.parametrize(
     "family",
     sweep(
-        sorted(FAMILIES.keys() - {"calls", "while", "integers", "complex sign and acosh"}),
+        sorted(FAMILIES.keys() - {"calls", "while", "integers", "complex sign"}),
         kept=("powers",),
     ),
 )
 def test_derivatives_of_each_family(family):
     """Those of a Lagrangian that consists of its outputs, against forward mode in JAX; `cube` and `while` have none.
 
-    JAX 0.10 has zero for that of the sign of a complex number, and the other sign for that of acosh where Re z < 0.
+    JAX 0.10 has zero for that of the sign of a complex number.
     """
     function, *arguments = FAMILIES[family]
     leaves, structure = jax.tree.flatten(arguments)

@@ -4,11 +4,10 @@ A pair has an id of its own (`Expansion.pair`), so that what only moves numbers 
 them apart: a function of z = x + iy becomes two of x and y. Logarithms, roots and powers have their branch cut on the
 negative real axis, as in JAX: it is that of atan2, a border.
 
-Fourier transforms are left to XLA.
+Fourier transforms and inverse circular and hyperbolic functions are left to XLA.
 """
 
 import functools
-import math
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -63,9 +62,6 @@ class Pair(NamedTuple):
         """The quotient z / i = −i z."""
         return Pair(self.im, -self.re)
 
-    def shift(self, number: float) -> "Pair":
-        return Pair(self.re + number, self.im)
-
 
 def _f(op: str, x: Scalars, *others) -> Scalars:
     return x.map(op, x, *others)
@@ -105,16 +101,6 @@ def _sign(z: Pair) -> Pair:
     is_zero = _f("eq", square, 0.0)
     size = _f("sqrt", is_zero.map("select", is_zero, square, 1.0))
     return Pair(z.re / size, z.im / size)
-
-
-def _log1p(z: Pair) -> Pair:
-    return Pair(0.5 * _f("log1p", z.re * (2.0 + z.re) + z.im * z.im), z.shift(1.0).angle)
-
-
-def _expm1(z: Pair) -> Pair:
-    """eˣ cos y − 1 = (eˣ − 1) cos y − 2 sin²(y/2), which loses no digits at small z."""
-    half = _f("sin", 0.5 * z.im)
-    return Pair(_f("expm1", z.re) * _f("cos", z.im) - 2.0 * half * half, _f("exp", z.re) * _f("sin", z.im))
 
 
 def _square_root(z: Pair) -> Pair:
@@ -163,28 +149,6 @@ def _tangent(z: Pair) -> Pair:
     return Pair(sine * cosine * (1.0 - ratio * ratio) / size, ratio / size)
 
 
-def _arcsine(z: Pair) -> Pair:
-    """The arcsine by roots of 1 ± z, without loss (Kahan, *Branch cuts for complex elementary functions* (1987))."""
-    less, more = _square_root((-z).shift(1.0)), _square_root(z.shift(1.0))
-    product = less * more
-    return Pair(_f("atan2", z.re, product.re), _f("asinh", (less.conjugate * more).im))
-
-
-def _arccosine(z: Pair) -> Pair:
-    less, more = _square_root((-z).shift(1.0)), _square_root(z.shift(1.0))
-    return Pair(2.0 * _f("atan2", less.re, more.re), _f("asinh", (more.conjugate * less).im))
-
-
-def _inverse_hyperbolic_cosine(z: Pair) -> Pair:
-    less, more = _square_root(z.shift(-1.0)), _square_root(z.shift(1.0))
-    return Pair(_f("asinh", (less.conjugate * more).re), 2.0 * _f("atan2", less.im, more.re))
-
-
-def _inverse_hyperbolic_tangent(z: Pair) -> Pair:
-    difference = _log1p(z) - _log1p(-z)
-    return Pair(0.5 * difference.re, 0.5 * difference.im)
-
-
 def _derive_circular(function: Callable) -> Callable:
     """The circular function of a hyperbolic one, or the other way about: f(z) = −i F(i z)."""
     return lambda z: function(z.multiply_by_i).divide_by_i
@@ -204,23 +168,13 @@ _FUNCTIONS: dict[str, Callable] = {
     "sqrt": _square_root,
     "rsqrt": lambda z: _inverse(_square_root(z)),
     "exp": lambda z: _polar(_f("exp", z.re), z.im),
-    "exp2": lambda z: _polar(_f("exp2", z.re), math.log(2.0) * z.im),
-    "expm1": _expm1,
     "log": lambda z: Pair(0.5 * _f("log", z.square), z.angle),
-    "log1p": _log1p,
-    "logistic": lambda z: _inverse(_polar(_f("exp", -z.re), -z.im).shift(1.0)),
     "sin": _sine,
     "cos": _cosine,
     "tan": _tangent,
-    "asin": _arcsine,
-    "acos": _arccosine,
-    "atan": _derive_circular(_inverse_hyperbolic_tangent),
     "sinh": _derive_circular(_sine),
     "cosh": lambda z: _cosine(z.multiply_by_i),
     "tanh": _derive_circular(_tangent),
-    "asinh": _derive_circular(_arcsine),
-    "acosh": _inverse_hyperbolic_cosine,
-    "atanh": _inverse_hyperbolic_tangent,
     "eq": lambda a, b: _f("and", _f("eq", a.re, b.re), _f("eq", a.im, b.im)),
     "ne": lambda a, b: _f("or", _f("ne", a.re, b.re), _f("ne", a.im, b.im)),
 }
