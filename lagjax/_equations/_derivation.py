@@ -490,9 +490,6 @@ class Derivation:
         system, solve = self._system(saddle, regular_only)
         return lower_solution(system, solve, self.layout.size, *self.scalar_shapes, budget=OPERATION_BUDGET)
 
-    def _is_dragged(self, saddle: _Saddle) -> bool:
-        return saddle.b is not None and not self.absent("drag").all()
-
     def _system(self, saddle: _Saddle, regular_only: bool = False) -> tuple[Callable, Callable]:
         """A z = r with z = (x, −λ), as two functions of scalars.
 
@@ -512,7 +509,7 @@ class Derivation:
             elimination = IndefiniteElimination(zeros[0], self.layout.dtype)
         else:
             elimination = SaddleElimination(zeros, self.layout.dtype, augmented, regular_only, released)
-            if self._is_dragged(saddle):
+            if released and saddle.b is not None:
                 elimination = DraggedElimination(elimination, self.absent("drag"))
         if elimination.operations > OPERATION_BUDGET:
             raise Unlowerable(

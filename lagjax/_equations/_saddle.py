@@ -227,6 +227,7 @@ class DraggedElimination:
     """
 
     def __init__(self, elimination: SaddleElimination, zeros: np.ndarray):
+        zeros = zeros if zeros.size else np.ones((elimination.size, 0), bool)
         self.saddle, self.zeros, self.operations = elimination, zeros, 3 * elimination.operations
         self.dragged = np.flatnonzero(~zeros.all(axis=0))
         self.own = len(elimination.entries)
@@ -251,11 +252,14 @@ class DraggedElimination:
                 row[k] = row[k] / matrix[k][k]
                 for j in range(k + 1, size):
                     row[j] = row[j] - row[k] * matrix[k][j]
+        if not size:
+            return (factors, of_rows), singular
         return (factors, of_rows, xp.stack(columns), xp.stack([x for row in matrix for x in row])), singular
 
     def solve(self, factors, right):
         """x and then −λ, linear in `right`: b and then c."""
-        of_saddle, of_rows, columns, coupling = factors
+        of_saddle, of_rows, *of_drag = factors
+        columns, coupling = of_drag or ([], [])
         n, saddle = self.saddle.size, self.saddle
         z = saddle.solve(of_saddle, right)
         size, multipliers = len(self.dragged), [-z[n + j] for j in self.dragged]

@@ -50,7 +50,7 @@ TOO_MANY, UNDECIDED, NOT_FINITE, INCONSISTENT = map(
 )
 CHANGES = ("closes", "opens", "bounces", "sticks", "slides")
 CLOSES, OPENS, BOUNCES, STICKS, SLIDES = range(5)
-BLOCK = 8  # rounds that run before it is asked whether any motion goes on
+BLOCK = 32  # rounds that are left out together where no motion goes on: what goes on is copied for each
 # The time that bounces still take, in parts of a step of the motion between them, below which they end in closed form,
 # and what that leaves out: twice as long, heights of 4e-9 of those of a step are left out.
 SHORT, LEFT_OUT = 1e-4, 1e-14
@@ -62,6 +62,7 @@ PARADOX = 1e-12
 # breaks away brings about in a step. Half of that takes √2 times the steps, of some ten thousand: at rest friction
 # turns a slip at once, and steps are as short as that takes.
 NO_SLIP, AT_REST = 1e-11, 1e-8
+EPS = float(np.finfo(float).eps)
 _LEAST = 1e-300  # a side that is exactly zero still has a sign
 
 
@@ -92,6 +93,7 @@ class Carry(NamedTuple):
     rounding: jax.Array  # (2, G), the largest of a watch of an open or sliding contact, and of a closed or sticking one
     rate_rounding: jax.Array
     slip: jax.Array  # (r,), the largest so far
+    largest: jax.Array  # (2n,), the largest numbers of the state so far
     path: jax.Array  # (T, 2n), NaN where not reached
     of_path: Contacts  # what the contacts did at the outputs
 
@@ -130,18 +132,19 @@ def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) ->
     first = vary_with(rounds.begin(y0), ts, y0, rounds.vector, varying=("t", "y", "path"))
     blocks = -(-plan.max_transitions // BLOCK)
 
+    absent = RoundRecord.absent(y0.size, rounds.count)
+
+    def while_going(run, idle):
+        return lambda carry, count: jax.lax.cond(
+            any_member(carry.going), run, lambda carry, _: (carry, idle), carry, count
+        )
+
     def run_block(carry, counts):
-        return jax.lax.scan(rounds.run_round, carry, counts)
-
-    def idle(carry, counts):
-        absent = RoundRecord.absent(y0.size, rounds.count)
-        return carry, jax.tree.map(lambda x: jnp.broadcast_to(x, (BLOCK, *x.shape)), absent)
-
-    def step(carry, counts):
-        return jax.lax.cond(any_member(carry.going), run_block, idle, carry, counts)
+        return jax.lax.scan(while_going(rounds.run_round, absent), carry, counts)
 
     counts = jnp.arange(blocks * BLOCK).reshape(blocks, BLOCK)
-    ending, record = jax.lax.scan(step, first, counts)
+    idle = jax.tree.map(lambda x: jnp.broadcast_to(x, (BLOCK, *x.shape)), absent)
+    ending, record = jax.lax.scan(while_going(run_block, idle), first, counts)
     record = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: plan.max_transitions], record)
     inputs = ts, y0, rounds.vector
 
@@ -242,7 +245,7 @@ class ContactRounds(NamedTuple):
             t=self.ts[0], y=y0, contacts=contacts, fresh=jnp.ones(guards, bool), going=result == SUCCESSFUL,
             result=result, steps=(jnp.zeros((), int), jnp.zeros((), int)), rounds=jnp.zeros((), int), longest=jnp.zeros(()),
             turns=jnp.zeros((), int), rounding=jnp.zeros((2, guards)), rate_rounding=jnp.zeros((2, guards)),
-            slip=jnp.zeros(self.flat.rough.size), path=jnp.full((self.ts.size, y0.size), jnp.nan),
+            slip=jnp.zeros(self.flat.rough.size), largest=jnp.abs(jax.lax.stop_gradient(y0)), path=jnp.full((self.ts.size, y0.size), jnp.nan),
             of_path=jax.tree.map(lambda x: jnp.full((self.ts.size, *x.shape), -1.0), contacts),
         )  # fmt: skip
 
@@ -357,7 +360,8 @@ class ContactRounds(NamedTuple):
 
         apart = quiet.rates + quiet.coupling @ still(impulses)
         closed = jnp.where(hits, meeting.touches & (jnp.abs(apart[:count]) <= meeting.noise), closed)
-        changed, undecided, slip = (closed != was_closed) | hits, hits & ~meeting.sound, before.slip
+        changed = (closed != was_closed) | (hits & meeting.involved)
+        undecided, slip = hits & ~meeting.sound, before.slip
         direction, turned, leaves_rest = contacts.direction, changed[:0], jnp.asarray(False)
         if self.rubs:
             behind = self.slips(quiet._replace(rates=apart), v + still(change), slip)
@@ -375,8 +379,11 @@ class ContactRounds(NamedTuple):
         y_next = y + jnp.concatenate([back @ rows.responses[:count], change])
         fast = jnp.abs(rows.gradients[:count]) @ jnp.maximum(jnp.abs(v), jnp.abs(v + change))
         before = _note_forces(before, still(fast / jnp.diagonal(rows.coupling)[:count]))
+        # What is less than its own rounding is zero: steps would be as short as to follow it.
+        largest = jnp.maximum(before.largest, jnp.abs(y))
+        y_next = y_next - still(jnp.where(jnp.abs(y_next) <= 2 * EPS * largest, y_next, 0.0))
         decided = before._replace(
-            y=differentiable_where(~((hits & meeting.tied) | leaves_rest), y_next, t, y), slip=slip,
+            largest=largest, y=differentiable_where(~((hits & meeting.tied) | leaves_rest), y_next, t, y), slip=slip,
             contacts=Contacts(closed.astype(float), sticks.astype(float), direction),
             fresh=before.fresh | jnp.concatenate([changed, turned]),
             result=jnp.where(undecided, UNDECIDED, before.result),
@@ -426,7 +433,8 @@ class ContactRounds(NamedTuple):
         pattern, sound = find_pattern(rows, involved, restitution, friction)
         others = involved & ~meets & ~was_closed & (rates < -noise) & ~before.fresh[: self.count]
         noise_behind = jnp.maximum(noise, 1e-12 * jnp.max(jnp.abs(rates)))
-        return Meeting((meets & (rates < -noise)).any(), sound, pattern, touches, noise_behind, others.any())
+        hits = (meets & (rates < -noise)).any()
+        return Meeting(hits, sound, pattern, involved, touches, noise_behind, others.any())
 
     def end_of_bounces(self, before: Carry, rows: Rows, t, y, impulses, bounced, restitution) -> tuple:
         """Which contacts that bounce with these velocities (k,) come to rest at once, and after which time.
@@ -454,7 +462,7 @@ class ContactRounds(NamedTuple):
 
 
 class Meeting(NamedTuple):
-    """Contacts that meet: whether an impact `happened`, its `pattern`, and whether that is a solution of its law.
+    """Contacts that meet: whether an impact `happened`, its `pattern`, whether that is a solution of its law, and for which.
 
     And which contacts touch (k,), below which rate they stay closed, and whether others that share the impact close at
     this instant by themselves: then the instants of both are `tied`.
@@ -463,6 +471,7 @@ class Meeting(NamedTuple):
     happened: Any
     sound: Any
     pattern: Pattern
+    involved: Any
     touches: Any
     noise: Any
     tied: Any
