@@ -14,7 +14,6 @@ EPS = 2.0**-52  # from 1 to the next double
 class Digits(NamedTuple):
     """The rounding of the numbers of a state, and of what is computed from them.
 
-    - `eps`: from 1 to the next number.
     - `round_off`: the rounding of an acceleration, and of a projected state, in parts of its size: some hundred
       operations, each half a unit in the last place. A scaled defect may contain it. It is for terms that cancel: in
       the motions above neither factor changed a step.
@@ -27,20 +26,14 @@ class Digits(NamedTuple):
     - `tiny`: what is less has terms that are zero, or have lost their digits, and counts as zero.
     """
 
-    eps: float
     round_off: float
     unit: float
     largest_unit: float
     small: float
     tiny: float
 
-    @classmethod
-    def from_rounding(cls, eps: float, largest_unit: float, small: float, tiny: float) -> "Digits":
-        """The rounding of numbers whose unit in the last place is `eps`."""
-        return cls(eps, 256 * eps, 16 * eps, largest_unit, small, tiny)
 
-
-DIGITS = Digits.from_rounding(EPS, 1e-6, 2.0**-400, 2.0**-960)
+DIGITS = Digits(256 * EPS, 16 * EPS, 1e-6, 2.0**-400, 2.0**-960)
 
 # ---- how a member ended ----------------------------------------------------------------------------------------------
 

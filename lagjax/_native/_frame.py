@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from llvmlite import ir
 
-from lagjax._native._constants import DIGITS, Digits
+from lagjax._native._constants import DIGITS
 from lagjax._native._ir import BIT, DOUBLE, INTEGER, POINTER, Code, Value, element_of
 
 Index = int | Value
@@ -64,7 +64,7 @@ class Field(NamedTuple):
 
 # The fields of a thread's memory by name: a number of vectors, rows and columns of them, or a `Field`.
 Fields = dict[str, Any]
-EXACT = 1  # one vector
+EXACT = 1  # one vector of doubles
 
 
 class Memory:
@@ -129,6 +129,8 @@ class Vectors:
 class Frame:
     """A function of a kernel under construction, with named access to all that it sees."""
 
+    digits = DIGITS
+
     def __init__(self, module: ir.Module, layout: Memory, job: type, name: str, *kinds: ir.Type, **options):
         self.code = Code(module, name, [POINTER] * 3 + list(kinds), layout.width, **options)
         self.layout, self.width, self.vector = layout, layout.width, self.code.vector
@@ -137,10 +139,6 @@ class Frame:
         self._mask: Value | None = None
 
     # ---- vectors, one element a lane ----
-
-    @property
-    def digits(self) -> Digits:
-        return DIGITS
 
     def __getitem__(self, key: "str | tuple") -> Value:
         name, *indices = _parts(key)
