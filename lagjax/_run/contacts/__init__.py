@@ -36,8 +36,12 @@ def follow_contacts(given: Problem, problem: Problem, max_transitions: int) -> T
 def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int, params, params_axes) -> Trajectory:
     """The motions of a batch whose system has contacts."""
     plan, _ = _plan(batch.member, max_transitions)
-    solved = batch.map_members(lambda problem: _motion(plan, problem))
-    return _trajectory(given.member, batch.member, *solved, params, params_axes)
+    return _trajectory(given.member, batch.member, *_follow_members(plan, batch), params, params_axes)
+
+
+@eqx.filter_jit
+def _follow_members(plan: ContactPlan, batch: Batch) -> tuple[Carry, RoundRecord, tuple]:
+    return batch.map_members(lambda problem: _motion(plan, problem))
 
 
 def _plan(problem: Problem, max_transitions: int) -> tuple[ContactPlan, Problem]:
@@ -100,12 +104,9 @@ def _motion(plan: ContactPlan, problem: Problem) -> tuple[Carry, RoundRecord, tu
 
 def _trajectory(given: Problem, problem: Problem, ending: Carry, record: RoundRecord, impacts, params, axes=None) -> Trajectory:
     (q, qdot), end = (map(problem.layout.restore, halves(y)) for y in (ending.path, ending.y))
-    (q_before, qdot_before), (q_next, qdot_next) = (
-        map(problem.layout.restore, halves(y)) for y in (record.y, record.y_next)
-    )
-    changes = ContactChanges(
-        record.t, q_before, qdot_before, q_next, qdot_next, record.contact, record.change, ending.rounds
-    )  # fmt: skip
+    at, behind = halves(record.y_next)
+    at, before, behind = map(problem.layout.restore, (at, record.qdot, behind))
+    changes = ContactChanges(record.t, at, before, at, behind, record.contact, record.change, ending.rounds)
     names = problem.system.contact_names(problem.layout, problem.params)
     return Trajectory(
         ts=jnp.asarray(given.ts), q=q, qdot=qdot, result=result_from(ending.result), end=State(ending.t, *end),

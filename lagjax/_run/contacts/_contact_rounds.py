@@ -99,14 +99,14 @@ class Carry(NamedTuple):
 
 
 class RoundRecord(NamedTuple):
-    """What a round came to, if it `happened`: the time, the states before and behind it, the contact, its `CHANGES`.
+    """What a round came to, if it `happened`: the time, the velocities before it, the state behind it, what changed.
 
-    And its impact, if there is one: `t_impact`, the normal impulses (k,), the energy that was lost. Else NaN and −1.
+    That is the contact, and one of `CHANGES`. And its impact, if there is one: `t_impact`, the normal impulses (k,), the energy that was lost. Else NaN and −1.
     """
 
     happened: jax.Array
     t: jax.Array
-    y: jax.Array
+    qdot: jax.Array
     y_next: jax.Array
     contact: jax.Array
     change: jax.Array
@@ -118,7 +118,7 @@ class RoundRecord(NamedTuple):
     @classmethod
     def absent(cls, states: int, contacts: int) -> "RoundRecord":
         no, none, nan, y = jnp.asarray(False), jnp.asarray(-1), jnp.asarray(jnp.nan), jnp.full(states, jnp.nan)
-        return cls(no, nan, y, y, none, none, no, nan, jnp.full(contacts, jnp.nan), nan)
+        return cls(no, nan, halves(y)[1], y, none, none, no, nan, jnp.full(contacts, jnp.nan), nan)
 
 
 @eqx.filter_jit
@@ -151,13 +151,13 @@ def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) ->
     def lost(there, *numbers):
         return (lost_unless(there[:, *[None] * (x.ndim - 1)], x, inputs) for x in numbers)
 
-    t, y, y_next = lost(record.happened, record.t, record.y, record.y_next)
+    t, qdot, y_next = lost(record.happened, record.t, record.qdot, record.y_next)
     t_impact, impulse, energy_lost = lost(record.hits, *record[-3:])
     path = lost_unless((ending.of_path.closed >= 0).all(axis=1)[:, None], ending.path, inputs)
     order = jnp.argsort(~record.hits, stable=True)  # impacts in front
     t_impact, impulse, energy_lost = (x[order] for x in (t_impact, impulse, energy_lost))
     impacts = t_impact, rounds.flat.shapes.by_name(impulse), energy_lost, jnp.sum(record.hits)
-    return ending._replace(path=path), record._replace(t=t, y=y, y_next=y_next), impacts
+    return ending._replace(path=path), record._replace(t=t, qdot=qdot, y_next=y_next), impacts
 
 
 @jax.custom_batching.custom_vmap
@@ -272,6 +272,9 @@ class ContactRounds(NamedTuple):
         crosses = happens & ~(at_once & _pick(before.fresh | beyond, k))
         located = located._replace(t_end=t_end)
         path, t, y = MachineCode().vary_to_event(problem, self.surfaces, located, k, crosses)
+        # What happens at once, and is no crossing, moves nothing: it varies with the instant at which it is decided.
+        stays = happens & at_once & ~crosses
+        t, y = jnp.where(stays, before.t, t), jnp.where(stays, before.y, y)
         turns = jnp.where(at_once, before.turns + 1, 0)
         step = jnp.where(at_once, 0.0, (t_end - t_start) / jnp.maximum(located.accepted, 1))
         before = _note_rounding(before, guarded, kinds, t_end - t_start)._replace(
@@ -398,7 +401,7 @@ class ContactRounds(NamedTuple):
             stuck = jnp.asarray(np.concatenate([np.zeros(count, int), np.arange(self.flat.rough.size)]))[k]
             change = jnp.where(k < count, normal, jnp.where(sticks[stuck], STICKS, SLIDES))
         return decided, RoundRecord(
-            jnp.asarray(True), t, y, decided.y, contact, change, hits, rest, impulses[:count], lost
+            jnp.asarray(True), t, v, decided.y, contact, change, hits, rest, impulses[:count], lost
         )  # fmt: skip
 
     def sticks(self, contacts: Contacts, slips: tuple, fell, renewed):
