@@ -4,8 +4,8 @@ Each of them is also found as `lagjax.Trajectory`, `lagjax.Orbit`, ….
 
 **Motion**
 
-- `Trajectory`, with its `State` at the end and the `Transitions` of a hybrid motion: from `simulate`, `simulate_batch`,
-  `simulate_hybrid`
+- `Trajectory`, with its `State` at the end, the `Transitions` of a hybrid motion, the `Impacts` and `ContactChanges` of
+  one with contacts: from `simulate`, `simulate_batch`, `simulate_hybrid`
 - `Crossings`: from `crossings`
 - `Animation`: from `Trajectory.animate`
 
@@ -61,7 +61,7 @@ from lagjax._analysis import (
 )
 from lagjax._analysis.orbits import Family, LyapunovExponent, Orbit, Path
 from lagjax._fit import Comparison, Experiments, Fit, Prediction, Profile
-from lagjax._run import Crossings, State, Trajectory, Transitions
+from lagjax._run import ContactChanges, Crossings, Impacts, State, Trajectory, Transitions
 from lagjax._scene import Explanation
 from lagjax._show import Animation
 from lagjax._sweep import Status, Summary

@@ -1,10 +1,11 @@
 """From a scene and its start to a motion in the user's own pytree.
 
 `_simulate` holds `simulate` and `simulate_batch`, `_crossings` the instants at which a function of the state changes
-sign, `hybrid/` motions through modes. `_trajectory` is what they return, `_batch_members` its members along one axis.
+sign, `hybrid/` motions through modes, `contacts/` those with contacts. `_trajectory` is what they return,
+`_batch_members` its members along one axis.
 """
 
 from lagjax._run._batch_members import Members
 from lagjax._run._crossings import Crossings, crossings, directions_of, restore_crossings, sections_of, surfaces_in
 from lagjax._run._simulate import simulate, simulate_batch, trajectory_of
-from lagjax._run._trajectory import State, Trajectory, Transitions
+from lagjax._run._trajectory import ContactChanges, Impacts, State, Trajectory, Transitions

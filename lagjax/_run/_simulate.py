@@ -76,6 +76,7 @@ def simulate(
     - `dt`: take fixed steps of this size instead of adaptive ones; `rtol` and `atol` then do not apply.
     - `max_steps`: the budget of steps, rejected ones included. A reverse-mode gradient by diffrax records that many
       times for every member: lower it for the gradient of a large batch.
+    - `max_transitions`: of a scene with contacts, the budget of changes: impacts, releases, slips that stop and begin.
     - `event`: a function of (q, qdot), and of `t`, `params` by name. A real-valued event stops the motion where it
       changes sign. Machine code finds that on its series, without sampling, so that none is missed. A motion that
       starts on the zero, to the rounding of the numbers that came in (eight roundings of each, in float32), has to

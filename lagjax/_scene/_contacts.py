@@ -180,13 +180,18 @@ class Shapes(NamedTuple):
         for role, tree in zip(("contacts", "one_way"), trees, strict=True):
             if any(not jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(tree)):
                 raise TypeError(f"{role} must return real numbers, the gaps or velocities that stay >= 0.")
-        counts, names = [sum(x.size for x in jax.tree.leaves(tree)) for tree in trees], system.contact_names(layout, params)
+        counts, names = (
+            [sum(x.size for x in jax.tree.leaves(tree)) for tree in trees],
+            system.contact_names(layout, params),
+        )
         rough, directions = _rough(system, layout, params, trees[0])
         shapes = cls(tuple(trees), counts[0], sum(counts), rough, directions, names)
         numbers, code = eqx.partition(params, eqx.is_array_like)
         for role in ("restitution", "friction"):
             function = getattr(system, role)
-            jax.eval_shape(lambda p, of=function, role=role: shapes.spread(of(params=eqx.combine(p, code)), role), numbers)
+            jax.eval_shape(
+                lambda p, of=function, role=role: shapes.spread(of(params=eqx.combine(p, code)), role), numbers
+            )
         return shapes
 
     def spread(self, value: PyTree, role: str):

@@ -69,6 +69,26 @@ class System(eqx.Module):
     Each may also take, by name, the time `t` and the parameters `params` (any pytree), and in a scene that is fitted to
     records their sampled `inputs` (`lagjax.Record`).
 
+    **Contacts**
+
+    - `contacts(q)`: gaps that stay ≥ 0, each a distance: a number, an array, or a dict of named ones. A contact closes
+      where its gap falls to zero, holds with a force λ ≥ 0 (`Trajectory.contact_forces`), and opens where λ would fall
+      below zero.
+    - `one_way(q, qdot)`: velocities that stay ≥ 0, as of freewheels and ratchets, in the same structures.
+    - `restitution`: e of Newton's law, ġ⁺ = −e ġ⁻, from 0 to 1: a number, a dict by name, or a function of `params`.
+      Bounces that accumulate end at the limit of their times, and the contact holds from there.
+    - `friction`: Coulomb's μ ≥ 0, likewise: |f| ≤ μλ where the contact sticks, f = −μλ s/|s| where it slides. It needs
+      `slip(q, qdot)`, the sliding velocity s at each contact in the structure of the gaps: a number in a plane, an
+      array of two in space.
+    - `impacts`: several contacts that touch take a blow together, by the linear complementarity problem of all of them
+      ("simultaneous", Moreau and Glocker), or one after the other ("sequential", as Newton's cradle does).
+
+    At a start a closed gap that moves inwards is an impact at once. `simulate` and `simulate_batch` follow motions with
+    contacts, in machine code on a CPU, and `fit`, `sweep`, `check` and `health` take such scenes. First and second
+    derivatives go through impacts, rest, opening and accumulation; by contacts that share an impact and close at one
+    instant by themselves, and by a slip in space that begins from rest, they are NaN. Not for meshes and hundreds of
+    contacts: MuJoCo is.
+
     - `path`: how the equations are evaluated. A small scene is reduced to a scalar program that holds only the
       arithmetic it needs, a large one keeps arrays; "auto" chooses, "scalar" and "array" insist. The motion is the
       same.
@@ -80,7 +100,8 @@ class System(eqx.Module):
     **Raises** `TypeError` when a function has another signature, when coordinates are not real floats or when a
     function does not return what its role asks for; `ValueError` when `q` and `qdot` differ in structure or shape.
 
-    Source: Landau & Lifshitz, *Mechanics*, §2 (Lagrange's equations), §6 (energy), §25 (dissipation).
+    Source: Landau & Lifshitz, *Mechanics*, §2 (Lagrange's equations), §6 (energy), §25 (dissipation); Moreau,
+    *Unilateral contact and dry friction in finite freedom dynamics* (1988), Glocker, *Set-Valued Force Laws* (2001).
 
     ```python
     import jax.numpy as jnp, lagjax
@@ -90,6 +111,9 @@ class System(eqx.Module):
 
     scene = lagjax.System(pendulum)
     scene.acceleration(0.1, 0.0, params={"m": 1.0, "l": 0.5})
+
+    ball = lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q, contacts=lambda q: {"floor": q}, restitution=0.8)
+    lagjax.simulate(ball, 1.0, 0.0, jnp.linspace(0.0, 6.0, 61)).impacts
     ```
     """
 
@@ -429,7 +453,9 @@ def _coefficients(contacts, one_way, restitution, friction, slip) -> tuple:
     if contacts is None:
         some = [name for name, x in given.items() if callable(x) or jax.tree.leaves(x) != [0.0]]
         if slip is not None or some:
-            raise ValueError(f"{(some or ['slip'])[0]} is that of contacts: give contacts=..., the gaps, to the System.")
+            raise ValueError(
+                f"{(some or ['slip'])[0]} is that of contacts: give contacts=..., the gaps, to the System."
+            )
         return (None, None) if one_way is None else (lambda: 0.0, lambda: 0.0)
     for name, value in given.items():
         if callable(value):

@@ -87,9 +87,13 @@ def _assemble_system(given: GivenSystem, parameters: Parameters, law: AbstractNo
     manifold = None
     if jumps(system):
         if fitted.any() and has_constraints(first_law(system)):
-            raise ValueError("A start on constraints of hybrid motion, or with contacts, cannot be fitted: give start=(q0, qdot0).")
+            raise ValueError(
+                "A start on constraints of hybrid motion, or with contacts, cannot be fitted: give start=(q0, qdot0)."
+            )
         if isinstance(observe, Delayed):
-            raise ValueError("Sensors of hybrid motion, or with contacts, cannot be lagjax.Delayed: keep the delay, and shift the times.")
+            raise ValueError(
+                "Sensors of hybrid motion, or with contacts, cannot be lagjax.Delayed: keep the delay, and shift the times."
+            )
     elif has_constraints(system) and not input_functions(system):
         manifold = Manifold(system, layout, parameters, motions.projection)
     elif has_constraints(system) and fitted.any():
@@ -115,7 +119,9 @@ def _require_motion(given: GivenSystem, recordings: list[Record], signals: Signa
 def _read_form(system: Scene, records: list[Record], hold: str) -> Form | None:
     asking = input_functions(system)
     if asking and jumps(system):
-        raise ValueError(f"{asking[0]} asks for `inputs`, which hybrid motion and contacts have none of: make it a function of `t`.")
+        raise ValueError(
+            f"{asking[0]} asks for `inputs`, which hybrid motion and contacts have none of: make it a function of `t`."
+        )
     for place, record in enumerate(records):
         if asking and (not isinstance(record, Record) or record.input_structure is None):
             raise ValueError(

@@ -102,7 +102,9 @@ def _motion(plan: ContactPlan, problem: Problem) -> tuple[Carry, RoundRecord, tu
     return compute_in_doubles(lambda *given: contact_motion(plan, layout, *given), *given)
 
 
-def _trajectory(given: Problem, problem: Problem, ending: Carry, record: RoundRecord, impacts, params, axes=None) -> Trajectory:
+def _trajectory(
+    given: Problem, problem: Problem, ending: Carry, record: RoundRecord, impacts, params, axes=None
+) -> Trajectory:
     (q, qdot), end = (map(problem.layout.restore, halves(y)) for y in (ending.path, ending.y))
     at, behind = halves(record.y_next)
     at, before, behind = map(problem.layout.restore, (at, record.qdot, behind))

@@ -34,7 +34,9 @@ def findings(scene: CheckedScene) -> list[Finding]:
                 f"The gradient of the gap {name} is zero here: where it closes it has no direction to push in. Write it "
                 "as a distance, not as a square or a product."
             )
-            reported.append(Finding("contact_zero_gradient", "error" if abs(gap) <= near else "warning", (name,), message))
+            reported.append(
+                Finding("contact_zero_gradient", "error" if abs(gap) <= near else "warning", (name,), message)
+            )
         elif gap < -near:
             message = f"The gap {name} is {gap:.6g}: the motion starts inside. Gaps stay >= 0."
             reported.append(Finding("contact_inside", "error", (name,), message))

@@ -286,7 +286,9 @@ class Health(eqx.Module):
             rows.append((law, f"off by {_worst(self.energy, self._energy_limit)}{known}"))
         else:
             count, lost = (np.asarray(x) for x in self.impacts)
-            rows.append(("impacts", f"{count.sum()}, which took {np.sum(lost):.3g} of the energy; its balance is not judged"))
+            rows.append(
+                ("impacts", f"{count.sum()}, which took {np.sum(lost):.3g} of the energy; its balance is not judged")
+            )
         if self.momentum_names is None:
             rows.append(("momenta", "not known which are conserved: the scene has no scalar program"))
         if text := self._border_contacts():
