@@ -71,7 +71,8 @@ from lagjax._trust.health import Health
 
 __all__ = [
     "Animation", "CanonicalTrajectory", "ChangedCoordinates", "Comparison", "Conserved", "ConservedQuantities",
-    "Crossings", "Equilibrium", "Experiments", "Explanation", "Family", "Finding", "Findings", "Fit", "Hamiltonian",
-    "Health", "Linearization", "LyapunovExponent", "Modes", "Orbit", "Path", "Prediction", "Profile", "Routhian",
+    "ContactChanges", "Crossings", "Equilibrium", "Experiments", "Explanation", "Family", "Finding", "Findings", "Fit",
+    "Hamiltonian", "Health", "Impacts", "Linearization", "LyapunovExponent", "Modes", "Orbit", "Path", "Prediction",
+    "Profile", "Routhian",
     "SameMotion", "State", "Status", "Summary", "Trajectory", "Transitions", "WorkPrecision", "WorkPrecisionRow",
 ]  # fmt: skip

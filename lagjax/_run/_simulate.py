@@ -267,7 +267,7 @@ def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, 
 def _refuse_options(**options) -> None:
     if given := [name for name, value in options.items() if value is not None]:
         raise TypeError(
-            f"A scene with contacts takes no {', '.join(given)}: its rounds run in machine code, to each event of its own."
+            f"A scene with contacts takes no {', '.join(given)}: it runs in machine code, to each event of its own."
         )
 
 

@@ -104,7 +104,7 @@ class Impacts(NamedTuple):
 
 
 class ContactChanges(NamedTuple):
-    """What contacts did along a motion, in order: NaN and −1 beyond the last of `count`.
+    """The changes of contacts along a motion, in order: NaN and −1 beyond the last of `count`.
 
     `t` (N,), `q`, `qdot` are those just before it, `q_next`, `qdot_next` just behind it; `contact` is its place in
     `Trajectory.contact_names`, and `change` is 0 where it closes, 1 where it opens, 2 where it bounces, 3 where it

@@ -56,15 +56,15 @@ class ContactScene(eqx.Module):
         """The motion while the contacts are as `params` say."""
         free, flat = self.system._motion(layout, params.params), Flat.from_system(self.system, layout, params.params)
 
-        def of_user(function: Callable | None):
+        def ask_user(function: Callable | None):
             return function and (lambda *arguments: function(*arguments[:-1], arguments[-1].params))
 
-        def on_positions(q, t, p):
+        def held_positions(q, t, p):
             own = free.constraints.f(q, t, p.params)
-            return jnp.concatenate([own, p.contacts.closed[: flat.of_gaps] * flat.gaps(q, t, p.params)])
+            return jnp.concatenate([own, p.contacts.closed[: flat.gap_count] * flat.gaps(q, t, p.params)])
 
-        def on_velocities(q, qdot, t, p):
-            one_way = p.contacts.closed[flat.of_gaps :] * flat.one_way(q, qdot, t, p.params)
+        def held_velocities(q, qdot, t, p):
+            one_way = p.contacts.closed[flat.gap_count :] * flat.one_way(q, qdot, t, p.params)
             slips = flat.held_slips(p.contacts) * flat.slips(q, qdot, t, p.params).ravel()
             return jnp.concatenate([free.constraints.a(q, qdot, t, p.params), one_way, slips])
 
@@ -76,7 +76,7 @@ class ContactScene(eqx.Module):
         def held(p):
             (f, a), closed = counts(p), p.contacts.closed
             ones = jnp.ones_like
-            rows = ones(closed, shape=f), closed[: flat.of_gaps], ones(closed, shape=a), closed[flat.of_gaps :]
+            rows = ones(closed, shape=f), closed[: flat.gap_count], ones(closed, shape=a), closed[flat.gap_count :]
             return jnp.concatenate([*rows, flat.held_slips(p.contacts)])
 
         def drag(q, qdot, t, p):
@@ -86,8 +86,8 @@ class ContactScene(eqx.Module):
             forces = -slides[:, None] * jnp.einsum("rd,rdn->rn", along, slopes)
             return jnp.zeros((layout.size, held(p).size), q.dtype).at[:, f + flat.rough].set(forces.T)
 
-        constraints = Constraints(on_positions, on_velocities, held, drag if flat.rough.size else None)
-        return Motion(*map(of_user, (free.lagrangian, free.forces, free.dissipation)), constraints)
+        constraints = Constraints(held_positions, held_velocities, held, drag if flat.rough.size else None)
+        return Motion(*map(ask_user, (free.lagrangian, free.forces, free.dissipation)), constraints)
 
 
 class Flat(NamedTuple):
@@ -101,7 +101,7 @@ class Flat(NamedTuple):
     friction: Callable  # (r,) of params
 
     @property
-    def of_gaps(self) -> int:
+    def gap_count(self) -> int:
         return self.shapes.of_gaps
 
     @property
@@ -132,11 +132,11 @@ class Flat(NamedTuple):
             return numbers_of(call("slip", (q, qdot), t, p)).reshape(-1, shapes.directions)
 
         def coefficient(role: str):
-            def of_contacts(p):
+            def spread_value(p):
                 value = call(role, (), jnp.zeros((), layout.dtype), p)
                 return shapes.spread(value, role).astype(layout.dtype)
 
-            return of_contacts
+            return spread_value
 
         friction = coefficient("friction")
         return cls(shapes, gaps, one_way, slips, coefficient("restitution"), lambda p: friction(p)[shapes.rough])

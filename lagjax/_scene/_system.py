@@ -473,7 +473,12 @@ def _coefficients(contacts, one_way, restitution, friction, slip) -> tuple:
             "friction needs the sliding velocity at every contact: give slip=lambda q, qdot: ... in the structure of "
             "the gaps."
         )
-    return tuple(x if callable(x) else (lambda x=x: x) for x in given.values())
+    return tuple(x if callable(x) else _constant(x) for x in given.values())
+
+
+def _constant(value) -> Callable:
+    """A function that gives a value which it closes over: by that, editions of functions tell them apart."""
+    return lambda: value
 
 
 def require_system(system: Any, contacts: bool = False) -> System:

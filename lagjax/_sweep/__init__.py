@@ -273,8 +273,9 @@ def sweep(
     if jumps(system):
         if given := [name for name in ("event", "crossings", "solver") if getattr(settled, name) is not None]:
             raise ValueError(
-                f"{' and '.join(given)} of sweep: for the motion of one System without contacts. Transitions watch a hybrid motion, in "
-                "machine code; one without a reset notes where it is crossed, and `trajectory.transitions` tells when."
+                f"{' and '.join(given)} of sweep: for the motion of one System without contacts. Transitions watch a "
+                "hybrid motion, in machine code; one without a reset notes where it is crossed, and "
+                "`trajectory.transitions` tells when."
             )
     if not callable(keep):
         raise TypeError(f"keep must be a function of a trajectory that returns a dict; got {keep!r}.")

@@ -24,7 +24,7 @@ from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes, Syste
 
 
 def follow_contacts(given: Problem, problem: Problem, max_transitions: int) -> Trajectory:
-    """The motion of a problem whose system has contacts; `problem` is `given` with the tracers it closes over lifted."""
+    """The motion of a problem whose system has contacts; `problem` is `given` with what it closes over lifted."""
     plan, closed = _plan(problem, max_transitions)
     _require_open(problem, closed)
     if has_constraints(problem.system):
@@ -123,7 +123,7 @@ def contact_forces(trajectory: Trajectory):
     system = trajectory.system
     assert isinstance(system, System)
 
-    def of_member(q, qdot, times, params, _, contacts: Contacts):
+    def normal_forces(q, qdot, times, params, _, contacts: Contacts):
         scene = ContactScene(system, system.path)
         layout = Layout.from_state(*jax.tree.map(lambda x: x[0], (q, qdot)))
         flat = Flat.from_system(system, layout, params)
@@ -132,11 +132,11 @@ def contact_forces(trajectory: Trajectory):
         program, places = line_of(derivation.multipliers), RowPlaces.from_derivation(derivation, flat)
         numbers = [jnp.ravel(x) for x in jax.tree.leaves(eqx.filter(params, eqx.is_array_like))]
 
-        def at_output(q, qdot, t, contacts):
+        def evaluate_output(q, qdot, t, contacts):
             parts = layout.flatten(q), layout.flatten(qdot), t[None], *numbers, *map(jnp.ravel, contacts)
             forces = program(jnp.concatenate([jnp.asarray(x, layout.dtype) for x in parts]))[places.normal]
             return jnp.where(contacts.closed >= 0, forces, jnp.nan)
 
-        return flat.shapes.by_name(jax.vmap(at_output)(q, qdot, times[0], contacts))
+        return flat.shapes.by_name(jax.vmap(evaluate_output)(q, qdot, times[0], contacts))
 
-    return trajectory.map_members(of_member, trajectory.contacts)
+    return trajectory.map_members(normal_forces, trajectory.contacts)

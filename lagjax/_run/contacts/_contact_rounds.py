@@ -33,8 +33,8 @@ from lagjax._primitives import differentiable_where, lost_unless
 from lagjax._run._trajectory import vary_with
 from lagjax._run.contacts._impact_law import (
     Friction,
+    ImpactRows,
     Pattern,
-    Rows,
     find_pattern,
     impulse_solver,
     reached,
@@ -101,7 +101,8 @@ class Carry(NamedTuple):
 class RoundRecord(NamedTuple):
     """What a round came to, if it `happened`: the time, the velocities before it, the state behind it, what changed.
 
-    That is the contact, and one of `CHANGES`. And its impact, if there is one: `t_impact`, the normal impulses (k,), the energy that was lost. Else NaN and −1.
+    That is the contact, and one of `CHANGES`. And its impact, if there is one: `t_impact`, the normal impulses (k,),
+    the energy that was lost. Else NaN and −1.
     """
 
     happened: jax.Array
@@ -179,7 +180,7 @@ class ContactRounds(NamedTuple):
     flat: Flat
     surfaces: Surfaces
     places: "RowPlaces"
-    response: Any  # the line of `Rows`
+    response: Any  # the line of `ImpactRows`
     multipliers: Any
     params: PyTree
     vector: jax.Array
@@ -213,7 +214,7 @@ class ContactRounds(NamedTuple):
 
     @property
     def has_gap(self) -> np.ndarray:
-        return np.arange(self.count) < self.flat.of_gaps
+        return np.arange(self.count) < self.flat.gap_count
 
     @property
     def friction(self) -> Friction:
@@ -243,9 +244,11 @@ class ContactRounds(NamedTuple):
             result = jnp.where(undecided & (result == SUCCESSFUL), UNDECIDED, result)
         return Carry(
             t=self.ts[0], y=y0, contacts=contacts, fresh=jnp.ones(guards, bool), going=result == SUCCESSFUL,
-            result=result, steps=(jnp.zeros((), int), jnp.zeros((), int)), rounds=jnp.zeros((), int), longest=jnp.zeros(()),
+            result=result, steps=(jnp.zeros((), int), jnp.zeros((), int)), rounds=jnp.zeros((), int),
+            longest=jnp.zeros(()),
             turns=jnp.zeros((), int), rounding=jnp.zeros((2, guards)), rate_rounding=jnp.zeros((2, guards)),
-            slip=jnp.zeros(self.flat.rough.size), largest=jnp.abs(jax.lax.stop_gradient(y0)), path=jnp.full((self.ts.size, y0.size), jnp.nan),
+            slip=jnp.zeros(self.flat.rough.size), largest=jnp.abs(jax.lax.stop_gradient(y0)),
+            path=jnp.full((self.ts.size, y0.size), jnp.nan),
             of_path=jax.tree.map(lambda x: jnp.full((self.ts.size, *x.shape), -1.0), contacts),
         )  # fmt: skip
 
@@ -254,7 +257,7 @@ class ContactRounds(NamedTuple):
         here, contacts, t_start = before.going, before.contacts, jax.lax.stop_gradient(before.t)
         guarded, kinds = self.watch(before.t, before.y, contacts), jnp.concatenate([contacts.closed, contacts.sticks])
         before = _note_rounding(before, guarded, kinds, 0.0)
-        rounding = jnp.maximum(_of_kind(before.rounding, kinds), guarded.of_time)
+        rounding = jnp.maximum(_choose_kind(before.rounding, kinds), guarded.of_time)
         beyond = guarded.values < -rounding
         sides = jnp.where(beyond, jnp.inf, jnp.maximum(rounding, _LEAST))
         ahead = here & ((self.ts > t_start) | (self.ts == jnp.where(t_start == self.ts[0], t_start, jnp.nan)))
@@ -262,13 +265,14 @@ class ContactRounds(NamedTuple):
         times = jnp.concatenate([before.t[None], jnp.where(ahead, self.ts, t_start), horizon[None]])
         problem = self.problem_in(contacts, times, before.y)
         problem = dataclasses.replace(problem, guards=self.surfaces.guards(remembers=True))
-        noted = jnp.concatenate([sides, _of_kind(before.rate_rounding, kinds)])
+        noted = jnp.concatenate([sides, _choose_kind(before.rate_rounding, kinds)])
         located = MachineCode().solve_to_event(problem, noted)
         fell = (jnp.where(here, located.event, 0) >> (2 * np.arange(kinds.size))) & 3 > 0
         t_end = jnp.where(here & (located.result == SUCCESSFUL), self.ts[-1], located.t_end)
         covered = ahead & (self.ts <= t_end)
 
-        happens, k, at_once = fell.any(), jnp.argmax(fell), t_end == t_start
+        happens, at_once = fell.any(), t_end == t_start
+        k = self.first_of(fell, at_once, contacts)
         crosses = happens & ~(at_once & _pick(before.fresh | beyond, k))
         located = located._replace(t_end=t_end)
         path, t, y = MachineCode().vary_to_event(problem, self.surfaces, located, k, crosses)
@@ -306,6 +310,15 @@ class ContactRounds(NamedTuple):
             *(jnp.where(is_kept, new, old) for is_kept, new, old in zip(kept, record, absent, strict=True))
         )
 
+    def first_of(self, fell, at_once, contacts: Contacts):
+        """The watch that is taken of those that `fell` (G,): of friction first, of which a guess that jams is one."""
+        count, rough = self.count, self.flat.rough
+        if not self.rubs:
+            return jnp.argmax(fell)
+        jams = at_once & fell[:count][rough] & (contacts.closed[rough] * contacts.sticks > 0)
+        of_friction = fell[count:] | jams
+        return jnp.where(of_friction.any(), count + jnp.argmax(of_friction), jnp.argmax(fell[:count]))
+
     # ---- what is known at a state ----
 
     def watch(self, t, y, contacts: Contacts) -> Guarded:
@@ -315,14 +328,14 @@ class ContactRounds(NamedTuple):
         exact = jnp.pad(of_params, (0, numbers.size - of_params.size))
         return self.surfaces.evaluate_guards(t, y, numbers, self.ts[-1], (of_state, exact))
 
-    def rows_at(self, t, y) -> Rows:
+    def rows_at(self, t, y) -> ImpactRows:
         size, n = len(self.places.all), y.size // 2
         values = self.response(jnp.concatenate([y, t[None], self.numbers_in(opened(self.flat))]))
         shapes = (size, n), (size, n), (size, size), (size,), (size,), (size,)
         parts = jnp.split(values, np.cumsum([math.prod(shape) for shape in shapes])[:-1])
-        return Rows(*(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))
+        return ImpactRows(*(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))
 
-    def slips(self, rows: Rows, v, largest) -> tuple:
+    def slips(self, rows: ImpactRows, v, largest) -> tuple:
         """The slips (r, d), and whether each is rounding, beside the `largest` so far."""
         slips = rows.rates[self.count :].reshape(-1, self.flat.shapes.directions)
         terms = (jnp.abs(rows.gradients[self.count :]) @ jnp.abs(v)).reshape(slips.shape).max(axis=1)
@@ -377,7 +390,7 @@ class ContactRounds(NamedTuple):
             turned = renewed | (sticks != (contacts.sticks > 0))
             along = Pattern(closed.astype(float), sticks.astype(float), _unit(direction))
             undecided |= (sliding_margin(quiet, along, friction.still) <= PARADOX).any()
-        # The gap that closes is zero, also as what went in varies: what rounding left of it would grow with each bounce.
+        # The gap that closes is zero, also as what went in varies: what rounding leaves of it grows with each bounce.
         back = jnp.where(meets & self.has_gap, -rows.values[:count] / jnp.diagonal(rows.coupling)[:count], 0.0)
         y_next = y + jnp.concatenate([back @ rows.responses[:count], change])
         fast = jnp.abs(rows.gradients[:count]) @ jnp.maximum(jnp.abs(v), jnp.abs(v + change))
@@ -409,8 +422,8 @@ class ContactRounds(NamedTuple):
         was_stuck = contacts.sticks > 0
         return jnp.where(renewed, slips[1], (was_stuck | fell) & ~(fell & was_stuck))
 
-    def directions(self, before: Carry, rows: Rows, t, y, slips: tuple, breaks, renewed):
-        """The directions in which contacts slide (r, d): against what held those that break away, else along the slip."""
+    def directions(self, before: Carry, rows: ImpactRows, t, y, slips: tuple, breaks, renewed):
+        """The directions in which contacts slide (r, d): against what held those that break away, or along the slip."""
         numbers = jnp.concatenate([y, t[None], self.numbers_in(before.contacts)])
         force, (slips, still) = jax.lax.stop_gradient(self.multipliers(numbers))[self.places.tangential], slips
         moving = jnp.where(breaks[:, None], -force, slips)
@@ -425,7 +438,7 @@ class ContactRounds(NamedTuple):
         takes = breaks | ((renewed | (self.flat.shapes.directions > 1)) & ~still)
         return jnp.where(takes[:, None], moving, before.contacts.direction)
 
-    def meet(self, before: Carry, rows: Rows, t, y, meets, restitution) -> "Meeting":
+    def meet(self, before: Carry, rows: ImpactRows, t, y, meets, restitution) -> "Meeting":
         """Which contacts take part where some meet, (k,), and what they do."""
         was_closed = before.contacts.closed > 0
         touches, rates, noise = self.touching(t, y)
@@ -439,7 +452,7 @@ class ContactRounds(NamedTuple):
         hits = (meets & (rates < -noise)).any()
         return Meeting(hits, sound, pattern, involved, touches, noise_behind, others.any())
 
-    def end_of_bounces(self, before: Carry, rows: Rows, t, y, impulses, bounced, restitution) -> tuple:
+    def end_of_bounces(self, before: Carry, rows: ImpactRows, t, y, impulses, bounced, restitution) -> tuple:
         """Which contacts that bounce with these velocities (k,) come to rest at once, and after which time.
 
         With gap″ = −b − b′ s the bounces take 2u/(b (1 − e)) (1 − ⅔ k), k = b′ u / b² (1 − e), up to k².
@@ -465,10 +478,10 @@ class ContactRounds(NamedTuple):
 
 
 class Meeting(NamedTuple):
-    """Contacts that meet: whether an impact `happened`, its `pattern`, whether that is a solution of its law, and for which.
+    """Contacts that meet: whether an impact `happened`, its `pattern`, and whether that is a solution of its law.
 
-    And which contacts touch (k,), below which rate they stay closed, and whether others that share the impact close at
-    this instant by themselves: then the instants of both are `tied`.
+    And which are `involved`, which touch (k,), below which rate they stay closed, and whether others that share the
+    impact close at this instant by themselves: then the instants of both are `tied`.
     """
 
     happened: Any
@@ -494,8 +507,8 @@ class RowPlaces(NamedTuple):
     def from_derivation(cls, derivation, flat: Flat) -> "RowPlaces":
         total, (r, d) = derivation.shape("jacobian")[0], (flat.rough.size, flat.shapes.directions)
         gaps_end, slips = derivation.position_count, total - r * d
-        one_way = flat.shapes.count - flat.of_gaps
-        normal = [*range(gaps_end - flat.of_gaps, gaps_end), *range(slips - one_way, slips)]
+        one_way = flat.shapes.count - flat.gap_count
+        normal = [*range(gaps_end - flat.gap_count, gaps_end), *range(slips - one_way, slips)]
         return cls(np.array(normal, int), slips + np.arange(r * d).reshape(r, d))
 
 
@@ -527,7 +540,7 @@ def opened(flat: Flat) -> Contacts:
     return Contacts(jnp.zeros(flat.shapes.count), jnp.ones(r), jnp.ones((r, d)))
 
 
-def _of_kind(values, kinds):
+def _choose_kind(values, kinds):
     return jnp.where(kinds > 0, values[1], values[0])
 
 

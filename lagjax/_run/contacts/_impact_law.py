@@ -1,4 +1,4 @@
-"""What happens to velocities at an instant: impulses of contacts that touch.
+"""The law of impacts: impulses of contacts that touch, and velocities behind them.
 
 With G the rows of k gaps and one-way velocities, and of r d slips, (K, n), q̇⁺ = q̇ + M⁻¹ Gᵀ E Λ, where E adds the
 friction −μ c of a contact that slides to its normal impulse. Newton's law of restitution with Coulomb friction, for all
@@ -29,7 +29,7 @@ MISSES = 1e-11
 DEPENDENT = float(np.finfo(float).eps) ** (2 / 3)
 
 
-class Rows(NamedTuple):
+class ImpactRows(NamedTuple):
     """The rows of contacts at a state: those of the k normals, then those of the slips, d for each of r contacts.
 
     `gradients` G (K, n), `responses` G M⁻¹ (K, n), `coupling` G M⁻¹ Gᵀ (K, K), the `values` of gaps, one-way velocities
@@ -69,11 +69,11 @@ class Friction(NamedTuple):
         return count + np.arange(len(self.rough) * self.directions).reshape(-1, self.directions)
 
 
-def impulse_solver(rows: Rows, pattern: Pattern, friction: Friction) -> Callable:
+def impulse_solver(rows: ImpactRows, pattern: Pattern, friction: Friction) -> Callable:
     """The function of `targets` (k,) that gives the impulses (K,) by which rates become these, and slips that stick 0.
 
-    Rates of contacts that push do. Rows that depend on those before them add nothing. The impulse of a row that is free
-    is zero, that of a contact that slides brings its friction.
+    Rates of contacts that push do. Rows that depend on those before them add nothing. The impulse of a row that is
+    free is zero, that of a contact that slides brings its friction.
     """
     count, rough, push = len(pattern.push), friction.rough, pattern.push
     places = friction.places(count)
@@ -100,7 +100,7 @@ def impulse_solver(rows: Rows, pattern: Pattern, friction: Friction) -> Callable
     return solve_in_space
 
 
-def _turn_directions(rows: Rows, impulses_along, direction, slides, places):
+def _turn_directions(rows: ImpactRows, impulses_along, direction, slides, places):
     """The directions (r, 2), which are those of the slips behind the impact, also as the state varies.
 
     Two steps of Newton's method from where they are give derivatives of first and second order.
@@ -138,7 +138,7 @@ def _independent(coupling, held):
     return jax.lax.fori_loop(0, len(held), eliminate, (coupling, jnp.zeros(len(held))))[1]
 
 
-def find_pattern(rows: Rows, touches, restitution, friction: Friction) -> tuple[Pattern, Any]:
+def find_pattern(rows: ImpactRows, touches, restitution, friction: Friction) -> tuple[Pattern, Any]:
     """What the contacts that touch (k,) do in an impact, and whether that is a solution of the law."""
     count, rough, places = len(touches), friction.rough, friction.places(len(touches))
     coupling, rates = rows.coupling, rows.rates
@@ -187,8 +187,8 @@ def find_pattern(rows: Rows, touches, restitution, friction: Friction) -> tuple[
     return pattern, misses <= MISSES * jnp.max(jnp.abs(towards))
 
 
-def _pattern_of_one(rows: Rows, towards, coefficients) -> tuple[Pattern, Any]:
-    """What one contact in a plane does: it sticks, if friction suffices for that, or slides against what it would take."""
+def _pattern_of_one(rows: ImpactRows, towards, coefficients) -> tuple[Pattern, Any]:
+    """The pattern of one contact in a plane: it sticks, if friction suffices, or slides against what that takes."""
     pushed, rubbed = factorize_general(rows.coupling)(-towards)
     sticks = jnp.abs(rubbed) <= coefficients[0] * pushed
     direction = jnp.where(rubbed > 0, -1.0, 1.0)
@@ -197,7 +197,7 @@ def _pattern_of_one(rows: Rows, towards, coefficients) -> tuple[Pattern, Any]:
     return Pattern(one, sticks * one, (direction * one)[:, None]), sticks | (own > 0)
 
 
-def sliding_margin(rows: Rows, pattern: Pattern, friction: Friction):
+def sliding_margin(rows: ImpactRows, pattern: Pattern, friction: Friction):
     """What is left of each contact's response to its normal force beside that to the friction it brings, (r,): a part.
 
     Where it is not positive no force, or more than one, keeps the contact closed: Painlevé's paradox.
@@ -209,7 +209,7 @@ def sliding_margin(rows: Rows, pattern: Pattern, friction: Friction):
     return 1.0 - slides * brought / jnp.where(own > 0, own, 1.0)
 
 
-def reached(rows: Rows, meets, touches, friction: Friction):
+def reached(rows: ImpactRows, meets, touches, friction: Friction):
     """The contacts that touch (k,) and that an impulse at those that meet reaches, one through the other."""
     k = len(meets)
     if k == 1:

@@ -31,8 +31,8 @@ def findings(scene: CheckedScene) -> list[Finding]:
     ):  # fmt: skip
         if not slope.any():
             message = (
-                f"The gradient of the gap {name} is zero here: where it closes it has no direction to push in. Write it "
-                "as a distance, not as a square or a product."
+                f"The gradient of the gap {name} is zero here: where it closes it has no direction to push in. Write "
+                "it as a distance, not as a square or a product."
             )
             reported.append(
                 Finding("contact_zero_gradient", "error" if abs(gap) <= near else "warning", (name,), message)
@@ -42,8 +42,8 @@ def findings(scene: CheckedScene) -> list[Finding]:
             reported.append(Finding("contact_inside", "error", (name,), message))
         elif abs(gap) <= near and rate < -slow:
             message = (
-                f"The gap {name} is closed and changes by {rate:.6g} per unit of time: the motion begins with an impact "
-                "at once. Start it with a velocity along the contact if that is not meant."
+                f"The gap {name} is closed and changes by {rate:.6g} per unit of time: the motion begins with an "
+                "impact at once. Start it with a velocity along the contact if that is not meant."
             )
             reported.append(Finding("contact_inwards", "advice", (name,), message))
     return reported
