@@ -24,7 +24,7 @@ PyTree = Any
 
 
 class Contacts(NamedTuple):
-    """What contacts do, of k contacts, of which r have friction in d directions.
+    """The state of k contacts, of which r have friction in d directions.
 
     - `closed` (k,): 1 where the contact is closed, else 0; `sticks` (r,): 1 where it does not slide.
     - `direction` (r, d): the direction of a slip that begins; in a plane its sign. In space its length is a velocity
@@ -210,7 +210,7 @@ class Shapes(NamedTuple):
         flat = jnp.broadcast_to(leaf, (self.of_gaps,)) if jnp.ndim(leaf) < 2 else jnp.ravel(leaf)
         return jnp.concatenate([flat, none])
 
-    def by_name(self, numbers, axis: int = -1) -> PyTree:
+    def name_numbers(self, numbers, axis: int = -1) -> PyTree:
         """Numbers of all contacts, along their `axis`, in the structure that the user's functions return."""
         numbers, parts, start = jnp.moveaxis(numbers, axis, -1), [], 0
         for tree in self.trees:

@@ -137,6 +137,6 @@ def contact_forces(trajectory: Trajectory):
             forces = program(jnp.concatenate([jnp.asarray(x, layout.dtype) for x in parts]))[places.normal]
             return jnp.where(contacts.closed >= 0, forces, jnp.nan)
 
-        return flat.shapes.by_name(jax.vmap(evaluate_output)(q, qdot, times[0], contacts))
+        return flat.shapes.name_numbers(jax.vmap(evaluate_output)(q, qdot, times[0], contacts))
 
     return trajectory.map_members(normal_forces, trajectory.contacts)

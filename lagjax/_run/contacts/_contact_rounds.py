@@ -99,7 +99,7 @@ class Carry(NamedTuple):
 
 
 class RoundRecord(NamedTuple):
-    """What a round came to, if it `happened`: the time, the velocities before it, the state behind it, what changed.
+    """The end of a round, if it `happened`: the time, the velocities before it, the state behind it, what changed.
 
     That is the contact, and one of `CHANGES`. And its impact, if there is one: `t_impact`, the normal impulses (k,),
     the energy that was lost. Else NaN and −1.
@@ -157,13 +157,13 @@ def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) ->
     path = lost_unless((ending.of_path.closed >= 0).all(axis=1)[:, None], ending.path, inputs)
     order = jnp.argsort(~record.hits, stable=True)  # impacts in front
     t_impact, impulse, energy_lost = (x[order] for x in (t_impact, impulse, energy_lost))
-    impacts = t_impact, rounds.flat.shapes.by_name(impulse), energy_lost, jnp.sum(record.hits)
+    impacts = t_impact, rounds.flat.shapes.name_numbers(impulse), energy_lost, jnp.sum(record.hits)
     return ending._replace(path=path), record._replace(t=t, qdot=qdot, y_next=y_next), impacts
 
 
 @jax.custom_batching.custom_vmap
 def any_member(going):
-    """Whether a motion, or any of those that `jax.vmap` runs beside it, goes on."""
+    """True if a motion, or any of those that `jax.vmap` runs beside it, goes on."""
     return going
 
 
@@ -342,7 +342,7 @@ class ContactRounds(NamedTuple):
         return slips, _length(slips) <= jnp.maximum(1e-12 * terms, 1e-13 * largest)
 
     def touching(self, t, y) -> tuple:
-        """Which contacts touch (k,), how fast they move apart, and the rounding of that, without derivatives."""
+        """True for contacts that touch (k,), the rates at which they move apart, and the rounding of these."""
         guarded, k = self.watch(t, y, opened(self.flat)), self.count
         values, noise = guarded.values[:k], guarded.rounding[:k] + guarded.of_time[:k]
         rates = jnp.where(self.has_gap, guarded.rates[:k], values)
@@ -418,7 +418,7 @@ class ContactRounds(NamedTuple):
         )  # fmt: skip
 
     def sticks(self, contacts: Contacts, slips: tuple, fell, renewed):
-        """Which contacts stick (r,) behind watches of friction that `fell`, where there is no impact."""
+        """True for contacts that stick (r,) behind watches of friction that `fell`, where there is no impact."""
         was_stuck = contacts.sticks > 0
         return jnp.where(renewed, slips[1], (was_stuck | fell) & ~(fell & was_stuck))
 
@@ -439,7 +439,7 @@ class ContactRounds(NamedTuple):
         return jnp.where(takes[:, None], moving, before.contacts.direction)
 
     def meet(self, before: Carry, rows: ImpactRows, t, y, meets, restitution) -> "Meeting":
-        """Which contacts take part where some meet, (k,), and what they do."""
+        """The contacts that take part where some meet, (k,), and what they do."""
         was_closed = before.contacts.closed > 0
         touches, rates, noise = self.touching(t, y)
         touches = touches | meets | was_closed | ~self.has_gap
@@ -453,7 +453,7 @@ class ContactRounds(NamedTuple):
         return Meeting(hits, sound, pattern, involved, touches, noise_behind, others.any())
 
     def end_of_bounces(self, before: Carry, rows: ImpactRows, t, y, impulses, bounced, restitution) -> tuple:
-        """Which contacts that bounce with these velocities (k,) come to rest at once, and after which time.
+        """True for contacts that bounce with these velocities (k,) and come to rest at once, and the time it takes.
 
         With gap″ = −b − b′ s the bounces take 2u/(b (1 − e)) (1 − ⅔ k), k = b′ u / b² (1 − e), up to k².
         """

@@ -46,7 +46,7 @@ class ImpactRows(NamedTuple):
 
 
 class Pattern(NamedTuple):
-    """What contacts do: `push` (k,), `sticks` (r,), the unit `direction` (r, d) in which the others slide."""
+    """The part that contacts take: `push` (k,), `sticks` (r,), the unit `direction` (r, d) in which others slide."""
 
     push: Any
     sticks: Any
@@ -54,7 +54,7 @@ class Pattern(NamedTuple):
 
 
 class Friction(NamedTuple):
-    """Which contacts have friction, `rough` (r,), in how many `directions`, and its coefficients μ (r,)."""
+    """The contacts with friction, `rough` (r,), in how many `directions`, and its coefficients μ (r,)."""
 
     rough: np.ndarray
     directions: int
@@ -139,7 +139,7 @@ def _independent(coupling, held):
 
 
 def find_pattern(rows: ImpactRows, touches, restitution, friction: Friction) -> tuple[Pattern, Any]:
-    """What the contacts that touch (k,) do in an impact, and whether that is a solution of the law."""
+    """The pattern of contacts that touch (k,) in an impact, and whether that is a solution of the law."""
     count, rough, places = len(touches), friction.rough, friction.places(len(touches))
     coupling, rates = rows.coupling, rows.rates
     towards = jnp.concatenate([(1.0 + restitution) * rates[:count], rates[count:]])
@@ -198,7 +198,7 @@ def _pattern_of_one(rows: ImpactRows, towards, coefficients) -> tuple[Pattern, A
 
 
 def sliding_margin(rows: ImpactRows, pattern: Pattern, friction: Friction):
-    """What is left of each contact's response to its normal force beside that to the friction it brings, (r,): a part.
+    """The part of each contact's response to its normal force that the friction which it brings leaves, (r,).
 
     Where it is not positive no force, or more than one, keeps the contact closed: Painlevé's paradox.
     """
