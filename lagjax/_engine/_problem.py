@@ -212,7 +212,7 @@ class Batch(eqx.Module):
     def __len__(self) -> int:
         return len(self.y0)
 
-    def map_members(self, solve: Callable[[Problem], "Solution"]) -> "Solution":
+    def map_members(self, solve: Callable[[Problem], Any]) -> Any:
         """`solve` under `jax.vmap` over the members."""
         axes = jax.tree.unflatten(jax.tree.structure(self.params), self.axes)
         return jax.vmap(lambda y0, params: solve(replace(self.member, y0=y0, params=params)), in_axes=(0, axes))(

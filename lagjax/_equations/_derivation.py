@@ -323,7 +323,7 @@ class Derivation:
         return lower_formula(multipliers, *self.scalar_shapes, budget=OPERATION_BUDGET)
 
     def impact_response(self, rows: tuple[int, ...], states: int) -> Program:
-        """What impulses at some `rows` of G (K) do: G, G M⁻¹ (K, n), G M⁻¹ Gᵀ (K, K), values, rates, and G q̈ − γ (K,).
+        """The response to impulses at K `rows` of G: G, G M⁻¹ (K, n), G M⁻¹ Gᵀ (K, K), values, rates, G q̈ − γ (K,).
 
         The last `states` parameters say what is held. G is that where everything is, q̈ that where nothing is; M⁻¹
         leaves the other constraints as they are.

@@ -9,4 +9,12 @@ from lagjax._scene._closed_over import lift_batch, lift_problem
 from lagjax._scene._contacts import Contacts, ContactScene, Flat, InContact, Shapes
 from lagjax._scene._explanation import Explanation
 from lagjax._scene._samples import HOLDS, MARGINS, continued, samples, unevenly_spaced
-from lagjax._scene._system import ARGUMENTS, ROLES, System, present_system, replace_functions, require_system
+from lagjax._scene._system import (
+    ARGUMENTS,
+    ROLES,
+    System,
+    present_system,
+    replace_functions,
+    require_coefficients,
+    require_system,
+)

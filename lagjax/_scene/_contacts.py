@@ -9,7 +9,7 @@ are rows of one matrix, each held or released by a number.
 """
 
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import equinox as eqx
 import jax
@@ -87,7 +87,8 @@ class ContactScene(eqx.Module):
             return jnp.zeros((layout.size, held(p).size), q.dtype).at[:, f + flat.rough].set(forces.T)
 
         constraints = Constraints(held_positions, held_velocities, held, drag if flat.rough.size else None)
-        return Motion(*map(ask_user, (free.lagrangian, free.forces, free.dissipation)), constraints)
+        lagrangian, forces, dissipation = map(ask_user, (free.lagrangian, free.forces, free.dissipation))
+        return Motion(cast(Callable, lagrangian), forces, dissipation, constraints)
 
 
 class Flat(NamedTuple):
@@ -180,10 +181,10 @@ class Shapes(NamedTuple):
         for role, tree in zip(("contacts", "one_way"), trees, strict=True):
             if any(not jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in jax.tree.leaves(tree)):
                 raise TypeError(f"{role} must return real numbers, the gaps or velocities that stay >= 0.")
-        counts, names = (
-            [sum(x.size for x in jax.tree.leaves(tree)) for tree in trees],
-            system.contact_names(layout, params),
-        )
+        counts = [sum(x.size for x in jax.tree.leaves(tree)) for tree in trees]
+        if not sum(counts):
+            raise ValueError("contacts, or one_way, returns no number: it must return the gaps that stay >= 0.")
+        names = system.contact_names(layout, params)
         rough, directions = _rough(system, layout, params, trees[0])
         shapes = cls(tuple(trees), counts[0], sum(counts), rough, directions, names)
         numbers, code = eqx.partition(params, eqx.is_array_like)

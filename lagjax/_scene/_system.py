@@ -34,13 +34,13 @@ from lagjax._program import Unlowerable, lack_of_memory
 from lagjax._scene._explanation import Explanation, explain
 
 PyTree = Any
-ROLES = (
-    "lagrangian", "forces", "dissipation", "constraints", "velocity_constraints",
-    "contacts", "one_way", "restitution", "friction", "slip",
-)  # fmt: skip
-# The arguments of a function of each role that come by position.
-ARGUMENTS = dict.fromkeys(ROLES, ("q", "qdot")) | dict.fromkeys(("constraints", "contacts"), ("q",))
-ARGUMENTS |= {"restitution": (), "friction": ()}
+# The functions of a scene by their roles, and the arguments of each that come by position.
+ARGUMENTS: dict[str, tuple[str, ...]] = {
+    "lagrangian": ("q", "qdot"), "forces": ("q", "qdot"), "dissipation": ("q", "qdot"), "constraints": ("q",),
+    "velocity_constraints": ("q", "qdot"), "contacts": ("q",), "one_way": ("q", "qdot"), "restitution": (),
+    "friction": (), "slip": ("q", "qdot"),
+}  # fmt: skip
+ROLES = tuple(ARGUMENTS)
 Time = Float[ArrayLike, ""]  # a number, or an array of shape ()
 
 
@@ -458,15 +458,8 @@ def _coefficients(contacts, one_way, restitution, friction, slip) -> tuple:
             )
         return (None, None) if one_way is None else (lambda: 0.0, lambda: 0.0)
     for name, value in given.items():
-        if callable(value):
-            continue
-        for leaf in jax.tree.leaves(value):
-            known = is_concrete(leaf) and np.ndim(leaf) < 2
-            least = np.min(leaf, initial=0.0) if known else 0.0
-            if known and not (np.isfinite(leaf).all() and least >= 0.0):
-                raise ValueError(f"{name} must be a number that is not negative; got {leaf}.")
-            if name == "restitution" and known and np.max(leaf, initial=0.0) > 1.0:
-                raise ValueError(f"restitution must be between 0 and 1: more would add energy; got {leaf}.")
+        if not callable(value):
+            _require_range(name, value)
     rubs = callable(friction) or any(not is_concrete(x) or np.any(x) for x in jax.tree.leaves(friction))
     if rubs and slip is None:
         raise ValueError(
@@ -474,6 +467,21 @@ def _coefficients(contacts, one_way, restitution, friction, slip) -> tuple:
             "the gaps."
         )
     return tuple(x if callable(x) else _constant(x) for x in given.values())
+
+
+def require_coefficients(system: "System", params: PyTree) -> None:
+    """Raise `ValueError` where restitution or friction is out of its range at these params, which are numbers."""
+    for name in ("restitution", "friction"):
+        if (function := getattr(system, name)) is not None and "params" in function.extras:
+            _require_range(name, function(params=params))
+
+
+def _require_range(name: str, values: PyTree) -> None:
+    for value in filter(is_concrete, jax.tree.leaves(values)):
+        if not (np.isfinite(value).all() and np.min(value, initial=0.0) >= 0.0):
+            raise ValueError(f"{name} must be a number that is not negative; got {value}.")
+        if name == "restitution" and np.max(value, initial=0.0) > 1.0:
+            raise ValueError(f"restitution must be between 0 and 1: more would add energy; got {value}.")
 
 
 def _constant(value) -> Callable:

@@ -171,7 +171,7 @@ class Batches:
     def _drift(self, run: Trajectory):
         """|h − h₀| from the first output to the end."""
         scene = self.description.system
-        if not self.conserves or jumps(scene):
+        if not self.conserves or isinstance(scene, Hybrid) or jumps(scene):
             return None
         q, qdot = jax.tree.map(lambda x: x[0], (run.q, run.qdot))
         energy, end = scene.energy, run.end

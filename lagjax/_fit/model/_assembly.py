@@ -24,7 +24,7 @@ from lagjax._fit.model._signals import Signals
 from lagjax._fit.model._timings import Timings, build_clock
 from lagjax._interface import Layout, find_params_expression
 from lagjax._primitives import DOUBLE
-from lagjax._run.hybrid import Scene, first_law, jumps, require_scene
+from lagjax._run.hybrid import Hybrid, Scene, first_law, jumps, require_scene
 
 PyTree = Any
 
@@ -85,7 +85,7 @@ def _assemble_system(given: GivenSystem, parameters: Parameters, law: AbstractNo
         sensor = Sensor(*(np.append(x, np.nan) for x in sensor))
     fitted = np.array([record.start is None or isinstance(record.start, Guess) for record in records])
     manifold = None
-    if jumps(system):
+    if isinstance(system, Hybrid) or jumps(system):
         if fitted.any() and has_constraints(first_law(system)):
             raise ValueError(
                 "A start on constraints of hybrid motion, or with contacts, cannot be fitted: give start=(q0, qdot0)."

@@ -86,7 +86,7 @@ class AbstractMotions(abc.ABC):
 def choose_motions(
     system: Scene, layout: Layout, parameters: Parameters, rtol, atol, form: Form | None = None
 ) -> AbstractMotions:
-    if jumps(system):
+    if not isinstance(system, System) or jumps(system):
         return _JaxMotions(system, layout, parameters, {"rtol": rtol, "atol": atol})
     form = form if input_functions(system) else None  # inputs that only sensors ask for, or nothing
     scene = system if form is None else form.drive_scene(system)

@@ -7,6 +7,7 @@ Source: Moreau, *Unilateral contact and dry friction* (1988); Brogliato, *Nonsmo
 """
 
 import dataclasses
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -20,13 +21,16 @@ from lagjax._interface import Layout, halves, is_concrete, require_budget, resul
 from lagjax._primitives import DOUBLE, compute_in_doubles
 from lagjax._run._trajectory import ContactChanges, Impacts, State, Trajectory, step_counts
 from lagjax._run.contacts._contact_rounds import Carry, ContactPlan, RoundRecord, RowPlaces, contact_motion
-from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes, System
+from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes, System, require_coefficients
 
 
 def follow_contacts(given: Problem, problem: Problem, max_transitions: int) -> Trajectory:
     """The motion of a problem whose system has contacts; `problem` is `given` with what it closes over lifted."""
     plan, closed = _plan(problem, max_transitions)
-    _require_open(problem, closed)
+    if problem.is_known:
+        with jax.enable_x64(True):
+            _require_open(problem, closed)
+        require_coefficients(problem.system, problem.params)
     if has_constraints(problem.system):
         q0, qdot0 = map(problem.layout.restore, halves(jnp.asarray(problem.y0)))
         require_consistent(problem.system, problem.layout, problem.ts, q0, qdot0, problem.params)
@@ -36,11 +40,12 @@ def follow_contacts(given: Problem, problem: Problem, max_transitions: int) -> T
 def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int, params, params_axes) -> Trajectory:
     """The motions of a batch whose system has contacts."""
     plan, _ = _plan(batch.member, max_transitions)
-    return _trajectory(given.member, batch.member, *_follow_members(plan, batch), params, params_axes)
+    ending, record, impacts = _follow_members(plan, batch)
+    return _trajectory(given.member, batch.member, ending, record, impacts, params, params_axes)
 
 
 @eqx.filter_jit
-def _follow_members(plan: ContactPlan, batch: Batch) -> tuple[Carry, RoundRecord, tuple]:
+def _follow_members(plan: ContactPlan, batch: Batch) -> Any:
     return batch.map_members(lambda problem: _motion(plan, problem))
 
 
@@ -70,16 +75,14 @@ def _plan(problem: Problem, max_transitions: int) -> tuple[ContactPlan, Problem]
 
 def _require_open(problem: Problem, closed: Problem) -> None:
     """Raise `ValueError` where the motion starts with a negative gap, beyond the rounding of its numbers."""
-    if not problem.is_known:
-        return
     derivation, n = closed.derivation.lowered, problem.layout.size
     shapes = Shapes.from_system(problem.system, problem.layout, problem.params)
     y0, numbers = np.asarray(closed.y0, float), np.asarray(closed.vector, float)
     columns = np.concatenate([y0, np.asarray(closed.ts, float)[:1], numbers])
-    of = derivation.evaluate(["residual", "jacobian"], columns)
+    of = derivation.evaluate(["residual", "jacobian"], list(columns))
     rows = range(derivation.position_count - shapes.of_gaps, derivation.position_count)
     gaps, slopes = of["residual"][0, rows], of["jacobian"][0, rows]
-    terms = derivation.term_sizes(*np.split(y0, 2), columns[2 * n], closed.numbers, names=("residual",))
+    terms = derivation.term_sizes(y0[:n], y0[n:], columns[2 * n], closed.numbers, names=("residual",))
     noise = ROUNDINGS * np.finfo(problem.layout.dtype).eps * (np.asarray(terms)[rows] + np.abs(slopes) @ np.abs(y0[:n]))
     for name, gap, slope, near in zip(shapes.names, gaps, slopes, noise, strict=False):
         if gap < -near:

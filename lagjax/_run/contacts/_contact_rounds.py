@@ -425,15 +425,15 @@ class ContactRounds(NamedTuple):
     def directions(self, before: Carry, rows: ImpactRows, t, y, slips: tuple, breaks, renewed):
         """The directions in which contacts slide (r, d): against what held those that break away, or along the slip."""
         numbers = jnp.concatenate([y, t[None], self.numbers_in(before.contacts)])
-        force, (slips, still) = jax.lax.stop_gradient(self.multipliers(numbers))[self.places.tangential], slips
-        moving = jnp.where(breaks[:, None], -force, slips)
+        force, (slip, still) = jax.lax.stop_gradient(self.multipliers(numbers))[self.places.tangential], slips
+        moving = jnp.where(breaks[:, None], -force, slip)
         if self.flat.shapes.directions == 1:
             moving = jnp.where(moving < 0, -1.0, 1.0)
         else:
             places = self.friction.places(self.count)
             lasts = jnp.where(before.longest > 0, before.longest, self.ts[-1] - self.ts[0])
             soon = _length(force) * jnp.diagonal(rows.coupling)[places].max(axis=1) * lasts
-            length = jnp.where(breaks, AT_REST * jnp.maximum(before.slip, soon), NO_SLIP * _length(slips))
+            length = jnp.where(breaks, AT_REST * jnp.maximum(before.slip, soon), NO_SLIP * _length(slip))
             moving = _unit(moving) * jnp.where(length > 0, length, _LEAST)[:, None]
         takes = breaks | ((renewed | (self.flat.shapes.directions > 1)) & ~still)
         return jnp.where(takes[:, None], moving, before.contacts.direction)
@@ -494,7 +494,7 @@ class Meeting(NamedTuple):
 
 
 class RowPlaces(NamedTuple):
-    """Where the rows of contacts stand among all: those of the normals (k,) and of the slips (r, d)."""
+    """The places of the rows of contacts among all: those of the normals (k,) and of the slips (r, d)."""
 
     normal: np.ndarray
     tangential: np.ndarray

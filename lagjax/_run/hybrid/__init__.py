@@ -304,7 +304,7 @@ def require_scene(scene: Any) -> Scene:
     return scene._now() if isinstance(scene, Hybrid) else require_system(scene, contacts=True)
 
 
-def jumps(scene: Scene) -> bool:
+def jumps(scene: Any) -> bool:
     """True if the motion of a scene may jump, in rounds of its own: a hybrid one, or one with contacts."""
     return isinstance(scene, Hybrid) or scene.touches
 
