@@ -22,17 +22,21 @@ def system_of(scene: Scene, rough: bool | None = None) -> lagjax.System:
     """The scene in lagjax; its functions of vectors ask for time and parameters."""
     options: dict[str, Any] = {}
     if scene.gaps is not no_numbers:
-        options["contacts"] = lambda q, t, params: scene.gaps(q, t, params)
+        options |= {
+            "contacts": lambda q, t, params: scene.gaps(q, t, params), "impacts": scene.impacts,
+            "restitution": lambda params: scene.restitution(params),
+        }  # fmt: skip
     if scene.one_way is not no_numbers:
         options["one_way"] = lambda q, qdot, t, params: scene.one_way(q, qdot, t, params)
     slip = scene.slip
     if slip is not None and rough is not False:
-        options |= {"friction": scene.friction, "slip": lambda q, qdot, t, params: slip(q, qdot, t, params)}
+        options |= {
+            "slip": lambda q, qdot, t, params: slip(q, qdot, t, params),
+            "friction": lambda params: scene.friction(params),
+        }  # fmt: skip
     return lagjax.System(
         lambda q, qdot, t, params: scene.lagrangian(q, qdot, t, params),
         forces=lambda q, qdot, t, params: scene.forces(q, qdot, t, params),
-        restitution=scene.restitution,
-        impacts=scene.impacts,
         **options,
     )
 

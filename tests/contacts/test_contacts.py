@@ -162,7 +162,9 @@ def test_members_have_their_own_impacts():
 
 WITHOUT_SWITCH = """
 import jax, jax.numpy as jnp, lagjax
-ball = lagjax.System(lambda q, v, p: 0.5 * v**2 - p["g"] * q, contacts=lambda q: q, restitution=lambda p: p["e"])
+ball = lagjax.System(
+    lambda q, v, params: 0.5 * v**2 - params["g"] * q, contacts=lambda q: q, restitution=lambda params: params["e"]
+)
 run = lambda h: lagjax.simulate(ball, h, 0.0, jnp.array([0.0, 0.8]), {"g": 9.81, "e": 0.5})
 t = lambda h: (2 * h / 9.81) ** 0.5
 def exact(h):
