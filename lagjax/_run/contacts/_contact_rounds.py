@@ -360,7 +360,7 @@ class ContactRounds(NamedTuple):
         restitution, quiet = self.flat.restitution(numbers), still(rows)
         meeting = self.meet(before, quiet, t, y, meets, still(restitution))
         hits = meeting.happened
-        slips = self.slips(quiet, v, before.slip)
+        slips = self.slips(quiet, still(v), before.slip)
         closed = (was_closed & ~first[:count]) | meets
         sticks = self.sticks(contacts, slips, first[count:], (closed != was_closed)[self.flat.rough])
 
@@ -380,7 +380,7 @@ class ContactRounds(NamedTuple):
         undecided, slip = hits & ~meeting.sound, before.slip
         direction, turned, leaves_rest = contacts.direction, changed[:0], jnp.asarray(False)
         if self.rubs:
-            behind = self.slips(quiet._replace(rates=apart), v + still(change), slip)
+            behind = self.slips(quiet._replace(rates=apart), still(v + change), slip)
             renewed = changed[self.flat.rough]
             sticks = jnp.where(hits & renewed, behind[1], sticks)
             breaks, slip = first[count:] & (contacts.sticks > 0), jnp.maximum(slip, _length(slips[0]))

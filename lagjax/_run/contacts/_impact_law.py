@@ -79,7 +79,7 @@ def impulse_solver(rows: ImpactRows, pattern: Pattern, friction: Friction) -> Ca
     places = friction.places(count)
     held = jnp.concatenate([push, jnp.broadcast_to((push[rough] * pattern.sticks)[:, None], places.shape).ravel()])
     if len(held) > 1:
-        held = held * jax.lax.stop_gradient(_independent(rows.coupling, held))
+        held = held * _independent(jax.lax.stop_gradient(rows.coupling), held)
     slides = friction.coefficients * push[rough] * (1.0 - pattern.sticks)
 
     def solver_along(direction):
