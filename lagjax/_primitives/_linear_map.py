@@ -63,7 +63,7 @@ def cond_alike(predicate, when_true: Callable, when_false: Callable, *operands):
     def alike(branch):
         def vary_results(*operands):
             results, structure = jax.tree.flatten(branch(*operands))
-            return jax.tree.unflatten(structure, vary_alike(results, like=operands))
+            return jax.tree.unflatten(structure, vary_alike(results, like=jax.tree.leaves(operands)))
 
         return vary_results
 

@@ -208,6 +208,10 @@ class Shapes(NamedTuple):
         if len(jax.tree.leaves(value)) != 1:
             raise TypeError(f"{role} must be a number for all contacts, or a dict by the names of the contacts.")
         (leaf,) = jax.tree.leaves(value)
+        if jnp.ndim(leaf) and jnp.size(leaf) > 1 and isinstance(tree, dict):
+            raise ValueError(
+                f"{role} must be a dict by the names of the contacts, which are {', '.join(map(repr, tree))}."
+            )
         flat = jnp.broadcast_to(leaf, (self.of_gaps,)) if jnp.ndim(leaf) < 2 else jnp.ravel(leaf)
         return jnp.concatenate([flat, none])
 

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine import Batch, Problem
-from lagjax._engine.taylor import MachineCode, line_of
+from lagjax._engine.taylor import MOST_GUARDS, MachineCode, line_of
 from lagjax._equations import ROUNDINGS, derivation_of, has_constraints, require_consistent
 from lagjax._interface import Layout, halves, is_concrete, require_budget, result_from
 from lagjax._primitives import DOUBLE, compute_in_doubles
@@ -66,6 +66,11 @@ def _plan(problem: Problem, max_transitions: int) -> tuple[ContactPlan, Problem]
     with jax.enable_x64(True):
         shapes = Shapes.from_system(problem.system, wide.layout, wide.params)
         r, d = shapes.rough.size, shapes.directions
+        if (watches := shapes.count + r) > MOST_GUARDS:
+            raise ValueError(
+                f"{shapes.count} contacts, {r} of them with friction, make {watches} watches, and {MOST_GUARDS} are "
+                "possible: one for each contact, and one more with friction. MuJoCo takes more."
+            )
         contacts = Contacts(np.ones(shapes.count), np.ones(r), np.ones((r, d)))
         closed = Problem.from_system(plan.scene, wide.layout, InContact(wide.params, contacts))
         if refusal := MachineCode().refuses(closed):

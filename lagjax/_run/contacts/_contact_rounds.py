@@ -29,7 +29,7 @@ from lagjax._engine import Problem
 from lagjax._engine.taylor import Guarded, MachineCode, Surfaces, line_of, vector_of
 from lagjax._interface import RESULTS, SUCCESSFUL, Layout, code_of, halves
 from lagjax._native import SINGLE_NOISE
-from lagjax._primitives import differentiable_where, lost_unless
+from lagjax._primitives import cond_alike, differentiable_where, lost_unless
 from lagjax._run._trajectory import vary_with
 from lagjax._run.contacts._impact_law import (
     Friction,
@@ -136,9 +136,10 @@ def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) ->
     absent = RoundRecord.absent(y0.size, rounds.count)
 
     def while_going(run, idle):
-        return lambda carry, count: jax.lax.cond(
-            any_member(carry.going), run, lambda carry, _: (carry, idle), carry, count
-        )
+        def keep(carry, _):
+            return carry, idle
+
+        return lambda carry, count: cond_alike(any_member(carry.going), run, keep, carry, count)
 
     def run_block(carry, counts):
         return jax.lax.scan(while_going(rounds.run_round, absent), carry, counts)

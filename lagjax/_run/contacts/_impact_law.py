@@ -6,9 +6,9 @@ contacts that touch at once, asks for
 
     ġ⁺ + e ġ⁻ ≥ 0  ⟂  Λ ≥ 0        |F| ≤ μ Λ,  F = −μ Λ s⁺/|s⁺| where s⁺ ≠ 0
 
-`find_pattern` finds which contacts push and stick, by relaxation; `impulse_solver` solves for what they do, and has
-derivatives. Source: Moreau, in *Nonsmooth Mechanics and Applications* (1988), §11; Glocker, *Set-Valued Force Laws*
-(2001), ch. 9; Jean, Comput. Methods Appl. Mech. Engrg. 177 (1999) 235 (relaxation).
+`find_pattern` finds which contacts push and stick; `impulse_solver` solves for what they do, and has derivatives.
+Source: Moreau, in *Nonsmooth Mechanics and Applications* (1988), §11; Glocker, *Set-Valued Force Laws* (2001), ch. 9;
+Murty, Linear Algebra Appl. 5 (1972) 65 (pivoting).
 """
 
 from collections.abc import Callable
@@ -20,9 +20,8 @@ import numpy as np
 
 from lagjax._equations import factorize_general
 
-# Sweeps of the relaxation, and when it ends, as a part of the largest velocity. Chains of contacts converge slowly; one
-# that has not, after twice as many, would not either.
-SWEEPS, SETTLED = 2000, 1e-15
+# Pivots for each condition before the law counts as undecided: as many as there are take a few in all.
+PIVOTS = 16
 # By how much of the largest velocity a solution may miss an inequality: some thousand roundings of a solved system.
 MISSES = 1e-11
 # What is left of a pivot, as a part of it, for a row to depend on those before it: as in `_equations._linear`.
@@ -139,52 +138,50 @@ def _independent(coupling, held):
 
 
 def find_pattern(rows: ImpactRows, touches, restitution, friction: Friction) -> tuple[Pattern, Any]:
-    """The pattern of contacts that touch (k,) in an impact, and whether that is a solution of the law."""
+    """The pattern of contacts that touch (k,) in an impact, and whether that is a solution of the law.
+
+    By principal pivoting: of what its solution violates, the first is taken back, until nothing is.
+    """
     count, rough, places = len(touches), friction.rough, friction.places(len(touches))
-    coupling, rates = rows.coupling, rows.rates
-    towards = jnp.concatenate([(1.0 + restitution) * rates[:count], rates[count:]])
+    rates, own = rows.rates, jnp.diagonal(rows.coupling)
     if count == 1 and not rough.size:
         pushes = (touches & (rates < 0)).astype(float)
         return Pattern(pushes, jnp.zeros(0), jnp.zeros((0, friction.directions))), jnp.asarray(True)
     if count == 1 and friction.directions == 1:
+        towards = jnp.concatenate([(1.0 + restitution) * rates[:1], rates[1:]])
         return _pattern_of_one(rows, towards, friction.coefficients)
-    own = jnp.diagonal(coupling)
-    own = jnp.concatenate([own[:count], jnp.repeat(jnp.max(own[places], axis=1, initial=0.0), friction.directions)])
-    step = jnp.where(own > 0, 1.0 / jnp.where(own > 0, own, 1.0), 0.0)
-    most_of = dict(zip(rough.tolist(), range(len(rough)), strict=True))
-    rubs = np.isin(np.arange(count), rough)
-    slip_rows = places[[most_of.get(i, 0) for i in range(count)]] if rough.size else np.zeros((count, 1), int)
-    coefficient = jnp.zeros(count).at[rough].set(friction.coefficients)
+    targets, least = -restitution * rates[:count], MISSES * jnp.max(jnp.abs(rates))
 
-    def relax_one(i, impulses):  # one contact after the other
-        pushed = impulses[i] - step[i] * (towards[i] + coupling[i] @ impulses)
-        impulses = impulses.at[i].set(jnp.where(touches[i], jnp.maximum(pushed, 0.0), 0.0))
-        if not rough.size:
-            return impulses
-        at = jnp.asarray(slip_rows)[i]
-        moved = impulses[at] - step[at] * (towards[at] + coupling[at] @ impulses)
-        length, most = jnp.sqrt(jnp.sum(moved * moved)), coefficient[i] * impulses[i]
-        moved = moved * jnp.where(length > most, most / jnp.where(length > 0, length, 1.0), 1.0)
-        return impulses.at[at].set(jnp.where(jnp.asarray(rubs)[i], moved, impulses[at]))
+    def violations(pattern: Pattern):
+        """The violated conditions of the normals (k,) and of friction (r,), and the forces of that (r, d)."""
+        impulses = impulse_solver(rows, pattern, friction)(targets)
+        after, pushes = rates + rows.coupling @ impulses, pattern.push > 0
+        normal = jnp.where(pushes, impulses[:count] * own[:count], after[:count] - targets) < -least
+        forces, slips = impulses[places], after[places]
+        size, most = jnp.sqrt(jnp.sum(forces**2, axis=1)), friction.coefficients * impulses[rough]
+        beyond = (size - most) * own[rough] > least
+        reverse = jnp.sum(slips * pattern.direction, axis=1) < -least
+        return touches & normal, pushes[rough] & jnp.where(pattern.sticks > 0, beyond, reverse), forces
 
-    def unsettled(carry):
-        _, moved, n = carry
-        return (moved > SETTLED * jnp.max(jnp.abs(towards))) & (n < SWEEPS)
+    def pivot(carry):
+        pattern, (normal, rubs, forces), n = carry
+        first = jnp.arange(count + len(rough)) == jnp.argmax(jnp.concatenate([normal, rubs]))
+        push = jnp.where(first[:count], 1.0 - pattern.push, pattern.push)
+        turns = first[count:]
+        size = jnp.sqrt(jnp.sum(forces**2, axis=1, keepdims=True))
+        against = jnp.where((turns & (pattern.sticks > 0))[:, None], -forces / jnp.where(size > 0, size, 1.0), 0.0)
+        direction = jnp.where(against != 0, against, pattern.direction)
+        pattern = Pattern(push, jnp.where(turns, 1.0 - pattern.sticks, pattern.sticks), direction)
+        return pattern, violations(pattern), n + 1
 
-    def relax(carry):
-        impulses, _, n = carry
-        new = jax.lax.fori_loop(0, count, relax_one, impulses)
-        return new, jnp.max(jnp.abs(new - impulses) * own), n + 1
+    def is_violated(carry):
+        _, (normal, rubs, _), n = carry
+        return (normal.any() | rubs.any()) & (n < PIVOTS * (count + len(rough)))
 
-    impulses, _, _ = jax.lax.while_loop(unsettled, relax, (jnp.zeros(len(rates)), jnp.inf, 0))
-    push, forces = impulses[:count] > 0, impulses[places]
-    size, most = jnp.sqrt(jnp.sum(forces * forces, axis=1)), friction.coefficients * impulses[rough]
-    sticks = push[rough] & (size < most * (1 - 1e-9))
-    direction = -forces / jnp.where(size > 0, size, 1.0)[:, None]
-    pattern = Pattern(push.astype(float), sticks.astype(float), direction)
-    after = rates + coupling @ impulses
-    misses = jnp.max(jnp.where(touches, -(after[:count] + restitution * rates[:count]), 0.0))
-    return pattern, misses <= MISSES * jnp.max(jnp.abs(towards))
+    pushes = (touches & (rates[:count] <= 0)).astype(float)
+    first = Pattern(pushes, jnp.ones(len(rough)), jnp.zeros(places.shape).at[:, 0].set(1.0))
+    pattern, (normal, rubs, _), _ = jax.lax.while_loop(is_violated, pivot, (first, violations(first), 0))
+    return pattern, ~(normal.any() | rubs.any())
 
 
 def _pattern_of_one(rows: ImpactRows, towards, coefficients) -> tuple[Pattern, Any]:
