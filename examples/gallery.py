@@ -17,6 +17,7 @@ NAMES = (
     "sliding_wedge",
     "double_pendulum_chaos",
     "rolling_cylinder",
+    "tumbling_cube",
     "foucault",
     "crossed_fields",
     "symmetric_top",

@@ -98,9 +98,9 @@ def test_a_start_inside_a_wall_is_named():
     assert "wall" in str(lagjax.check(BOX, state(x=1.0, y=1.1), state(x=0.0, y=0.0)))
 
 
-def test_a_closed_gap_that_moves_inwards_is_named():
-    with pytest.raises(ValueError, match="floor"):
-        lagjax.simulate(BOX, state(x=0.0, y=0.1), state(x=0.0, y=-1.0), jnp.array([0.0, 1.0]))
+def test_a_closed_gap_that_moves_inwards_is_an_impact_at_once_which_check_names():
+    run = lagjax.simulate(BOX, state(x=0.0, y=0.1), state(x=0.0, y=-1.0), jnp.array([0.0, 0.1]))
+    assert run.impacts.t[0] == 0.0 and run.impacts.impulse["floor"][0] == 1.8
     assert "floor" in str(lagjax.check(BOX, state(x=0.0, y=0.1), state(x=0.0, y=-1.0)))
 
 
@@ -200,14 +200,6 @@ def test_a_scan_over_pieces_is_the_whole():
     np.testing.assert_allclose(pieces, whole.q[1:], atol=1e-12)
 
 
-@pytest.mark.slow
-def test_an_event_of_the_user_beside_contacts():
-    run = lagjax.simulate(BALL, 1.0, 0.0, jnp.array([0.0, 5.0]), {"g": G, "e": 0.5}, event=lambda q, v, t: t - 0.7)
-    u = np.sqrt(2 * G)
-    left = 0.7 - u / G
-    np.testing.assert_allclose(run.end.q, 0.5 * u * left - G * left**2 / 2, rtol=1e-12)
-
-
 # ---- scenes with a history -------------------------------------------------------------------------------------------
 
 R, A = 1.0, 0.25
@@ -262,20 +254,9 @@ def test_housners_block_loses_what_he_says():
     np.testing.assert_allclose(np.concatenate([run.q[-1], run.qdot[-1]]), right.z, atol=1e-9)
 
 
-def test_a_fallen_rod_has_no_derivative_by_what_turns_it():
-    system = lagjax.System(
-        lambda q, v: (v[0] ** 2 + v[1] ** 2 / 12) / 2 - G * q[0],
-        contacts=lambda q: q[0] + jnp.array([-0.5, 0.5]) * jnp.sin(q[1]), restitution=0.5,
-    )  # fmt: skip
-    end = lambda q: lagjax.simulate(system, q, jnp.zeros(2), jnp.array([0.0, 0.6])).q[-1, 0]
-    q = jnp.array([1.0, 0.0])
-    by_height, by_angle = (jax.jvp(end, (q,), (direction,))[1] for direction in jnp.eye(2))
-    assert np.isfinite(by_height) and np.isnan(by_angle)
-
-
 @pytest.mark.slow
 def test_contacts_in_a_text_about_the_system():
-    assert "floor" in BOX.explain(state(x=0.0, y=1.0), state(x=0.0, y=0.0))
+    assert "floor" in str(BOX.explain(state(x=0.0, y=1.0), state(x=0.0, y=0.0)))
 
 
 @pytest.mark.slow

@@ -14,13 +14,10 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 import lagjax
 from benchmarks._contact_reference import Reference
-from benchmarks._contacts import MANY, ROWS, end_of, rest_time, system_of, two_balls
+from benchmarks._contacts import MANY, ROWS, billiard, end_of, rest_time, system_of, two_balls
 
-# One of every law: a blow, rest after bounces, blows at one instant, opening, a freewheel, rest and slips.
-FAST = (
-    "two balls, m = 1, 3, e = 0.5", "bouncing ball at rest, e = 0.8", "rod falls flat", "cradle", "spinning ball",
-    "ball on a table", "ball leaves", "one-way clutch", "block slides", "puck",
-)  # fmt: skip
+# One of every law: a blow, blows at one instant, rest after bounces, opening, a freewheel, and friction.
+FAST = ("two balls, m = 1, 3, e = 0.5", "rod falls flat", "spinning ball on a rough floor, mu = 0.5", "one-way clutch")
 
 
 def by_columns(row):
@@ -40,39 +37,57 @@ def exact_by_columns(row):
 def test_motion_and_first_derivatives(row):
     measured, y = by_columns(row)
     exact = exact_by_columns(row)
-    np.testing.assert_allclose(jax.jit(measured)(y), exact(y), atol=row.value)
+    values, slopes = jax.jit(lambda y: _along(measured, y))(y)
+    np.testing.assert_allclose(values[0], exact(y), rtol=row.value, atol=row.value)
     if row.columns:
-        slopes = jax.jacfwd(exact)(y)
-        scale = max(1.0, float(jnp.abs(slopes).max()))
-        np.testing.assert_allclose(jax.jit(jax.jacfwd(measured))(y) / scale, slopes / scale, atol=row.slopes)
+        _assert_slopes(slopes.T, jax.jacfwd(exact)(y), row.slopes)
+
+
+def _along(function, y):
+    """Values and derivatives along every direction, in one program: values (m, n), one row for each of them."""
+    directions = jnp.eye(max(y.size, 1), y.size)
+    return jax.vmap(lambda direction: jax.jvp(function, (y,), (direction,)))(directions)
+
+
+def _assert_slopes(found, right, tolerance):
+    """They agree in parts of the largest one; without a tolerance they do not exist, and are NaN."""
+    if tolerance is None:
+        assert np.isnan(found).all()
+        return
+    scale = max(1.0, float(jnp.abs(right).max()))
+    np.testing.assert_allclose(found / scale, right / scale, rtol=0.0, atol=tolerance)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("row", [row for row in ROWS.values() if row.columns], ids=lambda row: row.name)
 def test_reverse_mode(row):
     measured, y = by_columns(row)
-    slopes = jax.jacfwd(exact_by_columns(row))(y)
-    scale = max(1.0, float(jnp.abs(slopes).max()))
-    np.testing.assert_allclose(jax.jit(jax.jacrev(measured))(y) / scale, slopes / scale, atol=row.slopes)
+    _assert_slopes(jax.jit(jax.jacrev(measured))(y), jax.jacfwd(exact_by_columns(row))(y), row.slopes)
 
 
-def _assert_hessian(row):
-    measured, y = by_columns(row)
-    second = jax.hessian(exact_by_columns(row))(y)
-    scale = max(1.0, float(jnp.abs(second).max()))
-    np.testing.assert_allclose(jax.jit(jax.hessian(measured))(y) / scale, second / scale, atol=row.second)
+def test_second_derivative_of_two_balls():
+    row = two_balls(3, 0.5)
+    (measured, y), exact = by_columns(row), exact_by_columns(row)
+    direction = jnp.cos(jnp.arange(y.size))
 
+    def second(function):
+        first = lambda y: jax.jvp(function, (y,), (direction,))[1]
+        return jax.jvp(first, (y,), (direction,))[1]
 
-def test_hessian_of_two_balls():
-    _assert_hessian(two_balls(3, 0.5))
+    np.testing.assert_allclose(jax.jit(lambda: second(measured))(), second(exact), rtol=row.second, atol=row.second)
 
 
 @pytest.mark.slow
 @pytest.mark.parametrize("row", [row for row in ROWS.values() if row.columns and row.second], ids=lambda row: row.name)
 def test_hessian(row):
-    _assert_hessian(row)
+    measured, y = by_columns(row)
+    second = jax.hessian(exact_by_columns(row))(y)
+    scale = max(1.0, float(jnp.abs(second).max()))
+    found = jax.jit(jax.jacfwd(jax.jacfwd(measured)))(y)
+    np.testing.assert_allclose(found / scale, second / scale, rtol=0.0, atol=row.second)
 
 
+@pytest.mark.slow
 def test_two_equal_balls_exchange_their_velocities():
     row = two_balls(1, 1)
     end = end_of(system_of(row.scene), 2, 1.0)
@@ -89,10 +104,9 @@ def test_the_time_of_rest_and_its_derivatives():
         return impacts.t[impacts.count - 1]
 
     x = jnp.array([[1.0, 0.0, 9.81, e] for e in (0.5, 0.8, 0.95)])
-    t, slopes = jax.jit(jax.vmap(jax.value_and_grad(last)))(x)
-    exact, right = jax.vmap(jax.value_and_grad(rest_time))(x)
-    np.testing.assert_allclose(t, exact, atol=1e-12)
-    np.testing.assert_allclose(slopes, right, rtol=1e-12, atol=1e-12)
+    found, right = (jax.jit(jax.vmap(lambda x, of=of: _along(of, x)))(x) for of in (last, rest_time))
+    for ours, exact in zip(found, right, strict=True):
+        np.testing.assert_allclose(ours, exact, rtol=1e-12, atol=1e-12)
 
 
 @pytest.mark.slow
@@ -113,12 +127,11 @@ def _members(many, count):
         system_of(many.scene), q, v, np.array([0.0, many.duration]), p, batch_axes=(0, 0, 0)
     )  # fmt: skip
     assert batch.ok.all()
-    np.testing.assert_allclose(batch.qdot[:, -1], right, atol=many.value)
+    np.testing.assert_allclose(batch.qdot[:, -1], right, rtol=0.0, atol=many.value)
 
 
-@pytest.mark.parametrize("many", MANY.values(), ids=lambda many: many.name)
-def test_a_few_of_many(many):
-    _members(many, 6)
+def test_a_few_shaken_blocks():
+    _members(MANY["shaken blocks: stick, slip, reverse"], 6)
 
 
 @pytest.mark.slow
@@ -132,11 +145,12 @@ def test_all_of_many(many):
 
 @pytest.mark.slow
 @pytest.mark.parametrize(
-    "row", [row for row in ROWS.values() if not row.name.startswith("puck")], ids=lambda row: row.name
-)
+    "row", [row for row in ROWS.values() if not row.name.startswith(("puck", "circular"))] + [billiard(10.0)],
+    ids=lambda row: row.name,
+)  # fmt: skip
 def test_closed_forms_are_those_of_a_reference_that_enumerates_modes(row):
     q, v, p = np.split(row.x, [row.n, 2 * row.n])
-    duration = min(row.duration, 40.0)  # DOP853 takes long to rest for a million
+    duration = min(row.duration, 20.0)  # all that last longer rest by then, for which DOP853 takes long
     motion = Reference(row.scene, q, p).run(q, v, duration, p)
     np.testing.assert_allclose(row.measure(motion.z), row.exact(row.x), atol=1e-11)
 

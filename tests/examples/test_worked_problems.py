@@ -72,6 +72,17 @@ def test_a_bead_on_a_rotating_hoop(tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
+def test_a_tumbling_cube(tmp_path, monkeypatch):
+    scope = run("tumbling_cube", tmp_path, monkeypatch)
+    q, qdot = scope["end"]
+    quarters = q["turn"] / (np.pi / 2)
+    np.testing.assert_allclose([q["y"], quarters], [0.5, round(quarters)], atol=1e-13)
+    np.testing.assert_allclose(list(qdot.values()), 0.0, atol=1e-30)
+    np.testing.assert_allclose(scope["weight"].sum(), scope["G"], rtol=1e-12)
+    assert scope["still"] < 2.0 and scope["run"].ok and all(np.isfinite(x) for x in scope["slopes"].values())
+
+
+@pytest.mark.slow
 def test_a_sliding_wedge(tmp_path, monkeypatch):
     scope = run("sliding_wedge", tmp_path, monkeypatch)
     for name in ("x", "X"):
