@@ -151,7 +151,7 @@ def brax_drop() -> dict[str, Any]:
 
 def cradle() -> dict[str, Any]:
     """Newton's cradle of five touching balls on strings, e = 1: 1000 impacts one after the other; energy too."""
-    row = swinging(500)
+    row = swinging(125)
     system, x, ts = system_of(row.scene), row.x, jnp.array([0.0, row.duration])
 
     def run():
