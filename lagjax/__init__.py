@@ -6,8 +6,9 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 
 **Motion**
 
-- `System`: L, constraints, forces, dissipation; `System.explain` tells what is in it
-- `simulate`, `simulate_batch`: one motion, or many at once, as a `Trajectory` of `State`s
+- `System`: L, constraints, forces, dissipation, contacts; `System.explain` tells what is in it
+- `simulate`, `simulate_batch`: one motion, or many at once, as a `Trajectory` of `State`s; with contacts its `Impacts`
+  and `ContactChanges`
 - `samples`: an input that was measured, as a function of time
 - `crossings`: where a motion crosses a section, as `Crossings`
 - `simulate_hybrid`: a motion through modes, by `Transition`s; those that happened are `Transitions`; `Hybrid`: all of

@@ -450,6 +450,7 @@ def _names_of(tree: PyTree, role: str) -> list[str]:
 def _coefficients(contacts, one_way, restitution, friction, slip) -> tuple:
     """Restitution and friction as functions of params; None without contacts. Raises `ValueError`."""
     given = {"restitution": restitution, "friction": friction}
+    given = {name: 0.0 if value is None else value for name, value in given.items()}
     if contacts is None:
         some = [name for name, x in given.items() if callable(x) or jax.tree.leaves(x) != [0.0]]
         if slip is not None or some:
@@ -460,6 +461,7 @@ def _coefficients(contacts, one_way, restitution, friction, slip) -> tuple:
     for name, value in given.items():
         if not callable(value):
             _require_range(name, value)
+    friction = given["friction"]
     rubs = callable(friction) or any(not is_concrete(x) or np.any(x) for x in jax.tree.leaves(friction))
     if rubs and slip is None:
         raise ValueError(

@@ -88,11 +88,11 @@ def _assemble_system(given: GivenSystem, parameters: Parameters, law: AbstractNo
     if isinstance(system, Hybrid) or jumps(system):
         if fitted.any() and has_constraints(first_law(system)):
             raise ValueError(
-                "A start on constraints of hybrid motion, or with contacts, cannot be fitted: give start=(q0, qdot0)."
+                "A start on constraints of hybrid motion, or beside contacts, cannot be fitted: give start=(q0, qdot0)."
             )
         if isinstance(observe, Delayed):
             raise ValueError(
-                "Sensors of hybrid motion, or with contacts, cannot be lagjax.Delayed: keep the delay, shift the times."
+                "Sensors of contacts and of hybrid motion cannot be lagjax.Delayed: keep the delay, and shift the times."
             )
     elif has_constraints(system) and not input_functions(system):
         manifold = Manifold(system, layout, parameters, motions.projection)
