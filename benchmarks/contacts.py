@@ -92,7 +92,8 @@ def _row(row) -> dict[str, Any]:
         line["slopes"] = _off(jax.jit(jax.jacfwd(measured))(x[columns]), slopes)
         line["reverse"] = _off(jax.jit(jax.jacrev(measured))(x[columns]), slopes)
     if row.columns and row.second:
-        line["second"] = _off(jax.jit(jax.hessian(measured))(x[columns]), jax.hessian(exact)(x[columns]))
+        second = jax.jacfwd(jax.jacfwd(measured)) if row.only_forward else jax.hessian(measured)
+        line["second"] = _off(jax.jit(second)(x[columns]), jax.hessian(exact)(x[columns]))
     return line
 
 

@@ -22,6 +22,7 @@ from lagjax._primitives._linear_map import (
     cond_alike,
     cotangent_of,
     is_zero,
+    keep_together,
     vary_alike,
     zero_like,
 )

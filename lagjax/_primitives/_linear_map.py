@@ -194,3 +194,30 @@ with_p = LinearMap("lagjax_differentiated_as", lambda *avals, count, **_: list(a
 with_p.def_impl(_values)
 mlir.register_lowering(with_p, mlir.lower_fun(_values, multiple_results=True))
 batching.primitive_batchers[with_p] = _batch_expression
+
+
+# ---- derivatives along which some numbers stay together --------------------------------------------------------------
+
+
+def keep_together(y, offsets, limits):
+    """`y` (…, m), whose derivatives are NaN along directions in which an offset (…, k) varies by more than its limit.
+
+    In reverse mode no direction is known: where a limit is finite, derivatives are NaN in all of them.
+    """
+    return together_p.bind(limits, y, offsets)[0]
+
+
+def _together(limits, y, offsets):
+    near = jnp.all(jnp.abs(offsets) <= limits, axis=-1, keepdims=True)
+    return [jnp.where(near, y, jnp.nan)]
+
+
+def _pull_together(known, cotangents, moving):
+    (limits,), (cotangent,) = known, cotangents
+    lost = jnp.isfinite(limits) & jnp.any(cotangent != 0, axis=-1, keepdims=True)
+    return [cotangent, jnp.where(lost, jnp.nan, 0.0)]
+
+
+together_p = LinearMap("lagjax_together", lambda limits, y, _: [y], lambda *_: [None], 2, _pull_together)
+together_p.def_impl(_together)
+mlir.register_lowering(together_p, mlir.lower_fun(_together, multiple_results=True))

@@ -85,9 +85,10 @@ class System(eqx.Module):
 
     At a start a closed gap that moves inwards is an impact at once. `simulate` and `simulate_batch` follow motions with
     contacts, in machine code on a CPU, and `fit`, `sweep`, `check` and `health` take such scenes. First and second
-    derivatives go through impacts, rest, opening and accumulation; by contacts that share an impact and close at one
-    instant by themselves, and by a slip in space that begins from rest, they are NaN. Not for meshes and hundreds of
-    contacts: MuJoCo is.
+    derivatives go through impacts, rest, opening and accumulation. Where contacts that share an impact close at one
+    instant by themselves, as the feet of a rod that falls flat, they exist along directions that keep them together; in
+    others, in reverse mode in all, they are NaN. So they are of a slip in space that begins from rest. For meshes and
+    hundreds of contacts take MuJoCo.
 
     - `path`: how the equations are evaluated. A small scene is reduced to a scalar program that holds only the
       arithmetic it needs, a large one keeps arrays; "auto" chooses, "scalar" and "array" insist. The motion is the

@@ -92,7 +92,7 @@ def _assemble_system(given: GivenSystem, parameters: Parameters, law: AbstractNo
             )
         if isinstance(observe, Delayed):
             raise ValueError(
-                "Sensors of contacts and of hybrid motion cannot be lagjax.Delayed: keep the delay, and shift the times."
+                "Sensors of contacts and of hybrid motion cannot be lagjax.Delayed: keep the delay, shift the times."
             )
     elif has_constraints(system) and not input_functions(system):
         manifold = Manifold(system, layout, parameters, motions.projection)

@@ -29,7 +29,7 @@ from lagjax._engine import Problem
 from lagjax._engine.taylor import Guarded, MachineCode, Surfaces, line_of, vector_of
 from lagjax._interface import RESULTS, SUCCESSFUL, Layout, code_of, halves
 from lagjax._native import SINGLE_NOISE
-from lagjax._primitives import cond_alike, differentiable_where, lost_unless
+from lagjax._primitives import cond_alike, differentiable_where, keep_together, lost_unless
 from lagjax._run._trajectory import vary_with
 from lagjax._run.contacts._impact_law import (
     Friction,
@@ -56,6 +56,8 @@ BLOCK = 32  # rounds that are left out together where no motion goes on: what go
 SHORT, LEFT_OUT = 1e-4, 1e-14
 # Forces that are none, in parts of those that stop the bodies within a step: some fifty roundings.
 FORCELESS = 1e-14
+# By how much the instants of contacts that share an impact may vary apart, for a tangent of length one: rounding.
+TOGETHER = 1e-8
 # What sliding leaves of a contact's response at which it is lost: a paradox, to rounding.
 PARADOX = 1e-12
 # The slip in space that has no direction of its own, in parts of the largest one; and in parts of what a force that
@@ -399,8 +401,11 @@ class ContactRounds(NamedTuple):
         # What is less than its own rounding is zero: steps would be as short as to follow it.
         largest = jnp.maximum(before.largest, jnp.abs(y))
         y_next = y_next - still(jnp.where(jnp.abs(y_next) <= 2 * EPS * largest, y_next, 0.0))
+        # Others that close at this instant by themselves do so along directions in which their gaps stay closed.
+        apart = jnp.where(hits & meeting.tied, TOGETHER * jnp.abs(quiet.rates[:count]), jnp.inf)
+        y_next = keep_together(y_next, rows.values[:count], apart)
         decided = before._replace(
-            largest=largest, y=differentiable_where(~((hits & meeting.tied) | leaves_rest), y_next, t, y), slip=slip,
+            largest=largest, y=differentiable_where(~leaves_rest, y_next, t, y), slip=slip,
             contacts=Contacts(closed.astype(float), sticks.astype(float), direction),
             fresh=before.fresh | jnp.concatenate([changed, turned]),
             result=jnp.where(undecided, UNDECIDED, before.result),
@@ -451,7 +456,7 @@ class ContactRounds(NamedTuple):
         others = involved & ~meets & ~was_closed & (rates < -noise) & ~before.fresh[: self.count]
         noise_behind = jnp.maximum(noise, 1e-12 * jnp.max(jnp.abs(rates)))
         hits = (meets & (rates < -noise)).any()
-        return Meeting(hits, sound, pattern, involved, touches, noise_behind, others.any())
+        return Meeting(hits, sound, pattern, involved, touches, noise_behind, others)
 
     def end_of_bounces(self, before: Carry, rows: ImpactRows, t, y, impulses, bounced, restitution) -> tuple:
         """True for contacts that bounce with these velocities (k,) and come to rest at once, and the time it takes.
@@ -481,8 +486,8 @@ class ContactRounds(NamedTuple):
 class Meeting(NamedTuple):
     """Contacts that meet: whether an impact `happened`, its `pattern`, and whether that is a solution of its law.
 
-    And which are `involved`, which touch (k,), below which rate they stay closed, and whether others that share the
-    impact close at this instant by themselves: then the instants of both are `tied`.
+    And which are `involved`, which touch (k,), below which rate they stay closed, and which others are `tied`: that
+    share the impact, and close at this instant by themselves.
     """
 
     happened: Any
