@@ -66,15 +66,11 @@ class Transitions(NamedTuple):
     _repr_pretty_ = show_str
 
     def __str__(self) -> str:
-        if not all(map(is_known, (self.t, self.count))):
-            return repr(self)
-        count = np.asarray(self.count)
-        if count.ndim:
-            return f"{count.sum()} transitions of {' × '.join(map(str, count.shape))} motions"
-        rows = list(zip(*(np.asarray(x)[: min(count, 10)] for x in (self.source, self.target, self.t)), strict=True))
-        listed = ", ".join(f"{source} → {target} at t = {t:.6g}" for source, target, t in rows)
-        more = f", … ({count - 10} more)" if count > 10 else ""
-        return f"{count} transitions between places in mode_names: {listed}{more}" if count else "no transitions"
+        def describe(t, source, target):
+            return ", ".join(f"{a} → {b} at t = {when:.6g}" for when, a, b in zip(t, source, target, strict=True))
+
+        numbers = self.t, self.source, self.target
+        return _list_first(self, "transitions", " between places in mode_names: ", describe, numbers)
 
 
 class Impacts(NamedTuple):
@@ -93,14 +89,22 @@ class Impacts(NamedTuple):
     _repr_pretty_ = show_str
 
     def __str__(self) -> str:
-        if not all(map(is_known, (self.t, self.count))):
-            return repr(self)
-        count = np.asarray(self.count)
-        if count.ndim:
-            return f"{count.sum()} impacts of {' × '.join(map(str, count.shape))} motions"
-        times = ", ".join(f"{t:.6g}" for t in np.asarray(self.t)[: min(count, 10)])
-        more = f", … ({count - 10} more)" if count > 10 else ""
-        return f"{count} impacts, at t = {times}{more}" if count else "no impacts"
+        def describe(t):
+            return ", ".join(f"{when:.6g}" for when in t)
+
+        return _list_first(self, "impacts", ", at t = ", describe, (self.t,))
+
+
+def _list_first(record: Any, what: str, joint: str, describe: Callable, numbers: tuple) -> str:
+    """A line that counts what a record holds and describes the first ten of its `numbers`; its repr where traced."""
+    if not all(map(is_known, (record.t, record.count))):
+        return repr(record)
+    count = np.asarray(record.count)
+    if count.ndim:
+        return f"{count.sum()} {what} of {' × '.join(map(str, count.shape))} motions"
+    listed = describe(*(np.asarray(x)[: min(count, 10)] for x in numbers))
+    more = f", … ({count - 10} more)" if count > 10 else ""
+    return f"{count} {what}{joint}{listed}{more}" if count else f"no {what}"
 
 
 class ContactChanges(NamedTuple):

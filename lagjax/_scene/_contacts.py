@@ -47,10 +47,10 @@ class ContactScene(eqx.Module):
     """A system with contacts, as machine code follows it: a scene whose parameters are `InContact`."""
 
     system: System
-    path: str = eqx.field(static=True, default="auto")
 
-    def shapes(self, layout: Layout, params: PyTree) -> "Shapes":
-        return Shapes.from_system(self.system, layout, params)
+    @property
+    def path(self) -> str:
+        return self.system.path
 
     def _motion(self, layout: Layout, params: InContact) -> Motion:
         """The motion while the contacts are as `params` say."""
@@ -215,9 +215,9 @@ class Shapes(NamedTuple):
         flat = jnp.broadcast_to(leaf, (self.of_gaps,)) if jnp.ndim(leaf) < 2 else jnp.ravel(leaf)
         return jnp.concatenate([flat, none])
 
-    def name_numbers(self, numbers, axis: int = -1) -> PyTree:
-        """Numbers of all contacts, along their `axis`, in the structure that the user's functions return."""
-        numbers, parts, start = jnp.moveaxis(numbers, axis, -1), [], 0
+    def name_numbers(self, numbers) -> PyTree:
+        """Numbers of all contacts, (…, k), in the structure that the user's functions return."""
+        parts, start = [], 0
         for tree in self.trees:
             leaves, structure = jax.tree.flatten(tree)
             own = []

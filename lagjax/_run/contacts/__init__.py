@@ -62,7 +62,7 @@ def _plan(problem: Problem, max_transitions: int) -> tuple[ContactPlan, Problem]
     wide = problem.double_precision if problem.is_single else problem
     rtol, atol = float(MachineCode().rtol(wide)), problem.tolerances[1]
     limits = rtol, None if atol is None else float(atol), problem.max_steps, max_transitions, problem.is_single
-    plan = ContactPlan(ContactScene(problem.system, problem.system.path), *limits)
+    plan = ContactPlan(ContactScene(problem.system), *limits)
     with jax.enable_x64(True):
         shapes = Shapes.from_system(problem.system, wide.layout, wide.params)
         r, d = shapes.rough.size, shapes.directions
@@ -132,7 +132,7 @@ def contact_forces(trajectory: Trajectory):
     assert isinstance(system, System)
 
     def normal_forces(q, qdot, times, params, _, contacts: Contacts):
-        scene = ContactScene(system, system.path)
+        scene = ContactScene(system)
         layout = Layout.from_state(*jax.tree.map(lambda x: x[0], (q, qdot)))
         flat = Flat.from_system(system, layout, params)
         inside = InContact(params, jax.tree.map(lambda x: x[0], contacts))

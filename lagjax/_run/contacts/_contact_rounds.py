@@ -48,8 +48,7 @@ TOO_MANY, UNDECIDED, NOT_FINITE, INCONSISTENT = map(
     code_of,
     (RESULTS.max_transitions_reached, RESULTS.contact_undecided, RESULTS.nonfinite_state, RESULTS.inconsistent_start),
 )
-CHANGES = ("closes", "opens", "bounces", "sticks", "slides")
-CLOSES, OPENS, BOUNCES, STICKS, SLIDES = range(5)
+CLOSES, OPENS, BOUNCES, STICKS, SLIDES = range(5)  # the kinds of `ContactChanges`
 BLOCK = 32  # rounds that are left out together where no motion goes on: what goes on is copied for each
 # The time that bounces still take, in parts of a step of the motion between them, below which they end in closed form,
 # and what that leaves out: twice as long, heights of 4e-9 of those of a step are left out.
@@ -103,8 +102,8 @@ class Carry(NamedTuple):
 class RoundRecord(NamedTuple):
     """The end of a round, if it `happened`: the time, the velocities before it, the state behind it, what changed.
 
-    That is the contact, and one of `CHANGES`. And its impact, if there is one: `t_impact`, the normal impulses (k,),
-    the energy that was lost. Else NaN and −1.
+    That is the contact, and the kind of its change. And its impact, if there is one: `t_impact`, the normal impulses
+    (k,), the energy that was lost. Else NaN and −1.
     """
 
     happened: jax.Array
@@ -361,7 +360,7 @@ class ContactRounds(NamedTuple):
         was_closed, meets = contacts.closed > 0, first[:count] & ~(contacts.closed > 0)
         rows, (_, v), friction = self.rows_at(t, y), halves(y), self.friction
         restitution, quiet = self.flat.restitution(numbers), still(rows)
-        meeting = self.meet(before, quiet, t, y, meets, still(restitution))
+        meeting = self.meet(before, quiet, t, y, meets, still(restitution), friction.still)
         hits = meeting.happened
         slips = self.slips(quiet, still(v), before.slip)
         closed = (was_closed & ~first[:count]) | meets
@@ -436,7 +435,7 @@ class ContactRounds(NamedTuple):
         if self.flat.shapes.directions == 1:
             moving = jnp.where(moving < 0, -1.0, 1.0)
         else:
-            places = self.friction.places(self.count)
+            places = self.count + np.arange(force.size).reshape(force.shape)
             lasts = jnp.where(before.longest > 0, before.longest, self.ts[-1] - self.ts[0])
             soon = _length(force) * jnp.diagonal(rows.coupling)[places].max(axis=1) * lasts
             length = jnp.where(breaks, AT_REST * jnp.maximum(before.slip, soon), NO_SLIP * _length(slip))
@@ -444,13 +443,13 @@ class ContactRounds(NamedTuple):
         takes = breaks | ((renewed | (self.flat.shapes.directions > 1)) & ~still)
         return jnp.where(takes[:, None], moving, before.contacts.direction)
 
-    def meet(self, before: Carry, rows: ImpactRows, t, y, meets, restitution) -> "Meeting":
+    def meet(self, before: Carry, rows: ImpactRows, t, y, meets, restitution, friction: Friction) -> "Meeting":
         """The contacts that take part where some meet, (k,), and what they do."""
         was_closed = before.contacts.closed > 0
         touches, rates, noise = self.touching(t, y)
         touches = touches | meets | was_closed | ~self.has_gap
         noise = jnp.maximum(noise, 0.01 * before.rate_rounding[0, : self.count])
-        together, friction = self.plan.scene.system.impacts == "simultaneous", self.friction.still
+        together = self.plan.scene.system.impacts == "simultaneous"
         involved = reached(rows, meets, touches, friction) if together else meets
         pattern, sound = find_pattern(rows, involved, restitution, friction)
         others = involved & ~meets & ~was_closed & (rates < -noise) & ~before.fresh[: self.count]
