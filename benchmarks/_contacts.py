@@ -188,7 +188,7 @@ def clock(e: float, duration: float) -> Row:
 
     return Row(
         f"area and moment below all bounces, e = {e}", CLOCK, [1, 0], [0, 0.1], [G, e], duration, exact,
-        (0, 1, 2, 3, 4, 5), value=1e-11, slopes=1e-10, second=1e-8,
+        (0, 1, 2, 3, 4, 5), value=1e-11, slopes=1e-11, second=1e-10,
     )  # fmt: skip
 
 

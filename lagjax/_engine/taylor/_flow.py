@@ -151,6 +151,12 @@ class Flow:
     def states(self) -> int:
         return 2 * self.size
 
+    @functools.cached_property
+    def reads_time(self) -> bool:
+        """True if the motion, or what keeps it on its constraints, depends on the time itself."""
+        programs = [self.general_program, *(self.projection or ())]
+        return any(self.states in of.find_inputs(range(len(of.line.outputs))) for of in programs)
+
     def path_shape(self, times: int, notes: int) -> tuple[int, ...]:
         """The shape of the `path` of a member: of states at this many output times, or of what is noted."""
         if self.guards is None or not self.guards.notes:
