@@ -14,7 +14,7 @@ and in which line.
 from lagjax._equations._blame import borders_of_motion, describe_pieces, offenders, pieces_of_motion, poles
 from lagjax._equations._consistency import has_constraints, inconsistent_members, require_consistent
 from lagjax._equations._constraints import ROUNDINGS, Constraints, distances
-from lagjax._equations._derivation import Derivation, derivation_of, numbers_of
+from lagjax._equations._derivation import OPERATION_BUDGET, Derivation, derivation_of, numbers_of
 from lagjax._equations._linear import (
     augment,
     dependent_rows,

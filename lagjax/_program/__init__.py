@@ -45,7 +45,7 @@ from jax.custom_derivatives import SymbolicZero
 
 from lagjax._program import _scalars as scalar_algebra
 from lagjax._program._borders import CLOCK, FLOOR, SIGN, TABLE, TRUNC, Borders, borders, distances, is_smooth
-from lagjax._program._differentiation import Derivatives, copy_nodes, pullback, pushforward, with_tangents
+from lagjax._program._differentiation import Derivatives, copy_nodes, pullback, pushforward, tangents_in, with_tangents
 from lagjax._program._emit import Rows, apply_in_jax, emit, emit_look_up, emit_rows
 from lagjax._program._graph import Graph, Tape, Unlowerable, find_ancestors
 from lagjax._program._jump import row_places
@@ -55,7 +55,7 @@ from lagjax._program._memory import lack_of_memory, machine_memory, operations_t
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, sink_negations
 from lagjax._program._rounding import rounding
-from lagjax._program._scalars import Scalars, apply_function, concatenate, fold, scatter, stack
+from lagjax._program._scalars import Scalars, absolute, apply_function, concatenate, fold, scatter, stack
 from lagjax._program._series import LinearSystem, series
 from lagjax._program.lowering import _complex
 from lagjax._program.lowering._matrices import orthogonalize, row_weights, solve_orthogonalized
@@ -171,6 +171,21 @@ def lower_solution(
     )
 
 
+def compose(outer: "Program", inner: "Program", budget: int, moving: int) -> "Program":
+    """The program of `outer`, whose last array is that of the outputs of `inner`, a program of the other inputs."""
+
+    def scalars(expansion, arguments):
+        ids = np.concatenate([x.ravel() for x in arguments])
+        found = inner.place(expansion, ids)[list(inner.line.outputs)]
+        return [outer.place(expansion, np.concatenate([ids, found]))[list(outer.line.outputs)]]
+
+    def evaluate(*leaves):
+        numbers = [x for leaf in leaves for x in jnp.ravel(leaf)]
+        return outer.function(*leaves, jnp.stack(inner(*numbers)))
+
+    return lower_scalars(scalars, evaluate, outer.shapes[:-1], budget, moving)
+
+
 @dataclass(frozen=True, eq=False)
 class Program:
     """A straight line of scalar operations; made by `lower`, compared and hashed by identity.
@@ -207,10 +222,14 @@ class Program:
         first = next((x for x in scalars if isinstance(x, Scalars)), None)
         if first is None:
             return jnp.stack(self(*scalars))
-        graph, ids = first.expansion.graph, stack(scalars).ids.tolist()
-        nodes = copy_nodes(graph, self.line, ids, [graph.position(i) for i in ids] if self.looks_up else None)
-        first.expansion.traced_operations += self.operations
-        return Scalars(first.expansion, np.array([nodes[i] for i in self.line.outputs], dtype=np.int64))
+        return Scalars(first.expansion, self.place(first.expansion, stack(scalars).ids)[list(self.line.outputs)])
+
+    def place(self, expansion: Expansion, ids: np.ndarray) -> np.ndarray:
+        """The nodes of the program in the graph where its inputs are these `ids`, (inputs,)."""
+        graph, inputs = expansion.graph, ids.tolist()
+        expansion.traced_operations += self.operations
+        places = [graph.position(i) for i in inputs] if self.looks_up else None
+        return np.array(copy_nodes(graph, self.line, inputs, places), dtype=np.int64)
 
     @property
     def looks_up(self) -> bool:

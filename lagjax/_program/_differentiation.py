@@ -34,7 +34,7 @@ _LARGEST = 100  # operations of a derivative for one of a line: a bound for erro
 
 
 def copy_nodes(
-    graph: Graph, line, inputs: Sequence[int] | Callable[[int, list[int]], int], places: Sequence[int] | None = None
+    graph: Graph, line, inputs: Sequence[int] | Callable[[int, list[int]], int], places: Sequence | None = None
 ) -> list[int]:
     """The nodes of a line, of a tape or of another graph in a graph, where `inputs` are its inputs.
 

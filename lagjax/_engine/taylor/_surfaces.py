@@ -18,10 +18,27 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine.taylor._line_functions import outputs
-from lagjax._equations import Derivation
+from lagjax._equations import OPERATION_BUDGET, Derivation
 from lagjax._native import GUARD_NOISE, INSTANT, SINGLE_NOISE, SMALLEST_STEP, Guards
 from lagjax._primitives import differentiable_where
-from lagjax._program import Program, StraightLine, Unlowerable, borders, distances, emit, lower
+from lagjax._program import (
+    Program,
+    Scalars,
+    StraightLine,
+    Unlowerable,
+    absolute,
+    borders,
+    compose,
+    concatenate,
+    copy_nodes,
+    distances,
+    emit,
+    fold,
+    lower,
+    lower_scalars,
+    stack,
+    tangents_in,
+)  # fmt: skip
 
 PyTree = Any
 
@@ -103,48 +120,86 @@ class Surfaces(NamedTuple):
         code: tuple,
         structure,
         is_rounded: bool = False,
+        given: Program | None = None,
     ) -> "Surfaces":
         """The surfaces of a function of y = (q, q̇, t), (2n + 1,), and params, which gives all g (G,).
 
-        `code` and `structure` are what params hold that is not a number. Raises `Unlowerable`.
+        It takes the outputs of `given` as well, where there is such a program of the same numbers. `code` and
+        `structure` are what params hold that is not a number. Raises `Unlowerable`.
         """
-        n, program = derivation.layout.size, derivation.acceleration
+        moving, motion = 2 * derivation.layout.size + 1, derivation.acceleration.complete
+        y, numbers = jax.ShapeDtypeStruct((moving,), derivation.layout.dtype), derivation.numbers
 
-        def values(y, numbers):
-            params = eqx.combine(numbers, structure.unflatten(code))
-            return function(y, params)
+        def values_at(y, numbers, *more):
+            return function(y, eqx.combine(numbers, structure.unflatten(code)), *more)
 
-        def rate_of(y, numbers):
-            acceleration = jnp.stack(program.complete.compute_outputs(y, vector_of(numbers))[:n])
-            return jnp.concatenate([y[n:-1], acceleration, jnp.ones(1)])
+        more = () if given is None else (jax.ShapeDtypeStruct((len(given.line.outputs),), jnp.result_type(float)),)
+        values = lower(values_at, y, numbers, *more, moving=moving)
+        if given is not None:
+            values = compose(values, given, OPERATION_BUDGET, moving)
 
-        def complete(y, numbers):
-            rate = rate_of(y, numbers)
-            by_y = jax.jacfwd(values)(y, numbers)
-            terms, moving = by_y * y, by_y * rate
-            found = values(y, numbers), moving.sum(1), jnp.abs(terms).sum(1), jnp.abs(moving).sum(1)
-            if not is_rounded:
-                return found
+        def sizes_by_rounding(y, numbers):
             floats, others = eqx.partition(numbers, eqx.is_inexact_array)
-            slopes = jax.jacrev(lambda y, floats: values(y, eqx.combine(floats, others)), (0, 1))(y, floats)
-            moved = jax.tree.map(lambda by, x: jnp.abs(by * x).reshape(len(terms), -1).sum(1), slopes, (y, floats))
-            return *found, SINGLE_NOISE * sum(jax.tree.leaves(moved))
+            slopes = jax.jacrev(lambda y, floats: values_at(y, eqx.combine(floats, others)), (0, 1))(y, floats)
+            moved = jax.tree.map(lambda by, x: jnp.abs(by * x).reshape(len(by), -1).sum(1), slopes, (y, floats))
+            return SINGLE_NOISE * sum(jax.tree.leaves(moved))
 
-        y = jax.ShapeDtypeStruct((2 * n + 1,), derivation.layout.dtype)
-        numbers = derivation.numbers
-        lowered = lower(values, y, numbers, moving=2 * n + 1)
-        pieces = _borders_of(lowered, n)
+        rounding = lower(sizes_by_rounding, y, numbers, moving=moving) if is_rounded else None
+        complete = _complete(values, motion, moving, rounding)
+        pieces = _borders_of(values, derivation.layout.size)
+        follow = functools.cache(lambda: _followed(values, motion, moving, pieces))
+        return cls(values, complete, follow, directions, is_rounded, pieces)
 
-        def followed(y, numbers):
-            def away(y):
-                more = () if pieces is None else emit(pieces, (*y, *vector_of(numbers)))
-                return jnp.stack([*values(y, numbers), *more])
 
-            rate = rate_of(y, numbers)
-            return *jax.jvp(away, (y,), (rate,)), rate[:-1]
+def _complete(values: Program, motion: Program, moving: int, rounding: Program | None) -> Program:
+    """g, ġ, the sizes of both, and what rounding of a start does to g, see `Surfaces`."""
 
-        follow = functools.cache(lambda: lower(followed, y, numbers, moving=2 * n + 1))
-        return cls(lowered, lower(complete, y, numbers, moving=2 * n + 1), follow, directions, is_rounded, pieces)
+    def scalars(expansion, arguments):
+        graph, ids = expansion.graph, np.concatenate([x.ravel() for x in arguments])
+        nodes, y = values.place(expansion, ids).tolist(), Scalars(expansion, ids[:moving])
+        outputs = values.line.outputs
+        one, zero = graph.constant(1.0, "float"), graph.constant(0.0, "float")
+        by_y = [tangents_in(graph, values.line, nodes, {j: one}, {}) for j in range(moving)]
+        slopes = Scalars(expansion, np.array([[by.get(i, zero) for by in by_y] for i in outputs]))
+        terms, moves = slopes * y, slopes * _rate(motion, expansion, ids, moving)
+        found = [[fold("add", row) for row in x] for x in (moves, absolute(terms), absolute(moves))]
+        more = [] if rounding is None else [rounding.place(expansion, ids)[list(rounding.line.outputs)]]
+        return [np.array([nodes[i] for i in outputs]), *(stack(x).ids for x in found), *more]
+
+    return lower_scalars(scalars, None, values.shapes, OPERATION_BUDGET, moving)
+
+
+def _followed(values: Program, motion: Program, moving: int, pieces: StraightLine | None) -> Program:
+    """All g and the distances of their borders, how fast both change along the motion, and (q̇, q̈)."""
+
+    def scalars(expansion, arguments):
+        graph, ids = expansion.graph, np.concatenate([x.ravel() for x in arguments])
+        rate, found = _rate(motion, expansion, ids, moving).ids.tolist(), []
+        lines = [values.line] if pieces is None else [values.line, pieces]
+        for line in lines:
+            nodes = copy_nodes(graph, line, ids.tolist(), [graph.position(i) for i in ids.tolist()])
+            tangents = tangents_in(graph, line, nodes, dict(enumerate(rate)), {})
+            zero = graph.constant(0.0, "float")
+            found.append(([nodes[i] for i in line.outputs], [tangents.get(i, zero) for i in line.outputs]))
+        at, moves = (np.array([x for part in parts for x in part]) for parts in zip(*found, strict=True))
+        return [at, moves, np.array(rate[:-1])]
+
+    def evaluate(y, *numbers):
+        def away(y):
+            more = () if pieces is None else emit(pieces, (*y, *vector_of(numbers)))
+            return jnp.stack([*vector_of(values.function(y, *numbers)), *more])
+
+        acceleration = jnp.stack(motion.compute_outputs(y, vector_of(numbers))[: moving // 2])
+        rate = jnp.concatenate([y[moving // 2 : -1], acceleration, jnp.ones(1)])
+        return *jax.jvp(away, (y,), (rate,)), rate[:-1]
+
+    return lower_scalars(scalars, evaluate, values.shapes, OPERATION_BUDGET, moving)
+
+
+def _rate(motion: Program, expansion, ids: np.ndarray, moving: int) -> Scalars:
+    """The rate of (q, q̇, t) in a graph where the inputs are `ids`."""
+    outputs = motion.place(expansion, ids)[list(motion.line.outputs[: moving // 2])]
+    return concatenate([Scalars(expansion, x) for x in (ids[moving // 2 : moving - 1], outputs)] + [np.ones(1)])
 
 
 @functools.lru_cache(maxsize=64)

@@ -572,13 +572,11 @@ def _watches(derivation, scene: ContactScene, code: tuple, structure) -> Surface
     params = eqx.combine(zeros, structure.unflatten(code)).params
     flat = Flat.from_system(scene.system, derivation.layout, params)
     shapes, places = flat.shapes, RowPlaces.from_derivation(derivation, flat)
-    multipliers, rough = derivation.multipliers, flat.rough
+    rough = flat.rough
 
-    def values_at(y, inside: InContact):
-        numbers = eqx.filter(inside, eqx.is_array_like)
-        user, (closed, sticks, direction) = numbers.params, inside.contacts
+    def values_at(y, inside: InContact, forces):
+        user, (closed, sticks, direction) = eqx.filter(inside.params, eqx.is_array_like), inside.contacts
         state = (*halves(y[:-1]), y[-1])
-        forces = jnp.stack(multipliers.compute_outputs(y, vector_of(numbers)))
         open_values = jnp.concatenate([flat.gaps(state[0], state[2], user), flat.one_way(*state, user)])
         normal = forces[places.normal]
         watches = normal + (1.0 - closed) * open_values
@@ -592,4 +590,4 @@ def _watches(derivation, scene: ContactScene, code: tuple, structure) -> Surface
         return jnp.concatenate([watches, of_friction])
 
     directions = (-1,) * (shapes.count + rough.size)
-    return Surfaces.from_function(derivation, values_at, directions, code, structure)
+    return Surfaces.from_function(derivation, values_at, directions, code, structure, given=derivation.multipliers)

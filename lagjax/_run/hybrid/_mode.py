@@ -27,7 +27,6 @@ from lagjax._engine.taylor import (
     Surfaces,
     crossing_variation,
     require_one_number,
-    vector_of,
 )
 from lagjax._equations import Derivation
 from lagjax._interface import Function, Layout, accept, halves, present
@@ -210,16 +209,15 @@ def _surfaces(
     if multipliers is None and any("multipliers" in guard.extras for guard in guards):
         raise ValueError("A guard asks for `multipliers`, but its mode has no constraints.")
 
-    def values_at(y, params):
+    def values_at(y, params, *found):
         extras = {"t": y[-1], "params": params}
-        if multipliers is not None:
-            flat = jnp.stack(multipliers.compute_outputs(y, vector_of(eqx.filter(params, eqx.is_array_like))))
-            extras["multipliers"] = system._split_by_constraint(flat, layout, params)
+        for forces in found:
+            extras["multipliers"] = system._split_by_constraint(forces, layout, params)
         state = [*map(layout.restore, halves(y[:-1]))]
         return jnp.stack([require_one_number(guard(*state, **extras), "A guard") for guard in guards])
 
     directions = tuple(transition.direction for transition in leaving)
-    return Surfaces.from_function(derivation, values_at, directions, code, structure)
+    return Surfaces.from_function(derivation, values_at, directions, code, structure, given=multipliers)
 
 
 def state_after(transition: Transition, layout: Layout, t, y, params) -> jax.Array:
