@@ -29,7 +29,6 @@ from lagjax._program import (
     absolute,
     borders,
     compose,
-    concatenate,
     copy_nodes,
     distances,
     emit,
@@ -199,7 +198,8 @@ def _followed(values: Program, motion: Program, moving: int, pieces: StraightLin
 def _rate(motion: Program, expansion, ids: np.ndarray, moving: int) -> Scalars:
     """The rate of (q, q̇, t) in a graph where the inputs are `ids`."""
     outputs = motion.place(expansion, ids)[list(motion.line.outputs[: moving // 2])]
-    return concatenate([Scalars(expansion, x) for x in (ids[moving // 2 : moving - 1], outputs)] + [np.ones(1)])
+    one = expansion.constants(np.ones(1))
+    return Scalars(expansion, np.concatenate([ids[moving // 2 : moving - 1], outputs, one]))
 
 
 @functools.lru_cache(maxsize=64)
