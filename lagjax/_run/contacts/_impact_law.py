@@ -24,6 +24,8 @@ from lagjax._equations import factorize_general
 PIVOTS = 16
 # By how much of the largest velocity a solution may miss an inequality: some thousand roundings of a solved system.
 MISSES = 1e-11
+# What is zero in a tableau whose numbers are of one: some thousand roundings.
+SMALL_PIVOT, _TINY = 1e-12, 1e-300
 # What is left of a pivot, as a part of it, for a row to depend on those before it: as in `_equations._linear`.
 DEPENDENT = float(np.finfo(float).eps) ** (2 / 3)
 
@@ -140,7 +142,7 @@ def _independent(coupling, held):
 def find_pattern(rows: ImpactRows, touches, restitution, friction: Friction) -> tuple[Pattern, Any]:
     """The pattern of contacts that touch (k,) in an impact, and whether that is a solution of the law.
 
-    By principal pivoting: of what its solution violates, the first is taken back, until nothing is.
+    In space by principal pivoting: of what its solution violates, the first is taken back, until nothing is.
     """
     count, rough, places = len(touches), friction.rough, friction.places(len(touches))
     rates, own = rows.rates, jnp.diagonal(rows.coupling)
@@ -163,9 +165,15 @@ def find_pattern(rows: ImpactRows, touches, restitution, friction: Friction) -> 
         reverse = jnp.sum(slips * pattern.direction, axis=1) < -least
         return touches & normal, pushes[rough] & jnp.where(pattern.sticks > 0, beyond, reverse), forces
 
+    if friction.directions == 1:
+        pattern = _complementary_pattern(rows, touches, targets, friction)
+        normal, rubs, _ = violations(pattern)
+        return pattern, ~(normal.any() | rubs.any())
+
     def pivot(carry):
         pattern, (normal, rubs, forces), n = carry
-        first = jnp.arange(count + len(rough)) == jnp.argmax(jnp.concatenate([normal, rubs]))
+        # Friction first: a contact that sticks and pulls is taken back by sliding.
+        first = jnp.arange(count + len(rough)) == jnp.where(rubs.any(), count + jnp.argmax(rubs), jnp.argmax(normal))
         push = jnp.where(first[:count], 1.0 - pattern.push, pattern.push)
         turns = first[count:]
         size = jnp.sqrt(jnp.sum(forces**2, axis=1, keepdims=True))
@@ -182,6 +190,66 @@ def find_pattern(rows: ImpactRows, touches, restitution, friction: Friction) -> 
     first = Pattern(pushes, jnp.ones(len(rough)), jnp.zeros(places.shape).at[:, 0].set(1.0))
     pattern, (normal, rubs, _), _ = jax.lax.while_loop(is_violated, pivot, (first, violations(first), 0))
     return pattern, ~(normal.any() | rubs.any())
+
+
+def _complementary_pattern(rows: ImpactRows, touches, targets, friction: Friction) -> Pattern:
+    """The pattern of contacts without friction, or in a plane, as a linear complementarity problem.
+
+    With N the normal impulses, s⁺ = s_R − s_L and the friction R − μN, it is
+
+        (ġ⁺ + e ġ⁻, s_R, 2μN − R) ≥ 0  ⟂  (N, R, s_L) ≥ 0
+    """
+    count, rough = len(touches), friction.rough
+    places, own = friction.places(count)[:, 0], jnp.diagonal(rows.coupling)
+    scale = 1.0 / jnp.sqrt(jnp.where(own > 0, own, 1.0))
+    part = jnp.concatenate([touches, touches[rough]])
+    coupling = jnp.where(part[:, None] & part, rows.coupling * jnp.outer(scale, scale), 0.0)
+    rates = jnp.where(part, scale * (rows.rates - jnp.pad(targets, (0, len(rough)))), 0.0)
+    brought = friction.coefficients * scale[rough] / scale[places]
+    mixed = jnp.eye(count + len(rough)).at[places, rough].add(-brought)
+    limits = jnp.zeros((len(rough), count)).at[np.arange(len(rough)), rough].set(2.0 * brought)
+    one, none = jnp.eye(len(rough)), jnp.zeros((count, len(rough)))
+    right = jnp.concatenate([none, one, jnp.zeros_like(one)])
+    matrix = jnp.concatenate(
+        [jnp.concatenate([coupling @ mixed, jnp.concatenate([limits, -one], axis=1)]), right], axis=1
+    )
+    chosen = _solve_complementary(matrix, jnp.concatenate([rates, jnp.zeros(len(rough))]))
+    push, against, back = jnp.split(chosen, [count, count + len(rough)])
+    direction = jnp.where(back, -1.0, 1.0)[:, None]
+    return Pattern((touches & push).astype(float), (against & ~back).astype(float), direction)
+
+
+def _solve_complementary(matrix, values):
+    """Which z may be positive (m,) in w = values + matrix z, with w, z ≥ 0 and w ⟂ z, by Lemke's pivoting.
+
+    Source: Cottle, Pang & Stone, *The Linear Complementarity Problem* (1992), algorithm 4.4.5.
+    """
+    size = len(values)
+    values = values / jnp.max(jnp.abs(values), initial=_TINY)
+    cover = 2 * size  # the place of the artificial variable, which makes all w positive
+    tableau = jnp.concatenate([jnp.eye(size), -matrix, -jnp.ones((size, 1)), values[:, None]], axis=1)
+
+    def exchange(tableau, basis, row, enters):
+        line = tableau[row] / tableau[row, enters]
+        return (tableau - jnp.outer(tableau[:, enters], line)).at[row].set(line), basis.at[row].set(enters)
+
+    def pivot(carry):
+        tableau, basis, enters, _, n = carry
+        column = tableau[:, enters]
+        falls = column > SMALL_PIVOT
+        ratios = jnp.where(falls, tableau[:, -1] / jnp.where(falls, column, 1.0), jnp.inf)
+        ties = falls & (ratios <= jnp.min(ratios) + SMALL_PIVOT)
+        row = jnp.argmax(ties + (ties & (basis == cover)).astype(int))
+        leaves = basis[row]
+        tableau, basis = exchange(tableau, basis, row, enters)
+        enters = jnp.where(leaves < size, leaves + size, leaves - size)
+        return tableau, basis, enters, falls.any() & (leaves != cover), n + 1
+
+    lowest, basis = jnp.argmin(values), jnp.arange(size)
+    first = (*exchange(tableau, basis, lowest, cover), lowest + size, values[lowest] < 0, 0)
+    done = jax.lax.while_loop(lambda carry: carry[3] & (carry[4] < PIVOTS * size), pivot, first)
+    basis = jnp.where(values[lowest] < 0, done[1], basis)
+    return (basis[:, None] == size + np.arange(size)).any(axis=0)
 
 
 def _pattern_of_one(rows: ImpactRows, towards, coefficients) -> tuple[Pattern, Any]:
