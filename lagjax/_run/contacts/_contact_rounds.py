@@ -397,6 +397,11 @@ class ContactRounds(NamedTuple):
         y_next = y + jnp.concatenate([back @ rows.responses[:count], change])
         fast = jnp.abs(rows.gradients[:count]) @ jnp.maximum(jnp.abs(v), jnp.abs(v + change))
         before = _note_forces(before, still(fast / jnp.diagonal(rows.coupling)[:count]))
+        # A contact that opens does so with an acceleration that rounding of its force may make: it is no rate.
+        opens = jnp.where(first[:count] & was_closed, before.longest * jnp.diagonal(quiet.coupling)[:count], 0.0)
+        before = before._replace(
+            rate_rounding=before.rate_rounding.at[0, :count].max(opens * before.rounding[1, :count])
+        )
         # What is less than its own rounding is zero: steps would be as short as to follow it.
         largest = jnp.maximum(before.largest, jnp.abs(y))
         y_next = y_next - still(jnp.where(jnp.abs(y_next) <= 2 * EPS * largest, y_next, 0.0))
