@@ -6,8 +6,8 @@
 
 *First* is a motion as a user waits for it, with its compilation; *again* the same once more. Errors of derivatives are
 in parts of the largest. *Rows* are motions in closed form, *many* random ones of one scene, *sizes* long motions, large
-batches and many contacts, *by_hand* the same scenes as modes and guards. Their docstrings say what they are measured
-against.
+batches and many contacts, *problems* worked ones, *by_hand* the same scenes as modes and guards. Their docstrings say
+what they are measured against.
 """
 
 import argparse
@@ -25,6 +25,7 @@ import numpy as np
 import lagjax
 from benchmarks import _report
 from benchmarks._contact_by_hand import PAIRS, lines
+from benchmarks._contact_problems import PROBLEMS
 from benchmarks._contacts import (
     BRAX,
     BRAX_RADIUS,
@@ -255,7 +256,15 @@ def _attempt(call: Callable) -> dict[str, Any]:
         return {"failed": f"{type(error).__name__}: {text[:160]}", "first s": time.perf_counter() - start}
 
 
-PARTS = {"rows": rows, "many": many, "sizes": sizes, "by_hand": by_hand}
+def problems(begins: str) -> Iterator[dict[str, Any]]:
+    """Worked problems: their figures, and the seconds of all of it."""
+    for problem in PROBLEMS.values():
+        if problem.name.startswith(begins):
+            spent, figures = seconds(lambda problem=problem: _attempt(problem.solve))
+            yield {"scene": problem.name} | figures | {"all s": spent}
+
+
+PARTS = {"rows": rows, "many": many, "sizes": sizes, "problems": problems, "by_hand": by_hand}
 
 
 def main() -> None:
