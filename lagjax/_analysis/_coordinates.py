@@ -74,7 +74,7 @@ def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordin
         return jax.jvp(lambda Q, t: present(place)(Q, t=t, params=params), (Q, t), (Qdot, jnp.ones_like(t)))
 
     def compose_state(function: Function):
-        return lambda Q, Qdot, t, params: function(*old_state(Q, Qdot, t, params), t=t, params=params)
+        return lambda Q, Qdot, t, params, **more: function(*old_state(Q, Qdot, t, params), t=t, params=params, **more)
 
     def compose_place(function: Function):
         return lambda Q, t, params: function(place(Q, t=t, params=params), t=t, params=params)
@@ -82,8 +82,8 @@ def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordin
     def compose_force(function: Function):
         force = compose_state(function)
 
-        def forces(Q, Qdot, t, params):
-            return jax.vjp(lambda Q: place(Q, t=t, params=params), Q)[1](force(Q, Qdot, t, params))[0]
+        def forces(Q, Qdot, t, params, **more):
+            return jax.vjp(lambda Q: place(Q, t=t, params=params), Q)[1](force(Q, Qdot, t, params, **more))[0]
 
         return forces
 
@@ -108,13 +108,13 @@ def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordin
 def restrict_signature(function: Callable, extras: set[str], roles: int = 2) -> Callable:
     """`function(*roles, t, params)` with a signature that has `t` and `params` only where `extras` names them.
 
-    A function without `t` in its signature is known not to depend on the time.
+    A function without `t` in its signature is known not to depend on the time. It passes `multipliers` on, likewise.
     """
 
-    def restricted(*state, t=0.0, params=None):
-        return function(*state, t, params)
+    def restricted(*state, t=0.0, params=None, **more):
+        return function(*state, t, params, **more)
 
-    names = *("q", "qdot")[:roles], *(name for name in ("t", "params") if name in extras)
+    names = *("q", "qdot")[:roles], *(name for name in ("t", "params", "multipliers") if name in extras)
     parameters = [inspect.Parameter(name, inspect.Parameter.POSITIONAL_OR_KEYWORD) for name in names]
     restricted.__signature__ = inspect.Signature(parameters)  # pyright: ignore[reportFunctionMemberAccess]
     return restricted

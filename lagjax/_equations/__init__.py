@@ -1,7 +1,8 @@
 """The equations of motion of a Lagrangian: M, F, q̈ and λ, on arrays and on scalars.
 
 `_motion` derives momentum, mass matrix, force, acceleration, energy and multipliers on arrays, `_quantities` the same
-on scalars, operation by operation. `_constraints` holds constraint Jacobian, right-hand side, distances and projection;
+on scalars, operation by operation; `_coupled_forces` are those that read multipliers. `_constraints` holds constraint
+Jacobian, right-hand side, distances and projection;
 `_consistency` tests a start against them. `_linear` solves symmetric systems and saddle points as arrays, and `_rank`
 decides which singular values count as zero; `_patterns` finds the patterns of a large scene's matrices, `_sparse`
 solves by them, `_structure` holds its motion; `_saddle` is the same elimination on scalars, which keeps the zeros of a
@@ -14,6 +15,7 @@ and in which line.
 from lagjax._equations._blame import borders_of_motion, describe_pieces, offenders, pieces_of_motion, poles
 from lagjax._equations._consistency import has_constraints, inconsistent_members, require_consistent
 from lagjax._equations._constraints import ROUNDINGS, Constraints, distances
+from lagjax._equations._coupled_forces import CoupledForces
 from lagjax._equations._derivation import OPERATION_BUDGET, Derivation, derivation_of, numbers_of
 from lagjax._equations._linear import (
     augment,

@@ -23,6 +23,7 @@ import numpy as np
 
 from lagjax._equations._blame import pieces_of_motion
 from lagjax._equations._constraints import velocity_scales
+from lagjax._equations._coupled_forces import CoupledForces
 from lagjax._equations._linear import eigen, solve_many
 from lagjax._equations._motion import Motion
 from lagjax._equations._patterns import gradient_memory, jacobian_pattern
@@ -440,6 +441,8 @@ class Derivation:
     @property
     def kick_refusal(self) -> str | None:
         """Why velocities behind a border are not known, as the end of a sentence; None where they are."""
+        if self.kicks and isinstance(self.motion.forces, CoupledForces):
+            return "L jumps at a border, and no law gives the impulse of a force that reads multipliers"
         if not self.kicks or (borders := self.borders) is None or borders.kick is None or not borders.kick.refused:
             return None
         piece, reason = borders.kick.refused[0]

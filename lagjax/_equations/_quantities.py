@@ -12,6 +12,7 @@ import jax
 import numpy as np
 
 from lagjax._equations._constraints import Constraints
+from lagjax._equations._coupled_forces import CoupledForces
 from lagjax._equations._motion import Motion
 from lagjax._equations._recursion import Recursion, RecursiveElimination, recursion_of
 from lagjax._equations._saddle import SaddleElimination
@@ -55,6 +56,13 @@ class _ScalarState:
         values = self.ids | ({"qdot": self.zeros(self.ids["qdot"].shape)} if at_rest else {})
         leaves = jax.tree.leaves([values[name] for name in arguments])
         (value,) = self.expansion.run_closed(self._traced(function, *arguments), leaves)
+        return value
+
+    def evaluate_with(self, function: Callable, *values: Ids) -> Ids:
+        """The value of a function of these numbers, and then of q, q̇, t and params."""
+        shapes = [jax.ShapeDtypeStruct(ids.shape, self.shapes["q"].dtype) for ids in values]
+        jaxpr = jax.make_jaxpr(function)(*shapes, *self.shapes.values())
+        (value,) = self.expansion.run_closed(jaxpr, [*values, *jax.tree.leaves(list(self.ids.values()))])
         return value
 
     def taped(self, function: Callable) -> "_Taped":
@@ -129,12 +137,17 @@ def quantities(
     rates = {"q": state.ids["qdot"], "t": True}
     lagrangian = state.taped(motion.lagrangian)
     by_q, momentum, by_t, matrix, inertial = _derivatives(state, lagrangian, rates)
-    zero = state.zeros(by_q.shape)
-    forces = zero if motion.forces is None else state.evaluate(motion.forces, *everything)
+    zero, of_constraints = state.zeros(by_q.shape), _constraint_quantities(motion.constraints, state, rates)
     dissipation, damping = state.zeros(0), zero
     if motion.dissipation is not None:
         taped = state.taped(motion.dissipation)
         dissipation, (damping,) = taped.value, state.gradient(taped, "qdot")
+    if isinstance(motion.forces, CoupledForces):
+        free = state.expansion.map("sub", inertial, damping)
+        rows = of_constraints["jacobian"], of_constraints["gamma"]
+        forces = state.evaluate_with(motion.forces.solve, matrix, free, *rows)
+    else:
+        forces = zero if motion.forces is None else state.evaluate(motion.forces, *everything)
     nonconservative = state.expansion.map("sub", forces, damping)
     generalized = state.expansion.map("add", by_q, nonconservative)
     result = {
@@ -150,7 +163,7 @@ def quantities(
         "dissipation_by_qdot": damping,
         "nonconservative_force": nonconservative,
         "generalized_force": generalized,
-        **_constraint_quantities(motion.constraints, state, rates),
+        **of_constraints,
     }
     # Last of all, so that programs of scenes without one are not touched by the search.
     recursion = _shorter_recursion(motion, state, lagrangian, matrix)

@@ -16,6 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
+from lagjax._equations._coupled_forces import CoupledForces
 from lagjax._equations._motion import Flag, Motion, PyTree, Row, Time, Vector
 from lagjax._equations._patterns import count_operations, hessian_pattern, jacobian_pattern
 from lagjax._equations._sparse import Blocks, Diagonal, MatrixForm, MatrixFree, Solver, form_of, refine
@@ -57,7 +58,7 @@ def structure_of(motion: Motion, shapes: tuple, insists: bool = False) -> Sparse
     """
     q, _, t, numbers = shapes
     n = q.size
-    if n < LEAST_COORDINATES:
+    if n < LEAST_COORDINATES or isinstance(motion.forces, CoupledForces):
         return None
     operations = count_operations(jax.make_jaxpr(motion.lagrangian)(*shapes).jaxpr)
     if not insists and not (operations >= LEAST_OPERATIONS or (motion.constrained and n >= LEAST_LINKED)):

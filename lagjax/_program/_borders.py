@@ -968,10 +968,25 @@ def _squares(line: StraightLine, i: int) -> list[int] | None:
     return _squares(line, others[0]) if len(others) == len(factors) == 1 and factors[0] > 0 else None
 
 
+def _velocity_degrees(line: StraightLine, size: int) -> list[int]:
+    """The degree of each node in the velocities; 2 for any that is not 0 or 1."""
+    degrees: list[int] = []
+    for op, operands, attribute in line.nodes:
+        of = [degrees[x] for x in operands]
+        if op == "input":
+            degrees.append(int(size <= attribute < 2 * size))
+        elif op in ("add", "sub", "neg", "select", "mul") or (op == "div" and not of[1]):
+            degrees.append(min(2, sum(of) if op == "mul" else max(of)))
+        else:
+            degrees.append(2 * any(of))
+    return degrees
+
+
 def _find_cones(line: StraightLine, size: int, linear: Any) -> dict[int, int]:
     """The nodes by which lengths |u| of velocities that something is divided by are known, each with the node of |u|².
 
     These are roots, also of what `where` or `maximum` puts in the place of |u| = 0, and the comparisons of such guards.
+    What is not linear in the velocities is a force.
     """
     nodes, cones = line.nodes, {}
 
@@ -983,12 +998,11 @@ def _find_cones(line: StraightLine, size: int, linear: Any) -> dict[int, int]:
 
     roots = {x for op, of, _ in nodes if op == "div" for x in guarded(of[1]) if nodes[x][0] == "sqrt"}
     roots |= {i for i, (op, _, _) in enumerate(nodes) if op == "rsqrt"}
-    squares = {}
+    squares, degrees = {}, _velocity_degrees(line, size) if roots else []
     for root in roots if linear is not None else ():
         for x in guarded(nodes[root][1][0]):
             parts = _squares(line, x)
-            velocities = range(size, 2 * size)
-            if parts and not any(inputs_below(line, [u]).isdisjoint(velocities) for u in parts):
+            if parts and all(degrees[u] == 1 for u in parts):
                 squares[x] = cones[root] = x
     squares |= {i: x for i, x in cones.items() if nodes[i][0] == "sqrt"}
     for i, (op, operands, _) in enumerate(nodes):

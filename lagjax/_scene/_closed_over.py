@@ -45,10 +45,10 @@ class _Trace:
     def __name__(self) -> str:
         return self.name
 
-    def __call__(self, *roles: Any, params: Lifted, t: Any = 0.0) -> PyTree:
+    def __call__(self, *roles: Any, params: Lifted, t: Any = 0.0, **more: Any) -> PyTree:
         pairs = zip(self.constants, self.places, strict=True)
         constants = [c if k is None else params.values[k] for c, k in pairs]
-        values = *constants, *jax.tree.leaves((roles, t, eqx.filter(params.params, eqx.is_array_like)))
+        values = *constants, *jax.tree.leaves((roles, t, eqx.filter(params.params, eqx.is_array_like), more))
         values = [jnp.asarray(x, v.aval.dtype) for x, v in zip(values, self.jaxpr.invars, strict=True)]
         return jax.tree.unflatten(self.structure, core.jaxpr_as_fun(core.ClosedJaxpr(self.jaxpr, []))(*values))
 
@@ -63,8 +63,8 @@ class Unchanged:
     def __name__(self) -> str:
         return self.function.name
 
-    def __call__(self, *roles: Any, params: Lifted, t: Any = 0.0) -> PyTree:
-        return self.function(*roles, t=t, params=params.params)
+    def __call__(self, *roles: Any, params: Lifted, t: Any = 0.0, **more: Any) -> PyTree:
+        return self.function(*roles, t=t, params=params.params, **more)
 
 
 def lift_problem(problem: Problem) -> Problem:
@@ -112,10 +112,12 @@ def _lift_function(function: Function, roles: int, problem: Problem, values: lis
     layout = problem.layout
     state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
 
-    def call_with_numbers(states, t, numbers):
-        return function(*states, t=t, params=eqx.combine(numbers, rest))
+    def call_with_numbers(states, t, numbers, more):
+        return function(*states, t=t, params=eqx.combine(numbers, rest), **more)
 
-    closed, shapes = jax.make_jaxpr(call_with_numbers, return_shape=True)((state,) * roles, t, numbers)
+    reads = "multipliers" in function.extras
+    more = problem.system.multiplier_shapes(layout, problem.params) if reads else {}
+    closed, shapes = jax.make_jaxpr(call_with_numbers, return_shape=True)((state,) * roles, t, numbers, more)
     places = tuple(place_in(values, c) if isinstance(c, Tracer) else None for c in closed.consts)
     constants = tuple(None if isinstance(c, Tracer) else c for c in closed.consts)
     # The first arguments of the trace are what it took from outside. An edition also says where the

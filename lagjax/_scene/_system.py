@@ -21,6 +21,7 @@ from lagjax._engine.taylor import lowered_motion
 from lagjax._equations import (
     SADDLE,
     Constraints,
+    CoupledForces,
     Motion,
     Sample,
     derivation_of,
@@ -67,7 +68,11 @@ class System(eqx.Module):
     - `velocity_constraints(q, qdot)`: a(q, q̇, t) = 0 that cannot be integrated to such an f: rolling, skates.
 
     Each may also take, by name, the time `t` and the parameters `params` (any pytree), and in a scene that is fitted to
-    records their sampled `inputs` (`lagjax.Record`).
+    records their sampled `inputs` (`lagjax.Record`). Forces may also ask for the `multipliers` of the constraints, in
+    the structure of `System.multipliers`, as the friction μ|N| of a bead on a wire or of a bearing does: both are
+    solved for together, of constraints that are independent. No acceleration exists (it is NaN) where none, or of a
+    single multiplier more than one, satisfies the law. At rest such friction holds where its direction is that of a
+    speed, `jnp.sign(tangent @ v)`.
 
     **Contacts**
 
@@ -159,9 +164,14 @@ class System(eqx.Module):
         )  # fmt: skip
         for role, function in zip(ROLES, functions, strict=True):
             absent, extras = function is None and role != ROLES[0], ("t", "params", "inputs")
-            extras = extras if ARGUMENTS[role] else ("params",)
+            extras = (*extras, "multipliers") if role == "forces" else extras if ARGUMENTS[role] else ("params",)
             accepted = None if absent else accept(cast(Callable, function), role, ARGUMENTS[role], extras)
             setattr(self, role, accepted)
+        if self.reads_multipliers and (self.touches or not self._constraint_roles):
+            raise ValueError(
+                "forces asks for `multipliers`, those of constraints=... and velocity_constraints=..., which this "
+                + ("scene has beside contacts: their friction is friction=..." if self.touches else "System has not.")
+            )
 
     def __repr__(self) -> str:
         """One line: the functions of the scene and what each asks for. `equinox.tree_pprint` prints the fields."""
@@ -174,6 +184,11 @@ class System(eqx.Module):
     def touches(self) -> bool:
         """True if the scene has contacts or one-way velocities."""
         return self.contacts is not None or self.one_way is not None
+
+    @property
+    def reads_multipliers(self) -> bool:
+        """True if the forces ask for the multipliers of the constraints."""
+        return isinstance(self.forces, Function) and "multipliers" in self.forces.extras
 
     def _require_present(self) -> None:
         """Raise `ValueError` where something that a function of the scene reads has changed since this one was made."""
@@ -307,25 +322,34 @@ class System(eqx.Module):
         def flatten_function(function: Any, to_array: Callable) -> Any:
             """The user's function in flat coordinates, the last of which are (t, params); `to_array` flattens it."""
 
-            def flat(*arguments):
+            def flat(*arguments, **more):
                 *vectors, t, numbers = arguments
                 trees = map(layout.restore, vectors)
-                return to_array(function(*trees, t=t, params=eqx.combine(numbers, code)))
+                return to_array(function(*trees, t=t, params=eqx.combine(numbers, code), **more))
 
             return function and flat
 
         def concatenate(tree: PyTree) -> jax.Array:  # of float64, as constants may be, in a scene in float32
             return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(tree)]).astype(layout.dtype)
 
-        return Motion(
+        forces = flatten_function(self.forces, layout.flatten)
+        motion = Motion(
             lagrangian=flatten_function(self.lagrangian, lambda value: value),
-            forces=flatten_function(self.forces, layout.flatten),
+            forces=None if self.reads_multipliers else forces,
             dissipation=flatten_function(self.dissipation, lambda value: value),
             constraints=Constraints(
                 flatten_function(self.constraints, concatenate),
                 flatten_function(self.velocity_constraints, concatenate),
             ),
         )
+        if not self.reads_multipliers:
+            return motion
+
+        def law(*state_and_multipliers):
+            *state, flat = state_and_multipliers
+            return forces(*state, multipliers=self._split_by_constraint(flat, layout, params))
+
+        return dataclasses.replace(motion, forces=CoupledForces(law, motion))
 
     def _require_constraints(self) -> None:
         if not self._constraint_roles:
@@ -435,9 +459,19 @@ class System(eqx.Module):
         numbers, code = eqx.partition(params, eqx.is_array_like)
         function, count = getattr(self, role), len(ARGUMENTS[role])
         state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
+        more = self.multiplier_shapes(layout, params) if role == "forces" else {}
         return jax.eval_shape(
-            lambda q, t, p: function(*[q] * count, t=t, params=eqx.combine(p, code)), state, t, numbers
-        )
+            lambda q, t, p, more: function(*[q] * count, t=t, params=eqx.combine(p, code), **more),
+            state, t, numbers, more,
+        )  # fmt: skip
+
+    def multiplier_shapes(self, layout: Layout, params: PyTree) -> dict[str, PyTree]:
+        """The shapes of what the forces are called with beside t and params: of the multipliers, if they read them."""
+        if not self.reads_multipliers:
+            return {}
+        count = sum(x.size for x in jax.tree.leaves(self._constraint_structure(layout, params)))
+        flat = jnp.zeros(count, layout.dtype)
+        return {"multipliers": jax.eval_shape(lambda x: self._split_by_constraint(x, layout, params), flat)}
 
 
 def _names_of(tree: PyTree, role: str) -> list[str]:

@@ -78,7 +78,11 @@ class Form(NamedTuple):
     def drive_scene(self, system: System) -> System:
         present = [name for name in _FUNCTIONS if getattr(system, name) is not None]
         parts = [eqx.partition(_FunctionOfInputs(getattr(system, name), self), eqx.is_array) for name in present]
-        wrapped = [Function(arrays, Edition.from_function(code), ("t", "params")) for arrays, code in parts]
+        extras = [tuple({"t": 0, "params": 0} | dict.fromkeys(getattr(system, x).extras)) for x in present]
+        wrapped = [
+            Function(arrays, Edition.from_function(code), tuple(x for x in of if x != "inputs"))
+            for (arrays, code), of in zip(parts, extras, strict=True)
+        ]
         return eqx.tree_at(lambda s: [getattr(s, name) for name in present], system, wrapped)
 
     def bind_samples(self, system: Scene, params: PyTree, ts: np.ndarray, inputs: np.ndarray) -> tuple[Scene, PyTree]:
@@ -103,8 +107,8 @@ class _FunctionOfInputs(eqx.Module):
     def __name__(self) -> str:
         return self.function.name
 
-    def __call__(self, *roles, t, params: Driven):
-        extras = {"t": t, "params": params.params}
+    def __call__(self, *roles, t, params: Driven, **more):
+        extras = {"t": t, "params": params.params, **more}
         if "inputs" in self.function.extras:
             extras["inputs"] = self.form.restore(samples(params.knots, params.values, self.form.hold)(t))
         return self.function(*roles, **extras)
