@@ -37,3 +37,11 @@ def test_none_of_a_family_is_wrong(family):
 @pytest.mark.slow
 def test_none_of_a_box_is_wrong_in_single_precision():
     assert_none_wrong("--scenes", "4", "--families", "box", "--float32")
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("seed", [317, 341])
+def test_arms_that_align_slide_on(seed):
+    """Where both rods are in line, what slips is held by the gap itself: it passes through zero and turns."""
+    counts = contact_population.main(["--scenes", "1", "--families", "arms", "--first", str(seed)])
+    assert counts == {"right": 1}, dict(counts)

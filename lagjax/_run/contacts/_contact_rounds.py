@@ -36,6 +36,7 @@ from lagjax._run.contacts._impact_law import (
     ImpactRows,
     Pattern,
     find_pattern,
+    held_slips,
     impulse_solver,
     reached,
     sliding_margin,
@@ -365,6 +366,9 @@ class ContactRounds(NamedTuple):
         slips = self.slips(quiet, still(v), before.slip)
         closed = (was_closed & ~first[:count]) | meets
         sticks = self.sticks(contacts, slips, first[count:], (closed != was_closed)[self.flat.rough])
+        # Where parts align, a slip that gaps hold passes through zero, and turns.
+        turns = first[count:] & sticks & held_slips(quiet, closed.astype(float), friction.still)
+        sticks = sticks & ~turns
 
         # Behind an impact impulses follow its law; else velocities become those that what is closed allows.
         held = Pattern(closed.astype(float), sticks.astype(float), jnp.zeros_like(contacts.direction))
@@ -389,7 +393,8 @@ class ContactRounds(NamedTuple):
             # In space what varies across a slip that begins from rest decays so fast that steps do not follow it.
             leaves_rest = (breaks & (self.flat.shapes.directions > 1)).any()
             direction = self.directions(before, quiet, t, y, behind, breaks, renewed)
-            turned = renewed | (sticks != (contacts.sticks > 0))
+            direction = jnp.where(turns[:, None], -direction, direction)
+            turned = renewed | turns | (sticks != (contacts.sticks > 0))
             along = Pattern(closed.astype(float), sticks.astype(float), _unit(direction))
             undecided |= (sliding_margin(quiet, along, friction.still) <= PARADOX).any()
         # The gap that closes is zero, also as what went in varies: what rounding leaves of it grows with each bounce.

@@ -139,6 +139,18 @@ def _independent(coupling, held):
     return jax.lax.fori_loop(0, len(held), eliminate, (coupling, jnp.zeros(len(held))))[1]
 
 
+def held_slips(rows: ImpactRows, closed, friction: Friction):
+    """True for each contact in a plane (r,) whose slip the `closed` gaps (k,) hold: friction cannot hold it as well."""
+    count, places = len(closed), friction.places(len(closed))[:, 0]
+    if friction.directions > 1 or not places.size:
+        return jnp.zeros(len(places), bool)
+    among = jnp.outer(closed, closed) * rows.coupling[:count, :count] + jnp.diag(1.0 - closed)
+    own, others = rows.coupling[places, places], closed * rows.coupling[places, :count]
+    solve = factorize_general(among)
+    held = jnp.stack([row @ solve(row) for row in others])
+    return own - held <= DEPENDENT * own
+
+
 def find_pattern(rows: ImpactRows, touches, restitution, friction: Friction) -> tuple[Pattern, Any]:
     """The pattern of contacts that touch (k,) in an impact, and whether that is a solution of the law.
 
