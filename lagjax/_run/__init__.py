@@ -1,8 +1,8 @@
 """From a scene and its start to a motion in the user's own pytree.
 
 `_simulate` holds `simulate` and `simulate_batch`, `_crossings` the instants at which a function of the state changes
-sign, `hybrid/` motions through modes, `contacts/` those with contacts. `_trajectory` is what they return,
-`_batch_members` its members along one axis.
+sign, `hybrid/` motions through modes, `contacts/` those with contacts, `_rounds` what these two share. `_trajectory` is
+what they return, `_batch_members` its members along one axis.
 """
 
 from lagjax._run._batch_members import Members

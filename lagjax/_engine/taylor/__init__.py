@@ -34,7 +34,7 @@ from lagjax._engine.taylor._flow import Flow, Tolerances, require_fit
 from lagjax._engine.taylor._kept_steps import KEPT, StepStore
 from lagjax._engine.taylor._line_functions import line_of
 from lagjax._engine.taylor._lowered_motion import lowered_motion
-from lagjax._engine.taylor._surfaces import Guarded, Surfaces, crossing_variation, require_one_number, vector_of
+from lagjax._engine.taylor._surfaces import Guarded, Surfaces, require_one_number, vector_of
 from lagjax._equations import Derivation
 from lagjax._interface import default_platform, has_nvidia_gpu, is_concrete
 from lagjax._native import Guards, Nesting, append_guards, pieces_of
@@ -155,7 +155,7 @@ class MachineCode(AbstractEngine):
         numbers = jnp.concatenate([numbers, jnp.asarray(sides, float)])
         return _primitives.run(flow_of(problem), tolerances_of(problem), ts, y0, numbers)
 
-    def vary_to_event(self, problem: Problem, surfaces: Surfaces, located: Solution, k, crosses) -> tuple:
+    def vary_to_event(self, problem: Problem, surfaces: Surfaces | None, located: Solution, k, crosses) -> tuple:
         """(path, t, y): what `solve_to_event` has `located`, of the same problem, with first and second derivatives.
 
         They are those of outputs up to the event, and of the event, where surface k is zero if it `crosses`; else the

@@ -26,10 +26,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine import Problem
-from lagjax._engine.taylor import Guarded, MachineCode, Surfaces, line_of, vector_of
+from lagjax._engine.taylor import Guarded, Surfaces, line_of, vector_of
 from lagjax._interface import RESULTS, SUCCESSFUL, Layout, code_of, halves
 from lagjax._native import SINGLE_NOISE
-from lagjax._primitives import cond_alike, differentiable_where, keep_together, lost_unless
+from lagjax._primitives import differentiable_where, keep_together, lost_unless
+from lagjax._run._rounds import Stretch, run_rounds
 from lagjax._run._trajectory import vary_with
 from lagjax._run.contacts._impact_law import (
     Friction,
@@ -50,7 +51,6 @@ TOO_MANY, UNDECIDED, NOT_FINITE, INCONSISTENT = map(
     (RESULTS.max_transitions_reached, RESULTS.contact_undecided, RESULTS.nonfinite_state, RESULTS.inconsistent_start),
 )
 CLOSES, OPENS, BOUNCES, STICKS, SLIDES = range(5)  # the kinds of `ContactChanges`
-BLOCK = 32  # rounds that are left out together where no motion goes on: what goes on is copied for each
 # The time that bounces still take, in parts of a step of the motion between them, below which they end in closed form,
 # and what that leaves out: twice as long, heights of 4e-9 of those of a step are left out.
 SHORT, LEFT_OUT = 1e-4, 1e-14
@@ -133,23 +133,8 @@ def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) ->
     ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
     rounds = ContactRounds.from_plan(plan, layout, ts, y0, params)
     first = vary_with(rounds.begin(y0), ts, y0, rounds.vector, varying=("t", "y", "path"))
-    blocks = -(-plan.max_transitions // BLOCK)
-
     absent = RoundRecord.absent(y0.size, rounds.count)
-
-    def while_going(run, idle):
-        def keep(carry, _):
-            return carry, idle
-
-        return lambda carry, count: cond_alike(any_member(carry.going), run, keep, carry, count)
-
-    def run_block(carry, counts):
-        return jax.lax.scan(while_going(rounds.run_round, absent), carry, counts)
-
-    counts = jnp.arange(blocks * BLOCK).reshape(blocks, BLOCK)
-    idle = jax.tree.map(lambda x: jnp.broadcast_to(x, (BLOCK, *x.shape)), absent)
-    ending, record = jax.lax.scan(while_going(run_block, idle), first, counts)
-    record = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[: plan.max_transitions], record)
+    ending, record = run_rounds(rounds.run_round, first, absent, plan.max_transitions)
     inputs = ts, y0, rounds.vector
 
     def lost(there, *numbers):
@@ -162,17 +147,6 @@ def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) ->
     t_impact, impulse, energy_lost = (x[order] for x in (t_impact, impulse, energy_lost))
     impacts = t_impact, rounds.flat.shapes.name_numbers(impulse), energy_lost, jnp.sum(record.hits)
     return ending._replace(path=path), record._replace(t=t, qdot=qdot, y_next=y_next), impacts
-
-
-@jax.custom_batching.custom_vmap
-def any_member(going):
-    """True if a motion, or any of those that `jax.vmap` runs beside it, goes on."""
-    return going
-
-
-@any_member.def_vmap
-def _(size, batched, going):
-    return any_member(going.any(0) if batched[0] else going), False
 
 
 class ContactRounds(NamedTuple):
@@ -227,9 +201,6 @@ class ContactRounds(NamedTuple):
     def numbers_in(self, contacts: Contacts):
         return jnp.concatenate([self.vector, *map(jnp.ravel, contacts)])
 
-    def problem_in(self, contacts: Contacts, ts, y0) -> Problem:
-        return dataclasses.replace(self.problem, params=InContact(self.params, contacts), ts=ts, y0=y0)
-
     # ---- a round ----
 
     def begin(self, y0) -> Carry:
@@ -257,34 +228,23 @@ class ContactRounds(NamedTuple):
 
     def run_round(self, before: Carry, count) -> tuple[Carry, RoundRecord]:
         """One round: to the next watch that falls, through what happens there; of a motion that is going."""
-        here, contacts, t_start = before.going, before.contacts, jax.lax.stop_gradient(before.t)
+        here, contacts = before.going, before.contacts
         guarded, kinds = self.watch(before.t, before.y, contacts), jnp.concatenate([contacts.closed, contacts.sticks])
         before = _note_rounding(before, guarded, kinds, 0.0)
         rounding = jnp.maximum(_choose_kind(before.rounding, kinds), guarded.of_time)
         beyond = guarded.values < -rounding
         sides = jnp.where(beyond, jnp.inf, jnp.maximum(rounding, _LEAST))
-        ahead = here & ((self.ts > t_start) | (self.ts == jnp.where(t_start == self.ts[0], t_start, jnp.nan)))
-        horizon = jnp.where(here, self.ts[-1], t_start)
-        times = jnp.concatenate([before.t[None], jnp.where(ahead, self.ts, t_start), horizon[None]])
-        problem = self.problem_in(contacts, times, before.y)
-        problem = dataclasses.replace(problem, guards=self.surfaces.guards(remembers=True))
         noted = jnp.concatenate([sides, _choose_kind(before.rate_rounding, kinds)])
-        located = MachineCode().solve_to_event(problem, noted)
-        fell = (jnp.where(here, located.event, 0) >> (2 * np.arange(kinds.size))) & 3 > 0
-        t_end = jnp.where(here & (located.result == SUCCESSFUL), self.ts[-1], located.t_end)
-        covered = ahead & (self.ts <= t_end)
-
-        happens, at_once = fell.any(), t_end == t_start
+        problem = dataclasses.replace(self.problem, params=InContact(self.params, contacts))
+        stretch = Stretch.locate(problem, self.surfaces, (before.t, before.y), self.ts, here, noted, kinds.size)
+        located, covered, at_once, fell = stretch.located, stretch.covers, stretch.at_once, stretch.kinds > 0
+        happens = fell.any()
         k = self.first_of(fell, at_once, contacts)
-        crosses = happens & ~(at_once & _pick(before.fresh | beyond, k))
-        located = located._replace(t_end=t_end)
-        path, t, y = MachineCode().vary_to_event(problem, self.surfaces, located, k, crosses)
-        # What happens at once, and is no crossing, moves nothing: it varies with the instant at which it is decided.
-        stays = happens & at_once & ~crosses
-        t, y = jnp.where(stays, before.t, t), jnp.where(stays, before.y, y)
+        path, t, y = stretch.vary(k, happens & ~(at_once & _pick(before.fresh | beyond, k)))
+        duration = located.t_end - jax.lax.stop_gradient(before.t)
         turns = jnp.where(at_once, before.turns + 1, 0)
-        step = jnp.where(at_once, 0.0, (t_end - t_start) / jnp.maximum(located.accepted, 1))
-        before = _note_rounding(before, guarded, kinds, t_end - t_start)._replace(
+        step = jnp.where(at_once, 0.0, duration / jnp.maximum(located.accepted, 1))
+        before = _note_rounding(before, guarded, kinds, duration)._replace(
             fresh=before.fresh & at_once, longest=jnp.maximum(before.longest, step)
         )
         decided, record = self.decide(before, t, y, k)
@@ -302,7 +262,7 @@ class ContactRounds(NamedTuple):
             result=jnp.where(spent, TOO_MANY, result), turns=turns,
             steps=(before.steps[0] + located.accepted, before.steps[1] + located.rejected),
             rounds=before.rounds + happens,
-            path=jnp.where(covered[:, None], path[1:-1], before.path),
+            path=jnp.where(covered[:, None], path, before.path),
             of_path=jax.tree.map(cover, before.of_path, contacts),
         )  # fmt: skip
         after = jax.tree.map(lambda new, old: jnp.where(here, new, old), after, before)

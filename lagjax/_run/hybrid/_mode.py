@@ -1,12 +1,7 @@
-"""One mode of a hybrid motion: its problem, its guards as programs, and the way through a transition.
+"""One mode of a hybrid motion: its problem, its guards as programs, and the reset of a transition.
 
-Where a guard vanishes is found by machine code, without derivatives. Those of the crossing come from the implicit
-function: with g the guard and ġ its rate along the motion,
-
-    dt* = −dg / ġ        dy* = dy + ẏ dt*
-
-and the same to second order (`Mode.crossing`), after which the reset is differentiated like any function. Together
-these are the jump of a sensitivity at an event ("saltation matrix").
+The reset is differentiated like any function. Together with the crossing of the guard (`taylor._surfaces`)
+this is the jump of a sensitivity at an event ("saltation matrix").
 """
 
 import dataclasses
@@ -19,18 +14,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._engine import Problem, Solution
+from lagjax._engine import Problem
 from lagjax._engine.taylor import (
     MOST_GUARDS,
     Guarded,
     MachineCode,
     Surfaces,
-    crossing_variation,
     require_one_number,
 )
 from lagjax._equations import Derivation
 from lagjax._interface import Function, Layout, accept, halves, present
-from lagjax._primitives import DOUBLE, SINGLE, attach_derivative
+from lagjax._primitives import DOUBLE, SINGLE
 from lagjax._program import Unlowerable
 from lagjax._scene import System
 
@@ -154,32 +148,9 @@ class Mode(NamedTuple):
     def layout(self) -> Layout:
         return self.problem.layout
 
-    # ---- along the mode ----
-
-    def solve(self, ts, y0) -> Solution:
-        return MachineCode().solve(dataclasses.replace(self.problem, ts=ts, y0=y0))
-
-    def solve_to_event(self, ts, y0, sides) -> Solution:
-        """The motion to the last of the times `ts`, or to the first zero of a guard; it has no derivatives.
-
-        Where it begins on a surface it comes from that one of the `sides` (see `_native.Guards`).
-        """
-        guards = self.surfaces and self.surfaces.guards(remembers=True)
-        guarded = dataclasses.replace(self.problem, ts=ts, y0=y0, guards=guards)
-        return MachineCode().solve_to_event(guarded, sides)
-
-    # ---- through a transition ----
-
     def guards_at(self, t, y, latest) -> Guarded:
         """The guards at a state, without derivatives, of a run that ends at `latest`."""
         return self.surfaces.evaluate_guards(t, y, self.vector, latest, self.widths)
-
-    def crossing(self, k, taken, t, y, numbers) -> tuple:
-        """(t, y): the state at t, where guard k is zero and stays so as what went in varies, if it is `taken`.
-
-        See `taylor.crossing_variation`.
-        """
-        return attach_derivative(crossing_variation(self.surfaces), (t, y), k, taken, t, y, numbers)
 
     def is_inconsistent(self, t, y):
         system, params = self.problem.system, self.problem.params

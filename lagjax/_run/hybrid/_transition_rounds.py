@@ -1,7 +1,7 @@
-"""The rounds of a hybrid motion: a `jax.lax.scan` in which every round ends with a transition, or ends the motion.
+"""The rounds of a hybrid motion: each ends with a transition, or ends the motion.
 
 A round runs every member to the end of its time or to the next zero of a guard of its mode, writes down the outputs on
-the way, and puts it into the next mode. Along a round derivatives are those of machine code; at its end see `_mode`.
+the way, and puts it into the next mode.
 """
 
 import dataclasses
@@ -19,6 +19,7 @@ from lagjax._engine.taylor import Guarded, vector_of
 from lagjax._interface import RESULTS, SUCCESSFUL, Layout, code_of
 from lagjax._native import SINGLE_NOISE
 from lagjax._primitives import lost_unless
+from lagjax._run._rounds import Stretch, run_rounds
 from lagjax._run._trajectory import constant_unless, vary_with
 from lagjax._run.hybrid._mode import Mode, Transition, state_after
 from lagjax._scene import System
@@ -128,12 +129,15 @@ class TransitionRecord(NamedTuple):
     target: jax.Array
     order_matters: jax.Array
 
+    @classmethod
+    def absent(cls, states: int) -> "TransitionRecord":
+        none, nowhere = jnp.asarray(-1), jnp.full(states, jnp.nan)
+        return cls(jnp.asarray(jnp.nan), nowhere, nowhere, none, none, jnp.asarray(False))
+
 
 class Exit(NamedTuple):
-    """The end of a round: when and where it was, the state after the reset, and what becomes of the motion."""
+    """The end of a round: the state after the reset, and what becomes of the motion."""
 
-    t: jax.Array
-    y: jax.Array
     y_next: jax.Array
     target: jax.Array
     number: jax.Array  # of the transition
@@ -158,7 +162,7 @@ def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree) -> tu
         let_out=jnp.full(len(plan.transitions), jnp.nan),
     )  # fmt: skip
     first = vary_with(first, ts, y0, rounds.modes[0].vector)
-    ending, record = jax.lax.scan(rounds.run_round, first, jnp.arange(plan.max_transitions + 1))
+    ending, record = run_rounds(rounds.run_round, first, TransitionRecord.absent(y0.size), plan.max_transitions + 1)
     record = jax.tree.map(lambda x: x[: plan.max_transitions], record)
     still = jax.lax.stop_gradient(record)
     named = jnp.where(_go_in_turn(still), IN_TURN, jnp.where(_pile_up(still.t, ts[-1]), ZENO, TOO_MANY))
@@ -178,9 +182,7 @@ class _Rounds(NamedTuple):
 
     def run_round(self, before: Ending, count) -> tuple[Ending, TransitionRecord]:
         """One round: every mode runs the members that are in it; the others are given no time."""
-        after, fired = before, jnp.asarray(False)
-        nowhere, none = jnp.full_like(before.y, jnp.nan), jnp.asarray(-1)
-        record = TransitionRecord(jnp.asarray(jnp.nan), nowhere, nowhere, none, none, fired)
+        after, fired, record = before, jnp.asarray(False), TransitionRecord.absent(before.y.size)
         guards = [mode.guards_at(before.t, before.y, self.ts[-1]) if mode.leaving else None for mode in self.modes]
         before = before._replace(memory=self._note_rounding(before, guards))
         for place in range(len(self.modes)):
@@ -203,83 +205,66 @@ class _Rounds(NamedTuple):
         self, place: int, guarded: Guarded | None, before: Ending, here
     ) -> tuple[Ending, jax.Array, TransitionRecord]:
         """One round in the mode of this `place` for members that are `here`, and whether a transition ended it."""
-        mode, t_start, memory = self.modes[place], jax.lax.stop_gradient(before.t), before.memory
-        outset = self._outset(place, guarded, before)
-        horizon = jnp.where(here, self.ts[-1], t_start)
-        noted = jnp.concatenate([outset.sides, _pick(memory.rate_rounding, self._places_of(mode))])
-        located = mode.solve_to_event(jnp.stack([t_start, horizon]), before.y, noted)
-        changes = jnp.where(here, located.event, 0)
-        t_end = jnp.where(here & (located.result == SUCCESSFUL), self.ts[-1], located.t_end)
-
-        # The same stretch once more, with derivatives and outputs; where it ends is known better already.
-        covered = here & ((self.ts > t_start) | (self.ts == jnp.where(t_start == self.ts[0], t_start, jnp.nan)))
-        covered = covered & (self.ts <= t_end)
-        inside = jnp.where(covered, self.ts, jax.lax.stop_gradient(jnp.clip(self.ts, t_start, t_end)))
-        moved = mode.solve(jnp.concatenate([before.t[None], inside, t_end[None]]), before.y)
-        y_end = located.y_end + jnp.where(here, moved.y_end - jax.lax.stop_gradient(moved.y_end), 0.0)
-
-        at_once = here & (t_end == t_start)
-        kinds = (changes >> jnp.arange(0, 2 * len(mode.leaving), 2)) & 3
-        put = outset.beyond & at_once
-        known = before.memory, outset.sides, t_end <= outset.lasting
-        exit, memory = self._pass_transition(place, before, kinds, at_once, put, t_end, y_end, known)
+        mode, outset = self.modes[place], self._outset(place, guarded, before)
+        noted = jnp.concatenate([outset.sides, _pick(before.memory.rate_rounding, self._places_of(mode))])
+        start, count = (before.t, before.y), len(mode.leaving)
+        stretch = Stretch.locate(mode.problem, mode.surfaces, start, self.ts, here, noted, count)
+        located, covered, at_once, kinds = stretch.located, stretch.covers, stretch.at_once, stretch.kinds
+        # One that the motion was put beyond is no crossing: it happens when the mode begins, however that varies.
+        put, k = outset.beyond & at_once, jnp.argmax(jnp.append(kinds, 0) > 0)
+        path, t_end, y_end = stretch.vary(k, (kinds > 0).any() & ~_pick(put, np.arange(kinds.size) == k))
+        known = before.memory, outset.sides, located.t_end <= outset.lasting
+        exit, memory = self._pass_transition(place, before, kinds, at_once & ~put, t_end, y_end, known)
         places = self._places_of(mode)
         are_let_out, first_time = here & outset.blows & ~((kinds > 0) & at_once), _pick(before.let_out, places)
-        event = (changes > 0) & ~exit.piled_up
+        event = (kinds > 0).any() & ~exit.piled_up
         result = jnp.where(exit.piled_up, ZENO, jnp.where(here & ~event, located.result, before.result))
         # A reset may give NaN, and a guard that is NaN never fires.
         sound = jnp.isfinite(jnp.where(event, exit.y_next, y_end)).all() & exit.guards_defined
         broken = here & ~sound & (event | (result == SUCCESSFUL))
         result = jnp.where(broken, NOT_FINITE, jnp.where(event & exit.inconsistent, INCONSISTENT, result))
-        let_out = _put(before.let_out, places, jnp.where(are_let_out & jnp.isnan(first_time), t_start, first_time))
+        first_let_out = jnp.where(are_let_out & jnp.isnan(first_time), jax.lax.stop_gradient(before.t), first_time)
         after = Ending(
-            *_select(event, (exit.t, exit.y_next, exit.target), (t_end, y_end, before.mode)),
+            t_end, *_select(event, (exit.y_next, exit.target), (y_end, before.mode)),
             going=event & ~exit.inconsistent & ~broken, result=result,
-            path=jnp.where(covered[:, None], moved.path[1:-1], before.path),
+            path=jnp.where(covered[:, None], path, before.path),
             modes=jnp.where(covered, before.mode, before.modes),
             steps=before.steps + jnp.stack([located.accepted, located.rejected]),
-            latest=exit.number, memory=memory, let_out=let_out,
+            latest=exit.number, memory=memory, let_out=_put(before.let_out, places, first_let_out),
         )  # fmt: skip
-        return after, event, TransitionRecord(exit.t, exit.y, exit.y_next, before.mode, exit.target, exit.order_matters)
+        return after, event, TransitionRecord(t_end, y_end, exit.y_next, before.mode, exit.target, exit.order_matters)
 
-    def _pass_transition(
-        self, place: int, before: Ending, kinds, at_once, put, t, y, known
-    ) -> tuple[Exit, GuardMemory]:
+    def _pass_transition(self, place: int, before: Ending, kinds, turns, t, y, known) -> tuple[Exit, GuardMemory]:
         """The state behind the first transition of those whose guard falls (1) or rises (2), as `kinds` (K,) say.
 
-        One that the motion was `put` beyond is no crossing: it happens when the mode begins, however that varies.
+        Where that `turns` (K,) a guard at once, against its rate, the motion that does so is lost in rounding.
         """
         no, mode = jnp.asarray(False), self.modes[place]
         if not mode.leaving:
-            none = Exit(t, y, y, before.mode, jnp.asarray(-1), no, no, jnp.asarray(True), no)
+            none = Exit(y, before.mode, jnp.asarray(-1), no, no, jnp.asarray(True), no)
             return none, self.no_memory(known[0].rounding, known[0].rate_rounding)
         happens, k = (kinds > 0).any(), jnp.argmax(kinds > 0)
         first, places = np.arange(len(mode.leaving)) == k, self._places_of(mode)
-        y_here, vector = constant_unless(happens, (y, mode.vector))
         guarded = mode.guards_at(t, y, self.ts[-1])
         rates = guarded.clear_rates(_pick(known[0].rate_rounding, places))
-        # It changes sign at once, against its rate: the motion that turns it round is lost in rounding.
-        against = happens & _pick(jnp.where(kinds == 2, rates < 0, rates > 0) & ~put, first) & at_once
-        is_put = _pick(put, first)
-        crossed = mode.crossing(k, happens & ~is_put, t, y_here, vector)
-        t_zero, y_zero = _select(happens, _select(is_put, (before.t, before.y), crossed), (t, y))
-        y_next = y_zero
+        against = happens & _pick(jnp.where(kinds == 2, rates < 0, rates > 0) & turns, first)
+        y_next = y
         for j, transition in enumerate(mode.leaving):
             if transition.reset is not None:
                 taken = happens & (k == j)
-                state = constant_unless(taken, (t_zero, y_zero, mode.problem.params))
+                state = constant_unless(taken, (t, y, mode.problem.params))
                 moved = state_after(transition, mode.layout, *state)
                 y_next = jnp.where(taken, moved, y_next)
         target, number = (
             jnp.where(happens, _pick(jnp.asarray(x), first), other)
             for x, other in ((mode.targets, before.mode), (mode.numbers, -1))
         )
-        inconsistent = happens & self.is_inconsistent(target, t_zero, y_next, np.unique(mode.targets).tolist())
+        inconsistent = happens & self.is_inconsistent(target, t, y_next, np.unique(mode.targets).tolist())
         memory = self._memory(mode, guarded, rates, kinds, *known)
         there = (kinds > 0) | (jnp.abs(guarded.values) <= _pick(memory.rounding, places) + guarded.of_time)
         order_matters = self._order_matters(place, t, y, rates, there & (kinds > 0).any())
         defined = ~jnp.isnan(guarded.values).any()
-        return Exit(t_zero, y_zero, y_next, target, number, against, inconsistent, defined, order_matters), memory
+        return Exit(y_next, target, number, against, inconsistent, defined, order_matters), memory
 
     def _order_matters(self, place: int, t, y, rates, there) -> jax.Array:
         """True if blows of guards that are `there`, (K,), lead elsewhere when the list is read from its end.

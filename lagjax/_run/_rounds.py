@@ -1,0 +1,100 @@
+"""Rounds of a motion: each follows one stretch, to the next guard that changes, and decides what comes behind it.
+
+    run_rounds ─► a round, while any motion goes on ─► Stretch.locate ─► which guard ends it ─► Stretch.vary
+
+Contacts and hybrid motion differ in their guards, and in what they decide.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._engine import Problem, Solution
+from lagjax._engine.taylor import MachineCode, Surfaces
+from lagjax._interface import SUCCESSFUL
+from lagjax._primitives import cond_alike
+
+PyTree = Any
+
+BLOCK = 32  # rounds that are left out together where no motion goes on: what goes on is copied for each
+
+
+def run_rounds(run_round: Callable, first, absent: PyTree, count: int) -> tuple[Any, PyTree]:
+    """The last carry, and the records (count, …), of `run_round(carry, number)` while a carry is `going`.
+
+    In a batch it runs while any member goes on. The records of rounds that are left out are `absent`.
+    """
+
+    def while_going(run, idle):
+        def keep(carry, _):
+            return carry, idle
+
+        return lambda carry, numbers: cond_alike(any_member(carry.going), run, keep, carry, numbers)
+
+    def run_block(carry, numbers):
+        return jax.lax.scan(while_going(run_round, absent), carry, numbers)
+
+    if count <= 2 * BLOCK:
+        return run_block(first, jnp.arange(count))
+    blocks = -(-count // BLOCK)
+    idle = jax.tree.map(lambda x: jnp.broadcast_to(x, (BLOCK, *x.shape)), absent)
+    numbers = jnp.arange(blocks * BLOCK).reshape(blocks, BLOCK)
+    ending, record = jax.lax.scan(while_going(run_block, idle), first, numbers)
+    return ending, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], record)
+
+
+@jax.custom_batching.custom_vmap
+def any_member(going):
+    """True if a motion, or any of those that `jax.vmap` runs beside it, goes on."""
+    return going
+
+
+@any_member.def_vmap
+def _(size, batched, going):
+    return any_member(going.any(0) if batched[0] else going), False
+
+
+class Stretch(NamedTuple):
+    """A motion to the first change of its guards, or to the last of the output times; of no length if it is not `here`.
+
+    It is `located` without derivatives. It starts at the first time and the state of `problem`, of which the others are
+    those outputs (T,) that lie ahead, and covers some of them; it may end `at_once`. `kinds` (G,) are 1 for guards that
+    fell where it ends, 2 for those that rose, and 0.
+    """
+
+    problem: Problem
+    surfaces: Surfaces | None
+    located: Solution
+    kinds: jax.Array
+    covers: jax.Array
+    at_once: jax.Array
+
+    @classmethod
+    def locate(
+        cls, problem: Problem, surfaces: Surfaces | None, start: tuple, ts, here, noted, count: int
+    ) -> "Stretch":
+        """The stretch from `start`, (t, y), with `count` guards, of which the motion has `noted` (see `Guards`)."""
+        t, y = start
+        t_start = jax.lax.stop_gradient(t)
+        ahead = here & ((ts > t_start) | (ts == jnp.where(t_start == ts[0], t_start, jnp.nan)))
+        last = jnp.where(here, ts[-1], t_start)
+        times = jnp.concatenate([t[None], jnp.where(ahead, ts, t_start), last[None]])
+        guards = surfaces and surfaces.guards(remembers=True)
+        problem = dataclasses.replace(problem, ts=times, y0=y, guards=guards)
+        located = MachineCode().solve_to_event(problem, noted)
+        t_end = jnp.where(here & (located.result == SUCCESSFUL), ts[-1], located.t_end)
+        kinds = (jnp.where(here, located.event, 0) >> (2 * np.arange(count))) & 3
+        return cls(problem, surfaces, located._replace(t_end=t_end), kinds, ahead & (ts <= t_end), t_end == t_start)
+
+    def vary(self, k, crosses) -> tuple:
+        """(path, t, y): the outputs (T, 2n), and the end, where guard k is zero and stays so if it `crosses`.
+
+        What changes and is no crossing does so at once, and moves nothing: it varies as the start does.
+        """
+        path, t, y = MachineCode().vary_to_event(self.problem, self.surfaces, self.located, k, crosses)
+        stays = (self.kinds > 0).any() & ~crosses
+        return path[1:-1], jnp.where(stays, self.problem.ts[0], t), jnp.where(stays, self.problem.y0, y)
