@@ -720,6 +720,41 @@ def test_pytrees_and_quantities_of_like_constraints():
     assert set(run.to_xarray()) == {"ok", "q.x", "q.y", "qdot.x", "qdot.y", "mode"}
 
 
+# ---- a motion in pieces ---------------------------------------------------------------------------------------------
+
+
+def test_a_motion_goes_on_in_a_scan_of_short_ones_from_the_mode_where_it_is():
+    # A free particle that is reflected at q = 1, into another mode, and at q = 0 back: |q| is the way to the next even
+    # number.
+    turn = lambda q, v: (q, -v)
+    back = [
+        lagjax.Transition("out", "in", lambda q, v: q - 1.0, 1, turn),
+        lagjax.Transition("in", "out", lambda q, v: q, -1, turn),
+    ]
+    scene = lagjax.Hybrid({"out": FREE, "in": FREE}, back, "out")
+    count, dt = 40, 0.17
+
+    def pieces(speed):
+        def step(carry, _):
+            q, v, mode = carry
+            run = lagjax.simulate_hybrid(scene, q, v, jnp.array([0.0, dt]), start=mode, max_transitions=2)
+            return (run.q[-1], run.qdot[-1], run.mode[-1]), (run.q[-1], run.mode[-1])
+
+        return jax.lax.scan(step, (0.0 * speed, speed, jnp.asarray(0)), None, length=count)[1]
+
+    speeds = jnp.array([1.0, 1.3, 2.9])
+    q, mode = jax.jit(jax.vmap(pieces))(speeds)
+    way = np.asarray(speeds)[:, None] * dt * np.arange(1, count + 1)
+    np.testing.assert_allclose(q, np.abs(way - 2 * np.round(way / 2)), atol=1e-12)
+    np.testing.assert_array_equal(mode, np.floor(way) % 2)
+    slopes = jax.jit(jax.jacrev(lambda speed: pieces(speed)[0]))(1.3)
+    np.testing.assert_allclose(slopes, dt * np.arange(1, count + 1) * np.where(mode[1] == 0, 1, -1), rtol=1e-12)
+    # A place that is none, as that of what was not reached, is no motion.
+    lost = jax.jit(lambda mode: lagjax.simulate_hybrid(scene, 0.0, 1.0, jnp.arange(2.0), start=mode, throw=False))(-1)
+    assert not lost.ok and np.isnan(lost.q).all()
+    assert lagjax.simulate_hybrid(scene, 0.5, -1.0, jnp.array([0.0, 1.0]), start="in").q[-1] == 0.5
+
+
 # ---- bad input ------------------------------------------------------------------------------------------------------
 
 
@@ -735,6 +770,9 @@ PLANE = lagjax.System(lambda q, v: 0.5 * v @ v)
     ("changes", "error", "sentence"),
     [
         ({"start": "z"}, ValueError, "start is 'z', which is no mode: the modes are 'a'"),
+        ({"start": 1}, ValueError, "start is 1, which is no mode: the modes are 'a'"),
+        ({"start": True}, ValueError, "start is True, which is no mode"),
+        ({"start": jnp.arange(2)}, ValueError, "start is Array.*, which is no mode"),
         ({"transitions": [stay("y")]}, ValueError, "source 'y', which is no mode"),
         ({"transitions": [stay("a", "y")]}, ValueError, "target 'y', which is no mode"),
         ({"modes": THREE, "transitions": [stay("a", "c"), stay("b", "a")]}, ValueError, "'a' to 'b': unreachable"),

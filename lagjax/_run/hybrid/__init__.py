@@ -94,7 +94,7 @@ def _accepts_hybrid(function: Callable) -> Callable:
         if not isinstance(modes, Hybrid):
             return function(modes, *args, **options)
         options = {"max_transitions": modes.max_transitions, **options}
-        start = options.pop("start", modes.start)
+        start = _place_of(modes.modes, options.pop("start", modes.start))
         return function(modes.modes, modes.transitions, start, *args, **options)
 
     return decorated
@@ -105,7 +105,7 @@ def _accepts_hybrid(function: Callable) -> Callable:
 def simulate_hybrid(
     modes: dict[str, System],
     transitions: list[Transition],
-    start: str,
+    start: str | int | jax.Array,
     q0: PyTree,
     qdot0: PyTree,
     ts: jax.Array,
@@ -120,7 +120,9 @@ def simulate_hybrid(
     r"""The motion from (q0, qdot0) in mode `start`, at the times `ts`, through every transition on the way.
 
     - `modes`: a `System` for each name; all share the structure of `q0` and `params`. Or a `Hybrid` in place of the
-      first three arguments: `simulate_hybrid(hybrid, q0, qdot0, ts, params)`.
+      first three arguments: `simulate_hybrid(hybrid, q0, qdot0, ts, params)`, and `start=` by name if it is another.
+    - `start`: the name of a mode, or its place in `modes`: an integer, which may be traced. So a motion goes on in a
+      `jax.lax.scan` of short ones, by `start=trajectory.mode[-1]`.
     - `transitions`: from which mode to which, and where. The earliest transition happens; of several at one instant,
       the first in the list. After it the same law holds as at the start (see `Transition`): guards that are at zero
       to rounding and go on in their direction follow at once, as do blows along a row of balls that touch, and those
@@ -164,26 +166,28 @@ def simulate_hybrid(
     require_flag(throw, "throw")
     layout = Layout.from_state(q0, qdot0)
     _require_modes(modes, transitions, start, max_transitions)
-    modes, transitions = _present(modes, transitions)
-    problem = Problem.from_arguments(modes[start], layout, q0, qdot0, ts, params, rtol, atol, max_steps)
+    start, (modes, transitions) = _place_of(modes, start), _present(modes, transitions)
+    systems, switches = tuple(modes.values()), tuple(transitions)
+    first = systems[int(start) if is_concrete(start) else 0]
+    problem = Problem.from_arguments(first, layout, q0, qdot0, ts, params, rtol, atol, max_steps)
     if not all(map(is_concrete, problem.tolerances)):
         raise ValueError("rtol and atol of simulate_hybrid must be numbers: they decide the order of the method.")
     if is_concrete(problem.ts) and np.asarray(problem.ts)[-1] < np.asarray(problem.ts)[0]:
         raise ValueError("simulate_hybrid goes forward in time: a reset cannot be undone; ts must increase.")
     q0, qdot0 = as_arrays((q0, qdot0), layout.dtype, "state")
-    require_consistent(modes[start], layout, problem.ts, q0, qdot0, problem.params)
+    if is_concrete(start):
+        require_consistent(first, layout, problem.ts, q0, qdot0, problem.params)
     rtol, atol = float(MachineCode().rtol(problem.double_precision)), None if atol is None else float(atol)
-    systems, switches = tuple(modes.values()), tuple(transitions)
-    limits = start, max_transitions, rtol, atol, max_steps, problem.is_single
+    limits = max_transitions, rtol, atol, max_steps, problem.is_single
     plan = RoundPlan(tuple(modes), systems, switches, *limits)
-    ending, record = _motion(plan, problem)
+    ending, record = _motion(plan, problem, start)
     trajectory = _trajectory(modes, problem, ending, record)
     return _raise_unless_ok(modes, trajectory, layout, ending.mode) if throw else trajectory
 
 
-def _motion(plan: RoundPlan, problem: Problem) -> tuple[Ending, TransitionRecord]:
-    """The rounds of a problem, in float64, in its own precision."""
-    given = problem.ts, problem.y0, problem.params
+def _motion(plan: RoundPlan, problem: Problem, start) -> tuple[Ending, TransitionRecord]:
+    """The rounds of a problem from the mode of place `start`, in float64, in its own precision."""
+    given = problem.ts, problem.y0, problem.params, start
     if not problem.is_single:
         return hybrid_motion(plan, problem.layout, *given)
     layout = dataclasses.replace(problem.layout, dtype=DOUBLE)
@@ -263,14 +267,26 @@ def _present(modes: dict[str, System], transitions) -> tuple[dict[str, System], 
     return systems, [transition.now() for transition in transitions]
 
 
+def _place_of(modes: dict[str, System], start) -> Any:
+    """The place of a mode, given by its name or its place, which may be traced. Raises `ValueError` for another one."""
+    if isinstance(start, str) and start in modes:
+        return list(modes).index(start)
+    is_place = (
+        not isinstance(start, str | bool) and jnp.shape(start) == () and np.issubdtype(jnp.result_type(start), int)
+    )
+    if is_place and not (is_concrete(start) and not 0 <= int(start) < len(modes)):
+        return start
+    raise ValueError(f"start is {start!r}, which is no mode: the modes are {', '.join(map(repr, modes))}.")
+
+
 def _require_modes(modes, transitions, start, max_transitions) -> None:
     if not isinstance(modes, dict) or not modes or not all(isinstance(m, System) for m in modes.values()):
         raise TypeError("modes must be a dict of lagjax.System by name.")
     if not isinstance(transitions, list | tuple):
         raise TypeError(f"transitions must be a list of lagjax.Transition; got {type(transitions).__name__}.")
-    known = ", ".join(map(repr, modes))
-    if not isinstance(start, str) or start not in modes:
-        raise ValueError(f"start is {start!r}, which is no mode: the modes are {known}.")
+    known, start = ", ".join(map(repr, modes)), start if isinstance(start, str) else None
+    if start is not None:
+        _place_of(modes, start)
     for transition in transitions:
         if not isinstance(transition, Transition):
             raise TypeError(f"transitions must be lagjax.Transition; got {transition!r}.")
@@ -279,7 +295,7 @@ def _require_modes(modes, transitions, start, max_transitions) -> None:
                 raise ValueError(f"A transition has the {role} {name!r}, which is no mode: the modes are {known}.")
     if jax.tree.leaves((modes, transitions)):
         raise ValueError("A function of a mode or a transition holds arrays of its own: pass these in `params`.")
-    reached, growing = {start}, True
+    reached, growing = {*modes} if start is None else {start}, True
     while growing:
         more = {t.target for t in transitions if t.source in reached} - reached
         reached, growing = reached | more, bool(more)

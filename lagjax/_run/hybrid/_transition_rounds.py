@@ -51,7 +51,6 @@ class RoundPlan(eqx.Module):
     names: tuple[str, ...] = eqx.field(static=True)
     systems: tuple[System, ...]
     transitions: tuple[Transition, ...]
-    start: str = eqx.field(static=True)
     max_transitions: int = eqx.field(static=True)
     rtol: float = eqx.field(static=True)
     atol: float | None = eqx.field(static=True)
@@ -148,16 +147,20 @@ class Exit(NamedTuple):
 
 
 @eqx.filter_jit
-def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree) -> tuple[Ending, TransitionRecord]:
-    """The motion from y0 (2n,) at ts[0]: how it ended, and its transitions, with an axis of `max_transitions`."""
+def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree, start) -> tuple[Ending, TransitionRecord]:
+    """The motion from y0 (2n,) at ts[0] in the mode of place `start`, and its transitions, `max_transitions` of them.
+
+    A place that is none, as −1 is, comes with a state that was not reached.
+    """
     ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
     given = jnp.append(y0, ts[0]), vector_of(eqx.filter(params, eqx.is_array_like))
     widths = tuple(SINGLE_NOISE * jnp.abs(jax.lax.stop_gradient(x)) for x in given)
-    rounds, start = _Rounds(plan, plan.modes(layout, params, widths), ts), plan.names.index(plan.start)
-    inconsistent = rounds.is_inconsistent(start, ts[0], y0, [start])
+    rounds, start = _Rounds(plan, plan.modes(layout, params, widths), ts), jnp.asarray(start, int)
+    result = jnp.where(rounds.is_inconsistent(start, ts[0], y0, range(len(plan.names))), INCONSISTENT, SUCCESSFUL)
+    result = jnp.where((start >= 0) & (start < len(plan.names)), result, NOT_FINITE)
     first = Ending(
-        t=ts[0], y=y0, mode=jnp.asarray(start), going=~inconsistent,
-        result=jnp.where(inconsistent, INCONSISTENT, SUCCESSFUL), path=jnp.full((ts.size, y0.size), jnp.nan),
+        t=ts[0], y=y0, mode=start, going=result == SUCCESSFUL, result=result,
+        path=jnp.full((ts.size, y0.size), jnp.nan),
         modes=jnp.full(ts.size, -1), steps=jnp.zeros(2, int), latest=jnp.asarray(-1), memory=rounds.no_memory(0.0, 0.0),
         let_out=jnp.full(len(plan.transitions), jnp.nan),
     )  # fmt: skip
