@@ -26,8 +26,12 @@ def forms(scene, *paths):
 FAST = [make for make in KINDS if make not in (scenes.chaplygin_sleigh, scenes.cartesian_pendulum)]
 
 
-@pytest.mark.parametrize("make", sweep(scenes.ALL, kept=FAST), ids=lambda make: make.__name__)
-def test_both_forms_of_every_scene_agree(make):
+# Beside these every third scene: the motions of all, by the scalar form, are held to their laws in tests/scenes.
+@pytest.mark.parametrize(
+    "make", sweep([make for k, make in enumerate(scenes.ALL) if make in KINDS or k % 3 == 0], kept=FAST),
+    ids=lambda make: make.__name__,
+)  # fmt: skip
+def test_both_forms_of_scenes_agree(make):
     scene = make()
     layout, params, (auto, array) = forms(scene, "auto", "array")
     assert isinstance(auto, ScalarEquations) or layout.size > 12

@@ -295,31 +295,6 @@ def test_parameters_that_are_not_seen_are_named():
     assert "not seen" in str(fit)
 
 
-@pytest.mark.slow
-@pytest.mark.parametrize(
-    "energies, params, sentence",
-    [
-        (lambda v, p: 0.5 * p["a"] * p["b"] * v**2 - v, {"a": 2.0, "b": 3.0}, None),
-        (lambda v, p: p["a"] * p["b"], {"a": 2.0, "b": 3.0}, "only params['a']·params['b'] is seen"),
-        (lambda v, p: p["a"] * p["b"] ** 2, {"a": 2.0, "b": 1.0}, "only params['a']·params['b']^2 is seen"),
-        (lambda v, p: p["a"] + p["b"], {"a": 2.0, "b": 2.0}, "only params['a'] + params['b'] is seen"),
-        (lambda v, p: p["a"] - 2 * p["b"], {"a": 9.0, "b": 1.5}, "only params['a'] − 2 params['b'] is seen"),
-        (lambda v, p: p["a"] / p["b"], {"a": 6.0, "b": 1.0}, "A common factor of params['a'] and params['b']"),
-        (lambda v, p: p["a"] * p["b"] / p["c"], {"a": 6.0, "b": 2.0, "c": 2.0}, "Of params['a'], params['b']"),
-        (lambda v, p: jnp.sinh(p["a"]) + p["b"] ** 3, {"a": 1.0, "b": 1.5}, "A combination of params['a']"),
-        (lambda v, p: p["a"], {"a": 6.0}, None),
-    ],
-)
-def test_known_freedoms_are_named_and_no_others(energies, params, sentence):
-    stiffness = energies if sentence or len(params) == 1 else (lambda v, p: p["a"] + p["b"] * v**2)
-    scene = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * stiffness(q, params) * q**2)
-    q = np.asarray(lagjax.simulate(scene, 1.0, 0.0, TS, params).q)
-    values = q + SIGMA * np.random.default_rng(0).normal(size=q.shape)
-    fit = lagjax.fit(scene, lagjax.Record(TS, values), params)
-    assert len(fit.unseen) == (sentence is not None)
-    assert sentence is None or sentence in fit.unseen[0], fit.unseen
-
-
 # ---- from far away ---------------------------------------------------------------------------------------------------
 
 

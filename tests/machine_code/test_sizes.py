@@ -68,14 +68,8 @@ def in_a_process(function, *arguments):
         return pool.submit(function, *arguments).result()
 
 
-@pytest.mark.slow
-def test_a_gradient_that_llvm_must_survive():
-    found, expected = in_a_process(slopes, "bodies in the plane", 5)
-    np.testing.assert_allclose(found, expected, rtol=1e-9)
-
-
-# Between the sizes of `test_derivative_sizes.py`.
-LARGE = [*(("bodies in the plane", count) for count in (6, 7, 10)), *(("chain", count) for count in (9, 10, 14))]
+# Between the sizes of `test_derivative_sizes.py`, where five bodies are those that LLVM once did not survive.
+LARGE = [("bodies in the plane", 7), ("chain", 10)]
 
 
 @pytest.mark.slow

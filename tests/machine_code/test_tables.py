@@ -67,7 +67,7 @@ QUICK = ("double_pendulum", "driven_pendulum")
 @pytest.mark.parametrize(
     "scene",
     [pytest.param(scene, id=scene.__name__, marks=() if scene.__name__ in QUICK else pytest.mark.slow)
-     for k, scene in enumerate(lagjax.scenes.ALL) if scene.__name__ in QUICK or k % 2 == 0],
+     for k, scene in enumerate(lagjax.scenes.ALL) if scene.__name__ in QUICK or k % 4 == 0],
 )  # fmt: skip
 def test_ready_scenes(scene):
     made = scene()

@@ -203,17 +203,11 @@ def test_all_families_in_jax():
     functions, arguments = zip(*((function, arguments) for function, *arguments in FAMILIES.values()), strict=True)
     program = lower(lambda *each: [f(*xs) for f, xs in zip(functions, each, strict=True)], *arguments)
     xs = scalars(*jax.tree.leaves(arguments))
-    outputs = jax.jit(program.__call__)(*[jnp.stack([x, x, x]) for x in xs])
-    assert all(output.shape == (3,) for output in outputs)
-    expected = flat(program.evaluate(*map(np.asarray, xs)))
-    np.testing.assert_allclose(flat([output[1] for output in outputs]), expected, rtol=TOLERANCE, atol=TOLERANCE * 10)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("family", FAMILIES)
-def test_each_family_in_jax(family):
-    function, *arguments = FAMILIES[family]
-    assert_same(function, *arguments, in_jax=True)
+    lanes, expected = [jnp.stack([x, x, x]) for x in xs], flat(program.evaluate(*map(np.asarray, xs)))
+    for outputs in (jax.jit(program.__call__)(*lanes), jax.jit(jax.vmap(program))(*lanes)):
+        assert all(output.shape == (3,) for output in outputs)
+        found = flat([output[1] for output in outputs])
+        np.testing.assert_allclose(found, expected, rtol=TOLERANCE, atol=TOLERANCE * 10)
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Lagrangians with small matrices and complex numbers: closed forms, and the same scene written with real numbers."""
 
 import math
+import re
 
 import jax
 import jax.numpy as jnp
@@ -10,9 +11,10 @@ import numpy as np
 import pytest
 import scipy.linalg
 from jax import lax
+from sweeps import sweep
 
 import lagjax
-from lagjax._program import OPERATIONS, apply_in_jax, lower
+from lagjax._program import OPERATIONS, Unlowerable, apply_in_jax, lower
 from lagjax._program.lowering._matrices import determinant, solution
 
 
@@ -265,6 +267,13 @@ LEFT_TO_XLA = {  # potentials V of one coordinate with V', and what their senten
 
 
 @pytest.mark.parametrize("name", LEFT_TO_XLA)
+def test_functions_that_xla_has_are_not_lowered(name):
+    potential, _, reason = LEFT_TO_XLA[name]
+    with pytest.raises(Unlowerable, match=re.escape(reason)):
+        lower(potential, 1.5)
+
+
+@pytest.mark.parametrize("name", sweep(LEFT_TO_XLA, kept=("eigenvalues",)))
 def test_functions_that_xla_has_run_on_arrays(name):
     potential, slope, reason = LEFT_TO_XLA[name]
     system = lagjax.System(lambda q, v: 0.5 * v**2 - potential(q))
