@@ -135,7 +135,7 @@ def test_angles_as_sections():
         np.testing.assert_allclose(times(found[name])[: len(where)], np.sort(where)[: len(where)], rtol=1e-8)
 
 
-@pytest.mark.parametrize("mode", [jax.jacrev, jax.jacfwd])
+@pytest.mark.parametrize("mode", [jax.jacrev, pytest.param(jax.jacfwd, marks=pytest.mark.slow)])
 def test_a_jump_varies_as_its_border(mode):
     # x = t passes √p, where the section jumps through zero whatever its own slopes are: dt/dp = 1/(2 √p).
     scene = lagjax.System(lambda q, v: 0.5 * v @ v)

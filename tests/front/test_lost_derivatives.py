@@ -46,9 +46,8 @@ def end(system, params, **options):
     return lagjax.simulate(system, 0.3, 1.0, TS, params, **options).q[-1]
 
 
-@pytest.mark.parametrize(
-    "name", [name if i == 6 else pytest.param(name, marks=pytest.mark.slow) for i, name in enumerate(FORCES)]
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("name", FORCES)
 def test_derivatives_over_steps_are_right_or_refused(name):
     """Beside those of machine code, which ends a step at every border.
 

@@ -59,7 +59,7 @@ def test_traced_tolerances_are_an_error_too():
     ("scene", "solver"),
     [
         (lagjax.scenes.double_pendulum(), "Taylor series in machine code"),
-        (lagjax.scenes.chain(60), "because a thread of a GPU would have to remember"),
+        (lagjax.scenes.chain(16), "because a thread of a GPU would have to remember"),
     ],
     ids=["fits", "too large"],
 )

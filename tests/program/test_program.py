@@ -1,5 +1,6 @@
 """Scalar programs: the same numbers as the function, by fewer operations, in every transformation."""
 
+import itertools
 import time
 
 import jax
@@ -609,10 +610,8 @@ def test_lanes_broadcast():
 # ---- derivatives in NumPy --------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("kept", [2**24, 20_000])  # all states together; a few at a time
-def test_derivatives_in_numpy_are_those_of_the_transposed_program(monkeypatch, kept):
+def test_derivatives_in_numpy_are_those_of_the_transposed_program(monkeypatch):
     # Pairs of bodies, of which some are beyond a border where the branch not taken has no derivative.
-    monkeypatch.setattr("lagjax._program._line._MOST_KEPT", kept)
     i, j = np.triu_indices(50, 1)
 
     def forces(x, k):
@@ -627,7 +626,9 @@ def test_derivatives_in_numpy_are_those_of_the_transposed_program(monkeypatch, k
     columns = [*x, np.asarray(2)]
     transposed = pullback(program.line, program.dtypes, range(50), range(44))
     one, many = [*x[:, 0], np.asarray(2)], [x[k] for k in range(44)]
-    for at, cotangents in [(columns, [1.0, -2.0] * 22), (columns, [None, x[0], *[None] * 42]), (one, many)]:
+    cases = [(columns, [1.0, -2.0] * 22), (columns, [None, x[0], *[None] * 42]), (one, many)]
+    for kept, (at, cotangents) in itertools.product([2**24, 20_000], cases):  # all states together; a few at a time
+        monkeypatch.setattr("lagjax._program._line._MOST_KEPT", kept)
         bars = [np.zeros(7) if x is None else np.broadcast_to(x, 7) for x in cotangents]
         *found, of_integer = program.line.vjp(at, cotangents)
         assert of_integer is None
