@@ -99,6 +99,7 @@ def test_a_ring_falls_from_its_unstable_equilibrium():
     assert modes.stable and np.abs(stable.q).max() > 0.9
 
 
+@pytest.mark.slow
 def test_other_forms_of_a_large_scene():
     n = 4000
     q, v = jnp.asarray(np.random.default_rng(0).normal(size=(2, n)))

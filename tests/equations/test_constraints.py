@@ -114,6 +114,7 @@ def test_a_double_pendulum_of_rods_is_the_double_pendulum():
         assert np.max(np.abs(found - expected)) < 1e-7 and np.median(np.abs(found - expected)) < 1e-11
 
 
+@pytest.mark.slow
 def test_the_forces_on_a_wire_and_a_sphere():
     wire = scenes.bead_on_wire()
     run = lagjax.simulate(wire.system, wire.q0, wire.qdot0, np.linspace(0, 3, 7), wire.params, rtol=1e-12)

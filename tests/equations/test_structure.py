@@ -143,6 +143,7 @@ def ring(n: int) -> lagjax.System:
     return lagjax.System(lagrangian)
 
 
+@pytest.mark.slow
 def test_a_large_ring_runs_on_arrays_as_in_machine_code():
     rng, n = np.random.default_rng(1), 600
     q, v, ts = 0.3 * rng.normal(size=n), 0.3 * rng.normal(size=n), np.array([0.0, 1.0])

@@ -99,6 +99,7 @@ def test_a_second_run_from_the_end_of_the_first():
         np.testing.assert_allclose(derivative(twice)(x), derivative(once)(x), rtol=1e-6, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_a_mode_that_begins_on_its_border():
     """A body falls on a belt that takes it along, whatever the velocity that the reset gives it."""
     fall = lagjax.System(lambda q, v, params: 0.5 * v @ v - q[1])

@@ -191,6 +191,7 @@ def test_derivatives_with_constraints(on_the_ptx):
         agree(on_the_ptx(function, *given), jax.jit(function)(*given), 1e-8)
 
 
+@pytest.mark.slow
 def test_borders_of_a_piecewise_scene(on_the_ptx):
     system = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - jnp.abs(q))
     here = on_the_ptx(lambda q0: motion(system, q0, 0.0, 5.0 * TS), 1.0)
@@ -224,6 +225,7 @@ def test_a_gradient_is_one_launch_for_all_members(on_the_ptx):
     assert on_the_ptx.launches == [9, 9]  # the motion itself, and there and back
 
 
+@pytest.mark.slow
 def test_members_whose_steps_do_not_do_take_tangents(on_the_ptx, monkeypatch):
     """At rest a pendulum takes steps that its tangents cannot; and there may be no room for all steps."""
     gradient, rest = jax.vmap(jax.grad(swung)), np.array([0.0, 0.5, 1.0])

@@ -241,6 +241,7 @@ def test_a_blow_goes_through_balls_that_touch(off, modes):
     np.testing.assert_array_equal(v, np.tile([0, 0, 0, 1], (len(TENTHS), 1)))
 
 
+@pytest.mark.slow
 def test_a_start_on_a_section_has_to_leave_it_first(off):
     """A throw returns to its level, once; with a direction a motion that goes that way ends where it starts."""
     throw = lagjax.System(lambda q, v: 0.5 * v**2 - q)
@@ -265,6 +266,7 @@ def test_a_start_on_a_section_has_to_leave_it_first(off):
             np.testing.assert_allclose(first, 4, atol=8 * EPS)
 
 
+@pytest.mark.slow
 def test_a_motion_that_leaves_slowly_has_not_met_the_surface(off):
     """In steps of 1e-3 that a fast coordinate needs it is within the rounding of its start for hundreds of steps."""
     fast = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2) - 0.5 * (1e3 * q[1]) ** 2 - 1e-6 * q[0])
@@ -304,6 +306,7 @@ def folded(q, v, t):
     return np.minimum(x, 2 * box - x)
 
 
+@pytest.mark.slow
 def test_a_loop_of_motions_stays_in_its_box(off):
     """Steps end on the walls to rounding: 0.35 to the wall and 0.7 back in whole numbers of steps."""
     k = np.arange(1, 17)

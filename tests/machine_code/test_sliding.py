@@ -396,6 +396,7 @@ def test_a_puck_rests_until_its_load_is_larger_than_friction():
     np.testing.assert_allclose(ramp.q[1:], [[0.0, 0.0], [2.7, 3.6]], atol=1e-9)
 
 
+@pytest.mark.slow
 def test_derivatives_of_a_puck_through_its_stop():
     """Down a slope that friction holds. Compiles a motion, its tangents and its transpose."""
     params = jnp.array([1.0, 0.0, 0.0, 0.0, 2.0])

@@ -138,7 +138,7 @@ def test_a_start_off_one_of_many_constraints_is_named():
         lagjax.simulate(chain, q - (np.arange(count) > 41)[:, None] * [1.0, 0.0], np.zeros_like(q), TS)
 
 
-@pytest.mark.parametrize("kind", ["band", "blocks"])
+@pytest.mark.parametrize("kind", ["band", pytest.param("blocks", marks=pytest.mark.slow)])
 def test_the_spectrum_of_a_sparse_mass_matrix(kind):
     def kinetic(q, qdot):
         coupled = qdot[1:] + qdot[:-1] if kind == "band" else qdot[::2] + 0.9 * qdot[1::2]
