@@ -57,7 +57,7 @@ def test_second_derivatives_in_every_order_of_modes(outer, inner):
 @pytest.mark.slow
 def test_second_derivatives_of_all_outputs_and_of_output_times():
     for outer, inner in itertools.product(MODES.values(), MODES.values()):
-        found = outer(inner(followed, argnums=(0, 1)), argnums=(0, 1))(X, TIMES)
+        found = jax.jit(outer(inner(followed, argnums=(0, 1)), argnums=(0, 1)))(X, TIMES)
         expected = jax.jacfwd(jax.jacfwd(exact, argnums=(0, 1)), argnums=(0, 1))(X, TIMES)
         for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(expected), strict=True):
             np.testing.assert_allclose(a, b, atol=1e-10)
@@ -126,9 +126,9 @@ def test_second_and_third_derivatives_by_a_start_that_moves_along_a_curved_const
     exact = jax.grad(jax.grad(by_angle))(0.65)
     for inner in (jax.grad, jax.jacfwd):
         for outer in (jax.grad, jax.jacfwd):
-            np.testing.assert_allclose(outer(inner(on_circle))(0.65), exact, rtol=1e-8)
+            np.testing.assert_allclose(jax.jit(outer(inner(on_circle)))(0.65), exact, rtol=1e-8)
     third = jax.jacfwd(jax.grad(jax.grad(by_angle)))(0.65)
-    np.testing.assert_allclose(jax.jacfwd(jax.jacfwd(jax.grad(on_circle)))(0.65), third, rtol=1e-7)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(jax.jacfwd(jax.grad(on_circle))))(0.65), third, rtol=1e-7)
 
 
 @pytest.mark.slow
