@@ -145,7 +145,7 @@ def test_a_jump_varies_as_its_border(mode):
         start = jnp.array([0.0, 0.1]), jnp.array([1.0, 0.05])
         return lagjax.crossings(scene, section, *start, jnp.array([0.0, 3.0]), p).t[0]
 
-    slopes = first(2.0), mode(first)(2.0), jax.grad(mode(first))(2.0)
+    slopes = first(2.0), mode(first)(2.0), jax.jit(jax.grad(mode(first)))(2.0)
     np.testing.assert_allclose(slopes, [np.sqrt(2), 0.5 / np.sqrt(2), -0.25 * 2**-1.5], rtol=1e-9)
 
 
@@ -221,7 +221,7 @@ def test_how_crossings_vary():
     expected = jax.vmap(jax.jacfwd(closed))(x)
     for mode in (jax.jacrev, jax.jacfwd):
         np.testing.assert_allclose(jax.jit(jax.vmap(mode(found)))(x), expected, atol=1e-9)
-    second = jax.jacfwd(jax.jacrev(found))(x[1])
+    second = jax.jit(jax.jacfwd(jax.jacrev(found)))(x[1])
     np.testing.assert_allclose(second, jax.jacfwd(jax.jacfwd(closed))(x[1]), atol=1e-7)
 
 

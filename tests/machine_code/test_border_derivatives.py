@@ -71,7 +71,7 @@ def test_first_derivatives():
 @pytest.mark.slow
 def test_products_with_the_hessian():
     along = jnp.linspace(1.0, -1.0, X.size)
-    product = jax.jvp(jax.grad(value), (X,), (along,))[1]
+    product = jax.jit(lambda x: jax.jvp(jax.grad(value), (x,), (along,))[1])(X)
     np.testing.assert_allclose(product, jax.hessian(exact)(X) @ along, atol=2e-7)
 
 
@@ -79,7 +79,7 @@ def test_products_with_the_hessian():
 @pytest.mark.parametrize("outer", [jax.jacfwd, jax.jacrev])
 @pytest.mark.parametrize("inner", [jax.jacfwd, jax.jacrev])
 def test_second_derivatives_in_every_mode(inner, outer):
-    np.testing.assert_allclose(outer(inner(value))(X), jax.hessian(exact)(X), atol=2e-7)
+    np.testing.assert_allclose(jax.jit(outer(inner(value)))(X), jax.hessian(exact)(X), atol=2e-7)
 
 
 @pytest.mark.slow
@@ -123,6 +123,7 @@ def test_where_a_border_is_grazed_there_is_no_derivative():
 def test_where_a_border_is_grazed_there_is_no_second_derivative():
     for params in (PULLED, SPRUNG):
         for second in (jax.jacfwd(jax.jacfwd(falls_to)), jax.jacfwd(jax.grad(falls_to)), jax.hessian(falls_to)):
+            second = jax.jit(second)
             assert np.isnan(second(GRAZING, params)) and second(GRAZING - 1e-3, params) == 0.0
 
 

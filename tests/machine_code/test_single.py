@@ -153,7 +153,7 @@ WAYS = {
     "grad": lambda f: jax.grad(f, (0, 1)),
     "jit grad": lambda f: jax.jit(jax.grad(f, (0, 1))),
     "jacfwd": lambda f: jax.jacfwd(f, (0, 1)),
-    "hessian": lambda f: jax.hessian(f, (0, 1)),
+    "hessian": lambda f: jax.jit(jax.hessian(f, (0, 1))),
     "jit of reverse over reverse": lambda f: jax.jit(jax.grad(lambda x, y: jax.grad(f)(x, y), (0, 1))),
 }
 
