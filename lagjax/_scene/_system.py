@@ -86,7 +86,8 @@ class System(eqx.Module):
       `slip(q, qdot)`, the sliding velocity s at each contact in the structure of the gaps: a number in a plane, an
       array of two in space.
     - `impacts`: several contacts that touch take a blow together, by the linear complementarity problem of all of them
-      ("simultaneous", Moreau and Glocker), or one after the other ("sequential", as Newton's cradle does).
+      ("simultaneous", Moreau and Glocker), or one after the other ("sequential", as Newton's cradle does). "poisson",
+      without friction: together, and e is of impulses, each of which gives back that part of what compression took.
 
     At a start a closed gap that moves inwards is an impact at once. `simulate` and `simulate_batch` follow motions with
     contacts, in machine code on a CPU, and `fit`, `sweep`, `check` and `health` take such scenes. First and second
@@ -149,13 +150,17 @@ class System(eqx.Module):
         restitution: Any = 0.0,
         friction: Any = 0.0,
         slip: Callable | None = None,
-        impacts: Literal["simultaneous", "sequential"] = "simultaneous",
+        impacts: Literal["simultaneous", "sequential", "poisson"] = "simultaneous",
         path: Literal["auto", "scalar", "array"] = "auto",
     ):
         if not isinstance(path, str) or path not in ("auto", "scalar", "array"):
             raise ValueError(f"path must be 'auto', 'scalar' or 'array'; got {path!r}.")
-        if impacts not in ("simultaneous", "sequential"):
-            raise ValueError(f"impacts must be 'simultaneous' or 'sequential'; got {impacts!r}.")
+        if impacts not in ("simultaneous", "sequential", "poisson"):
+            raise ValueError(f"impacts must be 'simultaneous', 'sequential' or 'poisson'; got {impacts!r}.")
+        if impacts == "poisson" and slip is not None:
+            raise ValueError(
+                "impacts='poisson' is for contacts without friction: leave out slip, or take Newton's law."
+            )
         self.path, self.impacts = path, impacts
         restitution, friction = _coefficients(contacts, one_way, restitution, friction, slip)
         functions = (

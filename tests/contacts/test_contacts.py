@@ -132,6 +132,7 @@ def test_the_budget_of_events_is_named():
         ({"restitution": 1.5}, "restitution"),
         ({"friction": -0.1, "slip": lambda q, v: {"floor": v["x"]}}, "friction"),
         ({"impacts": "at once"}, "sequential"),
+        ({"impacts": "poisson", "slip": lambda q, v: {"floor": v["x"]}}, "without friction"),
     ],
 )
 def test_what_cannot_be_a_contact(options, sentence):
@@ -277,3 +278,60 @@ def test_restitution_and_friction_are_fitted():
     low, high = fit.intervals(0.999)
     for name, value in truth.items():
         assert low[name] <= value <= high[name] and high[name] - low[name] < 1e-2
+
+
+def test_poissons_law_throws_up_the_foot_that_rests():
+    """A rod turns on foot A until B strikes: Newton's law keeps A down, whose velocity was zero; Poisson's gives back
+
+    e of the impulse by which A was pressed, against which B holds (Glocker, *Set-Valued Force Laws*, §9.4).
+    """
+    mass, inertia, half, turning = 1.0, 0.1, 0.5, 2.0
+
+    def feet(q):
+        return {"A": q[0] - half * q[1], "B": q[0] + half * q[1]}
+
+    def rates_behind(e, impacts):
+        def lagrangian(q, v):
+            return 0.5 * mass * v[0] ** 2 + 0.5 * inertia * v[1] ** 2
+
+        rod = lagjax.System(
+            lagrangian, contacts=feet, restitution=lambda params: {"A": params, "B": 0.0}, impacts=impacts
+        )
+        start = jnp.array([0.1, 0.2]), jnp.array([-half * turning, -turning])
+        y, phi = lagjax.simulate(rod, *start, jnp.linspace(0.0, 0.2, 3), e).qdot[-1]
+        return jnp.stack([y - half * phi, y + half * phi])
+
+    own, shared = 1 / mass + half**2 / inertia, 1 / mass - half**2 / inertia
+    alone = own - shared**2 / own
+    pressed = -shared / own * 2 * half * turning / alone
+    np.testing.assert_allclose(rates_behind(0.6, "poisson"), [0.6 * pressed * alone, 0.0], atol=1e-13)
+    np.testing.assert_allclose(rates_behind(0.6, "simultaneous"), 0.0, atol=1e-13)
+    slopes = jax.jacfwd(rates_behind)(0.6, "poisson")
+    np.testing.assert_allclose(slopes, [pressed * alone, 0.0], atol=1e-13)
+
+
+@pytest.mark.parametrize("e", [1.0, 0.5])
+def test_both_laws_agree_where_all_contacts_press_alike(e):
+    """Balls in a row: with one e for all, Poisson's law is Newton's, and one that strikes goes back."""
+
+    def gaps(q):
+        return q[1:] - q[:-1]
+
+    ends = []
+    for impacts in ("poisson", "simultaneous"):
+        balls = lagjax.System(lambda q, v: 0.5 * v @ v, contacts=gaps, restitution=e, impacts=impacts)
+        start = jnp.array([-0.5, 0.0, 0.0]), jnp.array([1.0, 0.0, 0.0])
+        ends.append(lagjax.simulate(balls, *start, jnp.linspace(0.0, 1.0, 3)).qdot[-1])
+    np.testing.assert_allclose(ends[0], ends[1], atol=1e-14)
+    np.testing.assert_allclose(ends[0], [1 / 3 - 2 * e / 3, (1 + e) / 3, (1 + e) / 3], atol=1e-14)
+
+
+@pytest.mark.parametrize("impacts", ["simultaneous", "sequential"])
+def test_health_says_where_laws_of_impacts_differ(impacts):
+    balls = lagjax.System(lambda q, v: 0.5 * v @ v, contacts=lambda q: q[1:] - q[:-1], restitution=1.0, impacts=impacts)
+    start = jnp.array([-0.5, 0.0, 0.0]), jnp.array([1.0, 0.0, 0.0])
+    health = lagjax.simulate(balls, *start, jnp.linspace(0.0, 1.0, 3)).health()
+    assert int(health.impacts[2]) == 1 and float(health.impacts[3]) == 0.5
+    assert "another law" in str(health)
+    apart = start[0].at[2].set(3.0)
+    assert "another law" not in str(lagjax.simulate(balls, apart, start[1], jnp.linspace(0.0, 1.0, 3)).health())

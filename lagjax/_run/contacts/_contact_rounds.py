@@ -37,8 +37,10 @@ from lagjax._run.contacts._impact_law import (
     ImpactRows,
     Pattern,
     find_pattern,
+    find_phases,
     held_slips,
     impulse_solver,
+    rates_behind,
     reached,
     sliding_margin,
 )
@@ -334,7 +336,8 @@ class ContactRounds(NamedTuple):
         held = Pattern(closed.astype(float), sticks.astype(float), jnp.zeros_like(contacts.direction))
         pattern = jax.tree.map(lambda a, b: jnp.where(hits, a, b), meeting.pattern, held)
         acting = friction._replace(coefficients=jnp.where(hits, friction.coefficients, 0.0))
-        solve, bounced = impulse_solver(rows, pattern, acting), jnp.where(hits, -restitution * rows.rates[:count], 0.0)
+        bounced = jnp.where(hits, rates_behind(rows, meeting.phases, restitution, acting), 0.0)
+        solve = impulse_solver(rows, pattern, acting)
         ends, left = self.end_of_bounces(before, rows, t, y, solve(bounced), bounced, restitution)
         ends = ends & hits & (pattern.push > 0)
         impulses = solve(jnp.where(ends, 0.0, bounced))
@@ -419,13 +422,16 @@ class ContactRounds(NamedTuple):
         touches, rates, noise = self.touching(t, y)
         touches = touches | meets | was_closed | ~self.has_gap
         noise = jnp.maximum(noise, 0.01 * before.rate_rounding[0, : self.count])
-        together = self.plan.scene.system.impacts == "simultaneous"
-        involved = reached(rows, meets, touches, friction) if together else meets
-        pattern, sound = find_pattern(rows, involved, restitution, friction)
+        law, phases = self.plan.scene.system.impacts, ()
+        involved = meets if law == "sequential" else reached(rows, meets, touches, friction)
+        if law == "poisson":
+            pattern, sound, phases = find_phases(rows, involved, restitution, friction)
+        else:
+            pattern, sound = find_pattern(rows, involved, restitution, friction)
         others = involved & ~meets & ~was_closed & (rates < -noise) & ~before.fresh[: self.count]
         noise_behind = jnp.maximum(noise, 1e-12 * jnp.max(jnp.abs(rates)))
         hits = (meets & (rates < -noise)).any()
-        return Meeting(hits, sound, pattern, involved, touches, noise_behind, others)
+        return Meeting(hits, sound, pattern, phases, involved, touches, noise_behind, others)
 
     def end_of_bounces(self, before: Carry, rows: ImpactRows, t, y, impulses, bounced, restitution) -> tuple:
         """True for contacts that bounce with these velocities (k,) and come to rest at once, and the time it takes.
@@ -455,6 +461,7 @@ class ContactRounds(NamedTuple):
 class Meeting(NamedTuple):
     """Contacts that meet: whether an impact `happened`, its `pattern`, and whether that is a solution of its law.
 
+    By Poisson's law it has `phases`, each with a pattern.
     And which are `involved`, which touch (k,), below which rate they stay closed, and which others are `tied`: that
     share the impact, and close at this instant by themselves.
     """
@@ -462,6 +469,7 @@ class Meeting(NamedTuple):
     happened: Any
     sound: Any
     pattern: Pattern
+    phases: tuple
     involved: Any
     touches: Any
     noise: Any

@@ -264,6 +264,31 @@ def _solve_complementary(matrix, values):
     return (basis[:, None] == size + np.arange(size)).any(axis=0)
 
 
+def find_phases(rows: ImpactRows, touches, restitution, friction: Friction) -> tuple[Pattern, Any, tuple]:
+    """What contacts without friction do by Poisson's law, whether that is a solution, and the pattern of each phase.
+
+    Compression ends where none moves inwards; each then gives back the part e of its impulse, and more where it would
+    move inwards still (Glocker, §9.4). Those that push are those of either phase.
+    """
+    first, sound = find_pattern(rows, touches, jnp.zeros_like(restitution), friction)
+    second, also = find_pattern(_give_back(rows, first, restitution, friction), touches, 0.0 * restitution, friction)
+    return first._replace(push=jnp.maximum(first.push, second.push)), sound & also, (first, second)
+
+
+def rates_behind(rows: ImpactRows, phases: tuple, restitution, friction: Friction):
+    """The rates (k,) at which contacts that push move apart behind an impact: Newton's, or those of two `phases`."""
+    count = len(restitution)
+    if not phases:
+        return -restitution * rows.rates[:count]
+    rows = _give_back(rows, phases[0], restitution, friction)
+    return (rows.rates + rows.coupling @ impulse_solver(rows, phases[1], friction)(jnp.zeros(count)))[:count]
+
+
+def _give_back(rows: ImpactRows, compression: Pattern, restitution, friction: Friction) -> ImpactRows:
+    impulses = impulse_solver(rows, compression, friction)(jnp.zeros_like(restitution))
+    return rows._replace(rates=rows.rates + rows.coupling @ ((1.0 + restitution) * impulses))
+
+
 def _pattern_of_one(rows: ImpactRows, towards, coefficients) -> tuple[Pattern, Any]:
     """The pattern of one contact in a plane: it sticks, if friction suffices, or slides against what that takes."""
     pushed, rubbed = factorize_general(rows.coupling)(-towards)

@@ -53,7 +53,8 @@ def examine(trajectory, reference=None) -> "Health":
     fields, names = measure_trajectory(trajectory)
     impacts = None
     if trajectory.impacts is not None:  # impacts and friction take energy: no balance of it is at hand
-        impacts = trajectory.impacts.count, jnp.nansum(trajectory.impacts.energy_lost, axis=-1)
+        shared = _shared_impacts(trajectory)
+        impacts = trajectory.impacts.count, jnp.nansum(trajectory.impacts.energy_lost, axis=-1), *shared
         fields["energy_allowed"] = jnp.full_like(jnp.asarray(fields["energy_allowed"]), jnp.inf)
     located, counts = _borders(trajectory)
     return Health(
@@ -94,6 +95,16 @@ def _diagnosis(trajectory) -> str:
     layout, row = members.layout, int(np.ravel_multi_index(which, members.batch)) if which else 0
     ended = motion_end(trajectory, layout, which, members.numbers_of(row).astype(layout.dtype))
     return diagnosis(trajectory.system, layout, members.params_of(row), ended).strip()
+
+
+def _shared_impacts(trajectory) -> tuple:
+    """The number of impacts that several contacts took part in, and the time of the first one."""
+    t, leaves = trajectory.impacts.t, jax.tree.leaves(trajectory.impacts.impulse)
+    pushes = jnp.concatenate([jnp.reshape(x, (*t.shape, -1)) > 0 for x in leaves], axis=-1)
+    shared = jnp.sum(pushes, axis=-1) > 1
+    if trajectory.system.impacts == "sequential":  # one after the other, at one instant
+        shared = jnp.concatenate([shared[..., :1], t[..., 1:] == t[..., :-1]], axis=-1)
+    return jnp.sum(shared, axis=-1), jnp.nanmin(jnp.where(shared, t, jnp.nan), axis=-1)
 
 
 def _borders(trajectory) -> tuple[bool, Met[Array] | None]:
@@ -154,8 +165,9 @@ class Health(eqx.Module):
       stepped across the borders.
     - `guards`: in a hybrid motion, whether blows met at one instant that do not commute, and whether a guard was let
       out that was beyond zero where a mode began (`Transitions`); else None.
-    - `impacts`: in a scene with contacts, how many there were and the energy that they took; else None. The balance of
-      energy and momenta are not judged there.
+    - `impacts`: in a scene with contacts, how many there were and the energy that they took, how many of them several
+      contacts shared, and when that first was (NaN: never); else None. Where contacts share an impact, the laws of
+      impacts (`impacts=` of the System) differ. The balance of energy and momenta are not judged there.
     - `global_error`: with a reference, the largest |yᵢ − reference| over the components of q and q̇, in units of the
       largest |yᵢ| along the path (and atol/rtol more, as in the tolerances); else None.
     """
@@ -185,7 +197,7 @@ class Health(eqx.Module):
     global_error: Extreme | None
     borders: Met[Array] | None
     guards: tuple[Bool[Array, "*batch"], Bool[Array, "*batch"]] | None
-    impacts: tuple[Int[Array, "*batch"], Float[Array, "*batch"]] | None
+    impacts: tuple[Int[Array, "*batch"], Float[Array, "*batch"], Int[Array, "*batch"], Float[Array, "*batch"]] | None
     borders_located: bool = eqx.field(static=True)
     outputs: int = eqx.field(static=True)
     diagnosis: str = eqx.field(static=True)
@@ -285,10 +297,13 @@ class Health(eqx.Module):
         if self.impacts is None:
             rows.append((law, f"off by {_worst(self.energy, self._energy_limit)}{known}"))
         else:
-            count, lost = (np.asarray(x) for x in self.impacts)
+            count, lost, shared, t = (np.asarray(x) for x in self.impacts)
             rows.append(
                 ("impacts", f"{count.sum()}, which took {np.sum(lost):.3g} of the energy; its balance is not judged")
             )
+            if shared.any():
+                law = f"{shared.sum()} shared by several contacts, the first at t = {np.nanmin(t):.6g}: there another"
+                rows.append(("", f"{law} law of impacts gives another motion"))
         if self.momentum_names is None:
             rows.append(("momenta", "not known which are conserved: the scene has no scalar program"))
         if text := self._border_contacts():
