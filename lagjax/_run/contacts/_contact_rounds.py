@@ -43,6 +43,7 @@ from lagjax._run.contacts._impact_law import (
     rates_behind,
     reached,
     sliding_margin,
+    violations,
 )
 from lagjax._scene import Contacts, ContactScene, Flat, InContact
 
@@ -329,24 +330,17 @@ class ContactRounds(NamedTuple):
         closed = (was_closed & ~first[:count]) | meets
         sticks = self.sticks(contacts, slips, first[count:], (closed != was_closed)[self.flat.rough])
         # Where parts align, a slip that gaps hold passes through zero, and turns.
-        turns = first[count:] & sticks & held_slips(quiet, closed.astype(float), friction.still)
+        turns = held_slips(quiet, closed, first[count:] & sticks, friction)
         sticks = sticks & ~turns
 
-        # Behind an impact impulses follow its law; else velocities become those that what is closed allows.
         held = Pattern(closed.astype(float), sticks.astype(float), jnp.zeros_like(contacts.direction))
-        pattern = jax.tree.map(lambda a, b: jnp.where(hits, a, b), meeting.pattern, held)
-        acting = friction._replace(coefficients=jnp.where(hits, friction.coefficients, 0.0))
-        bounced = jnp.where(hits, rates_behind(rows, meeting.phases, restitution, acting), 0.0)
-        solve = impulse_solver(rows, pattern, acting)
-        ends, left = self.end_of_bounces(before, rows, t, y, solve(bounced), bounced, restitution)
-        ends = ends & hits & (pattern.push > 0)
-        impulses = solve(jnp.where(ends, 0.0, bounced))
+        impulses, ends, left, sound = self.impulses(before, rows, t, y, meeting, held, restitution)
         change = impulses @ rows.responses
 
         apart = quiet.rates + quiet.coupling @ still(impulses)
         closed = jnp.where(hits, meeting.touches & (jnp.abs(apart[:count]) <= meeting.noise), closed)
         changed = (closed != was_closed) | (hits & meeting.involved)
-        undecided, slip = hits & ~meeting.sound, before.slip
+        undecided, slip = hits & ~sound, before.slip
         direction, turned, leaves_rest = contacts.direction, changed[:0], jnp.asarray(False)
         if self.rubs:
             behind = self.slips(quiet._replace(rates=apart), still(v + change), slip)
@@ -395,6 +389,23 @@ class ContactRounds(NamedTuple):
             jnp.asarray(True), t, v, decided.y, contact, change, hits, rest, impulses[:count], lost
         )  # fmt: skip
 
+    def impulses(self, before: Carry, rows: ImpactRows, t, y, meeting: "Meeting", held: Pattern, restitution) -> tuple:
+        """The impulses (K,), which bounces end, (k,), how long these would take, and whether the law is obeyed.
+
+        Behind an impact they follow its law; else velocities become those that what is `held` allows.
+        """
+        hits, friction = meeting.happened, self.friction
+        pattern = jax.tree.map(lambda a, b: jnp.where(hits, a, b), meeting.pattern, held)
+        acting = friction._replace(coefficients=jnp.where(hits, friction.coefficients, 0.0))
+        bounced = jnp.where(hits, rates_behind(rows, meeting.phases, restitution, acting), 0.0)
+        solve = impulse_solver(rows, pattern, acting)
+        first = solve(bounced)
+        given = rows, pattern, meeting.involved, first, 0.0 * bounced if meeting.phases else bounced
+        normal, rubs = violations(*jax.lax.stop_gradient(given), friction.still)
+        ends, left = self.end_of_bounces(before, rows, t, y, first, bounced, restitution)
+        ends = ends & hits & (pattern.push > 0)
+        return solve(jnp.where(ends, 0.0, bounced)), ends, left, ~(normal.any() | rubs.any())
+
     def sticks(self, contacts: Contacts, slips: tuple, fell, renewed):
         """True for contacts that stick (r,) behind watches of friction that `fell`, where there is no impact."""
         was_stuck = contacts.sticks > 0
@@ -425,13 +436,13 @@ class ContactRounds(NamedTuple):
         law, phases = self.plan.scene.system.impacts, ()
         involved = meets if law == "sequential" else reached(rows, meets, touches, friction)
         if law == "poisson":
-            pattern, sound, phases = find_phases(rows, involved, restitution, friction)
+            pattern, phases = find_phases(rows, involved, restitution, friction)
         else:
-            pattern, sound = find_pattern(rows, involved, restitution, friction)
+            pattern = find_pattern(rows, involved, restitution, friction)
         others = involved & ~meets & ~was_closed & (rates < -noise) & ~before.fresh[: self.count]
         noise_behind = jnp.maximum(noise, 1e-12 * jnp.max(jnp.abs(rates)))
         hits = (meets & (rates < -noise)).any()
-        return Meeting(hits, sound, pattern, phases, involved, touches, noise_behind, others)
+        return Meeting(hits, pattern, phases, involved, touches, noise_behind, others)
 
     def end_of_bounces(self, before: Carry, rows: ImpactRows, t, y, impulses, bounced, restitution) -> tuple:
         """True for contacts that bounce with these velocities (k,) and come to rest at once, and the time it takes.
@@ -459,15 +470,13 @@ class ContactRounds(NamedTuple):
 
 
 class Meeting(NamedTuple):
-    """Contacts that meet: whether an impact `happened`, its `pattern`, and whether that is a solution of its law.
+    """Contacts that meet: whether an impact `happened`, its `pattern`, and by Poisson's law that of its `phases`.
 
-    By Poisson's law it has `phases`, each with a pattern.
     And which are `involved`, which touch (k,), below which rate they stay closed, and which others are `tied`: that
     share the impact, and close at this instant by themselves.
     """
 
     happened: Any
-    sound: Any
     pattern: Pattern
     phases: tuple
     involved: Any

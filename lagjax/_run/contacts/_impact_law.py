@@ -139,69 +139,62 @@ def _independent(coupling, held):
     return jax.lax.fori_loop(0, len(held), eliminate, (coupling, jnp.zeros(len(held))))[1]
 
 
-def held_slips(rows: ImpactRows, closed, friction: Friction):
-    """True for each contact in a plane (r,) whose slip the `closed` gaps (k,) hold: friction cannot hold it as well."""
-    count, places = len(closed), friction.places(len(closed))[:, 0]
-    if friction.directions > 1 or not places.size:
-        return jnp.zeros(len(places), bool)
-    among = jnp.outer(closed, closed) * rows.coupling[:count, :count] + jnp.diag(1.0 - closed)
-    own, others = rows.coupling[places, places], closed * rows.coupling[places, :count]
-    solve = factorize_general(among)
-    held = jnp.stack([row @ solve(row) for row in others])
-    return own - held <= DEPENDENT * own
+def held_slips(rows: ImpactRows, closed, slips, friction: Friction):
+    """True for each contact in a plane of which one of the `slips` (r,) is held by the `closed` gaps (k,) already."""
+    if friction.directions > 1 or not slips.size:
+        return jnp.zeros_like(slips)
+    held = jnp.concatenate([closed, slips]).astype(float)
+    return slips & (_independent(rows.coupling, held)[len(closed) :] == 0)
 
 
-def find_pattern(rows: ImpactRows, touches, restitution, friction: Friction) -> tuple[Pattern, Any]:
-    """The pattern of contacts that touch (k,) in an impact, and whether that is a solution of the law.
+def find_pattern(rows: ImpactRows, touches, restitution, friction: Friction) -> Pattern:
+    """The pattern of contacts that touch (k,) in an impact; `violations` tells whether it solves the law.
 
     In space by principal pivoting: of what its solution violates, the first is taken back, until nothing is.
     """
     count, rough, places = len(touches), friction.rough, friction.places(len(touches))
-    rates, own = rows.rates, jnp.diagonal(rows.coupling)
+    rates = rows.rates
     if count == 1 and not rough.size:
         pushes = (touches & (rates < 0)).astype(float)
-        return Pattern(pushes, jnp.zeros(0), jnp.zeros((0, friction.directions))), jnp.asarray(True)
+        return Pattern(pushes, jnp.zeros(0), jnp.zeros((0, friction.directions)))
     if count == 1 and friction.directions == 1:
         towards = jnp.concatenate([(1.0 + restitution) * rates[:1], rates[1:]])
         return _pattern_of_one(rows, towards, friction.coefficients)
-    targets, least = -restitution * rates[:count], MISSES * jnp.max(jnp.abs(rates))
-
-    def violations(pattern: Pattern):
-        """The violated conditions of the normals (k,) and of friction (r,), and the forces of that (r, d)."""
-        impulses = impulse_solver(rows, pattern, friction)(targets)
-        after, pushes = rates + rows.coupling @ impulses, pattern.push > 0
-        normal = jnp.where(pushes, impulses[:count] * own[:count], after[:count] - targets) < -least
-        forces, slips = impulses[places], after[places]
-        size, most = jnp.sqrt(jnp.sum(forces**2, axis=1)), friction.coefficients * impulses[rough]
-        beyond = (size - most) * own[rough] > least
-        reverse = jnp.sum(slips * pattern.direction, axis=1) < -least
-        return touches & normal, pushes[rough] & jnp.where(pattern.sticks > 0, beyond, reverse), forces
-
+    targets = -restitution * rates[:count]
     if friction.directions == 1:
-        pattern = _complementary_pattern(rows, touches, targets, friction)
-        normal, rubs, _ = violations(pattern)
-        return pattern, ~(normal.any() | rubs.any())
+        return _complementary_pattern(rows, touches, targets, friction)
 
     def pivot(carry):
-        pattern, (normal, rubs, forces), n = carry
+        pattern, _, n = carry
+        impulses = impulse_solver(rows, pattern, friction)(targets)
+        normal, rubs = violations(rows, pattern, touches, impulses, targets, friction)
         # Friction first: a contact that sticks and pulls is taken back by sliding.
         first = jnp.arange(count + len(rough)) == jnp.where(rubs.any(), count + jnp.argmax(rubs), jnp.argmax(normal))
-        push = jnp.where(first[:count], 1.0 - pattern.push, pattern.push)
-        turns = first[count:]
+        wrong = normal.any() | rubs.any()
+        push = jnp.where(wrong & first[:count], 1.0 - pattern.push, pattern.push)
+        turns, forces = wrong & first[count:], impulses[places]
         size = jnp.sqrt(jnp.sum(forces**2, axis=1, keepdims=True))
         against = jnp.where((turns & (pattern.sticks > 0))[:, None], -forces / jnp.where(size > 0, size, 1.0), 0.0)
         direction = jnp.where(against != 0, against, pattern.direction)
-        pattern = Pattern(push, jnp.where(turns, 1.0 - pattern.sticks, pattern.sticks), direction)
-        return pattern, violations(pattern), n + 1
-
-    def is_violated(carry):
-        _, (normal, rubs, _), n = carry
-        return (normal.any() | rubs.any()) & (n < PIVOTS * (count + len(rough)))
+        return Pattern(push, jnp.where(turns, 1.0 - pattern.sticks, pattern.sticks), direction), wrong, n + 1
 
     pushes = (touches & (rates[:count] <= 0)).astype(float)
     first = Pattern(pushes, jnp.ones(len(rough)), jnp.zeros(places.shape).at[:, 0].set(1.0))
-    pattern, (normal, rubs, _), _ = jax.lax.while_loop(is_violated, pivot, (first, violations(first), 0))
-    return pattern, ~(normal.any() | rubs.any())
+    most = PIVOTS * (count + len(rough))
+    return jax.lax.while_loop(lambda carry: carry[1] & (carry[2] < most), pivot, (first, jnp.asarray(True), 0))[0]
+
+
+def violations(rows: ImpactRows, pattern: Pattern, touches, impulses, targets, friction: Friction) -> tuple:
+    """The conditions of the law that `impulses` (K,) violate: of normals (k,), whose rates are `targets`, and slips."""
+    count, rough, places = len(targets), friction.rough, friction.places(len(targets))
+    rates, own = rows.rates, jnp.diagonal(rows.coupling)
+    after, pushes, least = rates + rows.coupling @ impulses, pattern.push > 0, MISSES * jnp.max(jnp.abs(rates))
+    normal = jnp.where(pushes, impulses[:count] * own[:count], after[:count] - targets) < -least
+    forces, slips = impulses[places], after[places]
+    size, most = jnp.sqrt(jnp.sum(forces**2, axis=1)), friction.coefficients * impulses[rough]
+    beyond = (size - most) * own[rough] > least
+    reverse = jnp.sum(slips * pattern.direction, axis=1) < -least
+    return touches & normal, pushes[rough] & jnp.where(pattern.sticks > 0, beyond, reverse)
 
 
 def _complementary_pattern(rows: ImpactRows, touches, targets, friction: Friction) -> Pattern:
@@ -232,7 +225,7 @@ def _complementary_pattern(rows: ImpactRows, touches, targets, friction: Frictio
 
 
 def _solve_complementary(matrix, values):
-    """Which z may be positive (m,) in w = values + matrix z, with w, z ≥ 0 and w ⟂ z, by Lemke's pivoting.
+    """True for each z (m,) that may be positive in w = values + matrix z, with w, z ≥ 0 and w ⟂ z: Lemke's pivoting.
 
     Source: Cottle, Pang & Stone, *The Linear Complementarity Problem* (1992), algorithm 4.4.5.
     """
@@ -264,15 +257,15 @@ def _solve_complementary(matrix, values):
     return (basis[:, None] == size + np.arange(size)).any(axis=0)
 
 
-def find_phases(rows: ImpactRows, touches, restitution, friction: Friction) -> tuple[Pattern, Any, tuple]:
-    """What contacts without friction do by Poisson's law, whether that is a solution, and the pattern of each phase.
+def find_phases(rows: ImpactRows, touches, restitution, friction: Friction) -> tuple[Pattern, tuple]:
+    """The pattern of contacts without friction by Poisson's law, and that of each phase.
 
     Compression ends where none moves inwards; each then gives back the part e of its impulse, and more where it would
     move inwards still (Glocker, §9.4). Those that push are those of either phase.
     """
-    first, sound = find_pattern(rows, touches, jnp.zeros_like(restitution), friction)
-    second, also = find_pattern(_give_back(rows, first, restitution, friction), touches, 0.0 * restitution, friction)
-    return first._replace(push=jnp.maximum(first.push, second.push)), sound & also, (first, second)
+    first = find_pattern(rows, touches, jnp.zeros_like(restitution), friction)
+    second = find_pattern(_give_back(rows, first, restitution, friction), touches, 0.0 * restitution, friction)
+    return first._replace(push=jnp.maximum(first.push, second.push)), (first, second)
 
 
 def rates_behind(rows: ImpactRows, phases: tuple, restitution, friction: Friction):
@@ -289,14 +282,12 @@ def _give_back(rows: ImpactRows, compression: Pattern, restitution, friction: Fr
     return rows._replace(rates=rows.rates + rows.coupling @ ((1.0 + restitution) * impulses))
 
 
-def _pattern_of_one(rows: ImpactRows, towards, coefficients) -> tuple[Pattern, Any]:
+def _pattern_of_one(rows: ImpactRows, towards, coefficients) -> Pattern:
     """The pattern of one contact in a plane: it sticks, if friction suffices, or slides against what that takes."""
     pushed, rubbed = factorize_general(rows.coupling)(-towards)
     sticks = jnp.abs(rubbed) <= coefficients[0] * pushed
-    direction = jnp.where(rubbed > 0, -1.0, 1.0)
-    own = rows.coupling[0, 0] - coefficients[0] * direction * rows.coupling[0, 1]
     one = jnp.ones(1)
-    return Pattern(one, sticks * one, (direction * one)[:, None]), sticks | (own > 0)
+    return Pattern(one, sticks * one, (jnp.where(rubbed > 0, -1.0, 1.0) * one)[:, None])
 
 
 def sliding_margin(rows: ImpactRows, pattern: Pattern, friction: Friction):
