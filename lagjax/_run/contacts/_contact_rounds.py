@@ -146,8 +146,10 @@ def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) ->
     t, qdot, y_next = lost(record.happened, record.t, record.qdot, record.y_next)
     t_impact, impulse, energy_lost = lost(record.hits, *record[-3:])
     path = lost_unless((ending.of_path.closed >= 0).all(axis=1)[:, None], ending.path, inputs)
-    order = jnp.argsort(~record.hits, stable=True)  # impacts in front
-    t_impact, impulse, energy_lost = (x[order] for x in (t_impact, impulse, energy_lost))
+    place = jnp.where(record.hits, jnp.cumsum(record.hits) - 1, record.hits.size)  # impacts in front
+    t_impact, impulse, energy_lost = (
+        jnp.full_like(x, jnp.nan).at[place].set(x, mode="drop") for x in (t_impact, impulse, energy_lost)
+    )
     impacts = t_impact, rounds.flat.shapes.name_numbers(impulse), energy_lost, jnp.sum(record.hits)
     return ending._replace(path=path), record._replace(t=t, qdot=qdot, y_next=y_next), impacts
 
