@@ -106,10 +106,101 @@ def bead_row():
     return lagjax.simulate(beads, q, v, ts).q[-1]
 
 
+def hopper_by_hand():
+    """Two masses and a spring: in the air and on the ground, where the foot is held; it must not stay there."""
+
+    def law(q, v):
+        return v[0] ** 2 + 0.1 * v[1] ** 2 - G * (2 * q[0] + 0.2 * q[1]) - 200 * (q[0] - q[1] - 1) ** 2
+
+    modes = {"air": lagjax.System(law), "ground": lagjax.System(law, constraints=lambda q: q[1])}
+    land = lagjax.Transition("air", "ground", lambda q, v: q[1], -1, lambda q, v: (q, v.at[1].set(0.0)))
+    leave = lagjax.Transition("ground", "air", lambda q, v, multipliers: multipliers, -1)
+    q, ts = jnp.array([1.5, 0.5]), jnp.array([0.0, 2.0])
+    return lagjax.simulate_hybrid(modes, [land, leave], "air", q, jnp.zeros(2), ts).q[-1]
+
+
+def hopper():
+    """One gap."""
+    scene = lagjax.System(
+        lambda q, v: v[0] ** 2 + 0.1 * v[1] ** 2 - G * (2 * q[0] + 0.2 * q[1]) - 200 * (q[0] - q[1] - 1) ** 2,
+        contacts=lambda q: q[1],
+    )
+    return lagjax.simulate(scene, jnp.array([1.5, 0.5]), jnp.zeros(2), jnp.array([0.0, 2.0])).q[-1]
+
+
+def ratchet_by_hand():
+    """A lever that swings, and a wheel that it drives one way: locked and free; the guard is the multiplier."""
+
+    def law(q, v):
+        return 0.5 * v[0] ** 2 + v[1] ** 2 - 2 * q[0] ** 2
+
+    def drag(q, v):
+        return jnp.stack([0.0, -0.3 * v[1]])
+
+    modes = {
+        "free": lagjax.System(law, forces=drag),
+        "locked": lagjax.System(law, forces=drag, velocity_constraints=lambda q, v: v[1] - v[0]),
+    }
+    lock = lagjax.Transition("free", "locked", lambda q, v: v[1] - v[0], -1)
+    free = lagjax.Transition("locked", "free", lambda q, v, multipliers: multipliers, -1)
+    q, v, ts = jnp.array([-1.0, 0.0]), jnp.zeros(2), jnp.array([0.0, 10.0])
+    return lagjax.simulate_hybrid(modes, [lock, free], "locked", q, v, ts).q[-1]
+
+
+def ratchet():
+    """One velocity that stays positive."""
+    scene = lagjax.System(
+        lambda q, v: 0.5 * v[0] ** 2 + v[1] ** 2 - 2 * q[0] ** 2,
+        forces=lambda q, v: jnp.stack([0.0, -0.3 * v[1]]),
+        one_way=lambda q, v: v[1] - v[0],
+    )
+    return lagjax.simulate(scene, jnp.array([-1.0, 0.0]), jnp.zeros(2), jnp.array([0.0, 10.0])).q[-1]
+
+
+def dominoes_by_hand():
+    """Two thin dominoes: the first falls alone, strikes, and pushes the other, until they part."""
+
+    def law(q, v):
+        return jnp.sum(v**2) / 6 - 0.5 * G * jnp.sum(jnp.cos(q - 0.1))
+
+    def between(q):
+        return (0.4 - jnp.sin(q[0])) * jnp.cos(q[1]) + jnp.cos(q[0]) * jnp.sin(q[1])
+
+    def strike(q, v):
+        slope = jax.grad(between)(q)
+        return q, v - slope * (slope @ v) / (slope @ slope)
+
+    modes = {
+        "one": lagjax.System(law, constraints=lambda q: q[1]),
+        "both": lagjax.System(law, constraints=between),
+        "apart": lagjax.System(law),
+    }
+    meet = lagjax.Transition("one", "both", lambda q, v: between(q), -1, strike)
+    part = lagjax.Transition("both", "apart", lambda q, v, multipliers: multipliers, -1)
+    again = lagjax.Transition("apart", "both", lambda q, v: between(q), -1, strike)
+    q, v, ts = jnp.array([0.15, 0.0]), jnp.zeros(2), jnp.array([0.0, 0.9])
+    return lagjax.simulate_hybrid(modes, [meet, part, again], "one", q, v, ts).q[-1]
+
+
+def dominoes():
+    """A gap between them, and one between the second and the ground on which it stands."""
+    scene = lagjax.System(
+        lambda q, v: jnp.sum(v**2) / 6 - 0.5 * G * jnp.sum(jnp.cos(q - 0.1)),
+        contacts=lambda q: {
+            "strike": (0.4 - jnp.sin(q[0])) * jnp.cos(q[1]) + jnp.cos(q[0]) * jnp.sin(q[1]),
+            "stand": q[1],
+        },
+    )
+    return lagjax.simulate(scene, jnp.array([0.15, 0.0]), jnp.zeros(2), jnp.array([0.0, 0.9])).q[-1]
+
+
 PAIRS = {
     "ball in a box": (ball_in_a_box_by_hand, ball_in_a_box),
     "ladder on wall and floor": (ladder_by_hand, ladder),
     "four beads between walls": (bead_row_by_hand, bead_row),
+    "hopper on a spring": (hopper_by_hand, hopper),
+    "ratchet": (ratchet_by_hand, ratchet),
+    "two dominoes": (dominoes_by_hand, dominoes),
 }
 
 
@@ -122,4 +213,4 @@ def lines(function: Callable) -> int:
 if __name__ == "__main__":
     jax.config.update("jax_enable_x64", True)
     for name, (old, new) in PAIRS.items():
-        print(name, lines(old), lines(new), old())
+        print(name, lines(old), lines(new), old(), new())

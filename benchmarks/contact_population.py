@@ -187,11 +187,14 @@ def blocks() -> Family:
 
 
 def cart() -> Family:
-    """A cart between two buffers, with a pendulum between two stops. p: g, mass, reach, stop, e."""
+    """A cart between two buffers, with a pendulum between two stops. p: g, mass, reach, stop, e.
+
+    The second stop is further off: a pendulum that leaves the first one at rest would graze it.
+    """
     scene = Scene(
         lambda q, v, t, p: 0.5 * p[1] * v[0] ** 2
         + 0.5 * (v[0] ** 2 + v[1] ** 2 + 2 * v[0] * v[1] * jnp.cos(q[1])) + p[0] * jnp.cos(q[1]),
-        gaps=lambda q, t, p: jnp.stack([q[0] + p[2], p[2] - q[0], q[1] + p[3], p[3] - q[1]]),
+        gaps=lambda q, t, p: jnp.stack([q[0] + p[2], p[2] - q[0], q[1] + p[3], p[3] + 0.07 - q[1]]),
         restitution=lambda p: p[4:8],
     )  # fmt: skip
 

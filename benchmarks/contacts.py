@@ -6,8 +6,8 @@
 
 *First* is a motion as a user waits for it, with its compilation; *again* the same once more. Errors of derivatives are
 in parts of the largest. *Rows* are motions in closed form, *many* random ones of one scene, *sizes* long motions, large
-batches and many contacts, *problems* worked ones, *by_hand* the same scenes as modes and guards. Their docstrings say
-what they are measured against.
+batches and many contacts, *problems* worked ones, *coverage* intervals of fits, *by_hand* the same scenes as modes and
+guards. Their docstrings say what they are measured against.
 """
 
 import argparse
@@ -231,6 +231,30 @@ def sizes(begins: str) -> Iterator[dict[str, Any]]:
             yield {"scene": name} | line
 
 
+def coverage(begins: str, count: int = 100) -> Iterator[dict[str, Any]]:
+    """How often 95 % intervals of e and μ hold them: fits of four noisy tosses along a rough floor."""
+    if not "noisy tosses".startswith(begins):
+        return
+    toss = lagjax.System(
+        lambda q, v: 0.5 * (v["x"] ** 2 + v["y"] ** 2) - G * q["y"], contacts=lambda q: {"floor": q["y"]},
+        restitution=lambda params: params["e"], friction=lambda params: params["mu"],
+        slip=lambda q, v: {"floor": v["x"]},
+    )  # fmt: skip
+    truth, ts, rng = {"e": 0.7, "mu": 0.25}, np.linspace(0.0, 1.2, 61), np.random.default_rng(0)
+    starts = [({"x": 0.0, "y": h}, {"x": 3.0, "y": 0.0}) for h in np.linspace(0.4, 1.2, 4)]
+    starts = jax.tree.map(jnp.asarray, starts)
+    exact = [lagjax.simulate(toss, *start, ts, truth).q for start in starts]
+    held, begun = dict.fromkeys(truth, 0), time.perf_counter()
+    for k in range(count):
+        seen = [{name: x + 1e-3 * rng.normal(size=x.size) for name, x in q.items()} for q in exact]
+        records = [lagjax.Record(ts, q, start=start) for q, start in zip(seen, starts, strict=True)]
+        low, high = lagjax.fit(toss, records, {"e": 0.6, "mu": 0.2}).intervals(0.95)
+        held = {name: held[name] + int(low[name] <= value <= high[name]) for name, value in truth.items()}
+        print(k + 1, held, file=sys.stderr, flush=True)
+    spent = time.perf_counter() - begun
+    yield {"scene": "noisy tosses", "fits": count, "held e": held["e"], "held mu": held["mu"], "all s": spent}
+
+
 def by_hand(begins: str) -> Iterator[dict[str, Any]]:
     """The same scenes as modes and guards, and as contacts."""
     for name, pair in PAIRS.items():
@@ -264,7 +288,7 @@ def problems(begins: str) -> Iterator[dict[str, Any]]:
             yield {"scene": problem.name} | figures | {"all s": spent}
 
 
-PARTS = {"rows": rows, "many": many, "sizes": sizes, "problems": problems, "by_hand": by_hand}
+PARTS = {"rows": rows, "many": many, "sizes": sizes, "problems": problems, "coverage": coverage, "by_hand": by_hand}
 
 
 def main() -> None:
