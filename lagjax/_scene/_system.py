@@ -86,8 +86,9 @@ class System(eqx.Module):
       `slip(q, qdot)`, the sliding velocity s at each contact in the structure of the gaps: a number in a plane, an
       array of two in space.
     - `impacts`: several contacts that touch take a blow together, by the linear complementarity problem of all of them
-      ("simultaneous", Moreau and Glocker), or one after the other ("sequential", as Newton's cradle does). "poisson",
-      without friction: together, and e is of impulses, each of which gives back that part of what compression took.
+      ("simultaneous", Moreau and Glocker), or one after the other ("sequential", as Newton's cradle does). "poisson":
+      together, and each gives back the part e of the impulse of its compression; without friction, or for one contact
+      in a plane, whose slip may stop and turn within the impact (Routh's construction).
 
     At a start a closed gap that moves inwards is an impact at once. `simulate` and `simulate_batch` follow motions with
     contacts, in machine code on a CPU, and `fit`, `sweep`, `check` and `health` take such scenes. First and second
@@ -157,10 +158,6 @@ class System(eqx.Module):
             raise ValueError(f"path must be 'auto', 'scalar' or 'array'; got {path!r}.")
         if impacts not in ("simultaneous", "sequential", "poisson"):
             raise ValueError(f"impacts must be 'simultaneous', 'sequential' or 'poisson'; got {impacts!r}.")
-        if impacts == "poisson" and slip is not None:
-            raise ValueError(
-                "impacts='poisson' is for contacts without friction: leave out slip, or take Newton's law."
-            )
         self.path, self.impacts = path, impacts
         restitution, friction = _coefficients(contacts, one_way, restitution, friction, slip)
         functions = (

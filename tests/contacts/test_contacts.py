@@ -132,7 +132,6 @@ def test_the_budget_of_events_is_named():
         ({"restitution": 1.5}, "restitution"),
         ({"friction": -0.1, "slip": lambda q, v: {"floor": v["x"]}}, "friction"),
         ({"impacts": "at once"}, "sequential"),
-        ({"impacts": "poisson", "slip": lambda q, v: {"floor": v["x"]}}, "without friction"),
     ],
 )
 def test_what_cannot_be_a_contact(options, sentence):
@@ -335,3 +334,78 @@ def test_health_says_where_laws_of_impacts_differ(impacts):
     assert "another law" in str(health)
     apart = start[0].at[2].set(3.0)
     assert "another law" not in str(lagjax.simulate(balls, apart, start[1], jnp.linspace(0.0, 1.0, 3)).health())
+
+
+# ---- Routh's construction --------------------------------------------------------------------------------------------
+
+
+def strike(angle, friction, e, slip, mass=1.0, inertia=1 / 12, half=0.5):
+    """The velocities of a rod behind a fall on its end, at an angle, with velocities 1 downwards and `slip` aside."""
+
+    def tip(q):
+        return jnp.array([q[0] + half * jnp.sin(q[2]), q[1] - half * jnp.cos(q[2])])
+
+    rod = lagjax.System(
+        lambda q, v: 0.5 * mass * v[:2] @ v[:2] + 0.5 * inertia * v[2] ** 2, contacts=lambda q: tip(q)[1],
+        slip=lambda q, v: jax.jvp(tip, (q,), (v,))[1][0], friction=lambda params: params[1],
+        restitution=lambda params: params[2], impacts="poisson",
+    )  # fmt: skip
+    start = jnp.array([0.0, half * jnp.cos(angle) + 0.5, angle]), jnp.array([slip, -1.0, 0.0])
+    run = lagjax.simulate(rod, *start, jnp.array([0.0, 0.6]), jnp.array([angle, friction, e]))
+    return run.qdot[-1]
+
+
+def strike_exactly(angle, friction, e, slip, mass=1.0, inertia=1 / 12, half=0.5):
+    """The same in small parts of the impulse, between which the slip of the moment decides (Darboux, Keller)."""
+    rows = np.array([[0, 1, half * np.sin(angle)], [1, 0, half * np.cos(angle)]])
+    response = rows / np.array([mass, mass, inertia])
+    (n, m), (_, t) = response @ rows.T
+    rates, impulses, end = np.array([-1.0, slip]), np.zeros(2), np.inf
+    for _ in range(6):  # phases of the impact
+        side = np.sign(rates[1]) if abs(rates[1]) > 1e-13 else np.sign(m) * (abs(m / t) > friction)
+        ratio = -friction * side if side else -m / t
+        by_impulse = np.array([n + m * ratio, m + t * ratio])
+        parts = [end - impulses[0]]
+        if rates[1] * by_impulse[1] < 0 and abs(rates[1]) > 1e-13:
+            parts.append(-rates[1] / by_impulse[1])
+        if end == np.inf and by_impulse[0] > 0:
+            parts.append(-rates[0] / by_impulse[0])
+        part = min(parts)
+        rates, impulses = rates + part * by_impulse, impulses + part * np.array([1.0, ratio])
+        if end == np.inf and abs(rates[0]) < 1e-13:
+            end = (1 + e) * impulses[0]
+        if impulses[0] >= end * (1 - 1e-14):
+            return np.array([slip, -1.0, 0.0]) + impulses @ response
+    raise AssertionError("the impact does not end")
+
+
+@pytest.mark.parametrize(
+    ("angle", "friction", "e", "slip"),
+    [
+        (0.6, 0.05, 0.5, 1.0),  # slides all along
+        (0.6, 0.3, 0.5, -0.1),  # the slip turns in compression
+        (0.6, 0.05, 0.5, -1.0),  # in expansion
+        (-0.9, 0.4, 0.6, 0.7),
+        (0.6, 0.3, 0.7, 0.0),  # begins in compression
+        (0.8, 3.0, 0.5, -1.0),  # it stops, and sticks
+        (0.8, 3.0, 0.5, 1.0),  # friction would jam: the slip stops first
+    ],
+)
+def test_rouths_construction(angle, friction, e, slip):
+    exact = strike_exactly(angle, friction, e, slip)
+    np.testing.assert_allclose(strike(angle, friction, e, slip), exact, atol=1e-13)
+    assert np.sum(np.array([1, 1, 1 / 12]) * exact**2) <= slip**2 + 1 + 1e-14
+    slopes = jax.jacfwd(lambda mu, e: strike(angle, mu, e, slip), argnums=(0, 1))(friction, e)
+    h = 1e-6
+    for slope, d in zip(slopes, ((h, 0.0), (0.0, h)), strict=True):
+        above, below = (strike_exactly(angle, friction + s * d[0], e + s * d[1], slip) for s in (1, -1))
+        np.testing.assert_allclose(slope, (above - below) / (2 * h), atol=1e-8)
+
+
+def test_poissons_law_with_friction_is_for_one_contact_in_a_plane():
+    system = lagjax.System(
+        planar, contacts=lambda q: {"floor": q["y"], "wall": q["x"]}, slip=lambda q, v: {"floor": v["x"]}, friction=0.1,
+        impacts="poisson",
+    )  # fmt: skip
+    with pytest.raises(ValueError, match="one contact in a plane"):
+        lagjax.simulate(system, state(x=1.0, y=1.0), state(x=0.0, y=0.0), jnp.array([0.0, 0.1]))

@@ -71,6 +71,11 @@ def _plan(problem: Problem, max_transitions: int) -> tuple[ContactPlan, Problem]
                 f"{shapes.count} contacts, {r} of them with friction, make {watches} watches, and {MOST_GUARDS} are "
                 "possible: one for each contact, and one more with friction. MuJoCo takes more."
             )
+        if problem.system.impacts == "poisson" and r and (shapes.count, d) != (1, 1):
+            raise ValueError(
+                "With friction impacts='poisson' is for one contact in a plane: leave out slip, or take Newton's law, "
+                "impacts='simultaneous'."
+            )
         contacts = Contacts(np.ones(shapes.count), np.ones(r), np.ones((r, d)))
         closed = Problem.from_system(plan.scene, wide.layout, InContact(wide.params, contacts))
         if refusal := MachineCode().refuses(closed):

@@ -36,6 +36,7 @@ from lagjax._run.contacts._impact_law import (
     Friction,
     ImpactRows,
     Pattern,
+    construct_impulses,
     find_pattern,
     find_phases,
     held_slips,
@@ -193,6 +194,10 @@ class ContactRounds(NamedTuple):
     @property
     def rubs(self) -> bool:
         return self.flat.rough.size > 0
+
+    @property
+    def impacts(self) -> str:
+        return self.plan.scene.system.impacts
 
     @property
     def has_gap(self) -> np.ndarray:
@@ -399,14 +404,19 @@ class ContactRounds(NamedTuple):
         hits, friction = meeting.happened, self.friction
         pattern = jax.tree.map(lambda a, b: jnp.where(hits, a, b), meeting.pattern, held)
         acting = friction._replace(coefficients=jnp.where(hits, friction.coefficients, 0.0))
-        bounced = jnp.where(hits, rates_behind(rows, meeting.phases, restitution, acting), 0.0)
-        solve = impulse_solver(rows, pattern, acting)
+        constructs = self.rubs and self.impacts == "poisson"
+        if constructs:
+            bounced, along = construct_impulses(rows, restitution, friction.coefficients)
+            pattern = pattern._replace(direction=jnp.where(hits, along, pattern.direction))
+        else:
+            bounced = rates_behind(rows, meeting.phases, restitution, acting)
+        solve, bounced = impulse_solver(rows, pattern, acting), jnp.where(hits, bounced, 0.0)
         first = solve(bounced)
         given = rows, pattern, meeting.involved, first, 0.0 * bounced if meeting.phases else bounced
         normal, rubs = violations(*jax.lax.stop_gradient(given), friction.still)
         ends, left = self.end_of_bounces(before, rows, t, y, first, bounced, restitution)
         ends = ends & hits & (pattern.push > 0)
-        return solve(jnp.where(ends, 0.0, bounced)), ends, left, ~(normal.any() | rubs.any())
+        return solve(jnp.where(ends, 0.0, bounced)), ends, left, constructs | ~(normal.any() | rubs.any())
 
     def sticks(self, contacts: Contacts, slips: tuple, fell, renewed):
         """True for contacts that stick (r,) behind watches of friction that `fell`, where there is no impact."""
@@ -435,12 +445,14 @@ class ContactRounds(NamedTuple):
         touches, rates, noise = self.touching(t, y)
         touches = touches | meets | was_closed | ~self.has_gap
         noise = jnp.maximum(noise, 0.01 * before.rate_rounding[0, : self.count])
-        law, phases = self.plan.scene.system.impacts, ()
-        involved = meets if law == "sequential" else reached(rows, meets, touches, friction)
-        if law == "poisson":
-            pattern, phases = find_phases(rows, involved, restitution, friction)
-        else:
+        phases = ()
+        involved = meets if self.impacts == "sequential" else reached(rows, meets, touches, friction)
+        if self.impacts != "poisson":
             pattern = find_pattern(rows, involved, restitution, friction)
+        elif self.rubs:  # one contact in a plane
+            pattern = Pattern(jnp.ones(1), jnp.zeros(1), jnp.zeros((1, 1)))
+        else:
+            pattern, phases = find_phases(rows, involved, restitution, friction)
         others = involved & ~meets & ~was_closed & (rates < -noise) & ~before.fresh[: self.count]
         noise_behind = jnp.maximum(noise, 1e-12 * jnp.max(jnp.abs(rates)))
         hits = (meets & (rates < -noise)).any()

@@ -6,7 +6,8 @@ contacts that touch at once, asks for
 
     ġ⁺ + e ġ⁻ ≥ 0  ⟂  Λ ≥ 0        |F| ≤ μ Λ,  F = −μ Λ s⁺/|s⁺| where s⁺ ≠ 0
 
-`find_pattern` finds which contacts push and stick; `impulse_solver` solves for what they do, and has derivatives.
+`find_pattern` finds which contacts push and stick; `impulse_solver` solves for what they do, and has derivatives. Of
+Poisson's law are `find_phases`, without friction, and `construct_impulses`, of one contact with it.
 Source: Moreau, in *Nonsmooth Mechanics and Applications* (1988), §11; Glocker, *Set-Valued Force Laws* (2001), ch. 9;
 Murty, Linear Algebra Appl. 5 (1972) 65 (pivoting).
 """
@@ -275,6 +276,31 @@ def rates_behind(rows: ImpactRows, phases: tuple, restitution, friction: Frictio
         return -restitution * rows.rates[:count]
     rows = _give_back(rows, phases[0], restitution, friction)
     return (rows.rates + rows.coupling @ impulse_solver(rows, phases[1], friction)(jnp.zeros(count)))[:count]
+
+
+def construct_impulses(rows: ImpactRows, restitution, coefficients) -> tuple[Any, Any]:
+    """The rate (1,) behind an impact of one contact in a plane, and −F/μΛ (1, 1), by Routh's construction.
+
+    As the normal impulse Λ grows, friction acts against the slip of that moment. Where that has stopped the contact
+    sticks, if friction suffices, or slides on the other way. Compression ends where the rate is zero, the impact at
+    1 + e times its impulse (Wang & Mason, J. Appl. Mech. 59 (1992) 635).
+    """
+    (normal, mixed), (_, tangential) = rows.coupling
+    (rate, slip), most = rows.rates, coefficients[0]
+    side = jnp.where(slip < 0, -1.0, 1.0)
+    slows = most * tangential - side * mixed  # of the slip, by Λ; it is positive where friction could jam
+    stops = jnp.where((slip == 0) | (slows > 0), jnp.abs(slip) / jnp.where(slows > 0, slows, 1.0), jnp.inf)
+    held = jnp.clip(mixed / tangential, -most, most)  # −dF/dΛ from there on
+    first, then = normal - most * side * mixed, normal - held * mixed
+    stays = first * stops >= -rate  # compression ends before the slip does
+    before = jnp.where(stays, 0.0, stops)
+    compression = before + (-rate - first * before) / jnp.where(stays, first, then)
+    impulse = (1.0 + restitution[0]) * compression
+    slides = jnp.minimum(impulse, stops)
+    force = -most * side * slides - held * (impulse - slides)
+    part = most * impulse
+    direction = jnp.where(part > 0, -force / jnp.where(part > 0, part, 1.0), 0.0)
+    return (rate + normal * impulse + mixed * force)[None], direction[None, None]
 
 
 def _give_back(rows: ImpactRows, compression: Pattern, restitution, friction: Friction) -> ImpactRows:
