@@ -538,14 +538,16 @@ def require_system(system: Any, contacts: bool = False) -> System:
         kind = type(system).__name__
         if kind == "Hybrid":
             raise TypeError(
-                "This is for one System: a lagjax.Hybrid is taken by simulate, simulate_hybrid, fit and sweep."
+                "This is for one System: a lagjax.Hybrid is taken by simulate, simulate_hybrid, periodic_orbit, "
+                "lyapunov_spectrum, fit and sweep."
             )
         name = getattr(system, "__name__", kind) if callable(system) else kind
         raise TypeError(f"system must be a lagjax.System, as lagjax.System(lagrangian) is; got {name}.")
     if system.touches and not contacts:
         raise TypeError(
-            "This is for scenes without contacts, which it would leave out: simulate and simulate_batch follow motions "
-            "with contacts. For the motion while none is closed, build the System without contacts=... and one_way=...."
+            "This is for scenes without contacts, which it would leave out: simulate, simulate_batch, periodic_orbit "
+            "and lyapunov_spectrum take these. For the motion while none is closed, build the System without "
+            "contacts=... and one_way=...."
         )
     return present_system(system)
 

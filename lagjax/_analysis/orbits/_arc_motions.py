@@ -13,29 +13,33 @@ import numpy as np
 
 from lagjax._analysis._scene_state import require_matrices
 from lagjax._analysis.orbits._flat_starts import require_untraced
+from lagjax._analysis.orbits._jumping_motions import JumpingMotions
 from lagjax._engine import Problem
 from lagjax._engine.taylor import KEPT, MachineCode, Motions, flow_of, jvp, tolerances_of
 from lagjax._equations import Sample, Scales, has_constraints
 from lagjax._interface import SUCCESSFUL, Layout, halves
 from lagjax._primitives import sentence
-from lagjax._scene import System, require_system
+from lagjax._run.hybrid import Scene, first_law, jumps, laws, require_scene
+from lagjax._scene import ROLES, replace_functions, require_system
 
 PyTree = Any
 
 
 class Arc(NamedTuple):
-    """R arcs: `end` (R, 2n), `by_start` (R, 2n, 2n), `by_params` (R, 2n, F), and how each ended.
+    """R arcs: `end` (R, 2n), its `rate` (R, 2n), `by_start` (R, 2n, 2n), `by_params` (R, 2n, F), and how each ended.
 
     `steps` (R,) counts what was taken; `result` (R,) and `t_end` (R,) are those of a `Solution`. Rows that failed are
-    NaN.
+    NaN. `returns` (R,) tells whether it ended in the mode in which it began.
     """
 
     end: np.ndarray
+    rate: np.ndarray
     by_start: np.ndarray
     by_params: np.ndarray
     result: np.ndarray
     t_end: np.ndarray
     steps: np.ndarray
+    returns: np.ndarray | bool = True
 
     @property
     def ok(self) -> np.ndarray:
@@ -71,24 +75,31 @@ def _or_one(x: np.ndarray) -> np.ndarray:
 class Arcs:
     """The follower of motions of one scene with one set of parameters, `numbers` (P,)."""
 
-    def __init__(self, problem: Problem, numbers: np.ndarray):
-        self.problem, self.numbers = problem, numbers
+    def __init__(self, problem: Problem, numbers: np.ndarray, jumping: JumpingMotions | None = None):
+        self.problem, self.numbers, self.jumping = problem, numbers, jumping
         self.flow, self.tolerances = flow_of(problem), tolerances_of(problem)
         self.derivation, self.layout = problem.derivation, problem.layout
         self.size = problem.layout.size
         named = {i for name in ("lagrangian", "mass_matrix", "force") for i in self.derivation.reads(name)}
-        self.driven = 2 * self.size in named  # by an explicit time
-        self.conserves = not self.derivation.works
+        self.driven = 2 * self.size in named if jumping is None else jumping.driven  # by an explicit time
+        self.conserves = not self.derivation.works and jumping is None
 
     @classmethod
-    def from_system(cls, system: System, layout: Layout, params: PyTree, rtol: float, what: str) -> "Arcs":
-        """The arcs of a scene whose states have this layout.
+    def from_system(
+        cls, scene: Scene, layout: Layout, params: PyTree, rtol: float, what: str, may_jump: bool = False
+    ) -> "Arcs":
+        """The arcs of a scene whose states have this layout; with contacts or modes only where it `may_jump`.
 
         Raises `ValueError`, a sentence about `what` they are for, where the scene has constraints or no machine code.
         """
-        system = require_system(system)
-        require_untraced((system, params), "A parameter")
-        if has_constraints(system):
+        scene = require_scene(scene) if may_jump else require_system(scene)
+        jumping = JumpingMotions(scene, layout, params, rtol) if jumps(scene) else None
+        require_untraced((laws(scene), params), "A parameter")
+        system = first_law(scene)
+        if system.touches:  # its free motion, for units and charts
+            of_contacts = dict.fromkeys(("contacts", "one_way", "restitution", "friction", "slip"))
+            system = replace_functions(system, {role: getattr(system, role) for role in ROLES} | of_contacts)
+        if any(map(has_constraints, laws(scene))):
             raise ValueError(
                 f"{what} cannot be found with constraints yet: give the scene coordinates that need none, angles of "
                 "links instead of positions of their ends."
@@ -102,7 +113,7 @@ class Arcs:
         problem = Problem.from_system(system, layout, params, rtol=rtol, max_steps=_BUDGET)
         if refusal := MachineCode().refuses(problem):
             raise ValueError(f"{what} are found with machine code, and there is none for this scene: {refusal}.")
-        return cls(problem, np.asarray(problem.vector))
+        return cls(problem, np.asarray(problem.vector), jumping)
 
     def with_numbers(self, numbers: np.ndarray) -> "Arcs":
         other = copy.copy(self)
@@ -110,7 +121,9 @@ class Arcs:
         return other
 
     def ends(self, times: np.ndarray, y0: np.ndarray):
-        """The motions alone: their `Solution`, `times` (R, T) or (1, T) and `y0` (R, 2n)."""
+        """The motions alone: their `Solution`, or `JumpRun`, `times` (R, T) or (1, T) and `y0` (R, 2n)."""
+        if self.jumping is not None:
+            return self.jumping.run(times, y0)
         return self.flow.run(times, y0, self.numbers[None], self.tolerances)
 
     def equal_shares(self, span: np.ndarray, y0: np.ndarray, count: int) -> np.ndarray:
@@ -134,9 +147,17 @@ class Arcs:
         shares[:, 0], shares[:, -1] = 0.0, 1.0
         return shares
 
-    def follow(self, times: np.ndarray, y0: np.ndarray, directions: np.ndarray | None = None) -> Arc:
-        """The arcs between `times` (R, 2) from `y0` (R, 2n), along `directions` (F, P) of the parameters too."""
+    def follow(self, times: np.ndarray, y0: np.ndarray, directions: np.ndarray | None = None, modes=None) -> Arc:
+        """The arcs between `times` (R, 2) from `y0` (R, 2n), along `directions` (F, P) of the parameters too.
+
+        Those that jump begin in `modes` (R,), by default in the first one.
+        """
         rows, states = y0.shape
+        if self.jumping is not None:
+            run = self.jumping.run(times, y0, modes, varies=True)
+            back = run.modes[:, -1] == run.modes[:, 0]
+            nothing = np.zeros((rows, states, 0))
+            return Arc(run.y_end, run.rate, run.by_start, nothing, run.result, run.t_end, run.accepted, back)
         directions = np.zeros((0, len(self.numbers))) if directions is None else directions
         params = self.numbers[None]
         run = self.flow.run(times, y0, params, self.tolerances, KEPT)
@@ -151,7 +172,8 @@ class Arcs:
             moved[well] = jvp(self.flow, motions, dy0[well], dparams[well], self.tolerances)[1]
         end = np.where(well[:, None], run.y_end, np.nan)
         moved = np.swapaxes(moved, 1, 2)
-        return Arc(end, moved[..., :states], moved[..., states:], run.result, run.t_end, run.accepted)
+        rate = self.rate(times[:, 1], end)
+        return Arc(end, rate, moved[..., :states], moved[..., states:], run.result, run.t_end, run.accepted)
 
     def units(self, y0: np.ndarray, time: np.ndarray | None = None) -> "Units":
         """The units of states (R, 2n), from the largest coordinate and velocity there, in the metric of M.
@@ -213,6 +235,8 @@ class Arcs:
         return chart * units.state[:, None, :] / np.concatenate([of_q, of_p], axis=1)[:, :, None]
 
     def why_not(self, row: int, arc: Arc, y0: np.ndarray, t_last: float) -> str:
+        if not np.broadcast_to(arc.returns, arc.result.shape)[row]:
+            return "It ends in another mode: give a period in which it comes back to the one it began in."
         if arc.result[row] == SUCCESSFUL:
             return "Its derivatives are not finite."
         return sentence(arc.result[row], arc.t_end[row], t_last, y0[row], self.layout.names) or ""

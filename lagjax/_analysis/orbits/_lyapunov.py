@@ -20,6 +20,7 @@ from lagjax._analysis.orbits._arc_motions import Arcs
 from lagjax._analysis.orbits._flat_starts import starts
 from lagjax._interface import SUCCESSFUL, SimulationError, require_flag, show_str
 from lagjax._primitives import accepts_singles, sentence
+from lagjax._run.hybrid import Scene
 from lagjax._scene import System
 
 PyTree = Any
@@ -56,7 +57,7 @@ class LyapunovExponent(NamedTuple):
 
 @accepts_singles(("q0", "qdot0"), ("duration", "params"))
 def lyapunov_spectrum(
-    system: System,
+    system: Scene,
     q0: PyTree,
     qdot0: PyTree,
     duration: jax.Array | float,
@@ -74,6 +75,8 @@ def lyapunov_spectrum(
       `q0` and `qdot0`. The result is then (N, 2n), NaN for a motion that cannot be followed.
     - `rtol`: the local error of the motion, see `simulate`.
 
+    The scene may have contacts, as billiards do, or be a `Hybrid`; 4096 of their changes are followed.
+
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, for a scene with constraints or without
     machine code; `SimulationError` when a single motion cannot be followed to its end.
 
@@ -87,7 +90,7 @@ def lyapunov_spectrum(
     """
     require_flag(throw, "throw")
     durations, layout, y0 = starts(q0, qdot0, duration, "duration")
-    arcs = Arcs.from_system(system, layout, params, rtol, "Lyapunov exponents")
+    arcs = Arcs.from_system(system, layout, params, rtol, "Lyapunov exponents", may_jump=True)
     spans = durations.ravel()
     run = arcs.ends(np.stack([np.zeros_like(spans), spans], axis=1), y0)
     if throw and durations.ndim == 0 and run.result[0] != SUCCESSFUL:
@@ -104,13 +107,16 @@ def _spectra(arcs: Arcs, y0: np.ndarray, duration: np.ndarray, pieces: int) -> n
     """The exponents (N, 2n) of some motions, each from this many arcs."""
     members, states = y0.shape
     times = duration[:, None] * np.arange(pieces + 1) / pieces
-    path = arcs.ends(times, y0).path
+    run: Any = arcs.ends(times, y0)
+    path, modes = run.path, run.modes[:, :-1].ravel() if arcs.jumping else None
     spans = np.stack([times[:, :-1], times[:, 1:]], axis=2).reshape(-1, 2)
     well = np.isfinite(path).all(axis=(1, 2))
     rows = np.repeat(well, pieces)
     moved = np.full((members * pieces, states, states), np.nan)
     if well.any():
-        moved[rows] = arcs.follow(spans[rows], path[:, :-1].reshape(-1, states)[rows]).by_start
+        moved[rows] = arcs.follow(
+            spans[rows], path[:, :-1].reshape(-1, states)[rows], modes=modes if modes is None else modes[rows]
+        ).by_start
     units = arcs.units(y0)
     moved = units.repeat(pieces).growth(moved)
     chart = arcs.canonical(times.ravel(), path.reshape(-1, states), units.repeat(pieces + 1))

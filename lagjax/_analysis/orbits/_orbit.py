@@ -15,7 +15,7 @@ from lagjax._analysis.orbits._shooting import Chain, Closing
 from lagjax._equations import decide, singular_threshold
 from lagjax._interface import SUCCESSFUL, Layout, SimulationError, halves, require_finite, require_flag, require_number
 from lagjax._primitives import accepts_singles
-from lagjax._scene import System
+from lagjax._run.hybrid import Scene
 
 PyTree = Any
 
@@ -91,7 +91,7 @@ _SHOWN = 6  # leaves of q0, which may have any number of them
 
 @accepts_singles(("q0", "qdot0"), ("period", "params"))
 def periodic_orbit(
-    system: System,
+    system: Scene,
     q0: PyTree,
     qdot0: PyTree,
     period: jax.Array | float,
@@ -118,6 +118,9 @@ def periodic_orbit(
       those of image⁻¹ φ_T. It should be a symmetry of the scene.
     - `throw`: raise when a single guess leads to no orbit. A batch never raises: look at `ok` and `message`.
 
+    The scene may have contacts, or be a `Hybrid`: it starts in that one's mode `start`, at a state off its guards, and
+    the period is followed as one arc.
+
     Multipliers that are 1 by symmetry are split off first. The others are computed as K-th roots over K arcs, so that a
     multiplier of 1e-9 beside one of 1e9 is as accurate as any.
 
@@ -137,7 +140,7 @@ def periodic_orbit(
     """
     require_flag(throw, "throw")
     periods, layout, y0 = starts(q0, qdot0, period, "period")
-    arcs = Arcs.from_system(system, layout, params, RTOL, "Periodic orbits")
+    arcs = Arcs.from_system(system, layout, params, RTOL, "Periodic orbits", may_jump=True)
     found = find(_closing(arcs, energy, image), y0, periods.ravel())
     if periods.ndim == 0:
         if throw and not found.ok[0]:
@@ -195,7 +198,7 @@ def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> FlatOrbits:
     """The orbits near these guesses; what does not close well is tried with more arcs as long as that helps."""
     arcs = closing.arcs
     counts = arc_counts(arcs, y0, period)
-    most = np.minimum(_MOST_ARCS, _MORE * counts)
+    most = counts if arcs.jumping else np.minimum(_MOST_ARCS, _MORE * counts)
     nothing, never = np.full(y0.shape, np.nan), np.zeros(len(y0), bool)
     found = FlatOrbits(
         nothing, nothing[:, 0], nothing.astype(complex), nothing[:, 0], never, never, np.full(len(y0), "", object)
@@ -219,6 +222,8 @@ def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> FlatOrbits:
 
 def arc_counts(arcs: Arcs, y0, period) -> np.ndarray:
     """The number of arcs of each orbit, a power of two: from the steps that its guess takes."""
+    if arcs.jumping:  # a state between does not tell the mode
+        return np.ones(len(period), int)
     run = arcs.ends(np.stack([np.zeros(len(period)), period], axis=1), y0)
     share = np.where(run.result == SUCCESSFUL, 1.0, np.clip(run.t_end / period, 1e-3, 1.0))
     count = np.maximum(1.0, run.accepted / share / _STEPS_OF_ARC)

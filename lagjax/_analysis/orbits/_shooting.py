@@ -169,8 +169,8 @@ def follow(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarra
     if not closing.lasts:  # each begins at zero, where times have the most digits
         times = (spans * np.diff(parts)).reshape(-1, 1) * np.array([0.0, 1.0])
     arc = arcs.follow(times, rows)
-    rate = arcs.rate(times[:, 1], arc.end).reshape(y.shape)
-    ok = np.asarray(arc.ok.reshape(chains, count).all(axis=1))
+    rate = arc.rate.reshape(y.shape)
+    ok = np.asarray((arc.ok & arc.returns).reshape(chains, count).all(axis=1))
     end, growth = arc.end.reshape(y.shape), arc.by_start.reshape(*y.shape, states)
     inverse = np.linalg.inv(closing.matrix)
     end[:, -1], rate[:, -1] = np.linalg.solve(closing.matrix, (end[:, -1] - closing.shift).T).T, rate[:, -1] @ inverse.T
@@ -181,7 +181,7 @@ def follow(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarra
     rate, slope = rate * units.time[:, None, None] / of_state, slope * of_state
     why = np.full(chains, "", object)
     for k in np.flatnonzero(~ok).tolist():
-        row = k * count + int(np.argmin(arc.ok[k * count : (k + 1) * count]))
+        row = k * count + int(np.argmin((arc.ok & arc.returns)[k * count : (k + 1) * count]))
         why[k] = arcs.why_not(row, arc, rows, times[row, 1])
     return Chain(y, period, parts, units, defect, units.growth(growth), rate, off, slope, ok, why)
 

@@ -1,0 +1,91 @@
+"""Motions that jump, with contacts or from mode to mode, on rows as `Arcs` asks for them.
+
+They are followed under `jax.vmap`, and vary by forward mode: a round for all rows at once.
+"""
+
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._interface import Function, Layout, halves
+from lagjax._run import simulate
+from lagjax._run.hybrid import Hybrid, Scene, laws, simulate_hybrid
+from lagjax._scene import ROLES
+
+PyTree = Any
+
+# The budgets of changes of one motion, and of one arc whose derivatives are taken: what they record takes memory.
+_CHANGES, _CHANGES_OF_ARC = 4096, 256
+
+
+class JumpRun(NamedTuple):
+    """R motions: as in a `Solution` `path` (R, T, 2n), `y_end`, `t_end`, `result`, `accepted`; and `modes` (R, T).
+
+    `by_start` (R, 2n, 2n) and `rate` (R, 2n) are the derivatives of `y_end` by the start and by the last time.
+    """
+
+    path: Any
+    y_end: Any
+    t_end: Any
+    result: Any
+    accepted: Any
+    modes: Any
+    by_start: Any = None
+    rate: Any = None
+
+
+class JumpingMotions(NamedTuple):
+    """The follower of motions of one scene that jumps."""
+
+    scene: Scene
+    layout: Layout
+    params: PyTree
+    rtol: float
+
+    @property
+    def driven(self) -> bool:
+        """True if anything of the scene asks for the time."""
+        functions = [getattr(system, role) for system in laws(self.scene) for role in ROLES]
+        if isinstance(self.scene, Hybrid):
+            functions += [f for transition in self.scene.transitions for f in (transition.guard, transition.reset)]
+        return any("t" in function.extras for function in functions if isinstance(function, Function))
+
+    def run(self, times: np.ndarray, y0: np.ndarray, modes=None, varies: bool = False) -> JumpRun:
+        """The motions from y0 (R, 2n) in `modes` (R,), by default the first one, at `times` (R, T) or (1, T)."""
+        rows, scene = len(y0), self.scene
+        if modes is None:
+            modes = np.full(rows, list(scene.modes).index(scene.start) if isinstance(scene, Hybrid) else 0)
+        given = np.broadcast_to(times, (rows, times.shape[-1])), y0, modes
+        more = 2 ** int(np.ceil(np.log2(rows))) - rows  # another number of rows compiles anew
+        times, y0, modes = (np.concatenate([x, np.repeat(x[-1:], more, axis=0)]) for x in given)
+        return jax.tree.map(lambda x: np.array(x)[:rows], _follow(self, times, y0, modes, varies))
+
+
+@eqx.filter_jit
+def _follow(motions: JumpingMotions, times, y0, modes, varies: bool) -> JumpRun:
+    scene, layout, params, rtol = motions
+
+    def end(y, last, ts, mode):
+        ts = jnp.append(ts[:-1], last)
+        state, options = map(layout.restore, halves(y)), {"rtol": rtol, "throw": False}
+        options["max_transitions"] = _CHANGES_OF_ARC if varies else _CHANGES
+        if isinstance(scene, Hybrid):
+            run = simulate_hybrid(scene, *state, ts, params, start=mode, **options)
+        else:
+            run = simulate(scene, *state, ts, params, **options)
+        path = jnp.concatenate([jax.vmap(layout.flatten)(part) for part in (run.q, run.qdot)], axis=1)
+        y_end = jnp.concatenate([layout.flatten(part) for part in run.end[1:]])
+        at = jnp.zeros(ts.shape, int) if run.mode is None else run.mode
+        return y_end, JumpRun(path, y_end, run.end.t, run.result._value, run.stats["num_accepted_steps"], at)
+
+    def vary(ts, y, mode):
+        given = y, ts[-1], ts, mode
+        if not varies:
+            return end(*given)[1]
+        (by_start, rate), run = jax.jacfwd(end, (0, 1), has_aux=True)(*given)
+        return run._replace(by_start=by_start, rate=rate)
+
+    return jax.vmap(vary)(times, y0, modes)

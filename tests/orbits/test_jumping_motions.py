@@ -1,0 +1,100 @@
+"""Limit cycles and Lyapunov exponents of motions with contacts and with modes, against closed forms and exact maps."""
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+
+G = 9.81
+
+
+def test_the_rimless_wheel_walks_as_its_map_says():
+    """Spokes of length one, 2α apart, on a slope γ: ω² → cos²2α ω² + 4 g sin α sin γ in a step."""
+    alpha, slope = 0.3, 0.08
+    wheel = lagjax.System(lambda q, v: 0.5 * v**2 - G * jnp.cos(q))
+    step = lagjax.Transition(
+        "roll", "roll", lambda q, v: q - (slope + alpha), 1, lambda q, v: (q - 2 * alpha, jnp.cos(2 * alpha) * v)
+    )
+    scene = lagjax.Hybrid({"roll": wheel}, [step], "roll")
+    orbit = lagjax.periodic_orbit(scene, 0.0, 1.0, 0.6)
+    fast = 4 * G * np.sin(alpha) * np.sin(slope) / np.sin(2 * alpha) ** 2  # ω² before a step
+    here = np.sqrt(fast + 2 * G * (np.cos(slope + alpha) - np.cos(orbit.q0)))
+    np.testing.assert_allclose(orbit.qdot0, here, rtol=1e-13)
+    # The energy lost in a step is a square of the speed, and one multiplier is that of the time shift.
+    np.testing.assert_allclose(orbit.multipliers, [np.cos(2 * alpha) ** 2, 1.0], rtol=1e-12)
+    assert orbit.stable and orbit.closure < 1e-14
+    with pytest.raises(ValueError, match="is not conserved"):
+        lagjax.periodic_orbit(scene, 0.0, 1.0, 0.6, energy=1.0)
+    with pytest.raises(TypeError, match="This is for one System"):
+        lagjax.family(scene, orbit)
+    modes = {"a": wheel, "b": wheel}
+    over = [lagjax.Transition(x, y, lambda q, v: q - 0.2, 1) for x, y in ("ab", "ba")]
+    with pytest.raises(lagjax.SimulationError, match="ends in another mode"):
+        lagjax.periodic_orbit(lagjax.Hybrid(modes, over, "a"), 0.0, 1.0, 0.3)
+
+
+@pytest.mark.slow
+def test_a_ball_bounces_once_in_a_period_of_its_table():
+    """Table a sin ωt, period T: it bounces where the table moves at w = gT/2 (1 − e)/(1 + e), and leaves at gT/2."""
+    e, omega, a, period = 0.5, 2 * np.pi, 0.1, 1.0
+    ball = lagjax.System(lambda q, v: 0.5 * v**2 - q, contacts=lambda q, t: q - a * jnp.sin(omega * t), restitution=e)
+    up, table = period / 2, period / 2 * (1 - e) / (1 + e)
+    phase = np.arccos(table / (a * omega))
+    since = period - phase / omega  # the last bounce
+    q0, v0 = a * np.sin(phase) + up * since - 0.5 * since**2, up - since
+    orbit = lagjax.periodic_orbit(ball, q0 + 1e-3, v0 - 2e-3, period)
+    np.testing.assert_allclose([orbit.q0, orbit.qdot0], [q0, v0], atol=1e-14)
+    # The map of time and velocity of a bounce, (dt, dv) → dt′ = dt + T dv / (w + v), dv′.
+    later = np.array([1.0, period / (table + up)])
+    bend = -a * omega**2 * np.sin(phase)
+    speed = np.array([0.0, -e]) + e * (later - np.array([1.0, 0.0])) + (1 + e) * bend * later
+    expected = np.linalg.eigvals(np.stack([later, speed]))
+    np.testing.assert_allclose(np.sort(orbit.multipliers.real), np.sort(expected), rtol=1e-12)
+    assert not orbit.stable
+
+
+def billiard(q, v, end, radius, wall):
+    """The end of a flight in a square box around a disc, and the product of its tangent maps, hit by hit."""
+    growth, t, eye, none = np.eye(4), 0.0, np.eye(2), np.zeros((2, 2))
+    while True:
+        hits = [((wall - s * q[i]) / (s * v[i]), -s * eye[i]) for i in (0, 1) for s in (1, -1) if s * v[i] > 0]
+        speed, toward = v @ v, q @ v
+        inside = toward**2 - speed * (q @ q - radius**2)
+        if toward < 0 < inside:
+            hits.append(((-toward - np.sqrt(inside)) / speed, None))
+        flight, normal = min(hits, key=lambda hit: hit[0])
+        last = min(flight, end - t)
+        q, t, growth = q + last * v, t + last, np.block([[eye, last * eye], [none, eye]]) @ growth
+        if last < flight:
+            return q, growth
+        bend = none
+        if normal is None:
+            normal = q / radius
+            bend = (eye - np.outer(normal, normal)) / radius
+        onto = eye - np.outer(v, normal) / (v @ normal)  # dq where it hits, at the instant that varies
+        mirror = eye - 2 * np.outer(normal, normal)
+        after = mirror @ v
+        turned = -2 * (np.outer(normal, v) + v @ normal * eye) @ bend @ onto
+        at_once = onto + np.outer(after, normal) / (v @ normal)
+        v, growth = after, np.block([[at_once, none], [turned, mirror]]) @ growth
+
+
+@pytest.mark.slow
+def test_lyapunov_exponents_of_the_sinai_billiard_are_those_of_its_tangent_maps():
+    radius, wall, end = 0.5, 2.0, 24.0
+
+    def gaps(q):
+        return jnp.stack([jnp.sqrt(q @ q) - radius, *(wall - q), *(wall + q)])
+
+    scene = lagjax.System(lambda q, v: 0.5 * v @ v, contacts=gaps, restitution=1.0)
+    q0, v0 = np.array([1.0, 0.3]), np.array([-1.0, 0.1])  # of size one: states are in their own units
+    q, growth = billiard(q0, v0, end, radius, wall)
+    run = lagjax.simulate(scene, q0, v0, jnp.array([0.0, end]), rtol=1e-13)
+    np.testing.assert_allclose(run.q[-1], q, atol=1e-14 * np.linalg.norm(growth))
+    order = [0, 1, 3, 2]  # q₁ q₂ p₂ p₁
+    stretch = np.abs(np.diag(np.linalg.qr(growth[np.ix_(order, order)])[1]))
+    found = lagjax.lyapunov_spectrum(scene, q0, v0, end)
+    # The product of all maps has lost the smallest numbers to the largest: the two largest are compared.
+    np.testing.assert_allclose(found[:2], np.sort(np.log(stretch) / end)[:1:-1], rtol=1e-9)
+    np.testing.assert_allclose(found, -found[::-1], atol=1e-13)
