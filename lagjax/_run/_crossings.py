@@ -7,6 +7,7 @@ import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -29,9 +30,11 @@ from lagjax._interface import (
     require_flag,
     show_str,
 )
-from lagjax._primitives import marks_absent, raise_where_failed, sentence
+from lagjax._primitives import lost_unless, marks_absent, raise_where_failed, sentence
 from lagjax._program import Unlowerable
-from lagjax._scene import System, require_system
+from lagjax._run._trajectory import Trajectory
+from lagjax._run.hybrid import Hybrid, Scene, require_scene
+from lagjax._scene import require_system
 
 PyTree = Any
 _TOO_MANY = code_of(RESULTS.max_crossings_reached)
@@ -64,7 +67,7 @@ class Crossings(NamedTuple):
 
 @marks_absent
 def crossings(
-    system: System,
+    system: Scene,
     section: Callable | dict[str, Callable],
     q0: PyTree,
     qdot0: PyTree,
@@ -93,6 +96,9 @@ def crossings(
     step, by a bound on that polynomial and without sampling, so that none is missed, down to the rounding of the time.
     A jump of the section through zero is a crossing, too. Sections may be piecewise (`abs`, `where`, `max`, …).
 
+    In a `Hybrid` a section is watched in every mode, and a reset through zero is no crossing; where a section of both
+    directions is zero as another mode begins, it has to leave zero first.
+
     `crossings` works under `jax.jit` and `jax.vmap`, which makes one batch of all members, and has first and second
     derivatives. With s′ the rate of the section along the motion, the derivative of a crossing time is −ds / s′, and
     that of the state there includes the rate of the state times it. Derivatives take one more run. Where the motion
@@ -114,12 +120,20 @@ def crossings(
     period = upward.t[1] - upward.t[0]
     ```
     """
-    system = require_system(system)
+    scene = require_scene(system)
     require_flag(throw, "throw")
     require_budget(count, "count")
     names, functions = sections_of(section)
     directions = directions_of(direction, names)
     layout = Layout.from_state(q0, qdot0)
+    if isinstance(scene, Hybrid):
+        watched = scene.with_sections(functions, directions, count)
+        options = {"rtol": rtol, "atol": atol, "max_steps": max_steps, "throw": False}
+        run = watched.follow(q0, qdot0, jnp.asarray(ts)[jnp.array([0, -1])], params, **options)
+        first, sections = len(scene.transitions), len(functions)
+        inputs = jax.tree.map(jnp.asarray, eqx.filter((q0, qdot0, ts, params), eqx.is_array_like))
+        return _read_crossings(run, first, sections, count, layout, names, throw, inputs)
+    system = require_system(scene)
     problem = Problem.from_arguments(system, layout, q0, qdot0, ts, params, rtol, atol, max_steps)
     if has_constraints(system):
         q0, qdot0 = as_arrays((q0, qdot0), layout.dtype, "state")
@@ -129,8 +143,30 @@ def crossings(
     how = _how_it_ended if isinstance(solution.y_end, np.ndarray) else _how_it_ended_traced
     result, end, ok = how(noted, solution, count)
     if throw:
-        noted = _raise_unless_ok(problem, end, noted, result)
+        noted = _raise_unless_ok(layout, problem.ts, end, noted, result)
     return restore_crossings(problem.layout, names, noted, ok)
+
+
+def _read_crossings(run: Trajectory, first: int, sections: int, count: int, layout: Layout, names, throw, inputs):
+    """The crossings among the transitions of a hybrid motion, whose places in the list begin with `first`.
+
+    They vary with the `inputs`, or have no derivative.
+    """
+    changes = run.transitions
+    assert changes is not None
+    # A section that holds where the motion begins is met at once, and not crossed.
+    which = jnp.where((changes.number >= first) & (changes.t > run.ts[0]), (changes.number - first) % sections, -1)
+    there = which == jnp.arange(sections)[:, None]
+    places = jnp.argsort(~there, axis=1, stable=True)[:, :count]
+    found = jnp.take_along_axis(there, places, axis=1)
+    y = jnp.concatenate([jax.vmap(layout.flatten)(part) for part in (changes.q, changes.qdot)], axis=1)
+    t, y = lost_unless(found, changes.t[places], inputs), lost_unless(found[..., None], y[places], inputs)
+    end = jnp.concatenate([layout.flatten(part) for part in run.end[1:]])
+    noted, many = Noted(t, y, there.sum(axis=1)), there.sum(axis=1) > count
+    result = jnp.where(many.any(), _TOO_MANY, run.result._value)
+    if throw:
+        noted = _raise_unless_ok(layout, run.ts, (run.end.t, end), noted, result)
+    return restore_crossings(layout, names, noted, (run.result._value == SUCCESSFUL) & ~many)
 
 
 def _how_it_ended(noted: Noted, solution: Solution, count: int, library: Any = np) -> tuple:
@@ -150,13 +186,12 @@ def _how_it_ended_traced(noted: Noted, solution: Solution, count: int) -> tuple:
     return _how_it_ended(noted, solution, count, jnp)
 
 
-def _raise_unless_ok(problem: Problem, end: tuple, noted: Noted, result) -> Noted:
+def _raise_unless_ok(layout: Layout, ts, end: tuple, noted: Noted, result) -> Noted:
     """The crossings, where all went well; else `SimulationError`, at run time where it is being traced."""
-    names = problem.layout.names
-    if not all(map(is_concrete, (result, *end, problem.ts))):
-        t, y = raise_where_failed((noted.t, noted.y), result, end, problem.ts[-1], names)
+    if not all(map(is_concrete, (result, *end, ts))):
+        t, y = raise_where_failed((noted.t, noted.y), result, end, ts[-1], layout.names)
         return noted._replace(t=t, y=y)
-    if text := sentence(result, end[0], np.asarray(problem.ts)[-1], end[1], names):
+    if text := sentence(result, end[0], np.asarray(ts)[-1], end[1], layout.names):
         raise SimulationError(text, None)
     return noted
 

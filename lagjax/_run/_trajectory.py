@@ -46,7 +46,7 @@ class Transitions(NamedTuple):
     """The changes of mode of a hybrid motion, in order: NaN or −1 beyond the last of `count`.
 
     `t`, `q`, `qdot` are those just before the reset, `q_next` and `qdot_next` just after it; `source` and `target` are
-    places in `Trajectory.mode_names`.
+    places in `Trajectory.mode_names`, `number` is that of the transition in the list.
     `order_matters` is true where blows meet at one instant that do not commute: read from its end, the list of
     transitions leads to another state. `let_out`, for each transition of that list: the first time at which its guard
     was beyond zero where a mode began, and came back instead of a blow; NaN where that never was.
@@ -57,6 +57,7 @@ class Transitions(NamedTuple):
     qdot: PyTree
     source: jax.Array
     target: jax.Array
+    number: jax.Array
     count: jax.Array
     order_matters: jax.Array
     let_out: jax.Array

@@ -538,8 +538,8 @@ def require_system(system: Any, contacts: bool = False) -> System:
         kind = type(system).__name__
         if kind == "Hybrid":
             raise TypeError(
-                "This is for one System: a lagjax.Hybrid is taken by simulate, simulate_hybrid, periodic_orbit, "
-                "lyapunov_spectrum, fit and sweep."
+                "This is for one System: a lagjax.Hybrid is taken by simulate, simulate_hybrid, crossings, "
+                "periodic_orbit, lyapunov_spectrum, fit and sweep."
             )
         name = getattr(system, "__name__", kind) if callable(system) else kind
         raise TypeError(f"system must be a lagjax.System, as lagjax.System(lagrangian) is; got {name}.")

@@ -81,7 +81,7 @@ BALL = lagjax.Hybrid(
         ),
         (lambda: lagjax.simulate_batch(PLAIN, jnp.ones((3, 2)), jnp.ones((3, 2)), jnp.ones((3, 5))), "jax.vmap"),
         (lambda: lagjax.normal_modes(PLAIN, jnp.zeros(2), jnp.ones(2)), "asks for params, .* name velocities, qdot="),
-        (lambda: lagjax.crossings(BALL, lambda q, v: q, 1.0, 0.0, TS), "^This is for one System: a lagjax.Hybrid is"),
+        (lambda: lagjax.find_path(BALL, 1.0, 0.0, 0.0, 1.0), "^This is for one System: a lagjax.Hybrid is"),
         (lambda: lagjax.lyapunov_exponent(BALL, 1.0, 0.0, 1.0), "^This is for one System: a lagjax.Hybrid is taken by"),
         (lambda: lagjax.work_precision(BALL, 1.0, 0.0, TS), "^This is for one System: a lagjax.Hybrid is taken by"),
         (lambda: lagjax.simulate(BALL, 1.0, 0.0, TS, event=lambda q, v: q), "takes no event for a lagjax.Hybrid"),

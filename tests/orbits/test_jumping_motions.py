@@ -1,5 +1,6 @@
 """Limit cycles and Lyapunov exponents of motions with contacts and with modes, against closed forms and exact maps."""
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
@@ -98,3 +99,57 @@ def test_lyapunov_exponents_of_the_sinai_billiard_are_those_of_its_tangent_maps(
     # The product of all maps has lost the smallest numbers to the largest: the two largest are compared.
     np.testing.assert_allclose(found[:2], np.sort(np.log(stretch) / end)[:1:-1], rtol=1e-9)
     np.testing.assert_allclose(found, -found[::-1], atol=1e-13)
+
+
+def bounce_crossings(h, e, count=8):
+    """A dropped ball through the height 0.3, by gravity one; and its tops, after each bounce."""
+    ball = lagjax.System(lambda q, v: 0.5 * v**2 - q)
+    turn = lagjax.Transition("f", "f", lambda q, v: q, -1, lambda q, v, params: (q, -params * v))
+    sections = {"through": lambda q, v: q - 0.3, "top": lambda q, v: v, "floor": lambda q, v: q}
+    scene, ts = lagjax.Hybrid({"f": ball}, [turn], "f"), jnp.array([0.0, 6.0])
+    return lagjax.crossings(scene, sections, h, 0.0, ts, e, count=count, throw=False)
+
+
+def crossings_of_a_bounce(h, e):
+    speed, met = jnp.sqrt(2 * h), jnp.sqrt(2 * h)
+    through, tops = [jnp.sqrt(2 * (h - 0.3))], []
+    for _ in range(2):
+        speed = e * speed
+        tops.append(met + speed)
+        through += [met + speed + sign * jnp.sqrt(speed**2 - 0.6) for sign in (-1, 1)]
+        met = met + 2 * speed
+    return jnp.stack(through), jnp.stack(tops)
+
+
+def test_crossings_of_a_ball_that_bounces_are_those_of_its_parabolas():
+    # Of the third flight only the top is within reach: it rises to 0.26.
+    h, e = 1.0, 0.8
+    found = bounce_crossings(h, e)
+    through, tops = crossings_of_a_bounce(h, e)
+    np.testing.assert_allclose(found["through"].t[:5], through, rtol=1e-9)
+    np.testing.assert_allclose(found["top"].t[:2], tops, rtol=1e-9)
+    assert found["through"].count == 5 and found["floor"].count == 0, "a blow turns round: it is no crossing"
+    np.testing.assert_allclose(found["through"].q[:5], 0.3, atol=1e-14)
+    by_both = jax.jit(jax.jacrev(lambda x: bounce_crossings(*x)["through"].t))(jnp.array([h, e]))
+    exact = jax.jacfwd(lambda x: crossings_of_a_bounce(*x)[0])(jnp.array([h, e]))
+    np.testing.assert_allclose(by_both[:5], exact, rtol=1e-7)
+    assert np.isnan(by_both[5:]).all()
+    little = bounce_crossings(h, e, count=3)
+    assert little["through"].count >= 4 and not little["through"].ok and np.isfinite(little["through"].t).all()
+
+
+def test_crossings_in_every_mode_and_where_the_mode_changes():
+    """A particle goes round: out to q = 1, back to q = 0, at speed one."""
+    free = lagjax.System(lambda q, v: 0.5 * v**2)
+    back = [
+        lagjax.Transition("out", "in", lambda q, v: q - 1.0, 1, lambda q, v: (q, -v)),
+        lagjax.Transition("in", "out", lambda q, v: q, -1, lambda q, v: (q, -v)),
+    ]
+    scene = lagjax.Hybrid({"out": free, "in": free}, back, "out")
+    sections = {"half": lambda q, v: q - 0.5, "rising": lambda q, v: q - 0.25, "clock": lambda q, v, t: t - 2.0}
+    found = lagjax.crossings(
+        scene, sections, 0.5, 1.0, jnp.array([0.0, 5.1]), direction={"half": 0, "rising": 1, "clock": 1}
+    )
+    np.testing.assert_allclose(found["half"].t[:6], [1.0, 2.0, 3.0, 4.0, 5.0, np.nan], atol=1e-13)
+    np.testing.assert_allclose(found["rising"].t[:3], [1.75, 3.75, np.nan], atol=1e-13)
+    np.testing.assert_allclose(found["clock"].t[:2], [2.0, np.nan], atol=1e-13)

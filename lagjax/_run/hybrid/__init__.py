@@ -72,6 +72,16 @@ class Hybrid:
         """The motion from (q0, qdot0), with the options that `simulate` and `simulate_hybrid` share."""
         return simulate_hybrid(self, q0, qdot0, ts, params, **options)
 
+    def with_sections(self, functions: tuple, directions: tuple[int, ...], room: int) -> "Hybrid":
+        """The scene with transitions behind its own that change nothing: each section in each mode, `room` times."""
+        notes = [
+            Transition(mode, mode, function, way, fires="crossing")
+            for mode in self.modes
+            for function, way in zip(functions, directions, strict=True)
+        ]
+        more = self.max_transitions + len(functions) * (room + 1)
+        return Hybrid(self.modes, [*self.transitions, *notes], self.start, more)
+
     def _now(self) -> "Hybrid":
         """The scene with its functions as they are now: this one, where nothing that they read has changed."""
         modes, transitions = _present(self.modes, self.transitions)
@@ -200,7 +210,7 @@ def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, reco
         map(problem.layout.restore, halves(y)) for y in states
     )
     transitions = Transitions(
-        t=record.t, q=q_before, qdot=qdot_before, source=record.source, target=record.target,
+        t=record.t, q=q_before, qdot=qdot_before, source=record.source, target=record.target, number=record.number,
         count=jnp.sum(record.source >= 0), order_matters=record.order_matters, let_out=ending.let_out,
         q_next=q_next, qdot_next=qdot_next,
     )  # fmt: skip

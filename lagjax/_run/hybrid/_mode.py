@@ -86,7 +86,8 @@ class Transition(eqx.Module):
         if fires == "beyond" and not direction:
             raise ValueError('fires="beyond" needs a direction, -1 or +1: zero is left on both sides.')
         self.source, self.target, self.direction, self.fires = source, target, int(direction), fires
-        self.guard = accept(guard, "guard", extras=("t", "params", "multipliers"))
+        known = isinstance(guard, Function)
+        self.guard = guard if known else accept(guard, "guard", extras=("t", "params", "multipliers"))
         self.reset = None if reset is None else accept(reset, "reset")
 
     def __repr__(self) -> str:

@@ -116,7 +116,7 @@ class Outset(NamedTuple):
 
 
 class TransitionRecord(NamedTuple):
-    """One transition: its time, the states around the reset, and the modes on both sides; NaN and −1 without any.
+    """One transition: its time, the states around the reset, both modes, its place in the list; else NaN and −1.
 
     And whether another order of the list leads to another state, where blows meet.
     """
@@ -126,12 +126,13 @@ class TransitionRecord(NamedTuple):
     y_next: jax.Array
     source: jax.Array
     target: jax.Array
+    number: jax.Array
     order_matters: jax.Array
 
     @classmethod
     def absent(cls, states: int) -> "TransitionRecord":
         none, nowhere = jnp.asarray(-1), jnp.full(states, jnp.nan)
-        return cls(jnp.asarray(jnp.nan), nowhere, nowhere, none, none, jnp.asarray(False))
+        return cls(jnp.asarray(jnp.nan), nowhere, nowhere, none, none, none, jnp.asarray(False))
 
 
 class Exit(NamedTuple):
@@ -235,7 +236,7 @@ class _Rounds(NamedTuple):
             steps=before.steps + jnp.stack([located.accepted, located.rejected]),
             latest=exit.number, memory=memory, let_out=_put(before.let_out, places, first_let_out),
         )  # fmt: skip
-        return after, event, TransitionRecord(t_end, y_end, exit.y_next, before.mode, exit.target, exit.order_matters)
+        return after, event, TransitionRecord(t_end, y_end, exit.y_next, before.mode, *exit[1:3], exit.order_matters)
 
     def _pass_transition(self, place: int, before: Ending, kinds, turns, t, y, known) -> tuple[Exit, GuardMemory]:
         """The state behind the first transition of those whose guard falls (1) or rises (2), as `kinds` (K,) say.
