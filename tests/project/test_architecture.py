@@ -1,6 +1,7 @@
 """The street runs one way: a module imports only from modules above it, and importing changes nothing."""
 
 import ast
+import functools
 import re
 import subprocess
 import sys
@@ -23,10 +24,20 @@ def place(path: Path) -> str:
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
 
 
+@functools.cache
+def tree_of(path: Path) -> ast.Module:
+    return ast.parse(path.read_text())
+
+
+@functools.cache
+def nodes_of(path: Path) -> list[ast.AST]:
+    return list(ast.walk(tree_of(path)))
+
+
 def imports(path: Path) -> set[str]:
     """The lagjax modules that a file imports, also inside functions."""
     found = set()
-    for node in ast.walk(ast.parse(path.read_text())):
+    for node in nodes_of(path):
         if isinstance(node, ast.ImportFrom) and node.module and node.module.split(".")[0] == "lagjax":
             parts = node.module.split(".")[1:]
             found |= {parts[0]} if parts else {alias.name for alias in node.names}
@@ -74,7 +85,7 @@ def test_packages_have_doors():
     # What a room uses of another stands in the `__init__` of a package there, and an underscore name does not cross.
     # `_native` reads the files of `_program` one by one, since it runs without JAX.
     for path in PACKAGE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in nodes_of(path):
             if not isinstance(node, ast.ImportFrom) or not (node.module or "").startswith("lagjax."):
                 continue
             there = node.module.split(".")[1]
@@ -88,14 +99,13 @@ def test_packages_have_doors():
 
 def test_doors_offer_what_is_used():
     """Every name that a door imports is used in it, or imported from it by another file."""
-    texts = {path: ast.parse(path.read_text()) for folder in (PACKAGE, TESTS) for path in folder.rglob("*.py")}
-    nodes = [node for tree in texts.values() for node in ast.walk(tree)]
+    nodes = [node for folder in (PACKAGE, TESTS) for path in folder.rglob("*.py") for node in nodes_of(path)]
     taken = {(node.module, alias.name) for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names}
     called = {node.attr for node in nodes if isinstance(node, ast.Attribute)} | set(lagjax._interface.PLACES)
     for door in PACKAGE.glob("_*/**/__init__.py"):
         module = ".".join(door.parent.relative_to(PACKAGE.parent).parts)
-        used = {node.id for node in ast.walk(texts[door]) if isinstance(node, ast.Name)}
-        for node in texts[door].body:
+        used = {node.id for node in nodes_of(door) if isinstance(node, ast.Name)}
+        for node in tree_of(door).body:
             for alias in node.names if isinstance(node, ast.ImportFrom) else ():
                 name = alias.asname or alias.name
                 if node.module != "lagjax._program.lowering":  # whose rules are registered by the import
@@ -104,7 +114,7 @@ def test_doors_offer_what_is_used():
 
 def test_the_head_of_a_room_names_its_files():
     for door in PACKAGE.glob("_*/**/__init__.py"):
-        head = ast.get_docstring(ast.parse(door.read_text())) or ""
+        head = ast.get_docstring(tree_of(door)) or ""
         files = {path.stem for path in door.parent.glob("_*.py")} - {"__init__"}
         files |= {path.parent.name + "/" for path in door.parent.glob("*/__init__.py")}
         missing = [name for name in sorted(files) if not re.search(rf"(?<!\w){name}(?!\w)", head)]
@@ -151,7 +161,7 @@ def test_machine_code_stands_alone():
         if path in seen:
             continue
         seen.add(path)
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in nodes_of(path):
             names = [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
             names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             assert not JAX & {name.split(".")[0] for name in names}, path
@@ -166,8 +176,8 @@ def test_machine_code_stands_alone():
 
 def test_only_one_module_integrates():
     for path in PACKAGE.rglob("*.py"):
-        called = {ast.unparse(n.func) for n in ast.walk(ast.parse(path.read_text())) if isinstance(n, ast.Call)}
-        assert "diffrax.diffeqsolve" not in called or path.stem == "_integrate"
+        called = {n.func.attr for n in nodes_of(path) if isinstance(n, ast.Call) and isinstance(n.func, ast.Attribute)}
+        assert "diffeqsolve" not in called or path.stem == "_integrate"
 
 
 def test_importing_changes_nothing():
@@ -214,7 +224,7 @@ VAGUE = ("What ", "How ", "Whether ", "Where ", "Which ")
 def test_docstrings_begin_with_their_subject():
     kinds = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
     for path in PACKAGE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in nodes_of(path):
             text = ast.get_docstring(node) if isinstance(node, kinds) else None
             name = getattr(node, "name", "its head")
             assert not (text or "").startswith(VAGUE), f"{path}: {name} says {text!r}: name the subject first"
@@ -224,10 +234,7 @@ def test_files_and_classes_have_names_of_their_own():
     """A name says where to look: a file, and a class at the top of one, is called as no other one is."""
     files = [path.name for path in PACKAGE.rglob("*.py") if path.name not in ("__init__.py", "__main__.py")]
     classes = [
-        node.name
-        for path in PACKAGE.rglob("*.py")
-        for node in ast.parse(path.read_text()).body
-        if isinstance(node, ast.ClassDef)
+        node.name for path in PACKAGE.rglob("*.py") for node in tree_of(path).body if isinstance(node, ast.ClassDef)
     ]
     for names in (files, classes):
         assert sorted(names) == sorted(set(names)), [name for name in set(names) if names.count(name) > 1]
@@ -243,6 +250,6 @@ def test_functions_are_no_prepositions():
     """A name says what a function does, or what it returns; `from_`, `to_`, `as_` and `with_` are Python's idioms."""
     begins = re.compile(rf"_?({'|'.join(PREPOSITIONS.split())})(_|$)")
     for path in PACKAGE.rglob("*.py"):
-        for node in ast.walk(ast.parse(path.read_text())):
+        for node in nodes_of(path):
             if isinstance(node, ast.FunctionDef):
                 assert not begins.match(node.name), f"{path}: {node.name} is not verb + object, nor a noun"
