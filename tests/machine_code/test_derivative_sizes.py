@@ -42,8 +42,8 @@ def first_derivatives(name, count):
     """Along a direction: by reverse mode, by forward mode and by differences."""
     with jax.enable_x64(True):
         value, x, direction = problem(name, count)
-        slope = float(jax.grad(value)(x) @ direction)
-        along = float(jax.jvp(value, (x,), (direction,))[1])
+        slope = float(jax.jit(jax.grad(value))(x) @ direction)
+        along = float(jax.jit(lambda x: jax.jvp(value, (x,), (direction,))[1])(x))
         return slope, along, float(WEIGHTS @ np.array([value(y) for y in x + PLACES * direction]))
 
 
@@ -51,8 +51,8 @@ def second_derivatives(name, count):
     """The Hessian times a direction: forward over reverse, and by differences of gradients."""
     with jax.enable_x64(True):
         value, x, direction = problem(name, count)
-        gradient = jax.grad(value)
-        product = jax.jvp(gradient, (x,), (direction,))[1]
+        gradient = jax.jit(jax.grad(value))
+        product = jax.jit(lambda x: jax.jvp(gradient, (x,), (direction,))[1])(x)
         return np.asarray(product), WEIGHTS @ np.array([gradient(y) for y in x + PLACES * direction])
 
 
@@ -67,10 +67,11 @@ def assert_second(name, count):
     np.testing.assert_allclose(product, differences, rtol=0, atol=1e-6 * np.abs(differences).max())
 
 
+# Between them lie those of `test_sizes`: seven bodies, and a chain of ten.
 LARGE = [
-    *(("bodies in the plane", count) for count in (2, 3, 5, 8, 12)),
+    *(("bodies in the plane", count) for count in (3, 5, 12)),
     ("bodies in space", 4),
-    *(("chain", count) for count in (2, 4, 8, 16)),
+    *(("chain", count) for count in (2, 4, 16)),
 ]
 
 
@@ -81,8 +82,6 @@ def test_first_derivatives_of_every_size(name, count):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("name", "count"), [("bodies in space", 3), ("bodies in space", 8), ("chain", 4), ("chain", 16)]
-)
+@pytest.mark.parametrize(("name", "count"), [("bodies in space", 8), ("chain", 4), ("chain", 16)])
 def test_second_derivatives_of_every_size(name, count):
     assert_second(name, count)

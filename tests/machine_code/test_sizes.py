@@ -58,7 +58,7 @@ def slopes(name, count):
         stack = np.broadcast_to(qdot0, starts.shape)
         ends = lagjax.simulate_batch(system, starts, stack, TS, params, rtol=1e-12).q[:, -1]
         differences = np.array([1, -8, 8, -1]) / (12 * STEP) @ np.sum(ends**2 * weight, axis=1)
-        return float(jax.grad(value)(q0) @ direction), float(differences)
+        return float(jax.jit(jax.grad(value))(q0) @ direction), float(differences)
 
 
 def in_a_process(function, *arguments):
