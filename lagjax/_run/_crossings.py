@@ -33,8 +33,8 @@ from lagjax._interface import (
 from lagjax._primitives import lost_unless, marks_absent, raise_where_failed, sentence
 from lagjax._program import Unlowerable
 from lagjax._run._trajectory import Trajectory
+from lagjax._run.contacts import note_sections
 from lagjax._run.hybrid import Hybrid, Scene, require_scene
-from lagjax._scene import require_system
 
 PyTree = Any
 _TOO_MANY = code_of(RESULTS.max_crossings_reached)
@@ -96,7 +96,8 @@ def crossings(
     step, by a bound on that polynomial and without sampling, so that none is missed, down to the rounding of the time.
     A jump of the section through zero is a crossing, too. Sections may be piecewise (`abs`, `where`, `max`, …).
 
-    In a `Hybrid` a section is watched in every mode, and a reset through zero is no crossing; where a section of both
+    In a `Hybrid` a section is watched in every mode, and with contacts whatever these do; a reset or an impact through
+    zero is no crossing. Where a section of both
     directions is zero as another mode begins, it has to leave zero first.
 
     `crossings` works under `jax.jit` and `jax.vmap`, which makes one batch of all members, and has first and second
@@ -126,18 +127,21 @@ def crossings(
     names, functions = sections_of(section)
     directions = directions_of(direction, names)
     layout = Layout.from_state(q0, qdot0)
+    inputs = jax.tree.map(jnp.asarray, eqx.filter((q0, qdot0, ts, params), eqx.is_array_like))
     if isinstance(scene, Hybrid):
+        ts = jnp.asarray(ts)[jnp.array([0, -1])]
         watched = scene.with_sections(functions, directions, count)
-        options = {"rtol": rtol, "atol": atol, "max_steps": max_steps, "throw": False}
-        run = watched.follow(q0, qdot0, jnp.asarray(ts)[jnp.array([0, -1])], params, **options)
-        first, sections = len(scene.transitions), len(functions)
-        inputs = jax.tree.map(jnp.asarray, eqx.filter((q0, qdot0, ts, params), eqx.is_array_like))
-        return _read_crossings(run, first, sections, count, layout, names, throw, inputs)
-    system = require_system(scene)
+        run = watched.follow(q0, qdot0, ts, params, rtol=rtol, atol=atol, max_steps=max_steps, throw=False)
+        notes = _notes_of(run, len(scene.transitions), len(functions))
+        return _read_crossings(notes, ts, len(functions), count, layout, names, throw, inputs)
+    system = scene
     problem = Problem.from_arguments(system, layout, q0, qdot0, ts, params, rtol, atol, max_steps)
     if has_constraints(system):
         q0, qdot0 = as_arrays((q0, qdot0), layout.dtype, "state")
         require_consistent(system, layout, problem.ts, q0, qdot0, problem.params)
+    if system.touches:
+        notes = note_sections(problem, functions, directions, count)
+        return _read_crossings(notes, problem.ts, len(functions), count, layout, names, throw, inputs)
     surfaces = surfaces_in(problem, functions, directions, names)
     solution, noted = MachineCode().crossings(problem, surfaces, count)
     how = _how_it_ended if isinstance(solution.y_end, np.ndarray) else _how_it_ended_traced
@@ -147,26 +151,28 @@ def crossings(
     return restore_crossings(problem.layout, names, noted, ok)
 
 
-def _read_crossings(run: Trajectory, first: int, sections: int, count: int, layout: Layout, names, throw, inputs):
-    """The crossings among the transitions of a hybrid motion, whose places in the list begin with `first`.
-
-    They vary with the `inputs`, or have no derivative.
-    """
-    changes = run.transitions
+def _notes_of(run: Trajectory, first: int, sections: int) -> tuple:
+    """The notes of a hybrid motion, as of `note_sections`: sections are transitions from place `first` of the list on."""
+    changes, flatten = run.transitions, Layout.from_state(*run.end[1:]).flatten
     assert changes is not None
     # A section that holds where the motion begins is met at once, and not crossed.
     which = jnp.where((changes.number >= first) & (changes.t > run.ts[0]), (changes.number - first) % sections, -1)
+    y = jnp.concatenate([jax.vmap(flatten)(part) for part in (changes.q, changes.qdot)], axis=1)
+    end = run.end.t, jnp.concatenate([flatten(part) for part in run.end[1:]])
+    return (which, changes.t, y), run.result._value, end
+
+
+def _read_crossings(notes: tuple, ts, sections: int, count: int, layout: Layout, names, throw: bool, inputs):
+    """The crossings among the changes of a motion that jumps; they vary with the `inputs`, or have no derivative."""
+    (which, t, y), result, end = notes
     there = which == jnp.arange(sections)[:, None]
     places = jnp.argsort(~there, axis=1, stable=True)[:, :count]
     found = jnp.take_along_axis(there, places, axis=1)
-    y = jnp.concatenate([jax.vmap(layout.flatten)(part) for part in (changes.q, changes.qdot)], axis=1)
-    t, y = lost_unless(found, changes.t[places], inputs), lost_unless(found[..., None], y[places], inputs)
-    end = jnp.concatenate([layout.flatten(part) for part in run.end[1:]])
+    t, y = lost_unless(found, t[places], inputs), lost_unless(found[..., None], y[places], inputs)
     noted, many = Noted(t, y, there.sum(axis=1)), there.sum(axis=1) > count
-    result = jnp.where(many.any(), _TOO_MANY, run.result._value)
     if throw:
-        noted = _raise_unless_ok(layout, run.ts, (run.end.t, end), noted, result)
-    return restore_crossings(layout, names, noted, (run.result._value == SUCCESSFUL) & ~many)
+        noted = _raise_unless_ok(layout, ts, end, noted, jnp.where(many.any(), _TOO_MANY, result))
+    return restore_crossings(layout, names, noted, (result == SUCCESSFUL) & ~many)
 
 
 def _how_it_ended(noted: Noted, solution: Solution, count: int, library: Any = np) -> tuple:

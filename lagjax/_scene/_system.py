@@ -545,9 +545,9 @@ def require_system(system: Any, contacts: bool = False) -> System:
         raise TypeError(f"system must be a lagjax.System, as lagjax.System(lagrangian) is; got {name}.")
     if system.touches and not contacts:
         raise TypeError(
-            "This is for scenes without contacts, which it would leave out: simulate, simulate_batch, periodic_orbit "
-            "and lyapunov_spectrum take these. For the motion while none is closed, build the System without "
-            "contacts=... and one_way=...."
+            "This is for scenes without contacts, which it would leave out: simulate, simulate_batch, crossings, "
+            "periodic_orbit and lyapunov_spectrum take these. For the motion while none is closed, build the System "
+            "without contacts=... and one_way=...."
         )
     return present_system(system)
 

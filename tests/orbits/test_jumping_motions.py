@@ -101,13 +101,18 @@ def test_lyapunov_exponents_of_the_sinai_billiard_are_those_of_its_tangent_maps(
     np.testing.assert_allclose(found, -found[::-1], atol=1e-13)
 
 
-def bounce_crossings(h, e, count=8):
-    """A dropped ball through the height 0.3, by gravity one; and its tops, after each bounce."""
-    ball = lagjax.System(lambda q, v: 0.5 * v**2 - q)
+def falling_ball(kind):
+    if kind == "contacts":
+        return lagjax.System(lambda q, v: 0.5 * v**2 - q, contacts=lambda q: q, restitution=lambda params: params)
     turn = lagjax.Transition("f", "f", lambda q, v: q, -1, lambda q, v, params: (q, -params * v))
+    return lagjax.Hybrid({"f": lagjax.System(lambda q, v: 0.5 * v**2 - q)}, [turn], "f")
+
+
+def bounce_crossings(kind, h, e, count=8):
+    """A dropped ball through the height 0.3, by gravity one; and its tops, after each bounce."""
     sections = {"through": lambda q, v: q - 0.3, "top": lambda q, v: v, "floor": lambda q, v: q}
-    scene, ts = lagjax.Hybrid({"f": ball}, [turn], "f"), jnp.array([0.0, 6.0])
-    return lagjax.crossings(scene, sections, h, 0.0, ts, e, count=count, throw=False)
+    ts = jnp.array([0.0, 6.0])
+    return lagjax.crossings(falling_ball(kind), sections, h, 0.0, ts, e, count=count, throw=False)
 
 
 def crossings_of_a_bounce(h, e):
@@ -121,20 +126,21 @@ def crossings_of_a_bounce(h, e):
     return jnp.stack(through), jnp.stack(tops)
 
 
-def test_crossings_of_a_ball_that_bounces_are_those_of_its_parabolas():
+@pytest.mark.parametrize("kind", ["contacts", "hybrid"])
+def test_crossings_of_a_ball_that_bounces_are_those_of_its_parabolas(kind):
     # Of the third flight only the top is within reach: it rises to 0.26.
     h, e = 1.0, 0.8
-    found = bounce_crossings(h, e)
+    found = bounce_crossings(kind, h, e)
     through, tops = crossings_of_a_bounce(h, e)
     np.testing.assert_allclose(found["through"].t[:5], through, rtol=1e-9)
     np.testing.assert_allclose(found["top"].t[:2], tops, rtol=1e-9)
     assert found["through"].count == 5 and found["floor"].count == 0, "a blow turns round: it is no crossing"
     np.testing.assert_allclose(found["through"].q[:5], 0.3, atol=1e-14)
-    by_both = jax.jit(jax.jacrev(lambda x: bounce_crossings(*x)["through"].t))(jnp.array([h, e]))
+    by_both = jax.jit(jax.jacrev(lambda x: bounce_crossings(kind, *x)["through"].t))(jnp.array([h, e]))
     exact = jax.jacfwd(lambda x: crossings_of_a_bounce(*x)[0])(jnp.array([h, e]))
     np.testing.assert_allclose(by_both[:5], exact, rtol=1e-7)
     assert np.isnan(by_both[5:]).all()
-    little = bounce_crossings(h, e, count=3)
+    little = bounce_crossings(kind, h, e, count=3)
     assert little["through"].count >= 4 and not little["through"].ok and np.isfinite(little["through"].t).all()
 
 
@@ -153,3 +159,27 @@ def test_crossings_in_every_mode_and_where_the_mode_changes():
     np.testing.assert_allclose(found["half"].t[:6], [1.0, 2.0, 3.0, 4.0, 5.0, np.nan], atol=1e-13)
     np.testing.assert_allclose(found["rising"].t[:3], [1.75, 3.75, np.nan], atol=1e-13)
     np.testing.assert_allclose(found["clock"].t[:2], [2.0, np.nan], atol=1e-13)
+
+
+def test_crossings_of_a_block_that_slides_and_stops():
+    """On the floor, with friction μ and gravity one: x = v t − ½ μ t² to the stop at v²/2μ, where it stays."""
+    block = lagjax.System(
+        lambda q, v: 0.5 * v @ v - q[1], contacts=lambda q: {"floor": q[1]}, slip=lambda q, v: {"floor": v[0]},
+        friction=lambda params: {"floor": params},
+    )  # fmt: skip
+    sections = {"near": lambda q, v: q[0] - 1.0, "stop": lambda q, v: v[0] - 1e-3, "beyond": lambda q, v: q[0] - 4.01}
+
+    def found(v, mu):
+        start = jnp.zeros(2), jnp.stack([v, 0.0])
+        return lagjax.crossings(block, sections, *start, jnp.array([0.0, 9.0]), mu, count=3)
+
+    v, mu = 2.0, 0.5
+    crossed = found(v, mu)
+    root = np.sqrt(v**2 - 2 * mu)
+    np.testing.assert_allclose(crossed["near"].t, [(v - root) / mu, np.nan, np.nan], rtol=1e-12)
+    np.testing.assert_allclose(crossed["stop"].t[0], (v - 1e-3) / mu, rtol=1e-12)
+    assert crossed["beyond"].count == 0 and crossed["stop"].count == 1
+    slope = jax.jacrev(lambda v: found(v, mu)["near"].t[0])(v)
+    np.testing.assert_allclose(slope, (1 - v / root) / mu, rtol=1e-11)
+    with pytest.raises(lagjax.SimulationError, match="more crossings"):
+        lagjax.crossings(falling_ball("contacts"), lambda q, v: q - 0.3, 1.0, 0.0, jnp.array([0.0, 6.0]), 0.8, count=4)

@@ -23,6 +23,8 @@ from lagjax._run._trajectory import ContactChanges, Impacts, State, Trajectory, 
 from lagjax._run.contacts._contact_rounds import Carry, ContactPlan, RoundRecord, RowPlaces, contact_motion
 from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes, System, require_coefficients
 
+CHANGES = 1024  # the budget of changes of a motion whose crossings are asked for; what they record takes memory
+
 
 def follow_contacts(given: Problem, problem: Problem, max_transitions: int) -> Trajectory:
     """The motion of a problem whose system has contacts; `problem` is `given` with what it closes over lifted."""
@@ -49,7 +51,23 @@ def _follow_members(plan: ContactPlan, batch: Batch) -> Any:
     return batch.map_members(lambda problem: _motion(plan, problem))
 
 
-def _plan(problem: Problem, max_transitions: int) -> tuple[ContactPlan, Problem]:
+def note_sections(problem: Problem, functions: tuple, directions: tuple[int, ...], room: int) -> tuple:
+    """The changes of a motion with contacts: which section each is, or −1; its time and state; how it all ended.
+
+    Raises `ValueError` as `follow_contacts` does, and for more sections than there is room for beside the contacts.
+    """
+    plan, closed = _plan(problem, CHANGES + len(functions) * (room + 1), len(functions))
+    if problem.is_known:
+        with jax.enable_x64(True):
+            _require_open(problem, closed)
+    plan = dataclasses.replace(plan, sections=functions, directions=directions)
+    ending, record, _ = _motion(plan, problem)
+    count = Shapes.from_system(problem.system, problem.layout, problem.params).count
+    which = jnp.maximum(record.contact - count, -1)
+    return (which, record.t, record.y_next), ending.result, (ending.t, ending.y)
+
+
+def _plan(problem: Problem, max_transitions: int, sections: int = 0) -> tuple[ContactPlan, Problem]:
     """The plan, and the problem of machine code with all contacts closed, in float64.
 
     Raises `ValueError` where the scene has no machine code, or the motion goes back in time.
@@ -66,10 +84,10 @@ def _plan(problem: Problem, max_transitions: int) -> tuple[ContactPlan, Problem]
     with jax.enable_x64(True):
         shapes = Shapes.from_system(problem.system, wide.layout, wide.params)
         r, d = shapes.rough.size, shapes.directions
-        if (watches := shapes.count + r) > MOST_GUARDS:
+        if (watches := shapes.count + r + sections) > MOST_GUARDS:
             raise ValueError(
-                f"{shapes.count} contacts, {r} of them with friction, make {watches} watches, and {MOST_GUARDS} are "
-                "possible: one for each contact, and one more with friction. MuJoCo takes more."
+                f"{shapes.count} contacts, {r} of them with friction, and {sections} sections make {watches} watches, "
+                f"and {MOST_GUARDS} are possible: one for each, and one more with friction. MuJoCo takes more."
             )
         if problem.system.impacts == "poisson" and r and (shapes.count, d) != (1, 1):
             raise ValueError(

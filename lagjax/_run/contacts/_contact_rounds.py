@@ -26,8 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine import Problem
-from lagjax._engine.taylor import Guarded, Surfaces, line_of, vector_of
-from lagjax._interface import RESULTS, SUCCESSFUL, Layout, code_of, halves
+from lagjax._engine.taylor import Guarded, Surfaces, line_of, require_one_number, vector_of
+from lagjax._interface import RESULTS, SUCCESSFUL, Function, Layout, code_of, halves
 from lagjax._native import SINGLE_NOISE
 from lagjax._primitives import differentiable_where, keep_together, lost_unless
 from lagjax._run._rounds import Stretch, run_rounds
@@ -73,7 +73,10 @@ _LEAST = 1e-300  # a side that is exactly zero still has a sign
 
 
 class ContactPlan(eqx.Module):
-    """The constants of a run: the scene, its budgets, and whether the start came in float32."""
+    """The constants of a run: the scene, its budgets, and whether the start came in float32.
+
+    The `sections` are watched, too, each for changes of its sign in its direction, of which a round makes a note.
+    """
 
     scene: ContactScene
     rtol: float = eqx.field(static=True)
@@ -81,6 +84,8 @@ class ContactPlan(eqx.Module):
     max_steps: int = eqx.field(static=True)
     max_transitions: int = eqx.field(static=True)
     is_single: bool = eqx.field(static=True)
+    sections: tuple[Function, ...] = ()
+    directions: tuple[int, ...] = eqx.field(static=True, default=())
 
 
 class Carry(NamedTuple):
@@ -98,6 +103,7 @@ class Carry(NamedTuple):
     turns: jax.Array  # how many decisions there were at this instant
     rounding: jax.Array  # (2, G), the largest of a watch of an open or sliding contact, and of a closed or sticking one
     rate_rounding: jax.Array
+    came: jax.Array  # (S,), the sides of the sections from which the motion comes
     slip: jax.Array  # (r,), the largest so far
     largest: jax.Array  # (2n,), the largest numbers of the state so far
     path: jax.Array  # (T, 2n), NaN where not reached
@@ -107,8 +113,8 @@ class Carry(NamedTuple):
 class RoundRecord(NamedTuple):
     """The end of a round, if it `happened`: the time, the velocities before it, the state behind it, what changed.
 
-    That is the contact, and the kind of its change. And its impact, if there is one: `t_impact`, the normal impulses
-    (k,), the energy that was lost. Else NaN and −1.
+    That is the contact, and the kind of its change; behind the contacts, a section that was crossed. And its impact, if
+    there is one: `t_impact`, the normal impulses (k,), the energy that was lost. Else NaN and −1.
     """
 
     happened: jax.Array
@@ -179,7 +185,8 @@ class ContactRounds(NamedTuple):
         problem = dataclasses.replace(problem, is_rounded=plan.is_single)
         derivation = problem.derivation.lowered
         code, structure = jax.tree.flatten(eqx.filter(inside, eqx.is_array_like, inverse=True))
-        surfaces = _watches(derivation, plan.scene, tuple(code), structure)._replace(is_rounded=plan.is_single)
+        watched = plan.scene, plan.sections, plan.directions
+        surfaces = _watches(derivation, *watched, tuple(code), structure)._replace(is_rounded=plan.is_single)
         places = RowPlaces.from_derivation(derivation, flat)
         states = sum(x.size for x in opened(flat))
         lines = line_of(derivation.impact_response(places.all, states)), line_of(derivation.multipliers)
@@ -215,7 +222,8 @@ class ContactRounds(NamedTuple):
 
     def begin(self, y0) -> Carry:
         """The start, with all contacts open: those that touch and do not move apart fall at once."""
-        contacts, guards = opened(self.flat), self.count + self.flat.rough.size
+        contacts, sections = opened(self.flat), len(self.plan.sections)
+        guards = self.count + self.flat.rough.size + sections
         guarded = self.watch(self.ts[0], y0, contacts)
         inside = (guarded.values < -guarded.rounding)[: self.count] & self.has_gap
         result = jnp.where(inside.any(), INCONSISTENT, SUCCESSFUL)
@@ -231,6 +239,7 @@ class ContactRounds(NamedTuple):
             result=result, steps=(jnp.zeros((), int), jnp.zeros((), int)), rounds=jnp.zeros((), int),
             longest=jnp.zeros(()),
             turns=jnp.zeros((), int), rounding=jnp.zeros((2, guards)), rate_rounding=jnp.zeros((2, guards)),
+            came=jnp.sign(guarded.rates)[guards - sections :],
             slip=jnp.zeros(self.flat.rough.size), largest=jnp.abs(jax.lax.stop_gradient(y0)),
             path=jnp.full((self.ts.size, y0.size), jnp.nan),
             of_path=jax.tree.map(lambda x: jnp.full((self.ts.size, *x.shape), -1.0), contacts),
@@ -239,17 +248,23 @@ class ContactRounds(NamedTuple):
     def run_round(self, before: Carry, count) -> tuple[Carry, RoundRecord]:
         """One round: to the next watch that falls, through what happens there; of a motion that is going."""
         here, contacts = before.going, before.contacts
-        guarded, kinds = self.watch(before.t, before.y, contacts), jnp.concatenate([contacts.closed, contacts.sticks])
+        watches, sections = self.count + self.flat.rough.size, len(self.plan.sections)
+        guarded = self.watch(before.t, before.y, contacts)
+        kinds = jnp.concatenate([contacts.closed, contacts.sticks, jnp.zeros(sections)])
         before = _note_rounding(before, guarded, kinds, 0.0)
         rounding = jnp.maximum(_choose_kind(before.rounding, kinds), guarded.of_time)
-        beyond = guarded.values < -rounding
+        beyond = (guarded.values < -rounding) & (np.arange(kinds.size) < watches)
         sides = jnp.where(beyond, jnp.inf, jnp.maximum(rounding, _LEAST))
+        clear = (jnp.abs(guarded.values) > rounding)[watches:]
+        came = jnp.where(clear, jnp.sign(guarded.values[watches:]), before.came)
+        sides = sides.at[watches:].multiply(came)
         noted = jnp.concatenate([sides, _choose_kind(before.rate_rounding, kinds)])
         problem = dataclasses.replace(self.problem, params=InContact(self.params, contacts))
         stretch = Stretch.locate(problem, self.surfaces, (before.t, before.y), self.ts, here, noted, kinds.size)
         located, covered, at_once, fell = stretch.located, stretch.covers, stretch.at_once, stretch.kinds > 0
-        happens = fell.any()
-        k = self.first_of(fell, at_once, contacts)
+        happens, decides, k = fell.any(), fell[:watches].any(), self.first_of(fell[:watches], at_once, contacts)
+        if sections:
+            k = jnp.where(decides, k, watches + jnp.argmax(fell[watches:]))
         path, t, y = stretch.vary(k, happens & ~(at_once & _pick(before.fresh | beyond, k)))
         duration = located.t_end - jax.lax.stop_gradient(before.t)
         turns = jnp.where(at_once, before.turns + 1, 0)
@@ -258,6 +273,8 @@ class ContactRounds(NamedTuple):
             fresh=before.fresh & at_once, longest=jnp.maximum(before.longest, step)
         )
         decided, record = self.decide(before, t, y, k)
+        if sections:  # a note changes nothing but the side of its section
+            decided, record = self.note(decides, decided, record, before._replace(came=came), t, y, k, stretch.kinds)
 
         result = jnp.where(happens, decided.result, located.result)
         result = jnp.where(happens & (turns > 16 + 8 * kinds.size), UNDECIDED, result)
@@ -282,6 +299,19 @@ class ContactRounds(NamedTuple):
         return after, RoundRecord(
             *(jnp.where(is_kept, new, old) for is_kept, new, old in zip(kept, record, absent, strict=True))
         )
+
+    def note(self, decides, decided: Carry, record: RoundRecord, before: Carry, t, y, k, kinds) -> tuple:
+        """What was decided, or the motion as it is, with a note of section k."""
+        place = k - kinds.size + len(self.plan.sections)
+        came = jnp.where(np.arange(before.came.size) == place, 2.0 * kinds[-before.came.size :] - 3.0, before.came)
+        noted = RoundRecord.absent(y.size, self.count)
+        noted = noted._replace(happened=jnp.asarray(True), t=t, y_next=y, contact=self.count + place)
+        decided, record = jax.tree.map(
+            lambda new, old: jnp.where(decides, new, old),
+            (decided._replace(came=before.came), record),
+            (before._replace(came=came, y=y), noted),
+        )
+        return decided, record
 
     def first_of(self, fell, at_once, contacts: Contacts):
         """The watch that is taken of those that `fell` (G,): of friction first, of which a guess that jams is one."""
@@ -380,7 +410,7 @@ class ContactRounds(NamedTuple):
         decided = before._replace(
             largest=largest, y=differentiable_where(~leaves_rest, y_next, t, y), slip=slip,
             contacts=Contacts(closed.astype(float), sticks.astype(float), direction),
-            fresh=before.fresh | jnp.concatenate([changed, turned]),
+            fresh=before.fresh | jnp.concatenate([changed, turned, jnp.zeros(before.came.size, bool)]),
             result=jnp.where(undecided, UNDECIDED, before.result),
         )  # fmt: skip
         # Of the work of impulses only what moves q is kinetic energy: gaps may move by themselves.
@@ -564,8 +594,8 @@ def _unit(vectors):
 
 
 @functools.lru_cache(maxsize=64)
-def _watches(derivation, scene: ContactScene, code: tuple, structure) -> Surfaces:
-    """The watches of all contacts as programs: the k normal ones, and then those of friction, r.
+def _watches(derivation, scene: ContactScene, sections: tuple, ways: tuple, code: tuple, structure) -> Surfaces:
+    """The watches of all contacts as programs: the k normal ones, those of friction, r, and then the sections.
 
     `code` and `structure` are what the parameters hold that is not a number.
     """
@@ -580,7 +610,9 @@ def _watches(derivation, scene: ContactScene, code: tuple, structure) -> Surface
         state = (*halves(y[:-1]), y[-1])
         open_values = jnp.concatenate([flat.gaps(state[0], state[2], user), flat.one_way(*state, user)])
         normal = forces[places.normal]
-        watches = normal + (1.0 - closed) * open_values
+        user_state = (*map(derivation.layout.restore, state[:2]),)
+        more = [require_one_number(of(*user_state, t=y[-1], params=inside.params), "A section") for of in sections]
+        watches = jnp.concatenate([normal + (1.0 - closed) * open_values, jnp.array(more)])
         if not rough.size:
             return watches
         held, slips = forces[places.tangential], flat.slips(*state, user)
@@ -588,7 +620,7 @@ def _watches(derivation, scene: ContactScene, code: tuple, structure) -> Surface
         most = flat.friction(user) * normal[rough]
         of_friction = sticks * (most**2 - jnp.sum(held**2, axis=1)) + (1.0 - sticks) * jnp.sum(slips * along, axis=1)
         of_friction = closed[rough] * of_friction + (1.0 - closed[rough])
-        return jnp.concatenate([watches, of_friction])
+        return jnp.concatenate([watches[: shapes.count], of_friction, watches[shapes.count :]])
 
-    directions = (-1,) * (shapes.count + rough.size)
+    directions = (-1,) * (shapes.count + rough.size) + ways
     return Surfaces.from_function(derivation, values_at, directions, code, structure, given=derivation.multipliers)
