@@ -152,7 +152,7 @@ def crossings(
 
 
 def _notes_of(run: Trajectory, first: int, sections: int) -> tuple:
-    """The notes of a hybrid motion, as of `note_sections`: sections are transitions from place `first` of the list on."""
+    """The notes of a hybrid motion, as of `note_sections`: of transitions from place `first` of the list on."""
     changes, flatten = run.transitions, Layout.from_state(*run.end[1:]).flatten
     assert changes is not None
     # A section that holds where the motion begins is met at once, and not crossed.

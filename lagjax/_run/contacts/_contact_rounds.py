@@ -301,7 +301,7 @@ class ContactRounds(NamedTuple):
         )
 
     def note(self, decides, decided: Carry, record: RoundRecord, before: Carry, t, y, k, kinds) -> tuple:
-        """What was decided, or the motion as it is, with a note of section k."""
+        """The decision as it is, where a round `decides`; else the motion as it was, with a note of section k."""
         place = k - kinds.size + len(self.plan.sections)
         came = jnp.where(np.arange(before.came.size) == place, 2.0 * kinds[-before.came.size :] - 3.0, before.came)
         noted = RoundRecord.absent(y.size, self.count)
