@@ -753,6 +753,8 @@ def test_a_motion_goes_on_in_a_scan_of_short_ones_from_the_mode_where_it_is():
     lost = jax.jit(lambda mode: lagjax.simulate_hybrid(scene, 0.0, 1.0, jnp.arange(2.0), start=mode, throw=False))(-1)
     assert not lost.ok and np.isnan(lost.q).all()
     assert lagjax.simulate_hybrid(scene, 0.5, -1.0, jnp.array([0.0, 1.0]), start="in").q[-1] == 0.5
+    with jax.enable_x64(False):
+        assert lagjax.simulate_hybrid(scene, 0.5, -1.0, jnp.array([0.0, 1.0]), start=1).q[-1] == 0.5
 
 
 # ---- bad input ------------------------------------------------------------------------------------------------------

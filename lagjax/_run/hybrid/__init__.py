@@ -282,7 +282,9 @@ def _place_of(modes: dict[str, System], start) -> Any:
     if isinstance(start, str) and start in modes:
         return list(modes).index(start)
     is_place = (
-        not isinstance(start, str | bool) and jnp.shape(start) == () and np.issubdtype(jnp.result_type(start), int)
+        not isinstance(start, str | bool)
+        and jnp.shape(start) == ()
+        and np.issubdtype(jnp.result_type(start), np.integer)
     )
     if is_place and not (is_concrete(start) and not 0 <= int(start) < len(modes)):
         return start
