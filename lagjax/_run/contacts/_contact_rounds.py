@@ -68,6 +68,8 @@ PARADOX = 1e-12
 # breaks away brings about in a step. Half of that takes √2 times the steps, of some ten thousand: at rest friction
 # turns a slip at once, and steps are as short as that takes.
 NO_SLIP, AT_REST = 1e-11, 1e-8
+# Of the largest slip so far: what is more, where the slip along its first direction ends, has turned.
+TURNED = 1e-6
 EPS = float(np.finfo(float).eps)
 _LEAST = 1e-300  # a side that is exactly zero still has a sign
 
@@ -365,7 +367,7 @@ class ContactRounds(NamedTuple):
         hits = meeting.happened
         slips = self.slips(quiet, still(v), before.slip)
         closed = (was_closed & ~first[:count]) | meets
-        sticks = self.sticks(contacts, slips, first[count:], (closed != was_closed)[self.flat.rough])
+        sticks = self.sticks(before, slips, first[count:], (closed != was_closed)[self.flat.rough])
         # Where parts align, a slip that gaps hold passes through zero, and turns.
         turns = held_slips(quiet, closed, first[count:] & sticks, friction)
         sticks = sticks & ~turns
@@ -388,7 +390,7 @@ class ContactRounds(NamedTuple):
             leaves_rest = (breaks & (self.flat.shapes.directions > 1)).any()
             direction = self.directions(before, quiet, t, y, behind, breaks, renewed)
             direction = jnp.where(turns[:, None], -direction, direction)
-            turned = renewed | turns | (sticks != (contacts.sticks > 0))
+            turned = renewed | first[count:] | (sticks != (contacts.sticks > 0))
             along = Pattern(closed.astype(float), sticks.astype(float), _unit(direction))
             undecided |= (sliding_margin(quiet, along, friction.still) <= PARADOX).any()
         # The gap that closes is zero, also as what went in varies: what rounding leaves of it grows with each bounce.
@@ -448,9 +450,14 @@ class ContactRounds(NamedTuple):
         ends = ends & hits & (pattern.push > 0)
         return solve(jnp.where(ends, 0.0, bounced)), ends, left, constructs | ~(normal.any() | rubs.any())
 
-    def sticks(self, contacts: Contacts, slips: tuple, fell, renewed):
-        """True for contacts that stick (r,) behind watches of friction that `fell`, where there is no impact."""
-        was_stuck = contacts.sticks > 0
+    def sticks(self, before: Carry, slips: tuple, fell, renewed):
+        """True for contacts that stick (r,) behind watches of friction that `fell`, where there is no impact.
+
+        A slip in space that has turned by a right angle goes on.
+        """
+        was_stuck = before.contacts.sticks > 0
+        if self.flat.shapes.directions > 1:
+            fell = fell & (was_stuck | (_length(slips[0]) <= TURNED * before.slip))
         return jnp.where(renewed, slips[1], (was_stuck | fell) & ~(fell & was_stuck))
 
     def directions(self, before: Carry, rows: ImpactRows, t, y, slips: tuple, breaks, renewed):
