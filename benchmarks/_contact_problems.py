@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import mpmath
 import numpy as np
+from scipy.integrate import solve_ivp
 from scipy.optimize import minimize
 
 import lagjax
@@ -220,6 +221,58 @@ def pecking() -> dict[str, Any]:
     }  # fmt: skip
 
 
+# ---- a stone that slides and turns -----------------------------------------------------------------------------------
+
+REACH, INERTIA, MU = 0.1, 0.02, 0.3
+
+
+def feet_slips(q, v, xp=jnp):
+    """The slips (2, 2) of two feet, of q = (x, y, angle, …)."""
+    across = xp.stack([-xp.sin(q[2]), xp.cos(q[2])])
+    return v[:2] + REACH * v[2] * np.array([[1.0], [-1.0]]) * across
+
+
+STONE = Scene(  # q = (x, y, angle, height, tilt)
+    lambda q, v, t, p: 0.5 * (v[:2] @ v[:2] + v[3] ** 2 + INERTIA * (v[2] ** 2 + v[4] ** 2)) - G * q[3],
+    gaps=lambda q, t, p: q[3] + REACH * jnp.array([1.0, -1.0]) * q[4], friction=lambda p: MU,
+    slip=lambda q, v, t, p: feet_slips(q, v),
+)  # fmt: skip
+
+
+def curling() -> dict[str, Any]:
+    """A stone on two feet: both slide, one stops, it turns about that, rests; by DOP853 and a closed form behind it."""
+
+    def flow(t, z):
+        slips = feet_slips(z, z[3:], np)
+        forces = -0.5 * MU * G * slips / np.linalg.norm(slips, axis=1)[:, None]
+        across = np.array([-np.sin(z[2]), np.cos(z[2])])
+        return np.array([*z[3:], *forces.sum(axis=0), REACH * (forces[0] - forces[1]) @ across / INERTIA])
+
+    def slow(t, z):
+        return np.linalg.norm(feet_slips(z, z[3:], np)[0]) - 1e-6
+
+    slow.terminal = True
+    v = np.array([1.0, 0.2, 8.0])
+    slides = solve_ivp(flow, (0.0, 1.0), [0.0, 0, 0, *v], "DOP853", rtol=1e-12, atol=1e-14, events=slow)
+    t, z = slides.t[-1], slides.y[:, -1]
+    rate = flow(t, z)
+    later = 1e-6 / np.linalg.norm(feet_slips(z, rate[3:], np)[0])  # the foot's slip goes to zero along a line
+    t, z = t + later, z + later * rate
+    brake = MU * G * REACH / (INERTIA + REACH**2)
+    turn = z[2] + z[5] ** 2 / (2 * brake)
+    foot = z[:2] + REACH * np.array([np.cos(z[2]), np.sin(z[2])])
+    end = [*foot - REACH * np.array([np.cos(turn), np.sin(turn)]), turn]
+    run = lagjax.simulate(
+        system_of(STONE), jnp.zeros(5), jnp.array([*v, 0, 0]), jnp.array([0.0, 1.0, 2.0]), jnp.zeros(0)
+    )  # fmt: skip
+    changes = run.contact_changes
+    stops = np.asarray(changes.t)[np.asarray(changes.change) == 3]
+    return {
+        "place": _error(run.q[-1, :3], end), "times": _error(stops, [t, t + z[5] / brake]),
+        "creep": _error(run.q[2], run.q[1]), "at rest": _error(run.qdot[1:], 0.0),
+    }  # fmt: skip
+
+
 # ---- optimal pushes (Zhong, Han, Dey & Brikis, arXiv 2305.00092) -----------------------------------------------------
 
 BALL, EFFORT = 0.2, 0.01  # the radius of both balls, the cost of pushing; both have mass 1 and a second
@@ -304,6 +357,7 @@ PROBLEMS = {
             {"each bounce": 1e-10, "all, in parts of their growth": 1e-12, "energy": 1e-12},
         ),
         Problem("woodpecker toy", pecking, {"two pecks": 1e-9}),
+        Problem("stone on two feet", curling, {"place": 1e-8, "times": 1e-8, "creep": 0.0, "at rest": 1e-15}),
         Problem("optimal push, one collision", lambda: optimal_push("one collision"), {"cost": 1e-8}),
         Problem("optimal push, collision and wall", lambda: optimal_push("collision and wall"), {"cost": 1e-8}),
     )
