@@ -20,6 +20,7 @@ import numpy as np
 
 from lagjax._engine import AHEAD
 from lagjax._equations import (
+    CoupledForces,
     Derivation,
     Sample,
     derivation_of,
@@ -205,6 +206,11 @@ def _offender(derivation: Derivation, role: str, arguments: tuple) -> str:
     if function is None or not _is_short(function, arguments):
         return ""
     to_blame = offenders(function, *arguments, derivatives=role != "forces")
+    if isinstance(function, CoupledForces) and to_blame and not to_blame[0].place:
+        return (
+            ". No multipliers satisfy its law there, or several do (Painlevé's paradox, or constraints that depend on "
+            "each other): take less friction, or independent constraints"
+        )
     return f". It comes from {to_blame[0]}" if to_blame else ""
 
 
