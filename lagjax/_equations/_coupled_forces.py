@@ -19,6 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.interpreters.partial_eval import dce_jaxpr
 
+from lagjax._program import Unlowerable, lower
+
 PyTree = Any
 
 # Steps of Newton's method. Each squares what is missing, times the part of λ that the force makes: from a tenth the
@@ -48,21 +50,17 @@ class CoupledForces(eqx.Module):
         moved = eliminate(matrix + jacobian.T @ weighted, jacobian.T).T  # G K⁻¹
         right = jnp.concatenate([(gamma - moved @ (force + weighted.T @ gamma))[:, None], -moved], axis=1)
         solved = eliminate(moved @ jacobian.T, right)
-        return _solve_law(lambda multipliers: self.law(*state, multipliers), solved[:, 0], solved[:, 1:])
+        read, zero = np.array(_multipliers_read(self.law, *state, solved[:, 0]), int), jnp.zeros_like(solved[:, 0])
+        law = lambda some: self.law(*state, zero.at[read].set(some))  # noqa: E731
+        return _solve_law(law, solved[read, 0], solved[read, 1:]) if read.size else self.law(*state, zero)
 
 
-def _solve_law(law: Callable, multipliers, responses):
-    """Q(λ) with λ = λ₀ + R Q(λ), for λ₀ (m,) and R (m, n)."""
-    read, decisive, curved = _dependence(law, multipliers)
-    zero = jnp.zeros_like(multipliers)
-    if not read:
-        return law(zero)
-    places = np.array(read)
-    of_read, responses = lambda some: law(zero.at[places].set(some)), responses[places]
-    unit = jnp.eye(len(read), dtype=zero.dtype)
-    alone = multipliers[places]
-    some = alone + responses @ of_read(zero[places]) if decisive else zero[places]
-    before, single = some, len(read) == 1 and not curved
+def _solve_law(of_read: Callable, alone, responses):
+    """Q(λ) with λ = λ₀ + R Q(λ), for λ₀ (m,) and R (m, n) of multipliers that are read."""
+    decisive, curved = _dependence(of_read, alone)
+    zero, unit, count = jnp.zeros_like(alone), jnp.eye(len(alone), dtype=alone.dtype), len(alone)
+    some = alone + responses @ of_read(zero) if decisive else zero
+    before, single = some, count == 1 and not curved
     for _ in range(1 if single or not decisive else STEPS if curved else STEPS_OF_PIECES):
         value, slopes = of_read(some), jax.jacfwd(of_read)(some)
         coupling = unit - responses @ slopes
@@ -80,19 +78,25 @@ def _solve_law(law: Callable, multipliers, responses):
     return jnp.where(1.0 + off < 2.0, force, jnp.nan)
 
 
-def _dependence(law: Callable, multipliers) -> tuple[list[int], bool, bool]:
-    """The multipliers that a law reads, whether its slopes by these depend on them, and whether they are curved."""
+def _multipliers_read(law: Callable, *arguments) -> list[int]:
+    """The places of the multipliers, the last argument of a law, that it reads; all where it has no program."""
+    m, inputs = arguments[-1].size, sum(jnp.size(x) for x in jax.tree.leaves(arguments))
+    try:
+        program = lower(law, *arguments)
+    except Unlowerable:
+        return list(range(m))
+    read = program.find_inputs(range(len(program.line.outputs)))
+    return [i for i in range(m) if inputs - m + i in read]
 
-    def slopes(*some):
-        return jax.jacfwd(lambda x: law(x))(jnp.stack(some))
 
-    def bends(some, directions):
-        return jax.jvp(slopes, some, directions)[1]
+def _dependence(law: Callable, multipliers) -> tuple[bool, bool]:
+    """True if the slopes of a law by its multipliers depend on these; and if they do so but for their pieces."""
 
-    some = tuple(multipliers[i] for i in range(len(multipliers)))
-    read = _inputs_read(lambda *some: law(jnp.stack(some)), *some)
-    curved = _inputs_read(lambda *both: bends(both[: len(some)], both[len(some) :]), *some, *some)[len(some) :]
-    return [i for i, reads in enumerate(read) if reads], any(_inputs_read(slopes, *some)), any(curved)
+    def slopes(some):
+        return jax.jacfwd(law)(some)
+
+    curved = _inputs_read(lambda some, along: jax.jvp(slopes, (some,), (along,))[1], multipliers, multipliers)[1]
+    return any(_inputs_read(slopes, multipliers)), curved
 
 
 def _inputs_read(function: Callable, *arguments) -> list[bool]:

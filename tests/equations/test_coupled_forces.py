@@ -237,6 +237,26 @@ def test_two_beads_rub_as_each_does_alone():
         np.testing.assert_allclose(run.q[-1, k], follow_bead(0.3, float(qdot0[k, 0]), 8.0).q[-1], atol=2e-11)
 
 
+def test_friction_by_one_multiplier_of_two_takes_what_it_works_and_lets_a_joint_rest():
+    """A double pendulum of points, whose first rod rubs in its bearing: it stops while the second one swings."""
+
+    def forces(q, v, params, multipliers):
+        along = jnp.array([-q[0, 1], q[0, 0]])
+        return jnp.zeros_like(q).at[0].set(-params * jnp.abs(multipliers[0]) * jnp.sign(along @ v[0]) * along)
+
+    double = lagjax.System(
+        lambda q, v: gravity(q[0], v[0]) + gravity(q[1], v[1]), forces=forces,
+        constraints=lambda q: jnp.stack([q[0] @ q[0], (q[1] - q[0]) @ (q[1] - q[0])]) - 1.0,
+    )  # fmt: skip
+    ts = jnp.linspace(0.0, 1.0, 2001)
+    run = lagjax.simulate(double, jnp.array([[0.0, -1.0], [0.0, -2.0]]), jnp.array([[0.7, 0.0], [1.4, 0.0]]), ts, 0.1)
+    first, rates = run.q[:, 0], run.qdot[:, 0]
+    power = -0.1 * jnp.abs(run.multipliers[:, 0] * (first[:, 0] * rates[:, 1] - first[:, 1] * rates[:, 0]))
+    lost = jnp.trapezoid(power, ts)
+    assert lost < -0.05
+    assert float(run.energy()[-1] - run.energy()[0]) == pytest.approx(float(lost), abs=1e-5)  # of 2000 trapezia
+
+
 def test_a_law_that_is_linear_in_several_multipliers_needs_no_sign():
     """Against one linear system for accelerations and multipliers."""
 
