@@ -62,6 +62,11 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "sticking is possible, or several are (Painleve's paradox), or contacts take turns at one instant without end. "
         "Less friction, a contact that gives way (a spring in its place), or other impacts=... decides it."
     )
+    contact_missed = (
+        "A gap is negative that did not fall through zero on its series: it has a corner that no series shows, as "
+        "sqrt(x**2) has at x = 0. Write it without a root of squares: r**2 - x**2 for r - sqrt(x**2), or with abs, "
+        "maximum, where, whose corners are followed."
+    )
     inconsistent_start = (
         "The initial state does not satisfy the constraints, or that behind a transition those of its mode. Put it "
         "there first: system.project(q0, qdot0, t, params), or give the transition a reset."

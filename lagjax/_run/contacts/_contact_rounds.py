@@ -28,7 +28,7 @@ import numpy as np
 from lagjax._engine import Problem
 from lagjax._engine.taylor import Guarded, Surfaces, line_of, require_one_number, vector_of
 from lagjax._interface import RESULTS, SUCCESSFUL, Function, Layout, code_of, halves
-from lagjax._native import SINGLE_NOISE
+from lagjax._native import GUARD_NOISE, SINGLE_NOISE
 from lagjax._primitives import differentiable_where, keep_together, lost_unless
 from lagjax._run._rounds import Stretch, run_rounds
 from lagjax._run._trajectory import vary_with
@@ -50,10 +50,11 @@ from lagjax._scene import Contacts, ContactScene, Flat, InContact
 
 PyTree = Any
 
-TOO_MANY, UNDECIDED, NOT_FINITE, INCONSISTENT = map(
+TOO_MANY, UNDECIDED, MISSED, NOT_FINITE, INCONSISTENT = map(
     code_of,
-    (RESULTS.max_transitions_reached, RESULTS.contact_undecided, RESULTS.nonfinite_state, RESULTS.inconsistent_start),
-)
+    (RESULTS.max_transitions_reached, RESULTS.contact_undecided, RESULTS.contact_missed, RESULTS.nonfinite_state,
+     RESULTS.inconsistent_start),
+)  # fmt: skip
 CLOSES, OPENS, BOUNCES, STICKS, SLIDES = range(5)  # the kinds of `ContactChanges`
 # The time that bounces still take, in parts of a step of the motion between them, below which they end in closed form,
 # and what that leaves out: twice as long, heights of 4e-9 of those of a step are left out.
@@ -62,6 +63,8 @@ SHORT, LEFT_OUT = 1e-4, 1e-14
 FORCELESS = 1e-14
 # By how much the instants of contacts that share an impact may vary apart, for a tangent of length one: rounding.
 TOGETHER = 1e-8
+# How far below zero a gap counts as gone through: a hundred local errors, of its largest terms.
+THROUGH = 100.0
 # What sliding leaves of a contact's response at which it is lost: a paradox, to rounding.
 PARADOX = 1e-12
 # The slip in space that has no direction of its own, in parts of the largest one; and in parts of what a force that
@@ -147,7 +150,9 @@ def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) ->
     first = vary_with(rounds.begin(y0), ts, y0, rounds.vector, varying=("t", "y", "path"))
     absent = RoundRecord.absent(y0.size, rounds.count)
     ending, record = run_rounds(rounds.run_round, first, absent, plan.max_transitions)
-    inputs = ts, y0, rounds.vector
+    inputs, outputs = (ts, y0, rounds.vector), jax.lax.stop_gradient((ts, ending.path, ending.of_path))
+    missed = jax.vmap(lambda *output: rounds.missed(ending, rounds.watch(*output), output[-1]).any())(*outputs).any()
+    ending = ending._replace(result=jnp.where(missed, MISSED, ending.result))
 
     def lost(there, *numbers):
         return (lost_unless(there[:, *[None] * (x.ndim - 1)], x, inputs) for x in numbers)
@@ -230,7 +235,7 @@ class ContactRounds(NamedTuple):
         inside = (guarded.values < -guarded.rounding)[: self.count] & self.has_gap
         result = jnp.where(inside.any(), INCONSISTENT, SUCCESSFUL)
         if self.rubs:  # one that slides and touches may stay or leave
-            touches, rates, noise = self.touching(self.ts[0], y0)
+            touches, rates, noise, _ = self.touching(self.ts[0], y0)
             rows = jax.lax.stop_gradient(self.rows_at(self.ts[0], y0))
             slips, still = self.slips(rows, halves(y0)[1], 0.0)
             along = Pattern((touches & (jnp.abs(rates) <= noise)).astype(float), still.astype(float), _unit(slips))
@@ -252,6 +257,7 @@ class ContactRounds(NamedTuple):
         here, contacts = before.going, before.contacts
         watches, sections = self.count + self.flat.rough.size, len(self.plan.sections)
         guarded = self.watch(before.t, before.y, contacts)
+        missed = (self.missed(before, guarded, contacts) & ~before.fresh[: self.count]).any()
         kinds = jnp.concatenate([contacts.closed, contacts.sticks, jnp.zeros(sections)])
         before = _note_rounding(before, guarded, kinds, 0.0)
         rounding = jnp.maximum(_choose_kind(before.rounding, kinds), guarded.of_time)
@@ -279,7 +285,7 @@ class ContactRounds(NamedTuple):
             decided, record = self.note(decides, decided, record, before._replace(came=came), t, y, k, stretch.kinds)
 
         result = jnp.where(happens, decided.result, located.result)
-        result = jnp.where(happens & (turns > 16 + 8 * kinds.size), UNDECIDED, result)
+        result = jnp.where(happens & (turns > 16 + 8 * kinds.size), UNDECIDED, jnp.where(missed, MISSED, result))
         sound = jnp.isfinite(jnp.where(happens, decided.y, y)).all()
         result = jnp.where(~sound & (result == SUCCESSFUL), NOT_FINITE, result)
         going = happens & (result == SUCCESSFUL)
@@ -333,6 +339,12 @@ class ContactRounds(NamedTuple):
         exact = jnp.pad(of_params, (0, numbers.size - of_params.size))
         return self.surfaces.evaluate_guards(t, y, numbers, self.ts[-1], (of_state, exact))
 
+    def missed(self, before: Carry, guarded: Guarded, contacts: Contacts):
+        """True for each gap (k,) that is negative though it was followed, and open: its series did not show that."""
+        rounding = jnp.maximum(guarded.rounding, jnp.maximum(guarded.of_time, before.rounding[0]))
+        slack = rounding * max(1.0, THROUGH * self.plan.rtol / GUARD_NOISE)
+        return (guarded.values < -slack)[: self.count] & self.has_gap & (contacts.closed == 0)
+
     def rows_at(self, t, y) -> ImpactRows:
         size, n = len(self.places.all), y.size // 2
         values = self.response(jnp.concatenate([y, t[None], self.numbers_in(opened(self.flat))]))
@@ -347,12 +359,13 @@ class ContactRounds(NamedTuple):
         return slips, _length(slips) <= jnp.maximum(1e-12 * terms, 1e-13 * largest)
 
     def touching(self, t, y) -> tuple:
-        """True for contacts that touch (k,), the rates at which they move apart, and the rounding of these."""
+        """True for contacts that touch (k,), how fast they move apart, the rounding of these rates; and the watches."""
         guarded, k = self.watch(t, y, opened(self.flat)), self.count
         values, noise = guarded.values[:k], guarded.rounding[:k] + guarded.of_time[:k]
         rates = jnp.where(self.has_gap, guarded.rates[:k], values)
         of_rates = jnp.where(self.has_gap, guarded.rate_rounding[:k], noise)
-        return jnp.where(self.has_gap, jnp.abs(values) <= noise, values <= noise), rates, of_rates
+        touches = jnp.where(self.has_gap, jnp.abs(values) <= noise, values <= noise)
+        return touches, rates, of_rates, guarded
 
     # ---- what happens at a watch that fell ----
 
@@ -413,7 +426,7 @@ class ContactRounds(NamedTuple):
             largest=largest, y=differentiable_where(~leaves_rest, y_next, t, y), slip=slip,
             contacts=Contacts(closed.astype(float), sticks.astype(float), direction),
             fresh=before.fresh | jnp.concatenate([changed, turned, jnp.zeros(before.came.size, bool)]),
-            result=jnp.where(undecided, UNDECIDED, before.result),
+            result=jnp.where(meeting.missed, MISSED, jnp.where(undecided, UNDECIDED, before.result)),
         )  # fmt: skip
         # Of the work of impulses only what moves q is kinetic energy: gaps may move by themselves.
         lost = -impulses @ (rows.gradients @ (v + 0.5 * change))
@@ -479,7 +492,7 @@ class ContactRounds(NamedTuple):
     def meet(self, before: Carry, rows: ImpactRows, t, y, meets, restitution, friction: Friction) -> "Meeting":
         """The contacts that take part where some meet, (k,), and what they do."""
         was_closed = before.contacts.closed > 0
-        touches, rates, noise = self.touching(t, y)
+        touches, rates, noise, guarded = self.touching(t, y)
         touches = touches | meets | was_closed | ~self.has_gap
         noise = jnp.maximum(noise, 0.01 * before.rate_rounding[0, : self.count])
         phases = ()
@@ -493,7 +506,8 @@ class ContactRounds(NamedTuple):
         others = involved & ~meets & ~was_closed & (rates < -noise) & ~before.fresh[: self.count]
         noise_behind = jnp.maximum(noise, 1e-12 * jnp.max(jnp.abs(rates)))
         hits = (meets & (rates < -noise)).any()
-        return Meeting(hits, pattern, phases, involved, touches, noise_behind, others)
+        missed = (meets & self.missed(before, guarded, before.contacts)).any()
+        return Meeting(hits, missed, pattern, phases, involved, touches, noise_behind, others)
 
     def end_of_bounces(self, before: Carry, rows: ImpactRows, t, y, impulses, bounced, restitution) -> tuple:
         """True for contacts that bounce with these velocities (k,) and come to rest at once, and the time it takes.
@@ -521,13 +535,14 @@ class ContactRounds(NamedTuple):
 
 
 class Meeting(NamedTuple):
-    """Contacts that meet: whether an impact `happened`, its `pattern`, and by Poisson's law that of its `phases`.
+    """Contacts that meet: whether an impact `happened`, was `missed` before, and its `pattern`, or those of `phases`.
 
     And which are `involved`, which touch (k,), below which rate they stay closed, and which others are `tied`: that
     share the impact, and close at this instant by themselves.
     """
 
     happened: Any
+    missed: Any
     pattern: Pattern
     phases: tuple
     involved: Any
