@@ -265,7 +265,7 @@ class Events:
 
         roots.shorten(frame, degree, is_long)
         roots.sum_up(frame, degree)
-        frame["doubt"], frame["begin"] = roots.last_terms(frame, degree), 0.0
+        frame["doubt"], frame["begin"] = roots.last_terms(frame, degree), self._way_out(watch, degree)
         frame["instant"] = 0.25 * frame["smallest"] / (abs(h) * frame["part"])  # no time is known better than this
         rounding = (limits.ROOT_NOISE * limits.EPS) * watch.recall("kept")
         matters = (rounding < float("inf")) & code.compare("!=", watch.recall("contact"), Touch.VALUE)
@@ -288,6 +288,19 @@ class Events:
         with code.only_if(code.any_lane(contact > Touch.VALUE)), code.loop(degree + 1, start=1) as k:
             c, is_zero = frame["poly", k], contact > code.lanes_of(code.as_number(k))
             frame["poly", k] = code.select(is_zero & (c < 0.0), 0.0, c)
+
+    def _way_out(self, watch: Watch, degree: Value) -> Value:
+        """Half the way along which the first term of a zero of several orders is larger than all that fall, or 0.
+
+        Behind such a zero a search that moves by what rounding hides does not come far.
+        """
+        frame, code, contact = watch.frame, watch.code, watch.recall("contact")
+        lead = code.variable(frame.constant(0.0))
+        with code.loop(degree + 1, start=2) as k:
+            is_first = code.compare("==", contact, code.lanes_of(code.as_number(k)))
+            lead.value = code.select(is_first, frame["poly", k], lead.value)
+        lead = lead.value
+        return code.select(lead > 0.0, 0.5 * lead / (lead + frame["falls"]), 0.0)
 
     def _follow_roots(self, watch: Watch, order: Value, degree: Value, ahead: Variable, where: Value) -> None:
         """The roots of the polynomial, one after the other, as long as none ends the motion."""
