@@ -466,12 +466,14 @@ class ContactRounds(NamedTuple):
     def sticks(self, before: Carry, slips: tuple, fell, renewed):
         """True for contacts that stick (r,) behind watches of friction that `fell`, where there is no impact.
 
-        A slip in space that has turned by a right angle goes on.
+        A slip in space that has turned by a right angle goes on. Where one stops others of the same body may, which
+        then stick as well.
         """
         was_stuck = before.contacts.sticks > 0
         if self.flat.shapes.directions > 1:
             fell = fell & (was_stuck | (_length(slips[0]) <= TURNED * before.slip))
-        return jnp.where(renewed, slips[1], (was_stuck | fell) & ~(fell & was_stuck))
+        stop = (fell & ~was_stuck).any() & slips[1]
+        return jnp.where(renewed, slips[1], (was_stuck | fell | stop) & ~(fell & was_stuck))
 
     def directions(self, before: Carry, rows: ImpactRows, t, y, slips: tuple, breaks, renewed):
         """The directions in which contacts slide (r, d): against what held those that break away, or along the slip."""
