@@ -253,7 +253,6 @@ class Solution(NamedTuple):
     - `result` (): how it ended, as the integer of a `lagjax.RESULTS`.
     - `accepted`, `rejected` (): counts of steps.
     - `event` (): which guards changed sign at the end, Σ 4ᵏ (1 where guard k falls, 2 where it rises); 0 without any.
-    - `ticket` (): names the steps that are kept for the transpose of this motion, −1 where they are not.
     - `idle`: of a batch as a whole, the steps for which a lane was idle; None for one motion.
     """
 
@@ -264,7 +263,6 @@ class Solution(NamedTuple):
     accepted: Int[Any, "*N"]
     rejected: Int[Any, "*N"]
     event: Int[Any, "*N"] = None
-    ticket: Int[Any, "*N"] = None
     idle: Int[Any, ""] = None
 
 

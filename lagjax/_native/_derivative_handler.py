@@ -1,4 +1,4 @@
-"""First derivatives of a few short motions as calls of XLA: no Python, no steps that are kept from before.
+"""First derivatives of a few short motions as calls of XLA, without Python.
 
     run again, with the steps written down ─► in the order of the members ─► forward along directions, or back
 

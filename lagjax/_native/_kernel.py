@@ -36,8 +36,8 @@ from lagjax._program._series import Recurrent
 # What a round takes for each operation of the acceleration: 0.03 to 0.1 µs, more where members go back over steps.
 # It decides the length of the first slice, for which a rough value is enough.
 _SECONDS_AN_OPERATION = 1e-7
-# A derivative runs a motion again that takes a thirtieth of a slice, a millisecond at most: less than Python with kept
-# steps. Where fewer rounds than these are in that, hardly a motion ends in time, and would be run twice for nothing.
+# A handler takes derivatives of motions that take a thirtieth of a slice, a millisecond at most. Where fewer rounds
+# than these are in that, hardly a motion ends in time, and would be run twice for nothing.
 _RERUNS_PER_SLICE, _LEAST_ROUNDS = 30, 16
 
 
@@ -312,7 +312,7 @@ class Kernel:
 
     @property
     def rounds_of_rerun(self) -> int:
-        """Rounds of a motion that is rather run again for a derivative than kept; 0 where that would take too long.
+        """Rounds of a motion that a handler runs again for a derivative; 0 where that would take too long.
 
         Or where more is written down of a step than its state: that of a piecewise program.
         """

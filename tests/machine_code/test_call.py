@@ -103,7 +103,7 @@ def end(q, m=1.0, ts=TS):
 
 
 def eagerly(function, monkeypatch):
-    """What a derivative is on the host, over steps that were kept."""
+    """What a derivative is on the host, with its steps taken once more."""
     with monkeypatch.context() as patch:
         patch.setattr(_call, "NO_HANDLER", "this test says so")
         _primitives.compile_once.cache_clear()
@@ -148,7 +148,7 @@ def test_a_derivative_inside_of_loops_takes_no_python(on_host):
     np.testing.assert_allclose(slope, (compiled(Q[0], 1.0 + h) - compiled(Q[0], 1.0 - h)) / (2 * h), atol=1e-7)
 
 
-def test_derivatives_of_long_runs_and_of_rest_are_those_of_kept_steps(on_host, monkeypatch):
+def test_derivatives_of_long_runs_and_of_rest_are_those_of_the_host(on_host, monkeypatch):
     long = np.linspace(0.0, 40.0, 5)
     for arguments in ((Q[0], 1.3, long), (np.zeros(2), 1.3, 10 * TS)):  # at rest steps are too long for derivatives
         compiled = jax.jit(jax.grad(end, (0, 1)))

@@ -8,9 +8,8 @@ from lagrangians import spring_k
 
 import lagjax
 from lagjax._engine._problem import Problem
-from lagjax._engine.taylor import _derivatives, _flow, flow_of
-from lagjax._engine.taylor._flow import Flow, Tolerances
-from lagjax._engine.taylor._kept_steps import KEPT, StepStore
+from lagjax._engine.taylor import _derivatives, flow_of
+from lagjax._engine.taylor._flow import Tolerances
 from lagjax._interface._layout import Layout
 
 TOLERANCES = Tolerances(1e-11, 1e-11, 4096)
@@ -85,47 +84,15 @@ def test_portions_do_not_change_a_cotangent(double, monkeypatch):
     np.testing.assert_array_equal(vjp(double, ts, y0, numbers, run, path_bar, y_bar), whole)
 
 
-def test_kept_steps_do_not_change_a_cotangent(double, monkeypatch):
+def test_members_in_another_order_have_the_same_cotangents(double):
     y0, numbers, rng = batch(23)
     ts, path_bar, y_bar = np.array([[0.0, 0.7, 1.5]]), rng.normal(size=(23, 3, 4)), rng.normal(size=(23, 4))
     run = double.run(ts, y0, numbers, TOLERANCES)
     plain = vjp(double, ts, y0, numbers, run, path_bar, y_bar)
-    runs = []
-    run = Flow.follow
-    monkeypatch.setattr(Flow, "follow", lambda self, *given: runs.append(len(given[1])) or run(self, *given))
-
-    def again(kept):
-        runs.clear()
-        return vjp(double, ts, y0, numbers, kept, path_bar, y_bar)
-
-    kept = double.run(ts, y0, numbers, TOLERANCES, KEPT)
-    np.testing.assert_array_equal(again(kept), plain)
-    assert runs == []
-    # Members in another order find their own steps; what is not there any more is followed once more.
     shuffled = rng.permutation(23)
-    turned = type(kept)(*(x[shuffled] for x in kept[:-1]))
+    turned = type(run)(*(x[shuffled] for x in run[:-1]))
     found = vjp(double, ts, y0[shuffled], numbers[shuffled], turned, path_bar[shuffled], y_bar[shuffled])
     np.testing.assert_array_equal(found, plain[shuffled])
-    monkeypatch.setattr(_derivatives, "KEPT", StepStore())
-    np.testing.assert_array_equal(again(kept), plain)
-    assert runs == [23]
-
-
-def test_steps_that_do_not_fit_are_followed_once_more(double, monkeypatch):
-    y0, numbers, rng = batch(23)
-    ts, path_bar, y_bar = np.array([[0.0, 0.7, 1.5]]), rng.normal(size=(23, 3, 4)), rng.normal(size=(23, 4))
-    plain = vjp(double, ts, y0, numbers, double.run(ts, y0, numbers, TOLERANCES), path_bar, y_bar)
-    monkeypatch.setattr(_flow, "LARGEST_KEPT", 23 * 6 * 3)  # room for three steps of each
-    run = double.run(ts, y0, numbers, TOLERANCES, KEPT)
-    assert (run.ticket < 0).any()
-    np.testing.assert_array_equal(vjp(double, ts, y0, numbers, run, path_bar, y_bar), plain)
-
-
-def test_the_oldest_steps_are_dropped_first(double):
-    y0, numbers, _ = batch(3)
-    store = StepStore(limit=0)
-    tickets = [double.run(np.array([[0.0, 1.0]]), y0, numbers, TOLERANCES, store).ticket for _ in range(2)]
-    assert not list(store.runs(tickets[0])) and [len(k) for _, k, _ in store.runs(tickets[1])] == [3]
 
 
 def loss(system, ts, rtol=1e-11):

@@ -8,7 +8,7 @@ import pytest
 import lagjax
 from lagjax import _native
 from lagjax._engine._problem import Problem
-from lagjax._engine.taylor import _derivatives, _flow, flow_of
+from lagjax._engine.taylor import _derivatives, flow_of
 from lagjax._engine.taylor._flow import Tolerances
 from lagjax._interface._layout import Layout
 from lagjax._native import _kernel
@@ -119,19 +119,6 @@ def test_a_failed_motion_has_the_tangents_of_what_it_did():
     ts = jnp.array([0.0, 0.5, 3.0])
     path = lambda g: lagjax.simulate(scene, 0.5, 0.0, ts, g, throw=False).q
     np.testing.assert_allclose(jax.jacfwd(path)(9.81), [0.0, -0.125, np.nan], atol=1e-10)
-
-
-def test_tangents_of_motions_whose_steps_are_gone(flow, monkeypatch):
-    y0, numbers, rng = starts(5)
-    dy0, dparams = rng.normal(size=(5, 2, 4)), rng.normal(size=(5, 2, 3))
-    run = flow.run(TS, y0, numbers, TOLERANCES, _derivatives.KEPT)
-    motions = _derivatives.Motions.from_solution(TS, y0, numbers, run)
-    kept = _derivatives.jvp(flow, motions, dy0, dparams, TOLERANCES)
-    runs, follow = [], _flow.Flow.follow
-    monkeypatch.setattr(_flow.Flow, "follow", lambda *given: runs.append(given) or follow(*given))
-    for a, b in zip(along(flow, y0, numbers, dy0, dparams), kept, strict=True):
-        np.testing.assert_array_equal(a, b)
-    assert len(runs) == 2  # the motion itself, and once more
 
 
 @pytest.mark.slow

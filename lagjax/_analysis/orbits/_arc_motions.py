@@ -15,7 +15,7 @@ from lagjax._analysis._scene_state import require_matrices
 from lagjax._analysis.orbits._flat_starts import require_untraced
 from lagjax._analysis.orbits._jumping_motions import JumpingMotions
 from lagjax._engine import Problem
-from lagjax._engine.taylor import KEPT, MachineCode, Motions, flow_of, jvp, tolerances_of
+from lagjax._engine.taylor import MachineCode, Motions, flow_of, jvp, tolerances_of
 from lagjax._equations import Sample, Scales, has_constraints
 from lagjax._interface import SUCCESSFUL, Layout, halves
 from lagjax._primitives import sentence
@@ -135,12 +135,13 @@ class Arcs:
         even = np.arange(count + 1) / count
         shares = np.tile(even, (len(y0), 1))
         times = np.stack([np.zeros_like(span), span], axis=1)
-        run = self.flow.run(times, y0, self.numbers[None], self.tolerances, KEPT)
-        for steps, rows, members in KEPT.runs(run.ticket):
-            for row, member in zip(rows.tolist(), members.tolist(), strict=True):
-                first, size = int(steps.first[member]), int(steps.counts[member])
+        room = min(_BUDGET * len(y0), _MOST_WRITTEN // (y0.shape[1] + 4))
+        run, found = self.flow.follow(times, y0, self.numbers[None], self.tolerances, room)
+        for steps in found:
+            for row, table in steps.split_members():
+                size = len(table)
                 if run.result[row] == SUCCESSFUL and size >= 4 * count:
-                    begins, lengths = steps.table[first : first + size, :2].T / span[row]
+                    begins, lengths = table[:, :2].T / span[row]
                     near = np.array_split(np.arange(size), 2 * count)[1:-1]  # halves of shares about their borders
                     around = [np.append(a, b) for a, b in zip(near[::2], near[1::2], strict=True)]
                     shares[row, 1:-1] = [begins[some[np.argmax(lengths[some])]] for some in around]
@@ -160,7 +161,7 @@ class Arcs:
             return Arc(run.y_end, run.rate, run.by_start, nothing, run.result, run.t_end, run.accepted, back)
         directions = np.zeros((0, len(self.numbers))) if directions is None else directions
         params = self.numbers[None]
-        run = self.flow.run(times, y0, params, self.tolerances, KEPT)
+        run = self.flow.run(times, y0, params, self.tolerances)
         dy0 = np.zeros((rows, states + len(directions), states))
         dy0[:, :states] = np.eye(states)
         dparams = np.zeros((rows, states + len(directions), len(self.numbers)))
@@ -243,3 +244,4 @@ class Arcs:
 
 
 _BUDGET = 2**16  # steps of an arc: a thousand times what it should take
+_MOST_WRITTEN = 2**26  # numbers of steps of all motions whose shares are sought, half a GiB

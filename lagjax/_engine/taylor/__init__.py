@@ -4,7 +4,7 @@ Its way: `Problem` ─► `Flow` (rows of NumPy) at once, where nothing is trace
 of JAX, where something is. All of that is in float64; a problem in float32 goes through the door of `_doubles` first.
 
 On rows of NumPy: `_flow` (the flow map), `_derivatives` (its jvp and vjp), `_variational` (its variational equations),
-`_kept_steps` (steps kept for transposes), `_state_rates` (how an output moves with its time). As JAX: `_primitives`,
+`_state_rates` (how an output moves with its time). As JAX: `_primitives`,
 which `_call` (CPU) and `_gpu_launch` run; `_line_functions` and `_lowered_motion` for the scene's own quantities. Where
 a motion meets a surface: `_surfaces`, `_crossing`.
 """
@@ -31,7 +31,6 @@ from lagjax._engine.taylor._crossing import (
 )
 from lagjax._engine.taylor._derivatives import Motions, jvp, portions, project_start_tangents, vjp
 from lagjax._engine.taylor._flow import Flow, Tolerances, require_fit
-from lagjax._engine.taylor._kept_steps import KEPT, StepStore
 from lagjax._engine.taylor._line_functions import line_of
 from lagjax._engine.taylor._lowered_motion import lowered_motion
 from lagjax._engine.taylor._surfaces import Guarded, Surfaces, require_one_number, vector_of

@@ -50,12 +50,9 @@ def derivatives_begin_in_handler(flow: Flow, members: int) -> bool:
     return begins_in_handler(flow, members) and flow.projection is None and flow.kernel.rounds_of_rerun > 0
 
 
-def run_by_handler(
-    flow: Flow, tolerances: Tolerances, host: Callable, shapes, ts, y0, params, rounds: int | None = None
-) -> tuple:
+def run_by_handler(flow: Flow, tolerances: Tolerances, host: Callable, shapes, ts, y0, params) -> tuple:
     """The run of N members, `ts` (1 or N, T), `y0` (N, 2n), `params` (1 or N, P), N not too many for one thread.
 
-    The handler goes this many `rounds`, by default those of a slice of time.
     `host(ts, y0, params, *begun)` continues what the handler leaves undone (`_native.Begun`); its results, of these
     `shapes`, are those of the whole.
     """
@@ -63,7 +60,6 @@ def run_by_handler(
     members, states = y0.shape
     kernel = flow.kernel.select_width(members)
     plan = kernel.plan(tolerances.rtol, tolerances.atol, tolerances.max_steps)
-    plan.rounds = plan.rounds if rounds is None else rounds
     rows, size = (members,), (kernel.rest_size,)
     of_handler = [(members, ts.shape[1], states), (members, states), *[rows] * 4, size]
     call = jax.ffi.ffi_call(_TARGET, [jax.ShapeDtypeStruct(shape, np.float64) for shape in of_handler])
@@ -74,8 +70,7 @@ def run_by_handler(
         happened = code >= _native.EVENT
         result = jnp.where(happened, EVENT_OCCURRED, SUCCESSFUL)
         event = jnp.where(happened, code - _native.EVENT, 0.0)
-        counts = result, steps, rejected, event, jnp.full(rows, -1)
-        return path, y_end, t_end, *(x.astype(int) for x in counts)
+        return path, y_end, t_end, *(x.astype(int) for x in (result, steps, rejected, event))
 
     def continue_on_host(*arrays):
         # The callback lives as long as the compiled program, and with it what the handler needs.

@@ -1,9 +1,10 @@
 """First derivatives of a flow map, for rows of members: `jvp` along directions, `vjp` from cotangents.
 
-Both go over the steps of the motion itself: forward along each direction (`_native._tangent`), back with each step
-transposed (`_native._adjoint`). They are transposes of each other to round-off, and as accurate as the motion as long
-as its steps suit its tangents: where they do not, they are divided (`_divide_steps`). The cost of `vjp` does not grow
-with the number of parameters. A name that ends in `_ct` is a cotangent, one that ends in `_dot` a tangent.
+Both go over the steps of the motion itself, which is run once more for them: forward along each direction
+(`_native._tangent`), back with each step transposed (`_native._adjoint`). They are transposes of each other to
+round-off, and as accurate as the motion as long as its steps suit its tangents: where they do not, they are divided
+(`_divide_steps`). The cost of `vjp` does not grow with the number of parameters. A name that ends in `_ct` is a
+cotangent, one that ends in `_dot` a tangent.
 """
 
 import functools
@@ -15,14 +16,13 @@ import numpy as np
 
 from lagjax import _native
 from lagjax._engine._problem import Solution
-from lagjax._engine.taylor._flow import Flow, Tolerances
-from lagjax._engine.taylor._kept_steps import KEPT, Steps, StepStore
+from lagjax._engine.taylor._flow import Flow, Steps, Tolerances
 from lagjax._interface import SUCCESSFUL
 from lagjax._native import Projection
 from lagjax._program import Program, StraightLine, pullback, pushforward
 
 LARGEST_PORTION = 2**23  # numbers of the steps that are written down at once: 64 MiB
-_ROOM_AGAIN = 2  # times the steps that were taken: those that are undone and those of a first try are written, too
+_ROOM_AGAIN = 2  # times the steps that were taken: those of a first try are written, too
 MOST_PARTS, TRIES = 64, 4  # of a step that is too long, at once; and how often they are divided once more
 
 
@@ -30,7 +30,7 @@ class Motions(NamedTuple):
     """Runs of a flow, of which derivatives are taken: what went in, and the results that say how far they came.
 
     Of N members: `ts` (1 or N, T), `y0` (N, 2n), `params` (1 or N, P), `path` (N, T, 2n), and `result`, `accepted` and
-    `ticket` (N,) of the `Solution`.
+    `rejected` (N,) of the `Solution`.
     """
 
     ts: Any
@@ -39,11 +39,11 @@ class Motions(NamedTuple):
     path: Any
     result: Any
     accepted: Any
-    ticket: Any
+    rejected: Any
 
     @classmethod
     def from_solution(cls, ts, y0, params, solution: Solution) -> "Motions":
-        return cls(ts, y0, params, solution.path, solution.result, solution.accepted, solution.ticket)
+        return cls(ts, y0, params, solution.path, solution.result, solution.accepted, solution.rejected)
 
     def take(self, rows: np.ndarray) -> "Motions":
         """The members `rows` (R,); an array (1, …) that all share stays."""
@@ -108,10 +108,10 @@ def _jvp_over_steps(flow: Flow, motions: Motions, dots, tolerances) -> tuple[np.
     y_dot = np.array(dy0, np.float64)
     path_dot = np.full((*dy0.shape[:2], *motions.path.shape[1:]), np.nan)
 
-    def advance_tangents(steps: Steps, rows, members):
-        of = motions.take(rows)
+    def advance_tangents(steps: Steps):
+        rows, of = steps.rows, motions.take(steps.rows)
         path_dot[rows], y_dot[rows], excess = steps.kernel.jvp(
-            of.ts, of.params, steps.record(members), dy0[rows], dparams[rows], tolerances.floor
+            of.ts, of.params, steps.record, dy0[rows], dparams[rows], tolerances.floor
         )
         return excess / tolerances.largest_excess
 
@@ -177,18 +177,18 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
     y_ct, params_ct = np.full(end_ct.shape, np.nan), np.full((len(end_ct), flow.numbers), np.nan)
     direction = np.random.default_rng(0).normal(size=flow.states + flow.numbers)
 
-    def transpose_steps(steps: Steps, rows, members):
-        of = motions.take(rows)
+    def transpose_steps(steps: Steps):
+        rows, of = steps.rows, motions.take(steps.rows)
         y_ct[rows], params_ct[rows], excess = steps.kernel.vjp(
-            of.ts, of.params, steps.record(members), path_ct[rows], end_ct[rows]
+            of.ts, of.params, steps.record, path_ct[rows], end_ct[rows]
         )
         return excess / tolerances.largest_excess
 
-    def probe(steps: Steps, rows, members):
+    def probe(steps: Steps):
         """The size of the last terms of the series of a tangent, in units of the limit, along any direction at all."""
-        of, record = motions.take(rows), steps.record(members)
-        y_dot, params_dot = (np.tile(x, (len(rows), 1, 1)) for x in np.split(direction, [flow.states]))
-        excess = steps.kernel.jvp(of.ts, of.params, record, y_dot, params_dot, tolerances.floor)[2]
+        of = motions.take(steps.rows)
+        y_dot, params_dot = (np.tile(x, (len(steps.rows), 1, 1)) for x in np.split(direction, [flow.states]))
+        excess = steps.kernel.jvp(of.ts, of.params, steps.record, y_dot, params_dot, tolerances.floor)[2]
         return excess / tolerances.largest_excess
 
     for row in _go_over_steps(flow, motions, tolerances, transpose_steps, probe):
@@ -250,54 +250,47 @@ def _projection_line(differentiate: Callable, program: Program, t: int) -> Strai
 
 def _go_over_steps(
     flow: Flow, motions: Motions, tolerances: Tolerances, go: Callable, probe: Callable
-) -> Iterator[np.ndarray]:
-    """Let `go(steps, rows, members)` take a derivative over the steps of all rows; rows that no steps suit are given.
+) -> Iterator[int]:
+    """Let `go(steps)` take a derivative over the steps of all rows; rows that no steps suit are given.
 
     `go` and `probe` return how large the last terms of the series are, (R,), in units of the limit. `go` may bound that
     from above; where `probe` is larger than 1, the steps are divided until they suit.
     """
-    for steps, rows, members in _steps_of(flow, motions, tolerances):
-        excess = go(steps, rows, members)
+    for steps in _steps_of(flow, motions, tolerances):
+        excess = go(steps)
         long = np.flatnonzero(excess > 1.0)
         if not long.size:
             continue
-        excess = excess[long] if probe is go else probe(steps, rows[long], members[long])
+        steps = steps.take(long)
+        excess = excess[long] if probe is go else probe(steps)
 
-        def divide(k: int, steps=steps, rows=rows[long], members=members[long], excess=excess):
-            row, only = rows[k : k + 1], np.zeros(1, int)
-            numbers = motions.params[row[0] if len(motions.params) > 1 else 0]
-            measure = functools.partial(probe, rows=row, members=only)
-            better = _suitable_steps(flow, steps, int(members[k]), numbers, tolerances, excess[k : k + 1], measure)
+        def divide(k: int, steps=steps, excess=excess):
+            one, row = steps.take([k]), int(steps.rows[k])
+            numbers = motions.params[row if len(motions.params) > 1 else 0]
+            better = _suitable_steps(flow, one, numbers, tolerances, excess[k : k + 1], probe)
             if better is None:
                 return row
             if probe is not go:  # here, so that no more than one table a thread is kept
-                go(better, row, only)
+                go(better)
 
         lost = _native.map_in_threads(np.flatnonzero(excess > 1.0).tolist(), divide, _native.cores())
         yield from (row for row in lost if row is not None)
 
 
-def _steps_of(flow: Flow, motions: Motions, tolerances: Tolerances) -> Iterator[tuple[Steps, np.ndarray, np.ndarray]]:
-    """The steps of all rows: those of a run, whose rows they are, and which members of the run.
+def _steps_of(flow: Flow, motions: Motions, tolerances: Tolerances) -> Iterator[Steps]:
+    """The steps of all rows, which are run once more, a portion after the other.
 
-    First those that are kept; motions whose steps are gone are run once more.
+    To keep those of the first run would save a twentieth of the time in most cases, and a fifth at most.
     """
-    waiting = np.ones(len(motions.y0), bool)
-    for steps, rows, members in KEPT.runs(motions.ticket):
-        waiting[rows] = False
-        yield steps, rows, members
-    for places in portions(np.flatnonzero(waiting), motions.accepted * (flow.states + 4), LARGEST_PORTION):
-        store, again = StepStore(), motions.take(places)
-        room = _ROOM_AGAIN * int(again.accepted.sum()) + len(places)
-        ticket = flow.follow(*again[:3], tolerances, store, room).ticket
-        for steps, rows, members in store.runs(ticket):
-            yield steps, places[rows], members
+    for places in portions(np.arange(len(motions.y0)), motions.accepted * (flow.states + 4), LARGEST_PORTION):
+        again = motions.take(places)
+        room = _ROOM_AGAIN * int(again.accepted.sum()) + int(again.rejected.sum()) + len(places)
+        for steps in flow.follow(*again[:3], tolerances, room)[1]:
+            yield steps._replace(rows=places[steps.rows])
 
 
-def _suitable_steps(
-    flow: Flow, steps: Steps, member: int, params, tolerances, excess, measure: Callable
-) -> Steps | None:
-    """The steps of a member, divided into ever smaller parts until they suit its tangents; None where none do.
+def _suitable_steps(flow: Flow, steps: Steps, params, tolerances, excess, measure: Callable) -> Steps | None:
+    """The steps of one member, divided into ever smaller parts until they suit its tangents; None where none do.
 
     `excess` (1,), and what `measure(steps)` returns, is how large the last terms of the series are, in units of the
     limit. Those of a motion with constraints that do not fall as its steps do are rounding, as beside a dead centre:
@@ -307,32 +300,28 @@ def _suitable_steps(
     for _ in range(TRIES):
         before = float(excess[0])
         parts *= math.ceil(min(MOST_PARTS, 1.1 * before ** (1 / (steps.order - 1))))
-        divided = _divide_steps(flow, steps, member, params, tolerances, parts)
+        divided = _divide_steps(flow, steps, params, tolerances, parts)
         excess = measure(divided)
         if not excess > 1.0:
             return divided
         if flow.projection is not None and float(excess[0]) > 0.5 * before:
-            one = slice(member, member + 1)
-            own = steps._replace(first=steps.first[one], counts=steps.counts[one], complete=steps.complete[one])
-            measure(own)
-            return own
+            measure(steps)
+            return steps
     return None
 
 
-def _divide_steps(flow: Flow, steps: Steps, member: int, params, tolerances: Tolerances, parts: int) -> Steps:
+def _divide_steps(flow: Flow, steps: Steps, params, tolerances: Tolerances, parts: int) -> Steps:
     """The steps of one member, each in this many parts: the states between are outputs of the motion."""
-    first = steps.first[member]
-    rows = steps.table[first : first + steps.counts[member]]
+    ((_, rows),) = steps.split_members()
     t, h, first_state = rows[:, 0], rows[:, 1], rows[:1, 4:]
     times = np.append((t[:, None] + h[:, None] * np.arange(parts) / parts).ravel(), t[-1] + h[-1])
-    path = flow.follow(times[None], first_state[:, : flow.states], params[None], tolerances).path[0]
+    path = flow.follow(times[None], first_state[:, : flow.states], params[None], tolerances)[0].path[0]
     more = np.repeat(rows[:, 4 + flow.states :], parts, axis=0)  # of a piecewise program
     last = np.arange(1, len(more) + 1)[:, None] % parts == 0
     more[:, -3:] = np.where(last, more[:, -3:], 0.0)  # which border it ends at, and whether that is grazed
     begins = np.stack([times[:-1], np.diff(times), *np.zeros((2, len(path) - 1))]).T
     table = np.concatenate([begins, path[:-1], more], axis=1)
-    count = np.array([len(table)])
-    return Steps(steps.kernel, steps.order, table, np.zeros(1, int), count, np.ones(1, bool))
+    return steps._replace(table=table, first=np.zeros(1, int), counts=np.array([len(table)]))
 
 
 def portions(places: np.ndarray, numbers: np.ndarray, largest: int) -> list[np.ndarray]:

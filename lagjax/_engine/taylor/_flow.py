@@ -5,7 +5,7 @@ functions of both that JAX can transform.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -13,7 +13,6 @@ import numpy as np
 from lagjax import _native
 from lagjax._engine._problem import Solution
 from lagjax._engine._stop_reason import End, what_stopped
-from lagjax._engine.taylor._kept_steps import LARGEST_KEPT, Steps, StepStore
 from lagjax._engine.taylor._variational import tangent_programs
 from lagjax._interface import RESULTS, SUCCESSFUL, code_of
 from lagjax._program import Program, Unlowerable, machine_memory, operations_that_fit
@@ -76,6 +75,33 @@ def require_fit(program: Program, size: int) -> None:
             f"derivatives fit into half of this machine's {machine_memory() / 1e9:.0f} GB of memory"
         )
     _native.recurrences(program, size)  # raises where an operation has none
+
+
+class Steps(NamedTuple):
+    """The steps of members of a run in one kernel, by a series of this order.
+
+    A row of `table` holds the time and the size of a step, the numbers of its member and of the step, and its first
+    state; those of the members that are the `rows` (M,) of the run are `counts` (M,) rows from `first` (M,) on.
+    """
+
+    kernel: _native.Kernel
+    order: int
+    table: np.ndarray
+    first: np.ndarray
+    counts: np.ndarray
+    rows: np.ndarray
+
+    def take(self, places) -> "Steps":
+        return self._replace(first=self.first[places], counts=self.counts[places], rows=self.rows[places])
+
+    @property
+    def record(self) -> _native.StepRecord:
+        return _native.StepRecord(self.table, self.first, self.counts, self.order)
+
+    def split_members(self) -> Iterator[tuple[int, np.ndarray]]:
+        """The row of each member, and those of the table that are its steps."""
+        for row, first, count in zip(self.rows.tolist(), self.first, self.counts, strict=True):
+            yield row, self.table[first : first + count]
 
 
 # ---- flows -----------------------------------------------------------------------------------------------------------
@@ -170,23 +196,13 @@ class Flow:
 
     # ---- forward ----
 
-    def run(
-        self,
-        ts,
-        y0,
-        params,
-        tolerances: Tolerances,
-        store: StepStore | None = None,
-        room: int | None = None,
-        begun: _native.Begun | None = None,
-    ) -> Solution:
+    def run(self, ts, y0, params, tolerances: Tolerances, begun: _native.Begun | None = None) -> Solution:
         """`ts` (N, T) or (1, T), `y0` (N, 2n), `params` (N, P) or (1, P) → the motions of N members.
 
-        With a `store` the steps are kept there, up to `room` of all members: by default as many as may be kept. Results
-        say what stopped a member, and not only that its steps became too small, or too many. A run that a handler has
-        `begun` is continued.
+        Results say what stopped a member, and not only that its steps became too small, or too many. A run that a
+        handler has `begun` is continued.
         """
-        solution = self.follow(ts, y0, params, tolerances, store, room, begun)
+        solution, _ = self.follow(ts, y0, params, tolerances, begun=begun)
         if (solution.result != SUCCESSFUL).any():
             solution = self._explain_stops(solution, ts, params)
         finite = np.isfinite(solution.y_end)
@@ -194,31 +210,27 @@ class Flow:
             solution.result[~finite.all(axis=1)] = _NOT_FINITE
         return solution
 
-    def follow(self, ts, y0, params, tolerances, store=None, room=None, begun=None) -> Solution:
-        """`run` without a look at what stopped a member: for another try, and for derivatives."""
+    def follow(self, ts, y0, params, tolerances, room: int = 0, begun=None) -> tuple[Solution, list[Steps]]:
+        """`run` without a look at what stopped a member; and the steps of members that there was `room` for."""
         rtol, atol, max_steps, notes, order = *tolerances[:3], tolerances.notes, tolerances.order
-        if store is not None and room is None:
-            room = min(max_steps * len(y0), LARGEST_KEPT // (self.states + 4))
-        done = self.kernel.select_width(len(y0))(ts, y0, params, rtol, atol, max_steps, room or 0, begun, notes, order)
+        done = self.kernel.select_width(len(y0))(ts, y0, params, rtol, atol, max_steps, room, begun, notes, order)
         result, event = RESULT_OF_CODE[np.minimum(done.code, _native.EVENT)], np.maximum(done.code - _native.EVENT, 0)
-        ticket = np.full(len(y0), -1)
-        if store is not None:
-            assert done.complete is not None and done.table is not None
-            counts = np.where(done.complete, done.steps, 0)
-            first = np.cumsum(counts) - counts
-            order = order or _native.order_for(rtol)
-            ticket = store.keep(Steps(self.kernel, order, done.table, first, counts, done.complete))
-        solution = Solution(*done[:3], result, done.steps, done.rejected, event, ticket, done.idle)
-        if (result == SUCCESSFUL).all():
-            return solution
-        again, flow, tolerances = self._second_chance(solution, ts, params, tolerances)
-        if not again.any():
-            return solution
-        some_ts, some_y0, some_params = members(again, ts, y0, params)
-        better = flow.follow(some_ts, some_y0, some_params, tolerances, store, room)
-        for values, new in zip(solution[:-1], better[:-1], strict=True):
-            values[again] = new
-        return solution._replace(idle=done.idle + better.idle)
+        solution, found = Solution(*done[:3], result, done.steps, done.rejected, event, done.idle), []
+        if done.table is not None and done.complete is not None:
+            rows = np.flatnonzero(done.complete)
+            counts, order = done.steps[rows], order or _native.order_for(rtol)
+            found.append(Steps(self.kernel, order, done.table, np.cumsum(counts) - counts, counts, rows))
+        if not (result == SUCCESSFUL).all():
+            again, flow, tolerances = self._second_chance(solution, ts, params, tolerances)
+            if again.any():
+                some_ts, some_y0, some_params = members(again, ts, y0, params)
+                better, steps_again = flow.follow(some_ts, some_y0, some_params, tolerances, room)
+                for values, new in zip(solution[:-1], better[:-1], strict=True):
+                    values[again] = new
+                solution, places = solution._replace(idle=done.idle + better.idle), np.flatnonzero(again)
+                found = [steps.take(~again[steps.rows]) for steps in found]
+                found += [steps._replace(rows=places[steps.rows]) for steps in steps_again]
+        return solution, [steps for steps in found if len(steps.rows)]
 
     def _explain_stops(self, solution: Solution, ts, params) -> Solution:
         """The solution with what stopped the members whose steps became too small, or too many."""

@@ -86,5 +86,4 @@ def _solution(path, y_end, t_end, code, steps, rejected, states: bool) -> tuple:
     if states:
         reached = (code == _native.DONE)[:, None, None] | jnp.isfinite(path).all(axis=2, keepdims=True)
         path = jnp.where(reached, path, jnp.nan)
-    event = jnp.maximum(code - _native.EVENT, 0)
-    return path, y_end, t_end, result, steps, rejected, event, jnp.full(code.shape, -1)
+    return path, y_end, t_end, result, steps, rejected, jnp.maximum(code - _native.EVENT, 0)

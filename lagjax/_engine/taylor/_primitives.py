@@ -43,7 +43,6 @@ from lagjax._engine.taylor._call import (
 from lagjax._engine.taylor._derivatives import Motions
 from lagjax._engine.taylor._flow import Flow, Tolerances
 from lagjax._engine.taylor._gpu_launch import run_on_gpu, transpose_on_gpu
-from lagjax._engine.taylor._kept_steps import KEPT
 from lagjax._engine.taylor._line_functions import outputs
 from lagjax._engine.taylor._state_rates import rate
 from lagjax._engine.taylor._variational import from_rows, to_rows
@@ -67,8 +66,8 @@ def run(flow: Flow, tolerances: Tolerances, ts, y0, params) -> Solution:
     A flow with guards has no derivatives: they would have to say how its end moves.
     """
     if default_platform() == "cpu":  # outside of `jit` the host computes, and nothing is compiled for a new scene
-        return _run(ts, y0, params, flow=flow, tolerances=tolerances, keep=False)
-    return compile_once(_run, flow=flow, tolerances=tolerances, keep=False)(ts, y0, params)
+        return _run(ts, y0, params, flow=flow, tolerances=tolerances)
+    return compile_once(_run, flow=flow, tolerances=tolerances)(ts, y0, params)
 
 
 @functools.lru_cache(maxsize=64)
@@ -109,9 +108,9 @@ def _restore_batch(results, batch):
     return [x.reshape(batch + x.shape[1:]) for x in results]
 
 
-def _run_on_host(ts, y0, params, *, flow, tolerances, keep):
+def _run_on_host(ts, y0, params, *, flow, tolerances):
     rows, batch = _rows((ts, y0, params), _RUN)
-    return _restore_batch(flow.run(*rows, tolerances, KEPT if keep else None)[:_OUTPUTS], batch)
+    return _restore_batch(flow.run(*rows, tolerances)[:_OUTPUTS], batch)
 
 
 def _derive_on_host(name, inner, *args, flow, tolerances, **_):
@@ -164,7 +163,7 @@ def _curvature_composed(ts, y0, params, path_ct, end_ct, dy0, dparams, *, flow, 
     """`curvature` by going back over the steps of the tangent flow, with cotangents of the tangent alone."""
     larger, tolerances = flow.tangent(1), tolerances.with_larger_budget
     given, length = _tangent_inputs(flow, ts, y0, params, dy0, dparams)
-    solution = _run(*given, flow=larger, tolerances=tolerances, keep=True)
+    solution = _run(*given, flow=larger, tolerances=tolerances)
     path_ct, end_ct = (from_rows(jnp.stack([jnp.zeros_like(ct), ct], axis=-2)) for ct in (path_ct, end_ct))
     cts = path_ct[..., None, :, :], end_ct[..., None, :]
     state_ct, numbers_ct = vjp_p.bind(*_motions(*given, solution), *cts, flow=larger, tolerances=tolerances)
@@ -175,7 +174,7 @@ def _curvature_composed(ts, y0, params, path_ct, end_ct, dy0, dparams, *, flow, 
 def _jvp_composed(ts, y0, params, dy0, dparams, *, flow, tolerances):
     """`jvp` along one direction, (…, 2n) and (…, P), by the run of the tangent flow, and the result of that."""
     given, length = _tangent_inputs(flow, ts, y0, params, dy0, dparams)
-    solution = _run(*given, flow=flow.tangent(1), tolerances=tolerances.with_larger_budget, keep=False)
+    solution = _run(*given, flow=flow.tangent(1), tolerances=tolerances.with_larger_budget)
     path, end = (to_rows(y, flow.size)[..., 1, :] for y in (solution.path, solution.y_end))
     return path * length[..., None], end * length, solution.result
 
@@ -218,12 +217,11 @@ def _motions(ts, y0, params, solution: Solution) -> Motions:
 # ---- derivatives -----------------------------------------------------------------------------------------------------
 
 
-def _derivative_of_run(primals, tangents, *, flow, tolerances, keep):
+def _derivative_of_run(primals, tangents, *, flow, tolerances):
     (ts, y0, params), (dts, dy0, dparams) = primals, tangents
-    varies = flow.guards is None and not all(map(is_zero, tangents))
-    outs = run_p.bind(*primals, flow=flow, tolerances=tolerances, keep=keep or varies)
+    outs = run_p.bind(*primals, flow=flow, tolerances=tolerances)
     along = list(map(zero_like, outs))
-    if not varies:
+    if flow.guards is not None or all(map(is_zero, tangents)):
         return outs, along
     solution = Solution(*outs)
     dy0, dparams = map(ad.instantiate_zeros, (dy0, dparams))
@@ -400,25 +398,21 @@ def _lowering_rule(form):
     return lower_form
 
 
-def _run_compiled(ts, y0, params, *, flow, tolerances, keep):
+def _run_compiled(ts, y0, params, *, flow, tolerances):
     """`run` of what XLA compiles: by the handler where that may be, else on the host."""
-    settings = dict(flow=flow, tolerances=tolerances, keep=keep)
+    settings = dict(flow=flow, tolerances=tolerances)
     shapes = _run_shapes(ts, y0, params, **settings)
     rows, batch = _rows((ts, y0, params), _RUN, library=jnp)
     with jax.enable_x64(True):  # where the kernel is made, and whatever was set where this is lowered
-        # Derivatives of short motions need no steps that are kept.
-        begins = derivatives_begin_in_handler if keep else begins_in_handler
-        if not begins(flow, math.prod(batch)):
+        if not begins_in_handler(flow, math.prod(batch)):
             return call_host(functools.partial(_run_on_host, **settings), shapes, ts, y0, params)
         of_rows = [jax.ShapeDtypeStruct((len(rows[1]), *x.shape[len(batch) :]), x.dtype) for x in shapes]
 
         def finish_run(ts, y0, params, *begun):
-            """The outputs of a run, by Python: continued from `begun`; from the beginning where steps are kept."""
-            more = (KEPT,) if keep else (None, None, Begun(*begun))
-            return flow.run(ts, y0, params, tolerances, *more)[:_OUTPUTS]
+            """The outputs of a run, which Python continues from `begun`."""
+            return flow.run(ts, y0, params, tolerances, Begun(*begun))[:_OUTPUTS]
 
-        rounds = flow.kernel.rounds_of_rerun if keep else None
-        return _restore_batch(run_by_handler(flow, tolerances, finish_run, of_rows, *rows, rounds=rounds), batch)
+        return _restore_batch(run_by_handler(flow, tolerances, finish_run, of_rows, *rows), batch)
 
 
 def _compile_derivative(run_handler, run_on_host, shapes_of, inner, args, settings):
@@ -428,7 +422,8 @@ def _compile_derivative(run_handler, run_on_host, shapes_of, inner, args, settin
     they are done, and what they need to live.
     """
     shapes, function = shapes_of(*args, **settings), functools.partial(run_on_host, **settings)
-    (ts, y0, params, *_, a, b), batch = _rows(args, (*_MOTIONS, *inner), library=jnp)
+    (ts, y0, params, _, _, *counts, a, b), batch = _rows(args, (*_MOTIONS, *inner), library=jnp)
+    flow, members = settings["flow"], math.prod(batch)
 
     def call_handler(*args):
         *results, excess, done, needed = run_handler(ts, y0, params, a, b)
@@ -438,9 +433,11 @@ def _compile_derivative(run_handler, run_on_host, shapes_of, inner, args, settin
 
     with jax.enable_x64(True):  # where kernels are made, and whatever was set where this is lowered
         host = functools.partial(call_host, function, shapes)
-        if not derivatives_begin_in_handler(settings["flow"], math.prod(batch)):
+        if not derivatives_begin_in_handler(flow, members):
             return host(*args)
-        return cond_alike(jnp.all(args[6] < 0), call_handler, host, *args)  # there are no steps that were kept
+        kernel = flow.kernel.select_width(members)
+        is_short = jnp.sum(sum(counts)) <= kernel.rounds_of_rerun * kernel.width
+        return cond_alike(is_short, call_handler, host, *args)
 
 
 def _jvp_compiled(*args, **settings):

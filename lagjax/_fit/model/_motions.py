@@ -25,7 +25,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine import Problem, choose
-from lagjax._engine.taylor import KEPT, Flow, MachineCode, Motions, flow_of, jvp, project_start_tangents, tolerances_of
+from lagjax._engine.taylor import Flow, MachineCode, Motions, flow_of, jvp, project_start_tangents, tolerances_of
 from lagjax._fit.model._inputs import Driven, Form, SampleTable, input_functions
 from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._records import start_pair
@@ -116,7 +116,7 @@ class _MachineCodeMotions(AbstractMotions):
 
     def follow(self, ts, y0, numbers, y0_dot, numbers_dot, table=None):
         flow, params = self._flow(numbers, table)
-        run = flow.run(ts, y0, params, self.tolerances, KEPT)
+        run = flow.run(ts, y0, params, self.tolerances)
         if not y0_dot.shape[1]:
             return RecordMotion(run.path, np.zeros((len(y0), 0, *run.path.shape[1:])), run.result, run.t_end, run.y_end)
         params_dot = np.zeros((*y0_dot.shape[:2], params.shape[1]))

@@ -10,7 +10,7 @@ import jax
 import numpy as np
 
 from lagjax._engine import Problem
-from lagjax._engine.taylor import Flow, StepStore, Tolerances, flow_of, portions
+from lagjax._engine.taylor import Flow, Tolerances, flow_of, portions
 from lagjax._equations import derivation_of, pieces_of_motion
 from lagjax._interface import Layout
 from lagjax._native import Crossed
@@ -78,16 +78,14 @@ def is_piecewise(system: System, layout: Layout, params) -> bool:
 
 def _count(flow: Flow, ts, y0, params, tolerances: Tolerances, steps, places, into: Met[np.ndarray]) -> None:
     """Follow some motions, and add what they met `into` the counts at their places."""
-    store, borders = StepStore(), flow.kernel.borders
+    borders = flow.kernel.borders
     assert borders is not None  # without a series there are none, and none are counted
-    again = flow.follow(ts, y0, params, tolerances, store, 2 * int(steps.sum()) + len(places))
     guards, pieces = borders.guards, len(borders.switches)
     # The time comes to entries of tables, too, which are no borders.
     enters, leaves = (np.array([getattr(guard, name) >= 0 for guard in guards] + [False]) for name in ("slide", "on"))
     slides = sorted({guard.slide for guard in guards if guard.slide >= 0})
-    for run, rows, members in store.runs(again.ticket):
-        for row, member in zip(rows, members, strict=True):
-            table = run.table[run.first[member] : run.first[member] + run.counts[member]]
+    for run in flow.follow(ts, y0, params, tolerances, 2 * int(steps.sum()) + len(places))[1]:
+        for row, table in run.split_members():
             place, (crossed, number), grazes = places[row], table[:, -3:-1].astype(int).T, table[:, -1] > 0
             along = table[:, flow.states + 4 : flow.states + 4 + pieces][:, slides] > 0.5
             begins = along & ~np.vstack([np.zeros((1, len(slides)), bool), along[:-1]])
