@@ -66,6 +66,5 @@ from lagjax._native._kernel import (
 from lagjax._native._line_handler import LineCode, line_handler
 from lagjax._native._motion_parts import Projection, pieces_of, recurrences
 from lagjax._native._taylor import is_large, order_for
-from lagjax._native._threads import map_in_threads
 from lagjax._native._watch import Crossed
 from lagjax._program._jump import Nesting

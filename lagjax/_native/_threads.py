@@ -12,10 +12,8 @@ import _thread
 import queue
 import threading
 import time
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Callable
 
-_outer = threading.local()  # `stopped` of the work that a helper does: whatever it runs by itself ends with that
 SLICE = 0.03  # seconds, more or less: a tenth of what a hand at the keyboard notices, a thousand times what it costs
 
 
@@ -42,11 +40,10 @@ def run_on_threads(work: Callable[[Callable[[], bool]], int], count: int) -> int
     hang on `work`, so that no thread outlives it.
     """
     if count == 1:  # there is no other thread to stop, or to wait for
-        return work(getattr(_outer, "stopped", lambda: False))
+        return work(lambda: False)
     stop, ended, signal = threading.Event(), [], queue.SimpleQueue()
 
     def help_out():
-        _outer.stopped = stop.is_set
         try:
             ended.append(work(stop.is_set))
         except BaseException as failure:
@@ -73,25 +70,6 @@ def run_on_threads(work: Callable[[Callable[[], bool]], int], count: int) -> int
             raise result
         total += result
     return total
-
-
-def map_in_threads(places: Sequence, work: Callable[[Any], Any], count: int) -> list:
-    """The results of `work(place)` for all places, which `count` threads take one after the other.
-
-    The first is done before the others begin: it compiles what all of them need.
-    """
-    results = [work(place) for place in places[:1]] + [None] * (len(places) - 1)
-    left = iter(range(1, len(places)))  # one thread at a time takes the next
-
-    def go(stopped) -> int:
-        for k in left:
-            if stopped():
-                break
-            results[k] = work(places[k])
-        return 0
-
-    run_on_threads(go, max(1, min(count, len(places) - 1)))
-    return results
 
 
 def _wait(helpers: int, ended: list, signal: queue.SimpleQueue, stop: threading.Event) -> None:

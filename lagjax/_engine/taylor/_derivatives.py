@@ -264,17 +264,14 @@ def _go_over_steps(
         steps = steps.take(long)
         excess = excess[long] if probe is go else probe(steps)
 
-        def divide(k: int, steps=steps, excess=excess):
-            one, row = steps.take([k]), int(steps.rows[k])
+        for k in np.flatnonzero(excess > 1.0).tolist():
+            row = int(steps.rows[k])
             numbers = motions.params[row if len(motions.params) > 1 else 0]
-            better = _suitable_steps(flow, one, numbers, tolerances, excess[k : k + 1], probe)
+            better = _suitable_steps(flow, steps.take([k]), numbers, tolerances, excess[k : k + 1], probe)
             if better is None:
-                return row
-            if probe is not go:  # here, so that no more than one table a thread is kept
+                yield row
+            elif probe is not go:
                 go(better)
-
-        lost = _native.map_in_threads(np.flatnonzero(excess > 1.0).tolist(), divide, _native.cores())
-        yield from (row for row in lost if row is not None)
 
 
 def _steps_of(flow: Flow, motions: Motions, tolerances: Tolerances) -> Iterator[Steps]:
