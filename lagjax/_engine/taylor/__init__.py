@@ -22,7 +22,6 @@ from lagjax._engine.taylor import _primitives
 from lagjax._engine.taylor._crossing import (
     MOST_GUARDS,
     Noted,
-    crossing_tangents,
     motion_to_event,
     motion_with_crossings,
     stretch_variation,
@@ -186,14 +185,6 @@ class MachineCode(AbstractEngine):
         ts, y0, params = map(jnp.asarray, (problem.ts, problem.y0, problem.vector))
         given = noting, flow, surfaces, tolerances
         return _primitives.compile_once(motion_with_crossings, *given)(ts, y0, params)
-
-    def crossing_tangents(self, problem: Problem, surfaces: Surfaces, room: int, slack: float, dy0, dparams):
-        """The times of the crossings (G, room), and their tangents (D, G, room), of a problem in float64.
-
-        They are along the directions `dy0` (D, 2n) of the start and `dparams` (D, P) of the parameters.
-        """
-        tangents = _primitives.compile_once(crossing_tangents, *_flows_to_crossings(problem, surfaces, room, slack))
-        return tangents(problem.ts, problem.y0, problem.vector, dy0, dparams)
 
     def solve_batch(self, batch: Batch) -> Solution:
         """The motions of all members, in the lanes of vectors and on all cores."""

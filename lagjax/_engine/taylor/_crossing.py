@@ -176,23 +176,6 @@ def stretch_variation(flow: Flow, surfaces: Surfaces | None, tolerances: Toleran
 # ---- all crossings ---------------------------------------------------------------------------------------------------
 
 
-def crossing_tangents(
-    noting: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances, ts, y0, params, dy0, dparams
-):
-    """The times of crossings, (G, room), and their tangents, (D, G, room).
-
-    These are along D directions of the start, `dy0` (D, 2n), and of the parameters, `dparams` (D, P).
-    """
-
-    def times(y0, params):
-        return motion_with_crossings(noting, flow, surfaces, tolerances, ts, y0, params)[1].t
-
-    def differentiate_times(*direction):
-        return jax.jvp(times, (y0, params), direction)
-
-    return jax.vmap(differentiate_times, out_axes=(None, 0))(dy0, dparams)
-
-
 def motion_with_crossings(
     noting: Flow, flow: Flow, surfaces: Surfaces, tolerances: Tolerances, ts, y0, params
 ) -> tuple[Solution, Noted]:

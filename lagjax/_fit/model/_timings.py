@@ -6,6 +6,7 @@ of `lagjax.simulate_hybrid`.
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -199,8 +200,14 @@ class Clock:
     """
 
     times: Callable[..., jax.Array]
-    tangents: Callable[..., tuple]
     describe_failure: Callable[[np.ndarray, np.ndarray], str]
+
+    @functools.cached_property
+    def tangents(self) -> Callable[..., tuple]:
+        def follow(y0, numbers, *directions):
+            return jax.vmap(lambda *way: jax.jvp(self.times, (y0, numbers), way), out_axes=(None, -1))(*directions)
+
+        return jax.jit(follow)
 
 
 def build_clock(scene: Scene, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> Clock:
@@ -240,11 +247,6 @@ def _build_section_clock(
     def times(y0, numbers):
         return crossings(y0, numbers)[1].t[flat.which, flat.numbers]
 
-    def tangents(y0, numbers, y0_dot, numbers_dot):
-        given = motion(y0, numbers), surfaces, room, 1 / _SHARPER
-        t, moved = map(np.asarray, MachineCode().crossing_tangents(*given, y0_dot, numbers_dot))
-        return t[flat.which, flat.numbers], moved[:, flat.which, flat.numbers].T
-
     def describe_failure(y0, numbers) -> str:
         solution, noted = crossings(y0, numbers)
         if text := sentence(solution.result, solution.t_end, span[1], solution.y_end, layout.names):
@@ -260,7 +262,7 @@ def _build_section_clock(
             f"{flat.numbers[first]}, counted from 0, was measured."
         )
 
-    return Clock(times, tangents, describe_failure)
+    return Clock(times, describe_failure)
 
 
 def _build_transition_clock(
@@ -290,11 +292,6 @@ def _build_transition_clock(
         place = jnp.argmax(mine, axis=1)
         return jnp.where(mine.any(axis=1), happened.t[place], jnp.nan)
 
-    @jax.jit
-    def tangents(y0, numbers, *directions):
-        t, moved = jax.linearize(times, y0, numbers)
-        return t, jax.vmap(moved)(*directions).T
-
     def describe_failure(y0, numbers) -> str:
         missing, motion = ~np.isfinite(np.asarray(times(y0, numbers))), run(y0, numbers)
         assert motion.transitions is not None
@@ -309,7 +306,7 @@ def _build_transition_clock(
             f"{flat.numbers[first]}, counted from 0, was measured." + (f" {text}" if text else "")
         )
 
-    return Clock(times, tangents, describe_failure)
+    return Clock(times, describe_failure)
 
 
 def _mode_places(scene: Hybrid, transition: Transition) -> tuple[int, int]:
