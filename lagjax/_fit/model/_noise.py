@@ -34,7 +34,8 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 from scipy.optimize import minimize_scalar
-from scipy.special import gammaln, log_ndtr
+from scipy.special import log_ndtr
+from scipy.stats import t
 
 from lagjax._fit.model._records import Record, real_numbers, spread_over_signals
 
@@ -201,7 +202,7 @@ class StudentT(AbstractNoise):
         if self.dof is not None:
             return _sigma(scaled, self.dof, least), float(self.dof)
         # The profile likelihood of log ν has one maximum, or its end.
-        cost = lambda x: _cost(scaled, _sigma(scaled, np.exp(x), least), np.exp(x))  # noqa: E731
+        cost = lambda x: -t.logpdf(scaled, np.exp(x), scale=_sigma(scaled, np.exp(x), least)).mean()  # noqa: E731
         ends = np.log(_NARROWEST), np.log(_WIDEST)
         best: Any = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": 3e-3})
         dof = float(np.exp(best.x))
@@ -230,11 +231,6 @@ def _sigma(scaled: np.ndarray, dof: float, least: float) -> float:
     return float(np.sqrt(variance))
 
 
-def _cost(scaled: np.ndarray, sigma: float, dof: float) -> float:
-    constant = gammaln((dof + 1) / 2) - gammaln(dof / 2) - 0.5 * np.log(dof * np.pi)
-    return np.log(sigma) - constant + 0.5 * (dof + 1) * float(np.mean(np.log1p((scaled / sigma) ** 2 / dof)))
-
-
 def scores(z: np.ndarray, sides: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
     """The slope and the curvature of −log L by x/σ of samples of standardised size z; `sides` as for `estimate`."""
     if sides is None:
@@ -256,23 +252,12 @@ def counts(noise: NoiseScale, residuals: np.ndarray, weights: np.ndarray, sides=
 
 def log_likelihood(noise: NoiseScale, residuals: np.ndarray, weights: np.ndarray, sides=None) -> float:
     """The logarithm of the likelihood of residuals (M, S) whose samples are independent."""
-    total = 0.0
+    root = np.sqrt(weights)
+    with np.errstate(divide="ignore"):  # of what does not count
+        each = t.logpdf(root * residuals, noise.dof, scale=noise.sigma) + np.log(root)
     if sides is not None:
-        at_limit = (sides != 0) & (weights > 0)
-        total = float(log_ndtr(sides * np.sqrt(weights) * residuals / noise.sigma).sum(where=at_limit))
-        weights = np.where(at_limit, 0.0, weights)
-    for s, (sigma, dof) in enumerate(zip(*noise, strict=True)):
-        keep = weights[:, s] > 0
-        if not keep.any():
-            continue
-        root = np.sqrt(weights[keep, s])
-        z = root * residuals[keep, s]
-        if np.isinf(dof):
-            each = -np.log(sigma) - 0.5 * np.log(2 * np.pi) - 0.5 * np.mean((z / sigma) ** 2)
-        else:
-            each = -_cost(z, sigma, dof)
-        total += len(z) * each + np.log(root).sum()
-    return float(total)
+        each = np.where(sides == 0, each, log_ndtr(sides * root * residuals / noise.sigma))
+    return float(each.sum(where=weights > 0))
 
 
 _LAG = 1.2  # ratio of the lags at which neighbours are compared: how many there are is known to as much
