@@ -14,7 +14,6 @@ for κ; Raue et al., Bioinformatics 25 (2009) 1923, for what profiles say about 
 
 import contextlib
 import itertools
-from collections.abc import Iterator
 from typing import NamedTuple, cast
 
 import numpy as np
@@ -62,7 +61,7 @@ class _Place(NamedTuple):
 
 
 class _ProfileLine:
-    """The values of the unknown `which` of a fit, each of which begins from its neighbours."""
+    """The values of the unknown `which` of a fit, each of which begins from its nearest neighbour."""
 
     def __init__(self, fit, which: int):
         self.residuals, self.noise, self.which, known = fit.residual_function, fit.noise_scale, which, fit.information
@@ -89,19 +88,11 @@ class _ProfileLine:
         u = self.u.copy()
         u[self.which] = at
         residuals = self.residuals.with_parameters(self.residuals.parameters.fix(u, self.which))
-        for guess in self._guesses(at):
-            with contextlib.suppress(LostMotion):
-                self.places.append(_Place(at, *self._minimise(residuals, guess, _TRIALS)))
-                return self.places[-1].deviance
+        nearest = min(self.places, key=lambda place: abs(place.at - at)).others
+        with contextlib.suppress(LostMotion):
+            self.places.append(_Place(at, *self._minimise(residuals, nearest, _TRIALS)))
+            return self.places[-1].deviance
         return np.inf
-
-    def _guesses(self, at: float) -> Iterator[Point]:
-        """The other unknowns and the starts, along the line through the two nearest places, and at the nearest."""
-        near = sorted(self.places, key=lambda place: abs(place.at - at))[:2]
-        if len(near) == 2 and abs(at - near[0].at) <= 2 * abs(near[0].at - near[1].at):
-            share = (at - near[0].at) / (near[0].at - near[1].at)
-            yield Point(*(x + share * (x - y) for x, y in zip(near[0].others, near[1].others, strict=True)))
-        yield near[0].others
 
     def minimum(self, place: _Place) -> tuple[float, float] | None:
         """The minimum that a search from one place ends in: the unknown and D there."""
