@@ -27,7 +27,7 @@ from lagjax._fit.search._adam import descend_gradient
 from lagjax._fit.search._descent import Anchor, Descent, minimise
 from lagjax._fit.search._multistart import misfit
 from lagjax._fit.search._reader import Reader, pad_states, short_windows, time_scales
-from lagjax._fit.search._segments import complete_pieces, levels
+from lagjax._fit.search._segments import levels
 from lagjax._fit.search._unexplained import measure_unexplained
 from lagjax._run.hybrid import jumps
 
@@ -85,9 +85,8 @@ class Search:
         return done
 
     def _search_pieces(self, level: Descent, joined: Descent | None) -> Descent:
-        """The search on the pieces of a level, with all samples of these and a start for each."""
-        pieces = complete_pieces(level.residuals.pieces, self.residuals.records)
-        part = self.residuals.with_pieces(pieces, level.residuals.fitted)
+        """The search on the pieces of a level, with a start for each."""
+        part, pieces = level.residuals, level.residuals.pieces
         done = minimise(part, level.trial.point, self.law, _ENOUGH, _TRIALS)
         worse = "fails"
         if joined is not None:

@@ -7,7 +7,6 @@ import numpy as np
 from lagjax._fit.model._pieces import Piece
 from lagjax._fit.model._records import Record
 
-_PER_SCALE = 24  # samples per time scale that early levels look at: more cost time and find the same
 _FEWEST_IN_SEGMENT = 8  # samples
 
 
@@ -25,7 +24,7 @@ def levels(records: list[Record | None], scales: list[float]) -> list[list[Piece
             cut = [*e[:-1:stride].tolist(), len(record)]
             if len(cut) > 2 and 2 * (e[-1] - cut[-2]) < e[min(stride, len(e) - 1)] - e[0]:
                 del cut[-2]  # a rest shorter than half a segment joins the one before
-            pieces += [_thin_segment(record, k, a, b, scales[k]) for a, b in itertools.pairwise(cut)]
+            pieces += [Piece(k, np.arange(a, b)) for a, b in itertools.pairwise(cut)]
         found.append(pieces)
         stride *= 2
     return found
@@ -37,24 +36,3 @@ def _edges(record: Record, length: float) -> np.ndarray:
     count = max(1, int((ts[-1] - ts[0]) / length)) if np.isfinite(length) else 1
     count = max(1, min(count, len(ts) // _FEWEST_IN_SEGMENT))
     return np.unique(np.append(np.searchsorted(ts, np.linspace(ts[0], ts[-1], count + 1)[:-1]), len(ts)))
-
-
-def _thin_segment(record: Record, which: int, begin: int, end: int, scale: float) -> Piece:
-    """The samples from `begin` to `end`, thinned to what the time scale of the motion needs."""
-    spacing = (record.ts[end - 1] - record.ts[begin]) / max(end - 1 - begin, 1)
-    step = int(scale / (_PER_SCALE * spacing)) if np.isfinite(scale) and spacing > 0 else 1
-    step = max(1, min(step, (end - begin) // _FEWEST_IN_SEGMENT))
-    return Piece(which, np.arange(begin, end, step))
-
-
-def complete_pieces(pieces: list[Piece], records: list[Record]) -> list[Piece]:
-    """The same pieces of records with all of their samples, up to the first of the next piece."""
-    firsts = {(piece.record, int(piece.places[0])) for piece in pieces}
-    ends = [
-        min((place for k, place in firsts if k == piece.record and place > piece.places[0]), default=None)
-        for piece in pieces
-    ]
-    return [
-        Piece(piece.record, np.arange(piece.places[0], len(records[piece.record]) if end is None else end))
-        for piece, end in zip(pieces, ends, strict=True)
-    ]
