@@ -279,6 +279,7 @@ def test_restitution_and_friction_are_fitted():
         assert low[name] <= value <= high[name] and high[name] - low[name] < 1e-2
 
 
+@pytest.mark.slow
 def test_poissons_law_throws_up_the_foot_that_rests():
     """A rod turns on foot A until B strikes: Newton's law keeps A down, whose velocity was zero; Poisson's gives back
 

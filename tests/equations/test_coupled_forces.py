@@ -70,6 +70,7 @@ def test_bead_on_hoop_stops_where_the_closed_form_does_and_rests(friction, speed
     np.testing.assert_allclose(run.q[-1], run.q[-2], atol=1e-15)
 
 
+@pytest.mark.slow
 def test_bead_has_first_and_second_derivatives_by_its_friction():
     def angle(friction):
         return angle_of(follow_bead(friction, 7.0, 8.0))
@@ -223,6 +224,7 @@ def test_paradox_of_a_rod_on_a_wire_is_not_a_number():
 # ---- two at once, and what has no multipliers ------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_two_beads_rub_as_each_does_alone():
     def forces(q, v, params, multipliers):
         return jnp.stack([rub(q[k], v[k], params, multipliers[k]) for k in range(2)])

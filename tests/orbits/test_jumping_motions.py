@@ -161,6 +161,7 @@ def test_crossings_in_every_mode_and_where_the_mode_changes():
     np.testing.assert_allclose(found["clock"].t[:2], [2.0, np.nan], atol=1e-13)
 
 
+@pytest.mark.slow
 def test_crossings_of_a_block_that_slides_and_stops():
     """On the floor, with friction μ and gravity one: x = v t − ½ μ t² to the stop at v²/2μ, where it stays."""
     block = lagjax.System(
