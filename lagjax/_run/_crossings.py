@@ -97,8 +97,7 @@ def crossings(
     A jump of the section through zero is a crossing, too. Sections may be piecewise (`abs`, `where`, `max`, …).
 
     In a `Hybrid` a section is watched in every mode, and with contacts whatever these do; a reset or an impact through
-    zero is no crossing. Where a section of both
-    directions is zero as another mode begins, it has to leave zero first.
+    zero is no crossing. Where a section of both directions is zero as another mode begins, it has to leave zero first.
 
     `crossings` works under `jax.jit` and `jax.vmap`, which makes one batch of all members, and has first and second
     derivatives. With s′ the rate of the section along the motion, the derivative of a crossing time is −ds / s′, and

@@ -431,15 +431,19 @@ class ContactRounds(NamedTuple):
         # Of the work of impulses only what moves q is kinetic energy: gaps may move by themselves.
         lost = -impulses @ (rows.gradients @ (v + 0.5 * change))
         rest = t + jnp.sum(jnp.where(ends, left, 0.0))
-        contact = jnp.asarray(np.concatenate([np.arange(count), self.flat.rough]))[k]
-        normal = jnp.where(closed[contact], CLOSES, jnp.where(hits, BOUNCES, OPENS))
-        change = normal
-        if self.rubs:
-            stuck = jnp.asarray(np.concatenate([np.zeros(count, int), np.arange(self.flat.rough.size)]))[k]
-            change = jnp.where(k < count, normal, jnp.where(sticks[stuck], STICKS, SLIDES))
+        contact, change = self.name_change(k, closed, sticks, hits)
         return decided, RoundRecord(
             jnp.asarray(True), t, v, decided.y, contact, change, hits, rest, impulses[:count], lost
         )  # fmt: skip
+
+    def name_change(self, k, closed, sticks, hits) -> tuple:
+        """The contact of watch k, and the kind of its change."""
+        contact = jnp.asarray(np.concatenate([np.arange(self.count), self.flat.rough]))[k]
+        normal = jnp.where(closed[contact], CLOSES, jnp.where(hits, BOUNCES, OPENS))
+        if not self.rubs:
+            return contact, normal
+        stuck = jnp.asarray(np.concatenate([np.zeros(self.count, int), np.arange(self.flat.rough.size)]))[k]
+        return contact, jnp.where(k < self.count, normal, jnp.where(sticks[stuck], STICKS, SLIDES))
 
     def impulses(self, before: Carry, rows: ImpactRows, t, y, meeting: "Meeting", held: Pattern, restitution) -> tuple:
         """The impulses (K,), which bounces end, (k,), how long these would take, and whether the law is obeyed.
