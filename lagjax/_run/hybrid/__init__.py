@@ -282,7 +282,7 @@ def _place_of(modes: dict[str, System], start) -> Any:
     if isinstance(start, str) and start in modes:
         return list(modes).index(start)
     is_number = isinstance(start, int | np.integer | np.ndarray | jax.Array) and not isinstance(start, bool)
-    is_place = is_number and jnp.shape(start) == () and np.issubdtype(jnp.result_type(start), np.integer)
+    is_place = is_number and jnp.shape(start) == () and jnp.issubdtype(jnp.result_type(start), jnp.integer)
     if is_place and not (is_concrete(start) and not 0 <= int(start) < len(modes)):
         return start
     raise ValueError(f"start is {start!r}, which is no mode: the modes are {', '.join(map(repr, modes))}.")
