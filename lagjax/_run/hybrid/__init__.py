@@ -277,14 +277,15 @@ def _present(modes: dict[str, System], transitions) -> tuple[dict[str, System], 
     return systems, [transition.now() for transition in transitions]
 
 
-def _place_of(modes: dict[str, System], start) -> Any:
+def _place_of(modes: dict[str, System], start: Any) -> Any:
     """The place of a mode, given by its name or its place, which may be traced. Raises `ValueError` for another one."""
     if isinstance(start, str) and start in modes:
         return list(modes).index(start)
-    is_number = isinstance(start, int | np.integer | np.ndarray | jax.Array) and not isinstance(start, bool)
-    is_place = is_number and jnp.shape(start) == () and jnp.issubdtype(jnp.result_type(start), jnp.integer)
-    if is_place and not (is_concrete(start) and not 0 <= int(start) < len(modes)):
-        return start
+    if isinstance(start, int | np.integer | np.ndarray | jax.Array) and not isinstance(start, bool):
+        place = jnp.asarray(start)
+        is_place = place.ndim == 0 and jnp.issubdtype(place.dtype, jnp.integer)
+        if is_place and not (is_concrete(place) and not 0 <= int(place) < len(modes)):
+            return start
     raise ValueError(f"start is {start!r}, which is no mode: the modes are {', '.join(map(repr, modes))}.")
 
 
