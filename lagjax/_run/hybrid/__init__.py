@@ -282,9 +282,9 @@ def _place_of(modes: dict[str, System], start: Any) -> Any:
     if isinstance(start, str) and start in modes:
         return list(modes).index(start)
     if isinstance(start, int | np.integer | np.ndarray | jax.Array) and not isinstance(start, bool):
-        place = jnp.asarray(start)
-        is_place = place.ndim == 0 and jnp.issubdtype(place.dtype, jnp.integer)
-        if is_place and not (is_concrete(place) and not 0 <= int(place) < len(modes)):
+        dtype, ndim = getattr(start, "dtype", np.dtype(int)), getattr(start, "ndim", 0)
+        is_place = ndim == 0 and jnp.issubdtype(dtype, jnp.integer)
+        if is_place and not (is_concrete(start) and not 0 <= int(start) < len(modes)):
             return start
     raise ValueError(f"start is {start!r}, which is no mode: the modes are {', '.join(map(repr, modes))}.")
 
