@@ -29,10 +29,7 @@ CHANGES = 1024  # the budget of changes of a motion whose crossings are asked fo
 def follow_contacts(given: Problem, problem: Problem, max_transitions: int) -> Trajectory:
     """The motion of a problem whose system has contacts; `problem` is `given` with what it closes over lifted."""
     plan, closed = _plan(problem, max_transitions)
-    if problem.is_known:
-        with jax.enable_x64(True):
-            _require_open(problem, closed)
-        require_coefficients(problem.system, problem.params)
+    _require_sound(problem, closed)
     if has_constraints(problem.system):
         q0, qdot0 = map(problem.layout.restore, halves(jnp.asarray(problem.y0)))
         require_consistent(problem.system, problem.layout, problem.ts, q0, qdot0, problem.params)
@@ -57,9 +54,7 @@ def note_sections(problem: Problem, functions: tuple, directions: tuple[int, ...
     Raises `ValueError` as `follow_contacts` does, and for more sections than there is room for beside the contacts.
     """
     plan, closed = _plan(problem, CHANGES + len(functions) * (room + 1), len(functions))
-    if problem.is_known:
-        with jax.enable_x64(True):
-            _require_open(problem, closed)
+    _require_sound(problem, closed)
     plan = dataclasses.replace(plan, sections=functions, directions=directions)
     ending, record, _ = _motion(plan, problem)
     count = Shapes.from_system(problem.system, problem.layout, problem.params).count
@@ -99,6 +94,14 @@ def _plan(problem: Problem, max_transitions: int, sections: int = 0) -> tuple[Co
         if refusal := MachineCode().refuses(closed):
             raise ValueError(f"A scene with contacts needs machine code, and has none: {refusal}.")
     return plan, dataclasses.replace(closed, ts=wide.ts, y0=wide.y0)
+
+
+def _require_sound(problem: Problem, closed: Problem) -> None:
+    """Raise `ValueError` for what can be known to be wrong of the gaps at the start and of the coefficients."""
+    if problem.is_known:
+        with jax.enable_x64(True):
+            _require_open(problem, closed)
+        require_coefficients(problem.system, problem.params)
 
 
 def _require_open(problem: Problem, closed: Problem) -> None:
