@@ -27,7 +27,7 @@ import numpy as np
 
 from lagjax._engine import Problem
 from lagjax._engine.taylor import Guarded, Surfaces, line_of, require_one_number, vector_of
-from lagjax._interface import RESULTS, SUCCESSFUL, Function, Layout, code_of, halves
+from lagjax._interface import RESULTS, SUCCESSFUL, Function, Layout, code_of, compile_for_one_call, halves
 from lagjax._native import GUARD_NOISE, SINGLE_NOISE
 from lagjax._primitives import differentiable_where, keep_together, lost_unless
 from lagjax._run._rounds import Stretch, run_rounds
@@ -139,7 +139,7 @@ class RoundRecord(NamedTuple):
         return cls(no, nan, halves(y)[1], y, none, none, no, nan, jnp.full(contacts, jnp.nan), nan)
 
 
-@eqx.filter_jit
+@compile_for_one_call
 def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) -> tuple[Carry, RoundRecord, tuple]:
     """The motion from y0 (2n,) at ts[0], its rounds, of which there may be `max_transitions`, and its impacts.
 
