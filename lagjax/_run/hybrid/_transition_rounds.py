@@ -16,7 +16,7 @@ import numpy as np
 
 from lagjax._engine import Problem
 from lagjax._engine.taylor import Guarded, vector_of
-from lagjax._interface import RESULTS, SUCCESSFUL, Layout, code_of
+from lagjax._interface import RESULTS, SUCCESSFUL, Layout, code_of, compile_for_one_call
 from lagjax._native import SINGLE_NOISE
 from lagjax._primitives import lost_unless
 from lagjax._run._rounds import Stretch, run_rounds
@@ -147,7 +147,7 @@ class Exit(NamedTuple):
     order_matters: jax.Array
 
 
-@eqx.filter_jit
+@compile_for_one_call
 def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree, start) -> tuple[Ending, TransitionRecord]:
     """The motion from y0 (2n,) at ts[0] in the mode of place `start`, and its transitions, `max_transitions` of them.
 
