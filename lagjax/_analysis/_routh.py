@@ -2,10 +2,11 @@
 
     R(s, ṡ; μ) = L − μ·ċ,   ∂L/∂ċ(s, ṡ, ċ) = μ
 
-R is a Lagrangian for the other coordinates s. The cyclic ones c follow by an integral over the time.
+R is a Lagrangian for the other coordinates s. The cyclic ones c follow by an integral of ċ over the time; machine code
+follows them beside the others at no other price, so that the motion of the whole scene is that of `lagjax.simulate`.
 """
 
-import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -18,13 +19,10 @@ from lagjax._analysis._coordinates import restrict_signature
 from lagjax._analysis._scene_state import SceneState
 from lagjax._equations import factorize
 from lagjax._interface import Layout, present
-from lagjax._run import State, Trajectory, simulate
-from lagjax._scene import System, present_system
+from lagjax._run import simulate
+from lagjax._scene import System
 
 PyTree = Any
-
-# Nodes of Gauss's rule between two output times, on which cyclic coordinates are integrated.
-_NODES = 8
 
 
 class Routhian(NamedTuple):
@@ -35,7 +33,7 @@ class Routhian(NamedTuple):
     - `names`, `cyclic`: the names of the coordinates that are left, and of those that are gone.
     - `reduce(q, qdot, t=0.0, params=None)`: (s, ṡ, the parameters of `system`) of a state of the scene.
     - `restore(s, sdot, c, params, t=0.0)`: the state (q, q̇) of the scene, with the cyclic coordinates c (k,).
-    - `simulate(q0, qdot0, ts, params, **options)`: the motion of the scene, a `Trajectory`, by that of `system`.
+    - `simulate(q0, qdot0, ts, params, **options)`: the motion of the whole scene, a `Trajectory`.
     """
 
     system: System
@@ -80,7 +78,7 @@ def routhian(system: System, q: PyTree, qdot: PyTree, params: PyTree = None) -> 
     extras = {*system.lagrangian.extras, "params"}
     reduced = System(restrict_signature(whole.routh, extras), path=system.path)  # pyright: ignore[reportArgumentType]
     names = tuple(layout.names[i] for i in left), tuple(layout.names[i] for i in gone)
-    return Routhian(reduced, *names, whole.reduce, whole.restore, lambda *a, **o: _simulate(whole, reduced, *a, **o))
+    return Routhian(reduced, *names, whole.reduce, whole.restore, functools.partial(simulate, scene.system))
 
 
 class _CyclicSplit(NamedTuple):
@@ -123,25 +121,3 @@ class _CyclicSplit(NamedTuple):
     def restore(self, s, sdot, c, params, t=0.0) -> tuple[PyTree, PyTree]:
         cdot = self.cyclic_velocity(s, sdot, jnp.asarray(t, self.layout.dtype), params)
         return self.layout.restore(self.join_coordinates(s, c)), self.layout.restore(self.join_coordinates(sdot, cdot))
-
-
-def _simulate(whole: _CyclicSplit, reduced: System, q0, qdot0, ts, params=None, **options) -> Trajectory:
-    """The motion of the scene: that of the reduced one at the output times and at nodes between them."""
-    ts = jnp.asarray(ts, whole.layout.dtype)
-    s0, sdot0, momenta = whole.reduce(q0, qdot0, ts[0], params)
-    nodes, weights = np.polynomial.legendre.leggauss(_NODES)
-    gaps, count = jnp.diff(ts), len(ts) - 1
-    between = ts[:-1, None] + gaps[:, None] * jnp.asarray(0.5 * (nodes + 1))
-    fine = jnp.concatenate([jnp.column_stack([ts[:-1, None], between]).ravel(), ts[-1:]])
-    done = simulate(reduced, s0, sdot0, fine, momenta, **options)
-    turning = jax.vmap(lambda s, v, t: whole.cyclic_velocity(s, v, t, momenta))(done.q, done.qdot, fine)
-    inside = turning[:-1].reshape(count, _NODES + 1, -1)[:, 1:]
-    turned = 0.5 * gaps[:, None] * jnp.einsum("g,cgk->ck", jnp.asarray(weights), inside)
-    start = whole.layout.flatten(q0)[whole.gone]
-    c = jnp.concatenate([start[None], start + jnp.cumsum(turned, axis=0)])
-    every = slice(None, None, _NODES + 1)
-    s, v = done.q[every], done.qdot[every]
-    q, qdot = jax.vmap(lambda s, v, c, t: whole.restore(s, v, c, momenta, t))(s, v, c, ts)
-    end = State(ts[-1], *jax.tree.map(lambda x: x[-1], (q, qdot)))
-    system = present_system(whole.system)
-    return dataclasses.replace(done, ts=ts, q=q, qdot=qdot, end=end, system=system, params=params)
