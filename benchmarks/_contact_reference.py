@@ -280,9 +280,11 @@ class Reference:
             if contact is None:
                 return Motion(z, events, rests)
             closed = np.array([kind > 0 for kind, _ in mode])
-            touching = closed | (self.terms(z, t).free <= STILL) | (np.arange(self.k) == contact)
-            before = z
-            z, mode, impulse, at_rest = self.settle(z, t, touching)
+            sure, before = closed | (np.arange(self.k) == contact), z
+            touching = sure | (self.terms(z, t).free <= STILL)
+            z, mode, impulse, at_rest = self.settle(before, t, touching)
+            if (touching != sure).any() and np.abs(self.settle(before, t, sure)[0] - z).max() > STILL:
+                raise Ambiguous(f"t = {t}: rounding decides what else touches")
             events.append(Event(t, before, z, contact, impulse))
             rests += at_rest
             if len(events) > MOST_EVENTS:
