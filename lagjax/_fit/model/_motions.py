@@ -16,6 +16,7 @@ derivative is that along them, and a direction across them changes nothing.
 """
 
 import abc
+import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -140,31 +141,12 @@ class _JaxMotions(AbstractMotions):
         if unfree:
             raise TypeError(f"params0 may only hold numbers where the scene has no machine code; got {unfree[0]!r}.")
 
-        def scene_params(numbers, table):
-            params = parameters.restore(numbers)
-            return Driven(params, *table) if is_driven else params
-
-        def run(state, ts, table):
-            y0, numbers = state
-            q, qdot = map(layout.restore, halves(y0))
-            trajectory = simulate(scene, q, qdot, ts, scene_params(numbers, table), throw=False, **options)
-            rows = jax.vmap(lambda q, v: jnp.concatenate([layout.flatten(q), layout.flatten(v)]))
-            end = jnp.concatenate([layout.flatten(trajectory.end.q), layout.flatten(trajectory.end.qdot)])
-            path = rows(trajectory.q, trajectory.qdot)
-            return path, (path, trajectory.result._value, trajectory.end.t, end)
-
-        def run_with_tangents(ts, y0, numbers, y0_dot, numbers_dot, table):
-            def tangent(*dot):
-                return jax.jvp(lambda state: run(state, ts, table)[0], ((y0, numbers),), (dot,))[1]
-
-            return run((y0, numbers), ts, table)[1], jax.vmap(tangent)(y0_dot, numbers_dot)
-
-        def rate(t, y, numbers, table):
-            q, qdot = map(layout.restore, halves(y))
-            return layout.flatten(first_law(scene).acceleration(q, qdot, t, scene_params(numbers, table)))
-
-        self._follow = jax.jit(jax.vmap(run_with_tangents, in_axes=(0, 0, 0, 0, 0, 0)))
-        self._rate = jax.jit(jax.vmap(rate, in_axes=(0, 0, None, 0)))
+        leaves = tuple((np.shape(leaf), np.asarray(leaf).dtype) for leaf in parameters.leaves)
+        key = scene, layout, parameters.tree, leaves, tuple(options.items()), is_driven
+        try:
+            self._follow, self._rate = _programs_once(*key)
+        except TypeError:  # its functions hold arrays
+            self._follow, self._rate = _programs_once.__wrapped__(*key)
         self.dtype = layout.dtype
 
     def follow(self, ts, y0, numbers, y0_dot, numbers_dot, table=None):
@@ -179,6 +161,37 @@ class _JaxMotions(AbstractMotions):
 
     def _array(self, x) -> np.ndarray:
         return np.asarray(x, self.dtype)
+
+
+@functools.lru_cache(maxsize=16)
+def _programs_once(scene: Scene, layout: Layout, tree, leaves: tuple, options: tuple, is_driven: bool):
+    """The motions with their tangents and the accelerations of many rows: compiled once for the fits of a scene."""
+    restore = Parameters([np.zeros(*leaf) for leaf in leaves], tree, np.zeros(0), (), ()).restore
+
+    def scene_params(numbers, table):
+        params = restore(numbers)
+        return Driven(params, *table) if is_driven else params
+
+    def run(state, ts, table):
+        y0, numbers = state
+        q, qdot = map(layout.restore, halves(y0))
+        trajectory = simulate(scene, q, qdot, ts, scene_params(numbers, table), throw=False, **dict(options))
+        rows = jax.vmap(lambda q, v: jnp.concatenate([layout.flatten(q), layout.flatten(v)]))
+        end = jnp.concatenate([layout.flatten(trajectory.end.q), layout.flatten(trajectory.end.qdot)])
+        path = rows(trajectory.q, trajectory.qdot)
+        return path, (path, trajectory.result._value, trajectory.end.t, end)
+
+    def run_with_tangents(ts, y0, numbers, y0_dot, numbers_dot, table):
+        def tangent(*dot):
+            return jax.jvp(lambda state: run(state, ts, table)[0], ((y0, numbers),), (dot,))[1]
+
+        return run((y0, numbers), ts, table)[1], jax.vmap(tangent)(y0_dot, numbers_dot)
+
+    def rate(t, y, numbers, table):
+        q, qdot = map(layout.restore, halves(y))
+        return layout.flatten(first_law(scene).acceleration(q, qdot, t, scene_params(numbers, table)))
+
+    return jax.jit(jax.vmap(run_with_tangents)), jax.jit(jax.vmap(rate, in_axes=(0, 0, None, 0)))
 
 
 _STEPS, _STILL = 30, 1e-13  # of Newton's method, which squares the distance; and the change at which it has ended
