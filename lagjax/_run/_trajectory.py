@@ -113,7 +113,9 @@ class ContactChanges(NamedTuple):
 
     `t` (N,), `q`, `qdot` are those just before it, `q_next`, `qdot_next` just behind it; `contact` is its place in
     `Trajectory.contact_names`, and `change` is 0 where it closes, 1 where it opens, 2 where it bounces, 3 where it
-    sticks, 4 where it slides. Several at one instant lead from one guess to the next.
+    sticks, 4 where it slides. Several at one instant lead from one guess to the next. `doubts` (3,) are how many
+    impacts gained energy, and how many changes have no derivative: where contacts that share an impact close at one
+    instant by themselves, and where a slip in space begins; `doubted` (3,) when they first did, NaN for never.
     """
 
     t: jax.Array
@@ -124,6 +126,8 @@ class ContactChanges(NamedTuple):
     contact: jax.Array
     change: jax.Array
     count: jax.Array
+    doubts: jax.Array
+    doubted: jax.Array
 
 
 class Trajectory(eqx.Module):

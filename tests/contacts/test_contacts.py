@@ -337,6 +337,66 @@ def test_health_says_where_laws_of_impacts_differ(impacts):
     assert "another law" not in str(lagjax.simulate(balls, apart, start[1], jnp.linspace(0.0, 1.0, 3)).health())
 
 
+def slender_rod(impacts):
+    """A rod above a rough incline, of which one end may touch it."""
+
+    def end(q):
+        return jnp.stack([q[0] + 0.5 * jnp.cos(q[2]), q[1] + 0.5 * jnp.sin(q[2])])
+
+    return lagjax.System(
+        lambda q, v: 0.5 * (v[:2] @ v[:2] + 0.02 * v[2] ** 2) + 1.95 * q[0] - 9.6 * q[1], contacts=lambda q: end(q)[1],
+        restitution=0.9, friction=1.0, slip=lambda q, v: jax.jvp(end, (q,), (v,))[1][0], impacts=impacts,
+    )  # fmt: skip
+
+
+def test_an_impact_that_gains_energy_is_suspicious():
+    """Kane's rods: in energies of the velocities on both sides. With Routh's construction none gains any."""
+    inertia, count = np.array([1.0, 1.0, 0.02]), 24
+    rng = np.random.default_rng(5)
+    q = np.stack([np.zeros(count), np.full(count, 1.0), rng.uniform(-3, 3, count)], axis=1)
+    v = rng.normal(size=(count, 3)) * [1.0, 1.0, 6.0] - [0.0, 2.0, 0.0]
+    for impacts in ("simultaneous", "poisson"):
+        runs = lagjax.simulate_batch(slender_rod(impacts), q, v, jnp.array([0.0, 0.5]))
+        before, after = (
+            np.asarray(x) ** 2 @ inertia for x in (runs.contact_changes.qdot, runs.contact_changes.qdot_next)
+        )
+        gained = np.sum(after > before * (1 + 1e-12), axis=1)
+        health = runs.health()
+        np.testing.assert_array_equal(runs.contact_changes.doubts[:, 0], gained)
+        np.testing.assert_array_equal(health.checks()["gained_energy"], gained > 0)
+        np.testing.assert_array_equal(np.isfinite(health.doubts[1][:, 0]), gained > 0)
+        assert (gained.sum() > 3) == (impacts == "simultaneous") and not (impacts == "poisson" and gained.any())
+        assert any("impacts='poisson'" in text for text in health.findings()) == (impacts == "simultaneous")
+
+
+def test_a_racket_that_hits_a_ball_gains_no_energy_by_its_law():
+    racket = lagjax.System(lambda q, v: 0.5 * v**2, contacts=lambda q, t: q - t, restitution=0.5)
+    run = lagjax.simulate(racket, 1.0, -1.0, jnp.array([0.0, 1.0]))
+    assert float(run.impacts.energy_lost[0]) == pytest.approx(0.5 - 2.0) and not run.health().suspicious
+
+
+def test_health_counts_the_derivatives_that_are_lost():
+    """Two feet of a rod that falls flat close at once; a tilt makes that two impacts, each with its derivatives."""
+    rod = lagjax.System(
+        lambda q, v: 0.5 * (v[0] ** 2 + 0.1 * v[1] ** 2) - G * q[0], restitution=0.5,
+        contacts=lambda q: q[0] + 0.5 * jnp.array([1.0, -1.0]) * jnp.sin(q[1]),
+    )  # fmt: skip
+    tilts, ts = jnp.array([0.0, 0.1, 0.0]), jnp.array([0.0, 0.5])
+
+    def run(tilt):
+        return lagjax.simulate(rod, jnp.stack([1.0 + 0.0 * tilt, tilt]), jnp.zeros(2), ts)
+
+    runs = jax.vmap(run)(tilts)
+    lost = ~np.isfinite(jax.vmap(jax.jacfwd(lambda tilt: run(tilt).q[-1]))(tilts)).all(axis=1)
+    health = runs.health()
+    np.testing.assert_array_equal(health.doubts[0][:, 1] > 0, lost)
+    np.testing.assert_array_equal(lost, [True, False, True])
+    np.testing.assert_allclose(health.doubts[1][0, 1], np.sqrt(2 / G), rtol=1e-14)
+    (text,) = health.findings()
+    assert "in 2 of 3 members, the first 0" in text and "part them do not exist" in text and "t = 0.451524" in text
+    assert bool(jax.jit(lambda tilt: run(tilt).health().suspicious)(0.0))
+
+
 # ---- Routh's construction --------------------------------------------------------------------------------------------
 
 

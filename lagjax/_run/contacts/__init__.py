@@ -142,7 +142,8 @@ def _trajectory(
     (q, qdot), end = (map(problem.layout.restore, halves(y)) for y in (ending.path, ending.y))
     at, behind = halves(record.y_next)
     at, before, behind = map(problem.layout.restore, (at, record.qdot, behind))
-    changes = ContactChanges(record.t, at, before, at, behind, record.contact, record.change, ending.rounds)
+    known = record.contact, record.change, ending.rounds, ending.doubts, ending.doubted
+    changes = ContactChanges(record.t, at, before, at, behind, *known)
     names = problem.system.contact_names(problem.layout, problem.params)
     return Trajectory(
         ts=jnp.asarray(given.ts), q=q, qdot=qdot, result=result_from(ending.result), end=State(ending.t, *end),

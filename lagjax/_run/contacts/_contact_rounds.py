@@ -71,6 +71,7 @@ PARADOX = 1e-12
 # breaks away brings about in a step. Half of that takes √2 times the steps, of some ten thousand: at rest friction
 # turns a slip at once, and steps are as short as that takes.
 NO_SLIP, AT_REST = 1e-11, 1e-8
+GAINED = 1e-12  # of the work of an impact: a gain of energy beyond rounding
 # Of the largest slip so far: what is more, where the slip along its first direction ends, has turned.
 TURNED = 1e-6
 EPS = float(np.finfo(float).eps)
@@ -111,6 +112,8 @@ class Carry(NamedTuple):
     came: jax.Array  # (S,), the sides of the sections from which the motion comes
     slip: jax.Array  # (r,), the largest so far
     largest: jax.Array  # (2n,), the largest numbers of the state so far
+    doubts: jax.Array  # (3,), as in `ContactChanges`
+    doubted: jax.Array
     path: jax.Array  # (T, 2n), NaN where not reached
     of_path: Contacts  # what the contacts did at the outputs
 
@@ -248,7 +251,7 @@ class ContactRounds(NamedTuple):
             turns=jnp.zeros((), int), rounding=jnp.zeros((2, guards)), rate_rounding=jnp.zeros((2, guards)),
             came=jnp.sign(guarded.rates)[guards - sections :],
             slip=jnp.zeros(self.flat.rough.size), largest=jnp.abs(jax.lax.stop_gradient(y0)),
-            path=jnp.full((self.ts.size, y0.size), jnp.nan),
+            doubts=jnp.zeros(3, int), doubted=jnp.full(3, jnp.nan), path=jnp.full((self.ts.size, y0.size), jnp.nan),
             of_path=jax.tree.map(lambda x: jnp.full((self.ts.size, *x.shape), -1.0), contacts),
         )  # fmt: skip
 
@@ -296,7 +299,8 @@ class ContactRounds(NamedTuple):
             contacts=jax.tree.map(lambda new, old: jnp.where(happens, new, old), decided.contacts, contacts),
             result=jnp.where(spent, TOO_MANY, result), turns=turns,
             steps=(before.steps[0] + located.accepted, before.steps[1] + located.rejected),
-            rounds=before.rounds + happens,
+            rounds=before.rounds + happens, doubts=jnp.where(happens, decided.doubts, before.doubts),
+            doubted=jnp.where(happens, decided.doubted, before.doubted),
             path=jnp.where(covered[:, None], path, before.path),
             of_path=jax.tree.map(cover, before.of_path, contacts),
         )  # fmt: skip
@@ -420,16 +424,20 @@ class ContactRounds(NamedTuple):
         largest = jnp.maximum(before.largest, jnp.abs(y))
         y_next = y_next - still(jnp.where(jnp.abs(y_next) <= 2 * EPS * largest, y_next, 0.0))
         # Others that close at this instant by themselves do so along directions in which their gaps stay closed.
-        apart = jnp.where(hits & meeting.tied, TOGETHER * jnp.abs(quiet.rates[:count]), jnp.inf)
-        y_next = keep_together(y_next, rows.values[:count], apart)
+        limits = jnp.where(hits & meeting.tied, TOGETHER * jnp.abs(quiet.rates[:count]), jnp.inf)
+        y_next = keep_together(y_next, rows.values[:count], limits)
+        # Of the work of impulses only what moves q is kinetic energy: gaps may move by themselves.
+        lost = -impulses @ (rows.gradients @ (v + 0.5 * change))
+        work = still(impulses) * (quiet.rates + apart)
+        doubts = jnp.stack([work.sum() > GAINED * jnp.abs(work).sum(), meeting.tied.any()]) & hits
+        doubts = jnp.append(doubts, leaves_rest)
         decided = before._replace(
+            doubts=before.doubts + doubts, doubted=jnp.where(doubts & (before.doubts == 0), still(t), before.doubted),
             largest=largest, y=differentiable_where(~leaves_rest, y_next, t, y), slip=slip,
             contacts=Contacts(closed.astype(float), sticks.astype(float), direction),
             fresh=before.fresh | jnp.concatenate([changed, turned, jnp.zeros(before.came.size, bool)]),
             result=jnp.where(meeting.missed, MISSED, jnp.where(undecided, UNDECIDED, before.result)),
         )  # fmt: skip
-        # Of the work of impulses only what moves q is kinetic energy: gaps may move by themselves.
-        lost = -impulses @ (rows.gradients @ (v + 0.5 * change))
         rest = t + jnp.sum(jnp.where(ends, left, 0.0))
         contact, change = self.name_change(k, closed, sticks, hits)
         return decided, RoundRecord(

@@ -51,10 +51,11 @@ UNSTEADY = 0.5
 def examine(trajectory, reference=None) -> "Health":
     """The `Health` of a trajectory, with its global error if there is a reference; see `Trajectory.health`."""
     fields, names = measure_trajectory(trajectory)
-    impacts = None
+    impacts = doubts = None
     if trajectory.impacts is not None:  # impacts and friction take energy: no balance of it is at hand
         shared = _shared_impacts(trajectory)
         impacts = trajectory.impacts.count, jnp.nansum(trajectory.impacts.energy_lost, axis=-1), *shared
+        doubts = trajectory.contact_changes.doubts, trajectory.contact_changes.doubted
         fields["energy_allowed"] = jnp.full_like(jnp.asarray(fields["energy_allowed"]), jnp.inf)
     located, counts = _borders(trajectory)
     return Health(
@@ -68,6 +69,7 @@ def examine(trajectory, reference=None) -> "Health":
         borders_located=located,
         guards=_guards(trajectory.transitions),
         impacts=impacts,
+        doubts=doubts,
         outputs=trajectory.ts.shape[-1],
         diagnosis=_diagnosis(trajectory),
         works=names.works,
@@ -168,6 +170,9 @@ class Health(eqx.Module):
     - `impacts`: in a scene with contacts, how many there were and the energy that they took, how many of them several
       contacts shared, and when that first was (NaN: never); else None. Where contacts share an impact, the laws of
       impacts (`impacts=` of the System) differ. The balance of energy and momenta are not judged there.
+    - `doubts`: in such a scene a pair, how many there were and when the first was (NaN: never), with a last axis for
+      impacts that gained energy, and for changes without a derivative: impacts that contacts share which close at one
+      instant by themselves, and slips in space that begin; else None.
     - `global_error`: with a reference, the largest |yᵢ − reference| over the components of q and q̇, in units of the
       largest |yᵢ| along the path (and atol/rtol more, as in the tolerances); else None.
     """
@@ -198,6 +203,7 @@ class Health(eqx.Module):
     borders: Met[Array] | None
     guards: tuple[Bool[Array, "*batch"], Bool[Array, "*batch"]] | None
     impacts: tuple[Int[Array, "*batch"], Float[Array, "*batch"], Int[Array, "*batch"], Float[Array, "*batch"]] | None
+    doubts: tuple[Int[Array, "*batch 3"], Float[Array, "*batch 3"]] | None
     borders_located: bool = eqx.field(static=True)
     outputs: int = eqx.field(static=True)
     diagnosis: str = eqx.field(static=True)
@@ -245,6 +251,8 @@ class Health(eqx.Module):
                 flags["borders"] = of.accepted_steps >= 0
             if of.guards is not None:
                 flags["order"], flags["let_out"] = of.guards
+            if of.doubts is not None:
+                flags |= {name: of.doubts[0][..., k] > 0 for k, name in enumerate(_DOUBTS)}
             if of.scaled_condition is not None:
                 flags["mass_matrix"] = _exceeds(xp, of.scaled_condition, of.scaled_condition_allowed)
             if of.global_error is not None:
@@ -257,6 +265,11 @@ class Health(eqx.Module):
         raised = {name: np.asarray(flags[name]) for name in _SENTENCES if name in flags and np.any(flags[name])}
         sides = "" if self.borders_located else "make it an event or a mode, or "
         sentences = {name: _SENTENCES[name].format(_member_share(members), sides) for name, members in raised.items()}
+        for k, name in enumerate(_DOUBTS):
+            if name in raised:
+                assert self.doubts is not None
+                counts, times = (np.asarray(x)[..., k] for x in self.doubts)
+                sentences[name] = f"{sentences[name]} {counts.sum()} in all, the first at t = {np.nanmin(times):.6g}."
         if "result" in raised:
             codes, counts = np.unique(np.asarray(self.result._value)[~np.asarray(self.ok)], return_counts=True)
             name = name_of(codes[np.argmax(counts)])  # of most of the members that failed
@@ -395,6 +408,7 @@ def _member(index) -> str:
     return str(int(index[0])) if len(index) == 1 else str(tuple(int(i) for i in index))
 
 
+_DOUBTS = "gained_energy", "closed_together", "began_to_slip"  # in the order of `ContactChanges.doubts`
 _SENTENCES = {
     "result": "The motion did not reach its end{0}.",
     "energy": (
@@ -437,6 +451,15 @@ _SENTENCES = {
         "Transitions: a guard was beyond zero where a mode began, and came back instead of a blow{0}. "
         "`trajectory.transitions.let_out` says which, and when. Begin on the other side of it."
     ),
+    "gained_energy": (
+        "Impacts: one gained energy{0}. Newton's law may, with friction or with several restitutions (Kane). Of one "
+        "contact in a plane impacts='poisson' does not; of several none does with restitution=0."
+    ),
+    "closed_together": (
+        "Contacts: several that share an impact closed at one instant by themselves{0}. Derivatives in directions that "
+        "part them do not exist and are NaN; in reverse mode all are."
+    ),
+    "began_to_slip": ("Contacts: a slip in space began{0}: derivatives of what comes after are NaN."),
     "global_error": (
         "Global error: the motion parts from its reference by a hundredth of its size or more{0}. If its steps are "
         "accurate it is chaotic or unstable: tighten rtol, trust a shorter time, or speak of averages."
