@@ -152,10 +152,17 @@ class Flat(NamedTuple):
         given = p.contacts.direction
         if self.shapes.directions == 1:
             return given
-        slips, length = self.slips(q, qdot, t, p.params), jnp.sqrt((given * given).sum(1))
-        along, across = given / length[:, None], jnp.stack([-given[:, 1], given[:, 0]], axis=1) / length[:, None]
-        turn = (slips * across).sum(1) / ((slips * along).sum(1) + length)
-        return (along + turn[:, None] * across) / jnp.sqrt(1.0 + turn * turn)[:, None]
+        unit, along, across = self.turning_slips(q, qdot, t, p)
+        turn = across / along
+        aside = jnp.stack([-unit[:, 1], unit[:, 0]], axis=1)
+        return (unit + turn[:, None] * aside) / jnp.sqrt(1.0 + turn * turn)[:, None]
+
+    def turning_slips(self, q, qdot, t, p: InContact) -> tuple:
+        """In space the first direction of each slip, (r, 2), and its parts along that and across; (r,)."""
+        given, slips = p.contacts.direction, self.slips(q, qdot, t, p.params)
+        length = jnp.sqrt((given * given).sum(1))
+        unit = given / length[:, None]
+        return unit, (slips * unit).sum(1) + length, slips[:, 1] * unit[:, 0] - slips[:, 0] * unit[:, 1]
 
 
 class Shapes(NamedTuple):

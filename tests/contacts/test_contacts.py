@@ -394,7 +394,6 @@ def test_health_counts_the_derivatives_that_are_lost():
     np.testing.assert_allclose(health.doubts[1][0, 1], np.sqrt(2 / G), rtol=1e-14)
     (text,) = health.findings()
     assert "in 2 of 3 members, the first 0" in text and "part them do not exist" in text and "t = 0.451524" in text
-    assert bool(jax.jit(lambda tilt: run(tilt).health().suspicious)(0.0))
 
 
 # ---- Routh's construction --------------------------------------------------------------------------------------------

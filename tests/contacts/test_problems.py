@@ -11,7 +11,7 @@ sys.path.insert(0, str(Path(__file__).parents[2]))
 
 from benchmarks._contact_problems import PROBLEMS
 
-KEPT = ("Housner", "stadium", "Sinai", "woodpecker")  # the others take long, and are the benchmark's
+KEPT = ("Housner", "stadium", "Sinai", "woodpecker", "stone")  # the others take long, and are the benchmark's
 
 
 @pytest.mark.slow

@@ -478,7 +478,7 @@ class ContactRounds(NamedTuple):
     def sticks(self, before: Carry, slips: tuple, fell, renewed):
         """True for contacts that stick (r,) behind watches of friction that `fell`, where there is no impact.
 
-        A slip in space that has turned by a right angle goes on. Where one stops others of the same body may, which
+        A slip in space that has turned goes on. Where one stops others of the same body may, which
         then stick as well.
         """
         was_stuck = before.contacts.sticks > 0
@@ -651,10 +651,13 @@ def _watches(derivation, scene: ContactScene, sections: tuple, ways: tuple, code
         watches = jnp.concatenate([normal + (1.0 - closed) * open_values, jnp.array(more)])
         if not rough.size:
             return watches
-        held, slips = forces[places.tangential], flat.slips(*state, user)
-        along = direction if shapes.directions == 1 else _unit(direction)
-        most = flat.friction(user) * normal[rough]
-        of_friction = sticks * (most**2 - jnp.sum(held**2, axis=1)) + (1.0 - sticks) * jnp.sum(slips * along, axis=1)
+        held, most = forces[places.tangential], flat.friction(user) * normal[rough]
+        if shapes.directions == 1:
+            slides = jnp.sum(flat.slips(*state, user) * direction, axis=1)
+        else:  # zero where it stops, and where it has turned by 60°: at 90° its direction has a pole
+            unit, along, across = flat.turning_slips(*state, inside._replace(params=user))
+            slides = jnp.sum(flat.slips(*state, user) * unit, axis=1) - across**2 / (3.0 * along)
+        of_friction = sticks * (most**2 - jnp.sum(held**2, axis=1)) + (1.0 - sticks) * slides
         of_friction = closed[rough] * of_friction + (1.0 - closed[rough])
         return jnp.concatenate([watches[: shapes.count], of_friction, watches[shapes.count :]])
 
