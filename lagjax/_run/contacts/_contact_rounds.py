@@ -510,14 +510,15 @@ class ContactRounds(NamedTuple):
         touches = touches | meets | was_closed | ~self.has_gap
         noise = jnp.maximum(noise, 0.01 * before.rate_rounding[0, : self.count])
         phases = ()
-        involved = meets if self.impacts == "sequential" else reached(rows, meets, touches, friction)
+        linked = reached(rows, meets, touches, friction)
+        involved = meets if self.impacts == "sequential" else linked
         if self.impacts != "poisson":
             pattern = find_pattern(rows, involved, restitution, friction)
         elif self.rubs:  # one contact in a plane
             pattern = Pattern(jnp.ones(1), jnp.zeros(1), jnp.zeros((1, 1)))
         else:
             pattern, phases = find_phases(rows, involved, restitution, friction)
-        others = involved & ~meets & ~was_closed & (rates < -noise) & ~before.fresh[: self.count]
+        others = linked & ~meets & ~was_closed & (rates < -noise) & ~before.fresh[: self.count]
         noise_behind = jnp.maximum(noise, 1e-12 * jnp.max(jnp.abs(rates)))
         hits = (meets & (rates < -noise)).any()
         missed = (meets & self.missed(before, guarded, before.contacts)).any()
@@ -552,7 +553,7 @@ class Meeting(NamedTuple):
     """Contacts that meet: whether an impact `happened`, was `missed` before, and its `pattern`, or those of `phases`.
 
     And which are `involved`, which touch (k,), below which rate they stay closed, and which others are `tied`: that
-    share the impact, and close at this instant by themselves.
+    the impact reaches, in turn if it is sequential, and that close at this instant by themselves.
     """
 
     happened: Any
