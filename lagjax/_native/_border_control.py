@@ -180,7 +180,7 @@ class BorderControl:
                 self._limit_growth(frame, border, level)
             comes = ~undecided & (~is_share | at_limit) & (border.touch <= Touch.NONE)
             leads = self.roots.leading_sign(frame, degree)
-            self._divide(frame, border, degree)
+            self.roots.divide(frame, degree, border.touch)
             idle = idle | (self._is_rounding(frame, border, degree) & ~undecided)
             tolerances = limits.SWITCH_TOLERANCES * frame.job("rtol"), absolute_tolerance(frame)
             self.roots.shorten_to(frame, degree, *tolerances, limits.RESOLVED)
@@ -250,16 +250,6 @@ class BorderControl:
             reach = code.select(frame["root"] > 0.0, 2.0 * frame["root"], straight)
             self.roots.stretch(frame, degree, code.select(early() & (reach > 0.0) & (reach < 1.0), reach, 1.0))
             frame.call(self.roots.first_root, degree)
-
-    def _divide(self, frame: Frame, border: Border, degree: Value) -> None:
-        """Divide the polynomial of a guard, where it begins at zero, by as many powers as vanish."""
-        code, touch = frame.code, border.touch
-        divided = touch > Touch.NONE
-        for power in range(3):
-            with code.only_if(code.any_lane(divided)), code.loop(degree + 1) as k:
-                frame.assign(divided, k, poly=frame["poly", k + 1])
-            vanishes = code.compare("==", frame["poly", 0], 0.0)
-            divided = divided & (vanishes | (touch > float(power + Touch.VALUE)))
 
     # ---- tables: borders at their entries ----
 

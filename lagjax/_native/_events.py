@@ -253,9 +253,8 @@ class Events:
 
     def _look_closely(self, watch: Watch, order: Value, degree: Value, side: Value, moving: Value) -> None:
         frame, code, roots, h = watch.frame, watch.code, self.roots, watch.frame["h"]
-        size = roots.size(frame, degree)
-        unknown = moving & ~(abs(frame["poly", 0]) < float("inf"))
-        self._leave_surface(watch, degree, size)
+        size, contact, start = roots.size(frame, degree), watch.recall("contact"), frame["poly", 0]
+        unknown = moving & ~(abs(start) < float("inf"))
         frame.assign(unknown, code=float(limits.NOT_FINITE), last=0.0, h=0.0)
         sound, moving = size < float("inf"), moving & ~unknown
 
@@ -264,13 +263,16 @@ class Events:
             return self._is_long(last, before, roots.size(frame, degree))
 
         roots.shorten(frame, degree, is_long)
+        frame["doubt"], frame["begin"] = roots.last_terms(frame, degree), 0.0
+        # A motion that begins on the surface, or has just gone through it, is not to do so by rounding.
+        continues = (contact < Touch.NONE) & (abs(start) <= limits.CONTINUOUS * size)
+        powers = code.select(continues, float(Touch.VALUE), contact)
+        roots.divide(frame, degree, powers)
         roots.sum_up(frame, degree)
-        frame["doubt"], frame["begin"] = roots.last_terms(frame, degree), self._way_out(watch, degree)
         frame["instant"] = 0.25 * frame["smallest"] / (abs(h) * frame["part"])  # no time is known better than this
         rounding = (limits.ROOT_NOISE * limits.EPS) * watch.recall("kept")
-        matters = (rounding < float("inf")) & code.compare("!=", watch.recall("contact"), Touch.VALUE)
-        rounding = code.select(matters, rounding, 0.0)
-        frame["unsure"] = abs(frame["poly", 1]) * frame["instant"] + rounding
+        matters = (rounding < float("inf")) & ~(powers > Touch.NONE)
+        frame["unsure"] = abs(frame["poly", 1]) * frame["instant"] + code.select(matters, rounding, 0.0)
         ahead = code.variable(side)
         self._follow_roots(watch, order, degree, ahead, moving & sound)
         self._bisect_change(watch, order, ahead, moving & ~sound)
@@ -279,28 +281,6 @@ class Events:
     def _is_long(self, last: Value, before: Value, size: Value) -> Value:
         """The lanes whose last terms are large, or do not fall: the polynomial may leave out as much as they are."""
         return (last > limits.GUARD_TERMS * size) | ((last > limits.FALL * before) & (last > limits.SEEN * size))
-
-    def _leave_surface(self, watch: Watch, degree: Value, size: Value) -> None:
-        """A motion that begins on the surface, or has just gone through it, is not to do so by rounding."""
-        frame, code, contact = watch.frame, watch.code, watch.recall("contact")
-        near = abs(frame["poly", 0]) <= limits.CONTINUOUS * size
-        frame.assign((contact > Touch.NONE) | ((contact < Touch.NONE) & near), 0, poly=0.0)
-        with code.only_if(code.any_lane(contact > Touch.VALUE)), code.loop(degree + 1, start=1) as k:
-            c, is_zero = frame["poly", k], contact > code.lanes_of(code.as_number(k))
-            frame["poly", k] = code.select(is_zero & (c < 0.0), 0.0, c)
-
-    def _way_out(self, watch: Watch, degree: Value) -> Value:
-        """Half the way along which the first term of a zero of several orders is larger than all that fall, or 0.
-
-        Behind such a zero a search that moves by what rounding hides does not come far.
-        """
-        frame, code, contact = watch.frame, watch.code, watch.recall("contact")
-        lead = code.variable(frame.constant(0.0))
-        with code.loop(degree + 1, start=2) as k:
-            is_first = code.compare("==", contact, code.lanes_of(code.as_number(k)))
-            lead.value = code.select(is_first, frame["poly", k], lead.value)
-        lead = lead.value
-        return code.select(lead > 0.0, 0.5 * lead / (lead + frame["falls"]), 0.0)
 
     def _follow_roots(self, watch: Watch, order: Value, degree: Value, ahead: Variable, where: Value) -> None:
         """The roots of the polynomial, one after the other, as long as none ends the motion."""
@@ -346,7 +326,7 @@ class Events:
         """The time of a root, by Newton's steps on the guard itself; a root at 0 is where it has jumped."""
         frame, code, root = watch.frame, watch.code, watch.frame["root"]
         scale = frame["part"] * frame["h"]
-        start, rate = root * scale, frame["slope"] / scale
+        start, rate = root * scale, self.roots.whole_slope(frame) / scale
         moving = code.flag(where & (root > 0.0))
         at, going = code.variable(start), code.variable(moving)
 

@@ -13,7 +13,7 @@ there, and a step that ends there, too, has a series that knows.
 import math
 from collections.abc import Callable
 
-from lagjax._native._constants import EPS, MOST_HALVINGS, MOST_MOVES, ROOT_NOISE
+from lagjax._native._constants import EPS, MAX_ORDER, MOST_HALVINGS, MOST_MOVES, ROOT_NOISE
 from lagjax._native._frame import Fields, Frame
 from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._taylor import TaylorSeries, integer
@@ -39,6 +39,7 @@ class Roots:
             "is_root": 1,  # 0 where only a part of the way was looked at, up to `root`
             "slope": 1,  # P′ at the root
             "error": 1,  # how well P is known there
+            "divided": 1,  # by how many powers P was divided
             "begin": 1,  # where the search begins
             "unsure": 1,  # the rounding of P
             "doubt": 1,  # what P leaves out, as the factor of the power after its last one
@@ -106,6 +107,18 @@ class Roots:
             frame["poly", k] = frame["poly", k] * power.value
             power.value = power.value * part
 
+    def divide(self, frame: Frame, degree: Value, powers: Value) -> None:
+        """Divide by so many powers, those of a zero at 0, which is no root to be found; and by all that vanish next."""
+        code, left = frame.code, frame.code.variable(powers)
+        frame["divided"] = 0.0
+        with code.repeat_while(lambda: code.any_lane(left.value > 0.0), at_most=MAX_ORDER):
+            divided = left.value > 0.0
+            frame["divided"] = frame["divided"] + code.flag(divided)
+            with code.loop(degree + 1) as k:
+                frame.assign(divided, k, poly=frame["poly", k + 1])
+            vanishes = divided & code.compare("==", frame["poly", 0], 0.0)
+            left.value = code.select(vanishes, code.maximum(left.value - 1.0, 1.0), left.value - 1.0)
+
     def leading_sign(self, frame: Frame, degree: Value) -> Value:
         """The sign of the first coefficient behind c₀ that is not zero; 0 without any."""
         code, sign = frame.code, frame.code.variable(frame.constant(0.0))
@@ -113,6 +126,14 @@ class Roots:
             c = frame["poly", degree - i]
             sign.value = code.select(code.compare("!=", c, 0.0), code.select(c > 0.0, 1, -1.0), sign.value)
         return sign.value
+
+    def whole_slope(self, frame: Frame) -> Value:
+        """The slope at the root of what P was before it was divided."""
+        code, slope = frame.code, frame.code.variable(frame["slope"])
+        with code.loop(MAX_ORDER) as k:
+            divided = frame["divided"] > code.lanes_of(code.as_number(k))
+            slope.value = code.select(divided, slope.value * frame["root"], slope.value)
+        return slope.value
 
     # ---- its roots ----
 
