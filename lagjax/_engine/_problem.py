@@ -252,7 +252,7 @@ class Solution(NamedTuple):
     - `y_end` (2n,), `t_end` (): the state and the time at which the motion ended.
     - `result` (): how it ended, as the integer of a `lagjax.RESULTS`.
     - `accepted`, `rejected` (): counts of steps.
-    - `event` (): which guards changed sign at the end, Σ 4ᵏ (1 where guard k falls, 2 where it rises); 0 without any.
+    - `event` (): which guards changed sign at the end, a mask (`taylor.changes_of`); 0 without any.
     - `idle`: of a batch as a whole, the steps for which a lane was idle; None for one motion.
     """
 

@@ -24,7 +24,7 @@ from lagjax._program._borders import inputs_below
 
 
 class Change(IntEnum):
-    """The sign of a guard's rate where it changes sign."""
+    """The sign of a guard's rate where it changes sign; 0 is none."""
 
     FALLS = 1
     RISES = 2
@@ -46,8 +46,9 @@ class Events:
         piecewise = [max(inputs_below(program.line, [i]), default=-1) >= first_piece for i in outputs]
         holds = [*guards.holds, *[False] * self.count]
         self.can_jump = any(piecewise)
-        rows = list(zip(guards.directions, piecewise, holds, strict=False))
-        self.table = Columns(motion.module, ("direction", "piecewise", "holds"), rows)
+        bits = [1 << limits.CHANGE_BITS * g for g in range(self.count)]
+        rows = list(zip(guards.directions, piecewise, holds, bits, strict=False))
+        self.table = Columns(motion.module, ("direction", "piecewise", "holds", "bits"), rows)
         self.guard = self._guard()
         self.begin_sides = self._begin_sides()
         self.note = self._note() if self.notes else None
@@ -205,11 +206,10 @@ class Events:
     def _end_at_first(self, frame: Frame) -> None:
         """The step ends at the earliest change, and the motion there; `event` tells of all at that instant."""
         code, event = frame.code, frame.code.variable(frame.constant(0.0))
-        happens, power = frame["first_at"] < float("inf"), code.variable(frame.constant(1.0))
-        with code.loop(self.count) as g:
-            now = happens & (frame["root_at", g] <= frame["first_at"] + frame["smallest"])
-            event.value += code.select(now, frame["change", g] * power.value, 0.0)
-            power.value = 4.0 * power.value
+        happens = frame["first_at"] < float("inf")
+        for watch in self.table.each(frame):
+            now = happens & (watch.recall("root_at") <= frame["first_at"] + frame["smallest"])
+            event.value += code.select(now, watch.recall("change") * watch.number("bits"), 0.0)
         frame["event"] = code.select(happens, event.value, -1.0)
         frame.assign(happens, last=0.0, h=frame["first_at"] * frame["forward"])
 

@@ -97,7 +97,7 @@ class Kernel:
 
     The outputs of the program are the n accelerations, then whether the mass matrix is singular. `projection` is
     applied to the state after every step, and to the outputs after the first. `guards`, again from the same inputs, end
-    the motion of a member with the code `EVENT` + Σ 4ᵏ (1 where guard k falls, 2 where it rises); or they are noted
+    the motion of a member with the code `EVENT` + a mask of bits (`CHANGE_BITS`); or they are noted
     and the motion goes on: then there are notes in the place of states at output times. Errors are relative
     to each coordinate, or to the largest one of those with the same number in `error_groups` (n,). The coordinates may
     be those of a motion with its tangents (`nesting`); then `motion` is the program of the motion alone. Vectors have

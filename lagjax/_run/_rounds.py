@@ -11,10 +11,9 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from lagjax._engine import Problem, Solution
-from lagjax._engine.taylor import MachineCode, Surfaces
+from lagjax._engine.taylor import MachineCode, Surfaces, changes_of
 from lagjax._interface import SUCCESSFUL
 from lagjax._primitives import cond_alike
 
@@ -87,7 +86,7 @@ class Stretch(NamedTuple):
         problem = dataclasses.replace(problem, ts=times, y0=y, guards=guards)
         located = MachineCode().solve_to_event(problem, noted)
         t_end = jnp.where(here & (located.result == SUCCESSFUL), ts[-1], located.t_end)
-        kinds = (jnp.where(here, located.event, 0) >> (2 * np.arange(count))) & 3
+        kinds = changes_of(jnp.where(here, located.event, 0), count)
         return cls(problem, surfaces, located._replace(t_end=t_end), kinds, ahead & (ts <= t_end), t_end == t_start)
 
     def vary(self, k, crosses) -> tuple:

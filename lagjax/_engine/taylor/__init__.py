@@ -22,6 +22,7 @@ from lagjax._engine.taylor import _primitives
 from lagjax._engine.taylor._crossing import (
     MOST_GUARDS,
     Noted,
+    changes_of,
     motion_to_event,
     motion_with_crossings,
     stretch_variation,

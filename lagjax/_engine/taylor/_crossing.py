@@ -22,11 +22,12 @@ from lagjax._engine.taylor._flow import Flow, Tolerances
 from lagjax._engine.taylor._surfaces import Surfaces, crossing_variation, require_one_number
 from lagjax._equations import Derivation
 from lagjax._interface import ENDED_WELL, EVENT_OCCURRED, halves
+from lagjax._native import CHANGE_BITS
 from lagjax._primitives import attach_derivative, differentiable_where, lost_unless
 from lagjax._program import Unlowerable
 
 _BEFORE = 64 * np.finfo(np.float64).eps  # of the largest time: more than the rounding of a time, and of a border's
-MOST_GUARDS = 24  # two bits each in the code of an event, which the kernel keeps in a double of 53
+MOST_GUARDS = 24  # `CHANGE_BITS` each in the code of an event, a whole number that the kernel keeps in a double of 53
 
 
 class Noted(NamedTuple):
@@ -102,6 +103,11 @@ def _lower_surfaces(derivation: Derivation, functions, directions, code, structu
     return Surfaces.from_function(derivation, values_at, directions, code, structure, is_rounded)
 
 
+def changes_of(event, count: int):
+    """How each of the guards changed, (G,), from the mask of an event: 1 where it fell, 2 where it rose, else 0."""
+    return (event >> (CHANGE_BITS * np.arange(count))) & (2**CHANGE_BITS - 1)
+
+
 # ---- to the first event ----------------------------------------------------------------------------------------------
 
 
@@ -124,7 +130,7 @@ def motion_to_event(guarded: Flow, flow: Flow, surfaces: Surfaces, tolerances: T
 @functools.lru_cache(maxsize=64)
 def _event_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
     """`(ts, y0, params, t_end, result, event)` → path, y_end, t_end, for the sake of their derivatives."""
-    move_to_zero, each = crossing_variation(surfaces), np.arange(len(surfaces.directions))
+    move_to_zero = crossing_variation(surfaces)
 
     @jax.jit
     def run_unguarded(ts, y0, params, t_stop, result, event):
@@ -133,7 +139,7 @@ def _event_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
         times = jnp.where((end - ts) * (ts[-1] - ts[0]) >= 0, ts, end)
         times = jnp.concatenate([ts[:1], times[1:-1], end[None]])
         solution = _primitives.run(flow, tolerances, times, y0, params)
-        first = jnp.argmax(((event >> (2 * each)) & 3) > 0)
+        first = jnp.argmax(changes_of(event, len(surfaces.directions)) > 0)
         moves = fired
         if any(surfaces.holds):  # what holds at the start ends the motion there
             at_once = jnp.asarray(surfaces.holds)[first] & (t_stop == ts[0])
