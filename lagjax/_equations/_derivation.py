@@ -155,7 +155,7 @@ class Derivation:
         self._shapes: dict[str, tuple[int, ...]] = {}
         self._sampled: dict[float, list[tuple[np.ndarray, np.ndarray]]] = {}
         self._recursion: Recursion | None = None  # known once the quantities are
-        self._own_rules = False
+        self.has_rules = False  # of its own for derivatives, in a function; known once the quantities are
         # Compiled functions are traced once for each of their derivatives, and all quantities share these.
         self._traced_once: Motion = jax.tree.map(jax.jit, motion)
 
@@ -197,24 +197,17 @@ class Derivation:
 
         leaves, structure = jax.tree.flatten(self.state_shapes)
         try:
-            return lower_scalars(trace_scalars, trace_arrays, tuple(leaves), OPERATION_BUDGET, 2 * self.layout.size + 1)
+            return lower_scalars(trace_scalars, tuple(leaves), OPERATION_BUDGET, 2 * self.layout.size + 1)
         except OwnRules:
-            self._own_rules = True
+            self.has_rules = True
             return lower(trace_arrays, *leaves, budget=OPERATION_BUDGET, moving=2 * self.layout.size + 1)
 
     def program(self, *names: str) -> Program:
         """The program for these of `Motion.quantities`, end to end, each in C order."""
         if names not in self._programs:
             positions = [k for name in names for k in self._positions(name)]
-            self._programs[names] = self._select(positions, lambda values: [values[name] for name in names])
+            self._programs[names] = self._whole.select_outputs(positions)
         return self._programs[names]
-
-    def _select(self, positions: list[int], choose: Callable) -> Program:
-        """The program for numbers of `_whole`, at these positions; `choose` takes them from arrays, by their names."""
-        structure = jax.tree.structure(tuple(self.state_shapes))
-        return self._whole.select_outputs(
-            positions, lambda *leaves: choose(self._traced_once.quantities(*jax.tree.unflatten(structure, leaves)))
-        )
 
     @functools.cached_property
     def _starts(self) -> dict[str, int]:
@@ -459,7 +452,7 @@ class Derivation:
         """True if derivatives are those of programs: no function has rules of its own or looks up a table, and the
         programs are not large."""
         try:
-            usual = not (self._whole.looks_up or self._own_rules)
+            usual = not (self._whole.looks_up or self.has_rules)
             return usual and self.layout.dtype == DOUBLE and self._whole.operations <= LARGEST_DIFFERENTIATED
         except Unlowerable:
             return False
@@ -540,21 +533,14 @@ class Derivation:
         elimination, n = RecursiveElimination(self._recursion, self.layout.dtype), self.layout.size
         places, count = elimination.entries, len(elimination.entries)
         positions = [*self._positions("recursion"), *self._positions("force")]
-        # The operations of the program alone are used, not its function.
-        cut = functools.cache(lambda: self._whole.select_outputs(positions, solve_dense))
+        cut = functools.cache(lambda: self._whole.select_outputs(positions))
 
         def system(*scalars):
             values = cut().vector(*scalars)
             right = scatter(values[count:], np.arange(n), n + 2 * elimination.velocities)
             return places, values[:count], right, *elimination.factors(values[:count])
 
-        def solve_dense(*scalars):  # the same function of the state, with arrays: M is eliminated
-            dense, solve = self._system(_ACCELERATION)
-            _, _, right, factors, singular = dense(*scalars)
-            return [*solve(factors, right), jnp.asarray(singular)]
-
-        options = {"budget": OPERATION_BUDGET, "in_jax": solve_dense}
-        program = lower_solution(system, elimination.solve, n, *self.scalar_shapes, **options)
+        program = lower_solution(system, elimination.solve, n, *self.scalar_shapes, budget=OPERATION_BUDGET)
         return program if self._agrees(program) else None
 
     def _agrees(self, program: Program) -> bool:
@@ -583,13 +569,7 @@ class Derivation:
         if saddle.b is not None:
             positions += range(starts[saddle.b], starts[saddle.b] + n)
 
-        def chosen(values):
-            right = [] if saddle.b is None else [values[saddle.b]]
-            flat = jnp.concatenate([values[name].ravel() for name in names])
-            return [flat[place], values[saddle.c][:constraints], *right]
-
-        cut = functools.cache(lambda: self._select(positions, chosen))
-
+        cut = functools.cache(lambda: self._whole.select_outputs(positions))
         return lambda *scalars: cut().vector(*scalars)
 
     def _rows(self, saddle: _Saddle) -> int:

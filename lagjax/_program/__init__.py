@@ -21,8 +21,8 @@ The inputs are the elements of the example arrays, leaf by leaf, each in C order
 A `Program` is called with one JAX scalar per input. Each may be an array of lanes instead, all lanes in one call: the
 inputs broadcast, and every output, constants too, has the shape they broadcast to. The precision is that of the inputs.
 
-Derivatives of a program are those of the function it came from, custom rules included: they are traced from that
-function and lowered in turn, on first use.
+Derivatives of a program are those of its operations, programs again that are made on first use (`_differentiation`);
+`has_own_rules` finds functions that have other ones.
 
 `_operations` has a row for each operation: its value, its derivatives, its series. `_graph` shares and, by `_simplify`,
 folds; `_scalars` writes formulas on it, `_passes` finish it; `_differentiation` differentiates it. Series: `_series`,
@@ -71,34 +71,18 @@ def lower(function: Callable, *examples, budget: int = 20_000, moving: int = 0) 
     """
     leaves, structure = jax.tree.flatten(examples)
     shapes = tuple(jax.ShapeDtypeStruct(jnp.shape(leaf), jnp.result_type(leaf)) for leaf in leaves)
-    return _lower_leaves(
-        lambda *xs: jax.tree.leaves(function(*jax.tree.unflatten(structure, xs))), shapes, budget, moving
-    )
-
-
-def _lower_leaves(
-    function: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], budget: int, moving: int = 0
-) -> "Program":
-    jaxpr = jax.make_jaxpr(function)(*shapes)
+    jaxpr = jax.make_jaxpr(lambda *xs: jax.tree.leaves(function(*jax.tree.unflatten(structure, xs))))(*shapes)
 
     def scalars(expansion, arguments):
         return expansion.run_closed(jaxpr, arguments)
 
-    return lower_scalars(scalars, function, shapes, budget, moving)
+    return lower_scalars(scalars, shapes, budget, moving)
 
 
 def lower_scalars(
-    scalars: Callable,
-    function: Callable | None,
-    shapes: tuple[jax.ShapeDtypeStruct, ...],
-    budget: int,
-    moving: int = 0,
+    scalars: Callable, shapes: tuple[jax.ShapeDtypeStruct, ...], budget: int, moving: int = 0
 ) -> "Program":
-    """The program of the id arrays that `scalars(expansion, arguments)` makes of those of its inputs.
-
-    `function` is the function in JAX that it stands for, of arrays of these `shapes`; None where it is not
-    differentiated there.
-    """
+    """The program of the id arrays that `scalars(expansion, arguments)` makes of those of its inputs."""
     expansion = Expansion(Graph(budget, moving))
     expansion.work(sum(math.prod(shape.shape) for shape in shapes))
     arguments = inputs_of(expansion.graph, shapes)
@@ -106,28 +90,25 @@ def lower_scalars(
         results = scalars(expansion, arguments)
     outputs = [expansion.graph.real(i) for result in results for i in result.ravel().tolist()]
     line = eliminate_dead_code(*sink_negations(*factor(expansion.graph, outputs)))
-    return Program(line, expansion.traced_operations, function, shapes, budget)
+    return Program(line, expansion.traced_operations, shapes)
 
 
 def lower_formula(formula: Callable, *shapes, budget: int) -> "Program":
-    """The program of a formula: a function of numbers, each a `Scalars` () or a JAX scalar, that gives a vector."""
+    """The program of a formula: a function of numbers, each a `Scalars` (), that gives a vector."""
 
     def scalars(expansion, arguments):
         return [formula(*(Scalars(expansion, x) for x in arguments)).ids]
 
-    return lower_scalars(scalars, lambda *xs: list(formula(*xs)), tuple(shapes), budget)
+    return lower_scalars(scalars, tuple(shapes), budget)
 
 
-def lower_solution(
-    system: Callable, solve: Callable, size: int, *shapes, budget: int, in_jax: Callable | None = None
-) -> "Program":
+def lower_solution(system: Callable, solve: Callable, size: int, *shapes, budget: int) -> "Program":
     """The program of the first `size` components of z with A z = r, and of one more number.
 
     A is symmetric, but for entries above its diagonal that are added to those. Both functions are formulas (see
     `lower_formula`) on numbers of these `shapes`. `system(*numbers)` gives the rows and columns (k, 2) of entries of A
     on and below its diagonal, and of those added, these entries (k,), r, what `solve` needs of A, a tree
-    of vectors, and that number; `solve(factors, r)` gives z, and is linear in r. `in_jax` is the function in JAX where
-    that is to be another one than these two.
+    of vectors, and that number; `solve(factors, r)` gives z, and is linear in r.
     """
     counts: list = []
 
@@ -139,12 +120,7 @@ def lower_solution(
         number = number.ids if isinstance(number, Scalars) else expansion.constants(number)
         return [z.ids[:size], number, z.ids[size:], *(x.ids for x in (entries, right, *leaves))]
 
-    def solve_system(*arguments):
-        _, _, right, factors, number = system(*arguments)
-        return [*solve(factors, right)[:size], jnp.asarray(number)]
-
-    in_jax = in_jax or solve_system
-    program = lower_scalars(expand_system, in_jax, tuple(shapes), budget)
+    program = lower_scalars(expand_system, tuple(shapes), budget)
     places, (of_z, of_entries, of_right), of_factors, factors = counts[0]
     ends = np.cumsum([size, 1, of_z - size, of_entries, of_right])
     z, _, others, entries, right, leaves = np.split(np.array(program.line.outputs), ends)
@@ -159,14 +135,13 @@ def lower_solution(
     return replace(
         program,
         line=program.line.replace(outputs=program.line.outputs[: size + 1]),
-        function=in_jax,
         linear=LinearSystem(
             z=(*z.tolist(), *others.tolist()),
             entries={(i, j): node for (i, j), node in nodes.items() if i >= j},
             others={(i, j): node for (i, j), node in nodes.items() if i < j},
             right=tuple(right.tolist()),
             factors=tuple(leaves.tolist()),
-            solve=functools.cache(lambda: lower_scalars(solution, None, tuple(vectors), budget).line),
+            solve=functools.cache(lambda: lower_scalars(solution, tuple(vectors), budget).line),
         ),
     )
 
@@ -179,11 +154,7 @@ def compose(outer: "Program", inner: "Program", budget: int, moving: int) -> "Pr
         found = inner.place(expansion, ids)[list(inner.line.outputs)]
         return [outer.place(expansion, np.concatenate([ids, found]))[list(outer.line.outputs)]]
 
-    def evaluate(*leaves):
-        numbers = [x for leaf in leaves for x in jnp.ravel(leaf)]
-        return outer.function(*leaves, jnp.stack(inner(*numbers)))
-
-    return lower_scalars(scalars, evaluate, outer.shapes[:-1], budget, moving)
+    return lower_scalars(scalars, outer.shapes[:-1], budget, moving)
 
 
 @dataclass(frozen=True, eq=False)
@@ -199,9 +170,7 @@ class Program:
 
     line: StraightLine
     traced_operations: int
-    function: Any
     shapes: tuple[jax.ShapeDtypeStruct, ...]
-    budget: int
     otherwise: "Callable[[], Program] | None" = None
     linear: LinearSystem | None = None
     mechanics: StraightLine | None = None
@@ -217,12 +186,10 @@ class Program:
             raise TypeError(f"this program takes {self.size} scalars, not {len(scalars)}")
         return self._differentiable(*scalars)
 
-    def vector(self, *scalars):
-        """The outputs as one vector, in a formula: of JAX, or of `Scalars`, of whose graph the program becomes part."""
-        first = next((x for x in scalars if isinstance(x, Scalars)), None)
-        if first is None:
-            return jnp.stack(self(*scalars))
-        return Scalars(first.expansion, self.place(first.expansion, stack(scalars).ids)[list(self.line.outputs)])
+    def vector(self, *scalars) -> Scalars:
+        """The outputs as one vector, in a formula of `Scalars`, of whose graph the program becomes part."""
+        inputs = stack(scalars)
+        return Scalars(inputs.expansion, self.place(inputs.expansion, inputs.ids)[list(self.line.outputs)])
 
     def place(self, expansion: Expansion, ids: np.ndarray) -> np.ndarray:
         """The nodes of the program in the graph where its inputs are these `ids`, (inputs,)."""
@@ -274,20 +241,18 @@ class Program:
         more, other = jax.ShapeDtypeStruct((count,), jnp.result_type(float)), self.otherwise
         return replace(
             self,
-            function=lambda *leaves: self.function(*leaves[:-1]),
             shapes=(*self.shapes, more),
             otherwise=None if other is None else functools.cache(lambda: other().append_inputs(count)),
         )
 
-    def select_outputs(self, positions: Sequence[int], function: Callable) -> "Program":
-        """The program of some of the outputs; `function` is the JAX function that gives just these, leaf by leaf."""
+    def select_outputs(self, positions: Sequence[int]) -> "Program":
         line = eliminate_dead_code(self.line, [self.line.outputs[i] for i in positions])
-        return replace(self, line=line, function=function, otherwise=None, linear=None)
+        return replace(self, line=line, otherwise=None, linear=None)
 
     def rounding_of(self, positions: Sequence[int], moving: int) -> "Program":
         """The program of the running errors of some outputs (see `_rounding`); it has no derivatives."""
         line = eliminate_dead_code(self.line, [self.line.outputs[i] for i in positions])
-        graph = Graph.from_line(line, 20 * self.budget)
+        graph = Graph.from_line(line, 20 * len(line.nodes) + 1000)
         with np.errstate(all="ignore"):
             errors = rounding(graph, line, range(len(line.nodes)), moving)
         return replace(self, line=eliminate_dead_code(graph, errors), otherwise=None, linear=None)
@@ -309,75 +274,42 @@ class Program:
     def depends(self, output: int) -> frozenset[int]:
         return self.find_inputs([output])
 
-    # ---- derivatives: from the function, not from the emitted code ----
+    # ---- derivatives ----
 
     @functools.cached_property
     def _differentiable(self) -> Callable:
-        run = jax.custom_jvp(lambda *scalars: emit(self.line, scalars))
+        def run(*scalars):
+            return emit(self.line, scalars)
+
+        if self.looks_up:  # the tangents of a table's entries are a table themselves
+            return run
+        run = jax.custom_jvp(run)
 
         @functools.partial(run.defjvp, symbolic_zeros=True)
         def rule(primals, tangents):
             values = run(*primals)
             active = tuple(i for i, tangent in enumerate(tangents) if not isinstance(tangent, SymbolicZero))
-            dots = self._tangents(active, primals, tuple(tangents[i] for i in active))
+            dots = list(self._tangent_programs(active)(*primals, *(tangents[i] for i in active)))
             return values, tuple(
-                dots.pop(0).astype(value.dtype) if _is_float(value) else np.zeros(value.shape, jax.dtypes.float0)
-                for value in values
+                dots.pop(0).astype(value.dtype) if kind == "float" else np.zeros(value.shape, jax.dtypes.float0)
+                for value, kind in zip(values, self._output_kinds, strict=True)
             )
 
         return run
 
-    def _tangents(self, active, primals, moving) -> list:
-        """The tangents of the float outputs, when the inputs `active` move."""
-        try:
-            return list(self._tangent_programs(active)(*primals, *moving))
-        except Unlowerable:
-            function = jnp.vectorize(lambda *scalars: tuple(_floats(self._call_function(*scalars))))
-
-            def evaluate_moved(*some):
-                replaced = dict(zip(active, some, strict=True))
-                return function(*(replaced.get(i, x) for i, x in enumerate(primals)))
-
-            return list(jax.jvp(evaluate_moved, tuple(primals[i] for i in active), moving)[1])
+    @property
+    def _output_kinds(self) -> list[str]:
+        return [self.line.kinds[i] for i in self.line.outputs]
 
     @functools.cached_property
     def _tangent_programs(self) -> Callable:
+        """`(active)`: the tangents of the floats, from the inputs and the tangents of those that are active."""
+
         @functools.cache
-        def tangent_program(active):
-            scalar, leaves = jax.ShapeDtypeStruct((), jnp.result_type(float)), len(self.shapes)
-            push = lambda *xs: self._push(active, xs[:leaves], xs[leaves:])  # noqa: E731
-            return _lower_leaves(push, (*self.shapes, *[scalar] * len(active)), 4 * self.budget)
+        def tangent_program(active: tuple[int, ...]) -> Program:
+            floats = [k for k, kind in enumerate(self._output_kinds) if kind == "float"]
+            line = pushforward(self.line, self.dtypes, active, floats, in_jax=True)
+            scalar = jax.ShapeDtypeStruct((), jnp.result_type(float))
+            return Program(line, len(line.nodes), (*self.shapes, *[scalar] * len(active)))
 
         return tangent_program
-
-    def _push(self, active, leaves, moving) -> list:
-        """The function's own jvp, with `moving` the tangents of the scalars `active` and zero for the others."""
-        tangents, start, given = [], 0, dict(zip(active, moving, strict=True))
-        for leaf in leaves:
-            if _is_float(leaf):
-                zero = jnp.zeros((), leaf.dtype)
-                parts = [given.get(start + k, zero).astype(leaf.dtype) for k in range(leaf.size)]
-                tangents.append(jnp.stack(parts).reshape(leaf.shape) if parts else jnp.zeros_like(leaf))
-            start += leaf.size
-
-        def evaluate_floats(*floats):
-            floats = iter(floats)
-            return _floats(self.function(*(next(floats) if _is_float(leaf) else leaf for leaf in leaves)))
-
-        return jax.jvp(evaluate_floats, tuple(leaf for leaf in leaves if _is_float(leaf)), tuple(tangents))[1]
-
-    def _call_function(self, *scalars) -> list:
-        """The outputs of the lowered function itself, at scalars: the program must agree with them."""
-        parts, leaves = iter(scalars), []
-        for shape in self.shapes:
-            some = [next(parts) for _ in range(shape.size)]
-            leaves.append(jnp.stack(some).reshape(shape.shape) if some else jnp.zeros(shape.shape, shape.dtype))
-        return [x for leaf in self.function(*leaves) for x in jnp.ravel(leaf)]
-
-
-def _is_float(x) -> bool:
-    return jnp.issubdtype(jnp.result_type(x), jnp.floating)
-
-
-def _floats(xs) -> list:
-    return [x for x in xs if _is_float(x)]

@@ -61,11 +61,12 @@ def copy_nodes(
 class Derivatives:
     """Derivatives of nodes of a graph; `operations` counts what they consist of before anything is simplified.
 
-    What has overflown `hides` its derivatives, but for those of a line of tangents, which are linear in these.
+    What has overflown `hides` its derivatives, but for those of a line of tangents, which are linear in these. A line
+    `asks` whether a tangent is zero, but one that JAX is to transpose.
     """
 
     def __init__(self, graph: Graph):
-        self.graph, self.operations, self.hides = graph, 0, True
+        self.graph, self.operations, self.hides, self.asks = graph, 0, True, True
 
     # ---- reverse mode ----
 
@@ -186,7 +187,7 @@ class Derivatives:
 
     def _mask_product(self, product: int, g: int, slope: int) -> int:
         """A product of g and a slope, 0 where g is and the slope is huge."""
-        if not (self.hides and self.graph.hides_growth and self.graph.grows(slope)):
+        if not (self.asks and self.hides and self.graph.hides_growth and self.graph.grows(slope)):
             return product
         is_zero = self._apply("eq", g, self._number(0.0))
         return self._zero_where(self._apply("and", is_zero, self.graph.is_huge(slope)), product)
@@ -243,14 +244,17 @@ class Derivatives:
 # ---- straight lines -------------------------------------------------------------------------------------------------
 
 
-def pushforward(line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Sequence[int], known=()) -> StraightLine:
+def pushforward(
+    line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Sequence[int], known=(), in_jax: bool = False
+) -> StraightLine:
     """The line from the inputs and the tangents of the inputs `by` to the tangents of the outputs `of`.
 
     `dtypes` has the type of every input of `line`. Its inputs come first, the tangents after them, and after those the
-    values of the outputs `known`, which are not computed once more.
+    values of the outputs `known`, which are not computed once more. JAX may transpose it where it is one `in_jax`.
     """
     places = {i: len(dtypes) + k for k, i in enumerate(by)}
     placed = _PlacedLine.from_line(line, dtypes, len(by))
+    placed.asks = not in_jax
     with np.errstate(all="ignore"):
         tangents = {i: placed.graph.input(place, "float") for i, place in places.items()}
         moved = placed.tangents(tangents, places, lambda table: table._replace(tangents=True))
@@ -460,7 +464,7 @@ class _PlacedLine(Derivatives):
         """
         nodes, (op, operands, _) = self.line.nodes, self.line.nodes[k]
         by_root = op == "div" and (of := nodes[operands[1]][0]) not in ("input", "constant") and OPERATIONS[of].steep
-        if not (OPERATIONS[op].steep or by_root):
+        if not (self.asks and (OPERATIONS[op].steep or by_root)):
             return part
         return self._select_unless_zero(g, part)
 

@@ -102,6 +102,8 @@ def form_of(derivation: Derivation, path: str = "auto") -> MotionEquations:
         return ArrayEquations(motion, str(reason))
     if path == "auto" and program.looks_up:  # whose inputs would be the entries of tables, one by one
         return ArrayEquations(motion, "it looks up entries of tables")
+    if path == "auto" and derivation.has_rules:  # of which a program keeps the first two derivatives alone
+        return ArrayEquations(motion, "a function has rules of its own for its derivatives")
     if path == "auto" and program.operations > LARGEST_XLA_PROGRAM:
         reason = f"{program.operations} operations are more than the {LARGEST_XLA_PROGRAM} that XLA compiles quickly"
         return ArrayEquations(motion, reason)

@@ -31,7 +31,6 @@ from lagjax._program import (
     compose,
     copy_nodes,
     distances,
-    emit,
     fold,
     lower,
     lower_scalars,
@@ -165,7 +164,7 @@ def _complete(values: Program, motion: Program, moving: int, rounding: Program |
         more = [] if rounding is None else [rounding.place(expansion, ids)[list(rounding.line.outputs)]]
         return [np.array([nodes[i] for i in outputs]), *(stack(x).ids for x in found), *more]
 
-    return lower_scalars(scalars, None, values.shapes, OPERATION_BUDGET, moving)
+    return lower_scalars(scalars, values.shapes, OPERATION_BUDGET, moving)
 
 
 def _followed(values: Program, motion: Program, moving: int, pieces: StraightLine | None) -> Program:
@@ -183,16 +182,7 @@ def _followed(values: Program, motion: Program, moving: int, pieces: StraightLin
         at, moves = (np.array([x for part in parts for x in part]) for parts in zip(*found, strict=True))
         return [at, moves, np.array(rate[:-1])]
 
-    def evaluate(y, *numbers):
-        def away(y):
-            more = () if pieces is None else emit(pieces, (*y, *vector_of(numbers)))
-            return jnp.stack([*vector_of(values.function(y, *numbers)), *more])
-
-        acceleration = jnp.stack(motion.compute_outputs(y, vector_of(numbers))[: moving // 2])
-        rate = jnp.concatenate([y[moving // 2 : -1], acceleration, jnp.ones(1)])
-        return *jax.jvp(away, (y,), (rate,)), rate[:-1]
-
-    return lower_scalars(scalars, evaluate, values.shapes, OPERATION_BUDGET, moving)
+    return lower_scalars(scalars, values.shapes, OPERATION_BUDGET, moving)
 
 
 def _rate(motion: Program, expansion, ids: np.ndarray, moving: int) -> Scalars:

@@ -59,4 +59,4 @@ def _build_tangent_program(program: Program, n: int, rows: int, numbers: int, ou
     line = with_tangents(program.line, program.dtypes, of_rows[0], directions, outputs)
     shapes = ((rows, n), (rows, n), (), (rows, numbers))
     structs = tuple(jax.ShapeDtypeStruct(shape, np.float64) for shape in shapes)
-    return Program(line, len(line.nodes), None, structs, program.budget)
+    return Program(line, len(line.nodes), structs)
