@@ -1,8 +1,7 @@
 """Formulas on the scalars of a graph, written like those on arrays: `Scalars` is to an id array what `jax.Array` is.
 
 An elimination has more operations than JAX should have to trace one by one. Written with the operators of `Scalars` and
-the functions below, the same formula makes nodes of a graph, where a program is wanted, and is a function of JAX
-arrays, where JAX is to differentiate or batch it.
+the functions below, it makes nodes of a graph. Other operands of these than `Scalars` are numbers, or arrays of them.
 """
 
 from collections.abc import Callable, Sequence
@@ -12,8 +11,6 @@ from typing import Any
 import jax
 import jax.numpy as jnp
 import numpy as np
-
-from lagjax._program._emit import apply_in_jax
 
 
 class Scalars:
@@ -57,74 +54,55 @@ class Scalars:
     __eq__, __or__ = partialmethod(_forward, "eq"), partialmethod(_forward, "or")  # type: ignore[assignment]
 
 
-def _scalars(*xs) -> Scalars | None:
-    return next((x for x in xs if isinstance(x, Scalars)), None)
+def _first(xs: Sequence) -> Scalars:
+    return next(x for x in xs if isinstance(x, Scalars))
 
 
-def _function(op: str, in_jax: Callable) -> Callable:
-    def function(*xs):
-        scalars = _scalars(*xs)
-        return in_jax(*xs) if scalars is None else scalars.map(op, *xs)
-
-    return function
+def _function(op: str) -> Callable[..., Scalars]:
+    return lambda *xs: _first(xs).map(op, *xs)
 
 
-binade = _function("binade", lambda x: apply_in_jax("binade", x))
-prefers, logarithm, root = _function("prefers", jnp.greater), _function("log", jnp.log), _function("sqrt", jnp.sqrt)
-maximum, absolute = _function("max", jnp.maximum), _function("abs", jnp.abs)
+binade, prefers, logarithm, root, maximum, absolute = map(
+    _function, ("binade", "prefers", "log", "sqrt", "max", "abs")
+)  # fmt: skip
 
 
-def where(condition, yes, no):
+def where(condition, yes, no) -> Scalars:
     """`yes` where the condition holds, else `no`."""
-    scalars = _scalars(condition, yes, no)
-    return jnp.where(condition, yes, no) if scalars is None else scalars.map("select", condition, no, yes)
+    return _first((condition, yes, no)).map("select", condition, no, yes)
 
 
-def fold(op: str, x):
+def fold(op: str, x: Scalars) -> Scalars:
     """The sum ("add"), smallest ("min"), largest ("max") or disjunction ("or") of a vector that is not empty."""
-    if isinstance(x, Scalars):
-        return Scalars(x.expansion, x.expansion.fold(op, x.ids))
-    return {"add": jnp.sum, "min": jnp.min, "max": jnp.max, "or": jnp.any}[op](x)
+    return Scalars(x.expansion, x.expansion.fold(op, x.ids))
 
 
-def concatenate(parts: Sequence):
-    scalars = _scalars(*parts)
-    if scalars is None:
-        return jnp.concatenate([jnp.asarray(part) for part in parts])
-    return Scalars(scalars.expansion, np.concatenate([scalars._ids(part) for part in parts]))
+def concatenate(parts: Sequence) -> Scalars:
+    first = _first(parts)
+    return Scalars(first.expansion, np.concatenate([first._ids(part) for part in parts]))
 
 
-def replace_entries(x, index, values):
-    if not isinstance(x, Scalars):
-        return jnp.asarray(x).at[index].set(values)
+def replace_entries(x: Scalars, index, values) -> Scalars:
     ids = x.ids.copy()
-    ids[index] = values.ids if isinstance(values, Scalars) else x.expansion.constants(values)
+    ids[index] = x._ids(values)
     return Scalars(x.expansion, ids)
 
 
-def scatter(x, index, size: int):
+def scatter(x: Scalars, index, size: int) -> Scalars:
     """A vector of `size` numbers, zero but for those of x at these places."""
-    zeros = (
-        Scalars(x.expansion, np.full(size, x.expansion.graph.constant(0.0, "float")))
-        if isinstance(x, Scalars)
-        else jnp.zeros(size, x.dtype)
-    )
-    return replace_entries(zeros, index, x)
+    zeros = np.full(size, x.expansion.graph.constant(0.0, "float"))
+    return replace_entries(Scalars(x.expansion, zeros), index, x)
 
 
-def stack(parts: Sequence) -> Any:
+def stack(parts: Sequence) -> Scalars:
     """Scalars as a vector, or vectors as the rows of a matrix."""
-    first = _scalars(*parts)
-    if first is None:
-        return jnp.stack([jnp.asarray(x) for x in parts])
+    first = _first(parts)
     return Scalars(first.expansion, np.stack([first._ids(x) for x in parts]))
 
 
-def apply_function(function: Callable, *arguments):
-    scalars = _scalars(*arguments)
-    if scalars is None:
-        return function(*arguments)
-    expansion = scalars.expansion
+def apply_function(function: Callable, *arguments: Scalars) -> Scalars:
+    """A function in JAX of vectors."""
+    expansion = arguments[0].expansion
     jaxpr = jax.make_jaxpr(function)(*(jax.ShapeDtypeStruct(x.shape, jnp.result_type(float)) for x in arguments))
     (result,) = expansion.run_closed(jaxpr, [x.ids for x in arguments])
     return Scalars(expansion, result)

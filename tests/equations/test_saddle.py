@@ -1,10 +1,11 @@
 """The written-out elimination of saddle points: right against dense algebra, and it keeps the zeros of a mechanism."""
 
-import jax.numpy as jnp
+import jax
 import numpy as np
 import pytest
 
 from lagjax._equations._saddle import SaddleElimination, elimination_order
+from lagjax._program import concatenate, lower_formula, stack
 
 
 def chain(links, rng):
@@ -27,9 +28,15 @@ def solved(matrix, rows, b, c, zeros=None, **kind):
     zeros = (matrix == 0, rows == 0) if zeros is None else zeros
     elimination = SaddleElimination(zeros, np.float64, **{"augmented": False, "regular_only": False} | kind)
     entries = np.concatenate([matrix, rows])[tuple(elimination.entries.T)]
-    factors, singular = elimination.factors(jnp.asarray(entries))
-    z = np.array(elimination.solve(factors, jnp.concatenate([b, c])))
-    return z[: len(b)], -z[len(b) :], bool(singular)
+
+    def formula(*numbers):
+        factors, singular = elimination.factors(stack(numbers[: len(entries)]))
+        return concatenate([elimination.solve(factors, stack(numbers[len(entries) :])), stack([singular])])
+
+    numbers = [*entries, *b, *c]
+    program = lower_formula(formula, *[jax.ShapeDtypeStruct((), float)] * len(numbers), budget=100_000)
+    *z, singular = program.evaluate(*numbers)
+    return np.array(z[: len(b)]), -np.array(z[len(b) :]), bool(singular)
 
 
 @pytest.mark.slow

@@ -13,8 +13,7 @@ treated as further columns, which makes it backward stable: the relative error i
 precision (Björck, BIT 7 (1967) 1). Cramer's rule for n ≥ 3 would lose up to cond(A)². Rows are weighted with powers of
 two, so that the units they are given in do not count; columns may have any.
 
-A matrix falls into blocks where its zeros let it, and every block is one system. The formulas are for `Scalars` as well
-as for arrays of JAX.
+A matrix falls into blocks where its zeros let it, and every block is one system.
 """
 
 import functools
