@@ -232,21 +232,27 @@ class Derivation:
         The rounding of a quantity is so many times `eps`: its running error, with inputs that are rounded, too. It is
         0.6 for 0.1 + q0 + 0.2 - q1 - 0.3 at q = 0, where the value, 0 or 6e-17, says nothing.
         """
-        key, state = ("rounding", *names), [q, qdot, t, *jax.tree.leaves(numbers)]
+        state = [q, qdot, t, *jax.tree.leaves(numbers)]
         try:
-            if key not in self._programs:
-                program = self.program(*names)
-                self._programs[key] = program.rounding_of(range(len(program.line.outputs)), program.size)
-            if all(map(is_concrete, state)):
-                return self._programs[key].evaluate_many(np.concatenate([np.ravel(x) for x in state]))[:, 0]
+            program = self._rounding_of(names, self.program(*names).size)
         except Unlowerable:
             return 0.0
+        if all(map(is_concrete, state)):
+            return program.evaluate_many(np.concatenate([np.ravel(x) for x in state]))[:, 0]
         first, *others = map(jnp.ravel, jax.lax.stop_gradient([jnp.concatenate([q, qdot, t[None]]), *state[3:]]))
-        return jnp.stack(self._programs[key].compute_outputs(first, jnp.concatenate(others) if others else ()))
+        return jnp.stack(program.compute_outputs(first, jnp.concatenate(others) if others else ()))
 
     def round_off(self, names: Sequence[str], columns: Sequence) -> dict[str, np.ndarray]:
-        """The rounding errors of these quantities at S states, each of shape (S, …)."""
-        return self._split_outputs(names, self.program(*names).line.round_off(columns))
+        """The rounding errors of these quantities at S states that are exact, each of shape (S, …)."""
+        sizes = self._rounding_of(tuple(names), 0).evaluate_many(columns)
+        return self._split_outputs(names, np.finfo(sizes.dtype).eps * sizes)
+
+    def _rounding_of(self, names: tuple[str, ...], moving: int) -> Program:
+        key = "rounding", str(moving), *names
+        if key not in self._programs:
+            program = self.program(*names)
+            self._programs[key] = program.rounding_of(range(len(program.line.outputs)), moving)
+        return self._programs[key]
 
     def _split_outputs(self, names: Sequence[str], outputs: np.ndarray) -> dict[str, np.ndarray]:
         rows, values, start = outputs.T, {}, 0

@@ -254,7 +254,7 @@ class Program:
         line = eliminate_dead_code(self.line, [self.line.outputs[i] for i in positions])
         graph = Graph.from_line(line, 20 * len(line.nodes) + 1000)
         with np.errstate(all="ignore"):
-            errors = rounding(graph, line, range(len(line.nodes)), moving)
+            errors = rounding(graph, line, range(len(line.nodes)), moving, to_zero=True)
         return replace(self, line=eliminate_dead_code(graph, errors), otherwise=None, linear=None)
 
     @property

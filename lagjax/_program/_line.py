@@ -68,29 +68,6 @@ class StraightLine:
         return results
 
     @np.errstate(all="ignore")
-    def round_off(self, columns: Sequence) -> np.ndarray:
-        """The rounding error of every output, to first order, shape (outputs, S); the inputs count as exact.
-
-        Every operation adds one unit in the last place of its result to what its operands bring along: terms that
-        cancel leave theirs behind. Source: Higham, *Accuracy and Stability of Numerical Algorithms*, §3.3.
-        """
-        columns, precision, count = self._prepare_columns(columns)
-        results, eps = np.zeros((len(self.outputs), count), precision), float(np.finfo(precision).eps)
-        for part in self._parts(count):
-            values = _values(self._steps(precision), [_cut(x, part) for x in columns], keep=True)
-            errors: list = [0.0] * len(values)
-            for k, (op, operands, _) in enumerate(self.nodes):
-                if self.kinds[k] != "float" or not operands:
-                    continue
-                errors[k] = 0.0 if OPERATIONS[op].exact else eps * np.abs(values[k])
-                for i, partial in self._partials(k, values):
-                    if np.any(errors[i]):
-                        errors[k] = errors[k] + np.where(errors[i] == 0, 0.0, np.abs(partial(errors[i])))
-            for row, i in enumerate(self.outputs):
-                results[row, part] = errors[i]
-        return results
-
-    @np.errstate(all="ignore")
     def vjp(self, columns: Sequence, cotangents: Sequence) -> list:
         """Σ cotangentₖ ∂outputₖ/∂input for every input, each of shape (S,); None where nothing flows there.
 

@@ -1,7 +1,7 @@
 """The rounding errors of a straight line, as nodes of a graph: running errors, to first order.
 
 Every operation adds one unit in the last place of its result to what its operands bring along, so that terms that
-cancel leave theirs behind. `StraightLine.round_off` says the same of arrays. Source: Higham, *Accuracy and Stability of
+cancel leave theirs behind. Source: Higham, *Accuracy and Stability of
 Numerical Algorithms*, §3.3.
 """
 
@@ -12,10 +12,11 @@ from lagjax._program._line import StraightLine
 from lagjax._program._operations import OPERATIONS
 
 
-def rounding(graph: Graph, line: StraightLine, nodes: Sequence[int], moving: int) -> list[int]:
+def rounding(graph: Graph, line: StraightLine, nodes: Sequence[int], moving: int, to_zero: bool = False) -> list[int]:
     """The errors of the outputs of a line in units of round-off, where its first `moving` inputs are rounded, too.
 
-    `nodes` are those of the line in the graph, to which the errors are added.
+    `nodes` are those of the line in the graph, to which the errors are added. What is exact leaves no error behind a
+    slope that is infinite either, where that is said (`to_zero`).
     """
     zero, errors = graph.constant(0.0, "float"), []
 
@@ -30,6 +31,8 @@ def rounding(graph: Graph, line: StraightLine, nodes: Sequence[int], moving: int
         for i, rule in zip(operands, () if op == "input" else OPERATIONS[op].transpose(), strict=False):
             if rule is not None and errors[i] != zero:
                 part = rule(graph.apply, number, errors[i], node, *(nodes[j] for j in operands))
+                if to_zero and (OPERATIONS[op].steep or op == "div"):
+                    part = graph.apply("select", graph.apply("eq", errors[i], zero), part, zero)
                 error = graph.apply("add", error, graph.apply("abs", part))
         errors.append(error)
     return [errors[i] for i in line.outputs]

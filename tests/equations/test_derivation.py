@@ -72,7 +72,7 @@ def test_round_off_is_bounded_and_seen_where_terms_cancel():
 
     program, x = lower(function, 1.0, 1.0), np.random.default_rng(1).uniform(1.0, 2.0, (2, 500)).astype(np.float32)
     single, double = program.evaluate_many(x), program.evaluate_many(x.astype(float))
-    bound = program.line.round_off(x)
+    bound = np.finfo(np.float32).eps * program.rounding_of(range(3), 0).evaluate_many(x)
     assert single.dtype == np.float32 and (np.abs(single - double) <= bound).all()
     # One unit in the last place for every operation, and not many times more.
     assert (bound[2] < 4 * np.finfo(np.float32).eps * np.abs(double[2])).all() and (bound[0] > 1e-7).all()

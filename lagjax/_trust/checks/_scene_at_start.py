@@ -80,7 +80,7 @@ class CheckedScene(NamedTuple):
             by_v = here.by_v_of_dissipation
             of_terms = (here.by_q,), (here.momentum[0],), (here.mass[0],), drift.values(), (by_v,), (here.jacobian[0],)
             return Sides(minus, plus, np.zeros_like(here.here), tuple(_rounding(*terms) for terms in of_terms))
-        noise = self.derivation.program(*_COMPARED).line.round_off(one.columns)[:, 0]
+        noise = np.concatenate([value[0].ravel() for value in one.round_off(*_COMPARED).values()])
         lost = {name: value[0] for name, value in one.round_off(*_DERIVED).items()}
         of_drift = sum(lost[name] + np.finfo(self.layout.dtype).eps * abs(value) for name, value in drift.items())
         round_off = (
