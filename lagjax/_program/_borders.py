@@ -1,7 +1,7 @@
 """The decisions of a program: its piecewise operations, each by a number whose series tells when the piece changes.
 
     comparisons, abs, max, min, sign    the sign of a switching number u: −1, 0 or 1
-    floor, ceil, round, mod             the whole number below a switching number x
+    floor, ceil, round                  the whole number below a switching number x
     rem, conversion to integers         the whole number between x and zero
     atan2(y, x)                         the sign of x, and where that is negative the sign of y: its cut
     look-ups (`locate`)                 the piece of an increasing table that a number x is on
@@ -248,7 +248,6 @@ class _Rewriting:
         self._moves: list[bool] = []
         self.features: dict[tuple[int, int], Feature] = {}  # by the argument, and the kind
         self.abrupt: set[int] = set()
-        self.moduli, self.quotients = _moduli(program.line), _floor_divisions(program.line)
         self.truncated = _truncations(program.line)
         self.cones = _find_cones(program.line, size, program.linear) if slides else {}
         self.parts: dict[int, tuple[int, ...]] = {}  # of the vector of a cone, by its piece
@@ -259,9 +258,7 @@ class _Rewriting:
         relevant = self.decisive | self.abrupt
         self.powers = find_powers(program.line, relevant, self._of_guards, size)
         if self.powers or any(
-            i in self.moduli
-            or i in self.cones
-            or i in self.quotients
+            i in self.cones
             or i in self.truncated
             or self._decides(i)
             or program.line.nodes[i][0] in (*_FEATURES, "pow")
@@ -278,9 +275,8 @@ class _Rewriting:
         """The nodes that q̈ depends on, without those of the elimination of a linear system."""
         linear, line = self.program.linear, self.program.line
         roots = line.outputs[: self.size] if linear is None else [*linear.right, *linear.entries.values()]
-        instead = self.moduli | self.quotients | self.truncated
-        needed = _below(line, roots, instead)
-        self._of_guards = _below(line, self.watched, instead)
+        needed = _below(line, roots, self.truncated)
+        self._of_guards = _below(line, self.watched, self.truncated)
         if self.watched:  # which may read the solution of a linear system, but not decide on its elimination
             needed |= self._of_guards - (_below(line, line.outputs[: self.size]) - needed)
         self.abrupt = self._find_abrupt(needed)
@@ -413,11 +409,7 @@ class _Rewriting:
 
     def _replace_by_piece(self, i: int, op: str, of: list[int], attribute) -> int | None:
         """The result of a node by its piece; None where it has none."""
-        if i in self.moduli:
-            op, of = "mod", [self.places[x] for x in self.moduli[i]]
-        elif i in self.quotients:
-            op, of = "floor", [self.graph.apply("div", *(self.places[x] for x in self.quotients[i]))]
-        elif i in self.truncated:
+        if i in self.truncated:
             op, of = "trunc", [self.places[x] for x in self.truncated[i]]
         elif not self._decides(i) or (
             op == "atan2" and is_nonnegative(self.program.line, self.program.line.nodes[i][1][1])
@@ -456,8 +448,8 @@ class _Rewriting:
             return None if below is None else f("neg", below)
         if op == "round":
             return self._piece(FLOOR, f("add", of[0], number(0.5)))
-        if op in ("mod", "rem"):
-            whole = self._piece(FLOOR if op == "mod" else TRUNC, f("div", *of))
+        if op == "rem":
+            whole = self._piece(TRUNC, f("div", *of))
             return None if whole is None else f("sub", of[0], f("mul", whole, of[1]))
         whole = self._piece(TRUNC, of[0])
         return whole if whole is None or op == "trunc" else f("convert", whole, attribute=attribute)
@@ -865,76 +857,6 @@ def with_outputs(program: Recurrent, more: StraightLine, moving: int | None = No
     line = StraightLine(tuple(graph.nodes), tuple(graph.kinds), outputs)
     mechanics = getattr(program, "mechanics", None)
     return Pieced(line, program.size, program.dtypes, program.linear, mechanics)
-
-
-def _moduli(line: StraightLine) -> dict[int, tuple[int, int]]:
-    """The nodes that are x mod y, with the sign of y, and x and y: one border, where rem and its sign have three.
-
-    NumPy and JAX write them as r = rem(x, y), and r + y in its place where r ≠ 0 and (r < 0) ≠ (y < 0).
-    """
-    nodes, found = line.nodes, {}
-
-    def is_separate_sign(i: int, r: int, y: int) -> bool:
-        """True if node i says that (r < 0) ≠ (y < 0)."""
-        op, operands, _ = nodes[i]
-        positive = nodes[y][2] > 0 if nodes[y][0] == "constant" else None
-        if op == "lt":
-            return operands[0] == r and positive is True
-        below = [x for x in operands if nodes[x][0] == "lt" and nodes[x][1][0] == r]
-        others = [x for x in operands if x not in below]
-        if op != "ne" or len(below) != 1 or len(others) != 1:
-            return False
-        other = nodes[others[0]]
-        if other[0] == "constant":
-            return positive is not None and bool(other[2]) != positive
-        return other[0] == "lt" and other[1][0] == y
-
-    for i, (op, operands, _) in enumerate(nodes):
-        if op != "select" or nodes[operands[0]][0] != "and":
-            continue
-        condition, r, total = operands
-        if nodes[r][0] != "rem" or nodes[total][0] != "add" or line.kinds[r] != "float":
-            continue
-        x, y = nodes[r][1]
-        parts = nodes[condition][1]
-        not_zero = [p for p in parts if nodes[p][0] == "ne" and r in nodes[p][1]]
-        apart = [p for p in parts if is_separate_sign(p, r, y)]
-        if set(nodes[total][1]) == {r, y} and not_zero and apart:
-            found[i] = x, y
-    return found
-
-
-def _floor_divisions(line: StraightLine) -> dict[int, tuple[int, int]]:
-    """The nodes that are the whole number below x / y, and x and y: one border, where they are written with five.
-
-    JAX writes x // y as round(d), d = (x − r) / y with r = rem(x, y), and d − 1 where r ≠ 0 and sign(r) ≠ sign(y).
-    """
-    nodes, found = line.nodes, {}
-    for i, (op, operands, _) in enumerate(nodes):
-        if op != "round" or nodes[operands[0]][0] != "select":
-            continue
-        condition, d, lower = nodes[operands[0]][1]
-        if nodes[condition][0] != "and" or nodes[lower][0] != "sub" or nodes[lower][1][0] != d:
-            continue
-        # Division by a power of two is a product, that by one is nothing.
-        factors = [1.0 if nodes[x][0] != "constant" else nodes[x][2] for x in nodes[d][1]]
-        whole = d if nodes[d][0] == "sub" else next((x for x in nodes[d][1] if nodes[x][0] == "sub"), d)
-        if nodes[whole][0] != "sub" or nodes[nodes[whole][1][1]][0] != "rem":
-            continue
-        x, r = nodes[whole][1]
-        y = nodes[r][1][1]
-        by = nodes[y][2] if nodes[y][0] == "constant" else None
-        is_divided = (
-            nodes[d][1] == (whole, y) if nodes[d][0] == "div" else by is not None and math.prod(factors) * by == 1
-        )
-        if nodes[d][0] not in ("div", "mul", "sub") or not is_divided:
-            continue
-        parts = nodes[condition][1]
-        not_zero = any(nodes[p][0] == "ne" and r in nodes[p][1] for p in parts)
-        signs = any(nodes[p][0] == "ne" and any(nodes[z] == ("sign", (r,), None) for z in nodes[p][1]) for p in parts)
-        if nodes[r][1][0] == x and not_zero and signs:
-            found[i] = x, y
-    return found
 
 
 def _truncations(line: StraightLine) -> dict[int, tuple[int]]:

@@ -208,6 +208,8 @@ def formula_of(equation) -> str | None:
     name, operands = equation.primitive.name, [variable.aval for variable in equation.invars]
     if name in ("jit", "pjit"):
         called, floats = equation.params["name"], [jnp.issubdtype(x.dtype, jnp.floating) for x in operands]
+        if called in _DIVISIONS:
+            return called if floats == [True, True] and _divides(called, equation) else None
         reads_bits = any(e.primitive.name == "bitcast_convert_type" for e in equation.params["jaxpr"].eqns)
         found = {"signbit": [True] if reads_bits else None, "hypot": [True, True]}
         if found.get(called) != floats:
@@ -221,6 +223,23 @@ def formula_of(equation) -> str | None:
         return None
     text = str(equation.params["call_jaxpr"])
     return next((name for name in ("det", "slogdet") if text in _determinant(name, shape, dtype)), None)
+
+
+_DIVISIONS = ("remainder", "floor_divide", "divmod")
+
+
+def _divides(called: str, equation) -> bool:
+    """True if a call that has the name of a division of NumPy's is that: it is tried with numbers."""
+    for numbers in itertools.product((7.25, -7.25), (2.0, -2.0)):
+        trial = Expansion(Graph(1_000_000))
+        given = [
+            trial.constants(np.full(v.aval.shape, x)) for v, x in zip(equation.invars, numbers, strict=True)
+        ]  # fmt: skip
+        found = trial.run_closed(equation.params["jaxpr"], given)
+        for ids, expected in zip(found, np.atleast_1d(getattr(np, called)(*numbers)), strict=True):
+            if any(trial.graph.value(i) != expected for i in trial.real(ids).ravel().tolist()):
+                return False
+    return True
 
 
 _OWN_RULES = frozenset(("stop_gradient", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"))
@@ -365,6 +384,17 @@ def _one_minus_square(expansion, params, x):
 def _hypotenuse(expansion, params, x, y):
     """√(x² + y²), which is smooth but for zero; JAX divides by the larger one, and has corners where both are alike."""
     return [expansion.map("sqrt", expansion.map("add", *(expansion.map("mul", z, z) for z in (x, y))))]
+
+
+def _divide(expansion, params, x, y):
+    """x // y and x mod y, each with one border, where JAX's have five and three."""
+    whole = expansion.map("floor", expansion.map("div", x, y))
+    return [whole, expansion.map("sub", x, expansion.map("mul", whole, y))]
+
+
+LOWER.update(
+    divmod=_divide, floor_divide=lambda *of: _divide(*of)[:1], remainder=lambda *of: _divide(*of)[1:]
+)  # fmt: skip
 
 
 @lowers("atan")
