@@ -156,11 +156,12 @@ print(f"SciPy and lagjax differ by {abs(run.y[:2].T - ours).max():.0e}")  # belo
 | `mj_step` with a fixed `timestep` | `simulate`, adaptive; `dt=` for fixed steps |
 | `equality`, `tendon` | `constraints=` |
 | `mj_fullM`, `qfrc_bias` | `system.mass_matrix`, and `∂L/∂q` by `jax.grad` |
-| contacts | transitions of `simulate_hybrid` that you write down; `forces=` |
+| contacts of shapes | `System(contacts=…)`: gaps that you write down, rigid, with their impacts and friction |
 | `mjx.step` under `vmap` on a GPU | `simulate_batch`, on CPUs in machine code |
 
-**Stay** if bodies touch each other, if control at coarse fixed steps is the task, or for its viewer. Come for digits,
-for forces that no model file has, and for derivatives that are those of the motion and not of its steps.
+**Stay** if meshes collide, if hundreds of contacts hold at once, if control at coarse fixed steps is the task, or for
+its viewer. Come for digits, for forces that no model file has, and for derivatives that are those of the motion and not
+of its steps.
 """
 
 # %%
