@@ -656,6 +656,12 @@ class _Structure(NamedTuple):
     params: Any
     leaves: tuple
 
+    @property
+    def restored(self) -> tuple[Any, Layout, PyTree]:
+        """The scene, the layout, and the parameters with zeros for numbers."""
+        leaves = [np.zeros(*leaf) if isinstance(leaf, _Number) else leaf for leaf in self.leaves]
+        return jax.tree.unflatten(self.system, []), self.layout, jax.tree.unflatten(self.params, leaves)
+
 
 def derivation_of(system: Any, layout: Layout, params: PyTree) -> Derivation:
     """The derivation of a scene with parameters of this structure, whatever their values.
@@ -663,17 +669,11 @@ def derivation_of(system: Any, layout: Layout, params: PyTree) -> Derivation:
     It is made once for scenes, layouts and structures that are equal. Scenes whose functions hold arrays of their own
     have no programs, as these arrays could change; those whose code cannot be hashed are derived anew each time.
     """
-    arrays, scene = jax.tree.flatten(system)
-    if arrays:
+    key = _structure_key(system, layout, params)
+    if key is None:
         numbers = eqx.filter(params, eqx.is_array_like)
         reason = "the functions of the scene hold arrays of their own"
         return Derivation(system._motion(layout, params), layout, numbers, reason, path=system.path)
-    leaves, tree = jax.tree.flatten(params)
-    kept = (
-        _Number(np.shape(x), np.dtype(dtype_of(x))) if type(x) is np.ndarray or eqx.is_array_like(x) else x
-        for x in leaves
-    )
-    key = _Structure(scene, layout, tree, tuple(kept))
     try:
         hash(key)
     except TypeError as reason:
@@ -681,12 +681,37 @@ def derivation_of(system: Any, layout: Layout, params: PyTree) -> Derivation:
     return _derived_once(key)
 
 
+def once_for_structure(make: Callable) -> Callable:
+    """`make(system, layout, params)`, which depends on no values, called once for all that `derivation_of` does so."""
+    make_once = functools.lru_cache(maxsize=64)(lambda key: make(*key.restored))
+
+    @functools.wraps(make)
+    def find(system: Any, layout: Layout, params: PyTree):
+        key = _structure_key(system, layout, params)
+        try:
+            hash(key)
+        except TypeError:
+            key = None
+        return make(system, layout, params) if key is None else make_once(key)
+
+    return find
+
+
+def _structure_key(system: Any, layout: Layout, params: PyTree) -> _Structure | None:
+    """All that decides how a scene is derived; None where its functions hold arrays."""
+    arrays, scene = jax.tree.flatten(system)
+    leaves, tree = jax.tree.flatten(params)
+    kept = (
+        _Number(np.shape(x), np.dtype(dtype_of(x))) if type(x) is np.ndarray or eqx.is_array_like(x) else x
+        for x in leaves
+    )
+    return None if arrays else _Structure(scene, layout, tree, tuple(kept))
+
+
 def _derived(key: _Structure, unhashable: str | None = None) -> Derivation:
-    leaves = [np.zeros(*leaf) if isinstance(leaf, _Number) else leaf for leaf in key.leaves]
-    params, system = jax.tree.unflatten(key.params, leaves), jax.tree.unflatten(key.system, [])
+    system, layout, params = key.restored
     numbers = eqx.filter(params, eqx.is_array_like)
-    motion = system._motion(key.layout, params)
-    return Derivation(motion, key.layout, numbers, unhashable=unhashable, path=system.path)
+    return Derivation(system._motion(layout, params), layout, numbers, unhashable=unhashable, path=system.path)
 
 
 _derived_once = functools.lru_cache(maxsize=64)(_derived)

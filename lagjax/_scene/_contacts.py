@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._equations import Constraints, Motion
+from lagjax._equations import Constraints, Motion, once_for_structure
 from lagjax._interface import Layout
 from lagjax._scene._system import System
 
@@ -178,8 +178,9 @@ class Shapes(NamedTuple):
     directions: int
     names: tuple[str, ...]
 
-    @classmethod
-    def from_system(cls, system: System, layout: Layout, params: PyTree) -> "Shapes":
+    @staticmethod
+    @once_for_structure
+    def from_system(system: System, layout: Layout, params: PyTree) -> "Shapes":
         """Raises `TypeError` or `ValueError` where a function does not return what its role asks for."""
         trees = [
             None if getattr(system, role) is None else system._output_shapes(role, layout, params)
@@ -193,7 +194,7 @@ class Shapes(NamedTuple):
             raise ValueError("contacts, or one_way, returns no number: it must return the gaps that stay >= 0.")
         names = system.contact_names(layout, params)
         rough, directions = _rough(system, layout, params, trees[0])
-        shapes = cls(tuple(trees), counts[0], sum(counts), rough, directions, names)
+        shapes = Shapes(tuple(trees), counts[0], sum(counts), rough, directions, names)
         numbers, code = eqx.partition(params, eqx.is_array_like)
         for role in ("restitution", "friction"):
             function = getattr(system, role)
