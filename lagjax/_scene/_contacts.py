@@ -44,9 +44,13 @@ class InContact(NamedTuple):
 
 
 class ContactScene(eqx.Module):
-    """A system with contacts, as machine code follows it: a scene whose parameters are `InContact`."""
+    """A system with contacts, as machine code follows it: a scene whose parameters are `InContact`.
+
+    Where it `is_open` no contact is closed, whatever the parameters say: the motion of the system by itself.
+    """
 
     system: System
+    is_open: bool = eqx.field(static=True, default=False)
 
     @property
     def path(self) -> str:
@@ -87,6 +91,8 @@ class ContactScene(eqx.Module):
             return jnp.zeros((layout.size, held(p).size), q.dtype).at[:, f + flat.rough].set(forces.T)
 
         constraints = Constraints(held_positions, held_velocities, held, drag if flat.rough.size else None)
+        if self.is_open:
+            constraints = Constraints(*map(ask_user, vars(free.constraints).values()))
         lagrangian, forces, dissipation = map(ask_user, (free.lagrangian, free.forces, free.dissipation))
         return Motion(cast(Callable, lagrangian), forces, dissipation, constraints)
 

@@ -26,11 +26,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine import Problem
-from lagjax._engine.taylor import Guarded, Surfaces, line_of, require_one_number, vector_of
+from lagjax._engine.taylor import Guarded, Surfaces, flow_of, line_of, require_one_number, vector_of
 from lagjax._interface import RESULTS, SUCCESSFUL, Function, Layout, code_of, compile_for_one_call, halves
-from lagjax._native import GUARD_NOISE, SINGLE_NOISE
-from lagjax._primitives import differentiable_where, keep_together, lost_unless
-from lagjax._run._rounds import Stretch, run_rounds
+from lagjax._native import GUARD_NOISE, SINGLE_NOISE, Released
+from lagjax._primitives import cond_alike, differentiable_where, keep_together, lost_unless
+from lagjax._run._rounds import Stretch, any_member, run_rounds
 from lagjax._run._trajectory import vary_with
 from lagjax._run.contacts._impact_law import (
     Friction,
@@ -75,6 +75,8 @@ GAINED = 1e-12  # of the work of an impact: a gain of energy beyond rounding
 # Of the largest slip so far: what is more, where the slip along its first direction ends, has turned.
 TURNED = 1e-6
 EPS = float(np.finfo(float).eps)
+# Operations that have a series everywhere, which hides nothing.
+_SEEN = frozenset(("input", "constant", "convert", "add", "sub", "mul", "neg", "sin", "cos", "exp", "tanh"))
 _LEAST = 1e-300  # a side that is exactly zero still has a sign
 
 
@@ -143,19 +145,24 @@ class RoundRecord(NamedTuple):
 
 
 @compile_for_one_call
-def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) -> tuple[Carry, RoundRecord, tuple]:
+def contact_motion(
+    plan: ContactPlan, layout: Layout, ts, y0, params: PyTree, room: int | None = None, begun: Carry | None = None
+) -> tuple[Carry, RoundRecord, tuple]:
     """The motion from y0 (2n,) at ts[0], its rounds, of which there may be `max_transitions`, and its impacts.
 
-    Those are their times, the normal impulses, the energy that was lost, and their count.
+    Those are their times, the normal impulses, the energy that was lost, and their count. With less `room` for rounds
+    the motion may have to go on: it has then `begun`.
     """
     ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
     rounds = ContactRounds.from_plan(plan, layout, ts, y0, params)
-    first = vary_with(rounds.begin(y0), ts, y0, rounds.vector, varying=("t", "y", "path"))
+    begun = rounds.begin(y0) if begun is None else begun
+    first = vary_with(begun, ts, y0, rounds.vector, varying=("t", "y", "path"))
     absent = RoundRecord.absent(y0.size, rounds.count)
-    ending, record = run_rounds(rounds.run_round, first, absent, plan.max_transitions)
+    ending, record = run_rounds(rounds.run_round, first, absent, room or plan.max_transitions)
     inputs, outputs = (ts, y0, rounds.vector), jax.lax.stop_gradient((ts, ending.path, ending.of_path))
-    missed = jax.vmap(lambda *output: rounds.missed(ending, rounds.watch(*output), output[-1]).any())(*outputs).any()
-    ending = ending._replace(result=jnp.where(missed, MISSED, ending.result))
+    if rounds.may_miss:
+        missed = jax.vmap(lambda *output: rounds.missed(ending, rounds.watch(*output), output[-1]).any())(*outputs)
+        ending = ending._replace(result=jnp.where(missed.any(), MISSED, ending.result))
 
     def lost(there, *numbers):
         return (lost_unless(there[:, *[None] * (x.ndim - 1)], x, inputs) for x in numbers)
@@ -163,9 +170,11 @@ def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) ->
     t, qdot, y_next = lost(record.happened, record.t, record.qdot, record.y_next)
     t_impact, impulse, energy_lost = lost(record.hits, *record[-3:])
     path = lost_unless((ending.of_path.closed >= 0).all(axis=1)[:, None], ending.path, inputs)
-    place = jnp.where(record.hits, jnp.cumsum(record.hits) - 1, record.hits.size)  # impacts in front
+    each = np.arange(record.hits.size)  # impacts in front
+    place = jnp.where(record.hits, jnp.cumsum(record.hits) - 1, each.size)
+    source = jnp.full(each.size, each.size).at[place].set(each, mode="drop")
     t_impact, impulse, energy_lost = (
-        jnp.full_like(x, jnp.nan).at[place].set(x, mode="drop") for x in (t_impact, impulse, energy_lost)
+        x.at[source].get(mode="fill", fill_value=jnp.nan) for x in (t_impact, impulse, energy_lost)
     )
     impacts = t_impact, rounds.flat.shapes.name_numbers(impulse), energy_lost, jnp.sum(record.hits)
     return ending._replace(path=path), record._replace(t=t, qdot=qdot, y_next=y_next), impacts
@@ -178,6 +187,7 @@ class ContactRounds(NamedTuple):
     problem: Problem  # without a state and times
     flat: Flat
     surfaces: Surfaces
+    of_open: Surfaces  # the same where no contact is closed
     places: "RowPlaces"
     response: Any  # the line of `ImpactRows`
     multipliers: Any
@@ -195,14 +205,15 @@ class ContactRounds(NamedTuple):
         problem = dataclasses.replace(problem, is_rounded=plan.is_single)
         derivation = problem.derivation.lowered
         code, structure = jax.tree.flatten(eqx.filter(inside, eqx.is_array_like, inverse=True))
-        watched = plan.scene, plan.sections, plan.directions
-        surfaces = _watches(derivation, *watched, tuple(code), structure)._replace(is_rounded=plan.is_single)
+        watched = plan.sections, plan.directions, tuple(code), structure, plan.is_single
+        surfaces = _watches(derivation, plan.scene, *watched)
+        _, of_open = _open_watches(derivation, plan.scene, *watched)
         places = RowPlaces.from_derivation(derivation, flat)
         states = sum(x.size for x in opened(flat))
         lines = line_of(derivation.impact_response(places.all, states)), line_of(derivation.multipliers)
         numbers = vector_of(eqx.filter(params, eqx.is_array_like))
         widths = tuple(SINGLE_NOISE * jnp.abs(jax.lax.stop_gradient(x)) for x in (jnp.append(y0, ts[0]), numbers))
-        return cls(plan, problem, flat, surfaces, places, *lines, params, numbers, widths, ts)
+        return cls(plan, problem, flat, surfaces, of_open, places, *lines, params, numbers, widths, ts)
 
     @property
     def count(self) -> int:
@@ -234,7 +245,7 @@ class ContactRounds(NamedTuple):
         """The start, with all contacts open: those that touch and do not move apart fall at once."""
         contacts, sections = opened(self.flat), len(self.plan.sections)
         guards = self.count + self.flat.rough.size + sections
-        guarded = self.watch(self.ts[0], y0, contacts)
+        guarded = self.watch(self.ts[0], y0)
         inside = (guarded.values < -guarded.rounding)[: self.count] & self.has_gap
         result = jnp.where(inside.any(), INCONSISTENT, SUCCESSFUL)
         if self.rubs:  # one that slides and touches may stay or leave
@@ -255,7 +266,7 @@ class ContactRounds(NamedTuple):
             of_path=jax.tree.map(lambda x: jnp.full((self.ts.size, *x.shape), -1.0), contacts),
         )  # fmt: skip
 
-    def run_round(self, before: Carry, count) -> tuple[Carry, RoundRecord]:
+    def run_round(self, before: Carry, _) -> tuple[Carry, RoundRecord]:
         """One round: to the next watch that falls, through what happens there; of a motion that is going."""
         here, contacts = before.going, before.contacts
         watches, sections = self.count + self.flat.rough.size, len(self.plan.sections)
@@ -292,7 +303,7 @@ class ContactRounds(NamedTuple):
         sound = jnp.isfinite(jnp.where(happens, decided.y, y)).all()
         result = jnp.where(~sound & (result == SUCCESSFUL), NOT_FINITE, result)
         going = happens & (result == SUCCESSFUL)
-        spent = going & (count + 1 >= self.plan.max_transitions)
+        spent = going & (before.rounds + 1 >= self.plan.max_transitions)
         cover = lambda old, new: jnp.where(covered[:, *[None] * new.ndim], new, old)  # noqa: E731
         after = decided._replace(
             t=t, y=jnp.where(happens, decided.y, y), going=going & ~spent,
@@ -336,15 +347,26 @@ class ContactRounds(NamedTuple):
 
     # ---- what is known at a state ----
 
-    def watch(self, t, y, contacts: Contacts) -> Guarded:
-        """The watches at a state, without derivatives."""
+    def watch(self, t, y, contacts: Contacts | None = None) -> Guarded:
+        """The watches at a state, without derivatives; by default those of open contacts."""
         of_state, of_params = self.widths
-        numbers = self.numbers_in(contacts)
+        numbers = self.numbers_in(contacts or opened(self.flat))
         exact = jnp.pad(of_params, (0, numbers.size - of_params.size))
-        return self.surfaces.evaluate_guards(t, y, numbers, self.ts[-1], (of_state, exact))
+        given = jax.lax.stop_gradient((t, y, numbers, self.ts[-1], (of_state, exact)))
+        if contacts is None:
+            return self.of_open.evaluate_guards(*given)
+        is_held = any_member((contacts.closed > 0).any())
+        return cond_alike(is_held, self.surfaces.evaluate_guards, self.of_open.evaluate_guards, *given)
+
+    @property
+    def may_miss(self) -> bool:
+        """True if an operation of the watches of open contacts may hide a corner from a series."""
+        return not {op for op, _, _ in self.of_open.values.line.nodes} <= _SEEN
 
     def missed(self, before: Carry, guarded: Guarded, contacts: Contacts):
         """True for each gap (k,) that is negative though it was followed, and open: its series did not show that."""
+        if not self.may_miss:
+            return np.zeros(self.count, bool)
         rounding = jnp.maximum(guarded.rounding, jnp.maximum(guarded.of_time, before.rounding[0]))
         slack = rounding * max(1.0, THROUGH * self.plan.rtol / GUARD_NOISE)
         return (guarded.values < -slack)[: self.count] & self.has_gap & (contacts.closed == 0)
@@ -364,7 +386,7 @@ class ContactRounds(NamedTuple):
 
     def touching(self, t, y) -> tuple:
         """True for contacts that touch (k,), how fast they move apart, the rounding of these rates; and the watches."""
-        guarded, k = self.watch(t, y, opened(self.flat)), self.count
+        guarded, k = self.watch(t, y), self.count
         values, noise = guarded.values[:k], guarded.rounding[:k] + guarded.of_time[:k]
         rates = jnp.where(self.has_gap, guarded.rates[:k], values)
         of_rates = jnp.where(self.has_gap, guarded.rate_rounding[:k], noise)
@@ -631,28 +653,30 @@ def _unit(vectors):
 
 
 @functools.lru_cache(maxsize=64)
-def _watches(derivation, scene: ContactScene, sections: tuple, ways: tuple, code: tuple, structure) -> Surfaces:
+def _watches(derivation, scene: ContactScene, sections: tuple, ways: tuple, code: tuple, structure, single) -> Surfaces:
     """The watches of all contacts as programs: the k normal ones, those of friction, r, and then the sections.
 
     `code` and `structure` are what the parameters hold that is not a number.
     """
     zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), derivation.numbers)
-    params = eqx.combine(zeros, structure.unflatten(code)).params
-    flat = Flat.from_system(scene.system, derivation.layout, params)
-    shapes, places = flat.shapes, RowPlaces.from_derivation(derivation, flat)
-    rough = flat.rough
+    inside = eqx.combine(zeros, structure.unflatten(code))
+    flat = Flat.from_system(scene.system, derivation.layout, inside.params)
+    shapes, rough = flat.shapes, flat.rough
+    places = None if scene.is_open else RowPlaces.from_derivation(derivation, flat)
 
-    def values_at(y, inside: InContact, forces):
+    def values_at(y, inside: InContact, *forces):
         user, (closed, sticks, direction) = eqx.filter(inside.params, eqx.is_array_like), inside.contacts
         state = (*halves(y[:-1]), y[-1])
         open_values = jnp.concatenate([flat.gaps(state[0], state[2], user), flat.one_way(*state, user)])
-        normal = forces[places.normal]
         user_state = (*map(derivation.layout.restore, state[:2]),)
         more = [require_one_number(of(*user_state, t=y[-1], params=inside.params), "A section") for of in sections]
+        if places is None:
+            return jnp.concatenate([open_values, jnp.ones(rough.size), jnp.array(more)])
+        normal = forces[0][places.normal]
         watches = jnp.concatenate([normal + (1.0 - closed) * open_values, jnp.array(more)])
         if not rough.size:
             return watches
-        held, most = forces[places.tangential], flat.friction(user) * normal[rough]
+        held, most = forces[0][places.tangential], flat.friction(user) * normal[rough]
         if shapes.directions == 1:
             slides = jnp.sum(flat.slips(*state, user) * direction, axis=1)
         else:  # zero where it stops, and where it has turned by 60°: at 90° its direction has a pole
@@ -663,4 +687,25 @@ def _watches(derivation, scene: ContactScene, sections: tuple, ways: tuple, code
         return jnp.concatenate([watches[: shapes.count], of_friction, watches[shapes.count :]])
 
     directions = (-1,) * (shapes.count + rough.size) + ways
-    return Surfaces.from_function(derivation, values_at, directions, code, structure, given=derivation.multipliers)
+    forces = None if scene.is_open else derivation.multipliers
+    surfaces = Surfaces.from_function(derivation, values_at, directions, code, structure, given=forces)
+    surfaces = surfaces._replace(is_rounded=single)
+    if scene.is_open:
+        return surfaces
+
+    @functools.cache
+    def make_flow():
+        problem, of_open = _open_watches(derivation, scene, sections, ways, code, structure, single)
+        return flow_of(dataclasses.replace(problem, guards=of_open.guards(remembers=True)))
+
+    start = sum(x.size for x in jax.tree.leaves(zeros.params))
+    return surfaces._replace(released=Released(tuple(range(start, start + shapes.count)), make_flow))
+
+
+def _open_watches(derivation, scene: ContactScene, sections, ways, code, structure, single) -> tuple[Problem, Surfaces]:
+    """The problem of a scene in which no contact is closed, and its watches."""
+    zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), derivation.numbers)
+    inside = eqx.combine(zeros, structure.unflatten(code))
+    problem = Problem.from_system(dataclasses.replace(scene, is_open=True), derivation.layout, inside)
+    given = problem.system, sections, ways, code, structure, single
+    return problem, _watches(problem.derivation.lowered, *given)
