@@ -212,12 +212,14 @@ class Batch(eqx.Module):
     def __len__(self) -> int:
         return len(self.y0)
 
-    def map_members(self, solve: Callable[[Problem], Any]) -> Any:
-        """`solve` under `jax.vmap` over the members."""
+    def map_members(self, solve: Callable[..., Any], *more: Any) -> Any:
+        """`solve` under `jax.vmap` over the members; of `more`, that comes behind a problem, each has its own."""
         axes = jax.tree.unflatten(jax.tree.structure(self.params), self.axes)
-        return jax.vmap(lambda y0, params: solve(replace(self.member, y0=y0, params=params)), in_axes=(0, axes))(
-            self.y0, self.params
-        )
+
+        def solve_member(y0, params, *more):
+            return solve(replace(self.member, y0=y0, params=params), *more)
+
+        return jax.vmap(solve_member, in_axes=(0, axes, *[0] * len(more)))(self.y0, self.params, *more)
 
     def map_in_turn(self, solve: Callable[[Problem], "Solution"]) -> "Solution":
         """`solve` of one member after the other."""

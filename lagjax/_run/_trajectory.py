@@ -77,6 +77,7 @@ class Transitions(NamedTuple):
 class Impacts(NamedTuple):
     """The impacts of a motion with contacts, in order: NaN beyond the last of `count`.
 
+    There is room for `max_transitions` of them; in a batch, outside of `jax.jit`, for no more than its members need.
     `t` (N,) are their times. `impulse`: the normal impulses, in the structure that `contacts` returns with an axis of N
     in front, zero of a contact that took no part. `energy_lost` (N,): the kinetic energy that each took away. Bounces
     that accumulate end in one impact, with all that they would still have given; its time is that of their limit.

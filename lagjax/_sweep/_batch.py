@@ -37,6 +37,7 @@ PyTree = Any
 _Kept = tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]  # values, |h − h₀| and complaints
 CRASHED, KEEP_FAILED = 1000, 1001  # result codes of the sweep's own, far from those of `lagjax.RESULTS`
 NAMES = {CRASHED: "crashed", KEEP_FAILED: "keep_failed"}
+MOST_CHANGES = 256  # of the contacts of a member: the default of `simulate_batch`
 MOST = 16_384  # members of a batch: more are no faster in machine code, and take more memory
 MOST_ON_DEVICES = 131_072
 PATH_BYTES = 64 * 2**20  # of the path of a batch
@@ -281,7 +282,19 @@ _KEPT = ("q", "qdot", "end", "mode", "transitions", "impacts", "contacts", "cont
 
 def _arrays(run: Trajectory) -> dict[str, Any]:
     fields = {name: getattr(run, name) for name in _KEPT}
+    fields |= {name: _fill_record(fields[name]) for name in ("impacts", "contact_changes") if fields[name] is not None}
     return fields | {"code": run.result._value, "stats": {k: x for k, x in run.stats.items() if jnp.ndim(x)}}
+
+
+def _fill_record(record: Any) -> Any:
+    """The `Impacts` or `ContactChanges` of a batch, (B, N, …), with the room that all batches have."""
+
+    def fill(x):
+        widths = [(0, 0), (0, MOST_CHANGES - x.shape[1]), *[(0, 0)] * (jnp.ndim(x) - 2)]
+        return jnp.pad(x, widths, constant_values=jnp.nan if x.dtype.kind == "f" else -1)
+
+    parts = {name: x for name, x in record._asdict().items() if name not in ("count", "doubts", "doubted")}
+    return record._replace(**jax.tree.map(fill, parts))
 
 
 def _misfit(expected: list[Quantity], row: dict[str, np.ndarray]) -> str | None:

@@ -145,20 +145,40 @@ def test_what_cannot_be_a_contact(options, sentence):
 
 
 def test_members_have_their_own_impacts():
-    """One, batched, under vmap, and of float32: bounces of six heights, up to rest."""
-    h, ts, params = jnp.array([0.2, 0.5, 1.0, 1.5, 2.0, 30.0]), jnp.array([0.0, 1.0, 2.0]), {"g": G, "e": 0.5}
-    batch = lagjax.simulate_batch(BALL, h, jnp.zeros(6), ts, params)
+    """One, batched, under vmap, and of float32: bounces of six heights, up to rest, of each as many as fill threads."""
+    h, ts, params = (
+        jnp.tile(jnp.array([0.2, 0.5, 1.0, 1.5, 2.0, 30.0]), 30),
+        jnp.array([0.0, 1.0, 2.0]),
+        {"g": G, "e": 0.5},
+    )
+    batch = lagjax.simulate_batch(BALL, h, jnp.zeros(h.size), ts, params)
     assert batch.ok.all() and int(batch.impacts.count[-1]) == 0
-    assert (batch.impacts.count[:-1] > 3).all()
+    assert (batch.impacts.count[:5] > 3).all()
+    np.testing.assert_array_equal(batch.q[:6], batch.q[-6:])
     mapped = jax.jit(jax.vmap(lambda h: lagjax.simulate(BALL, h, jnp.zeros_like(h), ts, params)))(h)
     np.testing.assert_allclose(mapped.q, batch.q, atol=1e-14)
     for k in (0, 3):
         np.testing.assert_allclose(lagjax.simulate(BALL, h[k], 0.0, ts, params).q, batch.q[k], atol=1e-14)
     single = lagjax.simulate_batch(
-        BALL, *jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (h, jnp.zeros(6), ts, params))
+        BALL, *jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), (h, jnp.zeros(h.size), ts, params))
     )
     assert single.q.dtype == single.impacts.t.dtype == jnp.float32
     np.testing.assert_allclose(single.q, batch.q, rtol=1e-5, atol=3e-6)
+
+
+def test_a_batch_has_room_for_the_impacts_of_its_members():
+    """An elastic ball falls on the floor at odd multiples of the time of its first fall: 3 to 78 times here."""
+    h, ts, params = jnp.array([0.02, 0.1, 1.0, 9.0]), jnp.array([0.0, 10.0]), {"g": G, "e": 1.0}
+    batch = lagjax.simulate_batch(BALL, h, jnp.zeros(4), ts, params)
+    falls = np.sqrt(2 * h / G)
+    odd = np.arange(1, 2 * batch.impacts.t.shape[1], 2)
+    exact = np.where(odd * falls[:, None] < 10.0, odd * falls[:, None], np.nan)
+    np.testing.assert_allclose(batch.impacts.t, exact, rtol=1e-13)
+    np.testing.assert_allclose(batch.impacts.impulse, np.where(exact > 0, 2 * G * falls[:, None], np.nan), rtol=1e-12)
+    np.testing.assert_array_equal(batch.impacts.count, np.isfinite(exact).sum(axis=1))
+    spent = lagjax.simulate_batch(BALL, h, jnp.zeros(4), ts, params, max_transitions=40)
+    np.testing.assert_array_equal(spent.result == lagjax.RESULTS.max_transitions_reached, [True, False, False, False])
+    np.testing.assert_array_equal(spent.impacts.t, batch.impacts.t[:, :40])
 
 
 WITHOUT_SWITCH = """

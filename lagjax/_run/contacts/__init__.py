@@ -19,6 +19,7 @@ from lagjax._engine.taylor import MOST_GUARDS, MachineCode, line_of
 from lagjax._equations import ROUNDINGS, derivation_of, has_constraints, require_consistent
 from lagjax._interface import Layout, halves, is_concrete, require_budget, result_from
 from lagjax._primitives import DOUBLE, compute_in_doubles
+from lagjax._run._rounds import BLOCK
 from lagjax._run._trajectory import ContactChanges, Impacts, State, Trajectory, step_counts
 from lagjax._run.contacts._contact_rounds import Carry, ContactPlan, RoundRecord, RowPlaces, contact_motion
 from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes, System, require_coefficients
@@ -39,13 +40,46 @@ def follow_contacts(given: Problem, problem: Problem, max_transitions: int) -> T
 def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int, params, params_axes) -> Trajectory:
     """The motions of a batch whose system has contacts."""
     plan, _ = _plan(batch.member, max_transitions)
-    ending, record, impacts = _follow_members(plan, batch)
+    if batch.is_known:
+        ending, record, impacts = _follow_known(plan, batch)
+    else:
+        ending, record, impacts = batch.map_members(lambda problem: _motion(plan, problem))
     return _trajectory(given.member, batch.member, ending, record, impacts, params, params_axes)
 
 
+def _follow_known(plan: ContactPlan, batch: Batch) -> tuple:
+    """The rounds of all members, block by block: what is recorded has no more room than they need."""
+    if batch.member.is_single:
+        member = dataclasses.replace(batch.member, layout=dataclasses.replace(batch.member.layout, dtype=DOUBLE))
+
+        def follow_wide(ts, y0, params):
+            return _follow_known(plan, Batch(dataclasses.replace(member, ts=ts), y0, params, batch.axes))
+
+        return compute_in_doubles(follow_wide, member.ts, batch.y0, batch.params)
+    ending, *found = _follow_block(plan, batch)
+    blocks = [found]
+    while np.asarray(ending.going).any():
+        ending, *found = _follow_block(plan, batch, ending)
+        blocks.append(found)
+    if len(blocks) == 1:
+        return ending, *found
+    counts = [impacts[-1] for _, impacts in blocks]
+    found = [(record, impacts[:-1]) for record, impacts in blocks]
+    record, impacts = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *found)
+    in_front = jnp.argsort(jnp.isnan(impacts[0]), axis=1, stable=True)
+    take = jax.vmap(lambda x, places: x[places])
+    impacts = jax.tree.map(lambda x: take(x, in_front), impacts)
+    record, impacts = jax.tree.map(lambda x: x[:, : plan.max_transitions], (record, impacts))
+    return ending, record, (*impacts, sum(counts))
+
+
 @eqx.filter_jit
-def _follow_members(plan: ContactPlan, batch: Batch) -> Any:
-    return batch.map_members(lambda problem: _motion(plan, problem))
+def _follow_block(plan: ContactPlan, batch: Batch, *begun: Carry) -> Any:
+    def follow_member(problem, *begun):
+        given = problem.ts, problem.y0, problem.params
+        return contact_motion(plan, problem.layout, *given, min(BLOCK, plan.max_transitions), *begun)
+
+    return batch.map_members(follow_member, *begun)
 
 
 def note_sections(problem: Problem, functions: tuple, directions: tuple[int, ...], room: int) -> tuple:
@@ -144,7 +178,7 @@ def _trajectory(
     at, before, behind = map(problem.layout.restore, (at, record.qdot, behind))
     known = record.contact, record.change, ending.rounds, ending.doubts, ending.doubted
     changes = ContactChanges(record.t, at, before, at, behind, *known)
-    names = problem.system.contact_names(problem.layout, problem.params)
+    names = Shapes.from_system(problem.system, problem.layout, problem.params).names
     return Trajectory(
         ts=jnp.asarray(given.ts), q=q, qdot=qdot, result=result_from(ending.result), end=State(ending.t, *end),
         stats=step_counts(*ending.steps), system=given.system, params=params, params_axes=axes,
