@@ -2,7 +2,7 @@
 
     comparisons, abs, max, min, sign    the sign of a switching number u: −1, 0 or 1
     floor, ceil, round                  the whole number below a switching number x
-    rem, conversion to integers         the whole number between x and zero
+    rem, trunc, conversion to integers  the whole number between x and zero
     atan2(y, x)                         the sign of x, and where that is negative the sign of y: its cut
     look-ups (`locate`)                 the piece of an increasing table that a number x is on
     u / |u| of velocities               whether the vector u moves, 1, or rests, −1: dry friction in the plane
@@ -21,7 +21,7 @@ a border is no piece but a feature, and a step that is to pass it begins next to
 """
 
 import math
-from collections.abc import Callable, Container, Mapping, Sequence
+from collections.abc import Callable, Container, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -55,7 +55,7 @@ _NOTHING, _NO_LENGTH = 2.0**-500, 1e-12
 _LARGEST = 10  # operations that one may become: a bound for errors, three are usual
 _COMPARISONS = ("lt", "le", "gt", "ge")
 _PIECEWISE = {
-    *_COMPARISONS, "abs", "max", "min", "sign", "floor", "ceil", "round", "rem", "convert", "locate", "atan2"
+    *_COMPARISONS, "abs", "max", "min", "sign", "floor", "ceil", "trunc", "round", "rem", "convert", "locate", "atan2"
 }  # fmt: skip
 _WITHOUT_ANY = {"input", "constant", "add", "sub", "neg", "sin", "cos"}  # no piece, no feature
 # Functions without a series where their first operand is zero, or ±1.
@@ -248,7 +248,6 @@ class _Rewriting:
         self._moves: list[bool] = []
         self.features: dict[tuple[int, int], Feature] = {}  # by the argument, and the kind
         self.abrupt: set[int] = set()
-        self.truncated = _truncations(program.line)
         self.cones = _find_cones(program.line, size, program.linear) if slides else {}
         self.parts: dict[int, tuple[int, ...]] = {}  # of the vector of a cone, by its piece
         self.decisive = self._decisive()
@@ -258,11 +257,7 @@ class _Rewriting:
         relevant = self.decisive | self.abrupt
         self.powers = find_powers(program.line, relevant, self._of_guards, size)
         if self.powers or any(
-            i in self.cones
-            or i in self.truncated
-            or self._decides(i)
-            or program.line.nodes[i][0] in (*_FEATURES, "pow")
-            for i in relevant
+            i in self.cones or self._decides(i) or program.line.nodes[i][0] in (*_FEATURES, "pow") for i in relevant
         ):
             for i in range(len(program.line.nodes)):
                 self.places.append(self._place(i))
@@ -275,8 +270,8 @@ class _Rewriting:
         """The nodes that q̈ depends on, without those of the elimination of a linear system."""
         linear, line = self.program.linear, self.program.line
         roots = line.outputs[: self.size] if linear is None else [*linear.right, *linear.entries.values()]
-        needed = _below(line, roots, self.truncated)
-        self._of_guards = _below(line, self.watched, self.truncated)
+        needed = _below(line, roots)
+        self._of_guards = _below(line, self.watched)
         if self.watched:  # which may read the solution of a linear system, but not decide on its elimination
             needed |= self._of_guards - (_below(line, line.outputs[: self.size]) - needed)
         self.abrupt = self._find_abrupt(needed)
@@ -409,9 +404,7 @@ class _Rewriting:
 
     def _replace_by_piece(self, i: int, op: str, of: list[int], attribute) -> int | None:
         """The result of a node by its piece; None where it has none."""
-        if i in self.truncated:
-            op, of = "trunc", [self.places[x] for x in self.truncated[i]]
-        elif not self._decides(i) or (
+        if not self._decides(i) or (
             op == "atan2" and is_nonnegative(self.program.line, self.program.line.nodes[i][1][1])
         ):
             return None
@@ -823,15 +816,15 @@ def _guards(kinds: Sequence[int], slides: Sequence[Slide]) -> tuple[Guard, ...]:
     return tuple(guards)
 
 
-def _below(line: StraightLine, roots: Sequence[int], instead: Mapping[int, Sequence[int]] | None = None) -> set[int]:
-    """The nodes that some nodes depend on, and these. Some read `instead` other nodes than their operands."""
+def _below(line: StraightLine, roots: Sequence[int]) -> set[int]:
+    """The nodes that some nodes depend on, and these."""
     seen: set[int] = set()
-    stack, instead = list(roots), instead or {}
+    stack = list(roots)
     while stack:
         i = stack.pop()
         if i not in seen:
             seen.add(i)
-            stack.extend(instead[i] if i in instead else line.nodes[i][1])
+            stack.extend(line.nodes[i][1])
     return seen
 
 
@@ -857,24 +850,6 @@ def with_outputs(program: Recurrent, more: StraightLine, moving: int | None = No
     line = StraightLine(tuple(graph.nodes), tuple(graph.kinds), outputs)
     mechanics = getattr(program, "mechanics", None)
     return Pieced(line, program.size, program.dtypes, program.linear, mechanics)
-
-
-def _truncations(line: StraightLine) -> dict[int, tuple[int]]:
-    """The nodes that are the whole number between x and zero, and x: written as floor(x), or ceil(x) where x < 0."""
-    nodes, found = line.nodes, {}
-    for i, (op, operands, _) in enumerate(nodes):
-        if op != "select" or nodes[operands[0]][0] not in _COMPARISONS:
-            continue
-        of_two = {nodes[x][0]: nodes[x][1] for x in operands[1:]}
-        x, level = nodes[operands[0]][1]
-        negative = operands[2 if nodes[operands[0]][0] in ("lt", "le") else 1]
-        if (
-            nodes[level] == ("constant", (), 0.0)
-            and of_two == {"floor": (x,), "ceil": (x,)}
-            and nodes[negative][0] == "ceil"
-        ):
-            found[i] = (x,)
-    return found
 
 
 def _squares(line: StraightLine, i: int) -> list[int] | None:

@@ -99,7 +99,7 @@ def _binade(x):
     return jnp.where(jnp.isfinite(x), power, jnp.abs(x))
 
 
-WRITTEN: dict[str, Callable] = {"binade": _binade}  # operations that `lax` does not have
+WRITTEN: dict[str, Callable] = {"binade": _binade, "trunc": jnp.trunc}  # operations that `lax` does not have
 
 
 def _apply(op: str, xs: list, attribute) -> jax.Array:

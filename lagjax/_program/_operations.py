@@ -317,6 +317,7 @@ _ROWS = (
     _step("sign", np.sign, lambda code, x: code.select(x > 0.0, 1.0, code.select(x < 0.0, -1.0, x)), _odd),
     _step("floor", np.floor, _intrinsic("floor")),
     _step("ceil", np.ceil, _intrinsic("ceil")),
+    _step("trunc", np.trunc, _intrinsic("trunc")),
     # The largest power of two that is at most |x|, and 1 for 0: for weights that do not change what is computed with
     # them. It has therefore no side: no step has to end where it jumps.
     Operation(

@@ -208,8 +208,8 @@ def formula_of(equation) -> str | None:
     name, operands = equation.primitive.name, [variable.aval for variable in equation.invars]
     if name in ("jit", "pjit"):
         called, floats = equation.params["name"], [jnp.issubdtype(x.dtype, jnp.floating) for x in operands]
-        if called in _DIVISIONS:
-            return called if floats == [True, True] and _divides(called, equation) else None
+        if called in _WHOLE:
+            return called if len(floats) == _WHOLE[called] and any(floats) and _is_named(called, equation) else None
         reads_bits = any(e.primitive.name == "bitcast_convert_type" for e in equation.params["jaxpr"].eqns)
         found = {"signbit": [True] if reads_bits else None, "hypot": [True, True]}
         if found.get(called) != floats:
@@ -225,20 +225,22 @@ def formula_of(equation) -> str | None:
     return next((name for name in ("det", "slogdet") if text in _determinant(name, shape, dtype)), None)
 
 
-_DIVISIONS = ("remainder", "floor_divide", "divmod")
+_WHOLE = {"remainder": 2, "floor_divide": 2, "divmod": 2, "trunc": 1}  # how many operands
 
 
-def _divides(called: str, equation) -> bool:
-    """True if a call that has the name of a division of NumPy's is that: it is tried with numbers."""
-    for numbers in itertools.product((7.25, -7.25), (2.0, -2.0)):
-        trial = Expansion(Graph(1_000_000))
-        given = [
-            trial.constants(np.full(v.aval.shape, x)) for v, x in zip(equation.invars, numbers, strict=True)
-        ]  # fmt: skip
-        found = trial.run_closed(equation.params["jaxpr"], given)
-        for ids, expected in zip(found, np.atleast_1d(getattr(np, called)(*numbers)), strict=True):
-            if any(trial.graph.value(i) != expected for i in trial.real(ids).ravel().tolist()):
-                return False
+def _is_named(called: str, equation) -> bool:
+    """True if a call that has the name of a function of NumPy's is that: it is tried with numbers."""
+    shapes = [variable.aval for variable in equation.invars]
+    for numbers in itertools.product(*[(7.25, -7.25), (2.0, -2.0)][: _WHOLE[called]]):
+        numbers = [shape.dtype.type(x) for shape, x in zip(shapes, numbers, strict=True)]
+        trial, expected = Expansion(Graph(1_000_000)), np.atleast_1d(getattr(np, called)(*numbers)).tolist()
+        given = [trial.constants(np.full(of.shape, x)) for of, x in zip(shapes, numbers, strict=True)]
+        try:
+            found = [trial.real(ids) for ids in trial.run_closed(equation.params["jaxpr"], given)]
+        except Unlowerable:
+            return False
+        if [{trial.graph.value(i) for i in ids.ravel().tolist()} for ids in found] != [{x} for x in expected]:
+            return False
     return True
 
 
@@ -388,13 +390,15 @@ def _hypotenuse(expansion, params, x, y):
 
 def _divide(expansion, params, x, y):
     """x // y and x mod y, each with one border, where JAX's have five and three."""
+    x, y = (expansion.map("convert", z, attribute="float") for z in (x, y))
     whole = expansion.map("floor", expansion.map("div", x, y))
     return [whole, expansion.map("sub", x, expansion.map("mul", whole, y))]
 
 
-LOWER.update(
-    divmod=_divide, floor_divide=lambda *of: _divide(*of)[:1], remainder=lambda *of: _divide(*of)[1:]
-)  # fmt: skip
+LOWER.update({
+    "divmod": _divide, "floor_divide": lambda *of: _divide(*of)[:1], "remainder": lambda *of: _divide(*of)[1:],
+    "trunc": lambda expansion, params, x: [expansion.map("trunc", x)],
+})  # fmt: skip
 
 
 @lowers("atan")
