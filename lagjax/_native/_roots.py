@@ -129,10 +129,10 @@ class Roots:
 
     def whole_slope(self, frame: Frame) -> Value:
         """The slope at the root of what P was before it was divided."""
-        code, slope = frame.code, frame.code.variable(frame["slope"])
-        with code.loop(MAX_ORDER) as k:
-            divided = frame["divided"] > code.lanes_of(code.as_number(k))
-            slope.value = code.select(divided, slope.value * frame["root"], slope.value)
+        code, slope, left = frame.code, *(frame.code.variable(frame[name]) for name in ("slope", "divided"))
+        with code.repeat_while(lambda: code.any_lane(left.value > 0.0), at_most=MAX_ORDER):
+            slope.value = code.select(left.value > 0.0, slope.value * frame["root"], slope.value)
+            left.value = left.value - 1.0
         return slope.value
 
     # ---- its roots ----
