@@ -63,7 +63,7 @@ def _each(function: Callable, *arrays: np.ndarray) -> list[np.ndarray]:
     shapes = next((r for r in results if r is not None), None)
     if shapes is None:
         shapes = function(*(np.eye(x.shape[-1], dtype=x.dtype) for x in arrays))
-    columns = zip(*(r or [np.full_like(x, np.nan) for x in shapes] for r in results), strict=True)
+    columns = zip(*(r or [x * np.nan for x in shapes] for r in results), strict=True)
     return [np.reshape(column, (*batch, *column[0].shape)) for column in columns]
 
 
@@ -126,16 +126,15 @@ def exponents_and_modes(matrix: Float[Array, "2n 2n"]) -> tuple[Array, Array]:
     smallest and so on, of which the larger is among the first. Those are sorted by Im s, growing ones first; the last n
     are their partners. Derivatives are NaN where there is no basis of eigenvectors.
     """
-    parts = _eigen(matrix)
-    return jax.lax.complex(*parts[:2]), jax.lax.complex(*parts[2:4])
+    return _eigen(matrix)[:2]
 
 
 @jax.custom_jvp
-def _eigen(matrix: Array) -> tuple[Array, ...]:
-    """Real and imaginary parts of s, X and X⁻¹."""
-    n = len(matrix)
-    vector, square = (jax.ShapeDtypeStruct(shape, matrix.dtype) for shape in ((n,), (n, n)))
-    return _call_numpy(lambda a: _each(_general, a), (vector, vector, square, square, square, square), matrix)
+def _eigen(matrix: Array) -> tuple[Array, Array, Array]:
+    """s, X and X⁻¹."""
+    n, dtype = len(matrix), jnp.result_type(matrix, jnp.complex64)
+    shapes = tuple(jax.ShapeDtypeStruct(shape, dtype) for shape in ((n,), (n, n), (n, n)))
+    return _call_numpy(lambda a: _each(_general, a), shapes, matrix)  # pyright: ignore[reportReturnType]
 
 
 # A basis of eigenvectors that has lost half of the digits is none: rounding splits a Jordan block of two by √eps.
@@ -146,11 +145,9 @@ def _general(matrix: np.ndarray) -> list[np.ndarray]:
     values, vectors = np.linalg.eig(matrix)
     order = _eigenvalue_order(values)
     values, vectors = values[order].astype(complex), vectors[:, order].astype(complex)
-    if np.linalg.cond(vectors) > _WORST_BASIS:
-        inverse = np.full_like(vectors, np.nan)
-    else:
-        inverse = np.linalg.inv(vectors)
-    return [part for x in (values, vectors, inverse) for part in (np.real(x), np.imag(x))]
+    broken = np.linalg.cond(vectors) > _WORST_BASIS
+    inverse = np.full_like(vectors, np.nan) if broken else np.linalg.inv(vectors)
+    return [x.astype(np.result_type(matrix, np.complex64)) for x in (values, vectors, inverse)]
 
 
 def _eigenvalue_order(values: np.ndarray) -> np.ndarray:
@@ -167,12 +164,10 @@ def _eigenvalue_order(values: np.ndarray) -> np.ndarray:
 
 @_eigen.defjvp
 def _eigen_jvp(primals, tangents):
-    parts = _eigen(*primals)
-    values, vectors, inverse = (jax.lax.complex(*parts[i : i + 2]) for i in (0, 2, 4))
+    values, vectors, inverse = _eigen(*primals)
     change = inverse @ tangents[0].astype(values.dtype) @ vectors
     turns = change * _inverse_gaps(values)
-    moved = jnp.diagonal(change), vectors @ turns, -turns @ inverse
-    return parts, tuple(part for x in moved for part in (x.real, x.imag))
+    return (values, vectors, inverse), (jnp.diagonal(change), vectors @ turns, -turns @ inverse)
 
 
 # ---- spaces ----------------------------------------------------------------------------------------------------------

@@ -9,6 +9,7 @@ from scipy.special import roots_laguerre
 from sweeps import sweep
 
 import lagjax
+from lagjax._analysis._eigen import exponents_and_modes
 from lagjax._equations._derivation import derivation_of
 from lagjax._interface._layout import Layout
 
@@ -279,6 +280,14 @@ def test_linearization():
     np.testing.assert_allclose(linear.B[2:] @ linear.mass_matrix, np.eye(2), atol=1e-14)
     lower = np.linalg.solve(linear.mass_matrix, -linear.stiffness)
     np.testing.assert_allclose(linear.A[2:, :2], lower, atol=1e-13)
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_eigenvalues_have_the_precision_of_the_matrix_on_accelerators_too(monkeypatch, dtype):
+    monkeypatch.setattr(jax.lax, "platform_dependent", lambda *arrays, cpu, default: default(*arrays))
+    values, vectors = exponents_and_modes(jnp.asarray([[0.0, 1.0], [-4.0, 0.0]], dtype))
+    np.testing.assert_allclose(values, [2j, -2j], rtol=1e-6)
+    assert values.dtype == vectors.dtype == np.result_type(dtype, np.complex64)
 
 
 @pytest.mark.slow
