@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from lagjax._equations._linear import rank_tolerance, singular_threshold
-from lagjax._program import orthogonalize, row_weights, solve_orthogonalized
+from lagjax._program import Scalars, eliminate, orthogonalize, row_weights, solve_orthogonalized, substitute
 from lagjax._program import scalar_algebra as xp
 
 # The part of a pivot that elimination has to leave for a matrix to count as regular in the regular-M variant: four
@@ -246,32 +246,26 @@ class DraggedElimination:
             columns.append(saddle.solve(factors, force))
         # 1 − P, by elimination without pivots: the parts that are left are those of fewer contacts that slide.
         size = len(self.dragged)
-        matrix = [[columns[j][n + i] + float(k == j) for j in range(size)] for k, i in enumerate(self.dragged)]
-        for k in range(size):
-            for row in matrix[k + 1 :]:
-                row[k] = row[k] / matrix[k][k]
-                for j in range(k + 1, size):
-                    row[j] = row[j] - row[k] * matrix[k][j]
         if not size:
             return (factors, of_rows), singular
-        return (factors, of_rows, xp.stack(columns), xp.stack([x for row in matrix for x in row])), singular
+        matrix = xp.stack([columns[j][n + i] + float(k == j) for k, i in enumerate(self.dragged) for j in range(size)])
+        rows = matrix.ids.reshape(size, size).tolist()
+        lower = eliminate(matrix.expansion.graph, rows)
+        both = [[*of, *row[k:]] for k, (of, row) in enumerate(zip(lower, rows, strict=True))]
+        return (factors, of_rows, xp.stack(columns), Scalars(matrix.expansion, np.array(both))), singular
 
     def solve(self, factors, right):
         """x and then −λ, linear in `right`: b and then c."""
         of_saddle, of_rows, *of_drag = factors
-        columns, coupling = of_drag or ([], [])
         n, saddle = self.saddle.size, self.saddle
         z = saddle.solve(of_saddle, right)
-        size, multipliers = len(self.dragged), [-z[n + j] for j in self.dragged]
-        for k in range(size):
-            for j in range(k):
-                multipliers[k] = multipliers[k] - coupling[size * k + j] * multipliers[j]
-        for k in reversed(range(size)):
-            for j in range(k + 1, size):
-                multipliers[k] = multipliers[k] - coupling[size * k + j] * multipliers[j]
-            multipliers[k] = multipliers[k] / coupling[size * k + k]
-        for k in range(size):
-            z = z + columns[k] * multipliers[k]
+        if of_drag:
+            columns, coupling = of_drag
+            rows = coupling.ids.tolist()
+            lower = [row[:k] for k, row in enumerate(rows)]
+            multipliers = substitute(z.expansion.graph, rows, lower, (-z[n + self.dragged]).ids.tolist())
+            for k, multiplier in enumerate(multipliers):
+                z = z + columns[k] * Scalars(z.expansion, np.array(multiplier))
         gaps, start = right[n:], 0
         for k, touching in enumerate(saddle.rows):
             if len(touching):
