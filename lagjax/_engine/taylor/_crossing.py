@@ -104,7 +104,7 @@ def _lower_surfaces(derivation: Derivation, functions, directions, code, structu
 
 
 def changes_of(event, count: int):
-    """How each of the guards changed, (G,), from the mask of an event: 1 where it fell, 2 where it rose, else 0."""
+    """The change of each guard, (G,), by the mask of an event: 1 where it fell, 2 where it rose, else 0."""
     return (event >> (CHANGE_BITS * np.arange(count))) & (2**CHANGE_BITS - 1)
 
 
