@@ -42,7 +42,9 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "float64 on a CPU (`System.explain` says why a scene is not for it). Or make the two sides modes of "
         "simulate_hybrid, or round the jump off over a width that steps resolve, tanh(v / w) for sign(v)."
     )
-    max_transitions_reached = "The budget of transitions was spent. Raise max_transitions, or end ts earlier."
+    max_transitions_reached = (
+        "The budget of transitions was spent. Raise max_transitions (of crossings it is fixed), or end ts earlier."
+    )
     max_crossings_reached = (
         "There are more crossings after that than there is room for. Raise `count`, or end ts earlier."
     )

@@ -108,6 +108,8 @@ def describe_failure(trajectory: Trajectory, layout: Layout, why: str | None) ->
 def diagnosis(system: System, layout: Layout, params, ended: Ended) -> str:
     """The facts about a failure, as sentences on a line of their own that begins with a line break; or nothing."""
     try:
+        if text := _undefined_gap(system, layout, params, ended):
+            return f"\n{text}"
         return _find_cause(system, layout, params, ended) if ended.code in _CODES else ""
     except Exception as error:  # the message of the failure itself must come out
         return f"\n(No more is known about it: {type(error).__name__}.)"
@@ -127,6 +129,20 @@ def _find_cause(system: System, layout: Layout, params, ended: Ended) -> str:
     if not text and (at := _running_away(derivation, ended)) is not None:
         text = _escape(derivation, params, ended, at)
     return f"\n{text}" if text else _run_check(system, derivation, params, ended) or _budget(ended)
+
+
+def _undefined_gap(system: System, layout: Layout, params, ended: Ended) -> str:
+    """A sentence about the first gap or one-way velocity that is not finite where the motion ended; or nothing."""
+    if not system.touches or not np.isfinite(ended.y).all():
+        return ""
+    q, qdot = map(layout.restore, halves(ended.y))
+    called = ((system.contacts, (q,)), (system.one_way, (q, qdot)))
+    values = [function(*state, t=ended.t, params=params) for function, state in called if function]
+    numbers = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(values)])
+    for name, value in zip(system.contact_names(layout, params), numbers, strict=True):
+        if not np.isfinite(value):
+            return f"The gap {name} is {value} there: contacts and one_way must return finite numbers."
+    return ""
 
 
 def _reset_to_nothing(layout: Layout, ended: Ended) -> str:

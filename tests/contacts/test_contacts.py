@@ -537,3 +537,16 @@ def test_a_gap_that_hides_a_corner_is_named(duration):
     q, v = jnp.array([0.85816433, -1.0]), jnp.array([-0.39057011, 0.92057318])
     run = lagjax.simulate(hidden, q, v, jnp.array([0.0, duration]), throw=False)
     assert run.result == lagjax.RESULTS.contact_missed
+
+
+@pytest.mark.parametrize(
+    ("options", "name"),
+    [
+        ({"contacts": lambda q: {"floor": q * jnp.nan}}, r"contacts\['floor'\]"),
+        ({"one_way": lambda q, v: {"ratchet": v + q * jnp.inf}}, r"one_way\['ratchet'\]"),
+    ],
+)
+def test_a_gap_that_is_no_number_is_named(options, name):
+    system = lagjax.System(lambda q, v: 0.5 * v**2, **options)
+    with pytest.raises(lagjax.SimulationError, match=f"The gap {name} is (nan|inf)"):
+        lagjax.simulate(system, 1.0, 0.0, jnp.array([0.0, 1.0]))
