@@ -1,4 +1,7 @@
-"""Slips that turn, stop and begin: a slider-crank through its dead centres, against the motion of its crank alone."""
+"""Slips that turn, stop and begin.
+
+A slider-crank through its dead centres, against the motion of its crank alone; in space what a force sets in motion.
+"""
 
 import jax
 import jax.numpy as jnp
@@ -82,3 +85,63 @@ def test_a_slip_that_gaps_hold_turns():
     np.testing.assert_allclose(found.contact_changes.t[1:4], times, rtol=1e-9)
     slope = (crank_alone(0.2 + 1e-4, 3.0)[0] - crank_alone(0.2 - 1e-4, 3.0)[0])[0] / 2e-4
     assert float(jax.grad(lambda mu: run(mu).q[-1, 0])(0.2)) == pytest.approx(slope, rel=1e-6)
+
+
+# ---- in space, from rest ---------------------------------------------------------------------------------------------
+
+PUSHED = lagjax.System(
+    lambda q, v: 0.5 * v @ v - G * q[2], contacts=lambda q: q[2], slip=lambda q, v: v[:2],
+    friction=lambda params: params[0],
+    forces=lambda q, v, params: params[1] * jnp.array([jnp.cos(params[2]), jnp.sin(params[2]), 0.0]),
+)  # fmt: skip
+PUSH = jnp.array([0.3, 5.0, 0.7])
+
+
+def pushed(x):
+    return lagjax.simulate(PUSHED, jnp.zeros(3), jnp.zeros(3), jnp.array([0.0, 2.0]), x, max_transitions=8).q[-1]
+
+
+def pushed_exactly(x):
+    mu, force, angle = x
+    return 2.0 * (force - mu * G) * jnp.array([jnp.cos(angle), jnp.sin(angle), 0.0])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("mu", [0.05, 0.3, 0.505])
+def test_a_slip_in_space_that_a_force_begins_has_derivatives(mu):
+    x = PUSH.at[0].set(mu)
+    right = jax.jacfwd(pushed_exactly)(x)
+    np.testing.assert_allclose(pushed(x), pushed_exactly(x), atol=1e-9)
+    np.testing.assert_allclose(jax.jacfwd(pushed)(x), right, atol=1e-7)
+    np.testing.assert_allclose(jax.jacrev(pushed)(x), right, atol=1e-7)
+
+
+@pytest.mark.slow
+def test_second_derivatives_of_a_slip_in_space_that_a_force_begins():
+    along = jnp.array([0.3, 1.0, 0.5])
+
+    def twice(end):
+        return jax.jvp(jax.grad(lambda x: end(x) @ jnp.array([1.0, 2.0, 0.0])), (PUSH,), (along,))[1]
+
+    np.testing.assert_allclose(twice(pushed), twice(pushed_exactly), rtol=1e-7)
+
+
+@pytest.mark.parametrize("space", [False, pytest.param(True, marks=pytest.mark.slow)])
+def test_a_start_at_rest_that_slides_at_once_has_no_derivative_by_its_slip(space):
+    """Friction turns with the least slip: the ends of starts uphill and downhill differ in their slopes."""
+    normal = 2 if space else 1
+    block = lagjax.System(
+        lambda q, v, params: 0.5 * v @ v - G * (jnp.cos(params) * q[normal] + jnp.sin(params) * q[0]),
+        contacts=lambda q: q[normal], slip=lambda q, v: v[:2] if space else v[0], friction=0.3,
+    )  # fmt: skip
+    rest = jnp.zeros(normal + 1)
+
+    def run(v, tilt):
+        return lagjax.simulate(block, rest, v, jnp.array([0.0, 2.0]), tilt)
+
+    by_start, by_tilt = jax.jacfwd(lambda *x: run(*x).q[-1, 0], argnums=(0, 1))(rest, 0.5)
+    assert np.isnan(by_start[0]) and by_start[normal] == 0.0
+    assert float(by_tilt) == pytest.approx(-2 * G * (np.cos(0.5) + 0.3 * np.sin(0.5)), rel=1e-8)
+    assert "1 slips begin from rest" in str(run(rest, 0.5).health())
+    by_start, by_tilt = jax.jacfwd(lambda *x: run(*x).q[-1], argnums=(0, 1))(rest, 0.2)  # it sticks
+    assert not by_start.any() and not by_tilt.any()

@@ -171,8 +171,9 @@ class Health(eqx.Module):
       contacts shared, and when that first was (NaN: never); else None. Where contacts share an impact, the laws of
       impacts (`impacts=` of the System) differ. The balance of energy and momenta are not judged there.
     - `doubts`: in such a scene a pair, how many there were and when the first was (NaN: never), with a last axis for
-      impacts that gained energy, and for changes without a derivative: impacts that contacts share which close at one
-      instant by themselves, and slips in space that begin; else None.
+      impacts that gained energy, for those that contacts share which close at one instant by themselves, and for slips
+      that begin at a start at rest, or in space by a force that grows: of the last two not all derivatives are there.
+      Else None.
     - `global_error`: with a reference, the largest |yᵢ − reference| over the components of q and q̇, in units of the
       largest |yᵢ| along the path (and atol/rtol more, as in the tolerances); else None.
     """
@@ -317,6 +318,8 @@ class Health(eqx.Module):
             if shared.any():
                 law = f"{shared.sum()} shared by several contacts, the first at t = {np.nanmin(t):.6g}: there another"
                 rows.append(("", f"{law} law of impacts gives another motion"))
+        if self.doubts is not None and (slips := np.asarray(self.doubts[0])[..., 2].sum()):
+            rows.append(("", f"{slips} slips begin from rest: not all derivatives of what follows are there"))
         if self.momentum_names is None:
             rows.append(("momenta", "not known which are conserved: the scene has no scalar program"))
         if text := self._border_contacts():
@@ -408,7 +411,7 @@ def _member(index) -> str:
     return str(int(index[0])) if len(index) == 1 else str(tuple(int(i) for i in index))
 
 
-_DOUBTS = "gained_energy", "closed_together", "began_to_slip"  # in the order of `ContactChanges.doubts`
+_DOUBTS = "gained_energy", "closed_together"  # in the order of `ContactChanges.doubts`
 _SENTENCES = {
     "result": "The motion did not reach its end{0}.",
     "energy": (
@@ -459,7 +462,6 @@ _SENTENCES = {
         "Contacts: several that share an impact closed at one instant by themselves{0}. Derivatives in directions that "
         "part them do not exist and are NaN; in reverse mode all are."
     ),
-    "began_to_slip": ("Contacts: a slip in space began{0}: derivatives of what comes after are NaN."),
     "global_error": (
         "Global error: the motion parts from its reference by a hundredth of its size or more{0}. If its steps are "
         "accurate it is chaotic or unstable: tighten rtol, trust a shorter time, or speak of averages."
