@@ -1,8 +1,7 @@
 """The rounding errors of a straight line, as nodes of a graph: running errors, to first order.
 
 Every operation adds one unit in the last place of its result to what its operands bring along, so that terms that
-cancel leave theirs behind. Source: Higham, *Accuracy and Stability of
-Numerical Algorithms*, §3.3.
+cancel leave theirs behind. Source: Higham, *Accuracy and Stability of Numerical Algorithms*, §3.3.
 """
 
 from collections.abc import Sequence
@@ -30,9 +29,10 @@ def rounding(graph: Graph, line: StraightLine, nodes: Sequence[int], moving: int
         error = zero if op != "input" and OPERATIONS[op].exact else graph.apply("abs", node)
         for i, rule in zip(operands, () if op == "input" else OPERATIONS[op].transpose(), strict=False):
             if rule is not None and errors[i] != zero:
-                part = rule(graph.apply, number, errors[i], node, *(nodes[j] for j in operands))
+                slope = rule(graph.apply, number, number(1.0), node, *(nodes[j] for j in operands))
+                part = graph.apply("mul", errors[i], graph.apply("abs", slope))
                 if to_zero and (OPERATIONS[op].steep or op == "div"):
                     part = graph.apply("select", graph.apply("eq", errors[i], zero), part, zero)
-                error = graph.apply("add", error, graph.apply("abs", part))
+                error = graph.apply("add", error, part)
         errors.append(error)
     return [errors[i] for i in line.outputs]

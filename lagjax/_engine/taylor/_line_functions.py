@@ -35,9 +35,9 @@ _TARGET = "lagjax_line"
 # Operations of a line on a GPU that XLA compiles; NumPy on the host evaluates a longer one. Twice as many would cost
 # several seconds of compilation.
 LARGEST_COMPILED = 100
-# Machine code takes some 70 µs a node to make, and NumPy 1 to 2 µs a node for a call: that of a line which XLA does not
+# Machine code takes 70 to 100 µs a node to make, and NumPy 1 to 2 µs a node for a call: that of a line which XLA does not
 # wait for is made after as many calls as take that long, so that one call is not slow, and a thousand are not.
-_NODES_PER_CALL = 40
+_CALLS = 60
 
 
 def outputs(program: Program, count: int, first, numbers):
@@ -99,7 +99,7 @@ class Line:
         """
         rows = np.concatenate([part.reshape(-1, part.shape[-1]) for part in parts], axis=1)
         self._calls += 1
-        if self._calls * _NODES_PER_CALL >= len(self.line.nodes) and self.code is not None:
+        if self._calls >= _CALLS and self.code is not None:
             found = self.code(rows)
         else:
             found = self.line.evaluate(list(rows.T)).T
