@@ -36,13 +36,15 @@ class Constraints(eqx.Module):
 
     q and qdot have shape (n,). Every result lists the constraints on positions first. `held(params)` (m,) is 1 for each
     row that holds and 0 for one that is released, whose value is then zero whatever the state. `drag(q, qdot, t,
-    params)` (n, m) is the force that comes with each multiplier beside Gᵀλ, as friction does.
+    params)` (n, m) is the force that comes with each multiplier beside Gᵀλ, as friction does. It `turns` where that has
+    the direction of a velocity in space.
     """
 
     on_positions: Callable | None = None
     on_velocities: Callable | None = None
     held: Callable | None = None
     drag: Callable | None = None
+    turns: bool = eqx.field(static=True, default=False)
 
     @property
     def exist(self) -> bool:

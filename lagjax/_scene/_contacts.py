@@ -90,7 +90,8 @@ class ContactScene(eqx.Module):
             forces = -slides[:, None] * jnp.einsum("rd,rdn->rn", along, slopes)
             return jnp.zeros((layout.size, held(p).size), q.dtype).at[:, f + flat.rough].set(forces.T)
 
-        constraints = Constraints(held_positions, held_velocities, held, drag if flat.rough.size else None)
+        drags = drag if flat.rough.size else None, flat.shapes.directions > 1
+        constraints = Constraints(held_positions, held_velocities, held, *drags)
         if self.is_open:
             constraints = Constraints(*map(ask_user, vars(free.constraints).values()))
         lagrangian, forces, dissipation = map(ask_user, (free.lagrangian, free.forces, free.dissipation))

@@ -261,7 +261,7 @@ def _make_flow(derivation: Derivation, path: str, guards: Guards | None) -> Flow
         return Unlowerable(f"of a guard, {reason}")
     if derivation.kicks and pieces is None:
         return Unlowerable("L, or its momentum p = dL/dqdot, jumps at a border that no series leads to")
-    return Flow.from_program(program, n, projection, guards)
+    return Flow.from_program(program, n, projection, guards, derivation.motion.constraints.turns)
 
 
 def _require_increasing(program: Program, vector) -> None:

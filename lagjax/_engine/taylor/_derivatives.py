@@ -132,7 +132,7 @@ def vjp(flow: Flow, motions: Motions, path_ct, end_ct, tolerances: Tolerances) -
     """
     ts, y0, params, path, *_ = motions
     members, m = end_ct.shape[:2]
-    if m > flow.states + flow.numbers:
+    if flow.turns or m > flow.states + flow.numbers:
         return _vjp_by_jacobian(flow, motions, path_ct, end_ct, tolerances)
     path_ct, lost = mask_cotangents(motions, path_ct, end_ct)
     params_ct = np.zeros((members, m, flow.numbers))
@@ -197,7 +197,7 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
 
 
 def _vjp_by_jacobian(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -> tuple[np.ndarray, np.ndarray]:
-    """`vjp` from the whole Jacobian: for more cotangents than there are numbers that vary."""
+    """`vjp` from the whole Jacobian: for more cotangents than there are numbers that vary, and where a flow turns."""
     inputs = flow.states + flow.numbers
     unit = np.broadcast_to(np.eye(inputs), (len(end_ct), inputs, inputs))
     path, end = jvp(flow, motions, unit[..., : flow.states], unit[..., flow.states :], tolerances)

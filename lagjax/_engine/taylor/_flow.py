@@ -115,7 +115,8 @@ class Flow:
     first needed. `guards` end a motion early. `groups` (n,) numbers the coordinates whose errors are measured together;
     these may be those of a motion with its tangents (`nesting`). `motion` gives the program of the motion alone, where
     the flow's has tangents too; `general` the flow of the variant for any mass matrix: members that the regular variant
-    cannot follow start again with it.
+    cannot follow start again with it. Where the flow `turns`, as a slip in space does, tangents across have poles that
+    the motion has not, and transposed steps do not see: its transpose is that of its tangents.
     """
 
     def __init__(
@@ -128,16 +129,17 @@ class Flow:
         nesting: _native.Nesting | None = None,
         general: "Callable[[], Flow | None]" = lambda: None,
         motion: "Callable[[], Program] | None" = None,
+        turns: bool = False,
     ):
         self._motion_program: Callable = (lambda: self.program) if motion is None else motion
         self._parts, self.size, self.numbers, self.guards = functools.cache(parts), size, numbers, guards
-        self.groups = tuple(range(size)) if groups is None else groups
+        self.groups, self.turns = tuple(range(size)) if groups is None else groups, turns
         self.nesting = nesting or _native.Nesting(size)
         self.general = functools.cache(general)
         self.tangent = functools.lru_cache(maxsize=8)(self._tangent)
 
     @classmethod
-    def from_program(cls, program: Program, size: int, projection=None, guards=None) -> "Flow":
+    def from_program(cls, program: Program, size: int, projection=None, guards=None, turns=False) -> "Flow":
         """The flow of a scene's program, with that of its general variant behind it."""
 
         def general():
@@ -146,9 +148,10 @@ class Flow:
             except Unlowerable:
                 return None
             fits = other is not program and other.operations <= LARGEST_PROGRAM
-            return cls.from_program(other, size, projection, guards) if fits else None
+            return cls.from_program(other, size, projection, guards, turns) if fits else None
 
-        return cls(lambda: (program, projection), size, program.size - 2 * size - 1, guards, general=general)
+        numbers = program.size - 2 * size - 1
+        return cls(lambda: (program, projection), size, numbers, guards, general=general, turns=turns)
 
     @property
     def program(self) -> Program:

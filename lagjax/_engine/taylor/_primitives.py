@@ -462,7 +462,7 @@ def _vjp_compiled(*args, **settings):
         y_ct, params_ct, *more = _derivatives.transpose_outputs(go_back, ts, path_ct[:, 0], end_ct[:, 0], library=jnp)
         return y_ct[:, None], params_ct[:, None], *more
 
-    if args[-1].shape[-2] != 1:
+    if settings["flow"].turns or args[-1].shape[-2] != 1:
         return call_host(functools.partial(_vjp_on_host, **settings), _vjp_shapes(*args, **settings), *args)
     return _compile_derivative(run_handler, _vjp_on_host, _vjp_shapes, (3, 2), args, settings)
 
