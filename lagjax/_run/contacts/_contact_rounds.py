@@ -72,9 +72,6 @@ PARADOX = 1e-12
 # turns a slip at once, and steps are as short as that takes.
 NO_SLIP, AT_REST = 1e-11, 1e-8
 GAINED = 1e-12  # of the work of an impact: a gain of energy beyond rounding
-# The part by which a force must exceed what friction holds for steps in space to follow what varies: below it all that
-# is across the slip decays so fast that rounding of it grows from step to step (1e-3 of slopes by a force that grows).
-BARELY = 1e-3
 # Of the largest slip so far: what is more, where the slip along its first direction ends, has turned.
 TURNED = 1e-6
 EPS = float(np.finfo(float).eps)
@@ -160,9 +157,6 @@ def contact_motion(
     rounds = ContactRounds.from_plan(plan, layout, ts, y0, params)
     begun = rounds.begin(y0) if begun is None else begun
     first = vary_with(begun, ts, y0, rounds.vector, varying=("t", "y", "path"))
-    if rounds.flat.shapes.directions > 1:
-        directions = vary_with(first.contacts, ts, y0, rounds.vector, varying=("direction",))
-        first = first._replace(contacts=directions)
     absent = RoundRecord.absent(y0.size, rounds.count)
     ending, record = run_rounds(rounds.run_round, first, absent, room or plan.max_transitions)
     inputs, outputs = (ts, y0, rounds.vector), jax.lax.stop_gradient((ts, ending.path, ending.of_path))
@@ -320,7 +314,7 @@ class ContactRounds(NamedTuple):
             rounds=before.rounds + happens, doubts=jnp.where(happens, decided.doubts, before.doubts),
             doubted=jnp.where(happens, decided.doubted, before.doubted),
             path=jnp.where(covered[:, None], path, before.path),
-            of_path=jax.tree.map(cover, before.of_path, jax.lax.stop_gradient(contacts)),
+            of_path=jax.tree.map(cover, before.of_path, contacts),
         )  # fmt: skip
         after = jax.tree.map(lambda new, old: jnp.where(here, new, old), after, before)
         absent, happened = RoundRecord.absent(before.y.size, self.count), happens & here
@@ -426,14 +420,16 @@ class ContactRounds(NamedTuple):
         closed = jnp.where(hits, meeting.touches & (jnp.abs(apart[:count]) <= meeting.noise), closed)
         changed = (closed != was_closed) | (hits & meeting.involved)
         undecided, slip = hits & ~sound, before.slip
-        direction, turned, starts, barely = contacts.direction, changed[:0], changed[:0], jnp.asarray(False)
+        direction, turned, starts, leaves_rest = contacts.direction, changed[:0], changed[:0], jnp.asarray(False)
         if self.rubs:
             behind = self.slips(quiet._replace(rates=apart), still(v + change), slip)
             renewed = changed[self.flat.rough]
             sticks = jnp.where(hits & renewed, behind[1], sticks)
             breaks, slip = first[count:] & (contacts.sticks > 0), jnp.maximum(slip, _length(slips[0]))
+            # In space what varies across a slip that begins from rest decays so fast that steps do not follow it.
+            leaves_rest = (breaks & (self.flat.shapes.directions > 1)).any()
             starts = breaks & (t == self.ts[0])
-            direction, barely = self.directions(before, quiet, t, y, behind, breaks, renewed)
+            direction = self.directions(before, quiet, t, y, behind, breaks, renewed)
             direction = jnp.where(turns[:, None], -direction, direction)
             turned = renewed | first[count:] | (sticks != (contacts.sticks > 0))
             along = Pattern(closed.astype(float), sticks.astype(float), _unit(direction))
@@ -453,7 +449,7 @@ class ContactRounds(NamedTuple):
         y_next = y_next - still(jnp.where(jnp.abs(y_next) <= 2 * EPS * largest, y_next, 0.0))
         # Others that close at this instant by themselves do so along directions in which their gaps stay closed.
         limits = jnp.where(hits & meeting.tied, TOGETHER * jnp.abs(quiet.rates[:count]), jnp.inf)
-        # Across the least slip at the start friction turns, or is gone at once: there is no derivative by it.
+        # By the least slip at the start friction turns: there is no derivative by it.
         begun = jnp.repeat(starts, self.flat.shapes.directions)
         gradients, start = quiet.gradients[count:], halves(self.y0)[1]
         limits = jnp.append(limits, jnp.where(begun, TOGETHER * jnp.abs(gradients).sum(axis=1), jnp.inf))
@@ -462,10 +458,10 @@ class ContactRounds(NamedTuple):
         lost = -impulses @ (rows.gradients @ (v + 0.5 * change))
         work = still(impulses) * (quiet.rates + apart)
         doubts = jnp.stack([work.sum() > GAINED * jnp.abs(work).sum(), meeting.tied.any()]) & hits
-        doubts = jnp.append(doubts, starts.any() | barely)
+        doubts = jnp.append(doubts, starts.any() | leaves_rest)
         decided = before._replace(
             doubts=before.doubts + doubts, doubted=jnp.where(doubts & (before.doubts == 0), still(t), before.doubted),
-            largest=largest, y=differentiable_where(~barely, y_next, t, y), slip=slip,
+            largest=largest, y=differentiable_where(~leaves_rest, y_next, t, y, self.vector), slip=slip,
             contacts=Contacts(closed.astype(float), sticks.astype(float), direction),
             fresh=before.fresh | jnp.concatenate([changed, turned, jnp.zeros(before.came.size, bool)]),
             result=jnp.where(meeting.missed, MISSED, jnp.where(undecided, UNDECIDED, before.result)),
@@ -520,28 +516,20 @@ class ContactRounds(NamedTuple):
         return jnp.where(renewed, slips[1], (was_stuck | fell | stop) & ~(fell & was_stuck))
 
     def directions(self, before: Carry, rows: ImpactRows, t, y, slips: tuple, breaks, renewed):
-        """The directions in which contacts slide (r, d): against what held those that break away, or along the slip.
-
-        And in space whether one breaks away by a force that barely grows beyond what friction holds.
-        """
+        """The directions in which contacts slide (r, d): against what held those that break away, or along the slip."""
         numbers = jnp.concatenate([y, t[None], self.numbers_in(before.contacts)])
-        forces, (slip, still) = self.multipliers(numbers), slips
-        force, barely = forces[self.places.tangential], jnp.asarray(False)
-        # A slip that begins in space follows its direction as that varies: all else decays at once.
-        force = jnp.where(breaks[:, None], force, jax.lax.stop_gradient(force))
+        force, (slip, still) = jax.lax.stop_gradient(self.multipliers(numbers))[self.places.tangential], slips
         moving = jnp.where(breaks[:, None], -force, slip)
         if self.flat.shapes.directions == 1:
             moving = jnp.where(moving < 0, -1.0, 1.0)
         else:
             places = self.count + np.arange(force.size).reshape(force.shape)
             lasts = jnp.where(before.longest > 0, before.longest, self.ts[-1] - self.ts[0])
-            soon = _length(jax.lax.stop_gradient(force)) * jnp.diagonal(rows.coupling)[places].max(axis=1) * lasts
-            most = self.friction.coefficients * forces[self.places.normal][self.flat.rough]
-            barely = (breaks & (_length(jax.lax.stop_gradient(force)) <= (1.0 + BARELY) * most)).any()
+            soon = _length(force) * jnp.diagonal(rows.coupling)[places].max(axis=1) * lasts
             length = jnp.where(breaks, AT_REST * jnp.maximum(before.slip, soon), NO_SLIP * _length(slip))
             moving = _unit(moving) * jnp.where(length > 0, length, _LEAST)[:, None]
         takes = breaks | ((renewed | (self.flat.shapes.directions > 1)) & ~still)
-        return jnp.where(takes[:, None], moving, before.contacts.direction), barely
+        return jnp.where(takes[:, None], moving, before.contacts.direction)
 
     def meet(self, before: Carry, rows: ImpactRows, t, y, meets, restitution, friction: Friction) -> "Meeting":
         """The contacts that take part where some meet, (k,), and what they do."""
@@ -666,8 +654,8 @@ def _length(vectors):
 
 
 def _unit(vectors):
-    zero = ~vectors.any(axis=1, keepdims=True)
-    return jnp.where(zero, 0.0, vectors) / _length(jnp.where(zero, 1.0, vectors))[:, None]
+    length = _length(vectors)
+    return vectors / jnp.where(length > 0, length, 1.0)[:, None]
 
 
 @functools.lru_cache(maxsize=64)

@@ -172,7 +172,7 @@ class Health(eqx.Module):
       impacts (`impacts=` of the System) differ. The balance of energy and momenta are not judged there.
     - `doubts`: in such a scene a pair, how many there were and when the first was (NaN: never), with a last axis for
       impacts that gained energy, for those that contacts share which close at one instant by themselves, and for slips
-      that begin at a start at rest, or in space by a force that grows: of the last two not all derivatives are there.
+      that begin at a start at rest, or from rest in space: of the last two not all derivatives are there.
       Else None.
     - `global_error`: with a reference, the largest |yᵢ − reference| over the components of q and q̇, in units of the
       largest |yᵢ| along the path (and atol/rtol more, as in the tolerances); else None.
