@@ -328,6 +328,9 @@ class Events:
         scale = frame["part"] * frame["h"]
         start, rate = root * scale, self.roots.whole_slope(frame) / scale
         moving = code.flag(where & (root > 0.0))
+        # Behind a zero the series knows a root that is near, which the value loses in its rounding.
+        most, share = 0.1 * abs(scale), 0.5 * abs(start)
+        most = code.select((watch.recall("contact") > 0.0) & (share < most), share, most)
         at, going = code.variable(start), code.variable(moving)
 
         def moves():  # each lane as long as it needs, so that its neighbours do not change its last digit
@@ -336,7 +339,7 @@ class Events:
         with code.repeat_while(lambda: code.any_lane(moves()), at_most=limits.MOST_CORRECTIONS):
             here = at.value
             after = here - side * self._guard_value(watch, order, here) / rate
-            near = abs(after - start) <= 0.1 * abs(scale)
+            near = abs(after - start) <= most
             after = code.select(moves() & near, after, here)
             after = code.select(after * frame["forward"] > 0.0, after, 0.0)
             at.value = after

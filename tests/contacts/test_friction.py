@@ -1,6 +1,7 @@
 """Slips that turn, stop and begin.
 
-A slider-crank through its dead centres, against the motion of its crank alone; in space what a force sets in motion.
+A slider-crank through its dead centres, against the motion of its crank alone; in space what a force sets in motion; a
+block that friction barely holds, against the law of its rocking.
 """
 
 import jax
@@ -144,3 +145,51 @@ def test_a_start_at_rest_that_slides_at_once_has_no_derivative_by_its_slip():
     assert "1 slips begin from rest" in str(run(rest, 0.5).health())
     by_start, by_tilt = jax.jacfwd(lambda *x: run(*x).q[-1], argnums=(0, 1))(rest, 0.2)  # it sticks
     assert not by_start.any() and not by_tilt.any()
+
+
+BLOCK = np.array([[1, 1], [1, -1], [-1, 1], [-1, -1]])
+
+
+def block_gaps(q, params):
+    c, s, (a, b) = jnp.cos(q[2]), jnp.sin(q[2]), params["sides"]
+    return jnp.stack([q[1] + s * x * a + c * y * b for x, y in BLOCK])
+
+
+def block_slips(q, qdot, params):
+    c, s, (a, b) = jnp.cos(q[2]), jnp.sin(q[2]), params["sides"]
+    return jnp.stack([qdot[0] + qdot[2] * (-s * x * a - c * y * b) for x, y in BLOCK])
+
+
+def time_of_rocking(rate, a, b):
+    """A rise from flat over one corner, which holds, until the block is flat again."""
+    r, start = np.hypot(a, b), np.arctan2(b, a)
+    pull = 9.81 / (4 / 3 * r)
+    top = 0.0
+    for _ in range(12):
+        top = 2 * np.arcsin(rate**2 / (4 * pull * np.cos(start + top / 2)))
+    x, weights = np.polynomial.legendre.leggauss(40)
+    u = 0.5 * (x + 1.0)  # of angles top (1 − u²), where sin α − sin β = 2 cos ½(α + β) sin ½(α − β)
+    fall = 2 * np.cos(start + top * (1 - u**2 / 2)) * np.sin(top * u**2 / 2)
+    return np.sum(weights * 2 * top * u / np.sqrt(2 * pull * fall))
+
+
+def test_a_block_that_friction_barely_holds_rocks_to_rest():
+    """With μ = ab/(k² − a²) a corner of a flat block is about to slip: at ever smaller rates rounding would decide.
+
+    From one corner to the other it keeps a part of its rate (Housner 1963); the sum of all times is that of its rest.
+    """
+    energy = lambda q, v, p: 0.5 * (v[0] ** 2 + v[1] ** 2 + v[2] ** 2 * jnp.sum(p["sides"] ** 2) / 3)
+    system = lagjax.System(
+        lambda q, qdot, params: energy(q, qdot, params) - 9.81 * q[1],
+        contacts=block_gaps, slip=block_slips, friction=lambda params: params["mu"],
+    )  # fmt: skip
+    for a, b in [(0.5, 0.5), (0.5, 0.4297574176026187), (0.5, 0.4708918362156634), (0.5, 0.40696801), (0.5, 0.37)]:
+        squares = a**2 + b**2
+        params = {"sides": jnp.array([a, b]), "mu": a * b / (4 / 3 * squares - a**2)}
+        rate, part = 0.2, 1 - 1.5 * a**2 / squares
+        run = lagjax.simulate(system, [0.0, b, 0.0], [-b * rate, a * rate, rate], jnp.array([0.0, 1.0]), params)
+        expected = sum(time_of_rocking(rate * abs(part) ** k, a, b) for k in range(40) if abs(part) ** k > 1e-14)
+        changes = run.contact_changes
+        closes = np.asarray(changes.t)[np.asarray(changes.change) == 0]
+        assert np.all(np.abs(run.end.qdot) < 1e-14) and abs(run.end.q[1] - b) < 1e-15
+        assert abs(closes[-1] - expected) < 1e-12, (a, b, closes[-1] - expected)

@@ -109,6 +109,7 @@ class Carry(NamedTuple):
     rounds: jax.Array  # how many there were
     longest: jax.Array  # the longest step of the motion
     turns: jax.Array  # how many decisions there were at this instant
+    tied: jax.Array  # (r,), whether a contact turns between sticking and sliding there, as rounding has it
     rounding: jax.Array  # (2, G), the largest of a watch of an open or sliding contact, and of a closed or sticking one
     rate_rounding: jax.Array
     came: jax.Array  # (S,), the sides of the sections from which the motion comes
@@ -260,7 +261,8 @@ class ContactRounds(NamedTuple):
             t=self.ts[0], y=y0, contacts=contacts, fresh=jnp.ones(guards, bool), going=result == SUCCESSFUL,
             result=result, steps=(jnp.zeros((), int), jnp.zeros((), int)), rounds=jnp.zeros((), int),
             longest=jnp.zeros(()),
-            turns=jnp.zeros((), int), rounding=jnp.zeros((2, guards)), rate_rounding=jnp.zeros((2, guards)),
+            turns=jnp.zeros((), int), tied=jnp.zeros(self.flat.rough.size, bool),
+            rounding=jnp.zeros((2, guards)), rate_rounding=jnp.zeros((2, guards)),
             came=jnp.sign(guarded.rates)[guards - sections :],
             slip=jnp.zeros(self.flat.rough.size), largest=jnp.abs(jax.lax.stop_gradient(y0)),
             doubts=jnp.zeros(3, int), doubted=jnp.full(3, jnp.nan), path=jnp.full((self.ts.size, y0.size), jnp.nan),
@@ -275,13 +277,19 @@ class ContactRounds(NamedTuple):
         missed = (self.missed(before, guarded, contacts) & ~before.fresh[: self.count]).any()
         kinds = jnp.concatenate([contacts.closed, contacts.sticks, jnp.zeros(sections)])
         before = _note_rounding(before, guarded, kinds, 0.0)
-        rounding = jnp.maximum(_choose_kind(before.rounding, kinds), guarded.of_time)
+        rounding, rates = (_choose_kind(x, kinds) for x in (before.rounding, before.rate_rounding))
+        if self.rubs:  # A tie: sliding has been refuted; it sticks until its value falls, and a rate is no reason.
+            tied = jnp.pad(before.tied & (contacts.sticks > 0), (self.count, sections))
+            most = self.friction.still.coefficients * guarded.values[: self.count][self.flat.rough]
+            rounding = jnp.where(tied, jnp.pad(GUARD_NOISE * most**2, (self.count, sections)), rounding)
+            rates = jnp.where(tied, jnp.maximum(guarded.rate_rounding, -2.0 * guarded.rates), rates)
+        rounding = jnp.maximum(rounding, guarded.of_time)
         beyond = (guarded.values < -rounding) & (np.arange(kinds.size) < watches)
         sides = jnp.where(beyond, jnp.inf, jnp.maximum(rounding, _LEAST))
         clear = (jnp.abs(guarded.values) > rounding)[watches:]
         came = jnp.where(clear, jnp.sign(guarded.values[watches:]), before.came)
         sides = sides.at[watches:].multiply(came)
-        noted = jnp.concatenate([sides, _choose_kind(before.rate_rounding, kinds)])
+        noted = jnp.concatenate([sides, rates])
         problem = dataclasses.replace(self.problem, params=InContact(self.params, contacts))
         stretch = Stretch.locate(problem, self.surfaces, (before.t, before.y), self.ts, here, noted, kinds.size)
         located, covered, at_once, fell = stretch.located, stretch.covers, stretch.at_once, stretch.kinds > 0
@@ -292,6 +300,8 @@ class ContactRounds(NamedTuple):
         duration = located.t_end - jax.lax.stop_gradient(before.t)
         turns = jnp.where(at_once, before.turns + 1, 0)
         step = jnp.where(at_once, 0.0, duration / jnp.maximum(located.accepted, 1))
+        stops = (np.arange(self.count, watches) == k) & (contacts.sticks == 0) & (self.flat.shapes.directions == 1)
+        tied = at_once & (before.tied | (stops & (turns > kinds.size)))
         before = _note_rounding(before, guarded, kinds, duration)._replace(
             fresh=before.fresh & at_once, longest=jnp.maximum(before.longest, step)
         )
@@ -309,7 +319,7 @@ class ContactRounds(NamedTuple):
         after = decided._replace(
             t=t, y=jnp.where(happens, decided.y, y), going=going & ~spent,
             contacts=jax.tree.map(lambda new, old: jnp.where(happens, new, old), decided.contacts, contacts),
-            result=jnp.where(spent, TOO_MANY, result), turns=turns,
+            result=jnp.where(spent, TOO_MANY, result), turns=turns, tied=tied,
             steps=(before.steps[0] + located.accepted, before.steps[1] + located.rejected),
             rounds=before.rounds + happens, doubts=jnp.where(happens, decided.doubts, before.doubts),
             doubted=jnp.where(happens, decided.doubted, before.doubted),
