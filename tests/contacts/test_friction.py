@@ -173,6 +173,7 @@ def time_of_rocking(rate, a, b):
     return np.sum(weights * 2 * top * u / np.sqrt(2 * pull * fall))
 
 
+@pytest.mark.slow
 def test_a_block_that_friction_barely_holds_rocks_to_rest():
     """With μ = ab/(k² − a²) a corner of a flat block is about to slip: at ever smaller rates rounding would decide.
 
