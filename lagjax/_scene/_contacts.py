@@ -93,7 +93,8 @@ class ContactScene(eqx.Module):
         drags = drag if flat.rough.size else None, flat.shapes.directions > 1
         constraints = Constraints(held_positions, held_velocities, held, *drags)
         if self.is_open:
-            constraints = Constraints(*map(ask_user, vars(free.constraints).values()))
+            own = free.constraints
+            constraints = Constraints(ask_user(own.on_positions), ask_user(own.on_velocities))
         lagrangian, forces, dissipation = map(ask_user, (free.lagrangian, free.forces, free.dissipation))
         return Motion(cast(Callable, lagrangian), forces, dissipation, constraints)
 
