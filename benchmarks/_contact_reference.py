@@ -22,6 +22,7 @@ from scipy.integrate import DOP853, solve_ivp
 from scipy.optimize import brentq
 
 STILL = 1e-9  # rates, slips and gaps below this are zero: all are solved to 1e-12, and numbers of scenes are 1
+TOGETHER = 5e-15  # gaps below this beside one that closes are zero by symmetry, and not by rounding
 ARMED = 1e-12  # a watch that was above this once is one that may fall
 LATER, LONGEST = 1e-3, 0.02  # where a watch that is zero is judged; the longest step
 SHORTEST_FLIGHT = 1e-6  # bounces that are shorter are rest: a sequence that ends here moves by 1e-11
@@ -280,8 +281,9 @@ class Reference:
             if contact is None:
                 return Motion(z, events, rests)
             closed = np.array([kind > 0 for kind, _ in mode])
-            sure, before = closed | (np.arange(self.k) == contact), z
-            touching = sure | (self.terms(z, t).free <= STILL)
+            before, free = z, self.terms(z, t).free
+            sure = closed | (np.arange(self.k) == contact) | (free <= TOGETHER)
+            touching = sure | (free <= STILL)
             z, mode, impulse, at_rest = self.settle(before, t, touching)
             if (touching != sure).any() and np.abs(self.settle(before, t, sure)[0] - z).max() > STILL:
                 raise Ambiguous(f"t = {t}: rounding decides what else touches")
