@@ -35,9 +35,9 @@ _TARGET = "lagjax_line"
 # Operations of a line on a GPU that XLA compiles; NumPy on the host evaluates a longer one. Twice as many would cost
 # several seconds of compilation.
 LARGEST_COMPILED = 100
-# Machine code takes some 80 µs a node to make, and NumPy 1 to 2 µs a node for a call: that of a line which XLA does not
-# wait for is made after as many calls as take that long, so that one call is not slow, and a thousand are not.
-_CALLS = 60
+# Machine code takes some 20 µs a node to make, and NumPy 1 µs a node for a call: that of a line which XLA does not wait
+# for is made after as many calls as take that long, so that one call is not slow, and a thousand are not.
+_CALLS = 20
 
 
 def outputs(program: Program, count: int, first, numbers):

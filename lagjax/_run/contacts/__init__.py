@@ -17,7 +17,7 @@ import numpy as np
 from lagjax._engine import Batch, Problem
 from lagjax._engine.taylor import MOST_GUARDS, MachineCode, line_of
 from lagjax._equations import ROUNDINGS, derivation_of, has_constraints, require_consistent
-from lagjax._interface import Layout, halves, is_concrete, require_budget, result_from
+from lagjax._interface import Layout, compile_for_one_call, halves, is_concrete, require_budget, result_from
 from lagjax._primitives import DOUBLE, compute_in_doubles
 from lagjax._run._rounds import BLOCK
 from lagjax._run._trajectory import ContactChanges, Impacts, State, Trajectory, step_counts
@@ -173,9 +173,7 @@ def _motion(plan: ContactPlan, problem: Problem) -> tuple[Carry, RoundRecord, tu
 def _trajectory(
     given: Problem, problem: Problem, ending: Carry, record: RoundRecord, impacts, params, axes=None
 ) -> Trajectory:
-    (q, qdot), end = (map(problem.layout.restore, halves(y)) for y in (ending.path, ending.y))
-    at, behind = halves(record.y_next)
-    at, before, behind = map(problem.layout.restore, (at, record.qdot, behind))
+    (q, qdot), end, (at, behind), before = _restore(problem.layout, ending, record)
     known = record.contact, record.change, ending.rounds, ending.doubts, ending.doubted
     changes = ContactChanges(record.t, at, before, at, behind, *known)
     names = Shapes.from_system(problem.system, problem.layout, problem.params).names
@@ -185,6 +183,13 @@ def _trajectory(
         tolerances=MachineCode().tolerances(problem, problem.y0), engine="MachineCode", impacts=Impacts(*impacts),
         contacts=ending.of_path, contact_changes=changes, contact_names=names,
     )  # fmt: skip
+
+
+@compile_for_one_call
+def _restore(layout: Layout, ending: Carry, record: RoundRecord) -> tuple:
+    """(q, q̇) in the user's structure: at the outputs, the end, behind changes; and the velocities before these."""
+    states = [tuple(map(layout.restore, halves(y))) for y in (ending.path, ending.y, record.y_next)]
+    return *states, layout.restore(record.qdot)
 
 
 def contact_forces(trajectory: Trajectory):

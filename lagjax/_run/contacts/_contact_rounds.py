@@ -527,8 +527,10 @@ class ContactRounds(NamedTuple):
 
     def directions(self, before: Carry, rows: ImpactRows, t, y, slips: tuple, breaks, renewed):
         """The directions in which contacts slide (r, d): against what held those that break away, or along the slip."""
-        numbers = jnp.concatenate([y, t[None], self.numbers_in(before.contacts)])
-        force, (slip, still) = jax.lax.stop_gradient(self.multipliers(numbers))[self.places.tangential], slips
+        numbers = jax.lax.stop_gradient(jnp.concatenate([y, t[None], self.numbers_in(before.contacts)]))
+        held = lambda numbers: self.multipliers(numbers)[self.places.tangential]  # noqa: E731
+        none = lambda _: jnp.zeros(self.places.tangential.shape)  # noqa: E731
+        force, (slip, still) = cond_alike(any_member(breaks.any()), held, none, numbers), slips
         moving = jnp.where(breaks[:, None], -force, slip)
         if self.flat.shapes.directions == 1:
             moving = jnp.where(moving < 0, -1.0, 1.0)

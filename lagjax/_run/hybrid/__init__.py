@@ -26,6 +26,7 @@ from lagjax._interface import (
     Layout,
     SimulationError,
     as_arrays,
+    compile_for_one_call,
     halves,
     is_concrete,
     require_budget,
@@ -205,10 +206,7 @@ def _motion(plan: RoundPlan, problem: Problem, start) -> tuple[Ending, Transitio
 
 
 def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, record: TransitionRecord) -> Trajectory:
-    states, (accepted, rejected) = (ending.path, ending.y, record.y, record.y_next), ending.steps
-    (q, qdot), end, (q_before, qdot_before), (q_next, qdot_next) = (
-        map(problem.layout.restore, halves(y)) for y in states
-    )
+    (q, qdot), end, (q_before, qdot_before), (q_next, qdot_next) = _restore(problem.layout, ending, record)
     transitions = Transitions(
         t=record.t, q=q_before, qdot=qdot_before, source=record.source, target=record.target, number=record.number,
         count=jnp.sum(record.source >= 0), order_matters=record.order_matters, let_out=ending.let_out,
@@ -216,9 +214,16 @@ def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, reco
     )  # fmt: skip
     return Trajectory(
         ts=jnp.asarray(problem.ts), q=q, qdot=qdot, result=result_from(ending.result), end=State(ending.t, *end),
-        stats=step_counts(accepted, rejected), system=dict(modes), params=problem.params, mode=ending.modes,
+        stats=step_counts(*ending.steps), system=dict(modes), params=problem.params, mode=ending.modes,
         transitions=transitions, mode_names=tuple(modes), tolerances=MachineCode().tolerances(problem, problem.y0),
     )  # fmt: skip
+
+
+@compile_for_one_call
+def _restore(layout: Layout, ending: Ending, record: TransitionRecord) -> list:
+    """(q, q̇) in the user's structure: at the outputs, the end, before and behind transitions."""
+    states = ending.path, ending.y, record.y, record.y_next
+    return [tuple(map(layout.restore, halves(y))) for y in states]
 
 
 def _raise_unless_ok(modes: dict[str, System], trajectory: Trajectory, layout: Layout, last) -> Trajectory:
