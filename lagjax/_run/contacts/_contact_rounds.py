@@ -278,11 +278,8 @@ class ContactRounds(NamedTuple):
         kinds = jnp.concatenate([contacts.closed, contacts.sticks, jnp.zeros(sections)])
         before = _note_rounding(before, guarded, kinds, 0.0)
         rounding, rates = (_choose_kind(x, kinds) for x in (before.rounding, before.rate_rounding))
-        if self.rubs:  # A tie: sliding has been refuted; it sticks until its value falls, and a rate is no reason.
-            tied = jnp.pad(before.tied & (contacts.sticks > 0), (self.count, sections))
-            most = self.friction.still.coefficients * guarded.values[: self.count][self.flat.rough]
-            rounding = jnp.where(tied, jnp.pad(GUARD_NOISE * most**2, (self.count, sections)), rounding)
-            rates = jnp.where(tied, jnp.maximum(guarded.rate_rounding, -2.0 * guarded.rates), rates)
+        if self.rubs:
+            rounding, rates = self.hold_ties(before, guarded, rounding, rates)
         rounding = jnp.maximum(rounding, guarded.of_time)
         beyond = (guarded.values < -rounding) & (np.arange(kinds.size) < watches)
         sides = jnp.where(beyond, jnp.inf, jnp.maximum(rounding, _LEAST))
@@ -332,6 +329,19 @@ class ContactRounds(NamedTuple):
         kept = (happened,) * 6 + (hits,) * 4
         return after, RoundRecord(
             *(jnp.where(is_kept, new, old) for is_kept, new, old in zip(kept, record, absent, strict=True))
+        )
+
+    def hold_ties(self, before: Carry, guarded: Guarded, rounding, rates) -> tuple:
+        """The roundings (G,) of watches and their rates; a tie is a contact whose sliding has been refuted.
+
+        It sticks until its value falls: a rate is no reason.
+        """
+        around = self.count, len(self.plan.sections)
+        tied = jnp.pad(before.tied & (before.contacts.sticks > 0), around)
+        most = self.friction.still.coefficients * guarded.values[: self.count][self.flat.rough]
+        return (
+            jnp.where(tied, jnp.pad(GUARD_NOISE * most**2, around), rounding),
+            jnp.where(tied, jnp.maximum(guarded.rate_rounding, -2.0 * guarded.rates), rates),
         )
 
     def note(self, decides, decided: Carry, record: RoundRecord, before: Carry, t, y, k, kinds) -> tuple:
@@ -444,26 +454,8 @@ class ContactRounds(NamedTuple):
             turned = renewed | first[count:] | (sticks != (contacts.sticks > 0))
             along = Pattern(closed.astype(float), sticks.astype(float), _unit(direction))
             undecided |= (sliding_margin(quiet, along, friction.still) <= PARADOX).any()
-        # The gap that closes is zero, also as what went in varies: what rounding leaves of it grows with each bounce.
-        back = jnp.where(meets & self.has_gap, -rows.values[:count] / jnp.diagonal(rows.coupling)[:count], 0.0)
-        y_next = y + jnp.concatenate([back @ rows.responses[:count], change])
-        fast = jnp.abs(rows.gradients[:count]) @ jnp.maximum(jnp.abs(v), jnp.abs(v + change))
-        before = _note_forces(before, still(fast / jnp.diagonal(rows.coupling)[:count]))
-        # A contact that opens does so with an acceleration that rounding of its force may make: it is no rate.
-        opens = jnp.where(first[:count] & was_closed, before.longest * jnp.diagonal(quiet.coupling)[:count], 0.0)
-        before = before._replace(
-            rate_rounding=before.rate_rounding.at[0, :count].max(opens * before.rounding[1, :count])
-        )
-        # What is less than its own rounding is zero: steps would be as short as to follow it.
-        largest = jnp.maximum(before.largest, jnp.abs(y))
-        y_next = y_next - still(jnp.where(jnp.abs(y_next) <= 2 * EPS * largest, y_next, 0.0))
-        # Others that close at this instant by themselves do so along directions in which their gaps stay closed.
-        limits = jnp.where(hits & meeting.tied, TOGETHER * jnp.abs(quiet.rates[:count]), jnp.inf)
-        # By the least slip at the start friction turns: there is no derivative by it.
-        begun = jnp.repeat(starts, self.flat.shapes.directions)
-        gradients, start = quiet.gradients[count:], halves(self.y0)[1]
-        limits = jnp.append(limits, jnp.where(begun, TOGETHER * jnp.abs(gradients).sum(axis=1), jnp.inf))
-        y_next = keep_together(y_next, jnp.append(rows.values[:count], gradients @ start), limits)
+        before, y_next = self.move(before, rows, y, change, meets, first[:count] & was_closed)
+        y_next = self.limit_variations(y_next, rows, meeting, starts)
         # Of the work of impulses only what moves q is kinetic energy: gaps may move by themselves.
         lost = -impulses @ (rows.gradients @ (v + 0.5 * change))
         work = still(impulses) * (quiet.rates + apart)
@@ -471,7 +463,7 @@ class ContactRounds(NamedTuple):
         doubts = jnp.append(doubts, starts.any() | leaves_rest)
         decided = before._replace(
             doubts=before.doubts + doubts, doubted=jnp.where(doubts & (before.doubts == 0), still(t), before.doubted),
-            largest=largest, y=differentiable_where(~leaves_rest, y_next, t, y, self.vector), slip=slip,
+            y=differentiable_where(~leaves_rest, y_next, t, y, self.vector), slip=slip,
             contacts=Contacts(closed.astype(float), sticks.astype(float), direction),
             fresh=before.fresh | jnp.concatenate([changed, turned, jnp.zeros(before.came.size, bool)]),
             result=jnp.where(meeting.missed, MISSED, jnp.where(undecided, UNDECIDED, before.result)),
@@ -481,6 +473,38 @@ class ContactRounds(NamedTuple):
         return decided, RoundRecord(
             jnp.asarray(True), t, v, decided.y, contact, change, hits, rest, impulses[:count], lost
         )  # fmt: skip
+
+    def move(self, before: Carry, rows: ImpactRows, y, change, meets, opens) -> tuple[Carry, Any]:
+        """The state behind a `change` of the velocities, where contacts `meets` close; and what rounding leaves there.
+
+        The gap that closes is zero, also as what went in varies: what rounding leaves of it grows with each bounce.
+        """
+        still, count, (_, v) = jax.lax.stop_gradient, self.count, halves(y)
+        responses = jnp.diagonal(rows.coupling)[:count]
+        back = jnp.where(meets & self.has_gap, -rows.values[:count] / responses, 0.0)
+        y_next = y + jnp.concatenate([back @ rows.responses[:count], change])
+        fast = jnp.abs(rows.gradients[:count]) @ jnp.maximum(jnp.abs(v), jnp.abs(v + change))
+        before = _note_forces(before, still(fast / responses))
+        # A contact that opens does so with an acceleration that rounding of its force may make: it is no rate.
+        of_rates = jnp.where(opens, before.longest * still(responses), 0.0) * before.rounding[1, :count]
+        # What is less than its own rounding is zero: steps would be as short as to follow it.
+        largest = jnp.maximum(before.largest, jnp.abs(y))
+        y_next = y_next - still(jnp.where(jnp.abs(y_next) <= 2 * EPS * largest, y_next, 0.0))
+        rate_rounding = before.rate_rounding.at[0, :count].max(of_rates)
+        return before._replace(rate_rounding=rate_rounding, largest=largest), y_next
+
+    def limit_variations(self, y_next, rows: ImpactRows, meeting: "Meeting", starts):
+        """The state, which has no derivatives in directions that take apart what happens at one instant.
+
+        Contacts that share an impact and close by themselves do so along directions in which their gaps stay closed.
+        By the least slip of a start at rest friction turns.
+        """
+        quiet, count = jax.lax.stop_gradient(rows), self.count
+        limits = jnp.where(meeting.happened & meeting.tied, TOGETHER * jnp.abs(quiet.rates[:count]), jnp.inf)
+        begun, gradients = jnp.repeat(starts, self.flat.shapes.directions), quiet.gradients[count:]
+        limits = jnp.append(limits, jnp.where(begun, TOGETHER * jnp.abs(gradients).sum(axis=1), jnp.inf))
+        start = halves(self.y0)[1]
+        return keep_together(y_next, jnp.append(rows.values[:count], gradients @ start), limits)
 
     def name_change(self, k, closed, sticks, hits) -> tuple:
         """The contact of watch k, and the kind of its change."""
