@@ -106,7 +106,7 @@ def require_room(doubles: int) -> None:
         raise Unlowerable(
             f"a thread of a GPU would have to remember at least {8 * doubles} bytes of a motion, "
             f"more than {LARGEST_THREAD}; a CPU is the better choice"
-        )  # fmt: skip
+        )
 
 
 def one_lane(motion: TaylorSeries) -> OneLane:

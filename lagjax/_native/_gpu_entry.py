@@ -129,7 +129,7 @@ class _Thread:
         self.numbers = {
             name: self.code.load(self.code.element(self.at["numbers"], i), _KINDS[name])
             for i, name in enumerate(entry.numbers)
-        }  # fmt: skip
+        }
 
     def finish(self) -> str:
         self.code.function.calling_convention = "ptx_kernel"

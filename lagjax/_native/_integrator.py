@@ -31,12 +31,11 @@ from lagjax._native._taylor import TaylorSeries, double, integer, is_large
 
 JOB = job(
     "Job",
-    ("next_member", "ts", "y0", "params", "path", "y_end", "t_end", "code", "steps", "rejected", "record",
-     "next_row"),
+    ("next_member", "ts", "y0", "params", "path", "y_end", "t_end", "code", "steps", "rejected", "record", "next_row"),
     # Strides from one member to the next: 0 where all share the output times, or the parameters.
     ("ts_stride", "params_stride", "members", "times", "order", "max_steps", "room", "room_of_notes"),
     ("rtol", "atol"),
-)  # fmt: skip
+)
 
 
 class Integrator:

@@ -212,13 +212,7 @@ class Code:
     """The body of one function, growing at its end."""
 
     def __init__(
-        self,
-        module: ir.Module,
-        name: str,
-        arguments: Sequence[ir.Type],
-        lanes: int,
-        result=None,
-        public=False,
+        self, module: ir.Module, name: str, arguments: Sequence[ir.Type], lanes: int, result=None, public=False
     ):
         self.lanes, self.vector = lanes, ir.VectorType(DOUBLE, lanes)
         self.module = module

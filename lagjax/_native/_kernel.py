@@ -11,12 +11,7 @@ import numpy as np
 
 from lagjax._native import _gpu
 from lagjax._native._adjoint import Adjoint
-from lagjax._native._constants import (
-    ATOL_OVER_RTOL,
-    DONE,
-    MOTIONS_PER_ADJOINT,
-    VECTORS_PER_THREAD,
-)
+from lagjax._native._constants import ATOL_OVER_RTOL, DONE, MOTIONS_PER_ADJOINT, VECTORS_PER_THREAD
 from lagjax._native._derivative_handler import DerivativePlan
 from lagjax._native._frame import LANE
 from lagjax._native._guards import Guards
@@ -350,9 +345,7 @@ class Kernel:
         return Adjoint(self._derivative_parts, width=width)
 
     def _strides(self, ts, params) -> dict[str, int]:
-        return dict(
-            ts_stride=ts.shape[1] if len(ts) > 1 else 0, params_stride=self.numbers if len(params) > 1 else 0
-        )  # fmt: skip
+        return dict(ts_stride=ts.shape[1] if len(ts) > 1 else 0, params_stride=self.numbers if len(params) > 1 else 0)
 
     def threads(self, members: int) -> int:
         return min(cores(), max(1, members // (VECTORS_PER_THREAD * self.width)))

@@ -58,9 +58,7 @@ class ZerothOrder:
     def pull(self, cotangents: Cotangents) -> Code:
         """`()`: from the coefficients of order 1 and the values to the state and the parameters."""
         motion, n = self.motion, self.motion.n
-        line, tables = pullback_and_entries(
-            motion.series.zeroth_order, self.dtypes, cotangents.varied, self.outputs
-        )  # fmt: skip
+        line, tables = pullback_and_entries(motion.series.zeroth_order, self.dtypes, cotangents.varied, self.outputs)
         frame, form = motion.function("back_start"), motion.form
         for i in form.each(frame.code, n):
             add(frame, frame["y_ct", i, 1], "y_ct", i + n, 0)

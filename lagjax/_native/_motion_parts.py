@@ -131,11 +131,7 @@ class _ChosenProgram:
 
 @functools.lru_cache(maxsize=16)
 def choose_parameters(
-    program: Recurrent,
-    projection: Projection | None,
-    guards: Guards | None,
-    motion: Recurrent | None,
-    nesting: Nesting,
+    program: Recurrent, projection: Projection | None, guards: Guards | None, motion: Recurrent | None, nesting: Nesting
 ) -> "tuple[Recurrent, Projection | None, Guards | None, Recurrent | None, Chosen | None]":
     """The programs with the parameters that they compute with, where they look up others in tables; and which.
 

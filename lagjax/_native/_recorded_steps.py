@@ -26,14 +26,7 @@ class Replay:
     """
 
     def __init__(
-        self,
-        name: str,
-        parts: MotionParts,
-        job: type,
-        fields: dict,
-        at_borders: dict,
-        width: int,
-        jumps: int,
+        self, name: str, parts: MotionParts, job: type, fields: dict, at_borders: dict, width: int, jumps: int
     ):
         self.parts, self._jump = parts, parts.jump_over_steps
         more = [] if self._jump is None else [self._jump.line] * jumps
@@ -41,9 +34,7 @@ class Replay:
         large = is_large(parts.program, parts.projection, times=2, more=more)
         if parts.borders is not None:
             fields = fields | Saltation.fields(parts.borders) | at_borders
-        self.motion = motion = TaylorSeries(
-            name, parts, job, fields, large, width, keep_sums=True
-        )  # fmt: skip
+        self.motion = motion = TaylorSeries(name, parts, job, fields, large, width, keep_sums=True)
         borders = parts.borders
         self.retraction = borders and borders.retraction and Retraction(motion, borders, parts.nesting)
         self._retract = self.retraction and self.retraction.apply(is_run=False)
@@ -54,9 +45,7 @@ class Replay:
         parts = self.parts
         if parts.borders is None or self._jump is None:
             return None
-        saltation = Saltation(
-            self.motion, GuardTable(self.motion, parts.borders), parts.nesting.base, self._jump
-        )  # fmt: skip
+        saltation = Saltation(self.motion, GuardTable(self.motion, parts.borders), parts.nesting.base, self._jump)
         self.motion.layout.extend_by(saltation.fields_along())
         return saltation
 

@@ -75,9 +75,7 @@ class Operation:
         """`(f, c, g, w, *operands)` → the cotangent, for every operand; empty where it is constant in pieces."""
         if self.cotangents:
             return self.cotangents
-        return tuple(
-            lambda f, c, g, w, *xs, slope=slope: f("mul", g, slope(f, c, w, *xs)) for slope in self.slopes
-        )  # fmt: skip
+        return tuple(lambda f, c, g, w, *xs, slope=slope: f("mul", g, slope(f, c, w, *xs)) for slope in self.slopes)
 
 
 def apply_in_numpy(op: str, *xs, attribute=None):
@@ -195,9 +193,7 @@ def _comparison(name: str, value: Callable, symbol: str, commutative: bool = Fal
 
 
 def _bitwise(name: str, value: Callable, llvm: Callable, simplify: Callable | None = _simplify.logical) -> Operation:
-    return Operation(
-        name, 2, value, llvm, lax=f"bitwise_{name}", simplify=simplify, commutative=True, is_step=True
-    )  # fmt: skip
+    return Operation(name, 2, value, llvm, lax=f"bitwise_{name}", simplify=simplify, commutative=True, is_step=True)
 
 
 def _step(name: str, value: Callable, llvm: Callable, simplify: Callable | None = None) -> Operation:
@@ -371,9 +367,7 @@ def is_function(op: str) -> bool:
 
 
 # Look-ups in tables (`_look_ups`): their operand is a number, and a whole array stands in their attribute.
-LOOK_UPS = {
-    name: Operation(name, 1, _refuse_look_up, None, is_step=True, exact=True) for name in ("take", "locate")
-}  # fmt: skip
+LOOK_UPS = {name: Operation(name, 1, _refuse_look_up, None, is_step=True, exact=True) for name in ("take", "locate")}
 
 
 class _OperationTable(dict):

@@ -62,9 +62,7 @@ def _function(op: str) -> Callable[..., Scalars]:
     return lambda *xs: _first(xs).map(op, *xs)
 
 
-binade, prefers, logarithm, root, maximum, absolute = map(
-    _function, ("binade", "prefers", "log", "sqrt", "max", "abs")
-)  # fmt: skip
+binade, prefers, logarithm, root, maximum, absolute = map(_function, ("binade", "prefers", "log", "sqrt", "max", "abs"))
 
 
 def where(condition, yes, no) -> Scalars:

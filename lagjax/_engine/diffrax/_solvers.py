@@ -55,11 +55,7 @@ _CORRECTION = _correction_weights()
 
 def _hermite_slope(place, rise, first, last):
     """The slope at `place` in [0, 1] of the cubic from 0 to `rise` whose slopes at the ends are `first` and `last`."""
-    return (
-        6 * place * (1 - place) * rise
-        + (1 - place) * (1 - 3 * place) * first
-        + place * (3 * place - 2) * last
-    )  # fmt: skip
+    return 6 * place * (1 - place) * rise + (1 - place) * (1 - 3 * place) * first + place * (3 * place - 2) * last
 
 
 class _Polynomial(diffrax.AbstractLocalInterpolation):

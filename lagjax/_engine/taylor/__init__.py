@@ -164,7 +164,7 @@ class MachineCode(AbstractEngine):
         values, given = (located.path, located.t_end, located.y_end), (problem.ts, problem.y0, problem.vector)
         return attach_derivative(
             stretch_variation(flow, surfaces, tolerances), values, *given, located.t_end, k, crosses
-        )  # fmt: skip
+        )
 
     def refuses_crossings(self, problem: Problem, surfaces: Surfaces) -> str | None:
         """Why it cannot find the crossings of these surfaces, as the end of a sentence; None where it can."""

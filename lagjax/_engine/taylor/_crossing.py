@@ -192,9 +192,7 @@ def motion_with_crossings(
     run_again = _crossings_variation(flow, surfaces, tolerances._replace(notes=0))
     t, y = attach_derivative(run_again, (noted.t, noted.y), ts, y0, params, noted.t)
     there, inputs = jnp.isfinite(noted.t), (ts, y0, params)
-    return solution, Noted(
-        lost_unless(there, t, inputs), lost_unless(there[..., None], y, inputs), noted.count
-    )  # fmt: skip
+    return solution, Noted(lost_unless(there, t, inputs), lost_unless(there[..., None], y, inputs), noted.count)
 
 
 @functools.lru_cache(maxsize=64)
@@ -207,9 +205,7 @@ def _crossings_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances)
         there = jnp.isfinite(t)
         times = jnp.where(there, _shortly_before(ts, t), jax.lax.stop_gradient(ts[-1])).ravel()
         order = jnp.argsort(times * jnp.sign(ts[-1] - ts[0]))
-        solution = _primitives.run(
-            flow, tolerances, jnp.concatenate([ts[:1], times[order], ts[-1:]]), y0, params
-        )  # fmt: skip
+        solution = _primitives.run(flow, tolerances, jnp.concatenate([ts[:1], times[order], ts[-1:]]), y0, params)
         path = jnp.zeros_like(solution.path[1:-1]).at[order].set(solution.path[1:-1])
         y, times = path.reshape(*t.shape, -1), times.reshape(t.shape)
         of_section = jax.vmap(move_to_zero, (None, 0, 0, 0, None))

@@ -36,7 +36,7 @@ from lagjax._program import (
     lower_scalars,
     stack,
     tangents_in,
-)  # fmt: skip
+)
 
 PyTree = Any
 
