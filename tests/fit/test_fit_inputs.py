@@ -97,7 +97,7 @@ def test_machine_code_and_diffrax_agree_and_derivatives_are_those_of_differences
     y0, numbers = np.array([[1.0, 0.0], [0.3, -1.0]]), parameters.first
     y0_dot = np.concatenate([np.broadcast_to(np.eye(2), (2, 2, 2)), np.zeros((2, 3, 2))], axis=1)
     along = y0_dot, np.concatenate([np.zeros((2, 3)), np.eye(3)])
-    fast = _motions.choose_motions(SCENE, layout, parameters, 1e-12, None, form)
+    fast = _motions.choose_motions(SCENE, layout, parameters, 1e-12, form)
     options = {"rtol": 1e-12, "atol": None, "adjoint": diffrax.ForwardMode()}
     plain = _motions._JaxMotions(form.drive_scene(SCENE), layout, parameters, options, True)
     one, other = (motions.follow(ts, y0, numbers, *along, table) for motions in (fast, plain))

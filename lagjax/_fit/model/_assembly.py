@@ -30,8 +30,7 @@ PyTree = Any
 
 
 class GivenSystem(NamedTuple):
-    """One system of a fit: its name, None for the only one, its records and sensors, and the structure of its inputs
-    and coordinates."""
+    """One system of a fit, its arguments checked; `name` is None for the only one."""
 
     name: str | None
     system: Scene
@@ -62,7 +61,7 @@ def assemble_residuals(given: list[GivenSystem], parameters: Parameters, law: Ab
 
 def _assemble_system(given: GivenSystem, parameters: Parameters, law: AbstractNoise) -> SystemResiduals:
     name, system, records, observe, form, layout = given
-    motions = choose_motions(system, layout, parameters, DEFAULT_RTOL, None, form)
+    motions = choose_motions(system, layout, parameters, DEFAULT_RTOL, form)
     recordings = [record for record in records if isinstance(record, Record)]
     if isinstance(observe, Delayed):
         for place, record in enumerate(recordings):
@@ -105,8 +104,7 @@ def _assemble_system(given: GivenSystem, parameters: Parameters, law: AbstractNo
 
 
 def _require_motion(given: GivenSystem, recordings: list[Record], signals: Signals) -> None:
-    """Raise `ValueError` where a signal jumps by a period without `lagjax.wrapped`, or where starts are fitted, and no
-    signal of any record ever changes. Hybrid motion may jump."""
+    """Raise `ValueError` where signals, but of hybrid motion, jump by a period, or where starts are fitted to rest."""
     of_state, wrap = sensors(given.observe)
     for place, record in enumerate(given.records):
         if isinstance(record, Record) and not jumps(given.system) and wrap is None:
@@ -150,34 +148,27 @@ def _read_layout(system: Scene, records: list[Record], params0, form: Form | Non
     try:
         jax.eval_shape(lambda q, qdot: scene.energy(q, qdot, 0.0, params), q, qdot)
     except Exception as reason:
+        said = f"({type(reason).__name__}: {str(reason).splitlines()[0]})"
         if where := find_params_expression(reason):
-            raise ValueError(
-                f"The scene's functions ask for `{where}`, which params0 does not have ({type(reason).__name__}: "
-                f"{str(reason).splitlines()[0]}): params0 is {jax.tree.structure(params0)}."
-            ) from reason
-        if place is not None:
-            raise ValueError(
-                f"The scene's functions cannot be called with the start of records[{place}] ({type(reason).__name__}: "
-                f"{str(reason).splitlines()[0]}): give it in the structure of q."
-            ) from reason
-        raise ValueError(
-            "The scene's functions cannot be called with coordinates of the structure of `values`, which q is taken to "
-            f"have where no record has a start ({type(reason).__name__}: {str(reason).splitlines()[0]}). If the values "
-            "are something else, give every record start=(q0, qdot0), or lagjax.Guess(q0, qdot0) to fit it."
-        ) from reason
+            text = f"ask for `{where}`, which params0 does not have {said}: params0 is {jax.tree.structure(params0)}."
+        elif place is not None:
+            text = f"cannot be called with the start of records[{place}] {said}: give it in the structure of q."
+        else:
+            text = (
+                "cannot be called with coordinates of the structure of `values`, which q is taken to have where no "
+                f"record has a start {said}. If the values are something else, give every record start=(q0, qdot0), or "
+                "lagjax.Guess(q0, qdot0) to fit it."
+            )
+        raise ValueError(f"The scene's functions {text}") from reason
     return replace(Layout.from_state(q, qdot), dtype=DOUBLE)
 
 
 def _systems_by_name(system, records, observe) -> list[tuple[str | None, Any, Any, Any]]:
-    """Name, system, records and `observe` of every system; the name of the only one is None.
-
-    Raises where one argument is a dict by names and another is not, or of other names.
-    """
+    """Name, system, records and `observe` of every system. Raises where not all are dicts by the same names."""
     if not isinstance(system, dict):
-        if isinstance(records, dict):
-            raise TypeError("records is a dict, so system must be a dict of systems by the same names.")
-        if isinstance(observe, dict):
-            raise TypeError("observe is a dict, so system must be a dict of systems by the same names.")
+        for what, given in (("records", records), ("observe", observe)):
+            if isinstance(given, dict):
+                raise TypeError(f"{what} is a dict, so system must be a dict of systems by the same names.")
         return [(None, system, records, observe)]
     if not system:
         raise ValueError("system is an empty dict: give at least one lagjax.System by its name.")

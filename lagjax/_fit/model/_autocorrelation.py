@@ -28,10 +28,9 @@ def autocorrelations(residuals: Residuals, point: Trial, noise: NoiseScale) -> l
 
 
 def _autocorrelation(residuals: Residuals, point: Trial, noise: NoiseScale, signal: int) -> Correlation:
-    """The correlation of the residuals of one signal, over all pieces.
+    """The correlation of the residuals of one signal, over all pieces, as far as it is larger than chance.
 
-    It is cut where it first is no larger than two standard errors, and tapered by Parzen's window of three times that
-    length: then its spectrum is nowhere negative.
+    It is cut at two standard errors, and tapered by Parzen's window of three times that length.
     """
     dof = noise.dof[signal]
     sums, count = np.zeros(1), 0

@@ -92,12 +92,11 @@ class Density:
         starts = jnp.where(self.start_places < len(self), jnp.append(x, 0.0)[self.start_places], starts)
         for part in self.residuals.parts:
             starts = part.trace_starts(starts, self.params(u))
-        dof = self._dof(x[self.noise_places.stop :]) if self.moves_dof else jnp.asarray(self.noise.dof, x.dtype)
+        dof = jnp.asarray(self.noise.dof, x.dtype)
+        if self.moves_dof:
+            share = jax.nn.sigmoid(x[self.noise_places.stop :])
+            dof = _LEAST_DOF * jnp.exp(math.log(_MOST_DOF / _LEAST_DOF) * share)
         return PosteriorUnknowns(u, starts, jnp.exp(x[self.noise_places]), dof)
-
-    @staticmethod
-    def _dof(moved):
-        return _LEAST_DOF * jnp.exp(math.log(_MOST_DOF / _LEAST_DOF) * jax.nn.sigmoid(moved))
 
     def params(self, u):
         """The user's pytree of parameters at u (F,)."""
@@ -122,9 +121,8 @@ class Density:
     def log_likelihood(self, x):
         """Σ_s shares_s log L_s, up to a constant; NaN where a motion could not be followed."""
         at = self.unknowns(jnp.asarray(x, self.dtype))
-        pairs = zip(self.residuals.batches, self.evaluate(at), strict=True)
-        weighted = [np.sqrt(batch.weights) * r for batch, r in pairs]
         batches = self.residuals.batches
+        weighted = [np.sqrt(batch.weights) * r for batch, r in zip(batches, self.evaluate(at), strict=True)]
         return self.weighted_log_likelihood(weighted, [b.weights > 0 for b in batches], [b.sides for b in batches], at)
 
     def evaluate(self, at: PosteriorUnknowns) -> list:
@@ -166,9 +164,8 @@ class Density:
             rate = d * math.log(_MOST_DOF / _LEAST_DOF) * share * (1 - share)
             own = 0.25 * (polygamma(1, d / 2) - polygamma(1, (d + 1) / 2)) - (d + 5) / (2 * d * (d + 1) * (d + 3))
             both = np.diag(-2 * samples * rate / ((d + 1) * (d + 3)))
-            information = np.block(
-                [[information, both], [both, np.diag(samples * own * rate**2 + 2 * share * (1 - share))]]
-            )
+            own = np.diag(samples * own * rate**2 + 2 * share * (1 - share))
+            information = np.block([[information, both], [both, own]])
         return np.linalg.inv(information)
 
     def covariance(self) -> np.ndarray:
@@ -178,10 +175,8 @@ class Density:
         """
         residuals, point = self.residuals, self.point
         robust = np.array([(d + 1) / (d + 3) if np.isfinite(d) else 1.0 for d in self.noise.dof])
-        weight = np.sqrt(self.shares * robust) / self.noise.sigma
-        triangles = residuals.triangles(
-            point, [f * weight * self.noise.sigma for f in residuals.fisher_factors(point, self.noise)]
-        )
+        factors = [f * np.sqrt(self.shares * robust) for f in residuals.fisher_factors(point, self.noise)]
+        triangles = residuals.triangles(point, factors)
         free, size = len(point.u), self.noise_places.start
         precision = np.zeros((len(self) + 1, len(self) + 1))
         for own, triangle in zip(self.start_places, triangles, strict=True):

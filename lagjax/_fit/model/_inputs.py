@@ -8,6 +8,7 @@ made for a length, and serves all records.
 """
 
 import functools
+import math
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -26,11 +27,7 @@ _FUNCTIONS = ("lagrangian", "forces", "dissipation", "constraints", "velocity_co
 
 
 class SampleTable(NamedTuple):
-    """The inputs of N pieces of records: I numbers at K instants, `knots` (N, K) and `values` (N, K, I).
-
-    Some samples about a piece are among them where its input asks for them, and behind the last one instants that still
-    increase (`build_table`).
-    """
+    """The inputs of N pieces of records: I numbers at K instants, `knots` (N, K) and `values` (N, K, I)."""
 
     knots: np.ndarray
     values: np.ndarray
@@ -44,9 +41,6 @@ class SampleTable(NamedTuple):
         count = len(self.knots)
         parts = np.broadcast_to(numbers, (count, numbers.shape[-1])), self.knots, self.values.reshape(count, -1)
         return np.concatenate(parts, axis=1)
-
-    def select(self, rows) -> "SampleTable":
-        return SampleTable(self.knots[rows], self.values[rows])
 
 
 class Driven(NamedTuple):
@@ -66,23 +60,17 @@ class Form(NamedTuple):
 
     @property
     def size(self) -> int:
-        return sum(int(np.prod(shape)) for shape in self.shapes)
+        return sum(map(math.prod, self.shapes))
 
     def restore(self, flat) -> PyTree:
-        sizes = [int(np.prod(shape)) for shape in self.shapes]
-        parts = jnp.split(flat, np.cumsum(sizes)[:-1].tolist(), axis=-1)
-        return jax.tree.unflatten(
-            self.tree, [part.reshape(part.shape[:-1] + shape) for part, shape in zip(parts, self.shapes, strict=True)]
-        )
+        return split_leaves(flat, self.tree, self.shapes)
 
     def drive_scene(self, system: System) -> System:
-        present = [name for name in _FUNCTIONS if getattr(system, name) is not None]
-        parts = [eqx.partition(_FunctionOfInputs(getattr(system, name), self), eqx.is_array) for name in present]
-        extras = [tuple({"t": 0, "params": 0} | dict.fromkeys(getattr(system, x).extras)) for x in present]
-        wrapped = [
-            Function(arrays, Edition.from_function(code), tuple(x for x in of if x != "inputs"))
-            for (arrays, code), of in zip(parts, extras, strict=True)
-        ]
+        present, wrapped = [name for name in _FUNCTIONS if getattr(system, name) is not None], []
+        for function in (getattr(system, name) for name in present):
+            arrays, code = eqx.partition(_FunctionOfInputs(function, self), eqx.is_array)
+            extras = tuple(x for x in dict.fromkeys(("t", "params", *function.extras)) if x != "inputs")
+            wrapped.append(Function(arrays, Edition.from_function(code), extras))
         return eqx.tree_at(lambda s: [getattr(s, name) for name in present], system, wrapped)
 
     def bind_samples(self, system: Scene, params: PyTree, ts: np.ndarray, inputs: np.ndarray) -> tuple[Scene, PyTree]:
@@ -95,6 +83,13 @@ class Form(NamedTuple):
     def params(self, params: PyTree, room: int) -> Driven:
         """Parameters of the driven scene, with a table of zeros of this many instants: a structure."""
         return Driven(params, np.arange(float(room)), np.zeros((room, self.size)))
+
+
+def split_leaves(flat, tree, shapes: tuple[tuple[int, ...], ...]) -> PyTree:
+    """Rows of numbers (..., I), of NumPy or JAX, as a pytree of leaves (..., *shape)."""
+    ends = np.cumsum([math.prod(shape) for shape in shapes]).tolist()
+    parts = [flat[..., end - math.prod(shape) : end] for end, shape in zip(ends, shapes, strict=True)]
+    return tree.unflatten([part.reshape(part.shape[:-1] + shape) for part, shape in zip(parts, shapes, strict=True)])
 
 
 class _FunctionOfInputs(eqx.Module):
@@ -127,10 +122,7 @@ def table_length(count: int) -> int:
 
 
 def build_table(pieces: list[tuple[np.ndarray, np.ndarray]], hold: str) -> SampleTable:
-    """The tables of N pieces, each given by its times (k,) and inputs (k, I), side by side.
-
-    What they are filled up with changes nothing up to the last sample: functions of time are those of (k,) samples.
-    """
+    """The tables of N pieces, each given by its times (k,) and inputs (k, I), and filled up behind its last sample."""
     room, size = table_length(max(len(ts) for ts, _ in pieces) + MARGINS[hold]), pieces[0][1].shape[1]
     knots, values = np.zeros((len(pieces), room)), np.zeros((len(pieces), room, size))
     for row, (ts, inputs) in enumerate(pieces):

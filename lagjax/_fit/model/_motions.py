@@ -1,7 +1,5 @@
 """Motions of many starts with their derivatives, and the starts that are functions of something else.
 
-It holds `AbstractMotions` with one class for each engine, `Origins` and `Manifold`.
-
 **Motions.** What a fit asks of an engine: rows of starts (N, 2n), each with times of its own (N, T), one vector of
 parameters (P,), and for each row a table of inputs where the scene has some. It gives the states (N, T, 2n) and how
 they move along D directions (N, D, T, 2n) of the starts and the parameters together. Machine code follows all
@@ -64,7 +62,7 @@ class RecordMotion(NamedTuple):
 
 
 class AbstractMotions(abc.ABC):
-    """Followers of motions and their tangents; `projection` puts states on the constraints, where it is a program."""
+    """Followers of motions and their tangents; `projection` puts states on the constraints by machine code."""
 
     projection: Projection | None = None
 
@@ -85,21 +83,20 @@ class AbstractMotions(abc.ABC):
 
 
 def choose_motions(
-    system: Scene, layout: Layout, parameters: Parameters, rtol, atol, form: Form | None = None
+    system: Scene, layout: Layout, parameters: Parameters, rtol: float, form: Form | None
 ) -> AbstractMotions:
     if not isinstance(system, System) or jumps(system):
-        return _JaxMotions(system, layout, parameters, {"rtol": rtol, "atol": atol})
+        return _JaxMotions(system, layout, parameters, {"rtol": rtol})
     form = form if input_functions(system) else None  # inputs that only sensors ask for, or nothing
     scene = system if form is None else form.drive_scene(system)
 
     def problem(room: int) -> Problem:
         params = parameters.restore(parameters.first)
-        params = params if form is None else form.params(params, room)
-        return Problem.from_system(scene, layout, params, rtol=rtol, atol=atol)
+        return Problem.from_system(scene, layout, params if form is None else form.params(params, room), rtol=rtol)
 
     if isinstance(choose(problem(2)).engine, MachineCode):
         return _MachineCodeMotions(problem, form is not None)
-    options = {"rtol": rtol, "atol": atol, "adjoint": diffrax.ForwardMode()}
+    options = {"rtol": rtol, "adjoint": diffrax.ForwardMode()}
     return _JaxMotions(scene, layout, parameters, options, form is not None)
 
 
@@ -140,7 +137,6 @@ class _JaxMotions(AbstractMotions):
         unfree = [leaf for leaf in parameters.leaves if not hasattr(leaf, "shape")]
         if unfree:
             raise TypeError(f"params0 may only hold numbers where the scene has no machine code; got {unfree[0]!r}.")
-
         leaves = tuple((np.shape(leaf), np.asarray(leaf).dtype) for leaf in parameters.leaves)
         key = scene, layout, parameters.tree, leaves, tuple(options.items()), is_driven
         try:
@@ -230,8 +226,7 @@ class Origins:
 class Manifold:
     """The states that satisfy the constraints of a scene: by the projection of its machine code, else by `project`.
 
-    Both have the same derivatives at a consistent state. The first is a step of Newton's method, which is taken until
-    nothing changes; it is a program that needs no compilation.
+    The first, a step of Newton's method that is taken until nothing changes, needs no compilation.
     """
 
     def __init__(self, system: System, layout: Layout, parameters: Parameters, projection: Projection | None):
@@ -258,8 +253,7 @@ class Manifold:
 
 
 def _project_by_newton(projection: Projection, y: np.ndarray, t: np.ndarray, numbers: np.ndarray, directions) -> tuple:
-    count, states = y.shape
-    rows = np.broadcast_to(numbers, (count, len(numbers)))
+    (count, states), rows = y.shape, np.broadcast_to(numbers, (len(y), len(numbers)))
     before = np.full_like(y, np.inf)
     for _ in range(_STEPS):
         if np.nanmax(np.abs(y - before), initial=0.0) <= _STILL * np.nanmax(np.abs(y), initial=0.0):
@@ -267,9 +261,8 @@ def _project_by_newton(projection: Projection, y: np.ndarray, t: np.ndarray, num
         before, y = y, projection.state.line.evaluate([*y.T, t, *rows.T]).T
     still = np.abs(y - before).max(axis=1) <= _STILL * np.abs(y).max(axis=1)
     y = np.where(still[:, None], y, np.nan)
-    along = np.zeros((count, states + len(directions), states)), np.zeros((states + len(directions), len(numbers)))
-    along[0][:, :states], along[1][states:] = np.eye(states), directions
-    moved = project_start_tangents(
-        projection, t[:, None], y, rows, along[0], np.broadcast_to(along[1], (count, *along[1].shape))
-    )
+    y_dot = np.zeros((count, states + len(directions), states))
+    rows_dot = np.zeros((count, states + len(directions), len(numbers)))
+    y_dot[:, :states], rows_dot[:, states:] = np.eye(states), directions
+    moved = project_start_tangents(projection, t[:, None], y, rows, y_dot, rows_dot)
     return y, moved[:, :states].swapaxes(1, 2), moved[:, states:]

@@ -72,16 +72,14 @@ class AbstractNoise(abc.ABC):  # noqa: B024
         """The noise of S signals that makes these residuals (M, S) likeliest; no σ is smaller than `least` (S,).
 
         `sides` (M, S), None for zeros, are 1 where a sample is at the upper limit of its sensor, −1 at the lower one.
-        Of normal noise σ² is the mean of w e², and the squared scores over curvatures where some are at a limit.
         """
         counted = (weights > 0) & (True if sides is None else sides == 0)
         sigma = np.sqrt((weights * residuals**2).sum(axis=0, where=counted) / np.maximum(counted.sum(axis=0), 1))
         noise = NoiseScale(np.maximum(sigma, least), np.full(len(least), np.inf))
         for _ in range(_ROUNDS if sides is not None else 0):
             score, curvature = scores(np.sqrt(weights) * residuals / noise.sigma, sides)
-            share = (score**2).sum(axis=0, where=weights > 0) / np.maximum(
-                curvature.sum(axis=0, where=weights > 0), 1e-9
-            )
+            squares, counts = (x.sum(axis=0, where=weights > 0) for x in (score**2, curvature))
+            share = squares / np.maximum(counts, 1e-9)
             noise = noise._replace(sigma=np.maximum(noise.sigma * np.sqrt(share), least))
         return noise
 
@@ -191,12 +189,9 @@ class StudentT(AbstractNoise):
 
     def estimate(self, residuals, weights, least, sides=None):
         """σ by its fixed point σ² = mean of c w e² with c = (ν+1)/(ν + z²), ν by search over its logarithm."""
-        found = [
-            self._fit_signal(np.sqrt(weights[keep, s]) * residuals[keep, s], least[s])
-            for s in range(residuals.shape[1])
-            for keep in [weights[:, s] > 0]
-        ]
-        return NoiseScale(np.array([sigma for sigma, _ in found]), np.array([dof for _, dof in found]))
+        columns = zip(residuals.T, weights.T, least, strict=True)
+        found = [self._fit_signal(np.sqrt(w[w > 0]) * r[w > 0], floor) for r, w, floor in columns]
+        return NoiseScale(*np.array(found).T)
 
     def _fit_signal(self, scaled: np.ndarray, least: float) -> tuple[float, float]:
         if self.dof is not None:
@@ -363,16 +358,12 @@ def read_sensor(records: list[Record], noise: AbstractNoise, names: tuple[str, .
         return found
     for place, record in enumerate(records):
         for column, name, step, low, high in zip(record.matrix.T, names, *given, strict=True):
-            column = column[np.isfinite(column)]
+            column, where = column[np.isfinite(column)], f"{name} in records[{place}]"
             if len(column) and np.isfinite(step):
                 off = (column - column[0]) / step
                 slack = _LATTICE + 8 * np.finfo(np.float32).eps * np.abs(column).max() / step
                 if np.abs(off - np.round(off)).max() > slack:
-                    raise ValueError(
-                        f"The values of {name} in records[{place}] do not differ by multiples of {step:g}."
-                    )
+                    raise ValueError(f"The values of {where} do not differ by multiples of {step:g}.")
             if (column < low).any() or (column > high).any():
-                raise ValueError(
-                    f"Some values of {name} in records[{place}] are beyond the limits {low:g} and {high:g}."
-                )
+                raise ValueError(f"Some values of {where} are beyond the limits {low:g} and {high:g}.")
     return Sensor(*(np.where(np.isnan(own), shown, own) for own, shown in zip(given, found, strict=True)))

@@ -44,19 +44,16 @@ class Parameters:
     parts: tuple[Part, ...]
 
     @classmethod
-    def from_pytree(
-        cls, params: PyTree, free: PyTree = None, transforms: PyTree = None, dtype: Any = np.float64
-    ) -> "Parameters":
+    def from_pytree(cls, params: PyTree, free: PyTree = None, transforms: PyTree = None) -> "Parameters":
         """The parameters as the user gives them; `free` and `transforms` are prefixes of the same structure.
 
         Raises `TypeError` or `ValueError` with the name of the parameter that cannot be right.
         """
         require_finite(params, "params0")
-        labels, leaves, tree = labelled_leaves(as_arrays(params, dtype, "params0"), "params")
+        labels, leaves, tree = labelled_leaves(as_arrays(params, np.float64, "params0"), "params")
         is_free = _broadcast_prefix(True if free is None else free, tree, leaves, "free")
         moved_by = _broadcast_prefix(Unbounded() if transforms is None else transforms, tree, leaves, "transforms")
-        numbers, names, parts = [], [], []
-        count = 0
+        numbers, names, parts, count = [], [], [], 0
         for label, leaf, may_move, transform in zip(labels, leaves, is_free, moved_by, strict=True):
             if not eqx.is_array_like(leaf):
                 continue
@@ -160,8 +157,7 @@ class Parameters:
         """The names of the unknowns (F,): as their numbers, or as the whole leaf that they move together."""
         found = []
         for own, rows, part in self._cuts:
-            together = [part.label] * (own.stop - own.start)
-            found += self.names[rows] if part.transform.separable else together
+            found += self.names[rows] if part.transform.separable else [part.label] * (own.stop - own.start)
         return tuple(found)
 
     def limits(self, u: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -229,17 +225,15 @@ class Parameters:
 
     def fix(self, u: np.ndarray, which: int | None = None) -> "Parameters":
         """The parameters at u (F,), where the unknown `which` of a number of its own is kept there; None: all are."""
-        at, parts, names = replace(self, first=self.numbers(u)), [], []
-        for own, rows, part in self._cuts:
-            if which is None:
-                continue
+        parts, names = [], []
+        for own, rows, part in [] if which is None else self._cuts:
             keep = np.ones(len(part.places), bool)
             if own.start <= which < own.stop:
                 keep[which - own.start] = False
             if keep.any():
                 parts.append(part._replace(places=part.places[keep]))
             names += [name for name, stays in zip(self.names[rows], keep, strict=True) if stays]
-        return replace(at, parts=tuple(parts), names=tuple(names))
+        return replace(self, first=self.numbers(u), parts=tuple(parts), names=tuple(names))
 
     def restore(self, numbers) -> PyTree:
         leaves, begin = [], 0

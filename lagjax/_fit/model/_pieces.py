@@ -7,8 +7,6 @@ import numpy as np
 from lagjax._fit.model._inputs import SampleTable, build_table, inputs_at, samples_between
 from lagjax._fit.model._records import Record
 
-PyTree = Any
-
 
 class Piece(NamedTuple):
     """The samples `places` of the record `record`, followed as a motion of its own from the first of them."""
@@ -58,8 +56,8 @@ def _stack_pieces(records: list[Record], pieces: list[Piece], rows: np.ndarray, 
     longest, signals = max(len(pieces[row].places) for row in rows), records[pieces[rows[0]].record].matrix.shape[1]
     ts = np.zeros((len(rows), longest))
     values, weights = np.zeros((2, len(rows), longest, signals))
-    matrices = {pieces[row].record: None for row in rows}
-    matrices = {k: (records[k].matrix, records[k].weight_matrix, records[k].input_samples) for k in matrices}
+    taken = [(k, records[k]) for k in {pieces[row].record for row in rows}]
+    matrices = {k: (record.matrix, record.weight_matrix, record.input_samples) for k, record in taken}
     driven = matrices[pieces[rows[0]].record][2]
     inputs, sampled = np.zeros((len(rows), longest, driven.shape[1])), []
     for i, row in enumerate(rows):

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._fit.model._inputs import interpolate_inputs
+from lagjax._fit.model._inputs import interpolate_inputs, split_leaves
 from lagjax._interface import Layout, labelled_leaves, require_concrete
 from lagjax._scene import unevenly_spaced
 
@@ -130,9 +130,9 @@ class Record(MeasuredSignal):
         That is for where a search begins. What a trial sees is what `hold` makes of them (`_stack_pieces`).
         """
         known = self.input_samples
-        if self.input_ts is None or not known.shape[1]:
-            return np.zeros((len(self), 0)) if not known.shape[1] else known
-        return interpolate_inputs(self.input_ts, known, self.ts)
+        if self.input_ts is None:
+            return known
+        return interpolate_inputs(self.input_ts, known, self.ts) if known.shape[1] else np.zeros((len(self), 0))
 
     @property
     def input_structure(self) -> tuple | None:
@@ -202,9 +202,8 @@ def real_numbers(array, name: str, what: str) -> np.ndarray:
         masked = isinstance(array, np.ma.MaskedArray)
         return np.ma.filled(array.astype(np.float64), np.nan) if masked else np.asarray(array, np.float64)
     except (TypeError, ValueError):
-        of = getattr(array, "dtype", None)
-        of = f"{type(array).__name__}" + (f" of {of}" if of is not None else "")
-        raise TypeError(f"{name} must be {what}; got {of}.") from None
+        of = f" of {array.dtype}" if hasattr(array, "dtype") else ""
+        raise TypeError(f"{name} must be {what}; got {type(array).__name__}{of}.") from None
 
 
 def require_untraced(tree: PyTree, what: str) -> None:
@@ -275,9 +274,7 @@ def require_start(start) -> None:
 
 def restore_structure(matrix: np.ndarray, record) -> PyTree:
     """Signals (T, S) in the structure of a record's values, or times (M, 1) in that of its times."""
-    if not isinstance(record, Record):
-        return record.restore(matrix)
-    return _split_columns(matrix, record.structure)
+    return split_leaves(matrix, *record.structure) if isinstance(record, Record) else record.restore(matrix)
 
 
 def spread_prefix(prefix: PyTree, values: PyTree, what: str) -> list:
@@ -306,16 +303,7 @@ def inputs_between(record: Record, ts: np.ndarray) -> PyTree:
     """The inputs of a record at other times, on lines between the samples; None where it has none."""
     if record.input_structure is None:
         return None
-    return _split_columns(interpolate_inputs(record.sampled_at, record.input_samples, ts), record.input_structure)
-
-
-def _split_columns(matrix: np.ndarray, structure: tuple) -> PyTree:
-    tree, shapes = structure
-    sizes = [int(np.prod(shape)) for shape in shapes]
-    columns = np.split(matrix, np.cumsum(sizes)[:-1], axis=1)
-    return tree.unflatten(
-        [column.reshape(len(matrix), *shape) for column, shape in zip(columns, shapes, strict=True)]
-    )  # fmt: skip
+    return split_leaves(interpolate_inputs(record.sampled_at, record.input_samples, ts), *record.input_structure)
 
 
 def require_records(records) -> list[Any]:
@@ -327,9 +315,7 @@ def require_records(records) -> list[Any]:
         raise ValueError("records is empty: a fit needs at least one lagjax.Record.")
     for place, record in enumerate(listed):
         if not isinstance(record, MeasuredSignal):
-            raise TypeError(
-                f"records[{place}] must be a lagjax.Record, or lagjax.Timings; got {type(record).__name__}."
-            )
+            raise TypeError(f"records[{place}] must be a lagjax.Record or Timings; got {type(record).__name__}.")
     _require_same_signals([(place, record) for place, record in enumerate(listed) if isinstance(record, Record)])
     for place, record in enumerate(listed):
         if not (record.weight_matrix > 0).any():

@@ -1,8 +1,5 @@
 """Residuals: the measured signals less those of the motions of a trial, with their derivatives.
 
-It holds `Residuals`, which every search, density and interval is about, `SystemResiduals`, the part of it that is of
-one system, `Point` and `Trial`, and the triangles that rows are compressed to.
-
 The unknowns are a `Point`: u (F,), the free parameters as their transforms move them, and the starts (N, 2n) of the N
 pieces of records. A residual of piece k depends on u and on start k alone: the rows of a piece, D = 2n + F columns and
 the residual, are compressed to a triangle of D + 1 rows (QR), in which all sums of squares are the same.
@@ -14,8 +11,7 @@ smaller system leaves the last ones without any influence, like those of a start
 systems stand side by side, with no weight where a record does not have them.
 
 `Residuals.evaluate` is the map for searches, and `SystemResiduals.trace_residuals` the same for JAX, from which
-densities have their gradients: back over the steps of motions, where trials go forward along every unknown. Both take
-the same batches, sensors and clocks.
+densities have their gradients: back over the steps of motions, where trials go forward along every unknown.
 """
 
 import copy
@@ -130,7 +126,7 @@ class SystemResiduals:
 
     def __post_init__(self):
         timed = any(piece.record in self.clocks for piece in self.pieces)
-        self.names = (*self.signals.names, *(("times",) if timed else ()))
+        self.names = (*self.signals.names, *["times"] * timed)
         self.size, self.sensor = self.size[: len(self.names)], Sensor(*(x[: len(self.names)] for x in self.sensor))
         self.least = self.rtol * self.size
         self.layout: Layout = self.signals.layout
@@ -162,10 +158,8 @@ class SystemResiduals:
     def batches(self) -> list[Samples]:
         """The records in batches, then each of the timings as a batch of its own, all with a column for each signal."""
         sensed = [row for row, piece in enumerate(self.pieces) if piece.record not in self.clocks]
-        hold = "zero" if self.signals.form is None else self.signals.form.hold
-        some = batch_pieces(
-            self.records, [self.pieces[row] for row in sensed], float(np.finfo(self.layout.dtype).eps), hold
-        )
+        own, eps = [self.pieces[row] for row in sensed], float(np.finfo(self.layout.dtype).eps)
+        some = batch_pieces(self.records, own, eps, "zero" if self.signals.form is None else self.signals.form.hold)
         found = [batch._replace(rows=np.array(sensed)[batch.rows]) for batch in some]
         for row, (k, _) in enumerate(self.pieces):
             if k in self.clocks:
@@ -312,16 +306,13 @@ class SystemResiduals:
     # ---- the same for JAX ----
 
     def trace_residuals(self, batch: Samples, u, starts):
-        """The residuals of one batch, (N, T, S), at u (F,) and the starts (N, 2n) of its pieces, for JAX: gradients
-        come back over the steps of the motions. NaN where one could not be followed."""
+        """The residuals of one batch, (N, T, S), at u (F,) and the starts (N, 2n) of its pieces; NaN where lost."""
         layout, signals = self.layout, self.signals
         numbers = self.parameters.numbers(u, jnp)
         params = self.parameters.restore(numbers)
         record = self.pieces[batch.rows[0]].record
         form = signals.form if signals.form is not None and input_functions(self.scene) else None
-        scene = self.scene
-        if form is not None and isinstance(scene, System):
-            scene = form.drive_scene(scene)
+        scene = form.drive_scene(self.scene) if form is not None and isinstance(self.scene, System) else self.scene
 
         def sense(ts, y0, inputs, table):
             q, qdot = map(layout.restore, halves(y0))
@@ -429,15 +420,14 @@ class Residuals:
         constrained, square = any(part.fits_on_constraints for part in self.parts), (self.states, self.states)
         across = np.zeros((len(point.starts), *square)) if constrained else None
         trial = Trial(point.u, point.starts.copy(), [], [], across)
+        watch = self.watch or (lambda _: None)
         try:
             for part in self.parts:
                 part.append_residuals(trial)
         except LostMotion as reason:
-            if self.watch is not None:
-                self.watch(reason)
+            watch(reason)
             raise
-        if self.watch is not None:
-            self.watch(trial)
+        watch(trial)
         return trial
 
     def noise_scale(self, point: Trial, noise: AbstractNoise) -> NoiseScale:
@@ -445,10 +435,8 @@ class Residuals:
 
     def factors(self, point: Trial, noise: NoiseScale) -> list[np.ndarray]:
         """√count/σ of every sample, by which its residual enters the sum of squares."""
-        return [
-            np.sqrt(counts(noise, r, batch.weights, batch.sides)) / noise.sigma
-            for r, batch in zip(point.residuals, self.batches, strict=True)
-        ]
+        pairs = zip(point.residuals, self.batches, strict=True)
+        return [np.sqrt(counts(noise, r, batch.weights, batch.sides)) / noise.sigma for r, batch in pairs]
 
     def log_likelihood(self, point: Trial, noise: NoiseScale) -> float:
         return log_likelihood(noise, point.flat(), self.weights, self.sides)
@@ -472,12 +460,11 @@ class Residuals:
         """Half the weighted sum of squares, and −log of the probability of samples at the limit of a sensor."""
         total = 0.0
         for f, r, batch in zip(factors, point.residuals, self.batches, strict=True):
-            if batch.sides is None:
-                total += 0.5 * float(np.sum((f * r) ** 2))
-            else:
-                at_limit = (batch.sides != 0) & (batch.weights > 0)
+            each = 0.5 * (f * r) ** 2
+            if batch.sides is not None:
                 u = batch.sides * np.sqrt(batch.weights) * r / noise.sigma
-                total += float(np.sum(np.where(at_limit, -log_ndtr(u), 0.5 * (f * r) ** 2)))
+                each = np.where((batch.sides != 0) & (batch.weights > 0), -log_ndtr(u), each)
+            total += float(np.sum(each))
         return total
 
     def linearise(self, point: Trial, noise: NoiseScale) -> np.ndarray:
@@ -537,7 +524,6 @@ class Residuals:
         return part.columns(record - part.frame.records.start)
 
     def label(self, record: int) -> str:
-        """The name by which the user reaches a record: `records[0]`, or `records['name'][0]`."""
         place = next(k for k, own in enumerate(self._records) if record < own.stop)
         return self.systems[place].label(record - self._records[place].start)
 
@@ -590,10 +576,9 @@ def compress_rows(rows: np.ndarray) -> np.ndarray:
     rows = rows if columns else rows[:, :0]
     while rows.shape[1] > columns:
         height = min(_BLOCK * columns, rows.shape[1])
-        missing = -rows.shape[1] % height
-        rows = np.concatenate([rows, np.zeros((pieces, missing, columns))], axis=1) if missing else rows
-        blocks = qr_triangle(rows.reshape(-1, height, columns))
-        rows = blocks.reshape(pieces, -1, columns)
+        if missing := -rows.shape[1] % height:
+            rows = np.concatenate([rows, np.zeros((pieces, missing, columns))], axis=1)
+        rows = qr_triangle(rows.reshape(-1, height, columns)).reshape(pieces, -1, columns)
     found = np.zeros((pieces, columns, columns))
     found[:, : rows.shape[1]] = rows
     return found

@@ -52,9 +52,8 @@ def _find_placeholder(column: np.ndarray, period: float) -> tuple[float, int] | 
         steps = np.abs(wrap_residuals(np.diff(others)[:, None], np.array([period])))
         before = np.maximum(np.cumsum(~there) - 1, 0)[there]
         after = np.minimum(before + 1, len(others) - 1)
-        jumps = np.abs(wrap_residuals(kinds[k] - others[np.stack([before, after], axis=1)], np.full(2, period))).min(
-            axis=1
-        )
+        beside = others[np.stack([before, after], axis=1)]
+        jumps = np.abs(wrap_residuals(kinds[k] - beside, np.full(2, period))).min(axis=1)
         # Or a value comes back and back among values that never do: samples of a real signal stay equal, or differ.
         runs = np.sum(there[1:] & ~there[:-1])
         alone = runs >= _REPEATED and there.sum() < 2 * runs and len(np.unique(others)) == len(others)
@@ -86,9 +85,8 @@ def describe_sensors(
             if np.isfinite(limit) and np.isnan(getattr(given, end)[k]):
                 law, count = f"noise=lagjax.Clipped({end}={limit:.4g})", (some == limit).sum()
                 how = f"take {law}." if is_student else f"they are fitted as with {law}, {limit:.4g} or beyond."
-                found.append(
-                    f"{count} of {len(some)} samples of {name} are {limit:.4g}, the {word} value, in runs: {how}"
-                )
+                there = f"{count} of {len(some)} samples of {name}"
+                found.append(f"{there} are {limit:.4g}, the {word} value, in runs: {how}")
     return found
 
 

@@ -84,13 +84,9 @@ class Signals:
     """
 
     def __init__(
-        self,
-        observe: Callable | Delayed | None,
-        layout: Layout,
-        parameters: Parameters,
-        record: Record | None,
+        self, observe: Callable | Delayed | None, layout: Layout, parameters: Parameters, record: Record | None,
         form: Form | None = None,
-    ):
+    ):  # fmt: skip
         self.layout, self.form, self.observe = layout, form, observe
         self.delays: Delays | None = None
         if record is None:
@@ -161,9 +157,8 @@ class Signals:
     def positions(self, record: Record, numbers: np.ndarray) -> Record:
         """The record with the coordinates that make sensors of the structure of q show its values, by Newton's method.
 
-        They are those of the record itself where there is no `observe`, and where these steps do not end: sensors that
-        show a gain, a bias, degrees do with two. Sensors that wrap by themselves, as `atan2` does, never show what was
-        made continuous: for these whole periods do not count.
+        It is the record itself where these steps do not end: sensors that show a gain, a bias, degrees do with two.
+        Sensors that wrap by themselves, as `atan2`, never show what was made continuous: up to whole periods, then.
         """
         if self._value_and_jacobians is None:
             return record

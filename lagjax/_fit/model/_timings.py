@@ -83,13 +83,13 @@ class Timings(MeasuredSignal):
         if not (np.ndim(self.t0) == 0 and np.isfinite(self.t0)):
             raise ValueError(f"t0 must be a finite number; got {self.t0!r}.")
         times = _section_arrays(self.times, keys, "times")
-        counted = [np.arange(len(x)) for x in times] if self.numbers is None else None
-        numbers = _section_arrays(self.numbers, keys, "numbers") if counted is None else counted
-        weights = [np.ones(len(x)) for x in times]
-        if self.weights is not None:
-            given = self.weights
-            weights = [w * given for w in weights] if np.ndim(given) == 0 and not isinstance(given, dict) else (
-                _section_arrays(given, keys, "weights"))  # fmt: skip
+        numbers, given = [np.arange(len(x)) for x in times], 1.0 if self.weights is None else self.weights
+        if self.numbers is not None:
+            numbers = _section_arrays(self.numbers, keys, "numbers")
+        if np.ndim(given) == 0 and not isinstance(given, dict):
+            weights = [np.full(len(x), given, float) for x in times]
+        else:
+            weights = _section_arrays(given, keys, "weights")
         for name, few in (("numbers", numbers), ("weights", weights)):
             if [len(x) for x in few] != [len(x) for x in times]:
                 raise ValueError(f"{name} must have the shape of times, {[len(x) for x in times]} by section.")
@@ -121,7 +121,6 @@ class Timings(MeasuredSignal):
 
     @property
     def weight_matrix(self) -> np.ndarray:
-        """The weight of every time (M, 1), zero where it is missing."""
         return np.where(np.isnan(self.flat.times), 0.0, self.flat.weights)[:, None]
 
     def restore(self, matrix: np.ndarray) -> PyTree:
@@ -238,11 +237,9 @@ def _build_section_clock(
         raise ValueError(text) from None
     room = int(flat.numbers.max()) + 1
 
-    def motion(y0, numbers) -> Problem:
-        return dataclasses.replace(problem, y0=y0, params=parameters.restore(numbers))
-
     def crossings(y0, numbers) -> tuple[Solution, Noted]:
-        return MachineCode().crossings(motion(y0, numbers), surfaces, room, 1 / _SHARPER)
+        motion = dataclasses.replace(problem, y0=y0, params=parameters.restore(numbers))
+        return MachineCode().crossings(motion, surfaces, room, 1 / _SHARPER)
 
     def times(y0, numbers):
         return crossings(y0, numbers)[1].t[flat.which, flat.numbers]
@@ -268,7 +265,6 @@ def _build_section_clock(
 def _build_transition_clock(
     scene: Hybrid, layout: Layout, parameters: Parameters, timings: Timings, rtol: float
 ) -> Clock:
-    """The times of transitions of hybrid motion, whose derivatives are those of `simulate_hybrid`."""
     flat, span = timings.flat, np.array([float(timings.t0), _last_time(timings)])
     _, transitions = _sections(timings.section)
     ways = np.array([_mode_places(scene, one) for one in transitions])[flat.which]
@@ -289,20 +285,18 @@ def _build_transition_clock(
         assert happened is not None
         mine = (happened.source == source) & (happened.target == target)  # (M, K)
         mine = mine & (jnp.cumsum(mine, axis=1) == number + 1)
-        place = jnp.argmax(mine, axis=1)
-        return jnp.where(mine.any(axis=1), happened.t[place], jnp.nan)
+        return jnp.where(mine.any(axis=1), happened.t[jnp.argmax(mine, axis=1)], jnp.nan)
 
     def describe_failure(y0, numbers) -> str:
         missing, motion = ~np.isfinite(np.asarray(times(y0, numbers))), run(y0, numbers)
         assert motion.transitions is not None
-        result, t_end, first = motion.result._value, motion.end.t, int(np.argmax(missing))
+        t_end, first = float(motion.end.t), int(np.argmax(missing))
         y_end = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves((motion.end.q, motion.end.qdot))])
-        source_k, target_k = ways[first]
-        happened = int(((motion.transitions.source == source_k) & (motion.transitions.target == target_k)).sum())
-        between = " to ".join(repr(tuple(scene.modes)[k]) for k in ways[first])
-        text = sentence(int(result), float(t_end), span[1], y_end, layout.names)
+        pairs = np.stack([motion.transitions.source, motion.transitions.target], axis=1)
+        happened, between = (pairs == ways[first]).all(axis=1).sum(), [repr([*scene.modes][k]) for k in ways[first]]
+        text = sentence(int(motion.result._value), t_end, span[1], y_end, layout.names)
         return (
-            f"There are {happened} transitions from {between} up to t = {float(t_end):g}, but number "
+            f"There are {happened} transitions from {' to '.join(between)} up to t = {t_end:g}, but number "
             f"{flat.numbers[first]}, counted from 0, was measured." + (f" {text}" if text else "")
         )
 

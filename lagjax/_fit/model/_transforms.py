@@ -104,8 +104,7 @@ class AbstractSeparable(AbstractTransform):
     def ends(self, x, spread):
         """x(u ± spread / slope): relative for logarithms, and inside of the bounds.
 
-        Where x ± spread does not exclude a bound, its logarithm says nothing: the ends are those of x ± spread then,
-        cut off at the bounds.
+        Where x ± spread does not exclude a bound, its logarithm says nothing: there x ± spread is cut off.
         """
         low, high = np.maximum(x - spread, self.bounds[0]), np.minimum(x + spread, self.bounds[1])
         excluded = (low > self.bounds[0]) & (high < self.bounds[1])
@@ -222,7 +221,6 @@ class Between(AbstractSeparable):
         return np.log(share / (1.0 - share))
 
     def refuses(self, x):
-        """The complaint that values must lie between the bounds, where one does not."""
         if np.all((x > self.lower) & (x < self.upper)):
             return None
         return f"must start between {self.lower:g} and {self.upper:g}, because its transform is {self!r}"
