@@ -485,7 +485,7 @@ def test_states_are_read_off_noisy_data():
     ts = np.linspace(0.0, 2.0, 1001)
     values = np.sin(3 * ts) + 1e-2 * np.random.default_rng(0).normal(size=ts.shape)
     values[100:120] = np.nan
-    states = Reader.from_record(lagjax.Record(ts, values)).states(np.arange(0, 1001, 50))
+    states = Reader.from_record(lagjax.Record(ts, values), 256, np.array([np.inf])).states(np.arange(0, 1001, 50))
     np.testing.assert_allclose(states[1:-1, 0], np.sin(3 * ts[50:-50:50]), atol=1e-2)
     np.testing.assert_allclose(states[1:-1, 1], 3 * np.cos(3 * ts[50:-50:50]), atol=0.3)
 

@@ -58,21 +58,13 @@ def comparison(fits: dict[str, Any], folds: int) -> Comparison:
     aic = tuple(float(2 * k - 2 * log) for k, log in zip(free, logs, strict=True))
     bic = tuple(float(np.log(count) * k - 2 * log) for k, log in zip(free, logs, strict=True))
     names, best, left = tuple(fits), int(np.argmin(bic)), None
-    if folds:
-        apart = []
-        for fit in fits.values():
-            try:
-                apart.append(_cross_validate(fit, folds))
-            except LostMotion:
-                apart.append((dict.fromkeys(fit.residual_function.names, np.inf), np.full(folds, np.inf)))
-        left, best = tuple(rms for rms, _ in apart), _choose_simplest(free, np.array([scores for _, scores in apart]))
-    rows = _table(names, free, logs, aic, bic, left)
     margin = np.partition(np.array(bic), 1)[1] - min(bic)
-    by_bic = names[int(np.argmin(bic))]
-    rows.append(f"The data prefer {_fit_label(by_bic)} fit, by {margin:.1f} in BIC ({count:.0f} effective samples).")
-    if left is not None:
-        simplest = _fit_label(names[best])
-        rows.append(f"Left out in {folds} groups, no record is followed better than by {simplest} fit, but for chance.")
+    said = [f"The data prefer {_fit_label(names[best])} fit, by {margin:.1f} in BIC ({count:.0f} effective samples)."]
+    if folds:
+        left, scores = zip(*(_cross_validate(fit, folds) for fit in fits.values()), strict=True)
+        simplest = _fit_label(names[best := _choose_simplest(free, np.array(scores))])
+        said.append(f"Left out in {folds} groups, no record is followed better than by {simplest} fit, but for chance.")
+    rows = [*_table(names, free, logs, aic, bic, left), *said]
     return Comparison(names, free, logs, aic, bic, left, names[best], "\n".join(rows))
 
 
@@ -106,24 +98,24 @@ def _table(names, free, logs, aic, bic, left) -> list[str]:
 
 
 def _cross_validate(fit, folds: int) -> tuple[dict[str, float], np.ndarray]:
-    """The root mean square residuals by signal of records that were left out, and for each group their mean logarithm.
-
-    A signal that only the records left out have is as noisy as the fit of all says. Raises `LostMotion` where a record
-    cannot be followed.
+    """The root mean square residuals by signal of records that were left out, and for each group their mean logarithm;
+    both infinite where a record cannot be followed. A signal that only these have is as noisy as the fit of all says.
     """
     residuals, scores = fit.residual_function, np.zeros(folds)
     groups = np.array([piece.record for piece in residuals.pieces]) % folds
     squares, weights = dict.fromkeys(residuals.names, 0.0), dict.fromkeys(residuals.names, 0.0)
     for group in range(folds):
-        rest = _select_pieces(residuals, groups != group)
-        done = minimise(rest, Point(fit.u, fit.states[groups != group]), fit.law, _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
-        apart = _select_pieces(residuals, groups == group).with_parameters(residuals.parameters.fix(done.trial.u))
-        known = {}
-        for names, noise in ((residuals.names, fit.noise_scale), (rest.names, done.noise)):
-            known |= dict(zip(names, zip(*noise, strict=True), strict=True))
-        law = KnownNoise(NoiseScale(*(np.array(x) for x in zip(*(known[name] for name in apart.names), strict=True))))
-        left_out = Point(np.zeros(0), fit.states[groups == group])
-        end = minimise(apart, left_out, law, _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
+        rest, apart = (_select_pieces(residuals, keep) for keep in (groups != group, groups == group))
+        begin, left_out = Point(fit.u, fit.states[groups != group]), Point(np.zeros(0), fit.states[groups == group])
+        known = dict(zip(residuals.names, zip(*fit.noise_scale, strict=True), strict=True))
+        try:
+            done = minimise(rest, begin, fit.law, _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
+            known |= zip(rest.names, zip(*done.noise, strict=True), strict=True)
+            law = KnownNoise(NoiseScale(*np.array([known[name] for name in apart.names]).T))
+            apart = apart.with_parameters(residuals.parameters.fix(done.trial.u))
+            end = minimise(apart, left_out, law, _ENOUGH_LEFT_OUT, _TRIALS_LEFT_OUT)
+        except LostMotion:
+            return dict.fromkeys(residuals.names, np.inf), np.full(folds, np.inf)
         square, weight = (apart.weights * end.trial.flat() ** 2).sum(axis=0), apart.weights.sum(axis=0)
         shown = weight > 0
         scores[group] = 0.5 * np.mean(np.log(np.maximum(square[shown] / weight[shown], apart.least[shown] ** 2)))
@@ -141,15 +133,12 @@ def _select_pieces(residuals: Residuals, keep: np.ndarray) -> Residuals:
 
 def _require_same_records(first, others) -> None:
     for other in others:
-        same = len(first.records) == len(other.records) and all(
-            np.array_equal(a.matrix, b.matrix, equal_nan=True)
-            for a, b in zip(first.records, other.records, strict=True)
-        )
-        if not same:
+        pairs = zip(first.records, other.records, strict=False)
+        same = all(np.array_equal(a.matrix, b.matrix, equal_nan=True) for a, b in pairs)
+        if not same or len(first.records) != len(other.records):
             raise ValueError("Only fits of the same records can be compared.")
 
 
 def effective_share(fit) -> float:
     """The number of independent samples that one sample of a fit is worth."""
-    samples = sum(noise.samples for noise in fit.noise.values())
-    return sum(noise.effective for noise in fit.noise.values()) / samples
+    return sum(noise.effective for noise in fit.noise.values()) / sum(noise.samples for noise in fit.noise.values())

@@ -106,10 +106,6 @@ class Chart(NamedTuple):
         steep = jax.nn.log_sigmoid(above) + jax.nn.log_sigmoid(-below)
         return x, zeta, jnp.sum(steep - jnp.log(to_low) - jnp.log(to_high))
 
-    def x(self, z):
-        """The unknowns x (D,) at z (D,)."""
-        return self(z)[0]
-
     def log_density(self, z):
         """The logarithm of the posterior density of z (D,), up to a constant; −∞ where that is no number."""
         x, _, volume = self(z)
@@ -170,11 +166,9 @@ class Surrogate(NamedTuple):
         """The logarithm of the approximate density of z, up to the constant of `Chart.log_density`."""
         x, zeta, volume = self.chart(z)
         padded = jnp.append(zeta, 0.0)  # where the start of a piece is known its numbers are those of the last place
-        weighted = [self._residuals(block, padded) for block in self.blocks]
-        density = self.chart.density
-        log_likelihood = density.weighted_log_likelihood(
-            weighted, [b.counts for b in self.blocks], [b.sides for b in self.blocks], density.unknowns(x)
-        )
+        weighted, density = [self._residuals(block, padded) for block in self.blocks], self.chart.density
+        flags = [block.counts for block in self.blocks], [block.sides for block in self.blocks]
+        log_likelihood = density.weighted_log_likelihood(weighted, *flags, density.unknowns(x))
         total = density.posterior(x, log_likelihood) + volume
         return jnp.where(jnp.isfinite(total), total, -jnp.inf)
 

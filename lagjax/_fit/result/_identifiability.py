@@ -30,8 +30,7 @@ def unseen_sentences(descent: Descent, known: Information) -> tuple[str, ...]:
     null, parameters = known.confirmed, residuals.parameters
     if not null.shape[1]:
         return hidden
-    spaces = [(parameters.jacobian(trial.u) @ null, parameters.values(trial.u))]
-    # The null directions a few per cent away, too.
+    spaces = [(parameters.jacobian(trial.u) @ null, parameters.values(trial.u))]  # here, and a few per cent away
     near = trial.u + parameters.sizes(trial.u) * np.random.default_rng(0).uniform(0.02, 0.06, len(trial.u))
     with contextlib.suppress(LostMotion):
         other = residuals.evaluate(Point(near, trial.starts))
@@ -53,11 +52,10 @@ def _sentence_on_rounding(residuals: Residuals, trial: Trial, known: Information
     left = left - basis @ (basis.T @ left)
     labels = residuals.parameters.labels
     names = list(dict.fromkeys(labels[k] for k in np.flatnonzero(np.linalg.norm(left, axis=1) > 1e-5)))
-    sizes = row_sizes(residuals, trial)
     grown, record = max(
-        (growth([row[None]]), residuals.pieces[batch.rows[k]].record)
-        for batch, size in zip(residuals.batches, sizes, strict=True)
-        for k, row in enumerate(size)
+        (growth([row[None]]), residuals.pieces[place].record)
+        for batch, size in zip(residuals.batches, row_sizes(residuals, trial), strict=True)
+        for place, row in zip(batch.rows, size, strict=True)
     )
     return (
         f"{residuals.label(record)} is chaotic: motions grow apart within it by a factor of {grown:.0e}, and rounding "
@@ -91,10 +89,8 @@ def _sentence(parameters: Parameters, block: np.ndarray, spaces) -> str:
         return f"{count} combinations of {_join_names(names)} are not seen: keep {count} of them fixed."
     changes = absolute[0][:, 0] / np.abs(absolute[0][:, 0]).max()
     together = ", ".join(f"{name} by {change:+.3g}" for name, change in zip(names, changes, strict=True))
-    return (
-        f"A combination of {_join_names(names)} is not seen: to change {together}, in proportion, changes nothing "
-        "measured."
-    )
+    whole = _join_names(names)
+    return f"A combination of {whole} is not seen: to change {together}, in proportion, changes nothing measured."
 
 
 def _directions_within(directions: np.ndarray, block: np.ndarray) -> np.ndarray:
@@ -160,8 +156,7 @@ def _product(row: list[int], names: list[str]) -> str:
 
 def _sum(row: list[int], names: list[str]) -> str:
     parts = [(x, name if abs(x) == 1 else f"{abs(x)} {name}") for x, name in zip(row, names, strict=True) if x]
-    text = "".join(f" {'+' if x > 0 else '−'} {part}" for x, part in parts)
-    return text.removeprefix(" + ")
+    return "".join(f" {'+' if x > 0 else '−'} {part}" for x, part in parts).removeprefix(" + ")
 
 
 def _join_names(names: list[str]) -> str:

@@ -27,8 +27,7 @@ _OWN = 0.2  # of the motion left in a record, explained by parameters of its own
 def disagreements(
     residuals: Residuals, triangles: np.ndarray, known: Information, inside: np.ndarray, motion: dict[int, float]
 ) -> tuple[list[str], list[str]]:
-    """Sentences for the records without which a parameter would move by more than they can have by chance: for those of
-    another motion, and for those that show, each in its way, what the scene lacks.
+    """Sentences for the records of another motion, and for those that show, each in its way, what the scene lacks.
 
     Only of parameters `inside` (F,) of their sets: at a bound the sum of squares has a slope. `motion` is the sum of
     squares of what the fit leaves in a record beyond white noise.
@@ -61,8 +60,7 @@ def disagreements(
 
 
 def _shift_clause(label: str, shift: float) -> str:
-    """The clause on a shift in standard deviations; parameters move up with their unknowns."""
-    way = "up" if shift > 0 else "down"
+    way = "up" if shift > 0 else "down"  # parameters move up with their unknowns
     return f"{label} would move {way} by {abs(shift):.1f} of the standard deviations that chance gives it"
 
 

@@ -89,9 +89,8 @@ def information(descent: Descent) -> Information:
     factors = residuals.fisher_factors(trial, noise)
     triangles = residuals.triangles(trial, factors)
     null, basis = null_space(triangles, residuals.states)
-    free = len(trial.u)
     # Growth alone is not enough: a drive that sets in smoothly begins with rows as small as numbers can be.
-    sizes, states = residuals.parameters.sizes(trial.u), residuals.states
+    free, sizes, states = len(trial.u), residuals.parameters.sizes(trial.u), residuals.states
     last = [np.abs(x[..., states:] * sizes / residuals.size[:, None]).max(initial=0.0) for x in trial.slopes]
     if max(last) > _LOST and growth(row_sizes(residuals, trial)) > _LOST:
         null, basis = np.eye(free), np.zeros((free, 0))
@@ -134,16 +133,13 @@ def information(descent: Descent) -> Information:
 
 def null_space(triangles: np.ndarray, states: int) -> tuple[np.ndarray, np.ndarray]:
     """Directions of u (F, K) that nothing depends on, the starts being free; and a basis (F, F − K) of the others."""
-    rows = _parameter_rows(triangles, states)
-    unit = _lengths(triangles, states)
+    rows, unit = _parameter_rows(triangles, states), _lengths(triangles, states)
     if not len(unit):
         return np.zeros((0, 0)), np.zeros((0, 0))
     # From above zero by its own round-off, so that a column which is noise alone counts as nothing.
     decided = decide(rows / unit, NULL, NULL)
     null = decided.null / unit[:, None]
-    null = null / np.abs(null).max(axis=0, initial=0.0)  # before squares of it are no numbers
-    null = null / np.linalg.norm(null, axis=0)
-    return null, decided.right[:, : int(decided.rank)] / unit[:, None]
+    return null / _norm(null, 0), decided.right[:, : int(decided.rank)] / unit[:, None]
 
 
 def confirmed_null(residuals: Residuals, point: Trial, null: np.ndarray) -> np.ndarray:
@@ -159,20 +155,16 @@ def confirmed_null(residuals: Residuals, point: Trial, null: np.ndarray) -> np.n
 def row_sizes(residuals: Residuals, point: Trial) -> list[np.ndarray]:
     """The length of the row of each sample (N, T, S) of every batch, its columns as fractions of their largest."""
     largest = np.max([np.abs(slopes).max(axis=(0, 1, 2)) for slopes in point.slopes], axis=0)
-    columns = np.where(largest > 0, largest, 1.0)
-    return [
-        np.where(batch.weights > 0, _norm(slopes / columns, -1), 0.0)
-        for batch, slopes in zip(residuals.batches, point.slopes, strict=True)
-    ]
+    columns, pairs = np.where(largest > 0, largest, 1.0), zip(residuals.batches, point.slopes, strict=True)
+    return [np.where(batch.weights > 0, _norm(slopes / columns, -1), 0.0) for batch, slopes in pairs]
 
 
 def growth(sizes: list[np.ndarray]) -> float:
     """The growth of rows (N, T, S) along the record in which they grow most, from the first that is not zero."""
     found = 1.0
     for row in (row for batch in sizes for row in batch.max(axis=2)):
-        (places,) = np.nonzero(row)
-        if len(places):
-            found = max(found, float(row.max() / row[places[0]]))
+        if row.any():
+            found = max(found, float(row.max() / row[np.argmax(row > 0)]))
     return found
 
 
@@ -209,10 +201,8 @@ def eliminate_starts(triangles: np.ndarray, slopes: np.ndarray, states: int) -> 
 def covariance_of_one_start(
     rows: np.ndarray, states: int, known: Information, share: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The uncertainty of a start by weighted rows (T, S, 2n + F): covariance (2n, 2n) for fixed parameters, and A⁺B.
-
-    Every sample is worth the `share` of an independent one.
-    """
+    """The uncertainty of a start by weighted rows (T, S, 2n + F), every sample worth the `share` of an independent one:
+    the covariance (2n, 2n) for fixed parameters, and A⁺B."""
     flat = rows.reshape(-1, rows.shape[-1])
     decided = decide(flat[:, :states], _UNFELT)
     half = decided.right[:, : int(decided.rank)] / decided.values[: int(decided.rank)]
@@ -222,8 +212,7 @@ def covariance_of_one_start(
 def signal_deviations(slopes: np.ndarray, states: int, start: np.ndarray, follows: np.ndarray, known: Information):
     """The standard deviations (T, S) of signals whose derivatives are `slopes` (T, S, 2n + F).
 
-    They come from the parameters as far as these are seen, and from a start of covariance `start` (2n, 2n) of its own
-    that `follows` (2n, F) the parameters.
+    The start has the covariance `start` (2n, 2n) of its own, and `follows` (2n, F) the parameters.
     """
     a = slopes[..., :states]
     along = slopes[..., states:] - a @ follows

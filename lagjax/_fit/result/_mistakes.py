@@ -61,10 +61,8 @@ def possible_mistakes(
     swaps = []
     for i, j in itertools.combinations(some, 2):
         order = np.arange(count)
-        order[[i, j]] = j, i
-        swaps.append(
-            PossibleMistake(f"with {names[i]} and {names[j]} swapped", _change_signals(records, np.asarray, order))
-        )
+        order[[i, j]], text = (j, i), f"with {names[i]} and {names[j]} swapped"
+        swaps.append(PossibleMistake(text, _change_signals(records, np.asarray, order)))
     yield from swaps if len(swaps) == 1 else []  # one try tells
     for place in worst[:_MOST] if len(records) > 2 else []:
         yield PossibleMistake(f"without records[{place}]", [*records[:place], *records[place + 1 :]])
@@ -83,17 +81,15 @@ def find_mistake(
 ) -> list[str]:
     """A sentence for the first mistake without which a fit follows the records; none where there is no such.
 
-    `share(records)` is what a fit of other records leaves of the signals, None where it fails as well; `left` is what
-    the fit of these left. No try begins after this many seconds of processor time.
+    `share(records)` is what a fit leaves of the signals, None where it fails; `left` is what the fit of these left.
     """
     until = time.process_time() + seconds
     for suspect in possible:
         now = share(suspect.records)
         if now is not None and now < _BETTER * left:
             before = "failed" if np.isinf(left) else f"leaves {100 * left:.2g} % of them"
-            return [
-                f"The data are followed {suspect.text}: that leaves {100 * now:.2g} % of them, and this fit {before}."
-            ]
+            after = f"that leaves {100 * now:.2g} % of them"
+            return [f"The data are followed {suspect.text}: {after}, and this fit {before}."]
         if time.process_time() > until:
             break
     return []

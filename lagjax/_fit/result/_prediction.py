@@ -1,9 +1,7 @@
 """Prediction: the fitted scene over other records, those that were measured and those that are planned.
 
-It holds `Prediction`, `predict_record` (the motion of a record with bands) and `planned_rows` (the rows of a planned
-record, for experiment design). Both follow a record once with derivatives by its start and by the parameters. The
-uncertainty of a start that is fitted to the record itself is that for fixed parameters and the way in which it follows
-these.
+Both follow a record once with derivatives by its start and by the parameters. The uncertainty of a start that is fitted
+to the record itself is that for fixed parameters and the way in which it follows these.
 """
 
 from dataclasses import replace
@@ -84,12 +82,10 @@ def predict_record(fit, record: Record, system: str | None) -> Prediction:
     state = known_start(record, layout, 0, fit.params)
     is_fitted = state is None or isinstance(record.start, Guess)
     if state is None:
-        reader = build_reader(record, part, fit.parameters.numbers(fit.u))
-        state = read_start(reader, record, part, "This record")
+        state = read_start(build_reader(record, part, fit.parameters.numbers(fit.u)), record, part, "This record")
     fixed = part.with_records([record], np.array([is_fitted]), fit.parameters.fix(fit.u), part.manifold)
     residuals, point = Residuals([fixed]), Point(np.zeros(0), state[None])
-    known = KnownNoise(noise)
-    trial = minimise(residuals, point, known, 1e-3).trial if is_fitted else residuals.evaluate(point)
+    trial = minimise(residuals, point, KnownNoise(noise), 1e-3).trial if is_fitted else residuals.evaluate(point)
     state = trial.starts[0]
     start = layout.restore(state[:n]), layout.restore(state[n:])
     q0, qdot0, ts = jax.tree.map(lambda x: np.asarray(x, layout.dtype), (*start, record.ts))

@@ -123,11 +123,10 @@ def profile(fit, name: str, level: float) -> Profile:
     if any(d < threshold for _, d in minima[1:]):
         verdict = "two minima"
     places = sorted(line.places, key=lambda place: place.at)
-    return Profile(
-        parameters.names[row], np.array([value(place.at) for place in places]),
-        np.array([place.deviance for place in places]), level, threshold, (value(ends[0]), value(ends[1])), verdict,
-        tuple((value(at), d) for at, d in minima),
-    )  # fmt: skip
+    values, deviances = np.array([(value(place.at), place.deviance) for place in places]).T
+    found = tuple((value(at), d) for at, d in minima)
+    interval = value(ends[0]), value(ends[1])
+    return Profile(parameters.names[row], values, deviances, level, threshold, interval, verdict, found)
 
 
 def _find_end(line: _ProfileLine, side: float, threshold: float, room: float) -> float:
@@ -167,19 +166,13 @@ def _locate_root(line: _ProfileLine, below: float, above: float, threshold: floa
 def _minima(line: _ProfileLine, threshold: float) -> list[tuple[float, float]]:
     """Minima of the profile: the fit's own, and those that searches find from where it falls again."""
     own, places = line.places[0], sorted(line.places, key=lambda place: place.at)
-    middle = places.index(own)
-    sides = [places[middle::-1], places[middle:]]
-    falls = [
-        after
-        for side in sides
-        for before, after in itertools.pairwise(side)
-        if after.deviance < before.deviance - 1e-3 * max(threshold, before.deviance)
-    ]
+    sides = [places[places.index(own) :: -1], places[places.index(own) :]]
     found, apart = [(own.at, 0.0)], max(1e-3 * abs(own.at), min(line.wide, 1.0))
-    for place in falls:
-        minimum = line.minimum(place)
-        if minimum is not None and all(abs(minimum[0] - at) > apart for at, _ in found):
-            found.append(minimum)
+    for before, after in (pair for side in sides for pair in itertools.pairwise(side)):
+        if after.deviance < before.deviance - 1e-3 * max(threshold, before.deviance):
+            minimum = line.minimum(after)
+            if minimum is not None and all(abs(minimum[0] - at) > apart for at, _ in found):
+                found.append(minimum)
     return sorted(found, key=lambda one: one[1])
 
 
@@ -200,9 +193,8 @@ def _sentence(profile: Profile) -> str:
         elif deviance > 1e-3 and deviance <= profile.threshold:
             text += f" Another minimum at {value:.6g} is not excluded: its deviance is {deviance:.3g}."
         elif deviance > profile.threshold:
-            text += (
-                f" Another minimum at {value:.6g} has the deviance {deviance:.3g}, {profile.threshold:.3g} excludes it."
-            )
+            excludes = f"{profile.threshold:.3g} excludes it"
+            text += f" Another minimum at {value:.6g} has the deviance {deviance:.3g}, {excludes}."
         elif value != profile.minima[0][0]:
             text += f" Another minimum at {value:.6g} is as good."
     return text

@@ -1,6 +1,4 @@
-"""Report: a fit in words, in figures drawn with matplotlib, and as a page of HTML with these inside.
-
-It holds `lab_book` (what `print(fit)` shows), the functions that draw, and `render_page`.
+"""Report: a fit in words (`lab_book`), in figures drawn with matplotlib, and as a page of HTML with these inside.
 
 The figures do without the state machine of matplotlib, and `lagjax.plot` draws them too.
 """
@@ -58,9 +56,8 @@ def draw_correlations(ax, matrix: np.ndarray, names: tuple[str, ...]) -> None:
     ax.set_yticks(range(len(names)), names, fontsize="small")
     if len(names) <= 12:
         for i, j in np.argwhere(np.isfinite(correlation)):
-            dark = abs(correlation[i, j]) > 0.6
-            ax.text(j, i, f"{correlation[i, j]:.2f}", ha="center", va="center", fontsize="x-small",
-                    color="white" if dark else "black")  # fmt: skip
+            color = "white" if abs(correlation[i, j]) > 0.6 else "black"
+            ax.text(j, i, f"{correlation[i, j]:.2f}", ha="center", va="center", fontsize="x-small", color=color)
     ax.figure.colorbar(image, ax=ax, shrink=0.8)
 
 
@@ -164,9 +161,8 @@ def lab_book(fit) -> str:
 
 def build_title(fit) -> str:
     samples = sum(noise.samples for noise in fit.noise.values())
-    spans = [record.ts[-1] - record.ts[0] for record in fit.records]
-    plural = "s" if len(fit.records) > 1 else ""
-    of_records = f"{len(fit.records)} record{plural}, {sum(spans):g} long, {samples} values"
+    long, plural = sum(record.ts[-1] - record.ts[0] for record in fit.records), "s" * (len(fit.records) > 1)
+    of_records = f"{len(fit.records)} record{plural}, {long:g} long, {samples} values"
     return f"Fit of {len(fit.u)} parameter{'s' * (len(fit.u) != 1)} to {of_records}"
 
 
@@ -197,14 +193,10 @@ def _noise_cells(fit) -> list[list[str]]:
 
 
 def _align(rows: list[list[str]], widths: dict[str, int]) -> list[str]:
-    """The lines of a table: numbers to the right, as wide as `widths` by their heads say, the first and last column to
-    the left."""
-    first = max(len(row[0]) for row in rows)
-    return [
-        "  ".join([f"{row[0]:<{first}}", *(f"{x:>{widths[h]}}" for x, h in zip(row[1:-1], rows[0][1:-1], strict=True)),
-                   row[-1]]).rstrip()
-        for row in rows
-    ]  # fmt: skip
+    """The lines of a table: the first and last column to the left, others to the right, as wide as `widths` by head."""
+    first, each = max(len(row[0]) for row in rows), [widths[head] for head in rows[0][1:-1]]
+    middles = [[f"{x:>{width}}" for x, width in zip(row[1:-1], each, strict=True)] for row in rows]
+    return ["  ".join([f"{row[0]:<{first}}", *some, row[-1]]).rstrip() for row, some in zip(rows, middles, strict=True)]
 
 
 def record_matrix(values: Any, record) -> np.ndarray:

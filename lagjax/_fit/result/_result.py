@@ -7,6 +7,7 @@ import functools
 import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -103,7 +104,7 @@ class Fit:
     @classmethod
     def from_descent(
         cls, descent: Descent, law: AbstractNoise, waterfall: Waterfall | None
-    ) -> "tuple[Fit, Unexplained]":
+    ) -> tuple["Fit", Unexplained]:
         """The fit that a search ended at, and what it leaves of the signals."""
         residuals, trial, noise = descent.residuals, descent.trial, descent.noise
         parameters, known = residuals.parameters, information(descent)
@@ -114,26 +115,14 @@ class Fit:
         columns = noise.sigma, noise.dof, samples, known.effective, 2 * (1 - known.correlation)
         signals = [SignalNoise(*(x.item() for x in one)) for one in zip(*columns, strict=True)]
         fit = cls(
-            params=parameters.restore(parameters.numbers(trial.u)),
-            starts=residuals.group_by_system(starts),
+            params=parameters.restore(parameters.numbers(trial.u)), starts=residuals.group_by_system(starts),
             covariance=Covariance(parameters.names, parameters.covariance(trial.u, known.covariance)),
             noise=dict(zip(residuals.names, signals, strict=True)),
             residuals=residuals.group_by_system(_record_residuals(residuals, trial)),
-            unseen=unseen,
-            ok=ok,
-            message=message,
-            log_likelihood=residuals.log_likelihood(trial, noise),
-            trials=descent.trials,
-            waterfall=waterfall,
-            records=tuple(residuals.records),
-            parameters=parameters,
-            u=trial.u,
-            states=trial.starts,
-            law=law,
-            information=known,
-            noise_scale=noise,
-            residual_function=residuals,
-        )
+            unseen=unseen, ok=ok, message=message, log_likelihood=residuals.log_likelihood(trial, noise),
+            trials=descent.trials, waterfall=waterfall, records=tuple(residuals.records), parameters=parameters,
+            u=trial.u, states=trial.starts, law=law, information=known, noise_scale=noise, residual_function=residuals,
+        )  # fmt: skip
         return fit, left
 
     def __repr__(self) -> str:
@@ -296,9 +285,7 @@ class Fit:
         matplotlib.
         """
         texts = {"What to measure next": str(self.next_experiment(experiments))} if experiments else {}
-        text = render_page(self, texts)
-        with open(path, "w", encoding="utf-8") as file:
-            file.write(text)
+        Path(path).write_text(render_page(self, texts), encoding="utf-8")
 
     @with_doubles
     def compare(self, other: "Fit | dict[str, Fit]", *, folds: int = 0) -> Comparison:
@@ -319,12 +306,10 @@ class Fit:
 def _record_residuals(residuals: Residuals, trial: Trial) -> list[PyTree]:
     """The residuals of every record in its structure, NaN where nothing was measured."""
     columns = [residuals.columns(k) for k in range(len(residuals.records))]
-    found = [
-        np.full((len(record), c.stop - c.start), np.nan) for record, c in zip(residuals.records, columns, strict=True)
-    ]
+    pairs = zip(residuals.records, columns, strict=True)
+    found = [np.full((len(record), own.stop - own.start), np.nan) for record, own in pairs]
     for batch, own in zip(residuals.batches, trial.residuals, strict=True):
         for row, left, weights in zip(batch.rows.tolist(), own, batch.weights, strict=True):
             record, places = residuals.pieces[row]
-            matrix = np.where(weights > 0, left, np.nan)[: len(places), columns[record]]
-            found[record][places] = matrix
+            found[record][places] = np.where(weights > 0, left, np.nan)[: len(places), columns[record]]
     return [restore_structure(matrix, record) for matrix, record in zip(found, residuals.records, strict=True)]

@@ -1,7 +1,5 @@
 """`sample`: draws from the posterior of a fit, by the No-U-Turn sampler in the fit's own metric.
 
-`Chart` has coordinates z in which the posterior π is nearly round, beside a bound too.
-
 By rule, where that can be had: the sampler moves along π*, the density whose residuals are expanded to second order
 (`Surrogate`), which costs no motions, with enough of its steps that y is nearly independent of the x where it began;
 then one exact density decides. The chain goes to y with the probability
@@ -13,8 +11,7 @@ poor expansion makes a slow chain, not a wrong one. Nothing of π* is changed af
 the draws are accepted, where the weights π/π* have no variance because π* is too narrow, and where chains are worth few
 independent draws, the sampler follows π itself, with gradients through the motions at every step.
 
-All chains go side by side in one batch of motions. The effective number of draws comes with them, and a warning where
-it is small.
+All chains go side by side in one batch of motions.
 
 Which library: blackjax, whose kernels are plain functions of a log density; arviz for what draws are worth. numpyro
 does the same behind a language for models, of which nothing is needed. The warming (`_tune_sampler`) is not
@@ -96,27 +93,19 @@ def _sample_expansion(chart: Chart, draws: int, chains: int, seed: int) -> Draws
     sampler = sampler._replace(inner=min(max(math.ceil(many), 1), _MOST_INNER))
     exact = jax.jit(jax.vmap(chart.log_density))
     drawn, tail = _correct_draws(surrogate, sampler, exact, Chains.from_state(state, exact), draws, going)
-    if (share := drawn.acceptance.mean()) < _LEAST:
-        raise Unexpanded(
-            f"Of draws of the expansion of its residuals to second order the exact density accepts {share:.2f}."
-        )
-    if drawn.acceptance.mean() < _NEARLY_ALL and tail > _HEAVY:
-        raise Unexpanded(
-            f"The expansion of its residuals to second order is too narrow: π/π* has a Pareto tail of {tail:.2f}."
-        )
+    share, expansion = drawn.acceptance.mean(), "the expansion of its residuals to second order"
+    if share < _LEAST:
+        raise Unexpanded(f"Of draws of {expansion} the exact density accepts {share:.2f}.")
+    if share < _NEARLY_ALL and tail > _HEAVY:
+        raise Unexpanded(f"{expansion.capitalize()} is too narrow: π/π* has a Pareto tail of {tail:.2f}.")
     if (worth := agreement(drawn.x)[0].min()) < _WORTH * draws * chains:
-        raise Unexpanded(
-            f"Of {draws * chains} draws along the expansion of its residuals {worth:.0f} were independent."
-        )
+        raise Unexpanded(f"Of {draws * chains} draws along {expansion} {worth:.0f} were independent.")
     return drawn
 
 
 class Sampler(NamedTuple):
-    """The sampler along a density: `move` (keys, state, step, metric), its step and metric (D, D), and how many steps
-    make a draw.
-
-    A state is that of C chains; the program of one step of all of them is compiled once for warming and drawing.
-    """
+    """The sampler along a density: `move` (keys, state, step, metric) of C chains, compiled once for warming and
+    drawing, its step and metric (D, D), and how many steps make a draw."""
 
     move: Callable
     step: float
@@ -174,8 +163,7 @@ def _tune_sampler(
 
 def _draw_possible_states(log_density: Callable, shape: tuple[int, int], dtype, key):
     """Draws (C, D) of the fit's normal density where `log_density` is finite: elsewhere a chain does not move."""
-    density = jax.jit(jax.vmap(log_density))
-    z = jax.random.normal(key, shape, dtype)
+    density, z = jax.jit(jax.vmap(log_density)), jax.random.normal(key, shape, dtype)
     for k in range(_TRIED):
         outside = ~jnp.isfinite(density(z))
         if not outside.any():
@@ -203,9 +191,8 @@ class Chains(NamedTuple):
     @staticmethod
     def from_state(state, exact: Callable) -> "Chains":
         log_exact, log_expansion = np.asarray(exact(state.position), float), np.asarray(state.logdensity, float)
-        ratio = np.subtract(
-            log_exact, log_expansion, out=np.full(len(log_exact), -np.inf), where=np.isfinite(log_exact)
-        )
+        with np.errstate(invalid="ignore"):
+            ratio = np.where(np.isfinite(log_exact), log_exact - log_expansion, -np.inf)
         return Chains(state, log_exact, ratio)
 
 
@@ -270,11 +257,9 @@ def agreement(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 def _check_agreement(density: Density, drawn: Draws) -> dict[str, float]:
     """The worst of the agreement of chains, by name; a warning where that is too little to read quantiles off draws."""
     each, r_hat = agreement(drawn.x)
-    worst, apart = int(np.argmin(each)), float(np.max(r_hat))
-    effective = float(each[worst])
-    count = drawn.x.shape[0] * drawn.x.shape[1]
+    effective, apart, count = float(np.min(each)), float(np.max(r_hat)), drawn.x.shape[0] * drawn.x.shape[1]
     if not effective >= _RELIABLE or apart > _APART:
-        at = density.names[worst if not effective >= _RELIABLE else int(np.argmax(r_hat))]
+        at = density.names[int(np.argmin(each) if not effective >= _RELIABLE else np.argmax(r_hat))]
         warnings.warn(
             f"The {count} draws of {at} are worth {effective:.0f} independent ones, and r-hat is {apart:.2f}: do not "
             f"read intervals off them. {_RELIABLE} and r-hat below {_APART} are the least; ask for more draws.",
@@ -315,10 +300,7 @@ def inference_data(density: Density, drawn: Draws) -> Any:
     posterior["sigma"], dims["sigma"] = sigma, ["signal"]
     if np.isfinite(density.noise.dof).any():
         posterior["dof"], dims["dof"] = dof, ["signal"]
-    stats = {
-        "lp": drawn.log_density, "n_steps": drawn.steps, "diverging": drawn.diverged,
-        "acceptance_rate": drawn.acceptance,
-    }  # fmt: skip
+    stats = dict(lp=drawn.log_density, n_steps=drawn.steps, diverging=drawn.diverged, acceptance_rate=drawn.acceptance)
     attributes = {"sampler": drawn.sampler, **_check_agreement(density, drawn)}
     return arviz.from_dict(posterior=posterior, sample_stats=stats, dims=dims, coords=coords, attrs=attributes)
 

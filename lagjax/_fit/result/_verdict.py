@@ -32,8 +32,7 @@ def verdict(
     descent: Descent, unseen: tuple[str, ...], known: Information, left: Unexplained, law: AbstractNoise
 ) -> tuple[bool, str]:
     """A flag that a fit can be relied upon, and the sentences that say why, where the search leaves `left`."""
-    residuals = descent.residuals
-    parts = [descent.message]
+    residuals, parts = descent.residuals, [descent.message]
     if known.confirmed.shape[1]:
         parts.append("Not everything that is free is seen: fix it, or measure more.")
     parts += left.motion + left.noise
@@ -102,8 +101,7 @@ def _describe_ends(residuals: Residuals, trial: Trial, triangles: np.ndarray, kn
         if not isinstance(transform, Positive | Between):
             continue
         x, slope = float(transform.value(trial.u[k])), float(transform.slope(trial.u[k]))
-        text = _describe_end(label, transform.bounds, x, slope * step[k], slope * deviations[k])
-        if text is not None:
+        if (text := _describe_end(label, transform.bounds, x, slope * step[k], slope * deviations[k])) is not None:
             found.append(text)
             named[k] = True
     return found, named

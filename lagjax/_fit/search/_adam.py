@@ -66,10 +66,8 @@ def descend_gradient(
         raise residuals.parts[0].lost(0, "The gradient is not finite at any trial.")
     x = np.asarray(first + scale * carry[2][1], float)
     rest = costs[-max(1, len(costs) // 10) - 1] if len(costs) > 1 else np.inf
-    at = density.unknowns(jnp.asarray(x, scale.dtype))
-    return Point(x[: len(point.u)], np.asarray(at.starts, float)), bool(
-        (rest - costs[-1]) * residuals.measured < _STILL
-    )
+    starts = np.asarray(density.unknowns(jnp.asarray(x, scale.dtype)).starts, float)
+    return Point(x[: len(point.u)], starts), bool((rest - costs[-1]) * residuals.measured < _STILL)
 
 
 def _units(density: Density, x: np.ndarray) -> np.ndarray:

@@ -40,8 +40,7 @@ _KINK = (
 
 
 class Descent(NamedTuple):
-    """The end of a search for the minimum of `residuals`: the last trial, its noise, whether the search converged, how
-    many trials it took, and a sentence."""
+    """The end of a search: its last trial with the noise, how many there were, and a sentence."""
 
     residuals: Residuals
     trial: Trial
@@ -102,8 +101,8 @@ def minimise(
     """The unknowns that make the measurements likeliest, by a search from a point.
 
     It ends when a step without damping, within the reach of the transforms, promises to lower half the sum of squares,
-    in units of the noise, by less than `enough`, correlated residuals counted for what they are worth: then no
-    parameter is further than √(2 enough) standard deviations from the minimum.
+    in units of the noise, by less than `enough`: then no parameter is further than √(2 enough) standard deviations from
+    the minimum.
     Raises `LostMotion` where the motion from the first trial cannot be followed.
     """
     trial = residuals.evaluate(point)
@@ -174,8 +173,7 @@ def _limited_step(rest: np.ndarray, of_u: np.ndarray, damping: float, limits) ->
     """δu (F,) that minimises |rest (δu, 1)|² + Σ damping (scale δu)², with more damping of what is beyond limits."""
     free, each = len(of_u), np.full(len(of_u), damping)
     while True:
-        rows = np.concatenate([rest, np.diag(np.append(np.sqrt(each) * of_u, 0.0))[:free]])
-        triangle = qr_triangle(rows)
+        triangle = qr_triangle(np.concatenate([rest, np.diag(np.append(np.sqrt(each) * of_u, 0.0))[:free]]))
         du = np.linalg.solve(triangle[:free, :free], -triangle[:free, free])
         beyond = (du < limits[0]) | (du > limits[1])
         if not beyond.any() or each[beyond].min() > _MOST:

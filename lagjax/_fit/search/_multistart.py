@@ -1,7 +1,6 @@
 """Multistart: many starts at once, and where each of them ended.
 
-The first start is the user's `params0`, the others are drawn from what the transforms say: a decade about a positive
-number, all of an interval, of a circle or of a simplex, and about any other number as far as it is large. All of them
+The first start is the user's `params0`, the others are drawn by the transforms (`AbstractTransform.draw`). All of them
 take a few damped steps of Gauss and Newton over a sample of the times of each record; the best few then go through the
 whole search.
 
@@ -48,16 +47,14 @@ class Waterfall(NamedTuple):
 
 
 def misfit(noise: NoiseScale, residuals: Residuals) -> float:
-    """The noise over the size of the signals of records, its geometric mean; of crossing times where there are no
-    others."""
+    """The geometric mean of the noise over the size of signals, without crossing times where there are others."""
     recorded = np.concatenate([np.arange(len(part.names)) < len(part.signals.names) for part in residuals.parts])
     keep = recorded if recorded.any() else ~recorded
     return float(np.exp(np.mean(np.log((noise.sigma / residuals.size)[keep]))))
 
 
 def _search_shortly(residuals: Residuals, u: np.ndarray, starts: np.ndarray) -> tuple[float, Point]:
-    """The misfit and the point after a few steps, over a sample of the times of each record; infinite where its motion
-    cannot be followed."""
+    """The misfit and the point after a few steps; infinite where a motion cannot be followed."""
     try:
         done = minimise(residuals, Point(u, starts), Gaussian(), _ENOUGH * residuals.measured, _SHORT_TRIALS)
     except LostMotion:
@@ -77,13 +74,11 @@ def run_multistart(
     short = residuals.with_pieces(pieces, residuals.fitted)
     short.watch = None
     trials = sorted((_search_shortly(short, one, point.starts) for one in u), key=lambda trial: trial[0])
-    misfits, done = np.array([trial[0] for trial in trials]), []
-    chosen: list[int] = []  # the best that came to different misfits
-    for k in np.flatnonzero(np.isfinite(misfits)).tolist():
+    misfits, done, chosen = np.array([trial[0] for trial in trials]), [], []
+    for k in np.flatnonzero(np.isfinite(misfits)).tolist():  # the best that came to different misfits
         if all(abs(np.log(misfits[k] / misfits[j])) > 1e-3 for j in chosen):
             chosen.append(k)
-    begins = [(k, trials[k][1]) for k in chosen[:_BEST]]
-    for place, begin in [*begins, (None, point)]:
+    for place, begin in [*((k, trials[k][1]) for k in chosen[:_BEST]), (None, point)]:
         try:
             done.append(search(begin))
         except ValueError:

@@ -33,15 +33,14 @@ class Reader(NamedTuple):
     periods: tuple[float, ...]
 
     @classmethod
-    def from_record(cls, record: Record, probes: int = 256, periods: np.ndarray | None = None) -> "Reader":
+    def from_record(cls, record: Record, probes: int, periods: np.ndarray) -> "Reader":
         """A reader with the longest windows whose cubics leave at most `_WORSE_WINDOW` times what the shortest leave.
 
         Beyond these they no longer follow the motion. They are tried at `probes` places.
         """
         places = even_places(len(record), probes)
         windows, scatter = zip(*(_window(record.ts[places], *signal) for signal in _signals(record)), strict=True)
-        each = np.full(len(windows), np.inf) if periods is None else periods
-        return cls(record, windows, scatter, tuple(each.tolist()))
+        return cls(record, windows, scatter, tuple(periods.tolist()))
 
     def states(self, places) -> np.ndarray:
         read = self.read(places)
@@ -49,24 +48,17 @@ class Reader(NamedTuple):
 
     def read(self, places) -> list[tuple]:
         """The result of `_read_states` for every signal at the samples `places`."""
-        ts = self.record.ts[places]
-        return [
-            _read_states(ts, *signal, window)
-            for signal, window in zip(_signals(self.record), self.windows, strict=True)
-        ]
+        ts, pairs = self.record.ts[places], zip(_signals(self.record), self.windows, strict=True)
+        return [_read_states(ts, *signal, window) for signal, window in pairs]
 
 
 def _signals(record: Record) -> list[tuple[np.ndarray, np.ndarray]]:
-    columns = record.matrix.T
-    return [(record.ts[np.isfinite(column)], column[np.isfinite(column)]) for column in columns]
+    return [(record.ts[np.isfinite(column)], column[np.isfinite(column)]) for column in record.matrix.T]
 
 
 def _read_states(ts: np.ndarray, t: np.ndarray, y: np.ndarray, window: int):
-    """The values of a signal (t, y) and its rates at the times `ts`, what is left, and the local cubics there.
-
-    Where hardly anything was measured the signal is taken to be at rest.
-    """
-    if len(t) <= _DEGREE + 1:
+    """The values of a signal (t, y) and its rates at the times `ts`, what is left, and the local cubics there."""
+    if len(t) <= _DEGREE + 1:  # hardly anything was measured: taken to be at rest
         level = np.full(len(ts), np.mean(y) if len(y) else 0.0)
         return level, np.zeros(len(ts)), 0.0, level[:, None]
     return _local_cubics(ts, t, y, min(window, len(t)))
@@ -108,17 +100,13 @@ def short_windows(readers: list[Reader], length: float) -> tuple[list[Record], n
     Motions that are shorter than the time between samples see the curvature of the cubics: what a scene says about
     accelerations, without a second derivative of the data.
     """
-    found, states = [], []
+    found, states, offsets = [], [], np.linspace(0.0, length, 4)
     for reader in readers:
         places = even_places(len(reader.record), max(4, _WINDOWS_IN_ALL // len(readers)))
-        offsets = np.linspace(0.0, length, 4)
         cubics = [one[3] for one in reader.read(places)]
         values = np.stack([np.polynomial.polynomial.polyval(offsets, c.T) for c in cubics], axis=-1)
-        structured = [restore_structure(v, reader.record) for v in values]
-        found += [
-            Record(t + offsets, v, inputs_between(reader.record, t + offsets))
-            for t, v in zip(reader.record.ts[places], structured, strict=True)
-        ]
+        for ts, shown in zip(reader.record.ts[places, None] + offsets, values, strict=True):
+            found.append(Record(ts, restore_structure(shown, reader.record), inputs_between(reader.record, ts)))
         states.append(reader.states(places))
     return found, np.concatenate(states)
 
@@ -133,9 +121,8 @@ class TimeScales(NamedTuple):
 def time_scales(readers: list[Reader], motions: AbstractMotions, numbers: np.ndarray) -> TimeScales:
     """The shortest times over which a motion looks like a straight line, with the parameters `numbers` (P,).
 
-    That of the data is the ratio of the spread of a coordinate to its rate, about 1/ω; that of the scene the root of
-    the spread of the coordinates, in units of each, over the accelerations there. Where nothing moves, they are
-    infinite.
+    That of the data is the spread of a coordinate over its rate, about 1/ω, that of the scene the root of the spread
+    over the acceleration there; infinite where nothing moves.
     """
     places = [even_places(len(reader.record), _PROBES) for reader in readers]
     states = [reader.states(some) for reader, some in zip(readers, places, strict=True)]
@@ -157,8 +144,7 @@ def build_reader(record: Record, about: SystemResiduals, numbers: np.ndarray, pr
     if not about.signals.look_like_positions(record):
         return None
     periods = about.signals.periods
-    smooth = unwrap_record(record, periods)
-    if smooth is None:
+    if (smooth := unwrap_record(record, periods)) is None:
         return None
     read = about.signals.positions(smooth, numbers)
     if np.isfinite(periods).any():  # in the units of coordinates
@@ -168,10 +154,7 @@ def build_reader(record: Record, about: SystemResiduals, numbers: np.ndarray, pr
 
 
 def read_records(residuals: Residuals) -> list[Reader | None]:
-    """Readers of states off the data, for each record whose signals are positions; None for others.
-
-    All records of a system together try windows at a few hundred places.
-    """
+    """A reader for each record whose signals are positions, None for others; a few hundred probes for each system."""
     numbers = residuals.parameters.first
     return [
         build_reader(record, part, numbers, max(8, 256 // len(part.records))) if isinstance(record, Record) else None

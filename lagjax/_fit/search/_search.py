@@ -45,11 +45,7 @@ _GRADIENT_STEPS = 3000  # of a descent by gradients
 
 
 class Search:
-    """The search of a fit: `search(point)` is the end of one from a point.
-
-    `law` is the law of the noise; `readers` read states off the records, None in the place of those that no state can
-    be read off; those of hybrid motion are not cut into segments.
-    """
+    """The search of a fit: `search(point)` is the end of one from a point; `readers` read states off the records."""
 
     def __init__(self, residuals: Residuals, law: AbstractNoise, method: str, readers: list[Reader | None]):
         self.residuals, self.law, self.method = residuals, law, method
@@ -93,20 +89,16 @@ class Search:
             ratio = misfit(joined.noise, joined.residuals) / misfit(done.noise, part)
             worse = f"leaves {ratio:.2g} times more"
         text = f"The records are followed in {len(pieces)} pieces, each with a start of its own: to join them {worse}"
-        growth = _separation(done)
-        if growth > _LYAPUNOV:
+        if is_chaotic := (growth := _separation(done)) > _LYAPUNOV:
             text += f", because motions that begin side by side part e^{growth:.0f}-fold over a record."
-            return done._replace(message=f"{done.message} {text}")
-        text += ", though the motion does not forget its start: the scene lacks something that lasts longer."
-        return done._replace(message=f"{done.message} {text}", converged=False)
+        else:
+            text += ", though the motion does not forget its start: the scene lacks something that lasts longer."
+        return done._replace(message=f"{done.message} {text}", converged=done.converged and is_chaotic)
 
     # ---- segments that grow ----
 
     def _fit_growing_segments(self, point: Point) -> tuple[Point, list[Descent]]:
-        """Better first values, from segments that grow together to whole records; and the levels.
-
-        Where joining loses the motion twice in a row, no longer segment is tried.
-        """
+        """Better first values, from segments that grow together to whole records; and the levels."""
         reach = self.residuals.parameters.reach
         anchor = Anchor(point.u, np.where(np.isfinite(reach), 1.0 / _LOOSE, 0.0))
         begun = self._fit_shortest_segments(point, anchor)
@@ -126,10 +118,8 @@ class Search:
         return Point(u, np.stack([best[k, 0] for k in range(len(self.residuals.records))])), levels_done
 
     def _fit_shortest_segments(self, point: Point, anchor: Anchor) -> "_ShortestSegments":
-        """The search on the shortest segments, whose misfit is positive where they were not fitted.
-
-        It is the mean logarithm of the noise σ of the signals, over `_POOR` times the scatter of the data or a share
-        `_COARSE` of the signals' size, whichever is larger.
+        """The search on the shortest segments. Their misfit, positive where they were not fitted, is the mean logarithm
+        of the noise over `_POOR` times the scatter of the data, or over `_COARSE` of the signals where that is larger.
         """
         u, cuts = point.u, self._cut_records(point.u)
         best = {(k, 0): start for k, start in enumerate(point.starts)}
@@ -148,8 +138,7 @@ class Search:
         return _ShortestSegments(done.trial.u, cuts, best, float(np.mean(np.log(ratio))), done)
 
     def _fit_level(self, pieces: list[Piece], u, best: dict, anchor: Anchor) -> Descent:
-        """The search on one cut of the records. The states in `best`, by record and sample, begin it and take its
-        end."""
+        """The search on one cut of the records, from the states in `best`, by record and sample, which take its end."""
         firsts = [(piece.record, int(piece.places[0])) for piece in pieces]
         for k, reader in enumerate(self.readers):
             new = [place for record, place in firsts if record == k and (k, place) not in best]
@@ -182,8 +171,7 @@ class Search:
         return [reader for reader in self.readers[part.frame.records] if reader is not None]
 
     def _time_scales(self, u) -> list[float]:
-        """The duration for which the motion of each system looks like a straight line, infinite for one of which no
-        state can be read off."""
+        """The duration for which the motion of each system looks like a straight line; infinite without readers."""
         numbers = self.residuals.parameters.numbers(u)
         return [
             min(time_scales(reading, part.motions, numbers)) if (reading := self._readers_of(part)) else np.inf
@@ -238,8 +226,7 @@ def search_again(done: Descent, law: AbstractNoise) -> Descent:
 
 
 class _ShortestSegments(NamedTuple):
-    """The beginning of growing segments: u, the cuts, the states at the first samples, their error, and the search
-    on the shortest segments where it came to an end."""
+    """The beginning of growing segments: u, the cuts, the states by record and sample, and the first search."""
 
     u: np.ndarray
     cuts: list[list[Piece]]
@@ -264,8 +251,7 @@ def _last_followed_level(levels_done: list[Descent]) -> int:
 def _separation(done: Descent) -> float:
     """The logarithm of how far motions part that begin side by side, over the longest record: λ times its length.
 
-    λ is the median over the pieces, from the mean square of the derivatives by the start over the first and the last
-    third of each.
+    λ is the median over pieces, from the mean squares of derivatives by the start in the first and the last third.
     """
     rates, states = [], done.residuals.states
     for batch, slopes in zip(done.residuals.batches, done.trial.slopes, strict=True):

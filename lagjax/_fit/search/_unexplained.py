@@ -18,9 +18,8 @@ _FAINT = 0.1  # of a signal's size over all records: what is left of a record th
 
 
 class Unexplained(NamedTuple):
-    """Sentences on what a search leaves: for signals of which motion is left, and for those whose noise is as large
-    as they are; the largest share of a signal that is left, whether it holds motion at all, and the records, the worst
-    first."""
+    """What a search leaves: sentences on signals of which motion is left, and on those as large as their noise; the
+    largest share of a signal, whether it holds motion at all, and the records, the worst first."""
 
     motion: list[str]
     noise: list[str]
@@ -30,7 +29,6 @@ class Unexplained(NamedTuple):
 
 
 def measure_unexplained(done: Descent) -> Unexplained:
-    """The share of the signals that the end of a search leaves, where that is much."""
     residuals = done.residuals
     left, noisy, shares, doubted = [], [], [0.0], False
     of_records = np.zeros(len(residuals.records))
@@ -80,11 +78,9 @@ class _Part(NamedTuple):
 
 
 def _measure_records(done: Descent, signal: int) -> dict[int, _Part]:
-    """The mean squares of one signal in every record that has it."""
     residuals, trial, noise = done.residuals, done.trial, done.noise
     rounding, pieces = np.nan_to_num(residuals.sensor.step[signal]) ** 2 / 12, {}
-    columns = zip(residuals.batches, trial.residuals, residuals.factors(trial, noise), strict=True)
-    for batch, r, factors in columns:
+    for batch, r, factors in zip(residuals.batches, trial.residuals, residuals.factors(trial, noise), strict=True):
         counts = (factors[..., signal] * noise.sigma[signal]) ** 2
         for row, place in enumerate(batch.rows):
             if counts[row].any():
@@ -93,8 +89,7 @@ def _measure_records(done: Descent, signal: int) -> dict[int, _Part]:
     found = {}
     for k, rows in pieces.items():
         longest = max(row.shape[1] for row in rows)
-        padded = np.stack([np.pad(row, ((0, 0), (0, longest - row.shape[1]))) for row in rows], axis=1)
-        r, values, counts = padded
+        r, values, counts = np.stack([np.pad(row, ((0, 0), (0, longest - row.shape[1]))) for row in rows], axis=1)
         samples = counts.sum()
         mean = np.sum(counts * values) / samples
         motion = correlated_power(np.sqrt(counts) * r, counts > 0) * (counts > 0).sum() / samples
