@@ -36,11 +36,8 @@ class Offender(NamedTuple):
 
 
 def offenders(function: Callable, *arguments, derivatives: bool = True) -> list[Offender]:
-    """The operations of `function(q, qdot, t, params)` that are not finite, or whose derivatives by (q, q̇, t) are not.
-
-    They are listed in the order in which they are evaluated. Without `derivatives`, which take a hundred times as
-    long, only values are looked at.
-    """
+    """The operations of `function(q, qdot, t, params)` that are not finite, or whose derivatives by q, q̇, t are not."""
+    # In the order in which they are evaluated. Derivatives take a hundred times as long as values.
     collected = []
 
     def visit(equation, operands, moves, results, place):
@@ -68,11 +65,7 @@ def offenders(function: Callable, *arguments, derivatives: bool = True) -> list[
 
 
 def poles(function: Callable, *arguments) -> list[Offender]:
-    """The operations of `function(q, qdot, t, params)` that are next to a pole or a branch point, in order.
-
-    There the second derivative of an operation is larger than any that a smooth one has: 1/x at 1e-5 has 2e15, a square
-    root of x² there 2.5e14.
-    """
+    """The operations of `function(q, qdot, t, params)` that are next to a pole or a branch point, in order."""
     collected = []
 
     def visit(equation, operands, moves, results, place):
@@ -91,16 +84,14 @@ def poles(function: Callable, *arguments) -> list[Offender]:
     return collected
 
 
+# Second derivatives of operations that no smooth one has: 1/x at 1e-5 has 2e15, a square root of x² there 2.5e14.
 _AT_A_POLE = 1e14
 _POWERS = ("pow", "integer_pow")
 _WITH_POLES = frozenset(("div", "sqrt", "rsqrt", "cbrt", "pow", "integer_pow", "log", "log1p", "tan", "atan2", "acos"))
 
 
 def borders(function: Callable, *arguments) -> list[tuple[str, str, Any]]:
-    """The operations of `function` at which it is pieced together: name, place, and the side on which the state is.
-
-    Values may be traced, so that the sides can be computed for many states at once.
-    """
+    """The operations that piece `function` together: name, place, and the side on which a state is, traced or not."""
     collected = []
 
     def visit(equation, operands, moves, results, place):
@@ -166,10 +157,8 @@ _RULES = ("custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")
 
 
 def _follow(function: Callable, arguments: tuple, visit: Callable, into_rules: bool) -> None:
-    """Evaluate `function(q, qdot, t, params)`, and show every equation that q, q̇ or t moves to `visit`.
-
-    A function with a custom rule for its derivative counts as one operation, unless `into_rules`.
-    """
+    """Evaluate `function(q, qdot, t, params)`, and show every equation that q, q̇ or t moves to `visit`."""
+    # A function with a custom rule for its derivative counts as one operation, unless `into_rules`.
     closed = jax.make_jaxpr(function)(*arguments)
     *state, params = arguments
     moves = [True] * len(jax.tree.leaves(state)) + [False] * len(jax.tree.leaves(params))
@@ -224,10 +213,8 @@ def _bind(equation, operands) -> list:
 
 
 def _derivatives(equation, operands, chosen: list[int]) -> tuple[list, list]:
-    """The first and the second derivatives of one operation, each summed over its results, by the `chosen` operands.
-
-    Reverse mode, then forward over reverse, as the derivation of the equations takes them.
-    """
+    """The first and second derivatives of one operation, summed over its results, by the `chosen` operands."""
+    # Reverse mode, then forward over reverse, as the derivation of the equations takes them.
 
     def local(*xs):
         filled = list(operands)

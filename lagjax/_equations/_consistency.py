@@ -56,10 +56,7 @@ def require_consistent(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, pa
 
 
 def _faults(names, start, dependent, tolerance, rounding) -> Iterator[tuple[bool, str]]:
-    """A sentence for each contradiction and distance, and whether it is a contradiction of positions.
-
-    `rounding` (3, m) is what may be left of values, rates and γ.
-    """
+    """Sentences for contradictions (True: of positions) and distances beyond `rounding` (3, m) of values, rates, γ."""
     of_rows = (
         (start.values, start.size_q, "q0", "it"),
         (start.rates, start.size_qdot, "qdot0", "its rate of change"),
@@ -85,9 +82,9 @@ class _StartConditions(NamedTuple):
     rates: np.ndarray  # J q̇ + ∂f/∂t, then a, (m,)
     gamma: np.ndarray  # γ of G q̈ = γ, (m,)
     lengths: np.ndarray  # of the rows of G, (m,)
+    scaled_lengths: np.ndarray  # the same with coordinates in units of 1/√Mᵢᵢ, (m,)
     schur: np.ndarray | None  # the Schur complement, (m, m); None for a large scene
     driven: np.ndarray  # whether the constraints move what is at rest, ()
-    scaled_lengths: np.ndarray  # the same with coordinates in units of 1/√Mᵢᵢ, (m,)
     size_q: np.ndarray  # the largest coordinate in these units, ()
     size_qdot: np.ndarray  # the largest velocity, ()
     sample: Sample
@@ -144,10 +141,8 @@ def _contradiction(names, values, what, lengths, dependent, tolerance, size, rou
 
 @accepts_singles(("values",), ("ts",))
 def inconsistent_members(system, layout: Layout, ts, values: dict, axes: dict) -> jax.Array | None:
-    """True for each member of a batch that starts off its constraints, shape (N,); None if that cannot be known.
-
-    `values` holds q0, qdot0 and params of the batch, `axes` which axis of each counts the members.
-    """
+    """True for each member of a batch that starts off its constraints, shape (N,); None if that cannot be known."""
+    # `values` holds q0, qdot0 and params of the batch, `axes` which axis of each counts the members.
     if not has_constraints(system) or not _all_concrete((ts, values, system)):
         return None
 
@@ -186,18 +181,9 @@ def _start(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree
         of |= {"unit_lengths": np.linalg.norm(jacobian * unit, axis=1)}
         of |= {"schur": schur_complements(mass[None], jacobian[None])[0]}
     size_q, size_qdot = sizes(of["unit"], q, qdot, abs(float(ts[-1]) - float(t)) or np.inf)
-    return _StartConditions(
-        values=np.where(on_positions, of["residual"], 0),
-        rates=of["rates"],
-        gamma=of["gamma"],
-        lengths=of["row_lengths"],
-        schur=of.get("schur"),
-        driven=(of["driving"] != 0).any(),
-        scaled_lengths=of["unit_lengths"],
-        size_q=size_q,
-        size_qdot=size_qdot,
-        sample=sample,
-    )
+    values, driven = np.where(on_positions, of["residual"], 0), (of["driving"] != 0).any()
+    rows = values, of["rates"], of["gamma"], of["row_lengths"], of["unit_lengths"]
+    return _StartConditions(*rows, of.get("schur"), driven, size_q, size_qdot, sample)
 
 
 _ASKED, _MATRICES = ("gamma", "residual", "rates", "driving"), ("mass_matrix", "jacobian")

@@ -11,8 +11,7 @@ Both are differentiated by the time until the acceleration appears linearly, f t
 
 A scene without constraints has m = 0 rows here, not another kind of object. Rows may be held or released by numbers in
 params, as contacts are: the row of G and γ of one that is released are zero, and its multiplier is. Nothing here knows
-a Lagrangian: the mass
-matrix M, by which distances between states are measured, is an argument.
+a Lagrangian: the mass matrix M, by which distances between states are measured, is an argument.
 """
 
 import math

@@ -78,10 +78,7 @@ _FAR = 1e3
 
 
 class _Saddle(NamedTuple):
-    """A linear system M x − Gᵀλ = b, G x = c by the names of b (None: zero) and c, and the sign c is taken with.
-
-    `velocities` tells whether constraints on velocities belong to it.
-    """
+    """M x − Gᵀλ = b, G x = c by the names of b (None: zero) and c, the `sign` of c, whether `velocities` are in G."""
 
     b: str | None
     c: str
@@ -118,8 +115,8 @@ def _lowered_once(make: Callable) -> property:
 class Derivation:
     """The derivation of a scene: its programs, and the facts that can be read off them.
 
-    Every program is lowered on first use. Each raises `Unlowerable`, with the end of a sentence, where
-    the scene has none: it is too large, or takes operations that have no scalar form.
+    Every program is lowered on first use. Each raises `Unlowerable`, with the end of a sentence, where the scene has
+    none: it is too large, or takes operations that have no scalar form.
     """
 
     def __init__(
@@ -227,11 +224,9 @@ class Derivation:
         return self._split_outputs(names, self.program(*names).evaluate_many(columns))
 
     def term_sizes(self, q, qdot, t, numbers: PyTree, names: tuple[str, ...] = ("residual", "rates")):
-        """The sizes of the terms of quantities at a state of numbers or tracers, (outputs,); 0 without programs.
-
-        The rounding of a quantity is so many times `eps`: its running error, with inputs that are rounded, too. It is
-        0.6 for 0.1 + q0 + 0.2 - q1 - 0.3 at q = 0, where the value, 0 or 6e-17, says nothing.
-        """
+        """The sizes of the terms of quantities at a state of numbers or tracers, (outputs,); 0 without programs."""
+        # The rounding of a quantity is so many times `eps`: its running error, with inputs that are rounded, too. It is
+        # 0.6 for 0.1 + q0 + 0.2 - q1 - 0.3 at q = 0, where the value, 0 or 6e-17, says nothing.
         state = [q, qdot, t, *jax.tree.leaves(numbers)]
         try:
             program = self._rounding_of(names, self.program(*names).size)
@@ -646,10 +641,7 @@ class _Number(NamedTuple):
 
 
 class _Structure(NamedTuple):
-    """All that decides how a scene is derived, which is structure alone, as its layout is.
-
-    `leaves` are those of the parameters: a `_Number`, or what is part of the program.
-    """
+    """All that decides how a scene is derived, structure alone; a leaf of params is a `_Number`, or program."""
 
     system: Any
     layout: Layout

@@ -99,23 +99,17 @@ def singular_threshold(n: int, dtype) -> float:
 
 
 def eigen(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Ascending eigenvalues (n,) of a symmetric matrix (n, n), and its eigenvectors, one a column (n, n).
-
-    A diagonal matrix, as large scenes of bodies have, is only sorted: LAPACK would take n³ operations.
-    """
+    """Ascending eigenvalues (n,) of a symmetric matrix (n, n), and its eigenvectors, one a column (n, n)."""
     diagonal = np.diagonal(matrix)
     if not np.array_equal(matrix, np.diag(diagonal)):
         values, vectors = np.linalg.eigh(matrix)
         return values, vectors
-    order = np.argsort(diagonal)
+    order = np.argsort(diagonal)  # as of large scenes of bodies: LAPACK would take n³ operations
     return diagonal[order], np.eye(len(matrix), dtype=matrix.dtype)[:, order]
 
 
 def null_directions(matrix: np.ndarray, threshold: float | None = None) -> np.ndarray:
-    """Unit vectors, one a row (k, n), that a symmetric matrix (n, n) sends to zero after scaling to a unit diagonal.
-
-    An eigenvalue counts as zero up to `threshold`, by default `singular_threshold`, of the largest.
-    """
+    """Unit vectors (k, n) that a symmetric matrix, scaled to a unit diagonal, sends to zero, up to `threshold`."""
     threshold = singular_threshold(len(matrix), matrix.dtype) if threshold is None else threshold
     scaled, scale = unit_diagonal(matrix)
     values, vectors = eigen(scaled)
@@ -137,9 +131,8 @@ _PANEL = 16
 def invert(matrix: Matrix) -> tuple[Matrix, Int[Array, " n"], Vector]:
     """B, `order` and the pivots of A with A⁻¹ b = B b[order], by Gauss-Jordan elimination with partial pivoting.
 
-    A need not be symmetric.
-    The pivots are those of LU. Where one of them is zero, B is meaningless. Source: Golub & Van Loan, *Matrix
-    Computations*, §3.2 and §3.4.
+    A need not be symmetric. The pivots are those of LU. Where one of them is zero, B is meaningless. Source: Golub &
+    Van Loan, *Matrix Computations*, §3.2 and §3.4.
     """
     n = len(matrix)
     width = min(n, _PANEL)
@@ -149,9 +142,8 @@ def invert(matrix: Matrix) -> tuple[Matrix, Int[Array, " n"], Vector]:
 
     def one_panel(index, carry):
         a, free, order, pivots = carry
-        panel, left, panel_order, panel_pivots = _eliminate(
-            jax.lax.dynamic_slice_in_dim(a, index * width, width, 1), free
-        )
+        columns = jax.lax.dynamic_slice_in_dim(a, index * width, width, 1)
+        panel, left, panel_order, panel_pivots = _eliminate(columns, free)
         if count > 1:
             a = jnp.where((free & ~left)[:, None], 0, a) + panel @ _permute_rows(a, panel_order)
             panel = jax.lax.dynamic_update_slice_in_dim(a, panel, index * width, 1)
@@ -164,10 +156,7 @@ def invert(matrix: Matrix) -> tuple[Matrix, Int[Array, " n"], Vector]:
 
 
 def factorize_general(matrix: Matrix) -> Callable[[Vector], Vector]:
-    """b ↦ x with A x = b, for an A that need not be symmetric. NaN where it is singular.
-
-    Differentiated implicitly: one more solve with the same inverse.
-    """
+    """b ↦ x with A x = b, for an A that need not be symmetric, as `Factorization.solve`: NaN where it is singular."""
     if len(matrix) == 1:
         return lambda b: b / jnp.where(matrix[0] == 0, jnp.nan, matrix[0])
     if len(matrix) == 2:  # XLA compiles loops for as long as all else around them
@@ -217,10 +206,8 @@ def _eliminate(panel: Array, free: Array) -> tuple[Array, Array, Array, Array]:
 
 
 def _exchange(a: Array, this_row: Array, this_column: Array) -> tuple[Array, Array]:
-    """The array A after one column was eliminated by one row, each given as a mask, and the pivot between them.
-
-    Masks and not indices, which become gathers and scatters under `vmap`: masks were measured to be faster on the CPU.
-    """
+    """The array A after one column was eliminated by one row, each given as a mask, and the pivot between them."""
+    # Masks and not indices, which become gathers and scatters under `vmap`: masks are faster on the CPU, as measured.
     row = jnp.sum(jnp.where(this_row[:, None], a, 0), axis=0)
     column = jnp.sum(jnp.where(this_column, a, 0), axis=1)
     pivot = jnp.sum(jnp.where(this_column, row, 0))
@@ -304,10 +291,7 @@ def rank_tolerance(dtype) -> float:
 
 
 def least_norm(matrix: Matrix, b: Vector) -> Vector:
-    """The shortest x with S x = b for a symmetric S (m, m) of any rank and b in its range.
-
-    The rank is that of S scaled to a unit diagonal, where pivots below `rank_tolerance` count as zero.
-    """
+    """The shortest x with S x = b for a symmetric S (m, m), its rank by `rank_tolerance`, and b in its range."""
     return _inverse_on_range(matrix) @ b
 
 
@@ -390,10 +374,7 @@ def solve_many(matrix: Matrices, b: np.ndarray) -> np.ndarray:
 
 
 def saddle_many(matrix: Matrices, b, jacobian, c) -> tuple[np.ndarray, np.ndarray]:
-    """X (S, n, k) and Λ (S, m, k), of least norm, of S saddle points, as `saddle`; `jacobian` (S, m, n) may be empty.
-
-    Their right-hand sides are `b` (S, n, k) and `c` (S, m, k).
-    """
+    """X (S, n, k), Λ (S, m, k) of S saddle points, as `saddle`, for b (S, n, k), c (S, m, k) and G (S, m, n), m ≥ 0."""
     if not jacobian.shape[1]:
         return solve_many(matrix, b), c
     augmented, weighted = augment(matrix, jacobian)

@@ -153,10 +153,8 @@ class Motion(eqx.Module):
         return self.saddle(jnp.zeros_like(q), -residual, q, qdot, t, params, positions=True)[0]
 
     def velocity_step(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Vector:
-        """δq̇ to velocities that are consistent, the shortest in the metric of M: M δq̇ = Gᵀμ, G δq̇ = −rates.
-
-        One step arrives, as the rates are affine in q̇ for every f, and for every a that d'Alembert's principle is for.
-        """
+        """δq̇ to velocities that are consistent, the shortest in the metric of M: M δq̇ = Gᵀμ, G δq̇ = −rates."""
+        # One step arrives, as the rates are affine in q̇: for every f, and every a that d'Alembert's principle is for.
         rates = self.constraints.rates(q, qdot, t, params)
         return self.saddle(jnp.zeros_like(q), -rates, q, qdot, t, params)[0]
 
@@ -165,10 +163,8 @@ class Motion(eqx.Module):
         return self.constraints.residual(q, qdot, t, params)
 
     def projected(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Vector, Vector]:
-        """(q, q̇) after one Newton step of each kind back to the constraints, the shortest in the metric of M.
-
-        That is enough after a step of an integration: close to the constraints Newton's method squares the distance.
-        """
+        """(q, q̇) after one Newton step of each kind back to the constraints, the shortest in the metric of M."""
+        # Enough after a step of an integration: close to the constraints Newton's method squares the distance.
         if self.constraints.on_positions is not None:
             q = q + self.position_step(q, qdot, t, params)
         return q, qdot + self.velocity_step(q, qdot, t, params)

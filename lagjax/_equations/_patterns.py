@@ -27,16 +27,9 @@ _READS_ALL = "cumsum", "cumprod", "cummax", "cummin", "cumlogsumexp", "fft"
 _MOST_PRODUCTS = 1000
 
 
-def hessian_pattern(function: Callable, shapes: tuple, by: int) -> csr_array | None:
-    """The pattern (n, n) of ∂²f/∂x², x being argument number `by` of f; None where to find it would take long.
-
-    `shapes` are those of all arguments, pytrees of them.
-    """
-    return jacobian_pattern(jax.grad(function, argnums=by), shapes, by)
-
-
 def jacobian_pattern(function: Callable, shapes: tuple, by: int) -> csr_array | None:
-    """The pattern (m, n) of ∂f/∂x, x being argument number `by` of f, f of shape (m,); arrays up to that one."""
+    """The pattern (m, n) of ∂f/∂x, x being argument number `by` of f, f of shape (m,); None where that takes long."""
+    # `shapes` are those of all arguments, pytrees of them; of arrays up to that one.
     import asdex
 
     leaves, structure = jax.tree.flatten(shapes)
@@ -79,12 +72,12 @@ def _largest_array(jaxpr) -> int:
     return largest
 
 
-def sparse_jacobian(function: Callable, shapes: tuple, by: int = 0) -> Callable[..., csr_array] | None:
-    """The function that takes the arguments of f and gives ∂f/∂x (m, n), by a product for each colour of its columns.
+def sparse_jacobian(function: Callable, shapes: tuple) -> Callable[..., csr_array] | None:
+    """∂f/∂x (m, n) as a function of the arguments x, … of f, by a product for each colour of its columns.
 
-    x is argument number `by` of f, with arrays up to that one. None where its pattern is not known or has many colours.
+    None where its pattern is not known or has many colours.
     """
-    pattern = jacobian_pattern(function, shapes, by)
+    pattern = jacobian_pattern(function, shapes, 0)
     if pattern is None:
         return None
     colors = color_columns(pattern)
@@ -95,9 +88,8 @@ def sparse_jacobian(function: Callable, shapes: tuple, by: int = 0) -> Callable[
     rows, columns = entries.row, entries.col
 
     @jax.jit
-    def read(*arguments):
-        x = arguments[by]
-        _, multiply = jax.linearize(lambda x: function(*arguments[:by], x, *arguments[by + 1 :]), x)
+    def read(x, *others):
+        _, multiply = jax.linearize(lambda x: function(x, *others), x)
         products = jax.lax.map(lambda k: multiply((colors == k).astype(x.dtype)), np.arange(count), batch_size=16)
         return products[colors[columns], rows]
 

@@ -18,14 +18,11 @@ import numpy as np
 
 
 class Decided(NamedTuple):
-    """The singular values of matrices (…, m, k), largest first, and how many of them count, `rank` (…).
+    """The singular values of matrices (…, m, k), largest first, and how many of them count, `rank` (…)."""
 
-    The singular vectors are the columns of `left` (…, m, min(m, k)) and `right` (…, k, k).
-    """
-
-    left: np.ndarray
+    left: np.ndarray  # singular vectors, one a column, (…, m, min(m, k))
     values: np.ndarray
-    right: np.ndarray
+    right: np.ndarray  # likewise, (…, k, k)
     rank: np.ndarray
 
     @property

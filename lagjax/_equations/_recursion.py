@@ -33,15 +33,11 @@ Form = dict[int, int]  # a linear combination of unknowns: the node of the facto
 
 
 class Recursion(NamedTuple):
-    """The sparse system of `size` coordinates and of velocities that L builds from them.
-
-    The unknowns are q̈, then w, then μ. `definitions` holds the terms of every w, and `energy` the entries of H on and
-    below its diagonal: each a node of a graph.
-    """
+    """The sparse system of `size` coordinates and of velocities that L builds from them: its unknowns are q̈, w, μ."""
 
     size: int
-    definitions: list[Form]
-    energy: dict[tuple[int, int], int]
+    definitions: list[Form]  # the terms of every w
+    energy: dict[tuple[int, int], int]  # the entries of H on and below its diagonal, nodes of a graph
 
     @property
     def entries(self) -> dict[tuple[int, int], int | None]:
@@ -112,11 +108,9 @@ def _terms(graph: Graph, op: str, operands: Sequence[int], linear) -> list[tuple
 
 
 def _hessian(derivatives: Derivatives, value: int, curved: Iterable[int], frontier: list[int]):
-    """The second derivatives of L by the nodes of a frontier, on and below the diagonal, as nodes of the graph.
-
-    In a graph of its own these nodes are inputs: where L is, a product with one of them may be known as another
-    product, in which it no longer appears.
-    """
+    """The second derivatives of L by the nodes of a frontier, on and below the diagonal, as nodes of the graph."""
+    # In a graph of its own these nodes are inputs: where L is, a product with one of them may be known as another
+    # product, in which it no longer appears.
     graph, apart = derivatives.graph, Graph(derivatives.graph.budget)
     inputs: list[int] = []
     nodes: dict[int, int] = {}
@@ -225,10 +219,8 @@ class RecursiveElimination:
         return len(self.steps) == self.size + self.velocities
 
     def operations(self, numbers: Sequence[float | None]) -> tuple[int, int]:
-        """The operations of the elimination and one solution, and of the solution of an order of a Taylor series.
-
-        `numbers` has those of the entries that are known.
-        """
+        """The operations of elimination and one solution, and of the solution of an order of a Taylor series."""
+        # `numbers` has those of the entries that are known.
         graph = Graph(_LARGEST)
         expansion = Expansion(graph)
 
@@ -291,11 +283,7 @@ class RecursiveElimination:
 
 
 class _Elimination:
-    """The entries of the energy while unknowns are eliminated, nodes of a graph.
-
-    `sizes` has what the entries on the diagonal would be if nothing had been taken off: lost pivots are recognised by
-    these.
-    """
+    """The entries of the energy while unknowns are eliminated, nodes of a graph."""
 
     def __init__(self, elimination: RecursiveElimination, values: Scalars):
         self._graph = graph = values.expansion.graph
@@ -313,6 +301,7 @@ class _Elimination:
                 self._energy[row, column] = node
             elif column != row - elimination.velocities:
                 self._definitions.setdefault(row - elimination.velocities, {})[column] = node
+        # Lost pivots are recognised by what the diagonal would be if nothing had been taken off.
         self._sizes = {u: node for (u, v), node in self._energy.items() if u == v}
 
     def _add(self, sums: dict, key, a: int, b: int) -> None:

@@ -101,10 +101,7 @@ class SaddleElimination:
     # ---- factors ----
 
     def factors(self, values) -> tuple[Any, Any]:
-        """The factors of M and G that `solve` needs, a tree of vectors, and whether the saddle point is singular.
-
-        `values` holds what stands at `entries`.
-        """
+        """The factors of M and G, of `values` at `entries`, for `solve`, and whether the saddle point is singular."""
         a, weighted, singular = xp.scatter(values, self.slots[tuple(self.entries.T)], self.count), None, None
         if self.augmented:
             a, weighted = self._weight_entries(a)
@@ -155,11 +152,9 @@ class SaddleElimination:
         return lost, 1.0 / xp.where(lost, np.nan, pivot)
 
     def _constraint_pivot(self, of_coordinates: list, of_constraints: list) -> tuple[Any, Any]:
-        """A flag that a constraint depends on those before it, and D⁻¹: it is left out then, or NaN if `regular_only`.
-
-        The pivot is −G M⁻¹ Gᵀ of this constraint, and what those before it take off that. A row that is left out
-        changes nothing where the constraints are consistent.
-        """
+        """A flag that a constraint depends on those before it, and D⁻¹: then left out, or NaN if `regular_only`."""
+        # The pivot is −G M⁻¹ Gᵀ of this constraint, and what those before it take off that. A row that is left out
+        # changes nothing where the constraints are consistent.
         own: Any = sum(of_coordinates, start=0.0)
         left = sum(of_constraints, start=own)
         lost = left <= (REGULAR if self.regular_only else rank_tolerance(self.dtype)) * own
@@ -168,11 +163,9 @@ class SaddleElimination:
         return lost, xp.where(lost, 0.0, -1.0 / xp.where(lost, 1.0, left))
 
     def _weight_entries(self, a) -> tuple[Any, Any]:
-        """The entries of M + GᵀW G and of G, and the entries of W G in the order of the rows of G.
-
-        The weights are the trace of M over |Gₖ|², within a factor n of those of `augment`. They are differentiated here
-        like everything else, and a trace is smooth where a maximum is not.
-        """
+        """The entries of M + GᵀW G and of G, and the entries of W G in the order of the rows of G."""
+        # The weights are the trace of M over |Gₖ|², within a factor n of those of `augment`. They are differentiated
+        # here like everything else, and a trace is smooth where a maximum is not.
         trace, weighted, added = xp.fold("add", a[: self.size]), [], xp.scatter(a[:0], np.zeros(0, int), self.count)
         for k, touching in enumerate(self.rows):
             if not len(touching):

@@ -34,25 +34,18 @@ _BENT, _SEEN = 0.25, 1e-6
 
 
 class Scales(NamedTuple):
-    """The sizes of the coordinates `q` (n,), of the velocities `qdot` (n,) and of the time `t` at a state.
-
-    `reach` tells by how many times those of q a state may be moved until the forces are not linear, 1 at least.
-    """
+    """The sizes of the coordinates `q` (n,), of the velocities `qdot` (n,) and of the time `t` at a state."""
 
     q: Numbers
     qdot: Numbers
     t: float
-    reach: float = 1.0
+    reach: float = 1.0  # by how many times those of q a state may be moved until forces are not linear, 1 at least
 
     @classmethod
     def from_quantities(
         cls, evaluate: Callable[[str, States, States], np.ndarray], q: Numbers, qdot: Numbers
     ) -> "Scales":
-        """The scales of a scene at (q, qdot).
-
-        `evaluate(name, q, qdot)` gives the "force" and the "momentum" (S, n), and the "mass_matrix" (S, n, n), at S
-        states.
-        """
+        """The scales at (q, qdot); `evaluate` gives "force", "momentum" and "mass_matrix" at S states q, q̇."""
         q, qdot = np.asarray(q, float), np.asarray(qdot, float)
         with np.errstate(all="ignore"):
             mass = np.diagonal(evaluate("mass_matrix", q[None], qdot[None])[0])

@@ -40,14 +40,11 @@ _MOST_ITERATIONS = 2000  # enough for a condition of 1e4: some 18 √κ of them 
 
 
 class Solver(NamedTuple):
-    """Solver of A x = b at one state, of an `iterative` form to half of the digits.
-
-    `singular`: A is so to working precision; `rank` counts independent rows.
-    """
+    """Solver of A x = b at one state, of an `iterative` form to half of the digits."""
 
     solve: Product
-    singular: Bool[Array, ""]
-    rank: Int[Array, ""]
+    singular: Bool[Array, ""]  # to working precision
+    rank: Int[Array, ""]  # the number of independent rows
 
 
 class MatrixForm(abc.ABC):
@@ -65,9 +62,9 @@ class MatrixForm(abc.ABC):
         others count as zero (`rank_tolerance`), and their unknowns are zero or small. Else a singular matrix gives NaN.
         """
 
+    @abc.abstractmethod
     def diagonal(self, multiply: Product, dtype) -> Vector:
         """The diagonal of the matrix with these products."""
-        raise NotImplementedError
 
 
 class Entries(MatrixForm):
@@ -254,10 +251,8 @@ class MatrixFree(MatrixForm):
 
 
 def conjugate_gradients(multiply: Product, b: Vector) -> Vector:
-    """x with A x = b for a positive (semi-)definite A, to half of the digits; NaN where it is not reached.
-
-    Source: Hestenes & Stiefel, J. Res. NBS 49 (1952) 409.
-    """
+    """x with A x = b for a positive (semi-)definite A, to half of the digits; NaN where it is not reached."""
+    # Source: Hestenes & Stiefel, J. Res. NBS 49 (1952) 409.
     tolerance, limit = float(jnp.finfo(b.dtype).eps) ** 0.5, min(_MOST_ITERATIONS, 4 * b.size)
     x, _ = jax.scipy.sparse.linalg.cg(multiply, b, tol=tolerance, maxiter=limit)
     missing = jnp.max(jnp.abs(b - multiply(x)))

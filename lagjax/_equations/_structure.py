@@ -18,7 +18,7 @@ from scipy.sparse import csr_array, vstack
 
 from lagjax._equations._coupled_forces import CoupledForces
 from lagjax._equations._motion import Flag, Motion, PyTree, Row, Time, Vector
-from lagjax._equations._patterns import count_operations, hessian_pattern, jacobian_pattern
+from lagjax._equations._patterns import count_operations, jacobian_pattern
 from lagjax._equations._sparse import Blocks, Diagonal, MatrixForm, MatrixFree, Solver, form_of, refine
 from lagjax._interface import compiled_once
 
@@ -36,12 +36,9 @@ LARGEST_LOWERED = 60_000
 
 
 class SparseStructure(NamedTuple):
-    """The forms of M, of S = G M⁻¹ Gᵀ, and of S for the constraints on positions alone (None without any).
+    """The forms of M, of S = G M⁻¹ Gᵀ, and of S for the constraints on positions alone (None without any)."""
 
-    `operations` are the scalar ones of L.
-    """
-
-    operations: int
+    operations: int  # the scalar ones of L
     mass: MatrixForm
     schur: MatrixForm | None
     positions: MatrixForm | None
@@ -52,10 +49,8 @@ class SparseStructure(NamedTuple):
 
 
 def structure_of(motion: Motion, shapes: tuple, insists: bool = False) -> SparseStructure | None:
-    """The structure of a large scene; None where it is small, or coupled so that machine code or dense arrays suit it.
-
-    `shapes` are those of (q, q̇, t, params). With `insists`, arrays were asked for, and size alone decides.
-    """
+    """The structure of a large scene; None where it is small, or coupled so that other forms of the motion suit it."""
+    # `shapes` are those of (q, q̇, t, params). With `insists`, arrays were asked for, and size alone decides.
     q, _, t, numbers = shapes
     n = q.size
     if n < LEAST_COORDINATES or isinstance(motion.forces, CoupledForces):
@@ -63,8 +58,7 @@ def structure_of(motion: Motion, shapes: tuple, insists: bool = False) -> Sparse
     operations = count_operations(jax.make_jaxpr(motion.lagrangian)(*shapes).jaxpr)
     if not insists and not (operations >= LEAST_OPERATIONS or (motion.constrained and n >= LEAST_LINKED)):
         return None
-    pattern = hessian_pattern(motion.lagrangian, shapes, by=1)
-    mass = form_of(pattern, n)
+    mass = form_of(jacobian_pattern(jax.grad(motion.lagrangian, argnums=1), shapes, by=1), n)
     if isinstance(mass, MatrixFree) and (n <= LARGEST_DENSE or not insists):
         return None
     if not motion.constrained:
@@ -103,11 +97,9 @@ class SparseMotion(Motion):
     structure: SparseStructure = eqx.field(static=True, kw_only=True)
 
     def mass_product(self, q, qdot, t, params):
-        """x ↦ M x."""
         return jax.linearize(lambda qdot: self.momentum(q, qdot, t, params), qdot)[1]
 
     def solved_acceleration(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> tuple[Vector, Flag]:
-        """q̈, and whether the matrix that it was solved with is singular (q̈ is NaN where it is)."""
         state = q, qdot, t, params
         if self.constrained:
             return super().solved_acceleration(*state)
@@ -154,12 +146,10 @@ class SparseMotion(Motion):
         return after < before
 
     def unit(self, q, qdot, t, params):
-        """The unit of each coordinate, 1/√Mᵢᵢ."""
         size = jnp.abs(self.structure.mass.diagonal(self.mass_product(q, qdot, t, params), q.dtype))
         return 1 / jnp.sqrt(jnp.where(size > 0, size, 1))
 
     def row_lengths(self, unit, q, qdot, t, params, positions=False):
-        """The lengths of the rows of G, or of ∂f/∂q for constraints on `positions`, in the `unit` of coordinates."""
         push, pull = self.constraints.products(q, qdot, t, params, positions=positions)
         form = self._form(positions)
         return jnp.sqrt(form.diagonal(lambda y: push(unit**2 * pull(y)), q.dtype))
@@ -214,20 +204,20 @@ class SparseMotion(Motion):
 
 @functools.lru_cache(maxsize=64)
 def _saddle_of(motion: SparseMotion, positions: bool) -> Callable:
-    return compiled_once(functools.partial(_saddle, motion, positions))
+    """`SparseMotion.saddle` as a compiled function of b, c and the state, in two rounds."""
 
+    def saddle(b: Vector, c: Row, *state):
+        mass, _, eliminate = motion._prepare(positions, *jax.lax.stop_gradient(state))
+        multiply, (push, pull) = motion.mass_product(*state), motion.constraints.products(*state, positions=positions)
 
-def _saddle(motion: SparseMotion, positions: bool, b: Vector, c: Row, *state):
-    """`SparseMotion.saddle`, in two rounds."""
-    mass, _, eliminate = motion._prepare(positions, *jax.lax.stop_gradient(state))
-    multiply, (push, pull) = motion.mass_product(*state), motion.constraints.products(*state, positions=positions)
+        def product(place):
+            x, nu = place
+            return multiply(x) + pull(nu), push(x)
 
-    def product(place):
-        x, nu = place
-        return multiply(x) + pull(nu), push(x)
+        def solve(_, right):
+            return refine(product, lambda rest: eliminate(*rest), right)
 
-    def solve(_, right):
-        return refine(product, lambda rest: eliminate(*rest), right)
+        x, nu = jax.lax.custom_linear_solve(product, (b, c), solve, symmetric=True)
+        return jnp.where(mass.singular, jnp.nan, x), -nu, mass.singular
 
-    x, nu = jax.lax.custom_linear_solve(product, (b, c), solve, symmetric=True)
-    return jnp.where(mass.singular, jnp.nan, x), -nu, mass.singular
+    return compiled_once(saddle)

@@ -68,11 +68,10 @@ def simulate(
 
     **Rarer ones**
 
-    - `solver`: any diffrax solver for ODEs, or `lagjax.MachineCode()` to insist on machine code. The default, on a
-      CPU, is Taylor series in machine code made for the scene, of an order that suits `rtol`;
-      `System.explain` says where that is not possible. Then the default is `lagjax.FineOutput(diffrax.Dopri8())`, of
-      order 8, whose states between steps are about as accurate as those at their ends (diffrax's own interpolation for
-      it is less accurate).
+    - `solver`: any diffrax solver for ODEs, or `lagjax.MachineCode()` to insist on machine code. The default, on a CPU,
+      is Taylor series in machine code made for the scene, of an order that suits `rtol`; `System.explain` says where
+      that is not possible. Then the default is `lagjax.FineOutput(diffrax.Dopri8())`, of order 8, whose states between
+      steps are about as accurate as those at their ends (diffrax's own interpolation for it is less accurate).
     - `dt`: take fixed steps of this size instead of adaptive ones; `rtol` and `atol` then do not apply.
     - `max_steps`: the budget of steps, rejected ones included. A reverse-mode gradient by diffrax records that many
       times for every member: lower it for the gradient of a large batch.

@@ -17,10 +17,9 @@ times √(2n) `SLACK` for solvers that measure errors in root mean square, and r
 all, may grow with the motion: there is no bound for them, only a second trajectory to compare with.
 
 Between outputs the power is integrated along the polynomial of degree five that has q, q̇ and q̈ of both ends. That is
-of order six; its error is estimated by the cubic through q and q̇, of order four, and the trapezoidal rule.
-Where the balance is off by more than a hundredth of the energy, and the work may be, the verdict says that it cannot
-be told. Source:
-Hairer, Nørsett & Wanner, *Solving Ordinary Differential Equations I*, §II.4 (error per step), §II.6 (Hermite
+of order six; its error is estimated by the cubic through q and q̇, of order four, and the trapezoidal rule. Where the
+balance is off by more than a hundredth of the energy, and the work may be, the verdict says that it cannot be told.
+Source: Hairer, Nørsett & Wanner, *Solving Ordinary Differential Equations I*, §II.4 (error per step), §II.6 (Hermite
 interpolation).
 
 `_measurements` goes from states to the arrays of a report, by the laws of `_laws`; `_border_counts` counts the borders
@@ -153,9 +152,8 @@ class Health(eqx.Module):
       `constraint_allowed`: for these two (a last axis).
     - `smallest_eigenvalue` of M = ∂²L/∂q̇² (negative where M is indefinite); `condition`: the largest max|λ| / min|λ|;
       `scaled_condition`: the same after scaling M to a unit diagonal, which decides the accuracy of accelerations. All
-      three are None in a large scene whose M is not diagonal.
-      `scaled_condition_allowed`: where round-off in q̈ reaches `SLACK` rtol; infinite with constraints, which may make
-      up for a singular M.
+      three are None in a large scene whose M is not diagonal. `scaled_condition_allowed`: where round-off in q̈ reaches
+      `SLACK` rtol; infinite with constraints, which may make up for a singular M.
     - `gradients_finite`: whether all terms of the equations of motion have finite derivatives with respect to the
       state, the time and every parameter, at every output; `gradients_time`: the first time at which they do not.
     - `diagnosis`: why the first member that failed did not reach its end, in words; empty where all did, and under
@@ -172,8 +170,7 @@ class Health(eqx.Module):
       impacts (`impacts=` of the System) differ. The balance of energy and momenta are not judged there.
     - `doubts`: in such a scene a pair, how many there were and when the first was (NaN: never), with a last axis for
       impacts that gained energy, for those that contacts share which close at one instant by themselves, and for slips
-      that begin at a start at rest, or from rest in space: of the last two not all derivatives are there.
-      Else None.
+      that begin at a start at rest, or from rest in space: of the last two not all derivatives are there. Else None.
     - `global_error`: with a reference, the largest |yᵢ − reference| over the components of q and q̇, in units of the
       largest |yᵢ| along the path (and atol/rtol more, as in the tolerances); else None.
     """

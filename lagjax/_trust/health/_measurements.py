@@ -471,8 +471,7 @@ def _outputs_needed(xp, T: int, imbalance, work_error, size):
     """About how many outputs it takes to tell whether the power is balanced; T where the present ones do.
 
     They do not where the balance is off by more than `VISIBLE` of the energy and the error of the work may be as large
-    as both.
-    That error is of order six, so that a sixth root gives the number.
+    as both. That error is of order six, so that a sixth root gives the number.
     """
     visible = VISIBLE * size
     excess = SLACK * work_error / xp.where(visible > 0, visible, 1.0)
