@@ -186,9 +186,7 @@ def _how_it_ended(noted: Noted, solution: Solution, count: int, library: Any = n
     return result, (t_end, library.where(too_many, noted.y[first, -1], solution.y_end)), well & ~many
 
 
-@functools.partial(jax.jit, static_argnums=2)
-def _how_it_ended_traced(noted: Noted, solution: Solution, count: int) -> tuple:
-    return _how_it_ended(noted, solution, count, jnp)
+_how_it_ended_traced = jax.jit(functools.partial(_how_it_ended, library=jnp), static_argnums=2)
 
 
 def _raise_unless_ok(layout: Layout, ts, end: tuple, noted: Noted, result) -> Noted:

@@ -135,14 +135,13 @@ def simulate(
     trajectory.q - jnp.cos(trajectory.ts)
     ```
     """
+    of_engines = {"solver": solver, "dt": dt, "event": event, "adjoint": adjoint, "progress": progress or None}
     if not isinstance(system, System) and hasattr(system, "follow"):  # a `Hybrid`
-        others = {"solver": solver, "dt": dt, "event": event, "adjoint": adjoint, "progress": progress or None}
-        if given := [name for name, value in others.items() if value is not None]:
-            raise TypeError(f"simulate takes no {', '.join(given)} for a lagjax.Hybrid, which runs in machine code.")
+        _refuse_options("a lagjax.Hybrid", of_engines)
         return system.follow(q0, qdot0, ts, params, rtol=rtol, atol=atol, max_steps=max_steps, throw=throw)
     system = require_system(system, contacts=True)
     if system.touches:
-        _refuse_options(solver=solver, dt=dt, event=event, adjoint=adjoint, progress=progress or None)
+        _refuse_options("a scene with contacts", of_engines)
     require_flag(throw, "throw")
     layout = Layout.from_state(q0, qdot0)
     requested = requested_engine(solver, dt, adjoint, progress, rtol, atol)
@@ -202,7 +201,8 @@ def simulate_batch(
     """
     system = require_system(system, contacts=True)
     if system.touches:
-        _refuse_options(solver=solver, dt=dt, event=event, adjoint=adjoint, progress=progress or None)
+        of_engines = {"solver": solver, "dt": dt, "event": event, "adjoint": adjoint, "progress": progress or None}
+        _refuse_options("a scene with contacts", of_engines)
     requested = requested_engine(solver, dt, adjoint, progress, rtol, atol)
     values = {"q0": q0, "qdot0": qdot0, "params": params}
     axes, size = axes_per_leaf(values, batch_axes)
@@ -218,19 +218,17 @@ def simulate_batch(
         raise
     values = {name: as_arrays(value, batch.member.layout.dtype, name) for name, value in values.items()}
     inconsistent = inconsistent_members(system, batch.member.layout, batch.member.ts, values, axes)
+    of_params = values["params"], batch_axes[2]
     if engine is None:
-        trajectory = follow_contacts_batch(given, batch, max_transitions, values["params"], batch_axes[2])
-        return trajectory if inconsistent is None else _mask_inconsistent(trajectory, inconsistent)
-    solution = engine.solve_batch(batch)
-    trajectory = trajectory_of(given.member, engine, solution, given.y0, values["params"], batch_axes[2])
+        trajectory = follow_contacts_batch(given, batch, max_transitions, *of_params)
+    else:
+        trajectory = trajectory_of(given.member, engine, engine.solve_batch(batch), given.y0, *of_params)
     return trajectory if inconsistent is None else _mask_inconsistent(trajectory, inconsistent)
 
 
 def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, y0, params: PyTree, params_axes=None):
-    """The solution in the pytree of the user, of one problem or of a batch; `y0` and `params` are those of all members.
-
-    Where nothing is traced, the few numbers stay in NumPy: each one sent to JAX costs as much as ten steps.
-    """
+    """The solution of a problem, or a batch, in the pytree of the user; `y0` and `params` are those of all members."""
+    # Where nothing is traced, the few numbers stay in NumPy: each one sent to JAX costs as much as ten steps.
     restore, (q, qdot), (q_end, qdot_end) = problem.layout.restore, halves(solution.path), halves(solution.y_end)
     arrays = problem.ts, restore(q), restore(qdot), solution.result
     if not isinstance(solution.y_end, np.ndarray):
@@ -251,31 +249,21 @@ def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, 
         system=problem.system,
         params=params,
         params_axes=params_axes,
-        mode=None,
-        transitions=None,
-        mode_names=(),
         tolerances=None if fixed_steps else engine.tolerances(problem, y0),
         engine=type(engine).__name__,
-        impacts=None,
-        contacts=None,
-        contact_changes=None,
-        contact_names=(),
     )
 
 
-def _refuse_options(**options) -> None:
+def _refuse_options(scene: str, options: dict[str, Any]) -> None:
     if given := [name for name, value in options.items() if value is not None]:
-        raise TypeError(
-            f"A scene with contacts takes no {', '.join(given)}: it runs in machine code, to each event of its own."
-        )
+        raise TypeError(f"simulate takes no {', '.join(given)} for {scene}, which runs in machine code.")
 
 
 def _device_arrays(arrays: tuple) -> tuple:
-    """NumPy arrays as arrays of JAX.
-
-    `jax.device_put` takes as long as a short motion, a compiled function of arrays of these shapes a tenth of that: it
-    is compiled for one motion. In a process that was forked nothing can be compiled: XLA's threads did not come along.
-    """
+    """NumPy arrays as arrays of JAX."""
+    # `jax.device_put` takes as long as a short motion, a compiled function of arrays of these shapes a tenth of that:
+    # it is compiled for one motion. In a process that was forked nothing can be compiled: XLA's threads did not come
+    # along.
     if os.getpid() != _PROCESS or np.ndim(arrays[-1]) > 0:
         return jax.device_put(arrays)
     return _as_they_are(*arrays)

@@ -5,6 +5,7 @@ states are methods: they cost nothing until they are called, and they are differ
 motion (`_trust`, `_show`) stands above it: its methods import it when they are called (`_interface._registered`).
 """
 
+import dataclasses
 import functools
 from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -14,6 +15,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._engine import Problem
+from lagjax._equations import has_constraints
 from lagjax._interface import (
     ENDED_WELL,
     RESULTS,
@@ -24,7 +27,7 @@ from lagjax._interface import (
     is_known,
     show_str,
 )
-from lagjax._primitives import marks_absent, raise_where_failed
+from lagjax._primitives import DOUBLE, compute_in_doubles, marks_absent, raise_where_failed
 from lagjax._scene import System
 
 if TYPE_CHECKING:
@@ -173,13 +176,11 @@ class Trajectory(eqx.Module):
 
     @classmethod
     def from_fields(cls, **fields) -> "Trajectory":
-        """A trajectory with all of these fields, made as equinox makes one from its leaves.
-
-        The constructor checks every field for mistakes, which takes a tenth of the time of a short motion.
-        """
+        """A trajectory with these fields, made as equinox makes one from its leaves."""
+        # The constructor checks every field for mistakes, which takes a tenth of the time of a short motion.
         trajectory = object.__new__(cls)
         for name in cls.__dataclass_fields__:
-            object.__setattr__(trajectory, name, fields.pop(name))
+            object.__setattr__(trajectory, name, fields.pop(name) if name in fields else getattr(cls, name))
         assert not fields, f"a Trajectory has no {', '.join(fields)}"
         return trajectory
 
@@ -364,9 +365,7 @@ class Trajectory(eqx.Module):
 
 def _require_like_constraints(modes: dict[str, System], name: str, q, qdot, params) -> None:
     """Raise where modes do not have the same constraints, so that there is no one structure to return."""
-    constrained = [
-        which for which, s in modes.items() if s.constraints is not None or s.velocity_constraints is not None
-    ]
+    constrained = [which for which, system in modes.items() if has_constraints(system)]
     structures = [modes[which]._constraint_structure(Layout.from_state(q, qdot), params) for which in constrained]
     if len(constrained) < len(modes) or any(structure != structures[0] for structure in structures):
         one = constrained[0] if constrained else next(iter(modes))
@@ -389,11 +388,9 @@ def constant_unless(varies, tree: PyTree) -> PyTree:
 
 
 def vary_with(first, *inputs, varying: tuple[str, ...] = ("t", "y", "path")):
-    """The state before the first round as it is, with derivatives, a batch and mesh axes where later ones have them.
-
-    Else JAX writes the rounds down once more for numbers that get these in a round. The derivatives of a sine vary with
-    the inputs, too, in every order.
-    """
+    """The state before the first round, with derivatives, a batch and mesh axes where later ones have them."""
+    # Else JAX writes the rounds down once more for numbers that get these in a round. The derivatives of a sine vary
+    # with the inputs, too, in every order.
     moving = jnp.sin(sum(x.ravel()[0] for x in inputs if x.size))
     still = jax.lax.stop_gradient(moving)
 
@@ -403,15 +400,22 @@ def vary_with(first, *inputs, varying: tuple[str, ...] = ("t", "y", "path")):
     return jax.tree.map(vary, first)._replace(**{name: vary(getattr(first, name), moving) for name in varying})
 
 
+def follow_in_doubles(motion: Callable, problem: Problem, *more) -> Any:
+    """`motion(layout, ts, y0, params, *more)` of a problem, in float64, in the problem's own precision."""
+    given = problem.ts, problem.y0, problem.params, *more
+    if not problem.is_single:
+        return motion(problem.layout, *given)
+    layout = dataclasses.replace(problem.layout, dtype=DOUBLE)
+    return compute_in_doubles(functools.partial(motion, layout), *given)
+
+
 def step_counts(accepted, rejected) -> dict:
     return {"num_steps": accepted + rejected, "num_accepted_steps": accepted, "num_rejected_steps": rejected}
 
 
 def raise_unless_ok(trajectory: Trajectory, layout: Layout, why: Callable[[], str | None]) -> Trajectory:
-    """Raise `SimulationError` for a trajectory that did not reach its end; at run time when it is being traced.
-
-    `why()` are the words for what stopped it, where they are known better than by the result.
-    """
+    """Raise `SimulationError` for a trajectory that did not reach its end; at run time when it is being traced."""
+    # `why()` are the words for what stopped it, where they are known better than by the result.
     end, code = trajectory.end, trajectory.result._value
     if is_concrete(code) and int(code) in ENDED_WELL:
         return trajectory

@@ -7,6 +7,7 @@ Source: Moreau, *Unilateral contact and dry friction* (1988); Brogliato, *Nonsmo
 """
 
 import dataclasses
+import functools
 from typing import Any
 
 import equinox as eqx
@@ -20,7 +21,7 @@ from lagjax._equations import ROUNDINGS, derivation_of, has_constraints, require
 from lagjax._interface import Layout, compile_for_one_call, halves, is_concrete, require_budget, result_from
 from lagjax._primitives import DOUBLE, compute_in_doubles
 from lagjax._run._rounds import BLOCK
-from lagjax._run._trajectory import ContactChanges, Impacts, State, Trajectory, step_counts
+from lagjax._run._trajectory import ContactChanges, Impacts, State, Trajectory, follow_in_doubles, step_counts
 from lagjax._run.contacts._contact_rounds import Carry, ContactPlan, RoundRecord, RowPlaces, contact_motion
 from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes, System, require_coefficients
 
@@ -162,12 +163,7 @@ def _require_open(problem: Problem, closed: Problem) -> None:
 
 
 def _motion(plan: ContactPlan, problem: Problem) -> tuple[Carry, RoundRecord, tuple]:
-    """The rounds of a problem, in float64, in its own precision."""
-    given = problem.ts, problem.y0, problem.params
-    if not problem.is_single:
-        return contact_motion(plan, problem.layout, *given)
-    layout = dataclasses.replace(problem.layout, dtype=DOUBLE)
-    return compute_in_doubles(lambda *given: contact_motion(plan, layout, *given), *given)
+    return follow_in_doubles(functools.partial(contact_motion, plan), problem)
 
 
 def _trajectory(

@@ -33,8 +33,8 @@ from lagjax._interface import (
     require_flag,
     result_from,
 )
-from lagjax._primitives import DOUBLE, compute_in_doubles, marks_absent
-from lagjax._run._trajectory import State, Trajectory, Transitions, raise_unless_ok, step_counts
+from lagjax._primitives import marks_absent
+from lagjax._run._trajectory import State, Trajectory, Transitions, follow_in_doubles, raise_unless_ok, step_counts
 from lagjax._run.hybrid._mode import Transition
 from lagjax._run.hybrid._transition_rounds import IN_ONE_PLACE, Ending, RoundPlan, TransitionRecord, hybrid_motion
 from lagjax._scene import System, present_system, require_system
@@ -191,18 +191,9 @@ def simulate_hybrid(
     rtol, atol = float(MachineCode().rtol(problem.double_precision)), None if atol is None else float(atol)
     limits = max_transitions, rtol, atol, max_steps, problem.is_single
     plan = RoundPlan(tuple(modes), systems, switches, *limits)
-    ending, record = _motion(plan, problem, start)
+    ending, record = follow_in_doubles(functools.partial(hybrid_motion, plan), problem, start)
     trajectory = _trajectory(modes, problem, ending, record)
     return _raise_unless_ok(modes, trajectory, layout, ending.mode) if throw else trajectory
-
-
-def _motion(plan: RoundPlan, problem: Problem, start) -> tuple[Ending, TransitionRecord]:
-    """The rounds of a problem from the mode of place `start`, in float64, in its own precision."""
-    given = problem.ts, problem.y0, problem.params, start
-    if not problem.is_single:
-        return hybrid_motion(plan, problem.layout, *given)
-    layout = dataclasses.replace(problem.layout, dtype=DOUBLE)
-    return compute_in_doubles(lambda *given: hybrid_motion(plan, layout, *given), *given)
 
 
 def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, record: TransitionRecord) -> Trajectory:
@@ -231,9 +222,8 @@ def _raise_unless_ok(modes: dict[str, System], trajectory: Trajectory, layout: L
     if not is_concrete(trajectory.ok) or trajectory.ok:
         return raise_unless_ok(trajectory, layout, lambda: None)
     name = trajectory.mode_names[int(last)]
-    system = modes[name]
+    of_mode = dataclasses.replace(trajectory, system=modes[name])
     try:
-        of_mode = dataclasses.replace(trajectory, system=system)
         return raise_unless_ok(of_mode, layout, lambda: _why_stopped(trajectory, layout))
     except SimulationError as error:
         text = f"{error}\nIt was in the mode {name!r}.{_last_transitions(trajectory)}"
@@ -252,8 +242,8 @@ def _why_stopped(trajectory: Trajectory, layout: Layout) -> str | None:
         return PUSHED if at_once and (not gaps.size or gaps[-1] > SUDDEN * span) else None
     if trajectory.result != RESULTS.inconsistent_start or not count:
         return None
-    source, target = (names[int(x[count - 1])] for x in (changes.source, changes.target))
-    q, qdot = jax.tree.map(lambda x: x[count - 1], (changes.q_next, changes.qdot_next))
+    last = jax.tree.map(lambda x: x[count - 1], (changes.source, changes.target, changes.q_next, changes.qdot_next))
+    source, target, (q, qdot) = names[int(last[0])], names[int(last[1])], last[2:]
     try:
         require_consistent(modes[target], layout, jnp.stack([end.t, trajectory.ts[-1]]), q, qdot, trajectory.params)
     except ValueError as error:
@@ -328,10 +318,7 @@ Scene = System | Hybrid
 
 
 def require_scene(scene: Any) -> Scene:
-    """The scene with its functions as they are now.
-
-    Raises `TypeError` for what is neither a `System` nor a `Hybrid`.
-    """
+    """The scene with its functions as they are now. Raises `TypeError` for what is no `System` or `Hybrid`."""
     return scene._now() if isinstance(scene, Hybrid) else require_system(scene, contacts=True)
 
 

@@ -15,14 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine import Problem
-from lagjax._engine.taylor import (
-    MOST_GUARDS,
-    Guarded,
-    MachineCode,
-    Surfaces,
-    require_one_number,
-)
-from lagjax._equations import Derivation
+from lagjax._engine.taylor import MOST_GUARDS, Guarded, MachineCode, Surfaces, require_one_number
+from lagjax._equations import Derivation, has_constraints
 from lagjax._interface import Function, Layout, accept, halves, present
 from lagjax._primitives import DOUBLE, SINGLE
 from lagjax._program import Unlowerable
@@ -98,24 +92,19 @@ class Transition(eqx.Module):
 
     def now(self) -> "Transition":
         guard, reset = present(self.guard), None if self.reset is None else present(self.reset)
-        return self if guard is self.guard and reset is self.reset else self.with_functions(guard, reset)
-
-    def with_functions(self, guard: Function, reset: Function | None) -> "Transition":
+        if guard is self.guard and reset is self.reset:
+            return self
         return eqx.tree_at(lambda t: (t.guard, t.reset), self, (guard, reset), is_leaf=lambda x: x is None)
 
 
 class Mode(NamedTuple):
-    """One mode: a problem that lacks a state and times, and the transitions that leave it.
-
-    Their `numbers` (K,) are their places among all transitions, their `targets` (K,) those of the modes that they lead
-    to. `surfaces` are their guards, a `Surfaces`; None where none leaves.
-    """
+    """One mode: a problem that lacks a state and times, and the K transitions that leave it."""
 
     problem: Problem
     leaving: tuple[Transition, ...]
-    numbers: np.ndarray
-    targets: np.ndarray
-    surfaces: Any
+    numbers: np.ndarray  # their places among all transitions, (K,)
+    targets: np.ndarray  # the places of the modes that they lead to, (K,)
+    surfaces: Any  # their guards, a `Surfaces`; None where none leaves
     vector: jax.Array  # every number in params, (P,)
     widths: tuple = ()  # of the first (q, q̇, t), and of params: their rounding, where the start came in float32
 
@@ -155,7 +144,7 @@ class Mode(NamedTuple):
 
     def is_inconsistent(self, t, y):
         system, params = self.problem.system, self.problem.params
-        if system.constraints is None and system.velocity_constraints is None:
+        if not has_constraints(system):
             return jnp.asarray(False)
         motion = system._motion(self.layout, params)
         t, y, numbers = jax.lax.stop_gradient((t, y, eqx.filter(params, eqx.is_array_like)))
@@ -169,10 +158,8 @@ class Mode(NamedTuple):
 def _surfaces(
     derivation: Derivation, system: System, leaving: tuple[Transition, ...], code: tuple, structure
 ) -> Surfaces | None:
-    """The guards of the transitions that leave a mode, lowered once; None where none leaves.
-
-    `code` and `structure` are what params hold that is not a number. Raises `Unlowerable`.
-    """
+    """The guards of the transitions that leave a mode, lowered once; None where none leaves."""
+    # `code` and `structure` are what params hold that is not a number. Raises `Unlowerable`.
     if not leaving:
         return None
     layout, multipliers = derivation.layout, derivation.multipliers

@@ -89,37 +89,25 @@ class Ending(NamedTuple):
 
 
 class GuardMemory(NamedTuple):
-    """The sides of every guard just before the last reset, (K,): its value, and the side of its surface.
+    """The sides of every guard just before the last reset, (K,): its value, and the side of its surface."""
 
-    Of a guard of another mode the value is NaN. `rounding` and `rate_rounding` are those of the largest terms that a
-    guard and its rate have had.
-    """
-
-    values: jax.Array
+    values: jax.Array  # NaN for a guard of another mode
     sides: jax.Array  # −1, +1, or 0 where it is unknown
-    rounding: jax.Array
-    rate_rounding: jax.Array
+    rounding: jax.Array  # of the largest terms that a guard has had
+    rate_rounding: jax.Array  # of those of its rate
 
 
 class Outset(NamedTuple):
-    """The guards of a mode where a motion begins in it, each (K,).
+    """The guards of a mode where a motion begins in it, each (K,)."""
 
-    The `sides` are those from which it comes, as large as what rounding does, and infinite where the transition happens
-    at once. `lasting` is until when those on their surface stay there. Those `beyond` zero in their direction are no
-    crossings; of these the blows that come back are let out.
-    """
-
-    sides: jax.Array
-    lasting: jax.Array
-    beyond: jax.Array
-    blows: jax.Array
+    sides: jax.Array  # from which they come, as large as what rounding does; infinite where one happens at once
+    lasting: jax.Array  # until when those on their surface stay there
+    beyond: jax.Array  # beyond zero in their direction, which is no crossing
+    blows: jax.Array  # those of these that are blows, which are let out where they come back
 
 
 class TransitionRecord(NamedTuple):
-    """One transition: its time, the states around the reset, both modes, its place in the list; else NaN and −1.
-
-    And whether another order of the list leads to another state, where blows meet.
-    """
+    """One transition: its time, the states around the reset, both modes, its place in the list; else NaN and −1."""
 
     t: jax.Array
     y: jax.Array
@@ -127,7 +115,7 @@ class TransitionRecord(NamedTuple):
     source: jax.Array
     target: jax.Array
     number: jax.Array
-    order_matters: jax.Array
+    order_matters: jax.Array  # whether another order of the list leads to another state, where blows meet
 
     @classmethod
     def absent(cls, states: int) -> "TransitionRecord":
@@ -149,10 +137,8 @@ class Exit(NamedTuple):
 
 @compile_for_one_call
 def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree, start) -> tuple[Ending, TransitionRecord]:
-    """The motion from y0 (2n,) at ts[0] in the mode of place `start`, and its transitions, `max_transitions` of them.
-
-    A place that is none, as −1 is, comes with a state that was not reached.
-    """
+    """The motion from y0 (2n,) at ts[0] in the mode of place `start`, and its `max_transitions` transitions."""
+    # A place that is none, as −1 is, comes with a state that was not reached.
     ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
     given = jnp.append(y0, ts[0]), vector_of(eqx.filter(params, eqx.is_array_like))
     widths = tuple(SINGLE_NOISE * jnp.abs(jax.lax.stop_gradient(x)) for x in given)
@@ -239,10 +225,8 @@ class _Rounds(NamedTuple):
         return after, event, TransitionRecord(t_end, y_end, exit.y_next, before.mode, *exit[1:3], exit.order_matters)
 
     def _pass_transition(self, place: int, before: Ending, kinds, turns, t, y, known) -> tuple[Exit, GuardMemory]:
-        """The state behind the first transition of those whose guard falls (1) or rises (2), as `kinds` (K,) say.
-
-        Where that `turns` (K,) a guard at once, against its rate, the motion that does so is lost in rounding.
-        """
+        """The state behind the first transition whose guard falls (1) or rises (2), as `kinds` (K,) say."""
+        # Where that `turns` (K,) a guard at once, against its rate, the motion that does so is lost in rounding.
         no, mode = jnp.asarray(False), self.modes[place]
         if not mode.leaving:
             none = Exit(y, before.mode, jnp.asarray(-1), no, no, jnp.asarray(True), no)
@@ -271,11 +255,9 @@ class _Rounds(NamedTuple):
         return Exit(y_next, target, number, against, inconsistent, defined, order_matters), memory
 
     def _order_matters(self, place: int, t, y, rates, there) -> jax.Array:
-        """True if blows of guards that are `there`, (K,), lead elsewhere when the list is read from its end.
-
-        Blows lead back into their own mode. They are followed in both orders, each as long as its guard goes on in its
-        direction, once before it has been turned.
-        """
+        """True if blows of guards that are `there`, (K,), lead elsewhere when the list is read from its end."""
+        # Blows lead back into their own mode. They are followed in both orders, each as long as its guard goes on in
+        # its direction, once before it has been turned.
         mode = self.modes[place]
         some, ways = mode.blows(place)
         if some.size < 2:
@@ -321,11 +303,9 @@ class _Rounds(NamedTuple):
         return GuardMemory(jnp.full(count, jnp.nan), jnp.zeros(count), *of_all)
 
     def _memory(self, mode: Mode, guarded: Guarded, rates, kinds, before: GuardMemory, sides, stays) -> GuardMemory:
-        """The sides before a reset of the guards of this mode, which began on these `sides`.
-
-        A guard that changes comes from the side that it leaves. Another one that is on its surface comes from where it
-        began, if it `stays` there since or has no rate, and else from where its rate does.
-        """
+        """The sides before a reset of the guards of this mode, which began on these `sides`."""
+        # A guard that changes comes from the side that it leaves. Another one that is on its surface comes from where
+        # it began, if it `stays` there since or has no rate, and else from where its rate does.
         places = self._places_of(mode)
         rounding = jnp.maximum(_pick(before.rounding, places), guarded.rounding)
         since = jnp.where(stays | (rates == 0), jnp.sign(sides), -jnp.sign(rates))
@@ -336,10 +316,9 @@ class _Rounds(NamedTuple):
         return GuardMemory(*(_put(x, places, of_mode) for x, of_mode in zip(nothing, new, strict=True)))
 
     def _note_rounding(self, before: Ending, guards: list[Guarded | None]) -> GuardMemory:
-        """The memory with the rounding of the guards where a round begins: of its mode, and of other modes.
-
-        A guard of another mode may be the same function. What is computed with that mode's equations says nothing here.
-        """
+        """The memory with the rounding of the guards where a round begins: of its mode, and of other modes."""
+        # A guard of another mode may be the same function. What is computed with that mode's equations says nothing
+        # here.
         memory = before.memory
         for place, (mode, guarded) in enumerate(zip(self.modes, guards, strict=True)):
             if guarded is None:
@@ -385,10 +364,8 @@ class _Rounds(NamedTuple):
         return Outset(sides, jax.lax.stop_gradient(lasting), at_once | blows, blows)
 
     def _are_blows(self, place: int, guarded: Guarded, rates, before: Ending) -> jax.Array:
-        """True for every guard, (K,), whose reset keeps it off its surface: turns it round, or puts it back.
-
-        A kick that leaves it to go on does not, nor does a section without a reset.
-        """
+        """True for every guard, (K,), whose reset keeps it off its surface: turns it round, or puts it back."""
+        # A kick that leaves it to go on does not, nor does a section without a reset.
         mode = self.modes[place]
         some, ways = mode.blows(place)
         are_blows = jnp.zeros(len(mode.leaving), bool)
@@ -412,10 +389,8 @@ def _select(condition, new: PyTree, old: PyTree) -> PyTree:
 
 
 def _pick(x: jax.Array, places) -> jax.Array:
-    """The entry of x (K,) in each row of `places` (…, K), which hold one at most: 0 without any.
-
-    In a batch XLA makes several programs of a look-up, and one of this.
-    """
+    """The entry of x (K,) in each row of `places` (…, K), which hold one at most: 0 without any."""
+    # In a batch XLA makes several programs of a look-up, and one of this.
     found = jnp.where(places, x, jnp.zeros_like(x))
     return found.any(-1) if x.dtype == bool else found.sum(-1)
 
