@@ -15,6 +15,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lagjax._interface._results import join_names
+
 PyTree = Any
 
 
@@ -109,11 +111,9 @@ _DOUBLE = np.dtype("float64")
 
 
 def dtype_of(x):
-    """The dtype that JAX computes with for a number or an array. Raises `TypeError` or `ValueError` where it has none.
-
-    An array of JAX has it already, and tells at a tenth of what `jnp.result_type` costs; a weak one does not. One of
-    NumPy in double precision has it where JAX has doubles.
-    """
+    """The dtype that JAX computes with for a number or an array. Raises `TypeError` or `ValueError` without one."""
+    # An array of JAX has it already, and tells at a tenth of what `jnp.result_type` costs; a weak one does not. One of
+    # NumPy in double precision has it where JAX has doubles.
     if isinstance(x, jax.Array) and not getattr(x, "weak_type", True):  # arrays of random keys have no such attribute
         return x.dtype
     if type(x) is np.ndarray and x.dtype == _DOUBLE == jax.dtypes.canonicalize_dtype(_DOUBLE):
@@ -121,14 +121,14 @@ def dtype_of(x):
     return jnp.result_type(x)
 
 
-def describe_numbers(tree: PyTree, name: str, most: int = 8) -> str:
-    """The numbers of a pytree by name, "q['x'] = 1, q['y'] = 2": the first of them, at `most`."""
+def describe_numbers(tree: PyTree, name: str) -> str:
+    """The numbers of a pytree by name, "q['x'] = 1, q['y'] = 2": the first of them."""
     found = [
         f"{label}{list(place) if place else ''} = {value:.6g}"
         for label, leaf in zip(*labelled_leaves(tree, name)[:2], strict=True)
         for place, value in np.ndenumerate(np.asarray(leaf))
     ]
-    return ", ".join(found[:most]) + (f", … ({len(found) - most} more)" if len(found) > most else "")
+    return join_names(found)
 
 
 def labelled_leaves(tree: PyTree, name: str, is_leaf=None) -> tuple[tuple[str, ...], list, Any]:

@@ -33,10 +33,8 @@ def has_nvidia_gpu() -> bool:
 
 @functools.cache
 def _as_written() -> dict[str, Any]:
-    """The options of XLA without optimisation, as far as this version of it has them.
-
-    Compilation of the algebra around a few matrices takes half of the time so, and runs as fast to a millisecond.
-    """
+    """The options of XLA without optimisation, as far as this version of it has them."""
+    # Compilation of the algebra around a few matrices takes half of the time so, and runs as fast to a millisecond.
     options = {"xla_backend_optimization_level": 0, "xla_cpu_use_fusion_emitters": False}
     try:
         jax.jit(lambda: 0.0, compiler_options=options).lower().compile()
@@ -46,10 +44,8 @@ def _as_written() -> dict[str, Any]:
 
 
 def compile_for_one_call(function: Callable) -> Callable:
-    """A function that XLA compiles without optimisation where it is called with numbers: what runs once, or seldom.
-
-    Within what is traced already, which may run often, it is optimised as all else there.
-    """
+    """A function that XLA compiles without optimisation where it is called with numbers: what runs once, or seldom."""
+    # Within what is traced already, which may run often, it is optimised as all else there.
     optimised = eqx.filter_jit(function)
 
     @functools.cache
@@ -65,10 +61,8 @@ def compile_for_one_call(function: Callable) -> Callable:
 
 
 def compiled_once(function: Callable) -> Callable:
-    """The jitted function, whose calls XLA does not inline on CPUs, in whose body it inlines all.
-
-    On a GPU a call of its own costs as much as the arithmetic of a step, and compiling ten of them is quick.
-    """
+    """The jitted function, whose calls XLA does not inline on CPUs, in whose body it inlines all."""
+    # On a GPU a call of its own costs as much as the arithmetic of a step, and compiling ten of them is quick.
 
     @jax.jit
     def body(*arguments):

@@ -140,13 +140,10 @@ class SimulationError(RuntimeError):
 
 
 def show_str(result, printer, cycle: bool) -> None:
-    """Let IPython show the `str` of a result, which is meant for reading, and not its fields.
-
-    A class takes it as its `_repr_pretty_`. Where `str` has no values to show, inside `jax.jit`, it is the fields.
-    """
+    """Let IPython show the `str` of a result, which is meant for reading: the `_repr_pretty_` of its class."""
     try:
         text = str(result)
-    except Exception:  # a display must not fail
+    except Exception:  # a display must not fail, as where `str` has no values to show inside `jax.jit`
         text = repr(result)
     printer.text(text)
 

@@ -18,11 +18,9 @@ PyTree = Any
 
 
 def as_arrays(tree: PyTree, dtype, name: str = "params") -> PyTree:
-    """Every number as an array, so that a new value is no new program; floats in the dtype of the state.
-
-    Raises `TypeError` or `ValueError`, with the name of the leaf, for what is neither a number nor can be a part of the
-    program.
-    """
+    """Every number as an array, so that a new value is no new program; floats in the dtype of the state."""
+    # Raises `TypeError` or `ValueError`, with the name of the leaf, for what is neither a number nor can be a part of
+    # the program.
     try:
         leaves, structure = jax.tree.flatten(tree)  # the names of leaves cost more than all else
     except ValueError:

@@ -105,8 +105,8 @@ def _is_function(x: Any) -> bool:
 
 
 def _lift_function(function: Function, roles: int, problem: Problem, values: list) -> Function:
+    extras = tuple(dict.fromkeys((*function.extras, "params")))
     if not function.code.tracers or "inputs" in function.extras:
-        extras = tuple(dict.fromkeys((*function.extras, "params")))
         return Function(None, Edition.from_function(Unchanged(function)), extras)
     numbers, rest = eqx.partition(problem.params, eqx.is_array_like)
     layout = problem.layout
@@ -124,5 +124,4 @@ def _lift_function(function: Function, roles: int, problem: Problem, values: lis
     # values stand in it, so that equal functions with equal places are one.
     jaxpr = closed.jaxpr.replace(constvars=[], invars=[*closed.jaxpr.constvars, *closed.jaxpr.invars])
     trace = _Trace(function.name, jaxpr, constants, places, jax.tree.structure(shapes))
-    extras = tuple(dict.fromkeys((*function.extras, "params")))
     return Function(None, function.code.trace_edition(trace, f"{places} {closed.in_avals}"), extras)

@@ -230,10 +230,8 @@ def _band(knots, values, t):
 
 @functools.cache
 def _polynomials() -> np.ndarray:
-    """The weight of sample i − 15 + k in the piece between samples i and i + 1, by powers of c = 2 s − 1 in [−1, 1].
-
-    Shape (10, 32). They interpolate at Chebyshev's points with both ends, so that u passes through its samples.
-    """
+    """The weight of sample i − 15 + k in the piece from sample i on, by powers of c = 2 s − 1 in [−1, 1], (10, 32)."""
+    # They interpolate at Chebyshev's points with both ends, so that u passes through its samples.
     nodes = -np.cos(np.pi * np.arange(_DEGREE + 1) / _DEGREE)
     distance = 0.5 * (nodes[:, None] + 1.0) - np.arange(1 - _HALF, _HALF + 1)
     weights = np.sinc(distance) * np.i0(_KAISER * np.sqrt(np.clip(1.0 - (distance / _HALF) ** 2, 0.0, 1.0)))

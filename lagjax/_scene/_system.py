@@ -313,12 +313,9 @@ class System(eqx.Module):
         return facts.with_constraints(names, np.asarray(schur) if is_concrete(schur) else None)
 
     def _motion(self, layout: Layout, params: PyTree = None) -> Motion:
-        """The scene in the flat coordinates of `layout`, after a look at what its functions return there.
-
-        The functions of the result take the numbers in `params` alone, with None in the place of everything else.
-        """
+        """The scene in the flat coordinates of `layout`, after a look at what its functions return there."""
+        # The functions of the result take the numbers in `params` alone, with None in the place of everything else.
         self._check_outputs(layout, params)
-
         code = eqx.filter(params, eqx.is_array_like, inverse=True)  # functions and strings: no part of the data
 
         def flatten_function(function: Any, to_array: Callable) -> Any:
@@ -382,18 +379,20 @@ class System(eqx.Module):
 
     def constraint_names(self, layout: Layout, params: PyTree) -> list[str]:
         """A name for each of the m constraints, such as constraints['rod'] or velocity_constraints[1]."""
-        names = []
-        for role, part in zip(self._constraint_roles, self._constraint_structure(layout, params), strict=True):
-            names += _names_of(part, role)
-        return names
+        return self._output_names(self._constraint_roles, layout, params)
 
     def contact_names(self, layout: Layout, params: PyTree) -> tuple[str, ...]:
         """A name for each gap and one-way velocity, such as contacts['floor'] or one_way[1]."""
+        roles = [role for role in ("contacts", "one_way") if getattr(self, role) is not None]
+        return tuple(self._output_names(roles, layout, params))
+
+    def _output_names(self, roles: list[str], layout: Layout, params: PyTree) -> list[str]:
         names = []
-        for role in ("contacts", "one_way"):
-            if getattr(self, role) is not None:
-                names += _names_of(self._output_shapes(role, layout, params), role)
-        return tuple(names)
+        for role in roles:
+            for path, leaf in jax.tree_util.tree_leaves_with_path(self._output_shapes(role, layout, params)):
+                label = role + jax.tree_util.keystr(path)
+                names += [label + (str(list(index)) if leaf.shape else "") for index in np.ndindex(leaf.shape)]
+        return names
 
     def _evaluate_quantity(self, quantity: Callable, q, qdot, t, params, restore: bool = False):
         """One of `Motion`'s functions at a state in the user's pytree, back in that pytree where `restore` says so."""
@@ -419,10 +418,7 @@ class System(eqx.Module):
         return jax.tree.map(jnp.asarray, layout.restore(value) if restore else value)
 
     def _evaluate_program(self, quantity: Callable, layout: Layout, q, qdot, t, params) -> np.ndarray | None:
-        """A quantity at a state of numbers, from the scene's programs in NumPy: nothing is compiled.
-
-        None where something is being traced, or the scene has no programs.
-        """
+        """A quantity at a state of numbers, from the scene's programs in NumPy; None where traced, or without these."""
         concrete = all(is_concrete(leaf) for leaf in jax.tree.leaves((self, q, qdot, t, params)))
         if self.path == "array" or quantity not in _OF_QUANTITIES or not concrete:
             return None
@@ -476,14 +472,6 @@ class System(eqx.Module):
         return {"multipliers": jax.eval_shape(lambda x: self._split_by_constraint(x, layout, params), flat)}
 
 
-def _names_of(tree: PyTree, role: str) -> list[str]:
-    names = []
-    for path, leaf in jax.tree_util.tree_leaves_with_path(tree):
-        label = role + jax.tree_util.keystr(path)
-        names += [label + (str(list(index)) if leaf.shape else "") for index in np.ndindex(leaf.shape)]
-    return names
-
-
 def _coefficients(contacts, one_way, restitution, friction, slip) -> tuple:
     """Restitution and friction as functions of params; None without contacts. Raises `ValueError`."""
     given = {"restitution": restitution, "friction": friction}
@@ -529,11 +517,9 @@ def _constant(value) -> Callable:
 
 
 def require_system(system: Any, contacts: bool = False) -> System:
-    """The scene with its functions as they are now (`Function.now`): what every public function begins with.
-
-    Raises `TypeError` for anything else in its place, a bare Lagrangian most often; and for a scene with contacts,
-    where these would be left out.
-    """
+    """The scene with its functions as they are now (`Function.now`): what every public function begins with."""
+    # Raises `TypeError` for anything else in its place, a bare Lagrangian most often; and for a scene with contacts,
+    # where these would be left out.
     if not isinstance(system, System):
         kind = type(system).__name__
         if kind == "Hybrid":

@@ -188,9 +188,8 @@ def _quantities_ahead(derivation: Derivation, numbers, ended: Ended) -> tuple[np
         y, t = _states_ahead(ended, np.concatenate([v, np.zeros(len(v))]))
     for name, function in (("given_force", motion.forces), ("lagrangian_by_q", jax.grad(motion.lagrangian))):
         if function is not None and len(v) <= LARGEST and _is_short(function, (*halves(ended.y), ended.t, numbers)):
-            values[name] = np.stack(
-                [function(*map(jnp.asarray, (*halves(y[k]), t[k])), numbers) for k in range(len(y))]
-            )
+            found = [function(*map(jnp.asarray, (*halves(y[k]), t[k])), numbers) for k in range(len(y))]
+            values[name] = np.stack(found)
     return y, t, values
 
 
@@ -253,11 +252,8 @@ def _equations(jaxpr) -> int:
 
 @np.errstate(all="ignore")
 def _singular_mass(derivation: Derivation, ended: Ended) -> str:
-    """A sentence where an eigenvalue of M has come down to next to nothing on the way; for scenes without constraints.
-
-    With constraints M may be singular where they hold what L does not.
-    """
-    if derivation.motion.constrained:
+    """A sentence where an eigenvalue of M has come down to next to nothing on the way."""
+    if derivation.motion.constrained:  # which may hold what L does not
         return ""
     try:
         y, t = np.stack([ended.y_first, ended.y]), np.array([ended.t_first, ended.t])

@@ -212,17 +212,9 @@ def _row(name: str, rtol: float, run: Callable[[], Trajectory], truth: np.ndarra
         np.atleast_1d(trajectory.stats[key]) for key in ("num_accepted_steps", "num_rejected_steps", "num_steps")
     )
     idle = trajectory.stats.get("num_wasted_lane_steps", 0)  # of a batch only
-    return WorkPrecisionRow(
-        name,
-        float(rtol),
-        seconds,
-        seconds / len(truth),
-        *_median_and_worst(_largest_difference(_path(trajectory), truth)),
-        float(accepted.mean()),
-        float(rejected.mean()),
-        float(np.mean(trajectory.ok)),
-        float(idle / max(steps.sum(), 1)),
-    )
+    errors = _median_and_worst(_largest_difference(_path(trajectory), truth))
+    shares = map(float, (accepted.mean(), rejected.mean(), np.mean(trajectory.ok), idle / max(steps.sum(), 1)))
+    return WorkPrecisionRow(name, float(rtol), seconds, seconds / len(truth), *errors, *shares)
 
 
 def _path(trajectory: Trajectory) -> np.ndarray:

@@ -49,10 +49,7 @@ class Edition:
         return (_watch_of(function) if is_plain else _Watch(function)).edition()
 
     def trace_edition(self, function: Callable, how: str) -> "Edition":
-        """The edition of `function`, a trace of this one whose tracers are arguments; `how` says which is which.
-
-        It is one and the same edition whatever is being traced.
-        """
+        """The edition of a trace of this one whose tracers are arguments, by `how`: one, whatever is being traced."""
         return Edition(function, f"{how}: {self.text}", self._held)
 
     def now(self) -> "Edition":

@@ -59,10 +59,8 @@ class Walk:
         self._numbers: dict[int, int] = {}
 
     def read(self, place: Any, key: Any, value: Any) -> Any:
-        """A value that is found in a dict or an object by a key, or in a cell; with the key None the place itself.
-
-        The result is the value, or `CHANGING` in its place.
-        """
+        """A value that is found in a dict or an object by a key, or in a cell; or `CHANGING` in its place."""
+        # With the key None it is the place itself.
         return value
 
     def describe_array(self, value: Any) -> str:
@@ -279,10 +277,8 @@ def _import_module(names: dict[str, Any], level: int, name: str) -> types.Module
 
 
 def _unwrap(thing: Any) -> Any:
-    """The function within one that `functools.wraps` or `jax.jit` made; None of others.
-
-    What jax.jit returns has no `__wrapped__` any more once it came from another process.
-    """
+    """The function within one that `functools.wraps` or `jax.jit` made; None of others."""
+    # What jax.jit returns has no `__wrapped__` any more once it came from another process.
     state = thing.__getstate__() if type(thing).__name__ == "PjitFunction" else {}
     return getattr(thing, "__wrapped__", state.get("fun"))
 
@@ -322,16 +318,12 @@ _OF_GLOBALS = frozenset("LOAD_NAME STORE_NAME DELETE_NAME LOAD_FROM_DICT_OR_GLOB
 
 @dataclasses.dataclass
 class ReadNames:
-    """The names in code, those in the functions inside of it included.
-
-    `globals`; `attributes`; `imports`, each (level, module); `stored`: globals, free variables and attributes that it
-    sets.
-    """
+    """The names in code, those in the functions inside of it included."""
 
     globals: set[str] = dataclasses.field(default_factory=set)
     attributes: set[str] = dataclasses.field(default_factory=set)
-    stored: set[str] = dataclasses.field(default_factory=set)
-    imports: set[tuple[int, str]] = dataclasses.field(default_factory=set)
+    stored: set[str] = dataclasses.field(default_factory=set)  # globals, free variables and attributes that it sets
+    imports: set[tuple[int, str]] = dataclasses.field(default_factory=set)  # level and module
 
     @property
     def reflects(self) -> bool:

@@ -4,39 +4,32 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._equations import ROUNDINGS
 from lagjax._scene import Flat
 from lagjax._trust.checks._findings import Finding
 from lagjax._trust.checks._scene_at_start import CheckedScene
-
-# Roundings of its terms below which a gap is closed: as in the constraints of a start.
-_CLOSED = 40
 
 
 def findings(scene: CheckedScene) -> list[Finding]:
     if scene.system.contacts is None:
         return []
-    q, qdot, t, params = scene.arguments
-    layout = scene.layout
-    flat = Flat.from_system(scene.system, layout, params)
-    numbers = jax.tree.map(lambda x: x if hasattr(x, "shape") or isinstance(x, float | int) else None, params)
-    q, qdot, t = layout.flatten(q), layout.flatten(qdot), jnp.asarray(t, layout.dtype)
+    (q, qdot, t, numbers), layout = scene.state, scene.layout
+    flat = Flat.from_system(scene.system, layout, scene.arguments[3])
     gaps, rates = jax.jvp(lambda q, t: flat.gaps(q, t, numbers), (q, t), (qdot, jnp.ones_like(t)))
     slopes = jax.jacfwd(lambda q: flat.gaps(q, t, numbers))(q)
     gaps, rates, slopes = (np.asarray(x) for x in (gaps, rates, slopes))
-    noise = _CLOSED * np.finfo(layout.dtype).eps * (np.abs(slopes) @ np.abs(np.asarray(q)) + np.abs(gaps))
-    fast = _CLOSED * np.finfo(layout.dtype).eps * (np.abs(slopes) @ np.abs(np.asarray(qdot)))
-    reported = []
-    for name, gap, rate, slope, near, slow in zip(
-        flat.shapes.names, gaps, rates, slopes, noise, fast, strict=False
-    ):  # fmt: skip
+    closed, reported = ROUNDINGS * np.finfo(layout.dtype).eps, []
+    near_zero = closed * (np.abs(slopes) @ np.abs(np.asarray(q)) + np.abs(gaps))
+    at_rest = closed * (np.abs(slopes) @ np.abs(np.asarray(qdot)))
+    measured = zip(flat.shapes.names, gaps, rates, slopes, near_zero, at_rest, strict=False)
+    for name, gap, rate, slope, near, slow in measured:
         if not slope.any():
             message = (
                 f"The gradient of the gap {name} is zero here: where it closes it has no direction to push in. Write "
                 "it as a distance, not as a square or a product."
             )
-            reported.append(
-                Finding("contact_zero_gradient", "error" if abs(gap) <= near else "warning", (name,), message)
-            )
+            level = "error" if abs(gap) <= near else "warning"
+            reported.append(Finding("contact_zero_gradient", level, (name,), message))
         elif gap < -near:
             message = f"The gap {name} is {gap:.6g}: the motion starts inside. Gaps stay >= 0."
             reported.append(Finding("contact_inside", "error", (name,), message))

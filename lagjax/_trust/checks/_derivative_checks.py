@@ -223,10 +223,8 @@ _OF_LINES = (
 
 
 def _compare_along_lines(scene: CheckedScene) -> list[Finding]:
-    """Findings where derivatives are not the slopes along random directions of all coordinates or velocities.
-
-    The coordinate to blame is looked for by halves. What is compared is a sum over all outputs of a function.
-    """
+    """Findings where derivatives are not the slopes along random directions of all coordinates or velocities."""
+    # The coordinate to blame is looked for by halves. What is compared is a sum over all outputs of a function.
     n, reported = scene.layout.size, {}
     directions = np.zeros((2 * _LINES + 1, 2 * n + 1))
     random = np.random.default_rng(0).standard_normal((2, _LINES, n)) * scene.sizes[:-1].reshape(2, 1, n)

@@ -61,10 +61,7 @@ def findings(scene: CheckedScene) -> list[Finding]:
 
 
 def _sides_of_states(scene: CheckedScene) -> Callable:
-    """A function of states (S, 2n + 1): on which sides of the borders they are.
-
-    It is a program where the scene has them, else compiled by XLA.
-    """
+    """The sides of the borders on which states (S, 2n + 1) are: by a program where the scene has one, else compiled."""
     n, params = scene.layout.size, scene.state[3]
 
     def sides_at(q, v, t, params):

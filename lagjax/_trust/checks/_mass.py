@@ -39,11 +39,9 @@ def findings(scene: CheckedScene) -> list[Finding]:
 
 
 def null_velocities(matrix: np.ndarray) -> np.ndarray:
-    """Unit vectors (k, n), one a row, along which a symmetric matrix (n, n) is zero up to the rounding of its entries.
-
-    The entries are derivatives with some units of round-off each: more is allowed for here than in `_linear`, where a
-    matrix is solved with that is taken to be exact.
-    """
+    """Unit vectors (k, n), one a row, along which a symmetric matrix is zero up to the rounding of its entries."""
+    # The entries are derivatives with some units of round-off each: more is allowed for here than in `_linear`, where a
+    # matrix is solved with that is taken to be exact.
     return null_directions(matrix, _rounding(matrix))
 
 

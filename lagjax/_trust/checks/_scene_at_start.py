@@ -249,11 +249,9 @@ def _sizes(q: PyTree, qdot: PyTree, scales: Scales) -> np.ndarray:
 
 
 def _offsets(sizes: np.ndarray, scales: Scales, dtype) -> np.ndarray:
-    """Offsets (1 + 2 · _NEARBY, 2n) from the state: zero, then random ones of q alone, then of q̇ alone.
-
-    Their deviation is a tenth of the sizes. A coordinate that is small beside the others moves by a tenth of its scale:
-    it may be next to where the chart is singular, and has to leave that.
-    """
+    """Offsets (1 + 2 · _NEARBY, 2n) from the state: zero, then random ones of q alone, then of q̇ alone."""
+    # Their deviation is a tenth of the sizes. A coordinate that is small beside the others moves by a tenth of its
+    # scale: it may be next to where the chart is singular, and has to leave that.
     n = len(scales.q)
     sizes = np.concatenate([np.maximum(sizes[:n], scales.q), sizes[n:-1]])
     moved = 0.1 * np.random.default_rng(0).standard_normal((2 * _NEARBY, 2 * n)) * sizes
@@ -313,12 +311,8 @@ def _evaluate_line(system: System, q, qdot, t, params, direction, steps):
         return jnp.sum(x * (weights := jnp.cos(jnp.arange(1.0, x.size + 1)))), jnp.sum(jnp.abs(x * weights))
 
     def values(q, v, t):
-        of = (
-            motion.momentum(q, v, t, numbers),
-            motion.constraints.f(q, t, numbers),
-            motion.constraints.a(q, v, t, numbers),
-        )
-        return list(map(weighted, of))
+        momentum, constraints = motion.momentum(q, v, t, numbers), motion.constraints
+        return list(map(weighted, (momentum, constraints.f(q, t, numbers), constraints.a(q, v, t, numbers))))
 
     def dissipation(*state):
         return jnp.zeros((), q0.dtype) if motion.dissipation is None else motion.dissipation(*state, numbers)
@@ -344,10 +338,8 @@ def _evaluate_line(system: System, q, qdot, t, params, direction, steps):
 
 
 def _program_variation(derivation: Derivation, state, acceleration, multipliers) -> np.ndarray:
-    """The slopes of M q̈ − Gᵀλ − F and G q̈ − γ by (q, q̇), (n + m, 2n), for constant q̈ and λ: by the programs.
-
-    It is one transposed derivative of the program of M, F, G and γ, for all n + m equations side by side.
-    """
+    """The slopes of M q̈ − Gᵀλ − F and G q̈ − γ by (q, q̇), (n + m, 2n), for constant q̈ and λ: by the programs."""
+    # It is one transposed derivative of the program of M, F, G and γ, for all n + m equations side by side.
     q, v, t, numbers = *map(np.asarray, state[:3]), numbers_of(state[3])
     n, m = len(q), len(multipliers)
     unit = np.eye(n + m, dtype=q.dtype)
@@ -366,10 +358,7 @@ def _program_variation(derivation: Derivation, state, acceleration, multipliers)
 
 
 def _rounding(*terms):
-    """The rounding of derivatives whose terms are not known one by one, in the shape of the first of `terms`.
-
-    Four units of round-off of the sum of the largest terms.
-    """
+    """The rounding of derivatives, in the shape of the first of `terms`: four units of the sum of the largest terms."""
     first, *_ = terms
     size = sum(np.max(np.abs(term), initial=0.0) for term in terms)
     return np.full(first.shape, 4 * np.finfo(first.dtype).eps * size)

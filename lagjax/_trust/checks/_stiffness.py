@@ -50,10 +50,8 @@ def _trusted_roots(matrix: np.ndarray, eps: float) -> np.ndarray:
 
 
 def _trusted_eigenvalues(linear: np.ndarray, eps: float) -> np.ndarray:
-    """The eigenvalues of ẏ = A y that a perturbation of the size of rounding moves by less than a tenth.
-
-    A defective zero, as of a free coordinate, is not one of them: rounding makes eigenvalues of √eps of it.
-    """
+    """The eigenvalues of ẏ = A y that a perturbation of the size of rounding moves by less than a tenth."""
+    # A defective zero, as of a free coordinate, is not one of them: rounding makes eigenvalues of √eps of it.
     speed = np.sqrt(np.abs(linear[len(linear) // 2 :]).max()) or 1.0
     scale = np.repeat([1.0, speed], len(linear) // 2)  # the time in units in which both halves are alike
     return _trust(np.linalg.eigvals, linear * scale / scale[:, None], eps)

@@ -49,7 +49,7 @@ UNSTEADY = 0.5
 
 def examine(trajectory, reference=None) -> "Health":
     """The `Health` of a trajectory, with its global error if there is a reference; see `Trajectory.health`."""
-    fields, names = measure_trajectory(trajectory)
+    fields = measure_trajectory(trajectory)
     impacts = doubts = None
     if trajectory.impacts is not None:  # impacts and friction take energy: no balance of it is at hand
         shared = _shared_impacts(trajectory)
@@ -71,9 +71,6 @@ def examine(trajectory, reference=None) -> "Health":
         doubts=doubts,
         outputs=trajectory.ts.shape[-1],
         diagnosis=_diagnosis(trajectory),
-        works=names.works,
-        momentum_names=names.momenta,
-        constraint_names=names.constraints,
         **fields,
     )
 

@@ -25,15 +25,12 @@ Numbers = TypeVar("Numbers", np.ndarray, jax.Array)
 
 
 class Met(NamedTuple, Generic[Numbers]):
-    """The number of times that each of N members crossed a border, began to slide along one, and grazed one; (N,) each.
-
-    `t` is when it first grazed one, NaN where it did not.
-    """
+    """The number of times each of N members crossed a border, began to slide along one, and grazed one; (N,) each."""
 
     crossed: Numbers
     slid: Numbers
     grazed: Numbers
-    t: Numbers
+    t: Numbers  # when it first grazed one, NaN where it did not
 
 
 def count_borders(members: Members) -> tuple[bool, Met[np.ndarray] | None]:

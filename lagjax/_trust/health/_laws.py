@@ -121,13 +121,12 @@ class Law(NamedTuple):
             return finite
         doubtful = [x if np.ndim(x) == 0 else x[~finite] for x in sample.columns]
         try:
-            slopes = lower(
-                partial(_slopes_of_all, self.motion), *self.derivation.state_shapes, budget=_DERIVATIVE_BUDGET
-            ).evaluate_many(doubtful)
+            slopes_of_all = partial(_slopes_of_all, self.motion)
+            program = lower(slopes_of_all, *self.derivation.state_shapes, budget=_DERIVATIVE_BUDGET)
         except Unlowerable:
             return finite
         finite = finite.copy()
-        finite[~finite] = np.isfinite(slopes).all(axis=0)
+        finite[~finite] = np.isfinite(program.evaluate_many(doubtful)).all(axis=0)
         return finite
 
     # ---- one state, in JAX ----
@@ -151,10 +150,8 @@ class Law(NamedTuple):
 
     @np.errstate(all="ignore")
     def _measure(self, momenta, tolerances, q, qdot, of, momenta_by_q, finite) -> Measurements:
-        """The `Measurements` from the quantities `of` states q, q̇ (…, n), their ∂pᵢ/∂q (…, k − 1, n) and `finite` (…).
-
-        Arrays of NumPy have an axis of states, those of JAX none.
-        """
+        """The `Measurements` of q, q̇ (…, n) from their quantities `of`, ∂pᵢ/∂q (…, k − 1, n) and `finite` (…)."""
+        # Arrays of NumPy have an axis of states, those of JAX none.
         xp, (rtol, atol), chosen = qdot.__array_namespace__(), tolerances, np.array(momenta, int)
         of = of if "mass_matrix" not in of else of | _products(xp, of["mass_matrix"], of["jacobian"], qdot, chosen)
         momentum, far, fast = of["momentum"], xp.abs(q), xp.abs(qdot)
@@ -223,11 +220,9 @@ def _conditions_of_diagonal(values):
 
 
 def _conditions(matrix):
-    """The smallest eigenvalue of symmetric matrices (…, n, n), max|λ| / min|λ|, and that ratio after scaling, (…, 3).
-
-    For arrays of NumPy or JAX. The matrix and the one scaled to a unit diagonal go into one call: LAPACK's kernels side
-    by side in one program of JAX deadlock (`_linear`).
-    """
+    """The smallest eigenvalue of symmetric matrices (…, n, n), max|λ| / min|λ| and that ratio after scaling, (…, 3)."""
+    # The matrix and the one scaled to a unit diagonal go into one call: LAPACK's kernels side by side in one program of
+    # JAX deadlock (`_linear`).
     xp = matrix.__array_namespace__()
     values, scaled = _eigenvalues(xp, xp.stack([matrix, unit_diagonal(matrix)[0]]))
     spread = (xp.max(xp.abs(x), axis=-1) / xp.min(xp.abs(x), axis=-1) for x in (values, scaled))

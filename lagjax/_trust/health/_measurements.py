@@ -44,21 +44,10 @@ class Extreme(NamedTuple):
     t: jax.Array | np.ndarray
 
 
-class Names(eqx.Module):
-    """The text of a report, which a compiled function returns as static data."""
-
-    works: bool = eqx.field(static=True)
-    momenta: tuple[str, ...] | None = eqx.field(static=True)
-    constraints: tuple[str, ...] = eqx.field(static=True)
-
-
 class SampledPath(NamedTuple):
-    """The S states of one member, or of N members with a first axis (N, …) in NumPy, and the tolerances of the run.
+    """The S states of one member, or of N members with a first axis (N, …) in NumPy, and the tolerances of the run."""
 
-    The T outputs come first, then the states just before each transition.
-    """
-
-    q: Any  # (…, S, n)
+    q: Any  # (…, S, n), of the T outputs, then of the states just before each transition
     qdot: Any  # (…, S, n)
     t: Any  # (…, S)
     mode: Any  # (…, S)
@@ -83,12 +72,11 @@ class SampledPath(NamedTuple):
         return self.library.take_along_axis(x, ends, axis=self.time)
 
 
-def measure_trajectory(trajectory) -> tuple[dict[str, Any], Names]:
+def measure_trajectory(trajectory) -> dict[str, Any]:
     """The fields of `Health` that are measured along the path, and names for them."""
     steps = trajectory.stats["num_accepted_steps"]
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
-        report = _report_in_doubles(Members(trajectory))
-        if report is not None:
+        if (report := _report_in_doubles(Members(trajectory))) is not None:
             return report
     axes, tree = jax.tree.flatten(trajectory.params_axes, is_leaf=lambda axis: axis is None)  # hashable
     arrays = dataclasses.replace(trajectory, stats={}, params_axes=None)
@@ -96,13 +84,13 @@ def measure_trajectory(trajectory) -> tuple[dict[str, Any], Names]:
 
 
 @with_doubles
-def _report_in_doubles(members: Members) -> tuple[dict[str, Any], Names] | None:
+def _report_in_doubles(members: Members) -> dict[str, Any] | None:
     """The report of all members, whose laws are those of float64; None where a scene has no programs."""
     layout = dataclasses.replace(members.layout, dtype=DOUBLE)
     laws = _laws(members.trajectory, layout, widen(members.params))
     if not all(is_lowered(law.derivation) for law in laws):
         return None
-    return _report_of(members, laws), _names(laws, layout)
+    return _report_of(members, laws) | _names(laws, layout)
 
 
 def _precision_of(trajectory, q) -> np.dtype:
@@ -122,13 +110,14 @@ def does_work(trajectory) -> bool:
     return any(law.works for law in _laws(trajectory, members.layout, members.params))
 
 
-def _names(laws: list[Law], layout: Layout) -> Names:
+def _names(laws: list[Law], layout: Layout) -> dict[str, Any]:
+    """The fields of `Health` that are known without a motion, none of them an array."""
     momenta = _conserved(laws)
-    return Names(
-        any(law.works for law in laws),
-        None if momenta is None else tuple(layout.names[i] for i in momenta),
-        tuple(name for law in laws for name in law.names),
-    )
+    return {
+        "works": any(law.works for law in laws),
+        "momentum_names": None if momenta is None else tuple(layout.names[i] for i in momenta),
+        "constraint_names": tuple(name for law in laws for name in law.names),
+    }
 
 
 def _conserved(laws: list[Law]) -> tuple[int, ...] | None:
@@ -205,7 +194,7 @@ def _measure_traced(trajectory, axes, tree, steps):
     def one(q, qdot, times_and_tolerances, params, mode, steps, transitions):
         layout = Layout.from_state(*jax.tree.map(lambda leaf: leaf[0], (q, qdot)))
         laws = _laws(trajectory, layout, params)
-        names["all"] = _names(laws, layout)
+        names.update(_names(laws, layout))
         flat, (ts, tolerances) = jax.vmap(layout.flatten), times_and_tolerances
         more = transitions and (flat(transitions.q), flat(transitions.qdot), transitions.t, transitions.source)
         outputs, precision = (flat(q), flat(qdot), ts, mode), _precision_of(trajectory, layout)
@@ -224,8 +213,7 @@ def _measure_traced(trajectory, axes, tree, steps):
         )
         return _report(path, laws, momenta, sample, between)
 
-    fields = trajectory.map_members(one, steps, trajectory.transitions)
-    return fields, names["all"]
+    return trajectory.map_members(one, steps, trajectory.transitions) | names
 
 
 def _evaluate_mode(laws: list[Law], function: Callable, q, qdot, t, mode):
@@ -329,11 +317,9 @@ def _ends(xp, ts, transitions):
 
 
 def _drifts(path: SampledPath, laws, momenta, samples: Measurements, reached, between: "Rates") -> tuple[Any, Any]:
-    """|h − h₀ − W| and |pᵢ − pᵢ₀| at every output, a column each, and how far W may be off, (…).
-
-    A piece of the path, from an output to its entry in `ends`, counts for a quantity that its mode conserves; whatever
-    changes the quantity between there and the next output, such as a transition, is left out.
-    """
+    """|h − h₀ − W| and |pᵢ − pᵢ₀| at every output, a column each, and how far W may be off, (…)."""
+    # A piece of the path, from an output to its entry in `ends`, counts for a quantity that its mode conserves;
+    # whatever changes the quantity between there and the next output, such as a transition, is left out.
     xp, until, T, values = path.library, path.take_ends, path.ts.shape[-1], samples.conserved
     start = values[..., : T - 1, :]
     measurable = until(reached) & reached[..., : T - 1]
@@ -441,10 +427,7 @@ def _work(path: SampledPath, samples: Measurements, measurable, between: Rates) 
 
 
 def _interpolants(begin, end) -> tuple[list, list]:
-    """The polynomials in s with these q, dq/ds and d²q/ds² at s = 0 and 1: the cubic of the first two, the quintic.
-
-    Lists of the coefficients of s⁰, s¹, ….
-    """
+    """Coefficients of s⁰, s¹, … of the cubic with these q and dq/ds at s = 0 and 1, and of the quintic with d²q/ds²."""
     (q0, v0, a0), (q1, v1, a1) = begin, end
     a0, rise = a0 / 2, q1 - q0
     # The three conditions at s = 1 on the coefficients of s³, s⁴ and s⁵.
@@ -468,11 +451,9 @@ def _error_of_work(xp, found):
 
 
 def _outputs_needed(xp, T: int, imbalance, work_error, size):
-    """About how many outputs it takes to tell whether the power is balanced; T where the present ones do.
-
-    They do not where the balance is off by more than `VISIBLE` of the energy and the error of the work may be as large
-    as both. That error is of order six, so that a sixth root gives the number.
-    """
+    """About how many outputs it takes to tell whether the power is balanced; T where the present ones do."""
+    # They do not where the balance is off by more than `VISIBLE` of the energy and the error of the work may be as
+    # large as both. That error is of order six, so that a sixth root gives the number.
     visible = VISIBLE * size
     excess = SLACK * work_error / xp.where(visible > 0, visible, 1.0)
     undecided = (excess > 1) & (imbalance > visible) & ~(imbalance > 2 * SLACK * work_error)
@@ -489,10 +470,8 @@ def _amplitude(xp, q, on_path):
 
 
 def _limits(path: SampledPath, here: Measurements, on_path) -> tuple[Any, Any]:
-    """The largest drift of h and the momenta by errors of steps and round-off, and their sizes, (…, k) each.
-
-    Fixed steps have no tolerances: there `VISIBLE` of the size is the limit.
-    """
+    """The largest drift of h and the momenta by errors of steps and round-off, and their sizes, (…, k) each."""
+    # Fixed steps have no tolerances: there `VISIBLE` of the size is the limit.
     xp, n = path.library, path.q.shape[-1]
     slope, size = (xp.max(xp.where(on_path[..., None], x, 0.0), axis=-2) for x in (here.slopes, here.sizes))
     allowed, steps = VISIBLE * size, path.steps[..., None]
