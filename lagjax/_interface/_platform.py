@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.core import Tracer
 from jax.experimental.xla_metadata import set_xla_metadata
+from jax.interpreters.ad import JVPTracer
 
 
 def default_platform() -> str:
@@ -45,7 +46,8 @@ def _as_written() -> dict[str, Any]:
 
 def compile_for_one_call(function: Callable) -> Callable:
     """A function that XLA compiles without optimisation where it is called with numbers: what runs once, or seldom."""
-    # Within what is traced already, which may run often, it is optimised as all else there.
+    # Within what is traced already, which may run often, it is optimised as all else there. `jax.jvp` and `jax.jacfwd`
+    # call it with numbers; reverse mode traces what it pulls back, which takes no options.
     optimised = eqx.filter_jit(function)
 
     @functools.cache
@@ -55,9 +57,15 @@ def compile_for_one_call(function: Callable) -> Callable:
     @functools.wraps(function)
     def call(*arguments):
         leaves = jnp.zeros(()), *jax.tree.leaves(arguments)  # what is made while something is traced is a tracer
-        return (optimised if any(isinstance(x, Tracer) for x in leaves) else as_written())(*arguments)
+        return (optimised if any(isinstance(_primal_of(x), Tracer) for x in leaves) else as_written())(*arguments)
 
     return call
+
+
+def _primal_of(x: Any) -> Any:
+    while isinstance(x, JVPTracer):
+        x = x.primal
+    return x
 
 
 def compiled_once(function: Callable) -> Callable:
