@@ -36,9 +36,8 @@ class Design:
         bounds = [x * len(names) if len(x) == 1 else x for x in (self.low, self.high)]
         for which, x in zip(("low", "high"), bounds, strict=True):
             if len(x) != len(names):
-                raise ValueError(
-                    f"`{which}` of the {self.kind} design for {names} has {len(x)} numbers: give one each."
-                )
+                design = f"the {self.kind} design for {names}"
+                raise ValueError(f"`{which}` of {design} has {len(x)} numbers: give one each.")
         return Design(self.kind, self.count, self.seed, *bounds)
 
     def described(self) -> dict:
@@ -51,9 +50,7 @@ class Design:
         key = (mixed << 64) | self.seed  # two axes with one seed are drawn independently
         if self.kind == "random":
             numbers = np.random.Generator(np.random.Philox(key=key))
-
-            def draw(n: int) -> np.ndarray:
-                return numbers.random((n, len(names)))
+            draw = lambda n: numbers.random((n, len(names)))  # noqa: E731
         else:
             from scipy.stats import qmc
 

@@ -95,10 +95,8 @@ def space_time(trajectory: Trajectory, *, label: str | None = None, cmap: str = 
     _require_numbers(trajectory, "trajectory")
     layout, course = course_of(trajectory)
     ax = _axes(ax)
-    mesh = ax.pcolormesh(
-        course.t, np.arange(layout.size), np.ma.masked_invalid(course.q.T), cmap=cmap, shading="nearest",
-        rasterized=True,
-    )  # fmt: skip
+    places, values = np.arange(layout.size), np.ma.masked_invalid(course.q.T)
+    mesh = ax.pcolormesh(course.t, places, values, cmap=cmap, shading="nearest", rasterized=True)
     ax.set(xlabel="t", ylabel="coordinate")
     ax.locator_params(axis="y", integer=True)
     if layout.size <= len(COLORS):
@@ -164,12 +162,11 @@ def compare(one: Trajectory, other, *coordinates: str, figure=None):
     ts, values, style = _other(other, layout)
     places = _places(layout, coordinates, most=4)
     axes = _two_rows(figure, len(places))
+    left = course.states_at(ts)[0] - values
     for (above, below), i in zip(axes.T, places, strict=True):
         _axes(above).plot(t, q[:, i], color=COLORS[0], linewidth=1.5, label="motion")
         above.plot(ts, values[:, i], style, color=COLORS[1], markersize=3.0, linewidth=1.2, label="other")
-        _axes(below).plot(
-            ts, course.states_at(ts)[0][:, i] - values[:, i], style[0], color=COLORS[1], markersize=3.0, linewidth=1
-        )
+        _axes(below).plot(ts, left[:, i], style[0], color=COLORS[1], markersize=3.0, linewidth=1)
         above.set_title(layout.names[i], fontsize="medium")
         below.set_xlabel("t")
     axes[1][0].set_ylabel("motion − other")
@@ -293,23 +290,20 @@ def path(x, y, *, values=None, label: str | None = None, cmap: str = "viridis", 
         _require_numbers(x, "x")
         layout, course = course_of(x)
         curve = course.curve()
-        (line,) = _project(layout, [curve], y)
         if values is not None:
             order = np.argsort(np.asarray(x.ts))
             values = np.interp(curve[0], np.asarray(x.ts)[order], np.asarray(values)[order])
-        x, y = line
+        ((x, y),) = _project(layout, [curve], y)
     ax = _axes(ax)
     ax.set_aspect("equal", adjustable="datalim")
     if values is None:
         ax.plot(x, y, linewidth=1.2, label=label)
         return ax
-    points = np.stack([np.asarray(x), np.asarray(y)], axis=-1)
-    values = np.asarray(values)
+    points, values = np.stack([np.asarray(x), np.asarray(y)], axis=-1), np.asarray(values)
     # The palest end of a map does not show as a line on white.
     inks = matplotlib.colors.ListedColormap(matplotlib.colormaps[cmap](np.linspace(0.0, 0.9, 256)))
-    lines = matplotlib.collections.LineCollection(
-        [*np.stack([points[:-1], points[1:]], axis=1)], cmap=inks, linewidth=1.4
-    )
+    pieces = [*np.stack([points[:-1], points[1:]], axis=1)]
+    lines = matplotlib.collections.LineCollection(pieces, cmap=inks, linewidth=1.4)
     lines.set(array=(values[:-1] + values[1:]) / 2, capstyle="round")
     ax.add_collection(lines)
     ax.autoscale_view()
@@ -361,12 +355,10 @@ def _section_points(crossings: Crossings, projection: Callable) -> tuple[np.ndar
     _require(crossings, "crossings", Crossings, "crossings", " for one section")
     t = np.asarray(crossings.t)
     if not np.isfinite(t).any():
-        raise ValueError(
-            "The section was never crossed: there is nothing to draw. Follow the motion longer, or move it."
-        )
-    states = jax.tree.map(
-        lambda leaf: jnp.asarray(leaf).reshape(-1, *leaf.shape[t.ndim :]), (crossings.q, crossings.qdot)
-    )
+        advice = "Follow the motion longer, or move it."
+        raise ValueError(f"The section was never crossed: there is nothing to draw. {advice}")
+    state = crossings.q, crossings.qdot
+    states = jax.tree.map(lambda leaf: jnp.asarray(leaf).reshape(-1, *leaf.shape[t.ndim :]), state)
     x, y = map(np.asarray, jax.vmap(_pair(projection))(*states))
     there = np.isfinite(t.ravel())
     members = np.repeat(np.arange(t.size // t.shape[-1]), t.shape[-1])
@@ -408,15 +400,12 @@ def energy_error(trajectory: Trajectory, *, scale: float | None = None, ax=None)
 
 def _loses_at_transitions(trajectory: Trajectory, h: np.ndarray) -> bool:
     """True if a transition changes the energy by more than rounding, in parts of the largest one."""
-    changes = trajectory.transitions
-    if changes is None:
+    if (changes := trajectory.transitions) is None:
         return False
+    sides = (changes.q, changes.qdot, changes.source), (changes.q_next, changes.qdot_next, changes.target)
     before, after = (
-        dataclasses.replace(trajectory, ts=changes.t, q=q, qdot=qdot, mode=mode).energy()
-        for q, qdot, mode in (
-            (changes.q, changes.qdot, changes.source), (changes.q_next, changes.qdot_next, changes.target),
-        )
-    )  # fmt: skip
+        dataclasses.replace(trajectory, ts=changes.t, q=q, qdot=qdot, mode=mode).energy() for q, qdot, mode in sides
+    )
     rounding = np.finfo(h.dtype).eps ** 0.5 * np.nanmax(np.abs(h))
     return bool(np.nanmax(np.abs(np.asarray(after - before)), initial=0.0) > rounding)
 
@@ -497,9 +486,8 @@ def state_map(x, y, values, *, label: str | None = None, cmap: str = "magma", no
     ax = _axes(ax)
     ax.grid(False)
     colors, extent = _matplotlib().colormaps[cmap].with_extremes(bad="white"), (*_edges(x), *_edges(y))
-    image = ax.imshow(
-        values, extent=extent, origin="lower", aspect="auto", interpolation="nearest", cmap=colors, norm=norm
-    )
+    style: dict[str, Any] = dict(origin="lower", aspect="auto", interpolation="nearest", cmap=colors, norm=norm)
+    image = ax.imshow(values, extent=extent, **style)
     _colorbar(image, ax, label)
     return ax
 
@@ -570,8 +558,7 @@ def _project(layout: Layout, curves: list, projection: Callable) -> list[tuple[n
     """The curves in the plane, x and y of each; NaN where a state jumps."""
     q, qdot = (np.concatenate([curve[part] for curve in curves]).astype(layout.dtype) for part in (1, 2))
     states = map(layout.restore, map(jnp.asarray, (q, qdot)))
-    known = np.isfinite(q).all(axis=1)
-    xy = np.where(known, np.stack([np.asarray(x) for x in jax.vmap(_pair(projection))(*states)]), np.nan)
+    xy = np.where(np.isfinite(q).all(axis=1), np.stack(jax.vmap(_pair(projection))(*states)), np.nan)
     return [tuple(part) for part in np.split(xy, np.cumsum([len(t) for t, _, _ in curves])[:-1], axis=1)]
 
 

@@ -86,9 +86,8 @@ class Animation:
             head = '<!doctype html><meta charset="utf-8"><title>A motion</title>'
             Path(path).write_text(head + self._page(), encoding="utf-8")
         else:
-            raise ValueError(
-                f"The suffix of {str(path)!r} names no film: write .gif, {', '.join(_VIDEO)}, .html; got {suffix!r}."
-            )
+            known = f".gif, {', '.join(_VIDEO)}, .html"
+            raise ValueError(f"The suffix of {str(path)!r} names no film: write {known}; got {suffix!r}.")
 
     def _gif(self, path) -> None:
         """Write the pictures one after another, so that no more than one of them is in memory in its full colours."""
@@ -118,13 +117,10 @@ class Animation:
     def _page(self) -> str:
         """The film as HTML: a video where ffmpeg is there, else pictures and a few lines of JavaScript."""
         matplotlib, program = _matplotlib(), _ffmpeg()
-        film = self._film()
         # Beyond its limit matplotlib leaves frames out, or the whole video.
-        with matplotlib.rc_context({"animation.embed_limit": _LARGEST, "savefig.dpi": _DPI}):
-            if program is None:
-                return film.to_jshtml(fps=self.fps)
-            with matplotlib.rc_context({"animation.ffmpeg_path": program}):
-                return film.to_html5_video()
+        options = {"animation.embed_limit": _LARGEST, "savefig.dpi": _DPI}
+        with matplotlib.rc_context(options | ({} if program is None else {"animation.ffmpeg_path": program})):
+            return self._film().to_jshtml(fps=self.fps) if program is None else self._film().to_html5_video()
 
     def _film(self):
         figure, show, count = self._figure(self.fps)
@@ -164,8 +160,7 @@ def make_animation(trajectory, points: Callable, trace, speed: float, fps: float
     members = Members(trajectory)
     courses = [course_of_member(members, k) for k in range(min(members.count, MEMBERS))]
     reached = [course.t[np.isfinite(course.q).all(axis=1)] for course in courses]
-    known = np.concatenate(reached)
-    if not len(known):
+    if not len(known := np.concatenate(reached)):
         raise ValueError("None of the members was followed to any output: there is nothing to show.")
     begin = courses[0].t[0]
     end = float(known[np.argmax(np.abs(known - begin))])
@@ -242,9 +237,8 @@ def _parse_trace(trace, shapes: dict[str, tuple[int, ...]]) -> tuple[tuple[str, 
         known = isinstance(place, int | np.integer) and name in shapes and -shapes[name][0] <= place < shapes[name][0]
         if not known:
             lines = ", ".join(f"{name or 'points'!r} of {shape[0]} points" for name, shape in shapes.items())
-            raise ValueError(
-                f"trace={trace!r} names no point: there are {lines}. Give a name, a place, or (name, place)."
-            )
+            advice = "Give a name, a place, or (name, place)."
+            raise ValueError(f"trace={trace!r} names no point: there are {lines}. {advice}")
     return tuple((name, int(place)) for name, place in pairs)
 
 
@@ -271,10 +265,7 @@ def _draw_film(ax, positions: dict[str, np.ndarray], times: np.ndarray, traces, 
 
     def show(i: int):
         for line, member in lines:
-            if space:
-                line.set_data_3d(*member[i].T)
-            else:
-                line.set_data(*member[i].T)
+            (line.set_data_3d if space else line.set_data)(*member[i].T)
         for collection, t, path, seen, color in faded:
             begin, recent = times[max(0, i - trail)], slice(max(0, seen[max(0, i - trail)] - 1), seen[i])
             collection.set_segments(np.stack([path[recent][:-1], path[recent][1:]], axis=1))
@@ -316,17 +307,15 @@ def _keep_the_rest(figure, moving: list) -> None:
 def _axes(figure, low: np.ndarray, high: np.ndarray):
     """Axes of equal scale that hold the whole motion."""
     ax = figure.add_subplot(projection="3d" if len(low) == 3 else None)
-    limits = {f"{axis}lim": ends for axis, *ends in zip("xyz", low, high, strict=False)}
-    ax.set(**limits)
+    ax.set(**{f"{axis}lim": ends for axis, *ends in zip("xyz", low, high, strict=False)})
     if len(low) == 3:
         ax.set_box_aspect(high - low)
         ax.set(xlabel="x", ylabel="y", zlabel="z")
         ax.locator_params(nbins=5)  # more would run into each other
         return ax
     ax.set_aspect("equal")
-    for axis, share, middle in zip(
-        (ax.xaxis, ax.yaxis), (high - low) / (high - low).max(), (low + high) / 2, strict=True
-    ):
+    sides = (high - low) / (high - low).max()
+    for axis, share, middle in zip((ax.xaxis, ax.yaxis), sides, (low + high) / 2, strict=True):
         if _INTERVALS * share < 2:  # a side of a motion along a line: there is room for one number
             axis.set_ticks([middle], [f"{middle:.3g}"])
         else:

@@ -32,13 +32,11 @@ def dataset(trajectory, units: PyTree = None, time_unit: str | None = None):
     if trajectory.mode is not None:
         names = {"names": list(trajectory.mode_names)}
         variables["mode"] = ((*members, "time"), np.asarray(trajectory.mode), names)
-    times, first = times_of_members(trajectory), (0,) * len(members)
-    of_time = {} if time_unit is None else {"units": time_unit}
-    if (times == times[first]).all():
-        coordinates = {"time": ("time", times[first], of_time)}
-    else:
-        coordinates = {"t": ((*members, "time"), times, of_time)}
-    return xarray.Dataset(variables, coords=coordinates)
+    times, of_time = times_of_members(trajectory), {} if time_unit is None else {"units": time_unit}
+    shared = times[(0,) * len(members)]
+    if (times == shared).all():
+        return xarray.Dataset(variables, coords={"time": ("time", shared, of_time)})
+    return xarray.Dataset(variables, coords={"t": ((*members, "time"), times, of_time)})
 
 
 def frame(trajectory, units: PyTree = None, time_unit: str | None = None):
@@ -47,7 +45,6 @@ def frame(trajectory, units: PyTree = None, time_unit: str | None = None):
     require_numbers(trajectory, "to_pandas() copies")
     members = _member_axes(trajectory)
     batch, count = np.shape(trajectory.result._value), trajectory.ts.shape[-1]
-    each = times_of_members(trajectory)
     # The names of the coordinates, as messages have them, which begin with q.
     first = jax.tree.map(lambda leaf: np.asarray(leaf)[(0,) * (len(batch) + 1)], (trajectory.q, trajectory.qdot))
     names = [name.removeprefix("q") for name in Layout.from_state(*first).names]
@@ -59,19 +56,16 @@ def frame(trajectory, units: PyTree = None, time_unit: str | None = None):
     if trajectory.mode is not None:
         codes = np.asarray(trajectory.mode).ravel()
         columns["mode"] = pandas.Categorical.from_codes(codes, categories=list(trajectory.mode_names))
+    index = pandas.Index(times_of_members(trajectory).ravel(), name="t")
     if batch:
         places = [place.ravel() for place in np.indices((*batch, count))[:-1]]
-        index = pandas.MultiIndex.from_arrays([*places, each.ravel()], names=[*members, "t"])
-    else:
-        index = pandas.Index(each.ravel(), name="t")
+        index = pandas.MultiIndex.from_arrays([*places, index], names=[*members, "t"])
     table = pandas.DataFrame(columns, index=index)
     of_q, of_qdot = _units(trajectory.q, units, time_unit)
     per_leaf = [np.size(leaf) for leaf in jax.tree.leaves(first[0])]
     spread = [unit for of in (of_q, of_qdot) for unit, size in zip(of, per_leaf, strict=True) for _ in range(size)]
-    known = {name: unit for name, unit in zip(columns, spread, strict=False) if unit is not None}
-    if time_unit is not None:
-        known["t"] = time_unit
-    if known:
+    known = dict(zip([*columns][: len(spread)], spread, strict=True)) | {"t": time_unit}
+    if known := {name: unit for name, unit in known.items() if unit is not None}:
         table.attrs["units"] = known
     return table
 

@@ -59,10 +59,8 @@ def import_package(what: str, name: str, source: str, *parts: str) -> Any:
 
 def _contents(trajectory) -> str:
     batch = trajectory.result._value.shape
-    named = [
-        f"q{jax.tree_util.keystr(path)} {tuple(leaf.shape)}"
-        for path, leaf in jax.tree_util.tree_leaves_with_path(trajectory.q)
-    ]  # fmt: skip
+    leaves = jax.tree_util.tree_leaves_with_path(trajectory.q)
+    named = [f"q{jax.tree_util.keystr(path)} {tuple(leaf.shape)}" for path, leaf in leaves]
     if len(named) > LEAVES_SHOWN:
         named[LEAVES_SHOWN - 1 :] = [f"… ({len(named) - LEAVES_SHOWN + 1} more)"]
     members = f" of {' × '.join(map(str, batch))} members" if batch else ""
@@ -84,10 +82,9 @@ def _span(trajectory) -> str:
     steps, rejected = map(np.asarray, counts)
     if steps.size == 0:
         return text
+    counted = f"{steps} steps ({rejected} rejected)"
     if steps.ndim:
         counted = f"{np.median(steps):.0f} steps in the median, at most {steps.max()} ({rejected.max()} rejected)"
-    else:
-        counted = f"{steps} steps ({rejected} rejected)"
     changes = trajectory.transitions
     if changes is not None and is_known(changes.count):
         counted += f", {'at most ' if steps.ndim else ''}{np.max(np.asarray(changes.count))} transitions"
@@ -104,15 +101,14 @@ def _verdict(trajectory) -> str:
         return "reached the end" if name == "successful" else f"ended at t = {times:.6g}: {name}"
     if codes.size == 0:
         return "no members"
-    values, counts = np.unique(codes, return_counts=True)
-    parts = [
-        f"{count} of {codes.size} reached the end" if name_of(value) == "successful" else f"{count} {name_of(value)}"
-        for value, count in zip(values, counts, strict=True)
-    ]
+    parts = []
+    for value, count in zip(*np.unique(codes, return_counts=True), strict=True):
+        name = name_of(value)
+        parts.append(f"{count} of {codes.size} reached the end" if name == "successful" else f"{count} {name}")
     failed = np.argwhere(~np.isin(codes, ENDED_WELL))
     if not len(failed):
         return ", ".join(parts)
-    first = tuple(int(i) for i in failed[0])
+    first = tuple(failed[0].tolist())
     shown = first[0] if len(first) == 1 else first
     return f"{', '.join(parts)}: the first that failed is member {shown}, at t = {times[first]:.6g}"
 
