@@ -270,13 +270,13 @@ def sweep(
     require_flag(progress, "progress")
     settled = _as_store(store, arguments)
     settings = {name: getattr(settled, name) for name in ("rtol", "atol", "max_steps", "event", "solver")}
-    if jumps(system):
-        if given := [name for name in ("event", "crossings", "solver") if getattr(settled, name) is not None]:
-            raise ValueError(
-                f"{' and '.join(given)} of sweep: for the motion of one System without contacts. Transitions watch a "
-                "hybrid motion, in machine code; one without a reset notes where it is crossed, and "
-                "`trajectory.transitions` tells when."
-            )
+    given = [name for name in ("event", "crossings", "solver") if getattr(settled, name) is not None]
+    if given and jumps(system):
+        raise ValueError(
+            f"{' and '.join(given)} of sweep: for the motion of one System without contacts. Transitions watch a "
+            "hybrid motion, in machine code; one without a reset notes where it is crossed, and "
+            "`trajectory.transitions` tells when."
+        )
     if not callable(keep):
         raise TypeError(f"keep must be a function of a trajectory that returns a dict; got {keep!r}.")
     reduce = {} if reduce is None else reduce

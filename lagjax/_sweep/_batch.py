@@ -6,6 +6,7 @@ The user's functions are for one member. Where they are written in jax.numpy the
 batch at once; else they are called member by member, and `slow` says why.
 """
 
+import contextlib
 import dataclasses
 import functools
 import re
@@ -29,7 +30,7 @@ from lagjax._run import (
     surfaces_in,
     trajectory_of,
 )
-from lagjax._run.hybrid import Hybrid, Scene, jumps
+from lagjax._run.hybrid import Hybrid, jumps
 from lagjax._sweep._description import NOT_TRACEABLE, Description, Sections
 from lagjax._sweep._files import RESULT, Quantity
 
@@ -77,8 +78,7 @@ class Batches:
         self._starts = {role: self._map_start(role, f) if callable(f) else None for role, f in roles.items()}
         self._axes = tuple(0 if start else None for start in self._starts.values())
         self._keep_all, self._keep_one = jax.jit(self._keep_vectorized), jax.jit(self._keep_member)
-        drift_of = lambda arrays, params: self._drift(self._trajectory(arrays[0], params))  # noqa: E731
-        self._drift_all, self._tolerances = jax.jit(jax.vmap(drift_of, in_axes=(0, self._axes[2]))), None
+        self._drift_all, self._tolerances = jax.jit(jax.vmap(self._drift_of, in_axes=(0, self._axes[2]))), None
 
     def __call__(self, points: dict[str, np.ndarray]) -> KeptResults:
         """The kept values of the members at these points (B,)."""
@@ -102,13 +102,9 @@ class Batches:
 
     def _compute_motions(self, points: dict[str, np.ndarray]) -> tuple["_BatchMotions", dict[int, str]]:
         description, ts, complaints = self.description, jnp.asarray(self.description.ts), {}
-        values = {
-            role: start(points, complaints) if start else getattr(description, role)
-            for role, start in self._starts.items()
-        }
-        run, crossings = run_batch(
-            description.system, values, ts, self._axes, description.settings, description.sections
-        )
+        starts = self._starts.items()
+        values = {role: f(points, complaints) if f else getattr(description, role) for role, f in starts}
+        run, crossings = run_batch(description, values, ts, self._axes)
         self._tolerances = None if jumps(description.system) else run.tolerances
         for_members = values["params"] if self._axes[2] == 0 else None
         return _BatchMotions(run, (_arrays(run), crossings), for_members), complaints
@@ -147,9 +143,7 @@ class Batches:
         return start
 
     def _keep_vectorized(self, arrays: tuple, params: PyTree) -> tuple:
-        def keep_member(arrays, params):
-            return self._keep_member(arrays, params), self._drift(self._trajectory(arrays[0], params))
-
+        keep_member = lambda *of: (self._keep_member(*of), self._drift_of(*of))  # noqa: E731
         return jax.vmap(keep_member, in_axes=(0, self._axes[2]))(arrays, params)
 
     def _keep_member(self, arrays: tuple, params: PyTree) -> dict:
@@ -169,9 +163,9 @@ class Batches:
             contact_names=(),
         )  # fmt: skip
 
-    def _drift(self, run: Trajectory):
-        """|h − h₀| from the first output to the end."""
-        scene = self.description.system
+    def _drift_of(self, arrays: tuple, params: PyTree):
+        """|h − h₀| of a member from the first output to the end."""
+        scene, run = self.description.system, self._trajectory(arrays[0], params)
         if not self.conserves or isinstance(scene, Hybrid) or jumps(scene):
             return None
         q, qdot = jax.tree.map(lambda x: x[0], (run.q, run.qdot))
@@ -198,7 +192,6 @@ class Batches:
 
     def _rows(self, motions: "_BatchMotions") -> tuple[list[dict[str, np.ndarray] | None], dict[int, Exception]]:
         of_all = jax.tree.map(np.asarray, (*motions.arrays, motions.params))
-
         keep_member = self._keep_member if "keep" in self.slow else self._keep_one
 
         def keep(k: int) -> dict[str, np.ndarray]:
@@ -251,13 +244,12 @@ def find_failing(members: np.ndarray, why_failed: Callable[[np.ndarray], str | N
     while groups and len(failing) <= most:
         group = groups.pop()
         half = len(group) // 2
-        if group is not members or not half:  # all of them together are known to fail
-            if (why := why_failed(group)) is None:
-                continue
-            if not half:
-                failing[int(group[0])] = why
-                continue
-        groups += [group[half:], group[:half]]
+        # All of them together are known to fail.
+        why = why_failed(group) if group is not members or not half else ""
+        if why is not None and not half:
+            failing[int(group[0])] = why
+        elif why is not None:
+            groups += [group[half:], group[:half]]
     return failing if len(failing) <= most else {}
 
 
@@ -268,11 +260,9 @@ def _common_quantities(rows: list[dict[str, np.ndarray]]) -> list[Quantity]:
     """
     common = []
     for name, first in rows[0].items():
-        types = [row[name].dtype for row in rows if name in row]
-        try:
-            dtype = np.result_type(*types)
-        except TypeError:
-            dtype = first.dtype
+        dtype = first.dtype
+        with contextlib.suppress(TypeError):
+            dtype = np.result_type(*(row[name].dtype for row in rows if name in row))
         common.append(Quantity(name, first.shape, dtype))
     return common
 
@@ -321,7 +311,7 @@ def _require_dict(kept: Any) -> None:
             raise ValueError(f"keep returns two quantities with the name {name!r} in the store: rename one of them.")
         dtype = leaf.dtype if hasattr(leaf, "dtype") else np.asarray(leaf).dtype
         if dtype.kind not in "fciub":
-            what = type(leaf).__name__ if not hasattr(leaf, "dtype") else f"an array of type {dtype}"
+            what = f"an array of type {dtype}" if hasattr(leaf, "dtype") else type(leaf).__name__
             raise TypeError(f"keep returns {name!r}, which is of type {what}: numbers can be kept.")
 
 
@@ -353,19 +343,17 @@ _INCONSISTENT = code_of(RESULTS.inconsistent_start)
 
 @functools.lru_cache(maxsize=8)
 def _hybrid_batch(scene: Hybrid, axes: tuple, **tolerances) -> Callable:
-    of_q0, of_qdot0, of_params = axes
     follow_member = functools.partial(simulate, scene, throw=False, **tolerances)
-    return jax.jit(jax.vmap(follow_member, in_axes=(of_q0, of_qdot0, None, of_params)))
+    return jax.jit(jax.vmap(follow_member, in_axes=(*axes[:2], None, axes[2])))
 
 
-def run_batch(
-    system: Scene, values: dict[str, PyTree], ts, axes: tuple, settings: dict[str, Any], sections: Sections | None
-) -> tuple[Trajectory, Any]:
+def run_batch(description: Description, values: dict[str, PyTree], ts, axes: tuple) -> tuple[Trajectory, Any]:
     """The motions of B members and their crossings: `Crossings`, or a dict of them, None without sections.
 
     `values` are q0, qdot0 and params by name, and `axes` their `batch_axes` of `simulate_batch`. Every leaf of the
     crossings has the members in front.
     """
+    system, settings, sections = description.system, description.settings, description.sections
     q0, qdot0, params = values.values()
     if jumps(system):
         tolerances = {name: settings[name] for name in ("rtol", "atol", "max_steps")}
@@ -373,9 +361,8 @@ def run_batch(
     if sections is None:
         return simulate_batch(system, q0, qdot0, ts, params, batch_axes=axes, **settings), None
     of_leaves, size = axes_per_leaf(values, axes)
-    batch = Batch.from_values(
-        system, values, of_leaves, size, ts, settings["rtol"], settings["atol"], settings["max_steps"]
-    )
+    tolerances = (settings[name] for name in ("rtol", "atol", "max_steps"))
+    batch = Batch.from_values(system, values, of_leaves, size, ts, *tolerances)
     solution, noted = _follow_crossings(batch, sections)
     if len(ts) == 2 and not has_constraints(system):
         params, reached = as_arrays(params, batch.member.layout.dtype), (solution.result == SUCCESSFUL)[:, None]

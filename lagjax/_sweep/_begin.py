@@ -32,7 +32,7 @@ class Look(NamedTuple):
     conserves: bool
 
 
-def first_look(description: Description, points: dict[str, np.ndarray], compiled: list[Batches] | None = None) -> Look:
+def first_look(description: Description, points: dict[str, np.ndarray], compiled: list[Batches]) -> Look:
     """A look at members at these points, or at as many as fit into the memory; what it compiles goes to `compiled`."""
     conserves = False  # resets may do work
     if not isinstance(description.system, Hybrid):
@@ -43,15 +43,13 @@ def first_look(description: Description, points: dict[str, np.ndarray], compiled
     batches(points)  # which compiles
     began = time.perf_counter()
     kept = batches(points)
-    if compiled is not None:
-        compiled.append(batches)
+    compiled.append(batches)
     return Look(kept, (time.perf_counter() - began) / len(kept.result), conserves)
 
 
 def _thin_points(points: dict[str, np.ndarray], most: int) -> dict[str, np.ndarray]:
     """Evenly chosen ones of these points: `most` at most, one at least."""
-    count = len(next(iter(points.values())))
-    return {name: x[:: -(-count // max(1, most))] for name, x in points.items()}
+    return {name: x[:: -(-len(x) // max(1, most))] for name, x in points.items()}
 
 
 def begin(
@@ -135,9 +133,8 @@ def _require_names(quantities: list[Quantity], axes: tuple[Axis, ...], reduce: d
         if name in taken:
             raise ValueError(f"keep returns {name!r}, which is a name in over, or `result`: give it another name.")
         if not is_file_name(name) or name == "zarr.json":
-            raise ValueError(
-                f"keep returns {name!r}: names must not be empty, begin with a dot, contain a slash, or be zarr.json."
-            )
+            must_not = "be empty, begin with a dot, contain a slash, or be zarr.json"
+            raise ValueError(f"keep returns {name!r}: names must not {must_not}.")
     for name in inner:
         if name in names or name in taken:
             raise ValueError(

@@ -158,8 +158,7 @@ def texts(description: Description, names: list[str]) -> dict[str, dict[str, str
         arrows = [(t.source, t.target, t.direction) for t in scene.transitions]
         plan = [list(scene.modes), scene.start, scene.max_transitions, arrows]
         entries["transitions"] = _entry(plan, None)
-    event = description.settings.get("event")
-    if event is not None:
+    if (event := description.settings.get("event")) is not None:
         condition = getattr(event, "cond_fn", event)
         of_event = _defer_trace(accept(condition, "event"), (q, qdot), params) if callable(condition) else None
         entries["event"] = _entry(condition, of_event)
@@ -186,13 +185,10 @@ def _functions(scene: Scene) -> dict[str, Any]:
 
 
 def _defer_trace(function, arguments: tuple, params) -> Callable:
-    def program():
-        def call(*roles, t, params):
-            return function(*roles, t=t, params=params)
+    def call(*roles, t, params):
+        return function(*roles, t=t, params=params)
 
-        return jax.make_jaxpr(call)(*arguments, t=jnp.zeros(()), params=params)
-
-    return program
+    return lambda: jax.make_jaxpr(call)(*arguments, t=jnp.zeros(()), params=params)
 
 
 def _entry(value: Any, program: Callable | None, *more: Any) -> dict[str, str]:

@@ -43,14 +43,13 @@ def require_extensible(old: Files, now: dict) -> None:
         lines.append(f"names of over: {names[0]} in the store, now {names[1]}")
     if spec["reduce"]:
         lines.append("reduce: statistics do not tell of single members, so that none of them is known")
+    if lines and spec["ts"] != now["ts"]:
+        lines.append(
+            "The kept values do not determine how a motion continues. For a later end give ts that begin at "
+            f"{spec['ts']['ends'][1]:g}, where the motions of that store end; else leave extend= away."
+        )
     if lines:
-        later = ""
-        if spec["ts"] != now["ts"]:
-            later = (
-                "\nThe kept values do not determine how a motion continues. For a later end give ts that begin at "
-                f"{spec['ts']['ends'][1]:g}, where the motions of that store end; else leave extend= away."
-            )
-        raise ValueError(f"{old.path} has members of another description. What differs:\n" + "\n".join(lines) + later)
+        raise ValueError("\n".join([f"{old.path} has members of another description. What differs:", *lines]))
 
 
 def _require_whole(other: Files, spec: dict) -> None:
@@ -93,12 +92,8 @@ def _match_places(old: Files, new: Files, old_axis: dict, new_axis: dict) -> Cal
     None where they have no value in common. Values are read where no one rule gives them.
     """
     if old_axis | {"size": 0} == new_axis | {"size": 0} and old_axis["rule"] in GROWING:
-
-        def same_places(part: slice) -> np.ndarray:
-            numbers = np.arange(part.start, part.stop)
-            return np.where(numbers < old_axis["size"], numbers, -1)
-
-        return same_places
+        size = old_axis["size"]
+        return lambda part: np.where((places := np.arange(part.start, part.stop)) < size, places, -1)
     sides = [store.coordinates([x], (slice(None),))[0] for store, x in ((old, old_axis), (new, new_axis))]
     before, now = (np.stack([side[name] for name in new_axis["names"]], axis=1) for side in sides)
     place_of = {row.tobytes(): k for k, row in enumerate(before)}
@@ -159,10 +154,8 @@ def later_end_of(other: Files, axes: tuple[Axis, ...], description: Description)
     spec = other.spec()
     _require_whole(other, spec)
     if lines := differences(spec, compared_entries(axes, description), ("axes", "x64", "scene"), MOTION):
-        raise ValueError(
-            f"{other.path} has motions of another description, which cannot continue. What differs:\n"
-            + "\n".join(lines)
-        )
+        said = f"{other.path} has motions of another description, which cannot continue. What differs:"
+        raise ValueError("\n".join([said, *lines]))
     if missing := other.grid(spec).units - len(other.finished_units()):
         raise ValueError(f"{other.path}: {missing} units are not done; motions can continue when they are.")
     names = [name for axis in spec["axes"] for name in axis["names"]]

@@ -98,11 +98,8 @@ class Files:
         """The description. Raises `FileNotFoundError` or `ValueError` where this is no store that can be read."""
         file = self.job / "spec.json"
         if not file.exists():
-            raise FileNotFoundError(
-                errno.ENOENT,
-                f"{self.path} is no store of a sweep, for it has no .sweep/spec.json: name another folder, or empty "
-                "this one",
-            )
+            why = "is no store of a sweep, for it has no .sweep/spec.json: name another folder, or empty this one"
+            raise FileNotFoundError(errno.ENOENT, f"{self.path} {why}")
         try:
             spec: Any = json.loads(file.read_bytes())
             written, fault = spec.pop("sha256", None), "it is not what was written"
@@ -127,10 +124,8 @@ class Files:
         Links are refused, too: what is written to a store stays in it.
         """
         grid, zarr = self.grid(spec), require_zarr()
-        axes = {name: axis for axis in spec["axes"] for name in axis["names"]}
-        wanted: dict = {
-            name: ((x["size"],), (min(x["size"], designs.SLICE),), np.dtype(float)) for name, x in axes.items()
-        }
+        sizes = {name: axis["size"] for axis in spec["axes"] for name in axis["names"]}
+        wanted: dict = {name: ((n,), (min(n, designs.SLICE),), np.dtype(float)) for name, n in sizes.items()}
         wanted |= {q.name: (grid.shape + q.shape, grid.chunk + q.shape, q.dtype) for q in self.quantities(spec)}
         for name, expected in wanted.items():
             own = self.path / name
@@ -138,19 +133,16 @@ class Files:
                 raise ValueError(f"{own} is a link, or its chunks are: a store has none. Move the whole store instead.")
             for folder in (self.path, own):
                 try:
-                    array: Any = (
-                        self.array(name) if folder == own else zarr.open_consolidated(str(folder), mode="r")[name]
-                    )
+                    whole = folder == self.path
+                    array: Any = zarr.open_consolidated(str(folder), mode="r")[name] if whole else self.array(name)
                     here = array.shape, array.chunks, array.dtype
                     fault = None if here == expected else f"it tells of {here}, where {expected} was written"
                 except Exception as why:  # whatever zarr makes of bytes that it did not write
                     fault = str(why) or type(why).__name__
                 if fault:
                     raise ValueError(f"{folder}/zarr.json cannot be read ({fault}): the store is damaged. {_ADVICE}")
-        for axis in spec["axes"]:
-            if axis["rule"] == "values" and axis["sha256"] != hash_columns(
-                self.coordinates([axis], (slice(None),))[0].values()
-            ):
+        for axis in (axis for axis in spec["axes"] if axis["rule"] == "values"):
+            if axis["sha256"] != hash_columns(self.coordinates([axis], (slice(None),))[0].values()):
                 raise self._damaged_coordinates(axis)
 
     def identity(self) -> str:
@@ -299,10 +291,7 @@ class Files:
                 self.chunk_file(self.grid(spec), unit, RESULT).unlink(missing_ok=True)
 
     def find_damage(self, spec: dict, units: Iterable[int], whole: bool = False) -> dict[int, str]:
-        """The damage of finished units, in words: files that lack or have another size or, `whole`, hash.
-
-        A unit of four chunks takes 0.3 ms; to read them a tenth of that more, and a second for a gigabyte.
-        """
+        """The damage of finished units, in words: files that lack or have another size or, `whole`, hash."""
         units, damage = sorted(units), {}
         with ThreadPoolExecutor(_READERS) as readers:
             for k in range(0, len(units), _AHEAD):
@@ -370,10 +359,8 @@ class Files:
                 text = f"the store is read-only for this process ({os.strerror(error.errno)})"
             else:
                 raise
-            raise OSError(
-                error.errno,
-                f"{self.path}: {what}: {text}; all units that are done are kept, and nothing is lost",
-            ) from error
+            text = f"{self.path}: {what}: {text}; all units that are done are kept, and nothing is lost"
+            raise OSError(error.errno, text) from error
 
 
 def is_file_name(name: Any) -> bool:

@@ -101,8 +101,7 @@ def open_job(path: str) -> Job:
 
     A store that was removed and made anew is another one; each is opened once.
     """
-    store = Files(Path(path))
-    return _open_job(path, store.identity())
+    return _open_job(path, Files(Path(path)).identity())
 
 
 @lru_cache(maxsize=4)
@@ -218,6 +217,4 @@ def record_of(grid: Grid, unit: int, result: np.ndarray, engine: str, complaints
     results = {label(int(code)): int(count) for code, count in zip(*codes, strict=True)}
     rows = zip(grid.numbers(unit, failed), result[failed], failed, strict=True)
     listed = [[int(number), label(int(code)), complaints.get(int(j), "")] for number, code, j in rows]
-    return {
-        "unit": unit, "members": len(result), "engine": engine, "slow": {}, "results": results, "failed": listed,
-    }  # fmt: skip
+    return dict(unit=unit, members=len(result), engine=engine, slow={}, results=results, failed=listed)

@@ -39,9 +39,8 @@ class Statistics:
     def __init__(self, edges=None, quantiles: Iterable[float] = ()):
         self.edges = None if edges is None else np.asarray(edges, float)
         self.quantiles = tuple(float(level) for level in quantiles)
-        if self.edges is not None and not (
-            self.edges.ndim == 1 and self.edges.size > 1 and np.all(np.diff(self.edges) > 0)
-        ):
+        x = self.edges
+        if x is not None and not (x.ndim == 1 and x.size > 1 and np.all(np.diff(x) > 0)):
             raise ValueError("edges must be two numbers or more that increase.")
         if any(not 0 <= level <= 1 for level in self.quantiles):
             raise ValueError(f"quantiles must lie between 0 and 1; got {self.quantiles}.")
@@ -138,9 +137,8 @@ def merge(one: Partial | None, two: Partial) -> Partial:
     """The statistics of two sets of members, those of `one` before those of `two`."""
     if one is None:
         return two
-    count = one.count + two.count
+    count, step = one.count + two.count, two.mean - one.mean
     share = two.count / np.maximum(count, 1)
-    step = two.mean - one.mean
     lower, higher = two.least < one.least, two.greatest > one.greatest
     keys, where = np.unique(np.concatenate([one.sketch[:, :2], two.sketch[:, :2]]), axis=0, return_inverse=True)
     counts = np.zeros(len(keys), int)
@@ -165,16 +163,14 @@ def summary(how: Statistics, total: Partial, shape: tuple[int, ...]) -> Summary:
     with np.errstate(invalid="ignore", divide="ignore"):
         variance = np.where(total.count > 1, total.square / (total.count - 1), np.nan)
     mean, least, greatest = (np.where(empty, np.nan, x) for x in (total.mean, total.least, total.greatest))
-    numbers = (
-        total.count, total.missing, mean, variance, least, total.least_member, greatest, total.greatest_member,
-    )  # fmt: skip
+    ends = least, total.least_member, greatest, total.greatest_member
     quantiles = np.full((len(total.count), len(how.quantiles)), np.nan)
     for c in np.flatnonzero(~empty) if how.quantiles else ():
         bins, counts = total.sketch[total.sketch[:, 0] == c, 1:].T
         ranks = np.array(how.quantiles) * (counts.sum() - 1)
         quantiles[c] = _bin_centres(bins[np.searchsorted(np.cumsum(counts), ranks, side="right")])
     return Summary(
-        *(x.reshape(shape) for x in numbers),
+        *(x.reshape(shape) for x in (total.count, total.missing, mean, variance, *ends)),
         histogram=None if how.edges is None else total.histogram.reshape(*shape, -1),
         outside=None if how.edges is None else total.outside.reshape(*shape, 2),
         quantiles=quantiles.reshape(*shape, -1) if how.quantiles else None,

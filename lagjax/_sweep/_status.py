@@ -94,8 +94,8 @@ def status(store: Files) -> Status:
     done = sorted(finished - set(damaged))
     records = [store.record(unit) for unit in done]
     results = sum((Counter(record["results"]) for record in records), Counter())
-    failed = [row for record in records for row in record["failed"]]
-    failures = tuple(Failure(number, point(store, spec, number), name, why) for number, name, why in failed[:_LISTED])
+    failed = [row for record in records for row in record["failed"]][:_LISTED]
+    failures = tuple(Failure(number, point(store, spec, number), name, why) for number, name, why in failed)
     drifts = [tuple(record["drift"]) for record in records if "drift" in record]
     worst = max(drifts, key=lambda pair: pair[0], default=None)
     members, rate = sum(r["members"] for r in records), _rate(store, done, records)
@@ -121,10 +121,9 @@ def _rate(store: Files, done: list[int], records: list[dict]) -> float | None:
     times = [(store.job / "done" / f"{unit}.json").stat().st_mtime for unit in done]
     recent = sorted(zip(times, records, strict=True), key=lambda pair: pair[0])[-_RECENT:]
     (begun, first), (end, _) = recent[0], recent[-1]
-    span = end - begun
-    if len(recent) < 2 or span <= 0:
+    if end <= begun:  # one alone, too
         return first["members"] / max(first["seconds"], 1e-9)
-    return sum(record["members"] for _, record in recent[1:]) / span
+    return sum(record["members"] for _, record in recent[1:]) / (end - begun)
 
 
 def duration(seconds: float) -> str:

@@ -150,8 +150,7 @@ def require_executor(executor: Any) -> None:
         raise TypeError(
             f"executor must be a concurrent.futures.Executor, such as dask's client.get_executor(); got {executor!r}."
         )
-    context = getattr(executor, "_mp_context", None)
-    if context is not None and context.get_start_method() == "fork":
+    if (context := getattr(executor, "_mp_context", None)) is not None and context.get_start_method() == "fork":
         raise ValueError(
             "This ProcessPoolExecutor forks, and a fork of a process that has used JAX hangs: give it "
             "mp_context=multiprocessing.get_context('spawn')."
@@ -302,7 +301,7 @@ def _probe(path: str, unit: int, members: np.ndarray, limit: float) -> None:
 
 def _look(data: bytes, path: list[str], doubles: bool, points: dict[str, np.ndarray]) -> Look:
     jax.config.update("jax_enable_x64", doubles)
-    return first_look(unpack_description(data, path), points)
+    return first_look(unpack_description(data, path), points, [])
 
 
 def _open_here(path: str) -> Job:
