@@ -78,8 +78,7 @@ class Arcs:
     def __init__(self, problem: Problem, numbers: np.ndarray, jumping: JumpingMotions | None = None):
         self.problem, self.numbers, self.jumping = problem, numbers, jumping
         self.flow, self.tolerances = flow_of(problem), tolerances_of(problem)
-        self.derivation, self.layout = problem.derivation, problem.layout
-        self.size = problem.layout.size
+        self.derivation, self.layout, self.size = problem.derivation, problem.layout, problem.layout.size
         named = {i for name in ("lagrangian", "mass_matrix", "force") for i in self.derivation.reads(name)}
         self.driven = 2 * self.size in named if jumping is None else jumping.driven  # by an explicit time
         self.conserves = not self.derivation.works and jumping is None
@@ -88,10 +87,7 @@ class Arcs:
     def from_system(
         cls, scene: Scene, layout: Layout, params: PyTree, rtol: float, what: str, may_jump: bool = False
     ) -> "Arcs":
-        """The arcs of a scene whose states have this layout; with contacts or modes only where it `may_jump`.
-
-        Raises `ValueError`, a sentence about `what` they are for, where the scene has constraints or no machine code.
-        """
+        """The arcs of a scene, for `what` a sentence names; with contacts or modes only where it `may_jump`."""
         scene = require_scene(scene) if may_jump else require_system(scene)
         jumping = JumpingMotions(scene, layout, params, rtol) if jumps(scene) else None
         require_untraced((laws(scene), params), "A parameter")
@@ -132,35 +128,27 @@ class Arcs:
         Each begins at the calmest moment near there, where steps are longest: a state in the midst of an encounter is
         large and changes fast, and Newton's method would have to creep.
         """
-        even = np.arange(count + 1) / count
-        shares = np.tile(even, (len(y0), 1))
+        shares = np.tile(np.arange(count + 1) / count, (len(y0), 1))
         times = np.stack([np.zeros_like(span), span], axis=1)
         room = min(_BUDGET * len(y0), _MOST_WRITTEN // (y0.shape[1] + 4))
         run, found = self.flow.follow(times, y0, self.numbers[None], self.tolerances, room)
-        for steps in found:
-            for row, table in steps.split_members():
-                size = len(table)
-                if run.result[row] == SUCCESSFUL and size >= 4 * count:
-                    begins, lengths = table[:, :2].T / span[row]
-                    near = np.array_split(np.arange(size), 2 * count)[1:-1]  # halves of shares about their borders
-                    around = [np.append(a, b) for a, b in zip(near[::2], near[1::2], strict=True)]
-                    shares[row, 1:-1] = [begins[some[np.argmax(lengths[some])]] for some in around]
-        shares[:, 0], shares[:, -1] = 0.0, 1.0
+        for row, table in (member for steps in found for member in steps.split_members()):
+            if run.result[row] == SUCCESSFUL and len(table) >= 4 * count:
+                begins, lengths = table[:, :2].T / span[row]
+                near = np.array_split(np.arange(len(table)), 2 * count)[1:-1]  # halves of shares about their borders
+                around = [np.append(a, b) for a, b in zip(near[::2], near[1::2], strict=True)]
+                shares[row, 1:-1] = [begins[some[np.argmax(lengths[some])]] for some in around]
         return shares
 
     def follow(self, times: np.ndarray, y0: np.ndarray, directions: np.ndarray | None = None, modes=None) -> Arc:
-        """The arcs between `times` (R, 2) from `y0` (R, 2n), along `directions` (F, P) of the parameters too.
-
-        Those that jump begin in `modes` (R,), by default in the first one.
-        """
+        """The arcs between `times` (R, 2) from `y0` (R, 2n), in `modes` (R,), by the parameters along `directions`."""
         rows, states = y0.shape
         if self.jumping is not None:
             run = self.jumping.run(times, y0, modes, varies=True)
             back = run.modes[:, -1] == run.modes[:, 0]
             nothing = np.zeros((rows, states, 0))
             return Arc(run.y_end, run.rate, run.by_start, nothing, run.result, run.t_end, run.accepted, back)
-        directions = np.zeros((0, len(self.numbers))) if directions is None else directions
-        params = self.numbers[None]
+        directions, params = np.zeros((0, len(self.numbers))) if directions is None else directions, self.numbers[None]
         run = self.flow.run(times, y0, params, self.tolerances)
         dy0 = np.zeros((rows, states + len(directions), states))
         dy0[:, :states] = np.eye(states)
@@ -172,9 +160,8 @@ class Arcs:
             motions = Motions.from_solution(times, y0, params, run).take(np.flatnonzero(well))
             moved[well] = jvp(self.flow, motions, dy0[well], dparams[well], self.tolerances)[1]
         end = np.where(well[:, None], run.y_end, np.nan)
-        moved = np.swapaxes(moved, 1, 2)
-        rate = self.rate(times[:, 1], end)
-        return Arc(end, rate, moved[..., :states], moved[..., states:], run.result, run.t_end, run.accepted)
+        by_start, by_params = np.split(np.swapaxes(moved, 1, 2), [states], axis=2)
+        return Arc(end, self.rate(times[:, 1], end), by_start, by_params, run.result, run.t_end, run.accepted)
 
     def units(self, y0: np.ndarray, time: np.ndarray | None = None) -> "Units":
         """The units of states (R, 2n), from the largest coordinate and velocity there, in the metric of M.

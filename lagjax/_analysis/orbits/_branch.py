@@ -96,8 +96,7 @@ def _numbers(arcs: Arcs, place: int | None, family: Family, k: int) -> np.ndarra
 def _branching_orbit(follower: Follower, here: FamilyPoint, before: FamilyTangent, size: float) -> FamilyPoint | None:
     """The orbit at a distance from a branch point along the null vector that is no symmetry, nor of the old family.
 
-    How many symmetries there are, and about which directions, is known from a neighbour on the old family: at the
-    branch point singular values do not tell them from the new direction.
+    Symmetries are known from a neighbour: at the branch point singular values do not tell them from the new direction.
     """
     states, count = here.matrix.shape[0], before.symmetries.shape[1]
     still = decide(here.matrix[:, :states]).right[:, states - count - 1 :]
@@ -105,8 +104,7 @@ def _branching_orbit(follower: Follower, here: FamilyPoint, before: FamilyTangen
     known = np.zeros((null.shape[0], count + 1))
     known[:states, :count] = still @ (still.T @ before.symmetries[:states])
     known[:, count] = null @ (null.T @ before.vector)
-    known = np.linalg.qr(known)[0]
-    directions = span_outside(null, known)
+    directions = span_outside(null, np.linalg.qr(known)[0])
     if not directions.shape[1]:
         return None
     across = FamilyTangent(directions[:, 0], before.rank, before.symmetries)

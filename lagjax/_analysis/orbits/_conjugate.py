@@ -30,9 +30,7 @@ def conjugate_times(arcs: Arcs, y: np.ndarray, times: np.ndarray, units: Units) 
         ts = np.linspace(times[k], times[k + 1], _GLANCES + 1)
         frames = _frames(arcs, start, ts, frame, units)
         phases = _phases(arcs, _states(arcs, start, ts), ts, frames, units)
-        for j in range(_GLANCES):
-            if k == j == 0:
-                continue  # the start itself, where all paths meet
+        for j in range(k == 0, _GLANCES):  # without the start itself, where all paths meet
             for nth in range(_count_turns(phases[j], phases[j + 1])):
                 found.append(_locate_conjugate_time(arcs, start, ts[0], ts[j], ts[j + 1], frame, frames[j], nth, units))
         frame = frames[-1]
@@ -44,11 +42,10 @@ def conjugate_times(arcs: Arcs, y: np.ndarray, times: np.ndarray, units: Units) 
 
 def _frames(arcs: Arcs, start, ts, frame, units: Units) -> np.ndarray:
     """The tangents (T, 2n, n) at times (T,) that begin as `frame` at the first one."""
-    later = ts[1:]
-    arc = arcs.follow(np.stack([np.full_like(later, ts[0]), later], axis=1), np.repeat(start[None], len(later), axis=0))
-    frames = np.concatenate([frame[None], units.growth(arc.by_start) @ frame])
+    times = np.stack([np.full(len(ts) - 1, ts[0]), ts[1:]], axis=1)
+    arc = arcs.follow(times, np.repeat(start[None], len(times), axis=0))
     # The plane is what counts: its vectors are made orthonormal, so that none outgrows the others.
-    return np.linalg.qr(frames)[0]
+    return np.linalg.qr(np.concatenate([frame[None], units.growth(arc.by_start) @ frame]))[0]
 
 
 def _phases(arcs: Arcs, y, t, frames, units: Units) -> np.ndarray:
@@ -66,8 +63,7 @@ def _states(arcs: Arcs, start, ts) -> np.ndarray:
 
 def _count_turns(before: np.ndarray, after: np.ndarray) -> int:
     """The number of phases that passed 2π between two sets of n that lie near each other on the circle."""
-    n = len(before)
-    shifts = [np.concatenate([after[k:], after[:k] + 2 * np.pi]) - before for k in range(n + 1)]
+    shifts = [np.concatenate([after[k:], after[:k] + 2 * np.pi]) - before for k in range(len(before) + 1)]
     return int(np.argmin([np.abs(shift).max() for shift in shifts]))
 
 
@@ -82,8 +78,5 @@ def _locate_conjugate_time(arcs: Arcs, start, t_first, low, high, frame, frame_l
         ts = np.array([t_first, middle])
         frames = _frames(arcs, start, ts, frame, units)[1:]
         after = _phases(arcs, _states(arcs, start, ts)[1:], ts[1:], frames, units)[0]
-        if _count_turns(before, after) > nth:
-            high = middle
-        else:
-            low = middle
+        low, high = (low, middle) if _count_turns(before, after) > nth else (middle, high)
     return float((low + high) / 2)

@@ -262,12 +262,9 @@ def step_along(follower: Follower, last: FamilyPoint, tangent: FamilyTangent, st
 def _chord(follower: Follower, last: FamilyPoint, point: FamilyPoint, step: float) -> np.ndarray:
     """The change of what is free, (2n + F,), in units of the step."""
     change = jax.tree.map(np.subtract, point.unknowns, last.unknowns)
-    parts = [change.y[0, 0]]
-    if follower.period_is_free:
-        parts.append(change.period)
-    if follower.place is not None:
-        parts.append(change.numbers[[follower.place]] / follower.of_parameter)
-    return np.concatenate(parts) / step
+    period = change.period if follower.period_is_free else []
+    parameter = [] if follower.place is None else change.numbers[[follower.place]] / follower.of_parameter
+    return np.concatenate([change.y[0, 0], period, parameter]) / step
 
 
 def next_step(step: float, there: FamilyStep) -> float:

@@ -128,8 +128,7 @@ def family(
 
 
 def parameter_index(params: PyTree, name: str) -> int:
-    labels, leaves, _ = labelled_leaves(params, "params")
-    begin = 0
+    (labels, leaves, _), begin = labelled_leaves(params, "params"), 0
     for label, leaf in zip(labels, leaves, strict=True):
         if name in (label, label.removeprefix("params").strip("[]'."), label.rsplit(".", 1)[-1]):
             if np.size(leaf) != 1:
@@ -204,8 +203,7 @@ def first_point(follower: Follower, y0: np.ndarray, period: np.ndarray, numbers:
 
 def _refine_member(follower: Follower, member: _Member) -> _Member:
     """The member with its orbit in more arcs where errors grow much along one arc; else the member itself."""
-    point = follower.refine_arcs(member.point)
-    if point is member.point:
+    if (point := follower.refine_arcs(member.point)) is member.point:
         return member
     there = correct(follower, point, member.tangent)
     return member if there is None else member._replace(point=there[0])
@@ -236,10 +234,8 @@ def _locate_events(follower: Follower, last: _Member, following: _Member, step: 
     located = {k: _locate_event(follower, last, following, step, k) for k in np.flatnonzero(turned).tolist()}
     if 0 in located and 1 in located and abs(located[0][0] - located[1][0]) < _SAME * step:
         del located[1]
-    ordered = sorted(located.items(), key=lambda item: item[1][0])
-    ends = [place for place, (k, _) in enumerate(ordered, 1) if k == 3]
-    ordered = ordered[: ends[0]] if ends else ordered
-    return [member._replace(events=tuple(k == j for j in range(3))) for k, (_, member) in ordered]
+    ordered, end = sorted(located.items(), key=lambda item: item[1][0]), located[3][0] if 3 in located else np.inf
+    return [one._replace(events=tuple(k == j for j in range(3))) for k, (place, one) in ordered if place <= end]
 
 
 def _locate_event(follower: Follower, last: _Member, following: _Member, step: float, k: int) -> tuple[float, _Member]:

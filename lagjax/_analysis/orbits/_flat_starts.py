@@ -29,9 +29,8 @@ def starts(q0: PyTree, qdot0: PyTree, time, name: str) -> tuple[np.ndarray, Layo
         raise ValueError(f"{name} must be one number, or an array (N,) of a batch; got shape {times.shape}.")
     if not (times > 0).all():
         raise ValueError(f"{name} must be positive; got {times.min()}.")
-    leaves, dtype = jax.tree.leaves((q0, qdot0)), np.dtype(float)
-    if times.ndim and any(np.shape(leaf)[:1] != times.shape for leaf in leaves):
-        shapes = sorted({np.shape(leaf) for leaf in leaves})
+    shapes, dtype = sorted({np.shape(leaf) for leaf in jax.tree.leaves((q0, qdot0))}), np.dtype(float)
+    if times.ndim and any(shape[:1] != times.shape for shape in shapes):
         raise ValueError(
             f"{name} has shape {times.shape}, a batch: every leaf of q0 and qdot0 must have that many members as its "
             f"first axis; got shapes {shapes}."
@@ -45,7 +44,6 @@ def starts(q0: PyTree, qdot0: PyTree, time, name: str) -> tuple[np.ndarray, Layo
 
 
 def require_untraced(tree: PyTree, what: str) -> None:
-    """Raise `TypeError` where a number of `what` is being traced."""
     require_concrete(
         tree,
         what,

@@ -39,8 +39,8 @@ def reduce(growth: np.ndarray, null: np.ndarray, of_transpose: np.ndarray) -> Re
     if not null.shape[2]:
         return Reduced(growth, 0)
     bases = [_quotient(w, ell) for w, ell in zip(null, of_transpose, strict=True)]
-    width = min(basis.shape[1] for basis in bases)
-    if any(basis.shape[1] != width for basis in bases):
+    width, *others = {basis.shape[1] for basis in bases}
+    if others:
         return Reduced(growth, 0)
     moved = [bases[(k + 1) % count].T @ growth[k] @ bases[k] for k in range(count)]
     return Reduced(np.stack(moved), states - width)
@@ -62,9 +62,7 @@ def multipliers_of(reduced: Reduced, paired: bool) -> np.ndarray:
     m = reduced.growth.shape[1]
     values = _product_eigenvalues(reduced.growth) if m else np.zeros(0, complex)
     values = values[np.argsort(-np.abs(values), kind="stable")]
-    if paired:
-        values = _pair_reciprocals(values)
-    return np.concatenate([values, np.ones(reduced.known, complex)])
+    return np.concatenate([_pair_reciprocals(values) if paired else values, np.ones(reduced.known, complex)])
 
 
 def passage_determinant(reduced: Reduced, sign: int) -> float:
@@ -113,10 +111,7 @@ def _merge_factors(growth: np.ndarray) -> np.ndarray:
     merged = [growth[0]]
     for matrix in growth[1:]:
         product = matrix @ merged[-1]
-        if np.linalg.norm(product) <= _LITTLE:
-            merged[-1] = product
-        else:
-            merged.append(matrix)
+        merged[-1:] = [product] if np.linalg.norm(product) <= _LITTLE else [merged[-1], matrix]
     return np.stack(merged)
 
 
@@ -143,6 +138,5 @@ def _pair_reciprocals(values: np.ndarray) -> np.ndarray:
         first = left.pop(0)
         ordered.append(first)
         if left:
-            other = min(range(len(left)), key=lambda i: abs(left[i] * first - 1))
-            ordered.append(left.pop(other))
+            ordered.append(left.pop(min(range(len(left)), key=lambda i: abs(left[i] * first - 1))))
     return np.array(ordered)

@@ -67,11 +67,10 @@ class JumpingMotions(NamedTuple):
 @eqx.filter_jit
 def _follow(motions: JumpingMotions, times, y0, modes, varies: bool) -> JumpRun:
     scene, layout, params, rtol = motions
+    options = {"rtol": rtol, "throw": False, "max_transitions": _CHANGES_OF_ARC if varies else _CHANGES}
 
     def end(y, last, ts, mode):
-        ts = jnp.append(ts[:-1], last)
-        state, options = map(layout.restore, halves(y)), {"rtol": rtol, "throw": False}
-        options["max_transitions"] = _CHANGES_OF_ARC if varies else _CHANGES
+        ts, state = jnp.append(ts[:-1], last), map(layout.restore, halves(y))
         if isinstance(scene, Hybrid):
             run = simulate_hybrid(scene, *state, ts, params, start=mode, **options)
         else:

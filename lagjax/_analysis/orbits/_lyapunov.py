@@ -114,9 +114,8 @@ def _spectra(arcs: Arcs, y0: np.ndarray, duration: np.ndarray, pieces: int) -> n
     rows = np.repeat(well, pieces)
     moved = np.full((members * pieces, states, states), np.nan)
     if well.any():
-        moved[rows] = arcs.follow(
-            spans[rows], path[:, :-1].reshape(-1, states)[rows], modes=modes if modes is None else modes[rows]
-        ).by_start
+        starts, modes = path[:, :-1].reshape(-1, states)[rows], modes if modes is None else modes[rows]
+        moved[rows] = arcs.follow(spans[rows], starts, modes=modes).by_start
     units = arcs.units(y0)
     moved = units.repeat(pieces).growth(moved)
     chart = arcs.canonical(times.ravel(), path.reshape(-1, states), units.repeat(pieces + 1))
@@ -166,10 +165,8 @@ def lyapunov_exponent(
     """
     durations, layout, y0 = starts(q0, qdot0, duration, "duration")
     arcs = Arcs.from_system(system, layout, params, rtol, "Lyapunov exponents")
-    parts = [
-        _largest(arcs, y0[k : k + _MEMBERS], durations.ravel()[k : k + _MEMBERS]) for k in range(0, len(y0), _MEMBERS)
-    ]
-    value, error = (np.concatenate(x) for x in zip(*parts, strict=True))
+    some = [slice(k, k + _MEMBERS) for k in range(0, len(y0), _MEMBERS)]
+    value, error = np.concatenate([_largest(arcs, y0[x], durations.ravel()[x]) for x in some], axis=1)
     if not durations.ndim:
         value, error = value[0], error[0]
     return LyapunovExponent(*map(jnp.asarray, (value, error, np.isfinite(value))))

@@ -69,18 +69,16 @@ def _lines(orbit: Orbit) -> list[str]:
     ok, period = (np.atleast_1d(np.asarray(x)) for x in (orbit.ok, orbit.period))
     sizes = np.abs(np.asarray(orbit.multipliers)).reshape(len(ok), -1).max(axis=1, initial=0.0)
     if not batch:
-        verdict = f"closes to {float(orbit.closure):.2g}" if ok[0] else "no orbit"
         stable = "stable" if orbit.stable else "not known to be stable" if orbit.message else "unstable"
-        verdicts = f"{verdict}, {stable}" if ok[0] else verdict
+        verdict = f"closes to {float(orbit.closure):.2g}, {stable}" if ok[0] else "no orbit"
         text = f": {orbit.message}" if orbit.message else ""
-        return [first, f"period {period[0]:.9g}, largest |multiplier| {sizes[0]:.6g}", verdicts + text]
+        return [first, f"period {period[0]:.9g}, largest |multiplier| {sizes[0]:.6g}", verdict + text]
     if not ok.any():
         return [first, "periods unknown", f"0 of {len(ok)} close: {orbit.message[0]}"]
     closure, stable = np.asarray(orbit.closure), np.asarray(orbit.stable)
     span = f"periods from {period[ok].min():.6g} to {period[ok].max():.6g}, |multipliers| up to {sizes[ok].max():.6g}"
-    verdicts = (
-        f"{ok.sum()} of {len(ok)} close, to {np.median(closure[ok]):.2g} in the median, {stable.sum()} are stable"
-    )
+    median = f"to {np.median(closure[ok]):.2g} in the median"
+    verdicts = f"{ok.sum()} of {len(ok)} close, {median}, {stable.sum()} are stable"
     if not ok.all():
         verdicts += f"; the first that does not is member {int(np.argmin(ok))}"
     return [first, span, verdicts]
@@ -209,7 +207,7 @@ def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> FlatOrbits:
             members = waiting[counts[waiting] == count]
             for some in np.array_split(members, -(-len(members) * count // _PORTION)):
                 parts, y = _shooting.guesses(closing, y0[some], period[some], count)
-                units = closing.arcs.units(y0[some], period[some])
+                units = arcs.units(y0[some], period[some])
                 trial = assess_orbits(closing, _shooting.close(closing, y, period[some], parts, units))
                 better = ~(found.closure[some] <= trial.closure)
                 gained[some] = better | ~found.ok[some]
@@ -235,8 +233,7 @@ def assess_orbits(closing: Closing, chain: Chain, most: int | None = None) -> Fl
 
     At most `most` directions count as symmetries; None counts all that monodromy − 1 sends to zero.
     """
-    closure = chain.closure()
-    message = np.array([_sentence(chain, k) for k in range(len(closure))], object)
+    message = np.array([_sentence(chain, k) for k in range(len(chain.period))], object)
     ok = np.array([not text for text in message])
     multipliers = np.full((len(ok), chain.y.shape[2]), np.nan, complex)
     if ok.any():
@@ -252,7 +249,7 @@ def assess_orbits(closing: Closing, chain: Chain, most: int | None = None) -> Fl
             f"The orbit closes, but its multipliers are uncertain: pairs that should multiply to 1 miss it by "
             f"{off[place]:.2g}, so that nothing is known of its stability."
         )
-    return FlatOrbits(chain.states(), chain.periods(), multipliers, closure, stable & ok, ok, message)
+    return FlatOrbits(chain.states(), chain.periods(), multipliers, chain.closure(), stable & ok, ok, message)
 
 
 def _sentence(chain: Chain, k: int) -> str:

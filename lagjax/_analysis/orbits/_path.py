@@ -172,16 +172,14 @@ def find_path(
     require_flag(throw, "throw")
     for name, value in (("q_start", q_start), ("q_end", q_end), ("t_start", t_start), ("t_end", t_end)):
         require_finite(value, name)
-    for name, value in (("t_start", t_start), ("t_end", t_end)):
-        require_number(value, name)
+        if name.startswith("t"):
+            require_number(value, name)
     if not t_end > t_start:
         raise ValueError(f"t_end must be later than t_start; got {t_end} and {t_start}.")
     layout = Layout.from_state(q_start, q_end)
     arcs = Arcs.from_system(system, layout, params, RTOL, "Paths")
-    ends = [
-        np.asarray(concatenate_leaves(jax.tree.leaves(as_arrays(q, layout.dtype, "state")), np.dtype(float)))
-        for q in (q_start, q_end)
-    ]
+    leaves = [jax.tree.leaves(as_arrays(q, layout.dtype, "state")) for q in (q_start, q_end)]
+    ends = [np.asarray(concatenate_leaves(of_one, np.dtype(float))) for of_one in leaves]
     times = np.linspace(float(t_start), float(t_end), _ARCS + 1)
     first = _guess_states(layout, guess, ends, times)
     closing = Closing.plain(arcs)._replace(t_first=times[0], q_end=ends[1])
@@ -198,8 +196,7 @@ def find_path(
 
 def _units(arcs: Arcs, y, ends, times) -> Units:
     """The units of the first state, (1, 2n), with the farther one of both ends as the size of q."""
-    n, duration = arcs.size, times[-1:] - times[:1]
-    farther = np.maximum(np.abs(ends[0]), np.abs(ends[1]))
+    n, duration, farther = arcs.size, times[-1:] - times[:1], np.abs(ends).max(axis=0)
     velocity = np.maximum(np.abs(y[0, n:]), np.abs(ends[1] - ends[0]) / duration)
     here = arcs.units(y[:1], duration)
     root = here.length[:, None] / here.state[:, :n]
@@ -251,11 +248,10 @@ def _build_path(system: System, arcs: Arcs, chain: Chain, q_start: np.ndarray, t
     ts = np.linspace(times[0], times[-1], 16 * _ARCS + 1)
     trajectory = simulate(system, q, qdot, ts, params, rtol=RTOL, throw=False)
     total = sum(_arc_action(arcs, y, t0, t1) for y, t0, t1 in zip(states, times[:-1], times[1:], strict=True))
-    index = len(conjugate)
-    return Path(
-        qdot, qdot_end, trajectory, jnp.asarray(total), jnp.asarray(conjugate), index, index == 0 and not at_end,
-        jnp.asarray(chain.closure()[0]), True, "",
-    )  # fmt: skip
+    index, numbers = len(conjugate), map(jnp.asarray, (total, conjugate, chain.closure()[0]))
+    total, conjugate, closure = numbers
+    least = index == 0 and not at_end
+    return Path(qdot, qdot_end, trajectory, total, conjugate, index, least, closure, True, "")
 
 
 def _arc_action(arcs: Arcs, y, t_first, t_last) -> float:

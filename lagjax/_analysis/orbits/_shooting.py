@@ -241,10 +241,9 @@ def close(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarray
             break
         places = np.flatnonzero(active)
         better = _improve(closing, chain.select(places))
-        gained = better.merit() < 0.9 * chain.merit()[places]
-        lower = better.merit() < chain.merit()[places]
-        chain = replace_members(chain, places[lower], better.select(lower))
-        active[places[~gained]] = False
+        after, before = better.merit(), chain.merit()[places]
+        chain = replace_members(chain, places[after < before], better.select(after < before))
+        active[places[~(after < 0.9 * before)]] = False
     return chain
 
 
@@ -281,11 +280,10 @@ def symmetries(chain: Chain, most: int | None = None) -> list[Symmetries]:
     forward, null = _null(chain.growth)
     # ℓ_k = G_kᵀ ℓ_(k+1): the same chain, walked back from the end.
     back, of_transpose = _null(np.swapaxes(chain.growth[:, ::-1], 2, 3))
-    found = []
+    found, states = [], chain.y.shape[2]
     for k in range(len(chain.period)):
-        count = chain.y.shape[2] - max(forward.rank[k], back.rank[k])
-        count = count if most is None else min(count, most)
-        right, left = null[k][..., null.shape[3] - count :], of_transpose[k][..., null.shape[3] - count :]
+        first = max(forward.rank[k], back.rank[k], 0 if most is None else states - most)
+        right, left = null[k][..., first:], of_transpose[k][..., first:]
         found.append(Symmetries(right, np.roll(left[::-1], 1, axis=0)))
     return found
 
