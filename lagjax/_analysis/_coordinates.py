@@ -4,6 +4,7 @@ With q = q(Q, t), q̇ = (∂q/∂Q) Q̇ + ∂q/∂t, L is a function of (Q, Q̇,
 for every set of coordinates. Forces become (∂q/∂Q)ᵀ F, so that they do the same work.
 """
 
+import functools
 import inspect
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -80,10 +81,9 @@ def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordin
         return lambda Q, t, params: function(place(Q, t=t, params=params), t=t, params=params)
 
     def compose_force(function: Function):
-        force = compose_state(function)
-
         def forces(Q, Qdot, t, params, **more):
-            return jax.vjp(lambda Q: place(Q, t=t, params=params), Q)[1](force(Q, Qdot, t, params, **more))[0]
+            force = compose_state(function)(Q, Qdot, t, params, **more)
+            return jax.vjp(lambda Q: place(Q, t=t, params=params), Q)[1](force)[0]
 
         return forces
 
@@ -106,10 +106,8 @@ def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordin
 
 
 def restrict_signature(function: Callable, extras: set[str], roles: int = 2) -> Callable:
-    """`function(*roles, t, params)` with a signature that has `t` and `params` only where `extras` names them.
-
-    A function without `t` in its signature is known not to depend on the time. It passes `multipliers` on, likewise.
-    """
+    """`function(*roles, t, params)` with a signature that has those of `t`, `params` and `multipliers` in `extras`: a
+    function without `t` is known not to depend on the time."""
 
     def restricted(*state, t=0.0, params=None, **more):
         return function(*state, t, params, **more)
@@ -134,9 +132,8 @@ def _new_state(place: Function, q: PyTree, qdot: PyTree, guess: PyTree, t, param
     def residual(x, t):
         return old.flatten(place(new.restore(x), t=t, params=params)) - wanted
 
-    x = jax.lax.custom_root(
-        lambda x: residual(x, t), jax.lax.stop_gradient(new.flatten(guess)), newton, shortest_preimage
-    )
-    x = nan_unless(jax.lax.stop_gradient(is_root(lambda x: residual(x, t), x, wanted)), x)
-    jacobian, drift = jax.jacfwd(residual, argnums=0)(x, t), jax.jacfwd(residual, argnums=1)(x, t)
+    start, at_t = jax.lax.stop_gradient(new.flatten(guess)), functools.partial(residual, t=t)
+    x = jax.lax.custom_root(at_t, start, newton, shortest_preimage)
+    x = nan_unless(jax.lax.stop_gradient(is_root(at_t, x, wanted)), x)
+    jacobian, drift = jax.jacfwd(residual, argnums=(0, 1))(x, t)
     return new.restore(x), new.restore(shortest_solution(jacobian, old.flatten(qdot) - drift))

@@ -37,24 +37,19 @@ def _call_numpy(function: Callable, shapes: tuple, *arrays) -> tuple:
         for place, value in zip(places, function(*map(np.asarray, buffers)), strict=True):
             np.asarray(place)[...] = value
 
-    def return_copies(*x):
-        return tuple(function(*map(np.asarray, x)))
-
-    def cpu(*x):
-        return buffer_callback(fill_buffers, shapes, vmap_method="broadcast_all")(*x)
-
     def others(*x):
-        return jax.pure_callback(return_copies, shapes, *x, vmap_method="broadcast_all")
+        return jax.pure_callback(
+            lambda *x: tuple(function(*map(np.asarray, x))), shapes, *x, vmap_method="broadcast_all"
+        )
 
+    cpu = buffer_callback(fill_buffers, shapes, vmap_method="broadcast_all")
     return tuple(jax.lax.platform_dependent(*arrays, cpu=cpu, default=others))
 
 
 def _each(function: Callable, *arrays: np.ndarray) -> list[np.ndarray]:
     """`function` of every matrix of a batch (…, n, n); NaN where they are not finite or LAPACK gives up."""
-    batch = arrays[0].shape[:-2]
-    rows = [x.reshape(-1, *x.shape[-2:]) for x in arrays]
-    results = []
-    for members in zip(*rows, strict=True):
+    batch, results = arrays[0].shape[:-2], []
+    for members in zip(*(x.reshape(-1, *x.shape[-2:]) for x in arrays), strict=True):
         try:
             finite = all(np.isfinite(x).all() for x in members)
             results.append(function(*members) if finite else None)

@@ -133,9 +133,8 @@ def require_steady(scene: SceneState) -> None:
     """Raise `ValueError` where a coordinate that something depends on has a velocity."""
     if not scene.concrete or scene.lowered is None:
         return
-    turning = np.flatnonzero(np.asarray(scene.qdot))
     cyclic = scene.conserved
-    if wrong := [scene.layout.names[i] for i in turning if i not in cyclic]:
+    if wrong := [scene.layout.names[i] for i in np.flatnonzero(np.asarray(scene.qdot)) if i not in cyclic]:
         raise ValueError(
             f"{', '.join(wrong)}: has a velocity, but is not cyclic (L, a force or a constraint depends on it or acts "
             "on it), so that it cannot move steadily. Give velocities to cyclic coordinates alone."
@@ -150,11 +149,7 @@ _TINY = 1e-6
 
 @compile_for_one_call
 def _solve_balance(has_terms: bool, *arguments) -> tuple[Vector, Array, Bool[Array, ""]]:
-    """q (n,), λ (m,) and whether they are an equilibrium, of a scene made of `SceneState.arguments`.
-
-    Near q = 0 the forces and constraints can be no more than rounding of their terms, which are looked at if
-    `has_terms`.
-    """
+    """q (n,), λ (m,) and whether they are an equilibrium; near q = 0 that is for the rounding of terms to decide."""
     scene = SceneState.from_arguments(*arguments)
     n = scene.layout.size
 
@@ -166,8 +161,6 @@ def _solve_balance(has_terms: bool, *arguments) -> tuple[Vector, Array, Bool[Arr
 
     start = jax.lax.stop_gradient(jnp.concatenate([scene.q, multipliers_at(scene.q)]))
     unit = _units(jax.lax.stop_gradient(scene.mass_matrix(scene.q, scene.qdot)), jax.jacfwd(residual)(start))
-
-    # A multiplier that is nothing beside the others is rounding.
     least = jnp.abs(start).at[n:].max(_TINY * unit[n:] * jnp.max(jnp.abs(start / unit)[n:], initial=0.0))
 
     def find(_, start):
@@ -186,10 +179,7 @@ def _solve_balance(has_terms: bool, *arguments) -> tuple[Vector, Array, Bool[Arr
 
 
 def _units(mass: Float[Array, "n n"], jacobian: Float[Array, "n+m n+m"]) -> Unknowns:
-    """A unit of each number of z, so that lengths of z mean the same in all units of a user: 1/√Mᵢᵢ for qᵢ.
-
-    λ has those that make as much of the forces as q does.
-    """
+    """A unit of each number of z, alike in all units of a user: 1/√Mᵢᵢ for qᵢ, for λ what makes as much of forces."""
     inertia, n = jnp.abs(jnp.diagonal(mass)), len(mass)
     root = jnp.sqrt(jnp.where((inertia > 0) & jnp.isfinite(inertia), inertia, 1))
     scaled = jax.lax.stop_gradient(jacobian)[:n] / root[:, None]
@@ -217,9 +207,7 @@ def _solve_large(scene: SceneState, qdot: PyTree, stable: bool) -> tuple[Vector,
     """q (n,), λ (m,), whether they are an equilibrium, and why not."""
     n, state = scene.layout.size, (scene.q, scene.qdot, jnp.zeros((), scene.q.dtype), scene.numbers)
     if qdot is not None:
-        raise ValueError(
-            f"Steady motions of {n} coordinates are not sought: leave qdot out, or give fewer coordinates."
-        )
+        raise ValueError(f"Steady motions of {n} coordinates are not sought: leave qdot out, or give fewer of them.")
     of = balance_of(scene, "An equilibrium")
     if stable:
         scene = _settled_scene(scene, None)

@@ -39,10 +39,7 @@ class Changes(NamedTuple):
 
 
 def changes_of(scene: SceneState, fields: Fields, weights: np.ndarray, states: FlatState) -> tuple[Changes, FlatState]:
-    """The changes of L by transformations with weights (D, K), at the states where they are finite, and these states.
-
-    Raises `ValueError` where there are none.
-    """
+    """The changes of L by transformations with weights (D, K), at states where they are finite, and these states."""
     parts = [np.asarray(x) for x in _changes(jnp.asarray(weights), fields, states, *scene.arguments)]
     well = np.logical_and.reduce([np.isfinite(x).all(axis=tuple(range(1, x.ndim))) for x in parts])
     if not well.any():
@@ -77,23 +74,17 @@ def is_right(gauge: Callable, scene: SceneState, fields: Fields, k: int, changes
     some = slice(0, 16)
     by_q, by_t = map(np.asarray, gradient(states.q[some], states.t[some]))
     by_q = by_q * speeds
-    off, allowed = np.abs(by_q - changes.slopes[some, k]), _ZERO * changes.sizes[:, k].max()
-    off_rest = np.abs(by_t - changes.at_rest[some, k])
-    return bool(
-        off.max() <= _RIGHT * np.abs(changes.slopes[:, k]).max() + allowed
-        and off_rest.max() <= _RIGHT * np.abs(changes.at_rest[:, k]).max() + allowed
-    )
+    allowed, pairs = _ZERO * changes.sizes[:, k].max(), ((by_q, changes.slopes), (by_t, changes.at_rest))
+    return all(np.abs(x - of[some, k]).max() <= _RIGHT * np.abs(of[:, k]).max() + allowed for x, of in pairs)
 
 
 def _function(scene: SceneState, fields: Fields, weights: np.ndarray, constant: bool) -> Callable:
-    layout, system = scene.layout, scene.system
-    reference = np.asarray(scene.q)
+    layout, system, reference = scene.layout, scene.system, np.asarray(scene.q)
 
     @accepts_singles(("q",), ("t", "params"))
     def gauge(q, t=0.0, params=None):
-        there = SceneState.from_arguments(
-            system, layout, layout.flatten(q), jnp.zeros(layout.size, layout.dtype), params
-        )
+        q, rest = layout.flatten(q), jnp.zeros(layout.size, layout.dtype)
+        there = SceneState.from_arguments(system, layout, q, rest, params)
         transform = fields.transform(jnp.asarray(weights, layout.dtype), params)
         start, t = jnp.asarray(reference, layout.dtype), jnp.asarray(t, layout.dtype)
 
@@ -101,21 +92,18 @@ def _function(scene: SceneState, fields: Fields, weights: np.ndarray, constant: 
             return variation(there, transform, q, qdot, t)
 
         def slope(q, t):
-            return jax.grad(change, argnums=1)(q, jnp.zeros_like(q), t)
+            return jax.grad(change, argnums=1)(q, rest, t)
 
         if constant:
-            return slope(start, jnp.zeros_like(t)) @ there.q
-        in_time = line_integral(
-            lambda t: change(start, jnp.zeros_like(start), t[0])[None], jnp.zeros_like(t)[None], t[None]
-        )
-        return line_integral(lambda q: slope(q, t), start, there.q) + in_time
+            return slope(start, jnp.zeros_like(t)) @ q
+        in_time = line_integral(lambda t: change(start, rest, t), jnp.zeros_like(t), t)
+        return line_integral(lambda q: slope(q, t), start, q) + in_time
 
     return gauge
 
 
 @compile_for_one_call
 def _changes(weights: Array, fields: Fields, states: FlatState, *arguments) -> tuple:
-    """The fields of `Changes`."""
     scene = SceneState.from_arguments(*arguments)
 
     def changes_at(state):

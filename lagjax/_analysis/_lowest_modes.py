@@ -55,7 +55,7 @@ def lowest_modes(
         raise ValueError(NO_MODES)
     n, rows = mass.shape[0], jacobian.shape[0]
     if count is None or needs_all(count, n - rows):
-        return _dense_modes(stiffness, mass, jacobian)
+        return _rayleigh_ritz(stiffness, mass, decide(jacobian.toarray()).null if rows else np.eye(n))
     shift, factors = lowest_shift(stiffness, mass, jacobian)
     slices: list[tuple[float, Any, int, str]] = [(shift, factors, count, "LM")]
     if rows:
@@ -81,16 +81,12 @@ def lowest_modes(
             values, shapes = np.append(values, value), np.column_stack([shapes, more])
     except ArpackNoConvergence as error:
         raise ValueError(f"The {count} lowest modes were not found: {error}. Ask for fewer.") from None
-    turned = symmetric_modes(shapes.T @ (stiffness @ shapes), shapes.T @ (mass @ shapes))
-    values, turn = map(np.asarray, turned)
-    values, shapes = values[:count], shapes @ turn[:, :count]
-    shift, factors = slices[0][:2]
+    values, shapes = _rayleigh_ritz(stiffness, mass, shapes)
+    values, shapes, factors = values[:count], shapes[:, :count], slices[0][1]
     again = np.column_stack([_invert(factors, x) for x in (mass @ shapes).T]) * (values - shift)
     off = np.linalg.norm(again - shapes, axis=0) / np.linalg.norm(shapes, axis=0)
     if not off.max() <= _OFF:
-        raise ValueError(
-            f"Mode {int(np.argmax(off))} was not found: its shape is off by {off.max():.1g} of its length."
-        )
+        raise ValueError(f"Mode {np.argmax(off)} was not found: its shape is off by {off.max():.1g} of its length.")
     return values, shapes
 
 
@@ -147,9 +143,8 @@ def _eliminate(matrix: Sparse) -> SuperLU | None:
     return factors if np.array_equal(factors.perm_r, factors.perm_c) else None
 
 
-def _dense_modes(stiffness: Sparse, mass: Sparse, jacobian: Sparse):
-    """λ and X of all modes."""
-    basis = decide(jacobian.toarray()).null if jacobian.shape[0] else np.eye(mass.shape[0])
+def _rayleigh_ritz(stiffness: Sparse, mass: Sparse, basis: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """λ (k,) and X (n, k) of the modes within the span of a basis (n, k)."""
     values, shapes = symmetric_modes(basis.T @ (stiffness @ basis), basis.T @ (mass @ basis))
     return np.asarray(values), basis @ np.asarray(shapes)
 

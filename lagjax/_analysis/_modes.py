@@ -149,8 +149,7 @@ def normal_modes(
         )
     if scene.concrete and not np.isfinite(np.asarray(modes.exponents)).all():
         raise ValueError(NO_MODES)
-    lowest = (x[:count] for x in (modes.frequencies, modes.exponents, modes.damping_ratios))
-    frequencies, exponents, ratios = lowest
+    frequencies, exponents, ratios = (x[:count] for x in (modes.frequencies, modes.exponents, modes.damping_ratios))
     shapes = jax.tree.map(lambda x: x[:count], modes.shapes)
     return Modes(frequencies, shapes, modes.stable, exponents, ratios)
 
@@ -180,8 +179,7 @@ def _rank(scene: SceneState) -> int:
 def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> tuple:
     """The modes of the k degrees of freedom, and how far q is from an equilibrium."""
     scene = SceneState.from_arguments(*arguments)
-    q = scene.q
-    matrices = steady_matrices(scene, q)
+    q, matrices = scene.q, steady_matrices(scene, scene.q)
     unit = jax.lax.stop_gradient(diagonal_scale(matrices[0]))
     mass, rates, stiffness = (unit[:, None] * x * unit for x in matrices[:3])
     jacobian = matrices[3] * unit
@@ -191,17 +189,13 @@ def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> 
     values = jnp.concatenate([matrices[4] * unit, rows])
     residual = jax.lax.stop_gradient(_distance(values, slopes, q / unit, stiffness, shortest_solution, force))
     residual = residual + jnp.where(_rank_is(jacobian, rank), 0, jnp.nan)
-    keep = np.array([i for i in range(len(q)) if i not in cyclic], int)
-    gone = np.array(cyclic, int)
+    gone, keep = np.array(cyclic, int), np.setdiff1d(np.arange(len(q)), cyclic)
     reduced, follow = _eliminate_cyclic(mass, rates, stiffness, keep, gone)
     basis = _tangent_basis(jacobian[:, keep], rank)
     within = tuple(basis.T @ x @ basis for x in reduced)
     solve = _reversible_modes if reversible else _general_modes
-    if basis.shape[1]:
-        exponents, amplitudes = solve(*within)
-    else:
-        exponents = jnp.zeros((0, 2), jnp.result_type(q.dtype, jnp.complex64))
-        amplitudes = jnp.zeros((0, 0), q.dtype)
+    nothing = jnp.zeros((0, 2), jnp.result_type(q.dtype, jnp.complex64)), jnp.zeros((0, 0), q.dtype)
+    exponents, amplitudes = solve(*within) if basis.shape[1] else nothing
     moved = (basis.astype(amplitudes.dtype) @ amplitudes).T  # (k, n without the cyclic ones)
     shapes = jnp.zeros((len(moved), len(q)), moved.dtype).at[:, keep].set(moved)
     shapes = shapes.at[:, gone].set(follow(moved, exponents[:, 0]))
@@ -227,8 +221,7 @@ def _restore(layout: Layout, exponents: Array, shapes: Array, weighted: Array, u
     size = jnp.max(jnp.abs(exponents), initial=0)
     stable = jnp.all(exponents.real <= _grows_beyond(size)) & jnp.all(jnp.isfinite(exponents))
     first = exponents[:, 0]
-    length = jnp.abs(jnp.where(first == 0, 1, first))
-    ratios = jnp.where(first.real == 0, 0, -first.real / length)
+    ratios = jnp.where(first.real == 0, 0, -first.real / jnp.abs(jnp.where(first == 0, 1, first)))
     return Modes(first.imag, shapes, stable, exponents, ratios)
 
 
@@ -243,9 +236,7 @@ def _large_modes(scene: SceneState, qdot: PyTree, count: int | None) -> tuple[Mo
             f"way: ask for the lowest ones, normal_modes(…, count=50), up to {freedoms // 4}."
         )
     if qdot is not None:
-        raise ValueError(
-            f"Modes about a steady motion are not tried for {n} coordinates: leave qdot out, or give less."
-        )
+        raise ValueError(f"Modes about a steady motion of {n} coordinates are not tried: leave qdot out.")
     of = balance_of(scene, "A normal mode")
     z, x = np.concatenate([scene.q, of.multipliers]), np.random.default_rng(0).normal(size=n)
     entries, unit, rate = map(np.asarray, _mass_and_rate(motion, jnp.asarray(x), *state))
@@ -297,8 +288,7 @@ def _distance(values: Any, slopes: Any, place: Any, stiffness: Any, solve: Calla
 
     All are given in the unit of each coordinate, q being `place`; `slopes` (n + m,) are the lengths of the rows of K
     and of J, `solve(K, b)` a solution x of K x = b. Zero also where the distance changes no mode: where without
-    constraints the `force`, a function of the place, is linear up to a thousand times as far. Takes arrays of NumPy or
-    JAX.
+    constraints the `force`, a function of the place, is linear up to a thousand times as far.
     """
     xp = slopes.__array_namespace__()
     # A row without any gradient may be left with the rounding of the others.
@@ -379,20 +369,18 @@ def _general_modes(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Arra
 
     Velocities are in units of the fastest rate there is: positions and they are then of one size.
     """
-    k = len(mass)
-    inverse = factorize(mass)
-    lower = [-inverse.solve_columns(stiffness), -inverse.solve_columns(rates)]
-    fastest = jax.lax.stop_gradient(jnp.maximum(jnp.sqrt(jnp.max(jnp.abs(lower[0]))), jnp.max(jnp.abs(lower[1]))))
+    k, inverse = len(mass), factorize(mass)
+    by_q, by_qdot = -inverse.solve_columns(stiffness), -inverse.solve_columns(rates)
+    fastest = jax.lax.stop_gradient(jnp.maximum(jnp.sqrt(jnp.max(jnp.abs(by_q))), jnp.max(jnp.abs(by_qdot))))
     fastest = jnp.where((fastest > 0) & (fastest < jnp.inf), fastest, 1)
-    zero, one = jnp.zeros_like(mass), jnp.eye(k, dtype=mass.dtype)
-    values, vectors = exponents_and_modes(jnp.block([[zero, fastest * one], [lower[0] / fastest, lower[1]]]))
+    above = [jnp.zeros_like(mass), fastest * jnp.eye(k, dtype=mass.dtype)]
+    values, vectors = exponents_and_modes(jnp.block([above, [by_q / fastest, by_qdot]]))
     return jnp.stack([values[:k], values[k:]], axis=1), vectors[:k, :k]
 
 
 def _normalise(shapes: Array, weighted: Array) -> Array:
     """Shapes x (k, n) with xᴴM x = 1 and the largest entry positive; `weighted` (k, n) are the M x."""
-    size = jnp.sum(shapes.conj() * weighted, axis=1).real
-    shapes = shapes / jnp.sqrt(size)[:, None].astype(shapes.dtype)
+    shapes = shapes / jnp.sqrt(jnp.sum(shapes.conj() * weighted, axis=1, keepdims=True).real).astype(shapes.dtype)
     sizes = jnp.abs(jax.lax.stop_gradient(shapes))
     # The first of those that are equal but for rounding: a symmetric shape has its sign by no accident.
     at = jnp.argmax(sizes > 0.999 * jnp.max(sizes, axis=1, keepdims=True), axis=1)

@@ -96,10 +96,7 @@ def noether_charge(system: System, generator: Callable, gauge: Callable | None =
 
 
 def flat_generator(generator: Function, layout: Layout) -> Callable:
-    """(ξ (n,), τ ()) as a function of (q (n,), t, params), of a generator in the user's pytree.
-
-    Raises `TypeError` where that returns neither ξ nor a pair (ξ, τ).
-    """
+    """(ξ (n,), τ ()) as a function of (q (n,), t, params), of a generator in the user's pytree."""
 
     def flat(q, t, params):
         value = generator(layout.restore(q), t=t, params=params)
@@ -153,7 +150,6 @@ def variation(scene: SceneState, transform: Callable, q: Vector, qdot: Vector, t
 
 def euler_lagrange(function: Callable, state: FlatState) -> tuple[Vector, Vector]:
     """d/dt ∂Λ/∂q̇ and ∂Λ/∂q (n,) of a function Λ(q, q̇, t): their difference is zero where Λ is some dG(q, t)/dt."""
-    by_q, by_qdot = jax.grad(function, argnums=0), jax.grad(function, argnums=1)
-    place = state.q, state.qdot, state.t
-    rate = jax.jvp(by_qdot, place, (state.qdot, state.qddot, jnp.ones_like(state.t)))[1]
-    return rate, by_q(*place)
+    place, onwards = (state.q, state.qdot, state.t), (state.qdot, state.qddot, jnp.ones_like(state.t))
+    rate = jax.jvp(jax.grad(function, argnums=1), place, onwards)[1]
+    return rate, jax.grad(function, argnums=0)(*place)

@@ -106,9 +106,8 @@ def _have_potential(scene: SceneState, scales: Scales, states: FlatState) -> boo
     force, by_q, by_qdot = (x[well] for x in terms)
     work = np.abs(force) @ scales.q
     by_q, by_qdot = by_q * scales.q[:, None] * scales.q, by_qdot * scales.q[:, None] * scales.qdot
-    size = max(float(work.max()), float(np.abs(by_q).max()))
-    off = max(float(np.abs(by_q - np.swapaxes(by_q, 1, 2)).max()), float(np.abs(by_qdot).max()))
-    return off <= _CURL * size
+    off = max(np.abs(by_q - np.swapaxes(by_q, 1, 2)).max(), np.abs(by_qdot).max())
+    return bool(off <= _CURL * max(work.max(), np.abs(by_q).max()))
 
 
 @compile_for_one_call

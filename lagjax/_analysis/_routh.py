@@ -69,7 +69,7 @@ def routhian(system: System, q: PyTree, qdot: PyTree, params: PyTree = None) -> 
     if scene.constrained or system.forces is not None or system.dissipation is not None:
         raise ValueError("routhian is of systems without constraints, forces and dissipation: R is a Lagrangian alone.")
     gone, layout = np.array(scene.conserved, int), scene.layout
-    left = np.array([i for i in range(layout.size) if i not in gone], int)
+    left = np.setdiff1d(np.arange(layout.size), gone)
     if not len(gone) or not len(left):
         what = "every coordinate is" if len(gone) else "no coordinate is"
         more = ", …" if layout.size > 8 else ""
@@ -90,7 +90,6 @@ class _CyclicSplit(NamedTuple):
     gone: np.ndarray
 
     def join_coordinates(self, s, c) -> Array:
-        """The vector (n,) of both kinds."""
         return jnp.zeros(self.layout.size, self.layout.dtype).at[self.left].set(s).at[self.gone].set(c)
 
     def lagrangian(self, s, sdot, cdot, t, params):
@@ -101,9 +100,7 @@ class _CyclicSplit(NamedTuple):
         """The velocity ċ (k,) of the cyclic coordinates at the momenta in `params`, those of the reduced scene."""
         none = jnp.zeros(len(self.gone), self.layout.dtype)
 
-        def momenta(cdot):
-            return jax.grad(lambda x: self.lagrangian(s, sdot, x, t, params["params"]))(cdot)
-
+        momenta = jax.grad(lambda cdot: self.lagrangian(s, sdot, cdot, t, params["params"]))
         mass, missing = jax.jacfwd(momenta)(none), params["momenta"] - momenta(none)
         if len(self.gone) == 1:  # a division, of which machine code is made
             return missing / mass[0]

@@ -87,8 +87,7 @@ def same_motion(a: System, b: System, q: PyTree, qdot: PyTree, params: PyTree = 
         raise ValueError("same_motion looks at numbers: call it outside of jit, vmap and grad, on one state.")
     piecewise = any(scene.piecewise for scene in scenes)
     states = random_states(scenes[0], scenes[0].scales, _STATES, seed, piecewise)
-    differences = _compare_equations(scenes, states)
-    if differences is None:
+    if (differences := _compare_equations(scenes, states)) is None:
         raise ValueError(
             "A Lagrangian, or a derivative of it, is not finite at most states about (q, qdot): give a state in the "
             "middle of where motions take place."
@@ -97,11 +96,10 @@ def same_motion(a: System, b: System, q: PyTree, qdot: PyTree, params: PyTree = 
     beside = _compare_equations(scenes, perturb_last_digits(states))
     noise = 0.0 if beside is None else float(np.median(np.abs(relative - beside[1]).max(axis=1)[well & beside[2]]))
     threshold = min(max(_SAME, _CHANCE * noise), _LARGEST)
-    state, coordinate = np.unravel_index(int(np.argmax(relative)), relative.shape)
+    state, coordinate = map(int, np.unravel_index(np.argmax(relative), relative.shape))
     residual = float(relative[state, coordinate])
     same = residual <= threshold and np.isfinite(factor) and factor != 0
-    states = jax.tree.map(np.asarray, states)
-    where = _place(scenes[0].layout, states, int(state), int(coordinate))
+    where = _place(scenes[0].layout, jax.tree.map(np.asarray, states), state, coordinate)
     return SameMotion(bool(same), factor, residual, threshold, where)
 
 

@@ -61,10 +61,7 @@ class SceneState(NamedTuple):
     def from_state(
         cls, system: System, q: PyTree, qdot: PyTree | None, params: PyTree, sparse: bool = False
     ) -> "SceneState":
-        """A scene at the state (q, qdot), at rest where `qdot` is None; on arrays if it is `sparse` and large.
-
-        Raises `TypeError` or `ValueError`, with a sentence, for arguments that cannot be right.
-        """
+        """A scene at the state (q, qdot), at rest where `qdot` is None; on arrays if it is `sparse` and large."""
         system = require_system(system)
         rest = jax.tree.map(lambda x: jnp.zeros_like(jnp.asarray(x, float)), q) if qdot is None else qdot
         layout = Layout.from_state(q, rest)
@@ -116,7 +113,6 @@ class SceneState(NamedTuple):
 
     @property
     def piecewise(self) -> bool:
-        """True if the motion decides on something: a comparison, an absolute value, a floor."""
         return self.lowered is not None and borders_of(self.derivation) is not None
 
     def require_autonomous(self, what: str) -> None:
@@ -159,9 +155,8 @@ class SceneState(NamedTuple):
         good as any other number, in whatever units. A wrong guess has to be caught by who relies on it.
         """
         motion, n = self.motion, self.layout.size
-        if motion.forces is not None or motion.dissipation is not None or self.system.velocity_constraints is not None:
-            return False
-        if self.lowered is None:
+        acting = motion.forces, motion.dissipation, self.system.velocity_constraints
+        if any(function is not None for function in acting) or self.lowered is None:
             return False
         draws = np.random.default_rng(1).uniform(0.3, 1.2, (3, len(self.derivation.scalar_shapes)))
         draws = draws.astype(self.layout.dtype)

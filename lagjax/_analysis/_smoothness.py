@@ -74,8 +74,7 @@ def _rough(scene: SceneState) -> _Rough:
     n, eps = len(q), jnp.finfo(q.dtype).eps
 
     def sides(y):
-        found = [x for _, _, x in borders_of_motion(scene.motion, y[:n], y[n:], t, numbers)]
-        return jnp.concatenate([jnp.ravel(x) for x in found])
+        return jnp.concatenate([jnp.ravel(x) for *_, x in borders_of_motion(scene.motion, y[:n], y[n:], t, numbers)])
 
     def force(y):
         return scene.force(y[:n], y[n:])

@@ -30,18 +30,13 @@ def shortest_solution(matrix: Matrix, b: Vector, unit: Vector | float = 1.0) -> 
     inverse, sizes = jnp.zeros_like(inverse).at[:, order].set(inverse), jnp.abs(pivots)
     singular = jnp.min(sizes) <= singular_threshold(len(matrix), matrix.dtype) * jnp.max(sizes)
 
-    def refine(a, inverse, b):
-        x = inverse @ b
-        return x + inverse @ (b - a @ x)
+    def refined(a, inverse):
+        return lambda _, b: inverse @ b + inverse @ (b - a @ (inverse @ b))
 
     def regular(matrix, b):
         a = rows[:, None] * matrix * columns
-        return columns * jax.lax.custom_linear_solve(
-            lambda x: a @ x,
-            rows * b,
-            lambda _, b: refine(a, inverse, b),
-            transpose_solve=lambda _, b: refine(a.T, inverse.T, b),
-        )
+        solve, transposed = refined(a, inverse), refined(a.T, inverse.T)
+        return columns * jax.lax.custom_linear_solve(lambda x: a @ x, rows * b, solve, transpose_solve=transposed)
 
     def shortest(matrix, b):
         return matrix.T @ least_norm(matrix @ matrix.T, b)
@@ -98,8 +93,7 @@ def levenberg_marquardt(f: Callable, start: Vector, least: Vector, unit: Vector)
     change of units changes nothing. The damping goes down with |r|, which keeps the convergence quadratic where
     solutions are not isolated (Fan & Yuan, Computing 74 (2005) 23).
     """
-    lengths = jnp.sqrt(jnp.sum((jax.jacfwd(f)(start) * unit) ** 2, axis=1))
-    weights = jnp.where(lengths > 0, 1 / jnp.where(lengths > 0, lengths, 1), 1)
+    weights = _reciprocal(jnp.sqrt(jnp.sum((jax.jacfwd(f)(start) * unit) ** 2, axis=1)))
 
     def weighted(z):
         return weights * f(z)
@@ -124,7 +118,9 @@ def levenberg_marquardt(f: Callable, start: Vector, least: Vector, unit: Vector)
         ratio = jnp.where(expected > 0, gain / jnp.where(expected > 0, expected, 1), 0.0)
         better = (gain > 0) & jnp.all(jnp.isfinite(new))
         damping = jnp.where(ratio > 0.75, damping / 4, jnp.where((ratio < 0.25) | ~better, damping * 4, damping))
-        length = relative_size(jacobian, step, z, least)
+        # The most that a step makes of a number of f(z), in parts of what the numbers of z make of it.
+        of_f, sizes = jnp.abs(jacobian), jnp.maximum(jnp.maximum(least, jnp.abs(z)), jnp.abs(step))
+        length = jnp.max(of_f @ jnp.abs(step) * _reciprocal(of_f @ sizes))
         stuck = ~better & ((length < NO_STEP) | ~jnp.isfinite(length))
         moved = jnp.where(better, length, jnp.where(stuck, 0.0, moved))
         return jnp.where(better, z + step, z), jnp.where(better, new, value), moved, damping, scale, count + 1
@@ -132,13 +128,6 @@ def levenberg_marquardt(f: Callable, start: Vector, least: Vector, unit: Vector)
     one = jnp.ones((), start.dtype)
     carry = start, weighted(start), one, 0.1 * one, jnp.zeros_like(start), jnp.zeros((), int)
     return jax.lax.while_loop(moves, once, carry)[0]
-
-
-def relative_size(jacobian: Float[Array, "m n"], step: Vector, z: Vector, least: Vector) -> Float[Array, ""]:
-    """The size of a step: the most that it makes of a number of f(z), in parts of what the numbers of z make of it."""
-    change = jnp.abs(jacobian) @ jnp.abs(step)
-    whole = jnp.abs(jacobian) @ jnp.maximum(jnp.maximum(least, jnp.abs(z)), jnp.abs(step))
-    return jnp.max(jnp.where(change == 0, 0.0, change / jnp.where(whole == 0, 1, whole)))
 
 
 # A step that is nothing, in parts of the numbers of z. Damped steps: 10 to 30 are usual, and twice as many change

@@ -55,10 +55,8 @@ def balance_of(scene: SceneState, what: str) -> SparseBalance:
             f"{large}, and the derivatives of its forces are not sparse, or hold products of large matrices: write "
             "forces as sums over neighbours, in slices and with jnp.roll, or give the scene fewer coordinates."
         )
-    numbers = scene.numbers
-    return SparseBalance(
-        lambda z: np.asarray(residual(z, numbers)), lambda z: jacobian(jnp.asarray(z), numbers), multipliers
-    )
+    at = scene.numbers
+    return SparseBalance(lambda z: np.asarray(residual(z, at)), lambda z: jacobian(jnp.asarray(z), at), multipliers)
 
 
 def multipliers_at_rest(scene: SceneState) -> np.ndarray:
@@ -108,8 +106,7 @@ def descend(residual: Callable, jacobian_at: Callable, start: Unknowns, least: U
         change, sizes = abs(weighted) @ np.abs(step / d), np.maximum(np.abs(z), np.abs(step / d))
         length = np.max(change * _reciprocal(abs(weighted) @ np.maximum(least, sizes)))
         if better:
-            z, value = z + step / d, new
-            jacobian = jacobian_at(z)
+            z, value, jacobian = z + step / d, new, jacobian_at(z + step / d)
         if not length >= NO_STEP:
             break
     return z
@@ -145,8 +142,7 @@ def is_balanced(of: SparseBalance, z: Unknowns, least: Unknowns) -> bool:
 
 def falls(of: SparseBalance, z: Unknowns, unit: np.ndarray) -> bool:
     """True if an equilibrium is no minimum of the potential on the constraints, with coordinates in their `unit`."""
-    whole, n = of.jacobian(z), len(unit)
-    scale = diags_array(unit)
+    whole, n, scale = of.jacobian(z), len(unit), diags_array(unit)
     forces, jacobian = scale @ whole[:n, :n] @ scale, whole[n:, :n] @ scale
     shift = lowest_shift(-0.5 * (forces + forces.T), eye_array(n), jacobian)[0]
     return shift < -_FALLS * abs(forces).sum(axis=1).max()

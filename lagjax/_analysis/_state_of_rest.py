@@ -77,7 +77,6 @@ def _add_friction(system: System) -> System:
 
         return function and restrict_signature(function_at_zero, {"params"}, roles)
 
-    counts = {role: 1 if role == "constraints" else 2 for role in ROLES}
-    functions: dict[str, Any] = {role: fix_time(getattr(system, role), count) for role, count in counts.items()}
-    functions["dissipation"] = dissipation
-    return System(**functions)
+    fixed: dict[str, Any] = {x: fix_time(getattr(system, x), 1 if x == "constraints" else 2) for x in ROLES}
+    fixed["dissipation"] = dissipation
+    return System(**fixed)

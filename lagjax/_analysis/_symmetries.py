@@ -194,7 +194,7 @@ def _approximate_symmetries(
     return notes
 
 
-_COMBINATION = "combination: "
+_COMBINATION, _SHOWN = "combination: ", 6  # and how many parts of one are named
 # Names of what is given only where it is no function of other quantities, as it is for free particles.
 _DEPENDENT = (_COMBINATION, "dilation")
 
@@ -214,11 +214,13 @@ class _SymmetryColumns(NamedTuple):
 
 def _measure_columns(scene: SceneState, fields: Fields, states: FlatState) -> _SymmetryColumns:
     """The columns where they are finite, and their noise: how much they differ between states that hardly do."""
-    of_lagrangian, of_others = _finite(*map(np.asarray, _columns(fields, states, *scene.arguments)))
-    beside = _finite(*map(np.asarray, _columns(fields, perturb_last_digits(states), *scene.arguments)))
-    pairs = [(a, b) for a, b in zip((of_lagrangian, of_others), beside, strict=True) if a.size and a.shape == b.shape]
-    noise = max(float(np.sqrt(np.mean((a - b) ** 2))) for a, b in pairs) if pairs else 0.0
-    return _SymmetryColumns(of_lagrangian, of_others, min(max(_NULL, _CHANCE * noise), _LARGEST))
+    here, beside = (
+        _finite(*map(np.asarray, _columns(fields, at, *scene.arguments)))
+        for at in (states, perturb_last_digits(states))
+    )
+    pairs = [(a, b) for a, b in zip(here, beside, strict=True) if a.size and a.shape == b.shape]
+    noise = max((float(np.sqrt(np.mean((a - b) ** 2))) for a, b in pairs), default=0.0)
+    return _SymmetryColumns(*here, min(max(_NULL, _CHANCE * noise), _LARGEST))
 
 
 def _flatten_generators(generators, layout: Layout) -> dict[str, Callable]:
@@ -249,11 +251,9 @@ def _columns(fields: Fields, states: FlatState, *arguments) -> tuple[Array, Arra
             rate, by_q = euler_lagrange(lambda *y: variation(scene, transform, *y), state)
             return rate - by_q, _work(scene, transform, state)
 
-        of_l, of_others = jax.vmap(jax.linearize(expression, jnp.zeros(fields.count, state.q.dtype))[1], out_axes=-1)(
-            jnp.eye(fields.count, dtype=state.q.dtype)
-        )
-        terms = [jnp.abs(x) for x in euler_lagrange(lagrangian, state)]
-        return of_l, of_others, terms[0] + terms[1]
+        none, each = jnp.zeros(fields.count, state.q.dtype), jnp.eye(fields.count, dtype=state.q.dtype)
+        of_l, of_others = jax.vmap(jax.linearize(expression, none)[1], out_axes=-1)(each)
+        return of_l, of_others, sum(map(jnp.abs, euler_lagrange(lagrangian, state)))
 
     of_l, of_others, terms = jax.lax.map(expressions_at, states)
     size = jnp.sqrt(jnp.nanmean(terms**2, axis=0))[:, None]
@@ -339,9 +339,6 @@ def _describe_combination(weights: np.ndarray, fields: Fields, names: tuple[str,
     return _COMBINATION + ", ".join(shown[:_SHOWN]) + (", …" if len(parts) > _SHOWN else "")
 
 
-_SHOWN = 6
-
-
 # ---- the charge ------------------------------------------------------------------------------------------------------
 
 
@@ -349,11 +346,11 @@ def _quantities(
     scene: SceneState, fields: Fields, chosen: list, states: FlatState
 ) -> tuple[list[Conserved], list[str]]:
     """The conserved quantities of the chosen symmetries, and what is to be said about others."""
+    quantities, notes = [], []
     if not chosen:
-        return [], []
+        return quantities, notes
     names, weights = [name for name, _ in chosen], np.array([_readable(w, fields) for _, w in chosen])
     changes, states = changes_of(scene, fields, weights, states)
-    quantities, notes = [], []
     for k in _independent(names, changes.gradients):
         gauge = gauge_of(scene, fields, weights[k], k, changes)
         if gauge is None or is_right(gauge, scene, fields, k, changes, states):
@@ -364,11 +361,9 @@ def _quantities(
 
 
 def _independent(names: list[str], gradients: np.ndarray) -> list[int]:
-    """The charges to keep of D with these gradients (S, D, 2n): all that have a name, and of combinations and
-    dilations those that are no function of the others.
-
-    A function of others has a gradient in the space of theirs at every state. So the angular momentum of the centre of
-    mass is left out where its momentum and its start are there.
+    """The charges to keep of D with these gradients (S, D, 2n): all but combinations and dilations whose gradients are
+    in the space of the others' at every state. So the angular momentum of the centre of mass is left out where its
+    momentum and its start are there.
     """
     kept = [k for k, name in enumerate(names) if not name.startswith(_DEPENDENT)]
     for k in range(len(names)):

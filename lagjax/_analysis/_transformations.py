@@ -78,16 +78,10 @@ class Fields(NamedTuple):
 
 def fields_of(layout: Layout, scale: np.ndarray, time: float, own: dict[str, Callable]) -> Fields:
     """The basis for coordinates of this layout, of these sizes (n,) and of this one of the time."""
-    maps = _maps(layout, scale)
-    names = [
-        "time translation",
-        *(f"translation of {name}" for name in layout.names),
-        *(f"boost of {name}" for name in layout.names),
-        *(name for name, _ in maps),
-        "scaling of the time",
-        *own,
-    ]
-    return Fields(scale, time, np.array([a for _, a in maps], float), tuple(names), tuple(own.values()))
+    named, maps = zip(*_maps(layout, scale), strict=True)
+    moved = [f"{how} of {name}" for how in ("translation", "boost") for name in layout.names]
+    names = "time translation", *moved, *named, "scaling of the time", *own
+    return Fields(scale, time, np.array(maps, float), names, tuple(own.values()))
 
 
 def _maps(layout: Layout, scale: np.ndarray) -> list[tuple[str, np.ndarray]]:
@@ -115,11 +109,9 @@ def _leaf_places(layout: Layout) -> list[np.ndarray]:
 
 def textbook_symmetries(layout: Layout, fields: Fields) -> list[tuple[str, np.ndarray]]:
     """Combinations that textbooks name: the name of what they conserve, and their weights (K,)."""
-    n, axes = layout.size, _axes(layout)
-    one, first_own = np.eye(n), fields.count - len(fields.own)
-    along = [
-        (i, d, np.isin(np.arange(n), vectors[:, i]).astype(float)) for d, vectors in axes.items() for i in range(d)
-    ]
+    n, axes, first_own = layout.size, _axes(layout), fields.count - len(fields.own)
+    one, each = np.eye(n), [(i, d, vectors[:, i]) for d, vectors in axes.items() for i in range(d)]
+    along = [(i, d, np.isin(np.arange(n), places).astype(float)) for i, d, places in each]
     space = {d: "" if len(axes) == 1 else f" of {d}" for d in axes}
     # The signs are those of what is conserved: h, p, M X − P t.
     known = [("energy", fields.weights(alpha=-1.0))]

@@ -18,8 +18,8 @@ _FAINT = 0.1  # of a signal's size over all records: what is left of a record th
 
 
 class Unexplained(NamedTuple):
-    """What a search leaves: sentences on signals of which motion is left, and on those as large as their noise; the
-    largest share of a signal, whether it holds motion at all, and the records, the worst first."""
+    """Sentences for signals of which a search leaves motion, and for those no larger than their noise; the largest
+    share of a signal that is left, whether it holds motion at all, and the records, the worst first."""
 
     motion: list[str]
     noise: list[str]
