@@ -34,6 +34,7 @@ from lagjax._equations._linear import (
     unit_diagonal,
 )
 from lagjax._equations._many_states import (
+    OF_QUANTITIES,
     SADDLE,
     Sample,
     borders_of,

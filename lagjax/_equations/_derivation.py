@@ -21,6 +21,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._equations import _saddle
 from lagjax._equations._blame import pieces_of_motion
 from lagjax._equations._constraints import velocity_scales
 from lagjax._equations._coupled_forces import CoupledForces
@@ -29,13 +30,6 @@ from lagjax._equations._motion import Motion
 from lagjax._equations._patterns import gradient_memory, jacobian_pattern
 from lagjax._equations._quantities import OwnRules, quantities
 from lagjax._equations._recursion import Recursion, RecursiveElimination
-from lagjax._equations._saddle import (
-    LARGEST_INDEFINITE,
-    DraggedElimination,
-    IndefiniteElimination,
-    SaddleElimination,
-    TwoCoordinates,
-)
 from lagjax._equations._structure import LARGEST_LOWERED, LEAST_COORDINATES, SparseMotion, SparseStructure, structure_of
 from lagjax._interface import Layout, dtype_of, is_concrete
 from lagjax._native import Projection
@@ -262,9 +256,8 @@ class Derivation:
         key = "momenta_by_q", *map(str, momenta)
         if key not in self._programs:
             chosen = jax.jacrev(lambda *state: self._traced_once.momentum(*state)[jnp.asarray(momenta, int)])
-            self._programs[key] = lower(
-                chosen, *self.state_shapes, budget=OPERATION_BUDGET, moving=2 * self.layout.size + 1
-            )
+            moving = 2 * self.layout.size + 1
+            self._programs[key] = lower(chosen, *self.state_shapes, budget=OPERATION_BUDGET, moving=moving)
         return self._programs[key]
 
     # ---- what is solved for ----
@@ -495,19 +488,19 @@ class Derivation:
         that says where M is not regular enough.
         """
         n, m, regular = self.layout.size, self._rows(saddle), self._regular(saddle)
-        if regular is None and (self.motion.constrained or n > LARGEST_INDEFINITE):
+        if regular is None and (self.motion.constrained or n > _saddle.LARGEST_INDEFINITE):
             raise Unlowerable("its mass matrix is not positive definite and needs pivoting")
         zeros = self.absent("mass_matrix"), self.absent("jacobian")[:m]
         released = self.motion.constraints.held is not None
         augmented = self.motion.constrained and not (regular_only or ((self._constant_mass or released) and regular))
         if n == 2 and not self.motion.constrained:
-            elimination = TwoCoordinates(zeros[0], self.layout.dtype)
+            elimination = _saddle.TwoCoordinates(zeros[0], self.layout.dtype)
         elif regular is None:
-            elimination = IndefiniteElimination(zeros[0], self.layout.dtype)
+            elimination = _saddle.IndefiniteElimination(zeros[0], self.layout.dtype)
         else:
-            elimination = SaddleElimination(zeros, self.layout.dtype, augmented, regular_only, released)
+            elimination = _saddle.SaddleElimination(zeros, self.layout.dtype, augmented, regular_only, released)
             if released and saddle.b is not None:
-                elimination = DraggedElimination(elimination, self.absent("drag"))
+                elimination = _saddle.DraggedElimination(elimination, self.absent("drag"))
         if elimination.operations > OPERATION_BUDGET:
             raise Unlowerable(
                 f"to solve for the accelerations takes some {elimination.operations} operations, more than the "

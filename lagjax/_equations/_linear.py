@@ -90,11 +90,9 @@ def unit_diagonal(matrix):
 
 
 def singular_threshold(n: int, dtype) -> float:
-    """The ratio of the smallest to the largest pivot at which a scaled n × n matrix counts as singular: n eps.
-
-    About so much is left of a pivot that is zero after n subtractions, and a solution has no digit left there. Twice as
-    large, it would refuse matrices whose solution has one binary digit.
-    """
+    """The ratio of the smallest to the largest pivot at which a scaled n × n matrix counts as singular: n eps."""
+    # About so much is left of a pivot that is zero after n subtractions, and a solution has no digit left there. Twice
+    # as large, it would refuse matrices whose solution has one binary digit.
     return n * float(jnp.finfo(dtype).eps)
 
 
@@ -297,11 +295,10 @@ def least_norm(matrix: Matrix, b: Vector) -> Vector:
 
 @jax.custom_jvp
 def _inverse_on_range(matrix: Matrix) -> Matrix:
-    """The pseudo-inverse of a symmetric matrix whose rank is decided by `rank_tolerance`.
-
-    It is applied to right-hand sides in the range alone: what dependent constraints ask for is tested to be consistent
-    before a motion starts. So it chooses among multipliers that all give the same motion, and hides no contradiction.
-    """
+    """The pseudo-inverse of a symmetric matrix whose rank is decided by `rank_tolerance`."""
+    # It is applied to right-hand sides in the range alone: what dependent constraints ask for is tested to be
+    # consistent before a motion starts. So it chooses among multipliers that all give the same motion, and hides no
+    # contradiction.
     scaled, scale = unit_diagonal(matrix)
     inverse, basis, pairs = _independent(scaled, scale)
     some = scale[:, None] * inverse * scale  # solves S x = b, but its x need not be the shortest

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._equations._derivation import Derivation, columns_of, derivation_of, numbers_of
-from lagjax._equations._linear import saddle_many
+from lagjax._equations._linear import saddle_many, schur_complements
 from lagjax._equations._motion import Motion
 from lagjax._equations._sparse import Diagonal, Entries
 from lagjax._interface import Layout, halves
@@ -133,6 +133,21 @@ def solve_saddle(of: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     """q̈ (S, n) and λ (S, m) from the quantities `SADDLE`."""
     x, multipliers = saddle_many(of["mass_matrix"], of["force"][:, :, None], of["jacobian"], of["gamma"][:, :, None])
     return x[:, :, 0], multipliers[:, :, 0]
+
+
+_OF_SCHUR, _OF_ENERGY = ("mass_matrix", "jacobian"), ("lagrangian", "momentum")
+# The functions of `Motion` in terms of `Motion.quantities` and q̇ (S, n) at S states: which of them, and the formula.
+OF_QUANTITIES: dict[Callable, tuple[tuple[str, ...], Callable]] = {
+    Motion.acceleration: (SADDLE, lambda of, v: solve_saddle(of)[0]),
+    Motion.multipliers: (SADDLE, lambda of, v: solve_saddle(of)[1]),
+    Motion.constraint_force: (SADDLE, lambda of, v: np.einsum("skn,sk->sn", of["jacobian"], solve_saddle(of)[1])),
+    Motion.schur_complement: (_OF_SCHUR, lambda of, v: schur_complements(of["mass_matrix"], of["jacobian"])),
+    Motion.mass_matrix: (("mass_matrix",), lambda of, v: of["mass_matrix"]),
+    Motion.momentum: (("momentum",), lambda of, v: of["momentum"]),
+    Motion.generalized_force: (("generalized_force",), lambda of, v: of["generalized_force"]),
+    Motion.residual: (("residual",), lambda of, v: of["residual"]),
+    Motion.energy: (_OF_ENERGY, lambda of, v: np.einsum("si,si->s", of["momentum"], v) - of["lagrangian"]),
+}
 
 
 @eqx.filter_jit

@@ -117,11 +117,9 @@ class Motion(eqx.Module):
         return jacobian @ _linear.factorize(augmented).solve_columns(jacobian.T)
 
     def rank_lost(self, start: tuple, end: tuple) -> Flag:
-        """True if fewer constraints are independent at `end` than at `start`, both (q, q̇, t, params).
-
-        Counted are the independent rows of S = G M⁻¹ Gᵀ, with every row of G in units of its length at the start: a
-        gradient that fades away on the way is lost as well.
-        """
+        """True if fewer constraints are independent at `end` than at `start`, both (q, q̇, t, params)."""
+        # Counted are the independent rows of S = G M⁻¹ Gᵀ, with every row of G in units of its length at the start: a
+        # gradient that fades away on the way is lost as well.
         first, last = (self.schur_complement(*jax.lax.stop_gradient(state)) for state in (start, end))
         diagonal = jnp.diagonal(first)
         scale = jax.lax.rsqrt(jnp.where(diagonal > 0, diagonal, 1))

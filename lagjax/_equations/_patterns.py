@@ -49,11 +49,9 @@ def jacobian_pattern(function: Callable, shapes: tuple, by: int) -> csr_array | 
 
 
 def gradient_memory(function: Callable, shapes: tuple) -> int:
-    """The bytes that the gradient of f by its first two arguments takes besides its result.
-
-    It is about twice the largest array among its operations: 1.7 times for the distances of all pairs. Where that does
-    not fit into memory XLA is asked, which compiles it in less than a second and may never form that array.
-    """
+    """The bytes that the gradient of f by its first two arguments takes besides its result."""
+    # It is about twice the largest array among its operations: 1.7 times for the distances of all pairs. Where that
+    # does not fit into memory XLA is asked, which compiles it in less than a second and may never form that array.
     gradient = jax.grad(function, argnums=(0, 1))
     needed = 2 * _largest_array(jax.make_jaxpr(gradient)(*shapes).jaxpr)
     if lack_of_memory(needed) is None:

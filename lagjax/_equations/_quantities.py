@@ -220,12 +220,10 @@ _SHORTER = 0.97
 
 
 def _derivatives(state: _ScalarState, lagrangian: _Taped, rates: dict) -> tuple[Ids, Ids, Ids, Ids, Ids]:
-    """∂L/∂q, p, ∂L/∂t, M, and ∂L/∂q − (∂p/∂q) q̇ − ∂p/∂t, in the form that takes fewer operations.
-
-    In a kinetic energy of rotations the terms of ∂L/∂q cancel with those of (∂p/∂q) q̇. Where the cotangents of equal
-    scalars are added up at once, that is not seen: where cos q is in the kinetic and in the potential energy, one term
-    cancels and the other does not. For forces between many bodies to add them up at once is a quarter shorter.
-    """
+    """∂L/∂q, p, ∂L/∂t, M, and ∂L/∂q − (∂p/∂q) q̇ − ∂p/∂t, in the form that takes fewer operations."""
+    # In a kinetic energy of rotations the terms of ∂L/∂q cancel with those of (∂p/∂q) q̇. Where the cotangents of equal
+    # scalars are added up at once, that is not seen: where cos q is in the kinetic and in the potential energy, one
+    # term cancels and the other does not. For forces between many bodies to add them up at once is a quarter shorter.
     forms = []
     for together in (True, False) if len(lagrangian.tape.nodes) <= _APART else (True,):
         by_q, momentum, by_t = state.gradient(lagrangian, "q", "qdot", "t", together=together)

@@ -355,11 +355,9 @@ class _Elimination:
 
 
 def _steps(size: int, terms: list[set[int]], energy: set[tuple[int, int]]) -> Iterator[_Step]:
-    """The order of elimination: of what may be eliminated, that which meets the fewest others.
-
-    Ends early at a coordinate without energy, whose pivot would be zero, or with none but that of products of different
-    velocities: nothing then tells how large its pivot should be.
-    """
+    """The order of elimination: of what may be eliminated, that which meets the fewest others."""
+    # Ends early at a coordinate without energy, whose pivot would be zero, or with none but that of products of
+    # different velocities: nothing then tells how large its pivot should be.
     others: list[set[int]] = [set() for _ in range(size + len(terms))]
     moving = {u for u, v in energy if u == v}
     sized = set(moving)

@@ -240,18 +240,10 @@ def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, 
         stats["num_wasted_lane_steps"] = solution.idle
     fixed_steps = isinstance(engine, Diffrax) and engine.dt is not None
     return Trajectory.from_fields(
-        ts=ts,
-        q=q,
-        qdot=qdot,
-        result=result_from(result),
-        end=State(solution.t_end, restore(q_end), restore(qdot_end)),
-        stats=stats,
-        system=problem.system,
-        params=params,
-        params_axes=params_axes,
+        ts=ts, q=q, qdot=qdot, result=result_from(result), end=State(solution.t_end, restore(q_end), restore(qdot_end)),
+        stats=stats, system=problem.system, params=params, params_axes=params_axes, engine=type(engine).__name__,
         tolerances=None if fixed_steps else engine.tolerances(problem, y0),
-        engine=type(engine).__name__,
-    )
+    )  # fmt: skip
 
 
 def _refuse_options(scene: str, options: dict[str, Any]) -> None:

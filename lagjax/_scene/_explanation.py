@@ -96,12 +96,10 @@ class Explanation:
         rows = [("coordinates", f"{len(self.coordinates)}: {_list_names(self.coordinates, counts=False)}")]
         if self.mass_matrix is not None:
             answers = {True: "yes", False: "no", None: "not known"}
+            read = _list_names(self.mass_matrix_depends_on or ()) or "none"
             rows += [
                 ("cyclic", "not known" if self.cyclic is None else _list_names(self.cyclic) or "none"),
-                (
-                    "mass matrix",
-                    f"{self.mass_matrix}; depends on {_list_names(self.mass_matrix_depends_on or ()) or 'none'}",
-                ),
+                ("mass matrix", f"{self.mass_matrix}; depends on {read}"),
                 ("velocity terms", answers[self.velocity_terms]),
                 ("explicit time", answers[self.explicit_time]),
                 ("energy conserved", answers[self.energy_conserved]),

@@ -18,17 +18,7 @@ from jaxtyping import Array, Float
 
 from lagjax._engine import Problem
 from lagjax._engine.taylor import lowered_motion
-from lagjax._equations import (
-    SADDLE,
-    Constraints,
-    CoupledForces,
-    Motion,
-    Sample,
-    derivation_of,
-    numbers_of,
-    schur_complements,
-    solve_saddle,
-)
+from lagjax._equations import OF_QUANTITIES, Constraints, CoupledForces, Motion, Sample, derivation_of
 from lagjax._interface import Function, Layout, ValueNotKnown, accept, as_arrays, is_concrete, present, require_number
 from lagjax._primitives import SINGLE, compute_in_doubles
 from lagjax._program import Unlowerable, lack_of_memory
@@ -332,15 +322,10 @@ class System(eqx.Module):
             return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(tree)]).astype(layout.dtype)
 
         forces = flatten_function(self.forces, layout.flatten)
-        motion = Motion(
-            lagrangian=flatten_function(self.lagrangian, lambda value: value),
-            forces=None if self.reads_multipliers else forces,
-            dissipation=flatten_function(self.dissipation, lambda value: value),
-            constraints=Constraints(
-                flatten_function(self.constraints, concatenate),
-                flatten_function(self.velocity_constraints, concatenate),
-            ),
-        )
+        lagrangian, dissipation = (flatten_function(f, lambda x: x) for f in (self.lagrangian, self.dissipation))
+        of_constraints = (flatten_function(f, concatenate) for f in (self.constraints, self.velocity_constraints))
+        given = None if self.reads_multipliers else forces
+        motion = Motion(lagrangian, given, dissipation, Constraints(*of_constraints))
         if not self.reads_multipliers:
             return motion
 
@@ -420,14 +405,14 @@ class System(eqx.Module):
     def _evaluate_program(self, quantity: Callable, layout: Layout, q, qdot, t, params) -> np.ndarray | None:
         """A quantity at a state of numbers, from the scene's programs in NumPy; None where traced, or without these."""
         concrete = all(is_concrete(leaf) for leaf in jax.tree.leaves((self, q, qdot, t, params)))
-        if self.path == "array" or quantity not in _OF_QUANTITIES or not concrete:
+        if self.path == "array" or quantity not in OF_QUANTITIES or not concrete:
             return None
-        names, function = _OF_QUANTITIES[quantity]
+        names, function = OF_QUANTITIES[quantity]
         q, qdot = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(x)])[None] for x in (q, qdot))
         q, qdot, t = (np.asarray(x, layout.dtype) for x in (q, qdot, t))
-        numbers = numbers_of(eqx.filter(params, eqx.is_array_like))
         try:
-            values = Sample(derivation_of(self, layout, params), q, qdot, t, numbers).quantities(*names)
+            sample = Sample.from_scene(self, layout, q, qdot, t, params)._replace(scene=None)
+            values = sample.quantities(*names)
         except Unlowerable:
             return None
         with np.errstate(all="ignore"):
@@ -554,21 +539,6 @@ def replace_functions(system: System, functions: dict[str, Function | None], pat
     for name, value in (functions | {"path": path or system.path, "impacts": system.impacts}).items():
         object.__setattr__(other, name, value)
     return other
-
-
-_OF_SCHUR, _OF_ENERGY = ("mass_matrix", "jacobian"), ("lagrangian", "momentum")
-# The functions of `Motion` in terms of `Motion.quantities` and q̇ (S, n) at S states: which of them, and the formula.
-_OF_QUANTITIES: dict[Callable, tuple[tuple[str, ...], Callable]] = {
-    Motion.acceleration: (SADDLE, lambda of, v: solve_saddle(of)[0]),
-    Motion.multipliers: (SADDLE, lambda of, v: solve_saddle(of)[1]),
-    Motion.constraint_force: (SADDLE, lambda of, v: np.einsum("skn,sk->sn", of["jacobian"], solve_saddle(of)[1])),
-    Motion.schur_complement: (_OF_SCHUR, lambda of, v: schur_complements(of["mass_matrix"], of["jacobian"])),
-    Motion.mass_matrix: (("mass_matrix",), lambda of, v: of["mass_matrix"]),
-    Motion.momentum: (("momentum",), lambda of, v: of["momentum"]),
-    Motion.generalized_force: (("generalized_force",), lambda of, v: of["generalized_force"]),
-    Motion.residual: (("residual",), lambda of, v: of["residual"]),
-    Motion.energy: (_OF_ENERGY, lambda of, v: np.einsum("si,si->s", of["momentum"], v) - of["lagrangian"]),
-}
 
 
 @eqx.filter_jit

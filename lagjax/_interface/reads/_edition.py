@@ -98,11 +98,9 @@ class Edition:
 
     @contextlib.contextmanager
     def traced(self) -> Iterator[None]:
-        """While the function runs. Raises `ValueError` where it is another edition by now.
-
-        What the function itself changes while it runs (it counts its calls, it remembers results) is found out here,
-        and is not watched any more.
-        """
+        """While the function runs. Raises `ValueError` where it is another edition by now."""
+        # What the function itself changes while it runs (it counts its calls, it remembers results) is found out here,
+        # and is not watched any more.
         if getattr(_inside, "is_traced", False):  # what it calls is part of what was read
             yield
             return

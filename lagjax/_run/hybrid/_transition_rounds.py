@@ -401,12 +401,10 @@ def _put(x: jax.Array, places, values: jax.Array) -> jax.Array:
 
 
 def _pile_up(times, end) -> jax.Array:
-    """True if the times of a spent budget of transitions run geometrically to a limit before `end`.
-
-    Aitken's extrapolation of the last times, taken far enough apart that a pattern of two, three or six transitions (a
-    flight and a contact, say) repeats in between: three intervals whose two ratios agree, and are below one. Or the
-    time does not move any more.
-    """
+    """True if the times of a spent budget of transitions run geometrically to a limit before `end`."""
+    # Aitken's extrapolation of the last times, taken far enough apart that a pattern of two, three or six transitions
+    # (a flight and a contact, say) repeats in between: three intervals whose two ratios agree, and are below one. Or
+    # the time does not move any more.
     pattern = next((k for k in (6, 2, 1) if 3 * k < times.size), None)
     if pattern is None:
         return jnp.asarray(False)  # too few to tell

@@ -93,10 +93,8 @@ def _scene_findings(system, q, qdot, t, params) -> tuple[list[Finding], str]:
     if layout.size > LARGEST_DENSE and derivation_of(system, layout, params).structure is None:
         system = replace_functions(system, {role: getattr(system, role) for role in ROLES}, "array")
     scene = CheckedScene.from_state(system, layout, q, qdot, t, params)
-    reported = _derivative_checks.findings(scene)
-    reported += _dissipation(scene)
-    reported += _constraint_checks.findings(scene) + _contact_checks.findings(scene)
-    reported += _mass.findings(scene)
+    reported = _derivative_checks.findings(scene) + _dissipation(scene) + _constraint_checks.findings(scene)
+    reported += _contact_checks.findings(scene) + _mass.findings(scene)
     if scene.is_large:
         reported += [] if any(finding.level == "error" for finding in reported) else _acceleration(scene)
         return [*reported, *_time(scene)], (

@@ -126,14 +126,12 @@ def _finding(jump: Discontinuity, scene: CheckedScene) -> Finding:
     where = "at this state" if here else f"{jump.distance:.3g} away along {jump.direction}"
     of_l, refusal = jump.what in ("L", "the momentum"), derivation.kick_refusal
     serious, consequence = of_l and (refusal is not None or not derivation.kicks), OF_FORCE
-    if serious:
+    if serious and refusal is not None:
+        consequence = f"{refusal[0].upper()}{refusal[1:]}."
+    elif serious:
         consequence = (
-            f"{refusal[0].upper()}{refusal[1:]}."
-            if refusal is not None
-            else (
-                "No force shows it, and diffrax goes through it: smooth it, 0.5 * (1 + jnp.tanh(x / w)) for x > 0, "
-                "or make two modes of it with a Transition for lagjax.simulate_hybrid."
-            )
+            "No force shows it, and diffrax goes through it: smooth it, 0.5 * (1 + jnp.tanh(x / w)) for x > 0, or make "
+            "two modes of it with a Transition for lagjax.simulate_hybrid."
         )
     elif of_l:
         consequence = OF_L

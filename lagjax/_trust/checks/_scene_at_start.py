@@ -10,17 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._equations import (
-    Derivation,
-    Motion,
-    Sample,
-    Scales,
-    augment,
-    derivation_of,
-    is_lowered,
-    numbers_of,
-    saddle_many,
-)
+from lagjax._equations import Derivation, Sample, Scales, augment, derivation_of, is_lowered, numbers_of, saddle_many
 from lagjax._interface import Layout, as_arrays
 from lagjax._program import Unlowerable
 from lagjax._scene import System
@@ -59,7 +49,7 @@ class CheckedScene(NamedTuple):
         return self.sample.derivation
 
     @property
-    def motion(self) -> Motion:
+    def motion(self):
         return self.derivation.motion
 
     @property
@@ -182,13 +172,13 @@ class Measured(NamedTuple):
     """The measurements. A first axis of states stands for the state itself, then others in q, then others in q̇."""
 
     by_q: Any  # ∂L/∂q, (n,)
-    momentum: Any  # (states, n)
-    mass: Any  # (states, n, n)
     force: Any  # F = M q̈ − Gᵀλ, (n,)
     extra: Any  # the user's forces, (n,)
     by_v_of_dissipation: Any  # ∂D/∂q̇, (n,)
-    jacobian: Any  # G, (states, m, n)
     gamma: Any  # γ of G q̈ = γ, (m,)
+    momentum: Any  # (states, n)
+    mass: Any  # (states, n, n)
+    jacobian: Any  # G, (states, m, n)
     velocity: Any  # (states, n)
     power: Any  # Σ q̇ᵢ ∂D/∂q̇ᵢ, which D takes out of the motion, and Σ |q̇ᵢ ∂D/∂q̇ᵢ|, (states, 2)
     here: Any  # the outputs L, p, D (if there is one), f and a at the state, (outputs,)
@@ -261,9 +251,8 @@ def _offsets(sizes: np.ndarray, scales: Scales, dtype) -> np.ndarray:
 
 
 _COMPARED = ("lagrangian", "momentum", "dissipation", "residual")
-_NEARBY_QUANTITIES = (
-    "mass_matrix", "jacobian", "momentum", "lagrangian_by_q", "force", "given_force", "gamma", "dissipation_by_qdot",
-)  # fmt: skip
+_AT_STATE = ("lagrangian_by_q", "force", "given_force", "dissipation_by_qdot", "gamma")
+_MATRICES = ("mass_matrix", "jacobian")
 _PRODUCTS = ("mass_by_some", "jacobian_by_some", "acceleration")  # in the place of M and G
 _DERIVED = ("lagrangian_by_q", "momentum", "mass_matrix", "given_force", "dissipation_by_qdot", "force", "jacobian")
 
@@ -273,31 +262,17 @@ def _measure(here: Sample, offsets: np.ndarray) -> Measured:
     n = here.derivation.layout.size
     velocity = here.qdot + offsets[:, n:]
     near = here._replace(q=here.q + offsets[:, :n], qdot=velocity)
-    names, acceleration, power = _NEARBY_QUANTITIES, None, np.zeros((len(offsets), 2))
+    acceleration, power = None, np.zeros((len(offsets), 2))
+    of = near.quantities("momentum", *_AT_STATE, *(_MATRICES if here.derivation.structure is None else _PRODUCTS))
     if here.derivation.structure is not None:
-        of = near.quantities(*names[2:], *_PRODUCTS)
         acceleration = of["acceleration"][0]
         of |= {"mass_matrix": of["mass_by_some"][..., None], "jacobian": of["jacobian_by_some"][..., None]}
-    else:
-        of = near.quantities(*names)
     if here.derivation.motion.dissipation is not None:
         damping = near._replace(q=here.q + 0 * offsets[:, :n]).quantities("dissipation_by_qdot")
         terms = damping["dissipation_by_qdot"] * velocity
         power = np.stack([terms.sum(axis=1), np.abs(terms).sum(axis=1)], axis=1)
-    return Measured(
-        by_q=of["lagrangian_by_q"][0],
-        momentum=of["momentum"],
-        mass=of["mass_matrix"],
-        force=of["force"][0],
-        extra=of["given_force"][0],
-        by_v_of_dissipation=of["dissipation_by_qdot"][0],
-        jacobian=of["jacobian"],
-        gamma=of["gamma"][0],
-        velocity=velocity,
-        power=power,
-        here=here.flat(*_COMPARED)[0],
-        acceleration=acceleration,
-    )
+    at_state, near_it = (of[name][0] for name in _AT_STATE), (of[name] for name in ("momentum", *_MATRICES))
+    return Measured._make([*at_state, *near_it, velocity, power, here.flat(*_COMPARED)[0], acceleration])
 
 
 @eqx.filter_jit

@@ -103,12 +103,10 @@ class Law(NamedTuple):
         return max(1, _CHUNK // sum(self.derivation.count(name) for name in names))
 
     def _finite(self, sample: Sample) -> np.ndarray:
-        """True if M, F, G and γ have finite derivatives by all inputs at S states, (S,).
-
-        One transposed derivative of the sum of them all is taken, which a single NaN makes NaN. The program's own
-        operations answer first. Where they say no, the program may have written a power as a root, or the user may have
-        given a rule for a derivative: there the derivative of the functions themselves decides.
-        """
+        """True if M, F, G and γ have finite derivatives by all inputs at S states, (S,)."""
+        # One transposed derivative of the sum of them all is taken, which a single NaN makes NaN. The program's own
+        # operations answer first. Where they say no, the program may have written a power as a root, or the user may
+        # have given a rule for a derivative: there the derivative of the functions themselves decides.
         program = self.derivation.program(*SADDLE)
 
         def finite_at(part: Sample):
