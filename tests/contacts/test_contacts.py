@@ -405,6 +405,7 @@ def slender_rod(impacts):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 def test_an_impact_that_gains_energy_is_suspicious():
     """Kane's rods: in energies of the velocities on both sides. With Routh's construction none gains any."""
     inertia, count = np.array([1.0, 1.0, 0.02]), 24

@@ -72,6 +72,7 @@ def crank_alone(mu, end):
     return z, times[:-1]
 
 
+@pytest.mark.slow
 def test_a_slip_that_gaps_hold_turns():
     rod, turns, _ = rod_of(START, SPEED)
     start, ts = (jnp.array([START, rod]), jnp.array([SPEED, turns])), jnp.array([0.0, 3.0])
@@ -128,6 +129,7 @@ def test_a_straight_slip_in_space_has_its_derivatives_across_in_both_modes():
     assert float(jax.jacfwd(across)(0.0)) == pytest.approx(right, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_a_start_at_rest_that_slides_at_once_has_no_derivative_by_its_slip():
     """Friction turns with the least slip: the ends of starts uphill and downhill differ in their slopes."""
     block = lagjax.System(

@@ -87,6 +87,7 @@ def test_bead_has_first_and_second_derivatives_by_its_friction():
     np.testing.assert_allclose(jax.vmap(angle)(frictions), [angle(x) for x in frictions], atol=1e-14)
 
 
+@pytest.mark.slow
 def test_a_friction_that_is_closed_over_has_the_same_slope():
     def end(friction):
         def forces(q, v, multipliers):

@@ -723,6 +723,7 @@ def test_pytrees_and_quantities_of_like_constraints():
 # ---- a motion in pieces ---------------------------------------------------------------------------------------------
 
 
+@pytest.mark.slow
 def test_a_motion_goes_on_in_a_scan_of_short_ones_from_the_mode_where_it_is():
     # A free particle that is reflected at q = 1, into another mode, and at q = 0 back: |q| is the way to the next even
     # number.
