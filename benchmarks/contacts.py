@@ -332,6 +332,9 @@ def main() -> None:
             print(
                 json.dumps({k: float(f"{v:.3g}") if isinstance(v, float) else v for k, v in line.items()}), flush=True
             )
+        if not found:
+            print(f"{part}: no scene begins with {options.begins!r}", file=sys.stderr)
+            continue
         names = [line["scene"] for line in found]
         others = [line for line in record.get(part, {}).get("rows", []) if line["scene"] not in names]
         record[part] = {"circumstances": _report.circumstances(), "rows": [*others, *found]}
