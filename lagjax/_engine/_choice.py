@@ -44,10 +44,7 @@ _MACHINE_CODE = MachineCode()
 
 
 def choose(problem: Problem, requested: AbstractEngine | None = None, members: int = 1) -> Choice:
-    """The engine for a problem, or for `members` like it.
-
-    Raises `ValueError` where the `requested` one, or without it every one, refuses it.
-    """
+    """The engine for one or `members` problems. Raises `ValueError` where the `requested` one, or all, refuse them."""
     if isinstance(requested, Diffrax):
         engine, refusal = requested, "diffrax was asked for"
     else:

@@ -506,10 +506,7 @@ class BorderControl:
         return frame.finish()
 
     def _go_on(self, frame: Frame, going: Value) -> None:
-        """Past borders, and entries of tables.
-
-        A motion that slides along another border, or touches it, does so no more where that jumps.
-        """
+        """Go past borders and knots; the motion slides along no border that jumps there, and touches none such."""
         shaken, code = self.borders.shaken, frame.code
         line = eliminate_dead_code(self.borders.program.line, [self.borders.switches[j] for j in shaken])
         before = self.motion.evaluate_now(frame, line) if shaken else []
@@ -624,10 +621,7 @@ class BorderControl:
         return j in self.kicks_in_time and self.borders.kinds[j] == _borders.SIGN
 
     def _look_at_end(self, frame: Frame, degree: Value, h: Value) -> None:
-        """The step ends at an instant at which L jumps also where that is the end of the motion, to rounding.
-
-        The velocities are those behind it there, in the order of time.
-        """
+        """A step ends, to rounding, where L jumps at the end of the motion: with the velocities behind, in time."""
         code, one = frame.code, frame.constant(1.0)
         ends = (frame["last"] > 0.0) & (frame["forward"] > 0.0) & code.compare("!=", h, 0.0)
         for g, guard in enumerate(self.guards):

@@ -68,10 +68,7 @@ EXACT = 1  # one vector of doubles
 
 
 class Memory:
-    """The places of the `fields` of a thread.
-
-    `width` is the lanes of a vector. A layout `beside` another one has vectors of another width in the same memory.
-    """
+    """The places of a thread's `fields`, vectors of `width` lanes; one `beside` another shares its memory."""
 
     def __init__(self, width: int, fields: Fields, beside: "Memory | None" = None):
         self.width, self._fields, self._offsets = width, {}, {}

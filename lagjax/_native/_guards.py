@@ -47,10 +47,7 @@ class Released(NamedTuple):
 
 
 class Watched(NamedTuple):
-    """A program whose last outputs are the rounding of guards, and guards; the series of its motion and of the guards.
-
-    And its borders, or None.
-    """
+    """A program with guards, and how rounding moves them, as its last outputs; the series of both, and its borders."""
 
     program: Recurrent
     series: Series

@@ -136,10 +136,7 @@ class Integrator:
     # ---- rounds ----
 
     def _run(self) -> None:
-        """`run(job, memory, lanes, idle, rounds)`: this many rounds, or until the batch is done.
-
-        Returns 1 if there is more to do. `idle` counts the lanes without a member.
-        """
+        """`run(job, memory, lanes, idle, rounds)`: 1 if there is more to do after these. `idle` counts idle lanes."""
         frame = self.motion.function("run", POINTER, INTEGER, result=INTEGER, public=True)
         code, (idle, rounds) = frame.code, frame.arguments
         order, borders = frame.job("order"), self.borders

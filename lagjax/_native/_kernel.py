@@ -61,10 +61,7 @@ class Outcome(NamedTuple):
 
 
 class StepRecord(NamedTuple):
-    """The steps of N members for a derivative: member k has `counts[k]` rows of `table` from `first[k]` on.
-
-    The series of the steps are of this `order`.
-    """
+    """The steps of N members, by series of this `order`: `counts[k]` rows of `table` from `first[k]` on of member k."""
 
     table: np.ndarray
     first: np.ndarray
@@ -73,10 +70,7 @@ class StepRecord(NamedTuple):
 
 
 class Begun(NamedTuple):
-    """A run as a handler left it: its results (`_handler.Handler`), some of which may not be written yet.
-
-    Arrays of NumPy, or of JAX in what XLA compiles.
-    """
+    """The results of a run as a handler left it (`_handler.Handler`), some not yet written; arrays of NumPy or JAX."""
 
     path: Any
     y_end: Any
@@ -307,10 +301,7 @@ class Kernel:
 
     @property
     def rounds_of_rerun(self) -> int:
-        """Rounds of a motion that a handler runs again for a derivative; 0 where that would take too long.
-
-        Or where more is written down of a step than its state: that of a piecewise program.
-        """
+        """Rounds of a motion that a handler runs again for a derivative; 0 of a long or a piecewise one."""
         if self.borders is not None and self.borders.switches:
             return 0
         rounds = self._rounds // _RERUNS_PER_SLICE

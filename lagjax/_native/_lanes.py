@@ -26,10 +26,7 @@ class Lines:
     def run(
         self, frame: Frame, line: StraightLine, *inputs: "Sequence[Value] | Vectors", to: "Vectors | None" = None
     ) -> Numbers:
-        """The outputs of a program, of which these are the inputs, one after the other; a bool is 1 or 0.
-
-        The last outputs go `to` some other place as well.
-        """
+        """The outputs of a program of all these inputs; a bool is 1 or 0. The last go `to` some other place, too."""
         parts = [(values, i) for values in inputs for i in range(len(values))]
 
         def read(position):
@@ -79,10 +76,7 @@ class Lines:
 def emit(
     code: Code, line: StraightLine, inputs: Callable[[int], Value], sincos: Code | None, look_up: Callable | None
 ) -> list[Value]:
-    """The outputs of a straight line; `inputs(i)` is its i-th input, as a vector. Integers are doubles here.
-
-    `look_up(op, attribute, x)` reads tables, where the line does.
-    """
+    """The outputs of a line, whose input i is `inputs(i)`, a vector; integers are doubles. `look_up` reads tables."""
     values: list[Value] = []
     turns: dict[int, tuple[Value, Value]] = {}
     for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):

@@ -25,10 +25,7 @@ class Projection(NamedTuple):
 
 
 class Chosen(NamedTuple):
-    """The numbers of a member that are parameters of a motion: those at `positions`, `of` this many.
-
-    The others are only looked up (`_table_reads`).
-    """
+    """The numbers of a member that a motion computes with, those at `positions` `of` so many; others are looked up."""
 
     positions: tuple[int, ...]
     of: int

@@ -70,10 +70,7 @@ class Schedule(NamedTuple):
 
 
 def schedule(line: StraightLine, stored: int) -> Schedule:
-    """The order of the operations that the outputs of a program need, and the slots of their results.
-
-    The last outputs, this many, are `stored` somewhere else as soon as they are there.
-    """
+    """The order of operations that outputs need, and slots of results; the last outputs are `stored` elsewhere."""
     nodes, uses = line.nodes, count_uses(line.nodes, line.outputs)
     kinds: _Kinds = {}
     operations = _join_pairs(_operations(line, uses, kinds), uses, kinds)

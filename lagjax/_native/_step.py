@@ -153,10 +153,7 @@ class StepControl:
     # ---- whether its series holds ----
 
     def _defect(self) -> Code:
-        """`(order, place)`: h ‖P″ − q̈(P, P′)‖ / (p+1) at that place of the step, into `defect` if larger.
-
-        The increment P − y stays in memory.
-        """
+        """`(order, place)`: h ‖P″ − q̈(P, P′)‖ / (p+1) there, into `defect` if larger, and P − y into `increment`."""
         motion, n = self.motion, self.motion.n
         frame = motion.function("defect", INTEGER, DOUBLE)
         code, (order, place), h = frame.code, frame.arguments, frame["h"]

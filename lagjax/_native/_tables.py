@@ -28,10 +28,7 @@ WORD = ir.IntType(32)  # an entry of a table: a kind, or a distance in the memor
 
 
 class Tables:
-    """The form of large kernels; `Lines` is that of small ones, with the same methods.
-
-    `function(name, *kinds)` makes a function of the kernel, with its frame.
-    """
+    """The form of large kernels, with the methods of `Lines`; `function(name, *kinds)` makes a frame of the kernel."""
 
     def __init__(self, function, sincos: Code, look_up: Callable):
         self._sincos, self._look_up = sincos, look_up

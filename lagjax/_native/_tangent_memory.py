@@ -46,10 +46,7 @@ class Directions:
     # ---- numbers of the motion, in a function of its tangents ----
 
     def numbers_of(self, frame: Frame, name: str, count: int, place=lambda i: (i,), in_place: bool = False) -> Vectors:
-        """Vectors of the motion; where it has no lanes, the same number in every lane.
-
-        Those that are `in_place` lie where `place` says, which does not change.
-        """
+        """Vectors of the motion, in every lane where it has none; those `in_place` lie where `place` says for good."""
         motion, alike = frame.view(self.motion.layout), self.motion.width == self.lanes
 
         def read(i):

@@ -200,10 +200,7 @@ class TaylorSeries:
     # ---- along the step ----
 
     def increments(self, frame: Frame, order: Value, s: Value) -> tuple[Numbers, Numbers]:
-        """P(s) − y for every component, and P′(s) for the velocities, by Horner's scheme.
-
-        A few components at a time, so that none waits for the other.
-        """
+        """P(s) − y for every component, P′(s) for velocities, by Horner's scheme; a few at a time: none waits."""
         code, increments, slopes = frame.code, self.form.room(frame, self.states), self.form.room(frame, self.n)
         s = code.lanes_of(s)
         for some, velocities in self.form.strands(code, self.n):

@@ -18,10 +18,7 @@ SLICE = 0.03  # seconds, more or less: a tenth of what a hand at the keyboard no
 
 
 def run_in_slices(run: Callable[[int], int], stopped: Callable[[], bool], rounds: int) -> None:
-    """Call `run(rounds)` until it returns 0, or until `stopped()`; with as many rounds as take about a `SLICE`.
-
-    The first time with as many as are given here.
-    """
+    """Call `run(rounds)` until it returns 0 or `stopped()`: with these `rounds`, then as many as take a `SLICE`."""
     while not stopped():
         begin = time.perf_counter()
         if not run(rounds):

@@ -80,10 +80,7 @@ _PLACES = ("piece", "back", "slide", "on", "order", "rest", "gains", "of_table")
 
 @dataclass(frozen=True, eq=False)
 class Watch:
-    """A number that is followed, in a function under construction: row `g` of a `table` of constants.
-
-    Its memory is in the fields of the frame that have a row for each number of the table.
-    """
+    """A number that is followed: row `g` of a `table` of constants; its memory has a row in fields of the frame."""
 
     frame: Frame
     table: Any

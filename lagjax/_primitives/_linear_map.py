@@ -138,10 +138,7 @@ def zero_like(x) -> ad.Zero:
 
 
 def cotangent_of(argument, cotangent):
-    """The cotangent of an argument of a transpose; None of one whose value is known.
-
-    Of one that was shared it is the sum over the axes of length one.
-    """
+    """The cotangent of an argument of a transpose, summed over axes that it shares; None where its value is known."""
     if not ad.is_undefined_primal(argument):
         return None
     shape = argument.aval.shape

@@ -239,11 +239,8 @@ class Program:
     def append_inputs(self, count: int) -> "Program":
         """The program with `count` more floats after its inputs; it reads none of them."""
         more, other = jax.ShapeDtypeStruct((count,), jnp.result_type(float)), self.otherwise
-        return replace(
-            self,
-            shapes=(*self.shapes, more),
-            otherwise=None if other is None else functools.cache(lambda: other().append_inputs(count)),
-        )
+        otherwise = other and functools.cache(lambda: other().append_inputs(count))
+        return replace(self, shapes=(*self.shapes, more), otherwise=otherwise)
 
     def select_outputs(self, positions: Sequence[int]) -> "Program":
         line = eliminate_dead_code(self.line, [self.line.outputs[i] for i in positions])

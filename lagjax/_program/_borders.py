@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._program._differentiation import copy_nodes, gradient_in, pullback
-from lagjax._program._graph import Graph
+from lagjax._program._graph import Graph, find_ancestors
 from lagjax._program._kick import Jumping, Kick, Mechanics, kick_line
 from lagjax._program._look_ups import Located, Table
 from lagjax._program._operations import OPERATIONS
@@ -818,14 +818,7 @@ def _guards(kinds: Sequence[int], slides: Sequence[Slide]) -> tuple[Guard, ...]:
 
 def _below(line: StraightLine, roots: Sequence[int]) -> set[int]:
     """The nodes that some nodes depend on, and these."""
-    seen: set[int] = set()
-    stack = list(roots)
-    while stack:
-        i = stack.pop()
-        if i not in seen:
-            seen.add(i)
-            stack.extend(line.nodes[i][1])
-    return seen
+    return set(find_ancestors(line.nodes, roots))
 
 
 def inputs_below(line: StraightLine, roots: Sequence[int]) -> frozenset[int]:

@@ -66,7 +66,8 @@ class Derivatives:
     """
 
     def __init__(self, graph: Graph):
-        self.graph, self.operations, self.hides, self.asks = graph, 0, True, True
+        self.graph, self._number = graph, graph.number
+        self.operations, self.hides, self.asks = 0, True, True
 
     # ---- reverse mode ----
 
@@ -98,10 +99,7 @@ class Derivatives:
         return [results.get(i, self._number(0.0)) for i in by]
 
     def slopes(self, output: int, through: Iterable[int], by: Sequence[int]) -> list[int]:
-        """The derivatives of a node by others, as if these were independent.
-
-        `through` holds the nodes that depend on the others, in order, `output` the last of them.
-        """
+        """The derivatives of a node by others as if they were independent, `through` the nodes between, in order."""
         cotangents, ends = {output: self._number(1.0)}, set(by)
         for i in reversed(list(through)):
             if i in ends or (g := cotangents.pop(i, None)) is None:
@@ -234,9 +232,6 @@ class Derivatives:
         self.operations += 1
         return self.graph.apply(op, *operands, attribute=attribute)
 
-    def _number(self, x: float) -> int:
-        return self.graph.constant(x, "float")
-
     def _add(self, parts: dict[int, int], i: int, part: int) -> None:
         parts[i] = self._apply("add", parts[i], part) if i in parts else part
 
@@ -258,17 +253,12 @@ def pushforward(
     with np.errstate(all="ignore"):
         tangents = {i: placed.graph.input(place, "float") for i, place in places.items()}
         moved = placed.tangents(tangents, places, lambda table: table._replace(tangents=True))
-        zero = placed.graph.constant(0.0, "float")
+        zero = placed.graph.number(0.0)
         return placed.finish_line([moved.get(line.outputs[i], zero) for i in of], known, len(dtypes) + len(by))
 
 
 def pullback(line: StraightLine, dtypes: Sequence, by: Sequence[int], of: Sequence[int], known=()) -> StraightLine:
-    """The transpose of `pushforward`: from the inputs and the cotangents of the outputs `of` to those of the inputs
-    `by`.
-
-    `dtypes` has the type of every input of `line`. Its inputs come first, the cotangents after them, and after those
-    the values of the outputs `known`, which are not computed once more.
-    """
+    """The transpose of `pushforward`: its last inputs but those `known` are the cotangents of the outputs `of`."""
     return pullback_and_entries(line, dtypes, by, of, known)[0]
 
 
@@ -281,12 +271,10 @@ def pullback_and_entries(
     varies: Callable[[Table], bool] = lambda table: True,
     is_linear: bool = False,
 ) -> tuple[StraightLine, tuple[Table, ...]]:
-    """`pullback`, and the cotangents of the entries of tables that are not among the inputs `by`.
+    """`pullback`, and the cotangents of the entries of tables that are not among the inputs `by`, where these `varies`.
 
-    `is_linear` says that the line is in these: it is one of tangents.
-
-    For each of the tables two outputs come behind those of the inputs: the index of an entry, and its cotangent. Only
-    entries of tables for which `varies` is true have cotangents.
+    For each of the tables two outputs come behind those of the inputs: the index of an entry, and its cotangent.
+    `is_linear` says that the line is one of tangents, linear in the inputs `by`.
     """
     placed, tables = _PlacedLine.from_line(line, dtypes), []
     placed.hides = not is_linear
@@ -325,17 +313,15 @@ def with_tangents(
         for direction, table in zip(directions, tables or [None] * len(directions), strict=True):
             tangents = {i: place + INPUTS for i, place in direction.items() if kinds[i] == "float"}
             moved.append(placed.tangents(tangents, direction, table))
-        zero = graph.constant(0.0, "float")
-        results = []
-        for output, direction in of:
-            node = line.outputs[output]
-            results.append(placed.nodes[node] if direction is None else moved[direction].get(node, zero))
+        zero = graph.number(0.0)
+        nodes = ((line.outputs[output], direction) for output, direction in of)
+        results = [placed.nodes[i] if d is None else moved[d].get(i, zero) for i, d in nodes]
         return eliminate_dead_code(*sink_negations(*factor(graph, results)))
 
 
 def gradient_in(graph: Graph, line: StraightLine, nodes: list[int], node: int, by: Sequence[int]) -> list[int]:
     """The derivatives of one node of a line by the inputs `by`, as nodes of the graph in which the line is `nodes`."""
-    return _PlacedLine(graph, line, nodes).cotangents({node: graph.constant(1.0, "float")}, by)
+    return _PlacedLine(graph, line, nodes).cotangents({node: graph.number(1.0)}, by)
 
 
 def tangents_in(

@@ -78,8 +78,7 @@ def emit_rows(line: StraightLine, rows: Rows) -> tuple:
 def emit_look_up(op: str, attribute, entries: Callable, precision, x) -> jax.Array:
     """An entry of a table, or the piece of one that x is on; `entries(table)` has shape (…, count)."""
     table = table_of(attribute)
-    known = table.numbers is not None
-    values = jnp.asarray(table.entries if known else entries(table)).astype(precision)
+    values = jnp.asarray(entries(table) if table.numbers is None else table.entries).astype(precision)
     if op == "take":
         x = jnp.clip(jnp.where(jnp.isnan(x), 0, x), 0, table.count - 1).astype(int)
         return jnp.vectorize(lambda of, i: jnp.asarray(of)[i], signature="(k),()->()")(values, x)

@@ -221,6 +221,9 @@ class Graph:
             return node
         return self._append(key, ("constant", (), value), kind)
 
+    def number(self, x: float) -> int:
+        return self.constant(x, "float")
+
     def find(self, op: str, *operands: int) -> int | None:
         return self._ids.get((op, operands, None))
 

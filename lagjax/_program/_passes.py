@@ -108,7 +108,7 @@ def _negative(graph, i) -> int | None:
     if op in ("mul", "div"):
         for k, operand in enumerate(operands):
             if (value := graph.value(operand)) is not None and graph.kinds[i] == "float":
-                opposite = graph.constant(-value, "float")
+                opposite = graph.number(-value)
                 return graph.node(op, *(opposite if k == j else x for j, x in enumerate(operands)))
     return None
 

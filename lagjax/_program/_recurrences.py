@@ -74,14 +74,14 @@ def select(r, i, operands, of):
         number = r.zeroth_order.value(other)
         if number is not None and math.isnan(number):  # a guard: NaN shows at order zero
             return of[1:][branch == yes]
-    zero = r.order_recursion.constant(0.0, "float")
+    zero = r.order_recursion.number(0.0)
     return choose(r, predicate, *(zero if c is None else c for c in of[1:]))
 
 
 def choose(r, predicate: int, no: int, yes: int) -> int:
     """`yes` where the predicate, a node of the program, holds at order zero, else `no`."""
     flag = r.zeroth_order.apply("select", predicate, r.number(0.0), r.number(1.0))
-    holds = r.order_recursion.apply("gt", r.value(flag), r.order_recursion.constant(0.5, "float"))
+    holds = r.order_recursion.apply("gt", r.value(flag), r.order_recursion.number(0.5))
     return r.order_recursion.apply("select", holds, no, yes)
 
 
@@ -95,7 +95,7 @@ def extremum(comparison: str) -> Callable:
     """The coefficient of the operand that is larger (`gt`) or smaller (`lt`) at order zero."""
 
     def rule(r, i, operands, of):
-        zero = r.order_recursion.constant(0.0, "float")
+        zero = r.order_recursion.number(0.0)
         a, b = (zero if c is None else c for c in of)
         return choose(r, r.zeroth_order.apply(comparison, *operands), b, a)
 

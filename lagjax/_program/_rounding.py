@@ -17,11 +17,7 @@ def rounding(graph: Graph, line: StraightLine, nodes: Sequence[int], moving: int
     `nodes` are those of the line in the graph, to which the errors are added. What is exact leaves no error behind a
     slope that is infinite either, where that is said (`to_zero`).
     """
-    zero, errors = graph.constant(0.0, "float"), []
-
-    def number(x: float) -> int:
-        return graph.constant(x, "float")
-
+    zero, errors = graph.number(0.0), []
     for (op, operands, attribute), kind, node in zip(line.nodes, line.kinds, nodes, strict=True):
         if kind != "float" or op == "constant" or (op == "input" and attribute >= moving):
             errors.append(zero)
@@ -29,7 +25,7 @@ def rounding(graph: Graph, line: StraightLine, nodes: Sequence[int], moving: int
         error = zero if op != "input" and OPERATIONS[op].exact else graph.apply("abs", node)
         for i, rule in zip(operands, () if op == "input" else OPERATIONS[op].transpose(), strict=False):
             if rule is not None and errors[i] != zero:
-                slope = rule(graph.apply, number, number(1.0), node, *(nodes[j] for j in operands))
+                slope = rule(graph.apply, graph.number, graph.number(1.0), node, *(nodes[j] for j in operands))
                 part = graph.apply("mul", errors[i], graph.apply("abs", slope))
                 if to_zero and (OPERATIONS[op].steep or op == "div"):
                     part = graph.apply("select", graph.apply("eq", errors[i], zero), part, zero)

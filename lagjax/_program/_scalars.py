@@ -88,7 +88,7 @@ def replace_entries(x: Scalars, index, values) -> Scalars:
 
 def scatter(x: Scalars, index, size: int) -> Scalars:
     """A vector of `size` numbers, zero but for those of x at these places."""
-    zeros = np.full(size, x.expansion.graph.constant(0.0, "float"))
+    zeros = np.full(size, x.expansion.graph.number(0.0))
     return replace_entries(Scalars(x.expansion, zeros), index, x)
 
 

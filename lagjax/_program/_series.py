@@ -104,16 +104,13 @@ def series(program: Recurrent, size: int, moving: int, followed: Sequence[int] =
 
 
 class _Recurrences:
-    """Two graphs grow side by side.
-
-    `zeroth_order` holds the program and the derivatives g, `order_recursion` what is linear in the coefficients of
-    order k.
-    """
+    """Two growing graphs: the program with derivatives g, and what is linear in the coefficients of order k."""
 
     def __init__(self, program: Recurrent, size: int, moving: int, followed: tuple[int, ...]):
         self.size, self.moving, self.followed = size, moving, followed
         budget = _LARGEST * len(program.line.nodes) + 1000
         self.zeroth_order, self.order_recursion = Graph.from_line(program.line, budget), Graph(budget)
+        self.number = self.zeroth_order.number
         # What overflows where it no longer matters has no coefficients there: infinite ones would be no numbers.
         self.hides_growth = self.zeroth_order.hides_growth
         self.outputs = list(program.line.outputs)
@@ -151,7 +148,7 @@ class _Recurrences:
     def value(self, node: int) -> int:
         number = self.zeroth_order.value(node)
         if number is not None:
-            return self.order_recursion.constant(number, "float")
+            return self.order_recursion.number(number)
         if self.hides_growth and self.zeroth_order.grows(node):
             node = self.zeroth_order.finite_part(node)
         return self._input("value", node)
@@ -187,7 +184,7 @@ class _Recurrences:
         for i in sorted(missing):
             c = self._coefficient(i)
             if self.hides_growth and isinstance(c, int) and self.zeroth_order.grows(i):
-                c = choose(self, self.zeroth_order.is_huge(i), c, self.order_recursion.constant(0.0, "float"))
+                c = choose(self, self.zeroth_order.is_huge(i), c, self.order_recursion.number(0.0))
             self._coefficients[i] = c
 
     def _coefficient(self, i: int) -> "int | _Unknown | None":
@@ -222,14 +219,11 @@ class _Recurrences:
             term = apply("mul", c, self.value(g))
             if self.zeroth_order.value(g) is None:
                 term = apply("add", term, apply("mul", self.inverse_k, self.cauchy_product(u, g, by_order=True)))
-            if total is None:
-                total = term if sign == "add" else apply("neg", term)
-            else:
+            if total is not None:
                 total = apply(sign, total, term)
+            else:
+                total = term if sign == "add" else apply("neg", term)
         return total
-
-    def number(self, x: float) -> int:
-        return self.zeroth_order.constant(x, "float")
 
     # ---- a linear system: the coefficients of its solution, without those of its elimination ----
 
@@ -311,7 +305,7 @@ class _Recurrences:
         c = self.coefficient(node)
         if isinstance(c, _Unknown):
             raise Unlowerable(f"`{c.op}` has no Taylor series here")
-        return self.order_recursion.constant(0.0, "float") if c is None else c
+        return self.order_recursion.number(0.0) if c is None else c
 
     def _row_coefficient(self, node: "int | _Component", by_order: bool) -> int:
         c = self.solution[node.i] if isinstance(node, _Component) else self._output_coefficient(node)

@@ -11,10 +11,7 @@ import numpy as np
 
 
 def add(graph, op, a, b):
-    """x + 0 is x; like terms are collected, and two selections of which one is zero where the other is not.
-
-    Those are what the derivative of `where` consists of.
-    """
+    """x + 0 is x; like terms are collected; and two selections of which one is zero: the derivative of `where`."""
     if graph.value(a) == 0:
         return b
     if graph.value(b) == 0:
@@ -268,9 +265,8 @@ def inverse(graph, op, x):
         whole, one = _wholes(graph, operands[0], math.pi), graph.constant(1.0, "float")
         halves = graph.apply("floor", graph.scale(0.5, whole))
         parity = graph.apply("sub", whole, graph.scale(2.0, halves))
-        found = graph.apply(
-            "mul", graph.apply("sub", one, graph.scale(2.0, parity)), _rest(graph, operands[0], math.pi)
-        )
+        side = graph.apply("sub", one, graph.scale(2.0, parity))
+        found = graph.apply("mul", side, _rest(graph, operands[0], math.pi))
     else:
         return odd(graph, op, x) if op == "asin" else graph.node(op, x)
     if (of, op) in (("cos", "acos"), ("sin", "asin")):

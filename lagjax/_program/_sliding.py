@@ -100,9 +100,8 @@ def with_sliding(
         done = _SlidingForces(line, n, first, switches, slides, linear).build()
         if done is not None:
             return done
-    if len(slides) > MOST_COPIES or len(line.nodes) > LARGEST_COPIED:
-        return None
-    if any(slide.order > 1 or slide.parts for slide in slides):
+    is_large = len(slides) > MOST_COPIES or len(line.nodes) > LARGEST_COPIED
+    if is_large or any(slide.order > 1 or slide.parts for slide in slides):
         return None
     done = _SlidingForces(line, n, first, switches, slides, _solved_system(line.outputs[:n])).build()
     return done and done._replace(linear=None)
@@ -124,7 +123,8 @@ class _SlidingForces:
     def __init__(self, line, n, first, switches, slides, linear):
         self.line, self.n, self.slides, self.linear = line, n, slides, linear
         self.graph = Graph.from_line(line, _LARGEST)
-        self.f, self.zero, self.one = self.graph.apply, self.number(0.0), self.number(1.0)
+        self.f, self.number = self.graph.apply, self.graph.number
+        self.zero, self.one = self.number(0.0), self.number(1.0)
         self.pieces = [self.graph.input(first + slide.piece, "float") for slide in slides]
         self.rows = []
         for k, (slide, piece) in enumerate(zip(slides, self.pieces, strict=True)):
@@ -135,12 +135,13 @@ class _SlidingForces:
         flags = [self.graph.input(first + len(switches) + k, "float") for k in range(len(slides))]
         self.flags = [self.f("gt", flag, self.number(0.5)) for flag in flags]
 
-    def number(self, x: float) -> int:
-        return self.graph.constant(x, "float")
+    def where(self, condition: int, x: int) -> int:
+        """x where the condition holds, else zero."""
+        return self.f("select", condition, self.zero, x)
 
     def masked(self, k: int, x: int) -> int:
         """Zero where nothing slides along the border of row k."""
-        return self.f("select", self.flags[self.rows[k].slide], self.zero, x)
+        return self.where(self.flags[self.rows[k].slide], x)
 
     def build(self) -> Sliding | None:
         """The program; None where pieces act on more than the right side, or not each for itself."""
@@ -156,12 +157,10 @@ class _SlidingForces:
         all_pushed = [functools.reduce(lambda a, b: self.f("and", a, b), of) for of in self._group_rows(pushed)]
         pushed = [all_pushed[row.slide] for row in self.rows]
         # Borders that are not pushed onto are left, and act on nothing until then.
-        acts = [
-            {i: self.f("select", p, self.zero, c) for i, c in act.items()} for p, act in zip(pushed, acts, strict=True)
-        ]
-        normals = [[self.f("select", p, self.zero, d) for d in of] for p, of in zip(pushed, slopes, strict=True)]
+        acts = [{i: self.where(p, c) for i, c in act.items()} for p, act in zip(pushed, acts, strict=True)]
+        normals = [[self.where(p, d) for d in of] for p, of in zip(pushed, slopes, strict=True)]
         equations = self._equations(effects, pushed, slopes)
-        ends = [self.f("select", p, self.zero, rate) for p, rate in zip(pushed, rates, strict=True)]
+        ends = list(map(self.where, pushed, rates))
         missing = [
             self.f("sub", end, dot(self.graph, d, self.linear.z[: self.n]))
             for end, d in zip(ends, normals, strict=True)
@@ -210,10 +209,11 @@ class _SlidingForces:
             if not slide.parts:
                 continue
             rows = [m for m, row in enumerate(self.rows) if row.slide == k]
-            length = f("sqrt", dot(self.graph, [directions[m] for m in rows], [directions[m] for m in rows]))
+            along = [directions[m] for m in rows]
+            length = f("sqrt", dot(self.graph, along, along))
             length = f("select", f("gt", length, self.zero), self.one, length)
             sizes = [dot(self.graph, slopes[m], slopes[m]) for m in rows]
-            for numbers in ([f("div", directions[m], length) for m in rows], [self.rows[m].offset for m in rows]):
+            for numbers in ([f("div", x, length) for x in along], [self.rows[m].offset for m in rows]):
                 parts = [f("div", x, size) for x, size in zip(numbers, sizes, strict=True)]
                 results += [dot(self.graph, [slopes[m][i] for m in rows], parts) for i in range(self.n)]
         return results
@@ -243,19 +243,15 @@ class _SlidingForces:
         """The linear equations of μ; μ = 0 where there is nothing to do."""
         f, rows = self.f, []
         for k, row in enumerate(effects):
-            both = [
-                f("select", pushed[k], self.zero, f("select", p, self.zero, x))
-                for p, x in zip(pushed, row, strict=True)
-            ]
+            both = [self.where(pushed[k], self.where(p, x)) for p, x in zip(pushed, row, strict=True)]
             both[k] = f("select", pushed[k], self.one, row[k])
             rows.append(both)
-        soft = self._are_dependent(slopes)
-        whole = [list(row) for row in rows]
-        if soft:
+        whole = []
+        if self._are_dependent(slopes):
+            whole = [list(row) for row in rows]
             for k, row in enumerate(rows):
                 row[k] = f("mul", self.number(1 + SOFT), row[k])
-        lower = eliminate(self.graph, rows)
-        return _Equations(rows, lower, whole if soft else [])
+        return _Equations(rows, eliminate(self.graph, rows), whole)
 
     def _pushes_back(self, j: int, effects, pushed: Sequence[int], slopes, missing: Sequence[int]) -> int:
         """True where border j of positions pushes back what lies beside it; other borders may hold that there, too."""
@@ -267,7 +263,7 @@ class _SlidingForces:
         stays = pushed[j]
         for change in (self.number(2.0), self.zero):
             beside = [f("sub", x, f("mul", effects[k][j], change)) for k, x in enumerate(missing)]
-            mu = self._unknown(equations, [f("select", p, self.zero, x) for p, x in zip(without, beside, strict=True)])
+            mu = self._unknown(equations, list(map(self.where, without, beside)))
             for k in others:
                 held = f("lt", f("abs", f("add", mu[k], self.number(self.rows[k].below))), self.one)
                 stays = f("and", stays, f("or", f("not", pushed[k]), held))
@@ -392,12 +388,8 @@ class _SlidingForces:
     def _system(self, z, unknown, acts, slopes, rates, of_unknowns, pivots) -> LinearSystem:
         system, count = self.linear, len(self.linear.right)
         others = {(i, count + k): self.f("neg", c) for k, act in enumerate(acts) for i, c in act.items()}
-        others |= {
-            (count + k, i): d
-            for k, of_one in enumerate(slopes)
-            for i, d in enumerate(of_one)
-            if self.graph.value(d) != 0
-        }
+        entries = ((k, i, d) for k, of_one in enumerate(slopes) for i, d in enumerate(of_one))
+        others |= {(count + k, i): d for k, i, d in entries if self.graph.value(d) != 0}
         # What `solve` needs besides: the entries, and the elimination of the unknowns.
         own = [*others.values(), *(x for table in of_unknowns for row in table for x in row)]
         own += [x for _, _, *numbers in pivots for x in numbers]
@@ -409,7 +401,7 @@ class _SlidingForces:
             graph = Graph(_LARGEST)
             inputs = [graph.input(i, "float") for i in range(len(factors) + count + len(acts))]
             at = {x: inputs[len(system.factors) + i] for i, x in enumerate(read)}
-            at |= {x: graph.constant(value, "float") for x, value in known.items() if value is not None}
+            at |= {x: graph.number(value) for x, value in known.items() if value is not None}
             right, ends = inputs[len(factors) : len(factors) + count], inputs[len(factors) + count :]
             equations = _Equations(*([[at[x] for x in row] for row in table] for table in of_unknowns))
             inner = system.solve()
@@ -431,7 +423,7 @@ class _SlidingForces:
             z = apply_inverse(subtract(right, mu, False))
             if len(pivots) < len(acts):
                 more = equations.solve(graph, subtract(ends, z, True))
-                rest = apply_inverse(subtract([graph.constant(0.0, "float")] * count, more, False))
+                rest = apply_inverse(subtract([graph.number(0.0)] * count, more, False))
                 z = [graph.apply("add", *pair) for pair in zip(z, rest, strict=True)]
                 mu = [graph.apply("add", *pair) for pair in zip(mu, more, strict=True)]
             for k, i, free, inverse in pivots:
@@ -440,8 +432,7 @@ class _SlidingForces:
                     if row == count + k and j != i:
                         end = graph.apply("sub", end, graph.apply("mul", at[d], z[j]))
                 z[i] = graph.apply("add", graph.apply("mul", at[free], z[i]), graph.apply("mul", at[inverse], end))
-            outputs = (*z, *mu)
-            return StraightLine(tuple(graph.nodes), tuple(graph.kinds), outputs)
+            return StraightLine(tuple(graph.nodes), tuple(graph.kinds), (*z, *mu))
 
         return LinearSystem((*z, *unknown), system.entries, (*system.right, *rates), factors, solve, others)
 
@@ -458,7 +449,7 @@ class _Held:
 
     def __init__(self, graph: Graph, n: int, pushed: Sequence[int], slopes, responses, pivots):
         self.graph, self.n, self.pushed, self.slopes, self.responses = graph, n, pushed, slopes, responses
-        self.zero, self.one = (graph.constant(x, "float") for x in (0.0, 1.0))
+        self.zero, self.one = (graph.number(x) for x in (0.0, 1.0))
         self.divisors = [(k, i, graph.apply("select", pushed[k], self.one, slopes[k][i])) for k, i in pivots]
         self.state = {i: graph.input(i, "float") for i in range(2 * n)}
 
@@ -559,7 +550,7 @@ def _constants(graph: Graph, numbers: Sequence[int]) -> dict[int, float | None]:
 
 
 def dot(graph: Graph, xs: Sequence[int], ys: Sequence[int]) -> int:
-    total = zero = graph.constant(0.0, "float")
+    total = zero = graph.number(0.0)
     for x, y in zip(xs, ys, strict=True):
         if zero not in (x, y):  # as nearly all are where many borders know nothing of each other
             total = graph.apply("add", total, graph.apply("mul", x, y))
@@ -568,7 +559,7 @@ def dot(graph: Graph, xs: Sequence[int], ys: Sequence[int]) -> int:
 
 def eliminate(graph: Graph, rows: list[list[int]]) -> list[list[int]]:
     """Eliminate in place, so that `rows` become upper triangular; returns the factors, those of row i to 0 … i − 1."""
-    f, n, lower, zero = graph.apply, len(rows), [[] for _ in rows], graph.constant(0.0, "float")
+    f, n, lower, zero = graph.apply, len(rows), [[] for _ in rows], graph.number(0.0)
     for k in range(n):
         for i in range(k + 1, n):
             factor = zero if rows[i][k] == zero else f("div", rows[i][k], rows[k][k])
@@ -581,7 +572,7 @@ def eliminate(graph: Graph, rows: list[list[int]]) -> list[list[int]]:
 
 
 def substitute(graph: Graph, rows: Sequence, lower: Sequence, right: Sequence[int]) -> list[int]:
-    f, x, n, zero = graph.apply, list(right), len(rows), graph.constant(0.0, "float")
+    f, x, n, zero = graph.apply, list(right), len(rows), graph.number(0.0)
     for i in range(n):
         for k in range(i):
             if lower[i][k] != zero:

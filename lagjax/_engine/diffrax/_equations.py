@@ -87,10 +87,7 @@ MotionEquations = ScalarEquations | ArrayEquations
 
 
 def form_of(derivation: Derivation, path: str = "auto") -> MotionEquations:
-    """The form of its equations that suits a scene; `path` "scalar" or "array" insists on one.
-
-    Raises `ValueError` where "scalar" is given and impossible, with the reason.
-    """
+    """The form of its equations that suits a scene, or that `path` names; `ValueError` where "scalar" is impossible."""
     motion = derivation.motion
     if path == "array":
         return ArrayEquations(motion, "asked for")

@@ -82,10 +82,7 @@ def jvp(flow: Flow, motions: Motions, dy0, dparams, tolerances: Tolerances) -> t
 
 
 def scale_directions(dy0, dparams, library: Any = np) -> tuple:
-    """Directions in units of their largest number, (…, 1), so that tolerances mean the same for tangents of any length.
-
-    Returns both parts, and the units.
-    """
+    """Directions in units of their largest numbers, for which tolerances mean the same; and these units, (…, 1)."""
     length = library.abs(library.concatenate([dy0, dparams], axis=-1)).max(axis=-1, initial=0.0, keepdims=True)
     unit = library.where(length > 0, length, 1.0)
     return dy0 / unit, dparams / unit, unit

@@ -93,10 +93,7 @@ class Line:
             return None
 
     def evaluate(self, *parts: np.ndarray) -> np.ndarray:
-        """The outputs (…, outputs) at inputs that are given in parts (…, some): by NumPy at first.
-
-        When that has taken about as long as machine code takes to make, it is made.
-        """
+        """Outputs (…, outputs) at inputs in parts (…, some): by NumPy until that took as long as to make code."""
         rows = np.concatenate([part.reshape(-1, part.shape[-1]) for part in parts], axis=1)
         self._calls += 1
         if self._calls >= _CALLS and self.code is not None:

@@ -158,7 +158,7 @@ def _complete(values: Program, motion: Program, moving: int, rounding: Program |
         graph, ids = expansion.graph, np.concatenate([x.ravel() for x in arguments])
         nodes, y = values.place(expansion, ids).tolist(), Scalars(expansion, ids[:moving])
         outputs = values.line.outputs
-        one, zero = graph.constant(1.0, "float"), graph.constant(0.0, "float")
+        one, zero = graph.number(1.0), graph.number(0.0)
         by_y = [tangents_in(graph, values.line, nodes, {j: one}, {}) for j in range(moving)]
         slopes = Scalars(expansion, np.array([[by.get(i, zero) for by in by_y] for i in outputs]))
         terms, moves = slopes * y, slopes * _rate(motion, expansion, ids, moving)
@@ -179,7 +179,7 @@ def _followed(values: Program, motion: Program, moving: int, pieces: StraightLin
         for line in lines:
             nodes = copy_nodes(graph, line, ids.tolist(), [graph.position(i) for i in ids.tolist()])
             tangents = tangents_in(graph, line, nodes, dict(enumerate(rate)), {})
-            zero = graph.constant(0.0, "float")
+            zero = graph.number(0.0)
             found.append(([nodes[i] for i in line.outputs], [tangents.get(i, zero) for i in line.outputs]))
         at, moves = (np.array([x for part in parts for x in part]) for parts in zip(*found, strict=True))
         return [at, moves, np.array(rate[:-1])]

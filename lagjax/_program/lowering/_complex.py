@@ -219,9 +219,7 @@ def _multiply_all(expansion, multiply: Callable, rows: np.ndarray) -> np.ndarray
     return functools.reduce(functools.partial(multiply, expansion, {}), rows)
 
 
-COMPLEX["integer_pow"] = lambda expansion, params, x: _ids_of(
-    expansion, _whole_power(_pair_of(expansion, x), params["y"])
-)
+COMPLEX["integer_pow"] = lambda of, params, x: _ids_of(of, _whole_power(_pair_of(of, x), params["y"]))
 COMPLEX["reduce_prod"] = reduction(COMPLEX["mul"], 1.0 + 0.0j, _multiply_all)
 COMPLEX["complex"] = lambda expansion, params, re, im: expansion.pair(*np.broadcast_arrays(re, im))
 
@@ -240,6 +238,5 @@ def _dot_general(expansion, params, x, y):
     params = {**params, "preferred_element_type": None}
     a, b = expansion.parts(x), expansion.parts(y)
     products = {(i, j): expansion.lower_primitive("dot_general", params, [a[i], b[j]]) for i in (0, 1) for j in (0, 1)}
-    return expansion.pair(
-        expansion.map("sub", products[0, 0], products[1, 1]), expansion.map("add", products[0, 1], products[1, 0])
-    )
+    real = expansion.map("sub", products[0, 0], products[1, 1])
+    return expansion.pair(real, expansion.map("add", products[0, 1], products[1, 0]))

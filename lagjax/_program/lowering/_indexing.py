@@ -29,10 +29,7 @@ def are_numbers(expansion: Any, ids: Ids) -> bool:
 
 
 def locate_knots(expansion: Any, knots: Ids, x: Ids, closed: bool) -> Ids | None:
-    """The number of the increasing `knots` that are at most x, less one, as integers; see `_look_ups.Located`.
-
-    None where the knots are no table from its first entry to its last.
-    """
+    """The number of increasing `knots` at most x, less one (`_look_ups.Located`); None where they are no table."""
     table = _table(expansion, knots) if knots.size else None
     if table is None or table.stride < 0:
         return None
@@ -42,10 +39,7 @@ def locate_knots(expansion: Any, knots: Ids, x: Ids, closed: bool) -> Ids | None
 
 
 def count_knots(expansion: Any, knots: Ids, x: Ids, side: str) -> Ids | None:
-    """The number of increasing `knots` below x, from the left side, or of those at most x, from the right; as integers.
-
-    None where the knots are no table, and too many to be compared.
-    """
+    """The number of increasing knots below x (`side` "left") or at most x; None where they are no table, and many."""
     f, one = expansion.map, expansion.constants(np.int32(1))
     if side == "right":
         found = locate_knots(expansion, knots, x, closed=False)
@@ -89,7 +83,7 @@ def _entry(expansion: Any, ids: Ids, place: int) -> int:
     if (table := _table(expansion, ids)) is not None:
         return graph.apply("take", place, attribute=table)
     if (parts := _combination(graph, ids)) is not None:
-        total = graph.constant(0.0, "float")
+        total = graph.number(0.0)
         for base, numbers in parts.items():
             factor = graph.apply("take", place, attribute=Table(0, 1, ids.size, numbers.tobytes()))
             total = graph.apply("add", total, graph.apply("mul", factor, base))
@@ -107,7 +101,7 @@ def _entry(expansion: Any, ids: Ids, place: int) -> int:
     expansion.work(ids.size)
     found = graph.real(int(ids[0]))
     for k in range(1, ids.size):
-        beyond = graph.apply("ge", place, graph.constant(float(k), "float"))
+        beyond = graph.apply("ge", place, graph.number(float(k)))
         found = graph.apply("select", beyond, found, graph.real(int(ids[k])))
     return found
 
@@ -172,7 +166,7 @@ def _as_float(graph: Graph, i: int) -> int:
         return graph.apply(op, *(_as_float(graph, x) for x in operands))
     if kind != "bool" and op == "select":
         return graph.apply(op, _compare_floats(graph, operands[0]), *(_as_float(graph, x) for x in operands[1:]))
-    return graph.constant(attribute, "float") if op == "constant" else graph.apply("convert", i, attribute="float")
+    return graph.number(attribute) if op == "constant" else graph.apply("convert", i, attribute="float")
 
 
 def _compare_floats(graph: Graph, i: int) -> int:

@@ -189,13 +189,11 @@ def _matrix_of(expansion: Expansion, matvec, constants) -> np.ndarray:
     inputs = inputs_of(apart.graph, shapes)
     vector = np.concatenate([apart.real(x).ravel() for x in inputs[len(constants) :]]).tolist()
     outputs = np.concatenate([apart.real(x).ravel() for x in apart.run_closed(matvec, inputs)]).tolist()
-    one, zero = (apart.graph.constant(x, "float") for x in (1.0, 0.0))
+    one, zero = (apart.graph.number(x) for x in (1.0, 0.0))
     entries = np.full((len(outputs), len(vector)), zero)
-    for row, tangents in zip(
-        entries, Derivatives(apart.graph).directional_derivatives(outputs, [{i: one} for i in vector]), strict=True
-    ):
-        for j, entry in tangents.items():
-            row[j] = entry
+    found = Derivatives(apart.graph).directional_derivatives(outputs, [{i: one} for i in vector])
+    for row, tangents in zip(entries, found, strict=True):
+        row[list(tangents)] = list(tangents.values())
     line = eliminate_dead_code(apart.graph, entries.ravel().tolist())
     given = [i for x in constants for i in x.ravel().tolist()]
     nodes = copy_nodes(expansion.graph, line, given)
@@ -227,10 +225,8 @@ def _map_matrices(what: str, function: Callable, expansion: Expansion, *arrays: 
     return [np.stack([x.ids for x in of]).reshape((*batch, *of[0].shape)) for of in zip(*done, strict=True)]
 
 
-LOWER["cholesky"] = lambda expansion, params, a: _map_matrices(
-    "a Cholesky factor", lambda a: [cholesky(a)], expansion, a
-)[0]
-LOWER["det"] = lambda expansion, params, a: _map_matrices("a determinant", lambda a: [determinant(a)], expansion, a)
+LOWER["cholesky"] = lambda of, params, a: _map_matrices("a Cholesky factor", lambda a: [cholesky(a)], of, a)[0]
+LOWER["det"] = lambda of, params, a: _map_matrices("a determinant", lambda a: [determinant(a)], of, a)
 
 
 @lowers("lu")
