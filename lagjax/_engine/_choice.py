@@ -27,17 +27,13 @@ def requested_engine(
     """
     if dt is not None and not (rtol is None and atol is None):
         raise ValueError("dt asks for fixed steps and rtol/atol for adaptive ones: give one or the other.")
-    others = {
-        "fixed steps": dt is not None,
-        "an adjoint": adjoint is not None,
-        "a progress meter": progress is not False,
-    }
+    asked = {"fixed steps were": dt is not None, "an adjoint was": adjoint is not None}
+    asked["a progress meter was"] = progress is not False
     if isinstance(solver, MachineCode):
-        for what, given in others.items():
-            if given:
-                raise ValueError(_refusal(f"{what} was asked for".replace("steps was", "steps were")))
+        if what := next((what for what, given in asked.items() if given), None):
+            raise ValueError(_refusal(f"{what} asked for"))
         return solver
-    return Diffrax.from_arguments(solver, dt, adjoint, progress) if solver is not None or any(others.values()) else None
+    return Diffrax.from_arguments(solver, dt, adjoint, progress) if solver is not None or any(asked.values()) else None
 
 
 _MACHINE_CODE = MachineCode()

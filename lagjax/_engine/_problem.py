@@ -10,6 +10,7 @@ vector (q, q̇), and the programs of a scene take the parameters as one vector t
 
 import abc
 import functools
+import itertools
 import types
 from collections.abc import Callable, Hashable, Mapping
 from dataclasses import dataclass, field, replace
@@ -202,10 +203,8 @@ class Batch(eqx.Module):
         params, structure = jax.tree.flatten(arrays["params"])
         of_params = structure.flatten_up_to(axes["params"])
         in_front = [x if axis is None else _move_axis_first(x, axis) for x, axis in zip(params, of_params, strict=True)]
-        of_state = [
-            axis for name in ("q0", "qdot0") for axis in jax.tree.structure(values[name]).flatten_up_to(axes[name])
-        ]
-        y0 = rows(state, of_state, size, layout.dtype)
+        of_state = (jax.tree.structure(values[name]).flatten_up_to(axes[name]) for name in ("q0", "qdot0"))
+        y0 = rows(state, itertools.chain(*of_state), size, layout.dtype)
         spread = tuple(None if axis is None else 0 for axis in of_params)
         return cls(one, y0, structure.unflatten(in_front), spread)
 
@@ -444,13 +443,9 @@ def too_tight(rtol, dtype, least: float) -> str | None:
 
 def _event(event, dtype) -> diffrax.Event | None:
     """The event with its functions' signatures checked, and with a root finder that uses the dtype's digits."""
-    if event is None:
-        return None
-    return (
-        _known_event(Edition.from_function(event), dtype)
-        if isinstance(event, types.FunctionType)
-        else _make_event(event, dtype)
-    )
+    if isinstance(event, types.FunctionType):
+        return _known_event(Edition.from_function(event), dtype)
+    return None if event is None else _make_event(event, dtype)
 
 
 @functools.lru_cache(maxsize=64)  # a signature takes as long to read as a short motion
@@ -477,10 +472,7 @@ _PASSING_ON = ("squeeze", "reshape", "broadcast_in_dim", "copy")
 
 
 def evaluate_condition(function: Callable, *arguments) -> tuple[Any, int]:
-    """The value of an event, and 0; of one that holds where a number is more than another their difference, and 1.
-
-    And −1 where it holds if the difference is less than zero.
-    """
+    """The value of an event, and 0; of a comparison the difference of its numbers, and the sign with which it holds."""
     leaves, structure = jax.tree.flatten(arguments)
     numbers = [i for i, x in enumerate(leaves) if eqx.is_array_like(x)]  # params may hold words as well
 
@@ -488,13 +480,11 @@ def evaluate_condition(function: Callable, *arguments) -> tuple[Any, int]:
         new = dict(zip(numbers, given, strict=True))
         return function(*jax.tree.unflatten(structure, [new.get(i, x) for i, x in enumerate(leaves)]))
 
-    leaves_of_call = [leaves[i] for i in numbers]
-    closed, shape = jax.make_jaxpr(call, return_shape=True)(*leaves_of_call)
-    if getattr(shape, "dtype", None) == np.dtype(bool) and shape.shape == ():
-        found = _difference(closed.jaxpr, closed.consts, leaves_of_call)
-        if found is not None:
-            return found
-    return function(*arguments), 0
+    given = [leaves[i] for i in numbers]
+    closed, shape = jax.make_jaxpr(call, return_shape=True)(*given)
+    is_bool = getattr(shape, "dtype", None) == np.dtype(bool) and shape.shape == ()
+    found = _difference(closed.jaxpr, closed.consts, given) if is_bool else None
+    return (function(*arguments), 0) if found is None else found
 
 
 def _difference(jaxpr, constants, arguments) -> tuple[Any, int] | None:

@@ -49,9 +49,8 @@ def what_stopped(acceleration: Callable, at: End, shrank, spent) -> tuple[jax.Ar
     `acceleration(t, y)` gives q̈, with a last axis of n. `shrank` are the members whose step became too small, `spent`
     those whose budget of steps is spent; others are not looked at.
     """
-    library, loop, evaluate_each = (
-        (np, _loop, map) if isinstance(at.y, np.ndarray) else (jnp, jax.lax.while_loop, _map_compiled)
-    )
+    on_host = isinstance(at.y, np.ndarray)
+    library, loop, evaluate_each = (np, _loop, map) if on_host else (jnp, jax.lax.while_loop, _map_compiled)
     n = at.y.shape[-1] // 2
     smallest = 4 * np.finfo(at.y.dtype).eps * library.maximum(abs(at.begin), abs(at.end))
     forward = library.where(at.end > at.begin, 1.0, -1.0) * smallest

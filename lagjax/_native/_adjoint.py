@@ -42,14 +42,10 @@ class Adjoint:
         self.motion = motion = self.replay.motion
         self.start_next = self.replay.start_next(self._begin_lane, self._take_member)
         cotangents = Cotangents(motion, parts)
-        series_sum, products, recursion = (
-            SeriesSum(motion, parts.kicks),
-            CauchyProducts(motion),
-            OrderRecursion(motion, parts),
-        )
+        orders = CauchyProducts(motion), OrderRecursion(motion, parts)
         steps = [
-            series_sum.pull(),
-            self._transpose_orders(products.pull(), recursion.pull()),
+            SeriesSum(motion, parts.kicks).pull(),
+            self._transpose_orders(*(of.pull() for of in orders)),
             ZerothOrder(motion, parts).pull(cotangents),
         ]
         if (retraction := self.replay.retraction) is not None:
@@ -59,21 +55,13 @@ class Adjoint:
         if (saltation := self.replay.saltation()) is not None:
             steps = [saltation.pull(cotangents), *steps, saltation.note_after()]
         self._run(steps)
-        self._begin()
+        motion.write_begin(self.start_next)
         motion.finish()
 
     # ---- rounds ----
 
-    def _begin(self) -> None:
-        frame = self.motion.function("begin", public=True)
-        self.motion.begin(frame, self.start_next)
-        frame.finish()
-
     def _run(self, steps: list[Code]) -> None:
-        """`run(job, memory, lanes, rounds)`: this many rounds, or until the batch is done; one step back in every lane.
-
-        Returns 1 if there is more to do.
-        """
+        """`run(job, memory, lanes, rounds)`: one step back in every lane a round; 1 if there is more to do."""
         frame = self.motion.function("run", INTEGER, result=INTEGER, public=True)
         with self.replay.rounds(frame, frame.arguments[0], self._leave_step):
             for step in steps:
@@ -136,6 +124,9 @@ class Adjoint:
         def change(i):
             return frame["y_ct", i, order - 1] - frame["before", i]
 
+        def first_terms(i):
+            return code.maximum(abs(frame["rows", i, 1]), abs(frame["rows", i, 2]) * h)
+
         # The Jacobian of the acceleration, times the cotangents: a frequency squared, and a rate of decay.
         velocities = form.largest(code, lambda i: abs(frame["y_ct", i + n, order]), n)
         squared = form.largest(code, lambda i: abs(change(i)), n)
@@ -143,7 +134,7 @@ class Adjoint:
         rate = p * decay / velocities + code.intrinsic("sqrt", p * squared / velocities)
         rate = code.select(velocities > 0.0, rate, 0.0)
         term, power = code.variable(frame.constant(1.0)), code.variable(frame.constant(1.0))
-        with code.loop(order - 1, start=0) as k:
+        with code.loop(order - 1) as k:
             term.value = term.value * (rate * h) / code.as_number(k + 1)
             with code.only_if(k > 0):
                 power.value = power.value * h
@@ -151,11 +142,7 @@ class Adjoint:
         last, first, rows = code.lanes_of(0.0), code.lanes_of(0.0), self.motion.series.rows
         if rows:
             last = form.largest(code, lambda i: abs(frame["rows", i, order - 1]), rows)
-            first = form.largest(
-                code,
-                lambda i: code.maximum(abs(frame["rows", i, 1]), abs(frame["rows", i, 2]) * h),
-                self.motion.series.rows,
-            )
+            first = form.largest(code, first_terms, rows)
         tail = code.select(first > 0.0, NEAR_ZERO * last * power.value / first, 0.0)
         frame["excess"] = code.maximum(code.maximum(term.value, tail), frame["excess"])
         return frame.finish()

@@ -19,7 +19,7 @@ import ctypes
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from llvmlite import ir
@@ -32,7 +32,7 @@ Numbers = Any  # vectors by their numbers: a list of values whose indices are kn
 # Integers of a lane: which member it carries (-1: none), which output comes next, and which step.
 LANE = ("member", "output", "step")
 CACHE_LINE = 8  # doubles
-_KINDS = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOUBLE}
+KINDS = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOUBLE}
 
 
 def job(name: str, pointers: tuple[str, ...], integers: tuple[str, ...], doubles: tuple[str, ...] = ()) -> type:
@@ -55,23 +55,15 @@ def integers(module: ir.Module, numbers: np.ndarray) -> ir.GlobalVariable:
     return table
 
 
-class Field(NamedTuple):
-    """Vectors of a thread's memory, in rows and columns."""
-
-    rows: int = 1
-    columns: int = 1
-
-
-# The fields of a thread's memory by name: a number of vectors, rows and columns of them, or a `Field`.
+# The fields of a thread's memory by name: a number of vectors, or rows and columns of them.
 Fields = dict[str, Any]
-EXACT = 1  # one vector of doubles
 
 
 class Memory:
     """The places of a thread's `fields`, vectors of `width` lanes; one `beside` another shares its memory."""
 
     def __init__(self, width: int, fields: Fields, beside: "Memory | None" = None):
-        self.width, self._fields, self._offsets = width, {}, {}
+        self.width, self._columns, self._offsets = width, {}, {}
         self._doubles = [0] if beside is None else beside._doubles  # of all that share the memory
         self.extend_by(fields)
 
@@ -86,14 +78,14 @@ class Memory:
 
     def extend_by(self, fields: Fields) -> None:
         for name, shape in fields.items():
-            field = Field(shape) if isinstance(shape, int) else Field(*shape)
-            self._fields[name], self._offsets[name] = field, self.end
-            self._doubles[0] = self.end + field.rows * field.columns * self.width
+            rows, self._columns[name] = (shape, 1) if isinstance(shape, int) else shape
+            self._offsets[name] = self.end
+            self._doubles[0] = self.end + rows * self._columns[name] * self.width
 
     def place(self, name: str, *indices: Index) -> Any:
         """The first element of a vector, counted in doubles: `name`, `name[i]` or `name[i, k]`."""
         row, column = (*indices, 0, 0)[:2]
-        columns = self._fields[name].columns
+        columns = self._columns[name]
         index = row if columns == 1 else column if isinstance(row, int) and row == 0 else column + row * columns
         return index * self.width + self._offsets[name]
 
@@ -169,9 +161,7 @@ class Frame:
         """Vectors of a field: number i is `name[place(i)]`, whose place does not change."""
 
         def where(i):
-            address = self.layout.place(name, *place(i))
-            assert isinstance(address, int)
-            return address
+            return self.layout.place(name, *place(i))
 
         def write(i, x):
             self[name, *place(i)] = x
@@ -187,9 +177,7 @@ class Frame:
         def write(i, x):
             self[name, *index(i)] = x
 
-        first = (0, 1) if not by_row else (1, 0)
-        stride = self.layout.place(name, *first) - self.layout.place(name, 0, 0)
-        assert isinstance(stride, int)
+        stride = self.layout.place(name, *((1, 0) if by_row else (0, 1))) - self.layout.place(name, 0, 0)
         place = self.vectors(name, count, (lambda i: (0, i)) if by_row else (lambda i: (i, 0))).place
         return Vectors(count, lambda i: self[name, *index(i)], write, place, k * stride)
 
@@ -208,7 +196,7 @@ class Frame:
     # ---- the job ----
 
     def job(self, name: str) -> Value:
-        position, kind = list(self._fields).index(name), _KINDS[self._fields[name]]
+        position, kind = list(self._fields).index(name), KINDS[self._fields[name]]
         return self.code.load(self.code.element(self._job, position, INTEGER), kind)
 
     def read(self, name: str, index: Index, kind: ir.Type = DOUBLE) -> Value:

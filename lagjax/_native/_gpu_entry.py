@@ -97,10 +97,7 @@ class OneLane(NamedTuple):
 
 
 def motion_entry(motion: OneLane, order: int) -> str:
-    """The module of `MOTION`, in LLVM's language: `integrate(*arguments, *results)`.
-
-    It calls the `begin` and `run` of an integrator (`_integrator`).
-    """
+    """The module of `MOTION`, `integrate(*arguments, *results)`: it calls the `begin` and `run` of an `_integrator`."""
     thread = _Thread(MOTION)
     job = job_of(thread.code, _integrator.JOB, thread.at | thread.numbers | {"order": thread.whole(order)})
     thread.run("", motion, job, thread.memory(motion.size), thread.words(1))
@@ -108,11 +105,7 @@ def motion_entry(motion: OneLane, order: int) -> str:
 
 
 def transpose_entry(motion: OneLane, adjoint: OneLane, form: GpuForm) -> str:
-    """The module of `TRANSPOSE`, in LLVM's language: `integrate(*arguments, *results)`.
-
-    It calls the `begin` and `run` of an integrator, and those of an adjoint under the names `begin_back` and `run_back`
-    (`_adjoint`).
-    """
+    """The module of `TRANSPOSE`: it calls an integrator, and an `_adjoint` by the names `begin_back` and `run_back`."""
     return _Transpose(motion, adjoint, form).finish()
 
 

@@ -2,6 +2,7 @@
 
 import functools
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, NamedTuple
 
 from lagjax._native._lanes import INTEGERS
@@ -71,7 +72,7 @@ def append_guards(program: Recurrent, size: int, values: Recurrent, slides: bool
 def drop_guards(found: Borders, size: int) -> tuple[Recurrent, Series]:
     """The program along the pieces that were found, without the guards, and its series: for derivatives over steps."""
     line = found.program.line
-    program = found.program._replace(line=line.replace(outputs=line.outputs[: size + 1]))
+    program = replace(found.program, line=line.replace(outputs=line.outputs[: size + 1]))
     return program, series(program, size, moving=2 * size + 1, followed=found.followed)
 
 

@@ -21,7 +21,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from llvmlite import ir
 
-from lagjax._native._frame import CACHE_LINE, LANE, Memory
+from lagjax._native._frame import CACHE_LINE, KINDS, LANE, Memory
 from lagjax._native._integrator import JOB
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value, compile_module, lanes
 
@@ -302,15 +302,11 @@ def _write_run(module: ir.Module) -> Callable:
 
 def job_of(code: Code, kind: type, fields: dict[str, Any]) -> Value:
     """A job on the stack, a structure of this kind: of `fields` those that it declares, others zero."""
-    kinds = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOUBLE}
     declared: Any = kind
     job = code.stack(len(declared._fields_))
     for i, (name, of_field) in enumerate(declared._fields_):
-        value = fields.get(name)
-        if value is None:
-            zero = ir.Constant(POINTER, None) if of_field is ctypes.c_void_p else ir.Constant(kinds[of_field], 0)
-            value = Value(code, zero)
-        code.store(value, code.element(job, i, INTEGER))
+        zero = ir.Constant(KINDS[of_field], None if of_field is ctypes.c_void_p else 0)
+        code.store(fields.get(name, Value(code, zero)), code.element(job, i, INTEGER))
     return job
 
 

@@ -81,7 +81,7 @@ class Integrator:
         self.events = guards and roots and Events(motion, self.step, self.output, roots, guards)
         self.start_next = self._start_next()
         self._run()
-        self._begin()
+        motion.write_begin(self.start_next)
         motion.finish()
 
     # ---- members ----
@@ -126,12 +126,6 @@ class Integrator:
             self.borders.begin(frame, lane)
         if self.events is not None:
             self.events.begin(frame, lane)
-
-    def _begin(self) -> None:
-        """`begin(job, memory, lanes)`: every lane takes a member."""
-        frame = self.motion.function("begin", public=True)
-        self.motion.begin(frame, self.start_next)
-        frame.finish()
 
     # ---- rounds ----
 

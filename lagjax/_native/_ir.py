@@ -85,8 +85,7 @@ def compile_module(module: ir.Module, functions: tuple[str, ...]) -> tuple[llvm.
     by = llvm.llvm_version_info, llvmlite.__version__, machine.triple, _PASSES, level
     processor = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
     made = load_or_make(lambda: _object(text, level), text, repr(by), *processor)
-    empty = llvm.parse_assembly("")
-    engine = llvm.create_mcjit_compiler(empty, machine)
+    engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
     engine.add_object_file(llvm.ObjectFileRef.from_data(made))
     engine.finalize_object()
     return engine, {name: engine.get_function_address(name) for name in functions}
@@ -216,12 +215,11 @@ class Code:
     ):
         self.lanes, self.vector = lanes, ir.VectorType(DOUBLE, lanes)
         self.module = module
-        function = ir.Function(module, ir.FunctionType(result or ir.VoidType(), arguments), name)
+        self.function = ir.Function(module, ir.FunctionType(result or ir.VoidType(), arguments), name)
         if not public:
-            function.linkage = "internal"
-        self.function = function
-        self.builder: Any = ir.IRBuilder(function.append_basic_block("entry"))
-        self.arguments = [Value(self, argument) for argument in function.args]
+            self.function.linkage = "internal"
+        self.builder: Any = ir.IRBuilder(self.function.append_basic_block("entry"))
+        self.arguments = [Value(self, argument) for argument in self.function.args]
 
     # ---- numbers ----
 

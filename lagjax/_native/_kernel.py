@@ -147,7 +147,7 @@ class Kernel:
             _gpu.require_room(size_of_series(self._parts.series))  # before what is larger than that is written down
             return self.select_width(1)._integrator().motion
 
-        return _gpu.GpuPrograms(motion, lambda: self._adjoint(width=1).motion)
+        return _gpu.GpuPrograms(motion, lambda: Adjoint(self._derivative_parts, width=1).motion)
 
     @functools.cached_property
     def _forward(self) -> "_Compiled":
@@ -330,10 +330,7 @@ class Kernel:
 
     @functools.cached_property
     def _backward(self) -> "_Compiled":
-        return _Compiled(self._adjoint(self.width), self._rounds)
-
-    def _adjoint(self, width: int) -> Adjoint:
-        return Adjoint(self._derivative_parts, width=width)
+        return _Compiled(Adjoint(self._derivative_parts, width=self.width), self._rounds)
 
     def _strides(self, ts, params) -> dict[str, int]:
         return dict(ts_stride=ts.shape[1] if len(ts) > 1 else 0, params_stride=self.numbers if len(params) > 1 else 0)
@@ -360,10 +357,10 @@ class _Compiled:
         if self._numbers is not None:
             ctypes.CFUNCTYPE(None, ctypes.c_void_p)(at[SET_NUMBERS])(self._numbers.ctypes.data)
         self.places = at["begin"], at["run"]
-        self._begin = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 3)(at["begin"])
-        self._run = ctypes.CFUNCTYPE(ctypes.c_int64, *[ctypes.c_void_p] * (3 + self._counts_idle), ctypes.c_int64)(
-            at["run"]
-        )
+        pointers = [ctypes.c_void_p] * 3
+        self._begin = ctypes.CFUNCTYPE(None, *pointers)(at["begin"])
+        pointers += [ctypes.c_void_p] * self._counts_idle
+        self._run = ctypes.CFUNCTYPE(ctypes.c_int64, *pointers, ctypes.c_int64)(at["run"])
 
     def __call__(
         self, arrays: Mapping[str, np.ndarray | None], numbers: Mapping[str, float], threads: int, rest=None

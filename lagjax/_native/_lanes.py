@@ -15,10 +15,7 @@ from lagjax._program._series import StraightLine
 
 
 class Lines:
-    """The form of small kernels: every operation is written down, and so is every component of the state.
-
-    `Tables` is that of large ones, with the same methods.
-    """
+    """The form of small kernels: every operation is written down, and every component of the state (else `Tables`)."""
 
     def __init__(self, sincos: Code, look_up: Callable):
         self._sincos, self._look_up = sincos, look_up
@@ -101,10 +98,7 @@ def emit(
 
 
 def apply(code: Code, op: str, xs: list[Value], attribute, kinds: Sequence[str], kind: str) -> Value:
-    """An operation by its row: of the C library, lane by lane, or written with vectors.
-
-    `kinds` and `kind` are those of the operands and of the result.
-    """
+    """An operation of operands of these `kinds` by its row: of the C library, lane by lane, or written with vectors."""
     if op == "convert":
         return _convert(code, xs[0], kinds[0], kind)
     if kind not in ("float", "bool"):

@@ -133,18 +133,11 @@ class CauchyProducts:
             frame["rows_ct", i] = 0.0
         kinds = (self.mixed, self.squares)
         tables = [motion.table(pairs) for pairs in kinds]
-        end = code.function.append_basic_block("end")
-        switch = code.builder.switch((order - 1 - k).it, end)
-        for terms in range(1, MAX_ORDER - 1):
-            block = code.function.append_basic_block(f"terms{terms}")
-            switch.add_case(ir.Constant(INTEGER, terms), block)
-            code.builder.position_at_end(block)
+        for terms in code.cases(order - 1 - k, range(1, MAX_ORDER - 1)):
             for table, pairs, first in zip(tables, kinds, (0, len(self.mixed)), strict=True):
                 if pairs:
                     with code.loop(len(pairs)) as i:
                         self._pull_product(frame, table, i, first, k, terms)
-            code.builder.branch(end)
-        code.builder.position_at_end(end)
         return frame.finish()
 
     def _pull_product(self, frame: Frame, table, i: Value, first: int, k: Value, terms: int) -> None:
@@ -238,7 +231,7 @@ class SeriesSum:
         form, states = directions.form, directions.states
         for i in form.each(code, states):
             frame[name, i] = frame["dy", i, 0]
-        with code.loop(order, start=0) as k:
+        with code.loop(order) as k:
             before = power.value
             now = before * s
             for i in form.each(code, states):

@@ -1,16 +1,15 @@
 """The programs that a kernel is made from: those of a motion, its series, and the borders between its pieces."""
 
 import functools
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from lagjax._native._guards import Guards, append_guards, drop_guards, require_lanes
-from lagjax._program._borders import Borders, borders
+from lagjax._program._borders import Borders, Pieced, borders
 from lagjax._program._graph import Unlowerable
 from lagjax._program._jump import Jump, Nesting, jump_at_border, with_borders_of_tangents
 from lagjax._program._look_ups import BESIDE, shift_look_up
 from lagjax._program._operations import LOOK_UPS
-from lagjax._program._series import Recurrent, Series, StraightLine, series
+from lagjax._program._series import Recurrent, Series, series
 
 
 class Projection(NamedTuple):
@@ -115,17 +114,6 @@ class MotionParts(NamedTuple):
         return self._replace(program=program, series=series)
 
 
-@dataclass(frozen=True, eq=False)
-class _ChosenProgram:
-    """A program of those numbers of a member that it computes with (`Recurrent`); others are only looked up."""
-
-    line: StraightLine
-    size: int
-    dtypes: tuple
-    linear: Any
-    mechanics: StraightLine | None = None
-
-
 @functools.lru_cache(maxsize=16)
 def choose_parameters(
     program: Recurrent, projection: Projection | None, guards: Guards | None, motion: Recurrent | None, nesting: Nesting
@@ -155,23 +143,15 @@ def choose_parameters(
     def reduce_program(one, first=first, positions=positions):
         place = {first + i: first + k for k, i in enumerate(positions)}
 
+        def reduce_attribute(op, a):
+            return place.get(a, a) if op == "input" else shift_look_up(a, BESIDE - first) if op in LOOK_UPS else a
+
         def reduce_line(line):
-            nodes = (
-                (
-                    op,
-                    of,
-                    place.get(a, a) if op == "input" else shift_look_up(a, BESIDE - first) if op in LOOK_UPS else a,
-                )
-                for op, of, a in line.nodes
-            )
-            return line.replace(nodes=tuple(nodes))
+            return line and line.replace(nodes=tuple((op, of, reduce_attribute(op, a)) for op, of, a in line.nodes))
 
         dtypes = (*one.dtypes[:first], *(kinds[i] for i in positions))
-        mechanics = getattr(one, "mechanics", None)
-        return _ChosenProgram(
-            reduce_line(one.line), first + len(positions), dtypes, one.linear,
-            None if mechanics is None else reduce_line(mechanics),
-        )  # fmt: skip
+        size, mechanics = first + len(positions), reduce_line(getattr(one, "mechanics", None))
+        return Pieced(reduce_line(one.line), size, dtypes, one.linear, mechanics)
 
     done = iter([reduce_program(one) for one in programs])
     return (

@@ -220,10 +220,8 @@ class Roots:
                 self._note_root(frame, here, (value, slope, error, bend), is_root, ends)
             root = code.intrinsic("sqrt", code.maximum(slope * slope + 2.0 * (down * value), 0.0))
             rising = slope > 0.0
-            numerator, denominator = (
-                code.select(rising, slope + root, 2.0 * value),
-                code.select(rising, down, root - slope),
-            )
+            numerator = code.select(rising, slope + root, 2.0 * value)
+            denominator = code.select(rising, down, root - slope)
             after = code.variable(here + numerator / denominator)
             with code.only_if(code.any_lane(open)):
                 after.value = code.select(open, here + self._hop(frame, error, bend), after.value)

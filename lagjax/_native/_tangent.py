@@ -56,23 +56,14 @@ class Tangent:
         if self.projected_end is not None:
             steps.insert(4, self.projected_end.push(directions))
         self._run(steps)
-        self._begin()
+        motion.write_begin(self.start_next, self.form)
         self.form.finish()
         motion.finish()
 
     # ---- rounds ----
 
-    def _begin(self) -> None:
-        frame = self.motion.function("begin", public=True)
-        self.form.prepare(frame)
-        self.motion.begin(frame, self.start_next)
-        frame.finish()
-
     def _run(self, steps: list[Code]) -> None:
-        """`run(job, memory, lanes, rounds)`: this many rounds, or until the batch is done; one step in every lane.
-
-        Returns 1 if there is more to do.
-        """
+        """`run(job, memory, lanes, rounds)`: one step in every lane a round; 1 if there is more to do."""
         frame = self.motion.function("run", INTEGER, result=INTEGER, public=True)
         code, (rounds,) = frame.code, frame.arguments
         directions, per_group = frame.job("directions"), self.directions.lanes // self.motion.width
@@ -175,16 +166,13 @@ class Tangent:
         frame, code, _ = self._step("measure")
         order, powers = frame.job("order"), [frame["power_before"], frame["power"]]
 
-        def size(x):
-            return abs(x)
-
         def last_terms(first):
             return lambda i: code.maximum(
-                *(size(frame["dy", i + first, order - (1 - k)] * power) for k, power in enumerate(powers))
+                *(abs(frame["dy", i + first, order - (1 - k)] * power) for k, power in enumerate(powers))
             )
 
         def whole(first):
-            return lambda i: code.maximum(size(frame["dy", i + first, 0]), size(frame["end", i + first]))
+            return lambda i: code.maximum(abs(frame["dy", i + first, 0]), abs(frame["end", i + first]))
 
         for first in (0, self.motion.n):
             terms, scale = (self.form.largest(code, of(first), self.motion.n) for of in (last_terms, whole))

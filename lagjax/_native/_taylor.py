@@ -152,7 +152,8 @@ class TaylorSeries:
             frame["sums", integer(code, 1) if self.keep_sums else 0, i] = 0.0
 
         # Borders are located on the last order too.
-        with code.loop(self._last_order(code, order) if self.pieces else order, start=1) as k:
+        last = code.select(order < MAX_ORDER, order + 1, MAX_ORDER) if self.pieces else order
+        with code.loop(last, start=1) as k:
             with code.only_if(k > 1):
                 frame.call(self._sums, k)
             inverse = 1.0 / code.as_number(k + 1)
@@ -173,9 +174,6 @@ class TaylorSeries:
         if self.pieces:  # see `coefficients`
             return code.select(order < MAX_ORDER - 1, order, MAX_ORDER - 1)
         return order - 1
-
-    def _last_order(self, code: Code, order: Value) -> Value:
-        return code.select(order < MAX_ORDER, order + 1, MAX_ORDER)
 
     def state_inputs(self, frame: Frame) -> list[Vectors]:
         """The inputs of the program at the present time: q, q̇, t, parameters."""
@@ -238,10 +236,14 @@ class TaylorSeries:
 
     # ---- members and rounds ----
 
-    def begin(self, frame: Frame, start_next: Code) -> None:
-        self.form.prepare(frame)
+    def write_begin(self, start_next: Code, *more: Lines | Tables) -> None:
+        """`begin(job, memory, lanes)`: every lane takes a member; `more` forms prepare the memory, too."""
+        frame = self.function("begin", public=True)
+        for form in (*more, self.form):
+            form.prepare(frame)
         with frame.code.loop(self.width) as lane:
             frame.call(start_next, lane)
+        frame.finish()
 
     def take_numbers(self, frame: Frame, lane: Lane, member: Value) -> None:
         first = member * frame.job("params_stride")

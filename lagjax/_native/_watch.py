@@ -16,7 +16,7 @@ from typing import Any
 import numpy as np
 from llvmlite import ir
 
-from lagjax._native._frame import EXACT, Fields, Frame, Index, integers
+from lagjax._native._frame import Fields, Frame, Index, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._taylor import TaylorSeries
 from lagjax._program._borders import Affine, Borders, Level
@@ -27,7 +27,7 @@ END_OF_STEP: Fields = {
     "nearest": 1,  # the first border, as a part of it
     "seen": 1,  # up to which part of the step all guards can be seen
     "first_at": 1,  # how far from the beginning of the step the first change of a guard is
-    "event": EXACT,  # the mask of the changes of guards, a whole number; −1 without any
+    "event": 1,  # the mask of the changes of guards, a whole number; −1 without any
 }
 
 

@@ -72,50 +72,40 @@ def sentence(result, t_end, t_last, y_end, names: tuple[str, ...], why: str | No
     )
 
 
-def _raise(result, t_end, t_last, y_end, *, names) -> None:
+def _check(result, t_end, t_last, y_end, *, names):
     if text := sentence(result, t_end, t_last, y_end, names):
         raise SimulationError(text, None)
-
-
-check_p = LinearMap(
-    "lagjax_check",
-    lambda result, t_end, *_, **__: [ShapedArray(result.shape, t_end.dtype)],
-    vary=lambda *_, **__: [None],
-)
-
-
-def _check(result, t_end, *others, names):
-    _raise(result, t_end, *others, names=names)
     return [np.zeros(result.shape, t_end.dtype)]
 
 
+def _check_shapes(result, t_end, *_, **__):
+    return [ShapedArray(result.shape, t_end.dtype)]
+
+
+check_p = LinearMap("lagjax_check", _check_shapes, vary=lambda *_, **__: [None])
 compute_on_host(check_p, _check)
 
 
-def _lower_with(on_host):
-    """One comparison where all is well; the host is called only where something failed."""
+def _lower_with(call: Callable):
+    """One comparison where all is well; the host is called, by `call(host, shape, *arrays)`, where something failed."""
 
     def check(result, t_end, *others, names):
         def host(*arrays):
-            _raise(*map(np.asarray, arrays), names=names)
+            _check(*map(np.asarray, arrays), names=names)
 
         shape = jax.ShapeDtypeStruct(result.shape, t_end.dtype)
         well = jnp.isin(result, jnp.asarray(ENDED_WELL, result.dtype)).all()
-        given = result, t_end, *others
-        return [cond_alike(well, lambda *_: jnp.zeros(shape.shape, shape.dtype), on_host(host, shape), *given)]
+        given = functools.partial(call, host, shape), result, t_end, *others
+        return [cond_alike(well, lambda *_: jnp.zeros(shape.shape, shape.dtype), *given)]
 
     return mlir.lower_fun(check, multiple_results=True)
 
 
-def _call_on_buffers(host, shape):
-    return buffer_callback(lambda _, place, *arrays: host(*arrays), shape)
+def _call_on_buffers(host, shape, *arrays):
+    return buffer_callback(lambda _, place, *arrays: host(*arrays), shape)(*arrays)
 
 
-def _call_on_copies(host, shape):
-    return lambda *arrays: jax.pure_callback(lambda *x: host(*x), shape, *arrays)
-
-
-mlir.register_lowering(check_p, _lower_with(_call_on_copies))
+mlir.register_lowering(check_p, _lower_with(jax.pure_callback))
 mlir.register_lowering(check_p, _lower_with(_call_on_buffers), platform="cpu")
 
 

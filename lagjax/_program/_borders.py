@@ -22,6 +22,7 @@ a border is no piece but a feature, and a step that is to pass it begins next to
 
 import math
 from collections.abc import Callable, Container, Sequence
+from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -118,8 +119,9 @@ class Feature(NamedTuple):
     scale: float
 
 
-class Pieced(NamedTuple):
-    """A program that takes its pieces as its last inputs (`Recurrent`)."""
+@dataclass(frozen=True, eq=False)
+class Pieced:
+    """A program that takes its pieces as its last inputs, or only some of the numbers of a member (`Recurrent`)."""
 
     line: StraightLine
     size: int

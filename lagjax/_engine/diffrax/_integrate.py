@@ -67,15 +67,7 @@ class Converted(eqx.Module):
         return jax.tree.unflatten(self.structure, results)
 
 
-def integrate(
-    form: MotionEquations,
-    method: Method,
-    adjoint: diffrax.AbstractAdjoint | None,
-    event: diffrax.Event | None,
-    ts: jax.Array,
-    y0: jax.Array,
-    params: PyTree,
-) -> Solution:
+def integrate(form: MotionEquations, method: Method, adjoint, event, ts, y0, params: PyTree) -> Solution:
     """ẏ = f(t, y) from y0 = (q, q̇), (2n,), at ts[0] to ts[-1], or to the event. Outputs not reached are infinite.
 
     The state is one array: two of them take a solver twice as many operations of half the size.
@@ -99,7 +91,7 @@ def integrate(
     jumps = functools.partial(may_jump, form.motion)
     solution = _differentiable((field, project, ts, y0, params), method, jumps, adjoint, event)
     if project is not None:
-        path = jax.lax.map(lambda at: project(at[0], at[1], params), (ts, solution.path))
+        path = jax.lax.map(lambda at: project(*at, params), (ts, solution.path))
         solution = solution._replace(path=path)
     return solution
 
@@ -128,10 +120,7 @@ def _note_jumps(moving, method: Method, varied) -> Method:
 
 
 def _call(moving, method: Method, adjoint, event=None, *more: diffrax.SubSaveAt) -> tuple[Solution, Any, Any]:
-    """The solution, what `more` diffrax saves, and whether a step crossed a jump, where that is noted.
-
-    `moving` is all that can be differentiated.
-    """
+    """The solution, what `more` diffrax saves, and whether a step crossed a jump, where that is noted."""
     field, project, ts, y0, params = moving
     solver = method.solver if project is None else Projected(method.solver, project)
     # Of the ends alone there is nothing to interpolate, and no test of `ts` by a call back to the host.
@@ -238,11 +227,10 @@ class _RecordedSteps(diffrax.AbstractStepSizeController):
 
     def wrap(self, direction):
         times = jnp.where(jnp.isinf(self.times), jnp.inf, self.times * direction)
-        if self.jumps is None:
-            return _RecordedSteps(times, None)
-        jumps = self.jumps.reversed(direction)
-        times = _exchange(times, jumps.behind, jumps.before)
-        return _RecordedSteps(times, jumps)  # what is recorded of a step is where the next one begins
+        jumps = self.jumps and self.jumps.reversed(direction)
+        if jumps is not None:  # what is recorded of a step is where the next one begins
+            times = _exchange(times, jumps.behind, jumps.before)
+        return _RecordedSteps(times, jumps)
 
     def init(self, terms, t0, t1, y0, dt0, args, func, error_order):
         return jnp.minimum(self.times[0], t1), jnp.array(1)  # the number of steps

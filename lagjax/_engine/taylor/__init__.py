@@ -137,8 +137,7 @@ class MachineCode(AbstractEngine):
         flow, tolerances = flow_of(problem), tolerances_of(problem)
         if problem.is_known and default_platform() == "cpu":
             _require_increasing(flow.program, problem.vector)
-            ts, y0, params = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
-            return Solution._make([*(x[0] for x in flow.run(ts, y0, params, tolerances)[:-1]), None])
+            return _run_one(flow, problem, tolerances)
         ts, y0, params = map(jnp.asarray, (problem.ts, problem.y0, problem.vector))
         if problem.event is None:
             return _primitives.run(flow, tolerances, ts, y0, params)
@@ -162,13 +161,12 @@ class MachineCode(AbstractEngine):
         """
         flow, tolerances = _unguarded_flow(problem), tolerances_of(problem)
         values, given = (located.path, located.t_end, located.y_end), (problem.ts, problem.y0, problem.vector)
-        return attach_derivative(
-            stretch_variation(flow, surfaces, tolerances), values, *given, located.t_end, k, crosses
-        )
+        varied = stretch_variation(flow, surfaces, tolerances)
+        return attach_derivative(varied, values, *given, located.t_end, k, crosses)
 
     def refuses_crossings(self, problem: Problem, surfaces: Surfaces) -> str | None:
         """Why it cannot find the crossings of these surfaces, as the end of a sentence; None where it can."""
-        return self.refuses(dataclasses.replace(problem, event=None, guards=surfaces.guards(notes=True)))
+        return self.refuses(_note_crossings(problem, surfaces))
 
     def crossings(self, problem: Problem, surfaces: Surfaces, room: int, slack: float = 1.0) -> tuple[Solution, Noted]:
         """The motion of one member, and the crossings of its surfaces, `room` for each, on the way.
@@ -177,11 +175,10 @@ class MachineCode(AbstractEngine):
         """
         if problem.is_single:
             return solve_in_doubles(lambda problem: self.crossings(problem, surfaces, room, slack), problem)
-        noting, flow, surfaces, tolerances = _flows_to_crossings(problem, surfaces, room, slack)
+        noting, flow = flow_of(_note_crossings(problem, surfaces)), _unguarded_flow(problem)
+        tolerances = tolerances_of(problem)._replace(notes=room, slack=slack)
         if problem.is_known:
-            ts, y0, params = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
-            solution = noting.run(ts, y0, params, tolerances)
-            solution = Solution._make([*(x[0] for x in solution[:-1]), None])
+            solution = _run_one(noting, problem, tolerances)
             return solution, Noted.read(solution.path, len(surfaces.directions))
         ts, y0, params = map(jnp.asarray, (problem.ts, problem.y0, problem.vector))
         given = noting, flow, surfaces, tolerances
@@ -192,15 +189,19 @@ class MachineCode(AbstractEngine):
         if not batch.is_known or default_platform() != "cpu":
             return batch.map_members(self.solve)
         member = batch.member
+
+        def run(ts, y0, params):
+            problem = member.double_precision if member.is_single else member
+            return flow_of(problem).run(ts, y0, params, tolerances_of(problem))
+
         given = np.asarray(member.ts)[None], np.asarray(batch.y0), np.asarray(batch.vectors)
-        if member.is_single:
-            return compute_in_doubles(lambda *given: _run(member.double_precision, given), *given)
-        return _run(member, given)
+        return compute_in_doubles(run, *given) if member.is_single else run(*given)
 
 
-def _run(problem: Problem, given: tuple) -> Solution:
-    ts, y0, params = given
-    return flow_of(problem).run(ts, y0, params, tolerances_of(problem))
+def _run_one(flow: Flow, problem: Problem, tolerances: Tolerances) -> Solution:
+    """The motion of one member on the host, whose numbers are known."""
+    ts, y0, params = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
+    return Solution._make([*(x[0] for x in flow.run(ts, y0, params, tolerances)[:-1]), None])
 
 
 def flow_of(problem: Problem) -> Flow:
@@ -214,13 +215,8 @@ def flow_of(problem: Problem) -> Flow:
         raise ValueError(f"There is no machine code for this scene: {reason}.") from None
 
 
-def _flows_to_crossings(
-    problem: Problem, surfaces: Surfaces, room: int, slack: float
-) -> tuple[Flow, Flow, Surfaces, Tolerances]:
-    """The flow that notes the crossings of surfaces, that without any, the surfaces, and the tolerances of both."""
-    noting = dataclasses.replace(problem, event=None, guards=surfaces.guards(notes=True))
-    tolerances = tolerances_of(problem)._replace(notes=room, slack=slack)
-    return flow_of(noting), _unguarded_flow(problem), surfaces, tolerances
+def _note_crossings(problem: Problem, surfaces: Surfaces) -> Problem:
+    return dataclasses.replace(problem, event=None, guards=surfaces.guards(notes=True))
 
 
 def _unguarded_flow(problem: Problem) -> Flow:

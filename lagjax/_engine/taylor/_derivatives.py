@@ -72,9 +72,8 @@ def jvp(flow: Flow, motions: Motions, dy0, dparams, tolerances: Tolerances) -> t
     path_dot, y_dot = (x.reshape(members, groups * directions, *x.shape[2:])[:, :m] for x in of_groups)
     if flow.projection is not None and path.shape[1] > 2:
         inner = path_dot[:, :, 1:-1]
-        inner[:] = _differentiate_projection(
-            pushforward, flow.projection, inner.shape[:-1], *_inner_states(motions), inner, dparams[:, :, None]
-        )
+        given = *_inner_states(motions), inner, dparams[:, :, None]
+        inner[:] = _differentiate_projection(pushforward, flow.projection, inner.shape[:-1], *given)
     path_dot[:, :, -1] = y_dot
     path_dot[~np.broadcast_to(np.isfinite(path)[:, None], path_dot.shape)] = np.nan
     y_dot[result != SUCCESSFUL] = np.nan
@@ -107,9 +106,8 @@ def _jvp_over_steps(flow: Flow, motions: Motions, dots, tolerances) -> tuple[np.
 
     def advance_tangents(steps: Steps):
         rows, of = steps.rows, motions.take(steps.rows)
-        path_dot[rows], y_dot[rows], excess = steps.kernel.jvp(
-            of.ts, of.params, steps.record, dy0[rows], dparams[rows], tolerances.floor
-        )
+        given = of.ts, of.params, steps.record, dy0[rows], dparams[rows]
+        path_dot[rows], y_dot[rows], excess = steps.kernel.jvp(*given, tolerances.floor)
         return excess / tolerances.largest_excess
 
     for row in _go_over_steps(flow, motions, tolerances, advance_tangents, advance_tangents):
@@ -176,9 +174,8 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
 
     def transpose_steps(steps: Steps):
         rows, of = steps.rows, motions.take(steps.rows)
-        y_ct[rows], params_ct[rows], excess = steps.kernel.vjp(
-            of.ts, of.params, steps.record, path_ct[rows], end_ct[rows]
-        )
+        given = of.ts, of.params, steps.record, path_ct[rows], end_ct[rows]
+        y_ct[rows], params_ct[rows], excess = steps.kernel.vjp(*given)
         return excess / tolerances.largest_excess
 
     def probe(steps: Steps):

@@ -96,29 +96,22 @@ class Line:
         """Outputs (…, outputs) at inputs in parts (…, some): by NumPy until that took as long as to make code."""
         rows = np.concatenate([part.reshape(-1, part.shape[-1]) for part in parts], axis=1)
         self._calls += 1
-        if self._calls >= _CALLS and self.code is not None:
-            found = self.code(rows)
-        else:
-            found = self.line.evaluate(list(rows.T)).T
+        code = self.code if self._calls >= _CALLS else None
+        found = self.line.evaluate(list(rows.T)).T if code is None else code(rows)
         return found.reshape(*parts[0].shape[:-1], self.outputs)
 
     @functools.cached_property
     def forward(self) -> "Line":
         """(x, v) ↦ D(x) v, v (count,)."""
-        return self._derivative(
-            pushforward(self.line, self._dtypes, range(self.count), range(self.outputs)), self.count
-        )
+        return self._derivative(pushforward, self.count)
 
     @functools.cached_property
     def back(self) -> "Line":
         """(x, w) ↦ D(x)ᵀ w, w (outputs,)."""
-        return self._derivative(pullback(self.line, self._dtypes, range(self.count), range(self.outputs)), self.outputs)
+        return self._derivative(pullback, self.outputs)
 
-    @property
-    def _dtypes(self) -> list[np.dtype]:
-        return [np.dtype(float)] * self.size
-
-    def _derivative(self, line: StraightLine, linear: int) -> "Line":
+    def _derivative(self, differentiate: Callable, linear: int) -> "Line":
+        line = differentiate(self.line, [np.dtype(float)] * self.size, range(self.count), range(self.outputs))
         return Line(line, self.size + linear, self.size)
 
     def __call__(self, x):
@@ -190,14 +183,14 @@ def _register_handler() -> None:
     jax.ffi.register_ffi_target(_TARGET, capsule(line_handler()), platform="cpu", api_version=1)
 
 
+def _push(x, w, _, line: Line):
+    return forward_p.bind(*x, *w, line=line)
+
+
+def _pull(x, w, _, line: Line):
+    return back_p.bind(*x, *w, line=line)
+
+
 value_p = _LineMap("value", lambda line: line, lambda line: line.outputs)
-forward_p = _LineMap(
-    "forward",
-    lambda line: line.forward,
-    lambda line: line.outputs,
-    1,
-    lambda x, w, _, line: back_p.bind(*x, *w, line=line),
-)
-back_p = _LineMap(
-    "back", lambda line: line.back, lambda line: line.count, 1, lambda x, w, _, line: forward_p.bind(*x, *w, line=line)
-)
+forward_p = _LineMap("forward", lambda line: line.forward, lambda line: line.outputs, 1, _pull)
+back_p = _LineMap("back", lambda line: line.back, lambda line: line.count, 1, _push)

@@ -324,10 +324,8 @@ def _curvature_transpose(cotangents, *args, **settings):
 
 def _batch_rule(primitive):
     def rule(args, axes, **settings):
-        given = [
-            jnp.expand_dims(x, 0) if axis is None else jnp.moveaxis(x, axis, 0)
-            for x, axis in zip(args, axes, strict=True)
-        ]
+        given = zip(args, axes, strict=True)
+        given = [jnp.expand_dims(x, 0) if axis is None else jnp.moveaxis(x, axis, 0) for x, axis in given]
         outs = primitive.bind(*given, **settings)
         return outs, [0] * len(outs)
 
@@ -361,12 +359,8 @@ def _batch_of_batches(primitive, outputs_after):
 run_p = VaryingPrimitive("lagjax_run")
 run_p.multiple_results = True
 run_p.def_abstract_eval(_run_shapes)
-jvp_p = LinearMap(
-    "lagjax_jvp", _jvp_shapes, _vary_jvp, 2, lambda given, w, _, **settings: vjp_p.bind(*given, *w, **settings)
-)
-vjp_p = LinearMap(
-    "lagjax_vjp", _vjp_shapes, _vary_vjp, 2, lambda given, w, _, **settings: jvp_p.bind(*given, *w, **settings)
-)
+jvp_p = LinearMap("lagjax_jvp", _jvp_shapes, _vary_jvp, 2, lambda given, w, _, **of: vjp_p.bind(*given, *w, **of))
+vjp_p = LinearMap("lagjax_vjp", _vjp_shapes, _vary_vjp, 2, lambda given, w, _, **of: jvp_p.bind(*given, *w, **of))
 curvature_p = LinearMap("lagjax_curvature", _curvature_shapes, _vary_curvature, 2)
 ad.primitive_jvps[run_p] = _derivative_of_run
 ad.primitive_transposes[curvature_p] = _curvature_transpose

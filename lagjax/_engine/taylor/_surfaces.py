@@ -246,16 +246,14 @@ def crossing_variation(surfaces: Surfaces) -> Callable:
     def move_to_zero(k, taken, t, y, numbers):
         numbers_there = still(numbers)
         values, rates, slope = follow(t, y, numbers)
-        _, (_, bends, turn) = jax.jvp(
-            lambda t, y: follow(t, y, numbers_there), still((t, y)), (jnp.ones_like(t), still(slope))
-        )
+        along, here = (jnp.ones_like(t), still(slope)), still((t, y))
+        _, (_, bends, turn) = jax.jvp(lambda t, y: follow(t, y, numbers_there), here, along)
         at = k
         if surfaces.borders is not None:
             times = jnp.abs(still(values / rates))
             times = jnp.where(jnp.isnan(times), jnp.inf, times).at[count:].multiply(_LATER)
-            at = jnp.argmin(
-                jnp.where((jnp.arange(times.size) >= count) | (jnp.arange(times.size) == k), times, jnp.inf)
-            )
+            number = jnp.arange(times.size)
+            at = jnp.argmin(jnp.where((number >= count) | (number == k), times, jnp.inf))
         value, rate, bend = (jnp.where(np.arange(len(values)) == at, x, 0.0).sum() for x in (values, rates, bends))
         crosses = ~taken | (rate != 0)
         rate = jnp.where(taken & crosses, rate, 1.0)
