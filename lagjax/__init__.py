@@ -145,10 +145,8 @@ def __getattr__(name: str) -> Any:
         return getattr(importlib.import_module("lagjax.designs"), name)
     if (path := _places().get(name)) is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value = (
-        importlib.import_module(f"{path}.{name}") if path == __name__ else getattr(importlib.import_module(path), name)
-    )
-    return globals().setdefault(name, value)
+    module = importlib.import_module(f"{path}.{name}" if path == __name__ else path)
+    return globals().setdefault(name, module if path == __name__ else getattr(module, name))
 
 
 def __dir__() -> list[str]:

@@ -48,5 +48,5 @@ from lagjax._equations._motion import Motion
 from lagjax._equations._patterns import jacobian_pattern, sparse_jacobian
 from lagjax._equations._rank import Decided, decide, echelon_form, null_space, span_outside
 from lagjax._equations._scales import Scales
-from lagjax._equations._sparse import Diagonal, MatrixFree
+from lagjax._equations._sparse import MatrixFree
 from lagjax._equations._structure import LARGEST_DENSE, LEAST_COORDINATES, SparseMotion, SparseStructure

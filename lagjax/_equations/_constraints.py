@@ -190,9 +190,7 @@ def _largest_term(terms, weights):
 _NEWTON_STEPS = 50
 
 
-def nearest_consistent(
-    motion: Any, q: Vector, qdot: Vector, t: Time, params: PyTree, terms=0.0
-) -> tuple[Vector, Vector]:
+def nearest_consistent(motion, q: Vector, qdot: Vector, t: Time, params: PyTree, terms=0.0) -> tuple[Vector, Vector]:
     """The consistent state of a `Motion` nearest to (q, q̇), shape (n,) each; NaN where it is not found.
 
     q̂ minimises (q̂ − q)ᵀM(q̂ − q) with M = M(q, q̇) among all with f = 0, and then the velocities minimise the same form

@@ -554,10 +554,8 @@ class Derivation:
         names = "mass_matrix", "jacobian", "release", "drag"
         table = [np.array(self._positions(name), int).reshape(self.shape(name)) for name in names]
         ends = np.cumsum([0, *(x.size for x in table)])
-        rows = self.shape("jacobian")[0]
-        place = np.select(
-            [column < n, row >= n], [n * row + column, ends[2] + row - n], ends[3] + rows * row + column - n
-        )
+        m = self.shape("jacobian")[0]
+        place = np.select([column < n, row >= n], [n * row + column, ends[2] + row - n], ends[3] + m * row + column - n)
         positions = np.concatenate([x.ravel() for x in table])[place].tolist()
         positions += range(starts[saddle.c], starts[saddle.c] + constraints)
         if saddle.b is not None:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._equations._derivation import Derivation, columns_of, derivation_of, numbers_of
-from lagjax._equations._linear import saddle_many, schur_complements
+from lagjax._equations._linear import factorize, saddle, saddle_many, schur_complements
 from lagjax._equations._motion import Motion
 from lagjax._equations._sparse import Diagonal, Entries
 from lagjax._interface import Layout, halves
@@ -129,10 +129,16 @@ def borders_of(derivation: Derivation):
     return borders if borders is not None and borders.switches else None
 
 
-def solve_saddle(of: dict[str, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """q̈ (S, n) and λ (S, m) from the quantities `SADDLE`."""
-    x, multipliers = saddle_many(of["mass_matrix"], of["force"][:, :, None], of["jacobian"], of["gamma"][:, :, None])
-    return x[:, :, 0], multipliers[:, :, 0]
+@np.errstate(all="ignore")
+def solve_saddle(of: dict[str, Any]) -> tuple[Any, Any]:
+    """q̈ and λ from the quantities `SADDLE` of states in NumPy, or of one state in JAX; of a large scene its own."""
+    if "mass_matrix" not in of:
+        return of["acceleration"], of["multipliers"]
+    matrix, b, jacobian, c = (of[name] for name in SADDLE)
+    if isinstance(b, np.ndarray):
+        x, multipliers = saddle_many(matrix, b[:, :, None], jacobian, c[:, :, None])
+        return x[:, :, 0], multipliers[:, :, 0]
+    return saddle(matrix, b, jacobian, c)[:2] if c.size else (factorize(matrix).solve(b), c)
 
 
 _OF_SCHUR, _OF_ENERGY = ("mass_matrix", "jacobian"), ("lagrangian", "momentum")

@@ -198,9 +198,7 @@ def _shorter_recursion(motion: Motion, state: _ScalarState, lagrangian: _Taped, 
     return recursion if all(a < b for a, b in zip(*costs, strict=True)) else None
 
 
-def _cost(
-    state: _ScalarState, nodes: list[int], places: np.ndarray, operations: int, solution: int
-) -> tuple[int, float]:
+def _cost(state: _ScalarState, nodes: list[int], places, operations: int, solution: int) -> tuple[int, float]:
     """The operations of an elimination with its matrix, whose `nodes` stand at these places, and those of a step."""
     operations += state.derivatives.size(nodes)
     sums = np.where(places[:, 0] == places[:, 1], 1, 2)[state.varying(np.array(nodes))].sum()

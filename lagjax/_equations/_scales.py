@@ -24,7 +24,6 @@ import numpy as np
 from jaxtyping import Float
 
 Numbers = Float[np.ndarray, " n"]
-States = Float[np.ndarray, "S n"]
 
 # Where along the line the forces are looked at, in parts of l: steps by two, which is how well a reach is known. Where
 # l is not known these are all sizes a double can have, but for those whose squares it has not.
@@ -42,10 +41,8 @@ class Scales(NamedTuple):
     reach: float = 1.0  # by how many times those of q a state may be moved until forces are not linear, 1 at least
 
     @classmethod
-    def from_quantities(
-        cls, evaluate: Callable[[str, States, States], np.ndarray], q: Numbers, qdot: Numbers
-    ) -> "Scales":
-        """The scales at (q, qdot); `evaluate` gives "force", "momentum" and "mass_matrix" at S states q, q̇."""
+    def from_quantities(cls, evaluate: Callable, q: Numbers, qdot: Numbers) -> "Scales":
+        """The scales at (q, qdot); `evaluate(name, q, qdot)` gives force, momentum or mass matrix at S states."""
         q, qdot = np.asarray(q, float), np.asarray(qdot, float)
         with np.errstate(all="ignore"):
             mass = np.diagonal(evaluate("mass_matrix", q[None], qdot[None])[0])

@@ -43,6 +43,10 @@ class SparseStructure(NamedTuple):
     schur: MatrixForm | None
     positions: MatrixForm | None
 
+    @property
+    def has_diagonal_mass(self) -> bool:
+        return isinstance(self.mass, Diagonal)
+
     def __str__(self) -> str:
         linked = "" if self.schur is None else f", G M⁻¹ Gᵀ is {self.schur.name}"
         return f"its mass matrix is {self.mass.name}{linked}"
@@ -193,11 +197,9 @@ class SparseMotion(Motion):
         eliminate = self._prepare(True, *jax.lax.stop_gradient(state), products=products)[2]
 
         def solve(_, right):
-            options = {"tol": 10 * float(jnp.finfo(state[0].dtype).eps), "restart": 30, "maxiter": 10}
-            preconditioner = lambda rest: eliminate(*rest)  # noqa: E731
-            return jax.scipy.sparse.linalg.gmres(
-                linear, right, M=preconditioner, solve_method="incremental", **options
-            )[0]
+            tolerance, prepare = 10 * float(jnp.finfo(state[0].dtype).eps), lambda rest: eliminate(*rest)
+            options = {"tol": tolerance, "restart": 30, "maxiter": 10, "solve_method": "incremental"}
+            return jax.scipy.sparse.linalg.gmres(linear, right, M=prepare, **options)[0]
 
         return jax.lax.custom_linear_solve(linear, right, solve, symmetric=True)
 

@@ -199,9 +199,7 @@ def _raise_unless_ok(layout: Layout, ts, end: tuple, noted: Noted, result) -> No
     return noted
 
 
-def restore_crossings(
-    layout: Layout, names: tuple[str, ...] | None, noted: Noted, ok
-) -> Crossings | dict[str, Crossings]:
+def restore_crossings(layout: Layout, names, noted: Noted, ok) -> Crossings | dict[str, Crossings]:
     """The crossings in the pytree of the user, and by the names of the sections."""
 
     def section_crossings(k: int) -> Crossings:

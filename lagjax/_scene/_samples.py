@@ -274,9 +274,7 @@ def _window(table, start, size: int) -> list:
     dimensions = jax.lax.GatherDimensionNumbers(
         offset_dims=tuple(range(where, where + table.ndim)), collapsed_slice_dims=(), start_index_map=(0,)
     )
-    found = jax.lax.gather(
-        table, start[..., None], dimensions, (size, *table.shape[1:]), mode=jax.lax.GatherScatterMode.CLIP
-    )
+    found = jax.lax.gather(table, start[..., None], dimensions, (size, *table.shape[1:]), mode="clip")
     return [jax.lax.index_in_dim(found, k, where, keepdims=False) for k in range(size)]
 
 

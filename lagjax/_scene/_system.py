@@ -464,9 +464,7 @@ def _coefficients(contacts, one_way, restitution, friction, slip) -> tuple:
     if contacts is None:
         some = [name for name, x in given.items() if callable(x) or jax.tree.leaves(x) != [0.0]]
         if slip is not None or some:
-            raise ValueError(
-                f"{(some or ['slip'])[0]} is that of contacts: give contacts=..., the gaps, to the System."
-            )
+            raise ValueError(f"{[*some, 'slip'][0]} is that of contacts: give contacts=..., the gaps, to the System.")
         return (None, None) if one_way is None else (lambda: 0.0, lambda: 0.0)
     for name, value in given.items():
         if not callable(value):

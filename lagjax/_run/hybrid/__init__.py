@@ -197,9 +197,9 @@ def simulate_hybrid(
 
 
 def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, record: TransitionRecord) -> Trajectory:
-    (q, qdot), end, (q_before, qdot_before), (q_next, qdot_next) = _restore(problem.layout, ending, record)
+    (q, qdot), end, (q_at, qdot_at), (q_next, qdot_next) = _restore(problem.layout, ending, record)
     transitions = Transitions(
-        t=record.t, q=q_before, qdot=qdot_before, source=record.source, target=record.target, number=record.number,
+        t=record.t, q=q_at, qdot=qdot_at, source=record.source, target=record.target, number=record.number,
         count=jnp.sum(record.source >= 0), order_matters=record.order_matters, let_out=ending.let_out,
         q_next=q_next, qdot_next=qdot_next,
     )  # fmt: skip

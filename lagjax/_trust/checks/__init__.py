@@ -3,7 +3,7 @@
 Everything is computed once, by the programs of the scene: values, derivatives, their finite differences, the mass
 matrix at states nearby, the linearised motion. What follows is NumPy and sentences, each file for one question.
 `_scene_at_start` is what they all look at, `_findings` what they return. In their order: `_derivative_checks` (by
-`_differences`), `_constraint_checks`, `_contact_checks`, `_mass`, `_jumps_nearby`, `_stiffness`.
+`_differences`), `_constraint_checks`, `_contact_checks`, `_mass`, `_jumps_near`, `_stiffness`.
 """
 
 from typing import Any
@@ -21,14 +21,7 @@ from lagjax._interface import Layout, is_concrete, join_names, not_finite, requi
 from lagjax._native import ATOL_OVER_MOTION, ATOL_OVER_RTOL
 from lagjax._primitives import accepts_singles
 from lagjax._scene import ROLES, System, replace_functions, require_system
-from lagjax._trust.checks import (
-    _constraint_checks,
-    _contact_checks,
-    _derivative_checks,
-    _jumps_nearby,
-    _mass,
-    _stiffness,
-)
+from lagjax._trust.checks import _constraint_checks, _contact_checks, _derivative_checks, _jumps_near, _mass, _stiffness
 from lagjax._trust.checks._findings import Finding, Findings
 from lagjax._trust.checks._mass import describe_direction
 from lagjax._trust.checks._scene_at_start import CheckedScene
@@ -103,7 +96,7 @@ def _scene_findings(system, q, qdot, t, params) -> tuple[list[Finding], str]:
         )
     if not any(finding.level == "error" for finding in reported):
         known = {finding.where for finding in reported if finding.kind == "kink"}  # one finding for each direction
-        nearby = [finding for finding in _jumps_nearby.findings(scene) if finding.where not in known]
+        nearby = [finding for finding in _jumps_near.findings(scene) if finding.where not in known]
         reported += [*_acceleration(scene), *nearby, *_stiffness.findings(scene)]
     return [*reported, *_time(scene)], ""
 

@@ -6,8 +6,8 @@ from lagjax._equations import describe_pieces, offenders
 from lagjax._interface import join_names
 from lagjax._trust.checks._differences import Slopes, differ, ladder, slopes
 from lagjax._trust.checks._findings import Finding
-from lagjax._trust.checks._jumps_nearby import OF_FORCE
-from lagjax._trust.checks._scene_at_start import CheckedScene, Sides
+from lagjax._trust.checks._jumps_near import OF_FORCE
+from lagjax._trust.checks._scene_at_start import CheckedScene
 
 _SHOWN = 3  # findings of one kind about one function
 # Coordinates beyond which derivatives are first compared along `_RANDOM` directions of q, as many of q̇, and along the
@@ -25,9 +25,7 @@ def findings(scene: CheckedScene) -> list[Finding]:
     if scene.layout.size > _ALL_AT_ONCE and scene.is_lowered and _agree(scene):
         return []
     sides = scene.sides()
-    return [
-        finding for block in _blocks(scene, sides.round_off) for finding in _compare_derivatives(scene, sides, *block)
-    ]
+    return [found for block in _blocks(scene, sides.round_off) for found in _compare_derivatives(scene, sides, *block)]
 
 
 # ---- finite ----------------------------------------------------------------------------------------------------------
@@ -160,9 +158,7 @@ def _agree(scene: CheckedScene) -> bool:
     return True
 
 
-def _compare_derivatives(
-    scene: CheckedScene, sides: Sides, name, role, derivative, directions, outputs
-) -> list[Finding]:
+def _compare_derivatives(scene: CheckedScene, sides, name, role, derivative, directions, outputs) -> list[Finding]:
     m, dtype, names = scene.measured, scene.layout.dtype, scene.names
     chosen = np.ix_(directions, range(sides.plus.shape[1]), outputs)
     place = _places(scene)[list(directions)]

@@ -13,19 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._equations import (
-    SADDLE,
-    Derivation,
-    Diagonal,
-    Motion,
-    Sample,
-    derivation_of,
-    distances,
-    factorize,
-    saddle,
-    solve_saddle,
-    unit_diagonal,
-)
+from lagjax._equations import SADDLE, Derivation, Motion, Sample, derivation_of, distances, solve_saddle, unit_diagonal
 from lagjax._interface import Layout
 from lagjax._program import Unlowerable, lower
 from lagjax._scene import System
@@ -66,7 +54,7 @@ class Law(NamedTuple):
     def knows_mass(self) -> bool:
         """True if the eigenvalues of M are known: not of a large scene, unless M is diagonal."""
         structure = self.derivation.structure
-        return structure is None or isinstance(structure.mass, Diagonal)
+        return structure is None or structure.has_diagonal_mass
 
     @classmethod
     def from_system(cls, system: System, layout: Layout, params, mode: str) -> "Law":
@@ -97,7 +85,7 @@ class Law(NamedTuple):
 
     def accelerations(self, sample: Sample) -> np.ndarray:
         """q̈ at S states, shape (S, n)."""
-        return sample.evaluate_in_parts(lambda part: _solve(part.quantities(*SADDLE))[0], self._portion(SADDLE))
+        return sample.evaluate_in_parts(lambda part: solve_saddle(part.quantities(*SADDLE))[0], self._portion(SADDLE))
 
     def _portion(self, names: tuple[str, ...]) -> int:
         return max(1, _CHUNK // sum(self.derivation.count(name) for name in names))
@@ -168,7 +156,7 @@ class Law(NamedTuple):
             slopes=add_changes(rtol * far + atol, rtol * fast + atol),
             sizes=add_changes(far, fast) + is_energy * terms[..., None],
             power=self._power(of, qdot),
-            acceleration=_solve(of)[0] if self.works else xp.zeros_like(q),
+            acceleration=solve_saddle(of)[0] if self.works else xp.zeros_like(q),
             distances=off_q,
             rates=off_qdot,
             mass=of["mass"],
@@ -182,23 +170,13 @@ class Law(NamedTuple):
         if not self.works:
             return xp.zeros_like(of["lagrangian_by_t"])
         power = xp.einsum("...i,...i->...", of["nonconservative_force"], qdot) - of["lagrangian_by_t"]
-        return power - xp.einsum("...k,...k->...", _solve(of)[1], of["driving"]) if self.motion.constrained else power
+        if not self.motion.constrained:
+            return power
+        return power - xp.einsum("...k,...k->...", solve_saddle(of)[1], of["driving"])
 
 
 _SOURCES = ("lagrangian_by_t", "nonconservative_force", "driving")
 _QUANTITIES = ("lagrangian", "momentum", "energy_by_q", "residual", "rates", *SADDLE, *_SOURCES)
-
-
-@np.errstate(all="ignore")
-def _solve(of: dict[str, Any]) -> tuple[Any, Any]:
-    """q̈ and λ from the quantities `SADDLE` of states in NumPy, or of one state in JAX; of a large scene its own."""
-    if "mass_matrix" not in of:
-        return of["acceleration"], of["multipliers"]
-    if isinstance(of["force"], np.ndarray):
-        return solve_saddle(of)
-    if not of["gamma"].size:
-        return factorize(of["mass_matrix"]).solve(of["force"]), of["gamma"]
-    return saddle(*(of[name] for name in SADDLE))[:2]
 
 
 def _products(xp, mass, jacobian, qdot, chosen) -> dict[str, Any]:
