@@ -176,8 +176,7 @@ class Batch(eqx.Module):
     """Many problems of one scene, which differ in their initial states and in numbers of their parameters.
 
     `member` is a problem of the structure of all; `y0` (N, 2n) holds the initial states, and `params` the parameters,
-    with the members as first axis of every leaf whose entry in `axes` is 0. The others, whose entry is None, are for
-    all members.
+    with the members as first axis of every leaf whose entry in `axes` is 0. Those whose entry is None are for all.
     """
 
     member: Problem
@@ -404,13 +403,6 @@ def _check_fields(dtype, params, ts, rtol, atol, max_steps, event) -> dict[str, 
     """The fields of a problem that depend neither on its scene nor on its state. Raises where they cannot be right."""
     ts = output_times(ts, dtype)
     require_budget(max_steps, "max_steps")
-    tolerances = _tolerances(dtype, rtol, atol)
-    event = _event(event, dtype)
-    return dict(params=as_arrays(params, dtype), ts=ts, tolerances=tolerances, max_steps=max_steps, event=event)
-
-
-def _tolerances(dtype, rtol, atol) -> tuple[Float[Numbers, ""] | None, Float[Numbers, ""] | None]:
-    """rtol and atol as arrays, where they are given. Raises where no engine meets them."""
     if rtol is not None and (reason := too_tight(require_tolerance(rtol, "rtol"), DOUBLE, LEAST_RTOL)):
         raise ValueError(f"{reason}.")
     if atol is not None:
@@ -419,7 +411,8 @@ def _tolerances(dtype, rtol, atol) -> tuple[Float[Numbers, ""] | None, Float[Num
     def array(x):
         return np.asarray(x, DOUBLE) if x is not None and is_concrete(x) else as_arrays(x, dtype)
 
-    return array(rtol), array(atol)
+    tolerances, event = (array(rtol), array(atol)), _event(event, dtype)
+    return dict(params=as_arrays(params, dtype), ts=ts, tolerances=tolerances, max_steps=max_steps, event=event)
 
 
 @functools.lru_cache(maxsize=16)
@@ -544,8 +537,7 @@ class _SignChange(optx.Bisection):
     """Bisection that stops when the interval is as small as the dtype resolves, whatever the size of the function.
 
     The sign change that fired an event brackets its root, so that this always arrives. It also does where there is
-    nothing to find, as in the members of a batch that had no event, or in a Boolean one: there diffrax asks for the end
-    of the step.
+    nothing to find, as in members of a batch that had no event, or in a Boolean one: diffrax asks for the step's end.
     """
 
     def init(self, fn, y, args, options, f_struct, aux_struct, tags):

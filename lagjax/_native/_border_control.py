@@ -550,8 +550,7 @@ class BorderControl:
         """Take the piece beyond a border, which touches it; a piece that touches one is not decided anew.
 
         A motion that would go back over the border at once is pushed onto it from both sides: it slides. So does one
-        that has come back in no measurable time, or not to rounding: it bounces off the border, less and less, and
-        comes to rest.
+        that has come back in no measurable time, or not to rounding: it bounces off the border, ever less, and rests.
         """
         code, hit, again = frame.code, border.is_hit, frame["stepped"] <= 0.0
         no_time = ~again & (abs(end_at_border(frame)) <= limits.NO_TIME * frame["smallest"])

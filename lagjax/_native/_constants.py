@@ -2,8 +2,7 @@
 
 "Measured" means: varied by factors of two on free motions (double pendulum, Kepler at e = 0.9), borders (a wedge, a
 bump and a pulse of the force), constrained ones (a double pendulum in Cartesian coordinates, a slider-crank through its
-dead centres) and events (waves, grazing, two crossings 2e-5 apart). Where nothing is said, neither factor changed a
-step.
+dead centres) and events (waves, grazing, two crossings 2e-5 apart). Else neither factor changed a step.
 """
 
 from typing import NamedTuple
@@ -143,15 +142,13 @@ GROWTH_OF_LENGTH = 0.25
 # motion rests on it. What is left of its velocity is as small as that.
 NO_TIME = 0.25
 # A switching number is known along a step where its last terms are at most `SWITCH_TOLERANCES` tolerances of its size.
-# They are less than one in a step that suits the state, unless the number is another one than that: there the step is
-# halved.
+# They are less than one in a step that suits the state, unless the number is another one than that: then it is halved.
 SWITCH_TOLERANCES, MOST_HALVINGS = 16.0, 64
 # Below atol they are at most this part of its size, so that what approaches zero for ever, as exp(−s), keeps its sign:
 # its series has it up to s = 3 at the order of the default tolerance. Doubled, that of order 20 loses it.
 RESOLVED = 2.0**-17
 # exp(u) below u = −`FAINT` is 2e-35: nothing, whatever it is multiplied with. Above it, u may rise in one step by
-# `RISE` parts of the order p: then exp(u) is the sum of terms Rᵏ/k! that fall from the last one on, as step control
-# expects.
+# `RISE` parts of the order p: then exp(u) is the sum of terms Rᵏ/k! that fall from the last one on, as steps expect.
 FAINT, RISE = 80.0, 0.5
 # exp(u) is infinite above u = 709.8: steps from above end below that, and fall by no more than they may rise as long as
 # its coefficients may be infinite, e²⁰⁰ times the twentieth power of a rate. Doubled, only rates up to 1e6 are told.

@@ -28,8 +28,7 @@ _NUMBERS = ("states", "numbers", "order", "max_steps", "rounds", "room", "direct
 class DerivativePlan(ctypes.Structure):
     """The plan of a handler: the functions of both kernels, doubles and integers of a thread of each, and how to run.
 
-    Steps of `room` are written down; `rounds` are those of the motion. `others` counts the doubles of a member in the
-    second result.
+    `room` steps are written down; `rounds` are those of the motion, `others` doubles of a member in the second result.
     """
 
     _fields_ = [

@@ -99,8 +99,7 @@ class Events:
         direction of the guard. To note what changes, it begins here. Where it goes to the other side, and does so in
         the direction of the guard, that is a change at the start, into `met`. Otherwise, and where nobody knows from
         where it comes, it is the side that the motion goes to. Where it goes its rate says or, where that is zero to
-        rounding too, the first term of its series that is not. The rounding of a start is that of the numbers that came
-        in.
+        rounding too, the first term of its series that is not. A start is rounded as the numbers that came in.
 
         A motion that remembers may begin beyond the surface, on the other side than it comes from. Where it goes on
         that is a change at the start, too, and where the side is infinite it is one wherever the motion goes.

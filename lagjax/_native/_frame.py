@@ -10,8 +10,7 @@ these like dictionaries:
     lane["member"]                              which member it carries, an integer
     frame.job("order"), frame.read("ts", i)     a field of the job, and an element of an array it points to
 
-Every function takes three pointers, to the job, the memory and the integers of the lanes, and then what it is called
-with.
+Every function takes three pointers, to the job, the memory and the integers of the lanes, and then its own arguments.
 """
 
 import copy

@@ -19,7 +19,7 @@ from lagjax._native._frame import CACHE_LINE, LANE
 from lagjax._native._handler import job_of
 from lagjax._native._ir import BIT, DOUBLE, INTEGER, POINTER, Code, Value, unroll_loops
 from lagjax._native._run_records import RECORDED
-from lagjax._native._taylor import TaylorSeries
+from lagjax._native._taylor import TaylorSeries, integer
 
 _ROUNDS = 2**63 - 1  # `max_steps` ends every member, and so the kernel
 _WORD = ir.IntType(32)
@@ -99,8 +99,8 @@ class OneLane(NamedTuple):
 def motion_entry(motion: OneLane, order: int) -> str:
     """The module of `MOTION`, `integrate(*arguments, *results)`: it calls the `begin` and `run` of an `_integrator`."""
     thread = _Thread(MOTION)
-    job = job_of(thread.code, _integrator.JOB, thread.at | thread.numbers | {"order": thread.whole(order)})
-    thread.run("", motion, job, thread.memory(motion.size), thread.words(1))
+    job = job_of(thread.code, _integrator.JOB, thread.at | thread.numbers | {"order": integer(thread.code, order)})
+    thread.run("", motion, job, thread.memory(motion.size), thread.code.stack(1))
     return thread.finish()
 
 
@@ -117,7 +117,7 @@ class _Thread:
         self.module.triple = ""
         kinds = [POINTER] * (len(entry.arguments) + len(entry.results))
         self.code = Code(self.module, "integrate", kinds, lanes=1, public=True)
-        self.lanes = self.words(len(LANE))
+        self.lanes = self.code.stack(len(LANE))
         self.at = dict(zip((*entry.arguments, *entry.results), self.code.arguments, strict=True))
         self.numbers = {
             name: self.code.load(self.code.element(self.at["numbers"], i), _KINDS[name])
@@ -129,21 +129,15 @@ class _Thread:
         self.code.finish()
         return str(self.module)
 
-    def whole(self, x: int) -> Value:
-        return self.code.as_value(x, INTEGER)
-
-    def words(self, count: int) -> Value:
-        return self.code.stack(count)
-
     def memory(self, doubles: int) -> Value:
         return self.code.stack(doubles, align=8 * CACHE_LINE)
 
     def run(self, name: str, motion: OneLane, job: Value, memory: Value, *more: Value) -> None:
         """Begin and run the members of a job, all of them, in a memory that is cleared before."""
-        bits = ir.Constant(ir.IntType(8), 0), self.whole(8 * motion.size), ir.Constant(BIT, 0)
+        bits = ir.Constant(ir.IntType(8), 0), integer(self.code, 8 * motion.size), ir.Constant(BIT, 0)
         self._call("llvm.memset.p0.i64", memory, *bits)
         self._call(f"begin{name}", job, memory, self.lanes)
-        self._call(f"run{name}", job, memory, self.lanes, *more, self.whole(_ROUNDS), result=INTEGER)
+        self._call(f"run{name}", job, memory, self.lanes, *more, integer(self.code, _ROUNDS), result=INTEGER)
 
     def _call(self, name: str, *arguments, result: ir.Type | None = None) -> Value:
         values = [getattr(x, "it", x) for x in arguments]
@@ -182,10 +176,10 @@ class _Transpose(_Thread):
         super().__init__(TRANSPOSE)
         code, states = self.code, motion.states
         self.states = states
-        self.common = self.numbers | {"members": self.whole(1), "order": self.whole(form.order)}
-        self.ends, self.path, self.y_end = self.words(2), self.words(2 * states), self.words(states)
+        self.common = self.numbers | {"members": integer(self.code, 1), "order": integer(self.code, form.order)}
+        self.ends, self.path, self.y_end = self.code.stack(2), self.code.stack(2 * states), self.code.stack(states)
         names = ("t_end", "code", "steps", "rejected", "next_member", "next_row", "first_step", "steps_back", "idle")
-        self.own = {name: self.words(1) for name in names}
+        self.own = {name: self.code.stack(1) for name in names}
         self.record = code.element(self.at["record"], self.index() * self.numbers["room"] * motion.row)
         self.motion, self.adjoint = motion, adjoint
         # One memory after the other, or one for both: loops that are unrolled leave none of the first two.
@@ -203,9 +197,9 @@ class _Transpose(_Thread):
         ts, params = member_address("ts", numbers["ts_stride"]), member_address("params", numbers["params_stride"])
         y_ct, params_ct = member_address("y_ct", self.states), member_address("params_ct", self.motion.numbers)
         self._follow(ts, member_address("y0", self.states), params)
-        with code.loop(self.whole(self.states)) as i:
+        with code.loop(integer(self.code, self.states)) as i:
             code.store(code.load(code.element(member_address("end_ct", self.states), i), DOUBLE), code.element(y_ct, i))
-        with code.loop(self.whole(self.motion.numbers)) as i:
+        with code.loop(integer(self.code, self.motion.numbers)) as i:
             code.store(code.as_value(0.0, DOUBLE), code.element(params_ct, i))
         code.store(code.as_value(0.0, DOUBLE), member_address("excess", 1))
         fits = code.load(self.own["next_row"], INTEGER) <= numbers["room"]
@@ -218,11 +212,11 @@ class _Transpose(_Thread):
     def _follow(self, ts: Value, y0: Value, params: Value) -> None:
         """The motion from the first output time to the last one, with its steps written down."""
         code, own = self.code, self.own
-        for i, time in enumerate((self.whole(0), self.numbers["times"] - 1)):
+        for i, time in enumerate((integer(self.code, 0), self.numbers["times"] - 1)):
             code.store(code.load(code.element(ts, time), DOUBLE), code.element(self.ends, i))
         for name in ("next_member", "next_row"):
-            code.store(self.whole(0), own[name])
-        fields = self.common | own | dict(record=self.record, times=self.whole(2))
+            code.store(integer(self.code, 0), own[name])
+        fields = self.common | own | dict(record=self.record, times=integer(self.code, 2))
         fields |= dict(ts=self.ends, y0=y0, params=params, path=self.path, y_end=self.y_end)
         self.run("", self.motion, job_of(code, _integrator.JOB, fields), self.memories[0], own["idle"])
 

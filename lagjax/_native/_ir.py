@@ -14,7 +14,7 @@ import ctypes
 import ctypes.util
 import functools
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any
@@ -120,6 +120,15 @@ def unroll_loops(module: ir.Module) -> None:
                 entered.add(target)
 
 
+def _arithmetic(op: str) -> "tuple[Callable[[Value, Any], Value], Callable[[Value, Any], Value]]":
+    """An operator of values, and the same where the value comes second."""
+    return lambda x, y: x.code.arithmetic(op, x, y), lambda x, y: x.code.arithmetic(op, y, x)
+
+
+def _comparison(op: str) -> "Callable[[Value, Any], Value]":
+    return lambda x, y: x.code.compare(op, x, y)
+
+
 @dataclass(frozen=True, eq=False)
 class Value:
     """The result of an instruction; `it` is llvmlite's value, which has no annotations that hold."""
@@ -127,47 +136,17 @@ class Value:
     code: "Code"
     it: Any
 
-    def __add__(self, other):
-        return self.code.arithmetic("add", self, other)
-
-    def __sub__(self, other):
-        return self.code.arithmetic("sub", self, other)
-
-    def __mul__(self, other):
-        return self.code.arithmetic("mul", self, other)
-
-    def __truediv__(self, other):
-        return self.code.arithmetic("div", self, other)
-
-    def __radd__(self, other):
-        return self.code.arithmetic("add", other, self)
-
-    def __rsub__(self, other):
-        return self.code.arithmetic("sub", other, self)
-
-    def __rmul__(self, other):
-        return self.code.arithmetic("mul", other, self)
-
-    def __rtruediv__(self, other):
-        return self.code.arithmetic("div", other, self)
+    __add__, __radd__ = _arithmetic("add")
+    __sub__, __rsub__ = _arithmetic("sub")
+    __mul__, __rmul__ = _arithmetic("mul")
+    __truediv__, __rtruediv__ = _arithmetic("div")
+    __lt__, __le__, __gt__, __ge__ = map(_comparison, ("<", "<=", ">", ">="))
 
     def __abs__(self):
         return self.code.intrinsic("fabs", self)
 
     def __neg__(self):
         return Value(self.code, self.code.builder.fneg(self.it))
-
-    def __lt__(self, other):
-        return self.code.compare("<", self, other)
-
-    def __le__(self, other):
-        return self.code.compare("<=", self, other)
-
-    def __gt__(self, other):
-        return self.code.compare(">", self, other)
-
-    def __ge__(self, other):
-        return self.code.compare(">=", self, other)
 
     def __and__(self, other):
         return Value(self.code, self.code.builder.and_(self.it, other.it))

@@ -86,12 +86,11 @@ class Kernel:
 
     The outputs of the program are the n accelerations, then whether the mass matrix is singular. `projection` is
     applied to the state after every step, and to the outputs after the first. `guards`, again from the same inputs, end
-    the motion of a member with the code `EVENT` + a mask of bits (`CHANGE_BITS`); or they are noted
-    and the motion goes on: then there are notes in the place of states at output times. Errors are relative
-    to each coordinate, or to the largest one of those with the same number in `error_groups` (n,). The coordinates may
-    be those of a motion with its tangents (`nesting`); then `motion` is the program of the motion alone. Vectors have
-    `width` lanes, by default those of the processor. Raises `Unlowerable` where an operation has no Taylor series or is
-    not one of doubles.
+    the motion of a member with the code `EVENT` + a mask of bits (`CHANGE_BITS`); or they are noted and the motion goes
+    on: then there are notes in the place of states at output times. Errors are relative to each coordinate, or to the
+    largest one of those with the same number in `error_groups` (n,). The coordinates may be those of a motion with its
+    tangents (`nesting`); then `motion` is the program of the motion alone. Vectors have `width` lanes, by default those
+    of the processor. Raises `Unlowerable` where an operation has no Taylor series or is not one of doubles.
     """
 
     def __init__(
@@ -233,8 +232,7 @@ class Kernel:
 
         From the cotangents of the outputs, `path_ct` (N, T, 2n), of which the first and the last are not looked at, and
         of the states at the end, `y_ct` (N, 2n), to those of the initial states (N, 2n) and of the parameters (N, P).
-        The last array (N,) estimates how large the last terms of the series of a tangent may have been, relative to the
-        tangent.
+        The last array (N,) estimates how large the last terms of the series of a tangent may have been, relative to it.
         """
         y_ct = np.array(y_ct, np.float64, order="C")
         results = y_ct, np.zeros((len(y_ct), self.numbers)), np.zeros(len(y_ct))
@@ -342,8 +340,7 @@ class Kernel:
 class _Compiled:
     """The functions `begin` and `run` of a module: all members of a job, on several threads.
 
-    `rounds` is how many of them a slice has at first, `more` the numbers that are written down behind the state of a
-    step.
+    `rounds` is how many of them a slice has at first, `more` the numbers that are recorded behind the state of a step.
     """
 
     def __init__(self, built: Integrator | Tangent | Adjoint, rounds: int):

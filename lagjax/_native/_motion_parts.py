@@ -176,8 +176,7 @@ def pieces_of(
 ) -> "tuple[Borders, Series] | None":
     """The borders of a piecewise program, and the series of its motion along a piece; None where there are none.
 
-    Of a motion with its tangents they are those of the `motion` alone, which has this many of the numbers of a
-    `member`, moved along.
+    With tangents they are those of the `motion` alone, which has so many of the numbers of a `member`, moved along.
     """
     size = nesting.size
     if nesting.directions:

@@ -2,8 +2,7 @@
 
 Derivatives of a Lagrangian, as JAX traces them, are mostly padding: products with the zeros and ones of unit vectors,
 arrays built to be taken apart again, the same product in three places. For a small scene all of it can be seen through.
-`lower` traces a function, follows every single number through every array operation, and keeps each distinct operation
-once:
+`lower` traces a function, follows every single number through every array operation, and keeps each operation once:
 
     jaxpr  ──_rules──►  graph of scalars  ──_graph──►  folded, shared  ──_passes──►  Program  ──_emit──►  JAX again
 
@@ -231,8 +230,7 @@ class Program:
     def evaluate_many(self, columns) -> np.ndarray:
         """The outputs at S states, shape (outputs, S), in NumPy without compiling anything.
 
-        `columns` holds one entry for each input: a number, or S of them, shape (S,). Floats have the precision of the
-        columns.
+        `columns` has one entry for each input: a number, or S of them, (S,), whose precision is that of floats.
         """
         return self.line.evaluate(columns)
 

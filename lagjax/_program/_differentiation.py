@@ -38,8 +38,7 @@ def copy_nodes(
 ) -> list[int]:
     """The nodes of a line, of a tape or of another graph in a graph, where `inputs` are its inputs.
 
-    These may follow from the nodes before: `inputs(i, nodes)`. Tables begin at other inputs where `places` says what
-    input i has become.
+    These may follow from the nodes before: `inputs(i, nodes)`. Tables move where `places` says what input i becomes.
     """
     nodes: list[int] = []
     for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):

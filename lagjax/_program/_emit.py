@@ -115,8 +115,7 @@ def apply_in_jax(op: str, *xs, attribute=None) -> jax.Array:
 @jax.custom_jvp
 @compiled_once
 def _sincos(x) -> tuple:
-    """Sine and cosine, once: XLA's CPU backend fuses operations into one loop for each output, and repeats in each what
-    they share."""
+    """Sine and cosine, once: XLA on CPUs fuses operations into a loop for each output, and repeats what they share."""
     return lax.sin(x), lax.cos(x)
 
 

@@ -10,8 +10,7 @@ Constants are folded in float64.
 What may change in the last digits: constants multiply out (`2*(3*x)` is `6*x`); products of the same factors are one
 product, and sums of the same terms one sum, in whatever order they were written; like terms are collected where that
 shortens a sum (`x + x` is `2*x`, `x - x` is 0); `sin(x)**2 + cos(x)**2` is 1; half-integer powers become roots. Nothing
-is multiplied out (but `_passes.factor` draws out common factors), and a quotient stays one unless its divisor is a
-power of two.
+is multiplied out (but `_passes.factor` draws out common factors), and no quotient but one by a power of two.
 
 A zero found here is *structural*: `0*x` is 0 whatever `x` will be, so an infinity or NaN it would have met is not seen;
 whoever runs the program checks what comes out of it.

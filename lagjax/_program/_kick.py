@@ -14,8 +14,7 @@ velocities for μ = 0, and M n = ∇u + Gᵀν, G n = 0,
 and u̇⁺ has the sign of u̇⁻. Where the right side is negative the energy does not suffice: the motion is reflected, which
 is the same with both sides alike and u̇⁺ = −u̇⁻. Source: Gelfand & Fomin, *Calculus of Variations*, §15.
 
-With which pieces L jumps is found at random states of their borders: there a corner is zero to rounding, and a jump is
-not.
+With which pieces L jumps is found at random states of their borders: there a corner is zero to rounding, a jump not.
 """
 
 from collections.abc import Callable, Sequence

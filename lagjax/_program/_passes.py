@@ -32,8 +32,7 @@ def factor(graph: Graph, outputs: list[int]) -> tuple[Graph, list[int]]:
 def _rewritten(graph, outputs, uses, node_of: Callable, make: Callable) -> tuple[Graph, list[int]]:
     """A graph with `node_of(new, i, moved)` in the place of every node i for which that is not None, and the outputs.
 
-    `moved(x)` says where a node before i is. The others are made anew by `make`, so that everything is compared once
-    more.
+    `moved(x)` says where a node before i is. The others are made anew by `make`, so that all is compared once more.
     """
     new, places = Graph(graph.budget), {}
     new.budget += LONGEST * len(uses)  # what a pass writes anew and drops again is not what the budget is for

@@ -9,6 +9,7 @@ of a distance, x / (x² + y²)^1.5: it is seen from as far away as the tolerance
 strong. A base of fewer squares comes near zero along a whole surface, which one meets without having aimed at it.
 """
 
+import functools
 import math
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -57,7 +58,7 @@ class _Products:
         self.line, self.factors = line, {}
         self.users: dict[int, list[int]] = {i: [] for i in line.outputs}
         self._bounds: dict[int, tuple[float, float]] = {}
-        self._squares: dict[int, set[int]] = {}
+        self.squares = functools.cache(self._find_squares)
         self._moving: set[int] = set()
         steps = {op for op in {node[0] for node in line.nodes} - {"input", "constant"} if OPERATIONS[op].is_step}
         for i in nodes:
@@ -104,13 +105,8 @@ class _Products:
         least, most = (low, high) if low > 0 else (-high, -low)
         return not (least > 0 and math.log(most / least) * -exponent < _SEEN)
 
-    def squares(self, i: int) -> set[int]:
-        """The numbers whose squares a sum consists of, but for what does not move; none of another sum."""
-        if i not in self._squares:
-            self._squares[i] = self._find_squares(i)
-        return self._squares[i]
-
     def _find_squares(self, i: int) -> set[int]:
+        """The numbers whose squares a sum consists of, but for what does not move; none of another sum."""
         squares, terms = set(), [i]
         while terms:
             op, operands, _ = self.line.nodes[terms.pop()]

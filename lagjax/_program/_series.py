@@ -22,9 +22,8 @@ qₖ₊₁ = q̇ₖ / (k+1) and q̇ₖ₊₁ = q̈ₖ / (k+1) for q̈(q, q̇, t)
 A piecewise operation (`abs`, `select`, `floor` …) has the series of the piece that the state is on: whoever takes steps
 must notice when one crosses the border.
 
-Source: Moore, *Interval Analysis* (1966) §11.2; Jorba & Zou, *A software package for the numerical integration of ODEs
-by means of high-order Taylor methods*, Exp. Math. 14 (2005) 99–117, §2.1; Griewank & Walther, *Evaluating Derivatives*
-(2008), ch. 13.
+Source: Moore, *Interval Analysis* (1966) §11.2; Jorba & Zou, Exp. Math. 14 (2005) 99–117, §2.1; Griewank & Walther,
+*Evaluating Derivatives* (2008), ch. 13.
 """
 
 from collections.abc import Callable, Sequence
@@ -95,9 +94,9 @@ class Series(NamedTuple):
 def series(program: Recurrent, size: int, moving: int, followed: Sequence[int] = ()) -> Series:
     """The recurrences of the first `size` outputs; all inputs but the first `moving` are constant along the motion.
 
-    For ẏ = f(t, y) with m components these are m outputs and m + 1 inputs (y and t, in any order); for q̈(q, q̇, t) with
-    n coordinates, n and 2n + 1. The nodes `followed` of the program get their series too. Raises `Unlowerable` for an
-    operation whose series is not known here.
+    For ẏ = f(t, y) with m components these are m outputs and m + 1 inputs (y and t, in any order); for q̈(q, q̇, t)
+    with n coordinates, n and 2n + 1. The nodes `followed` of the program get their series too. Raises `Unlowerable` for
+    an operation whose series is not known here.
     """
     with np.errstate(all="ignore"):  # a constant may be 1/0, where the mass matrix is singular: that is found later
         return _Recurrences(program, size, moving, tuple(followed)).finish()

@@ -5,9 +5,9 @@ such that u stays zero (Filippov, *Differential Equations with Discontinuous Rig
 depends on velocities, u̇ is to be zero; where it depends on positions alone, ü. Several borders at once have their
 shares together, from one linear system.
 
-Where pieces act on the right side alone of A z = r, each for itself, they are unknowns of that system: the piece
-p + μ instead of p, with A z − Σ μₖ ∂r/∂pₖ = r, and one row more for each, that of u̇ = 0, or μ = 0 where nothing slides.
-Its series needs no series of an elimination. Else, for a few pieces at most, that system is that of q̈ itself, z = q̈.
+Where pieces act on the right side alone of A z = r, each for itself, they are unknowns of that system: the piece p + μ
+instead of p, with A z − Σ μₖ ∂r/∂pₖ = r, and one row more for each, that of u̇ = 0, or μ = 0 where nothing slides. Its
+series needs no series of an elimination. Else, for a few pieces at most, that system is that of q̈ itself, z = q̈.
 
 What such equations leave is rounding, which a body at rest would gather to ½ ε t². So the acceleration of one
 coordinate of each border, its *pivot*, follows from u̇ = 0 itself: it is zero where u is a velocity alone. And a step
@@ -73,8 +73,8 @@ class Sliding(NamedTuple):
     """A program with shares; `places` says where the nodes of the one without them are.
 
     `retraction` takes the same inputs to the state (q, q̇) on the borders that the motion slides along; `moved` are the
-    coordinates that the force of each of these moves. `release` gives for each cone changes of q̇ (n,): one by which its
-    vector becomes a unit along what it does not hold, and what takes the vector away.
+    coordinates that the force of each of these moves. `release` gives for each cone changes of q̇ (n,): one by which
+    its vector becomes a unit along what it does not hold, and what takes the vector away.
     """
 
     line: StraightLine
@@ -91,8 +91,7 @@ def with_sliding(
 ) -> Sliding | None:
     """The program whose motion slides along the borders `slides` where flags, its last inputs, are 1.
 
-    `first` is the input of the first piece, `switches` are the nodes of the switching numbers. None where that takes
-    too many operations.
+    `first` is the input of the first piece, `switches` are the nodes of the switching numbers. None if it is too long.
     """
     if not slides:
         return Sliding(line, range(len(line.nodes)), [], linear, None, ())

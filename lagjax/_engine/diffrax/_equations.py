@@ -3,8 +3,8 @@
 A small scene becomes a *scalar program*: the mass matrix is eliminated by formulas written out for exactly its pattern
 of zeros, and nothing is left that this scene does not need. Any other scene keeps the derivatives as JAX arrays. Both
 forms give the same motion to round-off, and are tested against each other. Each has `acceleration` and, for constrained
-scenes, `projected`: y after one Newton step of positions and of velocities back to the constraints. `params` holds
-numbers alone.
+scenes, `projected`: y after one Newton step of positions and of velocities back to the constraints. `params` are
+numbers.
 """
 
 from typing import Any

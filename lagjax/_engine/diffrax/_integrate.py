@@ -1,10 +1,10 @@
 """One integration by diffrax, and its reverse-mode derivative.
 
 The motion is integrated with adaptive steps in a plain loop that keeps nothing. Its derivative is that of the same
-method taken over the *same steps*: for a gradient the times of the accepted steps are recorded, and the
-backward pass differentiates a second integration with those times. It makes no decisions, so that recomputing
-a part of it (checkpointing) cannot decide otherwise, and it has no rejected steps. The sizes of the steps are not
-differentiated, as everywhere in diffrax.
+method taken over the *same steps*: for a gradient the times of the accepted steps are recorded, and the backward pass
+differentiates a second integration with those times. It makes no decisions, so that recomputing a part of it
+(checkpointing) cannot decide otherwise, and it has no rejected steps. As everywhere in diffrax, the sizes of steps are
+not differentiated.
 
 Differentiating the adaptive loop itself by recomputation is not safe: recomputed steps are compiled apart from the
 first ones, differ from them in the last digit, and then accept or reject otherwise, which gives wrong gradients without

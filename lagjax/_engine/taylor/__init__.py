@@ -4,9 +4,8 @@ Its way: `Problem` ─► `Flow` (rows of NumPy) at once, where nothing is trace
 of JAX, where something is. All of that is in float64; a problem in float32 goes through the door of `_doubles` first.
 
 On rows of NumPy: `_flow` (the flow map), `_derivatives` (its jvp and vjp), `_variational` (its variational equations),
-`_state_rates` (how an output moves with its time). As JAX: `_primitives`,
-which `_call` (CPU) and `_gpu_launch` run; `_line_functions` and `_lowered_motion` for the scene's own quantities. Where
-a motion meets a surface: `_surfaces`, `_crossing`.
+`_state_rates` (how an output moves with its time). As JAX: `_primitives`, which `_call` (CPU) and `_gpu_launch` run;
+`_line_functions` and `_lowered_motion` for the scene's quantities. Surfaces it meets: `_surfaces`, `_crossing`.
 """
 
 import dataclasses

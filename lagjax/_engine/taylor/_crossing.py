@@ -44,8 +44,7 @@ class Noted(NamedTuple):
     def read(cls, path, surfaces: int) -> "Noted":
         """The crossings in the `path` of a motion that notes them, (G (room + 1), 2n + 1)."""
         rows = path.reshape(surfaces, -1, path.shape[-1])
-        count = rows[:, -1, 0]
-        return cls(rows[:, :-1, 0], rows[:, :-1, 1:], count)
+        return cls(rows[:, :-1, 0], rows[:, :-1, 1:], rows[:, -1, 0])
 
 
 # ---- an event as a surface -------------------------------------------------------------------------------------------

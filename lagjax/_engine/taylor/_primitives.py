@@ -14,8 +14,7 @@ and their derivatives close the circle, so that there are derivatives of every o
     d vjp = vjp(dw) + curvature(w, dx) + …          by the vjp of the tangent flow, and what moves with the times
 
 To move an output time by δt moves the output by f δt; to start later from the same state is to start from another one.
-Source: Griewank & Walther, *Evaluating Derivatives* (2008), §§3–5, for forward, reverse, and forward over
-reverse.
+Source: Griewank & Walther, *Evaluating Derivatives* (2008), §§3–5, for forward, reverse, and forward over reverse.
 
 Every primitive takes arrays with any batch axes in front, as many of them in each, of length one where an argument is
 shared; under `jax.vmap` it is still one call of machine code. Outside of `jit` nothing is compiled but that.

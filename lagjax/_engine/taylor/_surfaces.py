@@ -227,8 +227,7 @@ def require_one_number(value, what: str) -> jax.Array:
 def crossing_variation(surfaces: Surfaces) -> Callable:
     """`(k, taken, t, y, numbers)` → (t, y): the state at t, where guard k is zero, moved to where it is zero then.
 
-    With δg the variation of the guard, f the rate of the state, and ′ the derivative along the
-    motion, the time moves by
+    With δg the variation of the guard, f the rate of the state, and ′ the derivative along the motion, time moves by
 
         s = −ε − ½ (g″/g′) ε²,  ε = δg/g′        and the state by   f s + ½ f′ s²,
 
