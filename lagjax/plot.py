@@ -11,6 +11,7 @@ colour maps are perceptually uniform, so that all of them can be told apart with
 """
 
 import dataclasses
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -403,9 +404,8 @@ def _loses_at_transitions(trajectory: Trajectory, h: np.ndarray) -> bool:
     if (changes := trajectory.transitions) is None:
         return False
     sides = (changes.q, changes.qdot, changes.source), (changes.q_next, changes.qdot_next, changes.target)
-    before, after = (
-        dataclasses.replace(trajectory, ts=changes.t, q=q, qdot=qdot, mode=mode).energy() for q, qdot, mode in sides
-    )
+    at = functools.partial(dataclasses.replace, trajectory, ts=changes.t)
+    before, after = (at(q=q, qdot=qdot, mode=mode).energy() for q, qdot, mode in sides)
     rounding = np.finfo(h.dtype).eps ** 0.5 * np.nanmax(np.abs(h))
     return bool(np.nanmax(np.abs(np.asarray(after - before)), initial=0.0) > rounding)
 

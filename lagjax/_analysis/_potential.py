@@ -89,12 +89,8 @@ def absorb_potential_forces(scene: SceneState, scales: Scales, states: FlatState
         work = _work(force, start, here, scales.q) + line_integral(force, here, place[0])
         return motion.lagrangian(*place) + work
 
-    whole = System(
-        lagrangian,
-        dissipation=system.dissipation,
-        constraints=system.constraints,
-        velocity_constraints=system.velocity_constraints,
-    )
+    kept = {role: getattr(system, role) for role in ("dissipation", "constraints", "velocity_constraints")}
+    whole = System(lagrangian, **kept)
     return SceneState.from_state(whole, layout.restore(scene.q), layout.restore(scene.qdot), scene.params)
 
 

@@ -214,10 +214,8 @@ class _SymmetryColumns(NamedTuple):
 
 def _measure_columns(scene: SceneState, fields: Fields, states: FlatState) -> _SymmetryColumns:
     """The columns where they are finite, and their noise: how much they differ between states that hardly do."""
-    here, beside = (
-        _finite(*map(np.asarray, _columns(fields, at, *scene.arguments)))
-        for at in (states, perturb_last_digits(states))
-    )
+    both = states, perturb_last_digits(states)
+    here, beside = (_finite(*map(np.asarray, _columns(fields, at, *scene.arguments))) for at in both)
     pairs = [(a, b) for a, b in zip(here, beside, strict=True) if a.size and a.shape == b.shape]
     noise = max((float(np.sqrt(np.mean((a - b) ** 2))) for a, b in pairs), default=0.0)
     return _SymmetryColumns(*here, min(max(_NULL, _CHANCE * noise), _LARGEST))

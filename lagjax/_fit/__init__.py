@@ -138,9 +138,7 @@ def fit(
     require_untraced(params0, "params0")
     noise = Gaussian() if noise is None else noise
     if not isinstance(noise, AbstractNoise):
-        raise TypeError(
-            f"noise must be lagjax.Gaussian(), StudentT(), Quantised(step) or Clipped(low, high); got {noise!r}."
-        )
+        raise TypeError(f"noise must be lagjax.Gaussian(), StudentT(), Quantised(…) or Clipped(…); got {noise!r}.")
     given = read_systems(system, records, params0, observe, hold)
     parameters = Parameters.from_pytree(params0, free, transforms)
     search = _FitSearch(params0, parameters, noise, int(starts), method, int(seed), progress)

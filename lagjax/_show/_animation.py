@@ -124,9 +124,8 @@ class Animation:
 
     def _film(self):
         figure, show, count = self._figure(self.fps)
-        return _matplotlib().animation.FuncAnimation(
-            figure, show, frames=count, init_func=lambda: (), interval=1000 / self.fps, cache_frame_data=False
-        )
+        options = dict(frames=count, init_func=lambda: (), interval=1000 / self.fps, cache_frame_data=False)
+        return _matplotlib().animation.FuncAnimation(figure, show, **options)
 
     def _figure(self, fps: float) -> tuple[Any, Callable, int]:
         """The figure, a function that sets it to frame i, and how many frames there are."""

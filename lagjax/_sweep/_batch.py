@@ -320,9 +320,8 @@ def _arrays_by_name(kept: dict) -> dict[str, np.ndarray]:
 
 
 def names_of(kept: dict) -> dict:
-    return jax.tree_util.tree_map_with_path(
-        lambda path, _: ".".join(str(getattr(k, "key", getattr(k, "name", getattr(k, "idx", k)))) for k in path), kept
-    )
+    key = lambda path, _: jax.tree_util.keystr(path, simple=True, separator=".")  # noqa: E731
+    return jax.tree_util.tree_map_with_path(key, kept)
 
 
 def _first_line(error: BaseException) -> str:

@@ -148,7 +148,7 @@ def _wait_for_first(running: set[Any]) -> set[Any]:
 def require_executor(executor: Any) -> None:
     if not isinstance(executor, Executor) and not hasattr(executor, "submit"):
         raise TypeError(
-            f"executor must be a concurrent.futures.Executor, such as dask's client.get_executor(); got {executor!r}."
+            f"executor must be a concurrent.futures.Executor, as dask's get_executor() is; got {executor!r}."
         )
     if (context := getattr(executor, "_mp_context", None)) is not None and context.get_start_method() == "fork":
         raise ValueError(

@@ -100,8 +100,7 @@ def _rod(q, params):
 
 
 def _two_rods(q, params):
-    upper, lower = _rods(q, params)
-    return {"upper": upper, "lower": lower}
+    return dict(zip(("upper", "lower"), _rods(q, params), strict=True))
 
 
 def cartesian_of_angles(theta, theta_dot, l):
@@ -271,9 +270,7 @@ def _turning(t, speed, acceleration, phi, rate):
 
 
 def _rolling_disc_lagrangian(q, qdot, params):
-    m, g = params["m"], params["g"]
-    kinetic = 0.5 * m * (qdot.x**2 + qdot.y**2) + 0.5 * params["J"] * qdot.phi**2 + 0.5 * params["I"] * qdot.psi**2
-    return kinetic + m * g * jnp.sin(params["slope"]) * q.x
+    return _knife_edge_lagrangian(q, qdot, params) + 0.5 * params["I"] * qdot.psi**2
 
 
 def _rolling_without_slipping(q, qdot, params):

@@ -157,8 +157,7 @@ def spherical_pendulum() -> Scene:
 
     >>> scene = lagjax.scenes.spherical_pendulum(); scene.system.momentum(scene.q0, scene.qdot0, params=scene.params)
     """
-    params = {"m": 1.0, "l": 1.0, "g": 9.81}
-    q0, qdot0 = Direction(1.0, 0.0), Direction(0.0, 2.0)
+    params, q0, qdot0 = {"m": 1.0, "l": 1.0, "g": 9.81}, Direction(1.0, 0.0), Direction(0.0, 2.0)
     more = {"p_phi": lambda q, qdot, t, params: params["m"] * (params["l"] * jnp.sin(q.theta)) ** 2 * qdot.phi}
     return conservative_scene(System(_spherical_pendulum_lagrangian), params, q0, qdot0, duration=10.0, more=more)
 
@@ -251,10 +250,8 @@ def swinging_atwood() -> Scene:
 
     >>> scene = lagjax.scenes.swinging_atwood(); scene.invariants["second"](scene.q0, scene.qdot0, 0.0, scene.params)
     """
-    params = {"mu": 3.0}
-    q0, qdot0 = Swing(1.0, np.pi / 2), Swing(0.0, 0.0)
-    more = {"second": _swinging_atwood_invariant}
-    return conservative_scene(System(_swinging_atwood_lagrangian), params, q0, qdot0, duration=10.0, more=more)
+    system, params, more = System(_swinging_atwood_lagrangian), {"mu": 3.0}, {"second": _swinging_atwood_invariant}
+    return conservative_scene(system, params, Swing(1.0, np.pi / 2), Swing(0.0, 0.0), duration=10.0, more=more)
 
 
 class SlowAndFast(NamedTuple):
@@ -291,7 +288,6 @@ def fermi_pasta_ulam() -> Scene:
 
     >>> scene = lagjax.scenes.fermi_pasta_ulam(); scene.system.energy(scene.q0, scene.qdot0, params=scene.params)
     """
-    omega = 50.0
-    first = np.array([1.0, 0.0, 0.0])
+    omega, first = 50.0, np.array([1.0, 0.0, 0.0])
     q0, qdot0 = SlowAndFast(slow=first, fast=first / omega), SlowAndFast(slow=first, fast=first)
     return conservative_scene(System(_fermi_pasta_ulam_lagrangian), {"omega": omega}, q0, qdot0, duration=20.0)

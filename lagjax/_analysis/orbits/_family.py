@@ -121,9 +121,7 @@ def family(
     place = None if by == "energy" else parameter_index(params, by)
     follower = Follower(arcs, place, y0, period.ravel(), until)
     if by == "energy" and not arcs.conserves:
-        raise ValueError(
-            "The energy of this scene is not conserved, so that there is no family by energy: name a parameter."
-        )
+        raise ValueError("This scene does not conserve its energy, so that there is no family by it: name a parameter.")
     return _build_family(follower, *_follow_family(follower, y0, period.ravel(), float(step), count))
 
 
@@ -135,9 +133,7 @@ def parameter_index(params: PyTree, name: str) -> int:
                 raise ValueError(f"{label} has {np.size(leaf)} numbers: a family needs a parameter that is one.")
             return begin
         begin += np.size(leaf)
-    raise ValueError(
-        f"by must be 'energy' or one of {', '.join(labels) or 'no parameters, for there are none'}; got {name!r}."
-    )
+    raise ValueError(f"by must be 'energy' or one of {', '.join(labels) or 'no parameters at all'}; got {name!r}.")
 
 
 class _Member(NamedTuple):

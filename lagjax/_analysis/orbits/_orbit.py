@@ -197,10 +197,8 @@ def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> FlatOrbits:
     arcs = closing.arcs
     counts = arc_counts(arcs, y0, period)
     most = counts if arcs.jumping else np.minimum(_MOST_ARCS, _MORE * counts)
-    nothing, never = np.full(y0.shape, np.nan), np.zeros(len(y0), bool)
-    found = FlatOrbits(
-        nothing, nothing[:, 0], nothing.astype(complex), nothing[:, 0], never, never, np.full(len(y0), "", object)
-    )
+    nothing, never, texts = np.full(y0.shape, np.nan), np.zeros(len(y0), bool), np.full(len(y0), "", object)
+    found = FlatOrbits(nothing, nothing[:, 0], nothing.astype(complex), nothing[:, 0], never, never, texts)
     waiting, gained = np.arange(len(y0)), np.ones(len(y0), bool)
     while len(waiting):
         for count in np.unique(counts[waiting]).tolist():

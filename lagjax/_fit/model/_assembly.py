@@ -90,9 +90,7 @@ def _assemble_system(given: GivenSystem, parameters: Parameters, law: AbstractNo
                 "A start on constraints of hybrid motion, or beside contacts, cannot be fitted: give start=(q0, qdot0)."
             )
         if isinstance(observe, Delayed):
-            raise ValueError(
-                "Sensors of contacts and of hybrid motion cannot be lagjax.Delayed: keep the delay, shift the times."
-            )
+            raise ValueError("Sensors of contacts and hybrid motion cannot be lagjax.Delayed: shift the times instead.")
     elif has_constraints(system) and not input_functions(system):
         manifold = Manifold(system, layout, parameters, motions.projection)
     elif has_constraints(system) and fitted.any():
@@ -117,14 +115,11 @@ def _require_motion(given: GivenSystem, recordings: list[Record], signals: Signa
 def _read_form(system: Scene, records: list[Record], hold: str) -> Form | None:
     asking = input_functions(system)
     if asking and jumps(system):
-        raise ValueError(
-            f"{asking[0]} asks for `inputs`, which hybrid motion and contacts have none of: make it a function of `t`."
-        )
+        raise ValueError(f"{asking[0]} asks for `inputs`; hybrid motion and contacts have none: make it one of `t`.")
     for place, record in enumerate(records):
         if asking and (not isinstance(record, Record) or record.input_structure is None):
-            raise ValueError(
-                f"{asking[0]} asks for `inputs`, which records[{place}] has none of: give Record(..., inputs=...)."
-            )
+            none = f"which records[{place}] has none of: give Record(..., inputs=...)."
+            raise ValueError(f"{asking[0]} asks for `inputs`, {none}")
     structures = [record.input_structure for record in records if isinstance(record, Record)]
     if not structures or structures[0] is None:
         return None
@@ -175,13 +170,10 @@ def _systems_by_name(system, records, observe) -> list[tuple[str | None, Any, An
     for name in system:
         if not isinstance(name, str):
             raise TypeError(f"The systems of a fit have names; {name!r} is no str.")
+    shown = observe if isinstance(observe, dict) else dict.fromkeys(system, observe)
     _require_names("records", records, system)
-    if isinstance(observe, dict):
-        _require_names("observe", observe, system)
-    return [
-        (name, one, records[name], observe[name] if isinstance(observe, dict) else observe)
-        for name, one in system.items()
-    ]
+    _require_names("observe", shown, system)
+    return [(name, one, records[name], shown[name]) for name, one in system.items()]
 
 
 def _require_names(what: str, given, systems: dict) -> None:

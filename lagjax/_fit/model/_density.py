@@ -50,9 +50,7 @@ class Density:
         self.residuals, self.shares, self.prior, self.point, self.noise = residuals, shares, prior, point, noise
         for part in residuals.parts:
             if part.fits_on_constraints:
-                raise ValueError(
-                    "There is no density for starts on constraints that are fitted: give start=(q0, qdot0)."
-                )
+                raise ValueError("There is no density for fitted starts on constraints: give start=(q0, qdot0).")
             if part.signals.delays is not None:
                 raise ValueError("There is no density for lagjax.Delayed sensors: keep the delay, and shift the times.")
         self.dtype = np.result_type(*(part.layout.dtype for part in residuals.parts))
@@ -127,11 +125,9 @@ class Density:
 
     def evaluate(self, at: PosteriorUnknowns) -> list:
         """The outputs of the sensors less the measurements, (N, T, S), of every batch."""
-        return [
-            part.trace_residuals(batch, at.u, at.starts[part.frame.rows[batch.rows], : part.states])
-            for part in self.residuals.parts
-            for batch in part.batches
-        ]
+        pairs = [(part, batch) for part in self.residuals.parts for batch in part.batches]
+        starts = [at.starts[part.frame.rows[batch.rows], : part.states] for part, batch in pairs]
+        return [part.trace_residuals(batch, at.u, y0) for (part, batch), y0 in zip(pairs, starts, strict=True)]
 
     def weighted_log_likelihood(self, weighted: list, counted: list, sides: list, at: PosteriorUnknowns):
         """Σ_s shares_s log L_s, up to a constant, of √weight · residual (N, T, S) of every batch, where they count.
@@ -186,13 +182,11 @@ class Density:
         scale = np.sqrt(np.diag(precision))
         if not (scale > 0).all():
             raise ValueError(
-                f"Nothing that was measured depends on {self.names[int(np.argmin(scale))]}: fix it with `free`."
+                f"Nothing that was measured depends on {self.names[np.argmin(scale)]}: fix it with `free`."
             )
         unit = precision / np.outer(scale, scale)
         if np.linalg.eigvalsh(unit).min() < 1e-13:
-            raise ValueError(
-                "The data do not determine some combination of parameters and starts: fix one parameter with `free`."
-            )
+            raise ValueError("The data do not determine all parameters and starts: fix one parameter with `free`.")
         found = np.zeros((len(self), len(self)))
         found[size:, size:] = self._noise_covariance((residuals.weights > 0).sum(axis=0) * self.shares)
         found[:size, :size] = np.linalg.inv(unit) / np.outer(scale, scale)

@@ -324,9 +324,8 @@ def find_limits(column: np.ndarray, step: float) -> list[float]:
         there = column == end
         begins = (np.flatnonzero(there[1:] & ~there[:-1]) + 1).tolist()
         runs = [int(np.argmin(np.append(there[i:], False))) for i in begins]
-        rises = [
-            abs(end - column[max(i - min(run, _BEFORE), 0)]) for i, run in zip(begins, runs, strict=True) if run >= _RUN
-        ]
+        long = [(i, run) for i, run in zip(begins, runs, strict=True) if run >= _RUN]
+        rises = [abs(end - column[max(i - min(run, _BEFORE), 0)]) for i, run in long]
         enough = rises and sum(runs) >= max(_AT_LIMIT * len(column), 4)
         sharp = np.median(rises) > _RISE * step if rises and np.isfinite(step) else not repeats
         found.append(float(end) if enough and sharp else np.nan)

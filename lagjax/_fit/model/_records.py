@@ -193,9 +193,7 @@ def real_numbers(array, name: str, what: str) -> np.ndarray:
     """The numbers of an array, NaN where a masked one hides them. Raises `TypeError` where they are not real."""
     require_untraced(array, name)
     if getattr(array, "dtype", None) is not None and np.asarray(array).dtype.kind in "mM":
-        raise TypeError(
-            f"{name} holds dates or durations: give numbers, in seconds (t - t[0]) / np.timedelta64(1, 's')."
-        )
+        raise TypeError(f"{name} holds dates or durations: give numbers, in s (t - t[0]) / np.timedelta64(1, 's').")
     try:
         if np.iscomplexobj(array):
             raise TypeError

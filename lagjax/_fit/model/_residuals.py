@@ -214,9 +214,8 @@ class SystemResiduals:
             assert self.manifold is not None and trial.across is not None
             some, tangents = self.fitted, np.tile(np.eye(states), (len(starts), 1, 1))
             t = np.array([self.records[piece.record].ts[piece.places[0]] for piece in self.pieces])
-            starts[some], tangents[some], starts_dot[some] = self.manifold.project(
-                starts[some], t[some], numbers, directions
-            )
+            consistent = self.manifold.project(starts[some], t[some], numbers, directions)
+            starts[some], tangents[some], starts_dot[some] = consistent
             if (lost := ~np.isfinite(starts).all(axis=1)).any():
                 raise self.lost(np.argmax(lost), "No start near the one that was tried satisfies the constraints.")
             trial.across[rows, :states, :states] = np.eye(states) - tangents
@@ -371,9 +370,8 @@ class Residuals:
         self.pieces, self.fitted = pieces, fitted
         self.states = max(system.states for system in systems)
         self.parts = self._split_by_system()
-        self.names = tuple(
-            signal if part.name is None else f"{part.name}: {signal}" for part in self.parts for signal in part.names
-        )
+        heads = ["" if part.name is None else f"{part.name}: " for part in self.parts]
+        self.names = tuple(head + x for head, part in zip(heads, self.parts, strict=True) for x in part.names)
         self.size = np.concatenate([part.size for part in self.parts])
         self.least = np.concatenate([part.least for part in self.parts])
         self.batches = [b._replace(rows=part.frame.rows[b.rows]) for part in self.parts for b in part.batches]
@@ -393,9 +391,8 @@ class Residuals:
                 places.append((rows, records))
         firsts = np.cumsum([0, *(len(part.names) for part in parts)]).tolist()
         sensor = Sensor(*(np.concatenate(x) for x in zip(*(part.sensor for part in parts), strict=True)))
-        periods = [
-            np.append(part.signals.periods, np.full(len(part.names), np.inf))[: len(part.names)] for part in parts
-        ]
+        endless = np.full(max(len(part.names) for part in parts), np.inf)  # of crossing times
+        periods = [np.append(part.signals.periods, endless)[: len(part.names)] for part in parts]
         return [
             replace(part, frame=SystemFrame(rows, records, first, sensor, np.concatenate(periods), self.states))
             for part, (rows, records), first in zip(parts, places, firsts, strict=False)

@@ -23,11 +23,10 @@ def require_measurements(records: list[Record], names: tuple[str, ...], periods:
                 continue
             value, count = found
             others = column[column != value]
-            repeat = (
-                "never repeat" if len(np.unique(others)) == len(others) else "are far from it just before and after"
-            )
+            repeats = len(np.unique(others)) < len(others)
+            among = "are far from it just before and after" if repeats else "never repeat"
             away = abs(value - np.median(others)) / max(np.ptp(others), np.finfo(float).tiny)
-            how = f"exactly {value:.6g}, among values that {repeat}"
+            how = f"exactly {value:.6g}, among values that {among}"
             if away > _FAR:
                 how = f"{value:.6g}, {float(f'{away:.2g}'):.0f} times the spread of the others"
             raise ValueError(

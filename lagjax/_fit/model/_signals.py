@@ -63,12 +63,10 @@ class Delays:
     def evaluate(self, numbers: np.ndarray) -> list[Delay]:
         """The different delays at the parameters `numbers` (P,)."""
         values, slopes = (np.asarray(x, float) for x in self._value_and_jacobian(numbers))
-        rows, which = np.unique(np.concatenate([values[:, None], slopes], axis=1), axis=0, return_inverse=True)
+        rows, which = np.unique(np.column_stack([values, slopes]), axis=0, return_inverse=True)
         which = which.ravel()
-        return [
-            Delay(np.concatenate([self.places[i] for i in np.flatnonzero(which == k)]), float(row[0]), row[1:])
-            for k, row in enumerate(rows)
-        ]
+        signals = [np.concatenate([self.places[i] for i in np.flatnonzero(which == k)]) for k in range(len(rows))]
+        return [Delay(own, float(row[0]), row[1:]) for own, row in zip(signals, rows, strict=True)]
 
 
 _AT_ONCE = 2048  # samples in one call of the compiled sensors: one program for records of any length

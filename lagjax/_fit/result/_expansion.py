@@ -194,9 +194,7 @@ def expand_residuals(chart: Chart) -> Surrogate:
     shapes = [batch.weights.shape for batch in residuals.batches]
     size = columns * sum(n * s * (min(t, columns) if plain else t) for n, t, s in shapes)
     if size > _LARGEST:
-        raise Unexpanded(
-            f"The expansion of its residuals to second order would hold {size} numbers, more than {_LARGEST}."
-        )
+        raise Unexpanded(f"The expansion of its residuals to second order takes {size} numbers, more than {_LARGEST}.")
     middle, slopes, bends = _differentiate_twice(chart, states)
     blocks = []
     for k, batch in enumerate(residuals.batches):

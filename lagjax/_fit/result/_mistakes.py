@@ -52,10 +52,8 @@ def possible_mistakes(
     milliseconds = [PossibleMistake("with the times in milliseconds", by_time)]
     ranges = [max(np.ptp(present_samples(r, k)) for r in records if isinstance(r, Record)) for k in range(count)]
     wide = [k for k in range(count) if ranges[k] > _WIDE]
-    degrees = [
-        PossibleMistake(f"with {_list_names(names, turned)} in degrees", change(turned, np.radians))
-        for turned in ([wide] if wide else []) + [[k] for k in wide[:_MOST] if len(wide) > 1]
-    ]
+    sets = ([wide] if wide else []) + [[k] for k in wide[:_MOST] if len(wide) > 1]
+    degrees = [PossibleMistake(f"with {_list_names(names, x)} in degrees", change(x, np.radians)) for x in sets]
     yield from milliseconds if slower > _SLOW else []
     yield from degrees if max(ranges) > _WIDEST else []
     swaps = []

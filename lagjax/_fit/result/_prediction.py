@@ -119,7 +119,7 @@ def planned_rows(fit, part: SystemResiduals, name: str, record: Record) -> np.nd
     """The rows (M, F) of a planned record in units of the noise, its start eliminated where it is not known."""
     if not isinstance(record, Record) or record.start is None:
         raise ValueError(
-            f"The planned record {name} needs a start: (q0, qdot0), or lagjax.Guess(q0, qdot0) if that is to be fitted."
+            f"The planned record {name} needs a start: (q0, qdot0), or lagjax.Guess(q0, qdot0) to be fitted."
         )
     state = known_start(record, part.layout, 0, fit.params)
     assert state is not None

@@ -89,10 +89,9 @@ class _Model:
 
     def is_enough(self, gain: float, enough: float) -> bool:
         """True if half the sum of squares is at most `enough`, correlated residuals counted for what they are worth."""
-        return gain <= enough or (
-            gain <= _NEAR * self.residuals.measured
-            and gain * independent_share(self.residuals, self.trial, self.noise) <= enough
-        )
+        if enough < gain <= _NEAR * self.residuals.measured:
+            gain *= independent_share(self.residuals, self.trial, self.noise)
+        return gain <= enough
 
 
 def minimise(

@@ -139,9 +139,9 @@ def time_scales(readers: list[Reader], motions: AbstractMotions, numbers: np.nda
     return TimeScales(*(float(one[np.isfinite(one) & (one > 0)].min(initial=np.inf)) for one in both))
 
 
-def build_reader(record: Record, about: SystemResiduals, numbers: np.ndarray, probes: int = 256) -> Reader | None:
+def build_reader(record: Any, about: SystemResiduals, numbers: np.ndarray, probes: int = 256) -> Reader | None:
     """A reader of states off a record; None where its signals are no positions, or go round too fast to tell."""
-    if not about.signals.look_like_positions(record):
+    if not isinstance(record, Record) or not about.signals.look_like_positions(record):
         return None
     periods = about.signals.periods
     if (smooth := unwrap_record(record, periods)) is None:
@@ -155,12 +155,8 @@ def build_reader(record: Record, about: SystemResiduals, numbers: np.ndarray, pr
 
 def read_records(residuals: Residuals) -> list[Reader | None]:
     """A reader for each record whose signals are positions, None for others; a few hundred probes for each system."""
-    numbers = residuals.parameters.first
-    return [
-        build_reader(record, part, numbers, max(8, 256 // len(part.records))) if isinstance(record, Record) else None
-        for part in residuals.parts
-        for record in part.records
-    ]
+    pairs, numbers = [(record, part) for part in residuals.parts for record in part.records], residuals.parameters.first
+    return [build_reader(record, part, numbers, max(8, 256 // len(part.records))) for record, part in pairs]
 
 
 def first_starts(residuals: Residuals, readers: list[Reader | None], params0: Any) -> np.ndarray:

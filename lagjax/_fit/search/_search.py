@@ -51,16 +51,12 @@ class Search:
         self.residuals, self.law, self.method = residuals, law, method
         hybrid = [jumps(part.scene) for part in residuals.parts for _ in part.records]
         if method == "segments" and all(hybrid):
-            raise ValueError(
-                'method="segments" cannot cut hybrid motion, whose mode is known at its start alone: leave it.'
-            )
+            raise ValueError('method="segments" cannot cut hybrid motion, whose mode is known at the start: leave it.')
         self.readers = [None if is_hybrid else reader for is_hybrid, reader in zip(hybrid, readers, strict=True)]
 
     def __call__(self, point: Point) -> Descent:
         if self.method == "segments" and not any(self.readers):
-            raise ValueError(
-                'method="segments" reads starts off the data: for that values must have the structure of q.'
-            )
+            raise ValueError('method="segments" reads starts off data: for that values must have the structure of q.')
         levels_done: list[Descent] = []
         if self.method != "whole" and any(self.readers):
             point, levels_done = self._fit_growing_segments(point)
@@ -173,10 +169,8 @@ class Search:
     def _time_scales(self, u) -> list[float]:
         """The duration for which the motion of each system looks like a straight line; infinite without readers."""
         numbers = self.residuals.parameters.numbers(u)
-        return [
-            min(time_scales(reading, part.motions, numbers)) if (reading := self._readers_of(part)) else np.inf
-            for part in self.residuals.parts
-        ]
+        pairs = [(part.motions, self._readers_of(part)) for part in self.residuals.parts]
+        return [min(time_scales(reading, motions, numbers)) if reading else np.inf for motions, reading in pairs]
 
     def _cut_records(self, u) -> list[list[Piece]]:
         pairs = zip(self.residuals.parts, self._time_scales(u), strict=True)

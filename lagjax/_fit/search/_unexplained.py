@@ -36,11 +36,8 @@ def measure_unexplained(done: Descent) -> Unexplained:
         parts = _measure_records(done, signal)
         if not parts:
             continue
-        samples = sum(part.samples for part in parts.values())
-        rms, own, motion = (
-            np.sqrt(sum(part.samples * getattr(part, kind) for part in parts.values()) / samples)
-            for kind in ("left", "own", "motion")
-        )
+        samples, *squares = np.array(list(parts.values())).T
+        rms, motion, own = (np.sqrt(samples @ x / samples.sum()) for x in squares)
         shares.append(rms / own if own > 0 else np.inf if rms > 0 else 0.0)
         doubted |= bool(motion > _DOUBTED * own)
         for k, part in parts.items():
