@@ -121,11 +121,9 @@ def _require_room(names: list[str], start: _StartConditions, coordinates: int, i
 
 
 def _contradiction(names, values, what, lengths, dependent, tolerance, size, rounding) -> str | None:
-    """A sentence where a constraint is a combination of others, but does not ask for the same combination.
-
-    `values` (m,) are what the constraints ask for in the quantity called `what`, of which errors count by `size` or
-    by the largest of `values`, and `rounding` (m,) is what may be left of them; `dependent` is from `dependent_rows`.
-    """
+    """A sentence where a constraint is a combination of others, but asks for another combination of `values` (m,)."""
+    # Errors of the quantity `what` count by `size`, or by the largest of `values`, of which `rounding` (m,) may be
+    # left.
     size = max(size, np.max(np.abs(values) / lengths))
     for row, factors in dependent.items():
         weights = np.abs(factors) * lengths

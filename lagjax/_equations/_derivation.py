@@ -580,10 +580,8 @@ class Derivation:
         """M and G at a few states that nothing speaks for, where they are finite."""
         if reach not in self._sampled:
             n, parts = self.layout.size, self.program("mass_matrix", "jacobian")
-            rows = parts.evaluate_many(self._columns(reach)).T
-            self._sampled[reach] = [
-                (x[: n * n].reshape(n, n), x[n * n :].reshape(-1, n)) for x in rows if np.isfinite(x).all()
-            ]
+            rows = [x for x in parts.evaluate_many(self._columns(reach)).T if np.isfinite(x).all()]
+            self._sampled[reach] = [(x[: n * n].reshape(n, n), x[n * n :].reshape(-1, n)) for x in rows]
         return self._sampled[reach]
 
     def _columns(self, reach: float = 1.0) -> list[np.ndarray]:

@@ -177,9 +177,7 @@ def factorize_general(matrix: Matrix) -> Callable[[Vector], Vector]:
         return solve
 
     def solve(b):
-        x = jax.lax.custom_linear_solve(
-            lambda y: scaled @ y, scale * b, solve_by(inverse), transpose_solve=solve_by(inverse.T)
-        )
+        x = jax.lax.custom_linear_solve(lambda y: scaled @ y, scale * b, solve_by(inverse), solve_by(inverse.T))
         return jnp.where(lost, jnp.nan, x)
 
     return solve

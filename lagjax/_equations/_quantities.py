@@ -125,9 +125,7 @@ class _ScalarState:
         return np.array([i in moving for i in values.ravel().tolist()], bool).reshape(values.shape)
 
 
-def quantities(
-    motion: Motion, expansion: Expansion, shapes: tuple, leaves: list[Ids]
-) -> tuple[dict[str, Ids], Recursion | None]:
+def quantities(motion: Motion, expansion: Expansion, shapes: tuple, leaves: list) -> tuple[dict, Recursion | None]:
     """`Motion.quantities`, as ids; `shapes` are those of (q, q̇, t, params) and `leaves` the ids of all their leaves.
 
     Where accelerations take fewer operations by the recursion in L, that comes with them, and its `entries` are one

@@ -57,21 +57,16 @@ class SaddleElimination:
     that order.
     """
 
-    def __init__(
-        self, zeros: tuple[np.ndarray, np.ndarray], dtype, augmented: bool, regular_only: bool, released: bool = False
-    ):
-        mass_zeros, row_zeros = zeros
+    def __init__(self, zeros: tuple, dtype, augmented: bool, regular_only: bool, released: bool = False):
+        mass, touched = (~x for x in zeros)
         self.dtype, self.augmented, self.regular_only, self.released = dtype, augmented, regular_only, released
-        self.size = row_zeros.shape[1]
-        touched = ~row_zeros
+        self.size = touched.shape[1]
         self.rows = [np.flatnonzero(row) for row in touched]
-        self.entries = np.concatenate(
-            [np.argwhere(np.tril(~mass_zeros | ~mass_zeros.T)), np.argwhere(touched) + [self.size, 0]]
-        )
+        parts = [np.argwhere(np.tril(mass | mass.T)), np.argwhere(touched) + [self.size, 0]]
         if released:
             diagonal = np.arange(self.size, self.size + len(touched))
-            self.entries = np.concatenate([self.entries, np.stack([diagonal, diagonal], axis=1)])
-        mass = ~mass_zeros
+            parts.append(np.stack([diagonal, diagonal], axis=1))
+        self.entries = np.concatenate(parts)
         if augmented:
             mass = mass | ((touched.T.astype(float) @ touched.astype(float)) > 0)
         self.order, filled = elimination_order(mass, touched)
@@ -229,8 +224,7 @@ class DraggedElimination:
     def factors(self, values) -> tuple[Any, Any]:
         n, saddle = self.saddle.size, self.saddle
         factors, singular = saddle.factors(values[: self.own])
-        rows = self.saddle.entries[:, 0] >= n
-        rows &= self.saddle.entries[:, 1] < n
+        rows = (saddle.entries[:, 0] >= n) & (saddle.entries[:, 1] < n)
         of_rows, forces = values[np.flatnonzero(rows)], values[self.own :]
         places, columns = np.argwhere(~self.zeros), []
         for j in self.dragged:

@@ -17,16 +17,7 @@ import numpy as np
 
 from lagjax._engine import Problem
 from lagjax._equations import has_constraints
-from lagjax._interface import (
-    ENDED_WELL,
-    RESULTS,
-    Layout,
-    SimulationError,
-    import_registered,
-    is_concrete,
-    is_known,
-    show_str,
-)
+from lagjax._interface import ENDED_WELL, RESULTS, Layout, SimulationError, import_registered, is_known, show_str
 from lagjax._primitives import DOUBLE, compute_in_doubles, marks_absent, raise_where_failed
 from lagjax._scene import System
 
@@ -417,10 +408,10 @@ def raise_unless_ok(trajectory: Trajectory, layout: Layout, why: Callable[[], st
     """Raise `SimulationError` for a trajectory that did not reach its end; at run time when it is being traced."""
     # `why()` are the words for what stopped it, where they are known better than by the result.
     end, code = trajectory.end, trajectory.result._value
-    if is_concrete(code) and int(code) in ENDED_WELL:
+    if is_known(code) and int(code) in ENDED_WELL:
         return trajectory
     t_last = trajectory.ts[-1]
-    if not all(is_concrete(leaf) for leaf in jax.tree.leaves((end, code, t_last))):
+    if not all(is_known(leaf) for leaf in jax.tree.leaves((end, code, t_last))):
         y_end = jnp.concatenate([layout.flatten(end.q), layout.flatten(end.qdot)])
         states = trajectory.q, trajectory.qdot, end
         states = raise_where_failed(states, code, (end.t, y_end), t_last, layout.names)

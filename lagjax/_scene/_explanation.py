@@ -109,10 +109,8 @@ class Explanation:
             rows.append(("borders", f"{_count_names(self.borders)}; {how}"))
         if self.narrow:
             rows.append(("narrow features", _count_names(self.narrow)))
-        if self.constraints:
-            rows.append(("constraints", f"{len(self.constraints)}: {_list_names(self.constraints, counts=False)}"))
-        if self.contacts:
-            rows.append(("contacts", f"{len(self.contacts)}: {_list_names(self.contacts, counts=False)}"))
+        for what, names in (("constraints", self.constraints), ("contacts", self.contacts)):
+            rows += [(what, f"{len(names)}: {_list_names(names, counts=False)}")] if names else []
         for name, others in (self.dependent_constraints or {}).items():
             rows.append(("dependent", f"{name} on {join_names(others, _LISTED)}"))
         if self.operations is not None:

@@ -386,9 +386,7 @@ def _acceleration(derivation: Derivation, ended: Ended) -> np.ndarray:
 # ---- of a trajectory -------------------------------------------------------------------------------------------------
 
 
-def motion_end(
-    trajectory: Trajectory, layout: Layout, member: tuple[int, ...] = (), numbers: np.ndarray | None = None
-) -> Ended:
+def motion_end(trajectory: Trajectory, layout: Layout, member: tuple = (), numbers: np.ndarray | None = None) -> Ended:
     """The end of a trajectory, or of one member of a batch, and where it began; `numbers` (P,) are its parameters."""
 
     def flatten_member(tree, *index):

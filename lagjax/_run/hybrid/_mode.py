@@ -155,9 +155,7 @@ class Mode(NamedTuple):
 
 
 @functools.lru_cache(maxsize=64)
-def _surfaces(
-    derivation: Derivation, system: System, leaving: tuple[Transition, ...], code: tuple, structure
-) -> Surfaces | None:
+def _surfaces(derivation: Derivation, system: System, leaving: tuple, code: tuple, structure) -> Surfaces | None:
     """The guards of the transitions that leave a mode, lowered once; None where none leaves."""
     # `code` and `structure` are what params hold that is not a number. Raises `Unlowerable`.
     if not leaving:

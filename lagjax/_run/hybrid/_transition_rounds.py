@@ -191,9 +191,7 @@ class _Rounds(NamedTuple):
             off = off | ((mode == place) & self.modes[place].is_inconsistent(t, y))
         return off
 
-    def _run_mode(
-        self, place: int, guarded: Guarded | None, before: Ending, here
-    ) -> tuple[Ending, jax.Array, TransitionRecord]:
+    def _run_mode(self, place: int, guarded, before: Ending, here) -> tuple[Ending, jax.Array, TransitionRecord]:
         """One round in the mode of this `place` for members that are `here`, and whether a transition ended it."""
         mode, outset = self.modes[place], self._outset(place, guarded, before)
         noted = jnp.concatenate([outset.sides, _pick(before.memory.rate_rounding, self._places_of(mode))])

@@ -50,9 +50,8 @@ def _not_finite(scene: CheckedScene) -> list[Finding]:
     second = ~np.isfinite(m.mass[0]).all(axis=1) | ~np.isfinite(scene.drift) & ~drag
     reported = []
     if first.any():
-        reported.append(
-            _no_derivative(scene, "lagrangian", "The derivative of L by", _select_names(names[:-1], first), "first")
-        )
+        where = _select_names(names[:-1], first)
+        reported.append(_no_derivative(scene, "lagrangian", "The derivative of L by", where, "first"))
     elif second.any():
         where = _select_names(names[n:-1], second)
         reported.append(_no_derivative(scene, "lagrangian", "The second derivative of L by", where, "second"))
