@@ -78,10 +78,7 @@ def unavailable(include: str) -> str | None:
 
 
 class Plan(ctypes.Structure):
-    """The plan of a kernel for its handler: the addresses of its functions, the size of its memory, and how to run it.
-
-    `memory` counts the doubles of a thread, `rounds` the rounds until the handler returns.
-    """
+    """The plan of a kernel: its functions, doubles of `memory` of a thread, and how to run, for `rounds` at first."""
 
     _fields_ = [
         *((name, ctypes.c_void_p) for name in ("begin", "run")),

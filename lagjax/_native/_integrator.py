@@ -39,22 +39,11 @@ JOB = job(
 
 
 class Integrator:
-    """Builds the module, whose public functions are `begin` and `run`.
-
-    Coordinates of one of the `error_groups` are measured by the largest of them. The first coordinates of a `nesting`
-    are the motion, the others derivatives of it, which follow where the projection takes it.
-    """
+    """Builds the module, whose public functions are `begin` and `run`; `error_groups` as in `StepControl`."""
 
     job = JOB
 
-    def __init__(
-        self,
-        parts: MotionParts,
-        guards: Guards | None = None,
-        error_groups: tuple[int, ...] | None = None,
-        *,
-        width: int,
-    ):
+    def __init__(self, parts: MotionParts, guards: Guards | None = None, error_groups=None, *, width: int):
         program, series, nesting, projection, borders, _ = parts
         n = series.size
         self.base_size = nesting.base

@@ -162,17 +162,7 @@ class Kernel:
         return Rest.size(self._forward.layout)
 
     def __call__(
-        self,
-        ts,
-        y0,
-        params,
-        rtol: float,
-        atol: float,
-        max_steps: int,
-        room: int = 0,
-        begun: Begun | None = None,
-        room_of_notes: int = 0,
-        order: int = 0,
+        self, ts, y0, params, rtol, atol, max_steps, room=0, begun: Begun | None = None, room_of_notes=0, order=0
     ) -> Outcome:
         """The motions from the states `y0` (N, 2n), all arrays of float64.
 

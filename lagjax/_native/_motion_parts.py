@@ -93,10 +93,7 @@ class MotionParts(NamedTuple):
         return cls(program, recurrences(program, size), Nesting(size), projection, chosen=chosen)
 
     def append_guards(self, nesting: Nesting, guards: Guards | None, motion: Recurrent | None) -> "MotionParts":
-        """The parts of a run, from those of the smooth motion: along its pieces, with guards behind q̈.
-
-        `motion` is the program of the motion without its tangents, of the same numbers of a member.
-        """
+        """The parts of a run, from those of the smooth motion: along its pieces, with guards behind q̈."""
         size, whole = nesting.size, self._replace(nesting=nesting)
         if guards is not None:
             program, series, found = append_guards(self.program, size, guards.values, not nesting.directions)

@@ -93,8 +93,8 @@ class Output:
     def record(self, frame: Frame, lane: Lane, kicks: bool, state: str = "y") -> None:
         """Time, size and first state of the step, a field, whose it is and which, as long as there is room.
 
-        Where anything `kicks` the motion, steps of no length may count as well.
-        All threads write rows into one table, in the order in which they come to it.
+        All threads write rows into one table, in the order in which they come to it. Where anything `kicks` the motion,
+        steps of no length may count, too.
         """
         code, member = frame.code, lane["member"]
         with code.only_if((member >= 0) & (lane["counts"] > 0.0 if kicks else code.compare("!=", lane["h"], 0.0))):

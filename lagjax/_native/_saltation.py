@@ -168,24 +168,20 @@ class Saltation:
 
     def push(self, directions: Directions, frame: Frame) -> None:
         """The tangents behind a border, at the beginning of the step from there."""
-        is_hit = directions.number_of(frame, "is_hit") > 0.0
-        with frame.code.only_if(frame.code.any_lane(is_hit)):
-            self._add_jumps(directions, frame)
-
-    def _add_jumps(self, directions: Directions, frame: Frame) -> None:
-        form, n, behind, jump = directions.form, directions.n, self.motion.parameters, self.jump
+        form, n, jump, code = directions.form, directions.n, self.jump, frame.code
 
         def numbers(name, count, first=0):
             return directions.numbers_of(frame, name, count, lambda i: (i + first,), in_place=True)
 
-        tangents = [frame.vectors("dy", n, lambda i: (i, 0)), frame.vectors("dy", n, lambda i: (i + n, 0))]
-        pieces = numbers("params", self.motion.pieces, behind)
-        inputs = self._edge_inputs(numbers, pieces)
-        out = form.run(frame, jump.line, *inputs, *tangents, frame.vectors("dparams", directions.numbers))
-        is_hit, grazes = (directions.number_of(frame, name) for name in ("is_hit", "grazes"))
-        added = self._tangent_jumps(frame, out, numbers("hit", self.pieces), pieces, is_hit, grazes)
-        for row, i, part, place in self._each(frame, form, range(jump.lower)):
-            frame["dy", place, 0] = frame["dy", place, 0] + added(jump.lower + row, i, part)
+        with code.only_if(code.any_lane(directions.number_of(frame, "is_hit") > 0.0)):
+            tangents = [frame.vectors("dy", n, lambda i: (i, 0)), frame.vectors("dy", n, lambda i: (i + n, 0))]
+            pieces = numbers("params", self.pieces, self.motion.parameters)
+            inputs = *self._edge_inputs(numbers, pieces), *tangents, frame.vectors("dparams", directions.numbers)
+            out = form.run(frame, jump.line, *inputs)
+            is_hit, grazes = (directions.number_of(frame, name) for name in ("is_hit", "grazes"))
+            added = self._tangent_jumps(frame, out, numbers("hit", self.pieces), pieces, is_hit, grazes)
+            for row, i, part, place in self._each(frame, form, range(jump.lower)):
+                frame["dy", place, 0] = frame["dy", place, 0] + added(jump.lower + row, i, part)
 
     def pull(self, cotangents: Cotangents) -> Code:
         """`()`: from the state beyond the border that a step ends at to that before it, and to the parameters."""

@@ -116,11 +116,7 @@ def _operations(line: StraightLine, uses: list[int], kinds: _Kinds) -> list[Sche
 def _outputs(
     line: StraightLine, operations: list[ScheduledOperation], kinds: _Kinds, staying: int
 ) -> tuple[dict[int, int], list[ScheduledOperation]]:
-    """The first outputs that every node is; and the copies for those that no operation makes, or that are an
-    earlier output too, and for all other outputs.
-
-    Of a program of N nodes, a copy for output k is node N + k.
-    """
+    """The first outputs that nodes are, and copies for all others: that for output k of N nodes is node N + k."""
     made = {x for operation in operations for x in operation.results}
     outputs: dict[int, int] = {}
     copies = []

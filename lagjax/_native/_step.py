@@ -236,10 +236,7 @@ class StepControl:
         return frame.code.select(is_last, frame["t_end"], after), frame.code.select(is_last, 0.0, rest)
 
     def advance(self, frame: Frame, after: Value, rest: Value, kicks: bool) -> None:
-        """The time and the state at the end of the step, what rounding takes carried along; and one step more.
-
-        Where anything `kicks` the motion, steps of no length may count as well.
-        """
+        """The time and the state at the end of the step, what rounding takes carried along; and one step more."""
         code, h = frame.code, frame["h"]
         moving = frame["counts"] > 0.0 if kicks else code.compare("!=", h, 0.0)
         frame.assign(moving, t=after, t_low=rest)

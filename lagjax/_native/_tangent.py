@@ -29,10 +29,7 @@ JOB = job(
 
 
 class Tangent:
-    """Builds the module; its public functions are `begin(job, memory, lanes)` and `run(job, memory, lanes, rounds)`.
-
-    Vectors of the motion have `width` lanes, those of its tangents `lanes` (`Directions`).
-    """
+    """Builds the module; its public functions are `begin(job, memory, lanes)` and `run(job, memory, lanes, rounds)`."""
 
     job = JOB
 

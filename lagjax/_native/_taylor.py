@@ -42,15 +42,7 @@ class TaylorSeries:
     """
 
     def __init__(
-        self,
-        name: str,
-        parts: MotionParts,
-        job: type,
-        fields: Fields,
-        large: bool,
-        width: int,
-        keep_sums: bool = False,
-        kept: int = 0,
+        self, name: str, parts: MotionParts, job: type, fields: Fields, large: bool, width: int, keep_sums=False, kept=0
     ):
         program, series, pieces, chosen = parts.program, parts.series, parts.pieces, parts.chosen
         self.program, self.series, self.n, self.states = program, series, series.size, 2 * series.size

@@ -56,11 +56,7 @@ class LinearSystem(NamedTuple):
 
 
 class Recurrent(Protocol):
-    """The part of a program that Taylor series and machine code read: `Program` without JAX.
-
-    `dtypes` has the type of every input, `size` their number. Where the outputs are the solution of a linear system,
-    `linear` is that (see `LinearSystem`).
-    """
+    """The part of a program that Taylor series and machine code read: `Program` without JAX."""
 
     @property
     def line(self) -> StraightLine: ...

@@ -113,14 +113,7 @@ class Surfaces(NamedTuple):
 
     @classmethod
     def from_function(
-        cls,
-        derivation: Derivation,
-        function: Callable,
-        directions: tuple[int, ...],
-        code: tuple,
-        structure,
-        is_rounded: bool = False,
-        given: Program | None = None,
+        cls, derivation: Derivation, function: Callable, directions, code, structure, is_rounded=False, given=None
     ) -> "Surfaces":
         """The surfaces of a function of y = (q, q̇, t), (2n + 1,), and params, which gives all g (G,).
 
