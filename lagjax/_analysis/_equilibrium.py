@@ -143,8 +143,7 @@ def require_steady(scene: SceneState) -> None:
 
 # ---- Newton's method -------------------------------------------------------------------------------------------------
 
-# A multiplier that counts as rounding of the others.
-_TINY = 1e-6
+_TINY = 1e-6  # of the other multipliers: one that counts as their rounding
 
 
 @compile_for_one_call

@@ -28,8 +28,7 @@ _TRIALS = 24
 # How stiff constraints are beside K where it is asked if K − σM is positive on their tangent space. Softer ones only
 # make the shift lower than need be.
 _STIFF = 1e6
-# What a shape may be off, in parts of its length. The error of its eigenvalue is the square of that.
-_OFF = 1e-6
+_OFF = 1e-6  # of its length that a shape may be off: the error of its eigenvalue is the square of that
 
 
 def needs_all(count: int | None, freedoms: int) -> bool:
@@ -193,5 +192,4 @@ def factorize_regular(matrix: Sparse) -> SuperLU | None:
     return factors if pivots.min() > _SINGULAR * pivots.max() else None
 
 
-# Pivots below this part of the largest are rounding: some hundred roundings of sums.
-_SINGULAR = 1e-14
+_SINGULAR = 1e-14  # of the largest pivot, below which others are rounding: some hundred roundings of sums

@@ -19,15 +19,12 @@ from lagjax._equations import Scales
 from lagjax._interface import compile_for_one_call
 from lagjax._scene import System
 
-# Nodes of Gauss's rule: exact for polynomials of degree 63.
-_NODES = 32
+_NODES = 32  # of Gauss's rule: exact for polynomials of degree 63
 
 # How far beside the straight line curves lead, in parts of its length, into how many parts they are divided, and what
 # rules over parts of two lengths may differ by.
 _BESIDE, _PARTS, _RESOLVED = (0.0, 0.5, -0.5), 4, 1e-10
-
-# The part of forces by which they may fail to have a potential: some tens of roundings of sums.
-_CURL = 1e-12
+_CURL = 1e-12  # of forces, by which they may fail to have a potential: some tens of roundings of sums
 
 
 def line_integral(slope: Callable, start: Array, end: Array) -> Array:

@@ -14,10 +14,8 @@ from lagjax._interface import compile_for_one_call
 # scale away, and terms of different powers differ by more than rounding. Halved or doubled, the same symmetries are
 # found in the ready scenes.
 _NEAR = 0.5
-# How much farther those of a piecewise scene are drawn: one piece may have what the next one has not.
-_FAR = 5.0
-# Every so manieth state is drawn as far off as it takes for the forces not to be linear.
-_THIRD = 3
+_FAR = 5.0  # times as far those of a piecewise scene are drawn: one piece may have what the next one has not
+_THIRD = 3  # of so many states one is drawn as far off as it takes for the forces not to be linear
 
 
 def random_states(scene: SceneState, scales: Scales, count: int, seed: int, piecewise: bool) -> FlatState:

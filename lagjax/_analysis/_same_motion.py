@@ -20,9 +20,7 @@ PyTree = Any
 # much of what the numbers of two scenes are made of. Where terms cancel within L more is left: this many times what it
 # is seen to change between states a few units in the last place apart, but never more than the last.
 _SAME, _CHANCE, _LARGEST = 1e-13, 100.0, 1e-8
-
-# Random states, of which rounding decides at none.
-_STATES = 64
+_STATES = 64  # random ones, of which rounding decides at none
 
 
 class SameMotion(NamedTuple):

@@ -20,8 +20,7 @@ from lagjax._scene import ROLES, System
 
 PyTree = Any
 
-# How far off the guess the motion begins, in sizes of the coordinates: to leave an unstable equilibrium.
-_ASIDE = 1e-3
+_ASIDE = 1e-3  # sizes of the coordinates off the guess where the motion begins: to leave an unstable equilibrium
 # Stages, each with half of the friction of the one before and some of its own times long, and the velocities that are
 # rest, in sizes of the velocities: the motion has then come down to where Newton's method finds the equilibrium.
 _STAGES, _TIMES, _AT_REST = 16, 20.0, 1e-4

@@ -37,14 +37,9 @@ _NULL = 1e-13
 # Where terms cancel inside of L rounding leaves more: this many times what it is seen to leave. A broken symmetry is
 # off by the same at a state and a few units in its last place beside it; one that holds is off by chance.
 _CHANCE = 30.0
-# The largest part of L that may be left. Beyond, nothing is distinguished from rounding, and no symmetry is reported.
-_LARGEST = 1e-8
-
-# At fresh states as much may be left of a symmetry, times this: the largest of many, not their mean.
-_SLACK = 100.0
-
-# What is left of a near symmetry, at most: relativity in the solar system breaks those of Newton by 1e-8.
-_NEARLY = 1e-6
+_LARGEST = 1e-8  # part of L that may be left: beyond, nothing is told from rounding, and no symmetry is reported
+_SLACK = 100.0  # times as much may be left of a symmetry at fresh states: the largest of many, not their mean
+_NEARLY = 1e-6  # is left of a near symmetry, at most: relativity in the solar system breaks those of Newton by 1e-8
 
 
 class Conserved(NamedTuple):

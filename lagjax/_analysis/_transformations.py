@@ -16,11 +16,8 @@ import numpy as np
 
 from lagjax._interface import Layout
 
-# Up to this many coordinates every linear map is tried, 144 of them.
-_ALL_MAPS = 12
-
-# Leaves whose last axis is so long are vectors, which can be rotated.
-_SPACE = (2,), (3,)
+_ALL_MAPS = 12  # coordinates up to which every linear map is tried, 144 of them
+_SPACE = (2,), (3,)  # last axes of leaves that are vectors, which can be rotated
 
 
 class Fields(NamedTuple):

@@ -32,8 +32,7 @@ _TRIALS = 8  # of Newton's method: beyond, the step along the family was too lon
 # A step is repeated at half its length beyond these: the ratio of the second correction to the first, the first one in
 # parts of the step, the turn of the tangent, and how far the chord is from midway between the tangents.
 _CONTRACTION, _DISTANCE, _TURN, _ASKEW = 0.5, 0.4, 0.6, 0.1
-# The next step is chosen for this share of them.
-_USUAL = 0.4
+_USUAL = 0.4  # of them, for which the next step is chosen
 _LONGEST = 0.3  # of the largest number of a state: orbits of a family along a straight line are some way apart, no more
 # Singular values of closed orbits beyond this share of the largest are no rounding, whatever the rank was before: about
 # branch points they pass through zero.

@@ -25,8 +25,7 @@ from lagjax._scene import System
 
 PyTree = Any
 
-# Steps of an arc, along which errors grow tenfold or so: the rounding of its derivative then stays round-off.
-_STEPS_OF_ARC = 8
+_STEPS_OF_ARC = 8  # along which errors grow tenfold or so: the rounding of its derivative then stays round-off
 _PORTION = 2**15  # arcs that are followed together: some ten megabytes for each coordinate
 _BLOCKS = 16  # of a motion, whose own exponents tell how much the mean may be off
 _MEMBERS = 2**14  # that are followed together: what a map of any size takes of memory

@@ -24,8 +24,7 @@ RTOL = 2.3e-16
 # The largest defect of an orbit that counts as closed, in units of its largest number: a thousand roundings of arcs
 # along which errors grow a thousandfold. Beyond, Newton's method came to rest at something that is no orbit.
 CLOSED = 1e-10
-# Where more arcs are not tried: in parts of the state, whose rounding a hundred steps magnify so far.
-WELL_CLOSED = 1e-12
+WELL_CLOSED = 1e-12  # of the state, whose rounding a hundred steps magnify so far: more arcs are not tried then
 # Steps of one arc: with a series of order twenty some hundred of them make errors grow a thousandfold at most.
 _STEPS_OF_ARC, _MOST_ARCS, _MORE = 400, 128, 8
 _PORTION = 2**13  # arcs that are followed together

@@ -28,9 +28,7 @@ from lagjax._scene import System
 
 PyTree = Any
 _BUDGET = 10_000_000  # steps: observations last for thousands of periods
-
-# Mean times between crossings that are waited for behind the last measured one: a trial may come later.
-_PATIENCE = 2.0
+_PATIENCE = 2.0  # mean times between crossings that are waited for behind the last one: a trial may come later
 
 # Of the tolerance of a fit, for the motion itself: its error grows with the square of the time, and after a thousand
 # periods of seven planets is a thirtieth of what they are measured to. Derivatives then need no shorter steps either.
