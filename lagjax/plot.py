@@ -535,7 +535,6 @@ def _require(value, name: str, kind: type, function: str, more: str = "") -> Non
 
 
 def _require_numbers(trajectory, name: str) -> None:
-    """Raise for what is no trajectory, and for one that is being traced."""
     _require(trajectory, name, Trajectory, "simulate")
     require_numbers(trajectory, "lagjax.plot draws")
 

@@ -73,7 +73,6 @@ class Modes(eqx.Module):
 
 
 def _kind(pair: np.ndarray, size: float) -> str:
-    """The kind of a mode with these two exponents, beside others of this size."""
     small, real, imaginary = _grows_beyond(size), np.real(pair), np.imag(pair)
     if np.abs(pair).max() <= small:
         return "zero mode: neutral, may drift"
@@ -275,7 +274,6 @@ _MOST_MODES = 2000
 
 
 def _rank_is(jacobian: Float[Array, "m n"], rank: int) -> Bool[Array, ""]:
-    """True if this many of the constraints are independent."""
     if not len(jacobian):
         return jnp.asarray(True)
     lengths = jnp.sqrt(jnp.sum(jacobian**2, axis=1, keepdims=True))

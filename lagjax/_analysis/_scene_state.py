@@ -116,7 +116,6 @@ class SceneState(NamedTuple):
         return self.lowered is not None and borders_of(self.derivation) is not None
 
     def require_autonomous(self, what: str) -> None:
-        """Raise `ValueError` where a function of the scene depends on the time."""
         asking = [role for role in ROLES if (f := getattr(self.system, role)) is not None and "t" in f.extras]
         if not asking:
             return

@@ -35,7 +35,6 @@ class _Rough(NamedTuple):
 
 
 def is_smooth(scene: SceneState) -> Bool[Array, ""]:
-    """True if the forces have derivatives at the state of a scene."""
     if not _pieces(scene):
         return jnp.asarray(True)
     rough = _rough(scene)

@@ -304,7 +304,6 @@ def _keep_the_rest(figure, moving: list) -> None:
 
 
 def _axes(figure, low: np.ndarray, high: np.ndarray):
-    """Axes of equal scale that hold the whole motion."""
     ax = figure.add_subplot(projection="3d" if len(low) == 3 else None)
     ax.set(**{f"{axis}lim": ends for axis, *ends in zip("xyz", low, high, strict=False)})
     if len(low) == 3:
@@ -357,7 +356,6 @@ def _digits(times: np.ndarray) -> int:
 
 
 def _ffmpeg() -> str | None:
-    """The path of ffmpeg, of the system or of the package imageio-ffmpeg; None without it."""
     if program := shutil.which("ffmpeg"):
         return program
     try:

@@ -114,7 +114,6 @@ def _verdict(trajectory) -> str:
 
 
 def _range(values: np.ndarray) -> str:
-    """One number, or the least and the largest of several."""
     if values.size == 0:
         return "?"
     least, largest = f"{values.min():.6g}", f"{values.max():.6g}"

@@ -59,7 +59,6 @@ def _require_whole(other: Files, spec: dict) -> None:
 
 
 def copy_members(old: Files, new: Files) -> None:
-    """Copy the members that `old` has into `new`, of which nothing is done yet."""
     before, spec = old.spec(), new.spec()
     matches = map(partial(_match_places, old, new), before["axes"], spec["axes"])
     grid, places = new.grid(spec), [places_in for places_in in matches if places_in is not None]

@@ -171,7 +171,6 @@ def unit_points(job: Job, unit: int) -> Callable[[np.ndarray], dict[str, np.ndar
 
 
 def compute(job: Job, unit: int, crashed: dict[int, str], before_batch: Callable[[], None] = lambda: None) -> Unit:
-    """Compute a unit without members that are known to end their process."""
     began, spent = time.monotonic(), time.process_time()
     size, points, copied = job.grid.size(unit), unit_points(job, unit), job.store.copied(unit)
     drifts, complaints = np.full(size, np.nan), dict(crashed)
@@ -204,7 +203,6 @@ def compute(job: Job, unit: int, crashed: dict[int, str], before_batch: Callable
 
 
 def _replace_crashed(which: np.ndarray, crashed: dict[int, str]) -> np.ndarray:
-    """The members of a batch; a healthy one replaces each of those that `crashed`."""
     bad = np.isin(which, list(crashed))
     if bad.all():
         raise ValueError("All members of a batch end their process: look at one of them alone, with `simulate`.")

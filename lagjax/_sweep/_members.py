@@ -39,7 +39,6 @@ class Axis:
             start += len(values)
 
     def described(self) -> dict:
-        """The names, the size and the rule, or a hash of the values."""
         about = {"names": list(self.names), "size": self.size}
         if isinstance(self.source, Design):
             return about | self.source.described()

@@ -59,7 +59,6 @@ class Units(NamedTuple):
     length: np.ndarray
 
     def repeat(self, count: int) -> "Units":
-        """The units with each row `count` times, (R count, 2n)."""
         return Units(*(np.repeat(x, count, axis=0) for x in self))
 
     def growth(self, growth: np.ndarray) -> np.ndarray:

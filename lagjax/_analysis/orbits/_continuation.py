@@ -169,7 +169,6 @@ class Follower:
         return float(self.arcs.energy(0.0, point.chain.states())[0])
 
     def energy(self, point: FamilyPoint) -> float:
-        """h = p·q̇ − L."""
         return float(self.arcs.with_numbers(point.numbers).energy(0.0, point.chain.states())[0])
 
 

@@ -47,7 +47,6 @@ class JumpingMotions(NamedTuple):
 
     @property
     def driven(self) -> bool:
-        """True if anything of the scene asks for the time."""
         functions = [getattr(system, role) for system in laws(self.scene) for role in ROLES]
         if isinstance(self.scene, Hybrid):
             functions += [f for transition in self.scene.transitions for f in (transition.guard, transition.reset)]

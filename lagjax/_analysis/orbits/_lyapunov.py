@@ -172,7 +172,6 @@ def lyapunov_exponent(
 
 
 def _largest(arcs: Arcs, y0: np.ndarray, duration: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The largest exponents and their standard errors, each (N,)."""
     (members, states), n = y0.shape, arcs.size
     flow = arcs.flow.tangent(1)
     numbers = np.concatenate([arcs.numbers, np.zeros_like(arcs.numbers)])[None]

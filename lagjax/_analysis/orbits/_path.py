@@ -239,7 +239,6 @@ def _why_not(closing: Closing, chain: Chain, times) -> str:
 
 
 def _build_path(system: System, arcs: Arcs, chain: Chain, q_start: np.ndarray, times, params) -> Path:
-    """The path in the user's structure, with its action and its second variation."""
     restore, states = arcs.layout.restore, chain.y[0] * chain.units.state
     states[0, : arcs.size] = q_start  # exactly, not by way of the units
     conjugate, at_end = conjugate_times(arcs, states, times, chain.units)

@@ -61,7 +61,6 @@ class Delays:
         jax.eval_shape(evaluate, jax.ShapeDtypeStruct(parameters.first.shape, parameters.first.dtype))
 
     def evaluate(self, numbers: np.ndarray) -> list[Delay]:
-        """The different delays at the parameters `numbers` (P,)."""
         values, slopes = (np.asarray(x, float) for x in self._value_and_jacobian(numbers))
         rows, which = np.unique(np.column_stack([values, slopes]), axis=0, return_inverse=True)
         which = which.ravel()

@@ -167,7 +167,6 @@ def _restore_keys(parts: list, keys: tuple[str, ...] | None) -> PyTree:
 
 
 def _require_valid_times(flat: FlatTimings, t0: float) -> None:
-    """Raise `ValueError` for times, numbers or weights that no motion from t0 can have."""
     if not np.isfinite(flat.times).any():
         raise ValueError("times holds no time: all are NaN, or there are none.")
     if np.isinf(flat.times).any():

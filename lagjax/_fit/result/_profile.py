@@ -105,7 +105,6 @@ class _ProfileLine:
 
 
 def profile(fit, name: str, level: float) -> Profile:
-    """The profile of a parameter of a `Fit`; see `Fit.profile`."""
     parameters = fit.parameters
     line, row = _ProfileLine(fit, parameters.unknown(name)), parameters.row(name)
     threshold = fit.information.quantile(level) ** 2

@@ -119,7 +119,6 @@ def recordings(fit, part: SystemResiduals) -> list[tuple[Record, np.ndarray]]:
 
 
 def _draw_records(fit, part: SystemResiduals) -> dict[str, list[str]]:
-    """Data over fit of the records of one system, and its residuals, by their headings."""
     pairs, names, sigma = recordings(fit, part), part.signals.names, part.sensor_noise(fit.noise_scale).sigma
     if not pairs:
         return {}
@@ -183,7 +182,6 @@ def _parameter_cells(fit) -> list[list[str]]:
 
 
 def _noise_cells(fit) -> list[list[str]]:
-    """The table of the noise of the signals, its head first; ν where one has tails."""
     rows = [["signal", "RMS", "noise σ", "ν", "samples", "effective", "Durbin–Watson"]]
     for (name, noise), rms in zip(fit.noise.items(), fit.rms.values(), strict=True):
         numbers = f"{rms:.3g}", f"{noise.sigma:.3g}", f"{noise.dof:.3g}", f"{noise.samples}", f"{noise.effective:.0f}"

@@ -105,7 +105,6 @@ class Fit:
     def from_descent(
         cls, descent: Descent, law: AbstractNoise, waterfall: Waterfall | None
     ) -> tuple["Fit", Unexplained]:
-        """The fit that a search ended at, and what it leaves of the signals."""
         residuals, trial, noise = descent.residuals, descent.trial, descent.noise
         parameters, known = residuals.parameters, information(descent)
         unseen, left = unseen_sentences(descent, known), measure_unexplained(descent)

@@ -77,7 +77,6 @@ class Search:
         return done
 
     def _search_pieces(self, level: Descent, joined: Descent | None) -> Descent:
-        """The search on the pieces of a level, with a start for each."""
         part, pieces = level.residuals, level.residuals.pieces
         done = minimise(part, level.trial.point, self.law, _ENOUGH, _TRIALS)
         worse = "fails"
