@@ -209,9 +209,7 @@ def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> 
 @compile_for_one_call
 def _restore(layout: Layout, exponents: Array, shapes: Array, weighted: Array, unit: Vector, balanced) -> Modes:
     """The modes of exponents (k, 2) and shapes (k, n) in the `unit` (n,) of each coordinate; NaN if not `balanced`.
-
-    `weighted` (k, n) are the M x of the shapes x.
-    """
+    `weighted` (k, n) are the M x of the shapes x."""
     shapes = _normalise(shapes, weighted)
     order = jnp.argsort(jax.lax.stop_gradient(exponents[:, 0].imag), stable=True)
     shapes = shapes[order] * unit
@@ -363,10 +361,8 @@ def _exponents(squares: Array, zero, ok=True) -> Array:
 
 
 def _general_modes(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Array, Array]:
-    """Exponents (k, 2) and complex amplitudes (k, k), a mode a column.
-
-    Velocities are in units of the fastest rate there is: positions and they are then of one size.
-    """
+    """Exponents (k, 2) and complex amplitudes (k, k), a mode a column. Velocities are in units of the fastest rate
+    there is: positions and they are then of one size."""
     k, inverse = len(mass), factorize(mass)
     by_q, by_qdot = -inverse.solve_columns(stiffness), -inverse.solve_columns(rates)
     fastest = jax.lax.stop_gradient(jnp.maximum(jnp.sqrt(jnp.max(jnp.abs(by_q))), jnp.max(jnp.abs(by_qdot))))

@@ -20,10 +20,8 @@ Vector = Float[Array, " n"]
 
 
 def shortest_solution(matrix: Matrix, b: Vector, unit: Vector | float = 1.0) -> Vector:
-    """x with A x = b, the shortest one in these units (n,) where A is singular and b in its range.
-
-    Linear in b, with derivatives by both. A singular A is one whose pivots, of rows and columns of unit size, say so.
-    """
+    """x with A x = b, the shortest one in these units (n,) where A is singular and b in its range. Linear in b, with
+    derivatives by both. A singular A is one whose pivots, of rows and columns of unit size, say so."""
     matrix = matrix * unit
     rows, columns = (jax.lax.stop_gradient(scale) for scale in _scales(matrix))
     inverse, order, pivots = invert(jax.lax.stop_gradient(rows[:, None] * matrix * columns))

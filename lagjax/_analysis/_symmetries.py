@@ -229,10 +229,8 @@ def _flatten_generators(generators, layout: Layout) -> dict[str, Callable]:
 
 @compile_for_one_call
 def _columns(fields: Fields, states: FlatState, *arguments) -> tuple[Array, Array]:
-    """The change under each of K transformations at S states: of L (S, n, K), of forces and constraints (S, r, K).
-
-    Both in units of the terms that would have to cancel, so that entries are of order one unless there is a symmetry.
-    """
+    """The change under each of K transformations at S states: of L (S, n, K), of forces and constraints (S, r, K). Both
+    in units of the terms that would have to cancel, so that entries are of order one unless there is a symmetry."""
     scene = SceneState.from_arguments(*arguments)
 
     def lagrangian(q, qdot, t):

@@ -45,9 +45,7 @@ class Course(NamedTuple):
 
     def curve(self, times: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """t (F,), q and q̇ (F, n) at all knots and at these times, in order; a row of NaN where the state jumps.
-
-        Without `times` they are evenly between the knots, so that the curve has `POINTS` at least.
-        """
+        Without `times` they are evenly between the knots, so that the curve has `POINTS` at least."""
         if times is None:
             count = len(self.t) - 1
             parts = np.arange(1, max(2, -(-POINTS // count))) / max(2, -(-POINTS // count))

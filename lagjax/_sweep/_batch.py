@@ -237,9 +237,7 @@ def _call_each(function: Callable[[int], Any], count: int) -> tuple[list[Any], d
 
 def find_failing(members: np.ndarray, why_failed: Callable[[np.ndarray], str | None], most: int) -> dict[int, str]:
     """The members, of some that fail together, that fail, with the reasons, by halves; none where more than `most` do.
-
-    `why_failed` says of a group of members why it fails, None where it does not.
-    """
+    `why_failed` says of a group of members why it fails, None where it does not."""
     failing, groups = {}, [members]
     while groups and len(failing) <= most:
         group = groups.pop()
@@ -255,9 +253,7 @@ def find_failing(members: np.ndarray, why_failed: Callable[[np.ndarray], str | N
 
 def _common_quantities(rows: list[dict[str, np.ndarray]]) -> list[Quantity]:
     """The quantities of the first of some members, of the type that holds what all of them keep: 1 and 1.5 are floats.
-
-    Where there is no such type it is that of the first; the others then have a misfit.
-    """
+    Where there is no such type it is that of the first; the others then have a misfit."""
     common = []
     for name, first in rows[0].items():
         dtype = first.dtype

@@ -153,10 +153,8 @@ def _require_names(quantities: list[Quantity], axes: tuple[Axis, ...], reduce: d
 def resume(
     store: Files, spec: dict, axes: tuple[Axis, ...], description: Description, other: Files | None
 ) -> Description:
-    """The description, with the names of the starts that a store has.
-
-    Raises `ValueError`, with the difference, where the store was begun with another one.
-    """
+    """The description, with the names of the starts that a store has. Raises `ValueError`, with the difference, where
+    the store was begun with another one."""
     require_versions(store, spec)
     here = compared_entries(axes, description) | {"continues": None}
     if other is not None and not other.exists():  # all that is needed of it was copied

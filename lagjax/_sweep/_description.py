@@ -40,9 +40,7 @@ _SHOWN = 40  # lines of a difference
 
 class Sections(NamedTuple):
     """The sections to watch: functions of (q, qdot) and, by name, `t` and `params`; how they change; room for each.
-
-    `names` are those of a dict of sections, None for one function.
-    """
+    `names` are those of a dict of sections, None for one function."""
 
     names: tuple[str, ...] | None
     functions: tuple[Callable, ...]

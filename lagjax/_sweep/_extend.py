@@ -86,10 +86,8 @@ def copy_members(old: Files, new: Files) -> None:
 
 
 def _match_places(old: Files, new: Files, old_axis: dict, new_axis: dict) -> Callable[[slice], np.ndarray] | None:
-    """The places in the old store with the values of a part of an axis of the new one; −1 where there is none.
-
-    None where they have no value in common. Values are read where no one rule gives them.
-    """
+    """The places in the old store with the values of a part of an axis of the new one; −1 where there is none. None
+    where they have no value in common. Values are read where no one rule gives them."""
     if old_axis | {"size": 0} == new_axis | {"size": 0} and old_axis["rule"] in GROWING:
         size = old_axis["size"]
         return lambda part: np.where((places := np.arange(part.start, part.stop)) < size, places, -1)
@@ -139,10 +137,8 @@ def continues(other: Files, description: Description) -> bool:
 
 
 def later_end_of(other: Files, axes: tuple[Axis, ...], description: Description) -> LaterEnd | None:
-    """The last states in a store, if these motions continue its own; None if they begin at another time.
-
-    Raises `ValueError` where they continue, and cannot.
-    """
+    """The last states in a store, if these motions continue its own; None if they begin at another time. Raises
+    `ValueError` where they continue, and cannot."""
     if not continues(other, description):
         return None
     if isinstance(description.system, Hybrid):

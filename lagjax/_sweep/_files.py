@@ -120,9 +120,7 @@ class Files:
 
     def require_arrays(self, spec: dict) -> None:
         """Raise `ValueError` where what zarr knows of an array, or a coordinate, is not what `create` has written.
-
-        Links are refused, too: what is written to a store stays in it.
-        """
+        Links are refused, too: what is written to a store stays in it."""
         grid, zarr = self.grid(spec), require_zarr()
         sizes = {name: axis["size"] for axis in spec["axes"] for name in axis["names"]}
         wanted: dict = {name: ((n,), (min(n, designs.SLICE),), np.dtype(float)) for name, n in sizes.items()}
@@ -165,10 +163,8 @@ class Files:
 
     @contextmanager
     def create_aside(self) -> "Iterator[Files]":
-        """A store in a folder beside this one's, which takes its place when the `with` statement ends.
-
-        So a store is there when it is whole. Of several processes that make it at once the first one's stays.
-        """
+        """A store in a folder beside this one's, which takes its place when the `with` statement ends. So a store is
+        there when it is whole. Of several processes that make it at once the first one's stays."""
         with self.explain_errors("the store was not made"):
             place = self.path.resolve()
             place.parent.mkdir(parents=True, exist_ok=True)

@@ -97,10 +97,8 @@ def _set_doubles_in_process(doubles: bool) -> None:
 
 
 def open_job(path: str) -> Job:
-    """The job of a store in a process that knows nothing but its path. Raises where it is not what was begun.
-
-    A store that was removed and made anew is another one; each is opened once.
-    """
+    """The job of a store in a process that knows nothing but its path. Raises where it is not what was begun. A store
+    that was removed and made anew is another one; each is opened once."""
     return _open_job(path, Files(Path(path)).identity())
 
 

@@ -57,10 +57,8 @@ def require_part(part: Any) -> slice:
 
 
 def units_to_compute(job: Job, part: slice) -> list[int]:
-    """The units of a part that are not done, or are damaged. Raises `OSError` where they could not be written.
-
-    Nothing is written where all are done: a finished store may lie on a disk that is read-only.
-    """
+    """The units of a part that are not done, or are damaged. Raises `OSError` where they could not be written. Nothing
+    is written where all are done: a finished store may lie on a disk that is read-only."""
     store, chosen = job.store, set(range(job.grid.units)[part])
     store.require_arrays(job.spec)
     finished = {unit for unit in store.finished_units() if unit in chosen or unit >= job.grid.units}
@@ -229,10 +227,8 @@ def look_in_children(description: Description, points: dict[str, np.ndarray], li
 
 
 def _call_child(function: Callable, *arguments: Any, limit: float) -> Any:
-    """The result of a function of this module in a process of its own, which has `limit` seconds.
-
-    Raises `_ChildDeath` where the process ends first, `RuntimeError` for what the function raises.
-    """
+    """The result of a function of this module in a process of its own, which has `limit` seconds. Raises `_ChildDeath`
+    where the process ends first, `RuntimeError` for what the function raises."""
     root = str(Path(__file__).parents[2])
     more = {"PYTHONPATH": os.pathsep.join(filter(None, [root, os.environ.get("PYTHONPATH")]))}
     if platforms := jax.config.values.get("jax_platforms"):

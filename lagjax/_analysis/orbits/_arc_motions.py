@@ -163,10 +163,8 @@ class Arcs:
         return Arc(end, self.rate(times[:, 1], end), by_start, by_params, run.result, run.t_end, run.accepted)
 
     def units(self, y0: np.ndarray, time: np.ndarray | None = None) -> "Units":
-        """The units of states (R, 2n), from the largest coordinate and velocity there, in the metric of M.
-
-        `time` (R,) is that of a change; by default it is read off the velocities and accelerations.
-        """
+        """The units of states (R, 2n), from the largest coordinate and velocity there, in the metric of M. `time` (R,)
+        is that of a change; by default it is read off the velocities and accelerations."""
         n = self.size
         mass = np.abs(self.sample(0.0, y0).quantities("mass_matrix")["mass_matrix"][:, np.arange(n), np.arange(n)])
         root = _or_one(np.sqrt(np.where(mass > 0, mass, mass.max(axis=1, initial=0.0)[:, None])))
@@ -209,10 +207,8 @@ class Arcs:
         return np.concatenate([of["energy_by_q"], np.einsum("rij,rj->ri", of["mass_matrix"], halves(y)[1])], axis=1)
 
     def canonical(self, t, y: np.ndarray, units: Units) -> np.ndarray:
-        """∂(q, p)/∂(q, q̇) (R, 2n, 2n), q and q̇ in units (R, 2n), and p in those that l² and the time belong to.
-
-        The product of the units of qᵢ and pᵢ is then the same for all i, so that the symplectic form is the usual one.
-        """
+        """∂(q, p)/∂(q, q̇) (R, 2n, 2n), q and q̇ in units (R, 2n), and p in those that l² and the time belong to. The
+        product of the units of qᵢ and pᵢ is then the same for all i, so that the symplectic form is the usual one."""
         n, sample = self.size, self.sample(t, y)
         chart = np.zeros((len(y), 2 * n, 2 * n))
         chart[:, :n, :n], chart[:, n:, :n] = np.eye(n), sample.momenta_by_q(tuple(range(n)))

@@ -20,10 +20,8 @@ _AT_END = 1e-9  # of the time: a conjugate time so near to the end counts as the
 
 
 def conjugate_times(arcs: Arcs, y: np.ndarray, times: np.ndarray, units: Units) -> tuple[np.ndarray, bool]:
-    """The conjugate times (k,) before the last time, ascending, and whether the last time is one.
-
-    The path is arcs from states `y` (K, 2n) at `times` (K + 1,); tangents are in the `units` (1, 2n) of states.
-    """
+    """The conjugate times (k,) before the last time, ascending, and whether the last time is one. The path is arcs from
+    states `y` (K, 2n) at `times` (K + 1,); tangents are in the `units` (1, 2n) of states."""
     n, found, duration = arcs.size, [], times[-1] - times[0]
     frame = np.concatenate([np.zeros((n, n)), np.eye(n)])  # (δq, δq̇) of all velocities
     for k, start in enumerate(y):

@@ -43,9 +43,7 @@ _LONGEST_GROWTH = 1e3
 
 class FamilyPoint(NamedTuple):
     """An orbit of a family: its chain (of one member), the numbers of the scene, and the closing equations there.
-
-    `matrix` (2n, 2n + F) are those of the first state and of what else is free, `right` (2n,) their right-hand side.
-    """
+    `matrix` (2n, 2n + F) are those of the first state and of what else is free, `right` (2n,) their right-hand side."""
 
     chain: Chain
     numbers: np.ndarray
@@ -214,10 +212,8 @@ class FamilyStep(NamedTuple):
 def correct(
     follower: Follower, point: FamilyPoint, across: FamilyTangent, left_out: int = 0
 ) -> tuple[FamilyPoint, np.ndarray] | None:
-    """The orbit in the plane across a tangent, and the sizes of Newton's corrections; None where there is none.
-
-    The smallest `left_out` singular values of the equations are left out, as at a branch point, where one is zero.
-    """
+    """The orbit in the plane across a tangent, and the sizes of Newton's corrections; None where there is none. The
+    smallest `left_out` singular values of the equations are left out, as at a branch point, where one is zero."""
     sizes, before = [], np.inf
     for _ in range(_TRIALS):
         if not point.chain.ok[0] or not point.chain.period[0] > 0:

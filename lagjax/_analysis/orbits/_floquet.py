@@ -31,10 +31,8 @@ class Reduced(NamedTuple):
 
 
 def reduce(growth: np.ndarray, null: np.ndarray, of_transpose: np.ndarray) -> Reduced:
-    """The arcs `growth` (K, 2n, 2n) of a closed chain, restricted to ker ℓ / W; as they are where W is empty.
-
-    W = `null` and ℓ = `of_transpose`, both (K, 2n, k).
-    """
+    """The arcs `growth` (K, 2n, 2n) of a closed chain, restricted to ker ℓ / W; as they are where W is empty. W =
+    `null` and ℓ = `of_transpose`, both (K, 2n, k)."""
     count, states, _ = growth.shape
     if not null.shape[2]:
         return Reduced(growth, 0)
@@ -104,10 +102,8 @@ def _product_eigenvalues(growth: np.ndarray) -> np.ndarray:
 
 
 def _merge_factors(growth: np.ndarray) -> np.ndarray:
-    """Fewer matrices with the same product: neighbours are multiplied as long as that grows little.
-
-    The eigenvalues of the cyclic matrix cost the cube of their number.
-    """
+    """Fewer matrices with the same product: neighbours are multiplied as long as that grows little. The eigenvalues of
+    the cyclic matrix cost the cube of their number."""
     merged = [growth[0]]
     for matrix in growth[1:]:
         product = matrix @ merged[-1]

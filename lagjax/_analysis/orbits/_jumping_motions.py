@@ -23,9 +23,7 @@ _CHANGES, _CHANGES_OF_ARC = 4096, 256
 
 class JumpRun(NamedTuple):
     """R motions: as in a `Solution` `path` (R, T, 2n), `y_end`, `t_end`, `result`, `accepted`; and `modes` (R, T).
-
-    `by_start` (R, 2n, 2n) and `rate` (R, 2n) are the derivatives of `y_end` by the start and by the last time.
-    """
+    `by_start` (R, 2n, 2n) and `rate` (R, 2n) are the derivatives of `y_end` by the start and by the last time."""
 
     path: Any
     y_end: Any

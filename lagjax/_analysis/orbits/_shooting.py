@@ -39,10 +39,8 @@ _ENOUGH = 8e-15  # of the size of the state: round-off, below which trials canno
 
 
 class Closing(NamedTuple):
-    """The conditions on the ends: those of an orbit are S y = `matrix` y + `shift`, and an energy if given.
-
-    Those of a path are the given positions: `q_end` (n,), and the one it begins with, at the time `t_first`.
-    """
+    """The conditions on the ends: those of an orbit are S y = `matrix` y + `shift`, and an energy if given. Those of a
+    path are the given positions: `q_end` (n,), and the one it begins with, at the time `t_first`."""
 
     arcs: Arcs
     matrix: np.ndarray
@@ -142,10 +140,8 @@ def replace_members(members: Members, places: np.ndarray, others: Members) -> Me
 
 
 def guesses(closing: Closing, y0: np.ndarray, period: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Parts (B, K + 1) of the period and states (B, K, 2n) there, from starts (B, 2n): from both sides to the middle.
-
-    K is a power of two. A driven motion that does not close has no past: it is followed forward only.
-    """
+    """Parts (B, K + 1) of the period and states (B, K, 2n) there, from starts (B, 2n): from both sides to the middle. K
+    is a power of two. A driven motion that does not close has no past: it is followed forward only."""
     arcs = closing.arcs
     if count == 1:
         return np.broadcast_to([0.0, 1.0], (len(y0), 2)), y0[:, None].copy()
@@ -187,10 +183,8 @@ def follow(closing: Closing, y: np.ndarray, period: np.ndarray, parts: np.ndarra
 
 
 class NewtonEquations(NamedTuple):
-    """The equations of Newton's method for B chains: condensed to both ends, with the rank decided.
-
-    The unknowns are u (2n,) of `Closing.free`, and the period where it is free; `right` (B, 2n + m).
-    """
+    """The equations of Newton's method for B chains: condensed to both ends, with the rank decided. The unknowns are u
+    (2n,) of `Closing.free`, and the period where it is free; `right` (B, 2n + m)."""
 
     condensed: Condensed
     decided: Decided
@@ -216,10 +210,8 @@ def equations(closing: Closing, chain: Chain) -> NewtonEquations:
 
 
 def correction(closing: Closing, chain: Chain) -> tuple[np.ndarray, np.ndarray]:
-    """The step of Newton's method, shortest in the first state and the period: dy (B, K, 2n) and dT (B,).
-
-    Zero for a path with conjugate ends.
-    """
+    """The step of Newton's method, shortest in the first state and the period: dy (B, K, 2n) and dT (B,). Zero for a
+    path with conjugate ends."""
     condensed, decided, right = equations(closing, chain)
     step, states = -decided.least_norm(right), chain.y.shape[2]
     period = np.zeros(len(step)) if closing.lasts else step[:, -1]
@@ -273,10 +265,8 @@ class Symmetries(NamedTuple):
 
 
 def symmetries(chain: Chain, most: int | None = None) -> list[Symmetries]:
-    """The rank decision about closed chains: which directions are symmetries, at most this many.
-
-    At a branch point monodromy − 1 sends more to zero, by chance: those of the smallest singular values are chosen.
-    """
+    """The rank decision about closed chains: which directions are symmetries, at most this many. At a branch point
+    monodromy − 1 sends more to zero, by chance: those of the smallest singular values are chosen."""
     forward, null = _null(chain.growth)
     # ℓ_k = G_kᵀ ℓ_(k+1): the same chain, walked back from the end.
     back, of_transpose = _null(np.swapaxes(chain.growth[:, ::-1], 2, 3))

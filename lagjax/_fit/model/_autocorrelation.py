@@ -28,10 +28,8 @@ def autocorrelations(residuals: Residuals, point: Trial, noise: NoiseScale) -> l
 
 
 def _autocorrelation(residuals: Residuals, point: Trial, noise: NoiseScale, signal: int) -> Correlation:
-    """The correlation of the residuals of one signal, over all pieces, as far as it is larger than chance.
-
-    It is cut at two standard errors, and tapered by Parzen's window of three times that length.
-    """
+    """The correlation of the residuals of one signal, over all pieces, as far as it is larger than chance. It is cut at
+    two standard errors, and tapered by Parzen's window of three times that length."""
     dof = noise.dof[signal]
     sums, count = np.zeros(1), 0
     for batch, r in zip(residuals.batches, point.residuals, strict=True):
@@ -80,10 +78,8 @@ def correlated_power(rows: np.ndarray, counted: np.ndarray) -> float:
 
 
 def close_gaps(rows: np.ndarray, counted: np.ndarray) -> np.ndarray:
-    """The rows (N, T, ...) with what `counted` (N, T) in front, so that lags count samples that are there.
-
-    Where every tenth sample is measured, or some are missing, the neighbour of one is the next that was measured.
-    """
+    """The rows (N, T, ...) with what `counted` (N, T) in front, so that lags count samples that are there. Where every
+    tenth sample is measured, or some are missing, the neighbour of one is the next that was measured."""
     if counted.all():
         return rows
     order = np.argsort(~counted, axis=1, kind="stable")

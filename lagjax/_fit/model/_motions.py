@@ -224,10 +224,8 @@ class Origins:
 
 
 class Manifold:
-    """The states that satisfy the constraints of a scene: by the projection of its machine code, else by `project`.
-
-    The first, a step of Newton's method that is taken until nothing changes, needs no compilation.
-    """
+    """The states that satisfy the constraints of a scene: by the projection of its machine code, else by `project`. The
+    first, a step of Newton's method that is taken until nothing changes, needs no compilation."""
 
     def __init__(self, system: System, layout: Layout, parameters: Parameters, projection: Projection | None):
         def project(y: jax.Array, t, numbers) -> jax.Array:

@@ -179,10 +179,8 @@ class SystemResiduals:
     # ---- the trials of a search ----
 
     def append_residuals(self, trial: Trial) -> None:
-        """Append the residuals of this system to a trial, whose starts move to where the motions begin.
-
-        Raises `LostMotion` for the first piece whose motion fails.
-        """
+        """Append the residuals of this system to a trial, whose starts move to where the motions begin. Raises
+        `LostMotion` for the first piece whose motion fails."""
         begun = self._begin_trial(trial)
         for batch in self.batches:
             clock = self.clocks.get(self.pieces[batch.rows[0]].record)
@@ -565,10 +563,8 @@ _BLOCK = 8  # times as many rows as columns in one factorisation
 
 
 def compress_rows(rows: np.ndarray) -> np.ndarray:
-    """The triangles (N, D, D) of N tall matrices (N, M, D), block by block.
-
-    Blocks stay in the cache, and are too small for a BLAS to start threads that wait for each other.
-    """
+    """The triangles (N, D, D) of N tall matrices (N, M, D), block by block. Blocks stay in the cache, and are too small
+    for a BLAS to start threads that wait for each other."""
     pieces, _, columns = rows.shape
     rows = rows if columns else rows[:, :0]
     while rows.shape[1] > columns:

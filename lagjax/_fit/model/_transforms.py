@@ -102,10 +102,8 @@ class AbstractSeparable(AbstractTransform):
         return np.diag(self.slope(u))
 
     def ends(self, x, spread):
-        """x(u ± spread / slope): relative for logarithms, and inside of the bounds.
-
-        Where x ± spread does not exclude a bound, its logarithm says nothing: there x ± spread is cut off.
-        """
+        """x(u ± spread / slope): relative for logarithms, and inside of the bounds. Where x ± spread does not exclude a
+        bound, its logarithm says nothing: there x ± spread is cut off."""
         low, high = np.maximum(x - spread, self.bounds[0]), np.minimum(x + spread, self.bounds[1])
         excluded = (low > self.bounds[0]) & (high < self.bounds[1])
         u = self.inverse(x)

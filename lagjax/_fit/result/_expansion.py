@@ -49,10 +49,8 @@ _NEAREST = float(np.log(2.0))
 
 
 class Chart(NamedTuple):
-    """The coordinates z (D,), where z = 0 is y = `centre` (D,), and ζ moves y by `root` (D, D).
-
-    `bounded` (B,) are the places of numbers between `low` and `high` (B,); `scale` (B,) is σ, `middle` (B,) is t̂.
-    """
+    """The coordinates z (D,), where z = 0 is y = `centre` (D,), and ζ moves y by `root` (D, D). `bounded` (B,) are the
+    places of numbers between `low` and `high` (B,); `scale` (B,) is σ, `middle` (B,) is t̂."""
 
     density: Density
     centre: np.ndarray
@@ -128,10 +126,8 @@ class Chart(NamedTuple):
         return by_y[:, None] * self.root
 
     def room(self, ways: np.ndarray) -> np.ndarray:
-        """The reach of ζ from zero, both ways, along each of `ways` (D, K), (K,): nine tenths of the way to a bound.
-
-        A number that is not bounded has room for one standard deviation.
-        """
+        """The reach of ζ from zero, both ways, along each of `ways` (D, K), (K,): nine tenths of the way to a bound. A
+        number that is not bounded has room for one standard deviation."""
         y = self.centre[self.bounded, None]
         most = 0.9 * np.minimum(y - self.low[:, None], self.high[:, None] - y)
         moved = np.abs(self.root @ ways)[self.bounded]

@@ -188,10 +188,8 @@ def _norm(x: np.ndarray, axis) -> np.ndarray:
 
 
 def eliminate_starts(triangles: np.ndarray, slopes: np.ndarray, states: int) -> np.ndarray:
-    """Columns of parameters less what the starts can do instead: `slopes` (N, ..., D) → (N, ..., F).
-
-    Directions of a start that nothing depends on can do nothing: they are left out.
-    """
+    """Columns of parameters less what the starts can do instead: `slopes` (N, ..., D) → (N, ..., F). Directions of a
+    start that nothing depends on can do nothing: they are left out."""
     of_starts, of_u = triangles[..., :states], triangles[..., states:-1]
     instead = decide(of_starts[:, None], _UNFELT).least_norm(of_u.swapaxes(1, 2)).swapaxes(1, 2)
     shape = (len(slopes), *[1] * (slopes.ndim - 3), *instead.shape[1:])
@@ -210,10 +208,8 @@ def covariance_of_one_start(
 
 
 def signal_deviations(slopes: np.ndarray, states: int, start: np.ndarray, follows: np.ndarray, known: Information):
-    """The standard deviations (T, S) of signals whose derivatives are `slopes` (T, S, 2n + F).
-
-    The start has the covariance `start` (2n, 2n) of its own, and `follows` (2n, F) the parameters.
-    """
+    """The standard deviations (T, S) of signals whose derivatives are `slopes` (T, S, 2n + F). The start has the
+    covariance `start` (2n, 2n) of its own, and `follows` (2n, F) the parameters."""
     a = slopes[..., :states]
     along = slopes[..., states:] - a @ follows
     variance = np.einsum("tsf,fg,tsg->ts", along, known.identifiable, along) + np.einsum("tsi,ij,tsj->ts", a, start, a)

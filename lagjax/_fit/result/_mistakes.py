@@ -78,9 +78,7 @@ def find_mistake(
     share: Callable[[list[Any]], float | None], possible: Iterable[PossibleMistake], left: float, seconds: float
 ) -> list[str]:
     """A sentence for the first mistake without which a fit follows the records; none where there is no such.
-
-    `share(records)` is what a fit leaves of the signals, None where it fails; `left` is what the fit of these left.
-    """
+    `share(records)` is what a fit leaves of the signals, None where it fails; `left` is what the fit of these left."""
     until = time.process_time() + seconds
     for suspect in possible:
         now = share(suspect.records)

@@ -243,9 +243,7 @@ def _unknowns(chart: Chart, z: np.ndarray, log_density: np.ndarray) -> tuple[np.
 
 def agreement(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The effective number of draws (C, K, D) of each unknown, for the bulk or the tails; r-hat, that chains disagree.
-
-    NaN where draws are too few to tell, r-hat also for a single chain.
-    """
+    NaN where draws are too few to tell, r-hat also for a single chain."""
     arviz = _arviz()
     if x.shape[1] < _FEWEST_TO_TELL:
         return np.full(x.shape[2], np.nan), np.full(x.shape[2], np.nan)

@@ -127,10 +127,8 @@ def minimise(
 
 
 def _find_better_trial(model: _Model, damping: float, trials: int, limit: int) -> tuple[Trial | None, float, int]:
-    """The first trial that is better, the damping to go on with, and the count of trials.
-
-    There is none, but None, after `limit` trials, or where steps promise no more than sums of squares are rounded to.
-    """
+    """The first trial that is better, the damping to go on with, and the count of trials. There is none, but None,
+    after `limit` trials, or where steps promise no more than sums of squares are rounded to."""
     growth, at, residuals = 2.0, model.trial, model.residuals
     while trials < limit:
         step = model.step(damping)

@@ -35,9 +35,7 @@ class Reader(NamedTuple):
     @classmethod
     def from_record(cls, record: Record, probes: int, periods: np.ndarray) -> "Reader":
         """A reader with the longest windows whose cubics leave at most `_WORSE_WINDOW` times what the shortest leave.
-
-        Beyond these they no longer follow the motion. They are tried at `probes` places.
-        """
+        Beyond these they no longer follow the motion. They are tried at `probes` places."""
         places = even_places(len(record), probes)
         windows, scatter = zip(*(_window(record.ts[places], *signal) for signal in _signals(record)), strict=True)
         return cls(record, windows, scatter, tuple(periods.tolist()))

@@ -208,9 +208,7 @@ class Search:
 
 def search_again(done: Descent, law: AbstractNoise) -> Descent:
     """The end of a search where samples that share a rounding error count once; of sensors that do not round the same.
-
-    Which samples do is known where the motion is, and does not change with the last digits of the parameters.
-    """
+    Which samples do is known where the motion is, and does not change with the last digits of the parameters."""
     if np.isnan(done.residuals.sensor.step).all():
         return done
     residuals = done.residuals.count_runs_once(done.trial, done.noise)
@@ -229,10 +227,8 @@ class _ShortestSegments(NamedTuple):
 
 
 def _last_followed_level(levels_done: list[Descent]) -> int:
-    """The place of the last level from which on joining did not lose the motion.
-
-    A scene that lacks something leaves up to three times more at each join, and motion that is lost some ten times.
-    """
+    """The place of the last level from which on joining did not lose the motion. A scene that lacks something leaves up
+    to three times more at each join, and motion that is lost some ten times."""
     good, last = 0, np.inf
     for k, done in enumerate(levels_done):
         now = misfit(done.noise, done.residuals)
@@ -242,10 +238,8 @@ def _last_followed_level(levels_done: list[Descent]) -> int:
 
 
 def _separation(done: Descent) -> float:
-    """The logarithm of how far motions part that begin side by side, over the longest record: λ times its length.
-
-    λ is the median over pieces, from the mean squares of derivatives by the start in the first and the last third.
-    """
+    """The logarithm of how far motions part that begin side by side, over the longest record: λ times its length. λ is
+    the median over pieces, from the mean squares of derivatives by the start in the first and the last third."""
     rates, states = [], done.residuals.states
     for batch, slopes in zip(done.residuals.batches, done.trial.slopes, strict=True):
         for ts, weights, by_start in zip(batch.ts, batch.weights, slopes[..., :states], strict=True):
