@@ -487,8 +487,7 @@ def state_map(x, y, values, *, label: str | None = None, cmap: str = "magma", no
     ax.grid(False)
     colors, extent = _matplotlib().colormaps[cmap].with_extremes(bad="white"), (*_edges(x), *_edges(y))
     style: dict[str, Any] = dict(origin="lower", aspect="auto", interpolation="nearest", cmap=colors, norm=norm)
-    image = ax.imshow(values, extent=extent, **style)
-    _colorbar(image, ax, label)
+    _colorbar(ax.imshow(values, extent=extent, **style), ax, label)
     return ax
 
 

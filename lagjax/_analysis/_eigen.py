@@ -91,8 +91,7 @@ def _symmetric_jvp(primals, tangents):
     by_stiffness, by_mass = (vectors.T @ (0.5 * (x + x.T)) @ vectors for x in tangents)
     change = by_stiffness - by_mass * values  # xᵢᵀ (dK − λⱼ dM) xⱼ
     turns = change * _inverse_gaps(values) * (1 - jnp.eye(len(values), dtype=values.dtype))
-    same = _meet(values)
-    return (values, vectors), (jnp.diagonal(change), vectors @ jnp.where(same, -0.5 * by_mass, turns))
+    return (values, vectors), (jnp.diagonal(change), vectors @ jnp.where(_meet(values), -0.5 * by_mass, turns))
 
 
 def _meet(values) -> Array:

@@ -255,8 +255,7 @@ def _large_modes(scene: SceneState, qdot: PyTree, count: int | None) -> tuple[Mo
     residual = _distance(units * values, slopes, scene.q / unit, stiffness, solve, force)
     squares, shapes = lowest_modes(stiffness, mass, jacobian, count)
     exponents = _exponents(squares, _UNITS * n**0.5 * np.finfo(float).eps * size)
-    weighted = (mass @ shapes).T
-    return _restore(scene.layout, exponents, shapes.T, weighted, unit, residual <= _BALANCED), residual
+    return _restore(scene.layout, exponents, shapes.T, (mass @ shapes).T, unit, residual <= _BALANCED), residual
 
 
 @compile_for_one_call

@@ -88,8 +88,7 @@ def noether_charge(system: System, generator: Callable, gauge: Callable | None =
         layout = Layout.from_state(q, qdot)
         change, t = flat_generator(present(generator), layout), jnp.asarray(t, layout.dtype)
         state = layout.flatten(q), layout.flatten(qdot), t, eqx.filter(params, eqx.is_array_like)
-        motion = present_system(system)._motion(layout, params)
-        value = charge_at(motion, lambda q, t: change(q, t, params), *state)
+        value = charge_at(present_system(system)._motion(layout, params), lambda q, t: change(q, t, params), *state)
         return value if gauge is None else value - present(gauge)(q, t=t, params=params)
 
     return charge
@@ -151,5 +150,4 @@ def variation(scene: SceneState, transform: Callable, q: Vector, qdot: Vector, t
 def euler_lagrange(function: Callable, state: FlatState) -> tuple[Vector, Vector]:
     """d/dt ∂Λ/∂q̇ and ∂Λ/∂q (n,) of a function Λ(q, q̇, t): their difference is zero where Λ is some dG(q, t)/dt."""
     place, onwards = (state.q, state.qdot, state.t), (state.qdot, state.qddot, jnp.ones_like(state.t))
-    rate = jax.jvp(jax.grad(function, argnums=1), place, onwards)[1]
-    return rate, jax.grad(function, argnums=0)(*place)
+    return jax.jvp(jax.grad(function, argnums=1), place, onwards)[1], jax.grad(function, argnums=0)(*place)

@@ -83,8 +83,7 @@ def absorb_potential_forces(scene: SceneState, scales: Scales, states: FlatState
         # The value is that of a long way; by q it changes as along the last, vanishing part of it, to every order.
         here = jax.lax.stop_gradient(place[0])
         start = jnp.asarray(reference, layout.dtype)
-        work = _work(force, start, here, scales.q) + line_integral(force, here, place[0])
-        return motion.lagrangian(*place) + work
+        return motion.lagrangian(*place) + _work(force, start, here, scales.q) + line_integral(force, here, place[0])
 
     kept = {role: getattr(system, role) for role in ("dissipation", "constraints", "velocity_constraints")}
     whole = System(lagrangian, **kept)

@@ -27,8 +27,7 @@ def random_states(scene: SceneState, scales: Scales, count: int, seed: int, piec
     qdot, t = np.asarray(scene.qdot) + _NEAR * scales.qdot * draws[1], scales.t * t
     if scene.constrained:
         q, qdot = _project(q, qdot, t, scene.system, scene.layout, scene.params)
-    dtype = scene.layout.dtype
-    return FlatState(*(jnp.asarray(x, dtype) for x in (q, qdot, scales.qdot / scales.t * draws[2], t)))
+    return FlatState(*(jnp.asarray(x, scene.layout.dtype) for x in (q, qdot, scales.qdot / scales.t * draws[2], t)))
 
 
 @compile_for_one_call

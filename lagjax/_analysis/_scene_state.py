@@ -142,8 +142,7 @@ class SceneState(NamedTuple):
             return () if acts else self.unread
         if self.lowered is None:
             return ()
-        names = "lagrangian", "nonconservative_force", "residual"
-        read = set().union(*map(self.derivation.reads, names))
+        read = set().union(*map(self.derivation.reads, ("lagrangian", "nonconservative_force", "residual")))
         return tuple(i for i in self.derivation.conserved if i not in read)
 
     @property

@@ -27,11 +27,9 @@ def dataset(trajectory, units: PyTree = None, time_unit: str | None = None):
             # A key as plain text: 'theta' for a dict's or a NamedTuple's, '0' for a list's.
             label = jax.tree_util.keystr((jax.tree_util.GetAttrKey(name), *path), simple=True, separator=".")
             inner = tuple(f"{label}_{axis}" for axis in range(leaf.ndim - len(members) - 1))
-            attributes = {} if one is None else {"units": one}
-            variables[label] = ((*members, "time", *inner), np.asarray(leaf), attributes)
+            variables[label] = ((*members, "time", *inner), np.asarray(leaf), {} if one is None else {"units": one})
     if trajectory.mode is not None:
-        names = {"names": list(trajectory.mode_names)}
-        variables["mode"] = ((*members, "time"), np.asarray(trajectory.mode), names)
+        variables["mode"] = ((*members, "time"), np.asarray(trajectory.mode), {"names": list(trajectory.mode_names)})
     times, of_time = times_of_members(trajectory), {} if time_unit is None else {"units": time_unit}
     shared = times[(0,) * len(members)]
     if (times == shared).all():

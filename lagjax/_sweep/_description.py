@@ -152,8 +152,7 @@ def texts(description: Description, names: list[str]) -> dict[str, dict[str, str
         entries[name] = _entry(function.code.function, _defer_trace(function, arguments, params), function.arrays)
     if isinstance(scene := description.system, Hybrid):  # its modes and transitions without their functions
         arrows = [(t.source, t.target, t.direction) for t in scene.transitions]
-        plan = [list(scene.modes), scene.start, scene.max_transitions, arrows]
-        entries["transitions"] = _entry(plan, None)
+        entries["transitions"] = _entry([list(scene.modes), scene.start, scene.max_transitions, arrows], None)
     if (event := description.settings.get("event")) is not None:
         condition = getattr(event, "cond_fn", event)
         of_event = _defer_trace(accept(condition, "event"), (q, qdot), params) if callable(condition) else None

@@ -67,8 +67,7 @@ def branch_off(
     numbers, numbers_beside = (_numbers(arcs, place, family, k) for k in (index, beside))
     follower = Follower(arcs.with_numbers(numbers), place, y0, period)
     here = first_point(follower, y0, period, numbers)
-    neighbour = first_point(follower, y0_beside, period_beside, numbers_beside)
-    before = tangent_at(follower, neighbour, None)
+    before = tangent_at(follower, first_point(follower, y0_beside, period_beside, numbers_beside), None)
     point = None if before is None else _branching_orbit(follower, here, before, float(size))
     if before is None or point is None:
         raise ValueError(

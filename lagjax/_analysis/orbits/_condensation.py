@@ -48,8 +48,7 @@ def condense(growth: np.ndarray, more: np.ndarray) -> Condensed:
     """A chain with A_k = `growth` (B, K, s, s), B_k = −1 and C_k = `more` (B, K, s, c), K a power of two."""
     s, left, right, rounds = growth.shape[2], growth, np.broadcast_to(-np.eye(growth.shape[2]), growth.shape), []
     while left.shape[1] > 1:
-        shared = np.concatenate([right[:, ::2], left[:, 1::2]], axis=2)
-        q, r = np.linalg.qr(shared, mode="complete")
+        q, r = np.linalg.qr(np.concatenate([right[:, ::2], left[:, 1::2]], axis=2), mode="complete")
         qt = np.swapaxes(q, 2, 3)
         of_left, of_right = qt[..., :s] @ left[:, ::2], qt[..., s:] @ right[:, 1::2]
         of_z = qt @ np.concatenate([more[:, ::2], more[:, 1::2]], axis=2)

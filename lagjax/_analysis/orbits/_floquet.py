@@ -97,8 +97,7 @@ def _product_eigenvalues(growth: np.ndarray) -> np.ndarray:
     if count == 1:
         return roots
     # The roots of one multiplier stand on a circle, a turn divided by K apart: one of each comes of sorting by power.
-    powers = np.exp(count * np.log(np.where(roots == 0, 1e-300, roots)))
-    return _group_means(powers, count)
+    return _group_means(np.exp(count * np.log(np.where(roots == 0, 1e-300, roots))), count)
 
 
 def _merge_factors(growth: np.ndarray) -> np.ndarray:

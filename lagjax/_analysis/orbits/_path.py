@@ -249,8 +249,7 @@ def _build_path(system: System, arcs: Arcs, chain: Chain, q_start: np.ndarray, t
     total = sum(_arc_action(arcs, y, t0, t1) for y, t0, t1 in zip(states, times[:-1], times[1:], strict=True))
     index, numbers = len(conjugate), map(jnp.asarray, (total, conjugate, chain.closure()[0]))
     total, conjugate, closure = numbers
-    least = index == 0 and not at_end
-    return Path(qdot, qdot_end, trajectory, total, conjugate, index, least, closure, True, "")
+    return Path(qdot, qdot_end, trajectory, total, conjugate, index, (index == 0 and not at_end), closure, True, "")
 
 
 def _arc_action(arcs: Arcs, y, t_first, t_last) -> float:

@@ -57,8 +57,7 @@ class RecordMotion(NamedTuple):
             row = int(np.argmin(np.isfinite(self.tangents).all(axis=(1, 2, 3))))
             return row, "Its derivatives are not finite."
         row = int(np.argmax(failed))
-        text = sentence(self.result[row], self.t_end[row], ts[row, -1], self.y_end[row], layout.names)
-        return row, text or ""
+        return row, sentence(self.result[row], self.t_end[row], ts[row, -1], self.y_end[row], layout.names) or ""
 
 
 class AbstractMotions(abc.ABC):
@@ -119,8 +118,7 @@ class _MachineCodeMotions(AbstractMotions):
             return RecordMotion(run.path, np.zeros((len(y0), 0, *run.path.shape[1:])), run.result, run.t_end, run.y_end)
         params_dot = np.zeros((*y0_dot.shape[:2], params.shape[1]))
         params_dot[..., : numbers.shape[-1]] = numbers_dot
-        motions = Motions.from_solution(ts, y0, params, run)
-        tangents, _ = jvp(flow, motions, y0_dot, params_dot, self.tolerances)
+        tangents, _ = jvp(flow, Motions.from_solution(ts, y0, params, run), y0_dot, params_dot, self.tolerances)
         return RecordMotion(run.path, tangents, run.result, run.t_end, run.y_end)
 
     def rate(self, t, y, numbers, table=None):

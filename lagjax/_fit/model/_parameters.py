@@ -107,8 +107,7 @@ class Parameters:
 
     def values(self, u, xp: Any = np):
         """The free numbers (X,) at u (F,)."""
-        parts = [part.transform.value(u[own], xp) for own, _, part in self._cuts]
-        return xp.concatenate([u[:0], *parts])
+        return xp.concatenate([u[:0], *[part.transform.value(u[own], xp) for own, _, part in self._cuts]])
 
     def jacobian(self, u: np.ndarray) -> np.ndarray:
         """The derivative of the free numbers by u, (X, F)."""

@@ -332,8 +332,7 @@ class SystemResiduals:
         for row, piece in zip(self.frame.rows, self.pieces, strict=True):
             start = self.records[piece.record].start
             if callable(start) and piece.places[0] == 0:
-                pair = start_pair(start, params)
-                flat = jnp.concatenate([self.layout.flatten(half) for half in pair])
+                flat = jnp.concatenate([self.layout.flatten(half) for half in start_pair(start, params)])
                 starts = starts.at[row, : self.states].set(flat)
         return starts
 

@@ -71,8 +71,7 @@ class _ProfileLine:
         self.best = 0.0
         point, lost = self._minimise(self.residuals, Point(fit.u, fit.states), _TRIALS)
         self.u, self.best = point.u, -lost / (2.0 * self.scale)
-        others = point._replace(u=np.delete(self.u, which))
-        self.places = [_Place(float(self.u[which]), others, 0.0)]
+        self.places = [_Place(float(self.u[which]), point._replace(u=np.delete(self.u, which)), 0.0)]
 
     def _minimise(self, residuals: Residuals, point: Point, trials: int) -> tuple[Point, float]:
         """The point that a search ends in and its deviance. Raises `LostMotion` where that cannot begin."""

@@ -72,8 +72,7 @@ def _units(density: Density, x: np.ndarray) -> np.ndarray:
     """The units in which x moves: of parameters one, or as large as they are; of starts their size over all records."""
     residuals, free = density.residuals, len(density.residuals.parameters)
     scale = np.ones(len(x))
-    unbounded = np.isinf(residuals.parameters.reach)
-    scale[:free] = np.where(unbounded, np.maximum(1.0, np.abs(x[:free])), 1.0)
+    scale[:free] = np.where(np.isinf(residuals.parameters.reach), np.maximum(1.0, np.abs(x[:free])), 1.0)
     for part in residuals.parts:
         fitted = part.frame.rows[part.fitted]
         if len(fitted):

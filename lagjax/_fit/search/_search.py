@@ -81,8 +81,7 @@ class Search:
         done = minimise(part, level.trial.point, self.law, _ENOUGH, _TRIALS)
         worse = "fails"
         if joined is not None:
-            ratio = misfit(joined.noise, joined.residuals) / misfit(done.noise, part)
-            worse = f"leaves {ratio:.2g} times more"
+            worse = f"leaves {misfit(joined.noise, joined.residuals) / misfit(done.noise, part):.2g} times more"
         text = f"The records are followed in {len(pieces)} pieces, each with a start of its own: to join them {worse}"
         if is_chaotic := (growth := _separation(done)) > _LYAPUNOV:
             text += f", because motions that begin side by side part e^{growth:.0f}-fold over a record."
@@ -202,8 +201,7 @@ class Search:
                 f"The descent by gradients was stopped after {_GRADIENT_STEPS} steps, and the likelihood still grew: "
                 "go on from there, with fit.params in the place of params0."
             )
-        noise = residuals.noise_scale(trial, self.law)
-        return Descent(residuals, trial, noise, at_rest, _GRADIENT_STEPS, text)
+        return Descent(residuals, trial, residuals.noise_scale(trial, self.law), at_rest, _GRADIENT_STEPS, text)
 
 
 def search_again(done: Descent, law: AbstractNoise) -> Descent:
