@@ -32,7 +32,7 @@ def require_consistent(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, pa
     size, and the value of the constraint is more than `ROUNDINGS` of its own terms. What depends on which is not asked
     in a large scene, where steps that do not arrive at the constraints end the motion.
     """
-    if not has_constraints(system) or not _all_concrete((ts, q0, qdot0, params, system)):
+    if not has_constraints(system) or not all(map(is_concrete, jax.tree.leaves((ts, q0, qdot0, params, system)))):
         return
     names = system.constraint_names(layout, params)
     start = _start(system, layout, ts, q0, qdot0, params)
@@ -141,7 +141,7 @@ def _contradiction(names, values, what, lengths, dependent, tolerance, size, rou
 def inconsistent_members(system, layout: Layout, ts, values: dict, axes: dict) -> jax.Array | None:
     """True for each member of a batch that starts off its constraints, shape (N,); None if that cannot be known."""
     # `values` holds q0, qdot0 and params of the batch, `axes` which axis of each counts the members.
-    if not has_constraints(system) or not _all_concrete((ts, values, system)):
+    if not has_constraints(system) or not all(map(is_concrete, jax.tree.leaves((ts, values, system)))):
         return None
 
     given = system, layout.dtype, jnp.asarray(ts[0]), jnp.abs(jnp.asarray(ts[-1]) - ts[0])
@@ -190,7 +190,3 @@ _LENGTHS = ("unit", "row_lengths", "unit_lengths")
 
 def has_constraints(system) -> bool:
     return system.constraints is not None or system.velocity_constraints is not None
-
-
-def _all_concrete(tree: PyTree) -> bool:
-    return all(is_concrete(leaf) for leaf in jax.tree.leaves(tree))

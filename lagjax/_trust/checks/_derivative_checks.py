@@ -246,9 +246,7 @@ def _compare_along_lines(scene: CheckedScene) -> list[Finding]:
 
 
 def _only(direction: np.ndarray, part: np.ndarray) -> np.ndarray:
-    alone = np.zeros_like(direction)
-    alone[part] = direction[part]
-    return alone
+    return np.where(np.isin(np.arange(direction.size), part), direction, 0.0)
 
 
 def _off_line(scene: CheckedScene, direction: np.ndarray) -> tuple[np.ndarray, Slopes, Slopes, Slopes, np.ndarray]:

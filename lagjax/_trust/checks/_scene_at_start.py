@@ -334,9 +334,8 @@ def _program_variation(derivation: Derivation, state, acceleration, multipliers)
 
 def _rounding(*terms):
     """The rounding of derivatives, in the shape of the first of `terms`: four units of the sum of the largest terms."""
-    first, *_ = terms
     size = sum(np.max(np.abs(term), initial=0.0) for term in terms)
-    return np.full(first.shape, 4 * np.finfo(first.dtype).eps * size)
+    return np.full(terms[0].shape, 4 * np.finfo(terms[0].dtype).eps * size)
 
 
 @eqx.filter_jit

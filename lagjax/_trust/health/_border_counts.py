@@ -47,8 +47,7 @@ def count_borders(members: Members) -> tuple[bool, Met[np.ndarray] | None]:
     path = path_of(members)
     start = np.concatenate([path.q[:, 0], path.qdot[:, 0]], axis=1)
     ts = np.stack([path.ts[:, 0], members.shared(trajectory.end.t, 0)], axis=1)
-    accepted, rejected = (members.shared(trajectory.stats[f"num_{kind}_steps"], 0) for kind in ("accepted", "rejected"))
-    steps = accepted + rejected
+    steps = members.shared(trajectory.stats["num_steps"], 0)
     rtol, atol = (float(np.max(x)) for x in trajectory.tolerances)
     system, layout = trajectory.system, members.layout
     flow = flow_of(Problem.from_system(system, layout, members.params, ts=ts[0], rtol=rtol, atol=atol))

@@ -74,13 +74,12 @@ class SampledPath(NamedTuple):
 
 def measure_trajectory(trajectory) -> dict[str, Any]:
     """The fields of `Health` that are measured along the path, and names for them."""
-    steps = trajectory.stats["num_accepted_steps"]
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
         if (report := _report_in_doubles(Members(trajectory))) is not None:
             return report
     axes, tree = jax.tree.flatten(trajectory.params_axes, is_leaf=lambda axis: axis is None)  # hashable
     arrays = dataclasses.replace(trajectory, stats={}, params_axes=None)
-    return _measure_traced(arrays, tuple(axes), tree, jnp.asarray(steps))
+    return _measure_traced(arrays, tuple(axes), tree, jnp.asarray(trajectory.stats["num_accepted_steps"]))
 
 
 @with_doubles
