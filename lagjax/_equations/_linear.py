@@ -72,11 +72,9 @@ def factorize(matrix: Matrix) -> Factorization:
 
 
 def diagonal_scale(matrix):
-    """1/√|Mᵢᵢ| of symmetric matrices (..., n, n), shape (..., n), by which both sides are scaled to a unit diagonal.
-
-    Where the diagonal is zero it is the row's largest entry that counts, and 1 where the whole row is. For arrays of
-    NumPy or JAX.
-    """
+    """1/√|Mᵢᵢ| of symmetric matrices (..., n, n), shape (..., n), by which both sides are scaled to a unit diagonal."""
+    # Where the diagonal is zero it is the row's largest entry that counts, and 1 where the whole row is. For arrays of
+    # NumPy or JAX.
     xp = matrix.__array_namespace__()
     diagonal = xp.abs(xp.diagonal(matrix, axis1=-2, axis2=-1))
     size = xp.where(diagonal > 0, diagonal, xp.max(xp.abs(matrix), axis=-1))
@@ -239,12 +237,10 @@ def saddle(matrix: Matrix, b: Vector, jacobian: Rows, c: Float[Array, " m"]) -> 
 
 
 def augment(matrix, jacobian):
-    """K = M + GᵀW G (..., n, n) and W G (..., m, n), with weights that make every row of G as heavy as M.
-
-    Wₖ = max|Mᵢᵢ|/|Gₖ|² gives both terms of K the same size, in whatever units a constraint is written: neither drowns
-    the other in rounding. 10ᵈ times larger or smaller, they would cost up to d digits. W has no derivative, as nothing
-    depends on it. For arrays of NumPy or JAX.
-    """
+    """K = M + GᵀW G (..., n, n) and W G (..., m, n), with weights that make every row of G as heavy as M."""
+    # Wₖ = max|Mᵢᵢ|/|Gₖ|² gives both terms of K the same size, in whatever units a constraint is written: neither drowns
+    # the other in rounding. 10ᵈ times larger or smaller, they would cost up to d digits. W has no derivative, as
+    # nothing depends on it. For arrays of NumPy or JAX.
     xp = matrix.__array_namespace__()
     size = xp.sum(jacobian**2, axis=-1)
     weights = xp.max(xp.abs(xp.diagonal(matrix, axis1=-2, axis2=-1)), axis=-1)[..., None] / xp.where(size > 0, size, 1)
@@ -276,13 +272,11 @@ def dependent_rows(matrix: np.ndarray) -> dict[int, np.ndarray]:
 
 
 def rank_tolerance(dtype) -> float:
-    """The part of a constraint, scaled to 1, below which it counts as a combination of the others: eps^(2/3).
-
-    It is compared with pivots of S. One of eps^(2/3) = 4e-11 is 2e5 units of round-off, so that redundant constraints,
-    whose pivots are some units, never count as independent, which would give multipliers of any size. A constraint that
-    differs from the others by less than eps^(1/3) = 6e-6 of its length counts as redundant; with twice the tolerance
-    that is 9e-6.
-    """
+    """The part of a constraint, scaled to 1, below which it counts as a combination of the others: eps^(2/3)."""
+    # It is compared with pivots of S. One of eps^(2/3) = 4e-11 is 2e5 units of round-off, so that redundant
+    # constraints, whose pivots are some units, never count as independent, which would give multipliers of any size. A
+    # constraint that differs from the others by less than eps^(1/3) = 6e-6 of its length counts as redundant; with
+    # twice the tolerance that is 9e-6.
     return float(jnp.finfo(dtype).eps) ** (2 / 3)
 
 

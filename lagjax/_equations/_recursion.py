@@ -251,11 +251,8 @@ class RecursiveElimination:
         graph, of_steps, end = right.expansion.graph, [], 0
         apply, z, ids = graph.apply, *([graph.real(i) for i in x.ids.tolist()] for x in (right, factors))
 
-        def minus(sum_, c, x):
-            return apply("sub", sum_, apply("mul", c, x))
-
-        def plus(sum_, c, x):
-            return apply("add", sum_, apply("mul", c, x))
+        def combine(operation, total, c, x):
+            return apply(operation, total, apply("mul", c, x))
 
         for step in self.steps:
             x, (count, others) = step.unknown, (len(step.terms), len(step.others))
@@ -263,21 +260,22 @@ class RecursiveElimination:
             of_steps.append((step, ids[start : start + count], ids[start + count : end - 1], ids[end - 1]))
             _, cs, ss, _ = of_steps[-1]
             for u, c in zip(step.terms, cs, strict=True):
-                z[u] = plus(z[u], c, z[x])
+                z[u] = combine("add", z[u], c, z[x])
+            operation, moved = ("add", z[x + self.velocities]) if step.terms else ("sub", z[x])
             for u, s in zip(step.others, ss, strict=True):
-                z[u] = plus(z[u], s, z[x + self.velocities]) if step.terms else minus(z[u], s, z[x])
+                z[u] = combine(operation, z[u], s, moved)
         for step, cs, ss, last in reversed(of_steps):
             x, y = step.unknown, step.unknown + self.velocities
             if not step.terms:
                 z[x] = apply("mul", z[x], last)
                 for u, s in zip(step.others, ss, strict=True):
-                    z[x] = minus(z[x], s, z[u])
+                    z[x] = combine("sub", z[x], s, z[u])
                 continue
-            velocity, multiplier = apply("neg", z[y]), apply("neg", plus(z[x], last, z[y]))
+            velocity, multiplier = apply("neg", z[y]), apply("neg", combine("add", z[x], last, z[y]))
             for u, c in zip(step.terms, cs, strict=True):
-                velocity = plus(velocity, c, z[u])
+                velocity = combine("add", velocity, c, z[u])
             for u, s in zip(step.others, ss, strict=True):
-                multiplier = plus(multiplier, s, z[u])
+                multiplier = combine("add", multiplier, s, z[u])
             z[x], z[y] = velocity, multiplier
         return Scalars(right.expansion, np.array(z))
 
@@ -338,10 +336,8 @@ class _Elimination:
         """Let a coordinate move freely: what is left of the energy is its least value for all its velocities."""
         x, size = step.unknown, self._sizes.pop(step.unknown)
         pivot = self._energy.pop((x, x))
-        if pivot == size:
-            lost = self._apply("le", pivot, self._number(0.0))
-        else:
-            lost = self._apply("le", pivot, self._apply("mul", self._threshold, size))
+        least = self._number(0.0) if pivot == size else self._apply("mul", self._threshold, size)
+        lost = self._apply("le", pivot, least)
         self.lost = self._apply("or", self.lost, lost)
         inverse = self._apply("div", self._number(1.0), self._apply("select", lost, pivot, self._number(np.nan)))
         column = [self._energy.pop(_pair(x, u)) for u in step.others]

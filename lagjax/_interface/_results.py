@@ -45,9 +45,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
     max_transitions_reached = (
         "The budget of transitions was spent. Raise max_transitions (of crossings it is fixed), or end ts earlier."
     )
-    max_crossings_reached = (
-        "There are more crossings after that than there is room for. Raise `count`, or end ts earlier."
-    )
+    max_crossings_reached = "There are more crossings after that than room for them. Raise `count`, or end ts earlier."
     zeno = (
         "Transitions follow each other at ever shorter times that add up to a finite one (Zeno), as the bounces of a "
         "ball do, or at once, as where it lies on the floor: no budget of transitions leads beyond it. End ts before "

@@ -221,9 +221,7 @@ def sections_of(section) -> tuple[tuple[str, ...] | None, tuple]:
     if not section:
         raise ValueError("section is an empty dict: give a function, or a dict of functions by name.")
     if len(section) > MOST_GUARDS:
-        raise ValueError(
-            f"There are {len(section)} sections, and one run can watch {MOST_GUARDS}: divide them among calls."
-        )
+        raise ValueError(f"There are {len(section)} sections, and a run watches {MOST_GUARDS}: divide them among runs.")
     return tuple(section), tuple(accept(function, f"section[{name!r}]") for name, function in section.items())
 
 

@@ -271,9 +271,8 @@ def _slopes(knots, values, i, chord):
 def _window(table, start, size: int) -> list:
     """Entries `start`, `start` + 1, … of a table, `size` of them; those that fit, where these would stick out."""
     where = start.ndim
-    dimensions = jax.lax.GatherDimensionNumbers(
-        offset_dims=tuple(range(where, where + table.ndim)), collapsed_slice_dims=(), start_index_map=(0,)
-    )
+    offsets = tuple(range(where, where + table.ndim))
+    dimensions = jax.lax.GatherDimensionNumbers(offsets, collapsed_slice_dims=(), start_index_map=(0,))
     found = jax.lax.gather(table, start[..., None], dimensions, (size, *table.shape[1:]), mode="clip")
     return [jax.lax.index_in_dim(found, k, where, keepdims=False) for k in range(size)]
 

@@ -208,9 +208,8 @@ def _row(name: str, rtol: float, run: Callable[[], Trajectory], truth: np.ndarra
         times.append(time.perf_counter() - start)
 
     seconds = statistics.median(times)
-    accepted, rejected, steps = (
-        np.atleast_1d(trajectory.stats[key]) for key in ("num_accepted_steps", "num_rejected_steps", "num_steps")
-    )
+    counts = "num_accepted_steps", "num_rejected_steps", "num_steps"
+    accepted, rejected, steps = (np.atleast_1d(trajectory.stats[key]) for key in counts)
     idle = trajectory.stats.get("num_wasted_lane_steps", 0)  # of a batch only
     errors = _median_and_worst(_largest_difference(_path(trajectory), truth))
     shares = map(float, (accepted.mean(), rejected.mean(), np.mean(trajectory.ok), idle / max(steps.sum(), 1)))

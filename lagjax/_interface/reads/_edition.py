@@ -2,8 +2,7 @@
 
 What is derived from a function is kept under its edition. On the next call `Edition.now` looks whether all that was
 read is still there; if not, the walk is gone again, and another text is another edition, under which everything is
-derived anew. Going back to former values goes back to what was derived from them. Two functions of one text, as a
-lambda in a loop gives them, are one edition.
+derived anew. Two functions of one text, as a lambda in a loop gives them, are one edition.
 
 JAX keeps the traces of helpers that a function hands to it, as the branches of `jax.lax.cond` or what is under
 `jax.jit`, and finds them by the helper alone. A trace under another context is another one: see `Edition.traced`.

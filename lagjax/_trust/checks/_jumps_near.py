@@ -137,7 +137,5 @@ def _finding(jump: Discontinuity, scene: CheckedScene) -> Finding:
         consequence = OF_L
     elif here:
         consequence = "At this very state `acceleration` is that of one side or between them. " + consequence
-    return Finding(
-        "discontinuity", "warning" if serious else "advice", (jump.direction,),
-        f"{jump.what[0].upper()}{jump.what[1:]} jumps {where}, at {jump.operation}. {consequence}",
-    )  # fmt: skip
+    message = f"{jump.what[0].upper()}{jump.what[1:]} jumps {where}, at {jump.operation}. {consequence}"
+    return Finding("discontinuity", "warning" if serious else "advice", (jump.direction,), message)

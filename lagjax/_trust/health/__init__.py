@@ -105,7 +105,7 @@ def _shared_impacts(trajectory) -> tuple:
     return jnp.sum(shared, axis=-1), jnp.nanmin(jnp.where(shared, t, jnp.nan), axis=-1)
 
 
-def _borders(trajectory) -> tuple[bool, Met[Array] | None]:
+def _borders(trajectory) -> tuple[bool, Met | None]:
     """`count_borders` with the batch axes of the trajectory; None for a piecewise scene where something is traced."""
     if all(is_concrete(leaf) for leaf in jax.tree.leaves(trajectory)):
         members = Members(trajectory)
@@ -195,7 +195,7 @@ class Health(eqx.Module):
     gradients_finite: Bool[Array, "*batch"]
     gradients_time: Float[Array, "*batch"]
     global_error: Extreme | None
-    borders: Met[Array] | None
+    borders: Met | None
     guards: tuple[Bool[Array, "*batch"], Bool[Array, "*batch"]] | None
     impacts: tuple[Int[Array, "*batch"], Float[Array, "*batch"], Int[Array, "*batch"], Float[Array, "*batch"]] | None
     doubts: tuple[Int[Array, "*batch 3"], Float[Array, "*batch 3"]] | None
@@ -306,9 +306,8 @@ class Health(eqx.Module):
             rows.append((law, f"off by {_worst(self.energy, self._energy_limit)}{known}"))
         else:
             count, lost, shared, t = (np.asarray(x) for x in self.impacts)
-            rows.append(
-                ("impacts", f"{count.sum()}, which took {np.sum(lost):.3g} of the energy; its balance is not judged")
-            )
+            took = f"{count.sum()}, which took {np.sum(lost):.3g} of the energy"
+            rows.append(("impacts", f"{took}; its balance is not judged"))
             if shared.any():
                 law = f"{shared.sum()} shared by several contacts, the first at t = {np.nanmin(t):.6g}: there another"
                 rows.append(("", f"{law} law of impacts gives another motion"))

@@ -4,9 +4,8 @@ What a step ends at is written down for derivatives, and for them alone. So the 
 over the time that it took. That costs as much as the motion did; scenes without borders pay nothing.
 """
 
-from typing import Generic, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
-import jax
 import numpy as np
 
 from lagjax._engine import Problem
@@ -21,19 +20,17 @@ from lagjax._trust.health._measurements import path_of
 
 LARGEST_PORTION = 2**22  # numbers of steps that are written down at once
 
-Numbers = TypeVar("Numbers", np.ndarray, jax.Array)
 
-
-class Met(NamedTuple, Generic[Numbers]):
+class Met(NamedTuple):
     """The number of times each of N members crossed a border, began to slide along one, and grazed one; (N,) each."""
 
-    crossed: Numbers
-    slid: Numbers
-    grazed: Numbers
-    t: Numbers  # when it first grazed one, NaN where it did not
+    crossed: Any
+    slid: Any
+    grazed: Any
+    t: Any  # when it first grazed one, NaN where it did not
 
 
-def count_borders(members: Members) -> tuple[bool, Met[np.ndarray] | None]:
+def count_borders(members: Members) -> tuple[bool, Met | None]:
     """A flag that steps ended at the borders of the scene; and how the motion met them; None where not known."""
     trajectory = members.trajectory
     if not isinstance(trajectory.system, System):  # modes have transitions for that
@@ -72,7 +69,7 @@ def is_piecewise(system: System, layout: Layout, params) -> bool:
         return bool(pieces_of_motion(derivation.motion, rest, rest, rest.sum(), params))
 
 
-def _count(flow: Flow, ts, y0, params, tolerances: Tolerances, steps, places, into: Met[np.ndarray]) -> None:
+def _count(flow: Flow, ts, y0, params, tolerances: Tolerances, steps, places, into: Met) -> None:
     """Follow some motions, and add what they met `into` the counts at their places."""
     borders = flow.kernel.borders
     assert borders is not None  # without a series there are none, and none are counted

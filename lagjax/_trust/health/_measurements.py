@@ -436,14 +436,12 @@ def _interpolants(begin, end) -> tuple[list, list]:
 
 
 def _error_of_work(xp, found):
-    """The error of the work of every piece, from its values `found` (4, …) by rules of order 2, 4, 6 and 8.
-
-    Once pieces are short enough, errors fall from order to order by the same factor, or a larger one; one of the first
-    two may be small by accident. Where they do not fall eightfold each, the pieces are longer than what they should
-    show, and a small difference proves nothing. Of 240 motions with coarse outputs the work was off by at most 1.5
-    times its error; by ten times where fourfold is enough, and eightfold twice sees as many wrong forces as it can
-    where 256 in all sees a quarter less.
-    """
+    """The error of the work of every piece, from its values `found` (4, …) by rules of order 2, 4, 6 and 8."""
+    # Once pieces are short enough, errors fall from order to order by the same factor, or a larger one; one of the
+    # first two may be small by accident. Where they do not fall eightfold each, the pieces are longer than what they
+    # should show, and a small difference proves nothing. Of 240 motions with coarse outputs the work was off by at most
+    # 1.5 times its error; by ten times where fourfold is enough, and eightfold twice sees as many wrong forces as it
+    # can where 256 in all sees a quarter less.
     rough, fine, finest = xp.abs(found[1:] - found[:-1])
     largest = xp.maximum(rough, fine)
     return xp.where(finest <= largest / 64, finest, xp.maximum(finest, largest))
