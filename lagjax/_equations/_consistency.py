@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._equations._constraints import ROUNDINGS, TOLERANCE, rows_of_terms, sizes
+from lagjax._equations._constraints import ROUNDINGS, TOLERANCE, is_inconsistent, rows_of_terms, sizes
 from lagjax._equations._derivation import derivation_of
 from lagjax._equations._linear import dependent_rows, diagonal_scale, schur_complements
 from lagjax._equations._many_states import Sample
@@ -160,8 +160,7 @@ def _inconsistent(has_terms: bool, system, dtype, t, span, q0: PyTree, qdot0: Py
     state = layout.flatten(q0), layout.flatten(qdot0), t, eqx.filter(params, eqx.is_array_like)
     derivation = derivation_of(system, layout, params)
     motion, terms = derivation.motion, derivation.term_sizes(*state) if has_terms else 0.0
-    unit = motion.unit(*state)
-    return motion.constraints.inconsistent(unit, motion.row_lengths(unit, *state), *state, span, dtype, terms)
+    return is_inconsistent(motion, state, span, dtype, terms)
 
 
 def _start(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree) -> _StartConditions:

@@ -9,9 +9,8 @@ Both are differentiated by the time until the acceleration appears linearly, f t
     J q̇ + ∂f/∂t = 0,  J = ∂f/∂q                      the rate of f
     G q̈ = γ,          G = (J; ∂a/∂q̇), shape (m, n)   the constraint Jacobian and the acceleration-level right-hand side
 
-A scene without constraints has m = 0 rows here, not another kind of object. Rows may be held or released by numbers in
-params, as contacts are: the row of G and γ of one that is released are zero, and its multiplier is. Nothing here knows
-a Lagrangian: the mass matrix M, by which distances between states are measured, is an argument.
+A scene without constraints has m = 0 rows here, not another kind of object. Nothing here knows a
+Lagrangian: the mass matrix M, by which distances between states are measured, is an argument.
 """
 
 import math
@@ -34,9 +33,9 @@ class Constraints(eqx.Module):
     """The constraint functions of a scene: f(q, t, params) → (k,) and a(q, qdot, t, params) → (m − k,), or None.
 
     q and qdot have shape (n,). Every result lists the constraints on positions first. `held(params)` (m,) is 1 for each
-    row that holds and 0 for one that is released, whose value is then zero whatever the state. `drag(q, qdot, t,
-    params)` (n, m) is the force that comes with each multiplier beside Gᵀλ, as friction does. It `turns` where that has
-    the direction of a velocity in space.
+    row that holds and 0 for one that is released, as of contacts: its value, its rows of G and γ and its multiplier are
+    then zero. `drag(q, qdot, t, params)` (n, m) is the force that comes with each multiplier beside Gᵀλ, as friction
+    does. It `turns` where that has the direction of a velocity in space.
     """
 
     on_positions: Callable | None = None
@@ -98,23 +97,6 @@ class Constraints(eqx.Module):
         pull = jax.linear_transpose(push, q)
         return push, lambda y: pull(y)[0]
 
-    def inconsistent(
-        self, unit: Vector, lengths: Row, q: Vector, qdot: Vector, t: Time, params: PyTree, span: Time, dtype, terms
-    ) -> Bool[Array, ""]:
-        """True if no motion may start from a state: off a constraint, or one of them has no gradient.
-
-        Of a motion over this span of time, with coordinates in their `unit` 1/√Mᵢᵢ and `lengths` (m,) of the rows of G
-        in it. Off is what is farther than `TOLERANCE` of the size of the state and has a value of more than `ROUNDINGS`
-        of the `terms` (2m,) of `residual` and of `rates` (see `Derivation.term_sizes`), in a start of this dtype. A
-        state that is not a number is inconsistent.
-        """
-        state = q, qdot, t, params
-        values, positions = jnp.stack([self.residual(*state), self.rates(*state)]), self.f(q, t, params).size
-        off = jnp.stack(distances(values[0], values[1], lengths, positions))
-        near = off <= TOLERANCE[dtype] * jnp.stack(sizes(unit, q, qdot, span))[:, None]
-        rounded = jnp.abs(values) <= ROUNDINGS * np.finfo(dtype).eps * rows_of_terms(terms, values.shape)
-        return ~jnp.all((near | rounded) & (lengths > 0))
-
 
 # ---- how far a state is from its constraints -------------------------------------------------------------------------
 
@@ -127,6 +109,21 @@ TOLERANCE = {np.dtype("float64"): 1e-6, np.dtype("float32"): 5e-6}
 # coordinates that are deviations from a drawn pose begin at zero, beside links of a metre. They are those that float32
 # is given above. Doubled, a link of a kilometre may be off by 18 nm, where it now may by 9.
 ROUNDINGS = 40
+
+
+def is_inconsistent(motion, state: tuple, span, dtype, terms) -> Bool[Array, ""]:
+    """True if no motion over this span of time may start from a state: off a constraint, or one has no gradient.
+
+    Off is what is farther than `TOLERANCE` of the size of the state and has a value of more than `ROUNDINGS` of the
+    `terms` (2m,) of `residual` and of `rates` (see `Derivation.term_sizes`), in a start of this dtype. A state that is
+    not a number is inconsistent.
+    """
+    (q, qdot, t, params), of, unit = state, motion.constraints, motion.unit(*state)
+    values, lengths = jnp.stack([of.residual(*state), of.rates(*state)]), motion.row_lengths(unit, *state)
+    off = jnp.stack(distances(values[0], values[1], lengths, of.f(q, t, params).size))
+    near = off <= TOLERANCE[dtype] * jnp.stack(sizes(unit, q, qdot, span))[:, None]
+    rounded = jnp.abs(values) <= ROUNDINGS * np.finfo(dtype).eps * rows_of_terms(terms, values.shape)
+    return ~jnp.all((near | rounded) & (lengths > 0))
 
 
 def sizes(unit, q, qdot, span):

@@ -483,9 +483,7 @@ class Derivation:
     def _system(self, saddle: _Saddle, regular_only: bool = False) -> tuple[Callable, Callable]:
         """A z = r with z = (x, −λ), as two functions of scalars.
 
-        The first gives the entries of A, r, factors of A and whether it is singular; the second z, from the factors and
-        r. With constraints M is augmented by GᵀW G, unless it is constant and regular, or `regular_only` is set:
-        that says where M is not regular enough.
+        The first gives the entries of A, r, factors of A and whether it is singular; the second z, of factors and r.
         """
         n, m, regular = self.layout.size, self._rows(saddle), self._regular(saddle)
         if regular is None and (self.motion.constrained or n > _saddle.LARGEST_INDEFINITE):

@@ -215,9 +215,7 @@ def _permute_rows(a: Array, order: Int[Array, " n"]) -> Array:
 
 # ---- with constraints: the saddle point ------------------------------------------------------------------------------
 #
-#     M x − Gᵀλ = b,   G x = c
-#
-# M may be singular where the constraints hold what it does not: adding GᵀW G x = GᵀW c to the first line, W diagonal,
+# M may be singular where the constraints hold what it does not: adding GᵀW G x = GᵀW c to M x − Gᵀλ = b, W diagonal,
 # changes neither x nor λ and makes the augmented matrix K = M + GᵀW G regular whenever the saddle point is. Then
 #
 #     S = G K⁻¹ Gᵀ,   S λ = c − G K⁻¹ (b + GᵀW c),   x = K⁻¹ (b + GᵀW c + Gᵀλ)

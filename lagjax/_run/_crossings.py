@@ -133,12 +133,11 @@ def crossings(
         run = watched.follow(q0, qdot0, ts, params, rtol=rtol, atol=atol, max_steps=max_steps, throw=False)
         notes = _notes_of(run, len(scene.transitions), len(functions))
         return _read_crossings(notes, ts, len(functions), count, layout, names, throw, inputs)
-    system = scene
-    problem = Problem.from_arguments(system, layout, q0, qdot0, ts, params, rtol, atol, max_steps)
-    if has_constraints(system):
+    problem = Problem.from_arguments(scene, layout, q0, qdot0, ts, params, rtol, atol, max_steps)
+    if has_constraints(scene):
         q0, qdot0 = as_arrays((q0, qdot0), layout.dtype, "state")
-        require_consistent(system, layout, problem.ts, q0, qdot0, problem.params)
-    if system.touches:
+        require_consistent(scene, layout, problem.ts, q0, qdot0, problem.params)
+    if scene.touches:
         notes = note_sections(problem, functions, directions, count)
         return _read_crossings(notes, problem.ts, len(functions), count, layout, names, throw, inputs)
     surfaces = surfaces_in(problem, functions, directions, names)

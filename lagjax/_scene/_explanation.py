@@ -218,9 +218,7 @@ def _borders(problem: Problem, inputs: tuple[str, ...]) -> dict[str, Any]:
 
 
 def _borders_in_lines(problem: Problem) -> dict[str, Any]:
-    n = problem.derivation.layout.size
-    state = problem.y0[:n], problem.y0[n:], problem.ts[0], problem.numbers
-    pieces = pieces_of_motion(problem.derivation.motion, *state)
+    pieces = pieces_of_motion(problem.derivation.motion, *problem.derivation.state_shapes)
     names = tuple(f"{name}{place}" for name, place, size in pieces for _ in range(size))
     return {"borders": names, "borders_located": not names}
 

@@ -5,9 +5,8 @@ scene is told about one motion: which force is not finite and from when on, the 
 comes from, a pole that was reached, a mass matrix that has become singular, an escape to infinity, and what `check`
 finds at the last state: a kink, a jump, stiff terms.
 
-All but the line and `check` is read off the scene's programs in NumPy, which compiles nothing. Looking for lines stops
-at scenes whose functions are longer than `LONGEST`, and `check` is called up to `LARGEST` coordinates or where it goes
-without matrices: a failure must not cost more than a motion does.
+All but the line and `check` is read off the scene's programs in NumPy, which compiles nothing. These two have limits,
+`LONGEST` and `LARGEST`: a failure must not cost more than a motion does.
 """
 
 from collections.abc import Callable

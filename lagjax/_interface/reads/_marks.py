@@ -1,7 +1,6 @@
 """`Marks`: where a walk found each value, so that the next call sees in a microsecond whether all are still there.
 
-A place holds the same object as before, or what is derived from the function may not serve any more: then the walk is
-gone again, and only another text is another function. An array is compared by its bytes, as it can be written to.
+Values must be the same objects; an array is compared by its bytes, as it can be written to.
 """
 
 import collections

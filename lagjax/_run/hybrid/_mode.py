@@ -16,7 +16,7 @@ import numpy as np
 
 from lagjax._engine import Problem
 from lagjax._engine.taylor import MOST_GUARDS, Guarded, MachineCode, Surfaces, require_one_number
-from lagjax._equations import Derivation, has_constraints
+from lagjax._equations import Derivation, has_constraints, is_inconsistent
 from lagjax._interface import Function, Layout, accept, halves, present
 from lagjax._primitives import DOUBLE, SINGLE
 from lagjax._program import Unlowerable
@@ -150,8 +150,7 @@ class Mode(NamedTuple):
         t, y, numbers = jax.lax.stop_gradient((t, y, eqx.filter(params, eqx.is_array_like)))
         state, dtype = (*halves(y), t, numbers), SINGLE if self.problem.is_rounded else DOUBLE
         terms = self.problem.derivation.term_sizes(*state)
-        unit = motion.unit(*state)
-        return motion.constraints.inconsistent(unit, motion.row_lengths(unit, *state), *state, jnp.inf, dtype, terms)
+        return is_inconsistent(motion, state, jnp.inf, dtype, terms)
 
 
 @functools.lru_cache(maxsize=64)

@@ -67,8 +67,7 @@ class RoundPlan(eqx.Module):
             leaving = tuple(self.transitions[k] for k in numbers)
             problem = Problem.from_system(system, layout, params, **limits)
             problem = dataclasses.replace(problem, is_rounded=self.is_single)
-            mode = Mode.from_problem(name, problem, leaving, numbers, target_of[numbers])
-            modes.append(mode._replace(widths=widths))
+            modes.append(Mode.from_problem(name, problem, leaving, numbers, target_of[numbers])._replace(widths=widths))
         return modes
 
 

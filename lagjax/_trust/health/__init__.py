@@ -16,11 +16,9 @@ of the state y = (q, q̇), and in a conserved quantity c such errors add up: aft
 times √(2n) `SLACK` for solvers that measure errors in root mean square, and round-off. Other errors, those of q above
 all, may grow with the motion: there is no bound for them, only a second trajectory to compare with.
 
-Between outputs the power is integrated along the polynomial of degree five that has q, q̇ and q̈ of both ends. That is
-of order six; its error is estimated by the cubic through q and q̇, of order four, and the trapezoidal rule. Where the
-balance is off by more than a hundredth of the energy, and the work may be, the verdict says that it cannot be told.
-Source: Hairer, Nørsett & Wanner, *Solving Ordinary Differential Equations I*, §II.4 (error per step), §II.6 (Hermite
-interpolation).
+Between outputs the power is integrated along polynomials (`_measurements`). Where the balance is off by more than a
+hundredth of the energy, and the work may be, the verdict says that it cannot be told. Source: Hairer, Nørsett & Wanner,
+*Solving Ordinary Differential Equations I*, §II.4 (error per step), §II.6 (Hermite interpolation).
 
 `_measurements` goes from states to the arrays of a report, by the laws of `_laws`; `_border_counts` counts the borders
 that were met, `_global_error` compares with a second trajectory.
@@ -57,6 +55,8 @@ def examine(trajectory, reference=None) -> "Health":
         doubts = trajectory.contact_changes.doubts, trajectory.contact_changes.doubted
         fields["energy_allowed"] = jnp.full_like(jnp.asarray(fields["energy_allowed"]), jnp.inf)
     located, counts = _borders(trajectory)
+    changes = trajectory.transitions
+    guards = changes and (changes.order_matters.any(-1), jnp.isfinite(changes.let_out).any(-1))
     return Health(
         result=trajectory.result,
         ok=jnp.asarray(trajectory.ok),
@@ -66,18 +66,13 @@ def examine(trajectory, reference=None) -> "Health":
         global_error=None if reference is None else global_error(trajectory, reference),
         borders=counts,
         borders_located=located,
-        guards=_guards(trajectory.transitions),
+        guards=guards,
         impacts=impacts,
         doubts=doubts,
         outputs=trajectory.ts.shape[-1],
         diagnosis=_diagnosis(trajectory),
         **fields,
     )
-
-
-def _guards(transitions) -> tuple[Array, Array] | None:
-    """Two flags of each member: the order of the list of transitions mattered, and a guard was let out."""
-    return transitions and (transitions.order_matters.any(-1), jnp.isfinite(transitions.let_out).any(-1))
 
 
 def _diagnosis(trajectory) -> str:

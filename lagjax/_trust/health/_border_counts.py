@@ -65,8 +65,7 @@ def is_piecewise(system: System, layout: Layout, params) -> bool:
     try:
         return derivation.borders is not None and bool(derivation.borders.switches)
     except Unlowerable:  # arrays; as `_explanation` asks
-        rest = np.zeros(layout.size, layout.dtype)
-        return bool(pieces_of_motion(derivation.motion, rest, rest, rest.sum(), params))
+        return bool(pieces_of_motion(derivation.motion, *derivation.state_shapes))
 
 
 def _count(flow: Flow, ts, y0, params, tolerances: Tolerances, steps, places, into: Met) -> None:
