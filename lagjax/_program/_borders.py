@@ -23,7 +23,7 @@ a border is no piece but a feature, and a step that is to pass it begins next to
 import math
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import numpy as np
 
@@ -37,7 +37,7 @@ from lagjax._program._powers import find_powers
 from lagjax._program._rounding import rounding
 from lagjax._program._series import LinearSystem, Recurrent, StraightLine
 from lagjax._program._simplify import is_nonnegative
-from lagjax._program._sliding import FAR, MOST_SLIDING, Slide, dot, with_sliding
+from lagjax._program._sliding import FAR, LARGEST_COPIED, MOST_SLIDING, Slide, dot, with_sliding
 
 # The kinds of pieces; `CLOCK` is the piece of a table that the time itself is on, whose borders are known.
 SIGN, FLOOR, TRUNC, SLIDE, TABLE, CLOCK, CONE = range(7)
@@ -228,14 +228,30 @@ def is_smooth(line: StraightLine) -> bool:
     return _PIECEWISE.isdisjoint(op for op, *_ in line.nodes)
 
 
+class _BothSides(NamedTuple):
+    """The nodes of a number below and above the border of a piece."""
+
+    below: int
+    above: int
+
+
 class _Rewriting:
     """The program anew, with an input for every piece where the program decides.
 
-    As many of its last outputs are the `mechanics` (`_kick.Mechanics`), which the result does not have.
+    As many of its last outputs are the `mechanics` (`_kick.Mechanics`), which the result does not have. What the piece
+    `apart` jumps with is there for both of its sides, each with pieces of its own, from where it begins to q̈.
     """
 
-    def __init__(self, program: Recurrent, size: int, slides: bool, watched: int = 0, mechanics: int = 0):
-        self.mechanics = mechanics
+    def __init__(
+        self,
+        program: Recurrent,
+        size: int,
+        slides: bool,
+        watched: int = 0,
+        mechanics: int = 0,
+        apart: int | None = None,
+    ):
+        self.mechanics, self._again = mechanics, (program, size, slides, watched, mechanics)
         self.program, self.size, self.moving, self.slides = program, size, 2 * size + 1, slides
         self.watched = program.line.outputs[len(program.line.outputs) - watched :]
         self._jumping: set[int] = set()  # pieces that something may jump with
@@ -255,16 +271,22 @@ class _Rewriting:
         self.decisive = self._decisive()
         comparisons = [i for i in self.decisive if program.line.nodes[i][0] not in ("eq", "ne")]
         self.borders_of_decisions = {self._compared(i) for i in comparisons} - {None}
-        self.places: list[int] = []
+        self.places: list[Any] = []
+        self.apart, self._below, self._above = apart, {}, {}
         relevant = self.decisive | self.abrupt
         self.powers = find_powers(program.line, relevant, self._of_guards, size)
         if self.powers or any(
             i in self.cones or self._decides(i) or program.line.nodes[i][0] in (*_FEATURES, "pow") for i in relevant
         ):
+            linear = program.linear
+            roots = {*program.line.outputs, *((*linear.right, *linear.entries.values()) if linear else ())}
             for i in range(len(program.line.nodes)):
-                self.places.append(self._place(i))
+                place = self._place(i)
+                self.places.append(self._join(place) if i in roots else place)
         for base, exponent in self.powers:
-            self._note_power(self.places[base], exponent)
+            place = self.places[base]
+            for node in place if isinstance(place, _BothSides) else (place,):
+                self._note_power(node, exponent)
 
     # ---- which operations decide ----
 
@@ -332,19 +354,25 @@ class _Rewriting:
 
     # ---- the new nodes ----
 
-    def _place(self, i: int) -> int:
+    def _place(self, i: int) -> Any:
         (op, operands, attribute), kind = self.program.line.nodes[i], self.program.line.kinds[i]
         if op == "input":
             return self.graph.input(attribute, kind)
         if op == "constant":
             return self.graph.constant(attribute, kind)
         of = [self.places[x] for x in operands]
+        if any(isinstance(x, _BothSides) for x in of):
+            return self._place_on_both_sides(i)
+        place = self._place_operation(i, op, operands, attribute, of)
+        return self._take_apart(place) if i in self.decisive else place
+
+    def _place_operation(self, i: int, op: str, operands: Sequence[int], attribute, of: list[int]) -> int:
         if i in self.cones and i in self.decisive:
             return self._place_on_cone(i, op, of)
         if i in self.decisive and (decided := self._replace_by_piece(i, op, of, attribute)) is not None:
             return decided
         if op in ("eq", "ne") and (sign := self._known_sign(i, *of)) is not None:
-            return self.graph.apply(op, sign, self.graph.constant(0.0, "float"))
+            return self.graph.apply(op, sign, self.graph.number(0.0))
         if i in self.abrupt and self._decides(i):
             self._note_border(op, of)
         if op in _FEATURES and i in self.decisive:
@@ -354,6 +382,41 @@ class _Rewriting:
         if op == "div" and (quotient := self._direction(*of)) is not None:
             return quotient
         return self.graph.node(op, *of, attribute=attribute)
+
+    def _place_on_both_sides(self, i: int) -> "int | _BothSides":
+        operands = dict.fromkeys(self.program.line.nodes[i][1])
+        before, sides = {x: self.places[x] for x in operands}, []
+        for side in range(2):
+            for x, place in before.items():
+                self.places[x] = place[side] if isinstance(place, _BothSides) else place
+            sides.append(self._place(i))
+        for x, place in before.items():
+            self.places[x] = place
+        return sides[0] if sides[0] == sides[1] else _BothSides(*sides)
+
+    def _take_apart(self, node: int) -> "int | _BothSides":
+        """A node, or both sides of it where it depends on the piece that is `apart`."""
+        if self.apart is None or self.apart >= len(self.pieces):
+            return node
+        below, above = self._put(node, self._below, -1.0), self._put(node, self._above, 1.0)
+        return node if below == above else _BothSides(below, above)
+
+    def _put(self, node: int, known: dict[int, int], side: float) -> int:
+        """A node where the piece that is `apart` is this number; `known` has what was found before."""
+        piece = self.pieces[cast(int, self.apart)]
+        if node < piece or node in known:
+            return known.get(node, node)
+        op, operands, attribute = self.graph.nodes[node]
+        of = tuple(self._put(x, known, side) for x in operands)
+        found = node if of == operands else self.graph.apply(op, *of, attribute=attribute)
+        known[node] = self.graph.number(side) if node == piece else found
+        return known[node]
+
+    def _join(self, place: "int | _BothSides") -> int:
+        if not isinstance(place, _BothSides):
+            return place
+        is_above = self.graph.apply("gt", self.pieces[cast(int, self.apart)], self.graph.number(0.0))
+        return self.graph.apply("select", is_above, *place)
 
     def _place_on_cone(self, i: int, op: str, of: list[int]) -> int:
         """A root of a sum of squares, or what is decided about it: 1 at rest, where the sum is zero."""
@@ -574,7 +637,10 @@ class _Rewriting:
         )
         nested = not _below(line, self.switches).isdisjoint(self.pieces)
         kicking = self._find_kicking(line) if self.mechanics else {}
-        sliding, switches, arguments = self._sliding(line, kicking), list(self.switches), [u for u, _ in features]
+        sliding, lost = self._sliding(line, kicking)
+        if len(lost) == 1 and self.apart is None and len(line.nodes) <= LARGEST_COPIED:
+            return _Rewriting(*self._again, apart=lost[0]).build()
+        switches, arguments = list(self.switches), [u for u, _ in features]
         linear = program.linear and self._linear(program.linear)
         at_rest = [slide for slide in sliding if slide.order == 1]
         for slides in (sliding, at_rest, []):
@@ -668,36 +734,50 @@ class _Rewriting:
             linear.solve,
         )
 
-    def _sliding(self, line: StraightLine, kicking: Container[int] = ()) -> list[Slide]:
+    def _sliding(self, line: StraightLine, kicking: Container[int] = ()) -> tuple[list[Slide], list[int]]:
         """The borders that a motion may slide along: those that something jumps with, but not L.
 
-        Those that depend on velocities come first, and are all there or none.
+        Those that depend on velocities come first, and are all there or none. And those of them that are lost, because
+        what other pieces are on their other side is not known.
         """
         n, acting, orders = self.size, _below(line, line.outputs[: self.size]), {}
+        undefined = self._find_undefined(acting)
         for j, kind in enumerate(self.kinds if self.slides else ()):
             if kind == CLOCK or self.pieces[j] not in acting or j in kicking:
                 continue
-            if kind == SIGN and self.pieces[j] not in self._jumping:
+            if self.pieces[j] in undefined or (kind == SIGN and self.pieces[j] not in self._jumping):
                 continue
             read = inputs_below(line, [self.switches[j]])
             if not read.isdisjoint(range(2 * n)):
                 orders[j] = 2 if read.isdisjoint(range(n, 2 * n)) else 1
-        others = [j for j in orders if self.kinds[j] not in (SIGN, CONE)]
-        shaking = {j: [m for m in self.switches if self.pieces[j] in _below(line, [m])] for j in orders}
+        # The sign of a force is a corner where |force| rubs, but the slopes that it is solved by jump.
+        degrees = _velocity_degrees(line, n) if orders else []
+        others = [
+            j for j in orders if self.kinds[j] != CONE and (self.kinds[j] != SIGN or degrees[self.switches[j]] > 1)
+        ]
+        lost, shaking = [], {j: [m for m in self.switches if self.pieces[j] in _below(line, [m])] for j in orders}
         if others or any(shaking.values()):
             search = Jumping(line, self._decide(len(self.switches), ()), self.switches, n, self.program.size)
             # An interpolation has a corner at its entries, and no jump.
             jumps = search.find(others, line.outputs[:n], self._levels) if others else {}
-            # Where other switching numbers jump, the pieces on the other side are not known.
             lost = [j for j, nodes in shaking.items() if nodes and search.find([j], nodes, self._levels)[j]]
-            orders = {j: order for j, order in orders.items() if jumps.get(j, True) is not False and j not in lost}
+            orders = {j: order for j, order in orders.items() if jumps.get(j, True) is not False}
+            lost = [j for j in lost if orders.pop(j, 0) == 1]
         widths = {SIGN: 2.0, CONE: 2.0}
         both = [
             Slide(j, order, widths.get(self.kinds[j], 1.0), self._level_between(j), self.parts.get(self.pieces[j], ()))
             for j, order in sorted(orders.items(), key=lambda item: item[1])
         ]
         by_velocity = [slide for slide in both if slide.order == 1]
-        return both if len(both) <= MOST_SLIDING else by_velocity if len(by_velocity) <= MOST_SLIDING else []
+        return both if len(both) <= MOST_SLIDING else by_velocity if len(by_velocity) <= MOST_SLIDING else [], lost
+
+    def _find_undefined(self, acting: set[int]) -> set[int]:
+        """The pieces on one of whose sides nothing is known: `where` has NaN there."""
+        nodes, found = self.graph.nodes, set()
+        for op, operands, _ in (nodes[i] for i in acting):
+            if op == "select" and any(self.graph.value(x) != self.graph.value(x) for x in operands[1:]):
+                found |= {x for x in (operands[0], *nodes[operands[0]][1]) if x in self.pieces}
+        return found
 
     def _level_between(self, j: int) -> Callable[[Graph, int], int]:
         """The level between a piece and the next one, of its switching number."""

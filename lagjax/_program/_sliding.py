@@ -17,7 +17,7 @@ on either side, the force brings it back at once.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -168,13 +168,14 @@ class _SlidingForces:
         pivots = _choose_pivots([_constants(self.graph, self._unmask(d)) for d in slopes])
         held = _Held(self.graph, self.n, pushed, [self._unmask(d) for d in slopes], responses, pivots)
         z = self._solve(self._push_right_side(self.linear.right, acts, unknown))
-        if len(pivots) < len(acts):  # what has none is held by the rounding of rounding
+        missed = self._miss_constraints(z)
+        if len(pivots) < len(acts) or missed:
+            # What has no pivot, and what constraints tie to one, is held by the rounding of rounding.
+            z = self._add(z, self._solve([missed.get(i, self.zero) for i in range(len(z))])) if missed else z
             left = [self.f("sub", end, dot(self.graph, d, z[: self.n])) for end, d in zip(ends, normals, strict=True)]
             more = equations.solve(self.graph, left)
-            rest = self._solve(self._push_right_side([self.zero] * len(z), acts, more))
-            z, unknown = (
-                [self.f("add", *pair) for pair in zip(*both, strict=True)] for both in ((z, rest), (unknown, more))
-            )
+            unknown = self._add(unknown, more)
+            z = self._add(z, [dot(self.graph, of, more) for of in zip(*responses, strict=True)])
         z = held.hold(z, rates)
         shares = [self._share(k, unknown, slopes, rates, all_pushed[k], z) for k in range(len(self.slides))]
         directions = [
@@ -223,10 +224,23 @@ class _SlidingForces:
         nodes = copy_nodes(self.graph, line, [*self.linear.factors, *right])
         return [nodes[i] for i in line.outputs]
 
+    def _add(self, xs: Sequence[int], ys: Sequence[int]) -> list[int]:
+        return [self.f("add", *pair) for pair in zip(xs, ys, strict=True)]
+
+    def _miss_constraints(self, z: Sequence[int]) -> dict[int, int]:
+        """r − A z in the rows of constraints, whose entries are those of coordinates alone."""
+        entries = self.linear.entries
+        rows = set(range(self.n, len(z))) - {i for place in entries if min(place) >= self.n for i in place}
+        found = {}
+        for i in sorted(rows):
+            known = {j: c for (k, j), c in entries.items() if k == i}
+            found[i] = self.f("sub", self.linear.right[i], dot(self.graph, known.values(), [z[j] for j in known]))
+        return found
+
     def _effects(self, acts: Sequence[dict[int, int]], slopes: Sequence[list[int]]) -> tuple[list[list[int]], ...]:
-        """The slopes of q̈ by each piece, and ∂u̇/∂p of each border by each piece; zeros where nothing slides."""
+        """The slopes of z by each piece, and ∂u̇/∂p of each border by each piece; zeros where nothing slides."""
         size = len(self.linear.right)
-        responses = [self._solve([act.get(i, self.zero) for i in range(size)])[: self.n] for act in acts]
+        responses = [self._solve([act.get(i, self.zero) for i in range(size)]) for act in acts]
         effects = []
         for d in slopes:
             some = [i for i, x in enumerate(d) if x != self.zero]
@@ -501,7 +515,7 @@ class _Held:
         """The line from the inputs of the program to the state, and which coordinates each border moves."""
         graph = self.graph
         line = eliminate_dead_code(graph, [self.state[i] for i in range(2 * self.n)])
-        return line, tuple(frozenset(_constants(graph, response)) for response in self.responses)
+        return line, tuple(frozenset(_constants(graph, response[: self.n])) for response in self.responses)
 
 
 def _choose_pivots(rows: Sequence[dict[int, float | None]]) -> list[tuple[int, int]]:
@@ -548,7 +562,7 @@ def _constants(graph: Graph, numbers: Sequence[int]) -> dict[int, float | None]:
     return {i: value for i, value in values.items() if value != 0}
 
 
-def dot(graph: Graph, xs: Sequence[int], ys: Sequence[int]) -> int:
+def dot(graph: Graph, xs: Iterable[int], ys: Iterable[int]) -> int:
     total = zero = graph.number(0.0)
     for x, y in zip(xs, ys, strict=True):
         if zero not in (x, y):  # as nearly all are where many borders know nothing of each other
