@@ -246,24 +246,16 @@ class Batch(eqx.Module):
 
 
 class Solution(NamedTuple):
-    """The motion that answers a problem; of a batch, with the members as first axis of everything.
+    """The motion that answers a problem, from its first output time to where it ended; of a batch, N of them."""
 
-    - `path` (T, 2n): the states at the output times, NaN where not reached; or what was noted on the way.
-    - `y_end` (2n,), `t_end` (): the state and the time at which the motion ended.
-    - `result` (): how it ended, as the integer of a `lagjax.RESULTS`.
-    - `accepted`, `rejected` (): counts of steps.
-    - `event` (): which guards changed sign at the end, a mask (`taylor.changes_of`); 0 without any.
-    - `idle`: of a batch as a whole, the steps for which a lane was idle; None for one motion.
-    """
-
-    path: Float[Any, "*N T states"]
+    path: Float[Any, "*N T states"]  # at the output times, NaN where not reached; or what was noted on the way
     y_end: Float[Any, "*N states"]
     t_end: Float[Any, "*N"]
-    result: Int[Any, "*N"]
-    accepted: Int[Any, "*N"]
+    result: Int[Any, "*N"]  # how it ended, as the integer of a `lagjax.RESULTS`
+    accepted: Int[Any, "*N"]  # steps
     rejected: Int[Any, "*N"]
-    event: Int[Any, "*N"] = None
-    idle: Int[Any, ""] = None
+    event: Int[Any, "*N"] = None  # which guards changed sign at the end, a mask (`taylor.changes_of`); 0 without any
+    idle: Int[Any, ""] = None  # of a batch as a whole, the steps for which a lane was idle
 
 
 class AbstractEngine(abc.ABC):

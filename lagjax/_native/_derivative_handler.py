@@ -45,16 +45,13 @@ class DerivativePlan(ctypes.Structure):
 
 
 class Kind(NamedTuple):
-    """A derivative: the structure of its job; its fields for the third argument, the first result and the second.
-
-    The first result begins as the fourth argument, the second as this number.
-    """
+    """A derivative: the structure of its job; its fields for the third argument, the first result and the second."""
 
     job: type
     argument: str
-    first: str
+    first: str  # begins as the fourth argument
     second: str
-    begin: float
+    begin: float  # as which the second begins
 
 
 KINDS = {

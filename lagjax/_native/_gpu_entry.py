@@ -69,21 +69,16 @@ class GpuForm(NamedTuple):
 
 
 class OneLane(NamedTuple):
-    """The module of a motion in one lane: its text, and what an entry and the choice of a form must know of it.
-
-    A thread remembers `size` doubles. The motion has this many `states` (2n) and `numbers` of a member, `row` doubles
-    are written down of a step, and its series have this many rows, those of the state among them. Of a `large` motion,
-    which is in tables, no loop can be unrolled; of another one the text `unrolled` asks for that.
-    """
+    """The module of a motion in one lane: its text, and what an entry and the choice of a form must know of it."""
 
     text: str
-    size: int
-    states: int
-    numbers: int
-    row: int
-    series: int
-    large: bool
-    unrolled: str = ""
+    size: int  # doubles that a thread remembers
+    states: int  # 2n
+    numbers: int  # of a member
+    row: int  # doubles that are written down of a step
+    series: int  # rows of the series, those of the state among them
+    large: bool  # in tables, where no loop can be unrolled
+    unrolled: str = ""  # the text that asks for loops to be unrolled
 
     @classmethod
     def from_motion(cls, motion: TaylorSeries) -> "OneLane":

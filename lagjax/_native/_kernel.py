@@ -39,25 +39,20 @@ _RERUNS_PER_SLICE, _LEAST_ROUNDS = 30, 16
 class Outcome(NamedTuple):
     """The results of a run of N members, T output times and 2n states.
 
-    - `path` (N, T, 2n): the states (q, q̇) at the output times, NaN where a member did not come.
-    - `y_end` (N, 2n), `t_end` (N,): where each member ended; `code` (N,): how.
-    - `steps`, `rejected` (N,): how many steps it took, and how many were too long.
-    - `idle`: the number of steps for which lanes were idle.
-    - `table` (rows, 2n + 4): a row for every step that was written down, member by member: its time, its size, the
-      number of the member, that of the step, its first state; None without. For a piecewise program the pieces follow,
-      and the number of the border that the step ends at.
-    - `complete` (N,): whether all steps of a member are there, Σ steps of such members before it on; None without.
+    A row of `table` (rows, 2n + 4) is a step that was written down, member by member: its time, its size, the number of
+    the member, that of the step, its first state. For a piecewise program the pieces follow, and the number of the
+    border that the step ends at.
     """
 
-    path: np.ndarray
-    y_end: np.ndarray
-    t_end: np.ndarray
-    code: np.ndarray
-    steps: np.ndarray
-    rejected: np.ndarray
-    idle: int
+    path: np.ndarray  # (N, T, 2n), the states (q, q̇) at the output times, NaN where a member did not come
+    y_end: np.ndarray  # (N, 2n), where each member ended
+    t_end: np.ndarray  # (N,)
+    code: np.ndarray  # (N,), how it ended
+    steps: np.ndarray  # (N,)
+    rejected: np.ndarray  # (N,), steps that were too long
+    idle: int  # steps for which lanes were idle
     table: np.ndarray | None
-    complete: np.ndarray | None
+    complete: np.ndarray | None  # (N,), whether all steps of a member are there, Σ steps of such members before it on
 
 
 class StepRecord(NamedTuple):

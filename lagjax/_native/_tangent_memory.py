@@ -36,9 +36,8 @@ class Directions:
         numbers = "power", "power_before", "next_output", "s", "is_due", "excess", "first_number", "first_dot"
         self.layout = Memory(lanes, fields | dict.fromkeys(numbers, 1), beside=motion.layout)
         sincos = sincos_function(motion.module, lanes, "sincos_of_tangents")
-        self.form: Tables | Lines = (
-            Tables(self.function, sincos, look_up=motion.look_up) if motion.large else Lines(sincos, motion.look_up)
-        )
+        look_up = motion.look_up
+        self.form = Tables(self.function, sincos, look_up) if motion.large else Lines(sincos, look_up)
 
     def function(self, name: str, *kinds: ir.Type, **options) -> Frame:
         return Frame(self.motion.module, self.layout, self.motion.job, f"tangent_{name}", *kinds, **options)

@@ -54,14 +54,11 @@ class ArrayEquations(eqx.Module):
 
 
 class ScalarEquations(eqx.Module):
-    """The equations as scalar programs, whose inputs are q, q̇, t and every number in params.
-
-    `program` gives q̈ and whether its matrix is singular, `projection` (q, q̇) after a step back to the constraints.
-    """
+    """The equations as scalar programs, whose inputs are q, q̇, t and every number in params."""
 
     motion: Motion = eqx.field(static=True)
-    program: Program = eqx.field(static=True)
-    projection: Program | None = eqx.field(static=True)
+    program: Program = eqx.field(static=True)  # q̈, and whether its matrix is singular
+    projection: Program | None = eqx.field(static=True)  # (q, q̇) after a step back to the constraints
     accelerate: Any = eqx.field(static=True)
     project: Any = eqx.field(static=True)
 

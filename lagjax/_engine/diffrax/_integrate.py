@@ -33,17 +33,14 @@ PyTree = Any
 
 
 class Method(eqx.Module):
-    """The stepping of diffrax: its solver, its controller, the fixed size of steps (None where adaptive), their budget.
-
-    `jumps` are where adaptive steps end and begin anew, None without any.
-    """
+    """The stepping of diffrax: its solver, its controller, the fixed size of steps (None if adaptive), their budget."""
 
     solver: diffrax.AbstractSolver
     controller: diffrax.AbstractStepSizeController
     dt0: jax.Array | None
     max_steps: int = eqx.field(static=True)
     progress: diffrax.AbstractProgressMeter
-    jumps: "Jumps | None" = None
+    jumps: "Jumps | None" = None  # where adaptive steps end and begin anew
 
 
 class Converted(eqx.Module):

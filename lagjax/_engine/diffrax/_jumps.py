@@ -124,15 +124,12 @@ class AdaptiveWrapper(diffrax.AbstractAdaptiveStepSizeController):
 
 
 class Noting(diffrax.AbstractStepSizeController):
-    """The steps of a controller; its state stands beside a flag, whether a step that was accepted crossed a jump.
-
-    `direction`, 1 or −1, is the sign of the time of diffrax, which integrates forward; `varied` as for `crosses`.
-    """
+    """The steps of a controller; its state stands beside a flag, whether a step that was accepted crossed a jump."""
 
     controller: Any
     field: Any
-    varied: Any
-    direction: Any = 1
+    varied: Any  # as for `crosses`
+    direction: Any = 1  # or −1, the sign of the time of diffrax, which integrates forward
 
     def wrap(self, direction):
         return type(self)(self.controller.wrap(direction), self.field, self.varied, direction)

@@ -31,14 +31,11 @@ MOST_GUARDS = 24  # `CHANGE_BITS` each in the code of an event, a whole number t
 
 
 class Noted(NamedTuple):
-    """The crossings of each of G surfaces, `room` at most, NaN beyond the last one.
+    """The crossings of each of G surfaces, `room` at most, NaN beyond the last one."""
 
-    `t` (G, room) and `y` (G, room, 2n): when, and the state then; `count` (G,): how many there were.
-    """
-
-    t: Any
-    y: Any
-    count: Any
+    t: Any  # (G, room)
+    y: Any  # (G, room, 2n), the state then
+    count: Any  # (G,), how many there were
 
     @classmethod
     def read(cls, path, surfaces: int) -> "Noted":

@@ -27,17 +27,13 @@ MOST_PARTS, TRIES = 64, 4  # of a step that is too long, at once; and how often 
 
 
 class Motions(NamedTuple):
-    """Runs of a flow, of which derivatives are taken: what went in, and the results that say how far they came.
+    """Runs of a flow, of which derivatives are taken: what went in, and the results that say how far they came."""
 
-    Of N members: `ts` (1 or N, T), `y0` (N, 2n), `params` (1 or N, P), `path` (N, T, 2n), and `result`, `accepted` and
-    `rejected` (N,) of the `Solution`.
-    """
-
-    ts: Any
-    y0: Any
-    params: Any
-    path: Any
-    result: Any
+    ts: Any  # (1 or N, T)
+    y0: Any  # (N, 2n)
+    params: Any  # (1 or N, P)
+    path: Any  # (N, T, 2n)
+    result: Any  # (N,), as the others of the `Solution`
     accepted: Any
     rejected: Any
 

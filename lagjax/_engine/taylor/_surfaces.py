@@ -42,15 +42,12 @@ PyTree = Any
 
 
 class Guarded(NamedTuple):
-    """The guards at a state, all (G,): their `values`, and their `rates` along the motion.
-
-    And how far a value is moved by its own `rounding`, and by that of the time (`of_time`), and a rate by its own.
-    """
+    """The guards at a state, all (G,), their rates along the motion, and how far rounding moves both."""
 
     values: jax.Array
     rates: jax.Array
-    rounding: jax.Array
-    of_time: jax.Array
+    rounding: jax.Array  # by how much its own moves a value
+    of_time: jax.Array  # by how much that of the time moves it
     rate_rounding: jax.Array
 
     def clear_rates(self, largest: jax.Array | float = 0.0) -> jax.Array:
