@@ -40,7 +40,7 @@ from benchmarks import _report
 from benchmarks._figures import write_picture
 from lagjax._sweep import Files, Progress, run_store, status
 from lagjax._sweep._batch import run_batch
-from lagjax._sweep._description import Sections
+from lagjax._sweep._description import Description, Sections
 
 SCENE = lagjax.scenes.double_pendulum()
 DURATION, RTOL = 5.0, 5e-9  # of which the median error is 1e-8
@@ -131,6 +131,8 @@ def _bare(over: dict, flips: dict | None = FLIPS) -> Callable[[int], None]:
     members, places = math.prod(shape), itertools.count()
     settings = dict(rtol=RTOL, atol=None, max_steps=65_536, event=None, solver=None)
     sections = None if flips is None else Sections.from_arguments(flips, keep, settings)
+    ts = np.array([0.0, DURATION])
+    description = Description(SCENE.system, ts, None, None, SCENE.params, keep, {}, settings, sections)
 
     def batches(count: int) -> None:
         for _ in range(count):
@@ -138,7 +140,7 @@ def _bare(over: dict, flips: dict | None = FLIPS) -> Callable[[int], None]:
             which = np.unravel_index((first + np.arange(BARE)) % members, shape)
             q0 = np.stack([angles[i] for angles, i in zip(over.values(), which, strict=True)], axis=1)
             values = {"q0": q0, "qdot0": np.zeros_like(q0), "params": SCENE.params}
-            one, _ = run_batch(SCENE.system, values, jnp.array([0.0, DURATION]), (0, 0, None), settings, sections)
+            one, _ = run_batch(description, values, jnp.asarray(ts), (0, 0, None))
             jax.block_until_ready(one.q)
 
     batches(1)
