@@ -25,6 +25,7 @@ from scipy.sparse.csgraph import connected_components
 
 from lagjax._program._differentiation import copy_nodes, gradient_in
 from lagjax._program._graph import Graph
+from lagjax._program._operations import LOOK_UPS
 from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._series import LinearSystem, StraightLine
 
@@ -38,6 +39,7 @@ SOFT, MENDED = 1e-9, 2
 # What moves less off a border, relative to what pushes it there, is held by others: rounding of forces that cancel. It
 # decides on derivatives alone; doubled, nothing that was looked at changes.
 STILL = 1e-9
+_BENT, _STATES = 1e-9, 32  # of a chord, of which rounding is a thousandth; and random states, for pieces of all kinds
 FAR = 1e100  # of a rate: a share that is beyond 0 and 1; the search for its roots squares it
 _LARGEST = 10_000_000  # operations: a bound for errors
 # The length of the vector of a cone that is as good as none: forces change by so little beside it, and its square is
@@ -125,7 +127,7 @@ class _SlidingForces:
         self.f, self.number = self.graph.apply, self.graph.number
         self.zero, self.one = self.number(0.0), self.number(1.0)
         self.pieces = [self.graph.input(first + slide.piece, "float") for slide in slides]
-        self.rows = []
+        self.rows, self.decided = [], range(first, first + len(switches))
         for k, (slide, piece) in enumerate(zip(slides, self.pieces, strict=True)):
             if slide.parts:
                 self.rows += [_Row(k, u, 0.0) for u in slide.parts]
@@ -145,7 +147,7 @@ class _SlidingForces:
     def build(self) -> Sliding | None:
         """The program; None where pieces act on more than the right side, or not each for itself."""
         acts = self._acts()
-        if acts is None:
+        if acts is None or self._bends(acts):
             return None
         slopes, rates, levels = zip(*map(self._rate, range(len(self.rows))), strict=True)
         responses, effects = self._effects(acts, slopes)
@@ -357,6 +359,32 @@ class _SlidingForces:
             if i not in known and any(x in known for x in operands):
                 known[i] = graph.apply(op, *(known.get(x, x) for x in operands), attribute=attribute)
         return known
+
+    def _bends(self, acts: Sequence[dict[int, int]]) -> bool:
+        """True if between both sides of a border r is not on their chord, at random numbers.
+
+        So it is where two frictions change each other's normal forces, and not in proportion. What one holds at rest,
+        between both sides, then says nothing about the other.
+        """
+        graph, draw, line = self.graph, np.random.default_rng(0), eliminate_dead_code(self.graph, self.linear.right)
+        if any(op in LOOK_UPS for op, *_ in line.nodes):
+            return False
+        for k in {row.slide for row, act in zip(self.rows, acts, strict=True) if self._reads_others(row.slide, act)}:
+            columns = draw.uniform(0.3, 1.2, (1 + max(node[2] for node in graph.nodes if node[0] == "input"), _STATES))
+            columns[self.decided] = draw.choice([-1.0, 1.0], (len(self.decided), _STATES))
+            at = []
+            for side in (-1.0, 0.0, 1.0):
+                columns[graph.nodes[self.pieces[k]][2]] = side
+                at.append(np.array([np.broadcast_to(x, _STATES) for x in line.evaluate(list(columns))]))
+            chord, part = at[2] - at[0], at[1] - at[0]
+            off = part - chord * (np.sum(part * chord, axis=0) / np.sum(chord * chord, axis=0))
+            if (np.abs(off).max(axis=0) > _BENT * np.abs(chord).max(axis=0)).any():
+                return True
+        return False
+
+    def _reads_others(self, k: int, act: dict[int, int]) -> bool:
+        others = {piece for m, piece in enumerate(self.pieces) if m != k}
+        return self.slides[k].width > 1 and not others.isdisjoint(self.graph.find_ancestors(act.values()))
 
     def _values_on_both_sides(self) -> dict[int, dict[int, tuple[int, int]]] | None:
         """The nodes that depend on pieces, and for each piece their values below and above, the others as they are."""

@@ -274,6 +274,30 @@ def test_bearing_that_sticks_and_slips_has_derivatives(size):
     np.testing.assert_allclose(jax.vmap(end)(several), [end(x) for x in several], atol=1e-14)
 
 
+@pytest.mark.slow
+def test_frictions_that_change_each_others_normal_force_end_by_name_at_rest():
+    """Two bearings of a double pendulum: what the one at rest holds says nothing about the force of the other."""
+    above, below = LENGTH, 0.5 * LENGTH
+
+    def constraints(q):
+        c, s = jnp.cos(q[:, 2]), jnp.sin(q[:, 2])
+        ends = jnp.stack([s[0], -c[0]]) * above
+        return jnp.stack([q[0, :2] - ends, q[1, :2] - q[0, :2] - below * jnp.stack([s[1], -c[1]])])
+
+    def forces(q, v, params, multipliers):
+        torque = params * RADIUS * jnp.sqrt(jnp.sum(multipliers**2, axis=1)) * jnp.sign(jnp.diff(v[:, 2], prepend=0.0))
+        return jnp.zeros_like(q).at[:, 2].set(-torque).at[0, 2].add(torque[1])
+
+    def lagrangian(q, v):
+        return 0.5 * MASS * jnp.sum(v[:, :2] ** 2) + 0.5 * INERTIA * jnp.sum(v[:, 2] ** 2) - MASS * G * jnp.sum(q[:, 1])
+
+    system = lagjax.System(lagrangian, forces=forces, constraints=constraints)
+    q0 = jnp.array([[0.0, -above, 0.0], [0.0, -above - below, 0.0]])
+    qdot0 = jnp.array([[above, 0.0, 1.0], [above - below, 0.0, -1.0]])
+    with pytest.raises(lagjax.SimulationError, match="jump"):
+        lagjax.simulate(system, q0, qdot0, jnp.array([0.0, 20.0]), 2.0)
+
+
 # ---- a rod with its end on a wire: friction changes the force that it is proportional to -----------------------------
 
 
