@@ -202,4 +202,6 @@ def _require_no_velocities(system: System, q: PyTree, params: PyTree) -> None:
     if params is None or any("params" in function.extras for function in functions if function is not None):
         return
     if jax.tree.map(jnp.shape, params) == jax.tree.map(jnp.shape, q):
-        raise ValueError("No function of this system asks for params; those given are like q: name velocities, qdot=….")
+        raise ValueError(
+            "No function of this system asks for params, and those given are like q: name velocities, qdot=…."
+        )

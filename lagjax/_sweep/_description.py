@@ -61,7 +61,9 @@ class Sections(NamedTuple):
                 f"got {list(crossings) if isinstance(crossings, dict) else crossings!r}."
             )
         if not takes_crossings:
-            raise ValueError("crossings are for keep, which does not ask for them: write keep(trajectory, crossings).")
+            raise ValueError(
+                "crossings are found for keep, which does not ask for them by name: write keep(trajectory, crossings)."
+            )
         if settings["event"] is not None:
             raise ValueError("An event ends the motion, and crossings do not: give one of the two.")
         if not isinstance(settings["solver"], MachineCode | None):
