@@ -293,7 +293,7 @@ class _Rewriting:
     def _decisive(self) -> set[int]:
         """The nodes that q̈ depends on, without those of the elimination of a linear system."""
         linear, line = self.program.linear, self.program.line
-        roots = line.outputs[: self.size] if linear is None else [*linear.right, *linear.entries.values()]
+        roots = line.outputs[: self.size] if linear is None else linear.read
         needed = _below(line, roots)
         self._of_guards = _below(line, self.watched)
         if self.watched:  # which may read the solution of a linear system, but not decide on its elimination
@@ -726,13 +726,9 @@ class _Rewriting:
         return Kick(kick_line(line, of, switches, spatial, n, size, m if moves else 0), tuple(kicking))
 
     def _linear(self, linear) -> LinearSystem:
-        return LinearSystem(
-            tuple(self.places[i] for i in linear.z),
-            {place: self.places[i] for place, i in linear.entries.items()},
-            tuple(self.places[i] for i in linear.right),
-            tuple(self.places[i] for i in linear.factors),
-            linear.solve,
-        )
+        z, right, factors = ([self.places[i] for i in some] for some in (linear.z, linear.right, linear.factors))
+        entries, others = ({at: self.places[i] for at, i in of.items()} for of in (linear.entries, linear.others))
+        return LinearSystem(tuple(z), entries, tuple(right), tuple(factors), linear.solve, others)
 
     def _sliding(self, line: StraightLine, kicking: Container[int] = ()) -> tuple[list[Slide], list[int]]:
         """The borders that a motion may slide along: those that something jumps with, but not L.

@@ -54,6 +54,11 @@ class LinearSystem(NamedTuple):
     solve: Callable[[], StraightLine]
     others: dict[tuple[int, int], int] = {}  # noqa: RUF012  (never written to)
 
+    @property
+    def read(self) -> list[int]:
+        """The nodes that A and r consist of."""
+        return [*self.right, *self.entries.values(), *self.others.values()]
+
 
 class Recurrent(Protocol):
     """The part of a program that Taylor series and machine code read: `Program` without JAX."""
@@ -116,8 +121,7 @@ class _Recurrences:
         self._coefficients: dict[int, int | _Unknown | None] = {}  # None: constant along the motion
         # Of an elimination no coefficient is needed: it is most of a large program.
         linear = program.linear
-        required = () if linear is None else (*linear.right, *linear.entries.values(), *linear.others.values())
-        self._find(list(required or self.outputs[:size]))
+        self._find((linear and linear.read) or self.outputs[:size])
         self._find_added(len(program.line.nodes))
         self.solution = [] if program.linear is None else self._solution(program.linear)
         if program.linear is not None:  # what is followed may depend on it

@@ -390,7 +390,8 @@ class _SlidingForces:
         """The nodes that depend on pieces, and for each piece their values below and above, the others as they are."""
         graph, system = self.graph, self.linear
         pieces = {node: k for k, node in enumerate(self.pieces)}
-        if not pieces.keys().isdisjoint(graph.find_ancestors([*system.entries.values(), *system.factors])):
+        matrix = *system.entries.values(), *system.others.values(), *system.factors
+        if not pieces.keys().isdisjoint(graph.find_ancestors(matrix)):
             return None
         sides: dict[int, dict[int, tuple[int, int]]] = {}
         minus_one = self.number(-1.0)
@@ -475,7 +476,8 @@ class _SlidingForces:
                 z[i] = graph.apply("add", graph.apply("mul", at[free], z[i]), graph.apply("mul", at[inverse], end))
             return StraightLine(tuple(graph.nodes), tuple(graph.kinds), (*z, *mu))
 
-        return LinearSystem((*z, *unknown), system.entries, (*system.right, *rates), factors, solve, others)
+        others_too = system.others | others
+        return LinearSystem((*z, *unknown), system.entries, (*system.right, *rates), factors, solve, others_too)
 
 
 # ---- what stays on borders ----

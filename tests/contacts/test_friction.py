@@ -196,3 +196,26 @@ def test_a_block_that_friction_barely_holds_rocks_to_rest():
         closes = np.asarray(changes.t)[np.asarray(changes.change) == 0]
         assert np.all(np.abs(run.end.qdot) < 1e-14) and abs(run.end.q[1] - b) < 1e-15
         assert abs(closes[-1] - expected) < 1e-12, (a, b, closes[-1] - expected)
+
+
+# ---- friction against a body that turns, in a scene whose forces have borders ----------------------------------------
+
+
+def test_a_particle_slides_up_a_drum_while_another_coordinate_stops():
+    """With u = θ̇² on a circle of radius 1 u′ = −2g sin θ − 2μ (g cos θ + u); the third coordinate stops by itself."""
+    mu, speed = 0.3, 3.0
+    drum = lagjax.System(
+        lambda q, v: 0.5 * v @ v - G * q[1],
+        forces=lambda q, v: jnp.array([0.0, 0.0, -jnp.sign(v[2])]),
+        contacts=lambda q: 1.0 - jnp.hypot(q[0], q[1]),
+        friction=mu,
+        slip=lambda q, v: (q[0] * v[1] - q[1] * v[0]) / jnp.hypot(q[0], q[1]),
+    )
+    run = lagjax.simulate(drum, jnp.array([0.0, -1.0, 0.0]), jnp.array([speed, 0.0, 0.2]), jnp.linspace(0.0, 0.35, 8))
+    angle = np.arctan2(run.q[:, 0], -run.q[:, 1])
+    b = -6 * mu * G / (1 + 4 * mu**2)
+    a = 2 * G + 2 * mu * b
+    square = (speed**2 - a) * np.exp(-2 * mu * angle) + a * np.cos(angle) + b * np.sin(angle)
+    np.testing.assert_allclose(np.sum(run.qdot[:, :2] ** 2, axis=1), square, atol=1e-9)
+    np.testing.assert_allclose(run.q[4:, 2], 0.02, atol=1e-12)
+    assert run.stats["num_steps"] < 50
