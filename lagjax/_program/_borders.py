@@ -746,19 +746,20 @@ class _Rewriting:
             read = inputs_below(line, [self.switches[j]])
             if not read.isdisjoint(range(2 * n)):
                 orders[j] = 2 if read.isdisjoint(range(n, 2 * n)) else 1
-        # The sign of a force is a corner where |force| rubs, but the slopes that it is solved by jump.
-        degrees = _velocity_degrees(line, n) if orders else []
+        # The sign of a force is a corner where |force| rubs, but the slopes that it is solved by jump. An interpolation
+        # has a corner at its entries, and no jump.
+        degrees, lost = _velocity_degrees(line, n) if orders else [], []
         others = [
             j for j in orders if self.kinds[j] != CONE and (self.kinds[j] != SIGN or degrees[self.switches[j]] > 1)
         ]
-        lost, shaking = [], {j: [m for m in self.switches if self.pieces[j] in _below(line, [m])] for j in orders}
+        shaking = {j: [m for m in self.switches if self.pieces[j] in _below(line, [m])] for j in orders}
         if others or any(shaking.values()):
             search = Jumping(line, self._decide(len(self.switches), ()), self.switches, n, self.program.size)
-            # An interpolation has a corner at its entries, and no jump.
             jumps = search.find(others, line.outputs[:n], self._levels) if others else {}
-            lost = [j for j, nodes in shaking.items() if nodes and search.find([j], nodes, self._levels)[j]]
             orders = {j: order for j, order in orders.items() if jumps.get(j, True) is not False}
-            lost = [j for j in lost if orders.pop(j, 0) == 1]
+            shaken = {j: shaking[j] for j in orders if shaking[j]}
+            lost = [j for j, nodes in shaken.items() if search.find([j], nodes, self._levels)[j]]
+            lost = [j for j in lost if orders.pop(j) == 1]
         widths = {SIGN: 2.0, CONE: 2.0}
         both = [
             Slide(j, order, widths.get(self.kinds[j], 1.0), self._level_between(j), self.parts.get(self.pieces[j], ()))
