@@ -291,11 +291,19 @@ class Derivation:
 
     @_lowered_once
     def _mechanics(self) -> StraightLine | None:
-        """The quantities that decide where L jumps (`_kick.Mechanics`), as one line; None if nothing is piecewise."""
-        if is_smooth(self.program("lagrangian", "momentum", "rates").line):
+        """The quantities that decide where L jumps (`_kick.Mechanics`), as one line; None if nothing is piecewise.
+
+        Constraints that numbers release, those of contacts, are left out: they push, and do not pull.
+        """
+        count, n = self.shape("rates")[0], self.layout.size
+        holds = range(count) if self.motion.constraints.held is None else np.flatnonzero(self.absent("release"))
+        of = {name: self._positions(name) for name in self._shapes}
+        rates, driving = ([of[name][k] for k in holds] for name in ("rates", "driving"))
+        if is_smooth(self._whole.select_outputs([*of["lagrangian"], *of["momentum"], *rates]).line):
             return None
-        names = "lagrangian", "momentum", "mass_matrix", "jacobian", "rates", "driving"
-        return self.program(*names).line
+        rows = [of["jacobian"][n * k + i] for k in holds for i in range(n)]
+        outputs = [*of["lagrangian"], *of["momentum"], *of["mass_matrix"], *rows, *rates, *driving]
+        return self._whole.select_outputs(outputs).line
 
     @_lowered_once
     def multipliers(self) -> Program | None:

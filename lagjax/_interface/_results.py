@@ -68,8 +68,9 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "maximum, where, whose corners are followed."
     )
     inconsistent_start = (
-        "The initial state does not satisfy the constraints, or that behind a transition those of its mode. Put it "
-        "there first: system.project(q0, qdot0, t, params), or give the transition a reset."
+        "The initial state does not satisfy the constraints, or a gap of contacts= is negative there, or that behind a "
+        "transition does not satisfy those of its mode. Put it there first: system.project(q0, qdot0, t, params), a "
+        "start with gaps >= 0, or give the transition a reset."
     )
     constraint_rank_lost = (
         "The constraints became dependent on each other, and no longer determine how the motion continues: a dead "
@@ -86,6 +87,18 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The mass matrix d2L/dqdot2 became singular. Some velocity, or combination of velocities, has no kinetic "
         "energy there: add it, drop the coordinate, or use coordinates that are regular there (polar coordinates are "
         "not at r = 0, spherical ones and Euler angles are not at a pole)."
+    )
+    contact_at_corner = (
+        "A contact is struck, or rests, at a corner or a jump of its gap (abs, minimum, maximum, where, an entry of a "
+        "table): the gap has more than one gradient there, and none says in which direction it pushes. Give each side "
+        "a gap of its own: contacts a and b for minimum(a, b), the side of a step beside its top. Round off an edge "
+        "that sticks out, as that of maximum(a, b)."
+    )
+    restitution_out_of_range = "restitution must be between 0 and 1 for every contact: more would add energy."
+    friction_out_of_range = "friction must be finite and not negative for every contact."
+    contact_backwards = (
+        "A scene with contacts goes forward in time: an impact cannot be undone. Let ts increase, also where "
+        "they are computed under jax.jit."
     )
 
 

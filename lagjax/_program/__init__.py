@@ -42,7 +42,19 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from lagjax._program import _scalars as scalar_algebra
-from lagjax._program._borders import CLOCK, FLOOR, SIGN, TABLE, TRUNC, Borders, borders, distances, is_smooth
+from lagjax._program._borders import (
+    CLOCK,
+    FLOOR,
+    SIGN,
+    TABLE,
+    TRUNC,
+    Borders,
+    borders,
+    distances,
+    find_corners,
+    is_smooth,
+    with_outputs,
+)
 from lagjax._program._differentiation import Derivatives, copy_nodes, pullback, pushforward, tangents_in, with_tangents
 from lagjax._program._emit import Rows, apply_in_jax, emit, emit_look_up, emit_rows
 from lagjax._program._graph import Graph, Tape, Unlowerable, find_ancestors

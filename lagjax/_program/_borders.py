@@ -224,6 +224,25 @@ def borders(program: Recurrent, size: int, slides: bool = True, watched: int = 0
         return rewriting.build() if rewriting.switches or rewriting.features else None
 
 
+class FoundCorners(NamedTuple):
+    """The borders, P of them, at which some outputs of a program of q, q̇, t and parameters jump: `jumps` (P, outputs).
+
+    `sides` takes the inputs of the program: numbers (P,) that change their sign at every such border. There an output
+    may `vanish` (P, outputs), on one side.
+    """
+
+    sides: StraightLine
+    jumps: np.ndarray
+    vanish: np.ndarray
+
+
+def find_corners(program: Recurrent, size: int) -> FoundCorners | None:
+    """The borders that depend on positions and time, of `size` coordinates; None where no output jumps."""
+    with np.errstate(all="ignore"):
+        rewriting = _Rewriting(program, size, False, len(program.line.outputs))
+        return rewriting.find_corners() if rewriting.switches else None
+
+
 def is_smooth(line: StraightLine) -> bool:
     return _PIECEWISE.isdisjoint(op for op, *_ in line.nodes)
 
@@ -662,6 +681,39 @@ class _Rewriting:
             tuple(arguments), tuple(features.values()), (*self.tables, *[None] * len(sliding)), None, kick,
             retraction, moved, release,
         )  # fmt: skip
+
+    def find_corners(self) -> FoundCorners | None:
+        nodes, kinds, n = tuple(self.graph.nodes), tuple(self.graph.kinds), self.size
+        line = StraightLine(nodes, kinds, tuple(self.places[i] for i in self.program.line.outputs))
+        inputs = [inputs_below(line, [switch]) for switch in self.switches]
+        pieces = [j for j, read in enumerate(inputs) if read.isdisjoint(range(n, 2 * n))]
+        search = Jumping(line, self._decide(len(self.switches), ()), self.switches, n, self.program.size)
+        found = [search.find(pieces, [i], self._levels) for i in line.outputs] if pieces else []
+        jumps = np.array([[bool(of[j]) for of in found] for j in pieces], bool).reshape(len(pieces), len(line.outputs))
+        pieces, jumps = [j for j, row in zip(pieces, jumps, strict=True) if row.any()], jumps[jumps.any(axis=1)]
+        if not pieces:
+            return None
+        vanish = np.array([search.find_zeros(pieces, i, self._levels) for i in line.outputs], bool).T
+        graph = Graph(_LARGEST * len(nodes) + 1000)
+        args = line, self.program.size, self.switches, self.kinds, self.tables
+        places = _copy_deciding(graph, *args, lambda j, piece: piece)
+        sides = [self._side(graph, j, places) for j in pieces]
+        return FoundCorners(eliminate_dead_code(graph, sides), jumps, vanish)
+
+    def _side(self, graph: Graph, j: int, places: Sequence[int]) -> int:
+        """Switching number j, or the distance from the nearest border of its piece, positive on every other one."""
+        f, number = graph.apply, lambda x: graph.constant(x, "float")
+        x, piece, located = places[self.switches[j]], places[self.pieces[j]], self.tables[j]
+        if self.kinds[j] == SIGN:
+            return x
+        level = self._level_between(j)
+        below, above = f("sub", x, level(graph, f("sub", piece, number(1.0)))), f("sub", level(graph, piece), x)
+        if located is not None:  # which has no border before its first entry, nor behind the last one
+            below = f("select", f("lt", piece, number(0.0)), below, number(FAR))
+            above = f("select", f("gt", piece, number(located.table.count - 1.5)), above, number(FAR))
+        half = f("mul", number(0.5), piece)
+        turn = f("sub", number(1.0), f("mul", number(4.0), f("sub", half, f("floor", half))))
+        return f("mul", turn, f("select", f("lt", below, above), above, below))
 
     # ---- where L jumps ----
 

@@ -254,9 +254,33 @@ class Jumping:
         and above, with `entries(located, index)` those of a table.
         """
         with np.errstate(all="ignore"):
-            return self._find(candidates, nodes, levels)
+            columns, near, blocks = self._locate_borders(candidates, levels)
+            values = np.array(self._differences(nodes).evaluate(list(columns)))
+        change, noise = np.abs(values[: len(nodes)]), values[len(nodes) :]
+        known = near & np.isfinite(change).all(axis=0) & np.isfinite(noise).all(axis=0)
+        jumps = known & (change > _NOISE * _EPS * noise).any(axis=0)
+        return {
+            j: bool(jumps[block].any()) if known[block].any() else None
+            for j, block in zip(candidates, blocks, strict=True)
+        }
 
-    def _find(self, candidates, nodes, levels) -> dict[int, bool | None]:
+    def find_zeros(self, candidates: Sequence[int], node: int, levels: Callable) -> list[bool]:
+        """For each of these pieces: whether the node is zero on one side of its border, wherever that is found."""
+        line = self._with_rounding(eliminate_dead_code(self.line, [node]), 1)
+        with np.errstate(all="ignore"):
+            columns, near, blocks = self._locate_borders(candidates, levels)
+            m, size = self.m, self.size
+            behind = np.concatenate([columns[:size], columns[size + m : size + 2 * m], columns[size + 2 * m :]])
+            zero = []
+            for inputs in (columns, behind):
+                value, error = line.evaluate(list(inputs))
+                zero.append(
+                    ~near | (np.abs(value) <= _HIT * _EPS * (error + np.abs(inputs[: self.moving]).max(axis=0)))
+                )
+        return [bool(near[block].any() and any(side[block].all() for side in zero)) for block in blocks]
+
+    def _locate_borders(self, candidates, levels) -> tuple[np.ndarray, np.ndarray, list[slice]]:
+        """States on the borders of pieces, with the pieces of both sides; which are there, and which are of each."""
         m, size = self.m, self.size
         columns, given = self._states(_STATES * len(candidates)), np.repeat(candidates, _STATES)
         lines, target = [self._distance(j) for j in candidates], np.full((3, len(given)), np.nan)
@@ -277,14 +301,7 @@ class Jumping:
             near[block] = np.abs(u - target[0, block]) <= _HIT * _EPS * (error + np.abs(target[0, block]))
         for side in range(2):
             columns[size + side * m : size + (side + 1) * m] = self._decide(columns, given, target[1 + side])
-        values = np.array(self._differences(nodes).evaluate(list(columns)))
-        change, noise = np.abs(values[: len(nodes)]), values[len(nodes) :]
-        known = near & np.isfinite(change).all(axis=0) & np.isfinite(noise).all(axis=0)
-        jumps = known & (change > _NOISE * _EPS * noise).any(axis=0)
-        return {
-            j: bool(jumps[block].any()) if known[block].any() else None
-            for j, block in zip(candidates, blocks, strict=True)
-        }
+        return columns, near, blocks
 
     def _entries(self, columns: np.ndarray) -> Callable:
         def entries(located, index: np.ndarray) -> np.ndarray:

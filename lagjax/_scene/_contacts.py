@@ -29,11 +29,13 @@ class Contacts(NamedTuple):
     - `closed` (k,): 1 where the contact is closed, else 0; `sticks` (r,): 1 where it does not slide.
     - `direction` (r, d): the direction of a slip that begins; in a plane its sign. In space its length is a velocity
       far below those of the motion, which is added to the slip: its direction is then defined at rest, too.
+    - `near` (): how near a corner of a gap counts as there (`_run.contacts._corners`).
     """
 
     closed: Any
     sticks: Any
     direction: Any
+    near: Any
 
 
 class InContact(NamedTuple):

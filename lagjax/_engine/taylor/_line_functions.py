@@ -88,7 +88,7 @@ class Line:
     @functools.cached_property
     def code(self) -> LineCode | None:
         try:
-            return None if NO_HANDLER is not None else LineCode(self.line, self.size)
+            return None if NO_HANDLER is not None or self.line.looks_up else LineCode(self.line, self.size)
         except Unlowerable:
             return None
 

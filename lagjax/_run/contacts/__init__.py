@@ -1,7 +1,8 @@
 """Motions with contacts: gaps and velocities that stay ≥ 0, impacts, rest and friction.
 
     System(contacts=…) ─► ContactPlan ─► _contact_rounds: round after round ─► Carry, RoundRecord ─► Trajectory
-                                          └─ _impact_law: what impulses do to velocities at an instant
+                                          ├─ _impact_law: what impulses do to velocities at an instant
+                                          └─ _corners: where gaps change their direction
 
 Source: Moreau, *Unilateral contact and dry friction* (1988); Brogliato, *Nonsmooth Mechanics* (2016).
 """
@@ -124,7 +125,7 @@ def _plan(problem: Problem, max_transitions: int, sections: int = 0) -> tuple[Co
                 "With friction impacts='poisson' is for one contact in a plane: leave out slip, or take Newton's law, "
                 "impacts='simultaneous'."
             )
-        contacts = Contacts(np.ones(shapes.count), np.ones(r), np.ones((r, d)))
+        contacts = Contacts(np.ones(shapes.count), np.ones(r), np.ones((r, d)), np.ones(()))
         closed = Problem.from_system(plan.scene, wide.layout, InContact(wide.params, contacts))
         if refusal := MachineCode().refuses(closed):
             raise ValueError(f"A scene with contacts needs machine code, and has none: {refusal}.")

@@ -26,12 +26,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine import Problem
-from lagjax._engine.taylor import Guarded, Surfaces, flow_of, line_of, require_one_number, vector_of
+from lagjax._engine.taylor import MOST_GUARDS, Guarded, Surfaces, flow_of, line_of, require_one_number, vector_of
 from lagjax._interface import RESULTS, SUCCESSFUL, Function, Layout, code_of, compile_for_one_call, halves
 from lagjax._native import GUARD_NOISE, SINGLE_NOISE, Released
 from lagjax._primitives import cond_alike, differentiable_where, keep_together, lost_unless
 from lagjax._run._rounds import Stretch, any_member, run_rounds
 from lagjax._run._trajectory import vary_with
+from lagjax._run.contacts._corners import Corners, append_sides, corners_of
 from lagjax._run.contacts._impact_law import (
     Friction,
     ImpactRows,
@@ -50,10 +51,11 @@ from lagjax._scene import Contacts, ContactScene, Flat, InContact
 
 PyTree = Any
 
-TOO_MANY, UNDECIDED, MISSED, NOT_FINITE, INCONSISTENT = map(
+TOO_MANY, UNDECIDED, MISSED, AT_CORNER, NOT_FINITE, INCONSISTENT, BACKWARDS, NO_RESTITUTION, NO_FRICTION = map(
     code_of,
-    (RESULTS.max_transitions_reached, RESULTS.contact_undecided, RESULTS.contact_missed, RESULTS.nonfinite_state,
-     RESULTS.inconsistent_start),
+    (RESULTS.max_transitions_reached, RESULTS.contact_undecided, RESULTS.contact_missed, RESULTS.contact_at_corner,
+     RESULTS.nonfinite_state, RESULTS.inconsistent_start, RESULTS.contact_backwards, RESULTS.restitution_out_of_range,
+     RESULTS.friction_out_of_range),
 )  # fmt: skip
 CLOSES, OPENS, BOUNCES, STICKS, SLIDES = range(5)  # the kinds of `ContactChanges`
 # The time that bounces still take, in parts of a step of the motion between them, below which they end in closed form,
@@ -190,6 +192,7 @@ class ContactRounds(NamedTuple):
     surfaces: Surfaces
     of_open: Surfaces  # the same where no contact is closed
     places: "RowPlaces"
+    corners: Corners | None
     response: Any  # the line of `ImpactRows`
     multipliers: Any
     params: PyTree
@@ -207,15 +210,22 @@ class ContactRounds(NamedTuple):
         problem = dataclasses.replace(problem, is_rounded=plan.is_single)
         derivation = problem.derivation.lowered
         code, structure = jax.tree.flatten(eqx.filter(inside, eqx.is_array_like, inverse=True))
-        watched = plan.sections, plan.directions, tuple(code), structure, plan.is_single
+        places = RowPlaces.from_derivation(derivation, flat)
+        corners = corners_of(derivation, places.all, flat.shapes)
+        turns = 0 if corners is None else len(corners.touch)
+        if (watches := flat.shapes.count + flat.rough.size + 2 * turns + len(plan.sections)) > MOST_GUARDS:
+            raise ValueError(
+                f"The contacts, with {turns} corners of their gaps, make {watches} watches, and {MOST_GUARDS} are "
+                "possible: one a contact, one more with friction, two a corner. A table (jnp.interp) is one corner."
+            )
+        watched = turns, plan.sections, plan.directions, tuple(code), structure, plan.is_single
         surfaces = _watches(derivation, plan.scene, *watched)
         _, of_open = _open_watches(derivation, plan.scene, *watched)
-        places = RowPlaces.from_derivation(derivation, flat)
         states = sum(x.size for x in opened(flat))
         lines = line_of(derivation.impact_response(places.all, states)), line_of(derivation.multipliers)
         numbers = vector_of(eqx.filter(params, eqx.is_array_like))
         widths = tuple(SINGLE_NOISE * jnp.abs(jax.lax.stop_gradient(x)) for x in (jnp.append(y0, ts[0]), numbers))
-        return cls(plan, problem, flat, surfaces, of_open, places, *lines, params, numbers, widths, ts, y0)
+        return cls(plan, problem, flat, surfaces, of_open, places, corners, *lines, params, numbers, widths, ts, y0)
 
     @property
     def count(self) -> int:
@@ -224,6 +234,11 @@ class ContactRounds(NamedTuple):
     @property
     def rubs(self) -> bool:
         return self.flat.rough.size > 0
+
+    @property
+    def deciding(self) -> int:
+        """The watches that decide: the normal ones, those of friction, two a corner. Behind them are the sections."""
+        return self.count + self.flat.rough.size + 2 * (0 if self.corners is None else len(self.corners.touch))
 
     @property
     def impacts(self) -> str:
@@ -246,10 +261,15 @@ class ContactRounds(NamedTuple):
     def begin(self, y0) -> Carry:
         """The start, with all contacts open: those that touch and do not move apart fall at once."""
         contacts, sections = opened(self.flat), len(self.plan.sections)
-        guards = self.count + self.flat.rough.size + sections
+        guards = self.deciding + sections
         guarded = self.watch(self.ts[0], y0)
         inside = (guarded.values < -guarded.rounding)[: self.count] & self.has_gap
-        result = jnp.where(inside.any(), INCONSISTENT, SUCCESSFUL)
+        e, mu = self.flat.restitution(eqx.filter(self.params, eqx.is_array_like)), self.friction.coefficients
+        wrong = {
+            BACKWARDS: self.ts[-1] < self.ts[0], NO_RESTITUTION: ~((e >= 0) & (e <= 1)).all(),
+            NO_FRICTION: ~((mu >= 0) & jnp.isfinite(mu)).all(), INCONSISTENT: inside.any(),
+        }  # fmt: skip
+        result = jnp.select(list(wrong.values()), list(wrong), SUCCESSFUL)
         if self.rubs:  # one that slides and touches may stay or leave
             touches, rates, noise, _ = self.touching(self.ts[0], y0)
             rows = jax.lax.stop_gradient(self.rows_at(self.ts[0], y0))
@@ -257,32 +277,48 @@ class ContactRounds(NamedTuple):
             along = Pattern((touches & (jnp.abs(rates) <= noise)).astype(float), still.astype(float), _unit(slips))
             undecided = (sliding_margin(rows, along, self.friction.still) <= PARADOX).any()
             result = jnp.where(undecided & (result == SUCCESSFUL), UNDECIDED, result)
+        t, path = self.ts[0], jnp.full((self.ts.size, y0.size), jnp.nan)
+        of_path = jax.tree.map(lambda x: jnp.full((self.ts.size, *x.shape), -1.0), contacts)
+        if self.corners is not None:  # a contact that starts on its corner goes where the motion does
+            at = self.locate_corners(t, y0, contacts, 0.0)
+            passed = (jnp.abs(at.values) <= at.far) & (self.corners.touch & self.touching(t, y0)[0]).any(axis=1)
+            acceleration = self.acceleration_at(t, y0, self.numbers_in(contacts))
+            t, y0, rests = at.go_beyond(passed, t, y0, acceleration, self.ts)
+            result = jnp.where(rests & (result == SUCCESSFUL), AT_CORNER, result)
+            late = (self.ts <= t) & (t > self.ts[0])
+            path = jnp.where(late[:, None], y0, path)
+            of_path = jax.tree.map(lambda old, new: jnp.where(late[:, *[None] * new.ndim], new, old), of_path, contacts)
         return Carry(
-            t=self.ts[0], y=y0, contacts=contacts, fresh=jnp.ones(guards, bool), going=result == SUCCESSFUL,
+            t=t, y=y0, contacts=contacts, fresh=jnp.ones(guards, bool), going=result == SUCCESSFUL,
             result=result, steps=(jnp.zeros((), int), jnp.zeros((), int)), rounds=jnp.zeros((), int),
             longest=jnp.zeros(()),
             turns=jnp.zeros((), int), tied=jnp.zeros(self.flat.rough.size, bool),
             rounding=jnp.zeros((2, guards)), rate_rounding=jnp.zeros((2, guards)),
             came=jnp.sign(guarded.rates)[guards - sections :],
             slip=jnp.zeros(self.flat.rough.size), largest=jnp.abs(jax.lax.stop_gradient(y0)),
-            doubts=jnp.zeros(3, int), doubted=jnp.full(3, jnp.nan), path=jnp.full((self.ts.size, y0.size), jnp.nan),
-            of_path=jax.tree.map(lambda x: jnp.full((self.ts.size, *x.shape), -1.0), contacts),
+            doubts=jnp.zeros(3, int), doubted=jnp.full(3, jnp.nan), path=path, of_path=of_path,
         )  # fmt: skip
 
     def run_round(self, before: Carry, _) -> tuple[Carry, RoundRecord]:
         """One round: to the next watch that falls, through what happens there; of a motion that is going."""
         here, contacts = before.going, before.contacts
-        watches, sections = self.count + self.flat.rough.size, len(self.plan.sections)
+        if self.corners is not None:
+            at = self.locate_corners(before.t, before.y, contacts, before.largest)
+            contacts = contacts._replace(near=at.near)
+            before = before._replace(contacts=contacts)
+        watches, sections = self.deciding, len(self.plan.sections)
         guarded = self.watch(before.t, before.y, contacts)
         missed = (self.missed(before, guarded, contacts) & ~before.fresh[: self.count]).any()
-        kinds = jnp.concatenate([contacts.closed, contacts.sticks, jnp.zeros(sections)])
+        others = sections + watches - self.count - self.flat.rough.size
+        kinds = jnp.concatenate([contacts.closed, contacts.sticks, jnp.zeros(others)])
         before = _note_rounding(before, guarded, kinds, 0.0)
         rounding, rates = (_choose_kind(x, kinds) for x in (before.rounding, before.rate_rounding))
         if self.rubs:
             rounding, rates = self.hold_ties(before, guarded, rounding, rates)
         rounding = jnp.maximum(rounding, guarded.of_time)
-        beyond = (guarded.values < -rounding) & (np.arange(kinds.size) < watches)
+        beyond = (guarded.values < -rounding) & (np.arange(kinds.size) < kinds.size - others)
         sides = jnp.where(beyond, jnp.inf, jnp.maximum(rounding, _LEAST))
+        sides = sides.at[kinds.size - others : watches].set(0.0)  # where a corner is met first tells the motion
         clear = (jnp.abs(guarded.values) > rounding)[watches:]
         came = jnp.where(clear, jnp.sign(guarded.values[watches:]), before.came)
         sides = sides.at[watches:].multiply(came)
@@ -297,7 +333,11 @@ class ContactRounds(NamedTuple):
         duration = located.t_end - jax.lax.stop_gradient(before.t)
         turns = jnp.where(at_once, before.turns + 1, 0)
         step = jnp.where(at_once, 0.0, duration / jnp.maximum(located.accepted, 1))
-        stops = (np.arange(self.count, watches) == k) & (contacts.sticks == 0) & (self.flat.shapes.directions == 1)
+        stops = (
+            (np.arange(self.count, kinds.size - others) == k)
+            & (contacts.sticks == 0)
+            & (self.flat.shapes.directions == 1)
+        )
         tied = at_once & (before.tied | (stops & (turns > kinds.size)))
         before = _note_rounding(before, guarded, kinds, duration)._replace(
             fresh=before.fresh & at_once, longest=jnp.maximum(before.longest, step)
@@ -308,13 +348,16 @@ class ContactRounds(NamedTuple):
 
         result = jnp.where(happens, decided.result, located.result)
         result = jnp.where(happens & (turns > 16 + 8 * kinds.size), UNDECIDED, jnp.where(missed, MISSED, result))
+        if self.corners is not None:  # time itself may go beyond its corner
+            late = happens & (self.ts <= decided.t) & ~covered & (before.of_path.closed[:, 0] < 0)
+            path, covered = jnp.where(late[:, None], decided.y, path), covered | late
         sound = jnp.isfinite(jnp.where(happens, decided.y, y)).all()
         result = jnp.where(~sound & (result == SUCCESSFUL), NOT_FINITE, result)
         going = happens & (result == SUCCESSFUL)
         spent = going & (before.rounds + 1 >= self.plan.max_transitions)
         cover = lambda old, new: jnp.where(covered[:, *[None] * new.ndim], new, old)  # noqa: E731
         after = decided._replace(
-            t=t, y=jnp.where(happens, decided.y, y), going=going & ~spent,
+            t=jnp.where(happens, decided.t, t), y=jnp.where(happens, decided.y, y), going=going & ~spent,
             contacts=jax.tree.map(lambda new, old: jnp.where(happens, new, old), decided.contacts, contacts),
             result=jnp.where(spent, TOO_MANY, result), turns=turns, tied=tied,
             steps=(before.steps[0] + located.accepted, before.steps[1] + located.rejected),
@@ -336,7 +379,7 @@ class ContactRounds(NamedTuple):
 
         It sticks until its value falls: a rate is no reason.
         """
-        around = self.count, len(self.plan.sections)
+        around = self.count, guarded.values.size - self.count - self.flat.rough.size
         tied = jnp.pad(before.tied & (before.contacts.sticks > 0), around)
         most = self.friction.still.coefficients * guarded.values[: self.count][self.flat.rough]
         return (
@@ -358,13 +401,15 @@ class ContactRounds(NamedTuple):
         return decided, record
 
     def first_of(self, fell, at_once, contacts: Contacts):
-        """The watch that is taken of those that `fell` (G,): of friction first, of which a guess that jams is one."""
-        count, rough = self.count, self.flat.rough
-        if not self.rubs:
-            return jnp.argmax(fell)
-        jams = at_once & fell[:count][rough] & (contacts.closed[rough] * contacts.sticks > 0)
-        of_friction = fell[count:] | jams
-        return jnp.where(of_friction.any(), count + jnp.argmax(of_friction), jnp.argmax(fell[:count]))
+        """The watch that is taken of those that `fell` (G,): of corners, then of friction, as one that jams is."""
+        count, rough, last = self.count, self.flat.rough, self.count + self.flat.rough.size
+        if self.rubs:
+            jams = at_once & fell[:count][rough] & (contacts.closed[rough] * contacts.sticks > 0)
+            of_friction = fell[count:last] | jams
+            k = jnp.where(of_friction.any(), count + jnp.argmax(of_friction), jnp.argmax(fell[:count]))
+        else:
+            k = jnp.argmax(fell[:count])
+        return jnp.where(fell[last:].any(), last + jnp.argmax(fell[last:]), k) if fell.size > last else k
 
     # ---- what is known at a state ----
 
@@ -421,12 +466,13 @@ class ContactRounds(NamedTuple):
         still, numbers, count = jax.lax.stop_gradient, eqx.filter(self.params, eqx.is_array_like), self.count
         first, contacts = np.arange(count + self.flat.rough.size) == k, before.contacts
         was_closed, meets = contacts.closed > 0, first[:count] & ~(contacts.closed > 0)
+        opens_at, struck, may_jump, t_next, y_beyond = self.pass_corners(before, t, y, k, meets)
         rows, (_, v), friction = self.rows_at(t, y), halves(y), self.friction
         restitution, quiet = self.flat.restitution(numbers), still(rows)
         meeting = self.meet(before, quiet, t, y, meets, still(restitution), friction.still)
         hits = meeting.happened
         slips = self.slips(quiet, still(v), before.slip)
-        closed = (was_closed & ~first[:count]) | meets
+        closed = (was_closed & ~first[:count] & ~opens_at) | meets
         sticks = self.sticks(before, slips, first[count:], (closed != was_closed)[self.flat.rough])
         # Where parts align, a slip that gaps hold passes through zero, and turns.
         turns = held_slips(quiet, closed, first[count:] & sticks, friction)
@@ -454,22 +500,31 @@ class ContactRounds(NamedTuple):
             turned = renewed | first[count:] | (sticks != (contacts.sticks > 0))
             along = Pattern(closed.astype(float), sticks.astype(float), _unit(direction))
             undecided |= (sliding_margin(quiet, along, friction.still) <= PARADOX).any()
-        before, y_next = self.move(before, rows, y, change, meets, first[:count] & was_closed)
+        before, y_next = self.move(before, rows, y_beyond, change, meets, first[:count] & was_closed)
         y_next = self.limit_variations(y_next, rows, meeting, starts)
         # Of the work of impulses only what moves q is kinetic energy: gaps may move by themselves.
         lost = -impulses @ (rows.gradients @ (v + 0.5 * change))
         work = still(impulses) * (quiet.rates + apart)
         doubts = jnp.stack([work.sum() > GAINED * jnp.abs(work).sum(), meeting.tied.any()]) & hits
         doubts = jnp.append(doubts, starts.any() | leaves_rest)
+        others = before.fresh.size - changed.size - turned.size
         decided = before._replace(
-            doubts=before.doubts + doubts, doubted=jnp.where(doubts & (before.doubts == 0), still(t), before.doubted),
+            t=t_next, doubts=before.doubts + doubts,
+            doubted=jnp.where(doubts & (before.doubts == 0), still(t), before.doubted),
             y=differentiable_where(~leaves_rest, y_next, t, y, self.vector), slip=slip,
-            contacts=Contacts(closed.astype(float), sticks.astype(float), direction),
-            fresh=before.fresh | jnp.concatenate([changed, turned, jnp.zeros(before.came.size, bool)]),
-            result=jnp.where(meeting.missed, MISSED, jnp.where(undecided, UNDECIDED, before.result)),
+            contacts=Contacts(closed.astype(float), sticks.astype(float), direction, contacts.near),
+            fresh=before.fresh | jnp.concatenate([changed, turned, jnp.broadcast_to(opens_at.any(), others)]),
+            result=jnp.select(
+                [struck | (meeting.missed & may_jump), meeting.missed, undecided], [AT_CORNER, MISSED, UNDECIDED],
+                before.result,
+            ),
         )  # fmt: skip
         rest = t + jnp.sum(jnp.where(ends, left, 0.0))
         contact, change = self.name_change(k, closed, sticks, hits)
+        if self.corners is not None:
+            leaves = k >= count + self.flat.rough.size
+            contact = jnp.where(leaves, jnp.where(opens_at.any(), jnp.argmax(opens_at), -1), contact)
+            change = jnp.where(leaves, jnp.where(opens_at.any(), OPENS, -1), change)
         return decided, RoundRecord(
             jnp.asarray(True), t, v, decided.y, contact, change, hits, rest, impulses[:count], lost
         )  # fmt: skip
@@ -505,6 +560,27 @@ class ContactRounds(NamedTuple):
         limits = jnp.append(limits, jnp.where(begun, TOGETHER * jnp.abs(gradients).sum(axis=1), jnp.inf))
         start = halves(self.y0)[1]
         return keep_together(y_next, jnp.append(rows.values[:count], gradients @ start), limits)
+
+    def pass_corners(self, before: Carry, t, y, k, meets) -> tuple:
+        """At (t, y), where watch k fell: the contacts (k,) that come to a corner and open there; time and state beyond.
+
+        And whether a contact is struck at its corner, or stays there; and whether one meets behind its corner.
+        """
+        if self.corners is None:
+            return np.zeros(self.count, bool), np.array(False), np.array(False), t, y
+        touch, contacts, first = self.corners.touch, before.contacts, self.count + self.flat.rough.size
+        at, closed = self.locate_corners(t, y, contacts, before.largest), contacts.closed > 0
+        away, new = jnp.abs(at.values), ~before.fresh[first : first + len(touch)]
+        meets = (touch & meets & (away <= 4.0 * at.far)[:, None]).any(axis=1)
+        passed = (away <= 2.0 * contacts.near) & new & (touch & closed).any(axis=1)
+        acceleration = self.acceleration_at(t, y, self.numbers_in(contacts))
+        t, y, rests = at.go_beyond(passed, t, y, acceleration, self.ts)
+        opens = (touch & passed[:, None]).any(axis=0) & closed
+        return opens, (meets & new).any() | rests, meets.any(), t, y
+
+    def locate_corners(self, t, y, contacts: Contacts, largest):
+        assert self.corners is not None
+        return self.corners.evaluate(t, y, self.numbers_in(contacts), largest, self.ts[-1])
 
     def name_change(self, k, closed, sticks, hits) -> tuple:
         """The contact of watch k, and the kind of its change."""
@@ -674,7 +750,7 @@ def _note_forces(carry: Carry, impulses) -> Carry:
 
 def opened(flat: Flat) -> Contacts:
     r, d = flat.rough.size, flat.shapes.directions
-    return Contacts(jnp.zeros(flat.shapes.count), jnp.ones(r), jnp.ones((r, d)))
+    return Contacts(jnp.zeros(flat.shapes.count), jnp.ones(r), jnp.ones((r, d)), jnp.zeros(()))
 
 
 def _choose_kind(values, kinds):
@@ -695,8 +771,10 @@ def _unit(vectors):
 
 
 @functools.lru_cache(maxsize=64)
-def _watches(derivation, scene: ContactScene, sections: tuple, ways: tuple, code: tuple, structure, single) -> Surfaces:
-    """The watches of all contacts as programs: the k normal ones, those of friction, r, and then the sections.
+def _watches(
+    derivation, scene: ContactScene, turns: int, sections: tuple, ways: tuple, code: tuple, structure, single
+) -> Surfaces:
+    """The watches of all contacts as programs: the k normal ones, those of friction, r, of corners, and the sections.
 
     `code` and `structure` are what the parameters hold that is not a number.
     """
@@ -705,16 +783,21 @@ def _watches(derivation, scene: ContactScene, sections: tuple, ways: tuple, code
     flat = Flat.from_system(scene.system, derivation.layout, inside.params)
     shapes, rough = flat.shapes, flat.rough
     places = None if scene.is_open else RowPlaces.from_derivation(derivation, flat)
+    corners = corners_of(derivation, places.all, shapes) if turns and places is not None else None
 
     def values_at(y, inside: InContact, *forces):
-        user, (closed, sticks, direction) = eqx.filter(inside.params, eqx.is_array_like), inside.contacts
+        user, (closed, sticks, direction, near) = eqx.filter(inside.params, eqx.is_array_like), inside.contacts
         state = (*halves(y[:-1]), y[-1])
         open_values = jnp.concatenate([flat.gaps(state[0], state[2], user), flat.one_way(*state, user)])
         user_state = (*map(derivation.layout.restore, state[:2]),)
         more = [require_one_number(of(*user_state, t=y[-1], params=inside.params), "A section") for of in sections]
         if places is None:
-            return jnp.concatenate([open_values, jnp.ones(rough.size), jnp.array(more)])
+            return jnp.concatenate([open_values, jnp.ones(rough.size + 2 * turns), jnp.array(more)])
         normal = forces[0][places.normal]
+        if corners is not None:
+            matters = [1.0 - jnp.prod(1.0 - closed[np.flatnonzero(row)]) for row in corners.touch]
+            sides = forces[0][-turns:] * jnp.stack(matters)  # 0 where all that is closed is elsewhere
+            more = [*(sides - near), *(sides + near), *more]
         watches = jnp.concatenate([normal + (1.0 - closed) * open_values, jnp.array(more)])
         if not rough.size:
             return watches
@@ -728,8 +811,9 @@ def _watches(derivation, scene: ContactScene, sections: tuple, ways: tuple, code
         of_friction = closed[rough] * of_friction + (1.0 - closed[rough])
         return jnp.concatenate([watches[: shapes.count], of_friction, watches[shapes.count :]])
 
-    directions = (-1,) * (shapes.count + rough.size) + ways
+    directions = (-1,) * (shapes.count + rough.size + turns) + (1,) * turns + ways
     forces = None if scene.is_open else derivation.multipliers
+    forces = forces if corners is None or forces is None else append_sides(forces, corners)
     surfaces = Surfaces.from_function(derivation, values_at, directions, code, structure, given=forces)
     surfaces = surfaces._replace(is_rounded=single)
     if scene.is_open:
@@ -737,17 +821,17 @@ def _watches(derivation, scene: ContactScene, sections: tuple, ways: tuple, code
 
     @functools.cache
     def make_flow():
-        problem, of_open = _open_watches(derivation, scene, sections, ways, code, structure, single)
+        problem, of_open = _open_watches(derivation, scene, turns, sections, ways, code, structure, single)
         return flow_of(dataclasses.replace(problem, guards=of_open.guards(remembers=True)))
 
     start = sum(x.size for x in jax.tree.leaves(zeros.params))
     return surfaces._replace(released=Released(tuple(range(start, start + shapes.count)), make_flow))
 
 
-def _open_watches(derivation, scene: ContactScene, sections, ways, code, structure, single) -> tuple[Problem, Surfaces]:
+def _open_watches(derivation, scene: ContactScene, *given) -> tuple[Problem, Surfaces]:
     """The problem of a scene in which no contact is closed, and its watches."""
+    *_, code, structure, _ = given
     zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), derivation.numbers)
     inside = eqx.combine(zeros, structure.unflatten(code))
     problem = Problem.from_system(dataclasses.replace(scene, is_open=True), derivation.layout, inside)
-    given = problem.system, sections, ways, code, structure, single
-    return problem, _watches(problem.derivation.lowered, *given)
+    return problem, _watches(problem.derivation.lowered, problem.system, *given)

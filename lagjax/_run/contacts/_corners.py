@@ -1,0 +1,104 @@
+"""The corners of contacts: borders at which a gap, its rate or a slip jumps (`abs`, `maximum`, `where`, tables).
+
+While a contact is open its corners are borders as those of L are, and nothing happens there. One that is closed opens
+where it comes to a corner, with the motion on the far side, by a few roundings; the watches of that side then tell
+whether it strikes, stays or leaves. On the corner itself there is no one direction in which it pushes: what is struck
+there, or rests there, ends.
+"""
+
+import dataclasses
+import functools
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._engine.taylor import line_of
+from lagjax._interface import halves
+from lagjax._native import SMALLEST_STEP
+from lagjax._program import Program, Unlowerable, find_corners, is_smooth, with_outputs
+from lagjax._scene import Shapes
+
+# How far beyond a corner a motion goes on, in parts of the terms that say where it is; and how many of the smallest
+# steps before it an event stops it: steps that end at a border may be refused, and halve what is left.
+BEYOND, BEFORE = 16.0 * float(np.finfo(float).eps), 64.0 * SMALLEST_STEP
+# The time that it takes to go beyond, in parts of the motion, from which on a contact rests on its corner.
+AT_REST = 1e-10
+
+
+class Corners(NamedTuple):
+    """The corners, P of them, of k contacts: which `touch` which (P, k), and a program of the side of each, (P,)."""
+
+    touch: np.ndarray
+    sides: Program
+
+    def evaluate(self, t, y, numbers, largest, latest) -> "AtCorners":
+        """The corners at a state, in a motion whose largest coordinates and velocities so far are these (2n,)."""
+        n, line = y.size // 2, line_of(self.sides)
+        t, y, numbers, largest = jax.lax.stop_gradient((t, y, numbers, jnp.maximum(largest, jnp.abs(y))))
+
+        def sides_at(state):
+            return line(jnp.concatenate([state[:n], y[n:], state[n:], numbers]))
+
+        state = jnp.append(y[:n], t)
+        values, slopes = sides_at(state), jax.jacfwd(sides_at)(state)
+        far = BEYOND * (jnp.abs(slopes) @ jnp.append(largest[:n], jnp.abs(t)) + jnp.abs(values))
+        soon = BEFORE * jnp.maximum(jnp.abs(t), jnp.abs(latest)) * (jnp.abs(slopes) @ jnp.append(largest[n:], 1.0))
+        return AtCorners(values, slopes @ jnp.append(y[n:], 1.0), far, jnp.max(far + soon))
+
+
+class AtCorners(NamedTuple):
+    """The sides of corners at a state (P,), their rates, how `far` beyond it goes on, and how `near` they count."""
+
+    values: jax.Array
+    rates: jax.Array
+    far: jax.Array
+    near: jax.Array
+
+    def go_beyond(self, passed, t, y, acceleration, ts) -> tuple:
+        """The time and the state beyond the corners that are `passed` (P,); and whether the motion rests on one."""
+        moves = self.rates != 0
+        left = (self.far - self.values * jnp.sign(self.rates)) / jnp.where(moves, jnp.abs(self.rates), 1.0)
+        rests = passed & (~moves | (left > AT_REST * (ts[-1] - ts[0])))
+        later = jnp.max(jnp.where(passed & ~rests, left, 0.0), initial=0.0)
+        v, a = halves(jax.lax.stop_gradient(y))[1], jax.lax.stop_gradient(acceleration)
+        return t + later, y + jnp.concatenate([later * (v + 0.5 * later * a), later * a]), rests.any()
+
+
+def corners_of(derivation, rows: tuple[int, ...], shapes: Shapes) -> Corners | None:
+    """The corners of contacts, which have these `rows` of all constraints, slips last; None without any.
+
+    Raises `ValueError` for a gap that is zero where it has its corner.
+    """
+    return _corners_of(derivation, rows, tuple(shapes.rough.tolist()), shapes.of_gaps, shapes.names)
+
+
+@functools.lru_cache(maxsize=64)
+def _corners_of(derivation, places: tuple[int, ...], rough: tuple[int, ...], gaps: int, names: tuple) -> Corners | None:
+    rows, count = np.array(places, int), len(names)
+    program, m = derivation.program("residual", "rates"), derivation.shape("residual")[0]
+    program = program.select_outputs([*rows, *(m + rows)])
+    try:
+        found = None if is_smooth(program.line) else find_corners(program, derivation.layout.size)
+    except Unlowerable:
+        return None
+    if found is None:
+        return None
+    jumps = found.jumps[:, : len(rows)] | found.jumps[:, len(rows) :]
+    for name, vanishes in zip(names[:gaps], (found.vanish[:, : len(rows)] & jumps).T, strict=False):
+        if vanishes.any():
+            raise ValueError(
+                f"The gap {name} is zero where two of its pieces meet, as abs(x) is at x = 0, and x % 1 at x = 1: it "
+                "does not tell from which side it is to be kept, nor in which direction it pushes. Give each side a "
+                "gap of its own, as x for x >= 0 and 1 - x for x <= 1."
+            )
+    touch = jumps[:, :count].copy()
+    for k, of_slip in zip(rough, np.split(jumps[:, count:], max(len(rough), 1), axis=1), strict=False):
+        touch[:, k] |= of_slip.any(axis=1)
+    return Corners(touch, dataclasses.replace(program.select_outputs([]), line=found.sides))
+
+
+def append_sides(program: Program, corners: Corners) -> Program:
+    """The program with the sides of corners behind its outputs."""
+    return dataclasses.replace(program, line=with_outputs(program, corners.sides.line).line)

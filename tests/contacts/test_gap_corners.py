@@ -1,0 +1,188 @@
+"""Gaps with corners: open ones against the same scene with a gap for each side, closed ones against closed forms."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+import lagjax
+
+G = 9.81
+WALLS = {
+    "abs": lambda q: {"walls": 1 - jnp.abs(q)},
+    "minimum": lambda q: {"walls": jnp.minimum(1 - q, 1 + q)},
+    "where": lambda q: {"walls": jnp.where(q > 0, 1 - q, 1 + q)},
+    "interp": lambda q: {"walls": jnp.interp(q, jnp.array([-2.0, 0.0, 2.0]), jnp.array([-1.0, 1.0, -1.0]))},
+}
+
+
+def end_of(contacts, restitution, q, v, duration=5.0):
+    system = lagjax.System(lambda q, v: 0.5 * v**2 - 0.1 * q, contacts=contacts, restitution=restitution)
+    run = lagjax.simulate(system, q, v, jnp.stack([0.0 * jnp.asarray(duration), jnp.asarray(duration)]))
+    return jnp.stack([run.q[-1], run.qdot[-1]]), run.impacts.count
+
+
+def two_walls(q):
+    return {"left": 1 + q, "right": 1 - q}
+
+
+@pytest.mark.parametrize("name", ["abs", *(pytest.param(name, marks=pytest.mark.slow) for name in list(WALLS)[1:])])
+def test_a_ball_between_walls_bounces_at_both(name):
+    """From x = 0 too, where the two pieces of the gap meet; with derivatives in both modes, and in batches."""
+    one, two = (jax.jit(lambda x, of=of: end_of(of, 0.9, *x)) for of in (WALLS[name], two_walls))
+    for x in ([0.0, 1.0], [0.2, -1.0]):
+        (state, count), (expected, number) = one(jnp.array(x)), two(jnp.array(x))
+        assert count == number >= 2
+        np.testing.assert_allclose(state, expected, rtol=0, atol=1e-13)
+    ahead, back, wanted = jax.jacfwd(lambda x: one(x)[0]), jax.jacrev(lambda x: one(x)[0]), jax.jacfwd(two)
+    x = jnp.array([0.0, 1.0])
+    for slopes in (ahead, back):
+        np.testing.assert_allclose(jax.jit(slopes)(x), jax.jit(wanted)(x)[0], rtol=0, atol=1e-12)
+    states = jnp.array([[0.0, 1.0], [0.0, -2.0], [-0.5, 0.3]])
+    np.testing.assert_allclose(jax.vmap(one)(states)[0], jax.vmap(two)(states)[0], rtol=0, atol=1e-13)
+
+
+@pytest.mark.slow
+def test_walls_of_one_gap_in_float32_and_to_second_order():
+    ones, twos = (
+        end_of(of, 0.9, jnp.float32(0.0), jnp.float32(1.0), jnp.float32(5.0))[0] for of in (WALLS["abs"], two_walls)
+    )
+    assert ones.dtype == jnp.float32
+    np.testing.assert_allclose(ones, twos, rtol=0, atol=2e-6)
+    curves = [
+        jax.hessian(lambda v, of=of: end_of(of, 0.9, 0.1, v, 3.0)[0][0])(jnp.array(1.0))
+        for of in (WALLS["abs"], two_walls)
+    ]
+    np.testing.assert_allclose(*curves, rtol=1e-11)
+
+
+def planar(q, v):
+    return 0.5 * (v["x"] ** 2 + v["y"] ** 2) - G * q["y"]
+
+
+def slide(gap, x, duration, restitution=0.0):
+    """(x, y, vx, vy) behind a start at (x, y) with velocity (vx, vy)."""
+    system = lagjax.System(planar, contacts=gap, restitution=restitution)
+    q, v = {"x": x[0], "y": x[1]}, {"x": x[2], "y": x[3]}
+    run = lagjax.simulate(system, q, v, jnp.array([0.0, duration]))
+    return jnp.stack([run.q["x"][-1], run.q["y"][-1], run.qdot["x"][-1], run.qdot["y"][-1]])
+
+
+@pytest.mark.parametrize(("slope", "restitution"), [(0.3, 0.0), (1.0, 0.5)])
+def test_a_block_that_slides_into_a_slope_strikes_it(slope, restitution):
+    """As with the slope for a contact of its own; it comes back, and strikes the floor."""
+    x = jnp.array([-1.0, 0.0, 0.5, 0.0])
+    of_one = jax.jit(lambda x: slide(lambda q: q["y"] - slope * jnp.maximum(q["x"], 0.0), x, 3.3, restitution))
+    of_two = jax.jit(lambda x: slide(lambda q: {"a": q["y"], "b": q["y"] - slope * q["x"]}, x, 3.3, restitution))
+    np.testing.assert_allclose(of_one(x), of_two(x), rtol=0, atol=1e-12)
+    np.testing.assert_allclose(jax.jacfwd(of_one)(x), jax.jacfwd(of_two)(x), rtol=0, atol=1e-10)
+
+
+@pytest.mark.parametrize(
+    "gap",
+    [
+        lambda q: q["y"] + 1e3 * jnp.maximum(q["x"], 0.0),
+        lambda q: jnp.where(q["x"] < 0, q["y"], 5.0),  # which jumps
+        lambda q: q["y"] - jnp.interp(q["x"], jnp.array([-9.0, 0.0, 0.1, 9.0]), jnp.array([0.0, 0.0, -50.0, -60.0])),
+    ],
+)
+def test_a_block_slides_off_the_edge_of_a_table(gap):
+    x = jnp.array([-1.0, 0.0, 0.5, 0.0])
+    fall = 1.3
+    state, slopes = slide(gap, x, 2.0 + fall), jax.jacrev(lambda x: slide(gap, x, 2.0 + fall))(x)
+    np.testing.assert_allclose(state, [0.65, -G * fall**2 / 2, 0.5, -G * fall], rtol=0, atol=1e-11)
+    np.testing.assert_allclose(slopes[1, 0], -2 * G * fall, rtol=1e-11)
+    np.testing.assert_allclose(slopes[1, 2], -4 * G * fall, rtol=1e-11)
+
+
+def test_a_step_in_time_strikes_what_rests_on_it():
+    """A piston that sets out at t = 1 with speed 2; outputs at that very time are there."""
+    system = lagjax.System(
+        lambda q, v: 0.5 * v**2 - G * q, contacts=lambda q, t: q - 2.0 * jnp.maximum(t - 1.0, 0.0), restitution=1.0
+    )
+    run = lagjax.simulate(system, 0.0, 0.0, jnp.array([0.0, 1.0, 1.2]))
+    np.testing.assert_allclose(run.q, [0.0, 0.0, 4 * 0.2 - G * 0.2**2 / 2], rtol=0, atol=1e-12)
+
+
+def test_a_belt_that_ends_lets_slip_what_sticks_to_it():
+    """From the belt, which is at rest, a block that a force pulls comes onto one that runs."""
+    system = lagjax.System(
+        planar, contacts=lambda q: q["y"], friction=0.2,
+        slip=lambda q, v, t: v["x"] - jnp.where(t > 1.0, 3.0, 0.0),
+    )  # fmt: skip
+    run = lagjax.simulate(system, {"x": 0.0, "y": 0.0}, {"x": 0.0, "y": 0.0}, jnp.array([0.0, 1.0, 2.0]))
+    np.testing.assert_allclose(run.qdot["x"], [0.0, 0.0, 0.2 * G], rtol=0, atol=1e-11)
+
+
+@pytest.mark.parametrize(
+    ("gap", "x"),
+    [
+        (lambda q: q["y"] - jnp.abs(q["x"]), [0.0, 1.0, 0.0, 0.0]),  # the bottom of a valley
+        (lambda q: q["y"] + jnp.abs(q["x"]), [0.0, 0.0, 0.0, 0.0]),  # rest on an edge
+        (lambda q: q["y"] - jnp.where(q["x"] > 0, 1.0, 0.0), [-1.0, 0.3, 1.0, 0.0]),  # into a step
+    ],
+)
+def test_what_is_struck_or_rests_on_a_corner_is_named(gap, x):
+    system = lagjax.System(planar, contacts=gap, restitution=0.5)
+    q, v = {"x": x[0], "y": x[1]}, {"x": x[2], "y": x[3]}
+    ts = jnp.array([0.0, 1.5])
+    assert lagjax.simulate(system, q, v, ts, throw=False).result == lagjax.RESULTS.contact_at_corner
+    with pytest.raises(lagjax.SimulationError, match=r"corner or a jump of its gap.*a gap of its own"):
+        lagjax.simulate(system, q, v, ts)
+
+
+@pytest.mark.parametrize("gap", [jnp.abs, lambda q: q % 1.0, lambda q: 0.5 - jnp.abs(q % 1.0 - 0.5)])
+def test_a_gap_that_is_zero_at_its_corner_is_refused(gap):
+    """It would be passed, or struck, as rounding has it."""
+    system = lagjax.System(lambda q, v: 0.5 * v**2, contacts=lambda q: {"wall": gap(q)}, restitution=1.0)
+    with pytest.raises(ValueError, match=r"contacts\['wall'\] is zero where two of its pieces meet.*a gap of its own"):
+        lagjax.simulate(system, 0.3, 1.0, jnp.array([0.0, 1.0]))
+
+
+def test_a_potential_step_and_a_table_beside_a_contact():
+    """L jumps by 0.1 at x = 0: ½ v² falls by that. Before, an open gap made the motion NaN."""
+    system = lagjax.System(
+        lambda q, v: 0.5 * v**2 - jnp.where(q > 0, 0.1, 0.0), contacts=lambda q: 1 - q, restitution=1.0
+    )
+    run = lagjax.simulate(system, -0.5, 1.0, jnp.array([0.0, 1.0, 3.0]))
+    slow = np.sqrt(0.8)
+    np.testing.assert_allclose(run.q[1], 0.5 * slow, rtol=0, atol=1e-13)
+    np.testing.assert_allclose(run.qdot[2], -1.0, rtol=0, atol=1e-13)
+
+    def end(entries):
+        system = lagjax.System(
+            lambda q, v, params: 0.5 * v**2 + q * jnp.interp(q, jnp.array([-2.0, 0.0, 2.0]), params),
+            contacts=lambda q: 1 - q, restitution=1.0,
+        )  # fmt: skip
+        return lagjax.simulate(system, 0.2, 1.0, jnp.array([0.0, 2.0]), entries).q[-1]
+
+    entries, h = jnp.array([0.1, 0.0, 1.0]), 1e-6
+    differences = [(end(entries + h * e) - end(entries - h * e)) / (2 * h) for e in jnp.eye(3)]
+    np.testing.assert_allclose(jax.grad(end)(entries), differences, atol=1e-8)
+
+
+# ---- results with a name ---------------------------------------------------------------------------------------------
+
+
+def drop(e=0.5, mu=0.1, last=1.0, **options):
+    system = lagjax.System(
+        planar, contacts=lambda q: {"floor": q["y"]}, slip=lambda q, v: {"floor": v["x"]},
+        restitution=lambda params: params[0], friction=lambda params: params[1],
+    )  # fmt: skip
+    q, v = {"x": 0.0, "y": 0.2}, {"x": 1.0, "y": 0.0}
+    ts = jnp.stack([jnp.asarray(0.0), jnp.asarray(last)])
+    return lagjax.simulate(system, q, v, ts, jnp.stack([jnp.asarray(e), jnp.asarray(mu)]), **options)
+
+
+def test_coefficients_out_of_range_and_times_that_fall_are_named_inside_jit_and_batches():
+    results = jax.jit(jax.vmap(lambda *given: drop(*given, throw=False).result))(
+        jnp.array([0.5, -0.1, 1.1, 0.5, 0.5, jnp.nan]), jnp.array([0.1, 0.1, 0.1, -0.1, 0.1, 0.1]),
+        jnp.array([1.0, 1.0, 1.0, 1.0, -1.0, 1.0]),
+    )  # fmt: skip
+    of = lagjax.RESULTS
+    expected = [of.successful, *[of.restitution_out_of_range] * 2, of.friction_out_of_range, of.contact_backwards,
+                of.restitution_out_of_range]  # fmt: skip
+    assert results._value.tolist() == [int(x._value) for x in expected]
+    for given, match in (((0.5, -0.1), "friction must be"), ((0.5, 0.1, -1.0), "goes forward in time")):
+        with pytest.raises(Exception, match=match):
+            jax.block_until_ready(jax.jit(lambda *given: drop(*given).q)(*map(jnp.asarray, given)))
