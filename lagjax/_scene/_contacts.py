@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._equations import Constraints, Motion, once_for_structure
-from lagjax._interface import Layout
+from lagjax._interface import Layout, is_concrete
 from lagjax._scene._system import System
 
 PyTree = Any
@@ -211,6 +211,14 @@ class Shapes(NamedTuple):
             jax.eval_shape(
                 lambda p, of=function, role=role: shapes.spread(of(params=eqx.combine(p, code)), role), numbers
             )
+        friction, slips = None, None
+        if system.friction is not None and "params" not in system.friction.extras:
+            friction = system.friction(params=params)
+        if isinstance(friction, dict) and system.slip is not None:
+            slips = system._output_shapes("slip", layout, params)
+        for name, value in (friction or {}).items() if isinstance(slips, dict) else ():
+            if name not in slips and (not is_concrete(value) or np.any(value)):
+                raise ValueError(f"friction names {name!r}, and slip does not: give its sliding velocity, too.")
         return shapes
 
     def spread(self, value: PyTree, role: str):

@@ -488,6 +488,8 @@ def require_coefficients(system: "System", params: PyTree) -> None:
 
 def _require_range(name: str, values: PyTree) -> None:
     for value in filter(is_concrete, jax.tree.leaves(values)):
+        if not np.issubdtype(np.asarray(value).dtype, np.number):
+            raise TypeError(f"{name} must be a number, a dict of numbers by name, or a function; got {value!r}.")
         if not (np.isfinite(value).all() and np.min(value, initial=0.0) >= 0.0):
             raise ValueError(f"{name} must be a number that is not negative; got {value}.")
         if name == "restitution" and np.max(value, initial=0.0) > 1.0:

@@ -186,3 +186,20 @@ def test_coefficients_out_of_range_and_times_that_fall_are_named_inside_jit_and_
     for given, match in (((0.5, -0.1), "friction must be"), ((0.5, 0.1, -1.0), "goes forward in time")):
         with pytest.raises(Exception, match=match):
             jax.block_until_ready(jax.jit(lambda *given: drop(*given).q)(*map(jnp.asarray, given)))
+
+
+@pytest.mark.parametrize(
+    ("options", "kind", "match"),
+    [
+        ({"restitution": "0.5"}, TypeError, "restitution must be a number, .* got '0.5'"),
+        ({"friction": {"floor": 0.1, "wall": 0.2}}, ValueError, "friction names 'wall', and slip does not"),
+        ({"one_way": lambda q, v: {"ratchet": q["x"]}}, ValueError, r"one_way\['ratchet'\] does not depend on qdot"),
+    ],
+)
+def test_what_newcomers_write_is_named(options, kind, match):
+    given = {
+        "contacts": lambda q: {"floor": q["y"], "wall": q["x"] + 2}, "slip": lambda q, v: {"floor": v["x"]}, **options
+    }  # fmt: skip
+    with pytest.raises(kind, match=match):
+        system = lagjax.System(planar, **given)
+        lagjax.simulate(system, {"x": 0.0, "y": 1.0}, {"x": 0.0, "y": 0.0}, jnp.array([0.0, 0.1]))

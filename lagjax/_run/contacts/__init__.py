@@ -129,6 +129,12 @@ def _plan(problem: Problem, max_transitions: int, sections: int = 0) -> tuple[Co
         closed = Problem.from_system(plan.scene, wide.layout, InContact(wide.params, contacts))
         if refusal := MachineCode().refuses(closed):
             raise ValueError(f"A scene with contacts needs machine code, and has none: {refusal}.")
+        lowered, flat = closed.derivation.lowered, Flat.from_system(problem.system, wide.layout, wide.params)
+        rows = RowPlaces.from_derivation(lowered, flat).normal[shapes.of_gaps :]
+        stays = np.reshape(lowered.absent("jacobian")[rows], (len(rows), -1)).all(axis=1).tolist()
+        for name, still in zip(shapes.names[shapes.of_gaps :], stays, strict=True):
+            if still:
+                raise ValueError(f"{name} does not depend on qdot: one_way returns velocities, contacts returns gaps.")
     return plan, dataclasses.replace(closed, ts=wide.ts, y0=wide.y0)
 
 
