@@ -131,7 +131,7 @@ def _plan(problem: Problem, max_transitions: int, sections: int = 0) -> tuple[Co
             raise ValueError(f"A scene with contacts needs machine code, and has none: {refusal}.")
         lowered, flat = closed.derivation.lowered, Flat.from_system(problem.system, wide.layout, wide.params)
         rows = RowPlaces.from_derivation(lowered, flat).normal[shapes.of_gaps :]
-        stays = np.reshape(lowered.absent("jacobian")[rows], (len(rows), -1)).all(axis=1).tolist()
+        stays = [not moves.any() for moves in ~lowered.absent("jacobian")[rows]]
         for name, still in zip(shapes.names[shapes.of_gaps :], stays, strict=True):
             if still:
                 raise ValueError(f"{name} does not depend on qdot: one_way returns velocities, contacts returns gaps.")
