@@ -454,8 +454,9 @@ class _PlacedLine(Derivatives):
         return self._select_unless_zero(g, part)
 
     def _select_unless_zero(self, number: int, part: int) -> int:
-        zero = self._number(0.0)
-        return self.graph.apply("select", self.graph.apply("eq", number, zero), part, zero)
+        """The part, but 0 in the place of NaN where the number is zero; where the part is finite it has derivatives."""
+        f, zero = self.graph.apply, self._number(0.0)
+        return f("select", f("eq", number, zero), part, f("select", f("is_finite", part), zero, part))
 
     def _find_beneath_roots(self, varied: list[bool], is_linear: bool) -> set[int]:
         """The nodes that vary and that operations of steep slopes depend on; in a line of tangents, their tangents.

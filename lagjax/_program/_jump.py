@@ -126,15 +126,20 @@ class Jump(NamedTuple):
         line, tables = pullback_and_entries(
             self.line, dtypes, by, of, varies=lambda table: table.tangents, is_linear=True
         )
-        nodes, of_upper = [], []
+        nodes, of_upper, places = [], [], []
         for op, operands, attribute in line.nodes:
+            operands = tuple(places[i] for i in operands)
             of_upper.append(first <= attribute < first + upper if op == "input" else any(of_upper[i] for i in operands))
+            places.append(len(nodes))
             if op == "input" and attribute >= first + upper:
                 attribute -= upper
             elif op == "eq" and of_upper[-1]:  # all that is read of them is whether a tangent is zero: it is not
                 op, operands, attribute, of_upper[-1] = "constant", (), False, False
+            elif op == "select" and (operands[1] == operands[2] or nodes[operands[0]] == ("constant", (), False)):
+                places[-1], of_upper[-1] = operands[1], of_upper[operands[1]]
             nodes.append((op, operands, attribute))
-        line = eliminate_dead_code(line.replace(nodes=tuple(nodes)), line.outputs)
+        outputs = tuple(places[i] for i in line.outputs)
+        line = eliminate_dead_code(line.replace(nodes=tuple(nodes)), outputs)
         return line, tables
 
 

@@ -41,3 +41,22 @@ MODES = {
 def test_derivatives_in_every_mode(mode):
     # Both are exact but for the rounding of some ten operations on numbers of order one.
     np.testing.assert_allclose(MODES[mode](LINE), MODES[mode](function), rtol=1e-13, atol=1e-13)
+
+
+def test_a_root_bends_where_its_argument_stands_still():
+    """Of h = |x| and a product with it, along what leaves h as it is, or where a factor is zero: slopes of 0 times."""
+
+    def root(x):
+        h = jnp.sqrt(x[0] ** 2 + x[1] ** 2)
+        return jnp.stack([h, x[2] * h, jnp.maximum(x[2], -h), jnp.arctan2(x[1], x[0])])
+
+    x, across = np.array([0.6, 0.8, 0.0]), np.array([-0.8, 0.6, 0.0])
+    line = Line(lower(root, jnp.ones(3)).line, 3, 3)
+    for derivative in (
+        lambda f: jax.jvp(lambda x: jax.jvp(f, (x,), (across,))[1], (x,), (across,))[1],
+        lambda f: jax.jacfwd(jax.jacfwd(f))(x),
+        lambda f: jax.jacfwd(jax.jacrev(f))(x),
+        lambda f: jax.jacrev(jax.jacfwd(f))(x),
+        lambda f: jax.jacrev(jax.jacrev(f))(x),
+    ):
+        np.testing.assert_allclose(derivative(line), derivative(root), atol=1e-14)
