@@ -135,7 +135,8 @@ def simulate(
     trajectory.q - jnp.cos(trajectory.ts)
     ```
     """
-    of_engines = {"solver": solver, "dt": dt, "event": event, "adjoint": adjoint, "progress": progress or None}
+    meter = None if progress is False else progress
+    of_engines = {"solver": solver, "dt": dt, "event": event, "adjoint": adjoint, "progress": meter}
     if not isinstance(system, System) and hasattr(system, "follow"):  # a `Hybrid`
         _refuse_options("a lagjax.Hybrid", of_engines)
         return system.follow(q0, qdot0, ts, params, rtol=rtol, atol=atol, max_steps=max_steps, throw=throw)
@@ -201,7 +202,8 @@ def simulate_batch(
     """
     system = require_system(system, contacts=True)
     if system.touches:
-        of_engines = {"solver": solver, "dt": dt, "event": event, "adjoint": adjoint, "progress": progress or None}
+        meter = None if progress is False else progress
+        of_engines = {"solver": solver, "dt": dt, "event": event, "adjoint": adjoint, "progress": meter}
         _refuse_options("a scene with contacts", of_engines)
     requested = requested_engine(solver, dt, adjoint, progress, rtol, atol)
     values = {"q0": q0, "qdot0": qdot0, "params": params}

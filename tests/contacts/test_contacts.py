@@ -251,6 +251,38 @@ def test_the_chapters_cylinder_flies_off_by_itself(alpha):
     np.testing.assert_allclose(run.contact_forces["normal"], np.where(pressed, closed, 0.0), atol=1e-10)
 
 
+ROUND = {
+    "length": lambda q: 1.0 - jnp.hypot(q[0], q[1]),
+    "logarithm": lambda q: 1.0 - jnp.exp(0.5 * jnp.log(q @ q)),
+    "square": lambda q: 0.5 * (1.0 - q @ q),
+}
+
+
+def end_in_drum(gap, x):
+    """A bounce on the inside of a circle, at t = 0.355, of a ball that falls from (x, −0.2)."""
+    drum = lagjax.System(lambda q, v: 0.5 * v @ v - G * q[1], contacts=lambda q: {"drum": gap(q)}, restitution=0.4)
+    start = jnp.stack([x, jnp.full_like(x, -0.2)]), jnp.array([0.5, 0.0])
+    return lagjax.simulate(drum, *start, jnp.array([0.0, 0.5])).q[-1]
+
+
+def test_a_bounce_is_the_same_by_every_gap_that_says_how_near_a_circle_is():
+    """Its terms cancel to more than their rounding in the logarithm, whose gap falls once more as it moves apart."""
+    starts = jnp.array([0.399, 0.3999, 0.4, 0.4001])
+    ends = [jax.vmap(lambda x, gap=gap: end_in_drum(gap, x))(starts) for gap in ROUND.values()]
+    np.testing.assert_allclose(ends[0], ends[2], rtol=1e-12)
+    np.testing.assert_allclose(ends[1], ends[2], rtol=1e-12)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("gap", ROUND)
+def test_second_derivatives_of_a_bounce_on_a_circle(gap):
+    """Along the circle the argument of the root in |q| stands still, and its second derivative does not."""
+    slope = jax.jit(lambda x: jax.jvp(lambda x: end_in_drum(ROUND[gap], x), (x,), (1.0,))[1])
+    second = jax.jit(lambda x: jax.jvp(slope, (x,), (1.0,))[1])(0.4)
+    h = 1e-4
+    np.testing.assert_allclose(second, (slope(0.4 + h) - slope(0.4 - h)) / (2 * h), rtol=1e-6)
+
+
 @pytest.mark.slow
 def test_housners_block_loses_what_he_says():
     """A block that rocks from one foot to the other keeps 1 − 3/2 sin²α of its angular velocity (Housner 1963)."""

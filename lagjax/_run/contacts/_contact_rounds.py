@@ -396,7 +396,7 @@ class ContactRounds(NamedTuple):
         decided, record = jax.tree.map(
             lambda new, old: jnp.where(decides, new, old),
             (decided._replace(came=before.came), record),
-            (before._replace(came=came, y=y), noted),
+            (before._replace(came=came, t=t, y=y), noted),
         )
         return decided, record
 
@@ -472,7 +472,9 @@ class ContactRounds(NamedTuple):
         meeting = self.meet(before, quiet, t, y, meets, still(restitution), friction.still)
         hits = meeting.happened
         slips = self.slips(quiet, still(v), before.slip)
-        closed = (was_closed & ~first[:count] & ~opens_at) | meets
+        # A gap that falls while it moves apart is zero to more than the rounding of its terms: it goes on beyond that.
+        parts = meets & ~hits & self.has_gap & (quiet.rates[:count] > meeting.noise)
+        closed = (was_closed & ~first[:count] & ~opens_at) | (meets & ~parts)
         sticks = self.sticks(before, slips, first[count:], (closed != was_closed)[self.flat.rough])
         # Where parts align, a slip that gaps hold passes through zero, and turns.
         turns = held_slips(quiet, closed, first[count:] & sticks, friction)
@@ -501,6 +503,8 @@ class ContactRounds(NamedTuple):
             along = Pattern(closed.astype(float), sticks.astype(float), _unit(direction))
             undecided |= (sliding_margin(quiet, along, friction.still) <= PARADOX).any()
         before, y_next = self.move(before, rows, y_beyond, change, meets, first[:count] & was_closed)
+        beyond = jnp.where(parts, 4.0 * before.rounding[0, :count] / jnp.diagonal(quiet.coupling)[:count], 0.0)
+        y_next = y_next + jnp.concatenate([beyond @ quiet.responses[:count], jnp.zeros_like(v)])
         y_next = self.limit_variations(y_next, rows, meeting, starts)
         # Of the work of impulses only what moves q is kinetic energy: gaps may move by themselves.
         lost = -impulses @ (rows.gradients @ (v + 0.5 * change))
