@@ -312,7 +312,8 @@ class _Rewriting:
     def _decisive(self) -> set[int]:
         """The nodes that q̈ depends on, without those of the elimination of a linear system."""
         linear, line = self.program.linear, self.program.line
-        roots = line.outputs[: self.size] if linear is None else linear.read
+        # What friction of contacts adds to A does not decide: it stops, and turns, by watches of its own.
+        roots = line.outputs[: self.size] if linear is None else [*linear.right, *linear.entries.values()]
         needed = _below(line, roots)
         self._of_guards = _below(line, self.watched)
         if self.watched:  # which may read the solution of a linear system, but not decide on its elimination

@@ -73,6 +73,7 @@ PARADOX = 1e-12
 # breaks away brings about in a step. Half of that takes √2 times the steps, of some ten thousand: at rest friction
 # turns a slip at once, and steps are as short as that takes.
 NO_SLIP, AT_REST = 1e-11, 1e-8
+HARDLY = 1e-6  # of the largest velocities so far: a contact that moves apart slower may close
 GAINED = 1e-12  # of the work of an impact: a gain of energy beyond rounding
 # Of the largest slip so far: what is more, where the slip along its first direction ends, has turned.
 TURNED = 1e-6
@@ -473,7 +474,9 @@ class ContactRounds(NamedTuple):
         hits = meeting.happened
         slips = self.slips(quiet, still(v), before.slip)
         # A gap that falls while it moves apart is zero to more than the rounding of its terms: it goes on beyond that.
-        parts = meets & ~hits & self.has_gap & (quiet.rates[:count] > meeting.noise)
+        # Where it hardly moves, as at the end of many bounces, it closes.
+        rates = jnp.abs(quiet.gradients[:count]) @ halves(before.largest)[1]
+        parts = meets & ~hits & self.has_gap & (quiet.rates[:count] > jnp.maximum(meeting.noise, HARDLY * rates))
         closed = (was_closed & ~first[:count] & ~opens_at) | (meets & ~parts)
         sticks = self.sticks(before, slips, first[count:], (closed != was_closed)[self.flat.rough])
         # Where parts align, a slip that gaps hold passes through zero, and turns.
