@@ -135,8 +135,7 @@ def simulate(
     trajectory.q - jnp.cos(trajectory.ts)
     ```
     """
-    meter = None if progress is False else progress
-    of_engines = {"solver": solver, "dt": dt, "event": event, "adjoint": adjoint, "progress": meter}
+    of_engines = {"solver": solver, "dt": dt, "event": event, "adjoint": adjoint, "progress": progress}
     if not isinstance(system, System) and hasattr(system, "follow"):  # a `Hybrid`
         _refuse_options("a lagjax.Hybrid", of_engines)
         return system.follow(q0, qdot0, ts, params, rtol=rtol, atol=atol, max_steps=max_steps, throw=throw)
@@ -202,8 +201,7 @@ def simulate_batch(
     """
     system = require_system(system, contacts=True)
     if system.touches:
-        meter = None if progress is False else progress
-        of_engines = {"solver": solver, "dt": dt, "event": event, "adjoint": adjoint, "progress": meter}
+        of_engines = {"solver": solver, "dt": dt, "event": event, "adjoint": adjoint, "progress": progress}
         _refuse_options("a scene with contacts", of_engines)
     requested = requested_engine(solver, dt, adjoint, progress, rtol, atol)
     values = {"q0": q0, "qdot0": qdot0, "params": params}
@@ -249,7 +247,8 @@ def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, 
 
 
 def _refuse_options(scene: str, options: dict[str, Any]) -> None:
-    if given := [name for name, value in options.items() if value is not None]:
+    unset = {"progress": False}
+    if given := [name for name, value in options.items() if value is not None and value is not unset.get(name)]:
         raise TypeError(f"simulate takes no {', '.join(given)} for {scene}, which runs in machine code.")
 
 
