@@ -237,14 +237,14 @@ class ContactRounds(NamedTuple):
         return self.flat.rough.size > 0
 
     @property
-    def of_contacts(self) -> int:
+    def contact_watches(self) -> int:
         """The watches of contacts alone: the normal ones, and behind them those of friction."""
         return self.count + self.flat.rough.size
 
     @property
     def deciding(self) -> int:
         """The watches that decide: those of contacts, two a corner. Behind them are the sections."""
-        return self.of_contacts + 2 * (0 if self.corners is None else len(self.corners.touch))
+        return self.contact_watches + 2 * (0 if self.corners is None else len(self.corners.touch))
 
     @property
     def impacts(self) -> str:
@@ -315,15 +315,15 @@ class ContactRounds(NamedTuple):
         watches, sections = self.deciding, len(self.plan.sections)
         guarded = self.watch(before.t, before.y, contacts)
         missed = (self.missed(before, guarded, contacts) & ~before.fresh[: self.count]).any()
-        kinds = jnp.pad(jnp.concatenate([contacts.closed, contacts.sticks]), (0, watches + sections - self.of_contacts))
+        kinds = jnp.pad(jnp.concatenate([contacts.closed, contacts.sticks]), (0, watches + sections - self.contact_watches))
         before = _note_rounding(before, guarded, kinds, 0.0)
         rounding, rates = (_choose_kind(x, kinds) for x in (before.rounding, before.rate_rounding))
         if self.rubs:
             rounding, rates = self.hold_ties(before, guarded, rounding, rates)
         rounding = jnp.maximum(rounding, guarded.of_time)
-        beyond = (guarded.values < -rounding) & (np.arange(kinds.size) < self.of_contacts)
+        beyond = (guarded.values < -rounding) & (np.arange(kinds.size) < self.contact_watches)
         sides = jnp.where(beyond, jnp.inf, jnp.maximum(rounding, _LEAST))
-        sides = sides.at[self.of_contacts : watches].set(0.0)  # where a corner is met first tells the motion
+        sides = sides.at[self.contact_watches : watches].set(0.0)  # where a corner is met first tells the motion
         clear = (jnp.abs(guarded.values) > rounding)[watches:]
         came = jnp.where(clear, jnp.sign(guarded.values[watches:]), before.came)
         sides = sides.at[watches:].multiply(came)
@@ -338,7 +338,7 @@ class ContactRounds(NamedTuple):
         duration = located.t_end - jax.lax.stop_gradient(before.t)
         turns = jnp.where(at_once, before.turns + 1, 0)
         step = jnp.where(at_once, 0.0, duration / jnp.maximum(located.accepted, 1))
-        stops = (np.arange(self.count, self.of_contacts) == k) & (contacts.sticks == 0)
+        stops = (np.arange(self.count, self.contact_watches) == k) & (contacts.sticks == 0)
         stops = stops & (self.flat.shapes.directions == 1)
         tied = at_once & (before.tied | (stops & (turns > kinds.size)))
         before = _note_rounding(before, guarded, kinds, duration)._replace(
@@ -381,7 +381,7 @@ class ContactRounds(NamedTuple):
 
         It sticks until its value falls: a rate is no reason.
         """
-        around = self.count, guarded.values.size - self.of_contacts
+        around = self.count, guarded.values.size - self.contact_watches
         tied = jnp.pad(before.tied & (before.contacts.sticks > 0), around)
         most = self.friction.still.coefficients * guarded.values[: self.count][self.flat.rough]
         return (
@@ -404,7 +404,7 @@ class ContactRounds(NamedTuple):
 
     def first_of(self, fell, at_once, contacts: Contacts):
         """The watch that is taken of those that `fell` (G,): of corners, then of friction, as one that jams is."""
-        count, rough, last = self.count, self.flat.rough, self.of_contacts
+        count, rough, last = self.count, self.flat.rough, self.contact_watches
         if self.rubs:
             jams = at_once & fell[:count][rough] & (contacts.closed[rough] * contacts.sticks > 0)
             of_friction = fell[count:last] | jams
@@ -466,7 +466,7 @@ class ContactRounds(NamedTuple):
     def decide(self, before: Carry, t, y, k) -> tuple[Carry, RoundRecord]:
         """The state and the contacts behind watch k, which fell at (t, y)."""
         still, numbers, count = jax.lax.stop_gradient, eqx.filter(self.params, eqx.is_array_like), self.count
-        first, contacts = np.arange(self.of_contacts) == k, before.contacts
+        first, contacts = np.arange(self.contact_watches) == k, before.contacts
         was_closed, meets = contacts.closed > 0, first[:count] & ~(contacts.closed > 0)
         opens_at, struck, may_jump, t_next, y_beyond = self.pass_corners(before, t, y, k, meets)
         rows, (_, v), friction = self.rows_at(t, y), halves(y), self.friction
@@ -530,7 +530,7 @@ class ContactRounds(NamedTuple):
         rest = t + jnp.sum(jnp.where(ends, left, 0.0))
         contact, change = self.name_change(k, closed, sticks, hits)
         if self.corners is not None:
-            leaves = k >= self.of_contacts
+            leaves = k >= self.contact_watches
             contact = jnp.where(leaves, jnp.where(opens_at.any(), jnp.argmax(opens_at), -1), contact)
             change = jnp.where(leaves, jnp.where(opens_at.any(), OPENS, -1), change)
         return decided, RoundRecord(
@@ -576,7 +576,7 @@ class ContactRounds(NamedTuple):
         """
         if self.corners is None:
             return np.zeros(self.count, bool), np.array(False), np.array(False), t, y
-        touch, contacts, first = self.corners.touch, before.contacts, self.of_contacts
+        touch, contacts, first = self.corners.touch, before.contacts, self.contact_watches
         at, closed = self.locate_corners(t, y, contacts, before.largest), contacts.closed > 0
         away, new = jnp.abs(at.values), ~before.fresh[first : first + len(touch)]
         meets = (touch & meets & (away <= 4.0 * at.far)[:, None]).any(axis=1)
