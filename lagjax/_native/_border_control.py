@@ -478,7 +478,8 @@ class BorderControl:
         code = frame.code
         stepped, crosses, was_cut = frame["stepped"] > 0.0, frame["crossed"] > Crossed.NOTHING, frame["nearest"] < 1.0
         if self.retraction is not None:  # borders that are left before the step begins do not take the state
-            self.retraction.undo(frame, ~stepped)
+            has_begun = stepped | (frame["returned"] > 0.0) if self.forgotten else stepped
+            self.retraction.undo(frame, ~has_begun)
         for border in self.table.each(frame):
             border.remember(stepped & (border.touch < Touch.SLIDING), touch=Touch.NONE)
         with code.only_if(code.any_lane(crosses | was_cut)):

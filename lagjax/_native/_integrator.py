@@ -52,7 +52,8 @@ class Integrator:
         fields = StepControl.fields(n) | Output.fields(n) | Events.fields(self.guards)
         fields["active"] = 1  # 1 in a lane that has a member
         if projection is not None:
-            fields |= Projector.fields(n) | _rank_drops.fields(n, self.guards)
+            self.begins = _rank_drops.beginning(2 * n, self.guards, 0 if borders is None else len(borders.guards))
+            fields |= Projector.fields(n) | _rank_drops.fields(self.begins)
         if guards is not None:
             fields |= Roots.fields(MAX_ORDER + 2)
         if borders is not None:
@@ -136,7 +137,7 @@ class Integrator:
                 frame.call(borders.stop, order)
             self.step.halve_until_sound(frame, order)
             if self.projector is not None:
-                _rank_drops.retry_last_long_step(frame, self.motion.form, self.motion.states, self.guards)
+                _rank_drops.retry_last_long_step(frame, self.motion.form, self.begins)
             if self.events is not None:
                 self.events.stop(frame, order)
             if crossings is not None:

@@ -4,25 +4,21 @@ Rounding allows no step there that is longer than the way to that configuration,
 none gets through. The last long one is then taken once more, a little shorter.
 """
 
-from collections.abc import Iterator
-
 from lagjax._native._constants import MOST_RETURNS, RETAKEN, RUNNING, SHORTER
 from lagjax._native._frame import Fields, Frame
 from lagjax._native._lanes import Lines
 from lagjax._native._tables import Tables
 
 
-def fields(n: int, guards: int) -> Fields:
-    return {
-        # Where the last long step began: the fields without `_before`, then.
-        "y_before": 2 * n,
-        "low_before": 2 * n,
-        "side_before": guards,
-        "contact_before": guards,
-        "noted_before": guards,
-        "t_before": 1,
-        "t_low_before": 1,
-        "steps_before": 1,
+def beginning(states: int, guards: int, borders: int) -> dict[str, int]:
+    """The sizes of the fields that a step begins with; of `guards` of events, and of those of `borders`."""
+    of_guards = dict.fromkeys(("side", "contact", "noted"), guards) | {"touch": borders}
+    return dict.fromkeys(("y", "low"), states) | of_guards | dict.fromkeys(("t", "t_low", "steps"), 1)
+
+
+def fields(begins: dict[str, int]) -> Fields:
+    # Where the last long step began: the fields without `_before`, then.
+    return {f"{name}_before": size for name, size in begins.items()} | {
         "h_before": 1,  # the size of that step; 0 without any
         "returns": 1,  # the number of returns to it
         "returned": 1,  # 1 if the motion has just returned
@@ -32,7 +28,7 @@ def fields(n: int, guards: int) -> Fields:
 AT_FIRST_ZERO = ("h_before", "returns", "returned")  # for every new member
 
 
-def retry_last_long_step(frame: Frame, form: Lines | Tables, states: int, guards: int) -> None:
+def retry_last_long_step(frame: Frame, form: Lines | Tables, begins: dict[str, int]) -> None:
     """Return to where the last long step began, if steps have become too short since; or remember this beginning."""
     code = frame.code
     size, long = (abs(frame[name]) for name in ("h", "h_before"))
@@ -48,18 +44,12 @@ def retry_last_long_step(frame: Frame, form: Lines | Tables, states: int, guards
     frame["returned"] = back
     frame["rejected"] = frame["rejected"] + code.select(back, undone + 1.0, 0.0)
     frame.assign(back, code=float(RUNNING), h=0.0)
-    for now, then in _beginnings(frame, form, states, guards):
-        here, there = frame[now], frame[then]
-        frame[now] = code.select(back, there, here)
-        frame[then] = code.select(new, here, there)
-
-
-def _beginnings(frame: Frame, form: Lines | Tables, states: int, guards: int) -> Iterator[tuple[tuple, tuple]]:
-    """The fields that a step begins with, each with the one that keeps it of the last long step."""
-    fields = dict.fromkeys(("y", "low"), states) | dict.fromkeys(("side", "contact", "noted"), guards)
-    for name, count in (fields | dict.fromkeys(("t", "t_low", "steps"), 1)).items():
-        for i in form.each(frame.code, count):
-            yield (name, i), (name + "_before", i)
+    for name, count in begins.items():
+        for i in form.each(code, count):
+            now, then = (name, i), (name + "_before", i)
+            here, there = frame[now], frame[then]
+            frame[now] = code.select(back, there, here)
+            frame[then] = code.select(new, here, there)
 
 
 def shorten(frame: Frame) -> None:

@@ -231,6 +231,33 @@ def test_pendulum_with_a_bearing_that_rubs(size, motion):
     np.testing.assert_allclose([run.q["phi"][-1], run.qdot["phi"][-1]], end, atol=1e-11, rtol=0)
 
 
+# Where the force of the bearing is small beside what shakes it, steps become short, and a long one is taken once more.
+SHAKEN_HARD = 0.3, 4200.0, 85.0
+
+
+def end_when_shaken_hard(numbers, rtol):
+    ts = jnp.array([0.0, 0.17])
+    run = lagjax.simulate(RUBBING[length], *state_of(-0.9, 0.0), ts, numbers, rtol=rtol)
+    return jnp.array([run.q["phi"][-1], run.qdot["phi"][-1]])
+
+
+def test_a_step_that_is_taken_once_more_begins_where_it_began():
+    exact = ExactPendulum(length, *SHAKEN_HARD).follow(-0.9, 0.0, 0.17)
+    for rtol in (1e-9, 1e-10, 1e-13):
+        np.testing.assert_allclose(end_when_shaken_hard(jnp.array(SHAKEN_HARD), rtol), exact, rtol=10 * rtol + 1e-11)
+
+
+@pytest.mark.slow
+def test_derivatives_pass_steps_that_are_taken_once_more():
+    at, along, step = jnp.array(SHAKEN_HARD), jnp.array([1.0, 0.0, 0.0]), 1e-4
+    ends = [end_when_shaken_hard(at + k * step * along, 1e-13) for k in (-2, -1, 0, 1, 2)]
+    slopes = np.dot([1, -8, 0, 8, -1], ends) / (12 * step)
+    forward = jax.jvp(lambda x: end_when_shaken_hard(x, 1e-12), (at,), (along,))[1]
+    np.testing.assert_allclose(forward, slopes, rtol=1e-8)
+    back = jax.jacrev(lambda x: end_when_shaken_hard(x, 1e-12))(at)
+    np.testing.assert_allclose(back[:, 0], slopes, rtol=1e-8)
+
+
 @pytest.mark.parametrize("size", [length, taxicab])
 def test_bearing_rests_for_ever(size):
     """In doubles, in single precision, and 10 kg on 1 mm, at whose angle of rest a force of 1e5 N would take it."""

@@ -315,7 +315,8 @@ class ContactRounds(NamedTuple):
         watches, sections = self.deciding, len(self.plan.sections)
         guarded = self.watch(before.t, before.y, contacts)
         missed = (self.missed(before, guarded, contacts) & ~before.fresh[: self.count]).any()
-        kinds = jnp.pad(jnp.concatenate([contacts.closed, contacts.sticks]), (0, watches + sections - self.contact_watches))
+        others = watches + sections - self.contact_watches
+        kinds = jnp.pad(jnp.concatenate([contacts.closed, contacts.sticks]), (0, others))
         before = _note_rounding(before, guarded, kinds, 0.0)
         rounding, rates = (_choose_kind(x, kinds) for x in (before.rounding, before.rate_rounding))
         if self.rubs:
