@@ -14,7 +14,7 @@ import numpy as np
 from jax.interpreters.partial_eval import dce_jaxpr
 
 from lagjax._engine import Problem, choose
-from lagjax._engine.diffrax import ArrayEquations, form_of
+from lagjax._engine.diffrax import form_of
 from lagjax._equations import Derivation, SparseStructure, dependent_rows, pieces_of_motion
 from lagjax._interface import join_names, show_str
 from lagjax._native import Nesting, is_large, pieces_of
@@ -181,18 +181,17 @@ def _engine(problem: Problem) -> dict[str, Any]:
     """The default solver of a motion, the form in which it evaluates the equations, and the cost of that."""
     derivation, refusal = problem.derivation, choose(problem).refusal
     if refusal is None:
-        solver, reason = "Taylor series in machine code", ""
-        if is_large(derivation.acceleration, derivation.projection):
+        solver, program = "Taylor series in machine code", derivation.acceleration
+        if is_large(program, derivation.projection):
             solver += ", whose operations stand in tables: for code operation by operation they are too many"
-        programs = derivation.acceleration, derivation.projected
     else:
         solver, form = f"diffrax.Dopri8, because {refusal}", form_of(derivation, problem.system.path)
-        if isinstance(form, ArrayEquations):
+        if form.reason is not None:
             return {"solver": solver, "path": "array", "reason": form.reason}
-        reason, programs = "", (form.program, form.projection)
-    operations, of_projection = (None if program is None else program.operations for program in programs)
-    costs = {"operations": operations, "projection_operations": of_projection}
-    return {"solver": solver, "path": "scalar", "reason": reason, **costs}
+        program = derivation.acceleration.complete
+    of_projection = None if derivation.projected is None else derivation.projected.operations
+    costs = {"operations": program.operations, "projection_operations": of_projection}
+    return {"solver": solver, "path": "scalar", "reason": "", **costs}
 
 
 def _borders(problem: Problem, inputs: tuple[str, ...]) -> dict[str, Any]:

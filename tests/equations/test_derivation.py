@@ -13,7 +13,7 @@ import lagjax
 from lagjax import scenes
 from lagjax._engine import diffrax as _diffrax
 from lagjax._engine import taylor as _machine_code
-from lagjax._engine.diffrax._equations import ArrayEquations, form_of
+from lagjax._engine.diffrax._equations import form_of
 from lagjax._equations import _derivation
 from lagjax._equations import _many_states as many_states
 from lagjax._equations._derivation import Derivation, columns_of, derivation_of, numbers_of
@@ -114,7 +114,7 @@ def test_derivatives_that_a_lagrangian_defines_itself():
     derivation = of(lagjax.System(lagrangian), q[0], v[0])
     force = derivation.evaluate(["force"], columns_of(q, v, 0.0, []))["force"][0]
     np.testing.assert_allclose(force, [-7 * 0.3 - 0.7, -7 * 0.7], rtol=1e-15)
-    assert isinstance(form_of(derivation), ArrayEquations)  # a program keeps the rules of two derivatives alone
+    assert form_of(derivation).reason is not None  # a program keeps the rules of two derivatives alone
 
 
 def test_powers_have_derivatives_where_their_products_and_roots_have_none():

@@ -29,7 +29,6 @@ from lagjax._engine._problem import (
     too_tight,
 )
 from lagjax._engine._stop_reason import End, what_stopped
-from lagjax._engine.diffrax._equations import ArrayEquations as ArrayEquations
 from lagjax._engine.diffrax._equations import MotionEquations, form_of
 from lagjax._engine.diffrax._integrate import Converted, Jumps, Method, WithJumps, integrate
 from lagjax._engine.diffrax._jumps import freeze

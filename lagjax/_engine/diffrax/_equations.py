@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from lagjax._equations import Derivation, Motion
-from lagjax._interface import compiled_once
+from lagjax._interface import compiled_once, halves
 from lagjax._program import Program, Unlowerable
 
 PyTree = Any
@@ -29,18 +29,34 @@ Acceleration = tuple[Vector, Bool[Array, ""]]  # q̈, and whether the matrix tha
 LARGEST_XLA_PROGRAM = 2_000
 
 
-class ArrayEquations(eqx.Module):
-    """The equations with M, F, G and γ as JAX arrays; `reason` says why the scene has no scalar program in use."""
+class MotionEquations(eqx.Module):
+    """The equations of a scene by two functions of (q, q̇, t, params), each traced once, however often it is called.
+
+    `reason` says why they are M, F, G and γ as JAX arrays; it is None for scalar programs.
+    """
 
     motion: Motion = eqx.field(static=True)
     accelerate: Any = eqx.field(static=True)
     project: Any = eqx.field(static=True)
-    reason: str = eqx.field(static=True)
+    reason: str | None = eqx.field(static=True)
 
-    def __init__(self, motion: Motion, reason: str):
-        self.motion, self.reason = motion, reason
-        # Traced once, however often they are called.
-        self.accelerate, self.project = compiled_once(motion.solved_acceleration), compiled_once(motion.projected)
+    @classmethod
+    def from_arrays(cls, motion: Motion, reason: str) -> "MotionEquations":
+        return cls(motion, compiled_once(motion.solved_acceleration), compiled_once(motion.projected), reason)
+
+    @classmethod
+    def from_programs(cls, motion: Motion, program: Program, projection: Program | None) -> "MotionEquations":
+        """The equations by programs of q, q̇, t and every number in params: `Derivation.acceleration`, `projected`."""
+
+        def accelerate(q, qdot, t, params):
+            *acceleration, singular = program(*q, *qdot, t, *_scalars(params))
+            return jnp.stack(acceleration), singular
+
+        def project(q, qdot, t, params):
+            assert projection is not None
+            return halves(jnp.stack(projection(*q, *qdot, t, *_scalars(params))))
+
+        return cls(motion, compiled_once(accelerate), compiled_once(project), None)
 
     @property
     def constrained(self) -> bool:
@@ -53,55 +69,25 @@ class ArrayEquations(eqx.Module):
         return self.accelerate(*y, t, params)
 
 
-class ScalarEquations(eqx.Module):
-    """The equations as scalar programs, whose inputs are q, q̇, t and every number in params."""
-
-    motion: Motion = eqx.field(static=True)
-    program: Program = eqx.field(static=True)  # q̈, and whether its matrix is singular
-    projection: Program | None = eqx.field(static=True)  # (q, q̇) after a step back to the constraints
-    accelerate: Any = eqx.field(static=True)
-    project: Any = eqx.field(static=True)
-
-    def __init__(self, motion: Motion, program: Program, projection: Program | None = None):
-        self.motion, self.program, self.projection = motion, program, projection
-        self.accelerate = compiled_once(program)
-        self.project = None if projection is None else compiled_once(projection)
-
-    @property
-    def constrained(self) -> bool:
-        return self.projection is not None
-
-    def projected(self, t: Time, y: State, params: PyTree) -> State:
-        state = self.project(*y[0], *y[1], t, *_scalars(params))
-        return jnp.stack(state[: len(state) // 2]), jnp.stack(state[len(state) // 2 :])
-
-    def acceleration(self, t: Time, y: State, params: PyTree) -> Acceleration:
-        *acceleration, singular = self.accelerate(*y[0], *y[1], t, *_scalars(params))
-        return jnp.stack(acceleration), singular
-
-
-MotionEquations = ScalarEquations | ArrayEquations
-
-
 def form_of(derivation: Derivation, path: str = "auto") -> MotionEquations:
     """The form of its equations that suits a scene, or that `path` names; `ValueError` where "scalar" is impossible."""
     motion = derivation.motion
     if path == "array":
-        return ArrayEquations(motion, "asked for")
+        return MotionEquations.from_arrays(motion, "asked for")
     try:
         program = derivation.acceleration.complete
     except Unlowerable as reason:
         if path == "scalar":
             raise ValueError(f"This scene has no scalar program: {reason}. Leave `path` at 'auto'.") from None
-        return ArrayEquations(motion, str(reason))
+        return MotionEquations.from_arrays(motion, str(reason))
     if path == "auto" and program.looks_up:  # whose inputs would be the entries of tables, one by one
-        return ArrayEquations(motion, "it looks up entries of tables")
+        return MotionEquations.from_arrays(motion, "it looks up entries of tables")
     if path == "auto" and derivation.has_rules:  # of which a program keeps the first two derivatives alone
-        return ArrayEquations(motion, "a function has rules of its own for its derivatives")
+        return MotionEquations.from_arrays(motion, "a function has rules of its own for its derivatives")
     if path == "auto" and program.operations > LARGEST_XLA_PROGRAM:
         reason = f"{program.operations} operations are more than the {LARGEST_XLA_PROGRAM} that XLA compiles quickly"
-        return ArrayEquations(motion, reason)
-    return ScalarEquations(motion, program, derivation.projected)
+        return MotionEquations.from_arrays(motion, reason)
+    return MotionEquations.from_programs(motion, program, derivation.projected)
 
 
 def _scalars(params: PyTree) -> list[jax.Array]:
