@@ -7,7 +7,6 @@ on several threads and devices, after a fork, and with what fails.
 import ctypes
 import functools
 import os
-import re
 import signal
 import subprocess
 import sys
@@ -210,31 +209,8 @@ def test_the_interface_is_compared_with_the_header(tmp_path):
     assert "there is no" in _native.unavailable(str(tmp_path))
     header.parent.mkdir(parents=True)
     text = (tmp_path.__class__(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text()
-    for old, new, reason in (
-        ("API_MAJOR 0", "API_MAJOR 1", "version of the interface is 1"),
-        ("  XLA_FFI_Args args;\n", "", "structure CallFrame is another"),
-        ("  int64_t rank;\n", "  int64_t offset;\n  int64_t rank;\n", "structure Buffer is another"),
-        ("  XLA_FFI_DataType dtype;\n  void* value;", "  void* value;\n  XLA_FFI_DataType dtype;", "structure Scalar"),
-        ("  int major_version;  // out\n", "  long major_version;  // out\n", "structure Api_Version is another"),
-    ):
-        assert old in text
-        header.write_text(text.replace(old, new))
-        assert reason in _native.unavailable(str(tmp_path))
-    header.write_text(text)
-    assert _native.unavailable(str(tmp_path)) is None
-
-
-@pytest.mark.parametrize(
-    "renamed",
-    [{}, {"Extension_Type": "InternalExtension_Type", "Extension_Base": "InternalExtension", "Execution": "Invoke"}],
-)
-def test_the_interface_by_its_older_and_its_newer_names(tmp_path, renamed):
-    """JAX 0.11 renames three types of the interface, whose structures stay as they are."""
-    header = tmp_path / "xla" / "ffi" / "api" / "c_api.h"
-    header.parent.mkdir(parents=True)
-    text = (tmp_path.__class__(jax.ffi.include_dir()) / "xla" / "ffi" / "api" / "c_api.h").read_text()
-    for old, new in renamed.items():
-        text = re.sub(rf"XLA_FFI_{old}(?=Context|\b)", f"XLA_FFI_{new}", text)
+    header.write_text(text.replace("API_MAJOR 0", "API_MAJOR 1"))
+    assert "version of the interface is 1" in _native.unavailable(str(tmp_path))
     header.write_text(text)
     assert _native.unavailable(str(tmp_path)) is None
 
