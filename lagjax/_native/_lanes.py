@@ -101,14 +101,13 @@ def apply(code: Code, op: str, xs: list[Value], attribute, kinds: Sequence[str],
     """An operation of operands of these `kinds` by its row: of the C library, lane by lane, or written with vectors."""
     if op == "convert":
         return _convert(code, xs[0], kinds[0], kind)
-    if kind not in ("float", "bool"):
-        return _apply_to_integers(code, op, xs, kind)
-    how = OPERATIONS[op].llvm
+    is_whole = kind not in ("float", "bool")
+    how = INTEGERS.get(op) if is_whole else OPERATIONS[op].llvm
     if how is None:
-        raise Unlowerable(f"`{op}` has no machine code here")
-    if isinstance(how, str):
-        return code.library(how, *xs)
-    return how(code, *xs) if attribute is None else how(code, *xs, attribute)
+        raise Unlowerable(f"`{op}`{' of integers' if is_whole else ''} has no machine code here")
+    more = () if attribute is None else (attribute,)
+    x = code.library(how, *xs) if isinstance(how, str) else how(code, *xs, *more)
+    return _check_range(code, x, kind) if is_whole else x
 
 
 def _convert(code, x, before, after):
@@ -121,7 +120,7 @@ def _convert(code, x, before, after):
     return _check_range(code, code.intrinsic("trunc", x) if before == "float" else x, after)
 
 
-# What is done with integers, which are whole doubles. Where the result is not listed it may leave their range.
+# What is done with integers, which are whole doubles.
 INTEGERS = {
     "add": lambda code, a, b: a + b,
     "sub": lambda code, a, b: a - b,
@@ -132,16 +131,8 @@ INTEGERS = {
 }
 
 
-def _apply_to_integers(code: Code, op: str, xs: list[Value], kind: str) -> Value:
-    """An operation whose result is an integer: NaN, and not another number, where that leaves the range of its type."""
-    how = INTEGERS.get(op)
-    if how is None:
-        raise Unlowerable(f"`{op}` of integers has no machine code here")
-    return _check_range(code, code.library(how, *xs) if isinstance(how, str) else how(code, *xs), kind)
-
-
 def _check_range(code: Code, x: Value, kind: str) -> Value:
-    """An integer, or NaN where its type does not hold it, or no double holds it exactly."""
+    """An integer, or NaN and not another one where its type does not hold it, or no double holds it exactly."""
     limits = np.iinfo(kind)
     low, high = max(int(limits.min), -(2**53)), min(int(limits.max), 2**53)
     return code.select((x >= float(low)) & (x <= float(high)), x, float("nan"))
