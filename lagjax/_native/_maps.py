@@ -18,12 +18,9 @@ brings its two rules, and nothing else knows of it.
 Source: Griewank & Walther, *Evaluating Derivatives* (2008), §§3.2, 13.
 """
 
-import numpy as np
-from llvmlite import ir
-
 from lagjax._native._constants import MAX_ORDER
 from lagjax._native._cotangents import Cotangents, add
-from lagjax._native._frame import Frame, Lane, Vectors, integers
+from lagjax._native._frame import Frame, Lane, Vectors
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._motion_parts import MotionParts
 from lagjax._native._run_records import instant_about
@@ -81,7 +78,7 @@ class CauchyProducts:
         """`(k)`: Σ' (δaⱼ bₖ₋ⱼ + aⱼ δbₖ₋ⱼ) for every product."""
         frame = directions.function("cauchy_products", INTEGER)
         code, (k,) = frame.code, frame.arguments
-        kinds = [(some, self._table(some)) for some in (self.mixed, self.squares)]
+        kinds = [(some, self.motion.table(some, 1)) for some in (self.mixed, self.squares)]
         for order in code.cases(k, range(2, MAX_ORDER)):
             for (some, table), first in zip(kinds, (0, len(self.mixed)), strict=True):
                 if some:
@@ -90,11 +87,6 @@ class CauchyProducts:
                         total = self._push_product(directions, frame, Value(code, table), i, order, square)
                         frame["dsums", i + first] = total
         return frame.finish()
-
-    def _table(self, pairs) -> ir.GlobalVariable:
-        """The rows of each product, in numbers of a row."""
-        flat = [row * MAX_ORDER for pair in pairs for row in pair]
-        return integers(self.motion.module, np.array(flat or [0], np.int64))
 
     def _push_product(
         self, directions: Directions, frame: Frame, table: Value, i: Value, order: int, square: bool

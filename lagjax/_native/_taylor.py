@@ -116,9 +116,9 @@ class TaylorSeries:
                         frame["sums", k if self.keep_sums else 0, i + first] = total(order, read, *rows)
         return frame.finish()
 
-    def table(self, pairs) -> ir.GlobalVariable:
-        """The rows of each product, as distances in memory from the first row."""
-        flat = [row * MAX_ORDER * self.width for pair in pairs for row in pair]
+    def table(self, pairs, width: int | None = None) -> ir.GlobalVariable:
+        """The rows of each product, as distances in memory from the first row, of vectors of this width."""
+        flat = [row * MAX_ORDER * (width or self.width) for pair in pairs for row in pair]
         return integers(self.module, np.array(flat or [0], np.int64))
 
     def _row(self, frame: Frame, table, index: Value) -> Value:
