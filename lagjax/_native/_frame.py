@@ -205,9 +205,7 @@ class Frame:
         self.code.store(value, self.code.element(self.job(name), index))
 
     def next(self, name: str) -> Value:
-        """The value of a counter that all threads share, which grows by one."""
-        counter = self.job(name)
-        return Value(self.code, self.code.builder.atomic_rmw("add", counter.it, ir.Constant(INTEGER, 1), "monotonic"))
+        return self.code.count_up(self.job(name))
 
     def time(self, member: Value, index: Index) -> Value:
         return self.read("ts", member * self.job("ts_stride") + index)

@@ -153,15 +153,10 @@ class _Thread:
     def members(self) -> Iterator[Value]:
         """A context: its body is for every member that the thread takes."""
         code, counter = self.code, self.at["next_member"]
-
-        def take() -> Value:
-            one = ir.Constant(INTEGER, 1)
-            return Value(code, code.builder.atomic_rmw("add", counter.it, one, "monotonic"))
-
-        member = code.variable(take())
+        member = code.variable(code.count_up(counter))
         with code.repeat_while(lambda: member.value < self.numbers["members"]):
             yield member.value
-            member.value = take()
+            member.value = code.count_up(counter)
 
 
 class _Transpose(_Thread):

@@ -363,6 +363,10 @@ class Code:
         self.builder.branch(head)
         self.builder.position_at_end(done)
 
+    def count_up(self, counter: Value) -> Value:
+        """The integer at an address that all threads share, which grows by one."""
+        return Value(self, self.builder.atomic_rmw("add", counter.it, ir.Constant(INTEGER, 1), "monotonic"))
+
     def only_if(self, condition: Value):
         """A context: its body runs where the bit is set."""
         return self.builder.if_then(condition.it)
