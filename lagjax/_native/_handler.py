@@ -86,14 +86,9 @@ class Rest(NamedTuple):
         return cls(memory, lanes, integers[-3:-2], integers[-2:-1])
 
     @staticmethod
-    def has_more(array: np.ndarray) -> bool:
-        """True if members are left to be integrated, by the rest that a handler wrote."""
-        return bool(array[-1:].view(np.int64)[0])
-
-    @staticmethod
-    def idle_lanes(array: np.ndarray) -> int:
-        """The idle steps of lanes, from what a handler wrote."""
-        return int(array[-3:-2].view(np.int64)[0])
+    def counts(array: np.ndarray) -> list[int]:
+        """The idle steps of lanes, the next member, and whether there are more, by the rest that a handler wrote."""
+        return array[-3:].view(np.int64).tolist()
 
 
 _OTHERS = 4  # integers after those of the lanes

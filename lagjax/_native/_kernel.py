@@ -181,8 +181,9 @@ class Kernel:
             t_end, code, steps, rejected = np.empty((4, members))
         else:
             path, y_end, t_end, code, steps, rejected, rest = begun
-            if not Rest.has_more(rest):
-                return _outcome(path, y_end, t_end, code, steps, rejected, Rest.idle_lanes(rest))
+            idle, _, more = Rest.counts(rest)
+            if not more:
+                return _outcome(path, y_end, t_end, code, steps, rejected, idle)
         rest = None if begun is None else Rest.from_array(begun.rest, self._forward.layout)
         table, rows = None, np.zeros(1, np.int64)
         if room:  # the system provides pages when they are written to
