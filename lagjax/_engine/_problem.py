@@ -201,7 +201,8 @@ class Batch(eqx.Module):
         state = jax.tree.leaves((arrays["q0"], arrays["qdot0"]))
         params, structure = jax.tree.flatten(arrays["params"])
         of_params = structure.flatten_up_to(axes["params"])
-        in_front = [x if axis is None else _move_axis_first(x, axis) for x, axis in zip(params, of_params, strict=True)]
+        pairs = zip(params, of_params, strict=True)
+        in_front = [x if k is None else (xp := _library_of(x)).moveaxis(xp.asarray(x), k, 0) for x, k in pairs]
         of_state = (jax.tree.structure(values[name]).flatten_up_to(axes[name]) for name in ("q0", "qdot0"))
         y0 = rows(state, itertools.chain(*of_state), size, layout.dtype)
         spread = tuple(None if axis is None else 0 for axis in of_params)
@@ -266,7 +267,7 @@ class AbstractEngine(abc.ABC):
     def rtol(self, problem: Problem) -> Float[Numbers, ""]:
         """rtol of a step: that of the problem, or by default that of this engine."""
         rtol, dtype = problem.tolerances[0], problem.layout.dtype
-        return _read_only(self.default_rtol[dtype], dtype) if rtol is None else as_arrays(rtol, dtype)
+        return np.asarray(self.default_rtol[dtype], dtype) if rtol is None else as_arrays(rtol, dtype)
 
     def tolerances(self, problem: Problem, y0: Float[Numbers, "*N states"]) -> tuple:
         """rtol, and atol where it was given; by default at most a sixteenth of rtol times the size of motions.
@@ -277,7 +278,7 @@ class AbstractEngine(abc.ABC):
         rtol, atol, ts = self.rtol(problem), problem.tolerances[1], problem.ts
         if atol is not None:
             return rtol, as_arrays(atol, problem.layout.dtype, "atol")
-        library: Any = np if all(map(_is_on_host, (y0, ts, rtol))) else jnp
+        library = _library_of(y0, ts, rtol)
         # Within `jit` an operation on an array of JAX is traced, even where its numbers are known.
         ts, relative = library.asarray(ts), library.asarray(rtol)
         far, fast = (library.abs(half).max(axis=-1) for half in halves(library.asarray(y0)))
@@ -308,6 +309,11 @@ def _is_on_host(leaf) -> bool:
     return is_concrete(leaf) and [device.platform for device in leaf.devices()] == ["cpu"]
 
 
+def _library_of(*leaves) -> Any:
+    """NumPy where it can read all of them, else JAX's."""
+    return np if all(map(_is_on_host, leaves)) else jnp
+
+
 def concatenate_leaves(leaves: list, dtype) -> Float[Numbers, " count"]:
     """All numbers of the leaves as one vector; by NumPy where it can read them, at a tenth of the cost of JAX.
 
@@ -321,7 +327,7 @@ def concatenate_leaves(leaves: list, dtype) -> Float[Numbers, " count"]:
 
 def rows(leaves, axes, size: int, dtype) -> Float[Numbers, "size numbers"]:
     """The numbers of every member end to end, shape (size, numbers); `axes` are those of the members, leaf by leaf."""
-    library: Any = np if all(map(_is_on_host, leaves)) else jnp
+    library = _library_of(*leaves)
     columns = [library.zeros((size, 0), dtype)]
     for leaf, axis in zip(leaves, axes, strict=True):
         array = library.asarray(leaf, dtype)
@@ -330,12 +336,6 @@ def rows(leaves, axes, size: int, dtype) -> Float[Numbers, "size numbers"]:
         else:
             columns.append(library.moveaxis(array, axis, 0).reshape(size, array.size // size))
     return library.concatenate(columns, axis=1)
-
-
-def _move_axis_first(leaf, axis: int):
-    """A leaf with this axis in front; by NumPy where it can read the leaf."""
-    library: Any = np if _is_on_host(leaf) else jnp
-    return library.moveaxis(library.asarray(leaf), axis, 0)
 
 
 def _shape_of_one(leaf, axis):
@@ -405,13 +405,6 @@ def _check_fields(dtype, params, ts, rtol, atol, max_steps, event) -> dict[str, 
 
     tolerances, event = (array(rtol), array(atol)), _event(event, dtype)
     return dict(params=as_arrays(params, dtype), ts=ts, tolerances=tolerances, max_steps=max_steps, event=event)
-
-
-@functools.lru_cache(maxsize=16)
-def _read_only(number: float, dtype) -> np.ndarray:
-    array = np.array(number, dtype)
-    array.flags.writeable = False
-    return array
 
 
 def too_tight(rtol, dtype, least: float) -> str | None:
