@@ -163,17 +163,13 @@ def _steps_of(line: StraightLine, precision) -> list[tuple[Callable | None, tupl
         elif op == "input":
             function = None
         elif op == "convert":
-            function, attribute = _convert, _dtype(kind, precision)
+            function, attribute = (lambda x, dtype: np.asarray(x).astype(dtype)), _dtype(kind, precision)
         elif op in LOOK_UPS:
             function, attribute = look_up, (op, attribute)
         else:  # a division of floats without a look at the kind for every state
             function = np.divide if op == "div" and kind == "float" else OPERATIONS[op].value
         steps.append((function, operands, (op == "input", attribute), tuple(dropped.get(k, ()))))
     return steps
-
-
-def _convert(x, dtype):
-    return np.asarray(x).astype(dtype)
 
 
 def _values(steps: list, columns: Sequence, keep: bool = False) -> list:

@@ -9,8 +9,8 @@ An entry is an input of the program, or a number of the program itself. Derivati
 passes its tangent on from the same place of a table of tangents, and its cotangent to one place (`_differentiation`).
 """
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple, overload
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple, TypeVar
 
 import numpy as np
 
@@ -62,26 +62,24 @@ def table_of(attribute: "Table | Located") -> Table:
     return attribute.table if isinstance(attribute, Located) else attribute
 
 
-@overload
-def shift_look_up(attribute: Table, by: int) -> Table: ...
-@overload
-def shift_look_up(attribute: Located, by: int) -> Located: ...
-def shift_look_up(attribute: "Table | Located", by: int) -> "Table | Located":
+_LookUp = TypeVar("_LookUp", Table, Located)
+
+
+def _with_table(attribute: _LookUp, move: Callable[[Table], Table]) -> _LookUp:
+    """A look-up in the table that `move` gives for its own; numbers of the program are where they are."""
+    if isinstance(attribute, Located):
+        return attribute._replace(table=_with_table(attribute.table, move))
+    return attribute if attribute.numbers is not None else move(attribute)
+
+
+def shift_look_up(attribute: _LookUp, by: int) -> _LookUp:
     """The look-up of a program whose inputs have positions larger by `by`."""
-    table = table_of(attribute)
-    if table.numbers is not None:
-        return attribute
-    table = table._replace(first=table.first + by)
-    return attribute._replace(table=table) if isinstance(attribute, Located) else table
+    return _with_table(attribute, lambda table: table._replace(first=table.first + by))
 
 
-def move_look_up(attribute: "Table | Located", places: Sequence[int]) -> "Table | Located":
+def move_look_up(attribute: _LookUp, places: Sequence[int]) -> _LookUp:
     """A look-up in a program whose input `places[i]` is what input i was; numbers of a member stay what they are."""
-    table = table_of(attribute)
-    if table.numbers is not None or table.first >= BESIDE:
-        return attribute
-    table = table.moved(places)
-    return attribute._replace(table=table) if isinstance(attribute, Located) else table
+    return _with_table(attribute, lambda table: table if table.first >= BESIDE else table.moved(places))
 
 
 def look_up(op: str, attribute: Any, columns: Sequence, x) -> np.ndarray:
