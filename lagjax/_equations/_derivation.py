@@ -215,7 +215,7 @@ class Derivation:
 
     def evaluate(self, names: Sequence[str], columns: Sequence) -> dict[str, np.ndarray]:
         """Named quantities at S states, each of shape (S, …), in NumPy; `columns` as `Program.evaluate_many` takes."""
-        return self._split_outputs(names, self.program(*names).evaluate_many(columns))
+        return self.split_outputs(names, self.program(*names).evaluate_many(columns).T)
 
     def term_sizes(self, q, qdot, t, numbers: PyTree, names: tuple[str, ...] = ("residual", "rates")):
         """The sizes of the terms of quantities at a state of numbers or tracers, (outputs,); 0 without programs."""
@@ -234,7 +234,7 @@ class Derivation:
     def round_off(self, names: Sequence[str], columns: Sequence) -> dict[str, np.ndarray]:
         """The rounding errors of these quantities at S states that are exact, each of shape (S, …)."""
         sizes = self._rounding_of(tuple(names), 0).evaluate_many(columns)
-        return self._split_outputs(names, np.finfo(sizes.dtype).eps * sizes)
+        return self.split_outputs(names, np.finfo(sizes.dtype).eps * sizes.T)
 
     def _rounding_of(self, names: tuple[str, ...], moving: int) -> Program:
         key = "rounding", str(moving), *names
@@ -243,13 +243,11 @@ class Derivation:
             self._programs[key] = program.rounding_of(range(len(program.line.outputs)), moving)
         return self._programs[key]
 
-    def _split_outputs(self, names: Sequence[str], outputs: np.ndarray) -> dict[str, np.ndarray]:
-        rows, values, start = outputs.T, {}, 0
-        for name in names:
-            end = start + self.count(name)
-            values[name] = rows[:, start:end].reshape(len(rows), *self.shape(name))
-            start = end
-        return values
+    def split_outputs(self, names: Sequence[str], outputs) -> dict[str, Any]:
+        """Named quantities (…, *shape) from the outputs (…, outputs) of their `program`, of NumPy or JAX."""
+        ends = np.cumsum([0, *map(self.count, names)])
+        parts = {name: outputs[..., ends[k] : ends[k + 1]] for k, name in enumerate(names)}
+        return {name: x.reshape(*x.shape[:-1], *self.shape(name)) for name, x in parts.items()}
 
     def momenta_by_q(self, momenta: tuple[int, ...]) -> Program:
         """∂pᵢ/∂q for the coordinates i in `momenta`, shape (len(momenta), n)."""

@@ -9,7 +9,6 @@ from collections.abc import Callable
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array
 
 from lagjax._engine.taylor._line_functions import line_of
@@ -68,9 +67,7 @@ class _LoweredMotion(Motion):
 
 def _evaluate(derivation: Derivation, q, qdot, t, params, *names: str) -> list[Array]:
     values = _outputs(derivation.program(*names), q, qdot, t, params)
-    shapes = [derivation.shape(name) for name in names]
-    parts = jnp.split(values, np.cumsum([derivation.count(name) for name in names])[:-1])
-    return [part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)]
+    return list(derivation.split_outputs(names, values).values())
 
 
 def _outputs(program: Program, q, qdot, t, params) -> Array:
