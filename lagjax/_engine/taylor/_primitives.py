@@ -49,12 +49,10 @@ from lagjax._interface import SUCCESSFUL, default_platform
 from lagjax._native import Begun, Projection
 from lagjax._primitives import (
     LinearMap,
-    VaryingPrimitive,
     compute_on_host,
     cond_alike,
     cotangent_of,
     is_zero,
-    zero_like,
 )
 from lagjax._program import Program, Unlowerable
 
@@ -216,13 +214,10 @@ def _motions(ts, y0, params, solution: Solution) -> Motions:
 # ---- derivatives -----------------------------------------------------------------------------------------------------
 
 
-def _derivative_of_run(primals, tangents, *, flow, tolerances):
-    (ts, y0, params), (dts, dy0, dparams) = primals, tangents
-    outs = run_p.bind(*primals, flow=flow, tolerances=tolerances)
-    along = list(map(zero_like, outs))
-    if flow.guards is not None or all(map(is_zero, tangents)):
-        return outs, along
-    solution = Solution(*outs)
+def _vary_run(primals, tangents, outs, *, flow, tolerances):
+    (ts, y0, params), (dts, dy0, dparams), solution = primals, tangents, Solution(*outs)
+    if flow.guards is not None:
+        return [None] * len(outs)
     dy0, dparams = map(ad.instantiate_zeros, (dy0, dparams))
     if not is_zero(dts):
         dy0 = dy0 - _rate(flow, ts[..., 0], y0, params) * dts[..., :1]
@@ -237,7 +232,7 @@ def _derivative_of_run(primals, tangents, *, flow, tolerances):
         d_path = d_path + jnp.where(reached, rates, 0.0)
         d_end = d_end + jnp.where(done[..., None], rates[..., -1, :], 0.0)
         d_t_end = jnp.where(done, dts[..., -1], 0.0)
-    return outs, [d_path, d_end, d_t_end, *along[3:]]
+    return [d_path, d_end, d_t_end, *[None] * (len(outs) - 3)]
 
 
 def _vary_jvp(primals, tangents, _, **settings):
@@ -355,13 +350,10 @@ def _batch_of_batches(primitive, outputs_after):
 
 # ---- primitives ------------------------------------------------------------------------------------------------------
 
-run_p = VaryingPrimitive("lagjax_run")
-run_p.multiple_results = True
-run_p.def_abstract_eval(_run_shapes)
+run_p = LinearMap("lagjax_run", _run_shapes, _vary_run)
 jvp_p = LinearMap("lagjax_jvp", _jvp_shapes, _vary_jvp, 2, lambda given, w, _, **of: vjp_p.bind(*given, *w, **of))
 vjp_p = LinearMap("lagjax_vjp", _vjp_shapes, _vary_vjp, 2, lambda given, w, _, **of: jvp_p.bind(*given, *w, **of))
 curvature_p = LinearMap("lagjax_curvature", _curvature_shapes, _vary_curvature, 2)
-ad.primitive_jvps[run_p] = _derivative_of_run
 ad.primitive_transposes[curvature_p] = _curvature_transpose
 for _primitive, _batching in (
     (run_p, _batch_rule(run_p)),
