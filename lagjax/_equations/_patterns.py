@@ -11,7 +11,7 @@ from typing import Any
 
 import jax
 import numpy as np
-from jax.extend.core import ClosedJaxpr, Jaxpr
+from jax.extend import core
 from scipy.sparse import csr_array
 
 from lagjax._program import lack_of_memory
@@ -62,12 +62,9 @@ def gradient_memory(function: Callable, shapes: tuple) -> int:
 
 def _largest_array(jaxpr) -> int:
     """The bytes of the largest array that an operation of a jaxpr gives."""
-    largest = 0
-    for equation in jaxpr.eqns:
-        arrays = [v.aval for v in equation.outvars]
-        sizes = (math.prod(x.shape) * x.dtype.itemsize for x in arrays if hasattr(x, "shape"))
-        largest = max(largest, *sizes, *map(_largest_array, _inner_jaxprs(equation)), 0)
-    return largest
+    arrays = [v.aval for equation in jaxpr.eqns for v in equation.outvars]
+    sizes = (math.prod(x.shape) * x.dtype.itemsize for x in arrays if hasattr(x, "shape"))
+    return max([0, *sizes, *map(_largest_array, core.subjaxprs(jaxpr))])
 
 
 def sparse_jacobian(function: Callable, shapes: tuple) -> Callable[..., csr_array] | None:
@@ -98,7 +95,7 @@ def count_operations(jaxpr) -> int:
     """The scalar operations of a jaxpr: numbers that its equations compute, those of loops in every round."""
     count = 0
     for equation in jaxpr.eqns:
-        inner = _inner_jaxprs(equation)
+        inner = list(core.jaxprs_in_params(equation.params))
         rounds = equation.params.get("length", 1) if equation.primitive.name == "scan" else 1
         count += rounds * sum(map(count_operations, inner))
         count += 0 if inner else sum(int(np.prod(v.aval.shape, dtype=int)) for v in equation.outvars)
@@ -107,9 +104,8 @@ def count_operations(jaxpr) -> int:
 
 def _visited(jaxpr) -> int:
     """The products of two numbers in products of matrices, and the numbers that running sums and transforms read."""
-    count = 0
+    count = sum(map(_visited, core.subjaxprs(jaxpr)))
     for equation in jaxpr.eqns:
-        count += sum(map(_visited, _inner_jaxprs(equation)))
         if equation.primitive.name == "dot_general":
             (contracted, _), _ = equation.params["dimension_numbers"]
             shape = equation.invars[0].aval.shape
@@ -118,12 +114,6 @@ def _visited(jaxpr) -> int:
             x = equation.invars[0].aval
             count += x.size * x.shape[equation.params.get("axis", -1)]
     return count
-
-
-def _inner_jaxprs(equation) -> list[Jaxpr]:
-    """The jaxprs that an equation calls, as loops and branches do."""
-    inner = jax.tree.leaves(equation.params, is_leaf=lambda x: isinstance(x, Jaxpr | ClosedJaxpr))
-    return [x.jaxpr if isinstance(x, ClosedJaxpr) else x for x in inner if isinstance(x, Jaxpr | ClosedJaxpr)]
 
 
 def color_columns(pattern: csr_array) -> np.ndarray:

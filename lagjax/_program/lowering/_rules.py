@@ -263,9 +263,7 @@ def _inner_jaxprs(equation) -> list:
     params = equation.params
     if equation.primitive.name == "custom_linear_solve":  # how JAX solves it is not what is lowered
         params = {"matvec": params["jaxprs"].matvec}
-    leaves = jax.tree.leaves(list(params.values()), is_leaf=lambda x: isinstance(x, core.Jaxpr | core.ClosedJaxpr))
-    closed = (x.jaxpr if isinstance(x, core.ClosedJaxpr) else x for x in leaves)
-    return [x for x in closed if isinstance(x, core.Jaxpr)]
+    return list(core.jaxprs_in_params(params))
 
 
 @functools.cache
