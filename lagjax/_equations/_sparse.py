@@ -77,8 +77,6 @@ class Entries(MatrixForm):
         self.on_diagonal = np.flatnonzero(self.rows == self.columns)  # one for each row, as rows ascend
 
     def read(self, multiply: Product, dtype) -> Float[Array, " entries"]:
-        if self.count == 1:
-            return multiply(jnp.ones(self.size, dtype))[self.rows]
         seeds = jnp.asarray(self.colors == np.arange(self.count)[:, None], dtype)
         return jax.vmap(multiply)(seeds)[self.colors[self.columns], self.rows]
 
