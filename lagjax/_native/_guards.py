@@ -2,7 +2,6 @@
 
 import functools
 from collections.abc import Callable
-from dataclasses import replace
 from typing import Any, NamedTuple
 
 from lagjax._native._lanes import INTEGERS
@@ -67,13 +66,6 @@ def append_guards(program: Recurrent, size: int, values: Recurrent, slides: bool
     except Unlowerable:  # a switching number without a series, or more operations than that takes
         pass
     return Watched(whole, _series_of_guards(whole, size, (), count), None)
-
-
-def drop_guards(found: Borders, size: int) -> tuple[Recurrent, Series]:
-    """The program along the pieces that were found, without the guards, and its series: for derivatives over steps."""
-    line = found.program.line
-    program = replace(found.program, line=line.replace(outputs=line.outputs[: size + 1]))
-    return program, series(program, size, moving=2 * size + 1, followed=found.followed)
 
 
 def require_lanes(line: StraightLine) -> None:

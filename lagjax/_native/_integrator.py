@@ -58,7 +58,7 @@ class Integrator:
             fields |= Roots.fields(MAX_ORDER + 2)
         if borders is not None:
             fields |= BorderControl.fields(borders)
-        jump = parts.jump
+        jump = parts.jump(over_steps=False)
         more = [line for line in (jump and jump.line, borders and borders.retraction) if line]
         large = is_large(program, projection, guards, more=more)
         self.motion = motion = TaylorSeries("motion", parts, JOB, fields, large, width, kept=self.guards)

@@ -1,9 +1,10 @@
 """The programs that a kernel is made from: those of a motion, its series, and the borders between its pieces."""
 
 import functools
+from dataclasses import replace
 from typing import NamedTuple
 
-from lagjax._native._guards import Guards, append_guards, drop_guards, require_lanes
+from lagjax._native._guards import Guards, append_guards, require_lanes
 from lagjax._program._borders import Borders, Pieced, borders
 from lagjax._program._graph import Unlowerable
 from lagjax._program._jump import Jump, Nesting, jump_at_border, with_borders_of_tangents
@@ -70,17 +71,9 @@ class MotionParts(NamedTuple):
         """The count of those numbers of a member that the motion itself has, where tables look up some; else 0."""
         return 0 if self.chosen is None else self.chosen.of * self.nesting.base // self.nesting.size
 
-    @property
-    def jump(self) -> Jump | None:
-        """The jump of the tangents at a border; None without borders, or without tangents."""
-        return self._jump(self.nesting, over_steps=False)
-
-    @property
-    def jump_over_steps(self) -> Jump | None:
-        """The jump at a border of a derivative of the motion over steps that have been taken; None without borders."""
-        return self._jump(self.nesting.with_tangents(1), over_steps=True)
-
-    def _jump(self, nesting: Nesting, over_steps: bool) -> Jump | None:
+    def jump(self, over_steps: bool) -> Jump | None:
+        """The jump at a border of tangents, or of a derivative `over_steps` that have been taken; None without any."""
+        nesting = self.nesting.with_tangents(1) if over_steps else self.nesting
         if not self.pieces or self.borders is None or not nesting.directions:
             return None
         return jump_at_border(self.borders.motion or self.borders, *nesting, self.numbers_of_motion, over_steps)
@@ -107,8 +100,9 @@ class MotionParts(NamedTuple):
     def drop_guards(self) -> "MotionParts":
         """The parts of a piecewise motion without the guards behind q̈."""
         assert self.borders is not None
-        program, series = drop_guards(self.borders, self.nesting.size)
-        return self._replace(program=program, series=series)
+        of, size = self.borders.program, self.nesting.size
+        program = replace(of, line=of.line.replace(outputs=of.line.outputs[: size + 1]))
+        return self._replace(program=program, series=along_pieces(program, size, self.borders))
 
 
 @functools.lru_cache(maxsize=16)
@@ -167,6 +161,11 @@ def recurrences(program: Recurrent, size: int) -> Series:
     return series(program, size, moving=2 * size + 1)
 
 
+def along_pieces(program: Recurrent, size: int, found: Borders) -> Series:
+    """The Taylor series of a motion along a piece, and of its switching numbers."""
+    return series(program, size, moving=2 * size + 1, followed=found.followed)
+
+
 @functools.lru_cache(maxsize=16)
 def pieces_of(
     program: Recurrent, nesting: Nesting, motion: Recurrent | None = None, member: int = 0
@@ -183,10 +182,10 @@ def pieces_of(
         found = of_motion[0]
         for inner, directions in nesting.levels:
             found = with_borders_of_tangents(found, inner, directions, member * (inner // nesting.base))
-        return found, series(found.program, size, moving=2 * size + 1, followed=found.followed)
+        return found, along_pieces(found.program, size, found)
     try:
         if (found := borders(program, size)) is not None:
-            return found, series(found.program, size, moving=2 * size + 1, followed=found.followed)
+            return found, along_pieces(found.program, size, found)
     except Unlowerable:  # a switching number without a series, or more operations than that takes
         pass
     return None

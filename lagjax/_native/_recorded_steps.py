@@ -28,7 +28,7 @@ class Replay:
     def __init__(
         self, name: str, parts: MotionParts, job: type, fields: dict, at_borders: dict, width: int, jumps: int
     ):
-        self.parts, self._jump = parts, parts.jump_over_steps
+        self.parts, self._jump = parts, parts.jump(over_steps=True)
         more = [] if self._jump is None else [self._jump.line] * jumps
         more += [line for line in (parts.borders and parts.borders.retraction,) if line]
         large = is_large(parts.program, parts.projection, times=2, more=more)
@@ -38,7 +38,7 @@ class Replay:
         borders = parts.borders
         self.retraction = borders and borders.retraction and Retraction(motion, borders, parts.nesting)
         self._retract = self.retraction and self.retraction.apply(is_run=False)
-        self._size = motion.states + RECORDED + motion.recorded_pieces  # of what is recorded of a step
+        self.size = motion.states + RECORDED + motion.recorded_pieces  # of what is recorded of a step
 
     def saltation(self) -> Saltation | None:
         """The map at the borders that steps end at; None without any."""
@@ -91,11 +91,7 @@ class Replay:
 
     def row(self, frame: Frame, lane: Lane) -> Value:
         """The place in the record of the step that a lane is at."""
-        return (frame.read("first_step", lane["member"], INTEGER) + lane["step"]) * self._size
-
-    def begin_of_next(self, frame: Frame, lane: Lane) -> Value:
-        """The time at which the step after the one at hand begins."""
-        return frame.read("record", self.row(frame, lane) + self._size)
+        return (frame.read("first_step", lane["member"], INTEGER) + lane["step"]) * self.size
 
     def _recall(self, frame: Frame, lane: Lane) -> None:
         """The time, size, first state and pieces of the step that the lane is at, and the border that it ends at."""

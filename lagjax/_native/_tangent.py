@@ -93,7 +93,7 @@ class Tangent:
             with code.only_if(lane["member"] >= 0):
                 lane["next_begin"] = lane["h"] * float("inf")  # of the last step: all outputs that are left
                 with code.only_if(lane["step"] + 1 < frame.read("steps", lane["member"], INTEGER)):
-                    lane["next_begin"] = self.replay.begin_of_next(frame, lane)
+                    lane["next_begin"] = frame.read("record", self.replay.row(frame, lane) + self.replay.size)
 
     def _leave_step(self, frame: Frame, lane: Lane, index: Value) -> None:
         """One step more; after the last one, write down how large the last terms were and take the next member."""
