@@ -22,7 +22,7 @@ import numpy as np
 from lagjax._analysis import Modes
 from lagjax._fit import Fit, Record, draw_record, record_matrix
 from lagjax._interface import Function, Layout, accept, join_names
-from lagjax._run import Crossings, Trajectory
+from lagjax._run import Crossings, Members, Trajectory
 from lagjax._show import (
     COLORS,
     course_of,
@@ -33,7 +33,6 @@ from lagjax._show import (
     require_numbers,
     require_points,
     simplify_axes,
-    times_of_members,
 )
 from lagjax._trust import WorkPrecision
 from lagjax._trust.health import does_work
@@ -386,7 +385,7 @@ def energy_error(trajectory: Trajectory, *, scale: float | None = None, ax=None)
     error = np.abs(h - h[:, :1]) / unit
     known = np.array(np.isfinite(error).any(axis=0))  # nothing is left of members that an event has ended
     known[0] = False  # zero, which has no logarithm
-    ts = times_of_members(trajectory).reshape(-1, len(known))
+    ts = Members(trajectory).shared(trajectory.ts, 1)
     if (ts != ts[0]).any():
         raise ValueError("The members have times of their own, at which no median is taken: draw one at a time.")
     times, error = ts[0, known], error[:, known]

@@ -4,11 +4,11 @@ _summary     the three lines of a trajectory
 _notebook    the HTML of a result: its text, and a small picture
 _course      a motion between its outputs
 _animation   a motion as a film
-_export      a trajectory as an xarray.Dataset or a pandas.DataFrame, intervals as a table
+_export      a trajectory as an xarray.Dataset or a pandas.DataFrame
 """
 
 from lagjax._show._animation import Animation, make_animation, require_points
 from lagjax._show._course import course_of, courses_of, join_curve
-from lagjax._show._export import dataset, frame, intervals
+from lagjax._show._export import dataset, frame
 from lagjax._show._notebook import COLORS, cell, even_places, render_picture, simplify_axes, trajectory_html
-from lagjax._show._summary import import_package, require_numbers, summary, times_of_members
+from lagjax._show._summary import import_package, require_numbers, summary

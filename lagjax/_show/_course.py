@@ -12,7 +12,6 @@ import numpy as np
 
 from lagjax._interface import RESULTS, Layout, numbers_at
 from lagjax._run import Members
-from lagjax._show._summary import times_of_members
 
 # Points of a curve, at least: four times as many as dots of a figure that is printed, because a planet passes its
 # perihelion in a fraction of them. Half as many show corners there.
@@ -90,7 +89,7 @@ def course_of_member(members: Members, k: int) -> Course:
         leaves = [numbers_at(leaf, place).reshape(rows, -1) for leaf in jax.tree.leaves(tree)]
         return np.concatenate(leaves, axis=1).astype(float)
 
-    t = times_of_members(trajectory).reshape(members.count, -1)[k].astype(float)
+    t = members.shared(trajectory.ts, 1)[k].astype(float)
     knots = [(t, *(flatten_member(tree, len(t)) for tree in (trajectory.q, trajectory.qdot)))]
     if changes is not None:
         when = numbers_at(changes.t, place).astype(float)

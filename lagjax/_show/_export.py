@@ -4,13 +4,14 @@ Units are given as a pytree prefix of q, as in `jax.vmap`: one for all coordinat
 those per unit of time. They stand in the `attrs` of what comes out, and not in the names, by which columns are found.
 """
 
+import math
 from typing import Any
 
 import jax
 import numpy as np
 
-from lagjax._interface import Layout
-from lagjax._show._summary import import_package, require_numbers, times_of_members
+from lagjax._run import Members
+from lagjax._show._summary import import_package, require_numbers
 
 PyTree = Any
 
@@ -30,10 +31,10 @@ def dataset(trajectory, units: PyTree = None, time_unit: str | None = None):
             variables[label] = ((*members, "time", *inner), np.asarray(leaf), {} if one is None else {"units": one})
     if trajectory.mode is not None:
         variables["mode"] = ((*members, "time"), np.asarray(trajectory.mode), {"names": list(trajectory.mode_names)})
-    times, of_time = times_of_members(trajectory), {} if time_unit is None else {"units": time_unit}
-    shared = times[(0,) * len(members)]
-    if (times == shared).all():
-        return xarray.Dataset(variables, coords={"time": ("time", shared, of_time)})
+    times, of_time = Members(trajectory).shared(trajectory.ts, 1), {} if time_unit is None else {"units": time_unit}
+    if (times == times[0]).all():
+        return xarray.Dataset(variables, coords={"time": ("time", times[0], of_time)})
+    times = times.reshape(*trajectory.ok.shape, -1)
     return xarray.Dataset(variables, coords={"t": ((*members, "time"), times, of_time)})
 
 
@@ -41,26 +42,23 @@ def frame(trajectory, units: PyTree = None, time_unit: str | None = None):
     """A `pandas.DataFrame` of a trajectory: see `Trajectory.to_pandas`."""
     pandas = import_package("to_pandas()", "pandas", "pandas")
     require_numbers(trajectory, "to_pandas() copies")
-    members = _member_axes(trajectory)
-    batch, count = np.shape(trajectory.result._value), trajectory.ts.shape[-1]
-    # The names of the coordinates, as messages have them, which begin with q.
-    first = jax.tree.map(lambda leaf: np.asarray(leaf)[(0,) * (len(batch) + 1)], (trajectory.q, trajectory.qdot))
-    names = [name.removeprefix("q") for name in Layout.from_state(*first).names]
+    members = Members(trajectory)
+    names = [name.removeprefix("q") for name in members.layout.names]
     columns = {
         which + name: column
         for which, tree in (("q", trajectory.q), ("qdot", trajectory.qdot))
-        for name, column in zip(names, _columns(tree, len(batch) + 1), strict=True)
+        for name, column in zip(names, members.flat(tree).reshape(-1, len(names)).T, strict=True)
     }
     if trajectory.mode is not None:
         codes = np.asarray(trajectory.mode).ravel()
         columns["mode"] = pandas.Categorical.from_codes(codes, categories=list(trajectory.mode_names))
-    index = pandas.Index(times_of_members(trajectory).ravel(), name="t")
-    if batch:
-        places = [place.ravel() for place in np.indices((*batch, count))[:-1]]
-        index = pandas.MultiIndex.from_arrays([*places, index], names=[*members, "t"])
+    index = pandas.Index(members.shared(trajectory.ts, 1).ravel(), name="t")
+    if members.batch:
+        places = [place.ravel() for place in np.indices((*members.batch, trajectory.ts.shape[-1]))[:-1]]
+        index = pandas.MultiIndex.from_arrays([*places, index], names=[*_member_axes(trajectory), "t"])
     table = pandas.DataFrame(columns, index=index)
     of_q, of_qdot = _units(trajectory.q, units, time_unit)
-    per_leaf = [np.size(leaf) for leaf in jax.tree.leaves(first[0])]
+    per_leaf = [math.prod(shape) for shape in members.layout.shapes]
     spread = [unit for of in (of_q, of_qdot) for unit, size in zip(of, per_leaf, strict=True) for _ in range(size)]
     known = dict(zip([*columns][: len(spread)], spread, strict=True)) | {"t": time_unit}
     if known := {name: unit for name, unit in known.items() if unit is not None}:
@@ -68,22 +66,10 @@ def frame(trajectory, units: PyTree = None, time_unit: str | None = None):
     return table
 
 
-def intervals(names, values, low, high):
-    """A `pandas.DataFrame` of numbers by name, with the ends of their intervals: see `Fit.to_pandas`."""
-    pandas = import_package("to_pandas()", "pandas", "pandas")
-    return pandas.DataFrame({"value": values, "low": low, "high": high}, index=pandas.Index(names, name="parameter"))
-
-
 def _member_axes(trajectory) -> tuple[str, ...]:
     """Names of the axes of the batch: "member", or "member_0", "member_1", … of batches of batches."""
     rank = np.ndim(trajectory.result._value)
     return ("member",) if rank == 1 else tuple(f"member_{axis}" for axis in range(rank))
-
-
-def _columns(tree: PyTree, axes: int) -> list[np.ndarray]:
-    """Every scalar coordinate with the leading axes end to end."""
-    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
-    return [column for leaf in leaves for column in leaf.reshape(int(np.prod(leaf.shape[:axes])), -1).T]
 
 
 def _units(tree: PyTree, units: PyTree, time_unit: str | None) -> tuple[list, list]:

@@ -34,13 +34,6 @@ def summary(trajectory) -> str:
     return "\n".join([_contents(trajectory), _span(trajectory), _verdict(trajectory)])
 
 
-def times_of_members(trajectory) -> np.ndarray:
-    """The output times of every member, (…, T) with the axes of the batch, whether they share them or not."""
-    ts, batch = np.asarray(trajectory.ts), np.shape(trajectory.result._value)
-    inner = (1,) * (len(batch) + 1 - ts.ndim)  # `simulate_batch` shares its times within each batch
-    return np.broadcast_to(ts.reshape(*ts.shape[:-1], *inner, ts.shape[-1]), (*batch, ts.shape[-1]))
-
-
 def require_numbers(trajectory, what: str) -> None:
     """Raise `ValueError` for a trajectory that is being traced; `what` says who does what with its numbers."""
     if not all(map(is_known, jax.tree.leaves((trajectory.ts, trajectory.q, trajectory.qdot)))):

@@ -30,7 +30,7 @@ from lagjax._fit.search._descent import Descent
 from lagjax._fit.search._multistart import Waterfall
 from lagjax._fit.search._unexplained import Unexplained, measure_unexplained
 from lagjax._primitives import with_doubles
-from lagjax._show import cell, intervals
+from lagjax._show import cell, import_package
 
 PyTree = Any
 
@@ -147,7 +147,9 @@ class Fit:
 
         Raises `ImportError` when pandas is not installed, `ValueError` for a level that is not between 0 and 1.
         """
-        return intervals(self.parameters.names, self.parameters.values(self.u), *self._ends(level))
+        pandas, (low, high) = import_package("to_pandas()", "pandas", "pandas"), self._ends(level)
+        columns = {"value": self.parameters.values(self.u), "low": low, "high": high}
+        return pandas.DataFrame(columns, index=pandas.Index(self.parameters.names, name="parameter"))
 
     @property
     def rms(self) -> dict[str, float]:
