@@ -139,11 +139,6 @@ def constant_tables(ts: np.ndarray, inputs: np.ndarray) -> SampleTable:
     return SampleTable(np.stack([ts, ts + later], axis=1), np.stack([inputs, inputs], axis=1))
 
 
-def interpolate_inputs(ts: np.ndarray, inputs: np.ndarray, at: np.ndarray) -> np.ndarray:
-    """The inputs (M, I) at the times `at` (M,), on lines between samples (T, I) at `ts` (T,)."""
-    return np.stack([np.interp(at, ts, column) for column in inputs.T], axis=-1)
-
-
 def samples_between(ts: np.ndarray, begin: float, end: float, hold: str) -> slice:
     """The samples at `ts` (K,) that determine the input from `begin` to `end`."""
     margin = MARGINS[hold]

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._fit.model._inputs import interpolate_inputs, split_leaves
+from lagjax._fit.model._inputs import split_leaves
 from lagjax._interface import Layout, labelled_leaves, require_concrete
 from lagjax._scene import unevenly_spaced
 
@@ -123,16 +123,14 @@ class Record(MeasuredSignal):
         leaves, count = jax.tree.leaves(self.inputs), len(self.sampled_at)
         return np.concatenate([np.zeros((count, 0)), *(x.reshape(count, -1) for x in leaves)], axis=1)
 
-    @property
-    def input_matrix(self) -> np.ndarray:
-        """All inputs at the times of the record, side by side, (T, I): on lines, where they have times of their own.
+    def interpolate_inputs(self, ts: np.ndarray) -> np.ndarray:
+        """All inputs at the times `ts` (M,), side by side, (M, I), on lines between samples.
 
         That is for where a search begins. What a trial sees is what `hold` makes of them (`_stack_pieces`).
         """
-        known = self.input_samples
-        if self.input_ts is None:
-            return known
-        return interpolate_inputs(self.input_ts, known, self.ts) if known.shape[1] else np.zeros((len(self), 0))
+        samples = self.input_samples.T
+        columns = [np.interp(ts, self.sampled_at, column) for column in samples]
+        return np.reshape(columns, (len(samples), len(ts))).T
 
     @property
     def input_structure(self) -> tuple | None:
@@ -295,13 +293,6 @@ def spread_over_signals(given: PyTree, record: Record, what: str) -> np.ndarray:
     given = jax.tree.map(lambda x: np.nan if x is None else x, given, is_leaf=lambda x: x is None)
     pairs = zip(spread_prefix(given, record.values, what), jax.tree.leaves(record.values), strict=True)
     return np.concatenate([_broadcast(one, leaf.shape[1:], what).ravel() for one, leaf in pairs]).astype(float)
-
-
-def inputs_between(record: Record, ts: np.ndarray) -> PyTree:
-    """The inputs of a record at other times, on lines between the samples; None where it has none."""
-    if record.input_structure is None:
-        return None
-    return split_leaves(interpolate_inputs(record.sampled_at, record.input_samples, ts), *record.input_structure)
 
 
 def require_records(records) -> list[Any]:

@@ -160,7 +160,7 @@ class Signals:
         if self._value_and_jacobians is None:
             return record
         there = np.isfinite(record.matrix).all(axis=1)
-        instants = record.ts[there], record.input_matrix[there]
+        instants = record.ts[there], record.interpolate_inputs(record.ts[there])
         for periods in (np.full(len(self.periods), np.inf), self.periods):
             q = self._newton(record.matrix[there], instants, numbers, periods)
             if q is not None:

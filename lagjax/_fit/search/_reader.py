@@ -5,9 +5,9 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._fit.model._assembly import errors_of_system
-from lagjax._fit.model._inputs import constant_tables
+from lagjax._fit.model._inputs import constant_tables, split_leaves
 from lagjax._fit.model._motions import AbstractMotions
-from lagjax._fit.model._records import Record, inputs_between, known_start, restore_structure
+from lagjax._fit.model._records import Record, known_start, restore_structure
 from lagjax._fit.model._residuals import Residuals, SystemResiduals
 from lagjax._fit.model._sensors import UNCLEAR, unwrap_record
 from lagjax._show import even_places
@@ -103,8 +103,10 @@ def short_windows(readers: list[Reader], length: float) -> tuple[list[Record], n
         places = even_places(len(reader.record), max(4, _WINDOWS_IN_ALL // len(readers)))
         cubics = [one[3] for one in reader.read(places)]
         values = np.stack([np.polynomial.polynomial.polyval(offsets, c.T) for c in cubics], axis=-1)
+        structure = reader.record.input_structure
         for ts, shown in zip(reader.record.ts[places, None] + offsets, values, strict=True):
-            found.append(Record(ts, restore_structure(shown, reader.record), inputs_between(reader.record, ts)))
+            inputs = structure and split_leaves(reader.record.interpolate_inputs(ts), *structure)
+            found.append(Record(ts, restore_structure(shown, reader.record), inputs))
         states.append(reader.states(places))
     return found, np.concatenate(states)
 
@@ -124,10 +126,11 @@ def time_scales(readers: list[Reader], motions: AbstractMotions, numbers: np.nda
     """
     places = [even_places(len(reader.record), _PROBES) for reader in readers]
     states = [reader.states(some) for reader, some in zip(readers, places, strict=True)]
-    t = np.concatenate([reader.record.ts[some] for reader, some in zip(readers, places, strict=True)])
+    times = [reader.record.ts[some] for reader, some in zip(readers, places, strict=True)]
     y, n = np.concatenate(states), states[0].shape[1] // 2
     within = np.concatenate([state[:, :n] - state[:, :n].mean(axis=0) for state in states])
-    inputs = np.concatenate([reader.record.input_matrix[some] for reader, some in zip(readers, places, strict=True)])
+    inputs = [reader.record.interpolate_inputs(ts) for reader, ts in zip(readers, times, strict=True)]
+    t, inputs = np.concatenate(times), np.concatenate(inputs)
     pulled = motions.rate(t, y, numbers, constant_tables(t, inputs))
     pulled = np.where(np.isfinite(pulled), pulled, 0.0)
     spread, rate, pulled = (np.sqrt(np.mean(x**2, axis=0)) for x in (within, y[:, n:], pulled))
