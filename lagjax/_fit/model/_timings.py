@@ -125,10 +125,6 @@ class Timings(MeasuredSignal):
         keys, functions = _sections(self.section)
         return _restore_keys([matrix[self.flat.which == k, 0] for k in range(len(functions))], keys)
 
-    def columns(self, values: PyTree) -> np.ndarray:
-        keys, _ = _sections(self.section)
-        return np.concatenate(_section_arrays(values, keys, "values"))[:, None]
-
 
 class FlatTimings(NamedTuple):
     """M times end to end: of which section, when, the number of the crossing, and the weight."""

@@ -197,8 +197,6 @@ def _align(rows: list[list[str]], widths: dict[str, int]) -> list[str]:
     return ["  ".join([f"{row[0]:<{first}}", *some, row[-1]]).rstrip() for row, some in zip(rows, middles, strict=True)]
 
 
-def record_matrix(values: Any, record) -> np.ndarray:
-    """Signals in the structure of a record's values, side by side (T, S); times end to end (M, 1)."""
-    if not isinstance(record, Record):
-        return record.columns(values)
+def record_matrix(values: Any, record: Record) -> np.ndarray:
+    """Signals in the structure of a record's values, side by side (T, S)."""
     return np.concatenate([np.reshape(leaf, (len(record), -1)) for leaf in jax.tree.leaves(values)], axis=1)

@@ -23,7 +23,7 @@ from lagjax._fit.result._identifiability import unseen_sentences
 from lagjax._fit.result._information import LEVEL, Information, information
 from lagjax._fit.result._prediction import Prediction, planned_rows, predict_record
 from lagjax._fit.result._profile import Profile, profile
-from lagjax._fit.result._report import draw_record, lab_book, record_matrix, recordings, render_page
+from lagjax._fit.result._report import draw_record, lab_book, recordings, render_page
 from lagjax._fit.result._sample import draw, inference_data
 from lagjax._fit.result._verdict import verdict
 from lagjax._fit.search._descent import Descent
@@ -73,6 +73,7 @@ class Fit:
     - `covariance`: of the free numbers, by name (`Covariance`).
     - `noise`: the scatter of each signal, by name (`SignalNoise`).
     - `residuals`: fitted minus measured values per record, in the structure of `values`; NaN where a sample is missing.
+      `rms`: their root mean square, by signal, in its own unit.
     - `unseen`: a sentence for each free parameter or combination of them that the data do not determine, and one for
       those of which rounding hides what a chaotic record says.
     - `ok`: whether the search converged, the data determine everything that is free, the fit leaves less than some 30 %
@@ -86,6 +87,7 @@ class Fit:
     covariance: Covariance
     noise: dict[str, SignalNoise]
     residuals: Any
+    rms: dict[str, float]
     unseen: tuple[str, ...]
     ok: bool
     message: str
@@ -110,7 +112,8 @@ class Fit:
         unseen, left = unseen_sentences(descent, known), measure_unexplained(descent)
         ok, message = verdict(descent, unseen, known, left, law)
         starts = [residuals.restore_state(k, trial.starts[row]) for k, row in enumerate(residuals.firsts)]
-        samples = (residuals.weights > 0).sum(axis=0)
+        measured = residuals.weights > 0
+        samples, squares = measured.sum(axis=0), (trial.flat() ** 2).sum(axis=0, where=measured)
         columns = noise.sigma, noise.dof, samples, known.effective, 2 * (1 - known.correlation)
         signals = [SignalNoise(*(x.item() for x in one)) for one in zip(*columns, strict=True)]
         fit = cls(
@@ -118,6 +121,7 @@ class Fit:
             covariance=Covariance(parameters.names, parameters.covariance(trial.u, known.covariance)),
             noise=dict(zip(residuals.names, signals, strict=True)),
             residuals=residuals.group_by_system(_record_residuals(residuals, trial)),
+            rms=dict(zip(residuals.names, np.sqrt(squares / samples).tolist(), strict=True)),
             unseen=unseen, ok=ok, message=message, log_likelihood=residuals.log_likelihood(trial, noise),
             trials=descent.trials, waterfall=waterfall, records=tuple(residuals.records), parameters=parameters,
             u=trial.u, states=trial.starts, law=law, information=known, noise_scale=noise, residual_function=residuals,
@@ -150,17 +154,6 @@ class Fit:
         pandas, (low, high) = import_package("to_pandas()", "pandas", "pandas"), self._ends(level)
         columns = {"value": self.parameters.values(self.u), "low": low, "high": high}
         return pandas.DataFrame(columns, index=pandas.Index(self.parameters.names, name="parameter"))
-
-    @property
-    def rms(self) -> dict[str, float]:
-        """The root mean square of the residuals of each signal, in its own unit."""
-        squares, count = np.zeros((2, len(self.residual_function.names)))
-        each = self.residual_function.end_to_end(self.residuals)
-        for k, (residuals, record) in enumerate(zip(each, self.records, strict=True)):
-            matrix, columns = record_matrix(residuals, record), self.residual_function.columns(k)
-            squares[columns] += np.nansum(matrix**2, axis=0)
-            count[columns] += np.isfinite(matrix).sum(axis=0)
-        return dict(zip(self.residual_function.names, np.sqrt(squares / count).tolist(), strict=True))
 
     def intervals(self, level: float = LEVEL) -> tuple[PyTree, PyTree]:
         """The ends (low, high) of the intervals that hold each free number with probability `level`, as two pytrees.
