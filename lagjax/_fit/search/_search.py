@@ -15,6 +15,7 @@ Source: Bock, *Recent advances in parameter identification for ODE* (1983); Pisa
 """
 
 import contextlib
+import itertools
 import sys
 from typing import NamedTuple
 
@@ -22,12 +23,12 @@ import numpy as np
 
 from lagjax._fit.model._noise import AbstractNoise
 from lagjax._fit.model._pieces import Piece
+from lagjax._fit.model._records import Record
 from lagjax._fit.model._residuals import LostMotion, Point, Residuals, SystemResiduals
 from lagjax._fit.search._adam import descend_gradient
 from lagjax._fit.search._descent import Anchor, Descent, minimise
 from lagjax._fit.search._multistart import misfit
 from lagjax._fit.search._reader import Reader, pad_states, short_windows, time_scales
-from lagjax._fit.search._segments import levels
 from lagjax._fit.search._unexplained import measure_unexplained
 from lagjax._run.hybrid import jumps
 
@@ -173,7 +174,7 @@ class Search:
     def _cut_records(self, u) -> list[list[Piece]]:
         pairs = zip(self.residuals.parts, self._time_scales(u), strict=True)
         scales = [scale for part, scale in pairs for _ in part.records]
-        return levels([None if reader is None else reader.record for reader in self.readers], scales)
+        return _levels([None if reader is None else reader.record for reader in self.readers], scales)
 
     # ---- gradients ----
 
@@ -248,3 +249,36 @@ def _separation(done: Descent) -> float:
                 rates.append(growth / (ts[2 * third] - ts[0]))
     longest = max(record.ts[-1] - record.ts[0] for record in done.residuals.records)
     return float(np.median(rates) * longest) if rates else 0.0
+
+
+# ---- cuts of records into segments -----------------------------------------------------------------------------------
+
+_FEWEST_IN_SEGMENT = 8  # samples
+
+
+def _levels(records: list[Record | None], scales: list[float]) -> list[list[Piece]]:
+    """Cuts of the records, from segments of two time scales to whole records, each twice as long as the one before.
+
+    Each record has its time scale. Without any where records are hardly longer than that; None in the place of a record
+    is left out.
+    """
+    edges = [(k, record, _edges(record, 2.0 * scales[k])) for k, record in enumerate(records) if record is not None]
+    most, found, stride = max(len(e) - 1 for *_, e in edges), [], 1
+    while stride < most:
+        pieces = []
+        for k, record, e in edges:
+            cut = [*e[:-1:stride].tolist(), len(record)]
+            if len(cut) > 2 and 2 * (e[-1] - cut[-2]) < e[min(stride, len(e) - 1)] - e[0]:
+                del cut[-2]  # a rest shorter than half a segment joins the one before
+            pieces += [Piece(k, np.arange(a, b)) for a, b in itertools.pairwise(cut)]
+        found.append(pieces)
+        stride *= 2
+    return found
+
+
+def _edges(record: Record, length: float) -> np.ndarray:
+    """The first samples of the shortest segments of one record, and its length."""
+    ts = record.ts
+    count = max(1, int((ts[-1] - ts[0]) / length)) if np.isfinite(length) else 1
+    count = max(1, min(count, len(ts) // _FEWEST_IN_SEGMENT))
+    return np.unique(np.append(np.searchsorted(ts, np.linspace(ts[0], ts[-1], count + 1)[:-1]), len(ts)))
