@@ -1,7 +1,5 @@
 """Time scales: the eigenvalues of the motion linearised at the state."""
 
-from collections.abc import Callable
-
 import numpy as np
 
 from lagjax._equations import null_space
@@ -21,10 +19,7 @@ def findings(scene: CheckedScene) -> list[Finding]:
     if not (np.isfinite(by_q).all() and np.isfinite(by_v).all()) or not free.shape[1]:
         return []
     f, eps = len(by_q), float(np.finfo(scene.layout.dtype).eps)
-    if by_v.any():
-        values = _trusted_eigenvalues(np.block([[np.zeros((f, f)), np.eye(f)], [by_q, by_v]]), eps)
-    else:
-        values = _trusted_roots(by_q, eps)
+    values = _trusted_eigenvalues(np.block([[np.zeros((f, f)), np.eye(f)], [by_q, by_v]]), eps)
     speeds = np.abs(values)
     if len(values) < 2 or speeds.max() < _RATIO * speeds.min():
         return []
@@ -43,23 +38,13 @@ def findings(scene: CheckedScene) -> list[Finding]:
     return [Finding("stiff", "advice", (), message)]
 
 
-def _trusted_roots(matrix: np.ndarray, eps: float) -> np.ndarray:
-    """`_trusted_eigenvalues` for ẍ = K x, of which the eigenvalues are ±√ of those of K: an eighth of the work."""
-    trusted = _trust(lambda k: np.sqrt(np.linalg.eigvals(k).astype(complex)), matrix, eps)
-    return np.concatenate([trusted, -trusted])
-
-
 def _trusted_eigenvalues(linear: np.ndarray, eps: float) -> np.ndarray:
-    """The eigenvalues of ẏ = A y that a perturbation of the size of rounding moves by less than a tenth."""
+    """The eigenvalues of ẏ = A y, but zero, that noise of the size of rounding moves by less than a tenth."""
     # A defective zero, as of a free coordinate, is not one of them: rounding makes eigenvalues of √eps of it.
     speed = np.sqrt(np.abs(linear[len(linear) // 2 :]).max()) or 1.0
     scale = np.repeat([1.0, speed], len(linear) // 2)  # the time in units in which both halves are alike
-    return _trust(np.linalg.eigvals, linear * scale / scale[:, None], eps)
-
-
-def _trust(spectrum: Callable, matrix: np.ndarray, eps: float) -> np.ndarray:
-    """The values of a spectrum that are not zero, and that noise of the size of rounding moves by less than a tenth."""
+    matrix = linear * scale / scale[:, None]
     noise = 64 * eps * np.abs(matrix).max() * np.random.default_rng(0).standard_normal(matrix.shape)
-    values, perturbed = spectrum(matrix), spectrum(matrix + noise)
+    values, perturbed = np.linalg.eigvals(matrix), np.linalg.eigvals(matrix + noise)
     nearest = np.abs(values[:, None] - perturbed).min(axis=1)
     return values[(np.abs(values) > 0) & (nearest < 0.1 * np.abs(values))]
