@@ -2,36 +2,7 @@
 
 Each of them is also found as `lagjax.Trajectory`, `lagjax.Orbit`, ….
 
-**Motion**
-
-- `Trajectory`, with its `State` at the end, the `Transitions` of a hybrid motion, the `Impacts` and `ContactChanges` of
-  one with contacts: from `simulate`, `simulate_batch`, `simulate_hybrid`
-- `Crossings`: from `crossings`
-- `Animation`: from `Trajectory.animate`
-
-**Trust**
-
-- `Findings`, each a `Finding`: from `check`
-- `Explanation`: from `System.explain`
-- `Health`: from `Trajectory.health`
-- `WorkPrecision`, of `WorkPrecisionRow`s: from `work_precision`
-
-**Analysis**
-
-- `Equilibrium`, `Linearization`, `Modes`: from `equilibrium`, `linearize`, `normal_modes`
-- `ConservedQuantities`, each a `Conserved`: from `conserved_quantities`
-- `SameMotion`: from `same_motion`
-- `ChangedCoordinates`, `Hamiltonian` with its `CanonicalTrajectory`, `Routhian`: from `change_coordinates`,
-  `hamiltonian`, `routhian`
-- `Orbit`, `Family`: from `periodic_orbit`, `family`, `branch_off`
-- `LyapunovExponent`: from `lyapunov_exponent`
-- `Path`: from `find_path`
-
-**Parameters and sweeps**
-
-- `Fit`: from `fit`; `Profile`, `Prediction`, `Experiments`, `Comparison`: from its methods `profile`, `predict`,
-  `next_experiment`, `compare`
-- `Status`, `Summary`: from `Sweep.status`, `Sweep.statistics`
+The map of the package, `help(lagjax)`, says which function returns which of them.
 
 ```python
 import jax.numpy as jnp, lagjax
