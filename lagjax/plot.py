@@ -20,7 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._analysis import Modes
-from lagjax._fit import Fit, Record, draw_record, record_matrix
+from lagjax._fit import Fit, Record, draw_record
 from lagjax._interface import Function, Layout, accept, join_names
 from lagjax._run import Crossings, Members, Trajectory
 from lagjax._show import (
@@ -441,8 +441,7 @@ def fit(fit: Fit, record: int = 0, *, figure=None):
     one, columns = fit.records[record], fit.residual_function.columns(record)
     names = fit.residual_function.names[columns]
     axes = _two_rows(figure, len(names))
-    residuals = fit.residual_function.end_to_end(fit.residuals)[record]
-    draw_record(axes, one, record_matrix(residuals, one), names, fit.noise_scale.sigma[columns])
+    draw_record(axes, one, fit.residual_matrices[record], names, fit.noise_scale.sigma[columns])
     return axes
 
 

@@ -35,7 +35,7 @@ from lagjax._fit.result._experiments import Experiments
 from lagjax._fit.result._mistakes import SECONDS, find_mistake, possible_mistakes
 from lagjax._fit.result._prediction import Prediction
 from lagjax._fit.result._profile import Profile
-from lagjax._fit.result._report import draw_record, record_matrix
+from lagjax._fit.result._report import draw_record
 from lagjax._fit.result._result import Fit
 from lagjax._fit.search._multistart import run_multistart
 from lagjax._fit.search._reader import TimeScales, first_starts, read_records, time_scales

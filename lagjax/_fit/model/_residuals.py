@@ -549,10 +549,6 @@ class Residuals:
             return tuple(values)
         return {part.name: tuple(values[part.frame.records]) for part in self.parts}
 
-    def end_to_end(self, groups: Any) -> list:
-        """The values that `group_by_system` returned, for all records in order."""
-        return list(groups) if self.parts[0].name is None else [x for own in groups.values() for x in own]
-
 
 def qr_triangle(rows: np.ndarray) -> np.ndarray:
     return np.asarray(np.linalg.qr(rows, mode="r"))

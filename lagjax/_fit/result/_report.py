@@ -5,9 +5,7 @@ The figures do without the state machine of matplotlib, and `lagjax.plot` draws 
 
 import html
 from collections import Counter
-from typing import Any
 
-import jax
 import numpy as np
 
 from lagjax._fit.model._records import Record
@@ -113,9 +111,8 @@ def _build_pictures(fit) -> dict[str, list[str]]:
 
 def recordings(fit, part: SystemResiduals) -> list[tuple[Record, np.ndarray]]:
     """The records of one system of a fit, each with its residuals (T, S)."""
-    residuals = fit.residual_function.end_to_end(fit.residuals)[part.frame.records]
-    pairs = zip(part.records, residuals, strict=True)
-    return [(record, record_matrix(r, record)) for record, r in pairs if isinstance(record, Record)]
+    pairs = zip(part.records, fit.residual_matrices[part.frame.records], strict=True)
+    return [pair for pair in pairs if isinstance(pair[0], Record)]
 
 
 def _draw_records(fit, part: SystemResiduals) -> dict[str, list[str]]:
@@ -195,8 +192,3 @@ def _align(rows: list[list[str]], widths: dict[str, int]) -> list[str]:
     first, each = max(len(row[0]) for row in rows), [widths[head] for head in rows[0][1:-1]]
     middles = [[f"{x:>{width}}" for x, width in zip(row[1:-1], each, strict=True)] for row in rows]
     return ["  ".join([f"{row[0]:<{first}}", *some, row[-1]]).rstrip() for row, some in zip(rows, middles, strict=True)]
-
-
-def record_matrix(values: Any, record: Record) -> np.ndarray:
-    """Signals in the structure of a record's values, side by side (T, S)."""
-    return np.concatenate([np.reshape(leaf, (len(record), -1)) for leaf in jax.tree.leaves(values)], axis=1)

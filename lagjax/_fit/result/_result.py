@@ -102,6 +102,7 @@ class Fit:
     information: Information = field(repr=False)
     noise_scale: NoiseScale = field(repr=False)
     residual_function: Residuals = field(repr=False)
+    residual_matrices: list[np.ndarray] = field(repr=False)  # of every record, (T, S)
 
     @classmethod
     def from_descent(
@@ -112,7 +113,7 @@ class Fit:
         unseen, left = unseen_sentences(descent, known), measure_unexplained(descent)
         ok, message = verdict(descent, unseen, known, left, law)
         starts = [residuals.restore_state(k, trial.starts[row]) for k, row in enumerate(residuals.firsts)]
-        measured = residuals.weights > 0
+        matrices, measured = _record_residuals(residuals, trial), residuals.weights > 0
         samples, squares = measured.sum(axis=0), (trial.flat() ** 2).sum(axis=0, where=measured)
         columns = noise.sigma, noise.dof, samples, known.effective, 2 * (1 - known.correlation)
         signals = [SignalNoise(*(x.item() for x in one)) for one in zip(*columns, strict=True)]
@@ -120,11 +121,12 @@ class Fit:
             params=parameters.restore(parameters.numbers(trial.u)), starts=residuals.group_by_system(starts),
             covariance=Covariance(parameters.names, parameters.covariance(trial.u, known.covariance)),
             noise=dict(zip(residuals.names, signals, strict=True)),
-            residuals=residuals.group_by_system(_record_residuals(residuals, trial)),
+            residuals=residuals.group_by_system(list(map(restore_structure, matrices, residuals.records))),
             rms=dict(zip(residuals.names, np.sqrt(squares / samples).tolist(), strict=True)),
             unseen=unseen, ok=ok, message=message, log_likelihood=residuals.log_likelihood(trial, noise),
             trials=descent.trials, waterfall=waterfall, records=tuple(residuals.records), parameters=parameters,
             u=trial.u, states=trial.starts, law=law, information=known, noise_scale=noise, residual_function=residuals,
+            residual_matrices=matrices,
         )  # fmt: skip
         return fit, left
 
@@ -297,8 +299,8 @@ class Fit:
         return comparison({"this": self, **others}, folds)
 
 
-def _record_residuals(residuals: Residuals, trial: Trial) -> list[PyTree]:
-    """The residuals of every record in its structure, NaN where nothing was measured."""
+def _record_residuals(residuals: Residuals, trial: Trial) -> list[np.ndarray]:
+    """The residuals of every record, (T, S), NaN where nothing was measured."""
     columns = [residuals.columns(k) for k in range(len(residuals.records))]
     pairs = zip(residuals.records, columns, strict=True)
     found = [np.full((len(record), own.stop - own.start), np.nan) for record, own in pairs]
@@ -306,4 +308,4 @@ def _record_residuals(residuals: Residuals, trial: Trial) -> list[PyTree]:
         for row, left, weights in zip(batch.rows.tolist(), own, batch.weights, strict=True):
             record, places = residuals.pieces[row]
             found[record][places] = np.where(weights > 0, left, np.nan)[: len(places), columns[record]]
-    return [restore_structure(matrix, record) for matrix, record in zip(found, residuals.records, strict=True)]
+    return found
