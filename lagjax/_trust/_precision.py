@@ -21,7 +21,7 @@ from lagjax._engine.diffrax import LEAST_RTOL as LEAST_RTOL_OF_DIFFRAX
 from lagjax._engine.diffrax import FineOutput
 from lagjax._engine.taylor import MachineCode
 from lagjax._interface import Layout, as_arrays, show_str
-from lagjax._run import Trajectory, simulate, simulate_batch
+from lagjax._run import Members, Trajectory, simulate, simulate_batch
 from lagjax._scene import System, require_system
 
 PyTree = Any
@@ -218,9 +218,7 @@ def _row(name: str, rtol: float, run: Callable[[], Trajectory], truth: np.ndarra
 
 def _path(trajectory: Trajectory) -> np.ndarray:
     """All coordinates at all times, shape (members, T, n); NaN throughout for a member that did not reach its end."""
-    ok = np.atleast_1d(trajectory.ok)
-    leaves = [np.asarray(leaf).reshape(len(ok), len(trajectory.ts), -1) for leaf in jax.tree.leaves(trajectory.q)]
-    return np.where(ok[:, None, None], np.concatenate(leaves, axis=-1), np.nan)
+    return np.where(np.atleast_1d(trajectory.ok)[:, None, None], Members(trajectory).flat(trajectory.q), np.nan)
 
 
 def _largest_difference(path: np.ndarray, truth: np.ndarray) -> np.ndarray:
