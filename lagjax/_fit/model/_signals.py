@@ -8,8 +8,8 @@ so that nothing is interpolated, and with ẏ its rate there
 
     δy(t − τ) = δy − ẏ δτ
 
-Before a record begins nothing is known: the samples of its first `longest` units of time are left out, whatever the
-delay of a trial is, so that the sum of squares does not jump where a delay passes a sample.
+The samples of the first `longest` are left out whatever the delay of a trial is, so that the sum of squares does not
+jump where a delay passes a sample.
 """
 
 from collections.abc import Callable

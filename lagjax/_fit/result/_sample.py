@@ -1,17 +1,8 @@
 """`sample`: draws from the posterior of a fit, by the No-U-Turn sampler in the fit's own metric.
 
-By rule, where that can be had: the sampler moves along π*, the density whose residuals are expanded to second order
-(`Surrogate`), which costs no motions, with enough of its steps that y is nearly independent of the x where it began;
-then one exact density decides. The chain goes to y with the probability
-
-    min(1, π(y) π*(x) / [π(x) π*(y)])
-
-and else stays at x. Its draws are those of π itself, whatever π* is, because the inner steps are reversible for π*: a
-poor expansion makes a slow chain, not a wrong one. Nothing of π* is changed after warming. Where less than `_LEAST` of
-the draws are accepted, where the weights π/π* have no variance because π* is too narrow, and where chains are worth few
-independent draws, the sampler follows π itself, with gradients through the motions at every step.
-
-All chains go side by side in one batch of motions.
+`Fit.sample` says how π* proposes (`Surrogate`) and π decides, and what is drawn where π* is too far from π. Draws are
+those of π itself, whatever π* is, because the inner steps are reversible for π*, of which nothing is changed after
+warming: a poor expansion makes a slow chain, not a wrong one.
 
 Which library: blackjax, whose kernels are plain functions of a log density; arviz for what draws are worth. numpyro
 does the same behind a language for models, of which nothing is needed. The warming (`_tune_sampler`) is not
