@@ -1,10 +1,9 @@
 """Orbits: where motions return, how they depend on energy and parameters, how fast they part, which path is taken.
 
-`_arc_motions` follows motions with their derivatives, on rows (`_flat_starts`), `_jumping_motions` those with contacts
-or modes; `_shooting` closes or joins chains of arcs by way of `_condensation`, `_floquet` says what their multipliers
-are, `_orbit` is `periodic_orbit`.
-`_continuation` goes along a family, `_family` is `family`, `_branch` goes from one to another. `_lyapunov` is about
-motions that never return, `_path` and `_conjugate` about those from one place to another. `decide` of
+`_arc_motions` follows motions with their derivatives, on rows, `_jumping_motions` those with contacts or modes;
+`_shooting` closes or joins chains of arcs by way of `_condensation`, `_floquet` says what their multipliers are,
+`_orbit` is `periodic_orbit`. `_continuation` goes along a family, `_family` is `family`, `_branch` goes from one to
+another. `_lyapunov` is about motions that never return, `_path` about those from one place to another. `decide` of
 `lagjax._equations` decides about singular values.
 """
 

@@ -9,15 +9,25 @@ nothing, and no kernel of LAPACK runs inside of one.
 import copy
 from typing import Any, NamedTuple
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from lagjax._analysis._scene_state import require_matrices
-from lagjax._analysis.orbits._flat_starts import require_untraced
 from lagjax._analysis.orbits._jumping_motions import JumpingMotions
 from lagjax._engine import Problem
 from lagjax._engine.taylor import MachineCode, Motions, flow_of, jvp, tolerances_of
 from lagjax._equations import Sample, Scales, has_constraints
-from lagjax._interface import SUCCESSFUL, Layout, halves
+from lagjax._interface import (
+    SUCCESSFUL,
+    Layout,
+    as_arrays,
+    halves,
+    require_concrete,
+    require_finite,
+    require_number,
+)
 from lagjax._primitives import sentence
 from lagjax._run.hybrid import Scene, first_law, jumps, laws, require_scene
 from lagjax._scene import ROLES, replace_functions, require_system
@@ -227,3 +237,43 @@ class Arcs:
 
 _BUDGET = 2**16  # steps of an arc: a thousand times what it should take
 _MOST_WRITTEN = 2**26  # numbers of steps of all motions whose shares are sought, half a GiB
+
+
+# ---- starts as the user gives them, as rows --------------------------------------------------------------------------
+
+
+def starts(q0: PyTree, qdot0: PyTree, time, name: str) -> tuple[np.ndarray, Layout, np.ndarray]:
+    """The times, () or (N,), the layout of one state, and all states, (1, 2n) or (N, 2n).
+
+    `time`, called `name`, is one number, or an array of as many as there are members on the first axis of every leaf.
+    Raises `TypeError` or `ValueError` where that is not so, or a number is not finite or not there yet.
+    """
+    require_untraced((q0, qdot0, time), "The start")
+    if isinstance(time, dict | eqx.Module):
+        require_number(time, name)
+    for label, value in ((name, time), ("q0", q0), ("qdot0", qdot0)):
+        require_finite(value, label)
+    times = np.asarray(time, float)
+    if times.ndim > 1 or not times.size:
+        raise ValueError(f"{name} must be one number, or an array (N,) of a batch; got shape {times.shape}.")
+    if not (times > 0).all():
+        raise ValueError(f"{name} must be positive; got {times.min()}.")
+    shapes = sorted({np.shape(leaf) for leaf in jax.tree.leaves((q0, qdot0))})
+    if times.ndim and any(shape[:1] != times.shape for shape in shapes):
+        raise ValueError(
+            f"{name} has shape {times.shape}, a batch: every leaf of q0 and qdot0 must have that many members as its "
+            f"first axis; got shapes {shapes}."
+        )
+    first = jax.tree.map(lambda leaf: jnp.asarray(leaf)[0], (q0, qdot0)) if times.ndim else (q0, qdot0)
+    layout = Layout.from_state(*first)
+    leaves = jax.tree.leaves(as_arrays((q0, qdot0), layout.dtype, "state"))
+    return times, layout, np.concatenate([np.asarray(x, float).reshape(times.size, -1) for x in leaves], axis=1)
+
+
+def require_untraced(tree: PyTree, what: str) -> None:
+    require_concrete(
+        tree,
+        what,
+        "Orbits are searched for with numbers, how often depends on what is met: search outside of jit, and give many "
+        "starts as arrays with the members as first axis, instead of jax.vmap.",
+    )

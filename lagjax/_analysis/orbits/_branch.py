@@ -11,10 +11,9 @@ from typing import Any
 import jax
 import numpy as np
 
-from lagjax._analysis.orbits._arc_motions import Arcs
+from lagjax._analysis.orbits._arc_motions import Arcs, starts
 from lagjax._analysis.orbits._continuation import FamilyPoint, FamilyTangent, Follower, correct, tangent_at
 from lagjax._analysis.orbits._family import Family, first_point, parameter_index
-from lagjax._analysis.orbits._flat_starts import starts
 from lagjax._analysis.orbits._orbit import RTOL, FlatOrbits, Orbit, assess_orbits, restore_orbits
 from lagjax._equations import decide, span_outside
 from lagjax._interface import Layout, require_tolerance

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._analysis.orbits import _shooting
-from lagjax._analysis.orbits._arc_motions import Arcs
+from lagjax._analysis.orbits._arc_motions import Arcs, starts
 from lagjax._analysis.orbits._continuation import (
     FamilyPoint,
     FamilyTangent,
@@ -28,7 +28,6 @@ from lagjax._analysis.orbits._continuation import (
     step_along,
     tangent_at,
 )
-from lagjax._analysis.orbits._flat_starts import starts
 from lagjax._analysis.orbits._floquet import passage_determinant, reduce
 from lagjax._analysis.orbits._orbit import RTOL, FlatOrbits, Orbit, arc_counts, assess_orbits
 from lagjax._interface import halves, labelled_leaves, require_budget, require_tolerance

@@ -16,8 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._analysis.orbits._arc_motions import Arcs
-from lagjax._analysis.orbits._flat_starts import starts
+from lagjax._analysis.orbits._arc_motions import Arcs, starts
 from lagjax._interface import SUCCESSFUL, SimulationError, require_flag, show_str
 from lagjax._primitives import accepts_singles, sentence
 from lagjax._run.hybrid import Scene

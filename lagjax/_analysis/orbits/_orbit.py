@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._analysis.orbits import _shooting
-from lagjax._analysis.orbits._arc_motions import Arcs
-from lagjax._analysis.orbits._flat_starts import starts
+from lagjax._analysis.orbits._arc_motions import Arcs, starts
 from lagjax._analysis.orbits._floquet import UNCERTAIN, UNSTABLE, multipliers_of, pairing_error, reduce
 from lagjax._analysis.orbits._shooting import Chain, Closing
 from lagjax._equations import decide, singular_threshold
