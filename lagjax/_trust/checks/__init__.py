@@ -3,7 +3,7 @@
 Everything is computed once, by the programs of the scene: values, derivatives, their finite differences, the mass
 matrix at states nearby, the linearised motion. What follows is NumPy and sentences, each file for one question.
 `_scene_at_start` is what they all look at, `_findings` what they return. In their order: `_derivative_checks` (by
-`_differences`), `_constraint_checks`, `_contact_checks`, `_mass`, `_jumps_near`, `_stiffness`.
+`_differences`), `_constraint_checks` (with contacts), `_mass`, `_jumps_near`, `_stiffness`.
 """
 
 from typing import Any
@@ -21,7 +21,7 @@ from lagjax._interface import Layout, is_concrete, join_names, not_finite, requi
 from lagjax._native import ATOL_OVER_MOTION, ATOL_OVER_RTOL
 from lagjax._primitives import accepts_singles
 from lagjax._scene import ROLES, System, replace_functions, require_system
-from lagjax._trust.checks import _constraint_checks, _contact_checks, _derivative_checks, _jumps_near, _mass, _stiffness
+from lagjax._trust.checks import _constraint_checks, _derivative_checks, _jumps_near, _mass, _stiffness
 from lagjax._trust.checks._findings import Finding, Findings
 from lagjax._trust.checks._mass import describe_direction
 from lagjax._trust.checks._scene_at_start import CheckedScene
@@ -87,7 +87,7 @@ def _scene_findings(system, q, qdot, t, params) -> tuple[list[Finding], str]:
         system = replace_functions(system, {role: getattr(system, role) for role in ROLES}, "array")
     scene = CheckedScene.from_state(system, layout, q, qdot, t, params)
     reported = _derivative_checks.findings(scene) + _dissipation(scene) + _constraint_checks.findings(scene)
-    reported += _contact_checks.findings(scene) + _mass.findings(scene)
+    reported += _constraint_checks.contact_findings(scene) + _mass.findings(scene)
     if scene.is_large:
         reported += [] if any(finding.level == "error" for finding in reported) else _acceleration(scene)
         return [*reported, *_time(scene)], (
