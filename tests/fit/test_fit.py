@@ -21,7 +21,7 @@ import lagjax
 from lagjax._fit.model import _autocorrelation, _residuals, _signals, _transforms
 from lagjax._fit.model._motions import _JaxMotions, choose_motions
 from lagjax._fit.model._parameters import Parameters
-from lagjax._fit.result._influence import shifts_without
+from lagjax._fit.result._verdict import shifts_without
 from lagjax._fit.search import _descent
 from lagjax._fit.search._reader import Reader
 from lagjax._interface._layout import Layout

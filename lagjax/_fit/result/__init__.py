@@ -2,7 +2,7 @@
 
 `_result` is `Fit`. `_information` is the covariance with its null directions, `_identifiability` says these in words,
 `_profile` and `_sample` are other ways to intervals (`_expansion`: the density that draws are proposed from).
-`_verdict` is the result of the search in words, `_influence` the records that pull at it, `_mistakes` those that
-explain a poor one. `_prediction` follows other records, `_experiments` ranks planned ones, `_comparison` compares fits,
+`_verdict` is the result of the search in words, with the records that pull at it, `_mistakes` those that explain a
+poor one. `_prediction` follows other records, `_experiments` ranks planned ones, `_comparison` compares fits,
 `_report` draws and writes.
 """
