@@ -113,7 +113,8 @@ class _ScalarState:
                 rates |= zip(self.ids[name].tolist(), rate.tolist(), strict=True)
         if t:
             rates[int(self.ids["t"])] = self.expansion.graph.constant(1.0, "float")
-        return np.array(self.derivatives.directional_derivative(values.tolist(), rates), dtype=np.int64)
+        found = self.derivatives.directional_derivatives(values.tolist(), [rates])
+        return np.array([of.get(0, self.expansion.graph.number(0.0)) for of in found], dtype=np.int64)
 
     def varying(self, values: Ids) -> np.ndarray:
         """True for each number that depends on q, q̇ or t."""

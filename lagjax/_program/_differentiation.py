@@ -133,10 +133,6 @@ class Derivatives:
                     tangents[i] = of_node
         return [tangents.get(i, {}) for i in outputs]
 
-    def directional_derivative(self, outputs: Sequence[int], direction: Tangents) -> list[int]:
-        """The tangents of the nodes `outputs` along one direction, which maps inputs to their tangents."""
-        return [t.get(0, self._number(0.0)) for t in self.directional_derivatives(outputs, [direction])]
-
     def _tangents(self, i: int, tangents: dict[int, Tangents]) -> Tangents:
         (op, operands, attribute), result = self.node_to_differentiate(i), {}
         if op == "div" and all(x in tangents for x in operands):

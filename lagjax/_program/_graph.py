@@ -223,9 +223,6 @@ class Graph:
     def number(self, x: float) -> int:
         return self.constant(x, "float")
 
-    def find(self, op: str, *operands: int) -> int | None:
-        return self._ids.get((op, operands, None))
-
     def value(self, i: int):
         op, _, attribute = self.nodes[i]
         return attribute if op == "constant" else None
@@ -365,7 +362,7 @@ class Graph:
                 if sine != other or self.nodes[sine][0] != "sin":
                     continue
                 rest = factors[:k] + factors[k + 2 :]
-                cosine = self.find("cos", *self.nodes[sine][1])
+                cosine = self._ids.get(("cos", self.nodes[sine][1], None))
                 partner = None if cosine is None else self._products.get(tuple(sorted([*rest, cosine, cosine])))
                 if base in terms and partner in terms and terms[partner] == terms[base]:
                     coefficient = terms.pop(base)
