@@ -102,7 +102,7 @@ class MotionParts(NamedTuple):
         assert self.borders is not None
         of, size = self.borders.program, self.nesting.size
         program = replace(of, line=of.line.replace(outputs=of.line.outputs[: size + 1]))
-        return self._replace(program=program, series=along_pieces(program, size, self.borders))
+        return self._replace(program=program, series=series_of_pieces(program, size, self.borders))
 
 
 @functools.lru_cache(maxsize=16)
@@ -161,7 +161,7 @@ def recurrences(program: Recurrent, size: int) -> Series:
     return series(program, size, moving=2 * size + 1)
 
 
-def along_pieces(program: Recurrent, size: int, found: Borders) -> Series:
+def series_of_pieces(program: Recurrent, size: int, found: Borders) -> Series:
     """The Taylor series of a motion along a piece, and of its switching numbers."""
     return series(program, size, moving=2 * size + 1, followed=found.followed)
 
@@ -182,10 +182,10 @@ def pieces_of(
         found = of_motion[0]
         for inner, directions in nesting.levels:
             found = with_borders_of_tangents(found, inner, directions, member * (inner // nesting.base))
-        return found, along_pieces(found.program, size, found)
+        return found, series_of_pieces(found.program, size, found)
     try:
         if (found := borders(program, size)) is not None:
-            return found, along_pieces(found.program, size, found)
+            return found, series_of_pieces(found.program, size, found)
     except Unlowerable:  # a switching number without a series, or more operations than that takes
         pass
     return None

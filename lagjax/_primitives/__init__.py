@@ -24,5 +24,4 @@ from lagjax._primitives._linear_map import (
     is_zero,
     keep_together,
     vary_alike,
-    zero_like,
 )
