@@ -488,11 +488,12 @@ def require_coefficients(system: "System", params: PyTree) -> None:
 
 def _require_range(name: str, values: PyTree) -> None:
     for value in filter(is_concrete, jax.tree.leaves(values)):
-        if not np.issubdtype(np.asarray(value).dtype, np.number):
+        numbers = np.asarray(value)  # of JAX's own, each comparison would be compiled
+        if not np.issubdtype(numbers.dtype, np.number):
             raise TypeError(f"{name} must be a number, a dict of numbers by name, or a function; got {value!r}.")
-        if not (np.isfinite(value).all() and np.min(value, initial=0.0) >= 0.0):
+        if not (np.isfinite(numbers).all() and numbers.min(initial=0.0) >= 0.0):
             raise ValueError(f"{name} must be a number that is not negative; got {value}.")
-        if name == "restitution" and np.max(value, initial=0.0) > 1.0:
+        if name == "restitution" and numbers.max(initial=0.0) > 1.0:
             raise ValueError(f"restitution must be between 0 and 1: more would add energy; got {value}.")
 
 

@@ -297,8 +297,7 @@ class ContactRounds(NamedTuple):
         return Carry(
             t=t, y=y0, contacts=contacts, fresh=jnp.ones(guards, bool), going=result == SUCCESSFUL,
             result=result, steps=(jnp.zeros((), int), jnp.zeros((), int)), rounds=jnp.zeros((), int),
-            longest=jnp.zeros(()),
-            turns=jnp.zeros((), int), tied=jnp.zeros(self.flat.rough.size, bool),
+            longest=jnp.zeros(()), turns=jnp.zeros((), int), tied=jnp.zeros(self.flat.rough.size, bool),
             rounding=jnp.zeros((2, guards)), rate_rounding=jnp.zeros((2, guards)),
             came=jnp.sign(guarded.rates)[guards - sections :],
             slip=jnp.zeros(self.flat.rough.size), largest=jnp.abs(jax.lax.stop_gradient(y0)),

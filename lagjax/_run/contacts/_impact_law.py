@@ -95,32 +95,34 @@ def impulse_solver(rows: ImpactRows, pattern: Pattern, friction: Friction) -> Ca
         return solver_along(pattern.direction)
 
     def solve_in_space(targets):
-        impulses_along = lambda direction: solver_along(direction)(targets)  # noqa: E731
-        direction = _turn_directions(rows, impulses_along, pattern.direction, slides > 0, places)
-        return impulses_along(direction)
+        return _turn_directions(rows, lambda x: solver_along(x)(targets), pattern.direction, slides > 0, places)
 
     return solve_in_space
 
 
 def _turn_directions(rows: ImpactRows, impulses_along, direction, slides, places):
-    """The directions (r, 2), which are those of the slips behind the impact, also as the state varies.
+    """The impulses (K,) along directions which are those of the slips behind the impact, also as the state varies.
 
     Two steps of Newton's method from where they are give derivatives of first and second order.
     """
 
     def off(angles):
         along = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1)
-        after = (rows.rates + rows.coupling @ impulses_along(along))[places]
+        impulses = impulses_along(along)
+        after = (rows.rates + rows.coupling @ impulses)[places]
         across = after[:, 0] * along[:, 1] - after[:, 1] * along[:, 0]
         size = jax.lax.stop_gradient(jnp.abs(after).max(axis=1))
-        return jnp.where(slides & (size > 0), across / jnp.where(size > 0, size, 1.0), 0.0)
+        turned = jnp.where(slides & (size > 0), across / jnp.where(size > 0, size, 1.0), 0.0)
+        return turned, (turned, impulses)
 
-    angles = jax.lax.stop_gradient(jnp.arctan2(direction[:, 1], direction[:, 0]))
-    for _ in range(2):
-        slopes = jax.jacfwd(off)(angles)
+    def turn(_, carry):
+        slopes, (turned, impulses) = jax.jacfwd(off, has_aux=True)(carry[0])
         still = jnp.diag(jnp.where(jnp.diagonal(slopes) == 0, 1.0, 0.0))
-        angles = angles - factorize_general(slopes + still)(off(angles))
-    return jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1)
+        return carry[0] - factorize_general(slopes + still)(turned), impulses
+
+    # XLA compiles one loop sooner than its rounds; the third one has the impulses behind two steps.
+    angles = jax.lax.stop_gradient(jnp.arctan2(direction[:, 1], direction[:, 0]))
+    return jax.lax.fori_loop(0, 3, turn, (angles, jnp.zeros_like(rows.rates)))[1]
 
 
 def _independent(coupling, held):
@@ -156,8 +158,7 @@ def find_pattern(rows: ImpactRows, touches, restitution, friction: Friction) -> 
     count, rough, places = len(touches), friction.rough, friction.places(len(touches))
     rates = rows.rates
     if count == 1 and not rough.size:
-        pushes = (touches & (rates < 0)).astype(float)
-        return Pattern(pushes, jnp.zeros(0), jnp.zeros((0, friction.directions)))
+        return Pattern((touches & (rates < 0)).astype(float), jnp.zeros(0), jnp.zeros((0, friction.directions)))
     if count == 1 and friction.directions == 1:
         towards = jnp.concatenate([(1.0 + restitution) * rates[:1], rates[1:]])
         return _pattern_of_one(rows, towards, friction.coefficients)
