@@ -31,8 +31,14 @@ import pytest
 jax.config.update("jax_enable_x64", True)
 
 # Tracing leaves many objects that live on, and Python's default looks through all of them so often that it took a tenth
-# of the time.
-gc.set_threshold(50_000, 20, 20)
+# of the time. What is imported before the first test is never garbage, and is looked through no more.
+gc.set_threshold(500_000, 10, 50)
+
+
+def pytest_collection_finish():
+    gc.collect()
+    gc.freeze()
+
 
 # Most of the suite's time is XLA at work, so what it compiles is kept: for the other workers of a run, and for the next
 # run. A compiled program is for one kind of CPU, which JAX does not ask about when it reads one back.
