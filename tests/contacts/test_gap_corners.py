@@ -1,9 +1,12 @@
 """Gaps with corners: open ones against the same scene with a gap for each side, closed ones against closed forms."""
 
+import functools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from sweeps import sweep
 
 import lagjax
 
@@ -26,20 +29,28 @@ def two_walls(q):
     return {"left": 1 + q, "right": 1 - q}
 
 
-@pytest.mark.parametrize("name", ["abs", *(pytest.param(name, marks=pytest.mark.slow) for name in list(WALLS)[1:])])
+@functools.cache
+def two_walls_apart():
+    """Ends and counts of many starts between two walls with a gap for each, and the slopes of one end."""
+    two = lambda x: end_of(two_walls, 0.9, *x)
+    return jax.jit(jax.vmap(two)), jax.jit(jax.jacfwd(lambda x: two(x)[0]))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", WALLS)
 def test_a_ball_between_walls_bounces_at_both(name):
     """From x = 0 too, where the two pieces of the gap meet; with derivatives in both modes, and in batches."""
-    one, two = (jax.jit(lambda x, of=of: end_of(of, 0.9, *x)) for of in (WALLS[name], two_walls))
+    one = lambda x: end_of(WALLS[name], 0.9, *x)
+    alone, expected, wanted = jax.jit(one), *two_walls_apart()
     for x in ([0.0, 1.0], [0.2, -1.0]):
-        (state, count), (expected, number) = one(jnp.array(x)), two(jnp.array(x))
-        assert count == number >= 2
-        np.testing.assert_allclose(state, expected, rtol=0, atol=1e-13)
-    ahead, back, wanted = jax.jacfwd(lambda x: one(x)[0]), jax.jacrev(lambda x: one(x)[0]), jax.jacfwd(two)
+        (state, count), (right, number) = alone(jnp.array(x)), expected(jnp.array([x]))
+        assert count == number[0] >= 2
+        np.testing.assert_allclose(state, right[0], rtol=0, atol=1e-13)
     x = jnp.array([0.0, 1.0])
-    for slopes in (ahead, back):
-        np.testing.assert_allclose(jax.jit(slopes)(x), jax.jit(wanted)(x)[0], rtol=0, atol=1e-12)
+    for mode in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(jax.jit(mode(lambda x: one(x)[0]))(x), wanted(x), rtol=0, atol=1e-12)
     states = jnp.array([[0.0, 1.0], [0.0, -2.0], [-0.5, 0.3]])
-    np.testing.assert_allclose(jax.vmap(one)(states)[0], jax.vmap(two)(states)[0], rtol=0, atol=1e-13)
+    np.testing.assert_allclose(jax.jit(jax.vmap(one))(states)[0], expected(states)[0], rtol=0, atol=1e-13)
 
 
 @pytest.mark.slow
@@ -50,7 +61,7 @@ def test_walls_of_one_gap_in_float32_and_to_second_order():
     assert ones.dtype == jnp.float32
     np.testing.assert_allclose(ones, twos, rtol=0, atol=2e-6)
     curves = [
-        jax.hessian(lambda v, of=of: end_of(of, 0.9, 0.1, v, 3.0)[0][0])(jnp.array(1.0))
+        jax.jit(jax.hessian(lambda v, of=of: end_of(of, 0.9, 0.1, v, 3.0)[0][0]))(jnp.array(1.0))
         for of in (WALLS["abs"], two_walls)
     ]
     np.testing.assert_allclose(*curves, rtol=1e-11)
@@ -60,36 +71,63 @@ def planar(q, v):
     return 0.5 * (v["x"] ** 2 + v["y"] ** 2) - G * q["y"]
 
 
-def slide(gap, x, duration, restitution=0.0):
+def slide(gap, x, duration, params=None, **options):
     """(x, y, vx, vy) behind a start at (x, y) with velocity (vx, vy)."""
-    system = lagjax.System(planar, contacts=gap, restitution=restitution)
+    system = lagjax.System(planar, contacts=gap, **options)
     q, v = {"x": x[0], "y": x[1]}, {"x": x[2], "y": x[3]}
-    run = lagjax.simulate(system, q, v, jnp.array([0.0, duration]))
+    run = lagjax.simulate(system, q, v, jnp.array([0.0, duration]), params)
     return jnp.stack([run.q["x"][-1], run.q["y"][-1], run.qdot["x"][-1], run.qdot["y"][-1]])
 
 
-@pytest.mark.parametrize(("slope", "restitution"), [(0.3, 0.0), (1.0, 0.5)])
-def test_a_block_that_slides_into_a_slope_strikes_it(slope, restitution):
+def with_slopes(mode, function):
+    """`x ↦ (function(x), its slopes)`, in one program."""
+
+    def twice(x, *given):
+        end = function(x, *given)
+        return end, end
+
+    def both(x, *given):
+        slopes, end = mode(twice, has_aux=True)(x, *given)
+        return end, slopes
+
+    return jax.jit(both)
+
+
+def test_a_block_that_slides_into_a_slope_strikes_it():
     """As with the slope for a contact of its own; it comes back, and strikes the floor."""
     x = jnp.array([-1.0, 0.0, 0.5, 0.0])
-    of_one = jax.jit(lambda x: slide(lambda q: q["y"] - slope * jnp.maximum(q["x"], 0.0), x, 3.3, restitution))
-    of_two = jax.jit(lambda x: slide(lambda q: {"a": q["y"], "b": q["y"] - slope * q["x"]}, x, 3.3, restitution))
-    np.testing.assert_allclose(of_one(x), of_two(x), rtol=0, atol=1e-12)
-    np.testing.assert_allclose(jax.jacfwd(of_one)(x), jax.jacfwd(of_two)(x), rtol=0, atol=1e-10)
+
+    def rising(q, params):
+        return q["y"] - params["slope"] * jnp.maximum(q["x"], 0.0)
+
+    def apart(q, params):
+        return {"a": q["y"], "b": q["y"] - params["slope"] * q["x"]}
+
+    of_one, of_two = (
+        with_slopes(jax.jacfwd, lambda x, p, of=of: slide(of, x, 3.3, p, restitution=lambda params: params["e"]))
+        for of in (rising, apart)
+    )
+    for slope, restitution in ((0.3, 0.0), (1.0, 0.5)):
+        params = {"slope": slope, "e": restitution}
+        (end, slopes), (right, right_slopes) = of_one(x, params), of_two(x, params)
+        np.testing.assert_allclose(end, right, rtol=0, atol=1e-12)
+        np.testing.assert_allclose(slopes, right_slopes, rtol=0, atol=1e-10)
 
 
-@pytest.mark.parametrize(
-    "gap",
-    [
-        lambda q: q["y"] + 1e3 * jnp.maximum(q["x"], 0.0),
-        lambda q: jnp.where(q["x"] < 0, q["y"], 5.0),  # which jumps
-        lambda q: q["y"] - jnp.interp(q["x"], jnp.array([-9.0, 0.0, 0.1, 9.0]), jnp.array([0.0, 0.0, -50.0, -60.0])),
-    ],
-)
-def test_a_block_slides_off_the_edge_of_a_table(gap):
+EDGES = {
+    "steep": lambda q: q["y"] + 1e3 * jnp.maximum(q["x"], 0.0),
+    "jump": lambda q: jnp.where(q["x"] < 0, q["y"], 5.0),
+    "table": lambda q: (
+        q["y"] - jnp.interp(q["x"], jnp.array([-9.0, 0.0, 0.1, 9.0]), jnp.array([0.0, 0.0, -50.0, -60.0]))
+    ),
+}
+
+
+@pytest.mark.parametrize("name", sweep(EDGES, kept=["steep"]))
+def test_a_block_slides_off_the_edge_of_a_table(name):
     x = jnp.array([-1.0, 0.0, 0.5, 0.0])
     fall = 1.3
-    state, slopes = slide(gap, x, 2.0 + fall), jax.jacrev(lambda x: slide(gap, x, 2.0 + fall))(x)
+    state, slopes = with_slopes(jax.jacrev, lambda x: slide(EDGES[name], x, 2.0 + fall))(x)
     np.testing.assert_allclose(state, [0.65, -G * fall**2 / 2, 0.5, -G * fall], rtol=0, atol=1e-11)
     np.testing.assert_allclose(slopes[1, 0], -2 * G * fall, rtol=1e-11)
     np.testing.assert_allclose(slopes[1, 2], -4 * G * fall, rtol=1e-11)
@@ -139,7 +177,7 @@ def test_a_gap_that_is_zero_at_its_corner_is_refused(gap):
         lagjax.simulate(system, 0.3, 1.0, jnp.array([0.0, 1.0]))
 
 
-def test_a_potential_step_and_a_table_beside_a_contact():
+def test_a_potential_step_beside_a_contact():
     """L jumps by 0.1 at x = 0: ½ v² falls by that. Before, an open gap made the motion NaN."""
     system = lagjax.System(
         lambda q, v: 0.5 * v**2 - jnp.where(q > 0, 0.1, 0.0), contacts=lambda q: 1 - q, restitution=1.0
@@ -149,6 +187,9 @@ def test_a_potential_step_and_a_table_beside_a_contact():
     np.testing.assert_allclose(run.q[1], 0.5 * slow, rtol=0, atol=1e-13)
     np.testing.assert_allclose(run.qdot[2], -1.0, rtol=0, atol=1e-13)
 
+
+@pytest.mark.slow
+def test_a_table_beside_a_contact_has_derivatives_by_its_entries():
     def end(entries):
         system = lagjax.System(
             lambda q, v, params: 0.5 * v**2 + q * jnp.interp(q, jnp.array([-2.0, 0.0, 2.0]), params),
@@ -156,9 +197,9 @@ def test_a_potential_step_and_a_table_beside_a_contact():
         )  # fmt: skip
         return lagjax.simulate(system, 0.2, 1.0, jnp.array([0.0, 2.0]), entries).q[-1]
 
-    entries, h = jnp.array([0.1, 0.0, 1.0]), 1e-6
-    differences = [(end(entries + h * e) - end(entries - h * e)) / (2 * h) for e in jnp.eye(3)]
-    np.testing.assert_allclose(jax.grad(end)(entries), differences, atol=1e-8)
+    entries, moved = jnp.array([0.1, 0.0, 1.0]), 1e-6 * jnp.eye(3)
+    above, below = (jax.jit(jax.vmap(end))(entries + side * moved) for side in (1, -1))
+    np.testing.assert_allclose(jax.jit(jax.grad(end))(entries), (above - below) / 2e-6, atol=1e-8)
 
 
 # ---- results with a name ---------------------------------------------------------------------------------------------
