@@ -18,8 +18,8 @@ from benchmarks._contacts import MANY, ROWS, billiard, end_of, rest_time, system
 
 # One of every law: a blow, blows at one instant, rest after bounces, opening, a freewheel, and friction.
 FAST = ("two balls, m = 1, 3, e = 0.5", "rod falls flat", "spinning ball on a rough floor, mu = 0.5", "one-way clutch")
-# Friction in a blow and blows at one instant have cheaper tests in `test_contacts.py`: Routh's construction, and balls in
-# a row.
+# Friction in a blow and blows at one instant have cheaper tests in `test_contacts.py`: Routh's construction, and balls
+# in a row.
 CHEAP = (FAST[0], FAST[3])
 SMOOTH = ("two balls, m = 1, 3, e = 0.5", "block slides up an incline, rests to 1e6")
 
