@@ -554,6 +554,7 @@ def test_a_fit_that_cannot_be_is_refused(rows, arguments, message):
         lagjax.fit(SCENE, rows, arguments.pop("params0", TRUTH), **arguments)
 
 
+@pytest.mark.slow
 def test_a_motion_that_fails_names_its_record_and_time():
     fall = lagjax.System(lambda q, v, params: 0.5 * v**2 + params / q)  # into the centre at t = 1.11
     rows = [lagjax.Record(TS, 1.0 + 0 * TS, start=start) for start in ((9.0, 0.0), (1.0, 0.0))]

@@ -41,6 +41,7 @@ def test_a_mode_whose_guard_is_beyond_zero_ends_at_once():
 BOUNCE = T("f", "f", lambda q, v: q, -1, lambda q, v: (q, -0.9 * v))
 
 
+@pytest.mark.slow
 def test_a_blow_beyond_its_wall_happens_where_the_motion_goes_on():
     # A millionth below the floor: downwards it bounces; upwards it is let out, which is said. At rest the floor pushes.
     def run(v, transitions, q=-1e-6):
@@ -231,9 +232,8 @@ def test_a_freewheel_and_a_block_let_go_where_nothing_moves_yet():
 # ---- many random scenes ----------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "first", [0, pytest.param(1, marks=pytest.mark.slow), pytest.param(8, marks=pytest.mark.slow)], ids=str
-)
+@pytest.mark.slow
+@pytest.mark.parametrize("first", [0, 1, 8])
 def test_scenes_of_one_family_against_closed_forms(monkeypatch, first):
     """Of the benchmark: shaken tables, 27 and 23 of 40 of which begin beyond; blocks; control loops."""
     monkeypatch.syspath_prepend(str(Path(__file__).parents[2]))

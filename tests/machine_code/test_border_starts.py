@@ -123,6 +123,7 @@ def test_a_mode_that_begins_on_its_border():
     np.testing.assert_allclose([slopes["belt"], slopes["reset"], slopes["mu"]], [2.0, 0.0, 0.0], atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("friction", "slopes"), [(0.5, [0.0, 0.0, 1.0, 0.0]), (2.5, [1.0, 0.0, 0.0, 0.0])])
 def test_a_body_in_a_corner_with_friction(friction, slopes):
     """Pushed by 2: from beside the corner it comes back to it in a time as the root of the way, or stays there."""

@@ -217,6 +217,7 @@ def swung(q0, scene=None, ts=TS, **how):
     return jnp.sum(jnp.sin(q) * jnp.arange(1.0, 6.0).reshape(5, *[1] * (q.ndim - 1))) + jnp.sum(qdot[-1])
 
 
+@pytest.mark.slow
 def test_a_gradient_is_one_launch_for_all_members(on_the_ptx):
     """Compiles a pendulum's motion, transpose and tangents, as the two tests below."""
     q0 = np.linspace(0.3, 2.8, 9)
@@ -388,7 +389,7 @@ ONE_OF_A_KIND = (
 # ---- the lowering ----------------------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("dtype", [pytest.param(np.float32, marks=pytest.mark.slow), np.float64])
 def test_the_lowering_launches_and_calls_nothing_else(dtype):
     scene = scenes.pendulum()
     params = jax.tree.map(dtype, scene.params)

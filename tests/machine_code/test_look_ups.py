@@ -230,7 +230,7 @@ def test_a_field_on_a_grid():
         np.testing.assert_allclose(jnp.vdot(slopes[name], along), (ahead - behind) / 2e-5, atol=1e-8)
 
 
-@pytest.mark.parametrize("where", ["a closure", "params"])
+@pytest.mark.parametrize("where", ["a closure", pytest.param("params", marks=pytest.mark.slow)])
 def test_a_table_of_any_length_is_looked_up(where):
     # A tenth of a second with 200 000 knots: none of them is an operation. A straight line needs one piece, so that the
     # motion q̈ = t is exact.
