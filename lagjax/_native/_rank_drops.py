@@ -5,6 +5,7 @@ none gets through. The last long one is then taken once more, a little shorter.
 """
 
 from lagjax._native._constants import MOST_RETURNS, RETAKEN, RUNNING, SHORTER
+from lagjax._native._events import MEMORY
 from lagjax._native._frame import Fields, Frame
 from lagjax._native._lanes import Lines
 from lagjax._native._tables import Tables
@@ -12,7 +13,7 @@ from lagjax._native._tables import Tables
 
 def beginning(states: int, guards: int, borders: int) -> dict[str, int]:
     """The sizes of the fields that a step begins with; of `guards` of events, and of those of `borders`."""
-    of_guards = dict.fromkeys(("side", "contact", "noted"), guards) | {"touch": borders}
+    of_guards = dict.fromkeys(MEMORY, guards) | {"touch": borders}
     return dict.fromkeys(("y", "low"), states) | of_guards | dict.fromkeys(("t", "t_low", "steps"), 1)
 
 
