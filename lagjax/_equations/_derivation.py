@@ -22,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._equations import _saddle
-from lagjax._equations._blame import pieces_of_motion
+from lagjax._equations._blame import pieces_of, pieces_of_motion
 from lagjax._equations._constraints import velocity_scales
 from lagjax._equations._coupled_forces import CoupledForces
 from lagjax._equations._linear import eigen, solve_many
@@ -389,8 +389,9 @@ class Derivation:
 
     def absent(self, name: str) -> np.ndarray:
         """True for each number of this quantity that is zero whatever the state, in its shape."""
-        zeros = [self._whole.constant(k) == 0 for k in self._positions(name)]
-        return np.array(zeros, bool).reshape(self.shape(name))
+        positions, line = self._positions(name), self._whole.line
+        zeros = np.array([op == "constant" and number == 0 for op, _, number in line.nodes], bool)
+        return zeros[np.array(line.outputs[positions.start : positions.stop], int)].reshape(self.shape(name))
 
     def _positions(self, name: str) -> range:
         """The outputs of the program of all quantities that are this one."""
@@ -424,7 +425,7 @@ class Derivation:
     @functools.cached_property
     def kicks(self) -> bool:
         """True if velocities jump at borders of the motion, as L or a speed that a constraint prescribes does."""
-        if not self.motion.constrained and not pieces_of_motion(self.motion, *self.state_shapes):
+        if not self.motion.constrained and not pieces_of([self.motion.lagrangian], *self.state_shapes):
             return False  # most scenes, and the largest ones, at no cost
         try:
             return self.borders is not None and bool(self.borders.kicking)

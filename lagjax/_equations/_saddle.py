@@ -27,7 +27,7 @@ from typing import Any
 import numpy as np
 
 from lagjax._equations._linear import rank_tolerance, singular_threshold
-from lagjax._program import Scalars, eliminate, orthogonalize, row_weights, solve_orthogonalized, substitute
+from lagjax._program import Scalars, eliminate, orthogonalize, row_weights, solve_orthogonalized, sparse_row, substitute
 from lagjax._program import scalar_algebra as xp
 
 # The part of a pivot that elimination has to leave for a matrix to count as regular in the regular-M variant: four
@@ -235,9 +235,9 @@ class DraggedElimination:
         if not size:
             return (factors, of_rows), singular
         matrix = xp.stack([columns[j][n + i] + float(k == j) for k, i in enumerate(self.dragged) for j in range(size)])
-        rows = matrix.ids.reshape(size, size).tolist()
-        lower = eliminate(matrix.expansion.graph, rows)
-        both = [[*of, *row[k:]] for k, (of, row) in enumerate(zip(lower, rows, strict=True))]
+        graph = matrix.expansion.graph
+        rows = eliminate(graph, [sparse_row(graph, row) for row in matrix.ids.reshape(size, size).tolist()])
+        both = [[row.get(j, graph.number(0.0)) for j in range(size)] for row in rows]
         return (factors, of_rows, xp.stack(columns), Scalars(matrix.expansion, np.array(both))), singular
 
     def solve(self, factors, right):
@@ -247,9 +247,9 @@ class DraggedElimination:
         z = saddle.solve(of_saddle, right)
         if of_drag:
             columns, coupling = of_drag
-            rows = coupling.ids.tolist()
-            lower = [row[:k] for k, row in enumerate(rows)]
-            multipliers = substitute(z.expansion.graph, rows, lower, (-z[n + self.dragged]).ids.tolist())
+            graph = z.expansion.graph
+            rows = [sparse_row(graph, row) for row in coupling.ids.tolist()]
+            multipliers = substitute(graph, rows, (-z[n + self.dragged]).ids.tolist())
             for k, multiplier in enumerate(multipliers):
                 z = z + columns[k] * Scalars(z.expansion, np.array(multiplier))
         gaps, start = right[n:], 0

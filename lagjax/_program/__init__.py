@@ -57,7 +57,7 @@ from lagjax._program._borders import (
 )
 from lagjax._program._differentiation import Derivatives, copy_nodes, pullback, pushforward, tangents_in, with_tangents
 from lagjax._program._emit import Rows, apply_in_jax, emit, emit_look_up, emit_rows
-from lagjax._program._graph import Graph, Tape, Unlowerable, find_ancestors
+from lagjax._program._graph import INPUTS, Graph, Tape, Unlowerable, find_ancestors
 from lagjax._program._jump import row_places
 from lagjax._program._line import StraightLine
 from lagjax._program._look_ups import table_of
@@ -67,7 +67,7 @@ from lagjax._program._passes import eliminate_dead_code, factor, sink_negations
 from lagjax._program._rounding import rounding
 from lagjax._program._scalars import Scalars, absolute, apply_function, concatenate, fold, scatter, stack
 from lagjax._program._series import LinearSystem, series
-from lagjax._program._sliding import eliminate, substitute
+from lagjax._program._sliding import eliminate, sparse_row, substitute
 from lagjax._program.lowering import _complex
 from lagjax._program.lowering._matrices import orthogonalize, row_weights, solve_orthogonalized
 from lagjax._program.lowering._rules import LARGEST_UNFOLDED, Expansion, expand_primitive, has_own_rules, inputs_of
@@ -99,7 +99,8 @@ def lower_scalars(
     arguments = inputs_of(expansion.graph, shapes)
     with np.errstate(all="ignore"):
         results = scalars(expansion, arguments)
-    outputs = [expansion.graph.real(i) for result in results for i in result.ravel().tolist()]
+    real = expansion.graph.real
+    outputs = [i if i < INPUTS else real(i) for result in results for i in result.ravel().tolist()]
     line = eliminate_dead_code(*sink_negations(*factor(expansion.graph, outputs)))
     return Program(line, expansion.traced_operations, shapes)
 

@@ -805,12 +805,15 @@ class _Rewriting:
         others = [
             j for j in orders if self.kinds[j] != CONE and (self.kinds[j] != SIGN or degrees[self.switches[j]] > 1)
         ]
-        shaking = {j: [m for m in self.switches if self.pieces[j] in _below(line, [m])] for j in orders}
-        if others or any(shaking.values()):
+        decides, of_pieces = {j: [] for j in orders}, {self.pieces[j]: j for j in orders}
+        for switch in self.switches:
+            for i in of_pieces.keys() & _below(line, [switch]):
+                decides[of_pieces[i]].append(switch)
+        if others or any(decides.values()):
             search = Jumping(line, self._decide(len(self.switches), ()), self.switches, n, self.program.size)
             jumps = search.find(others, line.outputs[:n], self._levels) if others else {}
             orders = {j: order for j, order in orders.items() if jumps.get(j, True) is not False}
-            shaken = {j: shaking[j] for j in orders if shaking[j]}
+            shaken = {j: decides[j] for j in orders if decides[j]}
             lost = [j for j, nodes in shaken.items() if search.find([j], nodes, self._levels)[j]]
             lost = [j for j in lost if orders.pop(j) == 1]
         widths = {SIGN: 2.0, CONE: 2.0}

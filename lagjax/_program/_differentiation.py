@@ -15,12 +15,12 @@ These are derivatives of the operations as they stand: `has_own_rules` in `_rule
 """
 
 import functools
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Container, Iterable, Sequence
 from typing import Any
 
 import numpy as np
 
-from lagjax._program._graph import INPUTS, Graph, Node, Tape
+from lagjax._program._graph import INPUTS, Graph, Node, Tape, find_ancestors
 from lagjax._program._line import StraightLine
 from lagjax._program._look_ups import Table, move_look_up
 from lagjax._program._operations import LOOK_UPS, OPERATIONS, is_function
@@ -46,12 +46,16 @@ def copy_nodes(
             nodes.append(inputs(attribute, nodes) if callable(inputs) else graph.real(inputs[attribute]))
         elif op == "constant":
             nodes.append(graph.constant(attribute, kind))
-        elif op == "integer_pow":
-            nodes.append(graph.power(nodes[operands[0]], attribute))
         else:
             here = move_look_up(attribute, places) if op in LOOK_UPS and places is not None else attribute
-            nodes.append(graph.apply(op, *[nodes[i] for i in operands], attribute=here))
+            nodes.append(copy_operation(graph, op, [nodes[i] for i in operands], here))
     return nodes
+
+
+def copy_operation(graph: Graph, op: str, operands: Sequence[int], attribute: Any) -> int:
+    if op == "integer_pow":
+        return graph.power(operands[0], attribute)
+    return graph.apply(op, *operands, attribute=attribute)
 
 
 # ---- nodes of a graph -----------------------------------------------------------------------------------------------
@@ -316,7 +320,13 @@ def with_tangents(
 
 def gradient_in(graph: Graph, line: StraightLine, nodes: list[int], node: int, by: Sequence[int]) -> list[int]:
     """The derivatives of one node of a line by the inputs `by`, as nodes of the graph in which the line is `nodes`."""
-    return _PlacedLine(graph, line, nodes).cotangents({node: graph.number(1.0)}, by)
+    slopes = slopes_in(graph, line, nodes, node, by)
+    return [slopes[i] if i in slopes else graph.number(0.0) for i in by]
+
+
+def slopes_in(graph: Graph, line: Any, nodes: Sequence[int], node: int, by: Container[int]) -> dict[int, int]:
+    """`gradient_in`, of a line or of a graph, by the inputs among `by` that the node depends on."""
+    return _PlacedLine(graph, line, nodes).pull({node: graph.number(1.0)}, by)
 
 
 def tangents_in(
@@ -334,7 +344,7 @@ def _kind(dtype) -> str:
 class _PlacedLine(Derivatives):
     """A straight line that is `nodes` in a graph, of which its derivatives become part."""
 
-    def __init__(self, graph: Graph, line: StraightLine, nodes: list[int]):
+    def __init__(self, graph: Graph, line: Any, nodes: Sequence[int]):
         super().__init__(graph)
         self.line, self.nodes = line, nodes
 
@@ -392,7 +402,19 @@ class _PlacedLine(Derivatives):
         varies: Callable[[Table], bool] = lambda table: False,
         is_linear: bool = False,
     ) -> list[int]:
-        """The cotangents of the inputs `by`, from those of some nodes.
+        """The cotangents of the inputs `by`, in their order, as `pull` gives them; 0 where there is none."""
+        results = self.pull(cotangents, frozenset(by), tables, varies, is_linear)
+        return [results[i] if i in results else self._number(0.0) for i in by]
+
+    def pull(
+        self,
+        cotangents: dict[int, int],
+        inputs: Container[int],
+        tables: list | None = None,
+        varies: Callable[[Table], bool] = lambda table: False,
+        is_linear: bool = False,
+    ) -> dict[int, int]:
+        """The cotangents of some inputs, by their numbers, from those of some nodes.
 
         A root whose slope is infinite has a cotangent that is infinite, too; past a slope of zero, as that of
         max(q, 0) on its flat side, it is zero.
@@ -400,12 +422,12 @@ class _PlacedLine(Derivatives):
         Those of entries of a table that `varies` are added to `tables`: the table, the index, and the cotangent; or,
         where the table consists of inputs `by`, to each of these.
         """
-        line, nodes, inputs, results = self.line, self.nodes, frozenset(by), {}
-        varied, flat = self._find_varying_nodes(inputs, varies), ("mul",) if is_linear else ("max", "min")
-        beneath = self._find_beneath_roots(varied, is_linear)
-        for k in range(len(line.nodes) - 1, -1, -1):
+        line, nodes, results, above = self.line, self.nodes, {}, find_ancestors(self.line.nodes, cotangents)
+        varied, flat = self._find_varying_nodes(above, inputs, varies), ("mul",) if is_linear else ("max", "min")
+        beneath = self._find_beneath_roots(above, varied, is_linear)
+        for k in reversed(above):
             (op, operands, attribute), g = line.nodes[k], cotangents.get(k)
-            if g is None or not varied[k]:
+            if g is None or k not in varied:
                 continue
             if op == "input":
                 self._add(results, attribute, g)
@@ -419,23 +441,28 @@ class _PlacedLine(Derivatives):
             else:
                 rules = self.rules(nodes[k], op, [nodes[j] for j in operands])
                 for i, rule in zip(operands, rules, strict=False):  # a step has no derivative at all
-                    if rule is not None and varied[i]:
+                    if rule is not None and i in varied:
                         part = self._zero_where_zero(k, g, rule(g))
                         if op in flat and k in beneath:
                             slope = rule(self._number(1.0))
                             part = self._select_unless_zero(slope, self._select_unless_zero(g, part))
                         self._add(cotangents, i, part)
-        return [results[i] if i in results else self._number(0.0) for i in by]
+        return results
 
-    def _find_varying_nodes(self, inputs: frozenset[int], varies: Callable[[Table], bool]) -> list[bool]:
-        """True for every node that depends on some inputs, or on entries of a table that `varies`."""
-        varied: list[bool] = []
-        for (op, operands, attribute), kind in zip(self.line.nodes, self.line.kinds, strict=True):
+    def _find_varying_nodes(
+        self, among: Sequence[int], inputs: Container[int], varies: Callable[[Table], bool]
+    ) -> set[int]:
+        """Those nodes that depend on some inputs, or on entries of a table that `varies`."""
+        varied: set[int] = set()
+        for k in among:
+            op, operands, attribute = self.line.nodes[k]
             if op == "take":
-                varied.append(attribute.numbers is None and (attribute.first in inputs or varies(attribute)))
+                depends = attribute.numbers is None and (attribute.first in inputs or varies(attribute))
             else:
-                depends = attribute in inputs if op == "input" else any(varied[i] for i in operands)
-                varied.append(kind == "float" and depends)
+                depends = attribute in inputs if op == "input" else not varied.isdisjoint(operands)
+                depends = depends and self.line.kinds[k] == "float"
+            if depends:
+                varied.add(k)
         return varied
 
     def _zero_where_zero(self, k: int, g: int, part: int) -> int:
@@ -454,18 +481,18 @@ class _PlacedLine(Derivatives):
         f, zero = self.graph.apply, self._number(0.0)
         return f("select", f("eq", number, zero), part, f("select", f("is_finite", part), zero, part))
 
-    def _find_beneath_roots(self, varied: list[bool], is_linear: bool) -> set[int]:
+    def _find_beneath_roots(self, among: Sequence[int], varied: set[int], is_linear: bool) -> set[int]:
         """The nodes that vary and that operations of steep slopes depend on; in a line of tangents, their tangents.
 
         There a tangent beneath a root is one that is asked whether it is zero (`_zero_where_zero`).
         """
         nodes, beneath = self.line.nodes, set()
-        for k in range(len(nodes) - 1, -1, -1):
+        for k in reversed(among):
             op, operands, _ = nodes[k]
             if is_linear and op == "select" and nodes[operands[0]][0] == "eq":
-                beneath.update(i for i in (*nodes[operands[0]][1], *operands[1:]) if varied[i])
-            elif k in beneath or (not is_linear and operands and varied[k] and OPERATIONS[op].steep):
-                beneath.update(i for i in operands if varied[i])
+                beneath.update(varied.intersection((*nodes[operands[0]][1], *operands[1:])))
+            elif k in beneath or (not is_linear and operands and k in varied and OPERATIONS[op].steep):
+                beneath.update(varied.intersection(operands))
         return beneath
 
 

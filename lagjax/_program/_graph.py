@@ -59,6 +59,26 @@ def find_ancestors(nodes: Sequence[Node], outputs: Iterable[int], powers: Mappin
     return order
 
 
+def find_readers(nodes: Sequence[Node]) -> list[list[int]]:
+    """For each node those that it is an operand of."""
+    readers: list[list[int]] = [[] for _ in nodes]
+    for i, (_, operands, _) in enumerate(nodes):
+        for x in operands:
+            readers[x].append(i)
+    return readers
+
+
+def find_descendants(readers: Sequence[Sequence[int]], starts: Iterable[int]) -> list[int]:
+    """The nodes that depend on some others, without these, in order; `readers` as `find_readers` gives them."""
+    found: set[int] = set()
+    left = list(starts)
+    while left:
+        new = [i for i in readers[left.pop()] if i not in found]
+        found.update(new)
+        left += new
+    return sorted(found)
+
+
 class Graph:
     """Scalars under construction. `apply` is the one door: it folds, simplifies and shares before it adds a node.
 

@@ -29,7 +29,7 @@ from lagjax._program._operations import LOOK_UPS
 from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._rounding import rounding
 from lagjax._program._series import StraightLine
-from lagjax._program._sliding import dot, eliminate, substitute
+from lagjax._program._sliding import dot, eliminate, sparse_row, substitute
 
 _LARGEST = 60  # operations that one may become: a bound for errors
 _STATES = 48  # at which a border is looked for: what jumps does so at nearly all of them
@@ -190,10 +190,10 @@ def _saddle(graph: Graph, mass: Sequence[int], jacobian: Sequence[int], n: int):
     m, zero = len(jacobian) // n if n else 0, graph.constant(0.0, "float")
     rows = [[*mass[i * n : (i + 1) * n], *(jacobian[k * n + i] for k in range(m))] for i in range(n)]
     rows += [[*jacobian[k * n : (k + 1) * n], *[zero] * m] for k in range(m)]
-    lower = eliminate(graph, rows)
+    factors = eliminate(graph, [sparse_row(graph, row) for row in rows])
 
     def solve(r: Sequence[int], c: Sequence[int]) -> tuple[list[int], list[int]]:
-        x = substitute(graph, rows, lower, [*r, *c])
+        x = substitute(graph, factors, [*r, *c])
         return x[:n], x[n:]
 
     return solve

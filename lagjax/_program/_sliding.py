@@ -17,21 +17,23 @@ on either side, the force brings it back at once.
 """
 
 import functools
+from collections import Counter
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from lagjax._program._differentiation import copy_nodes, gradient_in
-from lagjax._program._graph import Graph
+from lagjax._program._differentiation import copy_nodes, copy_operation, slopes_in
+from lagjax._program._graph import Graph, find_descendants, find_readers
 from lagjax._program._operations import LOOK_UPS
 from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._series import LinearSystem, StraightLine
 
-# Borders that act on each other, whose elimination takes a third of the cube; and borders in all, of which each solves
-# the linear system once more.
-MOST_COUPLED, MOST_SLIDING = 64, 512
+# Borders that act on each other, whose elimination takes a third of the cube; and borders in all. The first result of
+# 2500 blocks that know nothing of each other takes 20 CPU s, half of it for M; twice as many take three times as long.
+MOST_COUPLED, MOST_SLIDING = 64, 6000
 MOST_COPIES, LARGEST_COPIED = 4, 4000  # pieces for which all of a program is done once more, and its operations
 # Borders that are not independent share what they hold as if they yielded by so much, relative; what that leaves is
 # mended this many times. The share of what no border holds alone is as exact as rounding, divided by it.
@@ -45,6 +47,9 @@ _LARGEST = 10_000_000  # operations: a bound for errors
 # The length of the vector of a cone that is as good as none: forces change by so little beside it, and its square is
 # there. What friction does along each of its parts is read off there.
 _TINY = 2.0**-300
+
+
+Sparse = dict[int, int]  # the nodes of a vector by their place in it; what is not there is zero
 
 
 class Slide(NamedTuple):
@@ -128,11 +133,14 @@ class _SlidingForces:
         self.zero, self.one = self.number(0.0), self.number(1.0)
         self.pieces = [self.graph.input(first + slide.piece, "float") for slide in slides]
         self.rows, self.decided = [], range(first, first + len(switches))
+        self.rows_of: list[range] = []  # of each slide
         for k, (slide, piece) in enumerate(zip(slides, self.pieces, strict=True)):
+            count = len(self.rows)
             if slide.parts:
                 self.rows += [_Row(k, u, 0.0) for u in slide.parts]
             else:
                 self.rows.append(_Row(k, self.f("sub", switches[slide.piece], slide.level(self.graph, piece)), -1.0))
+            self.rows_of.append(range(count, len(self.rows)))
         flags = [self.graph.input(first + len(switches) + k, "float") for k in range(len(slides))]
         self.flags = [self.f("gt", flag, self.number(0.5)) for flag in flags]
 
@@ -151,21 +159,17 @@ class _SlidingForces:
             return None
         slopes, rates, levels = zip(*map(self._rate, range(len(self.rows))), strict=True)
         responses, effects = self._effects(acts, slopes)
-        _, groups = connected_components(np.array(effects) != self.zero, directed=False)
-        if np.bincount(groups).max() > MOST_COUPLED:
+        if np.bincount(_find_groups(effects, len(effects))).max() > MOST_COUPLED:
             return None
-        pushed = [self.f("lt", row[k], self.zero) for k, row in enumerate(effects)]
+        pushed = [self.f("lt", row.get(k, self.zero), self.zero) for k, row in enumerate(effects)]
         all_pushed = [functools.reduce(lambda a, b: self.f("and", a, b), of) for of in self._group_rows(pushed)]
         pushed = [all_pushed[row.slide] for row in self.rows]
         # Borders that are not pushed onto are left, and act on nothing until then.
         acts = [{i: self.where(p, c) for i, c in act.items()} for p, act in zip(pushed, acts, strict=True)]
-        normals = [[self.where(p, d) for d in of] for p, of in zip(pushed, slopes, strict=True)]
+        normals = [{i: self.where(p, d) for i, d in of.items()} for p, of in zip(pushed, slopes, strict=True)]
         equations = self._equations(effects, pushed, slopes)
         ends = list(map(self.where, pushed, rates))
-        missing = [
-            self.f("sub", end, dot(self.graph, d, self.linear.z[: self.n]))
-            for end, d in zip(ends, normals, strict=True)
-        ]
+        missing = [self.f("sub", end, self._dot(d, self.linear.z)) for end, d in zip(ends, normals, strict=True)]
         unknown = self._unknown(equations, missing)
         pivots = _choose_pivots([_constants(self.graph, self._unmask(d)) for d in slopes])
         held = _Held(self.graph, self.n, pushed, [self._unmask(d) for d in slopes], responses, pivots)
@@ -174,10 +178,10 @@ class _SlidingForces:
         if len(pivots) < len(acts) or missed:
             # What has no pivot, and what constraints tie to one, is held by the rounding of rounding.
             z = self._add(z, self._solve([missed.get(i, self.zero) for i in range(len(z))])) if missed else z
-            left = [self.f("sub", end, dot(self.graph, d, z[: self.n])) for end, d in zip(ends, normals, strict=True)]
+            left = [self.f("sub", end, self._dot(d, z)) for end, d in zip(ends, normals, strict=True)]
             more = equations.solve(self.graph, left)
             unknown = self._add(unknown, more)
-            z = self._add(z, [dot(self.graph, of, more) for of in zip(*responses, strict=True)])
+            z = self._add(z, [self._dot(of, more) for of in _transpose(responses, len(z))])
         z = held.hold(z, rates)
         shares = [self._share(k, unknown, slopes, rates, all_pushed[k], z) for k in range(len(self.slides))]
         directions = [
@@ -189,7 +193,8 @@ class _SlidingForces:
         line = StraightLine(tuple(self.graph.nodes), tuple(self.graph.kinds), outputs)
         by_position = [k for k, row in enumerate(self.rows) if self.slides[row.slide].order > 1]
         if by_position:
-            some = [[effects[k][m] for m in by_position] for k in by_position]
+            at = {m: i for i, m in enumerate(by_position)}
+            some = [{at[m]: x for m, x in effects[k].items() if m in at} for k in by_position]
             pushes = [self._pushes_back(k, effects, pushed, slopes, missing) for k in by_position]
             of_positions = self._equations(some, pushes, [slopes[k] for k in by_position])
             at = [self.rows[k].offset for k in by_position]
@@ -201,30 +206,49 @@ class _SlidingForces:
         return Sliding(line, range(len(self.line.nodes)), shares, linear, retraction, of_slides, release)
 
     def _group_rows(self, of_rows: Sequence) -> list[list]:
-        return [
-            [x for row, x in zip(self.rows, of_rows, strict=True) if row.slide == k] for k in range(len(self.slides))
-        ]
+        return [[of_rows[m] for m in rows] for rows in self.rows_of]
 
-    def _release(self, directions: Sequence[int], slopes: Sequence[list[int]]) -> list[int]:
+    def _dot(self, row: Sparse, xs: Sequence[int]) -> int:
+        return dot(self.graph, row.values(), [xs[i] for i in row])
+
+    def _release(self, directions: Sequence[int], slopes: Sequence[Sparse]) -> list[int]:
         f, results = self.f, []
         for k, slide in enumerate(self.slides):
             if not slide.parts:
                 continue
-            rows = [m for m, row in enumerate(self.rows) if row.slide == k]
+            rows = self.rows_of[k]
             along = [directions[m] for m in rows]
             length = f("sqrt", dot(self.graph, along, along))
             length = f("select", f("gt", length, self.zero), self.one, length)
-            sizes = [dot(self.graph, slopes[m], slopes[m]) for m in rows]
+            sizes = [dot(self.graph, slopes[m].values(), slopes[m].values()) for m in rows]
             for numbers in ([f("div", x, length) for x in along], [self.rows[m].offset for m in rows]):
                 parts = [f("div", x, size) for x, size in zip(numbers, sizes, strict=True)]
-                results += [dot(self.graph, [slopes[m][i] for m in rows], parts) for i in range(self.n)]
+                results += [self._dot(of, parts) for of in _transpose([slopes[m] for m in rows], self.n)]
         return results
+
+    @functools.cached_property
+    def _solution(self) -> StraightLine:
+        return self.linear.solve()
 
     def _solve(self, right: Sequence[int]) -> list[int]:
         """z of A z = r."""
-        line = self.linear.solve()
-        nodes = copy_nodes(self.graph, line, [*self.linear.factors, *right])
-        return [nodes[i] for i in line.outputs]
+        nodes = copy_nodes(self.graph, self._solution, [*self.linear.factors, *right])
+        return [nodes[i] for i in self._solution.outputs]
+
+    def _respond(self, acts: Sequence[Sparse]) -> list[Sparse]:
+        """z of A z = r for some r of few entries each: only what depends on these is computed."""
+        line, first, results = self._solution, len(self.linear.factors), []
+        still = copy_nodes(self.graph, line, [*self.linear.factors, *[self.zero] * len(self.linear.right)])
+        inputs = {node[2]: i for i, node in enumerate(line.nodes) if node[0] == "input"}
+        readers = find_readers(line.nodes)
+        for act in acts:
+            moved = {inputs[first + i]: x for i, x in act.items() if first + i in inputs}
+            for i in find_descendants(readers, moved):
+                op, operands, attribute = line.nodes[i]
+                moved[i] = copy_operation(self.graph, op, [moved.get(x, still[x]) for x in operands], attribute)
+            z = {i: moved[node] for i, node in enumerate(line.outputs) if node in moved}
+            results.append({i: x for i, x in z.items() if x != self.zero})
+        return results
 
     def _add(self, xs: Sequence[int], ys: Sequence[int]) -> list[int]:
         return [self.f("add", *pair) for pair in zip(xs, ys, strict=True)]
@@ -236,37 +260,39 @@ class _SlidingForces:
         found = {}
         for i in sorted(rows):
             known = {j: c for (k, j), c in entries.items() if k == i}
-            found[i] = self.f("sub", self.linear.right[i], dot(self.graph, known.values(), [z[j] for j in known]))
+            found[i] = self.f("sub", self.linear.right[i], self._dot(known, z))
         return found
 
-    def _effects(self, acts: Sequence[dict[int, int]], slopes: Sequence[list[int]]) -> tuple[list[list[int]], ...]:
+    def _effects(self, acts: Sequence[Sparse], slopes: Sequence[Sparse]) -> tuple[list[Sparse], list[Sparse]]:
         """The slopes of z by each piece, and ∂u̇/∂p of each border by each piece; zeros where nothing slides."""
-        size = len(self.linear.right)
-        responses = [self._solve([act.get(i, self.zero) for i in range(size)]) for act in acts]
-        effects = []
+        responses, effects = self._respond(acts), []
+        of_coordinates = _transpose(responses, len(self.linear.right))
         for d in slopes:
-            some = [i for i, x in enumerate(d) if x != self.zero]
-            effects.append([dot(self.graph, [d[i] for i in some], [of[i] for i in some]) for of in responses])
+            row = {}
+            for m in sorted({m for i in d for m in of_coordinates[i]}):
+                both = [i for i in d if i in responses[m]]
+                row[m] = dot(self.graph, [d[i] for i in both], [responses[m][i] for i in both])
+            effects.append({m: x for m, x in row.items() if x != self.zero})
         return responses, effects
 
-    def _unmask(self, numbers: Sequence[int]) -> list[int]:
+    def _unmask(self, row: Sparse) -> Sparse:
         """Numbers that are zero where nothing slides, as they are where something does."""
         nodes = self.graph.nodes
-        return [nodes[d][1][2] if nodes[d][0] == "select" else d for d in numbers]
+        return {i: nodes[d][1][2] if nodes[d][0] == "select" else d for i, d in row.items()}
 
-    def _equations(self, effects: list[list[int]], pushed: Sequence[int], slopes: Sequence[list[int]]) -> "_Equations":
+    def _equations(self, effects: list[Sparse], pushed: Sequence[int], slopes: Sequence[Sparse]) -> "_Equations":
         """The linear equations of μ; μ = 0 where there is nothing to do."""
         f, rows = self.f, []
         for k, row in enumerate(effects):
-            both = [self.where(pushed[k], self.where(p, x)) for p, x in zip(pushed, row, strict=True)]
-            both[k] = f("select", pushed[k], self.one, row[k])
+            both = {m: self.where(pushed[k], self.where(pushed[m], x)) for m, x in row.items()}
+            both[k] = f("select", pushed[k], self.one, row.get(k, self.zero))
             rows.append(both)
         whole = []
         if self._are_dependent(slopes):
-            whole = [list(row) for row in rows]
+            whole = [dict(row) for row in rows]
             for k, row in enumerate(rows):
                 row[k] = f("mul", self.number(1 + SOFT), row[k])
-        return _Equations(rows, eliminate(self.graph, rows), whole)
+        return _Equations(eliminate(self.graph, rows), whole)
 
     def _pushes_back(self, j: int, effects, pushed: Sequence[int], slopes, missing: Sequence[int]) -> int:
         """True where border j of positions pushes back what lies beside it; other borders may hold that there, too."""
@@ -277,14 +303,16 @@ class _SlidingForces:
         equations = self._equations(effects, without, slopes)
         stays = pushed[j]
         for change in (self.number(2.0), self.zero):
-            beside = [f("sub", x, f("mul", effects[k][j], change)) for k, x in enumerate(missing)]
+            beside = [
+                f("sub", x, f("mul", effects[k][j], change)) if j in effects[k] else x for k, x in enumerate(missing)
+            ]
             mu = self._unknown(equations, list(map(self.where, without, beside)))
             for k in others:
                 held = f("lt", f("abs", f("add", mu[k], self.number(self.rows[k].below))), self.one)
                 stays = f("and", stays, f("or", f("not", pushed[k]), held))
-            row = [self.zero if k == j else x for k, x in enumerate(effects[j])]
-            moves = f("abs", f("sub", beside[j], dot(self.graph, row, mu)))
-            stays = f("and", stays, f("le", moves, f("mul", self.number(STILL), f("abs", effects[j][j]))))
+            moves = f("abs", f("sub", beside[j], self._dot(_drop_entry(effects[j], j), mu)))
+            own = effects[j].get(j, self.zero)
+            stays = f("and", stays, f("le", moves, f("mul", self.number(STILL), f("abs", own))))
         return f("and", pushed[j], f("not", stays))
 
     def _unknown(self, equations: "_Equations", missing: list[int]) -> list[int]:
@@ -293,16 +321,24 @@ class _SlidingForces:
             return equations.solve(self.graph, missing)
         f, rows = self.f, equations.whole
         below = [self.number(row.below) for row in self.rows]
-        there = [f("add", x, dot(self.graph, row, below)) for x, row in zip(missing, rows, strict=True)]
+        there = [f("add", x, self._dot(row, below)) for x, row in zip(missing, rows, strict=True)]
         return [f("sub", x, p) for x, p in zip(equations.solve(self.graph, there), below, strict=True)]
 
-    def _are_dependent(self, slopes: Sequence[list[int]]) -> bool:
+    def _are_dependent(self, slopes: Sequence[Sparse]) -> bool:
         """True if the rates of some borders are combinations of others, so that these can share what they hold."""
-        some, numbers = np.random.default_rng(0), np.zeros((len(slopes), self.n))
-        for k, of_one in enumerate(slopes):
-            for i, value in _constants(self.graph, self._unmask(of_one)).items():
-                numbers[k, i] = some.uniform(0.5, 1.5) if value is None else value
-        return bool(np.linalg.matrix_rank(numbers) < len(slopes))
+        some, groups = np.random.default_rng(0), {}
+        constants = [_constants(self.graph, self._unmask(of_one)) for of_one in slopes]
+        for k, group in enumerate(_find_groups(slopes, self.n)):
+            groups.setdefault(group, []).append(constants[k])
+        for rows in groups.values():
+            place = {i: at for at, i in enumerate(sorted({i for row in rows for i in row}))}
+            numbers = np.zeros((len(rows), len(place)))
+            for k, row in enumerate(rows):
+                for i, value in row.items():
+                    numbers[k, place[i]] = some.uniform(0.5, 1.5) if value is None else value
+            if not place or np.linalg.matrix_rank(numbers) < len(rows):
+                return True
+        return False
 
     def _share(self, k: int, unknown: Sequence[int], slopes: Sequence, rates: Sequence, pushed: int, z) -> int:
         """The share of the upper side: μ/2, and far beyond 0 or 1 where both sides do not push.
@@ -310,12 +346,12 @@ class _SlidingForces:
         Of a cone, which holds up to a length of 1, it is what is left of the square of that, of 1/4: never 1.
         """
         f, half = self.f, self.number(0.5)
-        rows = [m for m, row in enumerate(self.rows) if row.slide == k]
+        rows = self.rows_of[k]
         mu = [unknown[m] for m in rows]
         if self.slides[k].parts:
             left = f("sub", self.one, dot(self.graph, mu, mu))
             return f("select", pushed, self.number(-FAR), f("mul", self.number(0.25), left))
-        moves = f("sub", dot(self.graph, slopes[rows[0]], z[: self.n]), rates[rows[0]])
+        moves = f("sub", self._dot(slopes[rows[0]], z), rates[rows[0]])
         return f("select", pushed, f("add", half, f("mul", self.number(FAR), moves)), f("mul", half, mu[0]))
 
     def _push_right_side(
@@ -328,22 +364,24 @@ class _SlidingForces:
                 pushed[i] = self.f("add", pushed[i], self.f("mul", c, mu))
         return pushed
 
-    def _acts(self) -> list[dict[int, int]] | None:
+    def _acts(self) -> list[Sparse] | None:
         """∂r/∂pₖ, entry by entry: half of the difference of both sides; of a cone, what a unit of its vector does."""
         of_sides = self._values_on_both_sides()
         if of_sides is None:
             return None
-        acts = []
+        acts, entries = [], {}
+        for i, x in enumerate(self.linear.right):
+            entries.setdefault(x, []).append(i)
         for m, (k, *_) in enumerate(self.rows):
             if self.slides[k].parts:
                 below, above = self._evaluate_cone(k, None), self._evaluate_cone(k, self.rows[m].offset)
                 factor = self.one
             else:
-                below, above = ({x: of[k][side] for x, of in of_sides.items() if k in of} for side in range(2))
+                below, above = ({x: pair[side] for x, pair in of_sides[k].items()} for side in range(2))
                 factor = self.number(0.5)
             act = {}
-            for i, x in enumerate(self.linear.right):
-                change = self.f("sub", above[x], below[x]) if x in below and x in above else self.zero
+            for i, node in sorted((i, x) for x in below.keys() & above.keys() & entries.keys() for i in entries[x]):
+                change = self.f("sub", above[node], below[node])
                 if self.graph.value(change) != 0:
                     act[i] = self.masked(m, self.f("mul", factor, change))
             acts.append(act)
@@ -382,25 +420,31 @@ class _SlidingForces:
                 return True
         return False
 
-    def _reads_others(self, k: int, act: dict[int, int]) -> bool:
-        others = {piece for m, piece in enumerate(self.pieces) if m != k}
-        return self.slides[k].width > 1 and not others.isdisjoint(self.graph.find_ancestors(act.values()))
+    def _reads_others(self, k: int, act: Sparse) -> bool:
+        others = self._all_pieces.intersection(self.graph.find_ancestors(act.values())) - {self.pieces[k]}
+        return self.slides[k].width > 1 and bool(others)
 
-    def _values_on_both_sides(self) -> dict[int, dict[int, tuple[int, int]]] | None:
-        """The nodes that depend on pieces, and for each piece their values below and above, the others as they are."""
+    @functools.cached_property
+    def _all_pieces(self) -> frozenset[int]:
+        return frozenset(self.pieces)
+
+    def _values_on_both_sides(self) -> list[dict[int, tuple[int, int]]] | None:
+        """For each piece the nodes that depend on it, with their values below and above, other pieces as they are."""
         graph, system = self.graph, self.linear
         pieces = {node: k for k, node in enumerate(self.pieces)}
         matrix = *system.entries.values(), *system.others.values(), *system.factors
         if not pieces.keys().isdisjoint(graph.find_ancestors(matrix)):
             return None
         sides: dict[int, dict[int, tuple[int, int]]] = {}
+        of_pieces: list[dict[int, tuple[int, int]]] = [{} for _ in self.slides]
         minus_one = self.number(-1.0)
         for i in graph.find_ancestors(system.right):
             if i in pieces and self.slides[pieces[i]].parts:
                 continue
             if i in pieces:
                 is_sign = self.slides[pieces[i]].width > 1
-                sides[i] = {pieces[i]: (minus_one, self.one) if is_sign else (i, self.f("add", i, self.one))}
+                of_pieces[pieces[i]][i] = (minus_one, self.one) if is_sign else (i, self.f("add", i, self.one))
+                sides[i] = {pieces[i]: of_pieces[pieces[i]][i]}
                 continue
             op, operands, attribute = graph.nodes[i]
             among = sorted({k for x in operands for k in sides.get(x, ())})
@@ -411,29 +455,30 @@ class _SlidingForces:
             values = {k: pair for k, pair in values.items() if pair[0] != pair[1]}
             if values:
                 sides[i] = values
-        return sides
+            for k, pair in values.items():
+                of_pieces[k][i] = pair
+        return of_pieces
 
-    def _rate(self, k: int) -> tuple[list[int], int, int]:
+    def _rate(self, k: int) -> tuple[Sparse, int, int]:
         """∂w/∂q̇ and −∂w/∂q q̇ − ∂w/∂t of what is to stay zero, u or u̇; zeros where nothing slides. And w."""
         n, node = self.n, self.rows[k].offset
-        level = node
+        level, slopes = node, {}
         for _ in range(self.slides[self.rows[k].slide].order):
-            level, slopes = node, self._slopes(node)
-            velocities = [self.graph.input(n + i, "float") for i in range(n)]
-            node = self.f("add", dot(self.graph, slopes[:n], velocities), slopes[2 * n])
-        return [self.masked(k, x) for x in slopes[n : 2 * n]], self.masked(k, self.f("neg", node)), level
-
-    def _slopes(self, node: int) -> list[int]:
-        line = StraightLine(tuple(self.graph.nodes), tuple(self.graph.kinds), ())
-        return gradient_in(self.graph, line, list(range(len(line.nodes))), node, range(2 * self.n + 1))
+            nodes = range(len(self.graph.nodes))
+            level, slopes = node, dict(sorted(slopes_in(self.graph, self.graph, nodes, node, range(2 * n + 1)).items()))
+            by_place = {i: x for i, x in slopes.items() if i < n}
+            velocities = [self.graph.input(n + i, "float") for i in by_place]
+            node = self.f("add", dot(self.graph, by_place.values(), velocities), slopes.get(2 * n, self.zero))
+        by_velocity = {i - n: self.masked(k, x) for i, x in slopes.items() if n <= i < 2 * n}
+        return by_velocity, self.masked(k, self.f("neg", node)), level
 
     def _system(self, z, unknown, acts, slopes, rates, of_unknowns, pivots) -> LinearSystem:
         system, count = self.linear, len(self.linear.right)
         others = {(i, count + k): self.f("neg", c) for k, act in enumerate(acts) for i, c in act.items()}
-        entries = ((k, i, d) for k, of_one in enumerate(slopes) for i, d in enumerate(of_one))
+        entries = ((k, i, d) for k, of_one in enumerate(slopes) for i, d in of_one.items())
         others |= {(count + k, i): d for k, i, d in entries if self.graph.value(d) != 0}
         # What `solve` needs besides: the entries, and the elimination of the unknowns.
-        own = [*others.values(), *(x for table in of_unknowns for row in table for x in row)]
+        own = [*others.values(), *(x for table in of_unknowns for row in table for x in row.values())]
         own += [x for _, _, *numbers in pivots for x in numbers]
         known = {x: self.graph.value(x) for x in own}
         read = list(dict.fromkeys(x for x in own if known[x] is None))
@@ -445,7 +490,7 @@ class _SlidingForces:
             at = {x: inputs[len(system.factors) + i] for i, x in enumerate(read)}
             at |= {x: graph.number(value) for x, value in known.items() if value is not None}
             right, ends = inputs[len(factors) : len(factors) + count], inputs[len(factors) + count :]
-            equations = _Equations(*([[at[x] for x in row] for row in table] for table in of_unknowns))
+            equations = _Equations(*([{j: at[x] for j, x in row.items()} for row in table] for table in of_unknowns))
             inner = system.solve()
 
             def apply_inverse(right):
@@ -468,11 +513,13 @@ class _SlidingForces:
                 rest = apply_inverse(subtract([graph.number(0.0)] * count, more, False))
                 z = [graph.apply("add", *pair) for pair in zip(z, rest, strict=True)]
                 mu = [graph.apply("add", *pair) for pair in zip(mu, more, strict=True)]
+            of_rows: dict[int, Sparse] = {}
+            for (row, j), d in others.items():
+                of_rows.setdefault(row - count, {})[j] = d
             for k, i, free, inverse in pivots:
                 end = ends[k]
-                for (row, j), d in others.items():
-                    if row == count + k and j != i:
-                        end = graph.apply("sub", end, graph.apply("mul", at[d], z[j]))
+                for j, d in _drop_entry(of_rows.get(k, {}), i).items():
+                    end = graph.apply("sub", end, graph.apply("mul", at[d], z[j]))
                 z[i] = graph.apply("add", graph.apply("mul", at[free], z[i]), graph.apply("mul", at[inverse], end))
             return StraightLine(tuple(graph.nodes), tuple(graph.kinds), (*z, *mu))
 
@@ -494,6 +541,7 @@ class _Held:
         self.graph, self.n, self.pushed, self.slopes, self.responses = graph, n, pushed, slopes, responses
         self.zero, self.one = (graph.number(x) for x in (0.0, 1.0))
         self.divisors = [(k, i, graph.apply("select", pushed[k], self.one, slopes[k][i])) for k, i in pivots]
+        self.of_coordinates = _transpose(responses, n)
         self.state = {i: graph.input(i, "float") for i in range(2 * n)}
 
     def pivots(self) -> list[tuple[int, int, int, int]]:
@@ -508,7 +556,8 @@ class _Held:
         """Accelerations with those of pivots from Σ ∂u̇/∂q̈ᵢ q̈ᵢ = `rates`."""
         f, z = self.graph.apply, list(z)
         for k, i, divisor in self.divisors:
-            others = dot(self.graph, [self.zero if j == i else d for j, d in enumerate(self.slopes[k])], z[: self.n])
+            row = _drop_entry(self.slopes[k], i)
+            others = dot(self.graph, row.values(), [z[j] for j in row])
             z[i] = f("select", self.pushed[k], z[i], f("div", f("sub", rates[k], others), divisor))
         return z
 
@@ -522,14 +571,17 @@ class _Held:
         """
         f, state, n, pushed_of = self.graph.apply, self.state, self.n, dict(zip(which, pushed, strict=True))
         left = zip(which, self._evaluate(levels), strict=True)
-        multiples = solve([f("select", pushed_of[k], self.zero, level) for k, level in left])
-        for i in range(n):
-            moves = dot(self.graph, [self.responses[k][i] for k in which], multiples)
+        changes = solve([f("select", pushed_of[k], self.zero, level) for k, level in left])
+        multiples = dict(zip(which, changes, strict=True))
+        for i, of in enumerate(self.of_coordinates):
+            some = [k for k in of if k in multiples]
+            moves = dot(self.graph, [of[k] for k in some], [multiples[k] for k in some])
             state[first + i] = f("sub", state[first + i], moves)
         left, moved = dict(zip(which, self._evaluate(levels), strict=True)), [self.zero] * n
         for k, i, divisor in self.divisors:
             if k in left:
-                change = f("div", f("add", left[k], dot(self.graph, self.slopes[k], moved)), divisor)
+                row = self.slopes[k]
+                change = f("div", f("add", left[k], dot(self.graph, row.values(), [moved[j] for j in row])), divisor)
                 before, change = state[first + i], f("neg", change)
                 state[first + i] = f("select", pushed_of[k], before, f("add", before, change))
                 moved[i] = f("add", moved[i], f("select", pushed_of[k], self.zero, change))
@@ -545,7 +597,8 @@ class _Held:
         """The line from the inputs of the program to the state, and which coordinates each border moves."""
         graph = self.graph
         line = eliminate_dead_code(graph, [self.state[i] for i in range(2 * self.n)])
-        return line, tuple(frozenset(_constants(graph, response[: self.n])) for response in self.responses)
+        moved = ({i: x for i, x in response.items() if i < self.n} for response in self.responses)
+        return line, tuple(frozenset(_constants(graph, of)) for of in moved)
 
 
 def _choose_pivots(rows: Sequence[dict[int, float | None]]) -> list[tuple[int, int]]:
@@ -554,16 +607,16 @@ def _choose_pivots(rows: Sequence[dict[int, float | None]]) -> list[tuple[int, i
     `rows` has the slopes ∂u̇/∂q̈ᵢ of each border that are not zero, None for those that are no constants. A pivot is
     alone in its row, or has the largest constant of it, so that it gathers no rounding. A border may have none.
     """
-    left, behind = dict(enumerate(rows)), []
+    left, behind, times = dict(enumerate(rows)), [], Counter(i for row in rows for i in row)
 
     def is_free(k: int, i: int) -> bool:
         constants = {j: abs(x) for j, x in rows[k].items() if x is not None}
         leads = len(rows[k]) == 1 or (i in constants and constants[i] == max(constants.values()))
-        return leads and not any(i in row for m, row in left.items() if m != k)
+        return leads and times[i] == 1
 
     while (found := next(((k, i) for k, row in left.items() for i in row if is_free(k, i)), None)) is not None:
         behind.append(found)
-        del left[found[0]]
+        times.subtract(left.pop(found[0]).keys())
     return [(k, i) for k, row in left.items() for i in row if len(row) == 1] + behind[::-1]
 
 
@@ -573,23 +626,50 @@ def _choose_pivots(rows: Sequence[dict[int, float | None]]) -> list[tuple[int, i
 class _Equations(NamedTuple):
     """Linear equations after `eliminate`, and as they are where they are solved softly (`SOFT`)."""
 
-    upper: list[list[int]]
-    lower: list[list[int]]
-    whole: list[list[int]]
+    factors: list[Sparse]
+    whole: list[Sparse]
 
     def solve(self, graph: Graph, right: Sequence[int]) -> list[int]:
-        x = substitute(graph, self.upper, self.lower, right)
+        x = substitute(graph, self.factors, right)
         for _ in range(MENDED if self.whole else 0):
-            left = [graph.apply("sub", b, dot(graph, row, x)) for b, row in zip(right, self.whole, strict=True)]
-            more = substitute(graph, self.upper, self.lower, left)
+            products = (dot(graph, row.values(), [x[j] for j in row]) for row in self.whole)
+            left = [graph.apply("sub", b, product) for b, product in zip(right, products, strict=True)]
+            more = substitute(graph, self.factors, left)
             x = [graph.apply("add", a, b) for a, b in zip(x, more, strict=True)]
         return x
 
 
-def _constants(graph: Graph, numbers: Sequence[int]) -> dict[int, float | None]:
+def _constants(graph: Graph, row: Sparse) -> dict[int, float | None]:
     """The numbers that are not zero throughout; None for those that are no constants."""
-    values = {i: graph.value(d) for i, d in enumerate(numbers)}
+    values = {i: graph.value(d) for i, d in row.items()}
     return {i: value for i, value in values.items() if value != 0}
+
+
+def _drop_entry(row: Sparse, place: int) -> Sparse:
+    return {i: x for i, x in row.items() if i != place}
+
+
+def _transpose(rows: Sequence[Sparse], count: int) -> list[Sparse]:
+    """The first columns of a matrix, `count` of them."""
+    columns: list[Sparse] = [{} for _ in range(count)]
+    for k, row in enumerate(rows):
+        for i, x in row.items():
+            if i < count:
+                columns[i][k] = x
+    return columns
+
+
+def _find_groups(rows: Sequence[Sparse], count: int) -> list[int]:
+    """The group of each row: rows of different groups have no column in common, of `count`."""
+    places = np.array([(k, len(rows) + i) for k, row in enumerate(rows) for i in row], int).reshape(-1, 2).T
+    size = len(rows) + count
+    graph = coo_array((np.ones(places.shape[1]), tuple(places)), (size, size))
+    return connected_components(graph, directed=False)[1][: len(rows)].tolist()
+
+
+def sparse_row(graph: Graph, xs: Iterable[int]) -> Sparse:
+    zero = graph.number(0.0)
+    return {i: x for i, x in enumerate(xs) if x != zero}
 
 
 def dot(graph: Graph, xs: Iterable[int], ys: Iterable[int]) -> int:
@@ -600,29 +680,29 @@ def dot(graph: Graph, xs: Iterable[int], ys: Iterable[int]) -> int:
     return total
 
 
-def eliminate(graph: Graph, rows: list[list[int]]) -> list[list[int]]:
-    """Eliminate in place, so that `rows` become upper triangular; returns the factors, those of row i to 0 … i − 1."""
-    f, n, lower, zero = graph.apply, len(rows), [[] for _ in rows], graph.number(0.0)
-    for k in range(n):
-        for i in range(k + 1, n):
-            factor = zero if rows[i][k] == zero else f("div", rows[i][k], rows[k][k])
-            lower[i].append(factor)
-            rows[i][k] = zero
-            for j in range(k + 1, n) if factor != zero else ():
-                if rows[k][j] != zero:
-                    rows[i][j] = f("sub", rows[i][j], f("mul", factor, rows[k][j]))
-    return lower
+def eliminate(graph: Graph, rows: list[Sparse]) -> list[Sparse]:
+    """L and U in the place of each other's zeros, without the ones of L: A = L U, of the rows of A, in place."""
+    f, zero = graph.apply, graph.number(0.0)
+    readers = [set(column) for column in _transpose(rows, len(rows))]
+    for k, pivot in enumerate(rows):
+        ahead = sorted(j for j in pivot if j > k)
+        for i in sorted(i for i in readers[k] if i > k):
+            row = rows[i]
+            row[k] = factor = f("div", row[k], pivot.get(k, zero))
+            for j in ahead:
+                row[j] = f("sub", row.get(j, zero), f("mul", factor, pivot[j]))
+                readers[j].add(i)
+    return rows
 
 
-def substitute(graph: Graph, rows: Sequence, lower: Sequence, right: Sequence[int]) -> list[int]:
-    f, x, n, zero = graph.apply, list(right), len(rows), graph.number(0.0)
-    for i in range(n):
-        for k in range(i):
-            if lower[i][k] != zero:
-                x[i] = f("sub", x[i], f("mul", lower[i][k], x[k]))
-    for k in range(n - 1, -1, -1):
-        for j in range(k + 1, n):
-            if rows[k][j] != zero:
-                x[k] = f("sub", x[k], f("mul", rows[k][j], x[j]))
-        x[k] = f("div", x[k], rows[k][k])
+def substitute(graph: Graph, rows: Sequence[Sparse], right: Sequence[int]) -> list[int]:
+    """x of A x = b, of what `eliminate` made of A."""
+    f, x, zero = graph.apply, list(right), graph.number(0.0)
+    for i, row in enumerate(rows):
+        for k in sorted(k for k in row if k < i):
+            x[i] = f("sub", x[i], f("mul", row[k], x[k]))
+    for i in range(len(rows) - 1, -1, -1):
+        for j in sorted(j for j in rows[i] if j > i):
+            x[i] = f("sub", x[i], f("mul", rows[i][j], x[j]))
+        x[i] = f("div", x[i], rows[i].get(i, zero))
     return x

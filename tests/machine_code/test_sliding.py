@@ -75,6 +75,17 @@ def test_twenty_blocks_stick_each_at_its_place():
     assert abs(run.qdot[-1]).max() < 1e-12 and run.stats["num_steps"] < 400
 
 
+@pytest.mark.slow
+def test_a_thousand_blocks_rest_from_the_start_or_stop_together():
+    q0, ts = 2 * np.cos(0.7 * np.arange(1000)), np.array([0.0, 5.0])
+    run = lagjax.simulate(springs(1000), q0, np.zeros(1000), ts, 0.3)
+    exact = np.array([swings(x, 0.3, 5.0) for x in q0])
+    np.testing.assert_allclose(run.q[-1], exact[:, 0], atol=1e-9)
+    np.testing.assert_allclose(run.qdot[-1], exact[:, 1], atol=1e-9)
+    rest = lagjax.simulate(springs(1000), 0.3 * np.cos(0.7 * np.arange(1000)), np.zeros(1000), ts, 0.3)
+    assert (rest.q[-1] == rest.q[0]).all()
+
+
 @pytest.mark.parametrize("count", [2, 8])
 def test_a_chain_rests_as_long_as_its_joints_hold(count):
     q0 = 0.4 + 0.1 * np.cos(np.arange(count))
