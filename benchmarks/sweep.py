@@ -4,7 +4,7 @@
     python -m benchmarks.sweep map --side 2048             # the map of first flips, as a picture
     python -m benchmarks.sweep kills --count 100           # kill -9 at random moments: the bits of an undisturbed run
     python -m benchmarks.sweep workers                     # processes, dask, two parts: one SHA-256
-    python -m benchmarks.sweep poison --members 1000000    # ten members that fail, one of which aborts its process
+    python -m benchmarks.sweep poison --members 1000000    # ten members that fail, and cost the others nothing
     python -m benchmarks.sweep plan                        # 10⁸ members described: seconds and memory
 
 Members start from rest at all pairs of angles, run over T = 5 with a median error of 1e-8, and keep the last state and
@@ -279,7 +279,6 @@ def workers(options: argparse.Namespace) -> dict[str, Any]:
             print(found, flush=True)
         found["two parts"] = _two_parts(next(places), over, unit)
         found |= _by_dask(next(places), over, unit)
-        found["isolated"] = digest(run(next(places), over, unit=unit, isolate=True, progress=False).store)
     print("\n".join(f"{sha}  {who}" for who, sha in found.items()))
     return {"members": options.members, "sha256": found, "one": len(set(found.values())) == 1}
 
@@ -303,18 +302,18 @@ def _by_dask(store: Path, over: dict, unit: int) -> dict[str, str]:
 
 
 KEY = ("theta1", "theta2", "poison")
-NAN, SINGULAR, ENDLESS, ABORTS = 1.0, 2.0, 3.0, 4.0
+NAN, SINGULAR, ENDLESS = 1.0, 2.0, 3.0
 
 
 def poison(options: argparse.Namespace) -> dict[str, Any]:
     """Ten members that fail among many; the others are what they are without them, bit for bit."""
     over, bad = _poisoned(options.members, np.random.default_rng(options.seed))
     rule = dict(
-        q0=poisoned_start, params=poisoned_params, keep=poisoned_keep, max_steps=2000,
+        q0=poisoned_start, params=poisoned_params, keep=keep, max_steps=2000,
         unit=max(1, options.members // 8), progress=options.progress,
     )  # fmt: skip
     with tempfile.TemporaryDirectory(dir=options.folder) as folder:
-        swept = run(Path(folder) / "poisoned", over, isolate=True, **rule)
+        swept = run(Path(folder) / "poisoned", over, **rule)
         print(swept)
         told, data = swept.status(), swept.open()
         other = run(Path(folder) / "clean", {KEY: (*over[KEY][:2], np.zeros(options.members))}, **rule).open()
@@ -324,7 +323,7 @@ def poison(options: argparse.Namespace) -> dict[str, Any]:
             for name in ("q", "qdot", "flip", "result")
         )
     named = {int(failure.member): failure.result for failure in told.failures}
-    kinds = {NAN: "NaN", SINGULAR: "singular", ENDLESS: "endless", ABORTS: "aborts"}
+    kinds = {NAN: "NaN", SINGULAR: "singular", ENDLESS: "endless"}
     return {
         "members": options.members, "poisoned": {k: kinds[kind] for k, kind in bad.items()}, "named": named,
         "all named": sorted(named) == sorted(bad), "others the same": same,
@@ -333,7 +332,7 @@ def poison(options: argparse.Namespace) -> dict[str, Any]:
 
 def _poisoned(members: int, rng: np.random.Generator) -> tuple[dict, dict[int, float]]:
     kinds, bad = np.zeros(members), np.sort(rng.choice(members, 10, replace=False))
-    kinds[bad] = rng.permutation([NAN] * 3 + [SINGULAR] * 3 + [ENDLESS] * 3 + [ABORTS])
+    kinds[bad] = rng.permutation([NAN] * 4 + [SINGULAR] * 3 + [ENDLESS] * 3)
     angles = rng.uniform(-np.pi, np.pi, (2, members))
     return {KEY: (*angles, kinds)}, {int(k): float(kinds[k]) for k in bad}
 
@@ -348,18 +347,6 @@ def poisoned_params(point):
     params = {name: jnp.asarray(x) * weightless for name, x in SCENE.params.items()}
     fast = jnp.where(point["poison"] == ENDLESS, 1e12, 1.0)  # oscillations for which no budget of steps suffices
     return params | {"g": fast * params["g"], "poison": point["poison"]}
-
-
-def poisoned_keep(trajectory, crossings):
-    kind = trajectory.params["poison"]
-    kind = jax.pure_callback(_abort, jax.ShapeDtypeStruct((), float), kind, vmap_method="expand_dims")
-    return keep(trajectory, crossings) | {"poison_met": kind}
-
-
-def _abort(kinds):
-    if np.any(kinds == ABORTS):
-        os.abort()
-    return kinds
 
 
 def plan(options: argparse.Namespace) -> dict[str, Any]:

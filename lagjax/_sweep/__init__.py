@@ -10,7 +10,7 @@ _batch         a batch of members: their motions, the crossings on the way, what
 _job           a store with its functions in a process; the computation of a unit
 _begin         stores that are begun, and those that are there
 _extend        the part of a new store that another one has: members, or the starts of motions that continue
-_workers       units in this process, by executors, in child processes
+_workers       units in this process, and by executors
 _status        the progress of a store
 """
 
@@ -18,7 +18,6 @@ import os
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,7 +27,7 @@ import numpy as np
 from lagjax._interface import output_times, require_flag
 from lagjax._run.hybrid import Hybrid, Scene, jumps, require_scene
 from lagjax._show import import_package
-from lagjax._sweep._begin import begin, first_look, resume
+from lagjax._sweep._begin import begin, resume
 from lagjax._sweep._description import Description, Sections, uses_doubles
 from lagjax._sweep._files import NOT_DONE, RESULT, Files
 from lagjax._sweep._job import Job, precision
@@ -36,15 +35,12 @@ from lagjax._sweep._members import axes_of
 from lagjax._sweep._statistics import Statistics, Summary, from_bytes, merge, summary
 from lagjax._sweep._status import Progress, Status, status
 from lagjax._sweep._workers import (
-    look_in_children,
     require_executor,
-    require_limit,
     require_part,
     run_store,
     submit,
     units_to_compute,
     work,
-    work_in_children,
 )
 
 PyTree = Any
@@ -184,7 +180,6 @@ def sweep(
     reduce: dict[str, Statistics] | None = None,
     store: Store | str | Path,
     executor: Any = None,
-    isolate: bool | float = False,
     progress: bool = True,
     **arguments: Any,
 ) -> Sweep:
@@ -195,7 +190,7 @@ def sweep(
     its units, and computes again what is not as it was written; for a million units that takes six minutes, and a
     second more for each gigabyte. Several machines work by an `executor`, or each on its part of the units.
 
-    **Run only stores of your own**: `python -m lagjax sweep run`, `isolate` and an `executor` unpickle the functions in
+    **Run only stores of your own**: `python -m lagjax sweep run`, and an `executor` unpickle the functions in
     the store, which can be any code.
 
     **What runs**
@@ -223,9 +218,8 @@ def sweep(
 
     - `executor`: any `concurrent.futures.Executor`, such as dask's `client.get_executor()`; a task is a unit. By
       default this process works, with the machine code's threads on all cores, and writes a unit while it computes the
-      next.
-    - `isolate`: compute in a child process. A unit whose child dies, or takes longer than `isolate` seconds over a
-      batch (True: 600), is halved until the members that end it are known; these are labelled `crashed`.
+      next. A member that kills its process, by memory or by a library of its own, costs a worker of an executor, and
+      the error names its unit: `ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))`.
     - `progress`: a line on stderr.
     - `arguments`: those of `Store`, which once were given here; with a warning.
 
@@ -242,8 +236,7 @@ def sweep(
 
     **Raises** `TypeError` or `ValueError` for what cannot be right, before anything is computed, and for a store that
     was begun with another description, saying what differs; `OSError` for a disk that is full or read-only,
-    `ImportError` without the packages zarr and cloudpickle; with `isolate`, `RuntimeError` for units that end their
-    process without a few members as the reason, after all others are done.
+    `ImportError` without the packages zarr and cloudpickle, `RuntimeError` for a worker that died.
 
     Source: Salmon et al., SC 2011, for the counter-based draws.
 
@@ -286,23 +279,18 @@ def sweep(
     description = Description(system, _times(ts), q0, qdot0, params, keep, reduce, settings, sections)
     if executor is not None:
         require_executor(executor)
-        if isolate:
-            raise ValueError("isolate is for sweeps of this process: give it, or an executor, whose processes may die.")
-    axes, limit, part = axes_of(over), require_limit(isolate), require_part(settled.part)
+    axes, part = axes_of(over), require_part(settled.part)
     place, compiled = _folder(settled.path, "store"), []
     other = None if settled.extend is None else _folder(settled.extend, "extend")
     with precision(uses_doubles()):
         if not place.exists():
-            look = partial(first_look, compiled=compiled) if limit is None else partial(look_in_children, limit=limit)
-            begin(place, axes, description, settled.unit, look, other)
+            begin(place, axes, description, settled.unit, compiled, other)
         spec = place.spec()
         description = resume(place, spec, axes, description, other)
         job = Job.from_store(place, spec, description, *compiled)
         show, units = Progress(place, spec, progress), units_to_compute(job, part)
         if executor is not None:
             submit(job, units, executor, show)
-        elif limit is not None:
-            work_in_children(job, units, limit, progress)
         else:
             work(job, units, show)
     show.end()

@@ -36,8 +36,8 @@ from lagjax._sweep._files import RESULT, Quantity
 
 PyTree = Any
 _Kept = tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]  # values, |h − h₀| and complaints
-CRASHED, KEEP_FAILED = 1000, 1001  # result codes of the sweep's own, far from those of `lagjax.RESULTS`
-NAMES = {CRASHED: "crashed", KEEP_FAILED: "keep_failed"}
+KEEP_FAILED = 1001  # a result code of the sweep's own, far from those of `lagjax.RESULTS`
+NAMES = {KEEP_FAILED: "keep_failed"}
 MOST_CHANGES = 256  # of the contacts of a member: the default of `simulate_batch`
 MOST = 16_384  # members of a batch: more are no faster in machine code, and take more memory
 MOST_ON_DEVICES = 131_072
@@ -233,22 +233,6 @@ def _call_each(function: Callable[[int], Any], count: int) -> tuple[list[Any], d
         except Exception as error:
             errors[k] = error
     return rows, errors
-
-
-def find_failing(members: np.ndarray, why_failed: Callable[[np.ndarray], str | None], most: int) -> dict[int, str]:
-    """The members, of some that fail together, that fail, with the reasons, by halves; none where more than `most` do.
-    `why_failed` says of a group of members why it fails, None where it does not."""
-    failing, groups = {}, [members]
-    while groups and len(failing) <= most:
-        group = groups.pop()
-        half = len(group) // 2
-        # All of them together are known to fail.
-        why = why_failed(group) if group is not members or not half else ""
-        if why is not None and not half:
-            failing[int(group[0])] = why
-        elif why is not None:
-            groups += [group[half:], group[:half]]
-    return failing if len(failing) <= most else {}
 
 
 def _common_quantities(rows: list[dict[str, np.ndarray]]) -> list[Quantity]:

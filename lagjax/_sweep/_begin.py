@@ -2,7 +2,6 @@
 
 import math
 import time
-from collections.abc import Callable
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -24,7 +23,7 @@ UNIT_BYTES = 64 * 2**20  # of what is kept of a unit, by default; two of them ar
 _PROBED = 4096  # members by which the time of a member is estimated
 
 
-class Look(NamedTuple):
+class _Look(NamedTuple):
     """The kept values of a few members, the seconds that one of them takes, and whether the energy is constant."""
 
     kept: KeptResults
@@ -32,7 +31,7 @@ class Look(NamedTuple):
     conserves: bool
 
 
-def first_look(description: Description, points: dict[str, np.ndarray], compiled: list[Batches]) -> Look:
+def _first_look(description: Description, points: dict[str, np.ndarray], compiled: list[Batches]) -> _Look:
     """A look at members at these points, or at as many as fit into the memory; what it compiles goes to `compiled`."""
     conserves = False  # resets may do work
     if not isinstance(description.system, Hybrid):
@@ -44,7 +43,7 @@ def first_look(description: Description, points: dict[str, np.ndarray], compiled
     began = time.perf_counter()
     kept = batches(points)
     compiled.append(batches)
-    return Look(kept, (time.perf_counter() - began) / len(kept.result), conserves)
+    return _Look(kept, (time.perf_counter() - began) / len(kept.result), conserves)
 
 
 def _thin_points(points: dict[str, np.ndarray], most: int) -> dict[str, np.ndarray]:
@@ -57,17 +56,20 @@ def begin(
     axes: tuple[Axis, ...],
     description: Description,
     unit: int | None,
-    look: Callable[[Description, dict[str, np.ndarray]], Look],
+    compiled: list[Batches],
     other: Files | None,
 ) -> None:
-    """Make the store, after a look at what a few members take and keep, with what it takes from another one."""
+    """Make the store, after a look at what a few members take and keep, with what it takes from another one.
+
+    What that look compiles goes to `compiled`.
+    """
     names, shape = [name for axis in axes for name in axis.names], tuple(axis.size for axis in axes)
     later = None if other is None else later_end_of(other, axes, description)
     if later is not None:
         description = replace(description, starts=later.starts)
     scene, points = pack_description(description), _sample_points(axes, later)
     points = _thin_points(points, _members_in_memory(description, points))
-    kept, seconds, conserves = look(description, points)
+    kept, seconds, conserves = _first_look(description, points, compiled)
     quantities = [Quantity(name, x.shape[1:], x.dtype) for name, x in kept.values.items()]
     _require_names(quantities, axes, description.reduce)
     most = _batch.MOST if kept.engine == "MachineCode" else _batch.MOST_ON_DEVICES

@@ -265,7 +265,7 @@ def unpack_description(data: bytes, path: list[str]) -> Description:
     except (pickle.UnpicklingError, EOFError, ValueError, IndexError, KeyError, TypeError) as why:
         raise ValueError(
             f"The functions of this sweep, in its .sweep/scene.pkl, cannot be read ({type(why).__name__}: {why}): the "
-            "file is damaged. Call `sweep` as before, without isolate and executor: that does not read it."
+            "file is damaged. Call `sweep` as before, without an executor: that does not read it."
         ) from why
     except (ImportError, AttributeError) as why:
         raise ImportError(

@@ -24,7 +24,7 @@ from llvmlite import binding as llvm
 
 import lagjax
 from lagjax._interface import ENDED_WELL
-from lagjax._sweep._batch import CRASHED, KEEP_FAILED, Batches, KeptResults, label
+from lagjax._sweep._batch import KEEP_FAILED, Batches, KeptResults, label
 from lagjax._sweep._description import Description, differences, texts, unpack_description, uses_doubles
 from lagjax._sweep._files import RESULT, Files
 from lagjax._sweep._members import Grid, points_of
@@ -168,26 +168,23 @@ def unit_points(job: Job, unit: int) -> Callable[[np.ndarray], dict[str, np.ndar
     return lambda which: points_of(axes, shape, which) | {name: x[which] for name, x in starts.items()}
 
 
-def compute(job: Job, unit: int, crashed: dict[int, str], before_batch: Callable[[], None] = lambda: None) -> Unit:
+def compute(job: Job, unit: int) -> Unit:
     began, spent = time.monotonic(), time.process_time()
     size, points, copied = job.grid.size(unit), unit_points(job, unit), job.store.copied(unit)
-    drifts, complaints = np.full(size, np.nan), dict(crashed)
+    drifts, complaints = np.full(size, np.nan), {}
     values = {q.name: np.full((size, *q.shape), q.filling, q.dtype) for q in (*job.batches.quantities, RESULT)}
     result = values[RESULT.name]
-    result[list(crashed)] = CRASHED
     for name, x in copied.values.items():
         values[name][copied.members] = x
     for which, count in parts(job, unit):
-        before_batch()
-        kept = job.batches(points(_replace_crashed(which, crashed)))
+        kept = job.batches(points(which))
         job.require_engine(kept)
-        rows = np.flatnonzero(~np.isin(which[:count], list(crashed)))
-        own = which[rows]
+        own = which[:count]
         for name, x in {**kept.values, RESULT.name: kept.result}.items():
-            values[name][own] = x[rows]
+            values[name][own] = x[:count]
         if kept.drift is not None:
-            drifts[own] = kept.drift[rows]
-        complaints |= {int(which[j]): kept.complaints[int(j)] for j in rows if j in kept.complaints}
+            drifts[own] = kept.drift[:count]
+        complaints |= {int(which[j]): text for j, text in kept.complaints.items() if j < count}
     record = record_of(job.grid, unit, result, job.spec["engine"], complaints)
     drifts = np.where(np.isin(result, (*ENDED_WELL, KEEP_FAILED)), drifts, np.nan)
     if np.isfinite(drifts).any():  # the largest change of energy, and its member
@@ -198,13 +195,6 @@ def compute(job: Job, unit: int, crashed: dict[int, str], before_batch: Callable
     ok, numbers = np.isin(result, ENDED_WELL), job.grid.numbers(unit, np.arange(size))
     reduced = {name: partial_of(how, values[name], ok, numbers) for name, how in job.description.reduce.items()}
     return Unit(values, record, to_bytes(reduced) if reduced else b"")
-
-
-def _replace_crashed(which: np.ndarray, crashed: dict[int, str]) -> np.ndarray:
-    bad = np.isin(which, list(crashed))
-    if bad.all():
-        raise ValueError("All members of a batch end their process: look at one of them alone, with `simulate`.")
-    return np.where(bad, which[~bad][0], which)
 
 
 def record_of(grid: Grid, unit: int, result: np.ndarray, engine: str, complaints: dict[int, str]) -> dict:

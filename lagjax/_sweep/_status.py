@@ -31,7 +31,7 @@ class Status(NamedTuple):
 
     - `done`, `members`: how many members are done, of how many; `units_done`, `units` alike.
     - `rate`: recent members per second, None before it is known; `left`: seconds until the end at that rate.
-    - `results`: the number of members that ended in each way, by the names of `lagjax.RESULTS`, `crashed` and
+    - `results`: the number of members that ended in each way, by the names of `lagjax.RESULTS`, and
       `keep_failed`.
     - `failures`: the first hundred of those that did not end well; the array `result` of the store has all.
     - `drift`: the largest change of the energy of a member that ended well, as (change, member, point); None where
