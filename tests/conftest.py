@@ -28,6 +28,8 @@ import jax
 import llvmlite.binding
 import pytest
 
+from lagjax._native import _ir
+
 jax.config.update("jax_enable_x64", True)
 
 # Tracing leaves many objects that live on, and Python's default looks through all of them so often that it took a tenth
@@ -48,6 +50,10 @@ jax.config.update("jax_compilation_cache_dir", str(COMPILED))
 os.environ["LAGJAX_CACHE"] = str(COMPILED.parent.parent / "objects")
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
+
+
+# Machine code is made fast instead of well, too; the bits stay, as sweeps in other processes are compared with.
+_ir.LEVELS[:] = [1, 1]
 
 
 # Every program of XLA takes some entries of the table of memory that a process has, 65 530 by Linux's default. Without

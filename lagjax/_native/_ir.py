@@ -51,10 +51,10 @@ def _link(name: str) -> None:
     llvm.add_symbol(name, ctypes.cast(getattr(library, name), ctypes.c_void_p).value)
 
 
-# Characters of a module's text beyond which code is generated at level 1 instead of 2. On chains of pendulums that runs
-# as fast to a few per cent, forward and back, and of 4 MB is made in 26 s instead of 134 s. Level 0 halves that once
-# more and runs up to 1.8 times as long.
-_LARGE = 2**20
+# Characters of a module's text beyond which code is generated at the second of the levels. On chains of pendulums that
+# runs as fast to a few per cent, forward and back, and of 4 MB is made in 26 s instead of 134 s. Level 0 halves that
+# once more and runs up to 1.8 times as long.
+_LARGE, LEVELS = 2**20, [2, 1]
 
 
 def _machine(level: int) -> llvm.TargetMachine:
@@ -80,7 +80,7 @@ _PASSES = ("sroa", "dead_code_elimination")
 def compile_module(module: ir.Module, functions: tuple[str, ...]) -> tuple[llvm.ExecutionEngine, dict[str, int]]:
     """Machine code for a module, and where its functions are. It lives as long as the engine."""
     text = str(module)
-    level = 1 if len(text) > _LARGE else 2
+    level = LEVELS[len(text) > _LARGE]
     machine = _machine(level)
     by = llvm.llvm_version_info, llvmlite.__version__, machine.triple, _PASSES, level
     processor = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
