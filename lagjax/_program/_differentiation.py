@@ -15,6 +15,7 @@ These are derivatives of the operations as they stand: `has_own_rules` in `_rule
 """
 
 import functools
+import math
 from collections.abc import Callable, Iterable, Sequence
 from typing import Any
 
@@ -23,7 +24,7 @@ import numpy as np
 from lagjax._program._graph import INPUTS, Graph, Node, Tape
 from lagjax._program._line import StraightLine
 from lagjax._program._look_ups import Table, move_look_up
-from lagjax._program._operations import LOOK_UPS, OPERATIONS, is_function
+from lagjax._program._operations import FLAT_FAR_OUT, LOOK_UPS, OPERATIONS, SLOW_FAR_OUT
 from lagjax._program._passes import eliminate_dead_code, factor, sink_negations
 
 _Rule = Callable[[int], int]
@@ -167,8 +168,10 @@ class Derivatives:
             if op == "div":
                 return self._mask_quotient(result, w, operands[1])
             slope = rule(self._apply, self._number, self._number(1.0), w, *operands)
-            if len(operands) == 1 and is_function(op):
-                result = self._zero_where(self.graph.vanishes(self.graph.apply("mul", slope, operands[0])), result)
+            if op in FLAT_FAR_OUT:
+                result = self._mask(result, lambda: self.graph.is_flat_far_out(slope, operands[0]))
+            elif op in SLOW_FAR_OUT:
+                result = self._refuse_overflow(result, g, w)
             return self._mask_product(result, g, slope)
 
         rules = OPERATIONS[op].transpose() if operands else ()
@@ -176,17 +179,25 @@ class Derivatives:
 
     def _mask_quotient(self, tangent: int, w: int, v: int) -> int:
         """A tangent, or a cotangent, of w = u/v: 0 where w is flat, as what has overflown gives no number."""
-        return self._zero_where(self.graph.is_flat_quotient(w, v), tangent) if self.graph.grows(v) else tangent
+        return self._mask(tangent, lambda: self.graph.is_flat_quotient(w, v)) if self.graph.grows(v) else tangent
 
     def _mask_product(self, product: int, g: int, slope: int) -> int:
         """A product of g and a slope, 0 where g is and the slope is huge."""
         if not (self.asks and self.hides and self.graph.hides_growth and self.graph.grows(slope)):
             return product
         is_zero = self._apply("eq", g, self._number(0.0))
-        return self._zero_where(self._apply("and", is_zero, self.graph.is_huge(slope)), product)
+        return self._mask(product, lambda: self._apply("and", is_zero, self.graph.is_huge(slope)))
 
-    def _zero_where(self, where: int, x: int) -> int:
-        return self._apply("select", where, x, self._number(0.0))
+    def _mask(self, x: int, where: Callable[[], int]) -> int:
+        """0 in the place of what is no number; what is finite stays, and has derivatives of its own."""
+        f, zero = self._apply, self._number(0.0)
+        return f("select", f("is_finite", x), f("select", where(), x, zero), x)
+
+    def _refuse_overflow(self, result: int, g: int, w: int) -> int:
+        """NaN where w is infinite and matters: its operand has overflown, whose logarithm or root has a slope."""
+        f = self._apply
+        known = f("or", f("is_finite", w), f("eq", g, self._number(0.0)))
+        return f("select", known, self._number(math.nan), result)
 
     def _rules(self, w: int, op: str, operands: Sequence[int], attribute: Any = None) -> Sequence[_Rule | None]:
         """`rules`, where a power is one operation."""
@@ -196,7 +207,7 @@ class Derivatives:
 
     def _rules_once(self, w: int, op: str, operands: Sequence[int], attribute: Any) -> Sequence[_Rule | None]:
         """`_rules` for the only cotangent of w: factors 2 and ½ are next to others, with which they cancel."""
-        if op == "sqrt":
+        if op == "sqrt" and not self.graph.grows(w):
             return [lambda g: self._apply("mul", self._number(0.5), self._apply("div", g, w))]
         if op == "mul" and operands[0] == operands[1]:
             return [lambda g: self._power_derivative(operands[0], 2, g)]

@@ -118,21 +118,35 @@ class Graph:
         return self._hides_growth
 
     def is_huge(self, v: int) -> int:
-        """True where v is so large that its coefficients may be infinite: the square of 1/v is zero; or no number."""
+        """True where v is so large that its coefficients may be infinite: the square of 1/v is zero."""
         first = len(self.nodes)
-        found = self.vanishes(self.apply("div", self.constant(1.0, "float"), v))
-        return self._bound(first, found)
+        return self._bound(first, self._is_nothing(self.apply("div", self.constant(1.0, "float"), v)))
+
+    def has_coefficients(self, v: int) -> int:
+        """True where v is neither huge nor NaN."""
+        first, zero = len(self.nodes), self.constant(0.0, "float")
+        inverse = self.apply("div", self.constant(1.0, "float"), v)
+        return self._bound(first, self.apply("prefers", self.apply("mul", inverse, inverse), zero))
 
     def finite_part(self, v: int) -> int:
-        huge, first = self.is_huge(v), len(self.nodes)
-        return self._bound(first, self.apply("select", huge, v, self.constant(0.0, "float")))
+        has_any, first = self.has_coefficients(v), len(self.nodes)
+        return self._bound(first, self.apply("select", has_any, self.constant(0.0, "float"), v))
 
     def is_flat_quotient(self, w: int, v: int) -> int:
-        return self.apply("and", self.is_huge(v), self.vanishes(w))
+        """True where w = u/v is nothing as v is huge."""
+        return self.apply("and", self.is_huge(v), self._is_nothing(w))
 
-    def vanishes(self, x: int) -> int:
-        """True where the square of x is zero, or x is no number."""
-        return self.apply("not", self.apply("prefers", self.apply("mul", x, x), self.constant(0.0, "float")))
+    def is_flat_far_out(self, slope: int, u: int) -> int:
+        """True where a function has no slope as its operand u is huge: what it changes by, slope · u, is nothing.
+
+        At u = 0, where it is nothing, too, there is a slope; and 0 · ∞ is NaN.
+        """
+        change = self.apply("mul", slope, u)
+        changes = self.apply("prefers", self.apply("mul", change, change), self.constant(0.0, "float"))
+        return self.apply("and", self.is_huge(u), self.apply("not", changes))
+
+    def _is_nothing(self, x: int) -> int:
+        return self.apply("eq", self.apply("mul", x, x), self.constant(0.0, "float"))
 
     def _bound(self, first: int, result: int) -> int:
         """The result, where nodes from the `first` one on do not grow."""

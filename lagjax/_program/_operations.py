@@ -360,6 +360,11 @@ _ROWS = (
 GROWING = frozenset(("exp", "exp2", "expm1", "sinh", "cosh"))
 BOUNDED = frozenset(("sin", "cos", "tanh", "logistic", "erf", "erfc", "atan", "atan2", "log", "log1p", "asinh"))
 
+# What has a slope of zero where its operand is infinite, on one side at least; and what is infinite itself there, and
+# has a slope that is rounded to zero.
+FLAT_FAR_OUT = frozenset(("exp", "exp2", "expm1", "tanh", "logistic", "erf", "erfc", "atan", "rsqrt"))
+SLOW_FAR_OUT = frozenset(("log", "log1p", "asinh", "acosh", "sqrt", "cbrt"))
+
 
 def is_function(op: str) -> bool:
     """True for an operation that is told by its slopes, and not by a recurrence of its own."""

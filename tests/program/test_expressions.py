@@ -1,0 +1,81 @@
+"""Derivatives of expressions where a rule leaves something out: at zero, at ties, at whole numbers, next to nothing."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from sweeps import sweep
+
+from lagjax._program import lower
+from lagjax._program._differentiation import pullback, pushforward
+
+
+@pytest.fixture(autouse=True)
+def _float64():
+    with jax.enable_x64(True):
+        yield
+
+
+def derivatives(function, x):
+    """First and second derivatives of a function of x (n,), each in both modes, by programs in NumPy."""
+    n, program = len(x), lower(function, np.asarray(x))
+    types = [np.dtype(float)] * (n + 1)
+    reverse, units = pullback(program.line, types[:n], range(n), [0]), np.eye(n)
+    forward = pushforward(program.line, types[:n], range(n), [0])
+    over, under = pushforward(reverse, types, range(n), range(n)), pullback(reverse, types, range(n), range(n))
+    with np.errstate(all="ignore"):
+        first = [reverse.evaluate([*x, 1.0])[:, 0], [forward.evaluate([*x, *e])[0, 0] for e in units]]
+        second = [np.stack([line.evaluate([*x, 1.0, *e])[:, 0] for e in units]) for line in (over, under)]
+    return first, second
+
+
+# Functions around exponentials. What is divided by one, or a function of one, is left out where that has overflown.
+AROUND = {
+    "log(1 + e)": lambda u: jnp.log(1 + jnp.exp(u)), "log e": lambda u: jnp.log(jnp.exp(u)),
+    "1/(1 + e)": lambda u: 1 / (1 + jnp.exp(u)), "root": lambda u: jnp.sqrt(1 + jnp.exp(u)),
+    "power": lambda u: (1 + jnp.exp(u)) ** 1.3, "half power": lambda u: jnp.exp(u) ** 0.5,
+    "atan": lambda u: jnp.arctan(jnp.exp2(u)), "sin": lambda u: jnp.sin(jnp.exp(u)),
+    "tanh": lambda u: jnp.tanh(jnp.expm1(u)), "exp": lambda u: jnp.exp(-u - jnp.exp(-u)),
+    "1/(2 + sinh)": lambda u: 1 / (2 + jnp.sinh(u)), "sech²": lambda u: 1 / jnp.cosh(u) ** 2,
+    "log(1 + e^sin)": lambda u: jnp.log1p(jnp.exp(jnp.sin(u))), "erf": lambda u: jax.scipy.special.erf(jnp.exp(u)),
+    "asinh": lambda u: jnp.arcsinh(jnp.sinh(u)), "quotient": lambda u: u / (1 + jnp.exp(u)),
+    "rsqrt": lambda u: jax.lax.rsqrt(jnp.cosh(u)), "cbrt": lambda u: jnp.cbrt(2 + jnp.expm1(u)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", sweep(AROUND, kept=("log(1 + e)", "1/(1 + e)", "power", "tanh", "exp", "quotient")))
+def test_functions_of_exponentials_have_slopes_where_the_exponent_is_zero(name):
+    """Also where their argument is next to nothing, or a product or difference that is zero."""
+    function = lambda x: AROUND[name](x[0] + x[1] - x[0] * x[1]) + AROUND[name](2 * (x[0] - x[1]))
+    exact = jax.jit(lambda x: (jax.grad(function)(x), jax.hessian(function)(x)))
+    for x in ([0.0, 0.0], [0.25, 0.25], [1e-300, 0.0], [1e-165, -1e-165], [0.0, 0.4]):
+        (first, second), (slope, bend) = derivatives(function, x), exact(jnp.array(x))
+        for found in first:
+            np.testing.assert_allclose(found, slope, rtol=1e-14, atol=1e-15)
+        for found in second:
+            np.testing.assert_allclose(found, bend, rtol=1e-13, atol=1e-14)
+
+
+FLAT, STEEP = np.zeros(2), np.full(2, np.nan)  # the slopes at u = −800 and 800
+
+
+@pytest.mark.parametrize(
+    ("name", "right"),
+    [("1/(1 + e)", FLAT), ("atan", FLAT), ("tanh", FLAT), ("erf", FLAT), ("sech²", FLAT), ("rsqrt", FLAT),
+     ("exp", FLAT), ("quotient", [1.0, 0.0]), ("log(1 + e)", [0.0, np.nan]), ("root", [0.0, np.nan]),
+     ("asinh", STEEP), ("cbrt", [0.0, np.nan]), ("sin", [0.0, np.nan])],
+)  # fmt: skip
+def test_what_has_overflown_is_flat_or_no_number(name, right):
+    """A slope that is lost with what has overflown, as that of a logarithm, is NaN, and not zero."""
+    for u, expected in zip((-800.0, 800.0), right, strict=True):
+        first, second = derivatives(lambda x: AROUND[name](x[0]), [u])
+        np.testing.assert_allclose(np.ravel(first), expected, atol=1e-200)
+        np.testing.assert_allclose(np.ravel(second), 0.0 * expected, atol=1e-200)
+
+
+def test_a_quotient_of_what_is_large_has_a_slope_where_it_is_zero():
+    """tanh u by exponentials of 500 ± u, whose difference is zero at u = 0."""
+    function = lambda x: (jnp.exp(500 + x[0]) - jnp.exp(500 - x[0])) / (jnp.exp(500 + x[0]) + jnp.exp(500 - x[0]))
+    first, second = derivatives(function, [0.0])
+    np.testing.assert_allclose(np.ravel(first), 1.0, rtol=1e-15)
+    np.testing.assert_allclose(np.ravel(second), 0.0, atol=1e-15)
