@@ -393,7 +393,25 @@ def _divide(expansion, params, x, y):
     return [whole, expansion.map("sub", x, expansion.map("mul", whole, y))]
 
 
+def _powers_of_two(expansion, x, places):
+    """2ᵏ in the kinds of x, for numbers k of places that x is shifted by."""
+    places = np.broadcast_to(expansion.require_numbers(places, "by how many places a number is shifted"), x.shape)
+    pairs = [(2**k, expansion.graph.kinds[i]) for k, i in zip(places.ravel().tolist(), x.ravel().tolist(), strict=True)]
+    if not all(1 <= power <= np.iinfo(kind).max for power, kind in pairs):
+        raise Unlowerable("a number is shifted by more places than it has, or by fewer than none")
+    return _ids([expansion.graph.constant(*pair) for pair in pairs], x.shape)
+
+
+def _shift_right(expansion, params, x, places):
+    power, zero = _powers_of_two(expansion, x, places), expansion.map("sub", x, x)
+    rest = expansion.map("rem", x, power)
+    rest = expansion.map("select", expansion.map("lt", rest, zero), rest, expansion.map("add", rest, power))
+    return expansion.map("div", expansion.map("sub", x, rest), power)
+
+
 LOWER.update({
+    "shift_left": lambda expansion, params, x, k: expansion.map("mul", x, _powers_of_two(expansion, x, k)),
+    "shift_right_arithmetic": _shift_right,
     "divmod": _divide, "floor_divide": lambda *of: _divide(*of)[:1], "remainder": lambda *of: _divide(*of)[1:],
     "trunc": lambda expansion, params, x: [expansion.map("trunc", x)],
 })  # fmt: skip
