@@ -81,8 +81,9 @@ class Derivatives:
         `nodes` holds what the tape is in the graph. The cotangents of scalars that are equal are added up at once where
         they are to be taken `together`, else each is followed on its own as far as it is written apart.
         """
-        first: dict[int, int] = {}
-        same = [first.setdefault(i, k) if together else k for k, i in enumerate(nodes)]
+        first: dict[tuple, int] = {}
+        taken = [tape.branches.get(k) for k in range(len(nodes))]
+        same = [first.setdefault((i, taken[k]), k) if together else k for k, i in enumerate(nodes)]
         varied, once_more = (self._find_varying(tape, nodes, inputs) for inputs in (by, again))
         cotangents, results = {same[output]: self._number(1.0)}, {}
         for k in range(output, -1, -1):
@@ -95,7 +96,10 @@ class Derivatives:
             rules = rules_of(nodes[k], op, [nodes[x] for x in operands], attribute)
             for x, rule in zip(operands, rules, strict=False):
                 if rule is not None and varied[x]:
-                    self._add(cotangents, same[x], rule(g))
+                    part = rule(g)
+                    if taken[k] is not None and taken[x] != taken[k]:
+                        part = self._apply("select", nodes[taken[k]], self._number(0.0), part)
+                    self._add(cotangents, same[x], part)
         return [results.get(i, self._number(0.0)) for i in by]
 
     def slopes(self, output: int, through: Iterable[int], by: Sequence[int]) -> list[int]:

@@ -19,7 +19,8 @@ whoever runs the program checks what comes out of it.
 import functools
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -155,6 +156,10 @@ class Graph:
         return result
 
     # ---- operations ----
+
+    def branch(self, predicate: int) -> AbstractContextManager:
+        """What is written meanwhile is one of the branches of a `cond`, taken where the predicate holds."""
+        return nullcontext()
 
     def apply(self, op: str, *operands: int, attribute=None) -> int:
         """The scalar `op(*operands)`, as simple as the rules below make it."""
@@ -390,7 +395,21 @@ class Tape(Graph):
 
     In a graph that shares equal scalars the cotangents of all their uses come together in one sum. That hides what
     cancels: in ∂L/∂q − (∂p/∂q) q̇ the kinetic part of one use of cos q cancels, and its potential part does not.
+
+    `branches` has the predicate of every node from a branch of a `cond`, of which no cotangent leaves it elsewhere.
     """
+
+    def __init__(self, budget: int, moving: int = 0):
+        super().__init__(budget, moving)
+        self.branches: dict[int, int] = {}
+        self._taken: int | None = None
+
+    @contextmanager
+    def branch(self, predicate: int) -> Iterator[None]:
+        outer = self._taken
+        self._taken = predicate if outer is None else self.apply("and", outer, predicate)
+        yield
+        self._taken = outer
 
     def apply(self, op: str, *operands: int, attribute=None) -> int:
         if all(self.nodes[i][0] == "constant" for i in operands):
@@ -404,6 +423,8 @@ class Tape(Graph):
         return self._append_operation("integer_pow", (a,), exponent, "float")
 
     def _append_operation(self, op: str, operands: tuple[int, ...], attribute: Any, kind: str) -> int:
+        if self._taken is not None:
+            self.branches[len(self.nodes)] = self._taken
         self.nodes.append((op, operands, attribute))
         self.kinds.append(kind)
         return len(self.nodes) - 1

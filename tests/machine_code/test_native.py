@@ -20,7 +20,7 @@ from lagjax._engine._problem import Problem
 from lagjax._engine.taylor import flow_of
 from lagjax._interface._layout import Layout
 from lagjax._native import _ir, _kernel, _lanes
-from lagjax._program import OPERATIONS, Unlowerable, lower, lower_formula
+from lagjax._program import OPERATIONS, lower, lower_formula
 from lagjax._program import _scalars as xp
 
 EPS = 2.0**-52

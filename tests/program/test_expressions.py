@@ -4,8 +4,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from jax import lax
 from sweeps import sweep
 
+import lagjax
+from lagjax._equations import derivation_of
+from lagjax._interface._layout import Layout
 from lagjax._program import lower
 from lagjax._program._differentiation import pullback, pushforward
 
@@ -79,3 +83,32 @@ def test_a_quotient_of_what_is_large_has_a_slope_where_it_is_zero():
     first, second = derivatives(function, [0.0])
     np.testing.assert_allclose(np.ravel(first), 1.0, rtol=1e-15)
     np.testing.assert_allclose(np.ravel(second), 0.0, atol=1e-15)
+
+
+BRANCHES = {
+    "root": lambda q: lax.cond(q[0] > 0, lambda: jnp.sqrt(q[0]) * q[1], lambda: q[1] * q[0]),
+    "power": lambda q: lax.cond(q[0] > 0, lambda: q[0] ** 1.5, lambda: q[0] ** 2),
+    "shared": lambda q: lax.cond(
+        q[0] > 0, lambda: jnp.sin(q[0] * q[1]) * jnp.log(q[0]), lambda: 2 * jnp.sin(q[0] * q[1])
+    ),
+    "switch": lambda q: lax.switch(
+        (q[0] > 0) * 1 + (q[0] > 0.4), [lambda: q[1] ** 2, lambda: jnp.sqrt(q[0]), lambda: jnp.log(q[0] - 0.4) / q[0]]
+    ),
+    "nested": lambda q: lax.cond(
+        q[0] > 0,
+        lambda: lax.cond(q[1] > 0, lambda: jnp.sqrt(q[0]) * jnp.log(q[1]), lambda: jnp.sqrt(q[0]) + jnp.sqrt(-q[1])),
+        lambda: lax.cond(q[1] > 0, lambda: jnp.sqrt(q[1]), lambda: q[0] * q[1]),
+    ),
+}
+
+
+@pytest.mark.parametrize("name", BRANCHES)
+def test_a_branch_that_is_not_taken_has_no_slope(name):
+    """Of `cond` and `switch`, whatever the branch is there: NaN, or infinite at zero."""
+    potential = BRANCHES[name]
+    scene = lagjax.System(lambda q, v: 0.5 * v @ v - potential(q))
+    derivation = derivation_of(scene, Layout.from_state(np.zeros(2), np.zeros(2)), None)
+    points = np.array([[-0.5, 0.3], [0.5, 0.3], [-0.5, -0.3], [0.3, -0.2], [0.0, 0.3], [0.0, 0.0]])
+    columns = [*points.T, *np.zeros((3, len(points)))]
+    found = derivation.evaluate(["lagrangian_by_q"], columns)["lagrangian_by_q"]
+    np.testing.assert_allclose(found, -jax.vmap(jax.grad(potential))(points), rtol=1e-14)

@@ -766,5 +766,10 @@ def _cond(expansion, params, which, *operands):
     branches = params["branches"]
     if (value := expansion.graph.value(int(which))) is not None:
         return expansion.run_closed(branches[min(max(int(value), 0), len(branches) - 1)], operands)
-    results = [expansion.run_closed(branch, operands) for branch in branches]
+    results, last = [], len(branches) - 1
+    for k, branch in enumerate(branches):
+        comparison = "le" if k == 0 else "ge" if k == last else "eq"
+        bound = expansion.graph.constant(k, expansion.graph.kinds[int(which)])
+        with expansion.graph.branch(expansion.graph.apply(comparison, int(which), bound)):
+            results.append(expansion.run_closed(branch, operands))
     return [_choose(expansion, np.broadcast_to(which, cases[0].shape), cases) for cases in zip(*results, strict=True)]
