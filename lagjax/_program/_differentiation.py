@@ -179,7 +179,26 @@ class Derivatives:
             return self._mask_product(result, g, slope)
 
         rules = OPERATIONS[op].transpose() if operands else ()
+        if op in ("max", "min") and any(self.graph.nodes[x][0] == op for x in operands):
+            u, v = operands
+            return [functools.partial(self._share, op, u, v), functools.partial(self._share, op, v, u)]
         return [rule and functools.partial(apply_rule, rule) for rule in rules]
+
+    def _share(self, op: str, u: int, v: int, g: int) -> int:
+        """The cotangent of the operand u of an extreme of several numbers: those that are equal have equal shares."""
+        f, counts = self._apply, [self._count_equal(op, x) for x in (u, v)]
+        shared = f("div", counts[0], f("add", *counts))
+        whole = f("select", f("gt" if op == "max" else "lt", u, v), self._number(0.0), self._number(1.0))
+        return f("mul", g, f("select", f("eq", u, v), whole, shared))
+
+    def _count_equal(self, op: str, i: int) -> int:
+        """How many of the numbers that a node is the extreme of are equal to it."""
+        if self.graph.nodes[i][0] != op:
+            return self._number(1.0)
+        f, (u, v) = self._apply, self.graph.nodes[i][1]
+        of_u, of_v = (self._count_equal(op, x) for x in (u, v))
+        one = f("select", f("gt" if op == "max" else "lt", u, v), of_v, of_u)
+        return f("select", f("eq", u, v), one, f("add", of_u, of_v))
 
     def _mask_quotient(self, tangent: int, w: int, v: int) -> int:
         """A tangent, or a cotangent, of w = u/v: 0 where w is flat, as what has overflown gives no number."""

@@ -112,3 +112,18 @@ def test_a_branch_that_is_not_taken_has_no_slope(name):
     columns = [*points.T, *np.zeros((3, len(points)))]
     found = derivation.evaluate(["lagrangian_by_q"], columns)["lagrangian_by_q"]
     np.testing.assert_allclose(found, -jax.vmap(jax.grad(potential))(points), rtol=1e-14)
+
+
+@pytest.mark.parametrize(
+    "function", [jnp.max, jnp.min, lambda q: jnp.linalg.norm(q, jnp.inf)], ids=["max", "min", "|q|"]
+)
+def test_equal_extremes_share_a_slope_alike(function):
+    """The slope of the largest of numbers of which k are equal is 1/k of each, as in JAX."""
+    points = np.array([[0.4, 0.4, 0.4, 0.4], [0.4, 0.4, 0.1, 0.4], [-0.1, 0.4, 0.4, 0.4], [0.1, -0.4, 0.4, -0.4]])
+    derivation = derivation_of(
+        lagjax.System(lambda q, v: 0.5 * v @ v + function(q)), Layout.from_state(np.zeros(4), np.zeros(4)), None
+    )
+    found = derivation.evaluate(["lagrangian_by_q"], [*points.T, *np.zeros((5, 4))])["lagrangian_by_q"]
+    np.testing.assert_allclose(found, jax.vmap(jax.grad(function))(points), rtol=1e-15)
+    first, _ = derivatives(function, points[1])
+    np.testing.assert_allclose(first, 2 * [jax.grad(function)(points[1])], rtol=1e-15)
