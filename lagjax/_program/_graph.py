@@ -7,10 +7,11 @@ true), or "input" (attribute: position) or "constant" (attribute: Python number)
 Every node has a *kind*: "float" (whatever precision the inputs will have), "bool", or the name of an integer type.
 Constants are folded in float64.
 
-What may change in the last digits: constants multiply out (`2*(3*x)` is `6*x`); products of the same factors are one
-product, and sums of the same terms one sum, in whatever order they were written; like terms are collected where that
-shortens a sum (`x + x` is `2*x`, `x - x` is 0); `sin(x)**2 + cos(x)**2` is 1; half-integer powers become roots. Nothing
-is multiplied out (but `_passes.factor` draws out common factors), and no quotient but one by a power of two.
+What may change in the last digits: constants multiply out (`2*(3*x)` is `6*x`), and add up where no large ones cancel;
+products of the same factors are one product, and sums of the same terms one sum, in whatever order they were written;
+like terms are collected where that shortens a sum (`x + x` is `2*x`, `x - x` is 0); `sin(x)**2 + cos(x)**2` is 1;
+half-integer powers become roots. Nothing is multiplied out (but `_passes.factor` draws out common factors), and no
+quotient but one by a power of two.
 
 A zero found here is *structural*: `0*x` is 0 whatever `x` will be, so an infinity or NaN it would have met is not seen;
 whoever runs the program checks what comes out of it.
@@ -43,6 +44,13 @@ INPUTS, NUMBERS = 2**40, 2**50
 PAIRS = 2**60
 
 Node = tuple[str, tuple[int, ...], Any]
+
+_ONE = ("float", 1.0, 1.0)  # the key of the constant 1
+
+
+def _cancel(a: float, b: float) -> bool:
+    """True for large constants whose sum is so small that what they were added to has been rounded."""
+    return abs(a + b) < 1e-8 * abs(a) and abs(a) > 1e8
 
 
 def find_ancestors(nodes: Sequence[Node], outputs: Iterable[int], powers: Mapping[int, tuple] = {}) -> list[int]:
@@ -328,6 +336,9 @@ class Graph:
     def sum(self, a: int, b: int, sign: int) -> int:
         """`a + sign*b` with like terms collected, or an earlier sum of the same terms."""
         left, right = self.terms(a), self.terms(b)
+        one = self._ids.get(_ONE)
+        if one in left and one in right and _cancel(left[one], sign * right[one]):
+            return self._round_by_adding(a, b, sign)
         terms = dict(left)
         for base, coefficient in right.items():
             terms[base] = terms.get(base, 0.0) + sign * coefficient
@@ -342,6 +353,17 @@ class Graph:
         if 2 * len(terms) <= len(left) + len(right):  # worth writing anew, though the old sums may live on elsewhere
             return self._add_terms(terms)
         return self._find_sum(terms, a, b, sign)
+
+    def _round_by_adding(self, a: int, b: int, sign: int) -> int:
+        """`a + sign*b`, of which large constants cancel: u + 1.5·2ᵏ − 1.5·2ᵏ is u to the nearest 2ᵏ⁻⁵²."""
+        one, taken = self.constant(1, "float"), a if self.value(b) is None else b
+        terms, large = self.terms(a if taken == b else b), self.value(taken)
+        if large is None or abs(terms[one]) != abs(large) or abs(math.frexp(large)[0]) != 0.75:
+            return self._signed_sum(a, b, sign)
+        unit = math.ulp(large)
+        others = self._add_terms({base: coefficient for base, coefficient in terms.items() if base != one})
+        whole = self.apply("round", self.scale(1 / unit, others), attribute=1)
+        return self.scale(unit if taken == b else sign * unit, whole)
 
     def _add_terms(self, terms: dict[int, float]) -> int:
         (base, coefficient), *rest = sorted(terms.items(), key=lambda term: term[1] < 0)

@@ -127,3 +127,19 @@ def test_equal_extremes_share_a_slope_alike(function):
     np.testing.assert_allclose(found, jax.vmap(jax.grad(function))(points), rtol=1e-15)
     first, _ = derivatives(function, points[1])
     np.testing.assert_allclose(first, 2 * [jax.grad(function)(points[1])], rtol=1e-15)
+
+
+ROUNDED = 6755399441055744.0  # 1.5 · 2⁵²: what is added to it, and is less than 2⁵¹, is rounded to a whole number
+
+
+@pytest.mark.parametrize(
+    "function",
+    [lambda x: (x + ROUNDED) - ROUNDED, lambda x: ROUNDED - (ROUNDED - 2 * x), lambda x: (x - 3e12) - 1 + 3e12,
+     lambda x: (x + 1.5 * 2**40) - 1.5 * 2**40, lambda x: (x + 1e16) - 1e16, lambda x: (x + ROUNDED) - (ROUNDED - 2),
+     lambda x: 1e-200 * (1e-200 * jnp.exp(500 + x)), lambda x: (1e200 * (x * 1e-300)) * 1e200],
+)  # fmt: skip
+def test_constants_are_not_collected_where_that_is_no_rounding(function):
+    program = lower(function, 0.3)
+    for x in (0.3, -1.7, 2.5, 7.0):
+        np.testing.assert_allclose(program.evaluate(x)[0], function(jnp.array(x)), rtol=1e-14)
+    assert lower(lambda x: ((x + 1.0) - 1.0) * 2.0 * 0.5, 0.3).operations == 0
