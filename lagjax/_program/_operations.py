@@ -272,9 +272,9 @@ _ROWS = (
     _function("cos", np.cos, lambda f, c, w, u: f("neg", f("sin", u)), simplify=_even),
     _function("tan", np.tan, lambda f, c, w, u: _one_plus(f, c, _square(f, w)), simplify=_odd),
     _function("asin", np.arcsin, lambda f, c, w, u: _inverse_root(f, c, _one_minus_square(f, c, u)),
-              simplify=_simplify.inverse, steep=True),
+              simplify=_odd, steep=True),
     _function("acos", np.arccos, lambda f, c, w, u: f("neg", _inverse_root(f, c, _one_minus_square(f, c, u))),
-              simplify=_simplify.inverse, steep=True),
+              steep=True),
     _function("atan", np.arctan, lambda f, c, w, u: _inverse(f, c, _one_plus(f, c, _square(f, u))), simplify=_odd),
     Operation(
         "atan2", 2, np.arctan2, "atan2", simplify=_simplify.angle, steep=True,

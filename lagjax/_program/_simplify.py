@@ -263,9 +263,14 @@ def arctangent(graph, u: int) -> int:
     return f("select", undefined, angle, graph.constant(math.nan, "float"))
 
 
-def inverse(graph, op, x):
+def inverse(graph, x: int, op: str) -> int:
     """arccos(cos u) is |u| less whole turns, arcsin(sin u) is ±u less half ones; the sum of both functions is π/2."""
     of, operands, _ = graph.nodes[x]
+    if of == "neg" and graph.nodes[operands[0]][0] in ("sin", "cos"):
+        found = inverse(graph, *operands, op)
+        return (
+            graph.apply("neg", found) if op == "asin" else graph.apply("sub", graph.constant(math.pi, "float"), found)
+        )
     if of == "cos":
         found = graph.apply("abs", _rest(graph, operands[0], 2 * math.pi))
     elif of == "sin":
@@ -275,7 +280,7 @@ def inverse(graph, op, x):
         side = graph.apply("sub", one, graph.scale(2.0, parity))
         found = graph.apply("mul", side, _rest(graph, operands[0], math.pi))
     else:
-        return odd(graph, op, x) if op == "asin" else graph.node(op, x)
+        return graph.apply(op, x)
     if (of, op) in (("cos", "acos"), ("sin", "asin")):
         return found
     return graph.apply("sub", graph.constant(math.pi / 2, "float"), found)

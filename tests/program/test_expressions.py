@@ -143,3 +143,23 @@ def test_constants_are_not_collected_where_that_is_no_rounding(function):
     for x in (0.3, -1.7, 2.5, 7.0):
         np.testing.assert_allclose(program.evaluate(x)[0], function(jnp.array(x)), rtol=1e-14)
     assert lower(lambda x: ((x + 1.0) - 1.0) * 2.0 * 0.5, 0.3).operations == 0
+
+
+WAVES = {
+    "arccos of a cosine": (lambda u: jnp.arccos(jnp.cos(u)), lambda u: np.sign(np.sin(u))),
+    "arcsin of a sine": (lambda u: jnp.arcsin(jnp.sin(u)), lambda u: np.sign(np.cos(u))),
+    "arcsin of a cosine": (lambda u: jnp.arcsin(-jnp.cos(2 * u)), lambda u: 2 * np.sign(np.sin(2 * u))),
+    "arccos of a sine": (lambda u: jnp.arccos(jnp.sin(u)), lambda u: -np.sign(np.cos(u))),
+}
+
+
+@pytest.mark.parametrize("name", WAVES)
+def test_triangular_waves_have_slopes_on_both_sides_of_their_corners(name):
+    wave, slope = WAVES[name]
+    points = np.array([-7.3, -1.58, -1.57, 0.3, 1.57, 1.58, 3.1, 3.2, 40.0])
+    derivation = derivation_of(lagjax.System(lambda q, v: 0.5 * v**2 + wave(q)), Layout.from_state(0.0, 0.0), None)
+    names, columns = ["lagrangian", "lagrangian_by_q"], [np.r_[points, 0.0, np.pi, np.pi / 2], *np.zeros((2, 12))]
+    values, slopes = (np.ravel(derivation.evaluate(names, columns)[of]) for of in names)
+    np.testing.assert_allclose(slopes[:9], slope(points))
+    np.testing.assert_allclose(np.abs(slopes[9:]), np.abs(slope(0.3)))  # at a corner it is one of both
+    np.testing.assert_allclose(values, wave(columns[0]), atol=1e-14)

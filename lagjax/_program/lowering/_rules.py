@@ -22,7 +22,7 @@ from jax.extend import core
 
 from lagjax._program._graph import INPUTS, PAIRS, Graph, Unlowerable
 from lagjax._program._operations import OPERATIONS
-from lagjax._program._simplify import arctangent
+from lagjax._program._simplify import arctangent, inverse
 from lagjax._program.lowering._indexing import are_numbers, count_knots, locate_knots, look_up_windows
 
 # Scalars that are looked at for each one that the budget allows, as most of a derivative folds away; and in all, which
@@ -417,11 +417,20 @@ LOWER.update({
 })  # fmt: skip
 
 
-@lowers("atan")
-def _atan(expansion, params, x):
-    expansion.work(x.size)
-    expansion.traced_operations += x.size
-    return _ids([arctangent(expansion.graph, i) for i in x.ravel().tolist()], x.shape)
+def _inverse(rule):
+    """The rule of an inverse function, by what it is the inverse of: as it is written, for its derivatives too."""
+
+    def apply_rule(expansion, params, x):
+        expansion.work(x.size)
+        expansion.traced_operations += x.size
+        return _ids([rule(expansion.graph, i) for i in x.ravel().tolist()], x.shape)
+
+    return apply_rule
+
+
+LOWER.update(
+    {"atan": _inverse(arctangent)} | {op: _inverse(functools.partial(inverse, op=op)) for op in ("asin", "acos")}
+)
 
 
 @lowers("integer_pow")
