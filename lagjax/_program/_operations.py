@@ -171,10 +171,12 @@ def _share(f, c, g, larger, smaller):
 
 
 def _power_by_base(f, c, g, w, u, v):
-    """The cotangent of the base of a power: zero where the exponent is zero, at a base of zero too."""
-    constant = f("eq", v, c(0.0))
-    power = f("pow", u, _where(f, constant, c(1.0), f("sub", v, c(1.0))))
-    return f("mul", g, _where(f, constant, c(0.0), f("mul", v, power)))
+    """The cotangent of the base of a power: zero where the exponent is zero, at a base of zero too.
+
+    It has a slope in the exponent there, so that no more is left out than 0 · ∞.
+    """
+    undefined = f("and", f("eq", u, c(0.0)), f("eq", v, c(0.0)))
+    return f("mul", g, _where(f, undefined, c(0.0), f("mul", v, f("pow", u, f("sub", v, c(1.0))))))
 
 
 def _power_by_exponent(f, c, g, w, u, v):

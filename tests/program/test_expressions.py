@@ -163,3 +163,17 @@ def test_triangular_waves_have_slopes_on_both_sides_of_their_corners(name):
     np.testing.assert_allclose(slopes[:9], slope(points))
     np.testing.assert_allclose(np.abs(slopes[9:]), np.abs(slope(0.3)))  # at a corner it is one of both
     np.testing.assert_allclose(values, wave(columns[0]), atol=1e-14)
+
+
+@pytest.mark.parametrize("exponent", [0.0, 0.3, 1.0, 2.0])
+def test_powers_have_mixed_slopes_where_the_exponent_is_zero(exponent):
+    """∂²uᵛ/∂u∂v = uᵛ⁻¹ (1 + v log u), also where v = 0 and ∂uᵛ/∂u is zero."""
+    u, v = 1.5, exponent
+    (reverse, forward), seconds = derivatives(lambda x: x[0] ** x[1], [u, v])
+    for first in (reverse, forward):
+        np.testing.assert_allclose(first, [v * u ** (v - 1), u**v * np.log(u)], rtol=1e-14)
+    mixed = u ** (v - 1) * (1 + v * np.log(u))
+    for second in seconds:
+        right = [[v * (v - 1) * u ** (v - 2), mixed], [mixed, u**v * np.log(u) ** 2]]
+        np.testing.assert_allclose(second, right, rtol=1e-14, atol=1e-15)
+    assert derivatives(lambda x: x[0] ** x[1], [0.0, 0.0])[0][0][0] == 0.0
