@@ -8,6 +8,7 @@ from jax import lax
 from sweeps import sweep
 
 import lagjax
+from benchmarks import expression_population
 from lagjax._equations import derivation_of
 from lagjax._interface._layout import Layout
 from lagjax._program import lower
@@ -177,3 +178,9 @@ def test_powers_have_mixed_slopes_where_the_exponent_is_zero(exponent):
         right = [[v * (v - 1) * u ** (v - 2), mixed], [mixed, u**v * np.log(u) ** 2]]
         np.testing.assert_allclose(second, right, rtol=1e-14, atol=1e-15)
     assert derivatives(lambda x: x[0] ** x[1], [0.0, 0.0])[0][0][0] == 0.0
+
+
+@pytest.mark.parametrize("number", sweep(range(60), kept=(19,)))
+def test_random_expressions_agree_with_jax(number):
+    scene, verdict, about = expression_population.judge(number, 0, False, 20)
+    assert verdict in expression_population.FINE, (scene, verdict, about)
