@@ -568,10 +568,10 @@ def main(arguments=None) -> dict[str, int]:
             print(f"# {number + 1}: {dict(counts.most_common())}", file=sys.stderr, flush=True)
     print(dict(counts.most_common()))
     if given.write:
-        record, name = _report.read_json(STORE), "float32" if given.float32 else "float64"
-        done = {"seed": given.seed, "first": given.first, "scenes": given.scenes, "counts": dict(counts.most_common())}
-        record[name] = done | {"not right": offenders, "circumstances": _report.circumstances()}
-        _report.write_json(STORE, record)
+        record, last = _report.read_json(STORE), given.first + given.scenes - 1
+        name = f"{'float32' if given.float32 else 'float64'}, scenes {given.first} to {last}"
+        done = {"seed": given.seed, "counts": dict(counts.most_common()), "not right": offenders}
+        _report.write_json(STORE, record | {name: done | {"circumstances": _report.circumstances()}})
     return dict(counts)
 
 

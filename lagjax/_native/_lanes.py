@@ -112,7 +112,7 @@ def apply(code: Code, op: str, xs: list[Value], attribute, kinds: Sequence[str],
     return _check_range(code, x, kind) if is_whole else x
 
 
-def _by_bits(op: str) -> Callable:
+def _combine_bits(op: str) -> Callable:
     """An operation on the bits of whole doubles; NaN where one of them is none."""
 
     def combine(code, a, b):
@@ -139,7 +139,7 @@ INTEGERS = {
     "mul": lambda code, a, b: a * b,
     "neg": lambda code, a: -a,
     "div": lambda code, a, b: code.intrinsic("trunc", a / b),
-    "not": lambda code, a: -1.0 - a, "and": _by_bits("and_"), "or": _by_bits("or_"), "xor": _by_bits("xor"),
+    "not": lambda code, a: -1.0 - a, "and": _combine_bits("and_"), "or": _combine_bits("or_"), "xor": _combine_bits("xor"),
     **{op: OPERATIONS[op].llvm for op in ("abs", "max", "min", "sign", "rem", "select")},
 }  # fmt: skip
 

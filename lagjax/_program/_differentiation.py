@@ -192,7 +192,7 @@ class Derivatives:
         return f("mul", g, f("select", f("eq", u, v), whole, shared))
 
     def _count_equal(self, op: str, i: int) -> int:
-        """How many of the numbers that a node is the extreme of are equal to it."""
+        """The count of the numbers that a node is the extreme of, and that are equal to it."""
         if self.graph.nodes[i][0] != op:
             return self._number(1.0)
         f, (u, v) = self._apply, self.graph.nodes[i][1]

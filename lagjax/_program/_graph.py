@@ -166,7 +166,7 @@ class Graph:
     # ---- operations ----
 
     def branch(self, predicate: int) -> AbstractContextManager:
-        """What is written meanwhile is one of the branches of a `cond`, taken where the predicate holds."""
+        """A context in which a branch of a `cond` is written that is taken where the predicate holds."""
         return nullcontext()
 
     def apply(self, op: str, *operands: int, attribute=None) -> int:
