@@ -28,7 +28,7 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "The state or its acceleration is NaN or infinite there, or just ahead. Look at the gaps of contacts, the "
         "Lagrangian, its gradient, the forces and the parameters at that time and state: a root or norm at zero, a "
         "logarithm of a negative number, a branch of `where` that is not taken, knots of a look-up that do not "
-        "increase."
+        "increase, an integer beyond its type or beyond 2**53, which JAX wraps around."
     )
     acceleration_discontinuous = (
         "The acceleration has a jump or a corner there, and the budget of steps was spent on such places, or no step "

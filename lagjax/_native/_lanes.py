@@ -8,7 +8,7 @@ from llvmlite import ir
 
 from lagjax._native._constants import LARGEST_ANGLE
 from lagjax._native._frame import Frame, Numbers, Vectors
-from lagjax._native._ir import BIT, DOUBLE, POINTER, Code, Value
+from lagjax._native._ir import BIT, DOUBLE, INTEGER, POINTER, Code, Value
 from lagjax._program._graph import Unlowerable
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._series import StraightLine
@@ -107,7 +107,19 @@ def apply(code: Code, op: str, xs: list[Value], attribute, kinds: Sequence[str],
         raise Unlowerable(f"`{op}`{' of integers' if is_whole else ''} has no machine code here")
     more = () if attribute is None else (attribute,)
     x = code.library(how, *xs) if isinstance(how, str) else how(code, *xs, *more)
+    if op == "not" and is_whole and not np.iinfo(kind).min:  # the complement of what has no sign
+        x = x + (np.iinfo(kind).max + 1.0)
     return _check_range(code, x, kind) if is_whole else x
+
+
+def _combine_bits(op: str) -> Callable:
+    """An operation on the bits of whole doubles; NaN where one of them is none."""
+
+    def combine(code, a, b):
+        x, y = (code.builder.fptosi(of.it, ir.VectorType(INTEGER, code.lanes)) for of in (a, b))
+        return Value(code, code.builder.sitofp(getattr(code.builder, op)(x, y), code.vector)) + 0.0 * (a + b)
+
+    return combine
 
 
 def _convert(code, x, before, after):
@@ -127,8 +139,9 @@ INTEGERS = {
     "mul": lambda code, a, b: a * b,
     "neg": lambda code, a: -a,
     "div": lambda code, a, b: code.intrinsic("trunc", a / b),
+    "not": lambda code, a: -1.0 - a, "and": _combine_bits("and_"), "or": _combine_bits("or_"), "xor": _combine_bits("xor"),
     **{op: OPERATIONS[op].llvm for op in ("abs", "max", "min", "sign", "rem", "select")},
-}
+}  # fmt: skip
 
 
 def _check_range(code: Code, x: Value, kind: str) -> Value:

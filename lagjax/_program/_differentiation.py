@@ -15,6 +15,7 @@ These are derivatives of the operations as they stand: `has_own_rules` in `_rule
 """
 
 import functools
+import math
 from collections.abc import Callable, Container, Iterable, Sequence
 from typing import Any
 
@@ -23,7 +24,7 @@ import numpy as np
 from lagjax._program._graph import INPUTS, Graph, Node, Tape, find_ancestors
 from lagjax._program._line import StraightLine
 from lagjax._program._look_ups import Table, move_look_up
-from lagjax._program._operations import LOOK_UPS, OPERATIONS, is_function
+from lagjax._program._operations import FLAT_FAR_OUT, LOOK_UPS, OPERATIONS, SLOW_FAR_OUT
 from lagjax._program._passes import eliminate_dead_code, factor, sink_negations
 
 _Rule = Callable[[int], int]
@@ -84,8 +85,9 @@ class Derivatives:
         `nodes` holds what the tape is in the graph. The cotangents of scalars that are equal are added up at once where
         they are to be taken `together`, else each is followed on its own as far as it is written apart.
         """
-        first: dict[int, int] = {}
-        same = [first.setdefault(i, k) if together else k for k, i in enumerate(nodes)]
+        first: dict[tuple, int] = {}
+        taken = [tape.branches.get(k) for k in range(len(nodes))]
+        same = [first.setdefault((i, taken[k]), k) if together else k for k, i in enumerate(nodes)]
         varied, once_more = (self._find_varying(tape, nodes, inputs) for inputs in (by, again))
         cotangents, results = {same[output]: self._number(1.0)}, {}
         for k in range(output, -1, -1):
@@ -98,7 +100,10 @@ class Derivatives:
             rules = rules_of(nodes[k], op, [nodes[x] for x in operands], attribute)
             for x, rule in zip(operands, rules, strict=False):
                 if rule is not None and varied[x]:
-                    self._add(cotangents, same[x], rule(g))
+                    part = rule(g)
+                    if taken[k] is not None and taken[x] != taken[k]:
+                        part = self._apply("select", nodes[taken[k]], self._number(0.0), part)
+                    self._add(cotangents, same[x], part)
         return [results.get(i, self._number(0.0)) for i in by]
 
     def slopes(self, output: int, through: Iterable[int], by: Sequence[int]) -> list[int]:
@@ -171,26 +176,55 @@ class Derivatives:
             if op == "div":
                 return self._mask_quotient(result, w, operands[1])
             slope = rule(self._apply, self._number, self._number(1.0), w, *operands)
-            if len(operands) == 1 and is_function(op):
-                result = self._zero_where(self.graph.vanishes(self.graph.apply("mul", slope, operands[0])), result)
+            if op in FLAT_FAR_OUT:
+                result = self._mask(result, lambda: self.graph.is_flat_far_out(slope, operands[0]))
+            elif op in SLOW_FAR_OUT:
+                result = self._refuse_overflow(result, g, w)
             return self._mask_product(result, g, slope)
 
         rules = OPERATIONS[op].transpose() if operands else ()
+        if op in ("max", "min") and any(self.graph.nodes[x][0] == op for x in operands):
+            u, v = operands
+            return [functools.partial(self._share, op, u, v), functools.partial(self._share, op, v, u)]
         return [rule and functools.partial(apply_rule, rule) for rule in rules]
+
+    def _share(self, op: str, u: int, v: int, g: int) -> int:
+        """The cotangent of the operand u of an extreme of several numbers: those that are equal have equal shares."""
+        f, counts = self._apply, [self._count_equal(op, x) for x in (u, v)]
+        shared = f("div", counts[0], f("add", *counts))
+        whole = f("select", f("gt" if op == "max" else "lt", u, v), self._number(0.0), self._number(1.0))
+        return f("mul", g, f("select", f("eq", u, v), whole, shared))
+
+    def _count_equal(self, op: str, i: int) -> int:
+        """The count of the numbers that a node is the extreme of, and that are equal to it."""
+        if self.graph.nodes[i][0] != op:
+            return self._number(1.0)
+        f, (u, v) = self._apply, self.graph.nodes[i][1]
+        of_u, of_v = (self._count_equal(op, x) for x in (u, v))
+        one = f("select", f("gt" if op == "max" else "lt", u, v), of_v, of_u)
+        return f("select", f("eq", u, v), one, f("add", of_u, of_v))
 
     def _mask_quotient(self, tangent: int, w: int, v: int) -> int:
         """A tangent, or a cotangent, of w = u/v: 0 where w is flat, as what has overflown gives no number."""
-        return self._zero_where(self.graph.is_flat_quotient(w, v), tangent) if self.graph.grows(v) else tangent
+        return self._mask(tangent, lambda: self.graph.is_flat_quotient(w, v)) if self.graph.grows(v) else tangent
 
     def _mask_product(self, product: int, g: int, slope: int) -> int:
         """A product of g and a slope, 0 where g is and the slope is huge."""
         if not (self.asks and self.hides and self.graph.hides_growth and self.graph.grows(slope)):
             return product
         is_zero = self._apply("eq", g, self._number(0.0))
-        return self._zero_where(self._apply("and", is_zero, self.graph.is_huge(slope)), product)
+        return self._mask(product, lambda: self._apply("and", is_zero, self.graph.is_huge(slope)))
 
-    def _zero_where(self, where: int, x: int) -> int:
-        return self._apply("select", where, x, self._number(0.0))
+    def _mask(self, x: int, where: Callable[[], int]) -> int:
+        """0 in the place of what is no number; what is finite stays, and has derivatives of its own."""
+        f, zero = self._apply, self._number(0.0)
+        return f("select", f("is_finite", x), f("select", where(), x, zero), x)
+
+    def _refuse_overflow(self, result: int, g: int, w: int) -> int:
+        """NaN where w is infinite and matters: its operand has overflown, whose logarithm or root has a slope."""
+        f = self._apply
+        known = f("or", f("is_finite", w), f("eq", g, self._number(0.0)))
+        return f("select", known, self._number(math.nan), result)
 
     def _rules(self, w: int, op: str, operands: Sequence[int], attribute: Any = None) -> Sequence[_Rule | None]:
         """`rules`, where a power is one operation."""
@@ -200,7 +234,7 @@ class Derivatives:
 
     def _rules_once(self, w: int, op: str, operands: Sequence[int], attribute: Any) -> Sequence[_Rule | None]:
         """`_rules` for the only cotangent of w: factors 2 and ½ are next to others, with which they cancel."""
-        if op == "sqrt":
+        if op == "sqrt" and not self.graph.grows(w):
             return [lambda g: self._apply("mul", self._number(0.5), self._apply("div", g, w))]
         if op == "mul" and operands[0] == operands[1]:
             return [lambda g: self._power_derivative(operands[0], 2, g)]

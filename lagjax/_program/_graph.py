@@ -7,10 +7,11 @@ true), or "input" (attribute: position) or "constant" (attribute: Python number)
 Every node has a *kind*: "float" (whatever precision the inputs will have), "bool", or the name of an integer type.
 Constants are folded in float64.
 
-What may change in the last digits: constants multiply out (`2*(3*x)` is `6*x`); products of the same factors are one
-product, and sums of the same terms one sum, in whatever order they were written; like terms are collected where that
-shortens a sum (`x + x` is `2*x`, `x - x` is 0); `sin(x)**2 + cos(x)**2` is 1; half-integer powers become roots. Nothing
-is multiplied out (but `_passes.factor` draws out common factors), and no quotient but one by a power of two.
+What may change in the last digits: constants multiply out (`2*(3*x)` is `6*x`), and add up where no large ones cancel;
+products of the same factors are one product, and sums of the same terms one sum, in whatever order they were written;
+like terms are collected where that shortens a sum (`x + x` is `2*x`, `x - x` is 0); `sin(x)**2 + cos(x)**2` is 1;
+half-integer powers become roots. Nothing is multiplied out (but `_passes.factor` draws out common factors), and no
+quotient but one by a power of two.
 
 A zero found here is *structural*: `0*x` is 0 whatever `x` will be, so an infinity or NaN it would have met is not seen;
 whoever runs the program checks what comes out of it.
@@ -19,7 +20,8 @@ whoever runs the program checks what comes out of it.
 import functools
 import itertools
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager, nullcontext
 from typing import Any
 
 import numpy as np
@@ -42,6 +44,13 @@ INPUTS, NUMBERS = 2**40, 2**50
 PAIRS = 2**60
 
 Node = tuple[str, tuple[int, ...], Any]
+
+_ONE = ("float", 1.0, 1.0)  # the key of the constant 1
+
+
+def _cancel(a: float, b: float) -> bool:
+    """True for large constants whose sum is so small that what they were added to has been rounded."""
+    return abs(a + b) < 1e-8 * abs(a) and abs(a) > 1e8
 
 
 def find_ancestors(nodes: Sequence[Node], outputs: Iterable[int], powers: Mapping[int, tuple] = {}) -> list[int]:
@@ -138,21 +147,35 @@ class Graph:
         return self._hides_growth
 
     def is_huge(self, v: int) -> int:
-        """True where v is so large that its coefficients may be infinite: the square of 1/v is zero; or no number."""
+        """True where v is so large that its coefficients may be infinite: the square of 1/v is zero."""
         first = len(self.nodes)
-        found = self.vanishes(self.apply("div", self.constant(1.0, "float"), v))
-        return self._bound(first, found)
+        return self._bound(first, self._is_nothing(self.apply("div", self.constant(1.0, "float"), v)))
+
+    def has_coefficients(self, v: int) -> int:
+        """True where v is neither huge nor NaN."""
+        first, zero = len(self.nodes), self.constant(0.0, "float")
+        inverse = self.apply("div", self.constant(1.0, "float"), v)
+        return self._bound(first, self.apply("prefers", self.apply("mul", inverse, inverse), zero))
 
     def finite_part(self, v: int) -> int:
-        huge, first = self.is_huge(v), len(self.nodes)
-        return self._bound(first, self.apply("select", huge, v, self.constant(0.0, "float")))
+        has_any, first = self.has_coefficients(v), len(self.nodes)
+        return self._bound(first, self.apply("select", has_any, self.constant(0.0, "float"), v))
 
     def is_flat_quotient(self, w: int, v: int) -> int:
-        return self.apply("and", self.is_huge(v), self.vanishes(w))
+        """True where w = u/v is nothing as v is huge."""
+        return self.apply("and", self.is_huge(v), self._is_nothing(w))
 
-    def vanishes(self, x: int) -> int:
-        """True where the square of x is zero, or x is no number."""
-        return self.apply("not", self.apply("prefers", self.apply("mul", x, x), self.constant(0.0, "float")))
+    def is_flat_far_out(self, slope: int, u: int) -> int:
+        """True where a function has no slope as its operand u is huge: what it changes by, slope · u, is nothing.
+
+        At u = 0, where it is nothing, too, there is a slope; and 0 · ∞ is NaN.
+        """
+        change = self.apply("mul", slope, u)
+        changes = self.apply("prefers", self.apply("mul", change, change), self.constant(0.0, "float"))
+        return self.apply("and", self.is_huge(u), self.apply("not", changes))
+
+    def _is_nothing(self, x: int) -> int:
+        return self.apply("eq", self.apply("mul", x, x), self.constant(0.0, "float"))
 
     def _bound(self, first: int, result: int) -> int:
         """The result, where nodes from the `first` one on do not grow."""
@@ -161,6 +184,10 @@ class Graph:
         return result
 
     # ---- operations ----
+
+    def branch(self, predicate: int) -> AbstractContextManager:
+        """A context in which a branch of a `cond` is written that is taken where the predicate holds."""
+        return nullcontext()
 
     def apply(self, op: str, *operands: int, attribute=None) -> int:
         """The scalar `op(*operands)`, as simple as the rules below make it."""
@@ -329,6 +356,9 @@ class Graph:
     def sum(self, a: int, b: int, sign: int) -> int:
         """`a + sign*b` with like terms collected, or an earlier sum of the same terms."""
         left, right = self.terms(a), self.terms(b)
+        one = self._ids.get(_ONE)
+        if one in left and one in right and _cancel(left[one], sign * right[one]):
+            return self._round_by_adding(a, b, sign)
         terms = dict(left)
         for base, coefficient in right.items():
             terms[base] = terms.get(base, 0.0) + sign * coefficient
@@ -343,6 +373,17 @@ class Graph:
         if 2 * len(terms) <= len(left) + len(right):  # worth writing anew, though the old sums may live on elsewhere
             return self._add_terms(terms)
         return self._find_sum(terms, a, b, sign)
+
+    def _round_by_adding(self, a: int, b: int, sign: int) -> int:
+        """`a + sign*b`, of which large constants cancel: u + 1.5·2ᵏ − 1.5·2ᵏ is u to the nearest 2ᵏ⁻⁵²."""
+        one, taken = self.constant(1, "float"), a if self.value(b) is None else b
+        terms, large = self.terms(a if taken == b else b), self.value(taken)
+        if large is None or abs(terms[one]) != abs(large) or abs(math.frexp(large)[0]) != 0.75:
+            return self._signed_sum(a, b, sign)
+        unit = math.ulp(large)
+        others = self._add_terms({base: coefficient for base, coefficient in terms.items() if base != one})
+        whole = self.apply("round", self.scale(1 / unit, others), attribute=1)
+        return self.scale(unit if taken == b else sign * unit, whole)
 
     def _add_terms(self, terms: dict[int, float]) -> int:
         (base, coefficient), *rest = sorted(terms.items(), key=lambda term: term[1] < 0)
@@ -396,7 +437,21 @@ class Tape(Graph):
 
     In a graph that shares equal scalars the cotangents of all their uses come together in one sum. That hides what
     cancels: in ∂L/∂q − (∂p/∂q) q̇ the kinetic part of one use of cos q cancels, and its potential part does not.
+
+    `branches` has the predicate of every node from a branch of a `cond`, of which no cotangent leaves it elsewhere.
     """
+
+    def __init__(self, budget: int, moving: int = 0):
+        super().__init__(budget, moving)
+        self.branches: dict[int, int] = {}
+        self._taken: int | None = None
+
+    @contextmanager
+    def branch(self, predicate: int) -> Iterator[None]:
+        outer = self._taken
+        self._taken = predicate if outer is None else self.apply("and", outer, predicate)
+        yield
+        self._taken = outer
 
     def apply(self, op: str, *operands: int, attribute=None) -> int:
         if all(self.nodes[i][0] == "constant" for i in operands):
@@ -410,6 +465,8 @@ class Tape(Graph):
         return self._append_operation("integer_pow", (a,), exponent, "float")
 
     def _append_operation(self, op: str, operands: tuple[int, ...], attribute: Any, kind: str) -> int:
+        if self._taken is not None:
+            self.branches[len(self.nodes)] = self._taken
         self.nodes.append((op, operands, attribute))
         self.kinds.append(kind)
         return len(self.nodes) - 1

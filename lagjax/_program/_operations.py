@@ -171,10 +171,12 @@ def _share(f, c, g, larger, smaller):
 
 
 def _power_by_base(f, c, g, w, u, v):
-    """The cotangent of the base of a power: zero where the exponent is zero, at a base of zero too."""
-    constant = f("eq", v, c(0.0))
-    power = f("pow", u, _where(f, constant, c(1.0), f("sub", v, c(1.0))))
-    return f("mul", g, _where(f, constant, c(0.0), f("mul", v, power)))
+    """The cotangent of the base of a power: zero where the exponent is zero, at a base of zero too.
+
+    It has a slope in the exponent there, so that no more is left out than 0 · ∞.
+    """
+    undefined = f("and", f("eq", u, c(0.0)), f("eq", v, c(0.0)))
+    return f("mul", g, _where(f, undefined, c(0.0), f("mul", v, f("pow", u, f("sub", v, c(1.0))))))
 
 
 def _power_by_exponent(f, c, g, w, u, v):
@@ -272,9 +274,9 @@ _ROWS = (
     _function("cos", np.cos, lambda f, c, w, u: f("neg", f("sin", u)), simplify=_even),
     _function("tan", np.tan, lambda f, c, w, u: _one_plus(f, c, _square(f, w)), simplify=_odd),
     _function("asin", np.arcsin, lambda f, c, w, u: _inverse_root(f, c, _one_minus_square(f, c, u)),
-              simplify=_simplify.inverse, steep=True),
+              simplify=_odd, steep=True),
     _function("acos", np.arccos, lambda f, c, w, u: f("neg", _inverse_root(f, c, _one_minus_square(f, c, u))),
-              simplify=_simplify.inverse, steep=True),
+              steep=True),
     _function("atan", np.arctan, lambda f, c, w, u: _inverse(f, c, _one_plus(f, c, _square(f, u))), simplify=_odd),
     Operation(
         "atan2", 2, np.arctan2, "atan2", simplify=_simplify.angle, steep=True,
@@ -359,6 +361,11 @@ _ROWS = (
 # What may come near the largest double where nothing else does, and what does not whatever its operand is.
 GROWING = frozenset(("exp", "exp2", "expm1", "sinh", "cosh"))
 BOUNDED = frozenset(("sin", "cos", "tanh", "logistic", "erf", "erfc", "atan", "atan2", "log", "log1p", "asinh"))
+
+# What has a slope of zero where its operand is infinite, on one side at least; and what is infinite itself there, and
+# has a slope that is rounded to zero.
+FLAT_FAR_OUT = frozenset(("exp", "exp2", "expm1", "tanh", "logistic", "erf", "erfc", "atan", "rsqrt"))
+SLOW_FAR_OUT = frozenset(("log", "log1p", "asinh", "acosh", "sqrt", "cbrt"))
 
 
 def is_function(op: str) -> bool:

@@ -63,6 +63,8 @@ def _factors(graph, uses, i) -> list[int]:
 def _square_first(graph, factors) -> int | None:
     """Their product, if one of them comes twice."""
     counts = Counter(factors)
+    if any(graph.value(x) is not None and n > 1 for x, n in counts.items()):  # constants that overflow, or underflow
+        return None
     if len(factors) < 3 or max(counts.values()) < 2:
         return None
 

@@ -183,7 +183,7 @@ class _Recurrences:
         for i in sorted(missing):
             c = self._coefficient(i)
             if self.hides_growth and isinstance(c, int) and self.zeroth_order.grows(i):
-                c = choose(self, self.zeroth_order.is_huge(i), c, self.order_recursion.number(0.0))
+                c = choose(self, self.zeroth_order.has_coefficients(i), self.order_recursion.number(0.0), c)
             self._coefficients[i] = c
 
     def _coefficient(self, i: int) -> "int | _Unknown | None":

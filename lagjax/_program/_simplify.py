@@ -50,9 +50,11 @@ def multiply(graph, op, a, b):
     for constant, other in ((a, b), (b, a)):
         if (value := graph.value(constant)) is not None and value == value:
             coefficient, base = graph.term(other)
-            return graph.scale(value * coefficient, base)
+            return graph.scale(value * coefficient, base) if _fits(value, coefficient) else graph.node("mul", a, b)
     (m, x), (n, y) = graph.term(a), graph.term(b)
-    if abs(m) != 1 and abs(n) != 1:  # two constant factors become one; a single one stays where it can be shared
+    if (
+        abs(m) != 1 and abs(n) != 1 and _fits(m, n)
+    ):  # two constant factors become one; a single one stays where it can be shared
         return graph.scale(m * n, graph.product(x, y))
     if m < 0 or n < 0:
         return graph.scale(math.copysign(1, m * n), multiply(graph, op, graph.scale(abs(m), x), graph.scale(abs(n), y)))
@@ -61,6 +63,11 @@ def multiply(graph, op, a, b):
         if divided == "div" and (sign := direction(graph, x, operands[1])) is not None:
             return graph.apply("mul", operands[0], sign)
     return graph.product(a, b)
+
+
+def _fits(m: float, n: float) -> bool:
+    """True where the product of two constants neither overflows nor underflows: what they multiply may not, either."""
+    return not (m and n) or 1e-290 < abs(m * n) < math.inf or abs(n) == 1
 
 
 def divide(graph, op, a, b):
@@ -256,9 +263,14 @@ def arctangent(graph, u: int) -> int:
     return f("select", undefined, angle, graph.constant(math.nan, "float"))
 
 
-def inverse(graph, op, x):
+def inverse(graph, x: int, op: str) -> int:
     """arccos(cos u) is |u| less whole turns, arcsin(sin u) is ±u less half ones; the sum of both functions is π/2."""
     of, operands, _ = graph.nodes[x]
+    if of == "neg" and graph.nodes[operands[0]][0] in ("sin", "cos"):
+        found = inverse(graph, *operands, op)
+        return (
+            graph.apply("neg", found) if op == "asin" else graph.apply("sub", graph.constant(math.pi, "float"), found)
+        )
     if of == "cos":
         found = graph.apply("abs", _rest(graph, operands[0], 2 * math.pi))
     elif of == "sin":
@@ -268,7 +280,7 @@ def inverse(graph, op, x):
         side = graph.apply("sub", one, graph.scale(2.0, parity))
         found = graph.apply("mul", side, _rest(graph, operands[0], math.pi))
     else:
-        return odd(graph, op, x) if op == "asin" else graph.node(op, x)
+        return graph.apply(op, x)
     if (of, op) in (("cos", "acos"), ("sin", "asin")):
         return found
     return graph.apply("sub", graph.constant(math.pi / 2, "float"), found)

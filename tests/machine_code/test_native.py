@@ -20,7 +20,7 @@ from lagjax._engine._problem import Problem
 from lagjax._engine.taylor import flow_of
 from lagjax._interface._layout import Layout
 from lagjax._native import _ir, _kernel, _lanes
-from lagjax._program import OPERATIONS, Unlowerable, lower, lower_formula
+from lagjax._program import OPERATIONS, lower, lower_formula
 from lagjax._program import _scalars as xp
 
 EPS = 2.0**-52
@@ -121,6 +121,9 @@ FAMILIES = {  # functions of two doubles and an integer; exact ones, and those o
     "remainder": lambda a, b, n: (lax.rem(a, b), jnp.mod(a, 2.5)),
     "comparison": lambda a, b, n: (a < b, a <= b, a > b, a >= b, a == b, a != b, jnp.isfinite(a), n > 1, n == 2),
     "logic": lambda a, b, n: ((a < 0) & (b > 0), (a < 0) | (b > 0), ~(a < 0), (a < 0) ^ (b > 0)),
+    "bits of integers": lambda a, b, n: (
+        n & 6, n | 5, n ^ 9, ~n, n >> 1, n << 2, ~(n + 3).astype(jnp.uint8), (n * n) ^ n,
+    ),
     "bits compared": lambda a, b, n: ((a < 0) == (b > 0), (a < 0) != (b > 0)),
     "select": lambda a, b, n: (
         jnp.where(a > b, a, b), jnp.where((a > 0) & (n > 0), a, 2.0), jnp.where(a > 0, b > 0, a < 1),
@@ -165,11 +168,6 @@ def test_operations(name):
         for right, column in zip(expected, found, strict=True):
             np.testing.assert_allclose(column, right, rtol=0 if exact else 4 * EPS, atol=np.max(EPS * size))
             assert (np.signbit(column) == np.signbit(right))[(right != 0) & ~np.isnan(right)].all()
-
-
-def test_bits_of_integers_are_refused():
-    with pytest.raises(Unlowerable, match="integers"):
-        kernel_of(lambda q, v, t, n: q * (n & 1), 1, jnp.int64(1))
 
 
 # ---- motions --------------------------------------------------------------------------------------------------------

@@ -21,6 +21,10 @@ PAIRS = {
     "a quotient of whole numbers": (
         lambda q, v: -0.5 * (jnp.floor(8 * q).astype(int) // 3) - 0.2, lambda q, v: -0.5 * jnp.floor(8 / 3 * q) - 0.2,
     ),
+    "bits of whole numbers": (  # two borders side by side
+        lambda q, v: 0.4 * ((jnp.floor(4 * q).astype(int) ^ jnp.floor(4 * q - 0.02).astype(int)) & 3) - 0.2,
+        lambda q, v: 0.4 * jnp.where(jnp.abs(4 * q % 1 - 0.01) > 0.01, 0.0, jnp.where(4 * q % 2 < 1, 3.0, 1.0)) - 0.2,
+    ),
     "the index of the largest": (
         lambda q, v: 0.3 - jnp.argmax(jnp.stack([0.2 - q, 0.1 + 0 * q, q - 0.3])),
         lambda q, v: 0.3 - jnp.where(q > 0.4, 2.0, jnp.where(q < 0.1, 0.0, 1.0)),
@@ -44,7 +48,7 @@ PAIRS = {
 }  # fmt: skip
 
 
-FAST = ("odd and even", "the index of the largest", "the middle of three", "floor_divide")
+FAST = ("bits of whole numbers", "odd and even", "the index of the largest", "the middle of three", "floor_divide")
 
 
 @pytest.mark.parametrize("name", [pytest.param(x, marks=() if x in FAST else pytest.mark.slow) for x in PAIRS])

@@ -96,7 +96,9 @@ FAMILIES = {
     "logic": (lambda a, b: ((a < 0) & (b > 0), (a < 0) | (b > 0), ~(a < 0), (a < 0) ^ (b > 0)), A, B),
     "where": (lambda a, b: (jnp.where(a > 0, a, b), jnp.where(a > 0, a, a), jnp.where(True, a, b)), A, B),
     "select of many": (lambda n, a: lax.select_n(jnp.abs(n) % 3, a, 2 * a, 3 * a), N, A),
-    "integers": (lambda n: (n + 1, n * n, n // 2, n % 3, -n, n & 3, n.astype(float) / 2, jnp.sum(n), n > 0), N),
+    "integers": (
+        lambda n: (n + 1, n * n, n // 2, n % 3, -n, n & 3, n >> 1, n << 3, n.astype(float) / 2, jnp.sum(n), n > 0), N
+    ),
     "conversion": (lambda a, n: ((a * 3).astype(jnp.int32), n.astype(bool), (a > 0) * a, (a > 0).astype(int)), A, N),
     "shapes": (lambda m: (m.T, m.reshape(2, 6), m[None], m[:, 0], m[::-1], jnp.tile(m, 2), jnp.rot90(m)), M),
     "pieces of arrays": (lambda m: (m[1:, ::2], m[-1], *jnp.split(m, 2, axis=1), jnp.roll(m, 1), list(m)), M),

@@ -22,7 +22,7 @@ from jax.extend import core
 
 from lagjax._program._graph import INPUTS, PAIRS, Graph, Unlowerable
 from lagjax._program._operations import OPERATIONS
-from lagjax._program._simplify import arctangent
+from lagjax._program._simplify import arctangent, inverse
 from lagjax._program.lowering._indexing import are_numbers, count_knots, locate_knots, look_up_windows
 
 # Scalars that are looked at for each one that the budget allows, as most of a derivative folds away; and in all, which
@@ -393,17 +393,44 @@ def _divide(expansion, params, x, y):
     return [whole, expansion.map("sub", x, expansion.map("mul", whole, y))]
 
 
+def _powers_of_two(expansion, x, places):
+    """2ᵏ in the kinds of x, for numbers k of places that x is shifted by."""
+    places = np.broadcast_to(expansion.require_numbers(places, "by how many places a number is shifted"), x.shape)
+    pairs = [(2**k, expansion.graph.kinds[i]) for k, i in zip(places.ravel().tolist(), x.ravel().tolist(), strict=True)]
+    if not all(1 <= power <= np.iinfo(kind).max for power, kind in pairs):
+        raise Unlowerable("a number is shifted by more places than it has, or by fewer than none")
+    return _ids([expansion.graph.constant(*pair) for pair in pairs], x.shape)
+
+
+def _shift_right(expansion, params, x, places):
+    power, zero = _powers_of_two(expansion, x, places), expansion.map("sub", x, x)
+    rest = expansion.map("rem", x, power)
+    rest = expansion.map("select", expansion.map("lt", rest, zero), rest, expansion.map("add", rest, power))
+    return expansion.map("div", expansion.map("sub", x, rest), power)
+
+
 LOWER.update({
+    "shift_left": lambda expansion, params, x, k: expansion.map("mul", x, _powers_of_two(expansion, x, k)),
+    "shift_right_arithmetic": _shift_right,
     "divmod": _divide, "floor_divide": lambda *of: _divide(*of)[:1], "remainder": lambda *of: _divide(*of)[1:],
     "trunc": lambda expansion, params, x: [expansion.map("trunc", x)],
 })  # fmt: skip
 
 
-@lowers("atan")
-def _atan(expansion, params, x):
-    expansion.work(x.size)
-    expansion.traced_operations += x.size
-    return _ids([arctangent(expansion.graph, i) for i in x.ravel().tolist()], x.shape)
+def _inverse(rule):
+    """The rule of an inverse function, by what it is the inverse of: as it is written, for its derivatives too."""
+
+    def apply_rule(expansion, params, x):
+        expansion.work(x.size)
+        expansion.traced_operations += x.size
+        return _ids([rule(expansion.graph, i) for i in x.ravel().tolist()], x.shape)
+
+    return apply_rule
+
+
+LOWER.update(
+    {"atan": _inverse(arctangent)} | {op: _inverse(functools.partial(inverse, op=op)) for op in ("asin", "acos")}
+)
 
 
 @lowers("integer_pow")
@@ -748,5 +775,10 @@ def _cond(expansion, params, which, *operands):
     branches = params["branches"]
     if (value := expansion.graph.value(int(which))) is not None:
         return expansion.run_closed(branches[min(max(int(value), 0), len(branches) - 1)], operands)
-    results = [expansion.run_closed(branch, operands) for branch in branches]
+    results, last = [], len(branches) - 1
+    for k, branch in enumerate(branches):
+        comparison = "le" if k == 0 else "ge" if k == last else "eq"
+        bound = expansion.graph.constant(k, expansion.graph.kinds[int(which)])
+        with expansion.graph.branch(expansion.graph.apply(comparison, int(which), bound)):
+            results.append(expansion.run_closed(branch, operands))
     return [_choose(expansion, np.broadcast_to(which, cases[0].shape), cases) for cases in zip(*results, strict=True)]
