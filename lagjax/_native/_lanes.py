@@ -139,9 +139,10 @@ INTEGERS = {
     "mul": lambda code, a, b: a * b,
     "neg": lambda code, a: -a,
     "div": lambda code, a, b: code.intrinsic("trunc", a / b),
-    "not": lambda code, a: -1.0 - a, "and": _combine_bits("and_"), "or": _combine_bits("or_"), "xor": _combine_bits("xor"),
+    "not": lambda code, a: -1.0 - a,
+    **{op: _combine_bits(f"{op}_" if op != "xor" else op) for op in ("and", "or", "xor")},
     **{op: OPERATIONS[op].llvm for op in ("abs", "max", "min", "sign", "rem", "select")},
-}  # fmt: skip
+}
 
 
 def _check_range(code: Code, x: Value, kind: str) -> Value:

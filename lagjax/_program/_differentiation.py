@@ -101,8 +101,8 @@ class Derivatives:
             for x, rule in zip(operands, rules, strict=False):
                 if rule is not None and varied[x]:
                     part = rule(g)
-                    if taken[k] is not None and taken[x] != taken[k]:
-                        part = self._apply("select", nodes[taken[k]], self._number(0.0), part)
+                    if (branch := taken[k]) is not None and taken[x] != branch:
+                        part = self._apply("select", nodes[branch], self._number(0.0), part)
                     self._add(cotangents, same[x], part)
         return [results.get(i, self._number(0.0)) for i in by]
 

@@ -133,7 +133,8 @@ class Jump(NamedTuple):
             places.append(len(nodes))
             if op == "input" and attribute >= first + upper:
                 attribute -= upper
-            elif op == "eq" and of_upper[-1]:  # all that is read of them is whether a tangent is zero: it is not
+            # All that is read of them is whether a tangent is zero, or a number: taken for neither, it has every mask.
+            elif op in ("eq", "is_finite") and of_upper[-1]:
                 op, operands, attribute, of_upper[-1] = "constant", (), False, False
             elif op == "select" and (operands[1] == operands[2] or nodes[operands[0]] == ("constant", (), False)):
                 places[-1], of_upper[-1] = operands[1], of_upper[operands[1]]

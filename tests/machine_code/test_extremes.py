@@ -115,3 +115,19 @@ def test_rates_whose_powers_overflow_on_the_way():
         return lagjax.simulate(system, 0.0, 1.5 * length / time, jnp.array([0.0, 10 * time])).q[-1] / length
 
     np.testing.assert_allclose(end(1e-10, 1e-13), end(1.0, 1.0), rtol=1e-8)
+
+
+def test_slopes_over_borders_of_functions_of_exponentials():
+    """Behind a border, too, and in reverse: what masks an overflow there asks of values, not of tangents."""
+
+    def force(q, v, params):
+        beyond = jnp.where(q > 0.3, 1 / (1 + jnp.exp(5 * q)), -1.0 / jnp.cosh(params * q) ** 2)
+        return beyond - jnp.tanh(jnp.exp(q)) * jnp.floor(2 * q)
+
+    def end(x):
+        return lagjax.simulate(system, x[0], x[1], jnp.array([0.0, 3.0]), x[2]).q[-1]
+
+    system = lagjax.System(lambda q, v: 0.5 * v**2 - 0.1 * jnp.log(1 + jnp.exp(q)), forces=force)
+    x = jnp.array([-0.4, 1.3, 1.0])
+    differences = [(end(x + 1e-6 * e) - end(x - 1e-6 * e)) / 2e-6 for e in jnp.eye(3)]
+    np.testing.assert_allclose(jax.grad(end)(x), differences, rtol=1e-6)
