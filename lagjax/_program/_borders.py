@@ -33,7 +33,7 @@ from lagjax._program._kick import Jumping, Kick, Mechanics, kick_line
 from lagjax._program._look_ups import Located, Table
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._passes import eliminate_dead_code
-from lagjax._program._powers import find_powers
+from lagjax._program._powers import LEAST_POWER, find_powers
 from lagjax._program._rounding import rounding
 from lagjax._program._series import LinearSystem, Recurrent, StraightLine
 from lagjax._program._simplify import is_nonnegative
@@ -646,7 +646,10 @@ class _Rewriting:
         """aᵇ = exp(b log |a|), where b is no constant."""
         f = self.graph.apply
         log = self.graph.scale(0.5, f("log", f("mul", a, a))) if self._is_moving(a) else f("log", a)
-        self._note_feature(f("mul", log, b), BELOW, 1.0)
+        argument, zero, least = f("mul", log, b), self.graph.number(0.0), self.graph.number(LEAST_POWER)
+        if not self._is_moving(b):  # others are seen, as those that are constants, and there is no log at a = 0
+            argument = f("select", f("or", f("lt", b, zero), f("ge", b, least)), zero, argument)
+        self._note_feature(argument, BELOW, 1.0)
 
     # ---- the end ----
 

@@ -9,6 +9,8 @@ other operation is w = f(u) and follows from its slopes.
 import math
 from collections.abc import Callable
 
+_BITS = 3  # of whole exponents that are not known before a motion begins; larger ones are watched as features
+
 
 def add(r, i, operands, of):
     """wₖ = uₖ ± vₖ."""
@@ -48,6 +50,30 @@ def square_root(r, i, operands, of):
     """wₖ = (uₖ − Σ' wⱼ wₖ₋ⱼ) / 2 w₀."""
     half_inverse = r.value(finite(r.zeroth_order.apply, r.number, r.zeroth_order.apply("div", r.number(0.5), i)))
     return r.order_recursion.apply("mul", r.order_recursion.apply("sub", of[0], r.cauchy_product(i, i)), half_inverse)
+
+
+def raise_to_power(r, i, operands, of):
+    """wₖ of w = uᵛ by its slopes; where v is a whole number n below 8, of the product uⁿ, whose series begins at u = 0, too.
+
+    An exponent that is a number of the member is told at order zero. The product is multiplied with exp((v − n) log u),
+    which is 1 and varies with v.
+    """
+    (u, v), (_, moves) = operands, of
+    slow = r.apply_slopes(i, operands, of)
+    if moves is not None or r.zeroth_order.value(v) is not None:
+        return slow
+    f, number = r.zeroth_order.apply, r.number
+    zero, one, n = number(0.0), number(1.0), f("floor", v)
+    product, power, rest = one, u, n
+    for k in range(_BITS):
+        half = f("floor", f("mul", number(0.5), rest))
+        is_odd = f("gt", f("sub", rest, f("mul", number(2.0), half)), number(0.5))
+        product = f("mul", product, f("select", is_odd, one, power))
+        power, rest = f("mul", power, power) if k < _BITS - 1 else power, half
+    size = f("abs", f("select", f("eq", u, zero), u, one))
+    product = f("mul", product, f("exp", f("mul", f("sub", v, n), f("log", size))))
+    is_whole = f("and", f("eq", v, n), f("eq", rest, zero))
+    return choose(r, is_whole, slow, r.coefficient(product))
 
 
 def finite(f, c, slope):

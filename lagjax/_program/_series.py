@@ -201,9 +201,9 @@ class _Recurrences:
             return unknown[0]
         if rule := OPERATIONS[op].recurrence:
             return rule(self, i, operands, of)
-        return self._apply_slopes(i, operands, of) if OPERATIONS[op].slopes else _Unknown(op)
+        return self.apply_slopes(i, operands, of) if OPERATIONS[op].slopes else _Unknown(op)
 
-    def _apply_slopes(self, i, operands, of):
+    def apply_slopes(self, i, operands, of):
         """w = f(u, …) by its partial derivatives."""
         row = OPERATIONS[self.zeroth_order.nodes[i][0]]
         total, apply = None, self.order_recursion.apply
