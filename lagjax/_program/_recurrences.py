@@ -9,7 +9,8 @@ other operation is w = f(u) and follows from its slopes.
 import math
 from collections.abc import Callable
 
-_BITS = 3  # of whole exponents that are not known before a motion begins; larger ones are watched as features
+_BITS = 4  # of whole exponents that are not known before a motion begins
+LARGEST_WHOLE = 2**_BITS  # beyond which a power is watched by its logarithm, which has no series where the base is zero
 
 
 def add(r, i, operands, of):
@@ -39,10 +40,13 @@ def multiply(r, i, operands, of):
 def divide(r, i, operands, of):
     """wₖ = (uₖ − w₀ vₖ − Σ' wⱼ vₖ₋ⱼ) / v₀."""
     (_, v), (a, b), apply = operands, of, r.order_recursion.apply
-    inverse = r.value(r.zeroth_order.apply("div", r.number(1.0), v))
+    inverse, w = r.zeroth_order.apply("div", r.number(1.0), v), i
+    if i in r.steep:  # of which a number that is read but not taken has derivatives, too
+        inverse, w = (finite(r.zeroth_order.apply, r.number, x) for x in (inverse, w))
+    inverse = r.value(inverse)
     if b is None:
         return apply("mul", a, inverse)
-    taken = apply("add", apply("mul", r.value(i), b), r.cauchy_product(i, v))
+    taken = apply("add", apply("mul", r.value(w), b), r.cauchy_product(i, v))
     return apply("mul", apply("neg", taken) if a is None else apply("sub", a, taken), inverse)
 
 
@@ -53,7 +57,7 @@ def square_root(r, i, operands, of):
 
 
 def raise_to_power(r, i, operands, of):
-    """wₖ of w = uᵛ by its slopes; where v is a whole number n below 8, of the product uⁿ, whose series begins at u = 0, too.
+    """wₖ of w = uᵛ by its slopes, or of the product uⁿ where v is a whole number n below 16: that has a series at u = 0.
 
     An exponent that is a number of the member is told at order zero. The product is multiplied with exp((v − n) log u),
     which is 1 and varies with v.
