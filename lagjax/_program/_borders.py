@@ -33,7 +33,8 @@ from lagjax._program._kick import Jumping, Kick, Mechanics, kick_line
 from lagjax._program._look_ups import Located, Table
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._passes import eliminate_dead_code
-from lagjax._program._powers import find_powers
+from lagjax._program._powers import LEAST_POWER, find_powers
+from lagjax._program._recurrences import LARGEST_WHOLE
 from lagjax._program._rounding import rounding
 from lagjax._program._series import LinearSystem, Recurrent, StraightLine
 from lagjax._program._simplify import is_nonnegative
@@ -645,7 +646,14 @@ class _Rewriting:
     def _note_exponent(self, a: int, b: int) -> None:
         """aᵇ = exp(b log |a|), where b is no constant."""
         f = self.graph.apply
-        log = self.graph.scale(0.5, f("log", f("mul", a, a))) if self._is_moving(a) else f("log", a)
+        base = f("mul", a, a) if self._is_moving(a) else a
+        if not self._is_moving(b):  # then it is told as a constant would be: there is no log at a = 0
+            bounds = (0.0, LEAST_POWER, LARGEST_WHOLE)
+            falls, is_seen, grows = (f("lt", b, self.graph.number(bound)) for bound in bounds)
+            large = f("and", grows, f("not", is_seen))
+            self._note_feature(f("select", large, self._one, base), GROWS, LARGEST_WHOLE / 2)
+            base = f("select", f("or", falls, f("not", grows)), self._one, base)
+        log = self.graph.scale(0.5, f("log", base)) if self._is_moving(a) else f("log", base)
         self._note_feature(f("mul", log, b), BELOW, 1.0)
 
     # ---- the end ----

@@ -506,9 +506,19 @@ class _PlacedLine(Derivatives):
         """
         nodes, (op, operands, _) = self.line.nodes, self.line.nodes[k]
         by_root = op == "div" and (of := nodes[operands[1]][0]) not in ("input", "constant") and OPERATIONS[of].steep
-        if not (self.asks and (OPERATIONS[op].steep or by_root)):
+        if not (self.asks and (OPERATIONS[op].steep or by_root or (op == "div" and k in self._guarded))):
             return part
         return self._select_unless_zero(g, part)
+
+    @functools.cached_property
+    def _guarded(self) -> set[int]:
+        """The nodes of products and quotients that the line asks whether they are finite."""
+        guarded: set[int] = set()
+        for k in range(len(self.nodes) - 1, -1, -1):
+            op, operands, _ = self.line.nodes[k]
+            if op == "is_finite" or (k in guarded and op in ("mul", "div", "neg")):
+                guarded.update(operands)
+        return guarded
 
     def _select_unless_zero(self, number: int, part: int) -> int:
         """The part, but 0 in the place of NaN where the number is zero; where the part is finite it has derivatives."""

@@ -247,6 +247,7 @@ _ROWS = (
     ),
     Operation(
         "pow", 2, np.power, "pow", simplify=_simplify.raise_to_power, steep=True,
+        recurrence=_recurrences.raise_to_power,
         slopes=(
             lambda f, c, w, u, v: f("div", f("mul", v, w), u),
             lambda f, c, w, u, v: f("mul", w, f("log", u)),

@@ -9,6 +9,9 @@ other operation is w = f(u) and follows from its slopes.
 import math
 from collections.abc import Callable
 
+_BITS = 4  # of whole exponents that are not known before a motion begins
+LARGEST_WHOLE = 2**_BITS  # beyond which a power is watched by its logarithm, which has no series where the base is zero
+
 
 def add(r, i, operands, of):
     """wₖ = uₖ ± vₖ."""
@@ -37,10 +40,13 @@ def multiply(r, i, operands, of):
 def divide(r, i, operands, of):
     """wₖ = (uₖ − w₀ vₖ − Σ' wⱼ vₖ₋ⱼ) / v₀."""
     (_, v), (a, b), apply = operands, of, r.order_recursion.apply
-    inverse = r.value(r.zeroth_order.apply("div", r.number(1.0), v))
+    inverse, w = r.zeroth_order.apply("div", r.number(1.0), v), i
+    if i in r.steep:  # of which a number that is read but not taken has derivatives, too
+        inverse, w = (finite(r.zeroth_order.apply, r.number, x) for x in (inverse, w))
+    inverse = r.value(inverse)
     if b is None:
         return apply("mul", a, inverse)
-    taken = apply("add", apply("mul", r.value(i), b), r.cauchy_product(i, v))
+    taken = apply("add", apply("mul", r.value(w), b), r.cauchy_product(i, v))
     return apply("mul", apply("neg", taken) if a is None else apply("sub", a, taken), inverse)
 
 
@@ -48,6 +54,30 @@ def square_root(r, i, operands, of):
     """wₖ = (uₖ − Σ' wⱼ wₖ₋ⱼ) / 2 w₀."""
     half_inverse = r.value(finite(r.zeroth_order.apply, r.number, r.zeroth_order.apply("div", r.number(0.5), i)))
     return r.order_recursion.apply("mul", r.order_recursion.apply("sub", of[0], r.cauchy_product(i, i)), half_inverse)
+
+
+def raise_to_power(r, i, operands, of):
+    """wₖ of w = uᵛ by its slopes, or of the product uⁿ where v is a whole number n below 16: that has a series at u = 0.
+
+    An exponent that is a number of the member is told at order zero. The product is multiplied with exp((v − n) log u),
+    which is 1 and varies with v.
+    """
+    (u, v), (_, moves) = operands, of
+    slow = r.apply_slopes(i, operands, of)
+    if moves is not None or r.zeroth_order.value(v) is not None:
+        return slow
+    f, number = r.zeroth_order.apply, r.number
+    zero, one, n = number(0.0), number(1.0), f("floor", v)
+    product, power, rest = one, u, n
+    for k in range(_BITS):
+        half = f("floor", f("mul", number(0.5), rest))
+        is_odd = f("gt", f("sub", rest, f("mul", number(2.0), half)), number(0.5))
+        product = f("mul", product, f("select", is_odd, one, power))
+        power, rest = f("mul", power, power) if k < _BITS - 1 else power, half
+    size = f("abs", f("select", f("eq", u, zero), u, one))
+    product = f("mul", product, f("exp", f("mul", f("sub", v, n), f("log", size))))
+    is_whole = f("and", f("eq", v, n), f("eq", rest, zero))
+    return choose(r, is_whole, slow, r.coefficient(product))
 
 
 def finite(f, c, slope):

@@ -119,6 +119,7 @@ class _Recurrences:
         self._given: dict[tuple, int] = {}  # what else is read: ("value", node) or ("product", row, row)
         self._rows: dict[tuple[int | _Component, bool], int] = {}
         self._coefficients: dict[int, int | _Unknown | None] = {}  # None: constant along the motion
+        self.steep: set[int] = set()  # slopes that may be infinite where the function itself is not
         # Of an elimination no coefficient is needed: it is most of a large program.
         linear = program.linear
         self._find((linear and linear.read) or self.outputs[:size])
@@ -201,9 +202,9 @@ class _Recurrences:
             return unknown[0]
         if rule := OPERATIONS[op].recurrence:
             return rule(self, i, operands, of)
-        return self._apply_slopes(i, operands, of) if OPERATIONS[op].slopes else _Unknown(op)
+        return self.apply_slopes(i, operands, of) if OPERATIONS[op].slopes else _Unknown(op)
 
-    def _apply_slopes(self, i, operands, of):
+    def apply_slopes(self, i, operands, of):
         """w = f(u, …) by its partial derivatives."""
         row = OPERATIONS[self.zeroth_order.nodes[i][0]]
         total, apply = None, self.order_recursion.apply
@@ -214,6 +215,7 @@ class _Recurrences:
             inner = self.zeroth_order.operand_of("neg", g)
             sign, g = ("sub", inner) if inner is not None else ("add", g)
             if row.steep:
+                self.steep.add(g)
                 g = finite(self.zeroth_order.apply, self.number, g)
             term = apply("mul", c, self.value(g))
             if self.zeroth_order.value(g) is None:
