@@ -152,7 +152,9 @@ def _compute_known(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
     if all(equation.primitive.name in _ALIKE for equation in equations):
         return closed
     made = [x for equation in equations for x in equation.outvars]
-    compute = core.jaxpr_as_fun(core.ClosedJaxpr(core.Jaxpr((), jaxpr.constvars, made, equations), ()))
+    names = jaxpr.debug_info.with_unknown_names()
+    part = jaxpr.replace(constvars=(), invars=jaxpr.constvars, outvars=made, eqns=equations, debug_info=names)
+    compute = core.jaxpr_as_fun(core.ClosedJaxpr(part, ()))
     constants = [*closed.consts, *jax.jit(compute)(*closed.consts)]
     return core.ClosedJaxpr(jaxpr.replace(constvars=[*jaxpr.constvars, *made], eqns=others), constants)
 
