@@ -119,10 +119,6 @@ def _calls_in_rounds(x, given):
     return jax.lax.scan(body, x, jnp.arange(2))[0] * x
 
 
-def _while(x, given):
-    return jax.lax.fori_loop(0, given.params["shift"], lambda _, y: 0.5 * jnp.roll(y, 1), x) * x
-
-
 _FORMS: dict[str, Callable] = {
     "gather": lambda x, g: x[g.index] * x,
     "take": lambda x, g: jnp.take(x, g.index) * x,
@@ -149,7 +145,6 @@ _FORMS: dict[str, Callable] = {
     "small matrix": lambda x, g: (x.reshape(-1, BLOCK) @ np.cos(np.arange(BLOCK * BLOCK)).reshape(BLOCK, -1)) ** 2,
     "scan": _rounds,
     "jits in a scan": _calls_in_rounds,
-    "loop by params": _while,
     "cond": lambda x, g: jax.lax.cond(g.t > 0.2, lambda y: y * jnp.roll(y, 1), lambda y: y * jnp.roll(y, 4), x),
     "switch": lambda x, g: jax.lax.switch(g.params["shift"] % 2, [lambda y: y * y[::-1], lambda y: y**2], x),
     "sort": lambda x, g: jnp.sort(x.reshape(-1, BLOCK), axis=1)[:, 0] ** 2,

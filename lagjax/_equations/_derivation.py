@@ -30,7 +30,7 @@ from lagjax._equations._motion import Motion
 from lagjax._equations._patterns import gradient_memory, jacobian_pattern
 from lagjax._equations._quantities import OwnRules, quantities
 from lagjax._equations._recursion import Recursion, RecursiveElimination
-from lagjax._equations._sparse import MatrixFree
+from lagjax._equations._sparse import MOST_COLORS, MatrixFree
 from lagjax._equations._structure import LARGEST_LOWERED, LEAST_COORDINATES, SparseMotion, SparseStructure, structure_of
 from lagjax._interface import Layout, dtype_of, is_concrete
 from lagjax._native import Projection
@@ -157,13 +157,17 @@ class Derivation:
         structure = structure_of(motion, self.state_shapes, insists)
         if structure is None or insists or structure.operations > LARGEST_LOWERED:
             return structure
-        if isinstance(structure.mass, MatrixFree):  # where scalars do not tell the pattern either
-            try:
-                self.acceleration  # noqa: B018
-            except Unlowerable:
-                return structure
-            return None
+        if isinstance(structure.mass, MatrixFree):
+            return structure if structure.mass.known or not self._is_sparse_in_scalars else None
         return None if pieces_of_motion(motion, *self.state_shapes) else structure  # steps end at borders there alone
+
+    @property
+    def _is_sparse_in_scalars(self) -> bool:
+        """True if the scene has scalar programs, and a mass matrix of few entries there."""
+        try:
+            return bool((~self.absent("mass_matrix")).sum(axis=1).max() <= MOST_COLORS)
+        except Unlowerable:
+            return False
 
     @functools.cached_property
     def lowered(self) -> "Derivation":
