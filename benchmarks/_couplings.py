@@ -222,6 +222,9 @@ class CoupledScene(NamedTuple):
         link = lambda q, t: constraints(q, t, params)
         rate = lambda s: jax.jvp(lambda s: along(link, s), (s,), (one,))[1]
         bend = jax.jvp(rate, (zero,), (one,))[1]
-        pulled, pushed = jax.vjp(lambda q: link(q, t), q)[1](multipliers)[0], jax.jvp(lambda q: link(q, t), (q,), (acceleration,))[1]
+        pulled, pushed = (
+            jax.vjp(lambda q: link(q, t), q)[1](multipliers)[0],
+            jax.jvp(lambda q: link(q, t), (q,), (acceleration,))[1],
+        )
         by_forces = abs(missed - pulled).max() / max(abs(term).max() for term in [*terms, pulled])
         return float(max(by_forces, abs(pushed + bend).max() / max(abs(pushed).max(), abs(bend).max(), 1e-3)))
