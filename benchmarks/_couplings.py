@@ -1,9 +1,9 @@
 """Random couplings of large scenes, written as users write them: gathers, masks, sums over segments, loops, calls.
 
-Each is a term of a kinetic energy, or a constraint on pairs of coordinates, and reads (x, q, t, params): numbers x (n,)
-that are coupled, and params, a dict of `index` (n,) whole numbers, `weight` (n,) and `shift`, one whole number. Where an
-index comes from is drawn as well: it is known, or made by arithmetic of whole numbers, or is that of params, of t, or
-of the order of q.
+Each is a term of a kinetic energy, or a constraint on pairs of coordinates. It reads (x, q, t, params): numbers x (n,)
+that are coupled, and params, a dict of `index` (n,) whole numbers, `weight` (n,) and `shift`, one whole number. Where
+an index comes from is drawn as well: it is known, or made by arithmetic of whole numbers, or is that of params, of t,
+or of the order of q.
 """
 
 from collections.abc import Callable
@@ -165,7 +165,7 @@ _FORMS: dict[str, Callable] = {
 
 
 class CoupledScene(NamedTuple):
-    """n coordinates with coupled masses, and constraints where it is `constrained`; `functions` L and f of the state."""
+    """n coordinates with coupled masses, and constraints in some; `functions` L and f of the state."""
 
     n: int
     path: str
@@ -219,12 +219,15 @@ class CoupledScene(NamedTuple):
         terms, missed = [product, drift, force := jax.grad(lagrangian)(q, v, t, params)], product + drift - force
         if constraints is None:
             return float(abs(missed).max() / max(abs(term).max() for term in terms))
-        link = lambda q, t: constraints(q, t, params)
-        rate = lambda s: jax.jvp(lambda s: along(link, s), (s,), (one,))[1]
+
+        def link(q, t):
+            return constraints(q, t, params)
+
+        def rate(s):
+            return jax.jvp(lambda s: along(link, s), (s,), (one,))[1]
+
         bend = jax.jvp(rate, (zero,), (one,))[1]
-        pulled, pushed = (
-            jax.vjp(lambda q: link(q, t), q)[1](multipliers)[0],
-            jax.jvp(lambda q: link(q, t), (q,), (acceleration,))[1],
-        )
+        pulled = jax.vjp(lambda q: link(q, t), q)[1](multipliers)[0]
+        pushed = jax.jvp(lambda q: link(q, t), (q,), (acceleration,))[1]
         by_forces = abs(missed - pulled).max() / max(abs(term).max() for term in [*terms, pulled])
         return float(max(by_forces, abs(pushed + bend).max() / max(abs(pushed).max(), abs(bend).max(), 1e-3)))

@@ -70,7 +70,7 @@ def jacobian_pattern(function: Callable, shapes: tuple, by: int) -> csr_array | 
 
 
 def _reads_all(pattern: csr_array, function: Callable, leaves: list, by: int) -> bool:
-    """True if products with ∂f/∂x as this pattern reads it off are derivatives of f, at two states of random numbers."""
+    """True if products with ∂f/∂x as this pattern reads it off are derivatives of f, at two random states."""
     # Rows that are full are read off by products from the left.
     full = bool(np.diff(pattern.indptr).max(initial=0) > _MOST_TESTED)
     pattern = csr_array(pattern.T) if full else pattern
