@@ -2,17 +2,24 @@
 
     python -m benchmarks.lattice_population --scenes 100
     python -m benchmarks.lattice_population --scenes 100 --float32
+    python -m benchmarks.lattice_population --couplings --scenes 300    # benchmarks/results/couplings.json
 
 A lattice has one or two dimensions, is periodic or has free ends, and has springs with a quadratic and a quartic term
 and an on-site potential of φ⁴ or sine-Gordon. One mass may be a thousand times the others, one spring be cut, the mass
 matrix is lumped (diagonal) or consistent (of linear elements along the rows: tridiagonal), a part may have masses that
 depend on their place, drag and drive. The reference is SciPy's DOP853 at 1e-12 with derivatives by hand. An end is
 *wrong* where it is off by more than 1000 tolerances times the growth of a small error of the start.
+
+`--couplings`: accelerations of random couplings (`_couplings`), in masses and in constraints, put into the equations of
+motion by products of derivatives alone: *wrong* where these are missed by more than 1e-8 of their terms.
 """
 
 import argparse
 import collections
+import signal
 import sys
+import time
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -23,6 +30,11 @@ from scipy.sparse import csc_array
 from scipy.sparse.linalg import splu
 
 import lagjax
+from benchmarks import _report
+from benchmarks._couplings import CoupledScene
+
+STORE = Path(__file__).parent / "results" / "couplings.json"
+LONGEST = 120  # seconds that a coupling may take
 
 T, RTOL, SLACK = 2.0, 1e-9, 1e3
 
@@ -154,14 +166,63 @@ def judge(lattice: Lattice, seed: int, dtype) -> tuple[str, float]:
     return "right" if error <= SLACK else "WRONG", error
 
 
+def judge_coupling(seed: int) -> dict:
+    """The row of a coupling: "right", "wrong", "undetermined", "hangs", or the error that it raised."""
+    rng = np.random.default_rng((7, seed))
+    scene = CoupledScene.draw(rng)
+    state, start = scene.state(rng), time.process_time()
+    system = lagjax.System(scene.functions[0], constraints=scene.functions[1], path=scene.path)
+    row = {"seed": seed, "n": scene.n, "path": scene.path, "terms": list(scene.names)}
+    signal.alarm(LONGEST)
+    try:
+        multipliers = None if scene.functions[1] is None else system.multipliers(*state)
+        acceleration = system.acceleration(*state)
+        missed = scene.missing(acceleration, multipliers, state)
+        row |= {"verdict": "undetermined" if np.isnan(missed) else "right" if missed < 1e-8 else "WRONG", "by": missed}
+    except _TooLong:
+        row["verdict"] = "hangs"
+    except Exception as error:  # a sentence or a raw one: who reads the row tells
+        row |= {"verdict": type(error).__name__, "says": str(error)[:300]}
+    finally:
+        signal.alarm(0)
+    return row | {"seconds": round(time.process_time() - start, 2)}
+
+
+class _TooLong(Exception):
+    pass
+
+
+def judge_couplings(seeds: range) -> int:
+    """Print and store the verdicts; the exit status says whether any acceleration is not right."""
+
+    def stop(*_):
+        raise _TooLong
+
+    signal.signal(signal.SIGALRM, stop)
+    rows = {row["seed"]: row for row in _report.read_json(STORE).get("couplings", {}).get("rows", [])}
+    for seed in seeds:
+        rows[seed] = row = judge_coupling(seed)
+        if row["verdict"] != "right":
+            print(row, flush=True)
+        record = {"circumstances": _report.circumstances(), "rows": [rows[k] for k in sorted(rows)]}
+        _report.write_json(STORE, {"couplings": record})  # a long run may be interrupted
+        jax.clear_caches()
+    counts = collections.Counter(rows[seed]["verdict"] for seed in seeds)
+    print(dict(counts), f"longest {max(rows[seed]['seconds'] for seed in seeds):.1f} s")
+    return set(counts) != {"right"}
+
+
 def main() -> int:
     """Print the verdicts by kind; the exit status says whether any motion is wrong."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--scenes", type=int, default=100)
-    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--seed", type=int, default=0, help="of lattices, or the first of couplings")
+    parser.add_argument("--couplings", action="store_true")
     parser.add_argument("--float32", action="store_true", help="states in float32, without the x64 switch")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", not options.float32)
+    if options.couplings:
+        return judge_couplings(range(options.seed, options.seed + options.scenes))
     verdicts, errors = collections.Counter(), []
     for k in range(options.scenes):
         lattice = Lattice.draw(np.random.default_rng((options.seed, k)))

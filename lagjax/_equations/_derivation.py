@@ -30,6 +30,7 @@ from lagjax._equations._motion import Motion
 from lagjax._equations._patterns import gradient_memory, jacobian_pattern
 from lagjax._equations._quantities import OwnRules, quantities
 from lagjax._equations._recursion import Recursion, RecursiveElimination
+from lagjax._equations._sparse import MOST_COLORS, MatrixFree
 from lagjax._equations._structure import LARGEST_LOWERED, LEAST_COORDINATES, SparseMotion, SparseStructure, structure_of
 from lagjax._interface import Layout, dtype_of, is_concrete
 from lagjax._native import Projection
@@ -136,10 +137,7 @@ class Derivation:
                 f"The gradient of this L, of {layout.size} coordinates, {lack}: sum over fewer terms (neighbours, a "
                 "cut-off), or over parts of them by jax.lax.map with jax.checkpoint."
             )
-        self.structure = None if path == "scalar" else self._structure_of(motion, path == "array")
-        if self.structure is not None:
-            self.motion = SparseMotion(*vars(motion).values(), structure=self.structure)
-            self.refusal = f"it has {layout.size} coordinates, {self.structure}, and arrays suit that better"
+        self.structure = None
         self._made: dict[str, Any] = {}
         self._lock = threading.RLock()
         self._programs: dict[tuple[str, ...], Program] = {}
@@ -149,12 +147,27 @@ class Derivation:
         self.has_rules = False  # of its own for derivatives, in a function; known once the quantities are
         # Compiled functions are traced once for each of their derivatives, and all quantities share these.
         self._traced_once: Motion = jax.tree.map(jax.jit, motion)
+        self.structure = None if path == "scalar" else self._structure_of(motion, path == "array")
+        if self.structure is not None:
+            self._made.clear()
+            self.motion = SparseMotion(*vars(motion).values(), structure=self.structure)
+            self.refusal = f"it has {layout.size} coordinates, {self.structure}, and arrays suit that better"
 
     def _structure_of(self, motion: Motion, insists: bool) -> SparseStructure | None:
         structure = structure_of(motion, self.state_shapes, insists)
         if structure is None or insists or structure.operations > LARGEST_LOWERED:
             return structure
+        if isinstance(structure.mass, MatrixFree):
+            return structure if structure.mass.known or not self._is_sparse_in_scalars else None
         return None if pieces_of_motion(motion, *self.state_shapes) else structure  # steps end at borders there alone
+
+    @property
+    def _is_sparse_in_scalars(self) -> bool:
+        """True if the scene has scalar programs, and a mass matrix of few entries there."""
+        try:
+            return bool((~self.absent("mass_matrix")).sum(axis=1).max() <= MOST_COLORS)
+        except Unlowerable:
+            return False
 
     @functools.cached_property
     def lowered(self) -> "Derivation":

@@ -2,9 +2,15 @@
 
 asdex walks through the operations of a function and follows of which inputs each number is made (Hill, Dalle,
 Montoison, *An Illustrated Guide to Automatic Sparse Differentiation*, 2025). It comes with numba and is imported for
-large scenes alone. A pattern may hold entries that are zero, never lack one that is not.
+large scenes alone. A pattern may hold entries that are zero, and must never lack one that is not.
+
+What asdex is given is written out first: it knows constants by the variables of a jaxpr, and two calls of one compiled
+function share theirs; and it computes whole numbers as NumPy does, not as XLA. What it gives is believed where products
+with the matrix that is read off by it are those of the derivatives (`_reads_all`).
 """
 
+import functools
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any
@@ -14,6 +20,7 @@ import numpy as np
 from jax.extend import core
 from scipy.sparse import csr_array
 
+from lagjax._interface import compile_for_one_call
 from lagjax._program import lack_of_memory
 
 PyTree = Any
@@ -21,6 +28,17 @@ PyTree = Any
 # Entries that asdex visits one by one in Python, at some 10 µs each, to follow a product of matrices. Doubled, a
 # pattern takes up to 4 s.
 _VISITED = 200_000
+# Calls of which the operations are written out in the place of the call, by the name of what is called in it.
+_CALLS = {name: "jaxpr" for name in ("jit", "pjit", "checkpoint", "remat", "remat2", "closed_call")}
+_CALLS |= {name: "call_jaxpr" for name in ("core_call", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr")}
+# Operations on known numbers that NumPy computes as XLA does, so that asdex may; with any others XLA computes them all.
+_ALIKE = {"iota", "broadcast_in_dim", "reshape", "squeeze", "transpose", "slice", "concatenate", "convert_element_type"}
+_ALIKE |= {"add", "sub", "mul", "neg", "lt", "le", "gt", "ge", "eq", "ne", "select_n", "copy", "stop_gradient"}
+# What products with a matrix that is read off may differ from the derivative, in sizes of their terms times `eps`:
+# rounding of the operations of L, some ten. A coupling of so small a part of its row is taken for none.
+_ROUNDING = 1e3
+# Products up to which a pattern is tested. No form is solved by rows and columns that are fuller (`_sparse`).
+_MOST_TESTED = 64
 # Operations of which each number depends on all others of a row.
 _READS_ALL = "cumsum", "cumprod", "cummax", "cummin", "cumlogsumexp", "fft"
 # Products that read off a sparse matrix, some 0.2 ms each at 10⁴ coordinates. More is a matrix that is dense in places.
@@ -38,14 +56,107 @@ def jacobian_pattern(function: Callable, shapes: tuple, by: int) -> csr_array | 
     def flat(*leaves):
         return function(*jax.tree.unflatten(structure, leaves))
 
-    try:
-        if _visited(jax.make_jaxpr(flat)(*leaves).jaxpr) > _VISITED:
-            return None
-        pattern = asdex.jacobian_sparsity(flat, *leaves, argnums=by)
-    except (NotImplementedError, jax.errors.TracerArrayConversionError):  # constants that are being traced
+    closed = jax.make_jaxpr(flat)(*leaves)
+    if _visited(closed.jaxpr) > _VISITED:
         return None
-    entries = np.ones(len(pattern.rows), bool), (np.asarray(pattern.rows), np.asarray(pattern.cols))
-    return csr_array(entries, shape=pattern.shape)
+    try:
+        found = asdex.jacobian_sparsity(core.jaxpr_as_fun(_write_out(closed)), *leaves, argnums=by)
+        entries = np.ones(len(found.rows), bool), (np.asarray(found.rows), np.asarray(found.cols))
+        pattern = csr_array(entries, shape=found.shape)
+        with jax.ensure_compile_time_eval():
+            return pattern if _reads_all(pattern, flat, leaves, by) else None
+    except Exception:  # of many kinds, as are the operations that it does not know
+        return None
+
+
+def _reads_all(pattern: csr_array, function: Callable, leaves: list, by: int) -> bool:
+    """True if products with ∂f/∂x as this pattern reads it off are derivatives of f, at two random states."""
+    # Rows that are full are read off by products from the left.
+    full = bool(np.diff(pattern.indptr).max(initial=0) > _MOST_TESTED)
+    pattern = csr_array(pattern.T) if full else pattern
+    colors = color_columns(pattern)
+    if (count := int(colors.max(initial=0)) + 1) > _MOST_TESTED:
+        return True
+    entries, rng, dtype = pattern.tocoo(), np.random.default_rng(0), leaves[by].dtype
+    factors = rng.uniform(0.5, 1.5, colors.size).astype(dtype)
+    seeds = np.concatenate([(colors == np.arange(count)[:, None]).astype(dtype), factors[None]])
+
+    @compile_for_one_call
+    def multiply(leaves, seeds):
+        def inside(x):
+            return function(*leaves[:by], x, *leaves[by + 1 :])
+
+        product = (lambda y: jax.vjp(inside, leaves[by])[1](y)[0]) if full else jax.linearize(inside, leaves[by])[1]
+        return jax.lax.map(product, seeds, batch_size=16)
+
+    def differs(low: float, whole: int) -> bool:
+        *products, exact = np.asarray(multiply([_draw(rng, x, low, whole) for x in leaves], seeds), float)
+        values = np.reshape(products, (count, -1))[colors[entries.col], entries.row]
+        return bool(differing_rows(values, entries.row, factors[entries.col], exact, dtype).any())
+
+    return not (differs(0.3, colors.size) or differs(-1.2, 2))
+
+
+def _draw(rng: np.random.Generator, like: np.ndarray, low: float, whole: int) -> np.ndarray:
+    """Random numbers of a shape and dtype: whole ones below `whole`, others of order one from `low`."""
+    if np.issubdtype(like.dtype, np.inexact):
+        return rng.uniform(low, 1.2, like.shape).astype(like.dtype)
+    most = 2 if like.dtype == bool else np.iinfo(like.dtype).max
+    return rng.integers(0, min(whole, most), like.shape).astype(like.dtype)
+
+
+def differing_rows(values, rows, factors, exact, dtype) -> np.ndarray:
+    """True for each row whose sum of `values` times `factors` is not the product that is `exact`, as far as finite."""
+    terms, count = np.asarray(values, float) * factors, len(exact)
+    sums, sizes = (np.bincount(rows, x, count) for x in (terms, np.abs(terms)))
+    sizes = np.where(sizes > 0, sizes, sizes.max(initial=0, where=np.isfinite(sizes)))
+    return np.abs(exact - sums) > _ROUNDING * np.finfo(dtype).eps * sizes
+
+
+def _write_out(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
+    """The same function without calls, every body of a loop its own, and with the numbers that are known."""
+    return _compute_known(jax.make_jaxpr(lambda *x: _run(closed.jaxpr, closed.consts, x))(*closed.in_avals))
+
+
+def _run(jaxpr, constants, arguments) -> list:
+    values = dict(zip((*jaxpr.constvars, *jaxpr.invars), (*constants, *arguments), strict=True))
+
+    def read(x):
+        return x.val if isinstance(x, core.Literal) else values[x]
+
+    for equation in jaxpr.eqns:
+        given, name, params = list(map(read, equation.invars)), equation.primitive.name, equation.params
+        if name in _CALLS:
+            inner = params[_CALLS[name]]
+            found = _run(*((inner.jaxpr, inner.consts) if hasattr(inner, "consts") else (inner, ())), given)
+        else:
+            if name in ("scan", "while", "cond"):
+                params = jax.tree.map(_own, params, is_leaf=lambda x: isinstance(x, core.ClosedJaxpr))
+            found = equation.primitive.bind(*given, **params)
+            found = found if equation.primitive.multiple_results else [found]
+        values.update(zip(equation.outvars, found, strict=True))
+    return list(map(read, jaxpr.outvars))
+
+
+def _own(x):
+    return _write_out(x) if isinstance(x, core.ClosedJaxpr) else x
+
+
+def _compute_known(closed: core.ClosedJaxpr) -> core.ClosedJaxpr:
+    """The same function, its known numbers computed by XLA where NumPy would not do as well."""
+    jaxpr, known, equations, others = closed.jaxpr, set(closed.jaxpr.constvars), [], []
+    for equation in jaxpr.eqns:
+        is_known = not equation.effects and all(isinstance(x, core.Literal) or x in known for x in equation.invars)
+        (equations if is_known else others).append(equation)
+        known.update(equation.outvars if is_known else ())
+    if all(equation.primitive.name in _ALIKE for equation in equations):
+        return closed
+    made = [x for equation in equations for x in equation.outvars]
+    names = jaxpr.debug_info.with_unknown_names()
+    part = jaxpr.replace(constvars=(), invars=jaxpr.constvars, outvars=made, eqns=equations, debug_info=names)
+    compute = core.jaxpr_as_fun(core.ClosedJaxpr(part, ()))
+    constants = [*closed.consts, *jax.jit(compute)(*closed.consts)]
+    return core.ClosedJaxpr(jaxpr.replace(constvars=[*jaxpr.constvars, *made], eqns=others), constants)
 
 
 def gradient_memory(function: Callable, shapes: tuple) -> int:
@@ -81,14 +192,24 @@ def sparse_jacobian(function: Callable, shapes: tuple) -> Callable[..., csr_arra
         return None
     shape, entries = pattern.shape, pattern.tocoo()
     rows, columns = entries.row, entries.col
+    factors = np.random.default_rng(0).uniform(0.5, 1.5, shape[1])
 
     @jax.jit
     def read(x, *others):
         _, multiply = jax.linearize(lambda x: function(x, *others), x)
         products = jax.lax.map(lambda k: multiply((colors == k).astype(x.dtype)), np.arange(count), batch_size=16)
-        return products[colors[columns], rows]
+        return products[colors[columns], rows], multiply(factors.astype(x.dtype))
 
-    return lambda *arguments: csr_array((np.asarray(read(*arguments)), (rows, columns)), shape=shape)
+    def jacobian(x, *others) -> csr_array:
+        values, exact = map(np.asarray, read(x, *others))
+        if differing_rows(values, rows, factors[columns], exact, x.dtype).any():
+            raise ValueError(
+                "The derivatives of the forces or constraints at this state hold entries that were not found among "
+                'the operations of the scene: give System(..., path="scalar"), which derives them one by one.'
+            )
+        return csr_array((values, (rows, columns)), shape=shape)
+
+    return jacobian
 
 
 def count_operations(jaxpr) -> int:
@@ -118,7 +239,13 @@ def _visited(jaxpr) -> int:
 
 def color_columns(pattern: csr_array) -> np.ndarray:
     """A colour for each column of a pattern: columns of one colour share no row (Curtis, Powell & Reid 1974)."""
-    import asdex
-
-    entries, m, n = pattern.tocoo(), len(pattern.indptr) - 1, int(pattern.indices.max(initial=-1)) + 1
-    return np.asarray(asdex.color_cols(asdex.SparsityPattern.from_coo(entries.row, entries.col, (m, n)))[0])
+    # The first that is free in all rows of the column; those taken in a row are the bits of a whole number.
+    columns, taken, colors = pattern.tocsc(), [0] * (len(pattern.indptr) - 1), []
+    rows, ends = columns.indices.tolist(), columns.indptr.tolist()
+    for start, end in itertools.pairwise(ends):
+        here = functools.reduce(int.__or__, [taken[i] for i in rows[start:end]], 0)
+        free = ~here & (here + 1)
+        for i in rows[start:end]:
+            taken[i] |= free
+        colors.append(free.bit_length() - 1)
+    return np.array(colors, int)

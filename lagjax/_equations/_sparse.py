@@ -239,7 +239,11 @@ class MatrixFree(MatrixForm):
 
     iterative = True
     size: int
-    name = "dense, or of an unknown pattern"
+    known: bool = False  # to be dense
+
+    @property
+    def name(self) -> str:  # pyright: ignore[reportIncompatibleVariableOverride]
+        return "dense" if self.known else "of a pattern that its operations do not tell"
 
     def prepare(self, multiply, dtype, dependent=False):
         return Solver(lambda b: conjugate_gradients(multiply, b), jnp.array(False), jnp.array(self.size))
@@ -286,5 +290,5 @@ def form_of(pattern: csr_array | None, size: int) -> MatrixForm:
     if width <= WIDEST_BAND:
         return Band(pattern, order, width)
     if np.diff(pattern.indptr).max() > MOST_COLORS:
-        return MatrixFree(size)
+        return MatrixFree(size, known=True)
     return Sparse(pattern, color_columns(pattern))

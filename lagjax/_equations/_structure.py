@@ -63,7 +63,7 @@ def structure_of(motion: Motion, shapes: tuple, insists: bool = False) -> Sparse
     if not insists and not (operations >= LEAST_OPERATIONS or (motion.constrained and n >= LEAST_LINKED)):
         return None
     mass = form_of(jacobian_pattern(jax.grad(motion.lagrangian, argnums=1), shapes, by=1), n)
-    if isinstance(mass, MatrixFree) and (n <= LARGEST_DENSE or not insists):
+    if isinstance(mass, MatrixFree) and n <= (LARGEST_DENSE if insists else 2 * LARGEST_DENSE):
         return None
     if not motion.constrained:
         return SparseStructure(operations, mass, None, None)

@@ -7,6 +7,7 @@ import pytest
 
 import lagjax
 from lagjax._equations import derivation_of
+from lagjax._equations._patterns import jacobian_pattern
 from lagjax._equations._sparse import Band, Blocks, Diagonal, MatrixFree, Sparse
 from lagjax._interface import Layout
 
@@ -217,3 +218,78 @@ def test_a_coordinate_without_any_energy_makes_a_sparse_mass_singular():
     structure = derivation_of(system, Layout.from_state(q, v), None).structure
     assert isinstance(structure.mass, Sparse)
     assert np.isnan(system.acceleration(q, v)).all()
+
+
+# ---- patterns that must not be believed ------------------------------------------------------------------------------
+
+
+@jax.jit
+def pick(x, index):
+    return x[index]
+
+
+def known_and_given(q, v, params):  # two calls of one compiled function share the variables of its operations
+    return pick(v, np.roll(np.arange(N), 1)) * v + 2 * pick(v, params) * v
+
+
+def in_rounds(q, v, params):
+    def body(y, k):
+        return y + 0.1 * pick(y, np.arange(4)).sum() + 0.1 * pick(y, params[:4] + 0 * k).sum(), None
+
+    return jax.lax.scan(body, v, jnp.arange(2))[0] * v
+
+
+COUPLINGS = {
+    "two calls": known_and_given,
+    "in a loop": in_rounds,
+    "whole quotients": lambda q, v, params: v[2 * jax.lax.div(jnp.arange(N), 2)] * v,
+    "whole remainders": lambda q, v, params: v[50 + jax.lax.rem(jnp.arange(N) - 50, 10)] * v,
+    "by the order of q": lambda q, v, params: jnp.take(v, jnp.arange(N) // 2) * v + jnp.take(v, jnp.argsort(q)) * v,
+    "sorted": lambda q, v, params: jnp.sort(v.reshape(-1, 4), axis=1)[:, 0] ** 2,
+    "convolved with itself": lambda q, v, params: jnp.convolve(v, v[:3], mode="same"),
+}
+
+
+@pytest.mark.parametrize("name", ["two calls", "whole quotients"])
+def test_the_pattern_of_a_coupling_holds_all_of_its_entries(name):
+    """Eagerly by `jax.hessian`; nothing of the scene is compiled but its pattern and two products."""
+    q, v, params = jnp.cos(jnp.arange(1.0, N + 1)), jnp.sin(jnp.arange(N) * 0.7), jnp.roll(jnp.arange(N), 5)
+
+    def kinetic(q, v, t, params):
+        return 2.0 * jnp.sum(v**2) + 0.1 * jnp.sum(COUPLINGS[name](q, v, params))
+
+    pattern = jacobian_pattern(jax.grad(kinetic, argnums=1), (q, v, jnp.zeros(()), params), by=1)
+    matrix = np.asarray(jax.hessian(kinetic, argnums=1)(q, v, 0.0, params))
+    assert ((matrix == 0) | pattern.toarray()).all()
+    assert pattern.nnz == (N * N if name == "two calls" else 2 * N)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", COUPLINGS)
+def test_accelerations_of_couplings_solve_the_equations_of_motion(name):
+    q, v, params = jnp.cos(jnp.arange(1.0, N + 1)), jnp.sin(jnp.arange(N) * 0.7), jnp.roll(jnp.arange(N), 5)
+
+    def lagrangian(q, v, params):
+        return 2.0 * jnp.sum(v**2) + 0.1 * jnp.sum(COUPLINGS[name](q, v, params)) - 0.5 * jnp.sum(q**2)
+
+    acceleration = lagjax.System(lagrangian, path="array").acceleration(q, v, params=params)
+    matrix = jax.hessian(lagrangian, argnums=1)(q, v, params)
+    np.testing.assert_allclose(matrix @ acceleration, -q, atol=1e-10 * float(jnp.abs(matrix).max()))
+
+
+def test_a_pattern_that_lacks_entries_is_not_believed(monkeypatch):
+    import asdex
+
+    found = asdex.jacobian_sparsity
+
+    def lacking(*arguments, **options):
+        whole = found(*arguments, **options)
+        kept = np.asarray(whole.rows) == np.asarray(whole.cols)
+        return asdex.SparsityPattern.from_coo(whole.rows[kept], whole.cols[kept], whole.shape)
+
+    def momentum(v):
+        return v * (2 + v) + 0.1 * jnp.roll(v, 1)
+
+    assert jacobian_pattern(momentum, (jnp.ones(N),), by=0).nnz == 2 * N
+    monkeypatch.setattr(asdex, "jacobian_sparsity", lacking)
+    assert jacobian_pattern(momentum, (jnp.ones(N),), by=0) is None

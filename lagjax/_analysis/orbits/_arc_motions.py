@@ -87,7 +87,7 @@ class Arcs:
     def __init__(self, problem: Problem, numbers: np.ndarray, jumping: JumpingMotions | None = None):
         self.problem, self.numbers, self.jumping = problem, numbers, jumping
         self.flow, self.tolerances = flow_of(problem), tolerances_of(problem)
-        self.derivation, self.layout, self.size = problem.derivation, problem.layout, problem.layout.size
+        self.derivation, self.layout, self.size = problem.derivation.lowered, problem.layout, problem.layout.size
         named = {i for name in ("lagrangian", "mass_matrix", "force") for i in self.derivation.reads(name)}
         self.driven = 2 * self.size in named if jumping is None else jumping.driven  # by an explicit time
         self.conserves = not self.derivation.works and jumping is None

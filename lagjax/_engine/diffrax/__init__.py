@@ -7,6 +7,7 @@ matrix that is singular, a force that is not finite or jumps, constraints that b
 `_jumps` finds jumps of the acceleration on the way, `_solvers` wraps solvers for dense output and for constraints.
 """
 
+import functools
 from typing import ClassVar
 
 import diffrax
@@ -50,6 +51,25 @@ from lagjax._program import CLOCK, Unlowerable, lack_of_memory, table_of
 
 # Solvers reject steps for the round-off of their error estimate where rtol is below some ten units of it.
 LEAST_RTOL = 10
+
+
+def _explains_forward_mode(solve):
+    """Solutions that say what forward mode through recorded steps needs, where JAX would name a `custom_vjp`."""
+
+    @functools.wraps(solve)
+    def solve_or_explain(self, problem):
+        try:
+            return solve(self, problem)
+        except TypeError as error:
+            if self.adjoint is not None or "custom_vjp" not in str(error):
+                raise
+            raise TypeError(
+                "The steps of diffrax are recorded for reverse mode, jax.grad and jax.vjp. For jax.jvp and jax.jacfwd "
+                "give simulate(..., adjoint=diffrax.ForwardMode()). (A function of the scene with a jax.custom_vjp "
+                "has no forward mode at all: give it a jax.custom_jvp.)"
+            ) from None
+
+    return solve_or_explain
 
 
 class Diffrax(AbstractEngine, eqx.Module):
@@ -118,6 +138,7 @@ class Diffrax(AbstractEngine, eqx.Module):
         batch = f"{members} members of " if members > 1 else ""
         return lack and f"A motion of {batch}{n} coordinates with {count} outputs {lack}"
 
+    @_explains_forward_mode
     def solve(self, problem: Problem) -> Solution:
         """The motion of one member, compiled once for all problems of its structure."""
         motion = problem.derivation.motion
@@ -125,6 +146,7 @@ class Diffrax(AbstractEngine, eqx.Module):
             return solve_in_doubles(self.solve, problem)  # many links are as large as the roundings of float32
         return _solve(self, problem)
 
+    @_explains_forward_mode
     @eqx.filter_jit
     def solve_batch(self, batch: Batch) -> Solution:
         """The motions of all members, which step together until the slowest has arrived; of large scenes in turn."""

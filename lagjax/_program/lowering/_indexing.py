@@ -140,8 +140,9 @@ def _operands(graph: Graph, ids: Ids) -> list[Ids] | None:
 def _place(expansion: Any, indices: Ids, room: list[int], strides: list[int]) -> tuple[Ids, Ids]:
     """The beginnings of windows, as floats: one index as it is, of several their place in the array; and which fit."""
     f, number, place, inside = expansion.map, expansion.constants, None, None
+    known: dict[int, int] = {}
     for k, (top, stride) in enumerate(zip(room, strides, strict=True)):
-        index = [_as_float(expansion.graph, i) for i in indices[..., k].ravel().tolist()]
+        index = [_as_float(expansion.graph, i, known) for i in indices[..., k].ravel().tolist()]
         index = np.array(index, np.int64).reshape(indices.shape[:-1])
         fits = f("and", f("ge", index, number(0.0)), f("le", index, number(float(top))))
         inside = fits if inside is None else f("and", inside, fits)
@@ -153,27 +154,35 @@ def _place(expansion: Any, indices: Ids, room: list[int], strides: list[int]) ->
     return place, inside
 
 
-def _as_float(graph: Graph, i: int) -> int:
+def _as_float(graph: Graph, i: int, known: dict[int, int]) -> int:
     """An integer as a float. What it was computed by with integers is computed with floats: these are exact, too."""
+    # `known` are those found before: what a sort gives is shared by as many paths as comparisons lie before it.
+    if i not in known:
+        known[i] = _float_of(graph, i, known)
+    return known[i]
+
+
+def _float_of(graph: Graph, i: int, known: dict[int, int]) -> int:
     (op, operands, attribute), kind = graph.nodes[i], graph.kinds[i]
     if kind == "float":
         return i
     if op == "convert" and graph.kinds[operands[0]] == "float" and graph.nodes[operands[0]][0] in _WHOLE:
         return operands[0]
     if op == "convert" and graph.kinds[operands[0]] not in ("float", "bool"):
-        return _as_float(graph, operands[0])
+        return _as_float(graph, operands[0], known)
     if kind != "bool" and op in ("add", "sub", "mul", "neg", "max", "min"):
-        return graph.apply(op, *(_as_float(graph, x) for x in operands))
+        return graph.apply(op, *(_as_float(graph, x, known) for x in operands))
     if kind != "bool" and op == "select":
-        return graph.apply(op, _compare_floats(graph, operands[0]), *(_as_float(graph, x) for x in operands[1:]))
+        decision = _compare_floats(graph, operands[0], known)
+        return graph.apply(op, decision, *(_as_float(graph, x, known) for x in operands[1:]))
     return graph.number(attribute) if op == "constant" else graph.apply("convert", i, attribute="float")
 
 
-def _compare_floats(graph: Graph, i: int) -> int:
+def _compare_floats(graph: Graph, i: int, known: dict[int, int]) -> int:
     """A comparison of integers as one of floats."""
     op, operands, _ = graph.nodes[i]
     if op in ("lt", "le", "gt", "ge", "eq", "ne") and graph.kinds[operands[0]] not in ("float", "bool"):
-        return graph.apply(op, *(_as_float(graph, x) for x in operands))
+        return graph.apply(op, *(_as_float(graph, x, known) for x in operands))
     return i
 
 
