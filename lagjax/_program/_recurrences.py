@@ -57,7 +57,7 @@ def square_root(r, i, operands, of):
 
 
 def raise_to_power(r, i, operands, of):
-    """wₖ of w = uᵛ by its slopes, or of the product uⁿ where v is a whole number n below 16: that has a series at u = 0.
+    """wₖ of w = uᵛ by its slopes, or of the product uⁿ where v is a whole number n below 16, which has them at u = 0.
 
     An exponent that is a number of the member is told at order zero. The product is multiplied with exp((v − n) log u),
     which is 1 and varies with v.
