@@ -24,6 +24,7 @@ from lagjax._engine._problem import (
     Solution,
     evaluate_condition,
     flat_condition,
+    has_own_root_finder,
     signs_of_event,
     solve_in_doubles,
     too_tight,
@@ -279,12 +280,20 @@ def _flatten_event(problem: Problem, ts, y0, numbers) -> tuple[diffrax.Event, bo
 
         return condition
 
-    functions, structure = jax.tree.flatten(event.cond_fn, is_leaf=callable)
+    functions = jax.tree.leaves(event.cond_fn, is_leaf=callable)
     ways = jax.tree.leaves(event.direction, is_leaf=lambda leaf: leaf is None)
     conditions = [flat(function, sign) for function, sign in zip(functions, signs, strict=True)]
     ways = [sign > 0 if sign else way for sign, way in zip(signs, ways, strict=True)]
-    located = diffrax.Event(structure.unflatten(conditions), event.root_finder, structure.unflatten(ways))
-    return located, None not in signs
+    if len(conditions) == 1:
+        return diffrax.Event(conditions[0], event.root_finder, ways[0]), None not in signs
+    if not has_own_root_finder(event):
+        raise ValueError(
+            f"An event of {len(functions)} functions is for machine code: of several that a step of diffrax passes, the "
+            "first of the list would end the motion, and not the first in time. Leave the solver out, or make one "
+            "function of them that changes sign where any of them does, as lambda q, qdot: jnp.minimum(f, g) of two "
+            "that are positive before."
+        )
+    return diffrax.Event(conditions, event.root_finder, ways), None not in signs
 
 
 # ---- what can be wrong with a solver ---------------------------------------------------------------------------------
