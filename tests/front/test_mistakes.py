@@ -84,7 +84,8 @@ BALL = lagjax.Hybrid(
         (lambda: lagjax.find_path(BALL, 1.0, 0.0, 0.0, 1.0), "^This is for one System: a lagjax.Hybrid is"),
         (lambda: lagjax.lyapunov_exponent(BALL, 1.0, 0.0, 1.0), "^This is for one System: a lagjax.Hybrid is taken by"),
         (lambda: lagjax.work_precision(BALL, 1.0, 0.0, TS), "^This is for one System: a lagjax.Hybrid is taken by"),
-        (lambda: lagjax.simulate(BALL, 1.0, 0.0, TS, event=lambda q, v: q), "takes no event for a lagjax.Hybrid"),
+        (lambda: lagjax.simulate(BALL, 1.0, 0.0, TS, event=lambda q, v: q), "takes no event for a .*lagjax.crossings"),
+        (lambda: lagjax.simulate(PLAIN, 1.0, 0.0, np.arange("2020-01", "2020-04", dtype="M8[D]")), "timedelta64"),
         (
             lambda: lagjax.simulate(lambda q, v: 0.5 * v**2, 1.0, 0.0, TS),
             r"lagjax.System\(lagrangian\) is; got <lam",
