@@ -84,7 +84,8 @@ def simulate(
       start: their difference is the event. Any other one stops it after the step on which it becomes true, and there
       derivatives of the end are NaN. These, and events with a root finder of their own, are integrated by diffrax;
       there give a direction if the motion starts on the zero. `diffrax.Event` around such functions sets the direction
-      and the root finder.
+      and the root finder. Of a list or a dict of functions the first to happen ends the motion: `trajectory.event` says
+      which. With contacts and in a `Hybrid`, `crossings` finds such instants.
     - `adjoint`: how derivatives are taken. By default machine code goes back over its own steps in reverse mode
       (`jax.grad`, `jax.vjp`), at the cost of a few motions however many parameters there are, and forward over them in
       forward mode, all directions together (`jax.jvp`, `jax.jacfwd`); derivatives of every order exist. A run of
@@ -238,18 +239,26 @@ def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, 
     stats = step_counts(solution.accepted, solution.rejected)
     if solution.idle is not None:
         stats["num_wasted_lane_steps"] = solution.idle
-    fixed_steps = isinstance(engine, Diffrax) and engine.dt is not None
+    fixed_steps, event = isinstance(engine, Diffrax) and engine.dt is not None, None
+    if problem.event is not None:
+        of, ended = jax.tree.structure(problem.event.cond_fn, is_leaf=callable), jnp.asarray(solution.event)
+        event = of.unflatten([ended[..., k] for k in range(of.num_leaves)])
     return Trajectory.from_fields(
         ts=ts, q=q, qdot=qdot, result=result_from(result), end=State(solution.t_end, restore(q_end), restore(qdot_end)),
         stats=stats, system=problem.system, params=params, params_axes=params_axes, engine=type(engine).__name__,
-        tolerances=None if fixed_steps else engine.tolerances(problem, y0),
+        tolerances=None if fixed_steps else engine.tolerances(problem, y0), event=event,
     )  # fmt: skip
 
 
 def _refuse_options(scene: str, options: dict[str, Any]) -> None:
     unset = {"progress": False}
     if given := [name for name, value in options.items() if value is not None and value is not unset.get(name)]:
-        raise TypeError(f"simulate takes no {', '.join(given)} for {scene}, which runs in machine code.")
+        found = (
+            " lagjax.crossings(system, section, q0, qdot0, ts) finds where a function of the state changes sign there: "
+            "simulate to that time, crossings(...).t[0], to end at it."
+        )
+        more = found if "event" in given else ""
+        raise TypeError(f"simulate takes no {', '.join(given)} for {scene}, which runs in machine code.{more}")
 
 
 def _device_arrays(arrays: tuple) -> tuple:
