@@ -288,8 +288,8 @@ def _flatten_event(problem: Problem, ts, y0, numbers) -> tuple[diffrax.Event, bo
         return diffrax.Event(conditions[0], event.root_finder, ways[0]), None not in signs
     if not has_own_root_finder(event):
         raise ValueError(
-            f"An event of {len(functions)} functions is for machine code: of several that a step of diffrax passes, the "
-            "first of the list would end the motion, and not the first in time. Leave the solver out, or make one "
+            f"An event of {len(functions)} functions is for machine code: of several that a step of diffrax passes, "
+            "the first of the list would end the motion, and not the first in time. Leave the solver out, or make one "
             "function of them that changes sign where any of them does, as lambda q, qdot: jnp.minimum(f, g) of two "
             "that are positive before."
         )
