@@ -59,8 +59,8 @@ class Held(NamedTuple):
             return multipliers, ok & fine, ""
         for k in np.flatnonzero(~np.asarray(stays_open)):
             why = (
-                f"At the equilibrium that was found {self.names[k]} is {gaps[k]:.6g}: this contact closes before. Begin "
-                "at a q where it is closed, with a gap of zero: what is closed there stays closed."
+                f"At the equilibrium that was found {self.names[k]} is {gaps[k]:.6g}: this contact closes before. "
+                "Begin at a q where it is closed, with a gap of zero: what is closed there stays closed."
             )
             return multipliers, fine, why
         # Of contacts that depend on each other, as the four feet of a table, other shares of the load may press.

@@ -46,7 +46,7 @@ from lagjax._interface import (
     require_number,
     result_from,
 )
-from lagjax._primitives import DOUBLE, SINGLE, differentiable_where, lost_unless
+from lagjax._primitives import DOUBLE, SINGLE, differentiable_where, lost_unless, mark_steps
 from lagjax._program import CLOCK, Unlowerable, lack_of_memory, table_of
 
 # Solvers reject steps for the round-off of their error estimate where rtol is below some ten units of it.
@@ -212,8 +212,8 @@ def _solve(engine: Diffrax, problem: Problem) -> Solution:
         result = RESULTS.where(not_projected, RESULTS.projection_failed, result)
     # diffrax leaves outputs it did not reach at inf, and those of a member without time at its start. Whatever adjoint
     # there is, their cotangents must not be lost: they go to all that went in.
-    reached = jnp.isfinite(solution.path).all(axis=1) & (ts == given)
-    well = jnp.isin(result._value, jnp.asarray(ENDED_WELL))
+    reached = mark_steps(jnp.isfinite(solution.path).all(axis=1) & (ts == given))
+    well = mark_steps(jnp.isin(result._value, jnp.asarray(ENDED_WELL)))
     y_end, t_end, inputs = solution.y_end, solution.t_end, (given, y0, *jax.tree.leaves(numbers))
     if not is_located:  # where a motion ends behind a step that an event ended does not vary with the step
         well = well & (result._value != EVENT_OCCURRED)
