@@ -137,7 +137,7 @@ mlir.register_lowering(steps_p, _lower_here(_same, "the checks of diffrax's step
 
 
 def mark_steps(ended):
-    """Whether steps of diffrax ended well; `ValueError` where that is exported together with their checks."""
+    """The marks of outputs of diffrax that were reached; `ValueError` where they are exported with its checks."""
     return steps_p.bind(ended)[0]
 
 

@@ -5,6 +5,7 @@ the engine; let it solve the problem; and dress the solution in the user's pytre
 trajectory fails.
 """
 
+import functools
 import os
 from collections.abc import Callable
 from typing import Any
@@ -27,7 +28,33 @@ from lagjax._scene import System, lift_batch, lift_problem, require_system
 
 PyTree = Any
 
+_TIMES = "the times at which the state is wanted, from the start to the end, are ts"
+_ELSEWHERE = {  # words of SciPy and diffrax
+    "t_eval": _TIMES,
+    "t_span": _TIMES,
+    "saveat": _TIMES,
+    "dense_output": f"{_TIMES}; outputs between steps are as accurate as steps",
+    "args": "what the functions of a scene take besides the state is params",
+    "y0": "the state is q0, qdot0",
+    "events": "event=f, or a dict of functions, ends the motion; lagjax.crossings finds all instants",
+    "method": "solver= takes a solver of diffrax",
+    "max_step": "dt= takes fixed steps",
+}
 
+
+def _translate_keywords(function: Callable) -> Callable:
+    """A decorator: keywords of other packages are told what to write."""
+
+    @functools.wraps(function)
+    def translated(*args, **keywords):
+        for name in _ELSEWHERE.keys() & keywords.keys():
+            raise TypeError(f"{function.__name__} takes no {name}=: {_ELSEWHERE[name]}.")
+        return function(*args, **keywords)
+
+    return translated
+
+
+@_translate_keywords
 @marks_absent
 def simulate(
     system: System | Any,
@@ -163,6 +190,7 @@ def simulate(
     return raise_unless_ok(trajectory, layout, lambda: advice(trajectory.result, implicit))
 
 
+@_translate_keywords
 @marks_absent
 def simulate_batch(
     system: System,

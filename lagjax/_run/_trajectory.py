@@ -213,6 +213,14 @@ class Trajectory(eqx.Module):
         assert not fields, f"a Trajectory has no {', '.join(fields)}"
         return trajectory
 
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str):
+            text = f"A Trajectory has no attribute {name!r}."
+            if name in ("t", "y", "ys", "sol"):
+                text += " Its times are `ts`, its states `q` and `qdot`; for states at more times give them in ts."
+            raise AttributeError(text)
+
     def __repr__(self) -> str:
         """Three lines; `equinox.tree_pprint` prints the fields."""
         return import_registered("summary")(self)
