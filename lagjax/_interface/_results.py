@@ -109,7 +109,8 @@ class RESULTS(diffrax.RESULTS, metaclass=_InWords):  # pyright: ignore[reportGen
         "A contact is struck, or rests, at a corner or a jump of its gap (abs, minimum, maximum, where, an entry of a "
         "table): the gap has more than one gradient there, and none says in which direction it pushes. Give each side "
         "a gap of its own: contacts a and b for minimum(a, b), the side of a step beside its top. Round off an edge "
-        "that sticks out, as that of maximum(a, b)."
+        "that sticks out, as that of maximum(a, b). A gap that was off, infinite, must not be negative where it is on "
+        "again."
     )
     restitution_out_of_range = "restitution must be between 0 and 1 for every contact: more would add energy."
     friction_out_of_range = "friction must be finite and not negative for every contact."
