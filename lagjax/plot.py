@@ -23,7 +23,7 @@ import numpy as np
 from lagjax._analysis import Modes
 from lagjax._fit import Fit, Record, draw_record
 from lagjax._interface import Function, Layout, accept, join_names
-from lagjax._run import Crossings, Members, Trajectory
+from lagjax._run import Crossings, Impacts, Members, Trajectory
 from lagjax._show import (
     COLORS,
     columns_of,
@@ -78,19 +78,19 @@ def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, me
             ax.plot(*join_curve(t, q[:, i]), color=color, alpha=opacity, linewidth=1.5)
         ax.lines[-len(curves)].set_label(layout.names[i])
     ax.set_xlabel("t")
-    marked = trajectory.impacts is not None and _mark_impacts(ax, trajectory, members)
+    marked = trajectory.impacts is not None and _mark_impacts(ax, trajectory.impacts, members)
     if layout.size == 1:
         ax.set_ylabel(layout.names[0])
         return _legend(ax) if marked else ax
     return _legend(ax, len(shown), layout)
 
 
-def _mark_impacts(ax, trajectory: Trajectory, members: int) -> bool:
+def _mark_impacts(ax, impacts: Impacts, members: int) -> bool:
     """Marks at the lower edge for the impacts of each contact, the first seven of more; False without any."""
-    t = np.atleast_2d(trajectory.impacts.t)
+    t = np.atleast_2d(impacts.t)
     t = t.reshape(-1, t.shape[-1])
     chosen, markers = even_places(len(t), members), iter(MARKERS)
-    for name, impulses in columns_of({"impact": trajectory.impacts.impulse}, np.ndim(trajectory.impacts.t)).items():
+    for name, impulses in columns_of({"impact": impacts.impulse}, np.ndim(impacts.t)).items():
         when = t[chosen][impulses.reshape(t.shape)[chosen] > 0]
         if len(when) and (marker := next(markers, None)):
             at_edge = dict(transform=ax.get_xaxis_transform(), color=GREY, linestyle="none", markersize=4)

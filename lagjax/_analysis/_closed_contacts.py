@@ -187,7 +187,7 @@ def _drop_contacts(system: System) -> System:
 def _hold(system: System, places: tuple[int, ...]) -> System:
     """The scene with these gaps among its constraints, and without contacts."""
     bare, own, contacts = _drop_contacts(system), system.constraints, system.contacts
-    if not places:
+    if not places or contacts is None:
         return bare
 
     def hold_gaps(q, t, params):

@@ -10,6 +10,7 @@ import diffrax
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.core import Tracer
 
 _TO_REST = (
     "let it come to rest in a mode whose constraint holds it. That transition stands in the list before the bounce and "
@@ -26,7 +27,7 @@ class _InWords(type(diffrax.RESULTS)):
     def __getitem__(cls, item) -> str:
         """The sentence of one result, or its name where it has none; of many, how many there are by name."""
         code = item._value
-        if isinstance(code, jax.core.Tracer) or not isinstance(code, np.ndarray | jax.Array):
+        if isinstance(code, Tracer) or not isinstance(code, np.ndarray | jax.Array):
             return super().__getitem__(item)
         if np.ndim(code) == 0:
             return super().__getitem__(item) or name_of(code)

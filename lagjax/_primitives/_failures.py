@@ -11,10 +11,10 @@ branch is a constant; `nan_unless` makes it NaN wherever its cotangent is not ze
 import functools
 from collections.abc import Callable
 
-import equinox
 import jax
 import jax.numpy as jnp
 import numpy as np
+from equinox._config import EQX_ON_ERROR
 from jax.core import ShapedArray
 from jax.experimental.buffer_callback import buffer_callback
 from jax.interpreters import ad, batching, mlir
@@ -131,7 +131,7 @@ mlir.register_lowering(check_p, _lower_here(_lower_with(_call_on_buffers), _RAIS
 # The steps of diffrax have checks of equinox, which call back to the host as well, but for EQX_ON_ERROR=nan.
 steps_p = LinearMap("lagjax_steps", lambda ended: [ended], vary=lambda *_, **__: [None])
 compute_on_host(steps_p, lambda ended: [ended])
-_silent = equinox._config.EQX_ON_ERROR in ("nan", "off")
+_silent = EQX_ON_ERROR in ("nan", "off")
 _same = mlir.lower_fun(lambda ended: [ended], multiple_results=True)
 mlir.register_lowering(steps_p, _lower_here(_same, "the checks of diffrax's steps", _silent))
 

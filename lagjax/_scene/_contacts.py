@@ -324,7 +324,11 @@ def _cap_constants(program: Any) -> Any:
         return program
 
     def cap(x):
-        return Literal(np.asarray(_OPEN, x.aval.dtype), x.aval) if isinstance(x, Literal) and _is_infinite(x.val) else x
+        return (
+            Literal(np.asarray(_OPEN, jnp.result_type(x.val)), x.aval)
+            if isinstance(x, Literal) and _is_infinite(x.val)
+            else x
+        )
 
     lines = [
         line.replace(
