@@ -12,6 +12,7 @@ colour maps are perceptually uniform, so that all of them can be told apart with
 
 import dataclasses
 import functools
+import inspect
 from collections.abc import Callable
 from typing import Any
 
@@ -22,9 +23,10 @@ import numpy as np
 from lagjax._analysis import Modes
 from lagjax._fit import Fit, Record, draw_record
 from lagjax._interface import Function, Layout, accept, join_names
-from lagjax._run import Crossings, Members, Trajectory
+from lagjax._run import Crossings, Impacts, Members, Trajectory
 from lagjax._show import (
     COLORS,
+    columns_of,
     course_of,
     courses_of,
     even_places,
@@ -56,10 +58,10 @@ def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, me
 
     Between two outputs curves are the cubic that has q and q̇ of both (Hermite); of a hybrid motion they go through the
     states before and after every transition, and end where a reset moves what is drawn. `space_time` shows all
-    coordinates of a chain or a lattice.
+    coordinates of a chain or a lattice. Marks at the lower edge are the impacts of contacts, one kind for each.
 
-    - `projection`: a function of one state (q, qdot) that returns (x, y): `lambda q, qdot: (q, qdot)` for the phase
-      portrait of one coordinate, or where a body is in space.
+    - `projection`: a function of one state, (q, qdot) or q alone, that returns (x, y): `lambda q, qdot: (q, qdot)` for
+      the phase portrait of one coordinate, or where a body is in space.
     - `members`: of a batch, draw this many, evenly chosen.
 
     >>> lagjax.plot.trajectory(trajectory); lagjax.plot.trajectory(trajectory, lambda q, qdot: (q[0], qdot[0]))
@@ -76,10 +78,24 @@ def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, me
             ax.plot(*join_curve(t, q[:, i]), color=color, alpha=opacity, linewidth=1.5)
         ax.lines[-len(curves)].set_label(layout.names[i])
     ax.set_xlabel("t")
+    marked = trajectory.impacts is not None and _mark_impacts(ax, trajectory.impacts, members)
     if layout.size == 1:
         ax.set_ylabel(layout.names[0])
-        return ax
+        return _legend(ax) if marked else ax
     return _legend(ax, len(shown), layout)
+
+
+def _mark_impacts(ax, impacts: Impacts, members: int) -> bool:
+    """Marks at the lower edge for the impacts of each contact, the first seven of more; False without any."""
+    t = np.atleast_2d(impacts.t)
+    t = t.reshape(-1, t.shape[-1])
+    chosen, markers = even_places(len(t), members), iter(MARKERS)
+    for name, impulses in columns_of({"impact": impacts.impulse}, np.ndim(impacts.t)).items():
+        when = t[chosen][impulses.reshape(t.shape)[chosen] > 0]
+        if len(when) and (marker := next(markers, None)):
+            at_edge = dict(transform=ax.get_xaxis_transform(), color=GREY, linestyle="none", markersize=4)
+            ax.plot(when, np.full(len(when), 0.02), marker=marker, label=name, **at_edge)
+    return next(markers, None) != MARKERS[0]
 
 
 def space_time(trajectory: Trajectory, *, label: str | None = None, cmap: str = "viridis", ax=None):
@@ -561,8 +577,16 @@ def _project(layout: Layout, curves: list, projection: Callable) -> list[tuple[n
 def _pair(projection: Callable) -> Callable:
     """A projection, with a sentence where it does not return two numbers."""
 
+    try:
+        inspect.signature(projection).bind(None, None)
+        alone = False
+    except TypeError:
+        alone = True  # a function of q, as films take them
+    except ValueError:  # without a signature
+        alone = False
+
     def two_numbers(q, qdot):
-        values = projection(q, qdot)
+        values = projection(q) if alone else projection(q, qdot)
         shapes = [jnp.shape(value) for value in values] if isinstance(values, tuple | list) else jnp.shape(values)
         if shapes not in ([(), ()], (2,)):
             raise ValueError(f"projection must return two numbers, (x, y), for one state; got shapes {shapes}.")

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from scipy.sparse import diags_array
 
+from lagjax._analysis._closed_contacts import hold_closed
 from lagjax._analysis._coordinates import restrict_signature
 from lagjax._analysis._lowest_modes import Sparse
 from lagjax._analysis._scene_state import SceneState
@@ -38,11 +39,13 @@ class Equilibrium(NamedTuple):
     - `q`: the coordinates, in the user's pytree; NaN where no equilibrium was found.
     - `multipliers`: λ there, in the structure the constraints return; None without constraints.
     - `ok`: whether an equilibrium was found.
+    - `contact_forces`: of a scene with contacts their normal forces λ ≥ 0, in the structure that `contacts` returns.
     """
 
     q: PyTree
     multipliers: PyTree
     ok: Bool[Array, ""]
+    contact_forces: PyTree = None
 
     _repr_pretty_ = show_str
 
@@ -53,6 +56,8 @@ class Equilibrium(NamedTuple):
         if ok.ndim:
             return f"{ok.sum()} of {ok.size} equilibria were found"
         forces = "" if self.multipliers is None else f"; {describe_numbers(self.multipliers, 'multipliers')}"
+        if self.contact_forces is not None:
+            forces += f"; {describe_numbers(self.contact_forces, 'contact_forces')}"
         return f"Equilibrium at {describe_numbers(self.q, 'q')}{forces}" if ok else "No equilibrium was found"
 
 
@@ -85,8 +90,13 @@ def equilibrium(
     function works under `jit`, `vmap` and `grad`; for large scenes with sparse matrices, where SuperLU finds the steps
     on the host, on numbers alone.
 
+    **Contacts** that are closed at `q`, whose gaps are zero there, stay closed, and what is found is an equilibrium if
+    their forces press, λ ≥ 0, and no other gap becomes negative; `contact_forces` are these λ. Contacts with friction
+    that are closed are refused. Inside `jit` the gaps must not read what is being traced.
+
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, a scene that depends on the time, a
-    velocity of a coordinate that is not cyclic, or where no equilibrium is found.
+    velocity of a coordinate that is not cyclic, or where no equilibrium is found, also because a contact opens or
+    closes on the way.
 
     Source: Landau & Lifshitz, *Mechanics*, §21; Nocedal & Wright, *Numerical Optimization*, §10.3, §11.2.
 
@@ -99,7 +109,13 @@ def equilibrium(
     """
     require_flag(throw, "throw")
     require_flag(stable, "stable")
-    scene = SceneState.from_state(system, q, qdot, params, sparse=True)
+    held = hold_closed(system, q, qdot, params, "An equilibrium")
+    if held is not None and stable:
+        raise ValueError(
+            "stable=True is for scenes without contacts: simulate this one with a dissipation until it rests, and give "
+            "the end, run.end.q, to equilibrium."
+        )
+    scene = SceneState.from_state(system if held is None else held.system, q, qdot, params, sparse=True)
     scene.require_autonomous("An equilibrium")
     if scene.large:
         place, multipliers, ok, why = _solve_large(scene, qdot, stable)
@@ -111,12 +127,19 @@ def equilibrium(
         if scene.concrete and not ok:  # with the rounding of terms, whose program is compiled where it may matter
             place, multipliers, ok = _solve_balance(True, *scene.arguments)
         why = "" if not throw or not scene.concrete or ok else _sentence(scene)
+    if held is not None and why:
+        why += " What rests on a contact is sought from where it is closed: begin at a q with a gap of zero."
+    elif held is not None:
+        multipliers, ok, why = held.judge(scene, place, multipliers, ok)
+        place, multipliers = nan_unless(ok, place), nan_unless(ok, multipliers)
     if throw and why:
         raise ValueError(why)
-    of_user = None
-    if scene.constrained:
+    of_user, pushes = None, None
+    if held is not None:
+        of_user, pushes = held.split(multipliers, scene.layout, scene.params)
+    elif scene.constrained:
         of_user = scene.system._split_by_constraint(multipliers, scene.layout, scene.params)
-    return Equilibrium(scene.layout.restore(place), of_user, ok)
+    return Equilibrium(scene.layout.restore(place), of_user, ok, pushes)
 
 
 def _settled_scene(scene: SceneState, qdot: PyTree) -> SceneState:

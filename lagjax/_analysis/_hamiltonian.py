@@ -19,6 +19,7 @@ from lagjax._interface import Layout, as_arrays, compile_for_one_call
 from lagjax._primitives import nan_unless
 from lagjax._run import simulate
 from lagjax._scene import System, present_system, require_system
+from lagjax._show import canonical_summary
 
 PyTree = Any
 Vector = Float[Array, " n"]
@@ -31,6 +32,9 @@ class CanonicalTrajectory(NamedTuple):
     q: PyTree
     p: PyTree
     ok: Bool[Array, ""]
+
+    def __repr__(self) -> str:
+        return canonical_summary(self)
 
 
 class Hamiltonian(NamedTuple):

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from lagjax._analysis._closed_contacts import hold_closed
 from lagjax._analysis._equilibrium import least_multipliers
 from lagjax._analysis._scene_state import SceneState, require_matrices
 from lagjax._analysis._smoothness import is_smooth, require_smooth
@@ -62,7 +63,8 @@ def linearize(system: System, q: PyTree, qdot: PyTree = None, params: PyTree = N
 
     u are additional generalised forces. At an equilibrium A is constant and the solutions are exponentials
     (`normal_modes`); along a motion these are the variational equations at that instant. With constraints, λ responds
-    to a deviation, and A and B keep a deviation on the constraints if it satisfies them. The function works under
+    to a deviation, and A and B keep a deviation on the constraints if it satisfies them. So it is with contacts that
+    are closed at the state and press: their gaps are the last rows of `constraint_jacobian`. The function works under
     `jit`, `vmap` and `grad`.
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, for a scene that depends on the time, and
@@ -84,6 +86,8 @@ def linearize(system: System, q: PyTree, qdot: PyTree = None, params: PyTree = N
         "The lowest modes are normal_modes(system, q, params, count=50); jax.jvp of system.acceleration gives the "
         "acceleration of one deviation.",
     )
+    if held := hold_closed(system, q, qdot, params, "A linearization"):
+        system, q = held.system, held.require_loaded(q, qdot, params, "A motion")
     scene = SceneState.from_state(system, q, qdot, params)
     scene.require_autonomous("A linearization")
     require_smooth(scene, "A linearization")

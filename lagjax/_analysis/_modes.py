@@ -17,6 +17,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Complex, Float
 from scipy.sparse import csr_array, diags_array
 
+from lagjax._analysis._closed_contacts import hold_closed
 from lagjax._analysis._eigen import exponents_and_modes, null_space, symmetric_modes
 from lagjax._analysis._equilibrium import require_steady
 from lagjax._analysis._linearize import steady_matrices
@@ -106,12 +107,12 @@ def normal_modes(
       constraints have to be independent, nothing may damp or turn, and the call cannot be traced.
 
     With constraints, the modes are those of the deviations that the constraints allow, as many as there are degrees of
-    freedom, and the constraint forces contribute (a pendulum is held by its rod). Works under `jit`, `vmap` and `grad`,
-    also where frequencies are equal: first derivatives are right for functions that are symmetric in the modes of equal
-    frequency (their sum, say); the derivative of a single mode is that of the mode as it is numbered. Second
-    derivatives are right for the sum of ω² alone. The frequency of a zero mode has the derivative zero, which is right
-    where a symmetry makes the mode zero. With friction or gyroscopic forces, derivatives are NaN where two modes
-    coincide and share one shape (critical damping).
+    freedom, and the constraint forces contribute (a pendulum is held by its rod). So it is with contacts that are
+    closed at q and press. Works under `jit`, `vmap` and `grad`, also where frequencies are equal: first derivatives are
+    right for functions that are symmetric in the modes of equal frequency (their sum, say); the derivative of a single
+    mode is that of the mode as it is numbered. Second derivatives are right for the sum of ω² alone. The frequency of a
+    zero mode has the derivative zero, which is right where a symmetry makes the mode zero. With friction or gyroscopic
+    forces, derivatives are NaN where two modes coincide and share one shape (critical damping).
 
     **Raises** `TypeError` or `ValueError` for arguments that cannot be right, for a scene that depends on the time, for
     a q that is no equilibrium, where M is not positive definite, or where the force jumps or has a kink at q, as dry
@@ -130,6 +131,8 @@ def normal_modes(
     """
     if count is not None and (type(count) is not int or count < 1):
         raise ValueError(f"count must be a positive integer, or None for all modes; got {count!r}.")
+    if held := hold_closed(system, q, qdot, params, "A normal mode"):
+        system, q = held.system, held.require_loaded(q, qdot, params, "A small oscillation")
     scene = SceneState.from_state(system, q, qdot, params, sparse=True)
     scene.require_autonomous("A normal mode")
     if scene.large:

@@ -255,7 +255,9 @@ class Solution(NamedTuple):
     result: Int[Any, "*N"]  # how it ended, as the integer of a `lagjax.RESULTS`
     accepted: Int[Any, "*N"]  # steps
     rejected: Int[Any, "*N"]
-    event: Int[Any, "*N"] = None  # which guards changed sign at the end, a mask (`taylor.changes_of`); 0 without any
+    # Of an event, which of its functions ended the motion, (*N, G); of guards, which of them changed sign at the end, a
+    # mask (`taylor.changes_of`).
+    event: Any = None
     idle: Int[Any, ""] = None  # of a batch as a whole, the steps for which a lane was idle
 
 

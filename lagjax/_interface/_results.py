@@ -9,6 +9,8 @@ from collections.abc import Sequence
 import diffrax
 import jax
 import jax.numpy as jnp
+import numpy as np
+from jax.core import Tracer
 
 _TO_REST = (
     "let it come to rest in a mode whose constraint holds it. That transition stands in the list before the bounce and "
@@ -21,8 +23,23 @@ PUSHED = (
 )
 
 
-class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
+class _InWords(type(diffrax.RESULTS)):
+    def __getitem__(cls, item) -> str:
+        """The sentence of one result, or its name where it has none; of many, how many there are by name."""
+        code = item._value
+        if isinstance(code, Tracer) or not isinstance(code, np.ndarray | jax.Array):
+            return super().__getitem__(item)
+        if np.ndim(code) == 0:
+            return super().__getitem__(item) or name_of(code)
+        return ", ".join(
+            f"{count} {name_of(value)}" for value, count in zip(*np.unique(code, return_counts=True), strict=True)
+        )
+
+
+class RESULTS(diffrax.RESULTS, metaclass=_InWords):  # pyright: ignore[reportGeneralTypeIssues]
     """The result codes of diffrax, extended; compare with `trajectory.result == lagjax.RESULTS.successful`."""
+
+    __module__ = "lagjax"  # as it is printed
 
     nonfinite_state = (
         "The state or its acceleration is NaN or infinite there, or just ahead. Look at the gaps of contacts, the "
@@ -93,7 +110,8 @@ class RESULTS(diffrax.RESULTS):  # pyright: ignore[reportGeneralTypeIssues]
         "A contact is struck, or rests, at a corner or a jump of its gap (abs, minimum, maximum, where, an entry of a "
         "table): the gap has more than one gradient there, and none says in which direction it pushes. Give each side "
         "a gap of its own: contacts a and b for minimum(a, b), the side of a step beside its top. Round off an edge "
-        "that sticks out, as that of maximum(a, b)."
+        "that sticks out, as that of maximum(a, b). A gap that was off, infinite, must not be negative where it is on "
+        "again."
     )
     restitution_out_of_range = "restitution must be between 0 and 1 for every contact: more would add energy."
     friction_out_of_range = "friction must be finite and not negative for every contact."

@@ -172,6 +172,11 @@ def output_times(ts, dtype) -> jax.Array | np.ndarray:
         values = np.asarray(ts)  # most often there is nothing to say
         if len(values) > 1 and _is_monotonic(values) and all_finite(values):
             return ts
+    if getattr(getattr(ts, "dtype", None), "kind", None) in ("m", "M"):
+        raise TypeError(
+            f"ts holds {ts.dtype}, dates or spans of time: give numbers in the unit of time of L, as of seconds "
+            "(ts - ts[0]) / numpy.timedelta64(1, 's')."
+        )
     try:
         kind = dtype_of(ts if isinstance(ts, jax.Array) else np.asarray(ts))
     except (TypeError, ValueError):

@@ -7,8 +7,10 @@ callers whose numbers are float32.
 
 from lagjax._primitives._doubles import DOUBLE, SINGLE, accepts_singles, compute_in_doubles, widen, with_doubles
 from lagjax._primitives._failures import (
+    NOT_EXPORTED,
     differentiable_where,
     lost_unless,
+    mark_steps,
     marks_absent,
     nan_unless,
     raise_where_failed,

@@ -14,6 +14,7 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
+from equinox._config import EQX_ON_ERROR
 from jax.core import ShapedArray
 from jax.experimental.buffer_callback import buffer_callback
 from jax.interpreters import ad, batching, mlir
@@ -105,8 +106,39 @@ def _call_on_buffers(host, shape, *arrays):
     return buffer_callback(lambda _, place, *arrays: host(*arrays), shape)(*arrays)
 
 
-mlir.register_lowering(check_p, _lower_with(jax.pure_callback))
-mlir.register_lowering(check_p, _lower_with(_call_on_buffers), platform="cpu")
+NOT_EXPORTED = (
+    "jax.export cannot take {} along: give a solver of diffrax and leave the error out, as "
+    "simulate(…, solver=diffrax.Dopri8(), throw=False), and set EQX_ON_ERROR=nan in the environment before Python "
+    "starts: all three. To serialize what is exported, pip install flatbuffers."
+)
+
+
+def _lower_here(rule: Callable, what: str, in_exports: bool = False):
+    """The rule of what may not be exported, as calls back to this process."""
+
+    def lower_checked(context, *args, **settings):
+        if context.module_context.lowering_parameters.for_export and not in_exports:
+            raise ValueError(NOT_EXPORTED.format(what))
+        return rule(context, *args, **settings)
+
+    return lower_checked
+
+
+_RAISES = "an error that is raised at run time, as with throw=True,"
+mlir.register_lowering(check_p, _lower_here(_lower_with(jax.pure_callback), _RAISES))
+mlir.register_lowering(check_p, _lower_here(_lower_with(_call_on_buffers), _RAISES), platform="cpu")
+
+# The steps of diffrax have checks of equinox, which call back to the host as well, but for EQX_ON_ERROR=nan.
+steps_p = LinearMap("lagjax_steps", lambda ended: [ended], vary=lambda *_, **__: [None])
+compute_on_host(steps_p, lambda ended: [ended])
+_silent = EQX_ON_ERROR in ("nan", "off")
+_same = mlir.lower_fun(lambda ended: [ended], multiple_results=True)
+mlir.register_lowering(steps_p, _lower_here(_same, "the checks of diffrax's steps", _silent))
+
+
+def mark_steps(ended):
+    """The marks of outputs of diffrax that were reached; `ValueError` where they are exported with its checks."""
+    return steps_p.bind(ended)[0]
 
 
 # ---- outputs that were not reached -----------------------------------------------------------------------------------

@@ -8,4 +8,4 @@ what they return, `_batch_members` its members along one axis.
 from lagjax._run._batch_members import Members
 from lagjax._run._crossings import Crossings, crossings, directions_of, restore_crossings, sections_of, surfaces_in
 from lagjax._run._simulate import simulate, simulate_batch, trajectory_of
-from lagjax._run._trajectory import ContactChanges, Impacts, State, Trajectory, Transitions
+from lagjax._run._trajectory import CHANGE_WORDS, ContactChanges, Impacts, State, Trajectory, Transitions

@@ -5,6 +5,7 @@ the engine; let it solve the problem; and dress the solution in the user's pytre
 trajectory fails.
 """
 
+import functools
 import os
 from collections.abc import Callable
 from typing import Any
@@ -27,7 +28,33 @@ from lagjax._scene import System, lift_batch, lift_problem, require_system
 
 PyTree = Any
 
+_TIMES = "the times at which the state is wanted, from the start to the end, are ts"
+_ELSEWHERE = {  # words of SciPy and diffrax
+    "t_eval": _TIMES,
+    "t_span": _TIMES,
+    "saveat": _TIMES,
+    "dense_output": f"{_TIMES}; outputs between steps are as accurate as steps",
+    "args": "what the functions of a scene take besides the state is params",
+    "y0": "the state is q0, qdot0",
+    "events": "event=f, or a dict of functions, ends the motion; lagjax.crossings finds all instants",
+    "method": "solver= takes a solver of diffrax",
+    "max_step": "dt= takes fixed steps",
+}
 
+
+def _translate_keywords(function: Callable) -> Callable:
+    """A decorator: keywords of other packages are told what to write."""
+
+    @functools.wraps(function)
+    def translated(*args, **keywords):
+        for name in _ELSEWHERE.keys() & keywords.keys():
+            raise TypeError(f"{function.__name__} takes no {name}=: {_ELSEWHERE[name]}.")
+        return function(*args, **keywords)
+
+    return translated
+
+
+@_translate_keywords
 @marks_absent
 def simulate(
     system: System | Any,
@@ -84,7 +111,8 @@ def simulate(
       start: their difference is the event. Any other one stops it after the step on which it becomes true, and there
       derivatives of the end are NaN. These, and events with a root finder of their own, are integrated by diffrax;
       there give a direction if the motion starts on the zero. `diffrax.Event` around such functions sets the direction
-      and the root finder.
+      and the root finder. Of a list or a dict of functions the first to happen ends the motion: `trajectory.event` says
+      which. With contacts and in a `Hybrid`, `crossings` finds such instants.
     - `adjoint`: how derivatives are taken. By default machine code goes back over its own steps in reverse mode
       (`jax.grad`, `jax.vjp`), at the cost of a few motions however many parameters there are, and forward over them in
       forward mode, all directions together (`jax.jvp`, `jax.jacfwd`); derivatives of every order exist. A run of
@@ -162,6 +190,7 @@ def simulate(
     return raise_unless_ok(trajectory, layout, lambda: advice(trajectory.result, implicit))
 
 
+@_translate_keywords
 @marks_absent
 def simulate_batch(
     system: System,
@@ -238,18 +267,26 @@ def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, 
     stats = step_counts(solution.accepted, solution.rejected)
     if solution.idle is not None:
         stats["num_wasted_lane_steps"] = solution.idle
-    fixed_steps = isinstance(engine, Diffrax) and engine.dt is not None
+    fixed_steps, event = isinstance(engine, Diffrax) and engine.dt is not None, None
+    if problem.event is not None:
+        of, ended = jax.tree.structure(problem.event.cond_fn, is_leaf=callable), jnp.asarray(solution.event)
+        event = of.unflatten([ended[..., k] for k in range(of.num_leaves)])
     return Trajectory.from_fields(
         ts=ts, q=q, qdot=qdot, result=result_from(result), end=State(solution.t_end, restore(q_end), restore(qdot_end)),
         stats=stats, system=problem.system, params=params, params_axes=params_axes, engine=type(engine).__name__,
-        tolerances=None if fixed_steps else engine.tolerances(problem, y0),
+        tolerances=None if fixed_steps else engine.tolerances(problem, y0), event=event,
     )  # fmt: skip
 
 
 def _refuse_options(scene: str, options: dict[str, Any]) -> None:
     unset = {"progress": False}
     if given := [name for name, value in options.items() if value is not None and value is not unset.get(name)]:
-        raise TypeError(f"simulate takes no {', '.join(given)} for {scene}, which runs in machine code.")
+        found = (
+            " lagjax.crossings(system, section, q0, qdot0, ts) finds where a function of the state changes sign there: "
+            "simulate to that time, crossings(...).t[0], to end at it."
+        )
+        more = found if "event" in given else ""
+        raise TypeError(f"simulate takes no {', '.join(given)} for {scene}, which runs in machine code.{more}")
 
 
 def _device_arrays(arrays: tuple) -> tuple:

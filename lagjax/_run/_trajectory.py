@@ -60,9 +60,9 @@ class Transitions(NamedTuple):
 
     _repr_pretty_ = show_str
 
-    def __str__(self) -> str:
+    def __repr__(self) -> str:
         def describe(t, source, target):
-            return ", ".join(f"{a} → {b} at t = {when:.6g}" for when, a, b in zip(t, source, target, strict=True))
+            return f"{source} → {target} at t = {t:.6g}"
 
         numbers = self.t, self.source, self.target
         return _list_first(self, "transitions", " between places in mode_names: ", describe, numbers)
@@ -75,6 +75,8 @@ class Impacts(NamedTuple):
     `t` (N,) are their times. `impulse`: the normal impulses, in the structure that `contacts` returns with an axis of N
     in front, zero of a contact that took no part. `energy_lost` (N,): the kinetic energy that each took away. Bounces
     that accumulate end in one impact, with all that they would still have given; its time is that of their limit.
+
+    `to_pandas()` makes a table of them.
     """
 
     t: jax.Array
@@ -84,23 +86,36 @@ class Impacts(NamedTuple):
 
     _repr_pretty_ = show_str
 
-    def __str__(self) -> str:
-        def describe(t):
-            return ", ".join(f"{when:.6g}" for when in t)
+    def __repr__(self) -> str:
+        return _list_first(self, "impacts", ", at t = ", lambda t: f"{t:.6g}", (self.t,))
 
-        return _list_first(self, "impacts", ", at t = ", describe, (self.t,))
+    def to_pandas(self):
+        """A `pandas.DataFrame` with a row per impact: the columns impulse['floor'], … and energy_lost.
+
+        The index is `t`, or (member, t) for a batch. Raises `ImportError` when pandas is not installed.
+        """
+        return import_registered("impact_frame")(self)
 
 
-def _list_first(record: Any, what: str, joint: str, describe: Callable, numbers: tuple) -> str:
-    """A line that counts what a record holds and describes the first ten of its `numbers`; its repr where traced."""
-    if not all(map(is_known, (record.t, record.count))):
-        return repr(record)
-    count = np.asarray(record.count)
+def _list_first(record: Any, what: str, joint: str, describe: Callable, numbers: tuple, between: str = ", ") -> str:
+    """A line that counts what a record holds and describes the first ten of its `numbers`; its fields where traced."""
+    count = record.count
+    if not (eqx.is_array_like(count) and is_known(count) and all(map(is_known, jax.tree.leaves(numbers)))):
+        return f"{type(record).__name__}({', '.join(f'{name}={x!r}' for name, x in record._asdict().items())})"
+    count = np.asarray(count)
     if count.ndim:
         return f"{count.sum()} {what} of {' × '.join(map(str, count.shape))} motions"
-    listed = describe(*(np.asarray(x)[: min(count, 10)] for x in numbers))
-    more = f", … ({count - 10} more)" if count > 10 else ""
-    return f"{count} {what}{joint}{listed}{more}" if count else f"no {what}"
+    listed = [describe(*row) for row in zip(*(np.asarray(x)[: min(count, 10)] for x in numbers), strict=True)]
+    listed += [f"… ({count - 10} more)"] if count > 10 else []
+    return f"{count} {what}{joint}{between.join(listed)}" if count else f"no {what}"
+
+
+@jax.tree_util.register_static
+class Names(tuple):
+    """Names that travel with arrays, through every transformation of JAX."""
+
+
+CHANGE_WORDS = ("closes", "opens", "bounces", "sticks", "slides")  # in words
 
 
 class ContactChanges(NamedTuple):
@@ -112,6 +127,8 @@ class ContactChanges(NamedTuple):
     impacts gained energy, and how many changes lack derivatives: where contacts that share an impact close at one
     instant by themselves, and where a slip begins at a start at rest (by the slip there), or in space; `doubted` (3,)
     are the first times.
+
+    Printed, they are lines of text. `to_pandas()` makes a table of them.
     """
 
     t: jax.Array
@@ -124,6 +141,24 @@ class ContactChanges(NamedTuple):
     count: jax.Array
     doubts: jax.Array
     doubted: jax.Array
+    names: tuple[str, ...] = Names()  # `Trajectory.contact_names`
+
+    _repr_pretty_ = show_str
+
+    def __repr__(self) -> str:
+        def describe(t, contact, change):
+            return f"t = {t:<10.6g} {self.names[contact]} {CHANGE_WORDS[change]}"
+
+        numbers = self.t, self.contact, self.change
+        return _list_first(self, "changes of contacts", ":\n  ", describe, numbers, "\n  ")
+
+    def to_pandas(self):
+        """A `pandas.DataFrame` with a row per change: what `contact` it is, the `change` in words, and the states.
+
+        The states have the columns q['x'], …, qdot['x'], … just before it, and q_next['x'], …, qdot_next['x'], … just
+        behind it. The index is `t`, or (member, t) for a batch. Raises `ImportError` when pandas is not installed.
+        """
+        return import_registered("change_frame")(self)
 
 
 class Trajectory(eqx.Module):
@@ -144,6 +179,8 @@ class Trajectory(eqx.Module):
       time, NaN where the mode is −1. A mode is a place in `mode_names`, because the dict loses its order in `jax.jit`.
     - `impacts`, `contact_changes`: of a scene with contacts its `Impacts` and all `ContactChanges`, otherwise None;
       `contact_names` names the contacts. `contacts` holds what they did at every output time.
+    - `event`: with an `event=`, for each of its functions, in their structure, whether it ended the motion; None
+      without one.
     """
 
     ts: jax.Array
@@ -164,6 +201,7 @@ class Trajectory(eqx.Module):
     contacts: Any = None
     contact_changes: "ContactChanges | None" = None
     contact_names: tuple[str, ...] = eqx.field(static=True, default=())
+    event: PyTree = None
 
     @classmethod
     def from_fields(cls, **fields) -> "Trajectory":
@@ -174,6 +212,14 @@ class Trajectory(eqx.Module):
             object.__setattr__(trajectory, name, fields.pop(name) if name in fields else getattr(cls, name))
         assert not fields, f"a Trajectory has no {', '.join(fields)}"
         return trajectory
+
+    if not TYPE_CHECKING:
+
+        def __getattr__(self, name: str):
+            text = f"A Trajectory has no attribute {name!r}."
+            if name in ("t", "y", "ys", "sol"):
+                text += " Its times are `ts`, its states `q` and `qdot`; for states at more times give them in ts."
+            raise AttributeError(text)
 
     def __repr__(self) -> str:
         """Three lines; `equinox.tree_pprint` prints the fields."""
@@ -246,6 +292,9 @@ class Trajectory(eqx.Module):
     def to_xarray(self, units: PyTree = None, time_unit: str | None = None):
         """An `xarray.Dataset` with a variable per leaf of `q` and `qdot` and the dimensions (member,) time, ...
 
+        Of a scene with contacts, their normal forces are variables, too: contact_forces.floor, …. What happens between
+        the outputs has tables of its own: `trajectory.impacts.to_pandas()`, `trajectory.contact_changes.to_pandas()`.
+
         - `units`: a pytree prefix of `q` of texts or None: "m" for all coordinates, {"x": "m", "theta": "rad"} for
           each. They are stored in the `attrs` of the variables; the units of velocities are these per `time_unit`.
         - `time_unit`: the unit of the times, such as "s" or "year".
@@ -261,8 +310,10 @@ class Trajectory(eqx.Module):
         """A `pandas.DataFrame` with a row per output and a column per number: q['x'], q[1], …, qdot['x'], ….
 
         The columns have the names that messages use. The index is `t`, or (member, t) for a batch. Hybrid motions have
-        a column `mode` of names, missing where there is none. `units` and `time_unit` are those of `to_xarray`; the
-        units are in `frame.attrs["units"]`, by column.
+        a column `mode` of names, missing where there is none, scenes with contacts one for each normal force,
+        contact_forces['floor'], …; their impacts and changes are `trajectory.impacts.to_pandas()` and
+        `trajectory.contact_changes.to_pandas()`. `units` and `time_unit` are those of `to_xarray`; the units are in
+        `frame.attrs["units"]`, by column.
 
         Raises `ImportError` when pandas is not installed.
 

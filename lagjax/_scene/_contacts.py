@@ -8,6 +8,7 @@ velocities and s the slips,
 are rows of one matrix, each held or released by a number.
 """
 
+import re
 from collections.abc import Callable
 from typing import Any, NamedTuple, cast
 
@@ -15,6 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
 from lagjax._equations import Constraints, Motion, once_for_structure
 from lagjax._interface import Layout, is_concrete
@@ -132,7 +134,8 @@ class Flat(NamedTuple):
             return jnp.concatenate(leaves).astype(layout.dtype) if leaves else jnp.zeros(0, layout.dtype)
 
         def gaps(q, t, p):
-            return numbers_of(() if system.contacts is None else call("contacts", (q,), t, p))
+            given = _replace_infinite(lambda *state: call("contacts", state[:1], *state[1:]))
+            return numbers_of(() if system.contacts is None else given(q, t, p))
 
         def one_way(q, qdot, t, p):
             return numbers_of(() if system.one_way is None else call("one_way", (q, qdot), t, p))
@@ -286,3 +289,51 @@ def _pair_by_name(slip: PyTree, tree: PyTree, places: PyTree) -> list[tuple]:
     if jax.tree.structure(slip) != jax.tree.structure(tree):
         raise ValueError("slip must return the structure that contacts returns.")
     return list(zip(*map(jax.tree.leaves, (slip, tree, places)), strict=True))
+
+
+# ---- gaps that are switched off --------------------------------------------------------------------------------------
+
+_OPEN = 1e30  # a gap of infinity, which has no series: nothing comes across it, and its square is finite
+
+
+def _replace_infinite(function: Callable) -> Callable:
+    """The function with a large number in place of every infinity that is written in it."""
+
+    def capped(*arguments):
+        program, shapes = jax.make_jaxpr(function, return_shape=True)(*arguments)
+        if not re.search(r"\binf\b", str(program)) and not any(map(_is_infinite, program.consts)):
+            return function(*arguments)
+        outputs = jaxpr_as_fun(_cap_constants(program))(*jax.tree.leaves(arguments))
+        return jax.tree.unflatten(jax.tree.structure(shapes), outputs)
+
+    return capped
+
+
+def _is_infinite(x) -> bool:
+    return is_concrete(x) and jnp.issubdtype(jnp.result_type(x), jnp.floating) and bool(np.isposinf(x).any())
+
+
+def _cap_constants(program: Any) -> Any:
+    """A jaxpr, or what a parameter of one holds, with `_OPEN` in place of the infinite numbers in it."""
+    if isinstance(program, tuple | list):
+        return type(program)(map(_cap_constants, program))
+    if isinstance(program, ClosedJaxpr):
+        consts = [np.where(np.isposinf(x), _OPEN, x) if _is_infinite(x) else x for x in program.consts]
+        return ClosedJaxpr(_cap_constants(program.jaxpr), consts)
+    if not isinstance(program, Jaxpr):
+        return program
+
+    def cap(x):
+        return (
+            Literal(np.asarray(_OPEN, jnp.result_type(x.val)), x.aval)
+            if isinstance(x, Literal) and _is_infinite(x.val)
+            else x
+        )
+
+    lines = [
+        line.replace(
+            invars=[*map(cap, line.invars)], params={name: _cap_constants(x) for name, x in line.params.items()}
+        )
+        for line in program.eqns
+    ]
+    return program.replace(eqns=lines, outvars=[*map(cap, program.outvars)])

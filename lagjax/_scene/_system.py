@@ -518,8 +518,8 @@ def require_system(system: Any, contacts: bool = False) -> System:
     if system.touches and not contacts:
         raise TypeError(
             "This is for scenes without contacts, which it would leave out: simulate, simulate_batch, crossings, "
-            "periodic_orbit and lyapunov_spectrum take these. For the motion while none is closed, build the System "
-            "without contacts=... and one_way=...."
+            "equilibrium, normal_modes, linearize, periodic_orbit and lyapunov_spectrum take these. For the motion "
+            "while none is closed, build the System without contacts=... and one_way=...."
         )
     return present_system(system)
 

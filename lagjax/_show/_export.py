@@ -10,7 +10,8 @@ from typing import Any
 import jax
 import numpy as np
 
-from lagjax._run import Members
+from lagjax._interface import is_known, labelled_leaves
+from lagjax._run import CHANGE_WORDS, Members
 from lagjax._show._summary import import_package, require_numbers
 
 PyTree = Any
@@ -23,7 +24,11 @@ def dataset(trajectory, units: PyTree = None, time_unit: str | None = None):
     members = _member_axes(trajectory)
     of_q, of_qdot = _units(trajectory.q, units, time_unit)
     variables: dict[str, tuple] = {"ok": (members, np.asarray(trajectory.ok))}
-    for name, tree, unit in (("q", trajectory.q, of_q), ("qdot", trajectory.qdot, of_qdot)):
+    trees = [("q", trajectory.q, of_q), ("qdot", trajectory.qdot, of_qdot)]
+    if trajectory.contacts is not None:
+        forces = trajectory.contact_forces
+        trees.append(("contact_forces", forces, [None] * len(jax.tree.leaves(forces))))
+    for name, tree, unit in trees:
         for (path, leaf), one in zip(jax.tree_util.tree_leaves_with_path(tree), unit, strict=True):
             # A key as plain text: 'theta' for a dict's or a NamedTuple's, '0' for a list's.
             label = jax.tree_util.keystr((jax.tree_util.GetAttrKey(name), *path), simple=True, separator=".")
@@ -43,12 +48,10 @@ def frame(trajectory, units: PyTree = None, time_unit: str | None = None):
     pandas = import_package("to_pandas()", "pandas", "pandas")
     require_numbers(trajectory, "to_pandas() copies")
     members = Members(trajectory)
-    names = [name.removeprefix("q") for name in members.layout.names]
-    columns = {
-        which + name: column
-        for which, tree in (("q", trajectory.q), ("qdot", trajectory.qdot))
-        for name, column in zip(names, members.flat(tree).reshape(-1, len(names)).T, strict=True)
-    }
+    lead = len(members.batch) + 1
+    columns = columns_of({"q": trajectory.q, "qdot": trajectory.qdot}, lead)
+    if trajectory.contacts is not None:
+        columns |= columns_of({"contact_forces": trajectory.contact_forces}, lead)
     if trajectory.mode is not None:
         codes = np.asarray(trajectory.mode).ravel()
         columns["mode"] = pandas.Categorical.from_codes(codes, categories=list(trajectory.mode_names))
@@ -66,9 +69,55 @@ def frame(trajectory, units: PyTree = None, time_unit: str | None = None):
     return table
 
 
+def impact_frame(impacts):
+    """A `pandas.DataFrame` of `Impacts`: see `Impacts.to_pandas`."""
+    return _event_frame(impacts, {"impulse": impacts.impulse, "energy_lost": impacts.energy_lost})
+
+
+def change_frame(changes):
+    """A `pandas.DataFrame` of `ContactChanges`: see `ContactChanges.to_pandas`."""
+    states = {name: getattr(changes, name) for name in ("q", "qdot", "q_next", "qdot_next")}
+    words = {"contact": (changes.contact, changes.names), "change": (changes.change, CHANGE_WORDS)}
+    return _event_frame(changes, states, **words)
+
+
+def _event_frame(record, trees: dict[str, PyTree], **words: tuple):
+    """A table of what happened at the times `record.t`, without the rows that pad it; codes are given with `words`."""
+    pandas = import_package("to_pandas()", "pandas", "pandas")
+    if not is_known(record.t):
+        raise ValueError("to_pandas() copies numbers: call it outside of jit, vmap and grad.")
+    t = np.asarray(record.t)
+    there = np.flatnonzero(np.isfinite(t.ravel()))
+    index = pandas.Index(t.ravel()[there], name="t")
+    if t.ndim > 1:
+        places = [place.ravel()[there] for place in np.indices(t.shape)[:-1]]
+        index = pandas.MultiIndex.from_arrays([*places, index], names=[*_axis_names(t.ndim - 1), "t"])
+    columns = {
+        name: pandas.Categorical.from_codes(np.asarray(codes).ravel()[there], categories=list(of))
+        for name, (codes, of) in words.items()
+    }
+    columns |= {name: column[there] for name, column in columns_of(trees, t.ndim).items()}
+    return pandas.DataFrame(columns, index=index)
+
+
+def columns_of(trees: dict[str, PyTree], lead: int) -> dict[str, np.ndarray]:
+    """Every number of some pytrees as messages name it, along all of the first `lead` axes."""
+    columns = {}
+    for name, tree in trees.items():
+        for label, leaf in zip(*labelled_leaves(tree, name)[:2], strict=True):
+            shape = leaf.shape[lead:]
+            numbers = np.asarray(leaf).reshape(-1, math.prod(shape)).T
+            for place, column in zip(np.ndindex(shape), numbers, strict=True):
+                columns[label + (str(list(place)) if shape else "")] = column
+    return columns
+
+
 def _member_axes(trajectory) -> tuple[str, ...]:
     """Names of the axes of the batch: "member", or "member_0", "member_1", … of batches of batches."""
-    rank = np.ndim(trajectory.result._value)
+    return _axis_names(np.ndim(trajectory.result._value))
+
+
+def _axis_names(rank: int) -> tuple[str, ...]:
     return ("member",) if rank == 1 else tuple(f"member_{axis}" for axis in range(rank))
 
 

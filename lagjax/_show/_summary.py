@@ -15,7 +15,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from lagjax._interface import ENDED_WELL, is_known, name_of
+from lagjax._interface import ENDED_WELL, is_known, labelled_leaves, name_of
 
 COUNTS = ("num_steps", "num_rejected_steps")
 LEAVES_SHOWN = 6  # of q, which may have any number of leaves
@@ -32,6 +32,21 @@ def summary(trajectory) -> str:
     if not all(hasattr(leaf, "shape") and hasattr(leaf, "dtype") for leaf in leaves):
         return eqx.tree_pformat(trajectory)
     return "\n".join([_contents(trajectory), _span(trajectory), _verdict(trajectory)])
+
+
+def canonical_summary(trajectory) -> str:
+    """The three lines for a `CanonicalTrajectory`; its fields where it has no shapes."""
+    leaves = jax.tree.leaves((*trajectory,), is_leaf=lambda leaf: leaf is None)
+    if not all(hasattr(leaf, "shape") and hasattr(leaf, "dtype") for leaf in leaves):
+        return f"CanonicalTrajectory{tuple(trajectory)}"
+    ts, ok, batch = trajectory.ts, trajectory.ok, trajectory.ok.shape
+    ended = "the result is being traced"
+    if is_known(ok):
+        well = np.asarray(ok)
+        ended = f"{well.sum()} of {well.size} reached the end" if batch else f"{'' if well else 'not '}reached the end"
+    members = f" of {' × '.join(map(str, batch))} members" if batch else ""
+    lines = f"CanonicalTrajectory{members}, {ts.dtype}: {_coordinates(trajectory.q)}, and p", _outputs(ts), ended
+    return "\n".join(lines)
 
 
 def require_numbers(trajectory, what: str) -> None:
@@ -52,24 +67,32 @@ def import_package(what: str, name: str, source: str, *parts: str) -> Any:
 
 def _contents(trajectory) -> str:
     batch = trajectory.result._value.shape
-    leaves = jax.tree_util.tree_leaves_with_path(trajectory.q)
-    named = [f"q{jax.tree_util.keystr(path)} {tuple(leaf.shape)}" for path, leaf in leaves]
-    if len(named) > LEAVES_SHOWN:
-        named[LEAVES_SHOWN - 1 :] = [f"… ({len(named) - LEAVES_SHOWN + 1} more)"]
     members = f" of {' × '.join(map(str, batch))} members" if batch else ""
     modes = f"; modes {', '.join(trajectory.mode_names)}" if trajectory.mode_names else ""
     off = trajectory.ts.dtype == np.float32 and not jax.config.jax_enable_x64  # pyright: ignore[reportAttributeAccessIssue]
     dtype = "float32, as jax_enable_x64 is off" if off else trajectory.ts.dtype
-    return f"Trajectory{members}, {dtype}: {', '.join(named)}, and qdot{modes}"
+    return f"Trajectory{members}, {dtype}: {_coordinates(trajectory.q)}, and qdot{modes}"
+
+
+def _coordinates(q) -> str:
+    leaves = jax.tree_util.tree_leaves_with_path(q)
+    named = [f"q{jax.tree_util.keystr(path)} {tuple(leaf.shape)}" for path, leaf in leaves]
+    if len(named) > LEAVES_SHOWN:
+        named[LEAVES_SHOWN - 1 :] = [f"… ({len(named) - LEAVES_SHOWN + 1} more)"]
+    return ", ".join(named)
+
+
+def _outputs(ts) -> str:
+    text = f"{ts.shape[-1]} outputs"
+    if not is_known(ts):
+        return text
+    # Under `jax.vmap` members may have times of their own.
+    start, end = (_range(np.asarray(ts)[..., place]) for place in (0, -1))
+    return f"t from {start} to {end} at {text}"
 
 
 def _span(trajectory) -> str:
-    ts, counts = trajectory.ts, [trajectory.stats[name] for name in COUNTS]
-    text = f"{ts.shape[-1]} outputs"
-    if is_known(ts):
-        # Under `jax.vmap` members may have times of their own.
-        start, end = (_range(np.asarray(ts)[..., place]) for place in (0, -1))
-        text = f"t from {start} to {end} at {text}"
+    text, counts = _outputs(trajectory.ts), [trajectory.stats[name] for name in COUNTS]
     if not all(map(is_known, counts)):
         return f"{text}; the steps are being traced"
     steps, rejected = map(np.asarray, counts)
@@ -91,7 +114,7 @@ def _verdict(trajectory) -> str:
     codes, times = np.asarray(code), np.asarray(t_end)
     if codes.ndim == 0:
         name = name_of(codes)
-        return "reached the end" if name == "successful" else f"ended at t = {times:.6g}: {name}"
+        return "reached the end" if name == "successful" else f"ended at t = {times:.6g}: {name}{_events(trajectory)}"
     if codes.size == 0:
         return "no members"
     parts = []
@@ -104,6 +127,13 @@ def _verdict(trajectory) -> str:
     first = tuple(failed[0].tolist())
     shown = first[0] if len(first) == 1 else first
     return f"{', '.join(parts)}: the first that failed is member {shown}, at t = {times[first]:.6g}"
+
+
+def _events(trajectory) -> str:
+    """The functions of an event that ended a motion, by name, where there are several."""
+    labels, leaves, _ = labelled_leaves(trajectory.event, "event")
+    ended = [label for label, leaf in zip(labels, leaves, strict=True) if is_known(leaf) and bool(leaf)]
+    return f", by {', '.join(ended)}" if len(leaves) > 1 and ended else ""
 
 
 def _range(values: np.ndarray) -> str:

@@ -244,3 +244,17 @@ def test_what_newcomers_write_is_named(options, kind, match):
     with pytest.raises(kind, match=match):
         system = lagjax.System(planar, **given)
         lagjax.simulate(system, {"x": 0.0, "y": 1.0}, {"x": 0.0, "y": 0.0}, jnp.array([0.0, 0.1]))
+
+
+@pytest.mark.slow
+def test_a_gap_is_infinite_while_it_is_off():
+    """A stone over a floor that begins at x = 0, or at x = 0 ends: where it is on, off, and on too late."""
+    gap = lambda q: {"floor": jnp.where(q[0] > 0, q[1], jnp.inf)}
+    stone, ts = lagjax.System(lambda q, v: 0.5 * v @ v - 2 * q[1], contacts=gap), jnp.array([0.0, 1.5, 3.0])
+    q0, v0 = jnp.array([[-1.0, 1.0], [1.5, 1.0], [-1.5, 1.0]]), jnp.array([[2.0, 0.0], [-1.0, 0.0], [1.0, 0.0]])
+    run = lagjax.simulate_batch(stone, q0, v0, ts)
+    assert repr(run.result) == "lagjax.RESULTS<2 successful, 1 contact_at_corner>"
+    # The first lands at t = 1 and rests; the second rests from t = 1 to 1.5 and falls on.
+    np.testing.assert_allclose(run.q[0, 1:], [[2.0, 0.0], [5.0, 0.0]], atol=1e-12)
+    np.testing.assert_allclose(run.q[1, 2], [-1.5, -(1.5**2)], atol=1e-9)
+    np.testing.assert_allclose(run.contact_forces["floor"][0], [0.0, 2.0, 2.0], atol=1e-12)

@@ -86,3 +86,58 @@ def test_without_the_package_it_says_what_to_install(run, package, monkeypatch):
     monkeypatch.setitem(sys.modules, package, None)
     with pytest.raises(ImportError, match=rf"to_{package}\(\) needs the package {package}: pip install {package}"):
         getattr(run, f"to_{package}")()
+
+
+# A plate that strikes the floor at t = 1 with e = ½, again at 2, and then flies on; one wall, which it never meets.
+STRUCK = lagjax.System(
+    lambda q, v: 0.5 * v @ v - 2 * q[1],
+    contacts=lambda q: {"floor": q[1], "walls": jnp.stack([9 - q[0]])},
+    restitution=0.5,
+)
+
+
+@pytest.fixture(scope="module")
+def struck():
+    start = jnp.array([[0.0, 1.0], [0.0, 0.25]]), jnp.zeros((2, 2))
+    alone = lagjax.simulate(STRUCK, start[0][0], start[1][0], jnp.linspace(0.0, 4.0, 5))
+    return alone, lagjax.simulate_batch(STRUCK, *start, jnp.linspace(0.0, 2.2, 3))
+
+
+def test_contacts_have_columns_and_tables_of_their_own(struck):
+    run, batch = struck
+    table, arrays, impacts = run.to_pandas(), run.to_xarray(), run.impacts.to_pandas()
+    assert list(table.columns)[4:] == ["contact_forces['floor']", "contact_forces['walls'][0]"]
+    np.testing.assert_allclose(table["contact_forces['floor']"], [0, 0, 0, 2, 2], atol=1e-12)  # rests from 3 on
+    np.testing.assert_array_equal(arrays["contact_forces.floor"], run.contact_forces["floor"])
+    assert list(impacts.columns) == ["impulse['floor']", "impulse['walls'][0]", "energy_lost"]
+    assert len(impacts) == run.impacts.count and impacts.index.name == "t"
+    np.testing.assert_allclose(impacts["impulse['floor']"].iloc[:2], [3.0, 1.5], rtol=1e-12)
+    np.testing.assert_allclose(impacts.index[:2], [1.0, 2.0], rtol=1e-12)
+    changes = run.contact_changes.to_pandas()
+    assert list(changes["change"])[:2] == ["bounces"] * 2 and changes["change"].iloc[-1] == "closes"
+    assert set(changes["contact"]) == {"contacts['floor']"}
+    np.testing.assert_allclose(changes[["qdot[1]", "qdot_next[1]"]].iloc[0], [-2.0, 1.0], rtol=1e-12)
+    of_batch = batch.impacts.to_pandas()
+    assert of_batch.index.names == ["member", "t"]
+    np.testing.assert_allclose(of_batch.loc[1].index[:3], [0.5, 1.0, 1.25], rtol=1e-12)
+    with pytest.raises(ValueError, match="outside of jit"):
+        jax.jit(lambda impacts: impacts.to_pandas())(run.impacts)
+
+
+def test_changes_and_impacts_print_in_words(struck):
+    run, batch = struck
+    lines = repr(run.contact_changes).splitlines()
+    assert lines[0] == f"{run.contact_changes.count} changes of contacts:" and len(lines) == 12
+    assert lines[1].split() == ["t", "=", "1", "contacts['floor']", "bounces"] and lines[-1].endswith("more)")
+    assert repr(run.impacts).startswith(f"{run.impacts.count} impacts, at t = 1, 2, 2.5,")
+    assert repr(batch.contact_changes).endswith(" changes of contacts of 2 motions")
+    assert "which took an energy of 2 away" in str(run.health())
+
+
+def test_a_picture_marks_impacts(struck):
+    plot = pytest.importorskip("matplotlib") and lagjax.plot
+    for run in struck:
+        ax = plot.trajectory(run)
+        assert [text.get_text() for text in ax.get_legend().get_texts()] == ["q[0]", "q[1]", "impact['floor']"]
+        assert len(ax.lines[-1].get_xdata()) == np.sum(run.impacts.count)
+    assert len(plot.trajectory(struck[0], lambda q: (q[0], q[1])).lines) == 1

@@ -1,6 +1,7 @@
 """`print(trajectory)`: three lines that say what it holds, how far it came and how it ended, wherever it is printed."""
 
 import dataclasses
+import pickle
 import sys
 
 import equinox as eqx
@@ -189,3 +190,17 @@ def test_an_integer_of_params_and_an_unknown_dataclass_are_explained():
 
     with pytest.raises(TypeError, match=r"call jax.tree_util.register_dataclass\(Place\) once"):
         lagjax.simulate(lagjax.System(lambda q, v: 0.5 * v.x**2), Place(1.0), Place(0.0), jnp.array([0.0, 1.0]))
+
+
+def test_results_are_printed_by_name(fallen):
+    assert repr(fallen.result) == "lagjax.RESULTS<2 successful, 2 dt_min_reached, 2 nonfinite_state>"
+    assert repr(lagjax.RESULTS.successful) == "lagjax.RESULTS<successful>"
+    assert repr(lagjax.RESULTS.zeno).startswith("lagjax.RESULTS<") and pickle.loads(pickle.dumps(lagjax.RESULTS.zeno))
+
+
+def test_a_canonical_motion():
+    motion = lagjax.hamiltonian(lagjax.System(lambda q, v: 0.5 * v["x"] ** 2)).simulate({"x": 0.0}, {"x": 1.0}, TS)
+    assert lines(motion) == [
+        "CanonicalTrajectory, float64: q['x'] (5,), and p", "t from 0 to 2 at 5 outputs", "reached the end",
+    ]  # fmt: skip
+    assert repr(jax.tree.map(lambda _: 0, motion)) == "CanonicalTrajectory(0, {'x': 0}, {'x': 0}, 0)"

@@ -201,3 +201,19 @@ def test_bits_of_events_do_not_depend_on_neighbours():
         runs.append(np.column_stack([run.end.t, run.end.q, run.end.qdot])[np.argsort(order)])
     assert (runs[0][:, 0] < 5.0).sum() > 1000
     np.testing.assert_array_equal(*runs)
+
+
+def test_the_result_says_which_of_several_events_ended_the_motion():
+    scene, ts = lagjax.System(lambda q, v: 0.5 * v**2), jnp.linspace(0.0, 10.0, 3)
+    event = {"far": lambda q, v: q - 3.0, "near": lambda q, v: q - 2.0, "held": lambda q, v: q < -1.0}
+    run = lagjax.simulate(scene, 0.0, 1.0, ts, event=event)
+    assert {name: bool(x) for name, x in run.event.items()} == {"far": False, "near": True, "held": False}
+    assert repr(run).endswith("ended at t = 2: event_occurred, by event['near']")
+    assert bool(lagjax.simulate(scene, -2.0, 1.0, ts, event=event).event["held"])  # at once
+    many = lagjax.simulate_batch(scene, jnp.array([0.0, 2.5, -0.5]), jnp.array([1.0, 1.0, -0.01]), ts, event=event)
+    np.testing.assert_array_equal(np.stack([many.event[x] for x in event]), [[0, 1, 0], [1, 0, 0], [0, 0, 0]])
+    assert lagjax.simulate(scene, 0.0, 1.0, ts).event is None
+    with pytest.raises(ValueError, match=r"of 3 functions is for machine code.*jnp.minimum"):
+        lagjax.simulate(scene, 0.0, 1.0, ts, event=event, solver=diffrax.Dopri8())
+    one = lagjax.simulate(scene, 0.0, 1.0, ts, event=[event["far"]], solver=diffrax.Dopri8())
+    assert bool(one.event[0]) and abs(one.end.t - 3) < 1e-9

@@ -84,7 +84,10 @@ BALL = lagjax.Hybrid(
         (lambda: lagjax.find_path(BALL, 1.0, 0.0, 0.0, 1.0), "^This is for one System: a lagjax.Hybrid is"),
         (lambda: lagjax.lyapunov_exponent(BALL, 1.0, 0.0, 1.0), "^This is for one System: a lagjax.Hybrid is taken by"),
         (lambda: lagjax.work_precision(BALL, 1.0, 0.0, TS), "^This is for one System: a lagjax.Hybrid is taken by"),
-        (lambda: lagjax.simulate(BALL, 1.0, 0.0, TS, event=lambda q, v: q), "takes no event for a lagjax.Hybrid"),
+        (lambda: lagjax.simulate(BALL, 1.0, 0.0, TS, event=lambda q, v: q), "takes no event for a .*lagjax.crossings"),
+        (lambda: lagjax.simulate(PLAIN, 1.0, 0.0, TS, t_eval=TS), "takes no t_eval=: .* are ts"),
+        (lambda: lagjax.simulate_batch(PLAIN, 1.0, 0.0, TS, args=(1.0,)), "takes no args=: .* is params"),
+        (lambda: lagjax.simulate(PLAIN, 1.0, 0.0, np.arange("2020-01", "2020-04", dtype="M8[D]")), "timedelta64"),
         (
             lambda: lagjax.simulate(lambda q, v: 0.5 * v**2, 1.0, 0.0, TS),
             r"lagjax.System\(lagrangian\) is; got <lam",
@@ -99,6 +102,13 @@ BALL = lagjax.Hybrid(
 def test_mistakes_are_told_with_what_to_do(call, said):
     with pytest.raises((TypeError, ValueError, lagjax.SimulationError), match=said):
         call()
+
+
+def test_names_of_another_package_are_told_ours():
+    run = lagjax.simulate(PLAIN, jnp.ones(1), jnp.zeros(1), TS)
+    with pytest.raises(AttributeError, match="Its times are `ts`"):
+        _ = run.t
+    assert not hasattr(run, "nothing") and pickle.loads(pickle.dumps(eqx.tree_at(lambda r: r.system, run, None))).ok
 
 
 def _sweep(ts, crossings=None):

@@ -1,6 +1,9 @@
 """Derivatives of motions in machine code: of every order, in every order of modes, against closed forms."""
 
 import itertools
+import os
+import subprocess
+import sys
 
 import jax
 import jax.numpy as jnp
@@ -185,5 +188,27 @@ def test_second_derivatives_through_a_bounce():
 
 @pytest.mark.parametrize("derivative", [lambda f: f, jax.jacfwd, jax.jacrev])
 def test_machine_code_of_a_cpu_is_not_exported(derivative):  # lowers without compiling
-    with pytest.raises(ValueError, match=r"jax\.export cannot take a motion along .* solver of diffrax"):
+    with pytest.raises(ValueError, match=r"jax\.export cannot take a motion in a CPU's .* solver of diffrax"):
         jax.export.export(jax.jit(derivative(followed)))(X)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("on_error", ["raise", "nan"])
+def test_the_recipe_for_exports_is_one_whole(on_error):
+    """With two of its three parts it says again what they are, and with all of them a motion is exported."""
+    code = """
+import diffrax, jax, jax.numpy as jnp, lagjax
+jax.config.update("jax_enable_x64", True)
+spring, ts = lagjax.System(lambda q, v: 0.5 * v**2 - 0.5 * q**2), jnp.array([0.0, 1.0])
+run = lambda q, throw: lagjax.simulate(spring, q, 0.0, ts, solver=diffrax.Dopri8(), throw=throw).q[-1]
+for throw in (True, False):
+    for function in (run, jax.grad(run)):
+        try:
+            exported = jax.export.export(jax.jit(lambda q: function(q, throw)))(1.0)
+            print("right" if abs(exported.call(1.0) - jnp.cos(1.0)) < 1e-8 else "wrong")
+        except ValueError as why:
+            print("told" if "throw=False), and set EQX_ON_ERROR=nan" in str(why) else "raw")
+"""
+    environment = os.environ | {"EQX_ON_ERROR": on_error}
+    said = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert said.stdout.split() == ["told", "told", *(["told"] * 2 if on_error == "raise" else ["right"] * 2)]

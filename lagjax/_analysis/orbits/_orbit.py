@@ -259,6 +259,7 @@ def _sentence(chain: Chain, k: int) -> str:
         return (
             f"No periodic orbit was found near the guess: after {chain.y.shape[1]} arcs per period and a period of "
             f"{chain.periods()[k]:.6g} the largest defect is {share:.2g} of the size of the state. Begin nearer: "
-            "another state or period."
+            "another state or period. A coordinate that goes on from period to period, as the x of a walker, never "
+            "closes: give image=lambda q, qdot: (q + step, qdot), or leave it out of L."
         )
     return ""

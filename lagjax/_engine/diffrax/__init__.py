@@ -25,6 +25,7 @@ from lagjax._engine._problem import (
     Solution,
     evaluate_condition,
     flat_condition,
+    has_own_root_finder,
     signs_of_event,
     solve_in_doubles,
     too_tight,
@@ -46,7 +47,7 @@ from lagjax._interface import (
     require_number,
     result_from,
 )
-from lagjax._primitives import DOUBLE, SINGLE, differentiable_where, lost_unless
+from lagjax._primitives import DOUBLE, SINGLE, differentiable_where, lost_unless, mark_steps
 from lagjax._program import CLOCK, Unlowerable, lack_of_memory, table_of
 
 # Solvers reject steps for the round-off of their error estimate where rtol is below some ten units of it.
@@ -233,8 +234,8 @@ def _solve(engine: Diffrax, problem: Problem) -> Solution:
         result = RESULTS.where(not_projected, RESULTS.projection_failed, result)
     # diffrax leaves outputs it did not reach at inf, and those of a member without time at its start. Whatever adjoint
     # there is, their cotangents must not be lost: they go to all that went in.
-    reached = jnp.isfinite(solution.path).all(axis=1) & (ts == given)
-    well = jnp.isin(result._value, jnp.asarray(ENDED_WELL))
+    reached = mark_steps(jnp.isfinite(solution.path).all(axis=1) & (ts == given))
+    well = mark_steps(jnp.isin(result._value, jnp.asarray(ENDED_WELL)))
     y_end, t_end, inputs = solution.y_end, solution.t_end, (given, y0, *jax.tree.leaves(numbers))
     if not is_located:  # where a motion ends behind a step that an event ended does not vary with the step
         well = well & (result._value != EVENT_OCCURRED)
@@ -301,12 +302,20 @@ def _flatten_event(problem: Problem, ts, y0, numbers) -> tuple[diffrax.Event, bo
 
         return condition
 
-    functions, structure = jax.tree.flatten(event.cond_fn, is_leaf=callable)
+    functions = jax.tree.leaves(event.cond_fn, is_leaf=callable)
     ways = jax.tree.leaves(event.direction, is_leaf=lambda leaf: leaf is None)
     conditions = [flat(function, sign) for function, sign in zip(functions, signs, strict=True)]
     ways = [sign > 0 if sign else way for sign, way in zip(signs, ways, strict=True)]
-    located = diffrax.Event(structure.unflatten(conditions), event.root_finder, structure.unflatten(ways))
-    return located, None not in signs
+    if len(conditions) == 1:
+        return diffrax.Event(conditions[0], event.root_finder, ways[0]), None not in signs
+    if not has_own_root_finder(event):
+        raise ValueError(
+            f"An event of {len(functions)} functions is for machine code: of several that a step of diffrax passes, "
+            "the first of the list would end the motion, and not the first in time. Leave the solver out, or make one "
+            "function of them that changes sign where any of them does, as lambda q, qdot: jnp.minimum(f, g) of two "
+            "that are positive before."
+        )
+    return diffrax.Event(conditions, event.root_finder, ways), None not in signs
 
 
 # ---- what can be wrong with a solver ---------------------------------------------------------------------------------

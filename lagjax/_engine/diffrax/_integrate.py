@@ -146,7 +146,8 @@ def _call(moving, method: Method, adjoint, event=None, *more: diffrax.SubSaveAt)
     path, y_end, t_end = done.ys[0], done.ys[1][0], done.ts[1][0]
     if len(ts) == 2:  # infinite where it was not reached, as the others are
         path = jnp.stack([path[0], jnp.where(t_end == ts[-1], path[1], jnp.inf)])
-    return Solution(path, y_end, t_end, result, accepted, rejected), done.ys[2:], crossed
+    ended = None if event is None else jnp.stack(jax.tree.leaves(done.event_mask))
+    return Solution(path, y_end, t_end, result, accepted, rejected, ended), done.ys[2:], crossed
 
 
 def _set_stage_loop(solver, adjoint):

@@ -34,7 +34,7 @@ from lagjax._engine.taylor._line_functions import line_of
 from lagjax._engine.taylor._lowered_motion import lowered_motion
 from lagjax._engine.taylor._surfaces import Guarded, Surfaces, require_one_number, vector_of
 from lagjax._equations import Derivation
-from lagjax._interface import default_platform, has_nvidia_gpu, is_concrete
+from lagjax._interface import EVENT_OCCURRED, default_platform, has_nvidia_gpu, is_concrete
 from lagjax._native import Guards, Nesting, append_guards, pieces_of
 from lagjax._primitives import attach_derivative, compute_in_doubles
 from lagjax._program import Program, Unlowerable
@@ -136,12 +136,12 @@ class MachineCode(AbstractEngine):
         flow, tolerances = flow_of(problem), tolerances_of(problem)
         if problem.is_known and default_platform() == "cpu":
             _require_increasing(flow.program, problem.vector)
-            return _run_one(flow, problem, tolerances)
+            return _name_events(problem, _run_one(flow, problem, tolerances))
         ts, y0, params = map(jnp.asarray, (problem.ts, problem.y0, problem.vector))
         if problem.event is None:
             return _primitives.run(flow, tolerances, ts, y0, params)
         given = flow, _unguarded_flow(problem), surfaces_of_event(problem), tolerances
-        return _primitives.compile_once(motion_to_event, *given)(ts, y0, params)
+        return _name_events(problem, _primitives.compile_once(motion_to_event, *given)(ts, y0, params))
 
     def solve_to_event(self, problem: Problem, sides) -> Solution:
         """The motion of one member to the first change of its guards; it remembers `sides` (see `Guards`).
@@ -191,10 +191,18 @@ class MachineCode(AbstractEngine):
 
         def run(ts, y0, params):
             problem = member.double_precision if member.is_single else member
-            return flow_of(problem).run(ts, y0, params, tolerances_of(problem))
+            return _name_events(problem, flow_of(problem).run(ts, y0, params, tolerances_of(problem)))
 
         given = np.asarray(member.ts)[None], np.asarray(batch.y0), np.asarray(batch.vectors)
         return compute_in_doubles(run, *given) if member.is_single else run(*given)
+
+
+def _name_events(problem: Problem, solution: Solution) -> Solution:
+    """The solution with the functions of the event that ended the motion in place of the mask of guards."""
+    if problem.event is None:
+        return solution
+    changes = changes_of(solution.event[..., None], len(surfaces_of_event(problem).directions))
+    return solution._replace(event=(changes > 0) & (solution.result == EVENT_OCCURRED)[..., None])
 
 
 def _run_one(flow: Flow, problem: Problem, tolerances: Tolerances) -> Solution:

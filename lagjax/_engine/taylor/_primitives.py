@@ -48,6 +48,7 @@ from lagjax._engine.taylor._variational import from_rows, to_rows
 from lagjax._interface import SUCCESSFUL, default_platform
 from lagjax._native import Begun, Projection
 from lagjax._primitives import (
+    NOT_EXPORTED,
     LinearMap,
     compute_on_host,
     cond_alike,
@@ -373,11 +374,8 @@ def _lowering_rule(form):
 
     def lower_form(context, *args, **settings):
         if context.module_context.lowering_parameters.for_export:
-            raise ValueError(
-                "jax.export cannot take a motion along that runs in a CPU's machine code, which lies in this process: "
-                "give a solver of diffrax, as simulate(…, solver=diffrax.Dopri8(), throw=False), and set "
-                "EQX_ON_ERROR=nan before Python starts; or export for CUDA alone."
-            )
+            here = "a motion in a CPU's machine code, which lies in this process,"
+            raise ValueError(f"{NOT_EXPORTED.format(here)} Or export for CUDA alone.")
         return rule(context, *args, **settings)
 
     return lower_form

@@ -22,7 +22,7 @@ from lagjax._equations import ROUNDINGS, derivation_of, has_constraints, require
 from lagjax._interface import Layout, compile_for_one_call, halves, is_concrete, require_budget, result_from
 from lagjax._primitives import DOUBLE, compute_in_doubles
 from lagjax._run._rounds import BLOCK
-from lagjax._run._trajectory import ContactChanges, Impacts, State, Trajectory, follow_in_doubles, step_counts
+from lagjax._run._trajectory import ContactChanges, Impacts, Names, State, Trajectory, follow_in_doubles, step_counts
 from lagjax._run.contacts._contact_rounds import Carry, ContactPlan, RoundRecord, RowPlaces, contact_motion
 from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes, System, require_coefficients
 
@@ -178,8 +178,8 @@ def _trajectory(
 ) -> Trajectory:
     (q, qdot), end, (at, behind), before = _restore(problem.layout, ending, record)
     known = record.contact, record.change, ending.rounds, ending.doubts, ending.doubted
-    changes = ContactChanges(record.t, at, before, at, behind, *known)
     names = Shapes.from_system(problem.system, problem.layout, problem.params).names
+    changes = ContactChanges(record.t, at, before, at, behind, *known, Names(names))
     return Trajectory(
         ts=jnp.asarray(given.ts), q=q, qdot=qdot, result=result_from(ending.result), end=State(ending.t, *end),
         stats=step_counts(*ending.steps), system=given.system, params=params, params_axes=axes,
@@ -212,7 +212,7 @@ def contact_forces(trajectory: Trajectory):
         def evaluate_output(q, qdot, t, contacts):
             parts = layout.flatten(q), layout.flatten(qdot), t[None], *numbers, *map(jnp.ravel, contacts)
             forces = program(jnp.concatenate([jnp.asarray(x, layout.dtype) for x in parts]))[places.normal]
-            return jnp.where(contacts.closed >= 0, forces, jnp.nan)
+            return jnp.where(contacts.closed > 0, forces, jnp.where(contacts.closed == 0, 0.0, jnp.nan))
 
         return flat.shapes.name_numbers(jax.vmap(evaluate_output)(q, qdot, times[0], contacts))
 

@@ -301,8 +301,8 @@ class Health(eqx.Module):
             rows.append((law, f"off by {_worst(self.energy, self._energy_limit)}{known}"))
         else:
             count, lost, shared, t = (np.asarray(x) for x in self.impacts)
-            took = f"{count.sum()}, which took {np.sum(lost):.3g} of the energy"
-            rows.append(("impacts", f"{took}; its balance is not judged"))
+            took = f"{count.sum()}, which took an energy of {np.sum(lost):.3g} away"
+            rows.append(("impacts", f"{took}; the balance of energy is not judged"))
             if shared.any():
                 law = f"{shared.sum()} shared by several contacts, the first at t = {np.nanmin(t):.6g}: there another"
                 rows.append(("", f"{law} law of impacts gives another motion"))
