@@ -52,7 +52,7 @@ def count_knots(expansion: Any, knots: Ids, x: Ids, side: str) -> Ids | None:
     return expansion.fold("add", f("convert", below, attribute="int32"))
 
 
-def look_up_windows(expansion: Any, x: Ids, indices: Ids, axes: Any, sizes: Any, missing: float | None) -> Ids:
+def look_up_windows(expansion: Any, x: Ids, indices: Ids, axes: Any, sizes: Any, missing: Any) -> Ids:
     """The windows (*sizes) of an array that begin at `indices` (…, axes) along some axes, shape (…, *sizes).
 
     A window that sticks out begins where it fits; or is `missing`, where that is a number.
@@ -74,14 +74,23 @@ def look_up_windows(expansion: Any, x: Ids, indices: Ids, axes: Any, sizes: Any,
     if missing is None:
         return result
     inside = inside.reshape(*place.shape, *[1] * window.ndim)
-    return expansion.map("select", inside, expansion.constants(float(missing)), result)
+    missing = expansion.graph.constant(missing, kind_of_ids(expansion.graph, x))
+    return expansion.map("select", inside, np.array(missing), result)
+
+
+def kind_of_ids(graph: Graph, x: Ids) -> str:
+    """The kind of an array; what is no node yet is a float."""
+    return graph.kinds[x.flat[0]] if x.size and x.flat[0] < INPUTS else "float"
 
 
 def _entry(expansion: Any, ids: Ids, place: int) -> int:
     """The entry of this number, a float that is whole; the nearest where there is none."""
     graph = expansion.graph
     if (table := _table(expansion, ids)) is not None:
-        return graph.apply("take", place, attribute=table)
+        entry, kind = graph.apply("take", place, attribute=table), kind_of_ids(graph, ids)
+        if kind == "bool":
+            return graph.apply("ne", entry, graph.number(0.0))
+        return entry if kind == "float" else graph.apply("convert", entry, attribute=kind)
     if (parts := _combination(graph, ids)) is not None:
         total = graph.number(0.0)
         for base, numbers in parts.items():
@@ -128,6 +137,8 @@ def _operands(graph: Graph, ids: Ids) -> list[Ids] | None:
     op, operands, attribute = nodes[0]
     if not operands or any(node[0] != op or node[2] != attribute for node in nodes):
         return None
+    if op == "convert" and len({graph.kinds[of] for _, (of,), _ in nodes}) > 1:
+        return None
     columns = np.array([node[1] for node in nodes]).T
     if OPERATIONS[op].commutative and not (columns == columns[:, :1]).all(axis=1).any():  # written in either order
         for shared in columns[:, 0]:
@@ -160,6 +171,8 @@ def _as_float(graph: Graph, i: int) -> int:
         return i
     if op == "convert" and graph.kinds[operands[0]] == "float" and graph.nodes[operands[0]][0] in _WHOLE:
         return operands[0]
+    if kind != "bool" and np.iinfo(kind).bits < 32:  # it wraps
+        return graph.apply("convert", i, attribute="float")
     if op == "convert" and graph.kinds[operands[0]] not in ("float", "bool"):
         return _as_float(graph, operands[0])
     if kind != "bool" and op in ("add", "sub", "mul", "neg", "max", "min"):
@@ -200,6 +213,6 @@ def _table_of_ids(graph: Graph, ids: Ids) -> Table | None:
     if (positions >= 0).all() and stride and (steps == stride).all():
         return Table(int(positions[0]), stride, ids.size)
     values = [None if INPUTS <= i < NUMBERS else graph.value(graph.real(i)) for i in ids.tolist()]
-    if None not in values:
+    if None not in values and all(abs(x) <= 2**53 for x in values if isinstance(x, int)):  # a float holds them
         return Table(0, 1, ids.size, np.array(values, np.float64).tobytes())
     return None

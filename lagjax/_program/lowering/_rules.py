@@ -23,7 +23,7 @@ from jax.extend import core
 from lagjax._program._graph import INPUTS, PAIRS, Graph, Unlowerable
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._simplify import arctangent
-from lagjax._program.lowering._indexing import are_numbers, count_knots, locate_knots, look_up_windows
+from lagjax._program.lowering._indexing import are_numbers, count_knots, kind_of_ids, locate_knots, look_up_windows
 
 # Scalars that are looked at for each one that the budget allows, as most of a derivative folds away; and in all, which
 # takes some minutes.
@@ -630,7 +630,7 @@ def _locate(expansion, params, knots, x):
 @lowers("gather")
 def _gather(expansion, params, x, indices):
     d, indices, clips = params["dimension_numbers"], expansion.real(indices), _clips(params["mode"])
-    missing = np.nan if params["fill_value"] is None else float(params["fill_value"])
+    missing = np.nan if params["fill_value"] is None else params["fill_value"]
     if not are_numbers(expansion, indices) and not d.operand_batching_dims:
         sizes = params["slice_sizes"]
         found = look_up_windows(expansion, x, indices, d.start_index_map, sizes, None if clips else missing)
@@ -643,9 +643,7 @@ def _gather(expansion, params, x, indices):
     )  # fmt: skip
     if (places >= 0).all():
         return x.ravel()[places]
-    if x.size and expansion.graph.kinds[x.flat[0]] != "float":
-        raise Unlowerable("an index into an array that is not of floats is out of bounds")
-    return np.append(x.ravel(), expansion.constants(missing))[places]
+    return np.append(x.ravel(), expansion.graph.constant(missing, kind_of_ids(expansion.graph, x)))[places]
 
 
 def _scatter(op):
