@@ -166,6 +166,12 @@ def _place(expansion: Any, indices: Ids, room: list[int], strides: list[int]) ->
 
 def _as_float(graph: Graph, i: int) -> int:
     """An integer as a float. What it was computed by with integers is computed with floats: these are exact, too."""
+    if i not in graph.floats:
+        graph.floats[i] = _compute_as_float(graph, i)
+    return graph.floats[i]
+
+
+def _compute_as_float(graph: Graph, i: int) -> int:
     (op, operands, attribute), kind = graph.nodes[i], graph.kinds[i]
     if kind == "float":
         return i
