@@ -610,7 +610,7 @@ class Derivation:
     def _constant_mass(self) -> bool:
         return not self.reads("mass_matrix")
 
-    def _samples(self, reach: float, numbers: Sequence | None = None) -> list[tuple[np.ndarray, np.ndarray]]:
+    def _samples(self, reach: float, numbers: Any = None) -> list[tuple[np.ndarray, np.ndarray]]:
         """M and G at a few states that nothing speaks for, where they are finite; `numbers` are those of params."""
         if numbers is not None:
             return self._evaluate_matrices([*self._columns(reach)[: 2 * self.layout.size + 1], *numbers])

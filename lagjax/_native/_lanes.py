@@ -104,7 +104,7 @@ def apply(code: Code, op: str, xs: list[Value], attribute, kinds: Sequence[str],
     is_whole = kind not in ("float", "bool")
     how = INTEGERS.get(op) if is_whole else OPERATIONS[op].llvm
     if op == "mul" and kind in ("int32", "uint32"):
-        how = functools.partial(_multiply_words, kind=kind)
+        how = functools.partial(_multiply_words, kind)
     if how is None:
         raise Unlowerable(f"`{op}`{' of integers' if is_whole else ''} has no machine code here")
     more = () if attribute is None else (attribute,)
@@ -134,7 +134,7 @@ INTEGERS = {
 }
 
 
-def _multiply_words(code: Code, a: Value, b: Value, kind: str) -> Value:
+def _multiply_words(kind: str, code: Code, a: Value, b: Value) -> Value:
     """A product of integers of 32 bits, less what wraps: of each half of one of them a double holds it exactly."""
     high = code.intrinsic("floor", a * 2.0**-16)
     return _wrap(code, high * b, kind) * 2.0**16 + (a - high * 2.0**16) * b
