@@ -117,7 +117,7 @@ class Problem:
     @functools.cached_property
     def derivation(self) -> Derivation:
         """The derivation of the scene: made once for all problems whose scene and structure are equal."""
-        return derivation_of(self.system, self.layout, self.params)
+        return derivation_of(self.system, self.layout, self.params).with_numbers(self.vector)
 
     @functools.cached_property
     def made(self) -> dict:

@@ -71,6 +71,10 @@ _FOLLOWED = 1_500_000
 # The order of coordinates of states far away, where a force between bodies is weak: its square is then a millionth.
 _FAR = 1e3
 
+# Steps of 0.3, of numbers of order one, to parameters that make M positive definite: eight coordinates take some ten.
+_MOST_CLIMBED = 60
+_INDEFINITE = "its mass matrix is not positive definite and needs pivoting"
+
 
 class _Saddle(NamedTuple):
     """M x − Gᵀλ = b, G x = c by the names of b (None: zero) and c, the `sign` of c, whether `velocities` are in G."""
@@ -122,11 +126,13 @@ class Derivation:
         refusal: str | None = None,
         unhashable: str | None = None,
         path: str = "auto",
+        counts_on_params: bool = False,
     ):
         """`params` holds numbers or shapes of numbers; `refusal` says why a scene must not be lowered at all.
 
         `unhashable` says why this derivation cannot be kept for the next time. On the `path` "auto" a large scene with
-        sparse matrices, whose functions are smooth, is not lowered: its motion is a `SparseMotion`.
+        sparse matrices, whose functions are smooth, is not lowered: its motion is a `SparseMotion`. One that
+        `counts_on_params` takes M for positive definite where some parameters make it so (`with_numbers`).
         """
         self.motion, self.layout, self.refusal, self.unhashable = motion, layout, refusal, unhashable
         self.numbers = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), params)
@@ -138,6 +144,7 @@ class Derivation:
                 "cut-off), or over parts of them by jax.lax.map with jax.checkpoint."
             )
         self.structure = None
+        self._path, self.counts_on_params = path, counts_on_params
         self._made: dict[str, Any] = {}
         self._lock = threading.RLock()
         self._programs: dict[tuple[str, ...], Program] = {}
@@ -178,7 +185,30 @@ class Derivation:
         refusal = None
         if self.structure.operations > LARGEST_LOWERED:
             refusal = f"{self.structure.operations} operations of L would take minutes to compile"
-        return Derivation(motion, self.layout, self.numbers, refusal, self.unhashable, "scalar")
+        return Derivation(motion, self.layout, self.numbers, refusal, self.unhashable, "scalar", self.counts_on_params)
+
+    def with_numbers(self, numbers=None) -> "Derivation":
+        """The derivation for these numbers of params; None, or traced ones, may be any.
+
+        Where nothing pivots, and parameters decide whether M is positive definite, it counts on that, unless these are
+        known and make another M.
+        """
+        doubted = self._counting_on_params
+        if doubted is None or numbers is None or not is_concrete(numbers):
+            return doubted or self
+        samples, m = (self._samples(reach, np.asarray(numbers)) for reach in (1.0, _FAR)), self._rows(_ACCELERATION)
+        return self if all(self._judge(of, m) is None for of in samples) else doubted
+
+    @functools.cached_property
+    def _counting_on_params(self) -> "Derivation | None":
+        """The derivation that counts on a positive definite M, where this one does not and needs to."""
+        try:
+            settled = self._path == "array" or self._pivots or self._regular(_ACCELERATION) is not None
+            if settled or self._favorable is None:
+                return None
+        except Unlowerable:
+            return None
+        return Derivation(self.motion, self.layout, self.numbers, self.refusal, self.unhashable, self._path, True)
 
     # ---- quantities of a state ----
 
@@ -506,8 +536,8 @@ class Derivation:
         The first gives the entries of A, r, factors of A and whether it is singular; the second z, of factors and r.
         """
         n, m, regular = self.layout.size, self._rows(saddle), self._regular(saddle)
-        if regular is None and (self.motion.constrained or n > _saddle.LARGEST_INDEFINITE):
-            raise Unlowerable("its mass matrix is not positive definite and needs pivoting")
+        if regular is None and not self._pivots:
+            raise Unlowerable(_INDEFINITE)
         zeros = self.absent("mass_matrix"), self.absent("jacobian")[:m]
         released = self.motion.constraints.held is not None
         augmented = self.motion.constrained and not (regular_only or ((self._constant_mass or released) and regular))
@@ -594,13 +624,18 @@ class Derivation:
     def _constant_mass(self) -> bool:
         return not self.reads("mass_matrix")
 
-    def _samples(self, reach: float) -> list[tuple[np.ndarray, np.ndarray]]:
-        """M and G at a few states that nothing speaks for, where they are finite."""
+    def _samples(self, reach: float, numbers: Any = None) -> list[tuple[np.ndarray, np.ndarray]]:
+        """M and G at a few states that nothing speaks for, where they are finite; `numbers` are those of params."""
+        if numbers is not None:
+            return self._evaluate_matrices([*self._columns(reach)[: 2 * self.layout.size + 1], *numbers])
         if reach not in self._sampled:
-            n, parts = self.layout.size, self.program("mass_matrix", "jacobian")
-            rows = [x for x in parts.evaluate_many(self._columns(reach)).T if np.isfinite(x).all()]
-            self._sampled[reach] = [(x[: n * n].reshape(n, n), x[n * n :].reshape(-1, n)) for x in rows]
+            self._sampled[reach] = self._evaluate_matrices(self._columns(reach))
         return self._sampled[reach]
+
+    def _evaluate_matrices(self, columns: list) -> list[tuple[np.ndarray, np.ndarray]]:
+        n, parts = self.layout.size, self.program("mass_matrix", "jacobian")
+        rows = [x for x in parts.evaluate_many(columns).T if np.isfinite(x).all()]
+        return [(x[: n * n].reshape(n, n), x[n * n :].reshape(-1, n)) for x in rows]
 
     def _columns(self, reach: float = 1.0) -> list[np.ndarray]:
         """The inputs at these states, one array (states,) for each: of order one, but q of this order."""
@@ -615,16 +650,50 @@ class Derivation:
         matrix that is a series in something small, as 1/(c² r) in relativity, is positive definite where that is small:
         a scene counts as positive definite that is so at all states near, or at all far away.
         """
-        n, m = self.layout.size, self._rows(saddle)
         for reach in (1.0, _FAR):
-            regular = definite = True
-            for matrix, jacobian in self._samples(reach):
-                lowest, size, rows = eigen(matrix)[0][0], np.abs(matrix).max(), jacobian[:m]
-                regular = regular and bool(lowest > 1e-10 * size)
-                augmented = eigen(matrix + rows.T @ rows)[0][0] if m else lowest
-                definite = definite and ((n <= 2 and not m) or bool(augmented >= -1e-12 * size))
-            if definite:
+            if (regular := self._judge(self._samples(reach), self._rows(saddle))) is not None:
                 return regular
+        return self._judge(self._samples(1.0, self._favorable), self._rows(saddle)) if self.counts_on_params else None
+
+    def _judge(self, samples: list[tuple[np.ndarray, np.ndarray]], m: int) -> bool | None:
+        """True if M is regular at some states; None where it is not positive definite, on m rows of G at rest."""
+        regular = True
+        for matrix, jacobian in samples:
+            lowest, size, rows = eigen(matrix)[0][0], np.abs(matrix).max(), jacobian[:m]
+            regular = regular and bool(lowest > 1e-10 * size)
+            augmented = eigen(matrix + rows.T @ rows)[0][0] if m else lowest
+            if (self.layout.size > 2 or m) and not augmented >= -1e-12 * size:
+                return None
+        return regular
+
+    @property
+    def _pivots(self) -> bool:
+        return not self.motion.constrained and self.layout.size <= _saddle.LARGEST_INDEFINITE
+
+    @functools.cached_property
+    def _favorable(self) -> np.ndarray | None:
+        """Numbers of params, none negative, that make M, with GᵀG, positive definite; None where none are found.
+
+        From those of the samples it is climbed along the slopes of what is negative in M: couplings, which are numbers
+        of their own, fall to zero.
+        """
+        first = 2 * self.layout.size + 1
+        program, columns = self.program("mass_matrix", "jacobian"), [x[:1] for x in self._columns()]
+        for _ in range(_MOST_CLIMBED):
+            samples = self._evaluate_matrices(columns)
+            if not samples:
+                return None
+            (matrix, jacobian), *_ = samples
+            values, vectors = eigen(matrix + jacobian.T @ jacobian)
+            if values[0] > 1e-3 * values[-1]:
+                return np.concatenate(columns[first:])
+            low = vectors[:, values <= 1e-3 * values[-1]]
+            slopes = program.line.vjp(columns, [*(low @ low.T).ravel(), *[None] * jacobian.size])[first:]
+            slopes = np.array([0.0 if x is None else x[0] for x in slopes])
+            if not np.isfinite(slopes).all() or not slopes.any():
+                return None
+            climbed = np.concatenate(columns[first:]) + 0.3 * slopes / np.linalg.norm(slopes)
+            columns[first:] = list(np.maximum(climbed, 0.0)[:, None])
         return None
 
 

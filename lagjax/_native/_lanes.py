@@ -103,13 +103,15 @@ def apply(code: Code, op: str, xs: list[Value], attribute, kinds: Sequence[str],
         return _convert(code, xs[0], kinds[0], kind)
     is_whole = kind not in ("float", "bool")
     how = INTEGERS.get(op) if is_whole else OPERATIONS[op].llvm
+    if op == "mul" and kind in ("int32", "uint32"):
+        how = functools.partial(_multiply_words, kind)
     if how is None:
         raise Unlowerable(f"`{op}`{' of integers' if is_whole else ''} has no machine code here")
     more = () if attribute is None else (attribute,)
     x = code.library(how, *xs) if isinstance(how, str) else how(code, *xs, *more)
     if op == "not" and is_whole and not np.iinfo(kind).min:  # the complement of what has no sign
         x = x + (np.iinfo(kind).max + 1.0)
-    return _check_range(code, x, kind) if is_whole else x
+    return _wrap(code, x, kind) if is_whole else x
 
 
 def _combine_bits(op: str) -> Callable:
@@ -129,7 +131,7 @@ def _convert(code, x, before, after):
         return code.compare("!=", x, 0.0)
     if after == "float":
         return x
-    return _check_range(code, code.intrinsic("trunc", x) if before == "float" else x, after)
+    return _check_range(code, code.intrinsic("trunc", x), after) if before == "float" else _wrap(code, x, after)
 
 
 # What is done with integers, which are whole doubles.
@@ -138,11 +140,26 @@ INTEGERS = {
     "sub": lambda code, a, b: a - b,
     "mul": lambda code, a, b: a * b,
     "neg": lambda code, a: -a,
-    "div": lambda code, a, b: code.intrinsic("trunc", a / b),
+    "div": lambda code, a, b: code.select(code.compare("==", b, 0.0), -1.0, code.intrinsic("trunc", a / b)),  # as JAX
+    "rem": lambda code, a, b: code.select(code.compare("==", b, 0.0), a, code.library("fmod", a, b)),
     "not": lambda code, a: -1.0 - a,
     **{op: _combine_bits(f"{op}_" if op != "xor" else op) for op in ("and", "or", "xor")},
-    **{op: OPERATIONS[op].llvm for op in ("abs", "max", "min", "sign", "rem", "select")},
+    **{op: OPERATIONS[op].llvm for op in ("abs", "max", "min", "sign", "select")},
 }
+
+
+def _multiply_words(kind: str, code: Code, a: Value, b: Value) -> Value:
+    """A product of integers of 32 bits, less what wraps: of each half of one of them a double holds it exactly."""
+    high = code.intrinsic("floor", a * 2.0**-16)
+    return _wrap(code, high * b, kind) * 2.0**16 + (a - high * 2.0**16) * b
+
+
+def _wrap(code: Code, x: Value, kind: str) -> Value:
+    """An integer as its type holds it: what is too large for one of up to 32 bits begins anew below."""
+    low, period = float(np.iinfo(kind).min), 2.0 ** np.iinfo(kind).bits
+    if period > 2.0**32:
+        return _check_range(code, x, kind)
+    return x - code.intrinsic("floor", (x - low) * (1 / period)) * period
 
 
 def _check_range(code: Code, x: Value, kind: str) -> Value:

@@ -110,6 +110,7 @@ class Graph:
         self.powers: dict[int, tuple[int, float]] = {}  # what is a power of another node, and which
         self._arrays: list[bytes] = []  # long arrays of numbers, and where their ids begin and end
         self._ends = [NUMBERS]
+        self.floats: dict[int, int] = {}  # integers that are indices, as floats
         self._growing: list[bool] = []
         self._hides_growth = False
 

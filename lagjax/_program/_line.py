@@ -123,7 +123,7 @@ class StraightLine:
         kinds = {node[2]: kind for node, kind in zip(self.nodes, self.kinds, strict=True) if node[0] == "input"}
         for op, _, attribute in self.nodes if self.looks_up else ():
             if op in LOOK_UPS:
-                kinds |= dict.fromkeys(table_of(attribute).positions, "float")
+                kinds = dict.fromkeys(table_of(attribute).positions, "float") | kinds
         return kinds
 
     def _prepare_columns(self, columns) -> tuple[list[np.ndarray], np.dtype, int]:

@@ -99,6 +99,12 @@ def _divide(x, y):
     return np.where(y == 0, -1, np.trunc(np.divide(x, np.where(y == 0, 1, y))))[()].astype(np.result_type(x))
 
 
+def _remainder(x, y):
+    return (
+        np.fmod(x, y) if np.result_type(x).kind == "f" else np.where(y == 0, x, np.fmod(x, np.where(y == 0, 1, y)))[()]
+    )
+
+
 def _refuse_look_up(x, attribute):
     raise TypeError("a look-up has no value without its table")
 
@@ -241,7 +247,7 @@ _ROWS = (
         cotangents=(lambda f, c, g, w, u: f("neg", g),),
     ),
     Operation(
-        "rem", 2, np.fmod, "fmod", exact=True, recurrence=_recurrences.remainder,
+        "rem", 2, _remainder, "fmod", exact=True, recurrence=_recurrences.remainder,
         slopes=(lambda f, c, w, u, v: c(1.0), lambda f, c, w, u, v: f("neg", _whole_part(f, w, u, v))),
         side=lambda f, c, w, u, v: _whole_part(f, w, u, v),
     ),

@@ -162,7 +162,9 @@ def even(graph, op, a):
 
 
 def extremum(graph, op, a, b):
-    """max(x, x) is x."""
+    """max(x, x) is x; of bools the larger one is `or`."""
+    if graph.kinds[a] == "bool":
+        return graph.apply("or" if op == "max" else "and", a, b)
     return a if a == b else graph.node(op, a, b)
 
 

@@ -589,3 +589,25 @@ def test_a_gap_that_is_no_number_is_named(options, name):
     system = lagjax.System(lambda q, v: 0.5 * v**2, **options)
     with pytest.raises(lagjax.SimulationError, match=f"The gap {name} is (nan|inf)"):
         lagjax.simulate(system, 1.0, 0.0, jnp.array([0.0, 1.0]))
+
+
+def struck(mass, restitution=0.5):
+    """Where all of ones, which meets q₀ = 0 at t = 1 with velocities of −1, is at t = 2."""
+    column = np.linalg.inv(mass)[:, 0]
+    return -1.0 + (1 + restitution) * column / column[0]
+
+
+@pytest.mark.parametrize("impacts", ["simultaneous", pytest.param("poisson", marks=pytest.mark.slow)])
+def test_a_mass_matrix_among_the_parameters(impacts):
+    scene = lagjax.System(
+        lambda q, v, params: 0.5 * v @ params @ v, contacts=lambda q: q[0], restitution=0.5, impacts=impacts
+    )
+    masses, ts = np.stack([np.eye(4) + 0.1, np.diag([1.0, 2.0, 3.0, 4.0]) - 0.2, np.eye(4)]), np.array([0.0, 2.0])
+    run = lagjax.simulate(scene, np.ones(4), -np.ones(4), ts, masses[1])
+    np.testing.assert_allclose(run.q[-1], struck(masses[1]), atol=1e-12)
+    if impacts == "poisson":
+        return
+    batch = lagjax.simulate_batch(scene, np.ones((3, 4)), -np.ones((3, 4)), ts, masses, batch_axes=(0, 0, 0))
+    np.testing.assert_allclose(batch.q[:, -1], [struck(mass) for mass in masses], atol=1e-12)
+    with pytest.raises(ValueError, match="mass matrix is not positive definite and needs pivoting"):
+        lagjax.simulate(scene, np.ones(4), -np.ones(4), ts, np.diag([1.0, 2.0, 3.0, -4.0]))

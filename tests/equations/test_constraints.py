@@ -894,3 +894,15 @@ def test_signatures_and_names_that_are_refused():
     for question in ("multipliers", "constraint_force", "constraint_residual", "project"):
         with pytest.raises(ValueError, match="no constraints"):
             getattr(lagjax.System(weight), question)(ORIGIN, REST)
+
+
+@pytest.mark.parametrize("first", [1.3, pytest.param(-1.3, marks=pytest.mark.slow)])
+def test_a_constrained_mass_matrix_among_the_parameters(first):
+    """In machine code where it is positive definite as given; else diffrax pivots, and `explain` says why."""
+    scene = lagjax.System(lambda q, v, params: 0.5 * v @ params @ v - q[1], constraints=lambda q: jnp.sum(q) - 3.0)
+    mass, ones = np.diag([first, 2.0, 3.0]) + 0.1, np.ones((1, 3))
+    pull = np.linalg.solve(np.block([[mass, ones.T], [ones, np.zeros((1, 1))]]), [0.0, -1.0, 0.0, 0.0])[:3]
+    run = lagjax.simulate(scene, np.ones(3), np.array([1.0, -1.0, 0.0]), np.array([0.0, 1.0]), mass)
+    np.testing.assert_allclose(run.q[-1], np.array([2.0, 0.0, 1.0]) + pull / 2, atol=1e-9)
+    said = str(scene.explain(np.ones(3), np.zeros(3), params=mass))
+    assert ("Taylor series in machine code" if first > 0 else "needs pivoting") in said

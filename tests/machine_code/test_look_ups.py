@@ -264,3 +264,72 @@ def test_a_coordinate_that_params_choose_is_differentiated_by(place):
     values, modes = np.linalg.eigh(stiffness)
     end = modes @ (np.cos(np.sqrt(values + 0j) * END[-1]).real * (modes.T @ q))
     np.testing.assert_allclose(run.q[-1], end, rtol=0, atol=1e-9)
+
+
+INTEGERS = np.array([3, 1, 4, 7, 5])
+MASK = np.array([True, False, True, True, False])
+
+
+def cell(x):
+    return jnp.floor(2 * x).astype(int) + 2
+
+
+def integer_entries(a, b, table, mask):
+    """Numbers made of the entries a and b, by every kind of look-up and of arithmetic that floats would do wrong."""
+    i, j = table[cell(a)], jax.lax.dynamic_index_in_dim(table - 4, cell(b), keepdims=False)
+    grid, window = jnp.stack([table, table[::-1]]), jax.lax.dynamic_slice(mask, (cell(b),), (2,))
+    small, words = table.astype(jnp.int8) * jnp.int8(31), (table - 4).astype(jnp.int32) * jnp.int32(2**29)
+    missing = table.at[cell(3 * a)].get(mode="fill", fill_value=7)
+    return jnp.stack(
+        [
+            *(i // 2, grid[cell(b) % 2, cell(a)] // 2, jnp.cumsum(table)[cell(a)] // 2, i * i // 2, *jnp.divmod(j, 2)),
+            *(jax.lax.div(j, 2), jax.lax.rem(j, 3), jax.lax.div(j, j - j), jnp.sort(jnp.stack([i, j]))[0] // 2),
+            *(
+                missing // 2,
+                table.astype(jnp.int32).at[cell(3 * b)].get(mode="fill") % 10,
+                (small * table.astype(jnp.int8))[cell(a)],
+            ),
+            *(small[cell(a)] + small[cell(b)], -small[cell(b)], words[cell(a)] * words[cell(b)] + words[cell(a)]),
+            *((words[cell(b)] // 3 * (words[cell(a)] // 5)), -table.astype(jnp.uint8)[cell(a)], i // (i - i)),
+            *(~mask[cell(a)], mask[cell(a)] & (b > 0.2), mask[cell(a)] | mask[cell(b)], mask[cell(a)] ^ (b > 0.2)),
+            *(mask[cell(a)] != mask[cell(b)], mask[cell(a)] + mask[cell(b)], jnp.any(window), jnp.all(window)),
+            *(jnp.maximum(a > 0, b > 0), jnp.min(jnp.stack([a > 0, b > 0])), *jnp.sort(jnp.stack([a > b, b > 0]))),
+            *(mask.at[cell(3 * a)].get(mode="fill"), jnp.stack([mask, ~mask])[cell(b) % 2, cell(a)]),
+        ]
+    ).astype(float)
+
+
+@pytest.mark.parametrize("where", ["a closure", "params"])
+def test_entries_of_integers_and_masks_are_computed_with_as_such(where):
+    n, closed = 33, (jnp.asarray(INTEGERS), jnp.asarray(MASK))
+    forces = lambda q, qdot, params: integer_entries(q[0], q[1], *(closed if where == "a closure" else params))
+    scene, instant = lagjax.System(free_particles, forces=forces), 1e-9
+    for a, b in [(-0.9, 0.3), (0.3, -0.7), (1.2, 0.7)]:
+        q = jnp.zeros(n).at[:2].set(jnp.array([a, b]))
+        exact = integer_entries(a, b, *closed)
+        np.testing.assert_array_equal(scene.acceleration(q, 0 * q, 0.0, closed), exact)
+        run = lagjax.simulate(scene, q, 0 * q, jnp.array([0.0, instant]), closed, solver=MACHINE)
+        np.testing.assert_allclose(run.qdot[-1] / instant, exact, rtol=1e-12)
+
+
+@pytest.mark.parametrize("what", ["force", "mass"])
+def test_a_force_and_a_mass_by_integers_of_a_table(what):
+    """q̈ = T // 2, and ½ (1 + T // 2) q̇², along which √m q̇ is constant: in closed form from cell to cell of ½."""
+    table, halves = jnp.asarray(INTEGERS), INTEGERS // 2
+
+    def exact_end(q, v=1.0, left=0.9):
+        for k, edge in enumerate([-0.5, 0.0]):
+            ahead = jnp.sqrt(v**2 + 2 * halves[k] * (edge - q)) if what == "force" else v
+            left = left - 2 * (edge - q) / (v + ahead)
+            v = ahead if what == "force" else v * jnp.sqrt((1 + halves[k]) / (1 + halves[k + 1]))
+            q = edge
+        return q + v * left + (what == "force") * halves[2] * left**2 / 2
+
+    half = lambda q: table[cell(q)] // 2
+    push = lagjax.System(free_particle, forces=lambda q, qdot: 1.0 * half(q))
+    heavy = lagjax.System(lambda q, qdot: 0.5 * (1 + half(q)) * qdot**2)
+    scene = push if what == "force" else heavy
+    end = lambda q: lagjax.simulate(scene, q, 1.0, jnp.array([0.0, 0.9]), solver=MACHINE).q[-1]
+    for found, exact in zip(jax.value_and_grad(end)(-0.9), jax.value_and_grad(exact_end)(-0.9), strict=True):
+        np.testing.assert_allclose(found, exact, rtol=1e-11)
+    assert float(heavy.energy(-0.9, 1.0)) == 1.0

@@ -61,13 +61,16 @@ def test_pieces_by_whole_numbers(name):
     np.testing.assert_allclose(ends[0], ends[1], atol=1e-9)
 
 
-def test_a_whole_number_beyond_its_type_is_no_number():
-    # 100000² does not fit into 32 bits: JAX wraps it around, which is not what anybody means.
-    scene = lagjax.System(
-        lambda q, v: 0.5 * v * v, forces=lambda q, v: 1e-9 * (jnp.floor(q).astype(jnp.int32) ** 2).astype(float)
-    )
-    run = lagjax.simulate(scene, 100_000.5, 0.0, np.array([0.0, 1.0]), throw=False, solver=lagjax.MachineCode())
-    assert run.result == lagjax.RESULTS.nonfinite_state
+@pytest.mark.parametrize("kind, power", [(jnp.int32, 2), (jnp.int64, 4)])
+def test_a_whole_number_beyond_its_type(kind, power):
+    """100000² wraps around in 32 bits, as in JAX; its square is more than 53 bits hold, and no other number."""
+    force = lambda q, v: 1e-9 * (jnp.floor(q).astype(kind) ** power).astype(float)
+    scene = lagjax.System(lambda q, v: 0.5 * v * v, forces=force)
+    run = lagjax.simulate(scene, 100_000.5, 0.0, np.array([0.0, 0.1]), throw=False, solver=lagjax.MachineCode())
+    if power == 2:
+        np.testing.assert_allclose(run.qdot[-1], 0.1e-9 * (100_000**2 % 2**32), rtol=1e-9)
+    else:
+        assert run.result == lagjax.RESULTS.nonfinite_state
 
 
 # Angles and signs that jump, in spellings of their own, and the same by `mod` and `where`.

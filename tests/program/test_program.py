@@ -461,6 +461,65 @@ def test_a_program_inside_a_lowered_function_dissolves():
     assert lower(jax.grad(outer), 0.3, 0.4).operations <= 11
 
 
+def name_like(name, function):
+    """A function that is jitted under a name of NumPy's."""
+    function.__name__ = name
+    return jax.jit(function)
+
+
+OWN = {  # functions of a user's own that have a name of NumPy's, and agree with NumPy's at most numbers, not at all
+    "trunc": (lambda x: jnp.clip(jnp.trunc(x), -8.0, 8.0), 20.3),
+    "remainder": (lambda x, y: jnp.where(y == 0, x, x - y * jnp.floor(x / jnp.where(y == 0, 1.0, y))), 2.3, 0.0),
+    "floor_divide": (lambda x, y: jnp.floor(x / jnp.where(jnp.abs(y) < 1e-4, jnp.inf, y)), 3.3, 1e-5),
+    "divmod": (lambda x, y: (jnp.where(x > 50.0, 0.0, jnp.floor(x / y)), x - y * jnp.floor(x / y)), 70.0, 3.0),
+    "signbit": (lambda x: jnp.sin(x) < 0.0, 4.0),
+    "hypot": (lambda x, y: jnp.sqrt(x**2 + y**2 + 1.0), 3.0, 4.0),
+    "searchsorted": (lambda knots, x: jnp.clip(jnp.ceil(x).astype(int), 0, 3), jnp.array([0.0, 0.1, 2.0]), 1.5),
+}
+
+
+@pytest.mark.parametrize("name", OWN)
+def test_functions_of_a_user_s_own_with_a_name_of_numpy_s_are_what_they_are(name):
+    function, *arguments = OWN[name]
+    assert_same(name_like(name, function), *arguments)
+    assert_same(
+        jax.vmap(name_like(name, function), (None, 0) if name == "searchsorted" else 0),
+        *(
+            jnp.stack([x, x]) if k == len(arguments) - 1 or name != "searchsorted" else x
+            for k, x in enumerate(arguments)
+        ),
+    )
+
+
+@pytest.mark.parametrize(
+    "function, arguments, most",
+    [
+        (lambda x: (x % 2, divmod(x, 2), x // 2, jnp.mod(x, 2.0)), (2.3,), 4),  # x/2, its whole part, twice it, a rest
+        (jax.vmap(lambda x: (x % 2, jnp.trunc(x), jnp.divmod(x, 2))), (A,), 15),
+        (jax.vmap(lambda x, y: x % y, (None, 0)), (jnp.array(0.3), B), 12),
+        (lambda x: jnp.hypot(x, 1.0), (0.4,), 3),
+        (jax.vmap(jnp.hypot), (A, B), 12),
+        (lambda k, x: [jnp.searchsorted(k, x, "right", method=m) for m in ("scan", "compare_all")], (A, 0.4), 3),
+        (jax.vmap(lambda x: jnp.searchsorted(jnp.arange(4.0), x)), (A,), 15),
+        (lambda x: 1.0 * jnp.signbit(jnp.float32(x)), (0.4,), 3),
+    ],
+)  # fmt: skip
+def test_functions_of_jax_have_few_borders(function, arguments, most):
+    """Each is a formula with one border, however it is written; JAX's own have up to five."""
+    assert lower(function, *arguments).operations <= most
+
+
+def test_an_index_by_a_loop_takes_no_longer_than_the_loop():
+    """Halving in twenty steps, each of which uses the one before three times."""
+
+    def index(x):
+        middle = lambda of: (of[0] + of[1]) // 2
+        halve = lambda k, of: lax.cond(x < middle(of), lambda: (of[0], middle(of)), lambda: (middle(of), of[1]))
+        return jnp.arange(1000.0)[lax.fori_loop(0, 20, halve, (0, 1000))[0]]
+
+    assert_same(index, 314.5)
+
+
 def test_identity():
     program, again = (lower(jnp.sin, 0.3) for _ in range(2))
     assert program != again and len({program, again, program}) == 2

@@ -82,6 +82,8 @@ def form_of(derivation: Derivation, path: str = "auto") -> MotionEquations:
         return MotionEquations.from_arrays(motion, str(reason))
     if path == "auto" and program.looks_up:  # whose inputs would be the entries of tables, one by one
         return MotionEquations.from_arrays(motion, "it looks up entries of tables")
+    if path == "auto" and derivation.counts_on_params:  # which may be traced here
+        return MotionEquations.from_arrays(motion, "its mass matrix may need pivoting")
     if path == "auto" and derivation.has_rules:  # of which a program keeps the first two derivatives alone
         return MotionEquations.from_arrays(motion, "a function has rules of its own for its derivatives")
     if path == "auto" and program.operations > LARGEST_XLA_PROGRAM:

@@ -52,7 +52,7 @@ def count_knots(expansion: Any, knots: Ids, x: Ids, side: str) -> Ids | None:
     return expansion.fold("add", f("convert", below, attribute="int32"))
 
 
-def look_up_windows(expansion: Any, x: Ids, indices: Ids, axes: Any, sizes: Any, missing: float | None) -> Ids:
+def look_up_windows(expansion: Any, x: Ids, indices: Ids, axes: Any, sizes: Any, missing: Any) -> Ids:
     """The windows (*sizes) of an array that begin at `indices` (…, axes) along some axes, shape (…, *sizes).
 
     A window that sticks out begins where it fits; or is `missing`, where that is a number.
@@ -74,14 +74,23 @@ def look_up_windows(expansion: Any, x: Ids, indices: Ids, axes: Any, sizes: Any,
     if missing is None:
         return result
     inside = inside.reshape(*place.shape, *[1] * window.ndim)
-    return expansion.map("select", inside, expansion.constants(float(missing)), result)
+    missing = expansion.graph.constant(missing, kind_of_ids(expansion.graph, x))
+    return expansion.map("select", inside, np.array(missing), result)
+
+
+def kind_of_ids(graph: Graph, x: Ids) -> str:
+    """The kind of an array; what is no node yet is a float."""
+    return graph.kinds[x.flat[0]] if x.size and x.flat[0] < INPUTS else "float"
 
 
 def _entry(expansion: Any, ids: Ids, place: int) -> int:
     """The entry of this number, a float that is whole; the nearest where there is none."""
     graph = expansion.graph
     if (table := _table(expansion, ids)) is not None:
-        return graph.apply("take", place, attribute=table)
+        entry, kind = graph.apply("take", place, attribute=table), kind_of_ids(graph, ids)
+        if kind == "bool":
+            return graph.apply("ne", entry, graph.number(0.0))
+        return entry if kind == "float" else graph.apply("convert", entry, attribute=kind)
     if (parts := _combination(graph, ids)) is not None:
         total = graph.number(0.0)
         for base, numbers in parts.items():
@@ -128,6 +137,8 @@ def _operands(graph: Graph, ids: Ids) -> list[Ids] | None:
     op, operands, attribute = nodes[0]
     if not operands or any(node[0] != op or node[2] != attribute for node in nodes):
         return None
+    if op == "convert" and len({graph.kinds[of] for _, (of,), _ in nodes}) > 1:
+        return None
     columns = np.array([node[1] for node in nodes]).T
     if OPERATIONS[op].commutative and not (columns == columns[:, :1]).all(axis=1).any():  # written in either order
         for shared in columns[:, 0]:
@@ -140,9 +151,8 @@ def _operands(graph: Graph, ids: Ids) -> list[Ids] | None:
 def _place(expansion: Any, indices: Ids, room: list[int], strides: list[int]) -> tuple[Ids, Ids]:
     """The beginnings of windows, as floats: one index as it is, of several their place in the array; and which fit."""
     f, number, place, inside = expansion.map, expansion.constants, None, None
-    known: dict[int, int] = {}
     for k, (top, stride) in enumerate(zip(room, strides, strict=True)):
-        index = [_as_float(expansion.graph, i, known) for i in indices[..., k].ravel().tolist()]
+        index = [_as_float(expansion.graph, i) for i in indices[..., k].ravel().tolist()]
         index = np.array(index, np.int64).reshape(indices.shape[:-1])
         fits = f("and", f("ge", index, number(0.0)), f("le", index, number(float(top))))
         inside = fits if inside is None else f("and", inside, fits)
@@ -154,35 +164,35 @@ def _place(expansion: Any, indices: Ids, room: list[int], strides: list[int]) ->
     return place, inside
 
 
-def _as_float(graph: Graph, i: int, known: dict[int, int]) -> int:
+def _as_float(graph: Graph, i: int) -> int:
     """An integer as a float. What it was computed by with integers is computed with floats: these are exact, too."""
-    # `known` are those found before: what a sort gives is shared by as many paths as comparisons lie before it.
-    if i not in known:
-        known[i] = _float_of(graph, i, known)
-    return known[i]
+    if i not in graph.floats:
+        graph.floats[i] = _compute_as_float(graph, i)
+    return graph.floats[i]
 
 
-def _float_of(graph: Graph, i: int, known: dict[int, int]) -> int:
+def _compute_as_float(graph: Graph, i: int) -> int:
     (op, operands, attribute), kind = graph.nodes[i], graph.kinds[i]
     if kind == "float":
         return i
     if op == "convert" and graph.kinds[operands[0]] == "float" and graph.nodes[operands[0]][0] in _WHOLE:
         return operands[0]
+    if kind != "bool" and np.iinfo(kind).bits < 32:  # it wraps
+        return graph.apply("convert", i, attribute="float")
     if op == "convert" and graph.kinds[operands[0]] not in ("float", "bool"):
-        return _as_float(graph, operands[0], known)
+        return _as_float(graph, operands[0])
     if kind != "bool" and op in ("add", "sub", "mul", "neg", "max", "min"):
-        return graph.apply(op, *(_as_float(graph, x, known) for x in operands))
+        return graph.apply(op, *(_as_float(graph, x) for x in operands))
     if kind != "bool" and op == "select":
-        decision = _compare_floats(graph, operands[0], known)
-        return graph.apply(op, decision, *(_as_float(graph, x, known) for x in operands[1:]))
+        return graph.apply(op, _compare_floats(graph, operands[0]), *(_as_float(graph, x) for x in operands[1:]))
     return graph.number(attribute) if op == "constant" else graph.apply("convert", i, attribute="float")
 
 
-def _compare_floats(graph: Graph, i: int, known: dict[int, int]) -> int:
+def _compare_floats(graph: Graph, i: int) -> int:
     """A comparison of integers as one of floats."""
     op, operands, _ = graph.nodes[i]
     if op in ("lt", "le", "gt", "ge", "eq", "ne") and graph.kinds[operands[0]] not in ("float", "bool"):
-        return graph.apply(op, *(_as_float(graph, x, known) for x in operands))
+        return graph.apply(op, *(_as_float(graph, x) for x in operands))
     return i
 
 
@@ -209,6 +219,6 @@ def _table_of_ids(graph: Graph, ids: Ids) -> Table | None:
     if (positions >= 0).all() and stride and (steps == stride).all():
         return Table(int(positions[0]), stride, ids.size)
     values = [None if INPUTS <= i < NUMBERS else graph.value(graph.real(i)) for i in ids.tolist()]
-    if None not in values:
+    if None not in values and all(abs(x) <= 2**53 for x in values if isinstance(x, int)):  # a float holds them
         return Table(0, 1, ids.size, np.array(values, np.float64).tobytes())
     return None

@@ -11,7 +11,7 @@ id arrays, and returns an id array (or a list of them). Each needs a row in `tes
 import functools
 import itertools
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Literal
 
 import jax
@@ -23,7 +23,7 @@ from jax.extend import core
 from lagjax._program._graph import INPUTS, PAIRS, Graph, Unlowerable
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._simplify import arctangent, inverse
-from lagjax._program.lowering._indexing import are_numbers, count_knots, locate_knots, look_up_windows
+from lagjax._program.lowering._indexing import are_numbers, count_knots, kind_of_ids, locate_knots, look_up_windows
 
 # Scalars that are looked at for each one that the budget allows, as most of a derivative folds away; and in all, which
 # takes some minutes.
@@ -208,14 +208,8 @@ def formula_of(equation) -> str | None:
     name, operands = equation.primitive.name, [variable.aval for variable in equation.invars]
     if name in ("jit", "pjit"):
         called, floats = equation.params["name"], [jnp.issubdtype(x.dtype, jnp.floating) for x in operands]
-        if called in _WHOLE:
-            return called if len(floats) == _WHOLE[called] and any(floats) and _is_named(called, equation) else None
-        reads_bits = any(e.primitive.name == "bitcast_convert_type" for e in equation.params["jaxpr"].eqns)
-        found = {"signbit": [True] if reads_bits else None, "hypot": [True, True]}
-        if found.get(called) != floats:
-            return None
-        own = called != "hypot" or str(equation.params["jaxpr"]) == _hypot(*((x.shape, x.dtype) for x in operands))
-        return called if own else None
+        suits = called in _FORMULAS and len(floats) == _FORMULAS[called] and (all if called == "hypot" else any)(floats)
+        return called if suits and _find_own(called, equation.params["jaxpr"]) is not None else None
     if name != "custom_jvp_call" or len(operands) != 1:
         return None
     shape, dtype = operands[0].shape, operands[0].dtype
@@ -225,23 +219,41 @@ def formula_of(equation) -> str | None:
     return next((name for name in ("det", "slogdet") if text in _determinant(name, shape, dtype)), None)
 
 
-_WHOLE = {"remainder": 2, "floor_divide": 2, "divmod": 2, "trunc": 1}  # how many operands
+# How many operands they have.
+_FORMULAS = {"remainder": 2, "floor_divide": 2, "divmod": 2, "trunc": 1, "signbit": 1, "hypot": 2}
 
 
-def _is_named(called: str, equation) -> bool:
-    """True if a call that has the name of a function of NumPy's is that: it is tried with numbers."""
-    shapes = [variable.aval for variable in equation.invars]
-    for numbers in itertools.product(*[(7.25, -7.25), (2.0, -2.0)][: _WHOLE[called]]):
-        numbers = [shape.dtype.type(x) for shape, x in zip(shapes, numbers, strict=True)]
-        trial, expected = Expansion(Graph(1_000_000)), np.atleast_1d(getattr(np, called)(*numbers)).tolist()
-        given = [trial.constants(np.full(of.shape, x)) for of, x in zip(shapes, numbers, strict=True)]
-        try:
-            found = [trial.real(ids) for ids in trial.run_closed(equation.params["jaxpr"], given)]
-        except Unlowerable:
-            return False
-        if [{trial.graph.value(i) for i in ids.ravel().tolist()} for ids in found] != [{x} for x in expected]:
-            return False
-    return True
+def _find_own(called: str, body: core.ClosedJaxpr, options: Sequence[dict] = ({},)) -> dict | None:
+    """The options with which a function of JAX has this body, if the call that is named like it is that; or None.
+
+    Its text tells, or, as that is another one under `vmap`, the scalars that are made of both.
+    """
+    operands = [(x.shape, x.dtype, x.weak_type) for x in body.in_avals]
+    bodies = [lambda of=of: _body_of(called, *operands, **of) for of in options]
+    text = str(body)
+    for is_own in (lambda own: str(own) == text, lambda own: own is not None and _make_the_same(own, body)):
+        for of, own in zip(options, bodies, strict=True):
+            if is_own(own()):
+                return of
+    return None
+
+
+def _make_the_same(*bodies: core.ClosedJaxpr) -> bool:
+    trial = Expansion(Graph(100_000))
+    try:
+        given = inputs_of(trial.graph, bodies[0].in_avals)
+        found = [[trial.real(ids) for ids in trial.run_closed(body, given)] for body in bodies]
+    except Unlowerable:
+        return False
+    return len(found[0]) == len(found[1]) and all(map(np.array_equal, *found))
+
+
+@functools.cache
+def _body_of(called: str, *operands, **options) -> core.ClosedJaxpr | None:
+    """The body of a function of JAX, of operands of these shapes and types."""
+    given = [jax.ShapeDtypeStruct(shape, dtype, weak_type=weak) for shape, dtype, weak in operands]
+    equations = jax.make_jaxpr(functools.partial(getattr(jnp, called), **options))(*given).eqns
+    return next((e.params["jaxpr"] for e in equations if e.params.get("name") == called), None)
 
 
 _OWN_RULES = frozenset(("stop_gradient", "custom_jvp_call", "custom_vjp_call", "custom_vjp_call_jaxpr"))
@@ -264,13 +276,6 @@ def _inner_jaxprs(equation) -> list:
     if equation.primitive.name == "custom_linear_solve":  # how JAX solves it is not what is lowered
         params = {"matvec": params["jaxprs"].matvec}
     return list(core.jaxprs_in_params(params))
-
-
-@functools.cache
-def _hypot(*operands) -> str:
-    """The body of JAX's hypot of operands of these shapes and types, as a text."""
-    (equation,) = jax.make_jaxpr(jnp.hypot)(*itertools.starmap(jax.ShapeDtypeStruct, operands)).eqns
-    return str(equation.params["jaxpr"])
 
 
 @functools.cache
@@ -657,7 +662,7 @@ def _locate(expansion, params, knots, x):
 @lowers("gather")
 def _gather(expansion, params, x, indices):
     d, indices, clips = params["dimension_numbers"], expansion.real(indices), _clips(params["mode"])
-    missing = np.nan if params["fill_value"] is None else float(params["fill_value"])
+    missing = np.nan if params["fill_value"] is None else params["fill_value"]
     if not are_numbers(expansion, indices) and not d.operand_batching_dims:
         sizes = params["slice_sizes"]
         found = look_up_windows(expansion, x, indices, d.start_index_map, sizes, None if clips else missing)
@@ -670,9 +675,7 @@ def _gather(expansion, params, x, indices):
     )  # fmt: skip
     if (places >= 0).all():
         return x.ravel()[places]
-    if x.size and expansion.graph.kinds[x.flat[0]] != "float":
-        raise Unlowerable("an index into an array that is not of floats is out of bounds")
-    return np.append(x.ravel(), expansion.constants(missing))[places]
+    return np.append(x.ravel(), expansion.graph.constant(missing, kind_of_ids(expansion.graph, x)))[places]
 
 
 def _scatter(op):
@@ -720,24 +723,15 @@ def expand_primitive(primitive) -> core.ClosedJaxpr:
 
 
 def _side_of_search(body, arguments) -> Literal["right", "left"] | None:
-    """The side of `jnp.searchsorted(knots, x, side)`, if a function that is named so is that; None of others.
-
-    It is tried with numbers: knots 0, 1, …, and a number below them, between two of them, at one, and beyond them.
-    """
-    if len(arguments) != 2 or arguments[0].ndim != 1 or not len(arguments[0]) or len(body.out_avals) != 1:
+    """The side of `jnp.searchsorted(knots, x, side)`, if a function that is named so is that; None of others."""
+    shapes = body.in_avals
+    if len(shapes) != 2 or arguments[0].ndim != 1 or not len(arguments[0]):
         return None
-    shapes, count = [variable.aval for variable in body.jaxpr.invars], len(arguments[0])
-    floats = all(jnp.issubdtype(shape.dtype, jnp.floating) for shape in shapes)
-    if not floats or body.out_avals[0].shape != shapes[1].shape:
+    if not all(jnp.issubdtype(shape.dtype, jnp.floating) for shape in shapes):
         return None
-    sides: list[Literal["right", "left"]] = ["right", "left"]
-    trial = Expansion(Graph(10_000))
-    for x in (-1.0, 0.5, float(count // 2), count + 1.0):
-        given = [trial.constants(np.arange(count, dtype=float)), trial.constants(np.full(shapes[1].shape, x))]
-        (found,) = trial.run_closed(body, given)
-        found = trial.require_numbers(trial.real(found), "it")
-        sides = [s for s in sides if (found == np.searchsorted(np.arange(count), x, side=s)).all()]
-    return next(iter(sides), None)
+    ways = itertools.product(("scan", "scan_unrolled", "compare_all", "sort"), ("left", "right"))
+    found = _find_own("searchsorted", body, [{"method": way, "side": side} for way, side in ways])
+    return None if found is None else found["side"]
 
 
 @lowers("scan")

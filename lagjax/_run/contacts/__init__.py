@@ -205,7 +205,7 @@ def contact_forces(trajectory: Trajectory):
         layout = Layout.from_state(*jax.tree.map(lambda x: x[0], (q, qdot)))
         flat = Flat.from_system(system, layout, params)
         inside = InContact(params, jax.tree.map(lambda x: x[0], contacts))
-        derivation = derivation_of(scene, layout, inside).lowered
+        derivation = derivation_of(scene, layout, inside).with_numbers().lowered
         program, places = line_of(derivation.multipliers), RowPlaces.from_derivation(derivation, flat)
         numbers = [jnp.ravel(x) for x in jax.tree.leaves(eqx.filter(params, eqx.is_array_like))]
 
