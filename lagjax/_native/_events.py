@@ -160,7 +160,7 @@ class Events:
         return watch.frame["params", first], watch.frame["params", first + self.count]
 
     def _noise(self, watch: Watch) -> Value:
-        """What counts as zero of a guard: its rounding now or, in a motion that remembers, the largest one so far."""
+        """The rounding of a guard: that of now or, in a motion that remembers, the largest one so far."""
         noise = limits.GUARD_NOISE * watch.recall("kept")
         if not self.guards.remembers:
             return noise
