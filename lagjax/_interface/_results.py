@@ -77,8 +77,13 @@ class RESULTS(diffrax.RESULTS, metaclass=_InWords):  # pyright: ignore[reportGen
     )
     contact_undecided = (
         "The law of contacts has no continuation there, or more than one: with much friction none of open, sliding and "
-        "sticking is possible, or several are (Painleve's paradox), or contacts take turns at one instant without end. "
-        "Less friction, a contact that gives way (a spring in its place), or other impacts=... decides it."
+        "sticking is possible, or several are (Painleve's paradox). Less friction, a contact that gives way (a spring "
+        "in its place), or other impacts=... decides it."
+    )
+    contacts_in_turn = (
+        "Contacts open and close, stick and slide, or strike one after the other at one instant without end, and time "
+        'does not move. impacts="sequential" may pass an impact on for ever, where "simultaneous" ends it. Else put a '
+        "spring in place of a contact among those that lie together, or leave some room between them at the start."
     )
     contact_missed = (
         "A gap is negative that did not fall through zero on its series: it has a corner that no series shows, as "

@@ -127,8 +127,7 @@ class Events:
         later, noise, rate_noise = watch.recall("guard"), limits.GUARD_NOISE * size, limits.GUARD_NOISE * rate_size
         before = frame.constant(0.0) if self.notes else 0.0 - direction  # from where it can change in its direction
         if self.guards.remembers:
-            first = self.motion.parameters + g - 2 * self.count
-            before, rate_noise = frame["params", first], frame["params", first + self.count]
+            before, rate_noise = self._noted(watch)
         of_rate = abs(frame["h"]) * rate_noise
         lead, order_of_zero = self._lead(watch, order, limits.GUARD_NOISE * size + of_rate)
         away, from_there, moved = (abs(x) for x in (value, before, rate))
@@ -154,6 +153,19 @@ class Events:
         watch.remember(fresh, side=self._sign(frame, side), contact=code.select(on_it, zeros, Touch.NONE))
         if is_rounded:
             watch.remember(fresh, zero=code.select(on_it, value, 0.0))
+
+    def _noted(self, watch: Watch) -> tuple[Value, Value]:
+        """The two numbers of a guard that a motion `remembers`."""
+        first = self.motion.parameters + watch.g - 2 * self.count
+        return watch.frame["params", first], watch.frame["params", first + self.count]
+
+    def _noise(self, watch: Watch) -> Value:
+        """The rounding of a guard: that of now or, in a motion that remembers, the largest one so far."""
+        noise = limits.GUARD_NOISE * watch.recall("kept")
+        if not self.guards.remembers:
+            return noise
+        noted = abs(self._noted(watch)[0])
+        return watch.code.select((noted > noise) & (noted < float("inf")), noted, noise)
 
     def _lead(self, watch: Watch, order: Value, noise: Value) -> tuple[Value, Value]:
         """The first term of a guard behind its rate that is more than noise, and its order, for a whole step.
@@ -233,12 +245,12 @@ class Events:
         side = code.select(code.compare("==", side, 0.0), here, side)
         self.roots.polynomial(frame, j, degree, h, side, zero)
         moving = moving & ~happened
-        with code.only_if(code.any_lane(moving & ~self._is_clear(frame, degree))):
+        with code.only_if(code.any_lane(moving & ~self._is_clear(watch, degree))):
             self._look_closely(watch, order, degree, side, moving)
 
-    def _is_clear(self, frame: Frame, degree: Value) -> Value:
+    def _is_clear(self, watch: Watch, degree: Value) -> Value:
         """The lanes whose polynomial has no root, as its coefficients alone tell; most often that is all."""
-        code, zero = frame.code, frame.constant(0.0)
+        frame, code, zero = watch.frame, watch.code, watch.frame.constant(0.0)
         falls, rises = code.variable(zero), code.variable(zero)
         with code.loop(degree + 1, start=1) as k:
             c = frame["poly", k]
@@ -248,7 +260,7 @@ class Events:
         start, falls, rises = frame["poly", 0], falls.value, rises.value
         last, before = (self.roots.last_terms(frame, degree, first) for first in (0, 3))
         size = start + falls + rises
-        return (start > falls + last) & ~self._is_long(last, before, size)
+        return (start > falls + last) & ~self._is_long(watch, last, before, size)
 
     def _look_closely(self, watch: Watch, order: Value, degree: Value, side: Value, moving: Value) -> None:
         frame, code, roots, h = watch.frame, watch.code, self.roots, watch.frame["h"]
@@ -256,10 +268,12 @@ class Events:
         unknown = moving & ~(abs(start) < float("inf"))
         frame.assign(unknown, code=float(limits.NOT_FINITE), last=0.0, h=0.0)
         sound, moving = size < float("inf"), moving & ~unknown
+        if self.guards.remembers:  # what stays zero to rounding, as between bodies at rest, does not fall
+            moving = moving & ~(size <= self._noise(watch))
 
         def is_long():
             last, before = (roots.last_terms(frame, degree, first) for first in (0, 3))
-            return self._is_long(last, before, roots.size(frame, degree))
+            return self._is_long(watch, last, before, roots.size(frame, degree))
 
         roots.shorten(frame, degree, is_long)
         frame["doubt"], frame["begin"] = roots.last_terms(frame, degree), 0.0
@@ -277,9 +291,13 @@ class Events:
         self._bisect_change(watch, order, ahead, moving & ~sound)
         watch.remember(moving, side_end=ahead.value)
 
-    def _is_long(self, last: Value, before: Value, size: Value) -> Value:
-        """The lanes whose last terms are large, or do not fall: the polynomial may leave out as much as they are."""
-        return (last > limits.GUARD_TERMS * size) | ((last > limits.FALL * before) & (last > limits.SEEN * size))
+    def _is_long(self, watch: Watch, last: Value, before: Value, size: Value) -> Value:
+        """The lanes whose last terms are large, or do not fall: the polynomial may leave out as much as they are.
+
+        Not where that is less than the rounding of the guard, as of one that leaves zero with a high power.
+        """
+        is_long = (last > limits.GUARD_TERMS * size) | ((last > limits.FALL * before) & (last > limits.SEEN * size))
+        return is_long & ~(last <= self._noise(watch))
 
     def _follow_roots(self, watch: Watch, order: Value, degree: Value, ahead: Variable, where: Value) -> None:
         """The roots of the polynomial, one after the other, as long as none ends the motion."""

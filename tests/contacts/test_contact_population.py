@@ -9,7 +9,7 @@ import pytest
 pytest.importorskip("scipy", reason="the references are computed with it")
 sys.path.insert(0, str(Path(__file__).parents[2]))
 
-from benchmarks import contact_population
+from benchmarks import contact_columns, contact_population
 
 
 @pytest.fixture(autouse=True)
@@ -45,3 +45,9 @@ def test_arms_that_align_slide_on(seed):
     """Where both rods are in line, what slips is held by the gap itself: it passes through zero and turns."""
     counts = contact_population.main(["--scenes", "1", "--families", "arms", "--first", str(seed)])
     assert counts == {"right": 1}, dict(counts)
+
+
+@pytest.mark.slow
+def test_columns_are_decided():
+    counts = contact_columns.main(["--sizes", "3", "12", "--restitutions", "0", "0.3"])
+    assert counts == {"right": 4}, dict(counts)

@@ -611,3 +611,32 @@ def test_a_mass_matrix_among_the_parameters(impacts):
     np.testing.assert_allclose(batch.q[:, -1], [struck(mass) for mass in masses], atol=1e-12)
     with pytest.raises(ValueError, match="mass matrix is not positive definite and needs pivoting"):
         lagjax.simulate(scene, np.ones(4), -np.ones(4), ts, np.diag([1.0, 2.0, 3.0, -4.0]))
+
+
+@pytest.mark.parametrize("n", [8, pytest.param(12, marks=pytest.mark.slow)])
+def test_a_column_that_falls_together_is_one_mass(n):
+    """Springs of no length hold it up until it is let go; where masses lie together only high derivatives part them."""
+    start = np.concatenate([np.zeros(1), -np.cumsum(9.81 / 200 * np.arange(n - 1, 0, -1.0))])
+    system = lagjax.System(
+        lambda q, v: 0.5 * jnp.sum(v**2) - 9.81 * jnp.sum(q) - 100 * jnp.sum((q[:-1] - q[1:]) ** 2),
+        contacts=lambda q: q[:-1] - q[1:],
+    )
+    end = 0.6  # all masses have met by then
+    run = lagjax.simulate(system, start, np.zeros(n), np.array([0.0, end]))
+    np.testing.assert_allclose(run.q[-1], np.full(n, start.mean() - 0.5 * 9.81 * end**2), atol=1e-9)
+
+
+def test_light_bodies_that_strike_a_heavy_one_without_rebound_rest():
+    """What is left of their velocities is rounding: contacts neither open nor close by it."""
+    n = 3
+    turns = 0.3 + 2 * np.pi * np.arange(n) / n
+    sides, centre = np.stack([np.cos(turns), np.sin(turns)], axis=1), np.zeros((1, 2))
+    masses = jnp.array([1.0] + [1e-3] * n)
+    system = lagjax.System(
+        lambda q, v: 0.5 * jnp.sum(masses[:, None] * v**2),
+        contacts=lambda q: jnp.sqrt(jnp.sum((q[1:] - q[0]) ** 2, axis=1)) - 1.0,
+    )
+    start = np.concatenate([centre, 1.5 * sides]), np.concatenate([centre, -sides])
+    run = lagjax.simulate(system, *start, np.array([0.0, 1.0]))
+    np.testing.assert_allclose(run.q[-1], np.concatenate([centre, sides]), atol=1e-14)
+    assert run.contact_changes.count <= n

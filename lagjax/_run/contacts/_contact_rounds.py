@@ -42,6 +42,7 @@ from lagjax._run.contacts._impact_law import (
     find_phases,
     held_slips,
     impulse_solver,
+    independent_rows,
     rates_behind,
     reached,
     sliding_margin,
@@ -51,11 +52,12 @@ from lagjax._scene import Contacts, ContactScene, Flat, InContact
 
 PyTree = Any
 
-TOO_MANY, UNDECIDED, MISSED, AT_CORNER, NOT_FINITE, INCONSISTENT, BACKWARDS, NO_RESTITUTION, NO_FRICTION = map(
+(TOO_MANY, UNDECIDED, IN_TURN, MISSED, AT_CORNER, NOT_FINITE, INCONSISTENT, BACKWARDS, NO_RESTITUTION,
+ NO_FRICTION) = map(
     code_of,
-    (RESULTS.max_transitions_reached, RESULTS.contact_undecided, RESULTS.contact_missed, RESULTS.contact_at_corner,
-     RESULTS.nonfinite_state, RESULTS.inconsistent_start, RESULTS.contact_backwards, RESULTS.restitution_out_of_range,
-     RESULTS.friction_out_of_range),
+    (RESULTS.max_transitions_reached, RESULTS.contact_undecided, RESULTS.contacts_in_turn, RESULTS.contact_missed,
+     RESULTS.contact_at_corner, RESULTS.nonfinite_state, RESULTS.inconsistent_start, RESULTS.contact_backwards,
+     RESULTS.restitution_out_of_range, RESULTS.friction_out_of_range),
 )  # fmt: skip
 CLOSES, OPENS, BOUNCES, STICKS, SLIDES = range(5)  # the kinds of `ContactChanges`
 # The time that bounces still take, in parts of a step of the motion between them, below which they end in closed form,
@@ -69,6 +71,8 @@ TOGETHER = 1e-8
 THROUGH = 100.0
 # What sliding leaves of a contact's response at which it is lost: a paradox, to rounding.
 PARADOX = 1e-12
+# How many of its roundings a gap may move in a step by a force that counts as none, where no other choice is left.
+TIED = 1e3
 # The slip in space that has no direction of its own, in parts of the largest one; and in parts of what a force that
 # breaks away brings about in a step. Half of that takes √2 times the steps, of some ten thousand: at rest friction
 # turns a slip at once, and steps are as short as that takes.
@@ -112,7 +116,9 @@ class Carry(NamedTuple):
     rounds: jax.Array  # how many there were
     longest: jax.Array  # the longest step of the motion
     turns: jax.Array  # how many decisions there were at this instant
-    tied: jax.Array  # (r,), whether a contact turns between sticking and sliding there, as rounding has it
+    tied: jax.Array  # (k + r,), whether it turns there by rounding between open and closed, sticking and sliding
+    refuted: jax.Array  # (k,), whether a contact has opened there
+    forceless: jax.Array  # (k,), the force that rounding of a gap and of its rate could make in a step
     rounding: jax.Array  # (2, G), the largest of a watch of an open or sliding contact, and of a closed or sticking one
     rate_rounding: jax.Array
     came: jax.Array  # (S,), the sides of the sections from which the motion comes
@@ -297,7 +303,8 @@ class ContactRounds(NamedTuple):
         return Carry(
             t=t, y=y0, contacts=contacts, fresh=jnp.ones(guards, bool), going=result == SUCCESSFUL,
             result=result, steps=(jnp.zeros((), int), jnp.zeros((), int)), rounds=jnp.zeros((), int),
-            longest=jnp.zeros(()), turns=jnp.zeros((), int), tied=jnp.zeros(self.flat.rough.size, bool),
+            longest=jnp.zeros(()), turns=jnp.zeros((), int), tied=jnp.zeros(self.contact_watches, bool),
+            refuted=jnp.zeros(self.count, bool), forceless=jnp.zeros(self.count),
             rounding=jnp.zeros((2, guards)), rate_rounding=jnp.zeros((2, guards)),
             came=jnp.sign(guarded.rates)[guards - sections :],
             slip=jnp.zeros(self.flat.rough.size), largest=jnp.abs(jax.lax.stop_gradient(y0)),
@@ -318,8 +325,7 @@ class ContactRounds(NamedTuple):
         kinds = jnp.pad(jnp.concatenate([contacts.closed, contacts.sticks]), (0, others))
         before = _note_rounding(before, guarded, kinds, 0.0)
         rounding, rates = (_choose_kind(x, kinds) for x in (before.rounding, before.rate_rounding))
-        if self.rubs:
-            rounding, rates = self.hold_ties(before, guarded, rounding, rates)
+        rounding, rates = self.hold_ties(before, guarded, rounding, rates)
         rounding = jnp.maximum(rounding, guarded.of_time)
         beyond = (guarded.values < -rounding) & (np.arange(kinds.size) < self.contact_watches)
         sides = jnp.where(beyond, jnp.inf, jnp.maximum(rounding, _LEAST))
@@ -338,9 +344,11 @@ class ContactRounds(NamedTuple):
         duration = located.t_end - jax.lax.stop_gradient(before.t)
         turns = jnp.where(at_once, before.turns + 1, 0)
         step = jnp.where(at_once, 0.0, duration / jnp.maximum(located.accepted, 1))
-        stops = (np.arange(self.count, self.contact_watches) == k) & (contacts.sticks == 0)
-        stops = stops & (self.flat.shapes.directions == 1)
-        tied = at_once & (before.tied | (stops & (turns > kinds.size)))
+        is_first, in_plane = np.arange(self.contact_watches) == k, self.flat.shapes.directions == 1
+        opens, sticks = contacts.closed > 0, (contacts.sticks == 0) & in_plane & (turns > kinds.size)
+        loops = jnp.concatenate([~opens & before.refuted, sticks])
+        tied, refuted = before.tied | (is_first & loops), before.refuted | (is_first[: self.count] & opens)
+        tied, refuted = at_once & tied, at_once & refuted
         before = _note_rounding(before, guarded, kinds, duration)._replace(
             fresh=before.fresh & at_once, longest=jnp.maximum(before.longest, step)
         )
@@ -349,7 +357,7 @@ class ContactRounds(NamedTuple):
             decided, record = self.note(decides, decided, record, before._replace(came=came), t, y, k, stretch.kinds)
 
         result = jnp.where(happens, decided.result, located.result)
-        result = jnp.where(happens & (turns > 16 + 8 * kinds.size), UNDECIDED, jnp.where(missed, MISSED, result))
+        result = jnp.where(happens & (turns > 16 + 8 * kinds.size), IN_TURN, jnp.where(missed, MISSED, result))
         if self.corners is not None:  # time itself may go beyond its corner
             late = happens & (self.ts <= decided.t) & ~covered & (before.of_path.closed[:, 0] < 0)
             path, covered = jnp.where(late[:, None], decided.y, path), covered | late
@@ -361,7 +369,7 @@ class ContactRounds(NamedTuple):
         after = decided._replace(
             t=jnp.where(happens, decided.t, t), y=jnp.where(happens, decided.y, y), going=going & ~spent,
             contacts=jax.tree.map(lambda new, old: jnp.where(happens, new, old), decided.contacts, contacts),
-            result=jnp.where(spent, TOO_MANY, result), turns=turns, tied=tied,
+            result=jnp.where(spent, TOO_MANY, result), turns=turns, tied=tied, refuted=refuted,
             steps=(before.steps[0] + located.accepted, before.steps[1] + located.rejected),
             rounds=before.rounds + happens, doubts=jnp.where(happens, decided.doubts, before.doubts),
             doubted=jnp.where(happens, decided.doubted, before.doubted),
@@ -377,12 +385,18 @@ class ContactRounds(NamedTuple):
         )
 
     def hold_ties(self, before: Carry, guarded: Guarded, rounding, rates) -> tuple:
-        """The roundings (G,) of watches and their rates; a tie is a contact whose sliding has been refuted.
+        """The roundings (G,) of watches and their rates; a tie is a contact that turns at an instant without end.
 
-        It sticks until its value falls: a rate is no reason.
+        Closed, its force is none if rounding of the gap could make it. It sticks until its value falls: a rate is no
+        reason.
         """
+        count, lasts = self.count, jnp.where(before.longest > 0, before.longest, 1.0)
+        none = jnp.where(before.tied[:count] & (before.contacts.closed > 0), before.forceless, 0.0)
+        rounding, rates = rounding.at[:count].max(none), rates.at[:count].max(3.0 * none / lasts)
+        if not self.rubs:
+            return rounding, rates
         around = self.count, guarded.values.size - self.contact_watches
-        tied = jnp.pad(before.tied & (before.contacts.sticks > 0), around)
+        tied = jnp.pad(before.tied[count:] & (before.contacts.sticks > 0), around)
         most = self.friction.still.coefficients * guarded.values[: self.count][self.flat.rough]
         return (
             jnp.where(tied, jnp.pad(GUARD_NOISE * most**2, around), rounding),
@@ -489,7 +503,8 @@ class ContactRounds(NamedTuple):
         change = impulses @ rows.responses
 
         apart = quiet.rates + quiet.coupling @ still(impulses)
-        closed = jnp.where(hits, meeting.touches & (jnp.abs(apart[:count]) <= meeting.noise), closed)
+        stays = meeting.touches & (jnp.abs(apart[:count]) <= meeting.noise)
+        closed = jnp.where(hits, self.press(rows, t, y, still(change), stays, friction.still), closed)
         changed = (closed != was_closed) | (hits & meeting.involved)
         undecided, slip = hits & ~sound, before.slip
         direction, turned, starts, leaves_rest = contacts.direction, changed[:0], changed[:0], jnp.asarray(False)
@@ -548,6 +563,7 @@ class ContactRounds(NamedTuple):
         y_next = y + jnp.concatenate([back @ rows.responses[:count], change])
         fast = jnp.abs(rows.gradients[:count]) @ jnp.maximum(jnp.abs(v), jnp.abs(v + change))
         before = _note_forces(before, still(fast / responses))
+        before = before._replace(forceless=self.forceless(before, still(responses)))
         # A contact that opens does so with an acceleration that rounding of its force may make: it is no rate.
         of_rates = jnp.where(opens, before.longest * still(responses), 0.0) * before.rounding[1, :count]
         # What is less than its own rounding is zero: steps would be as short as to follow it.
@@ -555,6 +571,12 @@ class ContactRounds(NamedTuple):
         y_next = y_next - still(jnp.where(jnp.abs(y_next) <= 2 * EPS * largest, y_next, 0.0))
         rate_rounding = before.rate_rounding.at[0, :count].max(of_rates)
         return before._replace(rate_rounding=rate_rounding, largest=largest), y_next
+
+    def forceless(self, before: Carry, responses):
+        """The forces (k,) that move gaps within a step by no more than some thousand of their roundings."""
+        lasts = jnp.where(before.longest > 0, before.longest, self.ts[-1] - self.ts[0])
+        noise = before.rounding[0, : self.count] + lasts * before.rate_rounding[0, : self.count]
+        return 2.0 * TIED * noise / (responses * lasts**2)
 
     def limit_variations(self, y_next, rows: ImpactRows, meeting: "Meeting", starts):
         """The state, which has no derivatives in directions that take apart what happens at one instant.
@@ -567,7 +589,8 @@ class ContactRounds(NamedTuple):
         begun, gradients = jnp.repeat(starts, self.flat.shapes.directions), quiet.gradients[count:]
         limits = jnp.append(limits, jnp.where(begun, TOGETHER * jnp.abs(gradients).sum(axis=1), jnp.inf))
         start = halves(self.y0)[1]
-        return keep_together(y_next, jnp.append(rows.values[:count], gradients @ start), limits)
+        offsets = jnp.append(rows.values[:count], gradients @ start)
+        return keep_together(y_next, offsets - jax.lax.stop_gradient(offsets), limits)  # only how they vary matters
 
     def pass_corners(self, before: Carry, t, y, k, meets) -> tuple:
         """At (t, y), where watch k fell: the contacts (k,) that come to a corner and open there; time and state beyond.
@@ -620,6 +643,21 @@ class ContactRounds(NamedTuple):
         ends, left = self.end_of_bounces(before, rows, t, y, first, bounced, restitution)
         ends = ends & hits & (pattern.push > 0)
         return solve(jnp.where(ends, 0.0, bounced)), ends, left, constructs | ~(normal.any() | rubs.any())
+
+    def press(self, rows: ImpactRows, t, y, change, stays, friction: Friction):
+        """The contacts (k,) of those that stay in touch behind an impact which press upon each other there.
+
+        Their accelerations decide, without friction; with it, or where these are zero, the rounds that follow do. Of
+        contacts that are redundant all stay.
+        """
+        if self.rubs or self.count == 1:
+            return stays
+        behind = jax.lax.stop_gradient(y + jnp.concatenate([jnp.zeros_like(change), change]))
+        bends = self.rows_at(t, behind).bends
+        rows = jax.lax.stop_gradient(rows)._replace(rates=jax.lax.stop_gradient(bends))
+        held = stays.astype(float)
+        redundant = (independent_rows(rows.coupling, held) < held).any()
+        return stays & (redundant | (find_pattern(rows, stays, jnp.zeros(self.count), friction).push > 0))
 
     def sticks(self, before: Carry, slips: tuple, fell, renewed):
         """True for contacts that stick (r,) behind watches of friction that `fell`, where there is no impact.

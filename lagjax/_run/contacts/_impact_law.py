@@ -81,7 +81,7 @@ def impulse_solver(rows: ImpactRows, pattern: Pattern, friction: Friction) -> Ca
     places = friction.places(count)
     held = jnp.concatenate([push, jnp.broadcast_to((push[rough] * pattern.sticks)[:, None], places.shape).ravel()])
     if len(held) > 1:
-        held = held * _independent(jax.lax.stop_gradient(rows.coupling), held)
+        held = held * independent_rows(jax.lax.stop_gradient(rows.coupling), held)
     slides = friction.coefficients * push[rough] * (1.0 - pattern.sticks)
 
     def solver_along(direction):
@@ -125,7 +125,7 @@ def _turn_directions(rows: ImpactRows, impulses_along, direction, slides, places
     return jax.lax.fori_loop(0, 3, turn, (angles, jnp.zeros_like(rows.rates)))[1]
 
 
-def _independent(coupling, held):
+def independent_rows(coupling, held):
     """1 for each of the rows `held` (K,) that does not depend on those before it, by elimination without pivots."""
     if len(held) == 2:
         first, second = jnp.diagonal(coupling)
@@ -147,7 +147,7 @@ def held_slips(rows: ImpactRows, closed, slips, friction: Friction):
     if friction.directions > 1 or not slips.size:
         return jnp.zeros_like(slips)
     held = jnp.concatenate([closed, slips]).astype(float)
-    return slips & (_independent(rows.coupling, held)[len(closed) :] == 0)
+    return slips & (independent_rows(rows.coupling, held)[len(closed) :] == 0)
 
 
 def find_pattern(rows: ImpactRows, touches, restitution, friction: Friction) -> Pattern:
