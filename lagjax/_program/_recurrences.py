@@ -10,6 +10,9 @@ import math
 from collections.abc import Callable
 
 _BITS = 4  # of whole exponents that are not known before a motion begins
+# Of a base: below it terms of log u overflow in a long step, and the derivative by the exponent is infinite or NaN. Steps
+# that come from beside zero begin at some 1e-6.
+_NEAR_ZERO = 1e-7
 LARGEST_WHOLE = 2**_BITS  # beyond which a power is watched by its logarithm, which has no series where the base is zero
 
 
@@ -60,7 +63,7 @@ def raise_to_power(r, i, operands, of):
     """wₖ of w = uᵛ by its slopes, or of the product uⁿ where v is a whole number n below 16, which has them at u = 0.
 
     An exponent that is a number of the member is told at order zero. The product is multiplied with exp((v − n) log u),
-    which is 1 and varies with v.
+    which is 1 and varies with v; not where a step begins so near u = 0 that uⁿ log u has no series to speak of.
     """
     (u, v), (_, moves) = operands, of
     slow = r.apply_slopes(i, operands, of)
@@ -74,8 +77,11 @@ def raise_to_power(r, i, operands, of):
         is_odd = f("gt", f("sub", rest, f("mul", number(2.0), half)), number(0.5))
         product = f("mul", product, f("select", is_odd, one, power))
         power, rest = f("mul", power, power) if k < _BITS - 1 else power, half
-    size = f("abs", f("select", f("eq", u, zero), u, one))
-    product = f("mul", product, f("exp", f("mul", f("sub", v, n), f("log", size))))
+    size, rest_of_v = f("abs", u), f("sub", v, n)
+    is_near = f("lt", size, number(_NEAR_ZERO))
+    by_v = f("exp", f("mul", rest_of_v, f("log", f("select", is_near, size, one))))
+    lost = f("select", is_near, zero, f("sqrt", rest_of_v))  # zero, and its slope is infinite
+    product = f("mul", product, f("add", by_v, lost))
     is_whole = f("and", f("eq", v, n), f("eq", rest, zero))
     return choose(r, is_whole, slow, r.coefficient(product))
 

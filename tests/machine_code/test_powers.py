@@ -40,6 +40,13 @@ def test_the_slope_by_an_exponent(p):
 
 
 @pytest.mark.slow
+def test_the_slope_by_a_whole_exponent_has_no_series_from_zero():
+    end = lambda q0, p: lagjax.simulate(WELL, q0, 1.0, np.array([0.0, 0.5]), {"p": p, "k": 2.0}).q[-1]
+    by_start, by_p = jax.grad(end, (0, 1))(0.0, 2.0)
+    assert abs(by_start - np.cos(1.0)) < 1e-9 and not np.isfinite(by_p)
+
+
+@pytest.mark.slow
 def test_drag_of_a_start_at_rest_has_the_same_slopes_in_both_modes():
     drag = lagjax.System(
         lambda q, v: 0.5 * v**2 - 0.5 * q**2, forces=lambda q, v, params: -params * jnp.sign(v) * abs(v) ** 1.7
