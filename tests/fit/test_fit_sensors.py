@@ -121,6 +121,15 @@ def test_a_converter_of_few_bits_at_its_limits():
     assert "Quantised(0.01)" in found.message
 
 
+@pytest.mark.parametrize(("step", "limit"), [(0.1, 0.5), (0.1, 0.55), (0.2, 0.8)])
+def test_a_sensor_of_few_lines_at_its_limits(step, limit):
+    """What is shown as a limit on a line begins half a step before it; one between lines at the next of them."""
+    shown = np.clip(np.round((EXACT + 4 * NOISE) / step) * step, -limit, limit)
+    found, told = fit(shown), fit(shown, noise=lagjax.Clipped(-limit, limit))
+    assert is_right(found) and "Clipped(low" in found.message and "Clipped(high" in found.message
+    assert is_right(told) and f"multiples of {step:g}" in told.message
+
+
 def test_the_density_has_the_limits_and_their_gradient():
     found = fit(np.clip(EXACT + 10 * NOISE, -0.8, 9.0), noise=lagjax.Clipped(low=-0.8))
     density = found.log_density()

@@ -64,6 +64,17 @@ class Sensor(NamedTuple):
             return None
         return (values >= self.high).astype(float) - (values <= self.low)
 
+    def bounds_shown(self, values: np.ndarray, weights: np.ndarray, sides: np.ndarray) -> np.ndarray:
+        """Samples (..., S) with those at a limit where the exact values that a rounding sensor shows so begin: half a
+        step before the first of its lines that is at the limit or beyond."""
+        shown = values.copy()
+        for k in np.flatnonzero(np.isfinite(self.step)):
+            inside = values[..., k][(sides[..., k] == 0) & (weights[..., k] > 0)]
+            side, step, offset = sides[..., k], self.step[k], inside[0] if len(inside) else 0.0
+            lines = np.ceil(side * (values[..., k] - offset) / step - _LATTICE)
+            shown[..., k] = np.where(side != 0, offset + side * (lines - 0.5) * step, values[..., k])
+        return shown
+
 
 class AbstractNoise(abc.ABC):  # noqa: B024
     """A law for the scatter of measurements, which is normal where the law says no more."""
@@ -143,7 +154,8 @@ class Clipped(AbstractNoise):
 
     A sample at a limit says that the value lies there or beyond, and contributes the probability of that, Φ(±e/σ).
 
-    Both are numbers for all signals, or prefixes of the structure of `values` with one for each; None for no limit.
+    Of a sensor that rounds as well this begins half a step before the first line at the limit. Both are numbers for all
+    signals, or prefixes of the structure of `values` with one for each; None for no limit.
 
     **Raises** `TypeError` or `ValueError` for what are no limits, and in `fit` where values are beyond.
 
@@ -297,7 +309,9 @@ def rounding_square(rows: list[np.ndarray], x: list[np.ndarray], step: float, si
 
 _LATTICE = 0.02  # of a step that a multiple may be off, in text of few digits or float32; chance is off by 0.25
 _EQUAL = 0.02  # of neighbours that are equal: with fewer, rounding errors are independent anyhow
-_BEFORE, _RISE = 10, 16  # samples before a limit at most, over which a motion that is cut off rises by as many steps
+# Samples beside a limit at most, over which a motion that is cut off changes by so many times what one that turns does;
+# and the noise in steps from which on a run of so many equal samples at the end of all is none of chance.
+_BESIDE, _SHARP, _NOISY, _CUT = 10, 1.5, 0.4, 6
 _RUN, _AT_LIMIT = 3, 0.01  # equal values in a row at a limit of a sensor, and the share of all samples in such rows
 
 
@@ -315,21 +329,34 @@ def find_step(column: np.ndarray) -> float:
 def find_limits(column: np.ndarray, step: float) -> list[float]:
     """The lowest and the highest value of a signal (T,) where its sensor is at a limit there; NaN where it is not.
 
-    A sensor at its limit shows one value for some time. Those of noise never repeat, and a motion that turns, or comes
-    to rest, within a step for r samples rises by eight steps over the r before: one that is cut off, by more.
+    A sensor at its limit shows one value for some time. Those of noise never repeat, and a motion that turns within a
+    step h for r samples changes by at most ((1 + 2w/r)² − 1) h, and a step of rounding, over the w before or after: one
+    that is cut off, by more.
     """
     found, others = [], column[(column > column.min()) & (column < column.max())]
     repeats = len(others) < 2 or np.mean(np.diff(others) == 0) >= _EQUAL
+    noise = np.median(np.abs(np.diff(others, 2))) / (0.6745 * np.sqrt(6)) if len(others) > 2 else 0.0
     for end in (column.min(), column.max()):
         there = column == end
         begins = (np.flatnonzero(there[1:] & ~there[:-1]) + 1).tolist()
         runs = [int(np.argmin(np.append(there[i:], False))) for i in begins]
         long = [(i, run) for i, run in zip(begins, runs, strict=True) if run >= _RUN]
-        rises = [abs(end - column[max(i - min(run, _BEFORE), 0)]) for i, run in long]
+        rises = [_steepness(column, i, run, step) for i, run in long]
         enough = rises and sum(runs) >= max(_AT_LIMIT * len(column), 4)
-        sharp = np.median(rises) > _RISE * step if rises and np.isfinite(step) else not repeats
+        sharp = np.median(rises) > _SHARP * step if rises and np.isfinite(step) else not repeats
+        sharp |= noise > _NOISY * step and sum(run >= _CUT for _, run in long) > 1
         found.append(float(end) if enough and sharp else np.nan)
     return found
+
+
+def _steepness(column: np.ndarray, first: int, run: int, step: float) -> float:
+    """The least step of a signal (T,) that turns in a run of equal samples: by what it changes before, and after."""
+    window, end = min(max(run // 3, 3), run, _BESIDE), first + run
+    before = abs(column[first] - column[max(first - window, 0)]) - step
+    if end + window > len(column):  # it may rest there: then it came as from a turn of as many samples
+        return before / 8
+    after = abs(column[first] - column[end + window - 1]) - step
+    return min(before, after) / ((1 + 2 * window / run) ** 2 - 1)
 
 
 def find_sensor(records: list[Record]) -> Sensor:
@@ -338,6 +365,9 @@ def find_sensor(records: list[Record]) -> Sensor:
     columns = [column[np.isfinite(column)] for column in columns]
     steps = np.array([find_step(column) for column in columns])
     ends = np.array([find_limits(column, step) for column, step in zip(columns, steps, strict=True)])
+    for k, (column, limits) in enumerate(zip(columns, ends, strict=True)):  # which may lie between two lines
+        if np.isfinite(limits).any() and np.isfinite(step := find_step(column[~np.isin(column, limits)])):
+            steps[k] = step
     return Sensor(steps, *ends.T)
 
 
