@@ -121,7 +121,7 @@ def test_a_converter_of_few_bits_at_its_limits():
     assert "Quantised(0.01)" in found.message
 
 
-@pytest.mark.parametrize(("step", "limit"), [(0.1, 0.5), (0.1, 0.55), (0.2, 0.8)])
+@pytest.mark.parametrize(("step", "limit"), [(0.1, 0.5), (0.1, 0.55), (0.05, 0.8)])
 def test_a_sensor_of_few_lines_at_its_limits(step, limit):
     """What is shown as a limit on a line begins half a step before it; one between lines at the next of them."""
     shown = np.clip(np.round((EXACT + 4 * NOISE) / step) * step, -limit, limit)
