@@ -26,7 +26,7 @@ from lagjax._fit.model._assembly import GivenSystem, assemble_residuals, read_sy
 from lagjax._fit.model._noise import AbstractNoise, Clipped, Gaussian, Quantised, StudentT
 from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._records import Guess, Record, require_untraced
-from lagjax._fit.model._residuals import LostMotion, Point, Residuals
+from lagjax._fit.model._residuals import LostMotion, Point, Residuals, SystemResiduals
 from lagjax._fit.model._sensors import Delayed, wrapped
 from lagjax._fit.model._timings import Timings
 from lagjax._fit.model._transforms import angle, between, inertia, positive, simplex
@@ -42,7 +42,7 @@ from lagjax._fit.search._reader import TimeScales, first_starts, read_records, t
 from lagjax._fit.search._search import Search, search_again
 from lagjax._fit.search._unexplained import Unexplained
 from lagjax._primitives import with_doubles
-from lagjax._run.hybrid import Scene
+from lagjax._run.hybrid import Scene, jumps
 from lagjax._scene import HOLDS
 
 PyTree = Any
@@ -50,6 +50,7 @@ _METHODS = ("auto", "segments", "whole", "gradient")
 # Free numbers from which on a sentence says that another method may be meant. Of a network of 337 a trial takes half a
 # minute, and the gradient's whole descent as long; scenes of 50 need no such advice.
 _MANY = 100
+_STARTS = 16, 64  # that are tried one after the other where motions jump and the first search ends doubtfully
 
 
 @with_doubles
@@ -99,7 +100,8 @@ def fit(
     - `starts`: the number of parameter values from which to search: `params0`, and random ones drawn with `seed`, about
       a positive number with a decade as standard deviation, uniform between bounds, on a circle or a simplex, and about
       any other number with its size as standard deviation. The best few go through the whole search, and `params0`
-      always does; `Fit.waterfall` tells where each of them ended.
+      always does; `Fit.waterfall` tells where each of them ended. Where motions jump, by contacts or in a `Hybrid`, 16
+      and then 64 are tried if the search from `params0` does not end well.
     - `progress`: print a line for every trial to stderr.
     - `method`: "whole" begins with whole records. "segments" begins with short segments of them, each with a start of
       its own read off the data, and joins these step by step; for that the signals must have the structure of q. "auto"
@@ -186,11 +188,22 @@ class _FitSearch(NamedTuple):
         search = Search(residuals, self.law, self.method, readers)
         if self.method == "gradient":
             descent = search.descend_gradient(point)
-        else:
-            descent, waterfall = run_multistart(residuals, search, point, self.starts, self.seed)
+            residuals.watch = descent.residuals.watch = None
+            return Fit.from_descent(descent, self.law, waterfall)
+        for starts in (self.starts, *self._more_starts(residuals)):
+            descent, waterfall = run_multistart(residuals, search, point, starts, self.seed)
             descent = search_again(descent, self.law)
+            found, left = Fit.from_descent(descent, self.law, waterfall)
+            if not found.unseen and found.ok:
+                break
         residuals.watch = descent.residuals.watch = None
-        return Fit.from_descent(descent, self.law, waterfall)
+        return found, left
+
+    def _more_starts(self, residuals: Residuals) -> tuple[int, ...]:
+        """Where motions jump, a search may end on other impacts than those that were measured."""
+        if self.starts > 1 or not len(self.parameters) or not any(jumps(part.scene) for part in residuals.parts):
+            return ()
+        return () if any(self._one_beginning(part) for part in residuals.parts) else _STARTS
 
     def _require_one_beginning(self, residuals: Residuals) -> None:
         if not len(self.parameters) and (self.method == "gradient" or self.starts > 1):
@@ -201,13 +214,16 @@ class _FitSearch(NamedTuple):
         if self.method == "gradient" and self.starts > 1:
             raise ValueError('method="gradient" goes down from one start: leave `starts` at 1.')
         for part in residuals.parts if self.starts > 1 else []:
-            why = (
-                "sensors are lagjax.Delayed" if part.signals.delays is not None
-                else "starts on constraints are fitted" if part.fits_on_constraints
-                else "there are lagjax.Timings" if part.clocks else None
-            )  # fmt: skip
-            if why is not None:
+            if (why := self._one_beginning(part)) is not None:
                 raise ValueError(f"starts must be 1 where {why}: their search has one beginning.")
+
+    @staticmethod
+    def _one_beginning(part: SystemResiduals) -> str | None:
+        return (
+            "sensors are lagjax.Delayed" if part.signals.delays is not None
+            else "starts on constraints are fitted" if part.fits_on_constraints
+            else "there are lagjax.Timings" if part.clocks else None
+        )  # fmt: skip
 
     def find_mistake(self, given: list[GivenSystem], left: Unexplained, spent: float) -> list[str]:
         """The mistakes in records of which a fit leaves much, as far as fits of other records tell; `spent` is the

@@ -170,3 +170,35 @@ def test_bounces_that_a_motion_does_not_have_are_counted():
     late = lagjax.Timings(BOUNCE, np.array([0.6, 1.2]), 0.0, (0.5, 0.0), numbers=np.array([0, 9]))
     with pytest.raises(ValueError, match=r"There are \d transitions from 'flight' to 'flight' up to .* but number 9"):
         lagjax.fit(BALL, late, {"e": 0.95})
+
+
+# ---- where motions jump a search may end on other impacts --------------------------------------------------------------
+
+PUCK = lagjax.System(
+    lambda q, v: 0.5 * v**2, forces=lambda q, v, params: -params["mu"] * G * jnp.sign(v),
+    contacts=lambda q: jnp.stack([q, 1 - q]), restitution=lambda params: params["e"],
+)  # fmt: skip
+CUSHION = lagjax.System(
+    lambda q, v: 0.5 * v @ v - G * q[1], contacts=lambda q: q[1], slip=lambda q, v: v[0],
+    friction=lambda params: params["mu"], restitution=lambda params: params["e"],
+)  # fmt: skip
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("scene", "start", "end", "truth", "mu"),
+    [
+        (PUCK, (0.5, 2.0), 4.0, {"mu": 0.05, "e": 0.85}, (0.03, 0.05, 0.2)),
+        # It sticks from μ = 0.154 on, where nothing depends on μ.
+        (CUSHION, (np.array([0.0, 1.0]), np.array([1.228, 0.0])), 0.8, {"mu": 0.15, "e": 0.8}, (0.05, 0.3)),
+    ],
+)
+def test_a_search_that_ends_on_other_impacts_begins_again_elsewhere(scene, start, end, truth, mu):
+    ts = np.linspace(0.0, end, 201)
+    exact = lagjax.simulate(scene, *start, ts, truth).q
+    values = exact + 0.002 * np.random.default_rng(0).normal(size=exact.shape)
+    for first in mu:
+        transforms = {"mu": lagjax.positive, "e": lagjax.between(0.0, 1.0)}
+        fit = lagjax.fit(scene, lagjax.Record(ts, values, start=start), {"mu": first, "e": 0.8}, transforms=transforms)
+        low, high = fit.intervals(0.9999)
+        assert fit.ok and all(low[k] <= x <= high[k] for k, x in truth.items())

@@ -33,7 +33,8 @@ from lagjax._fit.search._unexplained import MOST_NAMED, Unexplained, unexplained
 from lagjax._run.hybrid import jumps
 
 _BEYOND = 2.0  # standard errors that a step must lead beyond a bound: of sound fits at a bound one in forty does
-_CORRELATED = 0.5
+# Correlation of neighbouring residuals that is told; and from which on motion that jumps may jump elsewhere.
+_CORRELATED, _ELSEWHERE = 0.5, 0.8
 _ASIDE, _KEPT = 4.0, 1e6  # standard errors: how far a kink is one that intervals may not leave out; and one over them
 _DISAGREE = 5.0  # standard deviations of a shift: twenty records of ten parameters show it in one of 1e4 fits
 _SEEN = 1e-5  # of the largest singular value of columns in units of their standard deviations
@@ -63,9 +64,16 @@ def verdict(
         records, own = [r for r in part.records if isinstance(r, Record)], part.sensor_noise(descent.noise)
         if records:
             parts += describe_sensors(records, law, part.signals.names, part.sensor, own.sigma)
-    if np.nanmax(known.correlation) > _CORRELATED:
+    correlation, elsewhere = np.nanmax(known.correlation), False
+    if any(jumps(part.scene) for part in residuals.parts) and (unseen or correlation > _ELSEWHERE):
+        elsewhere = True
+        parts.append(
+            "The search may have ended on other impacts, or on sticking in the place of sliding, where slopes vanish: "
+            "begin nearer, by other params0, or with starts=256."
+        )
+    elif correlation > _CORRELATED:
         parts.append("The residuals are correlated: they hold motion that the scene lacks, and intervals allow for it.")
-    ok = descent.converged and not (unseen or left.motion or apart or bent)
+    ok = descent.converged and not (unseen or left.motion or apart or bent or elsewhere)
     ok &= not any("take noise=" in text or TOO_COARSE in text for text in parts)
     if not ok or at_ends or labels:
         still = [x for part in residuals.parts for x in constant_signals(part.records, part.signals.names)]
