@@ -172,7 +172,7 @@ def test_bounces_that_a_motion_does_not_have_are_counted():
         lagjax.fit(BALL, late, {"e": 0.95})
 
 
-# ---- where motions jump a search may end on other impacts --------------------------------------------------------------
+# ---- where motions jump a search may end on other impacts ------------------------------------------------------------
 
 PUCK = lagjax.System(
     lambda q, v: 0.5 * v**2, forces=lambda q, v, params: -params["mu"] * G * jnp.sign(v),
