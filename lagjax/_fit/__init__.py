@@ -37,12 +37,13 @@ from lagjax._fit.result._prediction import Prediction
 from lagjax._fit.result._profile import Profile
 from lagjax._fit.result._report import draw_record
 from lagjax._fit.result._result import Fit
+from lagjax._fit.result._verdict import is_doubtful
 from lagjax._fit.search._multistart import run_multistart
 from lagjax._fit.search._reader import TimeScales, first_starts, read_records, time_scales
 from lagjax._fit.search._search import Search, search_again
 from lagjax._fit.search._unexplained import Unexplained
 from lagjax._primitives import with_doubles
-from lagjax._run.hybrid import Scene
+from lagjax._run.hybrid import Scene, jumps
 from lagjax._scene import HOLDS
 
 PyTree = Any
@@ -50,6 +51,7 @@ _METHODS = ("auto", "segments", "whole", "gradient")
 # Free numbers from which on a sentence says that another method may be meant. Of a network of 337 a trial takes half a
 # minute, and the gradient's whole descent as long; scenes of 50 need no such advice.
 _MANY = 100
+_MORE_STARTS = 16, 64  # of motion that sticks, or strikes, where one start leaves motion
 
 
 @with_doubles
@@ -151,7 +153,7 @@ def fit(
         )
     begun = time.process_time()
     try:
-        done, left = search.fit(given)
+        done, left = search.fit(given, looks_further=True)
     except LostMotion as reason:
         text = f"{reason} Begin nearer: other params0, or starts that are known."
         nothing = Unexplained([text], [], np.inf, True, list(range(len(given[0].records))))
@@ -174,8 +176,12 @@ class _FitSearch(NamedTuple):
     seed: int
     progress: bool
 
-    def fit(self, given: list[GivenSystem]) -> tuple[Fit, Unexplained]:
-        """The fit of records that were checked, and what it leaves. Raises `LostMotion` where none can be followed."""
+    def fit(self, given: list[GivenSystem], looks_further: bool = False) -> tuple[Fit, Unexplained]:
+        """The fit of records that were checked, and what it leaves. Raises `LostMotion` where none can be followed.
+
+        Motion that sticks, or strikes, has many minima: with `looks_further` more starts are tried where one leaves
+        motion.
+        """
         residuals = assemble_residuals(given, self.parameters, self.law)
         self._require_one_beginning(residuals)
         readers = read_records(residuals)
@@ -188,6 +194,17 @@ class _FitSearch(NamedTuple):
             descent = search.descend_gradient(point)
         else:
             descent, waterfall = run_multistart(residuals, search, point, self.starts, self.seed)
+            may = (
+                looks_further
+                and self.starts == 1
+                and len(self.parameters)
+                and not any(p.clocks for p in residuals.parts)
+            )
+            for starts in _MORE_STARTS if may and any(jumps(part.scene) for part in residuals.parts) else ():
+                if not is_doubtful(descent):
+                    break
+                other, waterfall = run_multistart(residuals, search, descent.trial.point, starts, self.seed)
+                descent = max(descent, other, key=lambda one: one.residuals.log_likelihood(one.trial, one.noise))
             descent = search_again(descent, self.law)
         residuals.watch = descent.residuals.watch = None
         return Fit.from_descent(descent, self.law, waterfall)

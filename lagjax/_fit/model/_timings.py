@@ -34,8 +34,8 @@ _PATIENCE = 2.0  # mean times between crossings that are waited for behind the l
 # periods of seven planets is a thirtieth of what they are measured to. Derivatives then need no shorter steps either.
 _SHARPER = 0.1
 _TOUCHES = (
-    " A section that only touches zero, as a gap does at an impact, is not crossed there. For times of impacts write the "
-    "scene as a lagjax.Hybrid with a Transition at the impact, and time that: Timings(transition, times, …)."
+    " A section that only touches zero, as a gap does at an impact, is not crossed there. For times of impacts write "
+    "the scene as a lagjax.Hybrid with a Transition at the impact, and time that: Timings(transition, times, …)."
 )
 
 
