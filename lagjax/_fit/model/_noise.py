@@ -64,6 +64,19 @@ class Sensor(NamedTuple):
             return None
         return (values >= self.high).astype(float) - (values <= self.low)
 
+    def thresholds(self, values: np.ndarray, sides: np.ndarray, counted: np.ndarray) -> np.ndarray:
+        """The values (..., S), of which those at a limit are what the sensor shows so from. One that rounds shows its
+        limit from half a step before the line at the limit, or the next beyond it."""
+        found = values.copy()
+        for s in np.flatnonzero(np.isfinite(self.step)).tolist():
+            for side in (1, -1):
+                there, others = sides[..., s] == side, values[..., s][counted[..., s] & (sides[..., s] == 0)]
+                if there.any() and others.size:
+                    line, step = np.max(side * others), self.step[s]
+                    beyond = np.ceil((side * values[there, s] - line) / step - _NEAR_LINE)
+                    found[there, s] = side * (line + (beyond - 0.5) * step)
+        return found
+
 
 class AbstractNoise(abc.ABC):  # noqa: B024
     """A law for the scatter of measurements, which is normal where the law says no more."""
@@ -295,9 +308,11 @@ def rounding_square(rows: list[np.ndarray], x: list[np.ndarray], step: float, si
     return total
 
 
+_NEAR_LINE = 0.1  # of a step that a limit may be beyond a line and count as that
 _LATTICE = 0.02  # of a step that a multiple may be off, in text of few digits or float32; chance is off by 0.25
 _EQUAL = 0.02  # of neighbours that are equal: with fewer, rounding errors are independent anyhow
 _BEFORE, _RISE = 10, 16  # samples before a limit at most, over which a motion that is cut off rises by as many steps
+_FEWEST_LINES = 4  # that show a step
 _RUN, _AT_LIMIT = 3, 0.01  # equal values in a row at a limit of a sensor, and the share of all samples in such rows
 
 
@@ -310,6 +325,12 @@ def find_step(column: np.ndarray) -> float:
     step, rounding = gaps.sum() / whole[-1], 4 * np.finfo(np.float32).eps * np.abs(column).max()
     off = np.abs(np.cumsum(gaps) - whole * step).max()
     return float(step) if off < _LATTICE * step + min(rounding, 0.1 * step) else np.nan
+
+
+def _find_step_between_limits(column: np.ndarray) -> float:
+    """The step of the values between the smallest and the largest, which may be limits between lines, or of all."""
+    inner = column[(column > column.min()) & (column < column.max())]
+    return float(np.fmax(find_step(column), find_step(inner) if len(np.unique(inner)) > _FEWEST_LINES else np.nan))
 
 
 def find_limits(column: np.ndarray, step: float) -> list[float]:
@@ -336,7 +357,7 @@ def find_sensor(records: list[Record]) -> Sensor:
     """The sensors as records show them: rounding that all of them share, and limits that some of them reach."""
     columns = [np.concatenate([r.matrix[:, s] for r in records]) for s in range(records[0].matrix.shape[1])]
     columns = [column[np.isfinite(column)] for column in columns]
-    steps = np.array([find_step(column) for column in columns])
+    steps = np.array([_find_step_between_limits(column) for column in columns])
     ends = np.array([find_limits(column, step) for column, step in zip(columns, steps, strict=True)])
     return Sensor(steps, *ends.T)
 

@@ -173,7 +173,9 @@ class SystemResiduals:
             values[..., columns], weights[..., columns] = batch.values, batch.weights
             if self.signals.delays is not None and self.pieces[batch.rows[0]].record not in self.clocks:
                 weights[batch.ts < batch.ts[:, :1] + self.signals.delays.longest] = 0.0
-            found[k] = batch._replace(values=values, weights=weights, sides=self.frame.sensor.sides(values))
+            if (sides := self.frame.sensor.sides(values)) is not None:
+                values = self.frame.sensor.thresholds(values, sides, weights > 0)
+            found[k] = batch._replace(values=values, weights=weights, sides=sides)
         return found
 
     # ---- the trials of a search ----
