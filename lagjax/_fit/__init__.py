@@ -26,7 +26,7 @@ from lagjax._fit.model._assembly import GivenSystem, assemble_residuals, read_sy
 from lagjax._fit.model._noise import AbstractNoise, Clipped, Gaussian, Quantised, StudentT
 from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._records import Guess, Record, require_untraced
-from lagjax._fit.model._residuals import LostMotion, Point, Residuals, SystemResiduals
+from lagjax._fit.model._residuals import LostMotion, Point, Residuals
 from lagjax._fit.model._sensors import Delayed, wrapped
 from lagjax._fit.model._timings import Timings
 from lagjax._fit.model._transforms import angle, between, inertia, positive, simplex
@@ -37,6 +37,7 @@ from lagjax._fit.result._prediction import Prediction
 from lagjax._fit.result._profile import Profile
 from lagjax._fit.result._report import draw_record
 from lagjax._fit.result._result import Fit
+from lagjax._fit.result._verdict import is_doubtful
 from lagjax._fit.search._multistart import run_multistart
 from lagjax._fit.search._reader import TimeScales, first_starts, read_records, time_scales
 from lagjax._fit.search._search import Search, search_again
@@ -50,7 +51,7 @@ _METHODS = ("auto", "segments", "whole", "gradient")
 # Free numbers from which on a sentence says that another method may be meant. Of a network of 337 a trial takes half a
 # minute, and the gradient's whole descent as long; scenes of 50 need no such advice.
 _MANY = 100
-_STARTS = 16, 64  # that are tried one after the other where motions jump and the first search ends doubtfully
+_MORE_STARTS = 16, 64  # of motion that sticks, or strikes, where one start leaves motion
 
 
 @with_doubles
@@ -101,7 +102,7 @@ def fit(
       a positive number with a decade as standard deviation, uniform between bounds, on a circle or a simplex, and about
       any other number with its size as standard deviation. The best few go through the whole search, and `params0`
       always does; `Fit.waterfall` tells where each of them ended. Where motions jump, by contacts or in a `Hybrid`, 16
-      and then 64 are tried if the search from `params0` does not end well.
+      and then 64 are tried if the search from `params0` leaves motion.
     - `progress`: print a line for every trial to stderr.
     - `method`: "whole" begins with whole records. "segments" begins with short segments of them, each with a start of
       its own read off the data, and joins these step by step; for that the signals must have the structure of q. "auto"
@@ -153,7 +154,7 @@ def fit(
         )
     begun = time.process_time()
     try:
-        done, left = search.fit(given)
+        done, left = search.fit(given, looks_further=True)
     except LostMotion as reason:
         text = f"{reason} Begin nearer: other params0, or starts that are known."
         nothing = Unexplained([text], [], np.inf, True, list(range(len(given[0].records))))
@@ -176,8 +177,12 @@ class _FitSearch(NamedTuple):
     seed: int
     progress: bool
 
-    def fit(self, given: list[GivenSystem]) -> tuple[Fit, Unexplained]:
-        """The fit of records that were checked, and what it leaves. Raises `LostMotion` where none can be followed."""
+    def fit(self, given: list[GivenSystem], looks_further: bool = False) -> tuple[Fit, Unexplained]:
+        """The fit of records that were checked, and what it leaves. Raises `LostMotion` where none can be followed.
+
+        Motion that sticks, or strikes, has many minima: with `looks_further` more starts are tried where one leaves
+        motion.
+        """
         residuals = assemble_residuals(given, self.parameters, self.law)
         self._require_one_beginning(residuals)
         readers = read_records(residuals)
@@ -188,22 +193,22 @@ class _FitSearch(NamedTuple):
         search = Search(residuals, self.law, self.method, readers)
         if self.method == "gradient":
             descent = search.descend_gradient(point)
-            residuals.watch = descent.residuals.watch = None
-            return Fit.from_descent(descent, self.law, waterfall)
-        for starts in (self.starts, *self._more_starts(residuals)):
-            descent, waterfall = run_multistart(residuals, search, point, starts, self.seed)
+        else:
+            descent, waterfall = run_multistart(residuals, search, point, self.starts, self.seed)
+            may = (
+                looks_further
+                and self.starts == 1
+                and len(self.parameters)
+                and not any(p.clocks for p in residuals.parts)
+            )
+            for starts in _MORE_STARTS if may and any(jumps(part.scene) for part in residuals.parts) else ():
+                if not is_doubtful(descent):
+                    break
+                other, waterfall = run_multistart(residuals, search, descent.trial.point, starts, self.seed)
+                descent = max(descent, other, key=lambda one: one.residuals.log_likelihood(one.trial, one.noise))
             descent = search_again(descent, self.law)
-            found, left = Fit.from_descent(descent, self.law, waterfall)
-            if not found.unseen and found.ok:
-                break
         residuals.watch = descent.residuals.watch = None
-        return found, left
-
-    def _more_starts(self, residuals: Residuals) -> tuple[int, ...]:
-        """Where motions jump, a search may end on other impacts than those that were measured."""
-        if self.starts > 1 or not len(self.parameters) or not any(jumps(part.scene) for part in residuals.parts):
-            return ()
-        return () if any(self._one_beginning(part) for part in residuals.parts) else _STARTS
+        return Fit.from_descent(descent, self.law, waterfall)
 
     def _require_one_beginning(self, residuals: Residuals) -> None:
         if not len(self.parameters) and (self.method == "gradient" or self.starts > 1):
@@ -214,16 +219,13 @@ class _FitSearch(NamedTuple):
         if self.method == "gradient" and self.starts > 1:
             raise ValueError('method="gradient" goes down from one start: leave `starts` at 1.')
         for part in residuals.parts if self.starts > 1 else []:
-            if (why := self._one_beginning(part)) is not None:
+            why = (
+                "sensors are lagjax.Delayed" if part.signals.delays is not None
+                else "starts on constraints are fitted" if part.fits_on_constraints
+                else "there are lagjax.Timings" if part.clocks else None
+            )  # fmt: skip
+            if why is not None:
                 raise ValueError(f"starts must be 1 where {why}: their search has one beginning.")
-
-    @staticmethod
-    def _one_beginning(part: SystemResiduals) -> str | None:
-        return (
-            "sensors are lagjax.Delayed" if part.signals.delays is not None
-            else "starts on constraints are fitted" if part.fits_on_constraints
-            else "there are lagjax.Timings" if part.clocks else None
-        )  # fmt: skip
 
     def find_mistake(self, given: list[GivenSystem], left: Unexplained, spent: float) -> list[str]:
         """The mistakes in records of which a fit leaves much, as far as fits of other records tell; `spent` is the

@@ -159,7 +159,8 @@ class Files:
 
     def exists(self) -> bool:
         """True if there is something by this name; an empty folder is nothing."""
-        return self.path.exists() and not (self.path.is_dir() and not any(self.path.iterdir()))
+        with self.explain_errors("the store was not made"):
+            return self.path.exists() and not (self.path.is_dir() and not any(self.path.iterdir()))
 
     @contextmanager
     def create_aside(self) -> "Iterator[Files]":
@@ -353,6 +354,8 @@ class Files:
                 text = "the disk is full. Make room and run the sweep again"
             elif error.errno in _REFUSED:
                 text = f"the store is read-only for this process ({os.strerror(error.errno)})"
+            elif error.errno == errno.ENAMETOOLONG:
+                raise OSError(error.errno, f"{what}: the name of the folder is too long, {self.path}") from error
             else:
                 raise
             text = f"{self.path}: {what}: {text}; all units that are done are kept, and nothing is lost"

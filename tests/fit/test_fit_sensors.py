@@ -130,6 +130,16 @@ def test_a_sensor_of_few_lines_at_its_limits(step, limit):
     assert is_right(told) and f"multiples of {step:g}" in told.message
 
 
+@pytest.mark.parametrize("limit", [0.8, 0.85, 0.82])
+def test_a_coarse_sensor_shows_its_limit_from_half_a_step_before(limit):
+    shown = np.clip(np.round((EXACT + 4 * NOISE) / 0.1) * 0.1, -limit, limit)
+    found = fit(shown, noise=lagjax.Clipped(shown.min(), shown.max()))
+    assert is_right(found, 0.999) and found.residual_function.sensor.step[0] == pytest.approx(0.1)
+    assert np.allclose(
+        found.residuals[0] + shown, found.predict(found.records[0]).values, atol=1e-3
+    )  # less what is shown
+
+
 def test_the_density_has_the_limits_and_their_gradient():
     found = fit(np.clip(EXACT + 10 * NOISE, -0.8, 9.0), noise=lagjax.Clipped(low=-0.8))
     density = found.log_density()

@@ -181,3 +181,12 @@ def test_times_with_stated_errors_beside_a_record_are_fitted_whole():
     fit = lagjax.fit(SCENE, [of_times, lagjax.Record(ts, q)], {"g": 9.5, "c": 0.05})
     assert fit.ok and list(fit.noise) == ["q", "times"] and "pieces" not in fit.message, fit.message
     assert fit.params["g"] == pytest.approx(9.81, rel=1e-3)
+
+
+def test_a_gap_that_an_impact_only_touches_is_said_with_what_to_write():
+    ball = lagjax.System(
+        lambda q, v: 0.5 * v**2 - 9.81 * q, contacts=lambda q: q, restitution=lambda params: params["e"]
+    )
+    heard = lagjax.Timings(bottom, jnp.array([0.45, 1.17, 1.75]), t0=0.0, start=(1.0, 0.0))
+    with pytest.raises(ValueError, match=r"only touches zero.*not crossed.*lagjax.Hybrid with a Transition"):
+        lagjax.fit(ball, heard, {"e": 0.8})

@@ -280,3 +280,23 @@ def test_one_parameter_that_a_chaotic_record_cannot_tell_has_no_interval():
     fit = lagjax.fit(CHAOTIC, chaotic_record(40.0, HIGH), {**TRUTH, "more": 1e-3}, free=free, method="whole")
     assert not fit.ok and "is chaotic" in fit.unseen[0] and "about params['more']." in fit.unseen[0]
     assert fit.intervals()[1]["more"] == np.inf
+
+
+def test_a_swing_that_noise_gives_says_nothing_of_its_frequency():
+    # A pendulum that hangs still, one that swings by half of the noise, and one that rests beside one that moves.
+    ts, rng = np.linspace(0.0, 10.0, 501), np.random.default_rng(1)
+    scene = lagjax.System(
+        lambda q, v, params: 0.5 * v**2 + params["w2"] * jnp.cos(q), forces=lambda q, v, params: -params["c"] * v
+    )
+    exact = np.asarray(lagjax.simulate(scene, 1.0, 0.0, ts, {"w2": 9.0, "c": 0.1}).q)
+
+    def found(*sizes, law=None, start=None):
+        records = [lagjax.Record(ts, x * exact + 0.005 * rng.normal(size=501), start=start) for x in sizes]
+        return lagjax.fit(scene, records, {"w2": 7.0, "c": 0.2}, transforms=lagjax.positive, noise=law)
+
+    still = [found(0.0) for _ in range(12)] + [found(0.0, law=lagjax.StudentT()), found(0.0, 0.0)]
+    assert sum(fit.ok for fit in still) <= 1
+    assert all(fit.ok or "params['c'] and params['w2']" in fit.unseen[-1] for fit in still)
+    moving = [found(0.0025) for _ in range(8)]
+    assert all(not fit.unseen for fit in [*moving, found(0.0, 0.1), found(0.1, law=lagjax.StudentT())])
+    assert not any("seen to move" in text for text in found(0.0, start=(0.0, 0.0)).unseen)

@@ -12,7 +12,7 @@ from lagrangians import damping
 
 import lagjax
 from lagjax._fit.model._autocorrelation import correlated_power
-from lagjax._fit.model._sensors import wrap_residuals
+from lagjax._fit.model._sensors import require_no_jumps, wrap_residuals
 
 SIGMA = 3e-3
 TS = np.linspace(0.0, 8.0, 401)
@@ -66,6 +66,17 @@ def test_no_jump_is_seen_where_there_is_none():
     spike[100] += 2 * np.pi
     for values in (ROUND, steep, spike):
         lagjax.fit(SCENE, lagjax.Record(TS, values), TRUTH, free={"w2": True, "c": False}, method="whole")
+
+
+def test_white_noise_is_no_angle():
+    # Some pair of neighbours is as far apart as the range, or a turn, but many others nearly are.
+    noise = np.random.default_rng(0).normal(size=(60, 501))
+    for scale in (0.005, 1.0, 1.5, 60.0, 100.0):
+        for place, values in enumerate(scale * noise):
+            require_no_jumps(lagjax.Record(np.arange(501.0), values), f"records[{place}]", ("q",), True)
+    turning = lagjax.Record(np.arange(501.0), 0.7 * np.mod(0.016 * np.arange(501) + 0.02 * noise[0], 1.0))
+    with pytest.raises(ValueError, match=r"jumps by about 0\.\d+ between"):
+        require_no_jumps(turning, "records[0]", ("q",), True)
 
 
 @pytest.mark.parametrize("q0", [None, 0.5 + 4 * np.pi])

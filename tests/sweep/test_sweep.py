@@ -371,6 +371,12 @@ def test_keep_in_numpy_may_fail_for_a_member(tmp_path):
     np.testing.assert_array_equal(np.isnan(run.open().late).all(axis=1), [False, True, False, True])
 
 
+def test_a_name_that_is_too_long_is_a_sentence(tmp_path):
+    with pytest.raises(OSError, match="the store was not made: the name of the folder is too long") as error:
+        Files(tmp_path / ("x" * 300 + ".zarr")).exists()
+    assert error.value.errno == errno.ENAMETOOLONG
+
+
 @pytest.mark.parametrize("number, words", [(errno.ENOSPC, "disk is full"), (errno.EROFS, "read-only")])
 def test_disks_that_refuse(tmp_path, undisturbed, monkeypatch, number, words):
     write, count = _files.write_through, []

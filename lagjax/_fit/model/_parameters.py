@@ -106,14 +106,16 @@ class Parameters:
         return xp.asarray(self.first, u.dtype).at[self.places].set(self.values(u, xp))
 
     def values(self, u, xp: Any = np):
-        """The free numbers (X,) at u (F,)."""
-        return xp.concatenate([u[:0], *[part.transform.value(u[own], xp) for own, _, part in self._cuts]])
+        """The free numbers (X,) at u (F,); infinite where a step of the search led too far, which is a lost trial."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            return xp.concatenate([u[:0], *[part.transform.value(u[own], xp) for own, _, part in self._cuts]])
 
     def jacobian(self, u: np.ndarray) -> np.ndarray:
         """The derivative of the free numbers by u, (X, F)."""
         matrix = np.zeros((len(self.names), len(self)))
         for own, rows, part in self._cuts:
-            matrix[rows, own] = part.transform.jacobian(u[own])
+            with np.errstate(over="ignore", invalid="ignore"):
+                matrix[rows, own] = part.transform.jacobian(u[own])
         return matrix
 
     def directions(self, u: np.ndarray) -> np.ndarray:

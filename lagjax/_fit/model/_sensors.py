@@ -24,6 +24,7 @@ _CLEAR = 0.35  # of a period between neighbours: at a half the way round is ambi
 _UNCLEAR = 0.05  # share of steps that may be longer, over gaps and glitches: states are read well where most are not
 _SHARP = 3.0  # times the steps beside it that a jump is large: a tent of noise is 2, and a period of 6 samples is 5
 _NEAR = 1.5  # times these steps that it may differ from a period: acceleration changes them by less in one sample
+_BETWEEN = 0.4, 0.75  # of a period: many steps of noise are so long, of a signal less whole periods few are
 _ENOUGH = 20  # samples of which one jump by a whole turn is no chance; of shorter records, and other periods, two
 _TURNS = {2 * np.pi: "2π", 360.0: "360"}  # whole turns: a signal may jump by one wherever it is
 _PERIODS = {**_TURNS, np.pi: "π", 180.0: "180", 1.0: "1"}  # of a signal that stays within one of them
@@ -180,9 +181,12 @@ def _jump(y: np.ndarray, positions: bool) -> tuple[int, str] | None:
     beside = np.sort(beside, axis=-1)[:, -2]
     low, high = y.min(), y.max()
     sharp = steps > _SHARP * np.maximum(beside, 1e-9 * (high - low))
-    sharp &= ~_isolated_steps(y, steps) & ~(steps < 2.5 * find_step(y))  # lines of a coarse encoder
+    alone = _isolated_steps(y, steps)
+    sharp &= ~alone & ~(steps < 2.5 * find_step(y))  # lines of a coarse encoder
     for period, text in _PERIODS.items():
         fits = sharp & (np.abs(steps - period) <= _NEAR * beside + 1e-6 * period)
+        if _count_between(steps[~alone], period) > fits.sum():
+            continue
         edge = 2 * np.max(beside[fits], initial=0.0)
         once = period in _TURNS and len(y) >= _ENOUGH
         within = any(a - edge <= low and high <= a + period + edge for a in (0.0, -period / 2))
@@ -190,9 +194,13 @@ def _jump(y: np.ndarray, positions: bool) -> tuple[int, str] | None:
             return int(np.argmax(fits)), text
     # A count whose number in a turn is unknown: it goes from one end of its range to the other, twice.
     ends = sharp & (np.abs(steps - (high - low)) <= _NEAR * beside)
-    if positions and ends.sum() > 1:
+    if positions and ends.sum() > 1 and _count_between(steps[~alone], high - low) <= ends.sum():
         return int(np.argmax(ends)), f"about {high - low:.4g}"
     return None
+
+
+def _count_between(steps: np.ndarray, period: float) -> int:
+    return int(((steps > _BETWEEN[0] * period) & (steps < _BETWEEN[1] * period)).sum())
 
 
 def _isolated_steps(y: np.ndarray, steps: np.ndarray) -> np.ndarray:

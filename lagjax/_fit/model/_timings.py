@@ -23,7 +23,7 @@ from lagjax._interface import Layout, halves
 from lagjax._primitives import sentence
 from lagjax._program import Unlowerable
 from lagjax._run import directions_of, sections_of, simulate
-from lagjax._run.hybrid import Hybrid, Scene, Transition
+from lagjax._run.hybrid import Hybrid, Scene, Transition, jumps
 from lagjax._scene import System
 
 PyTree = Any
@@ -33,6 +33,10 @@ _PATIENCE = 2.0  # mean times between crossings that are waited for behind the l
 # Of the tolerance of a fit, for the motion itself: its error grows with the square of the time, and after a thousand
 # periods of seven planets is a thirtieth of what they are measured to. Derivatives then need no shorter steps either.
 _SHARPER = 0.1
+_TOUCHES = (
+    " A section that only touches zero, as a gap does at an impact, is not crossed there. For times of impacts write "
+    "the scene as a lagjax.Hybrid with a Transition at the impact, and time that: Timings(transition, times, …)."
+)
 
 
 @dataclass(frozen=True, eq=False)
@@ -247,10 +251,11 @@ def _build_section_clock(
         first = int(np.argmax(missing))
         which = flat.which[first]
         name = "" if keys is None else f" of section[{keys[which]!r}]"
-        return (
+        text = (
             f"There are {int(noted.count[which])} crossings{name} up to t = {span[1]:g}, but number "
             f"{flat.numbers[first]}, counted from 0, was measured."
         )
+        return text + _TOUCHES * jumps(system)
 
     return Clock(times, describe_failure)
 

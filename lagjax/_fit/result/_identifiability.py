@@ -12,13 +12,19 @@ from fractions import Fraction
 
 import numpy as np
 from scipy.sparse.csgraph import connected_components
+from scipy.special import chdtri
 
 from lagjax._equations import decide, echelon_form
+from lagjax._fit.model._inputs import input_functions
+from lagjax._fit.model._noise import AbstractNoise, StudentT
 from lagjax._fit.model._parameters import Parameters
+from lagjax._fit.model._records import Record
 from lagjax._fit.model._residuals import LostMotion, Point, Residuals, Trial
+from lagjax._fit.model._sensors import wrap_residuals
 from lagjax._fit.result._information import Information, confirmed_null, growth, null_space, row_sizes
 from lagjax._fit.search._descent import Descent
 
+_CHANCE = 0.05  # of noise alone to be as likely a motion
 _MOST_NAMES = 12  # in one sentence
 _LARGEST_EXPONENT, _EXACT = 6, 1e-3  # of recognised products; how near to a whole number an exponent must be
 
@@ -61,6 +67,42 @@ def _sentence_on_rounding(residuals: Residuals, trial: Trial, known: Information
         f"{residuals.label(record)} is chaotic: motions grow apart within it by a factor of {grown:.0e}, and rounding "
         f"hides what it says about {_join_names(names)}. There are no intervals from records that long: cut it into "
         "several shorter ones.",
+    )
+
+
+def sentence_on_rest(descent: Descent, known: Information, law: AbstractNoise) -> tuple[str, ...]:
+    """A sentence where the motion that was fitted, starts and all, is no likelier than rest, as far as noise can tell.
+
+    White noise has some swing at each of T/2 frequencies, and a search finds one of them. Its gain in log-likelihood is
+    exponential at each, so that of the best of them is beyond log(T/2) + χ²/2 by chance alone in few fits. Where inputs
+    drive the motion, its frequencies are theirs.
+    """
+    residuals, trial = descent.residuals, descent.trial
+    recordings = [record for record in residuals.records if isinstance(record, Record)]
+    if not len(residuals.parameters) or len(recordings) < len(residuals.records) or not residuals.fitted.all():
+        return ()
+    still, constants = [], 0
+    for batch in residuals.batches:
+        counted = batch.weights > 0
+        centre = np.sum(batch.weights * batch.values, axis=1) / np.maximum(batch.weights.sum(axis=1), 1e-300)
+        if isinstance(law, StudentT):  # whose mean outliers do not move
+            centre = np.nan_to_num(np.nanmedian(np.where(counted, batch.values, np.nan), axis=1))
+        still.append(np.where(counted, centre[:, None] - batch.values, 0.0))
+        constants += int(counted.any(axis=1).sum())
+    rest = trial._replace(residuals=[wrap_residuals(r, residuals.parts[0].frame.periods) for r in still])
+    of_rest = residuals.log_likelihood(rest, residuals.noise_scale(rest, law))
+    share = known.effective.sum() / residuals.measured
+    gain = share * (residuals.log_likelihood(trial, descent.noise) - of_rest)
+    driven = all(input_functions(part.scene) for part in residuals.parts)
+    many = 1.0 if driven else max(len(record) for record in recordings) / 2
+    used = max(len(residuals.parameters) + residuals.unknowns - constants - (many > 1), 1)
+    least = np.log(many) + 0.5 * float(chdtri(used, _CHANCE))
+    if gain >= least:
+        return ()
+    return (
+        f"Nothing is seen to move: the fitted motion is likelier than rest by a factor of e^{max(gain, 0.0):.2g} only, "
+        f"and noise alone gives up to e^{least:.2g}. What it says of {_join_names([*residuals.parameters.labels])} is "
+        "chance: measure a larger motion, or a longer one, or give start=(q0, qdot0) where it is known.",
     )
 
 

@@ -19,7 +19,7 @@ from lagjax._fit.model._records import Record, restore_structure
 from lagjax._fit.model._residuals import Point, Residuals, Trial
 from lagjax._fit.result._comparison import Comparison, comparison
 from lagjax._fit.result._experiments import Experiments, rank_experiments
-from lagjax._fit.result._identifiability import unseen_sentences
+from lagjax._fit.result._identifiability import sentence_on_rest, unseen_sentences
 from lagjax._fit.result._information import LEVEL, Information, information
 from lagjax._fit.result._prediction import Prediction, planned_rows, predict_record
 from lagjax._fit.result._profile import Profile, profile
@@ -110,8 +110,11 @@ class Fit:
     ) -> tuple["Fit", Unexplained]:
         residuals, trial, noise = descent.residuals, descent.trial, descent.noise
         parameters, known = residuals.parameters, information(descent)
-        unseen, left = unseen_sentences(descent, known), measure_unexplained(descent)
-        ok, message = verdict(descent, unseen, known, left, law)
+        left = measure_unexplained(descent)
+        rest = () if left.motion else sentence_on_rest(descent, known, law)
+        unseen, left = (*unseen_sentences(descent, known), *rest), left._replace(noise=[*left.noise, *rest])
+        starts = 1 if waterfall is None else len(waterfall.misfits)
+        ok, message = verdict(descent, unseen, known, left, law, starts)
         starts = [residuals.restore_state(k, trial.starts[row]) for k, row in enumerate(residuals.firsts)]
         matrices, measured = _record_residuals(residuals, trial), residuals.weights > 0
         samples, squares = measured.sum(axis=0), (trial.flat() ** 2).sum(axis=0, where=measured)
@@ -305,7 +308,8 @@ def _record_residuals(residuals: Residuals, trial: Trial) -> list[np.ndarray]:
     pairs = zip(residuals.records, columns, strict=True)
     found = [np.full((len(record), own.stop - own.start), np.nan) for record, own in pairs]
     for batch, own in zip(residuals.batches, trial.residuals, strict=True):
-        for row, left, weights in zip(batch.rows.tolist(), own, batch.weights, strict=True):
+        for row, left, weights, values in zip(batch.rows.tolist(), own, batch.weights, batch.values, strict=True):
             record, places = residuals.pieces[row]
-            found[record][places] = np.where(weights > 0, left, np.nan)[: len(places), columns[record]]
+            inside = np.where(weights > 0, left + values, np.nan)[: len(places), columns[record]]
+            found[record][places] = inside - residuals.records[record].matrix[places]
     return found

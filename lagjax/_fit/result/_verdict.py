@@ -27,14 +27,13 @@ from lagjax._fit.model._records import Record
 from lagjax._fit.model._residuals import LostMotion, Point, Residuals, Trial, compress_rows
 from lagjax._fit.model._sensor_faults import TOO_COARSE, constant_signals, describe_sensors
 from lagjax._fit.model._transforms import Between, Positive
-from lagjax._fit.result._information import Information, eliminate_starts
+from lagjax._fit.result._information import Information, eliminate_starts, information
 from lagjax._fit.search._descent import Descent, column_norms, eliminate
-from lagjax._fit.search._unexplained import MOST_NAMED, Unexplained, unexplained_motion
+from lagjax._fit.search._unexplained import MOST_NAMED, Unexplained, measure_unexplained, unexplained_motion
 from lagjax._run.hybrid import jumps
 
 _BEYOND = 2.0  # standard errors that a step must lead beyond a bound: of sound fits at a bound one in forty does
-# Correlation of neighbouring residuals that is told; and from which on motion that jumps may jump elsewhere.
-_CORRELATED, _ELSEWHERE = 0.5, 0.8
+_CORRELATED = 0.5
 _ASIDE, _KEPT = 4.0, 1e6  # standard errors: how far a kink is one that intervals may not leave out; and one over them
 _DISAGREE = 5.0  # standard deviations of a shift: twenty records of ten parameters show it in one of 1e4 fits
 _SEEN = 1e-5  # of the largest singular value of columns in units of their standard deviations
@@ -42,12 +41,23 @@ _OWN = 0.2  # of the motion left in a record, explained by parameters of its own
 
 
 def verdict(
-    descent: Descent, unseen: tuple[str, ...], known: Information, left: Unexplained, law: AbstractNoise
+    descent: Descent, unseen: tuple[str, ...], known: Information, left: Unexplained, law: AbstractNoise, starts: int
 ) -> tuple[bool, str]:
-    """A flag that a fit can be relied upon, and the sentences that say why, where the search leaves `left`."""
+    """A flag that a fit can be relied upon, and the sentences that say why, where the best search from so many `starts`
+    leaves `left`."""
     residuals, parts = descent.residuals, [descent.message]
-    if known.confirmed.shape[1]:
+    strikes = any(jumps(part.scene) for part in residuals.parts)
+    more, astray = max(64, 4 * starts), strikes and _leaves_motion(known, left)
+    if known.confirmed.shape[1] and strikes:
+        text = f"Take starts={more}; else fix it, or measure more."
+        parts.append(
+            f"Not everything that is free is seen where the motion sticks, or strikes, as it does here. {text}"
+        )
+    elif known.confirmed.shape[1]:
         parts.append("Not everything that is free is seen: fix it, or measure more.")
+    elif astray:
+        text = f"Take starts={more}, or begin nearer; else the scene lacks something."
+        parts.append(f"Motion is left, and of motion that sticks, or strikes, another search may end better. {text}")
     parts += left.motion + left.noise
     triangles = residuals.linearise(descent.trial, descent.noise)
     at_ends, named = _describe_ends(residuals, descent.trial, triangles, known)
@@ -64,21 +74,25 @@ def verdict(
         records, own = [r for r in part.records if isinstance(r, Record)], part.sensor_noise(descent.noise)
         if records:
             parts += describe_sensors(records, law, part.signals.names, part.sensor, own.sigma)
-    correlation, elsewhere = np.nanmax(known.correlation), False
-    if any(jumps(part.scene) for part in residuals.parts) and (unseen or correlation > _ELSEWHERE):
-        elsewhere = True
-        parts.append(
-            "The search may have ended on other impacts, or on sticking in the place of sliding, where slopes vanish: "
-            "begin nearer, by other params0, or with starts=256."
-        )
-    elif correlation > _CORRELATED:
+    if np.nanmax(known.correlation) > _CORRELATED:
         parts.append("The residuals are correlated: they hold motion that the scene lacks, and intervals allow for it.")
-    ok = descent.converged and not (unseen or left.motion or apart or bent or elsewhere)
+    ok = descent.converged and not (unseen or left.motion or apart or bent or astray)
     ok &= not any("take noise=" in text or TOO_COARSE in text for text in parts)
     if not ok or at_ends or labels:
         still = [x for part in residuals.parts for x in constant_signals(part.records, part.signals.names)]
         parts, ok = parts + still, ok and not still
     return ok, " ".join(parts)
+
+
+def is_doubtful(descent: Descent) -> bool:
+    """True where a search leaves motion, which residuals show that hardly change from one sample to the next, or where
+    nothing depends on a parameter: in motion that sticks, or strikes, other starts may then end elsewhere."""
+    known = information(descent)
+    return bool(known.null.shape[1]) or _leaves_motion(known, measure_unexplained(descent))
+
+
+def _leaves_motion(known: Information, left: Unexplained) -> bool:
+    return left.doubted and bool(np.nanmax(known.correlation) > _CORRELATED)
 
 
 def _describe_bends(descent: Descent, known: Information) -> list[str]:
