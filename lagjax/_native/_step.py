@@ -12,9 +12,10 @@ narrow feature ahead.
 The floor a is atol where it was given. By default (an atol of 0) it is rtol·min(1/1000, S/16), S the largest
 coordinate, or velocity, that the motion has had: a motion of 1e-10 metres is followed as the same one in ångströms is.
 A velocity moves a coordinate by h times as much, so that S of the velocities is no less than S of the coordinates over
-the longest step so far: a motion at rest has velocities that are rounding. A motion that starts at rest at q = 0 has no size that could be
-known, and S is infinite. Of the alternatives, a floor for every component would follow rounding where a component is
-zero by symmetry, and one for every array of the user would not be the same for coordinates of two arrays as of one.
+the longest step so far: a motion at rest has velocities that are rounding. A motion that starts at rest at q = 0 has no
+size that could be known, and S is infinite. Of the alternatives, a floor for every component would follow rounding
+where a component is zero by symmetry, and one for every array of the user would not be the same for coordinates of two
+arrays as of one.
 """
 
 from collections.abc import Callable
