@@ -409,11 +409,14 @@ class BorderControl:
         code, found = frame.code, self.roots.is_found(frame)
         way, whole = frame["root"] * frame["part"], abs(h)
         nearby = (limits.NEARBY if kind == UP_TO else limits.NARROWEST) * code.maximum(whole, frame["approach"])
+        instant = code.lanes_of(limits.INSTANT * frame["smallest"])  # what is as near, time does not tell from here
+        nearby = code.maximum(nearby, instant) if kind == UP_TO else nearby
         far = way * whole > nearby
         frame.assign(matters & far & found, next_approach=code.maximum(whole, frame["approach"]))
         if kind == FALLS:
             return matters & (far | ~found), root
-        past = code.select(far, way * limits.SHORT_OF, way * limits.PAST + limits.NEARBY)
+        beyond = code.maximum(frame.constant(limits.NEARBY), 2.0 * instant / whole)
+        past = code.select(far, way * limits.SHORT_OF, way * limits.PAST + beyond)
         return matters, code.select(found, past, root)
 
     # ---- beyond it ----

@@ -185,6 +185,9 @@ CONTINUOUS = 2.0**-20
 MOST_CHANGES = 32
 # Newton's steps from the root of the polynomial to that of the guard: two or three at the tolerances there are.
 MOST_CORRECTIONS = 8
+# A guard that comes to zero to rounding, from this many times as much, may go through it and back unseen: the step ends
+# there, and the next one, which begins near, has less rounding. One that is rounding all along ends no steps.
+MEETS = 16.0
 # Where a guard has no series, this part of the step is taken, and its end looked at.
 WITHOUT_SERIES = 1 / 8
 # Halvings of such a step to find the zero: more than the digits of a double.

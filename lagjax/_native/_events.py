@@ -276,7 +276,7 @@ class Events:
             return self._is_long(watch, last, before, roots.size(frame, degree))
 
         roots.shorten(frame, degree, is_long)
-        frame["doubt"], frame["begin"] = roots.last_terms(frame, degree), 0.0
+        frame["doubt"], frame["begin"], frame["closer"] = roots.last_terms(frame, degree), 0.0, 1.0
         # A motion that begins on the surface, or has just gone through it, is not to do so by rounding.
         continues = (contact < Touch.NONE) & (abs(start) <= limits.CONTINUOUS * size)
         powers = code.select(continues, float(Touch.VALUE), contact)

@@ -83,7 +83,7 @@ class Integrator:
         member = frame.next("next_member")
         there = member < frame.job("members")
         lane["member"] = code.select(there, member, -1)
-        for name in ("h", "t_low", "steps", "rejected", *(_rank_drops.AT_FIRST_ZERO if self.projector else ())):
+        for name in ("h", "t_low", "steps", "rejected", "pace", *(_rank_drops.AT_FIRST_ZERO if self.projector else ())):
             lane[name] = 0.0
         for k in range(2 * PARTS):
             lane["reach", k] = 0.0

@@ -13,7 +13,7 @@ there, and a step that ends there, too, has a series that knows.
 import math
 from collections.abc import Callable
 
-from lagjax._native._constants import EPS, MAX_ORDER, MOST_HALVINGS, MOST_MOVES, ROOT_NOISE
+from lagjax._native._constants import EPS, MAX_ORDER, MEETS, MOST_HALVINGS, MOST_MOVES, ROOT_NOISE
 from lagjax._native._frame import Fields, Frame
 from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._taylor import TaylorSeries, integer
@@ -44,6 +44,7 @@ class Roots:
             "unsure": 1,  # the rounding of P
             "doubt": 1,  # what P leaves out, as the factor of the power after its last one
             "instant": 1,  # what is closer is one place
+            "closer": 1,  # 1 to end the search where P comes to zero to its rounding, and may go through it unseen
             "part": 1,  # of the step that [0, 1] is
             "falls": 1,  # Σ of the negative coefficients but P(0), as a size
             "rises": 1,  # Σ of the positive ones
@@ -147,7 +148,7 @@ class Roots:
 
     def _first_root(self) -> Code:
         frame = self.motion.function("first_root", INTEGER)
-        frame["begin"], frame["doubt"], frame["instant"] = 0.0, 0.0, EPS
+        frame["begin"], frame["doubt"], frame["instant"], frame["closer"] = 0.0, 0.0, EPS, 0.0
         code, small = frame.code, frame.digits.small
         self.sum_up(frame, *frame.arguments)
 
@@ -215,7 +216,8 @@ class Roots:
             near, steep = value <= error, slope * slope > 4.0 * (bend * error)
             is_root = now & ((value < 0.0 - error) | (near & steep & (slope < 0.0)))
             open = now & near & ~is_root & ~(steep & (slope > 0.0))
-            ends = is_root | (open & (left_out > noise))
+            touches = (frame["closer"] > 0.0) & (frame["poly", 0] > MEETS * error) & (here > frame["begin"])
+            ends = is_root | (open & ((left_out > noise) | touches))
             with code.only_if(code.any_lane(ends)):
                 self._note_root(frame, here, (value, slope, error, bend), is_root, ends)
             root = code.intrinsic("sqrt", code.maximum(slope * slope + 2.0 * (down * value), 0.0))

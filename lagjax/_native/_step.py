@@ -12,9 +12,10 @@ narrow feature ahead.
 The floor a is atol where it was given. By default (an atol of 0) it is rtol·min(1/1000, S/16), S the largest
 coordinate, or velocity, that the motion has had: a motion of 1e-10 metres is followed as the same one in ångströms is.
 A velocity moves a coordinate by h times as much, so that S of the velocities is no less than S of the coordinates over
-h: a motion at rest has velocities that are rounding. A motion that starts at rest at q = 0 has no size that could be
-known, and S is infinite. Of the alternatives, a floor for every component would follow rounding where a component is
-zero by symmetry, and one for every array of the user would not be the same for coordinates of two arrays as of one.
+the longest step so far: a motion at rest has velocities that are rounding. A motion that starts at rest at q = 0 has no
+size that could be known, and S is infinite. Of the alternatives, a floor for every component would follow rounding
+where a component is zero by symmetry, and one for every array of the user would not be the same for coordinates of two
+arrays as of one.
 """
 
 from collections.abc import Callable
@@ -49,6 +50,7 @@ class StepControl:
             "low": 2 * n,  # what rounding took from the state
             "scale": 2 * n,  # 1 / (floor + rtol·size)
             "reach": 2 * PARTS,  # the largest coordinate, and the largest velocity, so far
+            "pace": 1,  # the longest step so far
             "increment": 2 * n,  # P(h) − y
             "t_low": 1,  # what rounding took from the time
             "t_end": 1,  # the last output time
@@ -115,8 +117,7 @@ class StepControl:
         code, form, (first, count), place = frame.code, self.motion.form, self.parts[part], 2 * part + half
         given, rtol = (code.lanes_of(frame.job(name)) for name in ("atol", "rtol"))
         largest = form.largest(code, lambda i: sizes[first + i], count)
-        step = abs(frame["h"])
-        step = code.lanes_of(code.select(step > 0.0, step, frame["longest"]))  # before the first step
+        step = code.select(frame["pace"] > 0.0, frame["pace"], frame["longest"])  # before the first step
         if half:
             frame["reach", place] = largest = code.maximum(frame["reach", place], largest)
             by_position = frame["reach", 2 * part] / step
@@ -241,6 +242,7 @@ class StepControl:
         moving = frame["counts"] > 0.0 if kicks else code.compare("!=", h, 0.0)
         frame.assign(moving, t=after, t_low=rest)
         frame["longest"] = abs(h) * frame["growth"]
+        frame["pace"] = code.maximum(frame["pace"], abs(h))
         for i in self.motion.form.each(code, self.motion.states):
             total, rest = end_of_step(frame, i)
             if self.projector is not None:

@@ -93,7 +93,8 @@ def crossings(
       `throw=False` not `ok`: the result then has the first `count`, and `Crossings.count` tells how many there were.
 
     The other arguments are those of `simulate`. Crossings are found on the Taylor series of the section along each
-    step, by a bound on that polynomial and without sampling, so that none is missed, down to the rounding of the time.
+    step, by a bound on that polynomial and without sampling, so that none is missed, down to the rounding of the time,
+    and of the section: a pair of crossings between which its value is less than that is touching zero.
     A jump of the section through zero is a crossing, too. Sections may be piecewise (`abs`, `where`, `max`, …).
 
     In a `Hybrid` a section is watched in every mode, and with contacts whatever these do; a reset or an impact through

@@ -74,6 +74,17 @@ def test_two_crossings_within_one_step():
     np.testing.assert_allclose(times(found), 0.47 + 1e-6 * np.array([-1.0, 1.0]), rtol=1e-14)
 
 
+@pytest.mark.parametrize("apart", [1e-6, 1e-9])
+def test_a_pair_of_crossings_far_nearer_than_the_rounding_of_a_long_step(apart):
+    """In one step of a free flight the section is known to 1e-13 of its size; between the two it is −apart²/4."""
+    free = lagjax.System(lambda q, qdot: 0.5 * qdot**2)
+    found = lagjax.crossings(
+        free, lambda q, qdot, params: (q - 2.5) * (q - 2.5 - params), -1.0, 1.0, jnp.array([0.0, 10.0]), apart
+    )
+    assert found.count == 2
+    np.testing.assert_allclose(found.t[:2], [3.5, 3.5 + apart], atol=1e-15 + 0.1 * apart)
+
+
 def test_many_crossings_within_one_step():
     roots = np.array([0.2, 0.2 + 1e-5, 0.5, 0.61, 0.6100001, 0.9])
     found = of_free(lambda q, v: jnp.prod(q - roots), rtol=1e-12)

@@ -464,3 +464,29 @@ def test_derivatives_where_several_borders_lie_at_one_instant(name):
     difference = float(last(0.8 + h) - last(0.8 - h)) / (2 * h)
     for slope in (jax.grad(last)(0.8), jax.jvp(last, (0.8,), (1.0,))[1]):
         assert float(slope) == pytest.approx(difference, rel=1e-6)
+
+
+@pytest.mark.parametrize(("rtol", "unit"), [(1e-6, 1.0), (1e-9, 1.0), (1e-8, 1e-6)])
+def test_a_cradle_of_hertzian_contacts_that_touch_is_struck(rtol, unit):
+    """Behind the blow all overlaps leave zero at one instant, each far less than the one before: 1e-9, 1e-21, 1e-44.
+
+    In any unit of length: where steps are short next to a corner, velocities are told as well as elsewhere.
+    """
+    count, mass, spring = 8, 0.1, 3.27
+
+    def lagrangian(q, v, params):
+        potential = 0.5 * spring * jnp.sum(q * q) + 0.4 * params * jnp.sum(jnp.maximum(q[:-1] - q[1:], 0.0) ** 2.5)
+        return 0.5 * mass * jnp.sum(v * v) - potential
+
+    def rate(t, y):
+        q, v = np.split(y, 2)
+        push = 1e9 * np.maximum(q[:-1] - q[1:], 0.0) ** 1.5
+        return np.concatenate([v, (np.append(0.0, push) - np.append(push, 0.0) - spring * q) / mass])
+
+    omega, after = np.sqrt(spring / mass), 1e-3
+    first, rest = np.eye(count)[0], np.zeros(count)
+    start = np.append(rest, 0.05 * omega * first)  # a quarter of a swing later
+    v = solve_ivp(rate, (0, after), start, method="DOP853", rtol=1e-12, atol=1e-15).y[count:, -1]
+    scene, times = lagjax.System(lagrangian), jnp.array([0.0, 0.5 * np.pi / omega + after])
+    run = lagjax.simulate(scene, -0.05 * unit * first, rest, times, 1e9 / np.sqrt(unit), rtol=rtol)
+    np.testing.assert_allclose(run.qdot[-1] / unit, v, atol=100 * rtol)
