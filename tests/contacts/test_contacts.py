@@ -589,3 +589,19 @@ def test_a_gap_that_is_no_number_is_named(options, name):
     system = lagjax.System(lambda q, v: 0.5 * v**2, **options)
     with pytest.raises(lagjax.SimulationError, match=f"The gap {name} is (nan|inf)"):
         lagjax.simulate(system, 1.0, 0.0, jnp.array([0.0, 1.0]))
+
+
+def test_what_rests_at_zero_is_lifted():
+    """A weight on a spring, at rest at q = 0, rises when a growing load exceeds it: in closed form, for 20 weights.
+
+    Compiles one batch. What rounding leaves of q before it rises, 1e-50, is no size of the motion.
+    """
+    weights, ts = jnp.arange(1, 21) / 10, jnp.linspace(0.0, 12.0, 5)
+    scene = lagjax.System(
+        lambda q, v, params: 0.15 * v**2 - params * q - 0.35 * (q + 0.1) ** 2,
+        forces=lambda q, v, t: 3 * t, contacts=lambda q: q,
+    )  # fmt: skip
+    run = lagjax.simulate_batch(scene, jnp.zeros(20), jnp.zeros(20), ts, weights, batch_axes=(0, 0, 0))
+    aloft, omega = jnp.maximum(ts - (weights[:, None] + 0.07) / 3, 0.0), np.sqrt(0.7 / 0.3)
+    assert run.ok.all()
+    np.testing.assert_allclose(run.q, 3 / 0.7 * (aloft - jnp.sin(omega * aloft) / omega), atol=1e-8)
