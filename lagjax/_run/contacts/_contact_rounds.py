@@ -163,6 +163,9 @@ def contact_motion(
     first = vary_with(begun, ts, y0, rounds.vector, varying=("t", "y", "path"))
     absent = RoundRecord.absent(y0.size, rounds.count)
     ending, record = run_rounds(rounds.run_round, first, absent, room or plan.max_transitions)
+    unseen = (ending.of_path.closed < 0).any() | ~jnp.isfinite(ending.path).all()
+    unseen = unseen & (ending.result == SUCCESSFUL) & ~ending.going
+    ending = ending._replace(result=jnp.where(unseen, NOT_FINITE, ending.result))
     inputs, outputs = (ts, y0, rounds.vector), jax.lax.stop_gradient((ts, ending.path, ending.of_path))
     if rounds.may_miss:
         missed = jax.vmap(lambda *output: rounds.missed(ending, rounds.watch(*output), output[-1]).any())(*outputs)
