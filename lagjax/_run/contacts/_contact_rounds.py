@@ -29,7 +29,7 @@ from lagjax._engine import Problem
 from lagjax._engine.taylor import MOST_GUARDS, Guarded, Surfaces, flow_of, line_of, require_one_number, vector_of
 from lagjax._interface import RESULTS, SUCCESSFUL, Function, Layout, code_of, compile_for_one_call, halves
 from lagjax._native import GUARD_NOISE, SINGLE_NOISE, Released
-from lagjax._primitives import cond_alike, differentiable_where, keep_together, lost_unless
+from lagjax._primitives import cond_alike, differentiable_where, keep_together, lost_unless, start_alike
 from lagjax._run._rounds import Stretch, any_member, run_rounds
 from lagjax._run._trajectory import vary_with
 from lagjax._run.contacts._corners import Corners, append_sides, corners_of
@@ -157,7 +157,7 @@ def contact_motion(
     Those are their times, the normal impulses, the energy that was lost, and their count. With less `room` for rounds
     the motion may have to go on: it has then `begun`.
     """
-    ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
+    ts, y0, params = start_alike((jnp.asarray(ts), jnp.asarray(y0), params))
     rounds = ContactRounds.from_plan(plan, layout, ts, y0, params)
     begun = rounds.begin(y0) if begun is None else begun
     first = vary_with(begun, ts, y0, rounds.vector, varying=("t", "y", "path"))
