@@ -272,7 +272,10 @@ class ContactRounds(NamedTuple):
         contacts, sections = opened(self.flat), len(self.plan.sections)
         guards = self.deciding + sections
         guarded = self.watch(self.ts[0], y0)
-        inside = (guarded.values < -guarded.rounding)[: self.count] & self.has_gap
+        rows, rises = self.rows_at(self.ts[0], y0), self.acceleration_at(self.ts[0], y0, self.numbers_in(contacts))
+        rows, rises = jax.lax.stop_gradient((rows, rises))
+        width = start_width(rows.gradients[: self.count], jax.lax.stop_gradient(y0), rises, self.ts)
+        inside = ((guarded.values + guarded.rounding)[: self.count] < -width) & self.has_gap
         e, mu = self.flat.restitution(eqx.filter(self.params, eqx.is_array_like)), self.friction.coefficients
         wrong = {
             BACKWARDS: self.ts[-1] < self.ts[0], NO_RESTITUTION: ~((e >= 0) & (e <= 1)).all(),
@@ -281,7 +284,6 @@ class ContactRounds(NamedTuple):
         result = jnp.select(list(wrong.values()), list(wrong), SUCCESSFUL)
         if self.rubs:  # one that slides and touches may stay or leave
             touches, rates, noise, _ = self.touching(self.ts[0], y0)
-            rows = jax.lax.stop_gradient(self.rows_at(self.ts[0], y0))
             slips, still = self.slips(rows, halves(y0)[1], 0.0)
             along = Pattern((touches & (jnp.abs(rates) <= noise)).astype(float), still.astype(float), _unit(slips))
             undecided = (sliding_margin(rows, along, self.friction.still) <= PARADOX).any()
@@ -337,7 +339,10 @@ class ContactRounds(NamedTuple):
         happens, decides, k = fell.any(), fell[:watches].any(), self.first_of(fell[:watches], at_once, contacts)
         if sections:
             k = jnp.where(decides, k, watches + jnp.argmax(fell[watches:]))
-        path, t, y = stretch.vary(k, happens & ~(at_once & _pick(before.fresh | beyond, k)))
+        # What starts on a gap and moves inwards comes from in front of it: that instant varies as any impact's does.
+        falls = (guarded.rates < -rates) & (np.arange(kinds.size) < self.count) & (before.t == self.ts[0])
+        stays = (before.fresh | beyond) & ~(falls & (kinds == 0))
+        path, t, y = stretch.vary(k, happens & ~(at_once & _pick(stays, k)))
         duration = located.t_end - jax.lax.stop_gradient(before.t)
         turns = jnp.where(at_once, before.turns + 1, 0)
         step = jnp.where(at_once, 0.0, duration / jnp.maximum(located.accepted, 1))
@@ -757,6 +762,15 @@ def _note_forces(carry: Carry, impulses) -> Carry:
     return carry._replace(
         rounding=carry.rounding.at[1, :k].max(least), rate_rounding=carry.rate_rounding.at[1, :k].max(of_rates)
     )
+
+
+def start_width(slopes, y0, acceleration, ts):
+    """How far below zero gaps (k,) with these `slopes` (k, n) may begin: the rounding of what leads a motion there.
+
+    A gap that is a coordinate is 1e-16 where it closes, and its rounding that of the height from which it fell.
+    """
+    (q, v), span, latest = halves(abs(y0)), ts[-1] - ts[0], jnp.maximum(abs(ts[0]), abs(ts[-1]))
+    return GUARD_NOISE * (abs(slopes) @ (q.max() + v * latest + abs(acceleration) * span**2 / 8))
 
 
 def opened(flat: Flat) -> Contacts:
