@@ -15,6 +15,9 @@ direction is that of differences; *named* where it ends in an error that says so
 run again with rtol = 1e-13, against differences that are ten times as wide: *right at 1e-13* is what agrees then (a
 motion that grazes a stop, whose error grows more than nearby motions show; rests beside each other, where the reference
 is off by 1e-10 and its differences by 1e-4), all else is *wrong*.
+`--lifted` asks 200 weights, in seven units of length, that rest at zero when a load that grows lifts them off: their
+motion has a closed form.
+
 With `--float32` start and parameters come in float32, without the x64 switch.
 """
 
@@ -417,6 +420,31 @@ def described(member: Member, z, count) -> str:
     )
 
 
+def follow_lifted(dtype, rtol: float | None) -> collections.Counter:
+    """How many weights on a spring are right, to a millionth, that rest at zero until a load lifts them."""
+    weight, unit = (x.ravel() for x in np.meshgrid(np.arange(1, 201) / 50, 10.0 ** np.arange(-9, 10, 3)))
+    ts, rate, spring, mass = np.linspace(0.0, 16.0, 9), 3.0, 0.7, 0.3
+
+    def lagrangian(q, v, params):
+        length, force = params["unit"], params["weight"]
+        return 0.5 * mass * v**2 - force * length * q - 0.5 * spring * (q + 0.1 * length) ** 2
+
+    def load(q, v, t, params):
+        return rate * params["unit"] * t
+
+    system = lagjax.System(lagrangian, forces=load, contacts=lambda q: q)
+    numbers = {"weight": jnp.asarray(weight, dtype), "unit": jnp.asarray(unit, dtype)}
+    rest = jnp.zeros(weight.size, dtype)
+    run = lagjax.simulate_batch(system, rest, rest, jnp.asarray(ts, dtype), numbers, batch_axes=(0, 0, 0), rtol=rtol)
+    weight, unit = (np.asarray(numbers[name], float)[:, None] for name in ("weight", "unit"))
+    aloft, omega = np.maximum(ts - (weight + 0.1 * spring) / rate, 0.0), np.sqrt(spring / mass)
+    exact = unit * rate / spring * (aloft - np.sin(omega * aloft) / omega)
+    off = np.abs(np.asarray(run.q, float) - exact).max(axis=1) / exact[:, -1]
+    verdicts = np.where(np.asarray(run.ok), np.where(off <= 1e-6, "right", "wrong"), "named")
+    print(f"rtol {rtol}: {collections.Counter(verdicts.tolist())}, at most {np.nanmax(off):.1e} off", file=sys.stderr)
+    return collections.Counter(verdicts.tolist())
+
+
 def main(arguments: list[str] | None = None) -> collections.Counter:
     """Compare so many scenes, print those that are not right, and count them."""
     parser = argparse.ArgumentParser(
@@ -426,8 +454,12 @@ def main(arguments: list[str] | None = None) -> collections.Counter:
     parser.add_argument("--first", type=int, default=0, help="the seed of the first one")
     parser.add_argument("--families", nargs="+", choices=tuple(FAMILIES), default=tuple(FAMILIES))
     parser.add_argument("--dry", action="store_true", help="the references alone")
+    parser.add_argument("--lifted", action="store_true", help="weights that are lifted off from rest at zero")
     _singles.add_option(parser)
     options = parser.parse_args(arguments)
+    if options.lifted:
+        dtype = _singles.precision_of(options)
+        return sum((follow_lifted(dtype, rtol) for rtol in (None, 1e-9, 1e-12)), collections.Counter())
     dtype, tolerance = np.dtype(np.float32 if options.float32 else np.float64), TOLERANCE
     jax.config.update("jax_enable_x64", True)  # of the references
     seeds = range(options.first, options.first + options.scenes)

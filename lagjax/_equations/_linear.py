@@ -27,6 +27,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from lagjax._primitives import start_alike
+
 # The numbers of one state, as arrays of JAX or NumPy, and those of S states, as arrays of NumPy.
 Matrix = Float[Array, "n n"]
 Vector = Float[Array, " n"]
@@ -146,7 +148,7 @@ def invert(matrix: Matrix) -> tuple[Matrix, Int[Array, " n"], Vector]:
         order = jax.lax.dynamic_update_slice_in_dim(order, panel_order, index * width, 0)
         return panel, left, order, jax.lax.dynamic_update_slice_in_dim(pivots, panel_pivots, index * width, 0)
 
-    start = a, jnp.ones(size, bool), jnp.zeros(size, np.int32), jnp.zeros(size, a.dtype)
+    start = start_alike((a, jnp.ones(size, bool), jnp.zeros(size, np.int32), jnp.zeros(size, a.dtype)))
     a, _, order, pivots = jax.lax.fori_loop(0, count, one_panel, start) if count > 1 else one_panel(0, start)
     return _permute_rows(a, order[:n])[:, :n], order[:n], pivots[:n]
 
@@ -195,7 +197,7 @@ def _eliminate(panel: Array, free: Array) -> tuple[Array, Array, Array, Array]:
         return panel, free & ~this_row, order, pivots
 
     width = panel.shape[1]
-    start = panel, free, jnp.zeros(width, np.int32), jnp.zeros(width, panel.dtype)
+    start = start_alike((panel, free, jnp.zeros(width, np.int32), jnp.zeros(width, panel.dtype)))
     return jax.lax.fori_loop(0, width, one_column, start)
 
 
@@ -339,7 +341,7 @@ def _independent(matrix: Matrix, scale: Vector) -> tuple[Matrix, Matrix, Matrix]
         a = jnp.where(counts, _exchange(a, row, column)[0], a)
         return a, pairs + (row[:, None] & column & counts)
 
-    a, pairs = jax.lax.fori_loop(0, m, one_pivot, (matrix, jnp.zeros_like(matrix)))
+    a, pairs = jax.lax.fori_loop(0, m, one_pivot, start_alike((matrix, jnp.zeros_like(matrix)), scale))
     rows, columns = jnp.sum(pairs, axis=1) > 0, jnp.sum(pairs, axis=0) > 0
     inverse = pairs.T @ jnp.where(rows[:, None] & columns, a, 0) @ pairs.T
     return inverse, pairs + jnp.where(~rows[:, None] & columns, -a, 0), pairs

@@ -80,6 +80,10 @@ LARGEST_TREE, OFTEN, ROUNDS = 10, 24, 12
 # units. Measured on a Morse oscillator of size 1e-12: 1 costs a digit, 1/16 a third of one, 1/256 none and two steps in
 # eighty more; the larger it is, the fewer motions of ordinary size are touched by it: here those below 1/60.
 ATOL_OVER_RTOL, ATOL_OVER_MOTION = 1e-3, 1 / 16
+# What was at rest at zero, and has had so many steps refused, half as many as it took, moves by rounding (`_step`):
+# other steps hold at once, or after a halving or two. Doubled, such a motion takes six halvings more.
+# A start below `NOTHING` counts as zero then, in any units: impulses at rest leave velocities of 1e-50.
+MOST_HALVINGS, NOTHING = 6, 1e-30
 
 # ---- step control ----------------------------------------------------------------------------------------------------
 

@@ -12,10 +12,12 @@ narrow feature ahead.
 The floor a is atol where it was given. By default (an atol of 0) it is rtol·min(1/1000, S/16), S the largest
 coordinate, or velocity, that the motion has had: a motion of 1e-10 metres is followed as the same one in ångströms is.
 A velocity moves a coordinate by h times as much, so that S of the velocities is no less than S of the coordinates over
-the longest step so far: a motion at rest has velocities that are rounding. A motion that starts at rest at q = 0 has no
-size that could be known, and S is infinite. Of the alternatives, a floor for every component would follow rounding
-where a component is zero by symmetry, and one for every array of the user would not be the same for coordinates of two
-arrays as of one.
+the longest step so far: a motion at rest has velocities that are rounding. Where a motion begins S is what its series
+promises, the largest of its terms over a step that holds in proportion to it: what rests at 1e-50 is as large as it
+will be a step away. If such a motion is refused its steps as often as not, what was promised is rounding, and S is
+infinite, as it is where a motion starts at rest at q = 0, of which nothing tells a size. Of the alternatives, a floor
+for every component would follow rounding where a component is zero by symmetry, and one for every array of the user
+would not be the same for coordinates of two arrays as of one.
 """
 
 from collections.abc import Callable
@@ -42,6 +44,7 @@ class StepControl:
         self.motion, self.error_groups, self.projector = motion, error_groups, projector
         # The motion, and the derivatives that follow it, whose units are others.
         self.parts = [(0, base_size)] + [(base_size, motion.n - base_size)] * (motion.n > base_size)
+        self.size_start = self._size_start()
         self.defect = self._defect()
 
     @staticmethod
@@ -51,6 +54,7 @@ class StepControl:
             "scale": 2 * n,  # 1 / (floor + rtol·size)
             "reach": 2 * PARTS,  # the largest coordinate, and the largest velocity, so far
             "pace": 1,  # the longest step so far
+            "promised": PARTS,  # 1 if S is so far what the series promises of a motion that was at rest at zero
             "increment": 2 * n,  # P(h) − y
             "t_low": 1,  # what rounding took from the time
             "t_end": 1,  # the last output time
@@ -71,6 +75,8 @@ class StepControl:
     def choose(self, frame: Frame, order: Value) -> None:
         """The step of every lane, into `h`: 0, and a code, where it cannot go on."""
         code = frame.code
+        with code.only_if(code.any_lane(code.compare("==", frame["steps"], 0.0))):
+            frame.call(self.size_start, order)
         last, before = self._errors(frame, order)
         p = code.as_number(order)
         a, b = _power(code, last, -1.0 / p), _power(code, before, -1.0 / (p - 1.0))
@@ -117,23 +123,63 @@ class StepControl:
         code, form, (first, count), place = frame.code, self.motion.form, self.parts[part], 2 * part + half
         given, rtol = (code.lanes_of(frame.job(name)) for name in ("atol", "rtol"))
         largest = form.largest(code, lambda i: sizes[first + i], count)
-        step = code.select(frame["pace"] > 0.0, frame["pace"], frame["longest"])  # before the first step
+        step = code.lanes_of(code.select(frame["pace"] > 0.0, frame["pace"], frame["longest"]))  # before the first step
+        frame["reach", place] = largest = code.maximum(frame["reach", place], largest)
         if half:
-            frame["reach", place] = largest = code.maximum(frame["reach", place], largest)
             by_position = frame["reach", 2 * part] / step
             largest = code.select(by_position < largest, largest, by_position)
-        else:
-            speed = form.largest(code, lambda i: abs(frame["y", first + i, 1]), count)
-            at_rest = code.compare("==", frame["steps"], 0.0) & code.compare("==", code.maximum(largest, speed), 0.0)
-            # From rest at zero, where nothing tells a size, what moves first may be rounding.
-            frame["reach", place] = largest = code.select(
-                at_rest, frame.constant(float("inf")), code.maximum(frame["reach", place], largest)
-            )
-            largest = code.select(largest > 0.0, largest, speed * step)
         share = limits.ATOL_OVER_MOTION * largest
         is_small = (share > 0.0) & (share < limits.ATOL_OVER_RTOL)
         floor = rtol * code.select(is_small, share, limits.ATOL_OVER_RTOL)
         return code.select(given > 0.0, given, floor)
+
+    def _size_start(self) -> Code:
+        """`(order)`: `reach` of the lanes that have taken no step; infinite where nothing moves, or rounding does."""
+        motion = self.motion
+        frame = motion.function("size_start", INTEGER)
+        code, (order,) = frame.code, frame.arguments
+        given, rtol = (code.lanes_of(frame.job(name)) for name in ("atol", "rtol"))
+        begins, p = code.compare("==", frame["steps"], 0.0), code.as_number(order)
+        for part, (first, count) in enumerate(self.parts):
+
+            def largest(k, first=first, count=count):
+                return motion.form.largest(code, lambda i: abs(frame["y", first + i, k]), count)
+
+            step = code.variable(frame["longest"])
+            for back in range(2):  # the last terms are to be a part of one that is five orders lower, or more
+                last, allowed = largest(order - back), code.variable(frame.constant(0.0))
+                with code.loop(order - (back + 4)) as k:
+                    term = largest(k)
+                    ratio = last / (rtol * limits.ATOL_OVER_MOTION * term)
+                    h = _power(code, ratio, code.lanes_of(-1.0 / (p - float(back) - code.as_number(k))))
+                    allowed.value = code.select((term > 0.0) & (h > allowed.value), h, allowed.value)
+                step.value = code.select(allowed.value < step.value, allowed.value, step.value)
+            reach, power = code.variable(frame.constant(0.0)), code.variable(frame.constant(1.0))
+            begun = code.maximum(largest(0), largest(1) * step.value)
+            with code.loop(order - 4) as k:
+                reach.value = code.maximum(largest(k) * power.value, reach.value)
+                power.value = power.value * step.value
+            moves = (reach.value > 0.0) & (begun > 0.0)  # from rest at zero what moves first may be rounding
+            promised = moves & ((2.0 * begun <= reach.value) | (begun < limits.NOTHING)) & ~(given > 0.0)
+            size, speed = (code.select(moves, x, float("inf")) for x in (reach.value, reach.value / step.value))
+            with frame.where(begins):
+                frame["reach", 2 * part], frame["reach", 2 * part + 1] = size, speed
+                frame["promised", part] = code.flag(promised)
+        return frame.finish()
+
+    def _forget_promises(self, frame: Frame, where: Value) -> None:
+        """Let S be infinite where steps do not hold of a motion that was at rest at zero."""
+        code, n = frame.code, self.motion.n
+        most = code.lanes_of(1.0 / (limits.ATOL_OVER_RTOL * frame.job("rtol")))
+        for part, (first, count) in enumerate(self.parts):
+            forgets = where & (frame["promised", part] > 0.0)
+            for half in range(2):
+                with frame.where(forgets):
+                    frame["reach", 2 * part + half] = float("inf")
+                for j in self.motion.form.each(code, count):
+                    i = first + j + half * n
+                    scale = frame["scale", i]
+                    frame["scale", i] = code.select(forgets & (most < scale), most, scale)
 
     def _sizes(self, frame: Frame, half: int) -> Numbers:
         """The size over the step of every coordinate, or of every velocity (half 1); the largest one of a group."""
@@ -215,6 +261,8 @@ class StepControl:
                     frame["code"] = self._reason(frame)
                 frame["rejected"] = frame["rejected"] + code.flag(bad)
                 note_halved(frame, bad)
+                often = (frame["rejected"] >= limits.MOST_HALVINGS) & (2.0 * frame["rejected"] >= frame["steps"])
+                self._forget_promises(frame, bad & often)
 
     def _reason(self, frame: Frame) -> Value:
         """Why no step is small enough: the series, or only the way from its end to the constraints."""

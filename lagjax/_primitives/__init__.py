@@ -25,5 +25,6 @@ from lagjax._primitives._linear_map import (
     cotangent_of,
     is_zero,
     keep_together,
+    start_alike,
     vary_alike,
 )

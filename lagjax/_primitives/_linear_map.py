@@ -13,6 +13,7 @@ instead, without a word; tests/equations/test_custom.py keeps the case). A primi
 import functools
 from collections.abc import Callable, Sequence
 
+import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -57,15 +58,22 @@ def vary_alike(arrays: Sequence, like: Sequence = ()) -> list:
     ]
 
 
+def start_alike(first, *operands):
+    """What rounds begin with, a pytree whose numbers all vary as one of them does, or one of the `operands`.
+
+    Else a number that is the same on all devices has its cotangent summed over them in each round, for which devices
+    that are done with theirs would wait for ever.
+    """
+    numbers, others = eqx.partition(first, eqx.is_array_like)
+    arrays, structure = jax.tree.flatten(numbers)
+    return eqx.combine(structure.unflatten(vary_alike(arrays, like=jax.tree.leaves(operands))), others)
+
+
 def cond_alike(predicate, when_true: Callable, when_false: Callable, *operands):
     """`jax.lax.cond`, of which both branches' results vary as the operands do."""
 
     def alike(branch):
-        def vary_results(*operands):
-            results, structure = jax.tree.flatten(branch(*operands))
-            return jax.tree.unflatten(structure, vary_alike(results, like=jax.tree.leaves(operands)))
-
-        return vary_results
+        return lambda *operands: start_alike(branch(*operands), operands)
 
     return jax.lax.cond(predicate, alike(when_true), alike(when_false), *operands)
 

@@ -100,6 +100,50 @@ def test_a_start_inside_a_wall_is_named():
     assert "wall" in str(lagjax.check(BOX, state(x=1.0, y=1.1), state(x=0.0, y=0.0)))
 
 
+DROP = lagjax.System(lambda q, v: 0.5 * v**2 - G * q, contacts=lambda q: q, restitution=0.6)
+
+
+def test_a_motion_goes_on_from_where_it_came_to_an_impact():
+    """Drops on q ≥ 0, cut where they first touch it, and starts at rest there that are rounding; one program.
+
+    A gap that is the coordinate ends as ±1e-16 of the height, of which its own rounding is nothing.
+    """
+    for height in np.random.default_rng(5).uniform(0.1, 3.0, 20):
+        at = np.sqrt(2 * height / G)
+        first = lagjax.simulate(DROP, height, 0.0, jnp.array([0.0, at]))
+        then = lagjax.simulate(DROP, first.q[-1], first.qdot[-1], jnp.array([at, 1.5 * at]))
+        np.testing.assert_allclose(then.q[-1], 0.5 * at * (0.6 * G * at - 0.25 * G * at), rtol=1e-12)
+    for gap in (-1e-16, -1e-17):
+        assert lagjax.simulate(DROP, gap, 0.0, jnp.array([0.0, 1.0])).ok
+    with pytest.raises(ValueError, match="starts inside"):
+        lagjax.simulate(DROP, -1e-6, 1.0, jnp.array([0.0, 1.0]))
+
+
+@pytest.mark.slow
+def test_the_impact_at_a_cut_varies_as_any_does():
+    """200 drops of micrometres in milliseconds, cut at their first or second impact, against whole motions.
+
+    Compiles a batch of three motions with its gradient.
+    """
+
+    def follow(q, v, *ts):
+        return lagjax.simulate(DROP, q, v, jnp.stack(ts), max_transitions=9, throw=False)
+
+    def change_by_cut(height, cut):
+        falls = jnp.sqrt(2 * jax.lax.stop_gradient(height) / G)
+        at, end = (1.0 + 1.2 * cut) * falls, 2.8 * falls
+        first, whole = follow(height, 0.0, 0.0, at), follow(height, 0.0, 0.0, end)
+        then = follow(first.q[-1], first.qdot[-1], at, end)
+        return then.q[-1] - whole.q[-1], first.ok & then.ok & whole.ok
+
+    rng = np.random.default_rng(5)
+    given = 1e-6 * rng.uniform(0.3, 3.0, 200), rng.integers(0, 2, 200)
+    (change, ok), slopes = jax.jit(jax.vmap(jax.value_and_grad(change_by_cut, has_aux=True)))(*given)
+    assert ok.all()
+    np.testing.assert_allclose(change, 0.0, atol=1e-19)
+    np.testing.assert_allclose(slopes, 0.0, atol=1e-10)
+
+
 def test_a_closed_gap_that_moves_inwards_is_an_impact_at_once_which_check_names():
     run = lagjax.simulate(BOX, state(x=0.0, y=0.1), state(x=0.0, y=-1.0), jnp.array([0.0, 0.1]))
     assert run.impacts.t[0] == 0.0 and run.impacts.impulse["floor"][0] == 1.8
@@ -640,3 +684,19 @@ def test_light_bodies_that_strike_a_heavy_one_without_rebound_rest():
     run = lagjax.simulate(system, *start, np.array([0.0, 1.0]))
     np.testing.assert_allclose(run.q[-1], np.concatenate([centre, sides]), atol=1e-14)
     assert run.contact_changes.count <= n
+
+
+def test_what_rests_at_zero_is_lifted():
+    """A weight on a spring, at rest at q = 0, rises when a growing load exceeds it: in closed form, for 20 weights.
+
+    Compiles one batch. What rounding leaves of q before it rises, 1e-50, is no size of the motion.
+    """
+    weights, ts = jnp.arange(1, 21) / 10, jnp.linspace(0.0, 12.0, 5)
+    scene = lagjax.System(
+        lambda q, v, params: 0.15 * v**2 - params * q - 0.35 * (q + 0.1) ** 2,
+        forces=lambda q, v, t: 3 * t, contacts=lambda q: q,
+    )  # fmt: skip
+    run = lagjax.simulate_batch(scene, jnp.zeros(20), jnp.zeros(20), ts, weights, batch_axes=(0, 0, 0))
+    aloft, omega = jnp.maximum(ts - (weights[:, None] + 0.07) / 3, 0.0), np.sqrt(0.7 / 0.3)
+    assert run.ok.all()
+    np.testing.assert_allclose(run.q, 3 / 0.7 * (aloft - jnp.sin(omega * aloft) / omega), atol=1e-8)

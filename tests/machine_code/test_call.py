@@ -240,6 +240,7 @@ def over_devices():
     """Each device has its own members, all share a parameter, whose cotangents are summed over the devices.
 
     `derivative(shard_map(…))` and `shard_map(derivative(…))`, with the types that JAX checks by default and without.
+    Some members have more impacts than others.
     """
     from jax.sharding import PartitionSpec as P
 
@@ -254,6 +255,12 @@ def over_devices():
         lambda q, v, params: 0.5 * v @ v - params * q[1], constraints=lambda q: q[0] ** 2 + q[1] ** 2 - 1.0
     )
     wall = lagjax.Transition("f", "f", lambda q, v: q - 0.1, -1, lambda q, v: (q, -v))
+    corner = lagjax.System(
+        lambda q, v, params: 0.5 * v @ v + params * (q[0] - q[1]),
+        contacts=lambda q: {"floor": q[1] + 0.5, "wall": 2.0 - q[0]},
+        slip=lambda q, v: {"floor": v[0], "wall": v[1]}, friction=lambda params: {"floor": 0.1 * params, "wall": 0.2},
+        restitution=0.5,
+    )  # fmt: skip
 
     def end(system, q, params):
         return lagjax.simulate(system, q, 0.0 * q, jnp.array([0.0, 1.0]), params).end.q
@@ -262,6 +269,7 @@ def over_devices():
         "simulate": lambda q, k: end(spring, q, k),
         "with a border": lambda q, k: end(rubbed, q, k),
         "with a constraint": lambda q, k: end(ring, jnp.stack([jnp.cos(q), jnp.sin(q)]), k)[1],
+        "with contacts": lambda q, k: end(corner, jnp.stack([1.6 * q, q - 0.4]), k)[1],
         "crossings": lambda q, k: lagjax.crossings(spring, lambda q, v: q - 0.3, q, 0.0, (0.0, 2.0), k, count=2).t[0],
         "simulate_hybrid": lambda q, k: (
             lagjax.simulate_hybrid(

@@ -23,7 +23,7 @@ from lagjax._interface import Layout, compile_for_one_call, halves, is_concrete,
 from lagjax._primitives import DOUBLE, compute_in_doubles
 from lagjax._run._rounds import BLOCK
 from lagjax._run._trajectory import ContactChanges, Impacts, Names, State, Trajectory, follow_in_doubles, step_counts
-from lagjax._run.contacts._contact_rounds import Carry, ContactPlan, RoundRecord, RowPlaces, contact_motion
+from lagjax._run.contacts._contact_rounds import Carry, ContactPlan, RoundRecord, RowPlaces, contact_motion, start_width
 from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes, System, require_coefficients
 
 CHANGES = 1024  # the budget of changes of a motion whose crossings are asked for; what they record takes memory
@@ -157,6 +157,9 @@ def _require_open(problem: Problem, closed: Problem) -> None:
     gaps, slopes = of["residual"][0, rows], of["jacobian"][0, rows]
     terms = derivation.term_sizes(y0[:n], y0[n:], columns[2 * n], closed.numbers, names=("residual",))
     noise = ROUNDINGS * np.finfo(problem.layout.dtype).eps * (np.asarray(terms)[rows] + np.abs(slopes) @ np.abs(y0[:n]))
+    columns[columns.size - sum(x.size for x in closed.params.contacts) :][: shapes.count] = 0.0  # all contacts open
+    acceleration = derivation.acceleration.evaluate_many(list(columns))[:n, 0]
+    noise = noise + np.asarray(start_width(slopes, y0, acceleration, np.asarray(closed.ts)))
     for name, gap, slope, near in zip(shapes.names, gaps, slopes, noise, strict=False):
         if gap < -near:
             raise ValueError(

@@ -29,7 +29,7 @@ from lagjax._engine import Problem
 from lagjax._engine.taylor import MOST_GUARDS, Guarded, Surfaces, flow_of, line_of, require_one_number, vector_of
 from lagjax._interface import RESULTS, SUCCESSFUL, Function, Layout, code_of, compile_for_one_call, halves
 from lagjax._native import GUARD_NOISE, SINGLE_NOISE, Released
-from lagjax._primitives import cond_alike, differentiable_where, keep_together, lost_unless
+from lagjax._primitives import cond_alike, differentiable_where, keep_together, lost_unless, start_alike
 from lagjax._run._rounds import Stretch, any_member, run_rounds
 from lagjax._run._trajectory import vary_with
 from lagjax._run.contacts._corners import Corners, append_sides, corners_of
@@ -163,12 +163,15 @@ def contact_motion(
     Those are their times, the normal impulses, the energy that was lost, and their count. With less `room` for rounds
     the motion may have to go on: it has then `begun`.
     """
-    ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
+    ts, y0, params = start_alike((jnp.asarray(ts), jnp.asarray(y0), params))
     rounds = ContactRounds.from_plan(plan, layout, ts, y0, params)
     begun = rounds.begin(y0) if begun is None else begun
     first = vary_with(begun, ts, y0, rounds.vector, varying=("t", "y", "path"))
     absent = RoundRecord.absent(y0.size, rounds.count)
     ending, record = run_rounds(rounds.run_round, first, absent, room or plan.max_transitions)
+    unseen = (ending.of_path.closed < 0).any() | ~jnp.isfinite(ending.path).all()
+    unseen = unseen & (ending.result == SUCCESSFUL) & ~ending.going
+    ending = ending._replace(result=jnp.where(unseen, NOT_FINITE, ending.result))
     inputs, outputs = (ts, y0, rounds.vector), jax.lax.stop_gradient((ts, ending.path, ending.of_path))
     if rounds.may_miss:
         missed = jax.vmap(lambda *output: rounds.missed(ending, rounds.watch(*output), output[-1]).any())(*outputs)
@@ -275,7 +278,10 @@ class ContactRounds(NamedTuple):
         contacts, sections = opened(self.flat), len(self.plan.sections)
         guards = self.deciding + sections
         guarded = self.watch(self.ts[0], y0)
-        inside = (guarded.values < -guarded.rounding)[: self.count] & self.has_gap
+        rows, rises = self.rows_at(self.ts[0], y0), self.acceleration_at(self.ts[0], y0, self.numbers_in(contacts))
+        rows, rises = jax.lax.stop_gradient((rows, rises))
+        width = start_width(rows.gradients[: self.count], jax.lax.stop_gradient(y0), rises, self.ts)
+        inside = ((guarded.values + guarded.rounding)[: self.count] < -width) & self.has_gap
         e, mu = self.flat.restitution(eqx.filter(self.params, eqx.is_array_like)), self.friction.coefficients
         wrong = {
             BACKWARDS: self.ts[-1] < self.ts[0], NO_RESTITUTION: ~((e >= 0) & (e <= 1)).all(),
@@ -284,7 +290,6 @@ class ContactRounds(NamedTuple):
         result = jnp.select(list(wrong.values()), list(wrong), SUCCESSFUL)
         if self.rubs:  # one that slides and touches may stay or leave
             touches, rates, noise, _ = self.touching(self.ts[0], y0)
-            rows = jax.lax.stop_gradient(self.rows_at(self.ts[0], y0))
             slips, still = self.slips(rows, halves(y0)[1], 0.0)
             along = Pattern((touches & (jnp.abs(rates) <= noise)).astype(float), still.astype(float), _unit(slips))
             undecided = (sliding_margin(rows, along, self.friction.still) <= PARADOX).any()
@@ -340,7 +345,10 @@ class ContactRounds(NamedTuple):
         happens, decides, k = fell.any(), fell[:watches].any(), self.first_of(fell[:watches], at_once, contacts)
         if sections:
             k = jnp.where(decides, k, watches + jnp.argmax(fell[watches:]))
-        path, t, y = stretch.vary(k, happens & ~(at_once & _pick(before.fresh | beyond, k)))
+        # What starts on a gap and moves inwards comes from in front of it: that instant varies as any impact's does.
+        falls = (guarded.rates < -rates) & (np.arange(kinds.size) < self.count) & (before.t == self.ts[0])
+        stays = (before.fresh | beyond) & ~(falls & (kinds == 0))
+        path, t, y = stretch.vary(k, happens & ~(at_once & _pick(stays, k)))
         duration = located.t_end - jax.lax.stop_gradient(before.t)
         turns = jnp.where(at_once, before.turns + 1, 0)
         step = jnp.where(at_once, 0.0, duration / jnp.maximum(located.accepted, 1))
@@ -792,6 +800,15 @@ def _note_forces(carry: Carry, impulses) -> Carry:
     return carry._replace(
         rounding=carry.rounding.at[1, :k].max(least), rate_rounding=carry.rate_rounding.at[1, :k].max(of_rates)
     )
+
+
+def start_width(slopes, y0, acceleration, ts):
+    """How far below zero gaps (k,) with these `slopes` (k, n) may begin: the rounding of what leads a motion there.
+
+    A gap that is a coordinate is 1e-16 where it closes, and its rounding that of the height from which it fell.
+    """
+    (q, v), span, latest = halves(abs(y0)), ts[-1] - ts[0], jnp.maximum(abs(ts[0]), abs(ts[-1]))
+    return GUARD_NOISE * (abs(slopes) @ (q.max() + v * latest + abs(acceleration) * span**2 / 8))
 
 
 def opened(flat: Flat) -> Contacts:

@@ -20,6 +20,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._equations import factorize_general
+from lagjax._primitives import start_alike
 
 # Pivots for each condition before the law counts as undecided: as many as there are take a few in all.
 PIVOTS = 16
@@ -122,7 +123,8 @@ def _turn_directions(rows: ImpactRows, impulses_along, direction, slides, places
 
     # XLA compiles one loop sooner than its rounds; the third one has the impulses behind two steps.
     angles = jax.lax.stop_gradient(jnp.arctan2(direction[:, 1], direction[:, 0]))
-    return jax.lax.fori_loop(0, 3, turn, (angles, jnp.zeros_like(rows.rates)))[1]
+    first = angles, jnp.zeros_like(rows.rates)
+    return jax.lax.fori_loop(0, 3, turn, start_alike(first, rows))[1]
 
 
 def independent_rows(coupling, held):
@@ -139,7 +141,7 @@ def independent_rows(coupling, held):
         taken = jnp.outer(matrix[:, i], matrix[i]) / jnp.where(keep, pivot, 1.0)
         return matrix - jnp.where(keep, taken, 0.0), kept.at[i].set(keep)
 
-    return jax.lax.fori_loop(0, len(held), eliminate, (coupling, jnp.zeros(len(held))))[1]
+    return jax.lax.fori_loop(0, len(held), eliminate, start_alike((coupling, jnp.zeros(len(held))), held))[1]
 
 
 def held_slips(rows: ImpactRows, closed, slips, friction: Friction):
@@ -182,8 +184,8 @@ def find_pattern(rows: ImpactRows, touches, restitution, friction: Friction) -> 
 
     pushes = (touches & (rates[:count] <= 0)).astype(float)
     first = Pattern(pushes, jnp.ones(len(rough)), jnp.zeros(places.shape).at[:, 0].set(1.0))
-    most = PIVOTS * (count + len(rough))
-    return jax.lax.while_loop(lambda carry: carry[1] & (carry[2] < most), pivot, (first, jnp.asarray(True), 0))[0]
+    first, most = start_alike((first, jnp.asarray(True), 0), rows), PIVOTS * (count + len(rough))
+    return jax.lax.while_loop(lambda carry: carry[1] & (carry[2] < most), pivot, first)[0]
 
 
 def violations(rows: ImpactRows, pattern: Pattern, touches, impulses, targets, friction: Friction) -> tuple:
@@ -253,7 +255,7 @@ def _solve_complementary(matrix, values):
         return tableau, basis, enters, falls.any() & (leaves != cover), n + 1
 
     lowest, basis = jnp.argmin(values), jnp.arange(size)
-    first = (*exchange(tableau, basis, lowest, cover), lowest + size, values[lowest] < 0, 0)
+    first = start_alike((*exchange(tableau, basis, lowest, cover), lowest + size, values[lowest] < 0, 0), matrix)
     done = jax.lax.while_loop(lambda carry: carry[3] & (carry[4] < PIVOTS * size), pivot, first)
     basis = jnp.where(values[lowest] < 0, done[1], basis)
     return (basis[:, None] == size + np.arange(size)).any(axis=0)
@@ -339,4 +341,4 @@ def reached(rows: ImpactRows, meets, touches, friction: Friction):
     contact_of = np.concatenate([np.arange(k), np.repeat(friction.rough, friction.directions)])
     member = (contact_of[:, None] == np.arange(k)).astype(float)
     pairs = ((member.T @ linked @ member) > 0) & touches[:, None] & touches
-    return jax.lax.fori_loop(0, k, lambda _, found: found | (pairs & found).any(axis=1), meets)
+    return jax.lax.fori_loop(0, k, lambda _, found: found | (pairs & found).any(axis=1), start_alike(meets, pairs))

@@ -18,7 +18,7 @@ from lagjax._engine import Problem
 from lagjax._engine.taylor import Guarded, vector_of
 from lagjax._interface import RESULTS, SUCCESSFUL, Layout, code_of, compile_for_one_call
 from lagjax._native import SINGLE_NOISE
-from lagjax._primitives import lost_unless
+from lagjax._primitives import lost_unless, start_alike
 from lagjax._run._rounds import Stretch, run_rounds
 from lagjax._run._trajectory import constant_unless, vary_with
 from lagjax._run.hybrid._mode import Mode, Transition, state_after
@@ -138,7 +138,7 @@ class Exit(NamedTuple):
 def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree, start) -> tuple[Ending, TransitionRecord]:
     """The motion from y0 (2n,) at ts[0] in the mode of place `start`, and its `max_transitions` transitions."""
     # A place that is none, as −1 is, comes with a state that was not reached.
-    ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
+    ts, y0, params = start_alike((jnp.asarray(ts), jnp.asarray(y0), params))
     given = jnp.append(y0, ts[0]), vector_of(eqx.filter(params, eqx.is_array_like))
     widths = tuple(SINGLE_NOISE * jnp.abs(jax.lax.stop_gradient(x)) for x in given)
     rounds, start = _Rounds(plan, plan.modes(layout, params, widths), ts), jnp.asarray(start, int)
