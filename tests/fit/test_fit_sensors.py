@@ -140,6 +140,19 @@ def test_a_coarse_sensor_shows_its_limit_from_half_a_step_before(limit):
     )  # less what is shown
 
 
+@pytest.mark.parametrize(("step", "limit", "many"), [(0.1, 0.8, 4), (0.1, 0.85, 4), (0.05, 0.5, 4), (0.1, 0.7, 20)])
+def test_a_limit_that_a_coarse_sensor_may_be_at_is_asked_for(step, limit, many):
+    shown = np.clip(np.round((EXACT + many * NOISE) / step) * step, -limit, limit)
+    found = fit(shown)
+    assert not found.ok and f"take noise=lagjax.Clipped(low=-{limit:g}, high={limit:g})" in found.message
+    assert is_right(fit(shown, noise=lagjax.Clipped(shown.min(), shown.max())))
+
+
+def test_the_ends_of_a_coarse_sensor_that_has_no_limit_are_none():
+    for step, many in ((0.1, 4), (0.3, 4), (0.3, 0.1), (0.1, 20)):
+        assert is_right(fit(np.round((EXACT + many * NOISE) / step) * step))
+
+
 def test_the_density_has_the_limits_and_their_gradient():
     found = fit(np.clip(EXACT + 10 * NOISE, -0.8, 9.0), noise=lagjax.Clipped(low=-0.8))
     density = found.log_density()

@@ -36,6 +36,8 @@ _BEYOND = 2.0  # standard errors that a step must lead beyond a bound: of sound 
 _CORRELATED = 0.5
 _ASIDE, _KEPT = 4.0, 1e6  # standard errors: how far a kink is one that intervals may not leave out; and one over them
 _DISAGREE = 5.0  # standard deviations of a shift: twenty records of ten parameters show it in one of 1e4 fits
+_FEW_LINES = 64  # that a coarse sensor shows, from whose values alone limits are not told (`find_limits`)
+_FEWEST_BEYOND = 3  # samples, each of which shows the next line with a chance of a half at least, if there is one
 _SEEN = 1e-5  # of the largest singular value of columns in units of their standard deviations
 _OWN = 0.2  # of the motion left in a record, explained by parameters of its own: 0.9 and more for another machine
 
@@ -74,6 +76,7 @@ def verdict(
         records, own = [r for r in part.records if isinstance(r, Record)], part.sensor_noise(descent.noise)
         if records:
             parts += describe_sensors(records, law, part.signals.names, part.sensor, own.sigma)
+    parts += [] if left.motion else _describe_missed_limits(residuals, descent.trial)
     if np.nanmax(known.correlation) > _CORRELATED:
         parts.append("The residuals are correlated: they hold motion that the scene lacks, and intervals allow for it.")
     ok = descent.converged and not (unseen or left.motion or apart or bent or astray)
@@ -93,6 +96,29 @@ def is_doubtful(descent: Descent) -> bool:
 
 def _leaves_motion(known: Information, left: Unexplained) -> bool:
     return left.doubted and bool(np.nanmax(known.correlation) > _CORRELATED)
+
+
+def _describe_missed_limits(residuals: Residuals, trial: Trial) -> list[str]:
+    """Sentences for coarse sensors that seem to be at a limit: the motion goes on by more than half a step beyond the
+    last line that they show, where at least every other sample of a sensor without limits would show the next one."""
+    values = np.concatenate([batch.values.reshape(-1, batch.values.shape[-1]) for batch in residuals.batches])
+    found, r = [], trial.flat()
+    sensor, periods = residuals.sensor, residuals.parts[0].frame.periods
+    for s, name in enumerate(residuals.names):
+        counted, step, beyond = residuals.weights[:, s] > 0, sensor.step[s], {}
+        x, e = values[counted, s], r[counted, s]
+        if not len(x) or not np.ptp(x) < _FEW_LINES * step or np.isfinite(periods[s]):
+            continue
+        for end, side, limit in (("low", -1, sensor.low[s]), ("high", 1, sensor.high[s])):
+            last = side * np.max(side * x)
+            if np.isnan(limit) and (many := int(np.sum(side * e[np.abs(x - last) < 0.25 * step] > 0.5 * step))):
+                beyond[f"{end}={last:.4g}"] = many
+        if sum(beyond.values()) >= _FEWEST_BEYOND:
+            found.append(
+                f"{name} is coarse, and the fit goes on beyond its last lines at {sum(beyond.values())} samples, where "
+                f"it shows no more: is it at a limit? Then take noise=lagjax.Clipped({', '.join(beyond)})."
+            )
+    return found
 
 
 def _describe_bends(descent: Descent, known: Information) -> list[str]:
