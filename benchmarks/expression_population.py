@@ -19,6 +19,7 @@ name; *raw* is any other error. Numbers beyond 1e100 are not compared, nor motio
 
 import argparse
 import collections
+import itertools
 import math
 import os
 import sys
@@ -42,7 +43,7 @@ from benchmarks import _report
 TOLERANCES = {False: (1e-9, 1e-13), True: (3e-5, 3e-6)}
 OF_MOTION = {False: 1e-6, True: 1e-3}
 STORE = Path(__file__).parent / "results" / "expressions.json"
-BESIDE, SIDES, DURATION, LARGEST = 1e-7, 32, 0.25, 1e100
+BESIDE, SIDES, DURATION, LARGEST, MOST_CALLS = 1e-7, 32, 0.25, 1e100, 20_000
 
 # ---- functions that expressions consist of, as they are written: of a number u ---------------------------------------
 
@@ -507,6 +508,10 @@ def _verdict(found: list[np.ndarray], exact: Exact, z: np.ndarray, single: bool)
     return verdict, ""
 
 
+class _SpentError(Exception):
+    """The reference took too many evaluations."""
+
+
 def _compare_motion(q, v, system, rates, single: bool) -> tuple[str, str]:
     n, ends = len(q), []
     run = lagjax.simulate(system, q, v, jnp.array([0.0, DURATION], q.dtype))
@@ -514,10 +519,17 @@ def _compare_motion(q, v, system, rates, single: bool) -> tuple[str, str]:
         compiled, z = jax.jit(rates), np.concatenate([q, v]).astype(float)
         for step in (DURATION / 40, DURATION / 53):
 
-            def right(t, z):
+            calls = itertools.count()
+
+            def right(t, z, calls=calls):
+                if next(calls) > MOST_CALLS:
+                    raise _SpentError
                 return np.concatenate([z[n:], np.nan_to_num(compiled(jnp.asarray(z)))])
 
-            end = solve_ivp(right, (0.0, DURATION), z, "DOP853", rtol=1e-10, atol=1e-12, max_step=step)
+            try:
+                end = solve_ivp(right, (0.0, DURATION), z, "DOP853", rtol=1e-10, atol=1e-12, max_step=step)
+            except _SpentError:  # the reference slides along a border in ever smaller steps
+                return "not compared", ""
             ends.append(end.y[:, -1] if end.status == 0 else np.full(2 * n, np.nan))
     found = np.concatenate([run.q[-1], run.qdot[-1]]).astype(float)
     allowed = OF_MOTION[single] * (1 + np.abs(ends[0]).max())
