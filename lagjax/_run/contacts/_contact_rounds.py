@@ -767,7 +767,7 @@ def _note_forces(carry: Carry, impulses) -> Carry:
 
 
 def start_width(slopes, y0, acceleration, ts):
-    """How far below zero gaps (k,) with these `slopes` (k, n) may begin: the rounding of what leads a motion there.
+    """The depths at which gaps (k,) with these `slopes` (k, n) may begin: the rounding of what leads a motion there.
 
     A gap that is a coordinate is 1e-16 where it closes, and its rounding that of the height from which it fell.
     """
