@@ -59,7 +59,7 @@ def vary_alike(arrays: Sequence, like: Sequence = ()) -> list:
 
 
 def start_alike(first, *operands):
-    """What rounds begin with, a pytree whose numbers all vary as one of them does, or one of the `operands`.
+    """The pytree that rounds begin with, whose numbers all vary as one of them does, or one of the `operands`.
 
     Else a number that is the same on all devices has its cotangent summed over them in each round, for which devices
     that are done with theirs would wait for ever.

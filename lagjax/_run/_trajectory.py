@@ -125,8 +125,8 @@ class ContactChanges(NamedTuple):
     `Trajectory.contact_names`, and `change` is 0 where it closes, 1 where it opens, 2 where it bounces, 3 where it
     sticks, 4 where it slides. Several at one instant lead from one guess to the next. `doubts` (3,) are how many
     impacts gained energy, and how many changes lack derivatives: where contacts that share an impact close at one
-    instant by themselves, and where a slip begins at a start at rest (by the slip there), or in space; `doubted` (3,)
-    are the first times.
+    instant by themselves, or bounced less than rounding before it, and where a slip begins at a start at rest (by the
+    slip there), or in space; `doubted` (3,) are the first times.
 
     Printed, they are lines of text. `to_pandas()` makes a table of them.
     """

@@ -535,6 +535,30 @@ def test_health_counts_the_derivatives_that_are_lost():
     assert "in 2 of 3 members, the first 0" in text and "part them do not exist" in text and "t = 0.451524" in text
 
 
+@pytest.mark.slow
+def test_impacts_in_turn_that_accumulate_are_shared_by_rounding_and_counted():
+    """A wedge of two walls that move inwards: a point bounces between them faster and faster. Compiles one motion."""
+    left, right = 1.23597994147044, 1.3381894906231333
+
+    def gaps(q, t):
+        return (
+            jnp.sin(left) * q[0] + jnp.cos(left) * q[1] - 1.7235077705954625 * t**2,
+            jnp.cos(right) * q[1] - jnp.sin(right) * q[0] - 2.302046437737974 * t**2,
+        )
+
+    def slips(q, v):
+        return (
+            jnp.cos(left) * v[0] - jnp.sin(left) * v[1],
+            jnp.cos(right) * v[0] + jnp.sin(right) * v[1],
+        )
+
+    wedge = lagjax.System(lambda q, v: 0.5 * v @ v - q[1], contacts=gaps, slip=slips, friction=0.1, restitution=0.3)
+    start = jnp.array([-0.08731105583085375, 0.5]), jnp.array([-1.0115259840204927, -0.017136269045231536])
+    run = lagjax.simulate(wedge, *start, jnp.array([0.0, 1.5]))
+    assert run.ok and run.contact_changes.doubts.tolist() == [0, 1, 0]
+    assert "t = 0.272844" in str(run.health().findings())
+
+
 # ---- Routh's construction --------------------------------------------------------------------------------------------
 
 

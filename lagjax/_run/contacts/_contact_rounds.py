@@ -712,7 +712,9 @@ class ContactRounds(NamedTuple):
             pattern = Pattern(jnp.ones(1), jnp.zeros(1), jnp.zeros((1, 1)))
         else:
             pattern, phases = find_phases(rows, involved, restitution, friction)
-        others = linked & ~meets & ~was_closed & (rates < -noise) & ~before.fresh[: self.count]
+        # One that has just bounced is pushed, too, where the time since then is rounding.
+        closes = (rates < -noise) | ((rates > noise) & (pattern.push > 0) & self.has_gap)
+        others = linked & ~meets & ~was_closed & closes & ~before.fresh[: self.count]
         noise_behind = jnp.maximum(noise, 1e-12 * jnp.max(jnp.abs(rates)))
         hits = (meets & (rates < -noise)).any()
         missed = (meets & self.missed(before, guarded, before.contacts)).any()
@@ -803,7 +805,7 @@ def _note_forces(carry: Carry, impulses) -> Carry:
 
 
 def start_width(slopes, y0, acceleration, ts):
-    """How far below zero gaps (k,) with these `slopes` (k, n) may begin: the rounding of what leads a motion there.
+    """The depths at which gaps (k,) with these `slopes` (k, n) may begin: the rounding of what leads a motion there.
 
     A gap that is a coordinate is 1e-16 where it closes, and its rounding that of the height from which it fell.
     """
