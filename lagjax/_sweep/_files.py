@@ -97,7 +97,7 @@ class Files:
     def spec(self) -> dict:
         """The description. Raises `FileNotFoundError` or `ValueError` where this is no store that can be read."""
         file = self.job / "spec.json"
-        if not file.exists():
+        if not self.exists() or not file.exists():
             why = "is no store of a sweep, for it has no .sweep/spec.json: name another folder, or empty this one"
             raise FileNotFoundError(errno.ENOENT, f"{self.path} {why}")
         try:
@@ -159,7 +159,7 @@ class Files:
 
     def exists(self) -> bool:
         """True if there is something by this name; an empty folder is nothing."""
-        with self.explain_errors("the store was not made"):
+        with self.explain_errors("no store can be there"):
             return self.path.exists() and not (self.path.is_dir() and not any(self.path.iterdir()))
 
     @contextmanager

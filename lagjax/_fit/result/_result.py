@@ -77,7 +77,8 @@ class Fit:
     - `unseen`: a sentence for each free parameter or combination of them that the data do not determine, and one for
       those of which rounding hides what a chaotic record says.
     - `ok`: whether the search converged, the data determine everything that is free, the fit leaves less than some 30 %
-      of every signal beyond white noise, and the records agree; `message`: what happened.
+      of every signal beyond white noise, the motion is more than noise gives, and the records agree; with contacts or
+      modes, also whether it leaves no motion of more than some 5 %. `message`: what happened.
     - `log_likelihood`: as if all samples were independent; `trials`: how often the motions were computed.
     - `waterfall`: where the search from each of several starts ended (`Waterfall`); None for a single start.
     """
