@@ -518,7 +518,6 @@ def _compare_motion(q, v, system, rates, single: bool) -> tuple[str, str]:
     with jax.enable_x64(True):
         compiled, z = jax.jit(rates), np.concatenate([q, v]).astype(float)
         for step in (DURATION / 40, DURATION / 53):
-
             calls = itertools.count()
 
             def right(t, z, calls=calls):

@@ -192,7 +192,7 @@ def sparse_jacobian(function: Callable, shapes: tuple) -> Callable[..., csr_arra
         return None
     shape, entries = pattern.shape, pattern.tocoo()
     rows, columns = entries.row, entries.col
-    factors = np.random.default_rng(0).uniform(0.5, 1.5, shape[1])
+    factors = np.random.default_rng(0).uniform(0.5, 1.5, len(colors))
 
     @jax.jit
     def read(x, *others):
@@ -241,7 +241,7 @@ def color_columns(pattern: csr_array) -> np.ndarray:
     """A colour for each column of a pattern: columns of one colour share no row (Curtis, Powell & Reid 1974)."""
     # The first that is free in all rows of the column; those taken in a row are the bits of a whole number.
     columns, taken, colors = pattern.tocsc(), [0] * (len(pattern.indptr) - 1), []
-    rows, ends = columns.indices.tolist(), columns.indptr.tolist()
+    rows, ends = np.asarray(columns.indices).tolist(), np.asarray(columns.indptr).tolist()
     for start, end in itertools.pairwise(ends):
         here = functools.reduce(int.__or__, [taken[i] for i in rows[start:end]], 0)
         free = ~here & (here + 1)

@@ -269,7 +269,7 @@ def inverse(graph, x: int, op: str) -> int:
     """arccos(cos u) is |u| less whole turns, arcsin(sin u) is ±u less half ones; the sum of both functions is π/2."""
     of, operands, _ = graph.nodes[x]
     if of == "neg" and graph.nodes[operands[0]][0] in ("sin", "cos"):
-        found = inverse(graph, *operands, op)
+        found = inverse(graph, operands[0], op)
         return (
             graph.apply("neg", found) if op == "asin" else graph.apply("sub", graph.constant(math.pi, "float"), found)
         )
