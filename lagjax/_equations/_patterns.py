@@ -111,11 +111,15 @@ def _draw(rng: np.random.Generator, like: np.ndarray, low: float, whole: int) ->
     return rng.integers(0, min(whole, most), like.shape).astype(like.dtype)
 
 
-def differing_rows(values, rows, factors, exact, dtype) -> np.ndarray:
-    """True for each row whose sum of `values` times `factors` is not the product that is `exact`, as far as finite."""
+def differing_rows(values, rows, factors, exact, dtype, least: float = 0.0) -> np.ndarray:
+    """True for each row whose sum of `values` times `factors` is not the product that is `exact`, as far as finite.
+
+    A row counts as no smaller than the part `least` of the largest one: its terms may have cancelled.
+    """
     terms, count = np.asarray(values, float) * factors, len(exact)
     sums, sizes = (np.bincount(rows, x, count) for x in (terms, np.abs(terms)))
-    sizes = np.where(sizes > 0, sizes, sizes.max(initial=0, where=np.isfinite(sizes)))
+    largest = sizes.max(initial=0, where=np.isfinite(sizes))
+    sizes = np.maximum(np.where(sizes > 0, sizes, largest), least * largest)
     return np.abs(exact - sums) > _ROUNDING * np.finfo(dtype).eps * sizes
 
 
@@ -208,7 +212,7 @@ def sparse_jacobian(function: Callable, shapes: tuple) -> Callable[..., csr_arra
 
     def jacobian(x, *others) -> csr_array:
         values, exact = map(np.asarray, read(x, *others))
-        if differing_rows(values, rows, factors[columns], exact, x.dtype).any():
+        if differing_rows(values, rows, factors[columns], exact, x.dtype, least=0.01).any():
             raise ValueError(
                 "The derivatives of the forces or constraints at this state hold entries that were not found among "
                 'the operations of the scene: give System(..., path="scalar"), which derives them one by one.'
