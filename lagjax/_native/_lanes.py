@@ -109,8 +109,6 @@ def apply(code: Code, op: str, xs: list[Value], attribute, kinds: Sequence[str],
         raise Unlowerable(f"`{op}`{' of integers' if is_whole else ''} has no machine code here")
     more = () if attribute is None else (attribute,)
     x = code.library(how, *xs) if isinstance(how, str) else how(code, *xs, *more)
-    if op == "not" and is_whole and not np.iinfo(kind).min:  # the complement of what has no sign
-        x = x + (np.iinfo(kind).max + 1.0)
     return _wrap(code, x, kind) if is_whole else x
 
 
