@@ -110,6 +110,16 @@ class Line:
         """(x, w) ↦ D(x)ᵀ w, w (outputs,)."""
         return self._derivative(pullback, self.outputs)
 
+    @functools.cached_property
+    def beside_derivative(self) -> "Line":
+        """(x, v) ↦ g(x), D(x) v, one behind the other."""
+        line, size = self.forward.line, self.forward.size
+        graph = Graph(2 * len(line.nodes) + len(self.line.nodes) + size)
+        ids = [graph.input(i, "float") for i in range(size)]
+        copies = [(of, copy_nodes(graph, of, ids[:count])) for of, count in ((self.line, self.size), (line, size))]
+        found = tuple(nodes[i] for of, nodes in copies for i in of.outputs)
+        return Line(StraightLine(tuple(graph.nodes), tuple(graph.kinds), found), size, size)
+
     def _derivative(self, differentiate: Callable, linear: int) -> "Line":
         line = differentiate(self.line, [np.dtype(float)] * self.size, range(self.count), range(self.outputs))
         return Line(line, self.size + linear, self.size)

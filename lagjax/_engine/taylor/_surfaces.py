@@ -98,7 +98,7 @@ class Surfaces(NamedTuple):
         given = jnp.append(y, t), numbers
         out = outputs(self.complete, 4 * count, *given)
         values, rates, sizes, rate_sizes = out.reshape(4, count)
-        errors = outputs(_rate_errors(self.complete, count), count, *given)
+        errors = outputs(rate_errors(self.complete, count), count, *given)
         errors = jnp.where(jnp.isfinite(errors), errors, 0.0)  # a root at zero has no slope
         instant = INSTANT * SMALLEST_STEP * jnp.maximum(jnp.abs(t), jnp.abs(latest))
         rounding, rate_rounding = GUARD_NOISE * sizes, GUARD_NOISE * (rate_sizes + errors)
@@ -185,7 +185,7 @@ def _rate(motion: Program, expansion, ids: np.ndarray, moving: int) -> Scalars:
 
 
 @functools.lru_cache(maxsize=64)
-def _rate_errors(complete: Program, count: int) -> Program:
+def rate_errors(complete: Program, count: int) -> Program:
     """The running errors of all ġ in units of round-off: what is left of terms that cancel is not seen in its size."""
     return complete.rounding_of(range(count, 2 * count), complete.shapes[0].size)
 

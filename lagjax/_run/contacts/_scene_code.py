@@ -1,0 +1,291 @@
+"""A scene with contacts as the search takes it: machine code by address, sizes, and the places of numbers; its runs.
+
+    SceneCode.search(ts, y0, numbers, e, μ) ─► search_p ─► rows of NumPy ─► `_search.follow` ─► Found
+                                                              └─ a stretch that the kernel gives up: `Flow.run`
+"""
+
+import ctypes
+import functools
+import math
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray
+from jax.interpreters import mlir
+
+from lagjax._engine.taylor import Line, call_host, line_of, rate_errors
+from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL
+from lagjax._native import SINGLE_NOISE, LineCode, compile_loops, cores, handler, make_once
+from lagjax._primitives import LinearMap, compute_on_host
+from lagjax._run.contacts import _search
+from lagjax._run.contacts._places import ARRAYS, MEMORY, NAMES, RECORD, WORK, at
+from lagjax._run.contacts._search import ASKS, GOING, NEW
+
+_TOGETHER = 256  # members that one call follows side by side: what it remembers of them fits into a processor's cache
+_ROOM = 32  # rows of a record, at first
+_ROUNDS = 10**6  # of a kernel, for a stretch: beyond that it continues on the host, where it can be interrupted
+
+
+class Found(NamedTuple):
+    """What a search found, of one member or with members in front.
+
+    The outputs `path` (T, 2n), what contacts `did` there (T, …), −1 where the motion did not come, the `record` (N, …),
+    whose rows `_places` declares, and the `ending`: t and y, result, rounds, accepted and rejected steps, doubts (3,)
+    and the times of the first ones, (3,); then y and t where it began, which corners move.
+    """
+
+    path: Any
+    did: Any
+    record: Any
+    ending: Any
+
+
+class SceneCode:
+    """The machine code of a scene of these `sizes` and `arrays` (see `_places`); it is known by identity.
+
+    Where contacts are closed ("HELD") and where all are "OPEN", `flows` make the flow, and `surfaces` are the watches.
+    `lines` do not depend on that; `multipliers` makes the line of those.
+    """
+
+    def __init__(self, sizes: dict, arrays: dict, flows: dict, surfaces: dict, lines: dict, multipliers, tolerances):
+        self.sizes, self.arrays, self.surfaces, self.tolerances = sizes, arrays, surfaces, tolerances
+        self.flows = {kind: functools.cache(make) for kind, make in flows.items()}
+        self._lines, self._multipliers, self._keep = lines, multipliers, []  # what the addresses point to
+        self.scene = functools.cache(self._scene)
+
+    def _scene(self, many: bool) -> np.ndarray:
+        """The row of integers that the search takes, without what closed contacts need; for one member, or for many."""
+        scene = np.zeros(len(NAMES) + sum(x.size for x in self.arrays.values()), np.int64)
+        fields = sizes_of_fields(self.sizes)
+        for name, size in self.sizes.items():
+            scene[getattr(at, name)] = size
+        place = len(NAMES)
+        for name in ARRAYS:
+            scene[getattr(at, name)], numbers = place, self.arrays[name].ravel()
+            scene[place : place + numbers.size], place = numbers, place + numbers.size
+        for names, whole, prefix in ((MEMORY, "MEMORY", ""), (WORK, "WORK", ""), (RECORD, "ROW", "TO_")):
+            ends = np.cumsum([0, *(fields[name] for name in names)])
+            for name, begin in zip(names, ends, strict=False):
+                scene[getattr(at, prefix + name)] = begin
+            scene[getattr(at, whole)] = ends[-1]
+        scene[at.BEGIN] = ctypes.cast(handler().begin, ctypes.c_void_p).value
+        self._add_codes(scene, self._lines)
+        self.add_kind(scene, "OPEN", many)
+        return scene
+
+    def add_kind(self, scene: np.ndarray, kind: str, many: bool) -> None:
+        """Add to a scene the kernel and the watches of closed contacts, or of open ones."""
+        surfaces, flow = self.surfaces[kind], self.flows[kind]()
+        count = len(surfaces.directions)
+        lines = {
+            f"{kind}_WATCH": line_of(surfaces.complete, 4 * count),
+            f"{kind}_ERRORS": line_of(rate_errors(surfaces.complete, count), count),
+        }
+        if surfaces.is_rounded:
+            lines[f"{kind}_SLOPES"] = line_of(surfaces.values, count).back
+        if kind == "HELD":
+            lines["MULTIPLIERS"] = self._multipliers()
+        self._add_codes(scene, lines)
+        for name, members in (("ONE", 1), ("MANY", 1000 if many else 1)):
+            kernel = flow.kernel.select_width(members)
+            plan = kernel.plan(*self.tolerances[:3])
+            plan = type(plan)(*(_ROUNDS if field == "rounds" else getattr(plan, field) for field, *_ in plan._fields_))
+            self._keep.append((plan, kernel))
+            scene[at.REST] = max(scene[at.REST], kernel.rest_size)
+            scene[getattr(at, f"{kind}_{name}")] = ctypes.addressof(plan)
+
+    def _add_codes(self, scene: np.ndarray, lines: dict[str, Line]) -> None:
+        for name, of in lines.items():
+            code = LineCode(of.line, of.size)
+            self._keep.append(code)
+            scene[getattr(at, name)] = code.address
+
+    # ---- runs ----
+
+    def search(self, ts, y0, numbers, restitution, friction, room: int | None = None) -> Found:
+        """What contacts do from `y0` (…, 2n) on, at `ts` (…, T) with `numbers` (…, P), e (…, k) and μ (…, r).
+
+        With `room` the record has that many rows, without as many as there are. It has no derivatives.
+        """
+        given = ts, y0, numbers, restitution, friction
+        room = self.sizes["MOST"] if room is None else room
+        return Found(*search_p.bind(*map(jnp.asarray, given), code=self, room=room))
+
+    def run(self, ts, y0, numbers, restitution, friction, room: int | None) -> Found:
+        """`search` on arrays of NumPy with members in front; with no `room` its records are as long as the longest."""
+        members, scene, begin = len(y0), self.scene(len(y0) > 1).copy(), 2 * self.sizes["N"]
+        memory = np.zeros((members, scene[at.MEMORY]))
+        is_open = np.zeros(self.sizes["DOING"])
+        is_open[self.sizes["K"] : -1] = 1.0
+        parts = {
+            "X": np.concatenate([y0, ts[:, :1], numbers, np.broadcast_to(is_open, (members, is_open.size))], axis=1),
+            "RESTITUTION": restitution, "MU": friction, "RTOL": np.full((members, 1), self.tolerances.rtol),
+            "FIRST": ts[:, :1], "LAST": ts[:, -1:], "RESULT": np.full((members, 1), float(NEW)),
+            "DOUBTED": np.full((members, 3), np.nan),
+        }  # fmt: skip
+        if self.sizes["SINGLE"]:
+            parts["WIDTHS"] = SINGLE_NOISE * np.abs(parts["X"][:, : begin + 1 + self.sizes["NUMBERS"]])
+        for name, x in parts.items():
+            place = scene[getattr(at, name)]
+            memory[:, place : place + x.shape[1]] = x
+        path = np.full((members, self.sizes["TIMES"], begin), np.nan)
+        did = np.full((members, self.sizes["TIMES"], self.sizes["DOING"]), -1.0)
+        run = _Run(self, scene, np.ascontiguousarray(ts), memory, path, did, room)
+        run.follow()
+        ending = [memory[:, scene[at.X] + begin], *memory[:, scene[at.X] : scene[at.X] + begin].T]
+        ending += [memory[:, scene[getattr(at, name)]] for name in ("RESULT", "ROUNDS", "ACCEPTED", "REJECTED")]
+        ending += [*memory[:, scene[at.DOUBTS] : scene[at.DOUBTS] + 3].T, *memory[:, scene[at.DOUBTED] :][:, :3].T]
+        ending += [*memory[:, scene[at.BEGUN] : scene[at.BEGUN] + begin + 1].T]
+        return Found(path, did, run.record, np.stack(ending, axis=-1))
+
+
+class _Run:
+    """A run of members, which is followed until none goes on."""
+
+    def __init__(self, code: SceneCode, scene, ts, memory, path, did, room: int | None):
+        self.code, self.scene, self.ts, self.memory, self.path, self.did = code, scene, ts, memory, path, did
+        self.record, self._fixed = np.zeros((len(memory), room or _ROOM, scene[at.ROW])), room is not None
+        scene[at.STRIDE] = ts.shape[1] if len(ts) > 1 else 0
+        self.results = memory[:, scene[at.RESULT]]
+
+    def follow(self) -> None:
+        """Follow all to their ends."""
+        members = len(self.memory)
+        together = min(_TOGETHER, max(1, -(-members // cores())))
+        places = [slice(begin, begin + together) for begin in range(0, members, together)]
+        while True:
+            self.scene[at.ROOM] = self.record.shape[1]
+            if len(places) == 1:
+                self._follow_some(places[0])
+            else:
+                with ThreadPoolExecutor(cores()) as pool:
+                    list(pool.map(self._follow_some, places))
+            for member in np.flatnonzero(self.results == ASKS):
+                self._continue(member)
+            if not (self.results == GOING).any():
+                break
+            if (self.memory[self.results == GOING, self.scene[at.ROWS]] >= self.record.shape[1]).any():
+                if self._fixed:
+                    break
+                self.record = np.concatenate([self.record, np.zeros_like(self.record)], axis=1)
+        if not self._fixed:
+            used = int(self.memory[:, self.scene[at.ROWS]].max(initial=1))
+            self.record = np.ascontiguousarray(self.record[:, : max(used, 1)])
+
+    def _follow_some(self, members: slice) -> None:
+        scene, memory = self.scene.copy(), self.memory[members]
+        outputs, states = scene[at.TIMES] + 2, 2 * scene[at.N]
+        numbers = scene[at.INPUTS] - states - 1 + 2 * scene[at.WATCHES]
+        scene[at.JOBS] = scene[at.ORDER] + len(memory)
+        each = outputs + states + numbers + outputs * states + states + 4
+        work = np.zeros(scene[at.JOBS] + len(memory) * each + scene[at.REST])
+        ts = self.ts[members] if scene[at.STRIDE] else self.ts
+        arrays = ts, self.path[members], self.did[members], self.record[members], memory, work
+        _loops().follow(scene.ctypes.data, len(memory), *(x.ctypes.data for x in arrays))
+
+    def _continue(self, member: int) -> None:
+        """Go on with a member that the kernel did not finish, or whose first contact has closed."""
+        code, scene, states = self.code, self.scene, 2 * self.scene[at.N]
+        memory = self.memory[member]
+        closed = memory[scene[at.X] + states + 1 + scene[at.NUMBERS] :][: scene[at.K]]
+        kind = "HELD" if (closed > 0).any() else "OPEN"
+        if scene[at.HELD_ONE] == 0:
+            code.add_kind(scene, "HELD", len(self.memory) > 1)
+            before = code.scene(len(self.memory) > 1)
+            before[:] = np.where(scene[: before.size] != 0, scene, before)  # later runs have them at once
+            scene[at.STRIDE] = self.ts.shape[1] if len(self.ts) > 1 else 0
+            if kind == "HELD":
+                self.results[self.results == ASKS] = GOING
+                return
+        if self.results[member] != ASKS:
+            return
+        ts = self.ts[member if scene[at.STRIDE] else 0]
+        times, y, work = np.zeros(ts.size + 2), np.zeros(states), np.zeros(scene[at.ORDER])
+        numbers = np.zeros(scene[at.INPUTS] - states - 1 + 2 * scene[at.WATCHES])
+        loops, place = _loops(), lambda x: x.ctypes.data
+        loops.prepare(place(scene), *map(place, (memory, ts, times, y, numbers, work)))
+        solution = code.flows[kind]().run(times[None], y[None], numbers[None], code.tolerances)
+        path, t_end, y_end, result, accepted, rejected, event = (np.asarray(x[0]) for x in solution[:7])
+        happened, path = result == EVENT_OCCURRED, np.ascontiguousarray(path)
+        loops.finish(
+            *map(place, (scene, memory, ts, self.path[member], self.did[member], self.record[member], path, y_end)),
+            float(t_end), int(event) if happened else 0, SUCCESSFUL if happened else int(result), float(accepted),
+            float(rejected), place(work),
+        )  # fmt: skip
+
+
+class _Loops(NamedTuple):
+    follow: Any
+    prepare: Any
+    finish: Any
+
+
+@make_once
+def _loops() -> _Loops:
+    entries = _search.follow, _search.prepare, _search.finish
+    return _Loops(*compile_loops(*entries))
+
+
+# ---- as a primitive --------------------------------------------------------------------------------------------------
+
+
+def _shapes(ts, y0, numbers, restitution, friction, *, code: SceneCode, room: int):
+    batch, states = y0.shape[:-1], y0.shape[-1]
+    row = sum(sizes_of_fields(code.sizes)[name] for name in RECORD)
+    shapes = (ts.shape[-1], states), (ts.shape[-1], code.sizes["DOING"]), (room, row), (2 * states + 12,)
+    return [ShapedArray((*batch, *shape), np.dtype(float)) for shape in shapes]
+
+
+def _search_rows(*arrays, code: SceneCode, room: int):
+    batch = arrays[1].shape[:-1]
+    rows = [np.asarray(x, float).reshape(math.prod(batch), x.shape[-1]) for x in arrays]
+    return [x.reshape(*batch, *x.shape[1:]) for x in code.run(*rows, room)]
+
+
+def _never_varies(*_, **__):
+    raise AssertionError("A search has no derivatives.")
+
+
+search_p = LinearMap("lagjax_search", _shapes, _never_varies)
+compute_on_host(search_p, _search_rows)
+
+
+def _call_host(*arrays, code: SceneCode, room: int):
+    shapes = _shapes(*arrays, code=code, room=room)
+    return call_host(functools.partial(_search_rows, code=code, room=room), shapes, *arrays)
+
+
+mlir.register_lowering(search_p, mlir.lower_fun(_call_host, multiple_results=True), platform="cpu")
+
+
+# ---- sizes -----------------------------------------------------------------------------------------------------------
+
+
+def sizes_of_fields(sizes: dict[str, int]) -> dict[str, int]:
+    """How many doubles each field of a memory, of the room of a thread and of a row has."""
+    n, k, r, d, corners, watches, inputs, doing = (
+        sizes[name] for name in ("N", "K", "R", "D", "CORNERS", "WATCHES", "INPUTS", "DOING")
+    )
+    size = k + r * d
+    law = 12 * size**2 + 40 * size + 40
+    lines = 4 * inputs + 2 * size * n + size**2 + 3 * size + 20 * watches + 4 * corners + sizes["MULTIPLIERS_COUNT"]
+    fields = dict.fromkeys((*MEMORY, *WORK, *RECORD), 1)
+    per_contact = (
+        "RESTITUTION", "REFUTED", "FORCE_NOISE", "TOUCHES", "PARTING", "NOISE", "INVOLVED", "CLOSED", "PUSH", "STAY",
+        "PARTS", "CHANGED", "TARGETS", "OPENING", "IMPULSE", "COMPRESSED", "RETURNED", "ENDS", "MEETS", "SHARES",
+    )  # fmt: skip
+    fields |= dict.fromkeys(per_contact, k) | dict.fromkeys(("MU", "SLIP", "STUCK", "TURNS_BACK", "SLIDES", "STARTS"), r)
+    fields |= dict.fromkeys(("VALUES", "RATES", "BENDS", "IMPULSES", "APART", "HELD"), size)
+    fields |= dict.fromkeys(("LARGEST", "SHIFT", "BEHIND", "OFFSET"), 2 * n)
+    fields |= dict.fromkeys(("X", "OPENED"), inputs) | dict.fromkeys(("DOUBTS", "DOUBTED"), 3)
+    fields |= dict.fromkeys(("FRESH", "KINDS", "STAYS", "FELL"), watches)
+    fields |= dict.fromkeys(("ROUNDING", "RATE_ROUNDING"), 2 * watches) | dict.fromkeys(("GUARDS", "WATCHED"), 5 * watches)
+    fields |= dict.fromkeys(("GRADIENTS", "RESPONSES"), size * n) | dict.fromkeys(("SLIPS", "SLIPS_BEHIND"), 2 * r)
+    fields |= {
+        "WIDTHS": inputs, "TIED": k + r, "CAME": sizes["SECTIONS"], "COUPLING": size**2, "FORCES": d, "CHANGE": n,
+        "CORNER": 3 * corners, "PASSED": corners, "ROOM_LEFT": law + lines, "ORDER": 0, "JOBS": 0, "DID": doing,
+        "BEFORE": n, "DIRECTION": r * d, "BEGUN": 2 * n + 1,
+    }  # fmt: skip
+    return fields
