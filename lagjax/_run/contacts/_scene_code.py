@@ -120,7 +120,7 @@ class SceneCode:
         is_open = np.zeros(self.sizes["DOING"])
         is_open[self.sizes["K"] : -1] = 1.0
         parts = {
-            "X": np.concatenate([y0, ts[:, :1], numbers, np.broadcast_to(is_open, (members, is_open.size))], axis=1),
+            "X": np.concatenate([y0, *np.broadcast_arrays(ts[:, :1], y0[:, :1])[:1], numbers, np.tile(is_open, (members, 1))], axis=1),
             "RESTITUTION": restitution, "MU": friction, "RTOL": np.full((members, 1), self.tolerances.rtol),
             "FIRST": ts[:, :1], "LAST": ts[:, -1:], "RESULT": np.full((members, 1), float(NEW)),
             "DOUBTED": np.full((members, 3), np.nan),
@@ -162,6 +162,8 @@ class _Run:
             else:
                 with ThreadPoolExecutor(cores()) as pool:
                     list(pool.map(self._follow_some, places))
+            if (self.results == ASKS).any() and self.scene[at.HELD_ONE] == 0:
+                self._add_held()
             for member in np.flatnonzero(self.results == ASKS):
                 self._continue(member)
             if not (self.results == GOING).any():
@@ -185,35 +187,30 @@ class _Run:
         arrays = ts, self.path[members], self.did[members], self.record[members], memory, work
         _loops().follow(scene.ctypes.data, len(memory), *(x.ctypes.data for x in arrays))
 
+    def _add_held(self) -> None:
+        """Add what closed contacts need to the scene, and let all that ask go on."""
+        whole, stride = self.code.scene(len(self.memory) > 1), self.scene[at.STRIDE]
+        if whole[at.HELD_ONE] == 0:
+            self.code.add_kind(whole, "HELD", len(self.memory) > 1)
+        self.scene = whole.copy()
+        self.scene[at.STRIDE], self.results[self.results == ASKS] = stride, GOING
+
     def _continue(self, member: int) -> None:
-        """Go on with a member that the kernel did not finish, or whose first contact has closed."""
-        code, scene, states = self.code, self.scene, 2 * self.scene[at.N]
-        memory = self.memory[member]
+        """Follow a stretch that the kernel did not finish."""
+        code, scene, memory = self.code, self.scene, self.memory[member]
+        states, ts = 2 * scene[at.N], self.ts[member if scene[at.STRIDE] else 0]
         closed = memory[scene[at.X] + states + 1 + scene[at.NUMBERS] :][: scene[at.K]]
-        kind = "HELD" if (closed > 0).any() else "OPEN"
-        if scene[at.HELD_ONE] == 0:
-            code.add_kind(scene, "HELD", len(self.memory) > 1)
-            before = code.scene(len(self.memory) > 1)
-            before[:] = np.where(scene[: before.size] != 0, scene, before)  # later runs have them at once
-            scene[at.STRIDE] = self.ts.shape[1] if len(self.ts) > 1 else 0
-            if kind == "HELD":
-                self.results[self.results == ASKS] = GOING
-                return
-        if self.results[member] != ASKS:
-            return
-        ts = self.ts[member if scene[at.STRIDE] else 0]
+        flow = code.flows["HELD" if (closed > 0).any() else "OPEN"]()
         times, y, work = np.zeros(ts.size + 2), np.zeros(states), np.zeros(scene[at.ORDER])
         numbers = np.zeros(scene[at.INPUTS] - states - 1 + 2 * scene[at.WATCHES])
-        loops, place = _loops(), lambda x: x.ctypes.data
-        loops.prepare(place(scene), *map(place, (memory, ts, times, y, numbers, work)))
-        solution = code.flows[kind]().run(times[None], y[None], numbers[None], code.tolerances)
-        path, t_end, y_end, result, accepted, rejected, event = (np.asarray(x[0]) for x in solution[:7])
-        happened, path = result == EVENT_OCCURRED, np.ascontiguousarray(path)
-        loops.finish(
-            *map(place, (scene, memory, ts, self.path[member], self.did[member], self.record[member], path, y_end)),
-            float(t_end), int(event) if happened else 0, SUCCESSFUL if happened else int(result), float(accepted),
-            float(rejected), place(work),
-        )  # fmt: skip
+        _loops().prepare(*(x.ctypes.data for x in (scene, memory, ts, times, y, numbers, work)))
+        done = flow.run(times[None], y[None], numbers[None], code.tolerances)
+        happened = bool(done.result[0] == EVENT_OCCURRED)
+        of_member = self.path[member], self.did[member], self.record[member]
+        given = scene, memory, ts, *of_member, np.ascontiguousarray(done.path[0]), np.ascontiguousarray(done.y_end[0])
+        event, result = (int(done.event[0]), SUCCESSFUL) if happened else (0, int(done.result[0]))
+        steps = float(done.accepted[0]), float(done.rejected[0])
+        _loops().finish(*(x.ctypes.data for x in given), float(done.t_end[0]), event, result, *steps, work.ctypes.data)
 
 
 class _Loops(NamedTuple):
