@@ -17,15 +17,17 @@ error, which in machine code nobody sees. Integers divide as those of C do.
 import ast
 import ctypes
 import functools
+import hashlib
 import inspect
 import textwrap
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 from llvmlite import ir
 
-from lagjax._native._ir import BIT, DOUBLE, INTEGER, POINTER, Code, Value, compile_module
+from lagjax._native._ir import BIT, DOUBLE, INTEGER, LEVELS, POINTER, Code, Value, compile_text
 
 Floats = Wholes = np.ndarray  # arrays of doubles, and of integers, as annotations name them
 _KINDS = {"float": DOUBLE, "int": INTEGER, "Floats": POINTER, "Wholes": POINTER, "bool": BIT}
@@ -87,14 +89,9 @@ _C_KINDS = {"int": ctypes.c_int64, "float": ctypes.c_double}
 @functools.cache
 def compile_loops(*entries: Loop) -> tuple[Callable, ...]:
     """Loops as functions in machine code, which take numbers and addresses of arrays."""
-    module = ir.Module("loops")
-    module.triple = ""
-    written: dict[Loop, Code] = {}
-    for entry in entries:
-        _write(module, entry, written)
-    for entry in entries:
-        written[entry].function.linkage = ""
-    engine, places = compile_module(module, tuple(entry.__name__ for entry in entries))
+    names = tuple(entry.__name__ for entry in entries)
+    level = LEVELS[0]
+    engine, places = compile_text(lambda: _write_module(entries), names, f"{_digest_sources()} {names}", level)
     _engines.append(engine)
     kinds = [[_C_KINDS.get(kind, ctypes.c_void_p) for kind in entry.arguments.values()] for entry in entries]
     results = [entry.result and _C_KINDS[entry.result] for entry in entries]
@@ -105,6 +102,22 @@ def compile_loops(*entries: Loop) -> tuple[Callable, ...]:
 
 
 _engines: list = []  # which hold the code
+
+
+def _digest_sources() -> str:
+    """A digest of this package's text, in which are all loops and all constants that they know."""
+    digest = hashlib.sha256()
+    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+        digest.update(path.read_bytes())
+    return digest.hexdigest()
+
+
+def _write_module(entries: tuple[Loop, ...]) -> str:
+    module, written = ir.Module("loops"), {}
+    module.triple = ""
+    for entry in entries:
+        _write(module, entry, written).function.linkage = ""
+    return str(module)
 
 
 def _write(module: ir.Module, of: Loop, written: dict) -> Code:

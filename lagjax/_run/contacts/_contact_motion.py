@@ -24,6 +24,7 @@ from lagjax._engine.taylor import (
 from lagjax._equations import Derivation, derivation_of
 from lagjax._interface import Function, Layout, compile_for_one_call, halves
 from lagjax._primitives import attach_derivative, lost_unless
+from lagjax._program import Program, Unlowerable, lower
 from lagjax._run.contacts._corners import append_sides, corners_of
 from lagjax._run.contacts._places import ARRAYS
 from lagjax._run.contacts._replay import Played, Replay, Row
@@ -78,11 +79,19 @@ class RoundRecord(NamedTuple):
 
 
 class Scene(NamedTuple):
-    """What is made once of a scene: its search, its replay, and its functions in flat coordinates."""
+    """What is made once of a scene: its search, its replay, its functions in flat coordinates.
+
+    `coefficients` are e and μ, (k + r,), or their program of the numbers of params; None where they have none.
+    """
 
     code: SceneCode
     replay: Replay
     flat: Flat
+    coefficients: np.ndarray | Program | None
+
+    def split_coefficients(self, values):
+        """e (…, k) and μ (…, r) of the coefficients (…, k + r)."""
+        return values[..., : self.code.sizes["K"]], values[..., self.code.sizes["K"] :]
 
 
 @compile_for_one_call
@@ -95,7 +104,13 @@ def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) ->
     numbers, still = eqx.filter(params, eqx.is_array_like), jax.lax.stop_gradient
     scene = scene_of(plan, layout, params, len(ts))
     vector = vector_of(numbers).astype(float)
-    given = ts, y0, vector, scene.flat.restitution(numbers), scene.flat.friction(numbers)
+    if scene.coefficients is None:
+        coefficients = scene.flat.restitution(numbers), scene.flat.friction(numbers)
+    elif isinstance(scene.coefficients, Program):
+        coefficients = scene.split_coefficients(line_of(scene.coefficients)(vector))
+    else:
+        coefficients = map(jnp.asarray, scene.split_coefficients(scene.coefficients))
+    given = ts, y0, vector, *coefficients
     found = scene.code.search(*map(still, given))
     row, played = _read(scene, found)
     start = found.ending[-2 * layout.size - 1 :]
@@ -109,18 +124,26 @@ def follow_known(plan: ContactPlan, layout: Layout, params: PyTree, ts, y0, vect
     `params` are those of one member. There is room for as many changes as there were.
     """
     scene, members = scene_of(plan, layout, params, len(ts)), len(y0)
-    numbers, structure = jax.tree.flatten(eqx.filter(params, eqx.is_array_like))
-    ends = np.cumsum([0, *map(np.size, numbers)])
-
-    def coefficients(vector):
-        parts = [vector[begin : begin + np.size(x)].reshape(np.shape(x)) for begin, x in zip(ends, numbers, strict=False)]
-        p = structure.unflatten(parts)
-        return scene.flat.restitution(p), scene.flat.friction(p)
-
-    given = [np.asarray(vectors, float), *jax.vmap(coefficients)(jnp.asarray(vectors))]
-    wide = [np.broadcast_to(np.asarray(x, float), (members, x.shape[-1])) for x in given]
-    found = scene.code.run(np.asarray(ts, float)[None], np.asarray(y0, float), *wide, None)
+    vectors = np.broadcast_to(np.asarray(vectors, float), (members, np.shape(vectors)[-1]))
+    if scene.coefficients is None:
+        rows = [_coefficients_at(scene.flat, params, vector) for vector in vectors]
+        coefficients = [np.stack(column) for column in zip(*rows, strict=True)]
+    elif isinstance(scene.coefficients, Program):
+        values = scene.coefficients.evaluate_many(list(vectors.T))
+        coefficients = scene.split_coefficients(np.stack([np.broadcast_to(x, members) for x in values], axis=-1))
+    else:
+        values = scene.split_coefficients(scene.coefficients)
+        coefficients = [np.broadcast_to(x, (members, x.size)) for x in values]
+    found = scene.code.run(np.asarray(ts, float)[None], np.asarray(y0, float), vectors, *coefficients, None)
     return _arrange(scene, found, *_read(scene, found), ())
+
+
+def _coefficients_at(flat: Flat, params: PyTree, vector) -> list[np.ndarray]:
+    """e and μ for the numbers (P,) of parameters of this structure."""
+    numbers, structure = jax.tree.flatten(eqx.filter(params, eqx.is_array_like))
+    parts = np.split(vector, np.cumsum([np.size(x) for x in numbers])[:-1])
+    given = structure.unflatten([part.reshape(np.shape(x)) for part, x in zip(parts, numbers, strict=True)])
+    return [np.asarray(flat.restitution(given)), np.asarray(flat.friction(given))]
 
 
 def _read(scene: Scene, found: Found) -> tuple[Row, Played]:
@@ -218,7 +241,17 @@ def _make_scene(
     multipliers = functools.cache(lambda: line_of(derivation.multipliers))
     searched = SceneCode(sizes, arrays, flows, surfaces, lines, multipliers, tolerances)
     flow = functools.cache(functools.partial(make_flow, derivation, scene.path, None))
-    return Scene(searched, Replay(flow, surfaces["HELD"], lines, sizes, flat.rough, tolerances), flat)
+    replay = Replay(flow, surfaces["HELD"], lines, sizes, flat.rough, tolerances)
+    return Scene(searched, replay, flat, _lower_coefficients(flat, derivation.numbers.params))
+
+
+def _lower_coefficients(flat: Flat, numbers: PyTree) -> np.ndarray | Program | None:
+    try:
+        program = lower(lambda p: jnp.concatenate([flat.restitution(p), flat.friction(p)]), numbers)
+    except Unlowerable:
+        return None
+    constants = [program.constant(i) for i in range(len(program.line.outputs))]
+    return program if None in constants else np.array(constants, float)
 
 
 def _flat_of(derivation: Derivation, scene: ContactScene, structure, code: tuple) -> Flat:
