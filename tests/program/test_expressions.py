@@ -113,6 +113,10 @@ def test_a_branch_that_is_not_taken_has_no_slope(name):
     columns = [*points.T, *np.zeros((3, len(points)))]
     found = derivation.evaluate(["lagrangian_by_q"], columns)["lagrangian_by_q"]
     np.testing.assert_allclose(found, -jax.vmap(jax.grad(potential))(points), rtol=1e-14)
+    for x in points[:4]:
+        (first, second), bend = derivatives(potential, x), jax.hessian(potential)(x)
+        np.testing.assert_allclose(first, 2 * [jax.grad(potential)(x)], rtol=1e-14)
+        np.testing.assert_allclose(second, 2 * [bend], rtol=1e-13, atol=1e-14)
 
 
 @pytest.mark.parametrize(
