@@ -458,7 +458,8 @@ class _PlacedLine(Derivatives):
         """
         line, nodes, results, above = self.line, self.nodes, {}, find_ancestors(self.line.nodes, cotangents)
         varied, flat = self._find_varying_nodes(above, inputs, varies), ("mul",) if is_linear else ("max", "min")
-        beneath, conditions = self._find_beneath_roots(above, varied, is_linear), self._find_conditions(above, cotangents)
+        beneath = self._find_beneath_roots(above, varied, is_linear)
+        conditions = self._find_conditions(above, cotangents)
         for k in reversed(above):
             (op, operands, attribute), g = line.nodes[k], cotangents.get(k)
             if g is None or k not in varied:
