@@ -588,16 +588,15 @@ LOWER.update({
 
 @lowers("sort")
 def _sort(expansion, params, *operands):
-    """Neighbours are exchanged until all are in order: n (n − 1) / 2 comparisons, for a few numbers."""
+    """Neighbours are exchanged until all are in order: n (n − 1) / 2 comparisons, for a few numbers.
+
+    Equal ones keep their places, and with these their derivatives, as in JAX.
+    """
     if params["num_keys"] != 1:
         raise Unlowerable("the primitive `sort` by several keys has no scalar form here")
     rows = [list(np.moveaxis(x, params["dimension"], 0)) for x in operands]
     for end in range(len(rows[0]) - 1, 0, -1):
         for k in range(end):
-            if len(operands) == 1:
-                (key,) = rows
-                key[k], key[k + 1] = (expansion.map(op, key[k], key[k + 1]) for op in ("min", "max"))
-                continue
             wrong = expansion.map("lt", rows[0][k + 1], rows[0][k])
             for row in rows:
                 pair = row[k], row[k + 1]
