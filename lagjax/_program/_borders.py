@@ -448,6 +448,8 @@ class _Rewriting:
         assert piece is not None
         self.parts[piece] = tuple(self.places[x] for x in _squares(self.program.line, self.cones[i]) or ())
         moves = f("gt", piece, number(0.0))
+        if op == "select":
+            return of[1] if self.graph.value(of[1]) is None else of[2]
         if op in ("sqrt", "rsqrt"):
             return f(op, f("select", moves, self._one, f("add", of[0], number(_NOTHING**2))))
         if op == "max":
@@ -1045,6 +1047,8 @@ def _find_cones(line: StraightLine, size: int, linear: Any) -> dict[int, int]:
             others = [x for x in operands if x not in squares]
             if len(others) == 1 and nodes[others[0]][0] == "constant" and 0 <= nodes[others[0]][2] <= _NO_LENGTH:
                 cones[i] = next(squares[x] for x in operands if x in squares)
+        elif op == "select" and operands[0] in cones and {nodes[x][2] for x in operands[1:] if x not in cones} == {0.0}:
+            cones[i] = cones[operands[0]]  # a length, written so that it has a slope at zero
     return cones
 
 

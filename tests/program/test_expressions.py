@@ -127,7 +127,7 @@ EXTREMES = {
 
 @pytest.mark.parametrize("function", EXTREMES.values(), ids=EXTREMES)
 def test_equal_extremes_share_a_slope_alike(function):
-    """The slope of the largest of numbers of which k are equal is 1/k of each, as in JAX; sorted, they keep their places."""
+    """The slope of the largest of numbers of which k are equal is 1/k of each, as in JAX; sorted, each has its own."""
     points = np.array([[0.4, 0.4, 0.4, 0.4], [0.4, 0.4, 0.1, 0.4], [-0.1, 0.4, 0.4, 0.4], [0.1, -0.4, 0.4, -0.4]])
     derivation = derivation_of(
         lagjax.System(lambda q, v: 0.5 * v @ v + function(q)), Layout.from_state(np.zeros(4), np.zeros(4)), None
@@ -164,10 +164,9 @@ def test_powers_of_lengths_have_slopes_at_zero(name):
 def test_a_motion_begins_and_passes_where_a_length_is_zero(power):
     """Along a line through the centre of |z|ᵖ, and of Re zᵖ along its real axis, it is that of one coordinate."""
     one = lagjax.System(lambda q, v: 0.5 * v**2 - abs(q) ** power)
-    ways = [lambda q: jnp.abs(q[0] + 1j * q[1]) ** power] + [lambda q: jnp.real((q[0] + 1j * q[1]) ** power)] * (power > 1)
-    for potential, q0 in [(way, q0) for way in ways for q0 in (0.0, -0.05)]:
-        if q0 < 0 and potential is not ways[0]:
-            continue
+    modulus = lambda q: jnp.abs(q[0] + 1j * q[1]) ** power
+    cases = [(modulus, 0.0), (modulus, -0.05), (lambda q: jnp.real((q[0] + 1j * q[1]) ** power), 0.0)]
+    for potential, q0 in cases[: 3 if power > 1 else 2]:
         plane = lagjax.System(lambda q, v, potential=potential: 0.5 * v @ v - potential(q))
         ts = np.array([0.0, 0.25])
         run = lagjax.simulate(plane, np.array([q0, 0.0]), np.array([0.3, 0.0]), ts)
