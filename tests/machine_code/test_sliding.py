@@ -370,6 +370,7 @@ def guarded(v):
 
 DIRECTIONS = [
     lambda v: v / jnp.linalg.norm(v),
+    lambda v: v / jnp.hypot(v[0], v[1]),
     lambda v: v / jnp.maximum(jnp.sqrt(v @ v), 1e-12),
     lambda v: v / jnp.where(v @ v == 0, 1.0, jnp.linalg.norm(v)),
     guarded,
