@@ -193,6 +193,11 @@ class Borders(NamedTuple):
         return tuple(shaken)
 
     @property
+    def abrupt(self) -> tuple[int, ...]:
+        """The nodes of what is zero where a root has no series."""
+        return tuple(u for u, of in zip(self.arguments, self.features, strict=True) if of.kind == UP_TO)
+
+    @property
     def followed(self) -> tuple[int, ...]:
         return self.switches + self.arguments
 
