@@ -816,7 +816,9 @@ class _Rewriting:
         # has a corner at its entries, and no jump.
         degrees, lost = _velocity_degrees(line, n) if orders else [], []
         others = [
-            j for j in orders if self.kinds[j] != CONE and (self.kinds[j] != SIGN or degrees[self.switches[j]] > 1)
+            j
+            for j, order in orders.items()
+            if self.kinds[j] != CONE and (self.kinds[j] != SIGN or order == 2 or degrees[self.switches[j]] > 1)
         ]
         decides, of_pieces = {j: [] for j in orders}, {self.pieces[j]: j for j in orders}
         for switch in self.switches:

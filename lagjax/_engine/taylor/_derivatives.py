@@ -109,6 +109,10 @@ def _jvp_over_steps(flow: Flow, motions: Motions, dots, tolerances) -> tuple[np.
 
     for row in _go_over_steps(flow, motions, tolerances, advance_tangents, advance_tangents):
         path_dot[row], y_dot[row] = np.nan, np.nan
+        if (m := dy0.shape[1]) > 1:  # steps may suit some of these directions
+            alone = [x[row, :, None] for x in dots]
+            of_each = _jvp_over_steps(flow, motions.take(np.full(m, row)), alone, tolerances)
+            path_dot[row], y_dot[row] = (x[:, 0] for x in of_each)
     return start_outputs(motions.ts, dy0, path_dot), y_dot
 
 
@@ -189,8 +193,10 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
         return np.where(np.isfinite(end).all(axis=(1, 2)), excess / tolerances.largest_excess, np.nan)
 
     if lost := list(_go_over_steps(flow, motions, tolerances, transpose_steps, probe)):
-        cotangents = path_ct[lost, None], end_ct[lost, None]
-        again = _vjp_by_jacobian(flow, motions.take(np.array(lost)), *cotangents, tolerances)
+        of = motions.take(np.array(lost))
+        inner = path_ct[lost] * (of.ts != of.ts[:, :1])[..., None]
+        inner[:, -1] = 0.0
+        again = _vjp_by_jacobian(flow, of, inner[:, None], end_ct[lost, None], tolerances)
         y_ct[lost], params_ct[lost] = (x[:, 0] for x in again)
     return y_ct, params_ct
 
@@ -304,17 +310,18 @@ def _suitable_steps(flow: Flow, steps: Steps, params, tolerances, excess, measur
     limit; of each step the record says it. Those of a motion with constraints that do not fall as its steps do are
     rounding, as beside a dead centre: its own steps are right.
     """
-    divided = steps
+    divided, found = steps, []
     for _ in range(TRIES):
         before = float(excess[0])
         divided = _divide_steps(flow, divided, params, tolerances)
-        excess = measure(divided)
+        found.append((float((excess := measure(divided))[0]), len(found), divided))
         if excess <= _limit_of(steps):
             return divided
         if flow.projection is not None and float(excess[0]) > 0.5 * before:
             measure(steps)
             return steps
-    return divided if excess <= 1.0 else None
+    least, _, best = min(found)
+    return best if least <= 1.0 else None
 
 
 def _divide_steps(flow: Flow, steps: Steps, params, tolerances: Tolerances) -> Steps:

@@ -13,7 +13,7 @@ from lagjax._program import eliminate_dead_code
 
 # The parts of a passage grow by `GROWTH`; of the first one, `NEAREST` of the passage, the slope is nothing either.
 GROWTH, NEAREST = 1.6, 1e-6
-_CLOCK = 8 * np.finfo(float).eps  # what is a shorter part of the time is none
+_ROUNDING = 64 * np.finfo(float).eps  # parts of the time, or of coordinates, within which nobody knows where it is
 
 
 def has_passages(kernel: Kernel) -> bool:
@@ -41,8 +41,8 @@ def part_passages(flow: Flow, steps: Steps, params, end, tolerances: Tolerances)
     at = np.where(is_before, at + (1 - at) * now / (now - u1), at * u0 / (u0 - now))
     parts = [GROWTH**-j for j in range(int(-np.log(NEAREST) / np.log(GROWTH)) + 1)]
     cuts = [np.zeros(1)] * len(rows)
-    for i, place in zip(step, at, strict=True):
-        least = _CLOCK * abs(t[i]) / abs(h[i])
+    unknown = _ROUNDING * np.maximum(abs(t[step] / h[step]), abs(states[step, : flow.size]).max(axis=1) / abs(u1 - u0))
+    for i, place, least in zip(step, at, unknown, strict=True):
         ways = np.outer([place, 1 - place], parts)
         cuts[i] = np.concatenate([cuts[i], (place - ways[0])[ways[0] > least], (place + ways[1, 1:])[ways[1, 1:] > least]])
     return cut_steps(flow, steps, [np.unique(cut) for cut in cuts], params, tolerances)
