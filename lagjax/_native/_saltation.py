@@ -88,8 +88,8 @@ class Saltation:
     ) -> Callable:
         """`(row, i, part)`: the number that is added to coordinate i of a row (part 0), or to its velocity (part 1)."""
         code, n, first = frame.code, self.base, (len(self.jump.orders) - 1) * 2 * self.base
-        both = (_some(out, first + k * n, n) for k in range(2))
-        jumps, lost = self._what_jumps(frame, form, hit, pieces, *both, grazes)
+        before, behind = (_some(out, first + k * n, n) for k in range(2))
+        jumps, lost = self._what_jumps(frame, form, hit, pieces, before, behind, grazes)
         jump_or_nan = self._jump_or_nan(code, is_hit, (grazes > 0.0) | lost)
 
         def added(row: int, i: Index, part: int) -> Value:

@@ -517,7 +517,7 @@ class _PlacedLine(Derivatives):
     def _roots_of_powers(self) -> set[int]:
         """The nodes √u of which only products with u are made, which have a slope at u = 0: u √u, that of u^1.5."""
         nodes, roots = self.line.nodes, {k for k, (op, *_) in enumerate(self.line.nodes) if op == "sqrt"}
-        parts = {k: {(k, nodes[k][1][0])} for k in roots}  # the roots that a node is a multiple of, and of what these are
+        parts = {k: {(k, nodes[k][1][0])} for k in roots}  # the roots that a node is a multiple of, each with its u
         factors: list[set[int]] = []
         for k, (op, operands, _) in enumerate(nodes):
             of = [factors[i] for i in operands] if op in ("mul", "neg") else []

@@ -188,8 +188,9 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
         """
         of = motions.take(steps.rows)
         found = np.isfinite(np.concatenate([y_ct[steps.rows], params_ct[steps.rows]], axis=1))
-        along = np.split(np.where(found[:, None], directions, 0.0), [flow.states], axis=2)
-        _, end, excess = steps.kernel.jvp(of.ts[:, [0, -1]], of.params, steps.record, *along, tolerances.floor)
+        y_dot, params_dot = np.split(np.where(found[:, None], directions, 0.0), [flow.states], axis=2)
+        given = of.ts[:, [0, -1]], of.params, steps.record, y_dot, params_dot
+        _, end, excess = steps.kernel.jvp(*given, tolerances.floor)
         return np.where(np.isfinite(end).all(axis=(1, 2)), excess / tolerances.largest_excess, np.nan)
 
     if lost := list(_go_over_steps(flow, motions, tolerances, transpose_steps, probe)):

@@ -39,12 +39,12 @@ def part_passages(flow: Flow, steps: Steps, params, end, tolerances: Tolerances)
     now = _arguments(steps, there, times, params, pieces[step])[k, np.arange(len(k))]
     is_before = now * u0 > 0
     at = np.where(is_before, at + (1 - at) * now / (now - u1), at * u0 / (u0 - now))
-    parts = [GROWTH**-j for j in range(int(-np.log(NEAREST) / np.log(GROWTH)) + 1)]
+    parts = GROWTH ** -np.arange(-np.log(NEAREST) / np.log(GROWTH))
     cuts = [np.zeros(1)] * len(rows)
     unknown = _ROUNDING * np.maximum(abs(t[step] / h[step]), abs(states[step, : flow.size]).max(axis=1) / abs(u1 - u0))
     for i, place, least in zip(step, at, unknown, strict=True):
-        ways = np.outer([place, 1 - place], parts)
-        cuts[i] = np.concatenate([cuts[i], (place - ways[0])[ways[0] > least], (place + ways[1, 1:])[ways[1, 1:] > least]])
+        before, behind = place * parts, (1 - place) * parts[1:]
+        cuts[i] = np.concatenate([cuts[i], place - before[before > least], place + behind[behind > least]])
     return cut_steps(flow, steps, [np.unique(cut) for cut in cuts], params, tolerances)
 
 
@@ -58,15 +58,15 @@ def _arguments(steps: Steps, states, t, params, pieces) -> np.ndarray:
 
 
 def cut_steps(flow: Flow, steps: Steps, cuts: list[np.ndarray], params, tolerances: Tolerances) -> Steps:
-    """The steps of one member in parts that begin at these `cuts` of each: the states there are outputs of the motion."""
+    """The steps of one member in parts that begin at these `cuts` of each, with outputs of the motion."""
     ((_, rows),) = steps.split_members()
     of = np.repeat(np.arange(len(rows)), [len(some) for some in cuts])
     table, part = rows[of], np.concatenate(cuts)
     table[:, 0] += rows[of, 1] * part
     end = rows[-1, 0] + rows[-1, 1]
     table[:, 1], inner = np.diff(np.append(table[:, 0], end)), part > 0
-    first = rows[0, 4 : 4 + flow.states]
-    table[inner, 4 : 4 + flow.states] = _states_at(flow, table[inner, 0], [*rows[:1, 0], end], first, params, tolerances)
+    first, t = rows[0, 4 : 4 + flow.states], [rows[0, 0], end]
+    table[inner, 4 : 4 + flow.states] = _states_at(flow, table[inner, 0], t, first, params, tolerances)
     if rows.shape[1] > 4 + flow.states:  # which border it ends at, and whether that is grazed
         table[np.append(of[1:] == of[:-1], False), -3:] = 0.0
     return steps._replace(table=table, first=np.zeros(1, int), counts=np.array([len(table)]))

@@ -42,8 +42,8 @@ from lagjax._engine.taylor._call import (
 from lagjax._engine.taylor._derivatives import Motions
 from lagjax._engine.taylor._flow import Flow, Tolerances
 from lagjax._engine.taylor._gpu_launch import run_on_gpu, transpose_on_gpu
-from lagjax._engine.taylor._passages import has_passages
 from lagjax._engine.taylor._line_functions import outputs
+from lagjax._engine.taylor._passages import has_passages
 from lagjax._engine.taylor._state_rates import rate
 from lagjax._engine.taylor._variational import from_rows, to_rows
 from lagjax._interface import SUCCESSFUL, default_platform
