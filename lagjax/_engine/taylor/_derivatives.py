@@ -25,6 +25,7 @@ from lagjax._program import Program, StraightLine, pullback, pushforward
 LARGEST_PORTION = 2**23  # numbers of the steps that are written down at once: 64 MiB
 _ROOM_AGAIN = 2  # times the steps that were taken: those of a first try are written, too
 MOST_PARTS, TRIES = 64, 4  # of a step that is too long, at once; and how often they are divided once more
+MOST_PROBES = 16  # directions along which steps that go past a border without a series are measured
 
 
 class Motions(NamedTuple):
@@ -172,7 +173,9 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
     """`vjp` of one cotangent a row, over the steps that were taken."""
     y_ct, params_ct = np.full(end_ct.shape, np.nan), np.full((len(end_ct), flow.numbers), np.nan)
     inputs = flow.states + flow.numbers
-    directions = np.eye(inputs) if has_passages(flow.kernel) else np.random.default_rng(0).normal(size=(1, inputs))
+    directions = np.random.default_rng(0).normal(size=(1, inputs))
+    if has_passages(flow.kernel):
+        directions = np.eye(some := min(inputs, MOST_PROBES))[:, np.arange(inputs) % some]
 
     def transpose_steps(steps: Steps):
         rows, of = steps.rows, motions.take(steps.rows)
@@ -184,14 +187,14 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
         """The size of the last terms of the series of a tangent, in units of the limit, along any direction at all.
 
         But not by what there is no derivative by: a tangent that is NaN tells nothing, and is none to go by. Past a
-        passage tangents fall by much along one direction, and not along others: there they are followed along each.
+        passage tangents fall by much along one direction, and not along others: there they are followed along each, or some.
         """
         of = motions.take(steps.rows)
         found = np.isfinite(np.concatenate([y_ct[steps.rows], params_ct[steps.rows]], axis=1))
         y_dot, params_dot = np.split(np.where(found[:, None], directions, 0.0), [flow.states], axis=2)
         given = of.ts[:, [0, -1]], of.params, steps.record, y_dot, params_dot
         _, end, excess = steps.kernel.jvp(*given, tolerances.floor)
-        return np.where(np.isfinite(end).all(axis=(1, 2)), excess / tolerances.largest_excess, np.nan)
+        return np.where(np.isfinite(end).all(axis=2).any(axis=1), excess / tolerances.largest_excess, np.nan)
 
     if lost := list(_go_over_steps(flow, motions, tolerances, transpose_steps, probe)):
         of = motions.take(np.array(lost))
@@ -321,7 +324,7 @@ def _suitable_steps(flow: Flow, steps: Steps, params, tolerances, excess, measur
         if flow.projection is not None and float(excess[0]) > 0.5 * before:
             measure(steps)
             return steps
-    least, _, best = min(found)
+    least, _, best = min(found, default=(math.inf, 0, None))
     return best if least <= 1.0 else None
 
 

@@ -49,7 +49,7 @@ def part_passages(flow: Flow, steps: Steps, params, end, tolerances: Tolerances)
 
 
 def _arguments(steps: Steps, states, t, params, pieces) -> np.ndarray:
-    """What is zero where a root has no series, (K, S), at S states of a member."""
+    """The numbers (K, S) that are zero where a root has no series, at S states of a member."""
     borders, chosen = steps.kernel.borders, steps.kernel.chosen
     assert borders is not None
     line = eliminate_dead_code(borders.program.line, borders.abrupt)
