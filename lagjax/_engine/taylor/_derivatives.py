@@ -316,7 +316,8 @@ def _suitable_steps(flow: Flow, steps: Steps, params, tolerances, excess, measur
     """
     divided, found = steps, []
     for _ in range(TRIES):
-        before = float(excess[0])
+        if math.isnan(before := float(excess[0])):
+            return None
         divided = _divide_steps(flow, divided, params, tolerances)
         found.append((float((excess := measure(divided))[0]), len(found), divided))
         if excess <= _limit_of(steps):
