@@ -187,7 +187,7 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
         """The size of the last terms of the series of a tangent, in units of the limit, along any direction at all.
 
         But not by what there is no derivative by: a tangent that is NaN tells nothing, and is none to go by. Past a
-        passage tangents fall by much along one direction, and not along others: there they are followed along each, or some.
+        passage tangents fall by much along one direction, and not along others: there they are followed along several.
         """
         of = motions.take(steps.rows)
         found = np.isfinite(np.concatenate([y_ct[steps.rows], params_ct[steps.rows]], axis=1))
