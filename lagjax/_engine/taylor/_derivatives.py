@@ -194,7 +194,7 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
         y_dot, params_dot = np.split(np.where(found[:, None], directions, 0.0), [flow.states], axis=2)
         given = of.ts[:, [0, -1]], of.params, steps.record, y_dot, params_dot
         _, end, excess = steps.kernel.jvp(*given, tolerances.floor)
-        return np.where(np.isfinite(end).all(axis=2).any(axis=1), excess / tolerances.largest_excess, np.nan)
+        return np.where(np.isfinite(end).all(axis=-1).any(axis=-1), excess / tolerances.largest_excess, np.nan)
 
     if lost := list(_go_over_steps(flow, motions, tolerances, transpose_steps, probe)):
         of = motions.take(np.array(lost))
