@@ -11,8 +11,7 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
   and `ContactChanges`
 - `samples`: an input that was measured, as a function of time
 - `crossings`: where a motion crosses a section, as `Crossings`
-- `simulate_hybrid`: a motion through modes, by `Transition`s; those that happened are `Transitions`; `Hybrid`: all of
-  it as one object, for `fit` and `sweep`
+- `Hybrid`: a motion through modes, by `Transition`s; those that happened are `Transitions`
 - `MachineCode`, `FineOutput`: what integrates
 - `SimulationError`, `RESULTS`: how a motion ends
 
@@ -108,7 +107,7 @@ if TYPE_CHECKING:  # each is imported on first use: all of them take as long as 
     )
     from lagjax._interface import RESULTS, SimulationError
     from lagjax._run import crossings, simulate, simulate_batch
-    from lagjax._run.hybrid import Hybrid, Transition, simulate_hybrid
+    from lagjax._run.hybrid import Hybrid, Transition
     from lagjax._scene import samples
     from lagjax._sweep import Statistics, Store, Sweep, sweep
     from lagjax._trust import work_precision
@@ -122,7 +121,7 @@ __all__ = [
     "between", "branch_off", "change_coordinates", "check", "conserved_quantities", "crossings", "cyclic_coordinates",
     "designs", "equilibrium", "family", "find_path", "fit", "hamiltonian", "inertia", "linearize", "lyapunov_exponent",
     "lyapunov_spectrum", "noether_charge", "normal_modes", "periodic_orbit", "plot", "positive", "results", "routhian",
-    "same_motion", "samples", "scenes", "simplex", "simulate", "simulate_batch", "simulate_hybrid", "sweep",
+    "same_motion", "samples", "scenes", "simplex", "simulate", "simulate_batch", "sweep",
     "work_precision", "wrapped",
 ]  # fmt: skip
 

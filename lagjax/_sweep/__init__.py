@@ -195,7 +195,7 @@ def sweep(
 
     **What runs**
 
-    - `system`: a `System`, or a `Hybrid`, of which `keep` gets the trajectory that `simulate_hybrid` returns.
+    - `system`: a `System`, or a `Hybrid`, of which `keep` gets the trajectory that `simulate` returns.
     - `over`: a dict of axes, of which the product is swept. A 1-D array is an axis by its name; a design of
       `lagjax.designs` (`random`, `sobol`, `latin_hypercube`) draws its values by a rule; a tuple of names with a tuple
       of arrays, or with a design, varies several together. There may be 10⁸ members: they are never listed.

@@ -908,8 +908,8 @@ def test_a_hybrid_scene(tmp_path):  # compiles the motion of a ball for one shap
     np.testing.assert_allclose(kept["first"], np.sqrt(2 * heights / g), rtol=1e-12)  # the fall from rest
     falls = np.sqrt(2 * heights / g)[:, None] * np.cumsum([1.0, *(2 * 0.8**k for k in range(1, 12))])
     np.testing.assert_array_equal(kept.bounces, (falls < 1.5).sum(axis=1))
-    one = lagjax.simulate_hybrid(
-        scene.modes, scene.transitions, "flight", heights[4], 0.0, BOUNCES["ts"], BOUNCES["params"]
+    one = lagjax.simulate(
+        lagjax.Hybrid(scene.modes, scene.transitions, "flight"), heights[4], 0.0, BOUNCES["ts"], BOUNCES["params"]
     )
     assert float(kept.q[4]) == float(one.q[-1])
     for other, words in ((bouncing(0.7), "reset of transition 0"), (bouncing(max_transitions=5), "transitions")):
