@@ -57,7 +57,6 @@ import ast
 import functools
 import importlib
 import importlib.util
-import warnings
 from typing import TYPE_CHECKING, Any
 
 from lagjax._interface import PLACES
@@ -131,18 +130,9 @@ PLACES.update(dict.fromkeys(("dataset", "frame", "impact_frame", "change_frame")
 PLACES.update(dict.fromkeys(("make_animation", "summary", "trajectory_html"), "lagjax._show"))
 PLACES.update(describe_failure="lagjax._trust", examine="lagjax._trust.health", contact_forces="lagjax._run.contacts")
 
-_MOVED = {name: f"lagjax.designs.{name}" for name in ("latin_hypercube", "random", "sobol")}
-
 
 def __getattr__(name: str) -> Any:
-    """A public name or a class of `lagjax.results`, imported from its module; an old name, with a warning."""
-    if name in _MOVED:
-        warnings.warn(
-            f"lagjax.{name} is {_MOVED[name]} now; the old name goes with the next version.",
-            DeprecationWarning,
-            stacklevel=2,
-        )
-        return getattr(importlib.import_module("lagjax.designs"), name)
+    """A public name or a class of `lagjax.results`, imported from its module."""
     if (path := _places().get(name)) is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module = importlib.import_module(f"{path}.{name}" if path == __name__ else path)

@@ -115,7 +115,7 @@ def _sweep(ts, crossings=None):
     def keep(run, found):
         return {"q": run.q[-1]}
 
-    more = {"params": MASS, "keep": keep, "store": "not-made", "crossings": crossings}
+    more = {"params": MASS, "keep": keep, "store": lagjax.Store("not-made", crossings=crossings)}
     return lagjax.sweep(SPRING, {"a": np.linspace(0.0, 1.0, 3)}, ts, q0=lambda point: point["a"], qdot0=0.0, **more)
 
 

@@ -206,17 +206,6 @@ def test_statistics_leave_out_what_is_not_finite():
     assert np.isnan(_statistics.summary(how, nothing, ()).mean)
 
 
-def test_old_arguments_say_the_new_ones(tmp_path, undisturbed):
-    old = dict(RULE, store=tmp_path / "store", part=(0, 1))
-    with pytest.warns(
-        DeprecationWarning, match=r"sweep\(…, store=lagjax.Store\('.*store', unit=…, part=…\)\) n"
-    ) as told:
-        lagjax.sweep(PENDULUM, OVER, TS, **old)
-    assert told[0].filename == __file__ and digests(tmp_path) == undisturbed
-    with pytest.raises(TypeError, match=r"sweep\(\) got an unexpected keyword argument 'units'"):
-        lagjax.sweep(PENDULUM, OVER, TS, **old, units=3)
-
-
 # ---- members and units -----------------------------------------------------------------------------------------------
 
 
