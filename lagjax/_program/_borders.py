@@ -193,6 +193,11 @@ class Borders(NamedTuple):
         return tuple(shaken)
 
     @property
+    def abrupt(self) -> tuple[int, ...]:
+        """The nodes of what is zero where a root has no series."""
+        return tuple(u for u, of in zip(self.arguments, self.features, strict=True) if of.kind == UP_TO)
+
+    @property
     def followed(self) -> tuple[int, ...]:
         return self.switches + self.arguments
 
@@ -811,7 +816,9 @@ class _Rewriting:
         # has a corner at its entries, and no jump.
         degrees, lost = _velocity_degrees(line, n) if orders else [], []
         others = [
-            j for j in orders if self.kinds[j] != CONE and (self.kinds[j] != SIGN or degrees[self.switches[j]] > 1)
+            j
+            for j, order in orders.items()
+            if self.kinds[j] != CONE and (self.kinds[j] != SIGN or order == 2 or degrees[self.switches[j]] > 1)
         ]
         decides, of_pieces = {j: [] for j in orders}, {self.pieces[j]: j for j in orders}
         for switch in self.switches:

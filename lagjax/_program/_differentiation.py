@@ -502,13 +502,33 @@ class _PlacedLine(Derivatives):
     def _zero_where_zero(self, k: int, g: int, part: int) -> int:
         """The part of `g` that node k passes on: 0 of 0, also where its slope is infinite, as that of u**0.5 at 0.
 
-        There a program has a number in the place of the slope (`_recurrences.finite`), so that g is 0.
+        There a program has a number in the place of the slope (`_recurrences.finite`), so that g is 0. And 0 past the
+        root of a power at a base of zero.
         """
         nodes, (op, operands, _) = self.line.nodes, self.line.nodes[k]
         by_root = op == "div" and (of := nodes[operands[1]][0]) not in ("input", "constant") and OPERATIONS[of].steep
         if not (self.asks and (OPERATIONS[op].steep or by_root or (op == "div" and k in self._guarded))):
             return part
+        if k in self._roots_of_powers:
+            part = self._select_unless_zero(self.nodes[operands[0]], part)
         return self._select_unless_zero(g, part)
+
+    @functools.cached_property
+    def _roots_of_powers(self) -> set[int]:
+        """The nodes √u of which only products with u are made, which have a slope at u = 0: u √u, that of u^1.5."""
+        nodes, roots = self.line.nodes, {k for k, (op, *_) in enumerate(self.line.nodes) if op == "sqrt"}
+        parts = {k: {(k, nodes[k][1][0])} for k in roots}  # the roots that a node is a multiple of, each with its u
+        factors: list[set[int]] = []
+        for k, (op, operands, _) in enumerate(nodes):
+            of = [factors[i] for i in operands] if op in ("mul", "neg") else []
+            factors.append({k}.union(*of))
+            for i in operands:
+                for root, u in parts.get(i, ()):
+                    if op == "neg" or (op == "mul" and u not in factors[k]):
+                        parts.setdefault(k, set()).add((root, u))
+                    elif op != "mul" and k not in self._guarded:
+                        roots.discard(root)
+        return roots
 
     @functools.cached_property
     def _guarded(self) -> set[int]:
