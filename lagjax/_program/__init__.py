@@ -228,12 +228,8 @@ class Program:
     def size(self) -> int:
         return len(self.dtypes)
 
-    @property
-    def dtypes(self) -> tuple[np.dtype, ...]:
-        return self._dtypes
-
     @functools.cached_property
-    def _dtypes(self) -> tuple[np.dtype, ...]:
+    def dtypes(self) -> tuple[np.dtype, ...]:
         return tuple(dtype for shape in self.shapes for dtype in [shape.dtype] * math.prod(shape.shape))
 
     def evaluate(self, *numbers) -> np.ndarray:
