@@ -34,7 +34,10 @@ class Retraction:
         self.motion, self.line, self.dtypes = motion, borders.retraction, borders.program.dtypes
         self.base, self.rows, self.nesting = nesting.base, nesting.size // nesting.base, nesting
         self.shares = [j for j, kind in enumerate(borders.kinds) if kind == SLIDE]
-        self.groups = _join(borders.moved)
+        groups: dict[int, list[int]] = {}
+        for k, group in enumerate(borders.groups):
+            groups.setdefault(group, []).append(k)
+        self.groups = [(some, frozenset().union(*(borders.moved[k] for k in some))) for some in groups.values()]
         motion.layout.extend_by({
             "unretracted": motion.states,  # the argument of the map
             "begins": 1,  # 1 if the step is the first one of its member; of steps that are taken again
@@ -219,15 +222,3 @@ class Retraction:
             with frame.where(where if which is None else where & which(i)):
                 for part in range(2):
                     frame[name, self._place(row, i, part)] = float("nan")
-
-
-def _join(moved: Sequence[frozenset[int]]) -> list[tuple[list[int], frozenset[int]]]:
-    """Borders that move the same coordinates, directly or by others between them, with all that they move."""
-    groups: list[tuple[list[int], frozenset[int]]] = []
-    for k, coordinates in enumerate(moved):
-        one, rest = [([k], coordinates)], []
-        for group in groups:
-            (one if group[1] & coordinates else rest).append(group)
-        borders, all_moved = zip(*one, strict=True)
-        groups = [*rest, ([i for some in borders for i in some], frozenset().union(*all_moved))]
-    return groups

@@ -141,7 +141,7 @@ class Borders(NamedTuple):
     table; those of a `CLOCK` have no guards. `motion` has the borders of the motion alone, where this is one with
     tangents (`_jump.with_borders_of_tangents`). `kick` is that at borders at which L jumps, None where there are none.
     `retraction` takes the inputs of the program to the state on the borders that it slides along, None where it may
-    slide along none; `moved` are the coordinates that each moves. `release` is that of the cones (`_sliding.Sliding`).
+    slide along none; `moved` are the coordinates that each moves, `groups` those of each, and `release` is that of the cones (`_sliding.Sliding`).
     """
 
     program: Pieced
@@ -157,7 +157,22 @@ class Borders(NamedTuple):
     kick: Kick | None = None
     retraction: StraightLine | None = None
     moved: tuple[frozenset[int], ...] = ()
+    groups: tuple[int, ...] = ()
     release: StraightLine = StraightLine((), (), ())
+
+    @property
+    def groups_of_guards(self) -> list[int]:
+        """The group of each guard of a border by velocity that the motion slides along, and of its shares.
+
+        −1 for others. Those of different groups may be crossed at one instant, in one step.
+        """
+        shares = [j for j, kind in enumerate(self.kinds) if kind == SLIDE]
+        of_shares, found = dict(zip(shares, self.groups, strict=True)), []
+        for guard in self.guards:
+            border = self.guards[guard.on] if guard.on >= 0 else guard
+            known = border.order == 1 and self.kinds[border.piece] != CONE
+            found.append(of_shares[border.slide] if known else -1)
+        return found
 
     @property
     def kicking(self) -> tuple[int, ...]:
@@ -671,12 +686,12 @@ class _Rewriting:
         switches, arguments = list(self.switches), [u for u, _ in features]
         linear = program.linear and self._linear(program.linear)
         at_rest = [slide for slide in sliding if slide.order == 1]
-        for slides in (sliding, at_rest, []):
+        for slides in (sliding, *([at_rest] if len(at_rest) < len(sliding) else ()), []):
             done = with_sliding(line, self.size, program.size, self.switches, slides, linear)
             if done is not None:
                 break
         assert done is not None  # without slides there is one
-        line, places, shares, linear, retraction, moved, release = done
+        line, places, shares, linear, retraction, moved, groups, release = done
         sliding, switches, arguments = slides, [places[i] for i in switches] + shares, [places[i] for i in arguments]
         count, kick = len(switches), None
         if self.mechanics:
@@ -688,7 +703,7 @@ class _Rewriting:
         return Borders(
             pieced, tuple(switches), kinds, self._decide(count, sliding), _guards(kinds, sliding), nested,
             tuple(arguments), tuple(features.values()), (*self.tables, *[None] * len(sliding)), None, kick,
-            retraction, moved, release,
+            retraction, moved, groups, release,
         )  # fmt: skip
 
     def find_corners(self) -> FoundCorners | None:

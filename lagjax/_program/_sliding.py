@@ -80,7 +80,8 @@ class Sliding(NamedTuple):
     """A program with shares; `places` says where the nodes of the one without them are.
 
     `retraction` takes the same inputs to the state (q, q̇) on the borders that the motion slides along; `moved` are the
-    coordinates that the force of each of these moves. `release` gives for each cone changes of q̇ (n,): one by which
+    coordinates that the force of each of these moves; those of different `groups` know nothing of each other as long as
+    no time passes. `release` gives for each cone changes of q̇ (n,): one by which
     its vector becomes a unit along what it does not hold, and what takes the vector away.
     """
 
@@ -90,6 +91,7 @@ class Sliding(NamedTuple):
     linear: LinearSystem | None
     retraction: StraightLine | None
     moved: tuple[frozenset[int], ...]
+    groups: tuple[int, ...] = ()
     release: StraightLine = StraightLine((), (), ())
 
 
@@ -158,9 +160,10 @@ class _SlidingForces:
         if acts is None or self._bends(acts):
             return None
         slopes, rates, levels = zip(*map(self._rate, range(len(self.rows))), strict=True)
-        responses, effects = self._effects(acts, slopes)
-        if np.bincount(_find_groups(effects, len(effects))).max() > MOST_COUPLED:
+        groups = self._find_groups(acts, slopes)
+        if np.bincount(groups).max() > MOST_COUPLED:
             return None
+        responses, effects = self._effects(acts, slopes)
         pushed = [self.f("lt", row.get(k, self.zero), self.zero) for k, row in enumerate(effects)]
         all_pushed = [functools.reduce(lambda a, b: self.f("and", a, b), of) for of in self._group_rows(pushed)]
         pushed = [all_pushed[row.slide] for row in self.rows]
@@ -202,8 +205,23 @@ class _SlidingForces:
         held.put_back(self.n, range(len(levels)), levels, lambda left: equations.solve(self.graph, left), pushed)
         retraction, moved = held.finish()
         of_slides = tuple(frozenset().union(*some) for some in self._group_rows(moved))
+        groups = tuple(groups[rows[0]] for rows in self.rows_of)
         release = eliminate_dead_code(self.graph, release)
-        return Sliding(line, range(len(self.line.nodes)), shares, linear, retraction, of_slides, release)
+        return Sliding(line, range(len(self.line.nodes)), shares, linear, retraction, of_slides, groups, release)
+
+    def _find_groups(self, acts: Sequence[Sparse], slopes: Sequence[Sparse]) -> list[int]:
+        """The group of each row: what those of different ones move, and read, A does not couple."""
+        matrix, size = self.linear.entries | self.linear.others, len(self.linear.right)
+        rows: list[Sparse] = [{i: self.one} for i in range(size)]
+        for (i, j), x in matrix.items():
+            if x != self.zero:
+                rows[i][j] = x
+        parts = _find_groups(rows, size)
+        of_cones = [rows[0] for rows in self.rows_of for _ in rows]
+        touched = [{parts[i]: self.one for i in both} for both in map(dict.__or__, acts, slopes)]
+        for row, first in zip(touched, of_cones, strict=True):
+            row[size + first] = self.one
+        return _find_groups(touched, size + len(touched))
 
     def _group_rows(self, of_rows: Sequence) -> list[list]:
         return [[of_rows[m] for m in rows] for rows in self.rows_of]
