@@ -44,8 +44,11 @@ class Retraction:
             "at_limit": self.base,  # 1 for a coordinate that a border moves which holds no more than it does; of these
         })  # fmt: skip
 
-    def _slides(self, numbers: Numbers) -> Value:
-        return functools.reduce(Value.__or__, [numbers(j + self.motion.parameters) > 0.0 for j in self.shares])
+    def _slides(self, code: Code, numbers: Numbers) -> Value:
+        most, first = code.variable(code.lanes_of(0.0)), self.motion.parameters + self.shares[0]
+        for k in self.motion.form.each(code, len(self.shares)):
+            most.value = code.maximum(most.value, numbers(k + first))
+        return most.value > 0.0
 
     # ---- the state ----
 
@@ -56,7 +59,7 @@ class Retraction:
         code = frame.code
         for i in form.each(code, motion.states):
             frame["unretracted", i] = frame["y", i]
-        slides = self._slides(lambda i: frame["params", i])
+        slides = self._slides(code, lambda i: frame["params", i])
         with code.only_if(code.any_lane(slides)):
             out = motion.evaluate_now(frame, self.line)
             for i in form.each(code, motion.states):
@@ -104,7 +107,7 @@ class Retraction:
         states, form, code = directions.states, directions.form, frame.code
         line = pushforward(self.line, self.dtypes, directions.varied, range(states))
         params = directions.numbers_of(frame, "params", self.motion.numbers)
-        slides = self._slides(lambda i: params[i])
+        slides = self._slides(code, lambda i: params[i])
         with code.only_if(code.any_lane(slides)):
             state = directions.numbers_of(frame, "unretracted", states, in_place=True)
             tangents = frame.vectors("dy", states, lambda i: (i, 0))
@@ -135,7 +138,8 @@ class Retraction:
         line, tables = pullback_and_entries(self.line, self.dtypes, cotangents.varied, range(motion.states))
         motion.layout.extend_by({"lost": motion.states})  # 1 for a number whose derivative does not exist
         frame = motion.function("back_retraction")
-        code, slides = frame.code, self._slides(lambda i: frame["params", i])
+        code = frame.code
+        slides = self._slides(code, lambda i: frame["params", i])
         begins = slides & (frame["begins"] > 0.0)
         _, t, params = motion.state_inputs(frame)
         state, state_ct, lost = (frame.vectors(x, motion.states) for x in ("unretracted", "state_ct", "lost"))

@@ -820,8 +820,8 @@ class _Rewriting:
             if self.pieces[j] in undefined or (kind == SIGN and self.pieces[j] not in self._jumping):
                 continue
             read = inputs_below(line, [self.switches[j]])
-            if not read.isdisjoint(range(2 * n)):
-                orders[j] = 2 if read.isdisjoint(range(n, 2 * n)) else 1
+            if state := [i for i in read if i < 2 * n]:
+                orders[j] = 2 if max(state) < n else 1
         # The sign of a force is a corner where |force| rubs, but the slopes that it is solved by jump. An interpolation
         # has a corner at its entries, and no jump.
         degrees, lost = _velocity_degrees(line, n) if orders else [], []
@@ -940,7 +940,7 @@ def _guards(kinds: Sequence[int], slides: Sequence[Slide]) -> tuple[Guard, ...]:
     """
     guards: list[Guard] = []
     as_it_is, zero = Affine(1.0, 0.0), Level()
-    sliding = [slide.piece for slide in slides]
+    sliding = {slide.piece: k for k, slide in enumerate(slides)}
     first = len(kinds) - len(sliding)
     for j, kind in enumerate(kinds[:first]):
         k = len(guards)
@@ -961,7 +961,7 @@ def _guards(kinds: Sequence[int], slides: Sequence[Slide]) -> tuple[Guard, ...]:
             ]
         if j in sliding:
             last = k + len(of_piece) - 1  # the upper border of a piece, which that below it slides on
-            slide, (_, order, width, *_) = first + sliding.index(j), slides[sliding.index(j)]
+            slide, (_, order, width, *_) = first + sliding[j], slides[sliding[j]]
             of_piece = [guard._replace(slide=slide, order=order, rest=last) for guard in of_piece]
             none = Affine(0.0, 0.0)
             of_piece += [
