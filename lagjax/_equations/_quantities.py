@@ -232,7 +232,8 @@ def _derivatives(state: _ScalarState, lagrangian: _Taped, rates: dict) -> tuple[
         forms.append((by_q, momentum, by_t, matrix, inertial))
     if len(forms) == 1:
         return forms[0]
-    sizes = [state.derivatives.size([*_filled(state, matrix).tolist(), *inertial.tolist()]) for *_, matrix, inertial in forms]
+    both = ([*_filled(state, matrix).tolist(), *inertial.tolist()] for *_, matrix, inertial in forms)
+    sizes = list(map(state.derivatives.size, both))
     return forms[0] if sizes[0] < _SHORTER * sizes[-1] else forms[-1]
 
 

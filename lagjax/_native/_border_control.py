@@ -85,6 +85,7 @@ class BorderControl:
             fields |= {
                 "joins": guards,  # where a guard is crossed, as a part of the step; then 1 if it is, at its end
                 "taken": 1 + max(groups),  # 1 for a group of which a guard is crossed
+                "more": 1,  # guards that are crossed beside the first one: each counts as a step, which it is elsewhere
             }
         if borders.kicking:
             fields |= {
@@ -261,7 +262,7 @@ class BorderControl:
         end = frame["nearest"] + code.select(none, 0.0, instant)
         with code.loop(1 + max(joint_groups(self.borders))) as k:
             frame["taken", k] = 0.0
-        joins = code.variable(joins)
+        joins, frame["more"] = code.variable(joins), 0.0
         for border in self.table.each(frame):
             group = groups.read(code, border.g, "group")
             with code.only_if(group >= 0):
@@ -275,6 +276,7 @@ class BorderControl:
                 at_once = at_once & (frame["taken", group] <= 0.0)
                 frame.assign(at_once, group, taken=1)
                 frame.assign(at_once, border.g, joins=1)
+                frame["more"] = frame["more"] + code.flag(at_once)
 
     def _look_closer(self, frame: Frame, degree: Value) -> None:
         """A root that comes early is as exact as what lies before it allows, and not the whole step."""
@@ -535,6 +537,9 @@ class BorderControl:
                 with code.loop(self.pieces) as j:
                     frame["kick_before", j] = self.table.piece(frame, j)
             self._go_on(frame, crosses)
+            if self.table.groups:
+                counts = stepped & self.table.crosses(frame, Crossed.GUARD)
+                frame["steps"] = frame["steps"] + code.select(counts, frame["more"], 0.0)
             frame.assign(crosses, **self.forgotten)
             if self.kick is not None:
                 self._kick_or_reflect(frame, self.kick, crosses)

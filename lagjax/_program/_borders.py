@@ -141,7 +141,8 @@ class Borders(NamedTuple):
     table; those of a `CLOCK` have no guards. `motion` has the borders of the motion alone, where this is one with
     tangents (`_jump.with_borders_of_tangents`). `kick` is that at borders at which L jumps, None where there are none.
     `retraction` takes the inputs of the program to the state on the borders that it slides along, None where it may
-    slide along none; `moved` are the coordinates that each moves, `groups` those of each, and `release` is that of the cones (`_sliding.Sliding`).
+    slide along none; `moved` are the coordinates that each moves, `groups` the group of each, and `release` is that of
+    the cones (`_sliding.Sliding`). Along so many borders, `unheld`, it may slide, and that is not followed.
     """
 
     program: Pieced
@@ -159,6 +160,7 @@ class Borders(NamedTuple):
     moved: tuple[frozenset[int], ...] = ()
     groups: tuple[int, ...] = ()
     release: StraightLine = StraightLine((), (), ())
+    unheld: int = 0
 
     @property
     def groups_of_guards(self) -> list[int]:
@@ -692,6 +694,7 @@ class _Rewriting:
                 break
         assert done is not None  # without slides there is one
         line, places, shares, linear, retraction, moved, groups, release = done
+        unheld = len(sliding) - len(slides)
         sliding, switches, arguments = slides, [places[i] for i in switches] + shares, [places[i] for i in arguments]
         count, kick = len(switches), None
         if self.mechanics:
@@ -703,7 +706,7 @@ class _Rewriting:
         return Borders(
             pieced, tuple(switches), kinds, self._decide(count, sliding), _guards(kinds, sliding), nested,
             tuple(arguments), tuple(features.values()), (*self.tables, *[None] * len(sliding)), None, kick,
-            retraction, moved, groups, release,
+            retraction, moved, groups, release, unheld,
         )  # fmt: skip
 
     def find_corners(self) -> FoundCorners | None:

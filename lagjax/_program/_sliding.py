@@ -32,8 +32,8 @@ from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._series import LinearSystem, StraightLine
 
 # Borders that act on each other, whose elimination takes a third of the cube; and borders in all. The first result of
-# 2500 blocks that know nothing of each other takes 20 CPU s, half of it for M; twice as many take three times as long.
-MOST_COUPLED, MOST_SLIDING = 64, 6000
+# 2500 blocks that know nothing of each other takes 6 CPU s, of 10 000 blocks 29, and 2 GB.
+MOST_COUPLED, MOST_SLIDING = 64, 20_000
 MOST_COPIES, LARGEST_COPIED = 4, 4000  # pieces for which all of a program is done once more, and its operations
 # Borders that are not independent share what they hold as if they yielded by so much, relative; what that leaves is
 # mended this many times. The share of what no border holds alone is as exact as rounding, divided by it.
