@@ -109,7 +109,7 @@ def eigen(matrix: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def is_definite(matrix: csr_array, least: float) -> bool:
     """True if all eigenvalues of a symmetric matrix are larger than this."""
-    n = matrix.shape[0]
+    n = len(matrix.indptr) - 1
     if matrix.nnz == n and np.array_equal(matrix.indices, np.arange(n)):
         return bool(matrix.data.min(initial=np.inf) > least)
     try:

@@ -256,6 +256,7 @@ class BorderControl:
         With derivatives a border is met in a step of its own, which shifts tangents; it is crossed in no time.
         """
         code, groups = frame.code, self.table.groups
+        assert groups is not None
         none, joins = code.compare("==", frame["nearest"], 0.0), frame.constant(0.0)
         may_join = none if self.varies else none | (code.lanes_of(code.as_double(frame.job("room"))) <= 0.0)
         instant = _AT_END * limits.EPS * (abs(frame["t"] / h) + 1.0)
