@@ -8,6 +8,7 @@ from lagjax._native._taylor import AT_BORDER, TaylorSeries
 
 _INSTANT = 4.0 * EPS  # the largest difference of two times that count as the same, relative to them
 RECORDED = 4  # numbers of a step that are written down before its state: time, size, member, number of the step
+NUMBER = 3  # the place of that; when steps are in order a tangent writes there how large its last terms are
 
 
 def instant_about(code: Code, t: Value) -> Value:

@@ -46,12 +46,13 @@ class Saltation:
     # ---- what jumps ----
 
     def _what_jumps(
-        self, frame: Frame, hit: Vectors, pieces: Numbers, before: Numbers, behind: Numbers
+        self, frame: Frame, form, hit: Vectors, pieces: Numbers, before: Numbers, behind: Numbers, grazes: Value
     ) -> tuple[Callable, Value]:
         """`(i, part)`: true if the first tangents of coordinate i (part 0), or of its velocity, jump at what is `hit`.
 
         Both do where L jumps, those of a velocity where its acceleration does by more than rounding. Then, where a cone
         is left: from there tangents across it follow its direction at a rate without a bound, they are not known.
+        At a border that is grazed, as by what begins to move there, that of one coordinate is rounding beside others.
         """
         code, guards = frame.code, self.table.borders.guards
         kicks = lost = frame.constant(0.0) > 0.0
@@ -62,10 +63,15 @@ class Saltation:
             here = [code.compare("!=", hit[j], 0.0) for j in (guards[share].piece, cone)]
             lost = lost | ((here[0] | here[1]) & (pieces[cone] > 0.0))
 
+        def size(i: Index) -> Value:
+            return code.maximum(abs(before[i]), abs(behind[i]))
+
+        largest = form.largest(code, size, self.base)
+
         def jumps(i: Index, part: int) -> Value:
             if not part:
                 return kicks
-            larger = code.maximum(abs(before[i]), abs(behind[i]))
+            larger = code.select(grazes > 0.0, largest, size(i))
             return kicks | lost | (abs(before[i] - behind[i]) > JUMP_NOISE * larger)
 
         return jumps, lost
@@ -78,11 +84,12 @@ class Saltation:
                     yield row, i, part, i + (part * self.motion.n + row * self.base)
 
     def _tangent_jumps(
-        self, frame: Frame, out: Numbers, hit: Vectors, pieces: Numbers, is_hit: Value, grazes: Value
+        self, frame: Frame, form, out: Numbers, hit: Vectors, pieces: Numbers, is_hit: Value, grazes: Value
     ) -> Callable:
         """`(row, i, part)`: the number that is added to coordinate i of a row (part 0), or to its velocity (part 1)."""
         code, n, first = frame.code, self.base, (len(self.jump.orders) - 1) * 2 * self.base
-        jumps, lost = self._what_jumps(frame, hit, pieces, *(_some(out, first + k * n, n) for k in range(2)))
+        before, behind = (_some(out, first + k * n, n) for k in range(2))
+        jumps, lost = self._what_jumps(frame, form, hit, pieces, before, behind, grazes)
         jump_or_nan = self._jump_or_nan(code, is_hit, (grazes > 0.0) | lost)
 
         def added(row: int, i: Index, part: int) -> Value:
@@ -128,7 +135,7 @@ class Saltation:
             ]  # fmt: skip
             out = motion.form.run(frame, self.jump.line, *parts)
             hit = frame.vectors("hit", self.pieces)
-            added = self._tangent_jumps(frame, out, hit, parts[5], frame["is_hit"], frame["grazes"])
+            added = self._tangent_jumps(frame, motion.form, out, hit, parts[5], frame["is_hit"], frame["grazes"])
             for row, i, part, place in self._each(frame, motion.form, range(1, len(self.jump.orders))):
                 frame.assign(is_hit, place, y=frame["edge", place] + added(row, i, part))
         return frame.finish()
@@ -136,7 +143,8 @@ class Saltation:
     # ---- over steps that have been taken ----
 
     def fields_along(self) -> Fields:
-        return {"edge": self.motion.states, "edge_t": 1}  # the state at the border, and the time there
+        # The state at the border, the time there, and whether it is grazed, when the next step is at hand.
+        return {"edge": self.motion.states, "edge_t": 1, "edge_grazes": 1}
 
     def _note_edge(self, frame: Frame) -> None:
         """The state at the end of a step, and what is to be known of the border there."""
@@ -145,7 +153,7 @@ class Saltation:
         moved = motion.move_state(frame, motion.increments(frame, frame.job("order"), frame["h"])[0])
         for i in motion.form.each(code, motion.states):
             frame["edge", i] = moved[i]
-        frame["edge_t"] = frame["t"] + frame["h"]
+        frame["edge_t"], frame["edge_grazes"] = frame["t"] + frame["h"], frame["grazes"]
 
     def note_end(self) -> Code:
         """`()`: note the state at the border that a step ends at, for tangents at the beginning of the next one."""
@@ -178,8 +186,8 @@ class Saltation:
             pieces = numbers("params", self.pieces, self.motion.parameters)
             inputs = *self._edge_inputs(numbers, pieces), *tangents, frame.vectors("dparams", directions.numbers)
             out = form.run(frame, jump.line, *inputs)
-            is_hit, grazes = (directions.number_of(frame, name) for name in ("is_hit", "grazes"))
-            added = self._tangent_jumps(frame, out, numbers("hit", self.pieces), pieces, is_hit, grazes)
+            is_hit, grazes = (directions.number_of(frame, name) for name in ("is_hit", "edge_grazes"))
+            added = self._tangent_jumps(frame, form, out, numbers("hit", self.pieces), pieces, is_hit, grazes)
             for row, i, part, place in self._each(frame, form, range(jump.lower)):
                 frame["dy", place, 0] = frame["dy", place, 0] + added(jump.lower + row, i, part)
 
@@ -216,7 +224,8 @@ class Saltation:
         inputs = self._edge_inputs(lambda name, count: frame.vectors(name, count), behind)
         out = motion.form.run(frame, self.jump.accelerations(n), *inputs)
         hit = frame.vectors("hit", self.pieces)
-        jumps, lost = self._what_jumps(frame, hit, behind, _some(out, 0, n), _some(out, n, n))
+        both = _some(out, 0, n), _some(out, n, n)
+        jumps, lost = self._what_jumps(frame, motion.form, hit, behind, *both, frame["grazes"])
         cotangents, sum = motion.form.room(frame, rows * 2 * n), code.variable(frame.constant(0.0))
         for row, i, part, place in self._each(frame, motion.form, range(rows)):
             ct = frame["state_ct", place]

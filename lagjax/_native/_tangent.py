@@ -7,17 +7,19 @@ The series of the motion is made once for all directions. Members stand in the l
 after the other is followed; or the directions of a single member do, whose own series is then computed without lanes.
 
 A step that suits the motion may be too long for its tangents: about an equilibrium the series of the motion ends, that
-of a tangent does not. So the last two terms of their series are measured, and `excess` says how large they became.
+of a tangent does not. So the last two terms of their series are measured, and `excess` says how large they became; in
+the record, in the place of the number of a step, how large they were in this one.
 """
+
+import functools
 
 from lagjax._native._frame import Frame, Lane, job
 from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._maps import CauchyProducts, OrderRecursion, ProjectedEnd, SeriesSum, ZerothOrder
 from lagjax._native._motion_parts import MotionParts
 from lagjax._native._recorded_steps import Replay
-from lagjax._native._run_records import instant_about
+from lagjax._native._run_records import NUMBER, instant_about
 from lagjax._native._tangent_memory import Directions
-from lagjax._native._taylor import double
 
 # `y_dot` is the tangent of the start, and becomes that of the end.
 JOB = job(
@@ -80,8 +82,6 @@ class Tangent:
     def _begin_lane(self, frame: Frame, index: Value) -> None:
         lane = frame.lane(index)
         lane["step"], lane["output"] = 0, 1
-        for tangents in self.directions.lanes_of_tangents(frame, index):
-            tangents["excess"] = 0.0
         if self.saltation is not None:
             lane["is_hit"] = 0.0
 
@@ -90,21 +90,22 @@ class Tangent:
         code = frame.code
         with code.loop(self.motion.width) as index:
             lane = frame.lane(index)
+            for tangents in self.directions.lanes_of_tangents(frame, index):
+                tangents["excess"] = 0.0
             with code.only_if(lane["member"] >= 0):
                 lane["next_begin"] = lane["h"] * float("inf")  # of the last step: all outputs that are left
                 with code.only_if(lane["step"] + 1 < frame.read("steps", lane["member"], INTEGER)):
                     lane["next_begin"] = frame.read("record", self.replay.row(frame, lane) + self.replay.size)
 
     def _leave_step(self, frame: Frame, lane: Lane, index: Value) -> None:
-        """One step more; after the last one, write down how large the last terms were and take the next member."""
+        """Write down how large the last terms were, and go one step on; after the last one take the next member."""
         code, member, tangents = frame.code, lane["member"], self.directions.lanes_of_tangents(frame, index)
+        largest = functools.reduce(code.maximum, [of_lane["excess"] for of_lane in tangents])
+        frame.write("record", self.replay.row(frame, lane) + NUMBER, largest)
+        frame.write("excess", member, code.maximum(largest, frame.read("excess", member)))
         lane["step"] = lane["step"] + 1
         lane["output"] = code.as_integer(tangents[0]["next_output"])
         with code.only_if(lane["step"] >= frame.read("steps", member, INTEGER)):
-            largest = double(code, 0.0)
-            for of_lane in tangents:
-                largest = code.maximum(of_lane["excess"], largest)
-            frame.write("excess", member, largest)
             frame.call(self.start_next, index)
 
     # ---- one step along one direction in every lane; `group` numbers the directions ----

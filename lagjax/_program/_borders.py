@@ -40,6 +40,7 @@ from lagjax._program._series import LinearSystem, Recurrent, StraightLine
 from lagjax._program._simplify import is_nonnegative
 from lagjax._program._sliding import FAR, LARGEST_COPIED, MOST_SLIDING, Slide, dot, with_sliding
 
+BENT = "a constraint prescribes a speed that jumps"  # a reason to refuse a kick
 # The kinds of pieces; `CLOCK` is the piece of a table that the time itself is on, whose borders are known.
 SIGN, FLOOR, TRUNC, SLIDE, TABLE, CLOCK, CONE = range(7)
 LARGEST_WITH_ROUNDING = 500  # operations of numbers that are watched, and whose rounding is: three times as many
@@ -208,6 +209,11 @@ class Borders(NamedTuple):
             if self.kinds[j] != SLIDE and any(nodes[i] in pieces for i in _below(self.program.line, [node])):
                 shaken.append(j)
         return tuple(shaken)
+
+    @property
+    def abrupt(self) -> tuple[int, ...]:
+        """The nodes of what is zero where a root has no series."""
+        return tuple(u for u, of in zip(self.arguments, self.features, strict=True) if of.kind == UP_TO)
 
     @property
     def followed(self) -> tuple[int, ...]:
@@ -464,6 +470,8 @@ class _Rewriting:
         assert piece is not None
         self.parts[piece] = tuple(self.places[x] for x in _squares(self.program.line, self.cones[i]) or ())
         moves = f("gt", piece, number(0.0))
+        if op == "select":
+            return of[1] if self.graph.value(of[1]) is None else of[2]
         if op in ("sqrt", "rsqrt"):
             return f(op, f("select", moves, self._one, f("add", of[0], number(_NOTHING**2))))
         if op == "max":
@@ -766,7 +774,7 @@ class _Rewriting:
         for j, by_constraint in jumping.items():
             reasons[j] = None
             if by_constraint:
-                reasons[j] = "a constraint prescribes a speed that jumps"
+                reasons[j] = BENT
             elif reads_velocity([self.switches[j]]):
                 reasons[j] = (
                     "L or the momentum p = dL/dqdot jumps, and no law says with what velocities the motion goes on"
@@ -797,12 +805,13 @@ class _Rewriting:
     def _kick(self, line: StraightLine, switches: Sequence[int], kicking: dict[int, str | None]) -> Kick:
         n, size, m = self.size, self.program.size, len(switches)
         of = Mechanics.from_nodes(line.outputs[-self.mechanics :], n)
-        refused = tuple((j, reason) for j, reason in kicking.items() if reason is not None)
+        spatial = [j for j in kicking if not inputs_below(line, [switches[j]]).isdisjoint(range(n))]
+        corners = [j for j in spatial if kicking[j] == BENT]
+        refused = tuple((j, reason) for j, reason in kicking.items() if reason is not None and j not in corners)
         if refused or not kicking:
             return Kick(StraightLine((), (), ()), tuple(kicking), refused)
-        spatial = [j for j in kicking if not inputs_below(line, [switches[j]]).isdisjoint(range(n))]
         moves = any(t is not None and t.table.numbers is None for t in self.tables)
-        return Kick(kick_line(line, of, switches, spatial, n, size, m if moves else 0), tuple(kicking))
+        return Kick(kick_line(line, of, switches, spatial, corners, n, size, m if moves else 0), tuple(kicking))
 
     def _linear(self, linear) -> LinearSystem:
         z, right, factors = ([self.places[i] for i in some] for some in (linear.z, linear.right, linear.factors))
@@ -829,7 +838,9 @@ class _Rewriting:
         # has a corner at its entries, and no jump.
         degrees, lost = _velocity_degrees(line, n) if orders else [], []
         others = [
-            j for j in orders if self.kinds[j] != CONE and (self.kinds[j] != SIGN or degrees[self.switches[j]] > 1)
+            j
+            for j, order in orders.items()
+            if self.kinds[j] != CONE and (self.kinds[j] != SIGN or order == 2 or degrees[self.switches[j]] > 1)
         ]
         decides, of_pieces = {j: [] for j in orders}, {self.pieces[j]: j for j in orders}
         for switch in self.switches:
@@ -1061,6 +1072,8 @@ def _find_cones(line: StraightLine, size: int, linear: Any) -> dict[int, int]:
             others = [x for x in operands if x not in squares]
             if len(others) == 1 and nodes[others[0]][0] == "constant" and 0 <= nodes[others[0]][2] <= _NO_LENGTH:
                 cones[i] = next(squares[x] for x in operands if x in squares)
+        elif op == "select" and operands[0] in cones and {nodes[x][2] for x in operands[1:] if x not in cones} == {0.0}:
+            cones[i] = cones[operands[0]]  # a length, written so that it has a slope at zero
     return cones
 
 

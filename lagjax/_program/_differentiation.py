@@ -24,7 +24,7 @@ import numpy as np
 from lagjax._program._graph import INPUTS, Graph, Node, Tape, find_ancestors
 from lagjax._program._line import StraightLine
 from lagjax._program._look_ups import Table, move_look_up
-from lagjax._program._operations import FLAT_FAR_OUT, LOOK_UPS, OPERATIONS, SLOW_FAR_OUT
+from lagjax._program._operations import FLAT_FAR_OUT, LOOK_UPS, OPERATIONS, SLOW_FAR_OUT, WILD
 from lagjax._program._passes import eliminate_dead_code, factor, sink_negations
 
 _Rule = Callable[[int], int]
@@ -451,7 +451,7 @@ class _PlacedLine(Derivatives):
         """The cotangents of some inputs, by their numbers, from those of some nodes.
 
         A root whose slope is infinite has a cotangent that is infinite, too; past a slope of zero, as that of
-        max(q, 0) on its flat side, it is zero.
+        max(q, 0) on its flat side, it is zero. So is all that leaves a branch that is not taken.
 
         Those of entries of a table that `varies` are added to `tables`: the table, the index, and the cotangent; or,
         where the table consists of inputs `by`, to each of these.
@@ -459,6 +459,7 @@ class _PlacedLine(Derivatives):
         line, nodes, results, above = self.line, self.nodes, {}, find_ancestors(self.line.nodes, cotangents)
         varied, flat = self._find_varying_nodes(above, inputs, varies), ("mul",) if is_linear else ("max", "min")
         beneath = self._find_beneath_roots(above, varied, is_linear)
+        conditions = self._find_conditions(above, cotangents)
         for k in reversed(above):
             (op, operands, attribute), g = line.nodes[k], cotangents.get(k)
             if g is None or k not in varied:
@@ -480,6 +481,9 @@ class _PlacedLine(Derivatives):
                         if op in flat and k in beneath:
                             slope = rule(self._number(1.0))
                             part = self._select_unless_zero(slope, self._select_unless_zero(g, part))
+                        for p, branch in sorted(conditions[k] - conditions[i]):
+                            cases = (part, self._number(0.0))[:: 1 if branch == 1 else -1]
+                            part = self.graph.apply("select", nodes[p], *cases)
                         self._add(cotangents, i, part)
         return results
 
@@ -499,16 +503,58 @@ class _PlacedLine(Derivatives):
                 varied.add(k)
         return varied
 
+    def _find_conditions(self, among: Sequence[int], outputs: Iterable[int]) -> dict[int, frozenset]:
+        """The predicates and branches of selections that each node but inputs is read in, and nowhere else.
+
+        Only those with nodes that may be no number, or infinite, where nothing that is read outside of branches is.
+        """
+        nodes, nothing = self.line.nodes, frozenset()
+        conditions, read, wild, doubtful = dict.fromkeys(outputs, nothing), set(outputs), set(), set()
+        for k in reversed(among):
+            op, operands, _ = nodes[k]
+            for branch, x in enumerate(operands):
+                chosen = op == "select" and branch > 0
+                here = conditions[k] | {(operands[0], branch)} if chosen else conditions[k]
+                conditions[x] = conditions.get(x, here) & here if nodes[x][1] and nodes[x][0] != "take" else nothing
+                if k in read and not chosen:
+                    read.add(x)
+        for k in among:
+            op, operands, _ = nodes[k]
+            if operands and k not in read and (op in WILD or OPERATIONS[op].steep or not wild.isdisjoint(operands)):
+                wild.add(k)
+                doubtful |= conditions[k]
+        return {k: of & doubtful for k, of in conditions.items()}
+
     def _zero_where_zero(self, k: int, g: int, part: int) -> int:
         """The part of `g` that node k passes on: 0 of 0, also where its slope is infinite, as that of u**0.5 at 0.
 
-        There a program has a number in the place of the slope (`_recurrences.finite`), so that g is 0.
+        There a program has a number in the place of the slope (`_recurrences.finite`), so that g is 0. And 0 past the
+        root of a power at a base of zero.
         """
         nodes, (op, operands, _) = self.line.nodes, self.line.nodes[k]
         by_root = op == "div" and (of := nodes[operands[1]][0]) not in ("input", "constant") and OPERATIONS[of].steep
         if not (self.asks and (OPERATIONS[op].steep or by_root or (op == "div" and k in self._guarded))):
             return part
+        if k in self._roots_of_powers:
+            part = self._select_unless_zero(self.nodes[operands[0]], part)
         return self._select_unless_zero(g, part)
+
+    @functools.cached_property
+    def _roots_of_powers(self) -> set[int]:
+        """The nodes √u of which only products with u are made, which have a slope at u = 0: u √u, that of u^1.5."""
+        nodes, roots = self.line.nodes, {k for k, (op, *_) in enumerate(self.line.nodes) if op == "sqrt"}
+        parts = {k: {(k, nodes[k][1][0])} for k in roots}  # the roots that a node is a multiple of, each with its u
+        factors: list[set[int]] = []
+        for k, (op, operands, _) in enumerate(nodes):
+            of = [factors[i] for i in operands] if op in ("mul", "neg") else []
+            factors.append({k}.union(*of))
+            for i in operands:
+                for root, u in parts.get(i, ()):
+                    if op == "neg" or (op == "mul" and u not in factors[k]):
+                        parts.setdefault(k, set()).add((root, u))
+                    elif op != "mul" and k not in self._guarded:
+                        roots.discard(root)
+        return roots
 
     @functools.cached_property
     def _guarded(self) -> set[int]:

@@ -17,7 +17,8 @@ is the same with both sides alike and u̇⁺ = −u̇⁻. Source: Gelfand & Fomi
 With which pieces L jumps is found at random states of their borders: there a corner is zero to rounding, a jump not.
 """
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable, Container, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -78,13 +79,15 @@ def kick_line(
     mechanics: Mechanics,
     switches: Sequence[int],
     spatial: Sequence[int],
+    corners: Container[int],
     n: int,
     size: int,
     more: int,
 ) -> StraightLine:
     """The line of a `Kick`. That of the program takes `size` inputs and the pieces; `more` numbers stand behind the hⱼ.
 
-    The pieces `spatial` are those that jump where u depends on positions.
+    The pieces `spatial` are those that jump where u depends on positions. At `corners` of a constraint velocities are
+    NaN behind it: no law says with what velocities the motion goes on.
     """
     m, graph = len(switches), Graph(_LARGEST * (len(line.nodes) + (n + len(mechanics.rates)) ** 3) + 10_000)
     sides = _Sides(graph, line, size, m)
@@ -118,13 +121,14 @@ def kick_line(
     squared = f("select", in_space, one, squared)
     speed = f("sqrt", squared)
     changes = [f("ne", graph.input(size + j, "float"), graph.input(size + m + j, "float")) for j in spatial]
-    passes = graph.constant(False, "bool")
-    for change in changes:
-        passes = f("or", passes, change)
+    passes = bent = graph.constant(False, "bool")
+    for j, change in zip(spatial, changes, strict=True):
+        passes, bent = f("or", passes, change), f("or", bent, change) if j in corners else bent
     forward = f("eq", f("gt", rate, zero), passes)
     speed = f("select", forward, f("neg", speed), speed)
     mu = f("select", in_space, zero, f("div", f("sub", speed, b), c))
     kicked = [f("add", x, f("mul", mu, y)) for x, y in zip(w, across, strict=True)]
+    kicked = [f("select", bent, x, graph.number(math.nan)) for x in kicked]
     lacks = f("lt", squared, zero)
     return eliminate_dead_code(graph, [*kicked, f("select", lacks, one, zero)])
 

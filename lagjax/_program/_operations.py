@@ -368,6 +368,8 @@ _ROWS = (
 # What may come near the largest double where nothing else does, and what does not whatever its operand is.
 GROWING = frozenset(("exp", "exp2", "expm1", "sinh", "cosh"))
 BOUNDED = frozenset(("sin", "cos", "tanh", "logistic", "erf", "erfc", "atan", "atan2", "log", "log1p", "asinh"))
+# What may be infinite, or no number, besides what is `steep`.
+WILD = GROWING | {"div", "rem", "log", "log1p", "rsqrt", "atanh"}
 
 # What has a slope of zero where its operand is infinite, on one side at least; and what is infinite itself there, and
 # has a slope that is rounded to zero.

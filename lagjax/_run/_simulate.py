@@ -127,7 +127,8 @@ def simulate(
     time. Angles have their cuts (`arctan2`, `jnp.angle`, `arctan(y / x)`, complex roots, logarithms and powers). Where
     L itself or p = ∂L/∂q̇ jumps, the velocities do: p is continuous at an instant, and along a border in space, across
     which the energy is (where that does not suffice, the motion is reflected); at the very instant they are those
-    behind it. What cannot be decided so is refused before the run, and so is all of it with a solver of diffrax.
+    behind it. What cannot be decided so is refused before the run, and so is all of it with a solver of diffrax; a
+    motion ends at a corner of its constraints.
     Machine code ends a step at every border and begins the next one beyond it; where both sides push towards the
     border, as dry friction at rest does, the motion stays on it. First and second derivatives, in every mode, include
     the jumps at borders. Where they do not exist they are NaN: where a border is grazed, and by knots of two inputs

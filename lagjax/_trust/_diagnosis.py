@@ -59,6 +59,10 @@ _OVERSTEPPED = (
     "The state itself is not finite, from the first output on that is NaN: a step of a fixed length does not stop "
     "where the motion does. Leave dt out, and the message says what it runs into."
 )
+_AT_CORNER = (
+    "A constraint has a corner there: its gradient jumps, and no law says with what velocities the motion goes on. "
+    "Round the corner off over a width w that the motion resolves, as in jnp.sqrt(x**2 + w**2) for abs(x)."
+)
 
 
 class Ended(NamedTuple):
@@ -123,6 +127,8 @@ def _find_cause(system: System, layout: Layout, params, ended: Ended) -> str:
         where, value = bad[0]
         return f"\n{where} is {value}: every number must be finite."
     if not np.isfinite(ended.y).all():
+        if np.isfinite(halves(ended.y)[0]).all() and derivation.kicks:
+            return f"\n{_AT_CORNER}"
         return f"\n{_reset_to_nothing(layout, ended) if ended.by_resets else _OVERSTEPPED}"
     text = _undefined(derivation, params, ended) or _singular_mass(derivation, ended)
     if not text and (at := _running_away(derivation, ended)) is not None:

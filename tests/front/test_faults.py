@@ -215,7 +215,7 @@ FOUND = {
     ),
     "the length of a path": (lagjax.System(length), ONES, ONES, "gauge", ("q[0]", "q[1]")),
     "a norm at rest": (
-        lagjax.System(lambda q, v: 0.5 * jnp.linalg.norm(v) ** 2), ONES, ZEROS, "derivative_not_finite",
+        lagjax.System(lambda q, v: v @ v + jnp.linalg.norm(v)), ONES, ZEROS, "derivative_not_finite",
         ("dq[0]", "dq[1]"),
     ),
     "abs at its kink": (lagjax.System(lambda q, v: 0.5 * v**2 - jnp.abs(q)), 0.0, 1.0, "kink", ("q",)),

@@ -490,3 +490,44 @@ def test_a_cradle_of_hertzian_contacts_that_touch_is_struck(rtol, unit):
     scene, times = lagjax.System(lagrangian), jnp.array([0.0, 0.5 * np.pi / omega + after])
     run = lagjax.simulate(scene, -0.05 * unit * first, rest, times, 1e9 / np.sqrt(unit), rtol=rtol)
     np.testing.assert_allclose(run.qdot[-1] / unit, v, atol=100 * rtol)
+
+
+@pytest.mark.parametrize(
+    ("count", "gap", "power"), [(2, 0.0, 1.5), (3, 0.0, 1.5), (3, 1e-6, 1.5), (3, 0.0, 1.0), (3, 0.0, 2.0)]
+)
+def test_derivatives_of_a_cradle_that_is_struck(count, gap, power):
+    """They rise to thousands while balls touch, and fall to one: steps past a corner are those of the tangents.
+
+    Balls at rest that touch stand at a corner; by the speed of the one that comes there is a derivative all the same.
+    """
+    mass, stiffness, first = 0.1, 1e6 if power == 1 else 1e9, jnp.eye(count)[0]
+
+    def potential(q):
+        return stiffness / (power + 1) * jnp.sum(jnp.maximum(q[:-1] - q[1:] - gap, 0.0) ** (power + 1))
+
+    def rate(t, y):
+        q, v, dq, dv = y.reshape(4, count)
+        over = np.maximum(q[:-1] - q[1:] - gap, 0.0)
+        push, slope = stiffness * over**power, np.where(over > 0, power * stiffness * over ** (power - 1), 0.0)
+        forces = [np.append(0.0, f) - np.append(f, 0.0) for f in (push, slope * (dq[:-1] - dq[1:]))]
+        return np.concatenate([v, forces[0] / mass, dv, forces[1] / mass])
+
+    speed, way, after = 0.1, 0.05, 2.5e-3
+    touch = (way + gap) / speed
+    start = np.concatenate([gap * first, speed * first, touch * first, first])  # the variation of a free flight
+    by_speed = solve_ivp(rate, (0, after), start, method="DOP853", rtol=1e-13, atol=1e-16).y[3 * count :, -1]
+    scene = lagjax.System(lambda q, v: 0.5 * mass * v @ v - potential(q))
+
+    def last(v):
+        return lagjax.simulate(scene, -way * first, v * first, jnp.array([0.0, touch + after]), rtol=1e-10).qdot[-1]
+
+    for of in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(of(last)(speed), by_speed, atol=1e-5)
+
+
+def test_balls_at_rest_that_touch_have_derivatives_by_where_they_are():
+    """By Hertz's law, whose slope is zero there."""
+    scene = lagjax.System(lambda q, v: 0.5 * v @ v - jnp.maximum(q[0] - q[1], 0.0) ** 2.5)
+    for of in (jax.jacfwd, jax.jacrev):
+        found = of(lambda q: lagjax.simulate(scene, q, jnp.zeros(2), jnp.array([0.0, 1.0])).q[-1])(jnp.zeros(2))
+        np.testing.assert_array_equal(found, np.eye(2))

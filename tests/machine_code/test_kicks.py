@@ -318,6 +318,19 @@ def test_constraint_with_a_speed_that_jumps():
     np.testing.assert_allclose(found.q[-1, 0], pivot["cubic"](1.0), rtol=1e-9)
 
 
+def test_a_corner_of_a_constraint_ends_the_motion_that_comes_to_it():
+    """A bead on y = |x| slides from x = −1 at speed √2 without a force, and reaches the corner after t = 1."""
+    wire = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q: q[1] - jnp.abs(q[0]))
+    q, v = np.array([-1.0, 1.0]), np.array([1.0, -1.0])
+    run = lagjax.simulate(wire, q, v, jnp.array([0.0, 0.75]))
+    np.testing.assert_allclose(run.q[-1], [-0.25, 0.25], rtol=1e-9)
+    with pytest.raises(lagjax.SimulationError, match=r"beyond t = 1 of 2"):
+        lagjax.simulate(wire, q, v, jnp.array([0.0, 2.0]))
+    pushed = lagjax.System(lambda q, v: 0.5 * v @ v - 0.4 * q[0], constraints=lambda q: q[1] - jnp.maximum(q[0], 0.0))
+    with pytest.raises(lagjax.SimulationError, match=r"(?s)beyond t = 0.56350\d* of 2.*constraint has a corner"):
+        lagjax.simulate(pushed, np.array([-0.5, 0.0]), np.array([1.0, 0.0]), jnp.array([0.0, 2.0]))
+
+
 @pytest.mark.parametrize("spelling", STEPS)
 def test_check_sees_every_spelling(spelling):
     found = lagjax.check(step(spelling), -0.9, 1.0, params=0.3)

@@ -394,6 +394,7 @@ def guarded(v):
 
 DIRECTIONS = [
     lambda v: v / jnp.linalg.norm(v),
+    lambda v: v / jnp.hypot(v[0], v[1]),
     lambda v: v / jnp.maximum(jnp.sqrt(v @ v), 1e-12),
     lambda v: v / jnp.where(v @ v == 0, 1.0, jnp.linalg.norm(v)),
     guarded,
@@ -415,8 +416,8 @@ def test_discs_stop_and_rest_in_every_spelling():
         forces=lambda q, v: -2.0 * jnp.stack([f(v[i]) for i, f in enumerate(DIRECTIONS)] + [0.0 * v[-1]]),
         dissipation=lambda q, v: 2.0 * jnp.linalg.norm(v[-1]),
     )
-    v0 = jnp.array([[0.3, 0.4], [-0.6, 0.2], [0.1, 0.7], [0.5, -0.5], [0.2, 0.3]])
-    run = lagjax.simulate(scene, jnp.zeros((5, 2)), v0, jnp.array([0.0, 1.0, 1e6]))
+    v0 = jnp.array([[0.3, 0.4], [-0.6, 0.2], [0.1, 0.7], [0.5, -0.5], [0.4, 0.1], [0.2, 0.3]])
+    run = lagjax.simulate(scene, jnp.zeros((6, 2)), v0, jnp.array([0.0, 1.0, 1e6]))
     exact = v0 * jnp.linalg.norm(v0, axis=1, keepdims=True) / 4
     np.testing.assert_allclose(run.q[1:], np.stack([exact, exact]), atol=1e-12)
     np.testing.assert_array_equal(run.qdot[1:], 0.0)

@@ -113,13 +113,21 @@ def test_a_branch_that_is_not_taken_has_no_slope(name):
     columns = [*points.T, *np.zeros((3, len(points)))]
     found = derivation.evaluate(["lagrangian_by_q"], columns)["lagrangian_by_q"]
     np.testing.assert_allclose(found, -jax.vmap(jax.grad(potential))(points), rtol=1e-14)
+    for x in points[:4]:
+        (first, second), bend = derivatives(potential, x), jax.hessian(potential)(x)
+        np.testing.assert_allclose(first, 2 * [jax.grad(potential)(x)], rtol=1e-14)
+        np.testing.assert_allclose(second, 2 * [bend], rtol=1e-13, atol=1e-14)
 
 
-@pytest.mark.parametrize(
-    "function", [jnp.max, jnp.min, lambda q: jnp.linalg.norm(q, jnp.inf)], ids=["max", "min", "|q|"]
-)
+EXTREMES = {
+    "max": jnp.max, "min": jnp.min, "|q|": lambda q: jnp.linalg.norm(q, jnp.inf), "median": jnp.median,
+    "sorted": lambda q: jnp.sort(q) @ jnp.arange(1.0, 5.0), "quantile": lambda q: jnp.quantile(q, 0.3),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("function", EXTREMES.values(), ids=EXTREMES)
 def test_equal_extremes_share_a_slope_alike(function):
-    """The slope of the largest of numbers of which k are equal is 1/k of each, as in JAX."""
+    """The slope of the largest of numbers of which k are equal is 1/k of each, as in JAX; sorted, each has its own."""
     points = np.array([[0.4, 0.4, 0.4, 0.4], [0.4, 0.4, 0.1, 0.4], [-0.1, 0.4, 0.4, 0.4], [0.1, -0.4, 0.4, -0.4]])
     derivation = derivation_of(
         lagjax.System(lambda q, v: 0.5 * v @ v + function(q)), Layout.from_state(np.zeros(4), np.zeros(4)), None
@@ -128,6 +136,41 @@ def test_equal_extremes_share_a_slope_alike(function):
     np.testing.assert_allclose(found, jax.vmap(jax.grad(function))(points), rtol=1e-15)
     first, _ = derivatives(function, points[1])
     np.testing.assert_allclose(first, 2 * [jax.grad(function)(points[1])], rtol=1e-15)
+
+
+LENGTHS = {
+    "hypot": lambda q: jnp.exp(-(jnp.hypot(*q) ** 2)), "norm": lambda q: jnp.log1p(jnp.linalg.norm(q) ** 2.0),
+    "root": lambda q: 1 / (1 + jnp.sqrt(q @ q) ** 4), "modulus": lambda q: jnp.abs(q[0] + 1j * q[1]) ** 2 * 0.5,
+    "cube": lambda q: jnp.hypot(*q) ** 3,
+}  # fmt: skip
+SMOOTH = {
+    "hypot": lambda r: jnp.exp(-r), "norm": jnp.log1p, "root": lambda r: 1 / (1 + r**2), "modulus": lambda r: 0.5 * r,
+    "cube": lambda r: r**1.5,
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", LENGTHS)
+def test_powers_of_lengths_have_slopes_at_zero(name):
+    """Those of the same function of the square; of a cube the second ones do not exist at zero."""
+    for x in ([0.0, 0.0], [0.3, -0.4]):
+        x, smooth = np.array(x), lambda q: SMOOTH[name](q @ q)
+        first, second = derivatives(LENGTHS[name], x)
+        np.testing.assert_allclose(first, 2 * [jax.grad(smooth)(x)], rtol=1e-14)
+        if name != "cube" or x.any():
+            np.testing.assert_allclose(second, 2 * [jax.hessian(smooth)(x)], rtol=1e-13, atol=1e-15)
+
+
+@pytest.mark.parametrize("power", [1.0, 1.5, 2.5])
+def test_a_motion_begins_and_passes_where_a_length_is_zero(power):
+    """Along a line through the centre of |z|ᵖ, and of Re zᵖ along its real axis, it is that of one coordinate."""
+    one = lagjax.System(lambda q, v: 0.5 * v**2 - abs(q) ** power)
+    modulus = lambda q: jnp.abs(q[0] + 1j * q[1]) ** power
+    cases = [(modulus, 0.0), (modulus, -0.05), (lambda q: jnp.real((q[0] + 1j * q[1]) ** power), 0.0)]
+    for potential, q0 in cases[: 3 if power > 1 else 2]:
+        plane = lagjax.System(lambda q, v, potential=potential: 0.5 * v @ v - potential(q))
+        ts = np.array([0.0, 0.25])
+        run = lagjax.simulate(plane, np.array([q0, 0.0]), np.array([0.3, 0.0]), ts)
+        np.testing.assert_allclose(run.q[-1], [lagjax.simulate(one, q0, 0.3, ts).q[-1], 0.0], atol=1e-8)
 
 
 ROUNDED = 6755399441055744.0  # 1.5 · 2⁵²: what is added to it, and is less than 2⁵¹, is rounded to a whole number

@@ -119,3 +119,28 @@ def test_a_removable_pole_is_named():
     scene = lagjax.System(lambda q, v: 0.5 * v * v, forces=lambda q, v: jnp.arctan(jnp.sin(q) / q))
     run = lagjax.simulate(scene, 0.0, 1.0, np.array([0.0, 1.0]), throw=False, solver=lagjax.MachineCode())
     assert run.result == lagjax.RESULTS.nonfinite_state
+
+
+def fall_in_order(q, v, forces, end):
+    """Free particles of unit mass, of which the one in place k has the force −forces[k]: from meeting to meeting."""
+    t, order = 0.0, np.argsort(q + 1e-9 * v)
+    while True:
+        a = np.empty_like(q)
+        a[order] = -forces
+        d, u, b = (np.diff(x[order]) for x in (q, v, a))  # of neighbours; b < 0
+        meetings = (-u - np.sqrt(u * u - 2 * b * np.abs(d))) / b
+        k = np.argmin(meetings)
+        h = min(meetings[k], end - t)
+        q, v, t = q + h * v + h * h / 2 * a, v + h * a, t + h
+        if t >= end:
+            return q
+        order[k : k + 2] = order[k : k + 2][::-1]
+
+
+@pytest.mark.parametrize("tied", [False, True])
+def test_sorted_numbers_that_pass_each_other(tied):
+    forces, v = np.array([0.3, 1.2, 2.7, 4.8]), np.array([0.5, -0.5, 1.3, 0.9])
+    q = np.full(4, 0.3) if tied else np.array([0.1, -0.1, 0.6, 0.1])
+    row = lagjax.System(lambda q, v: 0.5 * v @ v - jnp.sort(q) @ forces)
+    run = lagjax.simulate(row, q, v, np.array([0.0, 1.5]))
+    np.testing.assert_allclose(run.q[-1], fall_in_order(q, v, forces, 1.5), atol=1e-8)

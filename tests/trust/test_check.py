@@ -90,7 +90,7 @@ def free(q, v):
 
 
 def at_rest(q, v):
-    return 0.5 * jnp.linalg.norm(v) ** 2 - 0.5 * jnp.sum(q**2)
+    return 0.5 * jnp.linalg.norm(v) * jnp.linalg.norm(v) - 0.5 * jnp.sum(q**2)
 
 
 @jax.custom_jvp
@@ -107,7 +107,7 @@ BROKEN = {
     # name: L, q, q̇, kind, where, words of the message
     "norm of the velocity at rest": (at_rest, jnp.ones(2), jnp.zeros(2), "derivative_not_finite", "dq[0]", "sqrt(0)"),
     "norm of the position at zero": (
-        lambda q, v: 0.5 * jnp.sum(v**2) - jnp.linalg.norm(q) ** 2,
+        lambda q, v: 0.5 * jnp.sum(v**2) - jnp.linalg.norm(q),
         jnp.zeros(2), jnp.ones(2), "derivative_not_finite", "q[0]", "norm at zero",
     ),
     "branch of where that is not taken": (

@@ -3,9 +3,10 @@
 Its way: `Problem` ─► `Flow` (rows of NumPy) at once, where nothing is traced; ─► `_primitives`, the flow as primitives
 of JAX, where something is. All of that is in float64; a problem in float32 goes through the door of `_doubles` first.
 
-On rows of NumPy: `_flow` (the flow map), `_derivatives` (its jvp and vjp), `_variational` (its variational equations),
-`_state_rates` (how an output moves with its time). As JAX: `_primitives`, which `_call` (CPU) and `_gpu_launch` run;
-`_line_functions` and `_lowered_motion` for the scene's quantities. Surfaces it meets: `_surfaces`, `_crossing`.
+On rows of NumPy: `_flow` (the flow map), `_derivatives` (its jvp and vjp; `_passages`: its steps in parts),
+`_variational` (its variational equations), `_state_rates` (how an output moves with its time). As JAX: `_primitives`,
+which `_call` (CPU) and `_gpu_launch` run; `_line_functions` and `_lowered_motion` for the scene's quantities. Surfaces
+it meets: `_surfaces`, `_crossing`.
 """
 
 import dataclasses

@@ -16,7 +16,8 @@ import numpy as np
 
 from lagjax import _native
 from lagjax._engine._problem import Solution
-from lagjax._engine.taylor._flow import Flow, Steps, Tolerances
+from lagjax._engine.taylor._flow import EXCESS, Flow, Steps, Tolerances
+from lagjax._engine.taylor._passages import cut_steps, has_passages, part_passages
 from lagjax._interface import SUCCESSFUL
 from lagjax._native import Projection
 from lagjax._program import Program, StraightLine, pullback, pushforward
@@ -24,6 +25,7 @@ from lagjax._program import Program, StraightLine, pullback, pushforward
 LARGEST_PORTION = 2**23  # numbers of the steps that are written down at once: 64 MiB
 _ROOM_AGAIN = 2  # times the steps that were taken: those of a first try are written, too
 MOST_PARTS, TRIES = 64, 4  # of a step that is too long, at once; and how often they are divided once more
+MOST_PROBES = 16  # directions along which steps that go past a border without a series are measured
 
 
 class Motions(NamedTuple):
@@ -108,6 +110,10 @@ def _jvp_over_steps(flow: Flow, motions: Motions, dots, tolerances) -> tuple[np.
 
     for row in _go_over_steps(flow, motions, tolerances, advance_tangents, advance_tangents):
         path_dot[row], y_dot[row] = np.nan, np.nan
+        if (m := dy0.shape[1]) > 1:  # steps may suit some of these directions
+            alone = [x[row, :, None] for x in dots]
+            of_each = _jvp_over_steps(flow, motions.take(np.full(m, row)), alone, tolerances)
+            path_dot[row], y_dot[row] = (x[:, 0] for x in of_each)
     return start_outputs(motions.ts, dy0, path_dot), y_dot
 
 
@@ -166,7 +172,10 @@ def transpose_outputs(go_back: Callable, ts, path_ct, end_ct, library: Any = np)
 def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -> tuple[np.ndarray, np.ndarray]:
     """`vjp` of one cotangent a row, over the steps that were taken."""
     y_ct, params_ct = np.full(end_ct.shape, np.nan), np.full((len(end_ct), flow.numbers), np.nan)
-    direction = np.random.default_rng(0).normal(size=flow.states + flow.numbers)
+    inputs = flow.states + flow.numbers
+    directions = np.random.default_rng(0).normal(size=(1, inputs))
+    if has_passages(flow.kernel):
+        directions = np.eye(some := min(inputs, MOST_PROBES))[:, np.arange(inputs) % some]
 
     def transpose_steps(steps: Steps):
         rows, of = steps.rows, motions.take(steps.rows)
@@ -175,14 +184,24 @@ def _vjp_over_steps(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) -
         return excess / tolerances.largest_excess
 
     def probe(steps: Steps):
-        """The size of the last terms of the series of a tangent, in units of the limit, along any direction at all."""
-        of = motions.take(steps.rows)
-        y_dot, params_dot = (np.tile(x, (len(steps.rows), 1, 1)) for x in np.split(direction, [flow.states]))
-        excess = steps.kernel.jvp(of.ts, of.params, steps.record, y_dot, params_dot, tolerances.floor)[2]
-        return excess / tolerances.largest_excess
+        """The size of the last terms of the series of a tangent, in units of the limit, along any direction at all.
 
-    for row in _go_over_steps(flow, motions, tolerances, transpose_steps, probe):
-        y_ct[row], params_ct[row] = np.nan, np.nan
+        But not by what there is no derivative by: a tangent that is NaN tells nothing, and is none to go by. Past a
+        passage tangents fall by much along one direction, and not along others: there they are followed along several.
+        """
+        of = motions.take(steps.rows)
+        found = np.isfinite(np.concatenate([y_ct[steps.rows], params_ct[steps.rows]], axis=1))
+        y_dot, params_dot = np.split(np.where(found[:, None], directions, 0.0), [flow.states], axis=2)
+        given = of.ts[:, [0, -1]], of.params, steps.record, y_dot, params_dot
+        _, end, excess = steps.kernel.jvp(*given, tolerances.floor)
+        return np.where(np.isfinite(end).all(axis=-1).any(axis=-1), excess / tolerances.largest_excess, np.nan)
+
+    if lost := list(_go_over_steps(flow, motions, tolerances, transpose_steps, probe)):
+        of = motions.take(np.array(lost))
+        inner = path_ct[lost] * (of.ts != of.ts[:, :1])[..., None]
+        inner[:, -1] = 0.0
+        again = _vjp_by_jacobian(flow, of, inner[:, None], end_ct[lost, None], tolerances)
+        y_ct[lost], params_ct[lost] = (x[:, 0] for x in again)
     return y_ct, params_ct
 
 
@@ -191,11 +210,11 @@ def _vjp_by_jacobian(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) 
     inputs = flow.states + flow.numbers
     unit = np.broadcast_to(np.eye(inputs), (len(end_ct), inputs, inputs))
     path, end = jvp(flow, motions, unit[..., : flow.states], unit[..., flow.states :], tolerances)
-    used = np.einsum("nmts,nrts->nmr", path_ct, np.where(np.isfinite(path), path, 0.0))
-    used += np.einsum("nms,nrs->nmr", end_ct, np.where(np.isfinite(end), end, 0.0))
-    path_lost, end_lost = (~np.all(np.isfinite(x), axis=1, keepdims=True) for x in (path, end))
-    lost = ((path_ct != 0) & path_lost).any(axis=(2, 3)) | ((end_ct != 0) & end_lost).any(axis=2)
-    used[lost] = np.nan
+    used = 0.0
+    for letters, ct, moved in (("ts", path_ct, path), ("s", end_ct, end)):
+        subscripts, found = f"nm{letters},nr{letters}->nmr", np.isfinite(moved)
+        used = used + np.einsum(subscripts, ct, np.where(found, moved, 0.0))
+        used[np.einsum(subscripts, 1.0 * (ct != 0), 1.0 * ~found) > 0] = np.nan
     return used[..., : flow.states], used[..., flow.states :]
 
 
@@ -247,14 +266,15 @@ def _go_over_steps(
     from above; where `probe` is larger than 1, the steps are divided until they suit.
     """
     for steps in _steps_of(flow, motions, tolerances):
+        limit = _limit_of(steps)
         excess = go(steps)
-        long = np.flatnonzero(excess > 1.0)
+        long = np.flatnonzero(excess > limit)
         if not long.size:
             continue
         steps = steps.take(long)
         excess = excess[long] if probe is go else probe(steps)
 
-        for k in np.flatnonzero(excess > 1.0).tolist():
+        for k in np.flatnonzero(~(excess <= limit)).tolist():
             row = int(steps.rows[k])
             numbers = motions.params[row if len(motions.params) > 1 else 0]
             better = _suitable_steps(flow, steps.take([k]), numbers, tolerances, excess[k : k + 1], probe)
@@ -262,6 +282,11 @@ def _go_over_steps(
                 yield row
             elif probe is not go:
                 go(better)
+
+
+def _limit_of(steps: Steps) -> float:
+    """The largest last terms in units of the limit: beside where a root has no series, those that follow are larger."""
+    return 1 / EXCESS if has_passages(steps.kernel) else 1.0
 
 
 def _steps_of(flow: Flow, motions: Motions, tolerances: Tolerances) -> Iterator[Steps]:
@@ -273,42 +298,44 @@ def _steps_of(flow: Flow, motions: Motions, tolerances: Tolerances) -> Iterator[
         again = motions.take(places)
         room = _ROOM_AGAIN * int(again.accepted.sum()) + int(again.rejected.sum()) + len(places)
         for steps in flow.follow(*again[:3], tolerances, room)[1]:
-            yield steps._replace(rows=places[steps.rows])
+            if not has_passages(steps.kernel):
+                yield steps._replace(rows=places[steps.rows])
+                continue
+            for k, row in enumerate(steps.rows):
+                of = again.take(np.array([row]))
+                parted = part_passages(flow, steps.take([k]), of.params[0], again.path[row, -1], tolerances)
+                yield parted._replace(rows=places[[row]])
 
 
 def _suitable_steps(flow: Flow, steps: Steps, params, tolerances, excess, measure: Callable) -> Steps | None:
-    """The steps of one member, divided into ever smaller parts until they suit its tangents; None where none do.
+    """The steps of one member, each divided into ever smaller parts until it suits its tangents; None where none do.
 
     `excess` (1,), and what `measure(steps)` returns, is how large the last terms of the series are, in units of the
-    limit. Those of a motion with constraints that do not fall as its steps do are rounding, as beside a dead centre:
-    its own steps are right.
+    limit; of each step the record says it. Those of a motion with constraints that do not fall as its steps do are
+    rounding, as beside a dead centre: its own steps are right.
     """
-    parts = 1
+    divided, found = steps, []
     for _ in range(TRIES):
-        before = float(excess[0])
-        parts *= math.ceil(min(MOST_PARTS, 1.1 * before ** (1 / (steps.order - 1))))
-        divided = _divide_steps(flow, steps, params, tolerances, parts)
-        excess = measure(divided)
-        if not excess > 1.0:
+        if math.isnan(before := float(excess[0])):
+            return None
+        divided = _divide_steps(flow, divided, params, tolerances)
+        found.append((float((excess := measure(divided))[0]), len(found), divided))
+        if excess <= _limit_of(steps):
             return divided
         if flow.projection is not None and float(excess[0]) > 0.5 * before:
             measure(steps)
             return steps
-    return None
+    least, _, best = min(found, default=(math.inf, 0, None))
+    return best if least <= 1.0 else None
 
 
-def _divide_steps(flow: Flow, steps: Steps, params, tolerances: Tolerances, parts: int) -> Steps:
-    """The steps of one member, each in this many parts: the states between are outputs of the motion."""
+def _divide_steps(flow: Flow, steps: Steps, params, tolerances: Tolerances) -> Steps:
+    """The steps of one member, those that are too long in parts; others stay as they are."""
     ((_, rows),) = steps.split_members()
-    t, h, first_state = rows[:, 0], rows[:, 1], rows[:1, 4:]
-    times = np.append((t[:, None] + h[:, None] * np.arange(parts) / parts).ravel(), t[-1] + h[-1])
-    path = flow.follow(times[None], first_state[:, : flow.states], params[None], tolerances)[0].path[0]
-    more = np.repeat(rows[:, 4 + flow.states :], parts, axis=0)  # of a piecewise program
-    last = np.arange(1, len(more) + 1)[:, None] % parts == 0
-    more[:, -3:] = np.where(last, more[:, -3:], 0.0)  # which border it ends at, and whether that is grazed
-    begins = np.stack([times[:-1], np.diff(times), *np.zeros((2, len(path) - 1))]).T
-    table = np.concatenate([begins, path[:-1], more], axis=1)
-    return steps._replace(table=table, first=np.zeros(1, int), counts=np.array([len(table)]))
+    excess = rows[:, 3] / (_limit_of(steps) * tolerances.largest_excess)
+    long = np.where(excess > 1.0, excess, 0.0) ** (1 / (steps.order - 1))
+    cuts = [np.arange(n) / n for n in np.ceil(np.clip(1.1 * long, 1, MOST_PARTS)).astype(int)]
+    return cut_steps(flow, steps, cuts, params, tolerances)
 
 
 def portions(places: np.ndarray, numbers: np.ndarray, largest: int) -> list[np.ndarray]:

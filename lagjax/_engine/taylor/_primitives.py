@@ -43,6 +43,7 @@ from lagjax._engine.taylor._derivatives import Motions
 from lagjax._engine.taylor._flow import Flow, Tolerances
 from lagjax._engine.taylor._gpu_launch import run_on_gpu, transpose_on_gpu
 from lagjax._engine.taylor._line_functions import outputs
+from lagjax._engine.taylor._passages import has_passages
 from lagjax._engine.taylor._state_rates import rate
 from lagjax._engine.taylor._variational import from_rows, to_rows
 from lagjax._interface import SUCCESSFUL, default_platform
@@ -496,6 +497,8 @@ def _go_back_on_gpu(motions: Motions, path_ct, end_ct, *, flow, tolerances):
 
     None where the GPU cannot compute them.
     """
+    if has_passages(flow.kernel):
+        return None
     members, m = end_ct.shape[:2]
     ts, y0, params, *_ = motions.take(np.repeat(np.arange(members), m))
     path_ct, end_ct = (x.reshape(members * m, *x.shape[2:]) for x in (path_ct, end_ct))

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 
 from lagjax._program._scalars import Scalars
-from lagjax._program.lowering._rules import COMPLEX, Expansion, lowers, reduction
+from lagjax._program.lowering._rules import COMPLEX, Expansion, lowers, reduction, take_length
 
 
 class Pair(NamedTuple):
@@ -87,12 +87,8 @@ def _inverse(z: Pair) -> Pair:
 
 
 def _absolute(z: Pair) -> Scalars:
-    if z.is_real:
-        return _f("abs", z.re)
-    square = z.square
-    size = _f("sqrt", square)
-    z.re.expansion.moduli |= zip(size.ids.ravel().tolist(), square.ids.ravel().tolist(), strict=True)
-    return size
+    expansion = z.re.expansion
+    return Scalars(expansion, expansion.map_ids(functools.partial(take_length, expansion), z.re.ids, z.im.ids))
 
 
 def _sign(z: Pair) -> Pair:
@@ -127,6 +123,11 @@ def _power(z: Pair, exponent: Pair) -> Pair:
     value = values.pop() if len(values) == 1 else None
     if value is not None and value == round(value) and abs(value) <= 16:
         return _whole_power(z, int(value))
+    if value is not None and value > 1:  # has a derivative at zero, which its parts have not
+        is_zero = _f("eq", z.square, 0.0)
+        beside = Pair(is_zero.map("select", is_zero, z.re, 1.0), z.im)
+        parts = _polar(_f("pow", beside.square, 0.5 * value), value * beside.angle)
+        return Pair(*(is_zero.map("select", is_zero, x, 0.0) for x in parts))
     size = _f("pow", z.square, 0.5 * exponent.re)
     if exponent.is_real:
         return _polar(size, z.angle * exponent.re)

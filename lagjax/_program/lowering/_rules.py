@@ -22,7 +22,7 @@ from jax.extend import core
 
 from lagjax._program._graph import INPUTS, PAIRS, Graph, Unlowerable
 from lagjax._program._operations import OPERATIONS
-from lagjax._program._simplify import arctangent, inverse
+from lagjax._program._simplify import arctangent, inverse, is_nonnegative
 from lagjax._program.lowering._indexing import are_numbers, count_knots, kind_of_ids, locate_knots, look_up_windows
 
 # Scalars that are looked at for each one that the budget allows, as most of a derivative folds away; and in all, which
@@ -40,7 +40,7 @@ class Expansion:
     def __init__(self, graph: Graph):
         self.graph = graph
         self.traced_operations = 0
-        self.moduli: dict[int, int] = {}  # |z| of complex numbers, and |z|², which is smooth at zero
+        self.squares: dict[int, int] = {}  # of lengths: smooth at zero, where these are not
         self._pairs: list[tuple[int, int]] = []
         self._work = 0
 
@@ -96,12 +96,15 @@ class Expansion:
         return bool(array.size) and array.max() >= PAIRS
 
     def map(self, op: str, *arrays: np.ndarray, attribute=None) -> np.ndarray:
+        return self.map_ids(functools.partial(self.graph.apply, op, attribute=attribute), *arrays)
+
+    def map_ids(self, function: Callable[..., int], *arrays: np.ndarray) -> np.ndarray:
+        """A function of scalars, here their ids, for each of arrays."""
         arrays = np.broadcast_arrays(*map(self.real, arrays))
-        shape, size = arrays[0].shape, arrays[0].size
-        self.work(size)
-        self.traced_operations += size
+        self.work(arrays[0].size)
+        self.traced_operations += arrays[0].size
         columns = zip(*(array.ravel().tolist() for array in arrays), strict=True)
-        return _ids([self.graph.apply(op, *of, attribute=attribute) for of in columns], shape)
+        return _ids([function(*of) for of in columns], arrays[0].shape)
 
     def fold(self, op: str, array: np.ndarray) -> np.ndarray:
         """`op` along the first axis, from the left."""
@@ -361,7 +364,6 @@ LOWER.update({
     "add_any": lambda expansion, params, x, y: expansion.map("add", x, y),
     "lt_to": lambda expansion, params, x, y: expansion.map("lt", x, y),
     "le_to": lambda expansion, params, x, y: expansion.map("le", x, y),
-    "pow": lambda expansion, params, x, y: expansion.map("pow", x, expansion.map("convert", y, attribute="float")),
     "round": lambda expansion, params, x: expansion.map("round", x, attribute=int(params["rounding_method"])),
     "signbit": lambda expansion, params, x: [expansion.map("lt", x, expansion.constants(0.0))],
     "polynomial": lambda expansion, params, x, *coefficients: functools.reduce(  # Σ cₖ xᵏ, by Horner's rule
@@ -369,14 +371,6 @@ LOWER.update({
     ),
     "call_hi_primitive": lambda expansion, params, *xs: expansion.run_closed(expand_primitive(params["_prim"]), xs),
 })  # fmt: skip
-
-
-@lowers("square")
-def _square(expansion, params, x):
-    moduli = expansion.moduli
-    if not moduli or moduli.keys().isdisjoint(ids := x.ravel().tolist()):
-        return expansion.map("mul", x, x)
-    return _ids([moduli[i] if i in moduli else expansion.graph.apply("mul", i, i) for i in ids], x.shape)
 
 
 @lowers("one_minus_square")
@@ -388,7 +382,23 @@ def _one_minus_square(expansion, params, x):
 @lowers("hypot")
 def _hypotenuse(expansion, params, x, y):
     """√(x² + y²), which is smooth but for zero; JAX divides by the larger one, and has corners where both are alike."""
-    return [expansion.map("sqrt", expansion.map("add", *(expansion.map("mul", z, z) for z in (x, y))))]
+    return [expansion.map_ids(functools.partial(take_length, expansion), x, y)]
+
+
+def take_length(expansion, x: int, y: int) -> int:
+    """√(x² + y²), with a slope of zero where it is zero, as |z| has in JAX."""
+    f, numbers = expansion.graph.apply, [expansion.graph.value(i) for i in (x, y)]
+    if 0.0 in numbers:
+        return f("abs", y if numbers[0] == 0.0 else x)
+    square = f("add", f("mul", x, x), f("mul", y, y))
+    if numbers == [None, None]:
+        zero, one = map(expansion.graph.number, (0.0, 1.0))
+        is_zero = f("eq", square, zero)
+        length = f("select", is_zero, f("sqrt", f("select", is_zero, square, one)), zero)
+    else:
+        length = f("sqrt", square)
+    expansion.squares[length] = square
+    return length
 
 
 def _divide(expansion, params, x, y):
@@ -422,30 +432,31 @@ LOWER.update({
 })  # fmt: skip
 
 
-def _inverse(rule):
-    """The rule of an inverse function, by what it is the inverse of: as it is written, for its derivatives too."""
-
-    def apply_rule(expansion, params, x):
-        expansion.work(x.size)
-        expansion.traced_operations += x.size
-        return _ids([rule(expansion.graph, i) for i in x.ravel().tolist()], x.shape)
-
-    return apply_rule
+def _raise_to_power(expansion, exponent: float, i: int) -> int:
+    """uᵖ for a number p; of u = √s, or of a length, from 2 on that is s^(p/2), which is smooth where s is zero."""
+    graph = expansion.graph
+    square = expansion.squares.get(i, graph.operand_of("sqrt", i))
+    if exponent >= 2 and square is not None and is_nonnegative(graph, square):
+        i, exponent = square, exponent / 2
+    return graph.apply("pow", i, graph.number(exponent)) if exponent % 1 else graph.power(i, int(exponent))
 
 
-LOWER.update(
-    {"atan": _inverse(arctangent)} | {op: _inverse(functools.partial(inverse, op=op)) for op in ("asin", "acos")}
-)
+def _power(expansion, params, x, y):
+    numbers = {expansion.graph.value(i) for i in y.ravel().tolist()}
+    if len(numbers) == 1 and (number := numbers.pop()) is not None:
+        return expansion.map_ids(functools.partial(_raise_to_power, expansion, number), x)
+    return expansion.map("pow", x, expansion.map("convert", y, attribute="float"))
 
 
-@lowers("integer_pow")
-def _integer_pow(expansion, params, x):
-    exponent, graph, moduli = params["y"], expansion.graph, expansion.moduli
-    expansion.work(x.size)
-    expansion.traced_operations += x.size
-    base, half = (moduli, exponent // 2) if exponent % 2 == 0 else ({}, exponent)
-    powers = (graph.power(base[i], half) if i in base else graph.power(i, exponent) for i in x.ravel().tolist())
-    return _ids([*powers], x.shape)
+# Inverse functions by what they are the inverse of: as it is written, for its derivatives too.
+LOWER.update({
+    "integer_pow": lambda of, params, x: of.map_ids(functools.partial(_raise_to_power, of, params["y"]), x),
+    "square": lambda of, params, x: of.map_ids(functools.partial(_raise_to_power, of, 2), x),
+    "pow": _power,
+    "atan": lambda of, params, x: of.map_ids(functools.partial(arctangent, of.graph), x),
+    **{op: lambda of, params, x, op=op: of.map_ids(functools.partial(inverse, of.graph, op=op), x)
+       for op in ("asin", "acos")},
+})  # fmt: skip
 
 
 @lowers("convert_element_type")
@@ -577,16 +588,15 @@ LOWER.update({
 
 @lowers("sort")
 def _sort(expansion, params, *operands):
-    """Neighbours are exchanged until all are in order: n (n − 1) / 2 comparisons, for a few numbers."""
+    """Neighbours are exchanged until all are in order: n (n − 1) / 2 comparisons, for a few numbers.
+
+    Equal ones keep their places, and with these their derivatives, as in JAX.
+    """
     if params["num_keys"] != 1:
         raise Unlowerable("the primitive `sort` by several keys has no scalar form here")
     rows = [list(np.moveaxis(x, params["dimension"], 0)) for x in operands]
     for end in range(len(rows[0]) - 1, 0, -1):
         for k in range(end):
-            if len(operands) == 1:
-                (key,) = rows
-                key[k], key[k + 1] = (expansion.map(op, key[k], key[k + 1]) for op in ("min", "max"))
-                continue
             wrong = expansion.map("lt", rows[0][k + 1], rows[0][k])
             for row in rows:
                 pair = row[k], row[k + 1]
