@@ -28,7 +28,7 @@ def ball_in_a_box_by_hand():
         wall("free", lambda q, v: 1 - q[0], 0, 0.8),
     ]
     q, v, ts = jnp.array([0.3, 1.0]), jnp.array([1.3, 0.0]), jnp.array([0.0, 3.0])
-    run = lagjax.simulate_hybrid({"free": fall}, walls, "free", q, v, ts)
+    run = lagjax.simulate(lagjax.Hybrid({"free": fall}, walls, "free"), q, v, ts)
     return run.q[-1]
 
 
@@ -61,7 +61,7 @@ def ladder_by_hand():
     }
     leave = lagjax.Transition("both", "floor", lambda q, v, multipliers: multipliers["wall"], -1)
     q, ts = jnp.array([np.cos(1.2) / 2, np.sin(1.2) / 2, 1.2]), jnp.array([0.0, 0.9])
-    return lagjax.simulate_hybrid(modes, [leave], "both", q, jnp.zeros(3), ts).q[-1]
+    return lagjax.simulate(lagjax.Hybrid(modes, [leave], "both"), q, jnp.zeros(3), ts).q[-1]
 
 
 def ladder():
@@ -92,7 +92,7 @@ def bead_row_by_hand():
     ]
     modes = {"free": lagjax.System(lambda q, v: 0.5 * v @ v)}
     q, v, ts = jnp.array([0.1, 0.4, 0.7, 1.0]), jnp.array([0.7, -0.3, 0.1, 0.5]), jnp.array([0.0, 4.0])
-    return lagjax.simulate_hybrid(modes, [*map(meet, range(3)), *walls], "free", q, v, ts).q[-1]
+    return lagjax.simulate(lagjax.Hybrid(modes, [*map(meet, range(3)), *walls], "free"), q, v, ts).q[-1]
 
 
 def bead_row():
@@ -116,7 +116,7 @@ def hopper_by_hand():
     land = lagjax.Transition("air", "ground", lambda q, v: q[1], -1, lambda q, v: (q, v.at[1].set(0.0)))
     leave = lagjax.Transition("ground", "air", lambda q, v, multipliers: multipliers, -1)
     q, ts = jnp.array([1.5, 0.5]), jnp.array([0.0, 2.0])
-    return lagjax.simulate_hybrid(modes, [land, leave], "air", q, jnp.zeros(2), ts).q[-1]
+    return lagjax.simulate(lagjax.Hybrid(modes, [land, leave], "air"), q, jnp.zeros(2), ts).q[-1]
 
 
 def hopper():
@@ -144,7 +144,7 @@ def ratchet_by_hand():
     lock = lagjax.Transition("free", "locked", lambda q, v: v[1] - v[0], -1)
     free = lagjax.Transition("locked", "free", lambda q, v, multipliers: multipliers, -1)
     q, v, ts = jnp.array([-1.0, 0.0]), jnp.zeros(2), jnp.array([0.0, 10.0])
-    return lagjax.simulate_hybrid(modes, [lock, free], "locked", q, v, ts).q[-1]
+    return lagjax.simulate(lagjax.Hybrid(modes, [lock, free], "locked"), q, v, ts).q[-1]
 
 
 def ratchet():
@@ -179,7 +179,7 @@ def dominoes_by_hand():
     part = lagjax.Transition("both", "apart", lambda q, v, multipliers: multipliers, -1)
     again = lagjax.Transition("apart", "both", lambda q, v: between(q), -1, strike)
     q, v, ts = jnp.array([0.15, 0.0]), jnp.zeros(2), jnp.array([0.0, 0.9])
-    return lagjax.simulate_hybrid(modes, [meet, part, again], "one", q, v, ts).q[-1]
+    return lagjax.simulate(lagjax.Hybrid(modes, [meet, part, again], "one"), q, v, ts).q[-1]
 
 
 def dominoes():

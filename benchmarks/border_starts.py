@@ -81,7 +81,7 @@ class Bodies:
         modes = {"free": lagjax.System(lagrangian, forces=free), "rubs": lagjax.System(lagrangian, forces=forces)}
         touch = lagjax.Transition("free", "rubs", lambda q, v, t: t - 0.5, 1, lambda q, v, params: (q, params[3]))
         ts = jnp.array([0.0, T], dtype)
-        run = lagjax.simulate_hybrid(modes, [touch], "free", q0, jnp.zeros(self.n, dtype), ts, (*params, v0))
+        run = lagjax.simulate(lagjax.Hybrid(modes, [touch], "free"), q0, jnp.zeros(self.n, dtype), ts, (*params, v0))
         return self.weights @ jnp.concatenate([run.q[-1], run.qdot[-1]])
 
     def refer(self, x):

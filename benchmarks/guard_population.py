@@ -456,8 +456,8 @@ def runs(family: str, start: str) -> Callable:
 
     def run(q, v, duration, params):
         ts = jnp.stack([jnp.zeros_like(duration), duration])
-        done = lagjax.simulate_hybrid(
-            modes, transitions, start, q, v, ts, params, max_transitions=MOST + 4, throw=False
+        done = lagjax.simulate(
+            lagjax.Hybrid(modes, transitions, start), q, v, ts, params, max_transitions=MOST + 4, throw=False
         )
         return done.ok, done.end.q, done.end.qdot, done.transitions.count, done.mode[-1]
 

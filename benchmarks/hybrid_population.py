@@ -347,7 +347,9 @@ def runs(family: str, d: int, guards: int) -> Callable:
 
     def run(q, v, duration, params):
         ts = jnp.stack([jnp.zeros(()), duration])
-        return lagjax.simulate_hybrid(modes, faces, start, q, v, ts, params, max_transitions=MOST + 4, throw=False)
+        return lagjax.simulate(
+            lagjax.Hybrid(modes, faces, start), q, v, ts, params, max_transitions=MOST + 4, throw=False
+        )
 
     return jax.jit(jax.vmap(run))
 

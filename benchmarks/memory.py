@@ -47,7 +47,7 @@ def gradient(scene, params) -> None:
 
 def hybrid(scene, params) -> None:
     """A motion with a wall."""
-    lagjax.simulate_hybrid({"flight": scene}, [BOUNCE], "flight", START, 0.0, 3 * TS, params, max_transitions=4)
+    lagjax.simulate(lagjax.Hybrid({"flight": scene}, [BOUNCE], "flight"), START, 0.0, 3 * TS, params, max_transitions=4)
 
 
 def by_diffrax(scene, params) -> None:

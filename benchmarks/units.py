@@ -188,7 +188,7 @@ def crossings(case: Case, u: Units):
 def hybrid(case: Case, u: Units):
     q, qdot, params = case.in_units(u)
     ts = u.time * jnp.linspace(0.0, 0.6 * case.duration, 4)
-    run = lagjax.simulate_hybrid({"one": case.system}, [slowed(case)], "one", q, qdot, ts, params, throw=False)
+    run = lagjax.simulate(lagjax.Hybrid({"one": case.system}, [slowed(case)], "one"), q, qdot, ts, params, throw=False)
     count = int(run.transitions.count)
     return (str(run.result), str(count)), [flat(run.q) / u.length, flat(run.transitions.t)[:count] / u.time]
 

@@ -38,8 +38,8 @@ BOUNCE = lagjax.Transition(
 def recorded(seed=0):
     """The times of bounces of a known ball, the first of which is at half a second."""
     longest = 4.0 * BOUNCES * V0 / G
-    run = lagjax.simulate_hybrid(
-        {"flight": FLIGHT}, [BOUNCE], "flight", 0.0, V0, jnp.array([0.0, longest]), TRUTH,
+    run = lagjax.simulate(
+        lagjax.Hybrid({"flight": FLIGHT}, [BOUNCE], "flight"), 0.0, V0, jnp.array([0.0, longest]), TRUTH,
         max_transitions=BOUNCES - 1, throw=False,
     )  # fmt: skip
     exact = 0.5 + np.append(0.0, run.transitions.t)

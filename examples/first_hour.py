@@ -209,7 +209,7 @@ axes[0, 0].figure.savefig("out/first_hour_4.png")
 
 # %% [markdown]
 """
-That was the hour. What else there is: motions that change their laws (`simulate_hybrid`), equilibria and modes
+That was the hour. What else there is: motions that change their laws (`Hybrid`), equilibria and modes
 (`equilibrium`, `normal_modes`), symmetries (`conserved_quantities`), closed orbits and chaos (`periodic_orbit`,
 `lyapunov_exponent`). Each is met in one of the worked problems beside this file.
 """

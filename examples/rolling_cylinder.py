@@ -55,7 +55,7 @@ rest = dict.fromkeys(start, 0.0)
 
 
 def run(alpha):
-    return lagjax.simulate_hybrid(modes, [leaves], "rolling", start, rest, ts, alpha, max_transitions=4)
+    return lagjax.simulate(lagjax.Hybrid(modes, [leaves], "rolling"), start, rest, ts, alpha, max_transitions=4)
 
 
 runs = jax.jit(jax.vmap(run))(jnp.array(list(INERTIA.values())))

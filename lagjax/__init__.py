@@ -11,8 +11,7 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
   and `ContactChanges`
 - `samples`: an input that was measured, as a function of time
 - `crossings`: where a motion crosses a section, as `Crossings`
-- `simulate_hybrid`: a motion through modes, by `Transition`s; those that happened are `Transitions`; `Hybrid`: all of
-  it as one object, for `fit` and `sweep`
+- `Hybrid`: a motion through modes, by `Transition`s; those that happened are `Transitions`
 - `MachineCode`, `FineOutput`: what integrates
 - `SimulationError`, `RESULTS`: how a motion ends
 
@@ -58,7 +57,6 @@ import ast
 import functools
 import importlib
 import importlib.util
-import warnings
 from typing import TYPE_CHECKING, Any
 
 from lagjax._interface import PLACES
@@ -108,7 +106,7 @@ if TYPE_CHECKING:  # each is imported on first use: all of them take as long as 
     )
     from lagjax._interface import RESULTS, SimulationError
     from lagjax._run import crossings, simulate, simulate_batch
-    from lagjax._run.hybrid import Hybrid, Transition, simulate_hybrid
+    from lagjax._run.hybrid import Hybrid, Transition
     from lagjax._scene import samples
     from lagjax._sweep import Statistics, Store, Sweep, sweep
     from lagjax._trust import work_precision
@@ -122,7 +120,7 @@ __all__ = [
     "between", "branch_off", "change_coordinates", "check", "conserved_quantities", "crossings", "cyclic_coordinates",
     "designs", "equilibrium", "family", "find_path", "fit", "hamiltonian", "inertia", "linearize", "lyapunov_exponent",
     "lyapunov_spectrum", "noether_charge", "normal_modes", "periodic_orbit", "plot", "positive", "results", "routhian",
-    "same_motion", "samples", "scenes", "simplex", "simulate", "simulate_batch", "simulate_hybrid", "sweep",
+    "same_motion", "samples", "scenes", "simplex", "simulate", "simulate_batch", "sweep",
     "work_precision", "wrapped",
 ]  # fmt: skip
 
@@ -132,18 +130,9 @@ PLACES.update(dict.fromkeys(("dataset", "frame", "impact_frame", "change_frame")
 PLACES.update(dict.fromkeys(("make_animation", "summary", "trajectory_html"), "lagjax._show"))
 PLACES.update(describe_failure="lagjax._trust", examine="lagjax._trust.health", contact_forces="lagjax._run.contacts")
 
-_MOVED = {name: f"lagjax.designs.{name}" for name in ("latin_hypercube", "random", "sobol")}
-
 
 def __getattr__(name: str) -> Any:
-    """A public name or a class of `lagjax.results`, imported from its module; an old name, with a warning."""
-    if name in _MOVED:
-        warnings.warn(
-            f"lagjax.{name} is {_MOVED[name]} now; the old name goes with the next version.",
-            DeprecationWarning,
-            stacklevel=2,
-        )
-        return getattr(importlib.import_module("lagjax.designs"), name)
+    """A public name or a class of `lagjax.results`, imported from its module."""
     if (path := _places().get(name)) is None:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
     module = importlib.import_module(f"{path}.{name}" if path == __name__ else path)

@@ -84,7 +84,7 @@ def hard_walls(short: bool) -> Found:
     ]
     ts = np.array([0.0, T])
     seconds, run = timed(
-        lambda: lagjax.simulate_hybrid({"flight": flight}, walls, "flight", 0.0, 1.0, ts, max_transitions=1000)
+        lambda: lagjax.simulate(lagjax.Hybrid({"flight": flight}, walls, "flight"), 0.0, 1.0, ts, max_transitions=1000)
     )
     n, s = divmod(T + 1.0, 2.0)
     side = (-1) ** int(n)
@@ -255,7 +255,9 @@ def relay(short: bool) -> Found:
     cycles = 3 if short else 100
     ts = np.array([0.0, (2 * cycles + 0.4) * half])
     seconds, run = timed(
-        lambda: lagjax.simulate_hybrid(modes, switches, "up", -1.0 + 1e-300, -v, ts, rtol=1e-13, max_transitions=300)
+        lambda: lagjax.simulate(
+            lagjax.Hybrid(modes, switches, "up"), -1.0 + 1e-300, -v, ts, rtol=1e-13, max_transitions=300
+        )
     )
     exact = along(-1.0, -v, 0.4 * half)
     error = max(abs(float(run.q[-1]) - exact[0]), abs(float(run.qdot[-1]) - exact[1]))

@@ -20,12 +20,13 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+from scipy.sparse import csr_array
 
 from lagjax._equations import _saddle
 from lagjax._equations._blame import pieces_of, pieces_of_motion
 from lagjax._equations._constraints import velocity_scales
 from lagjax._equations._coupled_forces import CoupledForces
-from lagjax._equations._linear import eigen, solve_many
+from lagjax._equations._linear import eigen, is_definite, solve_many
 from lagjax._equations._motion import Motion
 from lagjax._equations._patterns import gradient_memory, jacobian_pattern
 from lagjax._equations._quantities import OwnRules, quantities
@@ -85,6 +86,7 @@ class _Saddle(NamedTuple):
     velocities: bool = True
 
 
+_MATRICES = "mass_matrix", "jacobian"
 _ACCELERATION = _Saddle("force", "gamma", 1)
 _VELOCITY_STEP = _Saddle(None, "rates", -1)
 _POSITION_STEP = _Saddle(None, "residual", -1, velocities=False)
@@ -149,7 +151,8 @@ class Derivation:
         self._lock = threading.RLock()
         self._programs: dict[tuple[str, ...], Program] = {}
         self._shapes: dict[str, tuple[int, ...]] = {}
-        self._sampled: dict[float, list[tuple[np.ndarray, np.ndarray]]] = {}
+        self._filled: dict[str, np.ndarray] = {}  # where a quantity, flat, is not zero as it is derived
+        self._sampled: dict[float, list[tuple[csr_array, csr_array]]] = {}
         self._recursion: Recursion | None = None  # known once the quantities are
         self.has_rules = False  # of its own for derivatives, in a function; known once the quantities are
         # Compiled functions are traced once for each of their derivatives, and all quantities share these.
@@ -214,20 +217,28 @@ class Derivation:
 
     @_lowered_once
     def _whole(self) -> Program:
-        """All of `Motion.quantities` in the order of their names."""
+        """A zero, and all of `Motion.quantities` in the order of their names, without what is `zero` as it is derived.
+
+        The matrices of large scenes are zeros but for a few numbers.
+        """
         if self.refusal is not None:
             raise Unlowerable(self.refusal)
 
-        def order_values(values):
+        def order_values(values, zero):
             self._shapes = {name: values[name].shape for name in sorted(values)}
-            return [values[name] for name in self._shapes]
+            flat = [values[name].ravel() for name in self._shapes]
+            filled = [np.arange(x.size) if zero is None else np.flatnonzero(x != zero) for x in flat]
+            self._filled = dict(zip(self._shapes, filled, strict=True))
+            return [x[at] for x, at in zip(flat, filled, strict=True)]
 
         def trace_arrays(*leaves):
-            return order_values(self._traced_once.quantities(*jax.tree.unflatten(structure, leaves)))
+            values = self._traced_once.quantities(*jax.tree.unflatten(structure, leaves))
+            return [jnp.zeros(1), *order_values(values, None)]
 
         def trace_scalars(expansion, leaves):
             values, self._recursion = quantities(self.motion, expansion, self.state_shapes, leaves)
-            return order_values(values)
+            zero = expansion.graph.number(0.0)
+            return [np.full(1, zero), *order_values(values, zero)]
 
         leaves, structure = jax.tree.flatten(self.state_shapes)
         try:
@@ -245,7 +256,7 @@ class Derivation:
 
     @functools.cached_property
     def _starts(self) -> dict[str, int]:
-        ends = np.cumsum([0, *(self.count(name) for name in self._shapes)]).tolist()
+        ends = np.cumsum([1, *map(len, self._filled.values())]).tolist()
         return dict(zip(self._shapes, ends, strict=False))
 
     def shape(self, name: str) -> tuple[int, ...]:
@@ -428,18 +439,25 @@ class Derivation:
 
     def reads(self, name: str) -> frozenset[int]:
         """The positions of the inputs that any number of this quantity depends on."""
-        return self._whole.find_inputs(self._positions(name))
+        return self._whole.find_inputs(self._filled_positions(name))
 
     def absent(self, name: str) -> np.ndarray:
         """True for each number of this quantity that is zero whatever the state, in its shape."""
-        positions, line = self._positions(name), self._whole.line
-        zeros = np.array([op == "constant" and number == 0 for op, _, number in line.nodes], bool)
-        return zeros[np.array(line.outputs[positions.start : positions.stop], int)].reshape(self.shape(name))
+        absent, line = np.ones(self.count(name), bool), self._whole.line
+        of = (line.nodes[line.outputs[k]] for k in self._filled_positions(name))
+        absent[self._filled[name]] = [op == "constant" and number == 0 for op, _, number in of]
+        return absent.reshape(self.shape(name))
 
-    def _positions(self, name: str) -> range:
-        """The outputs of the program of all quantities that are this one."""
-        count = self.count(name)  # first of all: it is the trace that says where quantities start
-        return range(self._starts[name], self._starts[name] + count)
+    def _positions(self, name: str) -> list[int]:
+        """The outputs of the program of all quantities that are this one, in C order."""
+        positions = np.zeros(self.count(name), int)
+        positions[self._filled[name]] = self._filled_positions(name)
+        return positions.tolist()
+
+    def _filled_positions(self, name: str) -> range:
+        """The outputs that are numbers of this quantity which are not zero as they are derived."""
+        self._whole  # noqa: B018  (its trace says where quantities start)
+        return range(self._starts[name], self._starts[name] + len(self._filled[name]))
 
     @_lowered_once
     def works(self) -> bool:
@@ -597,17 +615,20 @@ class Derivation:
 
     def _parts(self, saddle: _Saddle, elimination, constraints: int) -> Callable:
         """A formula for the entries of an elimination, the `constraints` numbers of c, and b, end to end."""
-        n, starts = self.layout.size, self._starts
+        n = self.layout.size
         row, column = elimination.entries.T
         names = "mass_matrix", "jacobian", "release", "drag"
-        table = [np.array(self._positions(name), int).reshape(self.shape(name)) for name in names]
-        ends = np.cumsum([0, *(x.size for x in table)])
+        ends = np.cumsum([0, *map(self.count, names)])
         m = self.shape("jacobian")[0]
         place = np.select([column < n, row >= n], [n * row + column, ends[2] + row - n], ends[3] + m * row + column - n)
-        positions = np.concatenate([x.ravel() for x in table])[place].tolist()
-        positions += range(starts[saddle.c], starts[saddle.c] + constraints)
+        filled = np.concatenate([end + self._filled[name] for end, name in zip(ends, names, strict=False)])
+        outputs = np.concatenate([self._filled_positions(name) for name in names]).astype(int)
+        at = np.searchsorted(filled, place)
+        found = np.append(filled, -1)[at] == place
+        positions = np.where(found, np.append(outputs, 0)[at], 0).tolist()
+        positions += self._positions(saddle.c)[:constraints]
         if saddle.b is not None:
-            positions += range(starts[saddle.b], starts[saddle.b] + n)
+            positions += self._positions(saddle.b)
 
         cut = functools.cache(lambda: self._whole.select_outputs(positions))
         return lambda *scalars: cut().vector(*scalars)
@@ -624,7 +645,7 @@ class Derivation:
     def _constant_mass(self) -> bool:
         return not self.reads("mass_matrix")
 
-    def _samples(self, reach: float, numbers: Any = None) -> list[tuple[np.ndarray, np.ndarray]]:
+    def _samples(self, reach: float, numbers: Any = None) -> list[tuple[csr_array, csr_array]]:
         """M and G at a few states that nothing speaks for, where they are finite; `numbers` are those of params."""
         if numbers is not None:
             return self._evaluate_matrices([*self._columns(reach)[: 2 * self.layout.size + 1], *numbers])
@@ -632,10 +653,17 @@ class Derivation:
             self._sampled[reach] = self._evaluate_matrices(self._columns(reach))
         return self._sampled[reach]
 
-    def _evaluate_matrices(self, columns: list) -> list[tuple[np.ndarray, np.ndarray]]:
-        n, parts = self.layout.size, self.program("mass_matrix", "jacobian")
-        rows = [x for x in parts.evaluate_many(columns).T if np.isfinite(x).all()]
-        return [(x[: n * n].reshape(n, n), x[n * n :].reshape(-1, n)) for x in rows]
+    @functools.cached_property
+    def _entries(self) -> Program:
+        """The numbers of M and G that are not zero as they are derived."""
+        return self._whole.select_outputs([k for name in _MATRICES for k in self._filled_positions(name)])
+
+    def _evaluate_matrices(self, columns: list) -> list[tuple[csr_array, csr_array]]:
+        shapes, ends = [self.shape(name) for name in _MATRICES], [len(self._filled["mass_matrix"])]
+        places = [np.divmod(self._filled[name], self.layout.size) for name in _MATRICES]
+        samples = [np.split(x, ends) for x in self._entries.evaluate_many(columns).T if np.isfinite(x).all()]
+        make: Any = lambda *matrix: csr_array(matrix[:2], shape=matrix[2])  # noqa: E731
+        return [tuple(map(make, of, places, shapes)) for of in samples]
 
     def _columns(self, reach: float = 1.0) -> list[np.ndarray]:
         """The inputs at these states, one array (states,) for each: of order one, but q of this order."""
@@ -655,14 +683,16 @@ class Derivation:
                 return regular
         return self._judge(self._samples(1.0, self._favorable), self._rows(saddle)) if self.counts_on_params else None
 
-    def _judge(self, samples: list[tuple[np.ndarray, np.ndarray]], m: int) -> bool | None:
+    def _judge(self, samples: list[tuple[csr_array, csr_array]], m: int) -> bool | None:
         """True if M is regular at some states; None where it is not positive definite, on m rows of G at rest."""
         regular = True
         for matrix, jacobian in samples:
-            lowest, size, rows = eigen(matrix)[0][0], np.abs(matrix).max(), jacobian[:m]
-            regular = regular and bool(lowest > 1e-10 * size)
-            augmented = eigen(matrix + rows.T @ rows)[0][0] if m else lowest
-            if (self.layout.size > 2 or m) and not augmented >= -1e-12 * size:
+            size = abs(matrix).max()
+            if is_definite(matrix, 1e-10 * size):
+                continue
+            regular, rows = False, jacobian[:m]
+            lowest = np.linalg.eigvalsh((matrix + rows.T @ rows).toarray())[0]
+            if (self.layout.size > 2 or m) and not lowest >= -1e-12 * size:
                 return None
         return regular
 
@@ -683,7 +713,7 @@ class Derivation:
             samples = self._evaluate_matrices(columns)
             if not samples:
                 return None
-            (matrix, jacobian), *_ = samples
+            matrix, jacobian = (x.toarray() for x in samples[0])
             values, vectors = eigen(matrix + jacobian.T @ jacobian)
             if values[0] > 1e-3 * values[-1]:
                 return np.concatenate(columns[first:])

@@ -179,7 +179,7 @@ _ORDERS = 20
 
 def _shorter_recursion(motion: Motion, state: _ScalarState, lagrangian: _Taped, matrix: Ids) -> Recursion | None:
     """The recursion in L, where that takes fewer operations than to eliminate M; two coordinates have Cramer's rule."""
-    if motion.constraints.exist or len(matrix) < 3 or not state.varying(matrix).any():
+    if motion.constraints.exist or len(matrix) < 3 or not state.varying(_filled(state, matrix)).any():
         return None
     recursion = recursion_of(state.derivatives, int(lagrangian.value), state.ids["qdot"].tolist())
     if recursion is None:
@@ -225,13 +225,21 @@ def _derivatives(state: _ScalarState, lagrangian: _Taped, rates: dict) -> tuple[
     for together in (True, False) if len(lagrangian.tape.nodes) <= _APART else (True,):
         by_q, momentum, by_t = state.gradient(lagrangian, "q", "qdot", "t", together=together)
         matrix = state.jacobian(momentum, "qdot")
-        matrix = np.where(np.tri(len(matrix), dtype=bool), matrix, matrix.T)
+        i, j = np.nonzero(matrix != state.zeros(()))
+        i, j = np.maximum(i, j), np.minimum(i, j)
+        matrix[j, i] = matrix[i, j]
         inertial = state.expansion.map("sub", by_q, state.rate(momentum, **rates))
         forms.append((by_q, momentum, by_t, matrix, inertial))
     if len(forms) == 1:
         return forms[0]
-    sizes = [state.derivatives.size([*matrix.ravel().tolist(), *inertial.tolist()]) for *_, matrix, inertial in forms]
+    both = ([*_filled(state, matrix).tolist(), *inertial.tolist()] for *_, matrix, inertial in forms)
+    sizes = list(map(state.derivatives.size, both))
     return forms[0] if sizes[0] < _SHORTER * sizes[-1] else forms[-1]
+
+
+def _filled(state: _ScalarState, matrix: Ids) -> Ids:
+    """The scalars of a matrix that are not zero."""
+    return matrix[matrix != state.zeros(())]
 
 
 def _constraint_quantities(constraints: Constraints, state: _ScalarState, rates: dict) -> dict[str, Ids]:

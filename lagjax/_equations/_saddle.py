@@ -75,7 +75,7 @@ class SaddleElimination:
     def _place_all(self, filled: np.ndarray) -> None:
         """The places in a vector of the entries of A on and below its diagonal: the diagonal, then L by columns."""
         total, place = len(self.order), np.argsort(self.order)
-        self.slots = np.full((total, total), -1)
+        self.slots = np.full((total, total), -1, np.int32)
         self.slots[range(total), range(total)] = range(total)
         self.below, self.count = {}, total
         for j in self.order:

@@ -51,14 +51,14 @@ class RESULTS(diffrax.RESULTS, metaclass=_InWords):  # pyright: ignore[reportGen
         "The acceleration has a jump or a corner there, and the budget of steps was spent on such places, or no step "
         "fits over it. Where the motion merely crosses them, as one that is switched fast does, raise max_steps: each "
         "takes a step of machine code, and some forty of diffrax. Where it rests on one, as on abs(q) at zero or, with "
-        "a solver of diffrax, by dry friction, make its two sides modes of simulate_hybrid, or round it off over a "
+        "a solver of diffrax, by dry friction, make its two sides modes of a lagjax.Hybrid, or round it off over a "
         "width that steps resolve."
     )
     derivatives_lost = (
         "The acceleration jumps on the way, where the steps of diffrax go across: a derivative over these steps lacks "
         "what the jump adds, and is another one. Machine code ends a step there and has it: leave solver at None, in "
-        "float64 on a CPU (`System.explain` says why a scene is not for it). Or make the two sides modes of "
-        "simulate_hybrid, or round the jump off over a width that steps resolve, tanh(v / w) for sign(v)."
+        "float64 on a CPU (`System.explain` says why a scene is not for it). Or make the two sides modes of a "
+        "lagjax.Hybrid, or round the jump off over a width that steps resolve, tanh(v / w) for sign(v)."
     )
     max_transitions_reached = (
         "The budget of transitions was spent. Raise max_transitions (of crossings it is fixed), or end ts earlier."

@@ -23,7 +23,7 @@ from lagjax._native._roots import Roots
 from lagjax._native._saltation import Saltation
 from lagjax._native._step import absolute_tolerance
 from lagjax._native._taylor import TaylorSeries, integer
-from lagjax._native._watch import Border, Crossed, GuardTable, Touch, end_at_border, reaches_border
+from lagjax._native._watch import Border, Crossed, GuardTable, Touch, end_at_border, joint_groups, reaches_border
 from lagjax._program import _borders
 from lagjax._program._borders import BELOW, FALLS, GROWS, SQUARED, UP_TO, Feature
 from lagjax._program._jump import Jump, Nesting
@@ -49,7 +49,7 @@ class BorderControl:
         if not self.pieces:
             self.stop = self._stop()
             return
-        self.table = GuardTable(motion, borders)
+        self.table, self.varies = GuardTable(motion, borders), jump is not None
         self.kicks_in_time = borders.kicks_in_time(motion.states)
         self.decide, self.stop = self._decide(), self._stop()
         self.retraction = borders.retraction and Retraction(motion, borders, nesting)
@@ -81,6 +81,12 @@ class BorderControl:
             "stops": 1,  # 1 if the step ends at a border that it comes to with no speed, to rounding
             "level": guards if any(guard.of_table for guard in borders.guards) else 0,  # a level that changes
         }
+        if groups := joint_groups(borders):
+            fields |= {
+                "joins": guards,  # where a guard is crossed, as a part of the step; then 1 if it is, at its end
+                "taken": 1 + max(groups),  # 1 for a group of which a guard is crossed
+                "more": 1,  # guards that are crossed beside the first one: each counts as a step, which it is elsewhere
+            }
         if borders.kicking:
             fields |= {
                 "kick_before": pieces,  # the pieces before the border
@@ -150,6 +156,8 @@ class BorderControl:
                     frame.assign(border.touch >= Touch.SLIDING, slides=1)
             for border in self.table.each(frame):
                 self._look(frame, border, degree, h)
+            if self.table.groups:
+                self._join(frame, h)
         frame["next_approach"] = 0.0
         first = 0
         for feature, row in itertools.groupby(self.borders.features):  # which shares its code: as of a chain's bonds
@@ -173,6 +181,8 @@ class BorderControl:
         is_share, undecided = border.has("on"), code.compare("==", side, 0.0)
         # Nothing is looked for along the border that the motion slides on, or in the share of one that does not.
         idle = (border.touch >= Touch.SLIDING) | (undecided & is_share)
+        if self.table.groups:
+            frame["joins", border.g] = 2.0
         with code.only_if(code.any_lane(~idle)):
             self.roots.polynomial(frame, border["piece"], degree, h, code.select(undecided, 1.0, side), level)
             at_limit = (abs(frame["poly", 0]) <= limits.JUMP_NOISE) & (frame["steps"] > 0.0)
@@ -234,9 +244,40 @@ class BorderControl:
         # Of two at one instant that of the piece on which the other one depends, which comes first, is crossed.
         apart = code.select(frame["crossed"] > 0.0, 1.0 - limits.AT_ONCE, 1.0) if self.borders.nested else 1.0
         sooner = (root < frame["nearest"] * apart) & code.compare("!=", h, 0.0) & ~idle
+        if self.table.groups:
+            frame.assign(is_root & ~undecided & ~idle, border.g, joins=root)
         crossed = code.select(is_root, Crossed.GUARD, Crossed.NOTHING)
         frame.assign(sooner, nearest=root, at_rest=at_rest, crossed=crossed, crossed_number=code.as_double(border.g))
         frame.assign(sooner, beyond=code.select(undecided, leads, beyond))
+
+    def _join(self, frame: Frame, h: Value) -> None:
+        """Cross the first border of every group that is there at one instant with the first of all.
+
+        With derivatives a border is met in a step of its own, which shifts tangents; it is crossed in no time.
+        """
+        code, groups = frame.code, self.table.groups
+        assert groups is not None
+        none, joins = code.compare("==", frame["nearest"], 0.0), frame.constant(0.0)
+        may_join = none if self.varies else none | (code.lanes_of(code.as_double(frame.job("room"))) <= 0.0)
+        instant = _AT_END * limits.EPS * (abs(frame["t"] / h) + 1.0)
+        end = frame["nearest"] + code.select(none, 0.0, instant)
+        with code.loop(1 + max(joint_groups(self.borders))) as k:
+            frame["taken", k] = 0.0
+        joins, frame["more"] = code.variable(joins), 0.0
+        for border in self.table.each(frame):
+            group = groups.read(code, border.g, "group")
+            with code.only_if(group >= 0):
+                is_first = may_join & self.table.crosses(frame, Crossed.GUARD, border.g)
+                frame.assign(is_first, group, taken=1)
+                joins.value = code.select(is_first, 1.0, joins.value)
+        for border in self.table.each(frame):
+            group, at_once = groups.read(code, border.g, "group"), (joins.value > 0.0) & (border.recall("joins") <= end)
+            frame["joins", border.g] = 0.0
+            with code.only_if(group >= 0):
+                at_once = at_once & (frame["taken", group] <= 0.0)
+                frame.assign(at_once, group, taken=1)
+                frame.assign(at_once, border.g, joins=1)
+                frame["more"] = frame["more"] + code.flag(at_once)
 
     def _look_closer(self, frame: Frame, degree: Value) -> None:
         """A root that comes early is as exact as what lies before it allows, and not the whole step."""
@@ -497,6 +538,9 @@ class BorderControl:
                 with code.loop(self.pieces) as j:
                     frame["kick_before", j] = self.table.piece(frame, j)
             self._go_on(frame, crosses)
+            if self.table.groups:
+                counts = stepped & self.table.crosses(frame, Crossed.GUARD)
+                frame["steps"] = frame["steps"] + code.select(counts, frame["more"], 0.0)
             frame.assign(crosses, **self.forgotten)
             if self.kick is not None:
                 self._kick_or_reflect(frame, self.kick, crosses)
@@ -556,7 +600,10 @@ class BorderControl:
         A motion that would go back over the border at once is pushed onto it from both sides: it slides. So does one
         that has come back in no measurable time, or not to rounding: it bounces off the border, ever less, and rests.
         """
-        code, hit, again = frame.code, border.is_hit, frame["stepped"] <= 0.0
+        code, hit, again, beyond = frame.code, border.is_hit, frame["stepped"] <= 0.0, frame["beyond"]
+        if self.table.groups:
+            is_first = self.table.crosses(frame, Crossed.GUARD, border.g)
+            beyond = code.select(is_first, beyond, border.rule("beyond")(border.piece))
         no_time = ~again & (abs(end_at_border(frame)) <= limits.NO_TIME * frame["smallest"])
         no_time = (no_time | (~again & (frame["stops"] > 0.0))) & (frame["at_rest"] > 0.0)
         place, back, slide = border["piece"] + self.motion.parameters, border["back"], border["slide"]
@@ -565,11 +612,11 @@ class BorderControl:
         if self.borders.releases:
             slides = slides | border.is_cone
         slides = hit & slides & border.has("slide")
-        frame.assign(hit & ~slides, place, params=frame["beyond"])
+        frame.assign(hit & ~slides, place, params=beyond)
         # A share jumps to where it is: it need not touch the border that it had crossed before.
         frame.assign(hit, back, touch=code.select(border.has("on"), Touch.NONE, Touch.VALUE))
         with code.only_if(slide >= 0):
-            below = code.select(border.piece < frame["beyond"], border.piece, frame["beyond"])
+            below = code.select(border.piece < beyond, border.piece, beyond)
             is_sign = code.lanes_of(border.rule("beyond").slope) <= 0.0
             frame.assign(slides, place, params=code.select(is_sign, -1.0, below))
             frame.assign(slides, slide + self.motion.parameters, params=1)

@@ -34,15 +34,21 @@ class Retraction:
         self.motion, self.line, self.dtypes = motion, borders.retraction, borders.program.dtypes
         self.base, self.rows, self.nesting = nesting.base, nesting.size // nesting.base, nesting
         self.shares = [j for j, kind in enumerate(borders.kinds) if kind == SLIDE]
-        self.groups = _join(borders.moved)
+        groups: dict[int, list[int]] = {}
+        for k, group in enumerate(borders.groups):
+            groups.setdefault(group, []).append(k)
+        self.groups = [(some, frozenset().union(*(borders.moved[k] for k in some))) for some in groups.values()]
         motion.layout.extend_by({
             "unretracted": motion.states,  # the argument of the map
             "begins": 1,  # 1 if the step is the first one of its member; of steps that are taken again
             "at_limit": self.base,  # 1 for a coordinate that a border moves which holds no more than it does; of these
         })  # fmt: skip
 
-    def _slides(self, numbers: Numbers) -> Value:
-        return functools.reduce(Value.__or__, [numbers(j + self.motion.parameters) > 0.0 for j in self.shares])
+    def _slides(self, code: Code, numbers: Numbers) -> Value:
+        most, first = code.variable(code.lanes_of(0.0)), self.motion.parameters + self.shares[0]
+        for k in self.motion.form.each(code, len(self.shares)):
+            most.value = code.maximum(most.value, numbers(k + first))
+        return most.value > 0.0
 
     # ---- the state ----
 
@@ -53,7 +59,7 @@ class Retraction:
         code = frame.code
         for i in form.each(code, motion.states):
             frame["unretracted", i] = frame["y", i]
-        slides = self._slides(lambda i: frame["params", i])
+        slides = self._slides(code, lambda i: frame["params", i])
         with code.only_if(code.any_lane(slides)):
             out = motion.evaluate_now(frame, self.line)
             for i in form.each(code, motion.states):
@@ -101,7 +107,7 @@ class Retraction:
         states, form, code = directions.states, directions.form, frame.code
         line = pushforward(self.line, self.dtypes, directions.varied, range(states))
         params = directions.numbers_of(frame, "params", self.motion.numbers)
-        slides = self._slides(lambda i: params[i])
+        slides = self._slides(code, lambda i: params[i])
         with code.only_if(code.any_lane(slides)):
             state = directions.numbers_of(frame, "unretracted", states, in_place=True)
             tangents = frame.vectors("dy", states, lambda i: (i, 0))
@@ -132,7 +138,8 @@ class Retraction:
         line, tables = pullback_and_entries(self.line, self.dtypes, cotangents.varied, range(motion.states))
         motion.layout.extend_by({"lost": motion.states})  # 1 for a number whose derivative does not exist
         frame = motion.function("back_retraction")
-        code, slides = frame.code, self._slides(lambda i: frame["params", i])
+        code = frame.code
+        slides = self._slides(code, lambda i: frame["params", i])
         begins = slides & (frame["begins"] > 0.0)
         _, t, params = motion.state_inputs(frame)
         state, state_ct, lost = (frame.vectors(x, motion.states) for x in ("unretracted", "state_ct", "lost"))
@@ -219,15 +226,3 @@ class Retraction:
             with frame.where(where if which is None else where & which(i)):
                 for part in range(2):
                     frame[name, self._place(row, i, part)] = float("nan")
-
-
-def _join(moved: Sequence[frozenset[int]]) -> list[tuple[list[int], frozenset[int]]]:
-    """Borders that move the same coordinates, directly or by others between them, with all that they move."""
-    groups: list[tuple[list[int], frozenset[int]]] = []
-    for k, coordinates in enumerate(moved):
-        one, rest = [([k], coordinates)], []
-        for group in groups:
-            (one if group[1] & coordinates else rest).append(group)
-        borders, all_moved = zip(*one, strict=True)
-        groups = [*rest, ([i for some in borders for i in some], frozenset().union(*all_moved))]
-    return groups

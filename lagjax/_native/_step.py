@@ -260,7 +260,7 @@ class StepControl:
                 with frame.where(small):
                     frame["code"] = self._reason(frame)
                 frame["rejected"] = frame["rejected"] + code.flag(bad)
-                note_halved(frame, bad)
+                frame.assign(bad, last=0.0, growth=limits.GROWTH_AFTER_REJECTION)  # nor is it the last one any more
                 often = (frame["rejected"] >= limits.MOST_HALVINGS) & (2.0 * frame["rejected"] >= frame["steps"])
                 self._forget_promises(frame, bad & often)
 
@@ -305,11 +305,6 @@ def absolute_tolerance(frame: Frame) -> Value:
     """The absolute tolerance of numbers whose units are not those of the state, as of a border."""
     given = frame.job("atol")
     return frame.code.select(given > 0.0, given, limits.ATOL_OVER_RTOL * frame.job("rtol"))
-
-
-def note_halved(frame: Frame, where: Value) -> None:
-    """Note that the step of some lanes has become shorter: it is not the last one any more, and the next grows less."""
-    frame.assign(where, last=0.0, growth=limits.GROWTH_AFTER_REJECTION)
 
 
 def _power(code: Code, x: Value, exponent: Value) -> Value:

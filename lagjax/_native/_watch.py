@@ -143,7 +143,10 @@ class Border(Watch):
     @property
     def is_hit(self) -> Value:
         """True in the lanes whose step ends at this border."""
-        return self.table.crosses(self.frame, Crossed.GUARD, self.g)
+        is_first = self.table.crosses(self.frame, Crossed.GUARD, self.g)
+        if not self.table.groups:
+            return is_first
+        return is_first | (self.table.crosses(self.frame, Crossed.GUARD) & (self.recall("joins") > 0.0))
 
     @property
     def is_cone(self) -> Value:
@@ -164,6 +167,12 @@ class Border(Watch):
         return level
 
 
+def joint_groups(borders: Borders) -> list[int]:
+    """The groups of guards of which several may be crossed in one step, one of each; none where that is not so."""
+    groups = [] if borders.nested or borders.kicking or len(set(borders.groups)) < 2 else borders.groups_of_guards
+    return groups if len({*groups} - {-1}) > 1 else []
+
+
 class GuardTable(Columns):
     """The guards of all pieces as constants of a kernel; and `knots`.
 
@@ -180,6 +189,8 @@ class GuardTable(Columns):
         rules = [[x for name in _RULES for x in getattr(guard, name)] for guard in borders.guards]
         self.rules = Columns(motion.module, names, rules, DOUBLE)
         super().__init__(motion.module, _PLACES, [[getattr(g, name) for name in _PLACES] for g in borders.guards])
+        groups = joint_groups(borders)
+        self.groups = Columns(motion.module, ["group"], [[group] for group in groups]) if groups else None
         moves = {j: borders.moving_table(j) is not None for j in borders.clocks}
         # The number and the piece of each clock that has knots.
         self.knots = [(c, j) for c, j in enumerate(borders.clocks) if moves[j] or j in borders.kicking]
@@ -232,7 +243,7 @@ class GuardTable(Columns):
             decided = code.compare("!=", border.rule("side")(frame["pieces_before", j]), 0.0)
             if self.borders.kicking:  # where L jumps, a motion that begins on the border comes from what L is there
                 decided = decided | self.kicks(frame)
-            with frame.where(where & border.is_hit & decided):
+            with frame.where(where & self.crosses(frame, Crossed.GUARD, border.g) & decided):
                 frame["hit", j], frame["is_hit"] = 1, Hit.BORDER
                 if moves:
                     frame["entry", j] = border.piece + border.rule("level").offset

@@ -67,7 +67,7 @@ from lagjax._program._passes import eliminate_dead_code, factor, sink_negations
 from lagjax._program._rounding import rounding
 from lagjax._program._scalars import Scalars, absolute, apply_function, concatenate, fold, scatter, stack
 from lagjax._program._series import LinearSystem, series
-from lagjax._program._sliding import eliminate, sparse_row, substitute
+from lagjax._program._sliding import MOST_COUPLED, eliminate, sparse_row, substitute
 from lagjax._program.lowering import _complex
 from lagjax._program.lowering._matrices import orthogonalize, row_weights, solve_orthogonalized
 from lagjax._program.lowering._rules import LARGEST_UNFOLDED, Expansion, expand_primitive, has_own_rules, inputs_of
@@ -228,12 +228,8 @@ class Program:
     def size(self) -> int:
         return len(self.dtypes)
 
-    @property
-    def dtypes(self) -> tuple[np.dtype, ...]:
-        return self._dtypes
-
     @functools.cached_property
-    def _dtypes(self) -> tuple[np.dtype, ...]:
+    def dtypes(self) -> tuple[np.dtype, ...]:
         return tuple(dtype for shape in self.shapes for dtype in [shape.dtype] * math.prod(shape.shape))
 
     def evaluate(self, *numbers) -> np.ndarray:

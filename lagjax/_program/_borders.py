@@ -142,7 +142,8 @@ class Borders(NamedTuple):
     table; those of a `CLOCK` have no guards. `motion` has the borders of the motion alone, where this is one with
     tangents (`_jump.with_borders_of_tangents`). `kick` is that at borders at which L jumps, None where there are none.
     `retraction` takes the inputs of the program to the state on the borders that it slides along, None where it may
-    slide along none; `moved` are the coordinates that each moves. `release` is that of the cones (`_sliding.Sliding`).
+    slide along none; `moved` are the coordinates that each moves, `groups` the group of each, and `release` is that of
+    the cones (`_sliding.Sliding`). Along so many borders, `unheld`, it may slide, and that is not followed.
     """
 
     program: Pieced
@@ -158,7 +159,23 @@ class Borders(NamedTuple):
     kick: Kick | None = None
     retraction: StraightLine | None = None
     moved: tuple[frozenset[int], ...] = ()
+    groups: tuple[int, ...] = ()
     release: StraightLine = StraightLine((), (), ())
+    unheld: int = 0
+
+    @property
+    def groups_of_guards(self) -> list[int]:
+        """The group of each guard of a border by velocity that the motion slides along, and of its shares.
+
+        −1 for others. Those of different groups may be crossed at one instant, in one step.
+        """
+        shares = [j for j, kind in enumerate(self.kinds) if kind == SLIDE]
+        of_shares, found = dict(zip(shares, self.groups, strict=True)), []
+        for guard in self.guards:
+            border = self.guards[guard.on] if guard.on >= 0 else guard
+            known = border.order == 1 and self.kinds[border.piece] != CONE
+            found.append(of_shares[border.slide] if known else -1)
+        return found
 
     @property
     def kicking(self) -> tuple[int, ...]:
@@ -679,12 +696,13 @@ class _Rewriting:
         switches, arguments = list(self.switches), [u for u, _ in features]
         linear = program.linear and self._linear(program.linear)
         at_rest = [slide for slide in sliding if slide.order == 1]
-        for slides in (sliding, at_rest, []):
+        for slides in (sliding, *([at_rest] if len(at_rest) < len(sliding) else ()), []):
             done = with_sliding(line, self.size, program.size, self.switches, slides, linear)
             if done is not None:
                 break
         assert done is not None  # without slides there is one
-        line, places, shares, linear, retraction, moved, release = done
+        line, places, shares, linear, retraction, moved, groups, release = done
+        unheld = len(sliding) - len(slides)
         sliding, switches, arguments = slides, [places[i] for i in switches] + shares, [places[i] for i in arguments]
         count, kick = len(switches), None
         if self.mechanics:
@@ -696,7 +714,7 @@ class _Rewriting:
         return Borders(
             pieced, tuple(switches), kinds, self._decide(count, sliding), _guards(kinds, sliding), nested,
             tuple(arguments), tuple(features.values()), (*self.tables, *[None] * len(sliding)), None, kick,
-            retraction, moved, release,
+            retraction, moved, groups, release, unheld,
         )  # fmt: skip
 
     def find_corners(self) -> FoundCorners | None:
@@ -814,8 +832,8 @@ class _Rewriting:
             if self.pieces[j] in undefined or (kind == SIGN and self.pieces[j] not in self._jumping):
                 continue
             read = inputs_below(line, [self.switches[j]])
-            if not read.isdisjoint(range(2 * n)):
-                orders[j] = 2 if read.isdisjoint(range(n, 2 * n)) else 1
+            if state := [i for i in read if i < 2 * n]:
+                orders[j] = 2 if max(state) < n else 1
         # The sign of a force is a corner where |force| rubs, but the slopes that it is solved by jump. An interpolation
         # has a corner at its entries, and no jump.
         degrees, lost = _velocity_degrees(line, n) if orders else [], []
@@ -936,7 +954,7 @@ def _guards(kinds: Sequence[int], slides: Sequence[Slide]) -> tuple[Guard, ...]:
     """
     guards: list[Guard] = []
     as_it_is, zero = Affine(1.0, 0.0), Level()
-    sliding = [slide.piece for slide in slides]
+    sliding = {slide.piece: k for k, slide in enumerate(slides)}
     first = len(kinds) - len(sliding)
     for j, kind in enumerate(kinds[:first]):
         k = len(guards)
@@ -957,7 +975,7 @@ def _guards(kinds: Sequence[int], slides: Sequence[Slide]) -> tuple[Guard, ...]:
             ]
         if j in sliding:
             last = k + len(of_piece) - 1  # the upper border of a piece, which that below it slides on
-            slide, (_, order, width, *_) = first + sliding.index(j), slides[sliding.index(j)]
+            slide, (_, order, width, *_) = first + sliding[j], slides[sliding[j]]
             of_piece = [guard._replace(slide=slide, order=order, rest=last) for guard in of_piece]
             none = Affine(0.0, 0.0)
             of_piece += [

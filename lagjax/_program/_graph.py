@@ -55,7 +55,8 @@ def _cancel(a: float, b: float) -> bool:
 
 def find_ancestors(nodes: Sequence[Node], outputs: Iterable[int], powers: Mapping[int, tuple] = {}) -> list[int]:
     """The nodes that some nodes depend on, and these, in order; those of `powers` depend on the base given there."""
-    marks, order = bytearray(len(nodes)), []
+    outputs, order = list(outputs), []
+    marks = bytearray(1 + max(outputs, default=0))
     for i in outputs:
         marks[i] = 1
     i = marks.rfind(1)

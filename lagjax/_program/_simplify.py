@@ -187,6 +187,7 @@ def invert(graph, op, a):
 def select(graph, op, predicate, no, yes):
     """One branch where the predicate is known or both branches are the same; the predicate where that is the result.
 
+    Of a branch that is a selection by the same predicate, it is one branch of that.
     `where(x == 0, 0, x)` is x: a series that begins at zero would be that of zero for good.
     """
     known = graph.value(predicate)
@@ -194,6 +195,9 @@ def select(graph, op, predicate, no, yes):
         return yes if known else no
     if (original := graph.operand_of("not", predicate)) is not None:
         return select(graph, op, original, yes, no)
+    for side, x in enumerate((no, yes)):
+        if graph.nodes[x][0] == "select" and graph.nodes[x][1][0] == predicate:
+            return select(graph, op, predicate, *(graph.nodes[x][1][1 + side] if y == x else y for y in (no, yes)))
     compared, operands, _ = graph.nodes[predicate]
     if compared in ("eq", "ne") and {no, yes} == {*operands}:  # both are the same number where they are equal
         return no if compared == "eq" else yes

@@ -32,8 +32,8 @@ from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._series import LinearSystem, StraightLine
 
 # Borders that act on each other, whose elimination takes a third of the cube; and borders in all. The first result of
-# 2500 blocks that know nothing of each other takes 20 CPU s, half of it for M; twice as many take three times as long.
-MOST_COUPLED, MOST_SLIDING = 64, 6000
+# 2500 blocks that know nothing of each other takes 6 CPU s, of 10 000 blocks 29, and 2 GB.
+MOST_COUPLED, MOST_SLIDING = 64, 20_000
 MOST_COPIES, LARGEST_COPIED = 4, 4000  # pieces for which all of a program is done once more, and its operations
 # Borders that are not independent share what they hold as if they yielded by so much, relative; what that leaves is
 # mended this many times. The share of what no border holds alone is as exact as rounding, divided by it.
@@ -80,7 +80,8 @@ class Sliding(NamedTuple):
     """A program with shares; `places` says where the nodes of the one without them are.
 
     `retraction` takes the same inputs to the state (q, q̇) on the borders that the motion slides along; `moved` are the
-    coordinates that the force of each of these moves. `release` gives for each cone changes of q̇ (n,): one by which
+    coordinates that the force of each of these moves; those of different `groups` know nothing of each other as long as
+    no time passes. `release` gives for each cone changes of q̇ (n,): one by which
     its vector becomes a unit along what it does not hold, and what takes the vector away.
     """
 
@@ -90,6 +91,7 @@ class Sliding(NamedTuple):
     linear: LinearSystem | None
     retraction: StraightLine | None
     moved: tuple[frozenset[int], ...]
+    groups: tuple[int, ...] = ()
     release: StraightLine = StraightLine((), (), ())
 
 
@@ -146,11 +148,7 @@ class _SlidingForces:
 
     def where(self, condition: int, x: int) -> int:
         """x where the condition holds, else zero."""
-        return self.f("select", condition, self.zero, x)
-
-    def masked(self, k: int, x: int) -> int:
-        """Zero where nothing slides along the border of row k."""
-        return self.where(self.flags[self.rows[k].slide], x)
+        return self.zero if self.graph.value(x) == 0 else self.f("select", condition, self.zero, x)
 
     def build(self) -> Sliding | None:
         """The program; None where pieces act on more than the right side, or not each for itself."""
@@ -158,11 +156,13 @@ class _SlidingForces:
         if acts is None or self._bends(acts):
             return None
         slopes, rates, levels = zip(*map(self._rate, range(len(self.rows))), strict=True)
-        responses, effects = self._effects(acts, slopes)
-        if np.bincount(_find_groups(effects, len(effects))).max() > MOST_COUPLED:
+        groups = self._find_groups(acts, slopes)
+        if np.bincount(groups).max() > MOST_COUPLED:
             return None
+        responses, effects = self._effects(acts, slopes)
         pushed = [self.f("lt", row.get(k, self.zero), self.zero) for k, row in enumerate(effects)]
-        all_pushed = [functools.reduce(lambda a, b: self.f("and", a, b), of) for of in self._group_rows(pushed)]
+        of_slides = zip(self.flags, self._group_rows(pushed), strict=True)
+        all_pushed = [functools.reduce(lambda a, b: self.f("and", a, b), of, flag) for flag, of in of_slides]
         pushed = [all_pushed[row.slide] for row in self.rows]
         # Borders that are not pushed onto are left, and act on nothing until then.
         acts = [{i: self.where(p, c) for i, c in act.items()} for p, act in zip(pushed, acts, strict=True)]
@@ -171,8 +171,8 @@ class _SlidingForces:
         ends = list(map(self.where, pushed, rates))
         missing = [self.f("sub", end, self._dot(d, self.linear.z)) for end, d in zip(ends, normals, strict=True)]
         unknown = self._unknown(equations, missing)
-        pivots = _choose_pivots([_constants(self.graph, self._unmask(d)) for d in slopes])
-        held = _Held(self.graph, self.n, pushed, [self._unmask(d) for d in slopes], responses, pivots)
+        pivots = _choose_pivots([_constants(self.graph, d) for d in slopes])
+        held = _Held(self.graph, self.n, pushed, slopes, responses, pivots)
         z = self._solve(self._push_right_side(self.linear.right, acts, unknown))
         missed = self._miss_constraints(z)
         if len(pivots) < len(acts) or missed:
@@ -187,7 +187,7 @@ class _SlidingForces:
         directions = [
             self.f("select", p, self.f("neg", x), y) for p, x, y in zip(pushed, missing, unknown, strict=True)
         ]
-        release = self._release(directions, [self._unmask(d) for d in slopes])
+        release = self._release(directions, slopes)
         linear = self._system(z, unknown, acts, normals, ends, equations, held.pivots())
         outputs = (*z[: self.n], *self.line.outputs[self.n :])
         line = StraightLine(tuple(self.graph.nodes), tuple(self.graph.kinds), outputs)
@@ -202,8 +202,23 @@ class _SlidingForces:
         held.put_back(self.n, range(len(levels)), levels, lambda left: equations.solve(self.graph, left), pushed)
         retraction, moved = held.finish()
         of_slides = tuple(frozenset().union(*some) for some in self._group_rows(moved))
+        groups = tuple(groups[rows[0]] for rows in self.rows_of)
         release = eliminate_dead_code(self.graph, release)
-        return Sliding(line, range(len(self.line.nodes)), shares, linear, retraction, of_slides, release)
+        return Sliding(line, range(len(self.line.nodes)), shares, linear, retraction, of_slides, groups, release)
+
+    def _find_groups(self, acts: Sequence[Sparse], slopes: Sequence[Sparse]) -> list[int]:
+        """The group of each row: what those of different ones move, and read, A does not couple."""
+        matrix, size = self.linear.entries | self.linear.others, len(self.linear.right)
+        rows: list[Sparse] = [{i: self.one} for i in range(size)]
+        for (i, j), x in matrix.items():
+            if x != self.zero:
+                rows[i][j] = x
+        parts = _find_groups(rows, size)
+        of_cones = [rows[0] for rows in self.rows_of for _ in rows]
+        touched = [{parts[i]: self.one for i in both} for both in map(dict.__or__, acts, slopes)]
+        for row, first in zip(touched, of_cones, strict=True):
+            row[size + first] = self.one
+        return _find_groups(touched, size + len(touched))
 
     def _group_rows(self, of_rows: Sequence) -> list[list]:
         return [[of_rows[m] for m in rows] for rows in self.rows_of]
@@ -240,14 +255,16 @@ class _SlidingForces:
         line, first, results = self._solution, len(self.linear.factors), []
         still = copy_nodes(self.graph, line, [*self.linear.factors, *[self.zero] * len(self.linear.right)])
         inputs = {node[2]: i for i, node in enumerate(line.nodes) if node[0] == "input"}
-        readers = find_readers(line.nodes)
+        readers, places = find_readers(line.nodes), {}
+        for i, node in enumerate(line.outputs):
+            places.setdefault(node, []).append(i)
         for act in acts:
             moved = {inputs[first + i]: x for i, x in act.items() if first + i in inputs}
             for i in find_descendants(readers, moved):
                 op, operands, attribute = line.nodes[i]
                 moved[i] = copy_operation(self.graph, op, [moved.get(x, still[x]) for x in operands], attribute)
-            z = {i: moved[node] for i, node in enumerate(line.outputs) if node in moved}
-            results.append({i: x for i, x in z.items() if x != self.zero})
+            z = sorted((i, x) for node, x in moved.items() for i in places.get(node, ()))
+            results.append({i: x for i, x in z if x != self.zero})
         return results
 
     def _add(self, xs: Sequence[int], ys: Sequence[int]) -> list[int]:
@@ -264,7 +281,7 @@ class _SlidingForces:
         return found
 
     def _effects(self, acts: Sequence[Sparse], slopes: Sequence[Sparse]) -> tuple[list[Sparse], list[Sparse]]:
-        """The slopes of z by each piece, and ∂u̇/∂p of each border by each piece; zeros where nothing slides."""
+        """The slopes of z by each piece, and ∂u̇/∂p of each border by each piece."""
         responses, effects = self._respond(acts), []
         of_coordinates = _transpose(responses, len(self.linear.right))
         for d in slopes:
@@ -274,11 +291,6 @@ class _SlidingForces:
                 row[m] = dot(self.graph, [d[i] for i in both], [responses[m][i] for i in both])
             effects.append({m: x for m, x in row.items() if x != self.zero})
         return responses, effects
-
-    def _unmask(self, row: Sparse) -> Sparse:
-        """Numbers that are zero where nothing slides, as they are where something does."""
-        nodes = self.graph.nodes
-        return {i: nodes[d][1][2] if nodes[d][0] == "select" else d for i, d in row.items()}
 
     def _equations(self, effects: list[Sparse], pushed: Sequence[int], slopes: Sequence[Sparse]) -> "_Equations":
         """The linear equations of μ; μ = 0 where there is nothing to do."""
@@ -327,7 +339,7 @@ class _SlidingForces:
     def _are_dependent(self, slopes: Sequence[Sparse]) -> bool:
         """True if the rates of some borders are combinations of others, so that these can share what they hold."""
         some, groups = np.random.default_rng(0), {}
-        constants = [_constants(self.graph, self._unmask(of_one)) for of_one in slopes]
+        constants = [_constants(self.graph, of_one) for of_one in slopes]
         for k, group in enumerate(_find_groups(slopes, self.n)):
             groups.setdefault(group, []).append(constants[k])
         for rows in groups.values():
@@ -352,7 +364,8 @@ class _SlidingForces:
             left = f("sub", self.one, dot(self.graph, mu, mu))
             return f("select", pushed, self.number(-FAR), f("mul", self.number(0.25), left))
         moves = f("sub", self._dot(slopes[rows[0]], z), rates[rows[0]])
-        return f("select", pushed, f("add", half, f("mul", self.number(FAR), moves)), f("mul", half, mu[0]))
+        beyond = f("select", self.flags[k], half, f("add", half, f("mul", self.number(FAR), moves)))
+        return f("select", pushed, beyond, f("mul", half, mu[0]))
 
     def _push_right_side(
         self, right: Sequence[int], acts: Sequence[dict[int, int]], unknown: Sequence[int]
@@ -383,7 +396,7 @@ class _SlidingForces:
             for i, node in sorted((i, x) for x in below.keys() & above.keys() & entries.keys() for i in entries[x]):
                 change = self.f("sub", above[node], below[node])
                 if self.graph.value(change) != 0:
-                    act[i] = self.masked(m, self.f("mul", factor, change))
+                    act[i] = self.f("mul", factor, change)
             acts.append(act)
         return acts
 
@@ -460,7 +473,7 @@ class _SlidingForces:
         return of_pieces
 
     def _rate(self, k: int) -> tuple[Sparse, int, int]:
-        """∂w/∂q̇ and −∂w/∂q q̇ − ∂w/∂t of what is to stay zero, u or u̇; zeros where nothing slides. And w."""
+        """∂w/∂q̇ and −∂w/∂q q̇ − ∂w/∂t of what is to stay zero, u or u̇. And w."""
         n, node = self.n, self.rows[k].offset
         level, slopes = node, {}
         for _ in range(self.slides[self.rows[k].slide].order):
@@ -469,8 +482,8 @@ class _SlidingForces:
             by_place = {i: x for i, x in slopes.items() if i < n}
             velocities = [self.graph.input(n + i, "float") for i in by_place]
             node = self.f("add", dot(self.graph, by_place.values(), velocities), slopes.get(2 * n, self.zero))
-        by_velocity = {i - n: self.masked(k, x) for i, x in slopes.items() if n <= i < 2 * n}
-        return by_velocity, self.masked(k, self.f("neg", node)), level
+        by_velocity = {i - n: x for i, x in slopes.items() if n <= i < 2 * n}
+        return by_velocity, self.f("neg", node), level
 
     def _system(self, z, unknown, acts, slopes, rates, of_unknowns, pivots) -> LinearSystem:
         system, count = self.linear, len(self.linear.right)

@@ -34,7 +34,7 @@ from lagjax._primitives import lost_unless, marks_absent, raise_where_failed, se
 from lagjax._program import Unlowerable
 from lagjax._run._trajectory import Trajectory
 from lagjax._run.contacts import note_sections
-from lagjax._run.hybrid import Hybrid, Scene, require_scene
+from lagjax._run.hybrid import Hybrid, Scene, follow_modes, require_scene
 
 PyTree = Any
 _TOO_MANY = code_of(RESULTS.max_crossings_reached)
@@ -131,7 +131,7 @@ def crossings(
     if isinstance(scene, Hybrid):
         ts = jnp.asarray(ts)[jnp.array([0, -1])]
         watched = scene.with_sections(functions, directions, count)
-        run = watched.follow(q0, qdot0, ts, params, rtol=rtol, atol=atol, max_steps=max_steps, throw=False)
+        run = follow_modes(watched, q0, qdot0, ts, params, rtol, atol, max_steps, throw=False)
         notes = _notes_of(run, len(scene.transitions), len(functions))
         return _read_crossings(notes, ts, len(functions), count, layout, names, throw, inputs)
     problem = Problem.from_arguments(scene, layout, q0, qdot0, ts, params, rtol, atol, max_steps)

@@ -5,6 +5,7 @@ the engine; let it solve the problem; and dress the solution in the user's pytre
 trajectory fails.
 """
 
+import dataclasses
 import functools
 import os
 from collections.abc import Callable
@@ -24,6 +25,7 @@ from lagjax._interface import ENDED_WELL, RESULTS, Layout, advice, as_arrays, ha
 from lagjax._primitives import marks_absent
 from lagjax._run._trajectory import State, Trajectory, raise_unless_ok, step_counts
 from lagjax._run.contacts import follow_contacts, follow_contacts_batch
+from lagjax._run.hybrid import Hybrid, follow_modes
 from lagjax._scene import System, lift_batch, lift_problem, require_system
 
 PyTree = Any
@@ -57,7 +59,7 @@ def _translate_keywords(function: Callable) -> Callable:
 @_translate_keywords
 @marks_absent
 def simulate(
-    system: System | Any,
+    system: System | Hybrid,
     q0: PyTree,
     qdot0: PyTree,
     ts: jax.Array | np.ndarray,
@@ -68,7 +70,7 @@ def simulate(
     atol: float | None = None,
     dt: float | None = None,
     max_steps: int = 65_536,
-    max_transitions: int = 256,
+    max_transitions: int | None = None,
     event: Callable | diffrax.Event | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     throw: bool = True,
@@ -80,7 +82,7 @@ def simulate(
 
     **Everyday arguments**
 
-    - `system`: a `System`, or a `Hybrid`, whose motion is that of `simulate_hybrid`.
+    - `system`: a `System`, or a `Hybrid`, whose motion runs through its modes.
     - `q0`, `qdot0`: the initial state, pytrees of real floats of one structure. Their dtype (float32, float64) is that
       of times, parameters and results. Machine code computes in float64 in any case and rounds once, at the end.
     - `ts`: output times, shape (T,), T ≥ 2, strictly increasing, or strictly decreasing to go back in time.
@@ -102,7 +104,8 @@ def simulate(
     - `dt`: take fixed steps of this size instead of adaptive ones; `rtol` and `atol` then do not apply.
     - `max_steps`: the budget of steps, rejected ones included. A reverse-mode gradient by diffrax records that many
       times for every member: lower it for the gradient of a large batch.
-    - `max_transitions`: of a scene with contacts, the budget of changes: impacts, releases, slips that stop and begin.
+    - `max_transitions`: of a scene with contacts, the budget of changes: impacts, releases, slips that stop and begin;
+      256 by default. Of a `Hybrid`, the budget of transitions, in place of its own.
     - `event`: a function of (q, qdot), and of `t`, `params` by name. A real-valued event stops the motion where it
       changes sign. Machine code finds that on its series, without sampling, so that none is missed. A motion that
       starts on the zero, to the rounding of the numbers that came in (eight roundings of each, in float32), has to
@@ -165,9 +168,11 @@ def simulate(
     ```
     """
     of_engines = {"solver": solver, "dt": dt, "event": event, "adjoint": adjoint, "progress": progress}
-    if not isinstance(system, System) and hasattr(system, "follow"):  # a `Hybrid`
+    if isinstance(system, Hybrid):
         _refuse_options("a lagjax.Hybrid", of_engines)
-        return system.follow(q0, qdot0, ts, params, rtol=rtol, atol=atol, max_steps=max_steps, throw=throw)
+        if max_transitions is not None:
+            system = dataclasses.replace(system, max_transitions=max_transitions)
+        return follow_modes(system, q0, qdot0, ts, params, rtol, atol, max_steps, throw)
     system = require_system(system, contacts=True)
     if system.touches:
         _refuse_options("a scene with contacts", of_engines)
@@ -194,7 +199,7 @@ def simulate(
 @_translate_keywords
 @marks_absent
 def simulate_batch(
-    system: System,
+    system: System | Hybrid,
     q0: PyTree,
     qdot0: PyTree,
     ts: jax.Array,
@@ -206,7 +211,7 @@ def simulate_batch(
     atol: float | None = None,
     dt: float | None = None,
     max_steps: int = 65_536,
-    max_transitions: int = 256,
+    max_transitions: int | None = None,
     event: Callable | diffrax.Event | None = None,
     adjoint: diffrax.AbstractAdjoint | None = None,
     progress: bool | diffrax.AbstractProgressMeter = False,
@@ -217,6 +222,8 @@ def simulate_batch(
     integer, None for an argument that all members share, or a pytree of these. The default is a batch of initial
     states; a sweep over parameters from one initial state is `batch_axes=(None, None, 0)`, and over one of them
     `batch_axes=(None, None, {"m": 0, "l": None})`. In the result the members are the first axis.
+
+    A `Hybrid` runs under `jax.vmap`: inside of a `jax.jit` of your own it is compiled once.
 
     A member that fails, or starts from NaN, never raises and does not affect the others: look at `trajectory.ok` and
     `trajectory.result`. The other arguments, their errors, and the source are those of `simulate`.
@@ -229,13 +236,18 @@ def simulate_batch(
     assert trajectory.q.shape == (1000, 101) and trajectory.ok.all()
     ```
     """
-    system = require_system(system, contacts=True)
-    if system.touches:
-        of_engines = {"solver": solver, "dt": dt, "event": event, "adjoint": adjoint, "progress": progress}
-        _refuse_options("a scene with contacts", of_engines)
-    requested = requested_engine(solver, dt, adjoint, progress, rtol, atol)
+    of_engines = {"solver": solver, "dt": dt, "event": event, "adjoint": adjoint, "progress": progress}
     values = {"q0": q0, "qdot0": qdot0, "params": params}
     axes, size = axes_per_leaf(values, batch_axes)
+    if isinstance(system, Hybrid):
+        options = of_engines | {"rtol": rtol, "atol": atol, "max_steps": max_steps, "max_transitions": max_transitions}
+        follow = functools.partial(simulate, system, throw=False, **options)
+        run = jax.vmap(lambda q0, qdot0, params: follow(q0, qdot0, ts, params), batch_axes)(q0, qdot0, params)
+        return dataclasses.replace(run, ts=run.ts[0], params=params, params_axes=batch_axes[2])
+    system = require_system(system, contacts=True)
+    if system.touches:
+        _refuse_options("a scene with contacts", of_engines)
+    requested = requested_engine(solver, dt, adjoint, progress, rtol, atol)
     given = Batch.from_values(system, values, axes, size, ts, rtol, atol, max_steps, event)
     try:
         batch = lift_batch(given)

@@ -174,7 +174,7 @@ class Trajectory(eqx.Module):
     - `stats`: counts of steps, per member: `num_steps`, `num_accepted_steps`, `num_rejected_steps`.
     - `tolerances`: rtol and atol of a step; None where it had a fixed size.
     - `engine`: the engine that integrated it, "MachineCode" or "Diffrax"; "" for a hybrid motion.
-    - `mode`, `transitions`: for a hybrid motion (`simulate_hybrid`) the mode at every output time and its
+    - `mode`, `transitions`: for the motion of a `Hybrid` the mode at every output time and its
       `Transitions`; otherwise None. `system` is then the dict of modes, and quantities are those of the mode at every
       time, NaN where the mode is −1. A mode is a place in `mode_names`, because the dict loses its order in `jax.jit`.
     - `impacts`, `contact_changes`: of a scene with contacts its `Impacts` and all `ContactChanges`, otherwise None;

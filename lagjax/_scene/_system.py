@@ -510,7 +510,7 @@ def require_system(system: Any, contacts: bool = False) -> System:
         kind = type(system).__name__
         if kind == "Hybrid":
             raise TypeError(
-                "This is for one System: a lagjax.Hybrid is taken by simulate, simulate_hybrid, crossings, "
+                "This is for one System: a lagjax.Hybrid is taken by simulate, simulate_batch, crossings, "
                 "periodic_orbit, lyapunov_spectrum, fit and sweep."
             )
         name = getattr(system, "__name__", kind) if callable(system) else kind

@@ -88,23 +88,6 @@ class Store:
     solver: Any = None
 
 
-def _as_store(store: Any, arguments: dict[str, Any]) -> Store:
-    """The store, with arguments that once were those of `sweep` itself; a warning tells where they are now."""
-    place = store if isinstance(store, Store) else Store(store)
-    if not arguments:
-        return place
-    if unknown := set(arguments) - {field.name for field in fields(Store)}:
-        raise TypeError(f"sweep() got an unexpected keyword argument {min(unknown)!r}")
-    shown = ", ".join(f"{name}=…" for name in arguments)
-    warnings.warn(
-        f"sweep(…, {shown}) is sweep(…, store=lagjax.Store({os.fspath(place.path)!r}, {shown})) now; the old spelling "
-        "goes with the next version.",
-        DeprecationWarning,
-        stacklevel=3,
-    )
-    return replace(place, **arguments)
-
-
 @dataclass(frozen=True)
 class Sweep:
     """A sweep that was begun, known by the path of its `store`: its members, progress, statistics and damage.
@@ -181,7 +164,6 @@ def sweep(
     store: Store | str | Path,
     executor: Any = None,
     progress: bool = True,
-    **arguments: Any,
 ) -> Sweep:
     r"""Run `system` for every point of `over`, keep a few numbers of each motion, and store them in a folder.
 
@@ -195,7 +177,7 @@ def sweep(
 
     **What runs**
 
-    - `system`: a `System`, or a `Hybrid`, of which `keep` gets the trajectory that `simulate_hybrid` returns.
+    - `system`: a `System`, or a `Hybrid`, of which `keep` gets the trajectory that `simulate` returns.
     - `over`: a dict of axes, of which the product is swept. A 1-D array is an axis by its name; a design of
       `lagjax.designs` (`random`, `sobol`, `latin_hypercube`) draws its values by a rule; a tuple of names with a tuple
       of arrays, or with a design, varies several together. There may be 10⁸ members: they are never listed.
@@ -221,7 +203,6 @@ def sweep(
       next. A member that kills its process, by memory or by a library of its own, costs a worker of an executor, and
       the error names its unit: `ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))`.
     - `progress`: a line on stderr.
-    - `arguments`: those of `Store`, which once were given here; with a warning.
 
     A store knows the scene and `keep` by their code and by all that this reads: helpers, globals, closures, classes
     with all their attributes, modules imported inside. What it cannot know is what a function reads from files, from
@@ -261,7 +242,7 @@ def sweep(
     """
     system = require_scene(system)
     require_flag(progress, "progress")
-    settled = _as_store(store, arguments)
+    settled = store if isinstance(store, Store) else Store(store)
     settings = {name: getattr(settled, name) for name in ("rtol", "atol", "max_steps", "event", "solver")}
     given = [name for name in ("event", "crossings", "solver") if getattr(settled, name) is not None]
     if given and jumps(system):

@@ -34,7 +34,7 @@ from lagjax._equations import (
 )
 from lagjax._interface import RESULTS, Layout, code_of, halves, join_names, not_finite, numbers_at
 from lagjax._primitives import sentence
-from lagjax._program import Unlowerable
+from lagjax._program import MOST_COUPLED, Unlowerable
 from lagjax._run import Trajectory
 from lagjax._scene import System
 from lagjax._trust.checks import check, describe_direction
@@ -359,15 +359,29 @@ _EXPLAIN = (
 
 def _run_check(system: System, derivation: Derivation, params, ended: Ended) -> str:
     """The first finding of `check` at the end that explains the failure."""
+    jumps = _CODES[ended.code] == "acceleration_discontinuous"
+    if jumps and (unheld := _count_unheld(derivation)):
+        return (
+            f"\nIt may rest, or slide, along {unheld} borders there, which dry friction makes: machine code follows at "
+            f"most {MOST_COUPLED} that M couples to each other, and none that change in other ways what others hold. "
+            "Round sign(v) off, as jnp.tanh(v / w) with a speed w that does not matter."
+        )
     if ended.scene is None and derivation.layout.size > (LARGEST if is_lowered(derivation) else 16):
         return ""
     q, qdot = map(derivation.layout.restore, halves(ended.y))
     found = {finding.kind: finding for finding in reversed(list(check(system, q, qdot, ended.t, params)))}
     if (kind := next((kind for kind in _EXPLAIN if kind in found), None)) is not None:
         return f"\nThere check says: {found[kind].message}{_budget(ended)}"
-    jumps = _CODES[ended.code] == "acceleration_discontinuous"
     pieces = describe_pieces(*_short_functions(derivation, params, ended)) if jumps else ""
     return f"\nThe scene is pieced together by {pieces}.{_budget(ended)}" if pieces else ""
+
+
+def _count_unheld(derivation: Derivation) -> int:
+    """The borders that the motion may slide along, and machine code does not."""
+    try:
+        return 0 if derivation.lowered.borders is None else derivation.lowered.borders.unheld
+    except Unlowerable:
+        return 0
 
 
 def _budget(ended: Ended) -> str:

@@ -77,7 +77,7 @@ def test_batches_of_batches_and_times_of_their_own():
 def test_hybrid_motions_have_their_modes_by_name():
     bounce = lagjax.Transition("fall", "rest", guard=lambda q, v: q, direction=-1, reset=lambda q, v: (q, 0 * v))
     modes = {"fall": lagjax.System(ramp), "rest": lagjax.System(free_particle)}
-    run = lagjax.simulate_hybrid(modes, [bounce], "fall", 0.25, 0.0, TS)
+    run = lagjax.simulate(lagjax.Hybrid(modes, [bounce], "fall"), 0.25, 0.0, TS)
     assert list(run.to_pandas()["mode"]) == ["fall"] * 3 + ["rest"] * 2
 
 

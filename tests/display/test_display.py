@@ -60,7 +60,7 @@ def test_a_batch(fallen):
 def test_a_hybrid_motion():
     bounce = lagjax.Transition("flight", "flight", guard=lambda q, v: q, direction=-1, reset=lambda q, v: (q, -0.5 * v))
     ball = lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q)
-    run = lagjax.simulate_hybrid({"flight": ball}, [bounce], "flight", 1.0, 0.0, TS, throw=False)
+    run = lagjax.simulate(lagjax.Hybrid({"flight": ball}, [bounce], "flight"), 1.0, 0.0, TS, throw=False)
     first, second, third = lines(run)
     assert first.endswith("; modes flight") and second.endswith("32 transitions") and third.endswith(": zeno")
     assert str(run.transitions).startswith("32 transitions between places in mode_names: 0 → 0 at t = 0.451524, 0 → 0")

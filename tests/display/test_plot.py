@@ -89,8 +89,8 @@ def balls():
     def run(restitution):
         def one(speed):
             start = jnp.array([0.0, 0.5]), jnp.stack([speed, 0.0 * speed])
-            return lagjax.simulate_hybrid(
-                {"f": flight}, [bounce, around], "f", *start, FALL, restitution, max_transitions=6
+            return lagjax.simulate(
+                lagjax.Hybrid({"f": flight}, [bounce, around], "f"), *start, FALL, restitution, max_transitions=6
             )
 
         return jax.vmap(one)(SPEEDS)

@@ -105,7 +105,7 @@ def test_nan_for_what_is_not_there_is_no_mistake_to_jax_debug_nans(derived):
         return lagjax.crossings(SPRING, lambda q, v: q, x, 0.0, ts, 1.0, count=4)
 
     def turned(x):
-        return lagjax.simulate_hybrid({"a": SPRING}, [turn], "a", x, 0.0, ts, 1.0, max_transitions=3)
+        return lagjax.simulate(lagjax.Hybrid({"a": SPRING}, [turn], "a"), x, 0.0, ts, 1.0, max_transitions=3)
 
     with jax.debug_nans(True):
         run = lagjax.simulate(SPRING, 1.0, 0.0, ts, 1.0, event=lambda q, v: q)

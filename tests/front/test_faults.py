@@ -67,8 +67,9 @@ def stay(**changes):
 def hybrid(transition=None, **changes):
     def call():
         made = [stay() if transition is None else transition()]
-        given = {"modes": {"a": FREE}, "transitions": made, "start": "a", "q0": 0.0, "qdot0": 1.0, "ts": TS}
-        return lagjax.simulate_hybrid(**(given | changes))
+        given = {"modes": {"a": FREE}, "start": "a", "q0": 0.0, "qdot0": 1.0, "ts": TS} | changes
+        scene = lagjax.Hybrid(given.pop("modes"), made, given.pop("start"))
+        return lagjax.simulate(scene, **given)
 
     return call
 
@@ -156,7 +157,7 @@ REFUSED = {
     "a batch of nothing": (batch(batch_axes=(None, None, None)), ValueError, "maps over nothing"),
     "an empty batch": (batch(jnp.zeros(0), jnp.zeros(0)), ValueError, "batch is empty"),
     "NaN that all members share": (batch(params={"m": np.inf, "k": 1.0}), ValueError, r"params\['m'\] is inf"),
-    # simulate_hybrid and Transition
+    # Hybrid and Transition
     "a transition without a guard": (hybrid(lambda: stay(guard=None)), TypeError, "has no guard"),
     "a guard of one argument": (hybrid(lambda: stay(guard=lambda q: q)), TypeError, "guard must have the form"),
     "a direction of two": (hybrid(lambda: stay(direction=2)), ValueError, "direction must be"),
@@ -276,7 +277,9 @@ def test_found(name):
 def bounces():
     floor = lagjax.Transition("a", "a", lambda q, v: q, -1, lambda q, v: (q, -0.5 * v))
     ball = lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q)
-    return lagjax.simulate_hybrid({"a": ball}, [floor], "a", 1.0, 0.0, [0.0, 5.0], max_transitions=8, throw=False)
+    return lagjax.simulate(
+        lagjax.Hybrid({"a": ball}, [floor], "a"), 1.0, 0.0, [0.0, 5.0], max_transitions=8, throw=False
+    )
 
 
 STOPPED = {

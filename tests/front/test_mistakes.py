@@ -115,7 +115,7 @@ def _sweep(ts, crossings=None):
     def keep(run, found):
         return {"q": run.q[-1]}
 
-    more = {"params": MASS, "keep": keep, "store": "not-made", "crossings": crossings}
+    more = {"params": MASS, "keep": keep, "store": lagjax.Store("not-made", crossings=crossings)}
     return lagjax.sweep(SPRING, {"a": np.linspace(0.0, 1.0, 3)}, ts, q0=lambda point: point["a"], qdot0=0.0, **more)
 
 
@@ -137,10 +137,14 @@ def test_whole_numbers_and_comparisons_are_forces(force):
 
 def test_a_hybrid_is_taken_where_a_motion_is_followed():
     one = lagjax.simulate(BALL, 0.5, 0.0, TS * 1.5, rtol=1e-9)
-    two = lagjax.simulate_hybrid(BALL, 0.5, 0.0, ts=TS * 1.5)
-    three = lagjax.simulate_hybrid(BALL.modes, BALL.transitions, "f", 0.5, 0.0, TS * 1.5)
-    for run in (one, two, three):
+    for run in (one, lagjax.simulate(lagjax.Hybrid(BALL.modes, BALL.transitions, 0), 0.5, 0.0, TS * 1.5)):
         np.testing.assert_allclose(run.q, [0.5, 0.5 - 0.75**2 / 2, 0.25 - 0.125], atol=1e-14)
+    starts = jnp.array([0.5, 0.3])
+    many = lagjax.simulate_batch(BALL, starts, 0.0, TS * 1.5, batch_axes=(0, None, None), max_transitions=2)
+    np.testing.assert_allclose(many.q[0], one.q, atol=1e-14)
+    assert many.ts.shape == TS.shape and many.transitions.t.shape == (2, 2) and many.energy().shape == (2, len(TS))
+    with pytest.raises(TypeError, match="takes no dt for a lagjax"):
+        lagjax.simulate_batch(BALL, starts, starts, TS, dt=0.1)
 
 
 @pytest.mark.slow

@@ -308,7 +308,11 @@ def a_system(**roles):
 
 def a_transition(**fields):
     transitions = [lagjax.Transition(**fields)]
-    return lagjax.simulate_hybrid({"a": SPRING}, transitions, "a", 1.0, 0.5, SHORT, PARAMS, rtol=RTOL)
+    return lagjax.simulate(lagjax.Hybrid({"a": SPRING}, transitions, "a"), 1.0, 0.5, SHORT, PARAMS, rtol=RTOL)
+
+
+def a_hybrid(modes, transitions, start, **arguments):
+    return lagjax.simulate(lagjax.Hybrid(modes, transitions, start), **arguments)
 
 
 MOTION = {"q0": 1.0, "qdot0": 0.5, "ts": SHORT, "params": PARAMS, "rtol": RTOL}
@@ -317,8 +321,8 @@ OPTIONS = ("atol", "dt", "max_steps", "solver", "event", "adjoint", "progress")
 CALLS = {  # what is called, with which arguments it is right, and which more it has
     "simulate": (lagjax.simulate, MOTION | {"system": SPRING}, (*OPTIONS, "throw")),
     "simulate_batch": (lagjax.simulate_batch, MANY | {"system": SPRING}, (*OPTIONS, "batch_axes")),
-    "simulate_hybrid": (
-        lagjax.simulate_hybrid, MOTION | {"modes": {"a": SPRING}, "transitions": [], "start": "a"},
+    "Hybrid": (
+        a_hybrid, MOTION | {"modes": {"a": SPRING}, "transitions": [], "start": "a"},
         ("atol", "max_steps", "max_transitions", "throw"),
     ),
     "Transition": (a_transition, {"source": "a", "target": "a", "guard": far}, ("direction", "reset")),
@@ -388,7 +392,7 @@ def check(name, changes):
 # By default not where a right motion compiles for long: `test_faults` shows what is refused of a fixed step.
 @pytest.mark.parametrize(
     ("name", "argument"),
-    sweep(EVERY, kept=lambda one: one[0] not in ("simulate_batch", "simulate_hybrid") and one != ("simulate", "dt")),
+    sweep(EVERY, kept=lambda one: one[0] not in ("simulate_batch", "Hybrid") and one != ("simulate", "dt")),
 )
 def test_one_wrong_argument(name, argument):
     # Not many are drawn but all of them: a refusal takes a millisecond.

@@ -437,7 +437,7 @@ def of_state(method):
 
 def bounced(scene):
     wall = lagjax.Transition("free", "free", lambda q, v: q - 0.1, -1, lambda q, v: (q, -v))
-    return lagjax.simulate_hybrid({"free": scene}, [wall], "free", 1.0, 0.0, np.array([0.0, 2.0])).end.q
+    return lagjax.simulate(lagjax.Hybrid({"free": scene}, [wall], "free"), 1.0, 0.0, np.array([0.0, 2.0])).end.q
 
 
 def fitted(scene):
@@ -461,7 +461,7 @@ PUBLIC = {
     "jit": lambda scene: jax.jit(lambda q: lagjax.simulate(scene, q, 0.0, TS).end.q)(1.0),
     "grad": lambda scene: jax.grad(lambda q: lagjax.simulate(scene, q, 0.0, TS).end.q)(1.0),
     "crossings": crossed,
-    "simulate_hybrid": bounced,
+    "a hybrid motion": bounced,
     "energy": of_state("energy"),
     "acceleration": of_state("acceleration"),
     "momentum": of_state("momentum"),
@@ -490,7 +490,7 @@ SPACE = cell("def gain(x): return K * x\ndef L(q, v): return 0.5 * M * v**2 - 0.
 SCENE = lagjax.System(SPACE["L"])
 
 
-SLOW = "simulate by diffrax|simulate_hybrid|equilibrium|conserved_quantities|linearize|hamiltonian|normal_modes|action"
+SLOW = "simulate by diffrax|a hybrid motion|equilibrium|conserved_quantities|linearize|hamiltonian|normal_modes|action"
 
 
 @pytest.mark.parametrize(

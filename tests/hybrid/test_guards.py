@@ -25,7 +25,7 @@ def on_sphere(speed, **options):
     s, c = np.sin(0.6), np.cos(0.6)
     leave = T("on", "off", lambda q, v, multipliers: multipliers, -1, **options)
     v = speed * jnp.array([c, -s])
-    return lagjax.simulate_hybrid(SPHERE, [leave], "on", jnp.array([s, c]), v, jnp.array([0.0, 0.2]))
+    return lagjax.simulate(lagjax.Hybrid(SPHERE, [leave], "on"), jnp.array([s, c]), v, jnp.array([0.0, 0.2]))
 
 
 def test_a_mode_whose_guard_is_beyond_zero_ends_at_once():
@@ -46,7 +46,7 @@ def test_a_blow_beyond_its_wall_happens_where_the_motion_goes_on():
     # A millionth below the floor: downwards it bounces; upwards it is let out, which is said. At rest the floor pushes.
     def run(v, transitions, q=-1e-6):
         ts, params = jnp.array([0.0, 0.05]), {"g": G}
-        return lagjax.simulate_hybrid({"f": BALL}, transitions, "f", q, v, ts, params, throw=False)
+        return lagjax.simulate(lagjax.Hybrid({"f": BALL}, transitions, "f"), q, v, ts, params, throw=False)
 
     runs = jax.jit(jax.vmap(lambda v: run(v, [BOUNCE])))(jnp.array([-0.5, 0.5, 0.0]))
     rise = np.array([0.45, 0.5]) * 0.05 - 0.5 * G * 0.05**2 - 1e-6
@@ -75,7 +75,7 @@ def test_a_reset_that_carries_beyond_another_guard():
     law = [jump, T("f", "g", lambda q, v: q + 1, -1)]
 
     def end(x):
-        run = lagjax.simulate_hybrid(modes, law, "f", x[0], x[1], jnp.array([0.0, 1.5]), {"d": x[2], "g": x[3]})
+        run = lagjax.simulate(lagjax.Hybrid(modes, law, "f"), x[0], x[1], jnp.array([0.0, 1.5]), {"d": x[2], "g": x[3]})
         return jnp.stack([run.q[-1], run.qdot[-1], run.transitions.t[1]])
 
     def closed(x):
@@ -104,7 +104,7 @@ def test_a_block_that_stops_where_its_load_is_beyond_the_static_limit_goes_on():
         T("down", "stick", lambda q, v: v, 1, stop),
     ]
     modes = {"stick": stick, "up": slip(1), "down": slip(-1)}
-    run = lagjax.simulate_hybrid(modes, law, "stick", 0.0, 0.0, jnp.array([0.0, 6.0]))
+    run = lagjax.simulate(lagjax.Hybrid(modes, law, "stick"), 0.0, 0.0, jnp.array([0.0, 6.0]))
 
     t, q, side, tries = 0.0, 0.0, 0, 0
     while t < 6.0 and (tries := tries + 1) < 50:
@@ -132,7 +132,9 @@ def test_transitions_that_go_back_and_forth_are_both_named():
     push = lambda s: lagjax.System(free_particle, forces=lambda q, v: s + 0.0 * q)
     law = [T("left", "right", lambda q, v: q + v, -1), T("right", "left", lambda q, v: q + v, 1)]
     with pytest.raises(lagjax.SimulationError, match=r"(?s)one instant.*sign or where.*'left' → 'right'") as caught:
-        lagjax.simulate_hybrid({"left": push(-1.0), "right": push(1.0)}, law, "left", 1.0, 0.2, jnp.array([0.0, 5.0]))
+        lagjax.simulate(
+            lagjax.Hybrid({"left": push(-1.0), "right": push(1.0)}, law, "left"), 1.0, 0.2, jnp.array([0.0, 5.0])
+        )
     assert "'right' → 'left'" in str(caught.value) and caught.value.trajectory.result == IN_TURN
     slides = lagjax.System(free_particle, forces=lambda q, v: -jnp.sign(q + v))  # as the sentence advises
     assert abs(lagjax.simulate(slides, 1.0, 0.2, jnp.array([0.0, 5.0])).q[-1]) < 0.1
@@ -143,10 +145,10 @@ def test_a_bouncing_ball_comes_to_rest_as_the_sentence_advises():
     bounce = T("f", "f", lambda q, v: q, -1, lambda q, v: (q, -0.5 * v))
     small = lambda q, v, params: 0.5 * v**2 + params["g"] * q - 1e-6
     law, ts = [bounce, T("f", "rest", small, -1, lambda q, v: (0 * q, 0 * v))], jnp.array([0.0, 3.0])
-    run = lagjax.simulate_hybrid({"f": BALL, "rest": rest}, law, "f", 1.0, 0.0, ts, {"g": G})
+    run = lagjax.simulate(lagjax.Hybrid({"f": BALL, "rest": rest}, law, "f"), 1.0, 0.0, ts, {"g": G})
     assert run.mode.tolist() == [0, 1] and run.q[-1] == 0.0
     with pytest.raises(lagjax.SimulationError, match=r"(?s)add up to a finite one.*'f' → 'f'"):
-        lagjax.simulate_hybrid({"f": BALL}, [bounce], "f", 1.0, 0.0, ts, {"g": G}, max_transitions=64)
+        lagjax.simulate(lagjax.Hybrid({"f": BALL}, [bounce], "f"), 1.0, 0.0, ts, {"g": G}, max_transitions=64)
 
 
 def test_blows_at_one_instant_that_do_not_commute_are_said():
@@ -161,7 +163,7 @@ def test_blows_at_one_instant_that_do_not_commute_are_said():
 
     def run(angle):
         q, ts = jnp.stack([1.0, angle]), jnp.array([0.0, 0.5])
-        return lagjax.simulate_hybrid({"f": rod}, [end(1), end(-1)], "f", q, jnp.zeros(2), ts)
+        return lagjax.simulate(lagjax.Hybrid({"f": rod}, [end(1), end(-1)], "f"), q, jnp.zeros(2), ts)
 
     flat = run(0.0)
     assert flat.transitions.order_matters.tolist()[:3] == [True, False, False] and flat.health().suspicious
@@ -178,9 +180,9 @@ def test_blows_at_one_instant_that_do_not_commute_are_said():
         return T("f", "f", lambda q, v: q[i + 1] - q[i], -1, reset)
 
     beads = lagjax.System(lambda q, v, params: 0.5 * params @ v**2)
-    meet = lambda m: lagjax.simulate_hybrid(
-        {"f": beads}, [collide(0), collide(1)], "f", jnp.array([-1.0, 0.0, 1.0]), jnp.array([1.0, 0.0, -1.0]),
-        jnp.array([0.0, 1.5]), m,
+    meet = lambda m: lagjax.simulate(
+        lagjax.Hybrid({"f": beads}, [collide(0), collide(1)], "f"), jnp.array([-1.0, 0.0, 1.0]),
+        jnp.array([1.0, 0.0, -1.0]), jnp.array([0.0, 1.5]), m,
     )  # fmt: skip
     assert [bool(meet(m).transitions.order_matters.any()) for m in masses] == [False, True]
 
@@ -199,8 +201,8 @@ def test_a_freewheel_and_a_block_let_go_where_nothing_moves_yet():
     law = [T("lock", "free", lambda q, v, multipliers: multipliers, 1), T("free", "lock", lambda q, v: v[0] - v[1], 1)]
     rng = np.random.default_rng(0)
     params = np.stack([rng.uniform(0.1, 3, 20), rng.uniform(0.5, 1.5, 20)], 1)
-    run = lambda p: lagjax.simulate_hybrid(
-        modes, law, "lock", jnp.zeros(2), jnp.zeros(2), jnp.stack([0.0, np.pi / p[1]]), p, throw=False
+    run = lambda p: lagjax.simulate(
+        lagjax.Hybrid(modes, law, "lock"), jnp.zeros(2), jnp.zeros(2), jnp.stack([0.0, np.pi / p[1]]), p, throw=False
     )
     runs = jax.jit(jax.vmap(run))(params)
     a, w = params.T
@@ -222,7 +224,7 @@ def test_a_freewheel_and_a_block_let_go_where_nothing_moves_yet():
     friction = lambda q, v, t, params: load(t, params) - params[2] * jnp.sign(v)
     one, ts = lagjax.System(free_particle, forces=friction), jnp.linspace(0.0, 6.0, 4)
     params = np.stack([rng.uniform(1, 3, 20), rng.uniform(0.5, 3, 20), rng.uniform(0.2, 0.9, 20)], 1)
-    run = lambda p: lagjax.simulate_hybrid(modes, law, "stick", 0.0, 0.0, ts, p, throw=False)
+    run = lambda p: lagjax.simulate(lagjax.Hybrid(modes, law, "stick"), 0.0, 0.0, ts, p, throw=False)
     runs = jax.jit(jax.vmap(run))(params)
     right = jax.jit(jax.vmap(lambda p: lagjax.simulate(one, 0.0, 0.0, ts, p, rtol=1e-12).q))(params)
     assert runs.ok.all()

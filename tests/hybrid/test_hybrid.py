@@ -22,13 +22,13 @@ OSCILLATOR = lagjax.System(oscillator)
 
 def bouncing(h, e, g=G, v=0.0, ts=None, **options):
     ts = jnp.linspace(0.0, 2.0, 9) if ts is None else ts
-    return lagjax.simulate_hybrid({"flight": BALL}, [BOUNCE], "flight", h, v, ts, {"e": e, "g": g}, **options)
+    return lagjax.simulate(lagjax.Hybrid({"flight": BALL}, [BOUNCE], "flight"), h, v, ts, {"e": e, "g": g}, **options)
 
 
 def hybrid(modes, transitions, q0=0.0, v0=1.0, ts=(0.0, 1.0), params=None, **options):
     """From the first mode."""
     ts = jnp.asarray(ts, float)
-    return lagjax.simulate_hybrid(modes, transitions, next(iter(modes)), q0, v0, ts, params, **options)
+    return lagjax.simulate(lagjax.Hybrid(modes, transitions, next(iter(modes))), q0, v0, ts, params, **options)
 
 
 def times(run):
@@ -68,7 +68,9 @@ ROLL_TS = jnp.linspace(0.0, 3.0, 13)
 def rolling(alpha, theta, **options):
     q0 = jnp.stack([jnp.asarray(R + A), theta, theta * (R + A) / A])
     options = {"rtol": 1e-12, "max_transitions": 1, "throw": False} | options
-    return lagjax.simulate_hybrid(ROLLING, [LEAVE], "rolling", q0, jnp.zeros(3), ROLL_TS, {"alpha": alpha}, **options)
+    return lagjax.simulate(
+        lagjax.Hybrid(ROLLING, [LEAVE], "rolling"), q0, jnp.zeros(3), ROLL_TS, {"alpha": alpha}, **options
+    )
 
 
 def place(q, v):
@@ -152,7 +154,7 @@ def test_a_force_read_off_samples_of_parameters_in_a_mode():
 
     wall = lagjax.Transition("free", "free", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -v))
     modes = {"free": lagjax.System(free_particle, forces=force)}
-    run = lagjax.simulate_hybrid(modes, [wall], "free", 1.0, -1.0, jnp.array([0.0, 3.0]), {"u": a * knots})
+    run = lagjax.simulate(lagjax.Hybrid(modes, [wall], "free"), 1.0, -1.0, jnp.array([0.0, 3.0]), {"u": a * knots})
     met = min(root.real for root in np.roots([a / 6, 0.0, -1.0, 1.0]) if abs(root.imag) < 1e-12 and root.real > 0)
     back, left = 1.0 - 0.5 * a * met**2, 3.0 - met
     np.testing.assert_allclose(run.q[-1], (back - 0.5 * a * met**2) * left + a / 6 * (27.0 - met**3), rtol=1e-8)
@@ -509,7 +511,7 @@ def unit_box(direction, q, v, end):
     walls = [lambda q, v: 1 - q[0], lambda q, v: 1 - q[1], lambda q, v: q[0], lambda q, v: q[1]]
     walls = [lagjax.Transition("a", "a", wall, direction, flip(k % 2)) for k, wall in enumerate(walls)]
     ts = jnp.stack([jnp.zeros(()), end])
-    return lagjax.simulate_hybrid({"a": PLANE}, walls, "a", q, v, ts, max_transitions=100, throw=False)
+    return lagjax.simulate(lagjax.Hybrid({"a": PLANE}, walls, "a"), q, v, ts, max_transitions=100, throw=False)
 
 
 @pytest.mark.parametrize("direction", sweep([-1, 0], kept=[-1]))
@@ -607,7 +609,7 @@ SIDE_TS = jnp.linspace(0.0, 6.0, 25)
 
 def two_springs(right, left, v=1.0):
     params = {"right": right, "left": left}
-    return lagjax.simulate_hybrid(SIDES, CROSS, "right", 0.0, v, SIDE_TS, params, rtol=1e-12)
+    return lagjax.simulate(lagjax.Hybrid(SIDES, CROSS, "right"), 0.0, v, SIDE_TS, params, rtol=1e-12)
 
 
 def exact_springs(right, left, v=1.0):
@@ -732,13 +734,13 @@ def test_a_motion_goes_on_in_a_scan_of_short_ones_from_the_mode_where_it_is():
         lagjax.Transition("out", "in", lambda q, v: q - 1.0, 1, turn),
         lagjax.Transition("in", "out", lambda q, v: q, -1, turn),
     ]
-    scene = lagjax.Hybrid({"out": FREE, "in": FREE}, back, "out")
+    start_in = lambda mode: lagjax.Hybrid({"out": FREE, "in": FREE}, back, mode, 2)
     count, dt = 40, 0.17
 
     def pieces(speed):
         def step(carry, _):
             q, v, mode = carry
-            run = lagjax.simulate_hybrid(scene, q, v, jnp.array([0.0, dt]), start=mode, max_transitions=2)
+            run = lagjax.simulate(start_in(mode), q, v, jnp.array([0.0, dt]))
             return (run.q[-1], run.qdot[-1], run.mode[-1]), (run.q[-1], run.mode[-1])
 
         return jax.lax.scan(step, (0.0 * speed, speed, jnp.asarray(0)), None, length=count)[1]
@@ -751,11 +753,11 @@ def test_a_motion_goes_on_in_a_scan_of_short_ones_from_the_mode_where_it_is():
     slopes = jax.jit(jax.jacrev(lambda speed: pieces(speed)[0]))(1.3)
     np.testing.assert_allclose(slopes, dt * np.arange(1, count + 1) * np.where(mode[1] == 0, 1, -1), rtol=1e-12)
     # A place that is none, as that of what was not reached, is no motion.
-    lost = jax.jit(lambda mode: lagjax.simulate_hybrid(scene, 0.0, 1.0, jnp.arange(2.0), start=mode, throw=False))(-1)
+    lost = jax.jit(lambda mode: lagjax.simulate(start_in(mode), 0.0, 1.0, jnp.arange(2.0), throw=False))(-1)
     assert not lost.ok and np.isnan(lost.q).all()
-    assert lagjax.simulate_hybrid(scene, 0.5, -1.0, jnp.array([0.0, 1.0]), start="in").q[-1] == 0.5
+    assert lagjax.simulate(start_in("in"), 0.5, -1.0, jnp.array([0.0, 1.0])).q[-1] == 0.5
     with jax.enable_x64(False):
-        assert lagjax.simulate_hybrid(scene, 0.5, -1.0, jnp.array([0.0, 1.0]), start=1).q[-1] == 0.5
+        assert lagjax.simulate(start_in(1), 0.5, -1.0, jnp.array([0.0, 1.0])).q[-1] == 0.5
 
 
 # ---- bad input ------------------------------------------------------------------------------------------------------
@@ -812,8 +814,10 @@ PLANE = lagjax.System(lambda q, v: 0.5 * v @ v)
 )  # fmt: skip
 def test_bad_input_gets_a_sentence(changes, error, sentence):
     given = {"modes": {"a": FREE}, "transitions": [stay()], "start": "a", "q0": 0.0, "qdot0": 1.0, "ts": [0.0, 1.0]}
+    given |= changes
+    of_scene = [given.pop(name) for name in ("modes", "transitions", "start")]
     with pytest.raises(error, match=sentence):
-        lagjax.simulate_hybrid(**(given | changes))
+        lagjax.simulate(lagjax.Hybrid(*of_scene), **given)
 
 
 @pytest.mark.parametrize(

@@ -115,7 +115,7 @@ def test_a_mode_that_begins_on_its_border():
     def end(x):
         law = [lagjax.Transition("fall", "carried", lambda q, v: q[1], -1, land)]
         start = jnp.array([0.0, 0.5]), jnp.zeros(2)
-        return lagjax.simulate_hybrid({"fall": fall, "carried": carried}, law, "fall", *start, TS, x).q[-1, 0]
+        return lagjax.simulate(lagjax.Hybrid({"fall": fall, "carried": carried}, law, "fall"), *start, TS, x).q[-1, 0]
 
     x = {"mu": 2.0, "belt": 0.25, "reset": 0.25}
     assert abs(end(x) - 0.5) < 1e-12  # it falls for a unit of time

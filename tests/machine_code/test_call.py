@@ -271,9 +271,9 @@ def over_devices():
         "with a constraint": lambda q, k: end(ring, jnp.stack([jnp.cos(q), jnp.sin(q)]), k)[1],
         "with contacts": lambda q, k: end(corner, jnp.stack([1.6 * q, q - 0.4]), k)[1],
         "crossings": lambda q, k: lagjax.crossings(spring, lambda q, v: q - 0.3, q, 0.0, (0.0, 2.0), k, count=2).t[0],
-        "simulate_hybrid": lambda q, k: (
-            lagjax.simulate_hybrid(
-                {"f": spring}, [wall], "f", q, 0.0, jnp.array([0.0, 2.0]), k, max_transitions=3
+        "a hybrid motion": lambda q, k: (
+            lagjax.simulate(
+                lagjax.Hybrid({"f": spring}, [wall], "f"), q, 0.0, jnp.array([0.0, 2.0]), k, max_transitions=3
             ).end.q
         ),
     }

@@ -604,7 +604,7 @@ def hybrid_motion():
     ball = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 9.81 * q)
 
     def run():
-        return lagjax.simulate_hybrid({"flight": ball}, [bounce], "flight", 1.0, 0.0, ts[:3])
+        return lagjax.simulate(lagjax.Hybrid({"flight": ball}, [bounce], "flight"), 1.0, 0.0, ts[:3])
 
     try:
         run()

@@ -53,7 +53,7 @@ def rest(start, length):
 
 
 def bounced(start, elasticity):
-    run = lagjax.simulate_hybrid({"flight": BALL}, [BOUNCE], "flight", start, 0.0 * start, TS[:3], elasticity,
+    run = lagjax.simulate(lagjax.Hybrid({"flight": BALL}, [BOUNCE], "flight"), start, 0.0 * start, TS[:3], elasticity,
                                  max_transitions=8)  # fmt: skip
     return run.q[-1]
 
@@ -209,7 +209,9 @@ def swap(i, guard, modes=("a", "a")):
 
 
 def end_of(transitions, q, v, ts, params, modes=("a",)):
-    run = lagjax.simulate_hybrid(dict.fromkeys(modes, FREE), transitions, "a", q, v, ts, params, max_transitions=8)
+    run = lagjax.simulate(
+        lagjax.Hybrid(dict.fromkeys(modes, FREE), transitions, "a"), q, v, ts, params, max_transitions=8
+    )
     return run.end.q, run.end.qdot, run.transitions.count
 
 
@@ -277,7 +279,7 @@ def test_a_motion_that_leaves_slowly_has_not_met_the_surface(off):
         def guard(q, v, params):
             return params / 10 - q[0]
 
-        met = lagjax.simulate_hybrid({"a": fast}, [wall(guard)], "a", q, 0 * q, ts, k, max_transitions=2)
+        met = lagjax.simulate(lagjax.Hybrid({"a": fast}, [wall(guard)], "a"), q, 0 * q, ts, k, max_transitions=2)
         event = lagjax.simulate(fast, q, 0 * q, ts, k, event=guard)
         return met.transitions.count, event.end.t, lagjax.crossings(fast, guard, q, 0 * q, ts, k, count=2).count
 
@@ -292,7 +294,7 @@ def loop_in_a_box(q, v, steps):
 
     def step(state, _):
         q, v, ok = state
-        run = lagjax.simulate_hybrid({"a": FREE}, walls, "a", q, v, np.float32([0.0, 0.01]), max_transitions=8,
+        run = lagjax.simulate(lagjax.Hybrid({"a": FREE}, walls, "a"), q, v, np.float32([0.0, 0.01]), max_transitions=8,
                                      throw=False)  # fmt: skip
         return (run.end.q, run.end.qdot, ok & run.ok), None
 

@@ -148,6 +148,30 @@ def test_a_motion_is_pulled_out_of_a_corner():
     np.testing.assert_allclose(run.qdot[1:], [0.0, 0.1], atol=1e-9)
 
 
+def test_sites_that_stop_at_one_instant_are_as_exact_as_alone():
+    count, mu, t = 40, 0.3, 5.0  # all come to rest at π at once, some for good, some begin at rest
+    q0, step = 2.0 * np.cos(0.7 * np.arange(count)), 1e-6
+    place = lambda mu: lagjax.simulate(springs(count), q0, 0.0 * q0, jnp.array([0.0, t]), mu).q[-1]
+    exact = lambda mu: np.array([swings(x, mu, t)[0] for x in q0])
+    np.testing.assert_allclose(place(mu), exact(mu), atol=1e-11)
+    slopes = (exact(mu + step) - exact(mu - step)) / (2 * step)
+    for derivative in (jax.jacrev, jax.jacfwd):
+        np.testing.assert_allclose(derivative(place)(mu), slopes, atol=1e-8)
+
+
+def test_sites_that_stop_at_one_instant_stop_beside_coupled_ones():
+    """Two sites that rub on each other, and stop as one does, among others that know nothing of them."""
+    q0, ts = jnp.array([2.0, 2.0, 1.5, 1.5, 1.7, 0.2]), jnp.array([0.0, 5.0])
+
+    def forces(q, v, params):
+        between = jnp.sign(v[0] - v[1])
+        return -params * jnp.sign(v) - 0.1 * between * jnp.array([1.0, -1.0, 0.0, 0.0, 0.0, 0.0])
+
+    scene = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q @ q, forces=forces)
+    run = lagjax.simulate(scene, q0, 0.0 * q0, ts, 0.3)
+    np.testing.assert_allclose(run.q[-1], [swings(x, 0.3, 5.0)[0] for x in np.array(q0)], atol=1e-11)
+
+
 def test_a_corner_without_friction_is_passed_and_kept_at_rest():
     ts = np.array([0.0, 1.0, 50.0])
     at_rest = lagjax.simulate(VALLEY, 0.0, 0.0, ts, jnp.zeros(2))

@@ -171,7 +171,9 @@ def test_second_derivatives_through_a_bounce():
 
     def run(x):
         params = {"g": x[1], "e": x[2]}
-        found = lagjax.simulate_hybrid({"flight": ball}, [bounce], "flight", x[0], x[3], ts, params, max_transitions=2)
+        found = lagjax.simulate(
+            lagjax.Hybrid({"flight": ball}, [bounce], "flight"), x[0], x[3], ts, params, max_transitions=2
+        )
         return jnp.sum(jnp.append(found.q, found.transitions.t[0]) ** 3)
 
     def closed(x):

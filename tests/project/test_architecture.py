@@ -7,8 +7,6 @@ import subprocess
 import sys
 from pathlib import Path
 
-import pytest
-
 import lagjax
 
 PACKAGE, TESTS = Path(lagjax.__file__).parent, Path(__file__).parents[1]
@@ -209,13 +207,6 @@ def test_results_have_one_module_and_keep_their_old_names():
     for name in lagjax.results.__all__:
         assert getattr(lagjax, name) is getattr(lagjax.results, name)
     assert not set(lagjax.__all__) & set(lagjax.results.__all__)
-
-
-@pytest.mark.parametrize("name", ["random", "sobol", "latin_hypercube"])
-def test_old_names_say_the_new_one(name):
-    with pytest.warns(DeprecationWarning, match=f"lagjax.{name} is lagjax.designs.{name} now") as told:
-        assert getattr(lagjax, name) is getattr(lagjax.designs, name)
-    assert told[0].filename == __file__
 
 
 VAGUE = ("What ", "How ", "Whether ", "Where ", "Which ")

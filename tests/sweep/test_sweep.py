@@ -206,17 +206,6 @@ def test_statistics_leave_out_what_is_not_finite():
     assert np.isnan(_statistics.summary(how, nothing, ()).mean)
 
 
-def test_old_arguments_say_the_new_ones(tmp_path, undisturbed):
-    old = dict(RULE, store=tmp_path / "store", part=(0, 1))
-    with pytest.warns(
-        DeprecationWarning, match=r"sweep\(…, store=lagjax.Store\('.*store', unit=…, part=…\)\) n"
-    ) as told:
-        lagjax.sweep(PENDULUM, OVER, TS, **old)
-    assert told[0].filename == __file__ and digests(tmp_path) == undisturbed
-    with pytest.raises(TypeError, match=r"sweep\(\) got an unexpected keyword argument 'units'"):
-        lagjax.sweep(PENDULUM, OVER, TS, **old, units=3)
-
-
 # ---- members and units -----------------------------------------------------------------------------------------------
 
 
@@ -908,8 +897,8 @@ def test_a_hybrid_scene(tmp_path):  # compiles the motion of a ball for one shap
     np.testing.assert_allclose(kept["first"], np.sqrt(2 * heights / g), rtol=1e-12)  # the fall from rest
     falls = np.sqrt(2 * heights / g)[:, None] * np.cumsum([1.0, *(2 * 0.8**k for k in range(1, 12))])
     np.testing.assert_array_equal(kept.bounces, (falls < 1.5).sum(axis=1))
-    one = lagjax.simulate_hybrid(
-        scene.modes, scene.transitions, "flight", heights[4], 0.0, BOUNCES["ts"], BOUNCES["params"]
+    one = lagjax.simulate(
+        lagjax.Hybrid(scene.modes, scene.transitions, "flight"), heights[4], 0.0, BOUNCES["ts"], BOUNCES["params"]
     )
     assert float(kept.q[4]) == float(one.q[-1])
     for other, words in ((bouncing(0.7), "reset of transition 0"), (bouncing(max_transitions=5), "transitions")):

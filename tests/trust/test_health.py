@@ -369,7 +369,7 @@ def test_numbers_and_traced_values_are_measured_alike():
     bounce = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -0.8 * v))
     for run in (
         lagjax.simulate(held, *start, jnp.linspace(0.0, 2.0, 21)),
-        lagjax.simulate_hybrid({"flight": ball}, [bounce], "flight", 1.0, 0.0, jnp.linspace(0.0, 1.5, 31)),
+        lagjax.simulate(lagjax.Hybrid({"flight": ball}, [bounce], "flight"), 1.0, 0.0, jnp.linspace(0.0, 1.5, 31)),
     ):
         eager, traced = run.health(), jax.jit(lambda run: run.health())(run)
         assert eager.works and (eager.work_error > 0).all() and flagged(eager) == set()
@@ -407,7 +407,9 @@ def test_energy_between_bounces():
     # Every bounce takes 0.36 of the energy; between them none is lost.
     ball = lagjax.System(lagrangians.ball)
     bounce = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -0.8 * v))
-    bouncing = lagjax.simulate_hybrid({"flight": ball}, [bounce], "flight", 1.0, 0.0, jnp.linspace(0.0, 1.5, 31))
+    bouncing = lagjax.simulate(
+        lagjax.Hybrid({"flight": ball}, [bounce], "flight"), 1.0, 0.0, jnp.linspace(0.0, 1.5, 31)
+    )
     health = bouncing.health()
     energy = np.asarray(bouncing.energy())
     assert bouncing.transitions.count == 2 and np.ptp(energy) > 5
@@ -424,7 +426,7 @@ def test_constraints_of_one_mode_and_not_of_another():
     free = lagjax.System(lagrangians.weight)
     off = lagjax.Transition("rail", "air", lambda q, v: q[0])
     modes, start = {"rail": held, "air": free}, (jnp.array([-1.0, 0.0]), jnp.zeros(2))
-    fallen = lagjax.simulate_hybrid(modes, [off], "rail", *start, jnp.linspace(0.0, 1.0, 21))
+    fallen = lagjax.simulate(lagjax.Hybrid(modes, [off], "rail"), *start, jnp.linspace(0.0, 1.0, 21))
     health = fallen.health()
     assert np.unique(fallen.mode).tolist() == [0, 1] and flagged(health) == set()
     assert health.constraint_names == ("rail: constraints['rail']",)

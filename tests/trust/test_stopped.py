@@ -229,4 +229,4 @@ def test_a_reset_that_is_not_finite_is_named():
     bounce = lagjax.Transition("fly", "fly", lambda q, v: q, direction=-1, reset=lambda q, v: (q, jnp.sqrt(v)))
     said = r"reset of the transition at t = 0.45\d* returned the velocity of q \(nan\): every number must be f"
     with pytest.raises(lagjax.SimulationError, match=said):
-        lagjax.simulate_hybrid({"fly": ball}, [bounce], "fly", 1.0, 0.0, TS)
+        lagjax.simulate(lagjax.Hybrid({"fly": ball}, [bounce], "fly"), 1.0, 0.0, TS)

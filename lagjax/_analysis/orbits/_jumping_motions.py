@@ -3,6 +3,7 @@
 They are followed under `jax.vmap`, and vary by forward mode: a round for all rows at once.
 """
 
+import dataclasses
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -12,7 +13,7 @@ import numpy as np
 
 from lagjax._interface import Function, Layout, halves
 from lagjax._run import simulate
-from lagjax._run.hybrid import Hybrid, Scene, laws, simulate_hybrid
+from lagjax._run.hybrid import Hybrid, Scene, laws
 from lagjax._scene import ROLES
 
 PyTree = Any
@@ -54,7 +55,7 @@ class JumpingMotions(NamedTuple):
         """The motions from y0 (R, 2n) in `modes` (R,), by default the first one, at `times` (R, T) or (1, T)."""
         rows, scene = len(y0), self.scene
         if modes is None:
-            modes = np.full(rows, list(scene.modes).index(scene.start) if isinstance(scene, Hybrid) else 0)
+            modes = np.full(rows, scene.first if isinstance(scene, Hybrid) else 0)
         given = np.broadcast_to(times, (rows, times.shape[-1])), y0, modes
         more = 2 ** int(np.ceil(np.log2(rows))) - rows  # another number of rows compiles anew
         times, y0, modes = (np.concatenate([x, np.repeat(x[-1:], more, axis=0)]) for x in given)
@@ -68,10 +69,8 @@ def _follow(motions: JumpingMotions, times, y0, modes, varies: bool) -> JumpRun:
 
     def end(y, last, ts, mode):
         ts, state = jnp.append(ts[:-1], last), map(layout.restore, halves(y))
-        if isinstance(scene, Hybrid):
-            run = simulate_hybrid(scene, *state, ts, params, start=mode, **options)
-        else:
-            run = simulate(scene, *state, ts, params, **options)
+        begun = dataclasses.replace(scene, start=mode) if isinstance(scene, Hybrid) else scene
+        run = simulate(begun, *state, ts, params, **options)
         path = jnp.concatenate([jax.vmap(layout.flatten)(part) for part in (run.q, run.qdot)], axis=1)
         y_end = jnp.concatenate([layout.flatten(part) for part in run.end[1:]])
         at = jnp.zeros(ts.shape, int) if run.mode is None else run.mode

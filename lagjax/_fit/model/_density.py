@@ -96,19 +96,16 @@ class Density:
             dof = _LEAST_DOF * jnp.exp(math.log(_MOST_DOF / _LEAST_DOF) * share)
         return PosteriorUnknowns(u, starts, jnp.exp(x[self.noise_places]), dof)
 
-    def params(self, u):
-        """The user's pytree of parameters at u (F,)."""
-        return self.residuals.parameters.restore(self.residuals.parameters.numbers(u, jnp))
+    def params(self, x):
+        """The user's pytree of parameters at x (D,), of which the first F numbers move them."""
+        parameters = self.residuals.parameters
+        return parameters.restore(parameters.numbers(x[: len(parameters)], jnp))
 
     @accepts_singles(("x",))
     def __call__(self, x):
         """log p(x), up to a constant; −∞ where a motion could not be followed."""
-        return self.posterior(x, self.log_likelihood(x))
-
-    def posterior(self, x, log_likelihood):
-        """log p(x) with what the measurements contribute to it; −∞ where that is no number."""
         at = self.unknowns(jnp.asarray(x, self.dtype))
-        total = log_likelihood + self.residuals.parameters.log_volume(at.u, jnp)
+        total = self.log_likelihood(x) + self.residuals.parameters.log_volume(at.u, jnp)
         if self.prior is not None:
             total = total + self.prior(self.params(at.u))
         if self.moves_dof:
@@ -119,33 +116,25 @@ class Density:
     def log_likelihood(self, x):
         """Σ_s shares_s log L_s, up to a constant; NaN where a motion could not be followed."""
         at = self.unknowns(jnp.asarray(x, self.dtype))
-        batches = self.residuals.batches
-        weighted = [np.sqrt(batch.weights) * r for batch, r in zip(batches, self.evaluate(at), strict=True)]
-        return self.weighted_log_likelihood(weighted, [b.weights > 0 for b in batches], [b.sides for b in batches], at)
+        exact = (self.residuals.weights > 0) & (True if self.residuals.sides is None else self.residuals.sides == 0)
+        total = -jnp.sum(self.shares * exact.sum(axis=0) * jnp.log(at.sigma))
+        dof = jnp.where(self._tails, at.dof, 1.0)
+        norm = gammaln((dof + 1) / 2) - gammaln(dof / 2) - 0.5 * jnp.log(dof)
+        for batch, left in zip(self.residuals.batches, self.evaluate(at), strict=True):
+            rows, side = np.sqrt(batch.weights) * left, batch.sides
+            squares = (rows / at.sigma) ** 2
+            each = jnp.where(self._tails, norm - (dof + 1) / 2 * jnp.log1p(squares / dof), -0.5 * squares)
+            if side is not None:
+                at_limit = jax.scipy.special.log_ndtr(jnp.where(side != 0, side * rows / at.sigma, 0.0))
+                each = jnp.where(side != 0, at_limit, each)
+            total = total + jnp.sum(jnp.where(batch.weights > 0, each * self.shares, 0.0))
+        return total
 
     def evaluate(self, at: PosteriorUnknowns) -> list:
         """The outputs of the sensors less the measurements, (N, T, S), of every batch."""
         pairs = [(part, batch) for part in self.residuals.parts for batch in part.batches]
         starts = [at.starts[part.frame.rows[batch.rows], : part.states] for part, batch in pairs]
         return [part.trace_residuals(batch, at.u, y0) for (part, batch), y0 in zip(pairs, starts, strict=True)]
-
-    def weighted_log_likelihood(self, weighted: list, counted: list, sides: list, at: PosteriorUnknowns):
-        """Σ_s shares_s log L_s, up to a constant, of √weight · residual (N, T, S) of every batch, where they count.
-
-        For a signal whose noise is Gaussian other numbers with the same sum of squares do as well.
-        """
-        exact = (self.residuals.weights > 0) & (True if self.residuals.sides is None else self.residuals.sides == 0)
-        total = -jnp.sum(self.shares * exact.sum(axis=0) * jnp.log(at.sigma))
-        dof = jnp.where(self._tails, at.dof, 1.0)
-        norm = gammaln((dof + 1) / 2) - gammaln(dof / 2) - 0.5 * jnp.log(dof)
-        for rows, counts, side in zip(weighted, counted, sides, strict=True):
-            squares = (rows / at.sigma) ** 2
-            each = jnp.where(self._tails, norm - (dof + 1) / 2 * jnp.log1p(squares / dof), -0.5 * squares)
-            if side is not None:
-                at_limit = jax.scipy.special.log_ndtr(jnp.where(side != 0, side * rows / at.sigma, 0.0))
-                each = jnp.where(side != 0, at_limit, each)
-            total = total + jnp.sum(jnp.where(counts, each * self.shares, 0.0))
-        return total
 
     def _noise_covariance(self, samples: np.ndarray) -> np.ndarray:
         """The covariance of log σ, and of the numbers that move ν, from Fisher's information of this many samples (S,).

@@ -1,8 +1,8 @@
 """`Timings`: instants at which a motion crossed sections, as data; and the times that a scene gives, with derivatives.
 
 A residual is the time of a crossing less the measured one. The crossings, and their derivatives, are those of
-`lagjax.crossings`; of hybrid motion (`lagjax.Hybrid`) the instants are those of its transitions, with the derivatives
-of `lagjax.simulate_hybrid`.
+`lagjax.crossings`; of hybrid motion (`lagjax.Hybrid`) the instants are those of its transitions, with their
+derivatives.
 """
 
 import dataclasses

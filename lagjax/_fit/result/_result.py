@@ -1,4 +1,4 @@
-"""`Fit`: the result of a search, with intervals, profiles, draws, predictions, comparison and a report.
+"""`Fit`: the result of a search, with intervals, profiles, predictions, comparison and a report.
 
 It holds the nouns `Covariance` and `SignalNoise`; every method hands over to the file of its subject.
 """
@@ -24,7 +24,6 @@ from lagjax._fit.result._information import LEVEL, Information, information
 from lagjax._fit.result._prediction import Prediction, planned_rows, predict_record
 from lagjax._fit.result._profile import Profile, profile
 from lagjax._fit.result._report import draw_record, lab_book, recordings, render_page
-from lagjax._fit.result._sample import draw, inference_data
 from lagjax._fit.result._verdict import verdict
 from lagjax._fit.search._descent import Descent
 from lagjax._fit.search._multistart import Waterfall
@@ -199,40 +198,13 @@ class Fit:
         The prior is flat in the free parameters within their sets, in the starts and in log σ, unless `prior(params)`
         returns the logarithm of another prior density of the parameters. Correlated samples count by their effective
         number. On the function, `first` is the vector of the fit, `names` names its numbers, `covariance()` is that of
-        least squares, and `params(u)` turns the first numbers into the user's pytree.
+        least squares: a metric for samplers. `params(x)` is the user's pytree of parameters, and `unknowns(x)` has the
+        starts and σ. The guide on recordings draws from it with blackjax.
+
+        Raises `ValueError` for fitted starts on constraints and for `lagjax.Delayed` sensors.
         """
         shares = np.array([noise.effective / noise.samples for noise in self.noise.values()])
         return Density(self.residual_function, self.law, self._point, self.noise_scale, shares, prior)
-
-    @with_doubles
-    def sample(self, draws: int = 1000, seed: int = 0, *, chains: int = 4, prior: Callable | None = None) -> Any:
-        """Draws of the posterior by the No-U-Turn sampler, `draws` of each chain, as `arviz.InferenceData`.
-
-        The density is that of `log_density(prior)`, π. The sampler walks in the fit's own metric along π*, the density
-        whose residuals are expanded to second order about the fit, r(0) + J z + ½ zᵀ H z; then one motion of each chain
-        accepts or refuses the draw, with min(1, π(y) π*(x) / [π(x) π*(y)]), so that draws are those of π. Where the
-        expansion is too far from π, the sampler follows π itself, with gradients through the motions. Beside a bound of
-        `positive` or `between` both are functions of the number itself, not of its logarithm; the density is the same.
-
-        `attrs` of the result says which of the two it was ("sampler"), how many independent draws those of the worst
-        number are worth ("effective_draws"), and the largest r-hat of chains ("r_hat"). A warning tells of fewer than
-        100, which intervals cannot be read off, and of an r-hat above 1.05.
-
-        All chains are integrated as one batch of motions: many chains with few draws are cheaper than few with many.
-        The variables are the free parameters by their names, `q0` and `qdot0` of the records whose starts are fitted
-        (`a: q0` where the fit is of several systems), and `sigma`, `dof` of the signals.
-
-        Source: Hoffman & Gelman, JMLR 15 (2014) 1593; Christen & Fox, J. Comput. Graph. Stat. 14 (2005) 795.
-
-        Raises `ImportError` without blackjax and arviz, and `ValueError` where something free is not seen.
-        """
-        for name, count in (("draws", draws), ("chains", chains)):
-            if not (isinstance(count, int | np.integer) and count > 0):
-                raise ValueError(f"{name} must be a positive whole number; got {count!r}.")
-        if self.unseen:
-            raise ValueError(f"There is no density of what is not seen. {self.unseen[0]}")
-        density = self.log_density(prior)
-        return inference_data(density, draw(density, draws, chains, seed))
 
     @functools.cached_property
     def _point(self) -> Trial:

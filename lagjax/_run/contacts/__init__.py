@@ -39,7 +39,7 @@ from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes, Syste
 CHANGES = 1024  # the budget of changes of a motion whose crossings are asked for; what they record takes memory
 
 
-def follow_contacts(given: Problem, problem: Problem, max_transitions: int) -> Trajectory:
+def follow_contacts(given: Problem, problem: Problem, max_transitions: int | None) -> Trajectory:
     """The motion of a problem whose system has contacts; `problem` is `given` with what it closes over lifted."""
     plan, closed = _plan(problem, max_transitions)
     _require_sound(problem, closed)
@@ -49,7 +49,7 @@ def follow_contacts(given: Problem, problem: Problem, max_transitions: int) -> T
     return _trajectory(given, problem, *_motion(plan, problem), given.params)
 
 
-def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int, params, params_axes) -> Trajectory:
+def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int | None, params, params_axes) -> Trajectory:
     """The motions of a batch whose system has contacts."""
     plan, _ = _plan(batch.member, max_transitions)
     if batch.is_known:
@@ -91,11 +91,12 @@ def note_sections(problem: Problem, functions: tuple, directions: tuple[int, ...
     return (which, record.t, record.y_next), ending.result, (ending.t, ending.y)
 
 
-def _plan(problem: Problem, max_transitions: int, sections: int = 0) -> tuple[ContactPlan, Problem]:
+def _plan(problem: Problem, max_transitions: int | None, sections: int = 0) -> tuple[ContactPlan, Problem]:
     """The plan, and the problem of machine code with all contacts closed, in float64.
 
     Raises `ValueError` where the scene has no machine code, or the motion goes back in time.
     """
+    max_transitions = 256 if max_transitions is None else max_transitions
     require_budget(max_transitions, "max_transitions")
     if not all(map(is_concrete, problem.tolerances)):
         raise ValueError("rtol and atol of a scene with contacts must be numbers: they decide the order of the method.")

@@ -1,6 +1,6 @@
 """Motion that changes its laws: modes, each a `System` of its own, and transitions between them.
 
-    Transition, modes ─► Plan ─► _transition_rounds: a scan, round after round ─► Ending, Record ─► Trajectory
+    Hybrid ─► RoundPlan ─► _transition_rounds: a scan, round after round ─► Ending, Record ─► Trajectory
                           └─ _mode: the problem of one mode, its guards, the crossing of a guard, the reset
 
 Source: Aizerman & Gantmakher, Q. J. Mech. Appl. Math. 11 (1958) 225; Hiskens & Pai, IEEE Trans. Circuits Syst. I 47
@@ -10,7 +10,6 @@ Source: Aizerman & Gantmakher, Q. J. Mech. Appl. Math. 11 (1958) 225; Hiskens & 
 import dataclasses
 import functools
 import operator
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -33,7 +32,6 @@ from lagjax._interface import (
     require_flag,
     result_from,
 )
-from lagjax._primitives import marks_absent
 from lagjax._run._trajectory import State, Trajectory, Transitions, follow_in_doubles, raise_unless_ok, step_counts
 from lagjax._run.hybrid._mode import Transition
 from lagjax._run.hybrid._transition_rounds import IN_ONE_PLACE, Ending, RoundPlan, TransitionRecord, hybrid_motion
@@ -47,105 +45,23 @@ SUDDEN = 1e-9
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Hybrid:
-    """A hybrid system as one object: `simulate`, `simulate_hybrid`, `fit` and `sweep` take it in place of a `System`.
+    r"""A motion that changes its laws, as one scene: `simulate` and others take it in place of a `System`.
 
-    - `modes`, `transitions`, `start`, `max_transitions`: those of `simulate_hybrid`; every motion begins in the mode
-      `start`.
-
-    **Raises** `TypeError` or `ValueError` as `simulate_hybrid` does.
-
-    ```python
-    import lagjax
-
-    ball = lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q)
-    bounce = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -0.9 * v))
-    scene = lagjax.Hybrid({"flight": ball}, [bounce], "flight")
-    lagjax.simulate(scene, 1.0, 0.0, ts=[0.0, 1.0])
-    ```
-    """
-
-    modes: dict[str, System]
-    transitions: list[Transition]
-    start: str
-    max_transitions: int = 32
-
-    def follow(self, q0: PyTree, qdot0: PyTree, ts, params: PyTree, **options) -> Trajectory:
-        """The motion from (q0, qdot0), with the options that `simulate` and `simulate_hybrid` share."""
-        return simulate_hybrid(self, q0, qdot0, ts, params, **options)
-
-    def with_sections(self, functions: tuple, directions: tuple[int, ...], room: int) -> "Hybrid":
-        """The scene with transitions behind its own that change nothing: each section in each mode, `room` times."""
-        notes = [
-            Transition(mode, mode, function, way, fires="crossing")
-            for mode in self.modes
-            for function, way in zip(functions, directions, strict=True)
-        ]
-        more = self.max_transitions + len(functions) * (room + 1)
-        return Hybrid(self.modes, [*self.transitions, *notes], self.start, more)
-
-    def _now(self) -> "Hybrid":
-        """The scene with its functions as they are now: this one, where nothing that they read has changed."""
-        modes, transitions = _present(self.modes, self.transitions)
-        before, now = [*self.modes.values(), *self.transitions], [*modes.values(), *transitions]
-        same = all(map(operator.is_, before, now))
-        return self if same else Hybrid(modes, transitions, self.start, self.max_transitions)
-
-    def __repr__(self) -> str:
-        return f"Hybrid of {', '.join(map(repr, self.modes))}, begins in {self.start!r}: {self.transitions}"
-
-    def __post_init__(self):
-        _require_modes(self.modes, self.transitions, self.start, self.max_transitions)
-
-
-def _accepts_hybrid(function: Callable) -> Callable:
-    """A decorator: a `Hybrid` may stand in place of the first three arguments."""
-
-    @functools.wraps(function)
-    def decorated(modes, *args, **options):
-        if not isinstance(modes, Hybrid):
-            return function(modes, *args, **options)
-        options = {"max_transitions": modes.max_transitions, **options}
-        start = _place_of(modes.modes, options.pop("start", modes.start))
-        return function(modes.modes, modes.transitions, start, *args, **options)
-
-    return decorated
-
-
-@marks_absent
-@_accepts_hybrid
-def simulate_hybrid(
-    modes: dict[str, System],
-    transitions: list[Transition],
-    start: str | int | jax.Array,
-    q0: PyTree,
-    qdot0: PyTree,
-    ts: jax.Array,
-    params: PyTree = None,
-    *,
-    max_transitions: int = 32,
-    rtol: float | None = None,
-    atol: float | None = None,
-    max_steps: int = 65_536,
-    throw: bool = True,
-) -> Trajectory:
-    r"""The motion from (q0, qdot0) in mode `start`, at the times `ts`, through every transition on the way.
-
-    - `modes`: a `System` for each name; all share the structure of `q0` and `params`. Or a `Hybrid` in place of the
-      first three arguments: `simulate_hybrid(hybrid, q0, qdot0, ts, params)`, and `start=` by name if it is another.
-    - `start`: the name of a mode, or its place in `modes`: an integer, which may be traced. So a motion goes on in a
-      `jax.lax.scan` of short ones, by `start=trajectory.mode[-1]`.
+    - `modes`: a `System` for each name; all share the structure of `q0` and `params`.
     - `transitions`: from which mode to which, and where. The earliest transition happens; of several at one instant,
       the first in the list. After it the same law holds as at the start (see `Transition`): guards that are at zero
       to rounding and go on in their direction follow at once, as do blows along a row of balls that touch, and those
       that are beyond it. What a stretch knows the next one remembers: from which side a guard comes that the reset has
       not moved, and that one without a reset has been crossed.
+    - `start`: the name of the mode in which every motion begins, or its place in `modes`: an integer, which may be
+      traced. So a motion goes on in a `jax.lax.scan` of short ones, from `Hybrid(modes, transitions, run.mode[-1])`.
     - `max_transitions`: the budget of transitions. A motion that needs more ends there, with the result
       `max_transitions_reached`; or with `zeno` where no budget is enough because the times accumulate, as the bounces
       of a ball do. Intervals that shrink steadily to a sum before `ts[-1]`, or below the rounding of the time, count as
       accumulating. Transitions that go back and forth at one instant end with `transitions_in_turn`.
 
-    The other arguments are those of `simulate`, `max_steps` counting for each stretch between transitions. The result
-    is a `Trajectory` with two more fields: `mode`, for every output time the place of its mode in `modes` (−1 where it
+    `simulate` counts its `max_steps` for each stretch between transitions, and takes none of the options of engines.
+    Its `Trajectory` has two more fields: `mode`, for every output time the place of its mode in `modes` (−1 where it
     was not reached; at the instant of a transition, the mode before it), and `transitions`: `t`, `q`, `qdot` just
     before the reset, `q_next`, `qdot_next` just after it, and `source`, `target` as places in `modes`, all of length
     `max_transitions` with NaN or −1 beyond the last, their `count`, whether the order of the list mattered
@@ -162,35 +78,73 @@ def simulate_hybrid(
     that touches zero, or crosses it and comes back between two steps, is resolved. A reset to a state off the
     constraints of the new mode ends the motion with the result `inconsistent_start`.
 
-    **Raises** `TypeError`, `ValueError` for arguments that cannot be right, `SimulationError` as `simulate` does. It
-    needs scenes that have machine code (see `System.explain`), on the CPU.
+    **Raises** `TypeError`, `ValueError` for arguments that cannot be right. Its motion needs scenes that have machine
+    code (see `System.explain`), on the CPU.
 
     ```python
     import jax.numpy as jnp, lagjax
 
     ball = lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q)
     bounce = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -0.9 * v))
-    run = lagjax.simulate_hybrid({"flight": ball}, [bounce], "flight", 1.0, 0.0, jnp.linspace(0.0, 2.0, 9))
+    run = lagjax.simulate(lagjax.Hybrid({"flight": ball}, [bounce], "flight"), 1.0, 0.0, jnp.linspace(0.0, 2.0, 9))
     run.transitions.t[: int(run.transitions.count)]
     ```
     """
+
+    modes: dict[str, System]
+    transitions: list[Transition]
+    start: str | int | jax.Array
+    max_transitions: int = 32
+
+    def with_sections(self, functions: tuple, directions: tuple[int, ...], room: int) -> "Hybrid":
+        """The scene with transitions behind its own that change nothing: each section in each mode, `room` times."""
+        notes = [
+            Transition(mode, mode, function, way, fires="crossing")
+            for mode in self.modes
+            for function, way in zip(functions, directions, strict=True)
+        ]
+        more = self.max_transitions + len(functions) * (room + 1)
+        return Hybrid(self.modes, [*self.transitions, *notes], self.start, more)
+
+    def _now(self) -> "Hybrid":
+        """The scene with its functions as they are now: this one, where nothing that they read has changed."""
+        modes = {name: present_system(mode) for name, mode in self.modes.items()}
+        transitions = [transition.now() for transition in self.transitions]
+        before, now = [*self.modes.values(), *self.transitions], [*modes.values(), *transitions]
+        same = all(map(operator.is_, before, now))
+        return self if same else Hybrid(modes, transitions, self.start, self.max_transitions)
+
+    @property
+    def first(self) -> Any:
+        """The place of the mode in which it begins, which may be traced."""
+        return list(self.modes).index(self.start) if isinstance(self.start, str) else self.start
+
+    def __repr__(self) -> str:
+        return f"Hybrid of {', '.join(map(repr, self.modes))}, begins in {self.start!r}: {self.transitions}"
+
+    def __post_init__(self):
+        _require_modes(self.modes, self.transitions, self.start, self.max_transitions)
+
+
+def follow_modes(
+    scene: Hybrid, q0: PyTree, qdot0: PyTree, ts, params: PyTree, rtol, atol, max_steps: int, throw: bool
+) -> Trajectory:
+    """The motion of a hybrid scene from (q0, qdot0); the arguments are those of `simulate`."""
     require_flag(throw, "throw")
-    layout = Layout.from_state(q0, qdot0)
-    _require_modes(modes, transitions, start, max_transitions)
-    start, (modes, transitions) = _place_of(modes, start), _present(modes, transitions)
-    systems, switches = tuple(modes.values()), tuple(transitions)
-    first = systems[int(start) if is_concrete(start) else 0]
+    layout, scene = Layout.from_state(q0, qdot0), scene._now()
+    modes, start = scene.modes, scene.first
+    first = first_law(scene)
     problem = Problem.from_arguments(first, layout, q0, qdot0, ts, params, rtol, atol, max_steps)
     if not all(map(is_concrete, problem.tolerances)):
-        raise ValueError("rtol and atol of simulate_hybrid must be numbers: they decide the order of the method.")
+        raise ValueError("rtol and atol of a lagjax.Hybrid must be numbers: they decide the order of the method.")
     if is_concrete(problem.ts) and np.asarray(problem.ts)[-1] < np.asarray(problem.ts)[0]:
-        raise ValueError("simulate_hybrid goes forward in time: a reset cannot be undone; ts must increase.")
+        raise ValueError("A lagjax.Hybrid moves forward in time: a reset cannot be undone; ts must increase.")
     q0, qdot0 = as_arrays((q0, qdot0), layout.dtype, "state")
     if is_concrete(start):
         require_consistent(first, layout, problem.ts, q0, qdot0, problem.params)
     rtol, atol = float(MachineCode().rtol(problem.double_precision)), None if atol is None else float(atol)
-    limits = max_transitions, rtol, atol, max_steps, problem.is_single
-    plan = RoundPlan(tuple(modes), systems, switches, *limits)
+    limits = scene.max_transitions, rtol, atol, max_steps, problem.is_single
+    plan = RoundPlan(tuple(modes), tuple(modes.values()), tuple(scene.transitions), *limits)
     ending, record = follow_in_doubles(functools.partial(hybrid_motion, plan), problem, start)
     trajectory = _trajectory(modes, problem, ending, record)
     return _raise_unless_ok(modes, trajectory, layout, ending.mode) if throw else trajectory
@@ -267,21 +221,15 @@ def _last_transitions(trajectory: Trajectory) -> str:
     return f" The last transitions were {' and '.join(pairs)}."
 
 
-def _present(modes: dict[str, System], transitions) -> tuple[dict[str, System], list[Transition]]:
-    systems = {name: present_system(mode) for name, mode in modes.items()}
-    return systems, [transition.now() for transition in transitions]
-
-
-def _place_of(modes: dict[str, System], start: Any) -> Any:
-    """The place of a mode, given by its name or its place, which may be traced. Raises `ValueError` for another one."""
-    if isinstance(start, str) and start in modes:
-        return list(modes).index(start)
-    if isinstance(start, int | np.integer | np.ndarray | jax.Array) and not isinstance(start, bool):
-        dtype, ndim = getattr(start, "dtype", np.dtype(int)), getattr(start, "ndim", 0)
-        is_place = ndim == 0 and jnp.issubdtype(dtype, jnp.integer)
-        if is_place and not (is_concrete(start) and not 0 <= int(start) < len(modes)):
-            return start
-    raise ValueError(f"start is {start!r}, which is no mode: the modes are {', '.join(map(repr, modes))}.")
+def _is_mode(modes: dict[str, System], start: Any) -> bool:
+    """True for the name of a mode or its place, which may be traced."""
+    if isinstance(start, str):
+        return start in modes
+    if isinstance(start, bool) or not isinstance(start, int | np.integer | np.ndarray | jax.Array):
+        return False
+    if np.ndim(start) or not jnp.issubdtype(getattr(start, "dtype", int), jnp.integer):
+        return False
+    return not is_concrete(start) or 0 <= int(start) < len(modes)
 
 
 def _require_modes(modes, transitions, start, max_transitions) -> None:
@@ -289,9 +237,9 @@ def _require_modes(modes, transitions, start, max_transitions) -> None:
         raise TypeError("modes must be a dict of lagjax.System by name.")
     if not isinstance(transitions, list | tuple):
         raise TypeError(f"transitions must be a list of lagjax.Transition; got {type(transitions).__name__}.")
-    known, start = ", ".join(map(repr, modes)), start if isinstance(start, str) else None
-    if start is not None:
-        _place_of(modes, start)
+    known = ", ".join(map(repr, modes))
+    if not _is_mode(modes, start):
+        raise ValueError(f"start is {start!r}, which is no mode: the modes are {known}.")
     for transition in transitions:
         if not isinstance(transition, Transition):
             raise TypeError(f"transitions must be lagjax.Transition; got {transition!r}.")
@@ -300,7 +248,7 @@ def _require_modes(modes, transitions, start, max_transitions) -> None:
                 raise ValueError(f"A transition has the {role} {name!r}, which is no mode: the modes are {known}.")
     if jax.tree.leaves((modes, transitions)):
         raise ValueError("A function of a mode or a transition holds arrays of its own: pass these in `params`.")
-    reached, growing = {*modes} if start is None else {start}, True
+    reached, growing = {start} if isinstance(start, str) else {*modes}, True
     while growing:
         more = {t.target for t in transitions if t.source in reached} - reached
         reached, growing = reached | more, bool(more)
@@ -328,7 +276,10 @@ def jumps(scene: Any) -> bool:
 
 
 def first_law(scene: Scene) -> System:
-    return scene.modes[scene.start] if isinstance(scene, Hybrid) else scene
+    """Its `System`, or that of the mode in which it begins: of any mode, where that is traced."""
+    if not isinstance(scene, Hybrid):
+        return scene
+    return laws(scene)[int(scene.first) if is_concrete(scene.first) else 0]
 
 
 def laws(scene: Scene) -> tuple[System, ...]:

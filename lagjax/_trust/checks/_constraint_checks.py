@@ -64,7 +64,7 @@ def _idle(name: str, of_velocities: bool, value, rows: np.ndarray) -> Finding:
         message = (
             f"{name} is {value:.3g} and has zero gradient here, {where}. A constraint is an equality with a gradient "
             "where it holds: write f and not f**2; a motion that may leave it (a string, a contact) is one of two "
-            "modes of simulate_hybrid, with a guard on the multiplier."
+            "modes of a lagjax.Hybrid, with a guard on the multiplier."
         )
     return Finding("constraint_zero_gradient", "error", (name,), message)
 

@@ -194,7 +194,7 @@ def _kink(scene: CheckedScene, name: str, role: str, along: str, values, of_velo
         rest = (
             f": a kink, where automatic differentiation says {derivative:.6g}. No force shows the kick that "
             "it gives to velocities. Smooth it (sqrt(x**2 + w**2) for abs(x)), or make two modes of it with a "
-            "Transition for lagjax.simulate_hybrid."
+            "Transition for a lagjax.Hybrid."
         )
     return Finding("kink", "advice" if of_force else "error", (along,), slope + rest)
 

@@ -131,7 +131,7 @@ def _finding(jump: Discontinuity, scene: CheckedScene) -> Finding:
     elif serious:
         consequence = (
             "No force shows it, and diffrax goes through it: smooth it, 0.5 * (1 + jnp.tanh(x / w)) for x > 0, or make "
-            "two modes of it with a Transition for lagjax.simulate_hybrid."
+            "two modes of it with a Transition for a lagjax.Hybrid."
         )
     elif of_l:
         consequence = OF_L

@@ -283,7 +283,7 @@ class Health(eqx.Module):
         advice = (
             f"Ask for at least about {most:.0f} outputs over the same time, evenly spread."
             if np.isfinite(most)
-            else "The power is not finite or not smooth somewhere: give it in modes of simulate_hybrid."
+            else "The power is not finite or not smooth somewhere: give it in modes of a lagjax.Hybrid."
         )
         return (
             f"Power balance: cannot be told{_member_share(undecided)} from {outputs} outputs, between which the "
