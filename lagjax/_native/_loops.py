@@ -21,8 +21,9 @@ import hashlib
 import inspect
 import textwrap
 from collections.abc import Callable
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from llvmlite import ir
@@ -30,6 +31,25 @@ from llvmlite import ir
 from lagjax._native._ir import BIT, DOUBLE, INTEGER, LEVELS, POINTER, Code, Value, compile_text
 
 Floats = Wholes = np.ndarray  # arrays of doubles, and of integers, as annotations name them
+
+
+@dataclass(frozen=True, eq=False)
+class Struct:
+    """Named fields of an array, as an annotation: `places` has the integer of a `table` that says where each begins.
+
+    The table is an argument of that name; without one the array is the table itself, of integers. Of `scalars` a field
+    is the number, of others the array from there on.
+    """
+
+    places: dict[str, int]
+    scalars: frozenset[str]
+    table: str | None
+
+    if TYPE_CHECKING:
+
+        def __getattr__(self, name: str) -> Any: ...
+
+
 _KINDS = {"float": DOUBLE, "int": INTEGER, "Floats": POINTER, "Wholes": POINTER, "bool": BIT}
 _ELEMENTS = {"Floats": "float", "Wholes": "int"}
 _COMPARISONS = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
@@ -75,9 +95,9 @@ class Loop:
     def result(self) -> str | None:
         return None if self.tree.returns is None else ast.unparse(self.tree.returns)
 
-    @functools.cached_property
+    @property
     def names(self) -> dict[str, Any]:
-        return dict(inspect.getclosurevars(self.function).globals)
+        return self.function.__globals__
 
 
 loop = Loop
@@ -122,7 +142,7 @@ def _write_module(entries: tuple[Loop, ...]) -> str:
 
 def _write(module: ir.Module, of: Loop, written: dict) -> Code:
     if of not in written:
-        kinds = [_KINDS[kind] for kind in of.arguments.values()]
+        kinds = [_KINDS.get(kind, POINTER) for kind in of.arguments.values()]
         code = Code(module, of.__name__, kinds, 1, _KINDS[of.result] if of.result else None)
         written[of] = code
         _Writer(code, of, lambda other: _write(module, other, written)).write_all()
@@ -177,6 +197,9 @@ class _Writer:
     def store(self, target, kind: str, value: Value) -> None:
         if isinstance(target, ast.Name):
             self.assign(target.id, kind, value)
+        elif isinstance(target, ast.Attribute):
+            wanted, address = self.field(target)
+            self.code.store(self.convert(target, kind, value, wanted), address)
         else:
             wanted, address = self.element(target)
             self.code.store(self.convert(target, kind, value, wanted), address)
@@ -184,7 +207,7 @@ class _Writer:
     def assign(self, name: str, kind: str, value: Value) -> None:
         if name not in self.variables:
             with self.builder.goto_entry_block():
-                place = Value(self.code, self.builder.alloca(_KINDS[kind]))
+                place = Value(self.code, self.builder.alloca(_KINDS.get(kind, POINTER)))
             self.variables[name] = kind, place
         wanted, place = self.variables[name]
         if kind != wanted and not (kind, wanted) == ("int", "float"):
@@ -271,7 +294,7 @@ class _Writer:
         return value
 
     def convert(self, node, kind: str, value: Value, wanted: str) -> Value:
-        if kind == wanted:
+        if kind == wanted or (kind == "Floats" and isinstance(self.of.names.get(wanted), Struct)):
             return value
         if kind == "int" and wanted == "float":
             return self.code.as_double(value)
@@ -294,24 +317,37 @@ class _Writer:
     def of_Name(self, node: ast.Name):
         if node.id in self.variables:
             kind, place = self.variables[node.id]
-            return kind, self.code.load(place, _KINDS[kind]) if kind != "bool" else Value(
-                self.code, self.builder.load(place.it, typ=BIT)
-            )
+            return kind, Value(self.code, self.builder.load(place.it, typ=_KINDS.get(kind, POINTER)))
         if node.id not in self.of.names:
             raise self.fail(node, "it has no value yet")
         return self.constant(self.of.names[node.id])
 
     def of_Attribute(self, node: ast.Attribute):
-        return self.constant(getattr(self.of.names[node.value.id], node.attr))  # type: ignore
+        kind, address = self.field(node)
+        is_scalar = kind in ("int", "float")
+        return kind, self.code.load(address, _KINDS[kind]) if is_scalar else address
+
+    def field(self, node: ast.Attribute) -> tuple[str, Value]:
+        """The kind of a field, that of an array unless it is a scalar, and its address."""
+        kind, base = self.value(node.value)
+        struct = self.of.names.get(kind)
+        if not isinstance(struct, Struct) or node.attr not in struct.places:
+            raise self.fail(node, "there is no such field")
+        element, of_array = ("int", "Wholes") if struct.table is None else ("float", "Floats")
+        place, is_scalar = self.number(struct.places[node.attr]), node.attr in struct.scalars
+        if struct.table is not None or not is_scalar:
+            table = base if struct.table is None else self.value(ast.Name(struct.table))[1]
+            place = self.code.load(self.code.element(table, place, INTEGER), INTEGER)
+        return element if is_scalar else of_array, self.code.element(base, place, _KINDS[element])
 
     def constant(self, x) -> tuple[str, Value]:
         return ("int", self.number(int(x))) if isinstance(x, (int, np.integer)) else ("float", self.number(float(x)))
 
     def element(self, node: ast.Subscript) -> tuple[str, Value]:
         kind, base = self.value(node.value)
-        if kind not in _ELEMENTS:
+        if kind in _KINDS and kind not in _ELEMENTS:
             raise self.fail(node, "it is no array")
-        element = _ELEMENTS[kind]
+        element = _ELEMENTS.get(kind, "float")
         index = self.value(node.slice)
         if index[0] != "int":
             raise self.fail(node, "an index is an integer")
@@ -321,7 +357,8 @@ class _Writer:
         if isinstance(node.slice, ast.Slice):
             assert node.slice.lower is not None and node.slice.upper is None
             kind, base = self.value(node.value)
-            return kind, self.code.element(base, self.value(node.slice.lower)[1], _KINDS[_ELEMENTS[kind]])
+            element = _KINDS[_ELEMENTS.get(kind, "float")]
+            return kind, self.code.element(base, self.value(node.slice.lower)[1], element)
         kind, address = self.element(node)
         return kind, self.code.load(address, _KINDS[kind])
 
@@ -361,7 +398,8 @@ class _Writer:
         return kind, self.code.select(self.condition(node.test), a, b)
 
     def of_Call(self, node: ast.Call):
-        name = node.func.attr if isinstance(node.func, ast.Attribute) else node.func.id  # type: ignore
+        assert isinstance(node.func, ast.Name)
+        name = node.func.id
         given = [self.value(x) for x in node.args]
         other = self.of.names.get(name)
         if isinstance(other, Loop):

@@ -6,6 +6,8 @@ double each field begins.
 
 from types import SimpleNamespace
 
+from lagjax._native import Struct
+
 SIZES = (
     "N",  # coordinates
     "K", "R", "D",  # contacts, those with friction, the directions in which these slip
@@ -71,7 +73,7 @@ WORK = (
     "CORNER", "PASSED", "OPENING",  # (3, corners), (corners,), (k,)
     "SHIFT", "LATER",  # (2n,), by how much the state and the time go beyond corners
     "FELL",  # (G,), 1 for watches that fell, 2 for those that rose
-    "ROOM_LEFT",  # for what is not named
+    "FREE",  # for what is not named
     "ORDER", "JOBS",  # the members whose stretch comes next, and what the kernel is given and gives
 )  # fmt: skip
 RECORD = (
@@ -93,4 +95,20 @@ RECORD = (
 
 
 NAMES = (*SIZES, *CODES, *ARRAYS, *MEMORY, *WORK, *(f"TO_{name}" for name in RECORD))
-at = SimpleNamespace(**{name: i for i, name in enumerate(NAMES)})
+_PLACES = {name: i for i, name in enumerate(NAMES)}
+at = SimpleNamespace(**_PLACES)
+_SCALARS = (
+    "RTOL", "FIRST", "LAST", "MISSED", "TURNS", "LONGEST", "RESULT", "ROUNDS", "ROWS", "ACCEPTED", "REJECTED", "LATER",
+    "RAN", "END", "WATCH", "CROSSES", "HAPPENS", "DECIDES", "CONTACT", "CHANGE", "HITS", "AT", "T_IMPACT", "LOST",
+    "LEAVES_REST", "LATER_ON",
+)  # fmt: skip
+
+
+def _struct(names: tuple[str, ...], scalars: tuple[str, ...] = _SCALARS, prefix: str = "", table: str | None = "scene"):
+    places = {name.lower(): _PLACES[prefix + name] for name in names}
+    return Struct(places, frozenset(name.lower() for name in names if name in scalars), table)
+
+
+Scene = _struct((*SIZES, *CODES, *ARRAYS), (*SIZES, *CODES), table=None)
+Member, Entry = _struct(MEMORY), _struct(RECORD, prefix="TO_")
+Room = _struct(WORK, ("LATER",))

@@ -282,7 +282,7 @@ def sizes_of_fields(sizes: dict[str, int]) -> dict[str, int]:
     fields |= dict.fromkeys(("GRADIENTS", "RESPONSES"), size * n) | dict.fromkeys(("SLIPS", "SLIPS_BEHIND"), 2 * r)
     fields |= {
         "WIDTHS": inputs, "TIED": k + r, "CAME": sizes["SECTIONS"], "COUPLING": size**2, "FORCES": d, "CHANGE": n,
-        "CORNER": 3 * corners, "PASSED": corners, "ROOM_LEFT": law + lines, "ORDER": 0, "JOBS": 0, "DID": doing,
+        "CORNER": 3 * corners, "PASSED": corners, "FREE": law + lines, "ORDER": 0, "JOBS": 0, "DID": doing,
         "BEFORE": n, "DIRECTION": r * d, "BEGUN": 2 * n + 1,
     }  # fmt: skip
     return fields

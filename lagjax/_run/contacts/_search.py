@@ -18,7 +18,7 @@ Bounces that accumulate end at a closed form of their limit (`end_bounces`).
                           ▲                                                                     │
                           └─────────────────────────────────────────────────────────────────────┘
 
-`scene` holds sizes, addresses of machine code, and the places of what is remembered of a member, its `memory`, and of
+`scene` holds sizes, addresses of machine code, and the places of what is remembered of a member, its `member`, and of
 what a `row` of the record says; they are declared in `_places`. A flag is 0 or 1. `work` is room that nobody else has.
 """
 
@@ -48,7 +48,7 @@ from lagjax._run.contacts._law import (
     hold_rows,
     solve,
 )
-from lagjax._run.contacts._places import at
+from lagjax._run.contacts._places import Entry, Member, Room, Scene
 
 # Results of a motion that goes on, of one whose stretch the kernel did not finish, and of one that has not begun.
 GOING, ASKS, NEW = -1, -2, -3
@@ -77,7 +77,7 @@ TIED_MOVES = 1e3
 # turns a slip at once, and steps are as short as that takes.
 NO_SLIP, AT_REST = 1e-11, 1e-8
 HARDLY = 1e-6  # of the largest velocities so far: a contact that moves apart slower may close
-GAINED = 1e-12  # of the work of an impact: a gain of energy beyond rounding
+GAINED = 1e-12  # of the room of an impact: a gain of energy beyond rounding
 # Of the largest slip so far: what is more, where the slip along its first direction ends, has turned.
 TURNED = 1e-6
 LEAST = 1e-300  # a side that is exactly zero still has a sign
@@ -109,75 +109,75 @@ def find_length(x: Floats, count: int) -> float:
 
 
 @loop
-def open_all(scene: Wholes, x: Floats, opened: Floats):
+def open_all(scene: Scene, x: Floats, opened: Floats):
     """Put the inputs of lines at the state of inputs x with all contacts open."""
-    k, r, d = scene[at.K], scene[at.R], scene[at.D]
-    first = 2 * scene[at.N] + 1 + scene[at.NUMBERS]
+    k, r, d = scene.k, scene.r, scene.d
+    first = 2 * scene.n + 1 + scene.numbers
     copy(x, opened, first)
     for i in range(k + r + r * d + 1):
         opened[first + i] = 1.0 if k <= i and i < k + r + r * d else 0.0
 
 
 @loop
-def is_held(scene: Wholes, x: Floats) -> bool:
+def is_held(scene: Scene, x: Floats) -> bool:
     """True where a contact is closed, at inputs x."""
-    for i in range(scene[at.K]):
-        if x[2 * scene[at.N] + 1 + scene[at.NUMBERS] + i] > 0:
+    for i in range(scene.k):
+        if x[2 * scene.n + 1 + scene.numbers + i] > 0:
             return True
     return False
 
 
 @loop
-def watch(scene: Wholes, memory: Floats, x: Floats, held: bool, out: Floats, work: Floats):
+def watch(scene: Scene, member: Member, x: Floats, held: bool, out: Floats, work: Floats):
     """Put the watches at inputs x, G each: values, rates, how far rounding moves a value, that of time, and a rate."""
-    n, total = scene[at.N], scene[at.WATCHES]
-    evaluate(scene[at.HELD_WATCH] if held else scene[at.OPEN_WATCH], x, work)
-    evaluate(scene[at.HELD_ERRORS] if held else scene[at.OPEN_ERRORS], x, work[4 * total :])
-    instant = INSTANT * SMALLEST_STEP * max(abs(x[2 * n]), abs(memory[scene[at.LAST]]))
+    n, total = scene.n, scene.watches
+    evaluate(scene.held_watch if held else scene.open_watch, x, work)
+    evaluate(scene.held_errors if held else scene.open_errors, x, work[4 * total :])
+    instant = INSTANT * SMALLEST_STEP * max(abs(x[2 * n]), abs(member.last))
     for g in range(total):
         more = work[4 * total + g]
         out[g], out[total + g] = work[g], work[total + g]
         out[2 * total + g] = GUARD_NOISE * work[2 * total + g]
         out[3 * total + g] = abs(work[total + g]) * instant
         out[4 * total + g] = GUARD_NOISE * (work[3 * total + g] + (more if isfinite(more) else 0.0))
-    if scene[at.SINGLE] > 0:  # the start is known to the rounding of float32
-        inputs, widths = scene[at.INPUTS], memory[scene[at.WIDTHS] :]
+    if scene.single > 0:  # the start is known to the rounding of float32
+        inputs, widths = scene.inputs, member.widths
         for g in range(total):
             copy(x, work, inputs)
             for j in range(total):
                 work[inputs + j] = float(j == g)
-            evaluate(scene[at.HELD_SLOPES] if held else scene[at.OPEN_SLOPES], work, work[inputs + total :])
-            for i in range(2 * n + 1 + scene[at.NUMBERS]):
+            evaluate(scene.held_slopes if held else scene.open_slopes, work, work[inputs + total :])
+            for i in range(2 * n + 1 + scene.numbers):
                 if widths[i] > 0:
                     out[2 * total + g] += abs(work[inputs + total + i]) * widths[i]
 
 
 @loop
-def has_missed(scene: Wholes, memory: Floats, watches: Floats, i: int, closed: bool) -> bool:
+def has_missed(scene: Scene, member: Member, watches: Floats, i: int, closed: bool) -> bool:
     """True for a gap that is negative though it was followed, and open: its series did not show that."""
-    if scene[at.MAY_MISS] == 0 or i >= scene[at.GAPS] or closed:
+    if scene.may_miss == 0 or i >= scene.gaps or closed:
         return False
-    total = scene[at.WATCHES]
-    rounding = max(watches[2 * total + i], watches[3 * total + i], memory[scene[at.ROUNDING] + i])
-    return watches[i] < -rounding * max(1.0, THROUGH * memory[scene[at.RTOL]] / GUARD_NOISE)
+    total = scene.watches
+    rounding = max(watches[2 * total + i], watches[3 * total + i], member.rounding[i])
+    return watches[i] < -rounding * max(1.0, THROUGH * member.rtol / GUARD_NOISE)
 
 
 @loop
-def touch(scene: Wholes, memory: Floats, opened: Floats, work: Floats):
+def touch(scene: Scene, member: Member, opened: Floats, room: Room):
     """Put which contacts touch, how fast they move apart, and the rounding of that; inputs have all contacts open."""
-    total, watches = scene[at.WATCHES], work[scene[at.WATCHED] :]
-    watch(scene, memory, opened, False, watches, work[scene[at.ROOM_LEFT] :])
-    for i in range(scene[at.K]):
-        value, noise, is_gap = watches[i], watches[2 * total + i] + watches[3 * total + i], i < scene[at.GAPS]
-        work[scene[at.TOUCHES] + i] = float((abs(value) if is_gap else value) <= noise)
-        work[scene[at.PARTING] + i] = watches[total + i] if is_gap else value
-        work[scene[at.NOISE] + i] = watches[4 * total + i] if is_gap else noise
+    total, watches = scene.watches, room.watched
+    watch(scene, member, opened, False, watches, room.free)
+    for i in range(scene.k):
+        value, noise, is_gap = watches[i], watches[2 * total + i] + watches[3 * total + i], i < scene.gaps
+        room.touches[i] = float((abs(value) if is_gap else value) <= noise)
+        room.parting[i] = watches[total + i] if is_gap else value
+        room.noise[i] = watches[4 * total + i] if is_gap else noise
 
 
 @loop
-def measure_slips(scene: Wholes, memory: Floats, rates: Floats, v: Floats, slips: Floats, work: Floats):
+def measure_slips(scene: Scene, member: Member, rates: Floats, v: Floats, slips: Floats, room: Room):
     """Put 1 for each slip that is none, beside the largest so far, then the lengths of all: (r,) each."""
-    k, r, d, n, gradients = scene[at.K], scene[at.R], scene[at.D], scene[at.N], work[scene[at.GRADIENTS] :]
+    k, r, d, n, gradients = scene.k, scene.r, scene.d, scene.n, room.gradients
     for c in range(r):
         terms = 0.0
         for i in range(k + c * d, k + c * d + d):
@@ -186,30 +186,30 @@ def measure_slips(scene: Wholes, memory: Floats, rates: Floats, v: Floats, slips
                 moves += abs(gradients[i * n + j]) * abs(v[j])
             terms = max(terms, moves)
         slips[r + c] = find_length(rates[k + c * d :], d)
-        slips[c] = float(slips[r + c] <= max(1e-12 * terms, 1e-13 * memory[scene[at.SLIP] + c]))
+        slips[c] = float(slips[r + c] <= max(1e-12 * terms, 1e-13 * member.slip[c]))
 
 
 # ---- corners of gaps ----
 
 
 @loop
-def locate_corners(scene: Wholes, memory: Floats, x: Floats, work: Floats) -> float:
+def locate_corners(scene: Scene, member: Member, x: Floats, room: Room) -> float:
     """Put the sides of corners at inputs x, their rates, and how far beyond them it goes on: (corners,) each.
 
     Returns how near they count.
     """
-    n, count, inputs, found = scene[at.N], scene[at.CORNERS], scene[at.INPUTS], work[scene[at.CORNER] :]
-    t, largest, near = x[2 * n], memory[scene[at.LARGEST] :], 0.0
-    terms, along = work[scene[at.ROOM_LEFT] :], work[scene[at.ROOM_LEFT] + count :]
+    n, count, inputs, found = scene.n, scene.corners, scene.inputs, room.corner
+    t, largest, near = x[2 * n], member.largest, 0.0
+    terms, along = room.free, room.free[count :]
     slopes = along[2 * inputs :]
-    evaluate(scene[at.SIDES], x, found)
+    evaluate(scene.sides, x, found)
     for p in range(count):
         found[count + p], found[2 * count + p], terms[p] = 0.0, abs(found[p]), 0.0
     copy(x, along, inputs)
     for i in range(n + 1):  # by each coordinate, and by time
         for j in range(inputs):
             along[inputs + j] = float(j == (i if i < n else 2 * n))
-        evaluate(scene[at.SIDE_SLOPES], along, slopes)
+        evaluate(scene.side_slopes, along, slopes)
         size, rate, speed = abs(t), 1.0, 1.0
         if i < n:
             size, rate, speed = max(largest[i], abs(x[i])), x[n + i], max(largest[n + i], abs(x[n + i]))
@@ -219,30 +219,30 @@ def locate_corners(scene: Wholes, memory: Floats, x: Floats, work: Floats) -> fl
             terms[p] += abs(slopes[p]) * speed
     for p in range(count):
         found[2 * count + p] = BEYOND * found[2 * count + p]
-        soon = BEFORE * max(abs(t), abs(memory[scene[at.LAST]])) * terms[p]
+        soon = BEFORE * max(abs(t), abs(member.last)) * terms[p]
         near = max(near, found[2 * count + p] + soon)
     return near
 
 
 @loop
-def go_beyond(scene: Wholes, memory: Floats, x: Floats, work: Floats) -> float:
+def go_beyond(scene: Scene, member: Member, x: Floats, room: Room) -> float:
     """Put by how much the state at inputs x moves beyond the corners that are passed; returns by when.
 
     Negative where the motion rests on one.
     """
-    n, count, corners, shift = scene[at.N], scene[at.CORNERS], work[scene[at.CORNER] :], work[scene[at.SHIFT] :]
+    n, count, corners, shift = scene.n, scene.corners, room.corner, room.shift
     later, rests = 0.0, False
     for p in range(count):
-        if work[scene[at.PASSED] + p] > 0:
+        if room.passed[p] > 0:
             rate = corners[count + p]
             left = corners[2 * count + p] - corners[p] * find_sign(rate)
             if rate != 0:
                 left = left / abs(rate)
-            if rate == 0 or left > ON_CORNER * (memory[scene[at.LAST]] - memory[scene[at.FIRST]]):
+            if rate == 0 or left > ON_CORNER * (member.last - member.first):
                 rests = True
             else:
                 later = max(later, left)
-    evaluate(scene[at.ACCELERATION], x, shift[n:])
+    evaluate(scene.acceleration, x, shift[n:])
     for i in range(n):
         a = shift[n + i]
         shift[i], shift[n + i] = later * (x[n + i] + 0.5 * later * a), later * a
@@ -253,55 +253,55 @@ def go_beyond(scene: Wholes, memory: Floats, x: Floats, work: Floats) -> float:
 
 
 @loop
-def begin(scene: Wholes, memory: Floats, work: Floats) -> int:
+def begin(scene: Scene, member: Member, room: Room) -> int:
     """The result of a start, whose inputs and coefficients are there, with all contacts open: `GOING` if it is sound.
 
     Those that touch and do not move apart fall at once.
     """
-    n, k, r, total = scene[at.N], scene[at.K], scene[at.R], scene[at.WATCHES]
-    x, watches, deciding = memory[scene[at.X] :], work[scene[at.WATCHED] :], total - scene[at.SECTIONS]
+    n, k, r, total = scene.n, scene.k, scene.r, scene.watches
+    x, watches, deciding = member.x, room.watched, total - scene.sections
     for g in range(total):
-        memory[scene[at.FRESH] + g] = 1.0
+        member.fresh[g] = 1.0
     for i in range(2 * n):
-        memory[scene[at.LARGEST] + i] = abs(x[i])
-    touch(scene, memory, x, work)
-    for s in range(scene[at.SECTIONS]):
-        memory[scene[at.CAME] + s] = find_sign(watches[total + deciding + s])
-    evaluate(scene[at.RESPONSE], x, work[scene[at.GRADIENTS] :])
-    if memory[scene[at.LAST]] < memory[scene[at.FIRST]]:
+        member.largest[i] = abs(x[i])
+    touch(scene, member, x, room)
+    for s in range(scene.sections):
+        member.came[s] = find_sign(watches[total + deciding + s])
+    evaluate(scene.response, x, room.gradients)
+    if member.last < member.first:
         return BACKWARDS
     for i in range(k):
-        if not (memory[scene[at.RESTITUTION] + i] >= 0 and memory[scene[at.RESTITUTION] + i] <= 1):
+        if not (member.restitution[i] >= 0 and member.restitution[i] <= 1):
             return NO_RESTITUTION
     for c in range(r):
-        if not (memory[scene[at.MU] + c] >= 0 and isfinite(memory[scene[at.MU] + c])):
+        if not (member.mu[c] >= 0 and isfinite(member.mu[c])):
             return NO_FRICTION
-    if starts_inside(scene, memory, work):
+    if starts_inside(scene, member, room):
         return INCONSISTENT
     result = GOING
     if r > 0:  # one that slides and touches may stay or leave
-        push, slips = work[scene[at.PUSH] :], work[scene[at.SLIPS] :]
-        measure_slips(scene, memory, work[scene[at.RATES] :], x[n:], slips, work)
+        push, slips = room.push, room.slips
+        measure_slips(scene, member, room.rates, x[n:], slips, room)
         for i in range(k):
-            still = abs(work[scene[at.PARTING] + i]) <= work[scene[at.NOISE] + i]
-            push[i] = float(work[scene[at.TOUCHES] + i] > 0 and still)
-        write_directions(scene, work[scene[at.RATES] + k :], work[scene[at.ROOM_LEFT] :])
-        if has_paradox(scene, memory, push, slips, work[scene[at.ROOM_LEFT] :], work):
+            still = abs(room.parting[i]) <= room.noise[i]
+            push[i] = float(room.touches[i] > 0 and still)
+        write_directions(scene, room.rates[k :], room.free)
+        if has_paradox(scene, member, push, slips, room.free, room):
             result = UNDECIDED
-    if scene[at.CORNERS] > 0:  # a contact that starts on its corner goes where the motion does
-        corners, touches, passed = work[scene[at.CORNER] :], scene[scene[at.TOUCH] :], work[scene[at.PASSED] :]
-        locate_corners(scene, memory, x, work)
-        for p in range(scene[at.CORNERS]):
+    if scene.corners > 0:  # a contact that starts on its corner goes where the motion does
+        corners, touches, passed = room.corner, scene.touch, room.passed
+        locate_corners(scene, member, x, room)
+        for p in range(scene.corners):
             passed[p] = 0.0
             for i in range(k):
-                is_there = abs(corners[p]) <= corners[2 * scene[at.CORNERS] + p]
-                if touches[p * k + i] > 0 and work[scene[at.TOUCHES] + i] > 0 and is_there:
+                is_there = abs(corners[p]) <= corners[2 * scene.corners + p]
+                if touches[p * k + i] > 0 and room.touches[i] > 0 and is_there:
                     passed[p] = 1.0
-        later = go_beyond(scene, memory, x, work)
+        later = go_beyond(scene, member, x, room)
         if later < 0 and result == GOING:
             result = AT_CORNER
         for i in range(2 * n):
-            x[i] += work[scene[at.SHIFT] + i]
+            x[i] += room.shift[i]
         x[2 * n] += later if later > 0 else 0.0
     return result
 
@@ -313,31 +313,31 @@ def find_sign(x: float) -> float:
 
 
 @loop
-def starts_inside(scene: Wholes, memory: Floats, work: Floats) -> bool:
+def starts_inside(scene: Scene, member: Member, room: Room) -> bool:
     """True where a gap is negative at the start, by more than the rounding of what leads a motion there.
 
     A gap that is a coordinate is 1e-16 where it closes, and its rounding that of the height from which it fell.
     """
-    n, total, x, rises = scene[at.N], scene[at.WATCHES], memory[scene[at.X] :], work[scene[at.ROOM_LEFT] :]
-    first, last, furthest, watches = memory[scene[at.FIRST]], memory[scene[at.LAST]], 0.0, work[scene[at.WATCHED] :]
-    evaluate(scene[at.ACCELERATION], x, rises)
+    n, total, x, rises = scene.n, scene.watches, member.x, room.free
+    first, last, furthest, watches = member.first, member.last, 0.0, room.watched
+    evaluate(scene.acceleration, x, rises)
     for j in range(n):
         furthest = max(furthest, abs(x[j]))
-    for i in range(scene[at.GAPS]):
+    for i in range(scene.gaps):
         width = 0.0
         for j in range(n):
             reach = abs(x[n + j]) * max(abs(first), abs(last)) + abs(rises[j]) * (last - first) ** 2 / 8.0
-            width += abs(work[scene[at.GRADIENTS] + i * n + j]) * (furthest + reach)
+            width += abs(room.gradients[i * n + j]) * (furthest + reach)
         if watches[i] + watches[2 * total + i] < -GUARD_NOISE * width:
             return True
     return False
 
 
 @loop
-def write_directions(scene: Wholes, vectors: Floats, units: Floats):
+def write_directions(scene: Scene, vectors: Floats, units: Floats):
     """Put the unit vectors along `vectors` (r, d), zero of none."""
-    d = scene[at.D]
-    for c in range(scene[at.R]):
+    d = scene.d
+    for c in range(scene.r):
         length = find_length(vectors[c * d :], d)
         for i in range(c * d, c * d + d):
             units[i] = vectors[i] / length if length > 0 else 0.0
@@ -345,29 +345,29 @@ def write_directions(scene: Wholes, vectors: Floats, units: Floats):
 
 @loop
 def has_paradox(
-    scene: Wholes, memory: Floats, push: Floats, sticks: Floats, direction: Floats, work: Floats
+    scene: Scene, member: Member, push: Floats, sticks: Floats, direction: Floats, room: Room
 ) -> bool:
     """True where friction leaves nothing of a contact's response to its normal force.
 
     There no force, or more than one, keeps it closed: Painlevé's paradox.
     """
-    k, r, d, rough, coupling = scene[at.K], scene[at.R], scene[at.D], scene[scene[at.ROUGH] :], work[scene[at.COUPLING] :]
+    k, r, d, rough, coupling = scene.k, scene.r, scene.d, scene.rough, room.coupling
     size = k + r * d
     for c in range(r):
         if push[rough[c]] > 0 and sticks[c] == 0:
             own, brought = coupling[rough[c] * size + rough[c]], 0.0
             for i in range(d):
                 brought += coupling[rough[c] * size + k + c * d + i] * direction[c * d + i]
-            if not 1.0 - memory[scene[at.MU] + c] * brought / (own if own > 0 else 1.0) > PARADOX:
+            if not 1.0 - member.mu[c] * brought / (own if own > 0 else 1.0) > PARADOX:
                 return True
     return False
 
 
 @loop
-def note_rounding(scene: Wholes, memory: Floats, duration: float):
+def note_rounding(scene: Scene, member: Member, duration: float):
     """Note the largest rounding of the watches: of one that went away and came back that between them."""
-    total, watches, kinds = scene[at.WATCHES], memory[scene[at.GUARDS] :], memory[scene[at.KINDS] :]
-    values, rates = memory[scene[at.ROUNDING] :], memory[scene[at.RATE_ROUNDING] :]
+    total, watches, kinds = scene.watches, member.guards, member.kinds
+    values, rates = member.rounding, member.rate_rounding
     for g in range(total):
         place = g + (total if kinds[g] > 0 else 0)
         value, rate = watches[2 * total + g], watches[4 * total + g]
@@ -378,25 +378,25 @@ def note_rounding(scene: Wholes, memory: Floats, duration: float):
 
 
 @loop
-def write_sides(scene: Wholes, memory: Floats, sides: Floats, rates: Floats):
+def write_sides(scene: Scene, member: Member, sides: Floats, rates: Floats):
     """Put the sides (G,) of all watches from which the motion comes, and the rounding of their rates, (G,).
 
     A tie is a contact that turns at an instant without end: closed, its force is none if rounding of the gap could make
     it; it sticks until its value falls, a rate is no reason.
     """
-    k, r, total, rough = scene[at.K], scene[at.R], scene[at.WATCHES], scene[scene[at.ROUGH] :]
-    watches, kinds, tied = memory[scene[at.GUARDS] :], memory[scene[at.KINDS] :], memory[scene[at.TIED] :]
-    came, deciding = memory[scene[at.CAME] :], total - scene[at.SECTIONS]
-    lasts = memory[scene[at.LONGEST]] if memory[scene[at.LONGEST]] > 0 else 1.0
+    k, r, total, rough = scene.k, scene.r, scene.watches, scene.rough
+    watches, kinds, tied = member.guards, member.kinds, member.tied
+    came, deciding = member.came, total - scene.sections
+    lasts = member.longest if member.longest > 0 else 1.0
     for g in range(total):
         place = g + (total if kinds[g] > 0 else 0)
-        rounding, of_rate = memory[scene[at.ROUNDING] + place], memory[scene[at.RATE_ROUNDING] + place]
+        rounding, of_rate = member.rounding[place], member.rate_rounding[place]
         if g < k + r and kinds[g] > 0 and tied[g] > 0:
             if g < k:
-                none = memory[scene[at.FORCE_NOISE] + g]
+                none = member.force_noise[g]
                 rounding, of_rate = max(rounding, none), max(of_rate, 3.0 * none / lasts)
             else:
-                most = memory[scene[at.MU] + g - k] * watches[rough[g - k]]
+                most = member.mu[g - k] * watches[rough[g - k]]
                 rounding = GUARD_NOISE * most**2
                 of_rate = max(watches[4 * total + g], -2.0 * watches[total + g])
         rounding = max(rounding, watches[3 * total + g])
@@ -413,32 +413,32 @@ def write_sides(scene: Wholes, memory: Floats, sides: Floats, rates: Floats):
 
 
 @loop
-def prepare(scene: Wholes, memory: Floats, ts: Floats, times: Floats, y: Floats, numbers: Floats, work: Floats):
+def prepare(scene: Scene, member: Member, ts: Floats, times: Floats, y: Floats, numbers: Floats, room: Room):
     """Put the run of a member's next stretch: its times (T + 2,), its start, and its numbers with the sides."""
-    n, k, r, total = scene[at.N], scene[at.K], scene[at.R], scene[at.WATCHES]
-    x, kinds, stays = memory[scene[at.X] :], memory[scene[at.KINDS] :], memory[scene[at.STAYS] :]
-    did, t = x[2 * n + 1 + scene[at.NUMBERS] :], x[2 * n]
-    if scene[at.CORNERS] > 0:
-        x[scene[at.INPUTS] - 1] = locate_corners(scene, memory, x, work)
-    watches = memory[scene[at.GUARDS] :]
-    watch(scene, memory, x, is_held(scene, x), watches, work[scene[at.ROOM_LEFT] :])
-    memory[scene[at.MISSED]] = 0.0
+    n, k, r, total = scene.n, scene.k, scene.r, scene.watches
+    x, kinds, stays = member.x, member.kinds, member.stays
+    did, t = x[2 * n + 1 + scene.numbers :], x[2 * n]
+    if scene.corners > 0:
+        x[scene.inputs - 1] = locate_corners(scene, member, x, room)
+    watches = member.guards
+    watch(scene, member, x, is_held(scene, x), watches, room.free)
+    member.missed = 0.0
     for g in range(total):
         kinds[g] = did[g] if g < k + r else 0.0
-        if g < k and memory[scene[at.FRESH] + g] == 0 and has_missed(scene, memory, watches, g, did[g] > 0):
-            memory[scene[at.MISSED]] = 1.0
-    note_rounding(scene, memory, 0.0)
-    used = scene[at.INPUTS] - 2 * n - 1
+        if g < k and member.fresh[g] == 0 and has_missed(scene, member, watches, g, did[g] > 0):
+            member.missed = 1.0
+    note_rounding(scene, member, 0.0)
+    used = scene.inputs - 2 * n - 1
     copy(x[2 * n + 1 :], numbers, used)
     sides, rates = numbers[used:], numbers[used + total :]
-    write_sides(scene, memory, sides, rates)
+    write_sides(scene, member, sides, rates)
     for g in range(total):  # what starts on a gap and moves inwards comes from in front of it
         falls = g < k and t == ts[0] and watches[total + g] < -rates[g] and kinds[g] == 0
         beyond = g < k + r and sides[g] == INFINITY
-        stays[g] = float((memory[scene[at.FRESH] + g] > 0 or beyond) and not falls)
+        stays[g] = float((member.fresh[g] > 0 or beyond) and not falls)
     copy(x, y, 2 * n)
-    times[0], times[scene[at.TIMES] + 1] = t, ts[scene[at.TIMES] - 1]
-    for j in range(scene[at.TIMES]):
+    times[0], times[scene.times + 1] = t, ts[scene.times - 1]
+    for j in range(scene.times):
         times[1 + j] = ts[j] if is_ahead(ts[j], t, ts[0]) else t
 
 
@@ -450,17 +450,17 @@ def is_ahead(output: float, t: float, first: float) -> bool:
 
 @loop
 def finish(
-    scene: Wholes, memory: Floats, ts: Floats, path: Floats, did: Floats, record: Floats, found: Floats, y_end: Floats,
-    t_end: float, event: int, result: int, accepted: float, rejected: float, work: Floats
+    scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, record: Entry, found: Floats, y_end: Floats,
+    t_end: float, event: int, result: int, accepted: float, rejected: float, room: Room
 ):  # fmt: skip
     """Take a stretch, its outputs `found` (T + 2, 2n) and its end: what the contacts do there, and a row of the record.
 
     `event` is the mask of the watches that fell or rose, `result` that of a run without one.
     """
-    n, k, total, times, x = scene[at.N], scene[at.K], scene[at.WATCHES], scene[at.TIMES], memory[scene[at.X] :]
-    row, fell, doing = record[int(memory[scene[at.ROUNDS]]) * scene[at.ROW] :], work[scene[at.FELL] :], scene[at.DOING]
-    deciding, start, begun = total - scene[at.SECTIONS], x[2 * n], x[2 * n + 1 + scene[at.NUMBERS] :]
-    for i in range(scene[at.ROW]):
+    n, k, total, times, x = scene.n, scene.k, scene.watches, scene.times, member.x
+    row, fell, doing = record[int(member.rounds) * scene.row :], room.fell, scene.doing
+    deciding, start, begun = total - scene.sections, x[2 * n], x[2 * n + 1 + scene.numbers :]
+    for i in range(scene.row):
         row[i] = 0.0
     happens, decides, first = event > 0, False, deciding
     for g in range(total):
@@ -478,93 +478,93 @@ def finish(
     elif happens:
         while fell[first] == 0:
             first += 1
-    crosses = happens and not (at_once and memory[scene[at.STAYS] + first] > 0)
-    row[scene[at.TO_END]], row[scene[at.TO_WATCH]], row[scene[at.TO_CROSSES]] = t_end, float(first), float(crosses)
-    row[scene[at.TO_HAPPENS]], row[scene[at.TO_DECIDES]] = float(happens), float(decides)
-    row[scene[at.TO_RAN]], row[scene[at.TO_T_IMPACT]] = 1.0, MISSING
-    copy(begun, row[scene[at.TO_DID] :], doing)
+    crosses = happens and not (at_once and member.stays[first] > 0)
+    row.end, row.watch, row.crosses = t_end, float(first), float(crosses)
+    row.happens, row.decides = float(happens), float(decides)
+    row.ran, row.t_impact = 1.0, MISSING
+    copy(begun, row.did, doing)
     if crosses or not happens:
         copy(y_end, x, 2 * n)
         x[2 * n] = t_end
-    note_stretch(scene, memory, first if happens else -1, at_once, t_end - start, accepted)
-    memory[scene[at.ACCEPTED]] += accepted
-    memory[scene[at.REJECTED]] += rejected
+    note_stretch(scene, member, first if happens else -1, at_once, t_end - start, accepted)
+    member.accepted += accepted
+    member.rejected += rejected
     reached = SUCCESSFUL if happens else result
-    row[scene[at.TO_AT]] = x[2 * n]
-    copy(x[n:], row[scene[at.TO_BEFORE] :], n)
+    row.at = x[2 * n]
+    copy(x[n:], row.before, n)
     if decides:
-        reached = decide(scene, memory, first, row, work)
+        reached = decide(scene, member, first, row, room)
     elif happens:  # a section, of which a note is made
-        memory[scene[at.CAME] + first - deciding] = 2.0 * fell[first] - 3.0
-        row[scene[at.TO_CONTACT]], row[scene[at.TO_CHANGE]] = float(k + first - deciding), -1.0
-    copy(x, row[scene[at.TO_BEHIND] :], 2 * n)
-    if memory[scene[at.MISSED]] > 0:
+        member.came[first - deciding] = 2.0 * fell[first] - 3.0
+        row.contact, row.change = float(k + first - deciding), -1.0
+    copy(x, row.behind, 2 * n)
+    if member.missed > 0:
         reached = MISSED
-    if happens and memory[scene[at.TURNS]] > 16 + 8 * total:
+    if happens and member.turns > 16 + 8 * total:
         reached = IN_TURN
-    if scene[at.CORNERS] > 0 and happens:  # time itself may go beyond its corner
+    if scene.corners > 0 and happens:  # time itself may go beyond its corner
         for j in range(times):
             if ts[j] <= x[2 * n] and did[j * doing] < 0:
                 copy(x, path[j * 2 * n :], 2 * n)
-                copy(row[scene[at.TO_DID] :], did[j * doing :], doing)
+                copy(row.did, did[j * doing :], doing)
     for i in range(2 * n):
         if not isfinite(x[i]) and reached == SUCCESSFUL:
             reached = NOT_FINITE
-    memory[scene[at.ROUNDS]] += float(happens)
-    memory[scene[at.ROWS]] += 1.0
+    member.rounds += float(happens)
+    member.rows += 1.0
     if happens and reached == SUCCESSFUL:
-        reached = TOO_MANY if memory[scene[at.ROUNDS]] >= scene[at.MOST] else GOING
-    memory[scene[at.RESULT]] = float(reached)
+        reached = TOO_MANY if member.rounds >= scene.most else GOING
+    member.result = float(reached)
     if reached == SUCCESSFUL:
-        check_outputs(scene, memory, ts, path, did, work)
+        check_outputs(scene, member, ts, path, did, room)
 
 
 @loop
-def note_stretch(scene: Wholes, memory: Floats, first: int, at_once: bool, duration: float, accepted: float):
+def note_stretch(scene: Scene, member: Member, first: int, at_once: bool, duration: float, accepted: float):
     """Note behind a stretch what is tied, its longest step, and what rounding it had; `first` fell where it ended."""
-    k, r, total, x = scene[at.K], scene[at.R], scene[at.WATCHES], memory[scene[at.X] :]
-    tied, refuted, did = memory[scene[at.TIED] :], memory[scene[at.REFUTED] :], memory[scene[at.KINDS] :]
-    memory[scene[at.TURNS]] = memory[scene[at.TURNS]] + 1.0 if at_once else 0.0
-    turns_in_plane = scene[at.D] == 1 and memory[scene[at.TURNS]] > total
+    k, r, total, x = scene.k, scene.r, scene.watches, member.x
+    tied, refuted, did = member.tied, member.refuted, member.kinds
+    member.turns = member.turns + 1.0 if at_once else 0.0
+    turns_in_plane = scene.d == 1 and member.turns > total
     for g in range(k + r):
         ties = g == first and did[g] == 0 and (refuted[g] > 0 if g < k else turns_in_plane)
         tied[g] = float(at_once and (tied[g] > 0 or ties))
     for i in range(k):
         refuted[i] = float(at_once and (refuted[i] > 0 or (i == first and did[i] > 0)))
-    note_rounding(scene, memory, duration)
+    note_rounding(scene, member, duration)
     for g in range(total):
-        memory[scene[at.FRESH] + g] *= float(at_once)
+        member.fresh[g] *= float(at_once)
     if not at_once:
-        memory[scene[at.LONGEST]] = max(memory[scene[at.LONGEST]], duration / max(accepted, 1.0))
+        member.longest = max(member.longest, duration / max(accepted, 1.0))
 
 
 @loop
-def check_outputs(scene: Wholes, memory: Floats, ts: Floats, path: Floats, did: Floats, work: Floats):
+def check_outputs(scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, room: Room):
     """Note as the result of a motion that outputs are missing, or that a gap is negative at one."""
-    n, k, times, doing = scene[at.N], scene[at.K], scene[at.TIMES], scene[at.DOING]
-    x, watches = work[scene[at.ROOM_LEFT] :], work[scene[at.ROOM_LEFT] + scene[at.INPUTS] :]
-    copy(memory[scene[at.X] :], x, scene[at.INPUTS])
+    n, k, times, doing = scene.n, scene.k, scene.times, scene.doing
+    x, watches = room.free, room.free[scene.inputs :]
+    copy(member.x, x, scene.inputs)
     for j in range(times):
         for i in range(2 * n):
             if did[j * doing] < 0 or not isfinite(path[j * 2 * n + i]):
-                memory[scene[at.RESULT]] = float(NOT_FINITE)
+                member.result = float(NOT_FINITE)
                 return
-        if scene[at.MAY_MISS] > 0:
+        if scene.may_miss > 0:
             copy(path[j * 2 * n :], x, 2 * n)
             x[2 * n] = ts[j]
-            copy(did[j * doing :], x[2 * n + 1 + scene[at.NUMBERS] :], doing)
-            watch(scene, memory, x, is_held(scene, x), watches, watches[5 * scene[at.WATCHES] :])
+            copy(did[j * doing :], x[2 * n + 1 + scene.numbers :], doing)
+            watch(scene, member, x, is_held(scene, x), watches, watches[5 * scene.watches :])
             for i in range(k):
-                if has_missed(scene, memory, watches, i, did[j * doing + i] > 0):
-                    memory[scene[at.RESULT]] = float(MISSED)
+                if has_missed(scene, member, watches, i, did[j * doing + i] > 0):
+                    member.result = float(MISSED)
                     return
 
 
 @loop
-def find_first(scene: Wholes, fell: Floats, at_once: bool, did: Floats) -> int:
+def find_first(scene: Scene, fell: Floats, at_once: bool, did: Floats) -> int:
     """The watch that is taken of those that `fell` (G,): of corners, then of friction, as one that jams is."""
-    k, r, rough = scene[at.K], scene[at.R], scene[scene[at.ROUGH] :]
-    for g in range(k + r, k + r + 2 * scene[at.CORNERS]):
+    k, r, rough = scene.k, scene.r, scene.rough
+    for g in range(k + r, k + r + 2 * scene.corners):
         if fell[g] > 0:
             return g
     for c in range(r):
@@ -580,55 +580,55 @@ def find_first(scene: Wholes, fell: Floats, at_once: bool, did: Floats) -> int:
 
 
 @loop
-def decide(scene: Wholes, memory: Floats, first: int, row: Floats, work: Floats) -> int:
+def decide(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> int:
     """The result behind watch `first`, which fell: state and contacts of the member go on there, and the row says it."""
-    n, k, r, d, total = scene[at.N], scene[at.K], scene[at.R], scene[at.D], scene[at.WATCHES]
-    x, opened, size, rough = memory[scene[at.X] :], memory[scene[at.OPENED] :], k + r * d, scene[scene[at.ROUGH] :]
-    closed, was_closed, was_stuck = x[2 * n + 1 + scene[at.NUMBERS] :], work[scene[at.CLOSED] :], work[scene[at.STUCK] :]
-    sticks, meets, opening = closed[k:], row[scene[at.TO_MEETS] :], work[scene[at.OPENING] :]
-    v, change, apart, flags = x[n:], work[scene[at.CHANGE] :], work[scene[at.APART] :], work[scene[at.CHANGED] :]
+    n, k, r, d, total = scene.n, scene.k, scene.r, scene.d, scene.watches
+    x, opened, size, rough = member.x, member.opened, k + r * d, scene.rough
+    closed, was_closed, was_stuck = x[2 * n + 1 + scene.numbers :], room.closed, room.stuck
+    sticks, meets, opening = closed[k:], row.meets, room.opening
+    v, change, apart, flags = x[n:], room.change, room.apart, room.changed
     copy(closed, was_closed, k)
     copy(sticks, was_stuck, r)
     for i in range(k):
         meets[i], opening[i] = float(i == first and closed[i] == 0), 0.0
     later, at_corner = 0.0, 0
-    if scene[at.CORNERS] > 0:
-        at_corner = meet_corners(scene, memory, first, meets, work)
-        later = work[scene[at.LATER]]
+    if scene.corners > 0:
+        at_corner = meet_corners(scene, member, first, meets, room)
+        later = room.later
     open_all(scene, x, opened)
-    evaluate(scene[at.RESPONSE], opened, work[scene[at.GRADIENTS] :])
-    missed = meet(scene, memory, meets, row, work)
-    hits = row[scene[at.TO_HITS]] > 0
-    measure_slips(scene, memory, work[scene[at.RATES] :], v, work[scene[at.SLIPS] :], work)
-    close_contacts(scene, memory, first, hits, meets, work)
-    undecided = find_change(scene, memory, hits, row, work)
-    stay_closed(scene, memory, hits, work)
-    slips = work[scene[at.SLIPS] :]
+    evaluate(scene.response, opened, room.gradients)
+    missed = meet(scene, member, meets, row, room)
+    hits = row.hits > 0
+    measure_slips(scene, member, room.rates, v, room.slips, room)
+    close_contacts(scene, member, first, hits, meets, room)
+    undecided = find_change(scene, member, hits, row, room)
+    stay_closed(scene, member, hits, room)
+    slips = room.slips
     for i in range(k):
-        flags[i] = float(closed[i] != was_closed[i] or (hits and work[scene[at.INVOLVED] + i] > 0))
+        flags[i] = float(closed[i] != was_closed[i] or (hits and room.involved[i] > 0))
         if flags[i] > 0:
-            memory[scene[at.FRESH] + i] = 1.0
+            member.fresh[i] = 1.0
     leaves_rest = False
     for c in range(r):
         leaves_rest = leaves_rest or (first == k + c and was_stuck[c] > 0 and d > 1)
-        row[scene[at.TO_STARTS] + c] = float(
-            first == k + c and was_stuck[c] > 0 and x[2 * n] == memory[scene[at.FIRST]]
+        row.starts[c] = float(
+            first == k + c and was_stuck[c] > 0 and x[2 * n] == member.first
         )
     if r > 0:
-        rub(scene, memory, first, hits, work)
-        write_directions(scene, sticks[r:], work[scene[at.ROOM_LEFT] :])
-        if has_paradox(scene, memory, closed, sticks, work[scene[at.ROOM_LEFT] :], work):
+        rub(scene, member, first, hits, room)
+        write_directions(scene, sticks[r:], room.free)
+        if has_paradox(scene, member, closed, sticks, room.free, room):
             undecided = True
-    row[scene[at.TO_LEAVES_REST]] = float(leaves_rest)
-    count_doubts(scene, memory, hits, leaves_rest, row, work)
-    move(scene, memory, first, meets, row, work)
+    row.leaves_rest = float(leaves_rest)
+    count_doubts(scene, member, hits, leaves_rest, row, room)
+    move(scene, member, first, meets, row, room)
     x[2 * n] += later
-    row[scene[at.TO_LATER_ON]] = later
-    name_change(scene, first, hits, closed, row, work)
+    row.later_on = later
+    name_change(scene, first, hits, closed, row, room)
     for g in range(k + r, total):
         for i in range(k):
             if opening[i] > 0:
-                memory[scene[at.FRESH] + g] = 1.0
+                member.fresh[g] = 1.0
     if at_corner == 2 or (missed and at_corner == 1):
         return AT_CORNER
     if missed:
@@ -637,17 +637,17 @@ def decide(scene: Wholes, memory: Floats, first: int, row: Floats, work: Floats)
 
 
 @loop
-def meet_corners(scene: Wholes, memory: Floats, first: int, meets: Floats, work: Floats) -> int:
+def meet_corners(scene: Scene, member: Member, first: int, meets: Floats, room: Room) -> int:
     """Put which contacts come to a corner where watch `first` fell, and open there; the state and time go beyond it.
 
     Returns 2 where one is struck at its corner, or stays there, 1 where one meets behind its corner, else 0.
     """
-    n, k, count, x, touches = scene[at.N], scene[at.K], scene[at.CORNERS], memory[scene[at.X] :], scene[scene[at.TOUCH] :]
-    corners, passed, opening = work[scene[at.CORNER] :], work[scene[at.PASSED] :], work[scene[at.OPENING] :]
-    near, answer, closed = x[scene[at.INPUTS] - 1], 0, work[scene[at.CLOSED] :]
-    locate_corners(scene, memory, x, work)
+    n, k, count, x, touches = scene.n, scene.k, scene.corners, member.x, scene.touch
+    corners, passed, opening = room.corner, room.passed, room.opening
+    near, answer, closed = x[scene.inputs - 1], 0, room.closed
+    locate_corners(scene, member, x, room)
     for p in range(count):
-        away, new, is_closed, is_met = abs(corners[p]), memory[scene[at.FRESH] + k + scene[at.R] + p] == 0, False, False
+        away, new, is_closed, is_met = abs(corners[p]), member.fresh[k + scene.r + p] == 0, False, False
         for i in range(k):
             if touches[p * k + i] > 0:
                 is_closed, is_met = is_closed or closed[i] > 0, is_met or meets[i] > 0
@@ -657,50 +657,50 @@ def meet_corners(scene: Wholes, memory: Floats, first: int, meets: Floats, work:
         for i in range(k):
             if passed[p] > 0 and touches[p * k + i] > 0 and closed[i] > 0:
                 opening[i] = 1.0
-    later = go_beyond(scene, memory, x, work)
-    work[scene[at.LATER]] = max(later, 0.0)
+    later = go_beyond(scene, member, x, room)
+    room.later = max(later, 0.0)
     return 2 if later < 0 else answer
 
 
 @loop
-def meet(scene: Wholes, memory: Floats, meets: Floats, row: Floats, work: Floats) -> bool:
+def meet(scene: Scene, member: Member, meets: Floats, row: Entry, room: Room) -> bool:
     """Put which contacts take part where some meet, and what they do: the row says whether it is an impact.
 
     Returns whether it was missed before.
     """
-    k, r, d, total = scene[at.K], scene[at.R], scene[at.D], scene[at.WATCHES]
-    touches, involved, noise = work[scene[at.TOUCHES] :], work[scene[at.INVOLVED] :], work[scene[at.NOISE] :]
-    parting, push, linked = work[scene[at.PARTING] :], work[scene[at.PUSH] :], work[scene[at.STAY] :]
-    closed, fastest, hits, missed = work[scene[at.CLOSED] :], 0.0, False, False
-    touch(scene, memory, memory[scene[at.OPENED] :], work)
+    k, r, d, total = scene.k, scene.r, scene.d, scene.watches
+    touches, involved, noise = room.touches, room.involved, room.noise
+    parting, push, linked = room.parting, room.push, room.stay
+    closed, fastest, hits, missed = room.closed, 0.0, False, False
+    touch(scene, member, member.opened, room)
     for i in range(k):
-        if meets[i] > 0 or closed[i] > 0 or i >= scene[at.GAPS]:
+        if meets[i] > 0 or closed[i] > 0 or i >= scene.gaps:
             touches[i] = 1.0
-        noise[i] = max(noise[i], 0.01 * memory[scene[at.RATE_ROUNDING] + i])
+        noise[i] = max(noise[i], 0.01 * member.rate_rounding[i])
         hits = hits or (meets[i] > 0 and parting[i] < -noise[i])
-        missed = missed or (meets[i] > 0 and has_missed(scene, memory, work[scene[at.WATCHED] :], i, closed[i] > 0))
-    reach(scene, meets, linked, work)
+        missed = missed or (meets[i] > 0 and has_missed(scene, member, room.watched, i, closed[i] > 0))
+    reach(scene, meets, linked, room)
     for i in range(k):
-        involved[i] = meets[i] if scene[at.LAW] == SEQUENTIAL else linked[i]
+        involved[i] = meets[i] if scene.law == SEQUENTIAL else linked[i]
     if hits:
-        find_pushes(scene, memory, row, work)
+        find_pushes(scene, member, row, room)
     for i in range(k):
-        presses = parting[i] > noise[i] and push[i] > 0 and i < scene[at.GAPS]
+        presses = parting[i] > noise[i] and push[i] > 0 and i < scene.gaps
         closes = parting[i] < -noise[i] or presses
-        alone = linked[i] > 0 and meets[i] == 0 and closed[i] == 0 and memory[scene[at.FRESH] + i] == 0
-        row[scene[at.TO_SHARES] + i] = float(hits and alone and closes)
+        alone = linked[i] > 0 and meets[i] == 0 and closed[i] == 0 and member.fresh[i] == 0
+        row.shares[i] = float(hits and alone and closes)
         fastest = max(fastest, abs(parting[i]))
     for i in range(k):
         noise[i] = max(noise[i], 1e-12 * fastest)
-    row[scene[at.TO_HITS]] = float(hits)
+    row.hits = float(hits)
     return missed
 
 
 @loop
-def reach(scene: Wholes, meets: Floats, found: Floats, work: Floats):
+def reach(scene: Scene, meets: Floats, found: Floats, room: Room):
     """Put the contacts that touch and that an impulse at those that meet reaches, one through the other."""
-    k, r, d, coupling, rough = scene[at.K], scene[at.R], scene[at.D], work[scene[at.COUPLING] :], scene[scene[at.ROUGH] :]
-    size, touches = k + r * d, work[scene[at.TOUCHES] :]
+    k, r, d, coupling, rough = scene.k, scene.r, scene.d, room.coupling, scene.rough
+    size, touches = k + r * d, room.touches
     copy(meets, found, k)
     for _ in range(k - 1):
         more = False
@@ -716,14 +716,14 @@ def reach(scene: Wholes, meets: Floats, found: Floats, work: Floats):
 
 
 @loop
-def find_pushes(scene: Wholes, memory: Floats, row: Floats, work: Floats):
+def find_pushes(scene: Scene, member: Member, row: Entry, room: Room):
     """Put the pattern of an impact: which contacts push, which slips stick, and in which directions others slide."""
-    k, r, d, rough = scene[at.K], scene[at.R], scene[at.D], scene[scene[at.ROUGH] :]
-    mu, e, coupling, rates = memory[scene[at.MU] :], memory[scene[at.RESTITUTION] :], work[scene[at.COUPLING] :], work[scene[at.RATES] :]
-    involved, push = work[scene[at.INVOLVED] :], work[scene[at.PUSH] :]
-    stuck, direction = row[scene[at.TO_SLIDES] :], row[scene[at.TO_DIRECTION] :]
-    rest = work[scene[at.ROOM_LEFT] :]
-    if scene[at.LAW] != POISSON:
+    k, r, d, rough = scene.k, scene.r, scene.d, scene.rough
+    mu, e, coupling, rates = member.mu, member.restitution, room.coupling, room.rates
+    involved, push = room.involved, room.push
+    stuck, direction = row.slides, row.direction
+    rest = room.free
+    if scene.law != POISSON:
         find_pattern(k, r, d, rough, mu, coupling, rates, involved, e, push, stuck, direction, rest)
         return
     if r > 0:  # one contact in a plane
@@ -734,21 +734,21 @@ def find_pushes(scene: Wholes, memory: Floats, row: Floats, work: Floats):
     for i in range(k):
         none[i] = 0.0
     find_pattern(k, r, d, rough, mu, coupling, rates, involved, none, push, stuck, direction, more)
-    hold_rows(k, r, d, rough, coupling, push, stuck, row[scene[at.TO_COMPRESSED] :], more)
+    hold_rows(k, r, d, rough, coupling, push, stuck, row.compressed, more)
     find_impulses(k, r, d, rough, mu, coupling, rates, push, stuck, direction, none, impulses, more)
     for i in range(k):
         impulses[i] *= 1.0 + e[i]
     add_rates(rates, coupling, impulses, behind, k)
     find_pattern(k, r, d, rough, mu, coupling, behind, involved, none, second, stuck, direction, more)
-    hold_rows(k, r, d, rough, coupling, second, stuck, row[scene[at.TO_RETURNED] :], more)
+    hold_rows(k, r, d, rough, coupling, second, stuck, row.returned, more)
     find_impulses(k, r, d, rough, mu, coupling, behind, second, stuck, direction, none, impulses, more)
-    add_rates(behind, coupling, impulses, work[scene[at.TARGETS] :], k)
+    add_rates(behind, coupling, impulses, room.targets, k)
     for i in range(k):
         push[i] = max(push[i], second[i])
 
 
 @loop
-def close_contacts(scene: Wholes, memory: Floats, first: int, hits: bool, meets: Floats, work: Floats):
+def close_contacts(scene: Scene, member: Member, first: int, hits: bool, meets: Floats, room: Room):
     """Close and open what watch `first` says, and stick and slide; of contacts that meet, `PARTS` are those that go on.
 
     A gap that falls while it moves apart is zero to more than the rounding of its terms: it goes on beyond that. Where
@@ -756,23 +756,23 @@ def close_contacts(scene: Wholes, memory: Floats, first: int, hits: bool, meets:
     others of the same body may, which then stick as well. Where parts align, a slip that gaps hold passes through zero,
     and turns.
     """
-    n, k, r, d, x, rough = scene[at.N], scene[at.K], scene[at.R], scene[at.D], memory[scene[at.X] :], scene[scene[at.ROUGH] :]
-    closed, was_closed, was_stuck = x[2 * n + 1 + scene[at.NUMBERS] :], work[scene[at.CLOSED] :], work[scene[at.STUCK] :]
-    sticks, parts, slips, turns = closed[k:], work[scene[at.PARTS] :], work[scene[at.SLIPS] :], work[scene[at.TURNS_BACK] :]
+    n, k, r, d, x, rough = scene.n, scene.k, scene.r, scene.d, member.x, scene.rough
+    closed, was_closed, was_stuck = x[2 * n + 1 + scene.numbers :], room.closed, room.stuck
+    sticks, parts, slips, turns = closed[k:], room.parts, room.slips, room.turns_back
     for i in range(k):
         moves = 0.0
         for j in range(n):
-            moves += abs(work[scene[at.GRADIENTS] + i * n + j]) * memory[scene[at.LARGEST] + n + j]
-        away = work[scene[at.RATES] + i] > max(work[scene[at.NOISE] + i], HARDLY * moves)
-        parts[i] = float(meets[i] > 0 and not hits and i < scene[at.GAPS] and away)
-        stays = was_closed[i] > 0 and i != first and work[scene[at.OPENING] + i] == 0
+            moves += abs(room.gradients[i * n + j]) * member.largest[n + j]
+        away = room.rates[i] > max(room.noise[i], HARDLY * moves)
+        parts[i] = float(meets[i] > 0 and not hits and i < scene.gaps and away)
+        stays = was_closed[i] > 0 and i != first and room.opening[i] == 0
         closed[i] = float(stays or (meets[i] > 0 and parts[i] == 0))
     stops = False
     for c in range(r):
-        if k + c == first and was_stuck[c] == 0 and (d == 1 or slips[r + c] <= TURNED * memory[scene[at.SLIP] + c]):
+        if k + c == first and was_stuck[c] == 0 and (d == 1 or slips[r + c] <= TURNED * member.slip[c]):
             stops = True
     for c in range(r):
-        fell = k + c == first and (was_stuck[c] > 0 or d == 1 or slips[r + c] <= TURNED * memory[scene[at.SLIP] + c])
+        fell = k + c == first and (was_stuck[c] > 0 or d == 1 or slips[r + c] <= TURNED * member.slip[c])
         if closed[rough[c]] != was_closed[rough[c]]:
             sticks[c] = slips[c]
         else:
@@ -780,26 +780,26 @@ def close_contacts(scene: Wholes, memory: Floats, first: int, hits: bool, meets:
             sticks[c] = float(does and not (fell and was_stuck[c] > 0))
         turns[c] = 0.0
     if d == 1 and first >= k and first < k + r and sticks[first - k] > 0:
-        held, rest = work[scene[at.ROOM_LEFT] :], work[scene[at.ROOM_LEFT] + k + r :]
+        held, rest = room.free, room.free[k + r :]
         for i in range(k + r):
             held[i] = closed[i] if i < k else float(i == first)
-        drop_dependent(work[scene[at.COUPLING] :], held, k + r, rest)
+        drop_dependent(room.coupling, held, k + r, rest)
         if held[first] == 0:
             turns[first - k], sticks[first - k] = 1.0, 0.0
 
 
 @loop
-def find_change(scene: Wholes, memory: Floats, hits: bool, row: Floats, work: Floats) -> bool:
+def find_change(scene: Scene, member: Member, hits: bool, row: Entry, room: Room) -> bool:
     """Put the impulses, the rates behind them, and the change of velocities; returns whether the law is not obeyed.
 
     Behind an impact they follow its law; else velocities become those that what is held allows.
     """
-    n, k, r, d, x = scene[at.N], scene[at.K], scene[at.R], scene[at.D], memory[scene[at.X] :]
-    rough, coupling, rates, e = scene[scene[at.ROUGH] :], work[scene[at.COUPLING] :], work[scene[at.RATES] :], memory[scene[at.RESTITUTION] :]
-    closed, push, targets, impulses = x[2 * n + 1 + scene[at.NUMBERS] :], work[scene[at.PUSH] :], work[scene[at.TARGETS] :], work[scene[at.IMPULSES] :]
-    stuck, direction, rest, mu = row[scene[at.TO_SLIDES] :], row[scene[at.TO_DIRECTION] :], work[scene[at.ROOM_LEFT] :], memory[scene[at.MU] :]
-    size, wrong, ends = k + r * d, False, row[scene[at.TO_ENDS] :]
-    constructs = hits and r > 0 and scene[at.LAW] == POISSON
+    n, k, r, d, x = scene.n, scene.k, scene.r, scene.d, member.x
+    rough, coupling, rates, e = scene.rough, room.coupling, room.rates, member.restitution
+    closed, push, targets, impulses = x[2 * n + 1 + scene.numbers :], room.push, room.targets, room.impulses
+    stuck, direction, rest, mu = row.slides, row.direction, room.free, member.mu
+    size, wrong, ends = k + r * d, False, row.ends
+    constructs = hits and r > 0 and scene.law == POISSON
     if not hits:
         mu = rest
         for i in range(k):
@@ -811,7 +811,7 @@ def find_change(scene: Wholes, memory: Floats, hits: bool, row: Floats, work: Fl
         rest = rest[r:]
     elif constructs:
         construct(e[0], mu[0], coupling, rates, targets, direction)
-    elif scene[at.LAW] != POISSON:
+    elif scene.law != POISSON:
         for i in range(k):
             targets[i] = -e[i] * rates[i]
     find_impulses(k, r, d, rough, mu, coupling, rates, push, stuck, direction, targets, impulses, rest)
@@ -820,26 +820,26 @@ def find_change(scene: Wholes, memory: Floats, hits: bool, row: Floats, work: Fl
             none = rest
             for i in range(k):
                 none[i] = 0.0
-            asked, flags = none if scene[at.LAW] == POISSON else targets, rest[k:]
+            asked, flags = none if scene.law == POISSON else targets, rest[k:]
             find_violations(
-                k, r, d, rough, mu, coupling, rates, work[scene[at.INVOLVED] :], push, stuck, direction, asked,
+                k, r, d, rough, mu, coupling, rates, room.involved, push, stuck, direction, asked,
                 impulses, flags, rest[k + k + r :]
             )  # fmt: skip
             for i in range(k + r):
                 wrong = wrong or flags[i] > 0
-        row[scene[at.TO_T_IMPACT]] = x[2 * n]
-        if end_bounces(scene, memory, row, work):
+        row.t_impact = x[2 * n]
+        if end_bounces(scene, member, row, room):
             for i in range(k):
                 targets[i] = 0.0 if ends[i] > 0 else targets[i]
             find_impulses(k, r, d, rough, mu, coupling, rates, push, stuck, direction, targets, impulses, rest)
-    hold_rows(k, r, d, rough, coupling, push, stuck, row[scene[at.TO_HELD] :], rest)
+    hold_rows(k, r, d, rough, coupling, push, stuck, row.held, rest)
     for c in range(r):
         stuck[c] = (1.0 - stuck[c]) * push[rough[c]] if hits else 0.0  # from here on those that slide
-    add_rates(rates, coupling, impulses, work[scene[at.APART] :], size)
+    add_rates(rates, coupling, impulses, room.apart, size)
     for j in range(n):
-        work[scene[at.CHANGE] + j] = 0.0
+        room.change[j] = 0.0
         for i in range(size):
-            work[scene[at.CHANGE] + j] += impulses[i] * work[scene[at.RESPONSES] + i * n + j]
+            room.change[j] += impulses[i] * room.responses[i * n + j]
     return wrong
 
 
@@ -870,98 +870,98 @@ def construct(e: float, mu: float, coupling: Floats, rates: Floats, target: Floa
 
 
 @loop
-def end_bounces(scene: Wholes, memory: Floats, row: Floats, work: Floats) -> bool:
+def end_bounces(scene: Scene, member: Member, row: Entry, room: Room) -> bool:
     """Put the contacts that bounce and come to rest at once, and add the time that it takes; returns whether any does.
 
     With gap″ = −b − b′ s the bounces take 2u/(b (1 − e)) (1 − ⅔ k), k = b′ u / b² (1 − e), up to k².
     """
-    n, k, size, inputs = scene[at.N], scene[at.K], scene[at.K] + scene[at.R] * scene[at.D], scene[at.INPUTS]
-    e, targets, ends, any_ends = memory[scene[at.RESTITUTION] :], work[scene[at.TARGETS] :], row[scene[at.TO_ENDS] :], False
-    x, behind = work[scene[at.ROOM_LEFT] :], work[scene[at.ROOM_LEFT] + 2 * inputs :]
+    n, k, size, inputs = scene.n, scene.k, scene.k + scene.r * scene.d, scene.inputs
+    e, targets, ends, any_ends = member.restitution, room.targets, row.ends, False
+    x, behind = room.free, room.free[2 * inputs :]
     may_end = False
     for i in range(k):
         ends[i] = 0.0
-        may_end = may_end or (e[i] < 1 and work[scene[at.PUSH] + i] > 0 and i < scene[at.GAPS])
+        may_end = may_end or (e[i] < 1 and room.push[i] > 0 and i < scene.gaps)
     if not may_end:
         return False
-    copy(memory[scene[at.OPENED] :], x, inputs)
+    copy(member.opened, x, inputs)
     for j in range(n):
         for i in range(size):
-            x[n + j] += work[scene[at.IMPULSES] + i] * work[scene[at.RESPONSES] + i * n + j]
+            x[n + j] += room.impulses[i] * room.responses[i * n + j]
     for j in range(inputs):
         x[inputs + j] = 0.0
     copy(x[n:], x[inputs:], n)
-    evaluate(scene[at.ACCELERATION], x, x[inputs + n :])
+    evaluate(scene.acceleration, x, x[inputs + n :])
     x[inputs + 2 * n] = 1.0
-    evaluate(scene[at.BENDS], x, behind)  # how gaps bend, and how that changes
+    evaluate(scene.bends, x, behind)  # how gaps bend, and how that changes
     for i in range(k):
         b, bounced, rest = -behind[i], targets[i], 1.0 - e[i] if e[i] < 1 else 1.0
-        if b > 0 and e[i] < 1 and i < scene[at.GAPS] and work[scene[at.PUSH] + i] > 0:
+        if b > 0 and e[i] < 1 and i < scene.gaps and room.push[i] > 0:
             uneven = -behind[k + i] * bounced / (b**2 * rest)
             left = 2.0 * bounced / (b * rest) * (1.0 - 2.0 / 3.0 * uneven)
-            short = left >= 0 and left <= SHORT * memory[scene[at.LONGEST]]
+            short = left >= 0 and left <= SHORT * member.longest
             if short and uneven**2 * left <= LEFT_OUT * (1.0 + abs(x[2 * n])):
                 ends[i], any_ends = 1.0, True
-                row[scene[at.TO_T_IMPACT]] += left
+                row.t_impact += left
     return any_ends
 
 
 @loop
-def stay_closed(scene: Wholes, memory: Floats, hits: bool, work: Floats):
+def stay_closed(scene: Scene, member: Member, hits: bool, room: Room):
     """Close those that stay in touch behind an impact, and press upon each other there.
 
     Their accelerations decide, without friction; with it, or where these are zero, the rounds that follow do. Of
     contacts that are redundant all stay.
     """
-    n, k, r, coupling = scene[at.N], scene[at.K], scene[at.R], work[scene[at.COUPLING] :]
-    closed, stay, rest = memory[scene[at.X] + 2 * n + 1 + scene[at.NUMBERS] :], work[scene[at.STAY] :], work[scene[at.ROOM_LEFT] :]
+    n, k, r, coupling = scene.n, scene.k, scene.r, room.coupling
+    closed, stay, rest = member.x[2 * n + 1 + scene.numbers :], room.stay, room.free
     if not hits:
         return
     count = 0
     for i in range(k):
-        still = abs(work[scene[at.APART] + i]) <= work[scene[at.NOISE] + i]
-        stay[i] = float(work[scene[at.TOUCHES] + i] > 0 and still)
+        still = abs(room.apart[i]) <= room.noise[i]
+        stay[i] = float(room.touches[i] > 0 and still)
         closed[i] = stay[i]
         count += int(stay[i])
     if r > 0 or k == 1 or count == 0:
         return
     held, more, none = rest, rest[k:], rest[2 * k :]
-    x, behind = rest[3 * k :], rest[3 * k + scene[at.INPUTS] :]
+    x, behind = rest[3 * k :], rest[3 * k + scene.inputs :]
     copy(stay, held, k)
-    room = behind[2 * k * n + k * k + 3 * k :]
-    drop_dependent(coupling, held, k, room)
+    left = behind[2 * k * n + k * k + 3 * k :]
+    drop_dependent(coupling, held, k, left)
     for i in range(k):
         none[i] = 0.0
         if held[i] < stay[i]:
             return
-    copy(memory[scene[at.OPENED] :], x, scene[at.INPUTS])
+    copy(member.opened, x, scene.inputs)
     for j in range(n):
-        x[n + j] += work[scene[at.CHANGE] + j]
-    evaluate(scene[at.RESPONSE], x, behind)
+        x[n + j] += room.change[j]
+    evaluate(scene.response, x, behind)
     bends = behind[2 * k * n + k * k + 2 * k :]
     find_pattern(
-        k, 0, 1, scene[scene[at.ROUGH] :], none, coupling, bends, stay, none, more, none, none, room
+        k, 0, 1, scene.rough, none, coupling, bends, stay, none, more, none, none, left
     )  # fmt: skip
     for i in range(k):
         closed[i] = float(stay[i] > 0 and more[i] > 0)
 
 
 @loop
-def rub(scene: Wholes, memory: Floats, first: int, hits: bool, work: Floats):
+def rub(scene: Scene, member: Member, first: int, hits: bool, room: Room):
     """Put which contacts stick behind what happened, and where others slide; `CHANGED` are contacts that have.
 
     They slide against what held those that break away, or along the slip.
     """
-    n, k, r, d, x, rough = scene[at.N], scene[at.K], scene[at.R], scene[at.D], memory[scene[at.X] :], scene[scene[at.ROUGH] :]
-    did, flags, behind = x[2 * n + 1 + scene[at.NUMBERS] :], work[scene[at.CHANGED] :], work[scene[at.SLIPS_BEHIND] :]
-    sticks, direction, apart = did[k:], did[k + r :], work[scene[at.APART] :]
-    slip, v, forces, was_stuck = memory[scene[at.SLIP] :], work[scene[at.ROOM_LEFT] :], work[scene[at.FORCES] :], work[scene[at.STUCK] :]
+    n, k, r, d, x, rough = scene.n, scene.k, scene.r, scene.d, member.x, scene.rough
+    did, flags, behind = x[2 * n + 1 + scene.numbers :], room.changed, room.slips_behind
+    sticks, direction, apart = did[k:], did[k + r :], room.apart
+    slip, v, forces, was_stuck = member.slip, room.free, room.forces, room.stuck
     if first >= k and first < k + r and was_stuck[first - k] > 0:
-        write_held_force(scene, memory, first - k, v, work)
+        write_held_force(scene, member, first - k, v, room)
     for j in range(n):
-        v[j] = x[n + j] + work[scene[at.CHANGE] + j]
-    measure_slips(scene, memory, apart, v, behind, work)
-    lasts = memory[scene[at.LONGEST]] if memory[scene[at.LONGEST]] > 0 else memory[scene[at.LAST]] - memory[scene[at.FIRST]]
+        v[j] = x[n + j] + room.change[j]
+    measure_slips(scene, member, apart, v, behind, room)
+    lasts = member.longest if member.longest > 0 else member.last - member.first
     for c in range(r):
         renewed, breaks = flags[rough[c]] > 0, first == k + c and was_stuck[c] > 0
         if hits and renewed:
@@ -975,73 +975,73 @@ def rub(scene: Wholes, memory: Floats, first: int, hits: bool, work: Floats):
                 if breaks:
                     for i in range(d):
                         place = k + c * d + i
-                        soon = max(soon, work[scene[at.COUPLING] + place * (k + r * d) + place])
+                        soon = max(soon, room.coupling[place * (k + r * d) + place])
                     length = AT_REST * max(slip[c], find_length(moving, d) * soon * lasts)
                 whole = find_length(moving, d)
                 for i in range(d):
                     direction[c * d + i] = moving[i] / (whole if whole > 0 else 1.0) * (length if length > 0 else LEAST)
-        if work[scene[at.TURNS_BACK] + c] > 0:
+        if room.turns_back[c] > 0:
             for i in range(d):
                 direction[c * d + i] = -direction[c * d + i]
-        slip[c] = max(slip[c], work[scene[at.SLIPS] + r + c])
+        slip[c] = max(slip[c], room.slips[r + c])
         if renewed or first == k + c or sticks[c] != was_stuck[c]:
-            memory[scene[at.FRESH] + k + c] = 1.0
+            member.fresh[k + c] = 1.0
 
 
 @loop
-def write_held_force(scene: Wholes, memory: Floats, c: int, x: Floats, work: Floats):
+def write_held_force(scene: Scene, member: Member, c: int, x: Floats, room: Room):
     """Put the force against which contact c breaks away, that held it before: −f (d,)."""
-    n, k, r, d, inputs, rows = scene[at.N], scene[at.K], scene[at.R], scene[at.D], scene[at.INPUTS], scene[scene[at.TANGENTIAL] :]
-    copy(memory[scene[at.X] :], x, inputs)
-    copy(work[scene[at.CLOSED] :], x[2 * n + 1 + scene[at.NUMBERS] :], k)
-    copy(work[scene[at.STUCK] :], x[2 * n + 1 + scene[at.NUMBERS] + k :], r)
-    evaluate(scene[at.MULTIPLIERS], x, x[inputs:])
+    n, k, r, d, inputs, rows = scene.n, scene.k, scene.r, scene.d, scene.inputs, scene.tangential
+    copy(member.x, x, inputs)
+    copy(room.closed, x[2 * n + 1 + scene.numbers :], k)
+    copy(room.stuck, x[2 * n + 1 + scene.numbers + k :], r)
+    evaluate(scene.multipliers, x, x[inputs:])
     for i in range(d):
-        work[scene[at.FORCES] + i] = -x[inputs + rows[c * d + i]]
+        room.forces[i] = -x[inputs + rows[c * d + i]]
 
 
 @loop
-def count_doubts(scene: Wholes, memory: Floats, hits: bool, leaves_rest: bool, row: Floats, work: Floats):
+def count_doubts(scene: Scene, member: Member, hits: bool, leaves_rest: bool, row: Entry, room: Room):
     """Count what is doubtful here: an impact that gains energy, one that is shared, derivatives that are lost."""
-    k, r, d, n = scene[at.K], scene[at.R], scene[at.D], scene[at.N]
+    k, r, d, n = scene.k, scene.r, scene.d, scene.n
     total, terms, shares, starts = 0.0, 0.0, False, leaves_rest
     for i in range(k + r * d):
-        part = work[scene[at.IMPULSES] + i] * (work[scene[at.RATES] + i] + work[scene[at.APART] + i])
+        part = room.impulses[i] * (room.rates[i] + room.apart[i])
         total, terms = total + part, terms + abs(part)
     for i in range(k):
-        shares = shares or row[scene[at.TO_SHARES] + i] > 0
+        shares = shares or row.shares[i] > 0
     for c in range(r):
-        starts = starts or row[scene[at.TO_STARTS] + c] > 0
+        starts = starts or row.starts[c] > 0
     for i in range(3):
         doubt = (hits and total > GAINED * terms) if i == 0 else ((hits and shares) if i == 1 else starts)
         if doubt:
-            if memory[scene[at.DOUBTS] + i] == 0:
-                memory[scene[at.DOUBTED] + i] = memory[scene[at.X] + 2 * n]
-            memory[scene[at.DOUBTS] + i] += 1.0
+            if member.doubts[i] == 0:
+                member.doubted[i] = member.x[2 * n]
+            member.doubts[i] += 1.0
 
 
 @loop
-def move(scene: Wholes, memory: Floats, first: int, meets: Floats, row: Floats, work: Floats):
+def move(scene: Scene, member: Member, first: int, meets: Floats, row: Entry, room: Room):
     """Move the state behind a change of velocities, where contacts `meets` close; note what rounding leaves there.
 
     The gap that closes is zero, also as what went in varies: what rounding leaves of it grows with each bounce. What is
     less than its own rounding is zero: steps would be as short as to follow it.
     """
-    n, k, size, x = scene[at.N], scene[at.K], scene[at.K] + scene[at.R] * scene[at.D], memory[scene[at.X] :]
-    gradients, responses, coupling = work[scene[at.GRADIENTS] :], work[scene[at.RESPONSES] :], work[scene[at.COUPLING] :]
-    largest, offset, change, shift = memory[scene[at.LARGEST] :], row[scene[at.TO_OFFSET] :], work[scene[at.CHANGE] :], work[scene[at.SHIFT] :]
-    values, rates, total = memory[scene[at.ROUNDING] :], memory[scene[at.RATE_ROUNDING] :], scene[at.WATCHES]
-    span = memory[scene[at.LAST]] - memory[scene[at.FIRST]]
-    longest = memory[scene[at.LONGEST]]
-    lasts, parts, lost = longest if longest > 0 else span, work[scene[at.PARTS] :], 0.0
+    n, k, size, x = scene.n, scene.k, scene.k + scene.r * scene.d, member.x
+    gradients, responses, coupling = room.gradients, room.responses, room.coupling
+    largest, offset, change, shift = member.largest, row.offset, room.change, room.shift
+    values, rates, total = member.rounding, member.rate_rounding, scene.watches
+    span = member.last - member.first
+    longest = member.longest
+    lasts, parts, lost = longest if longest > 0 else span, room.parts, 0.0
     for i in range(size):
         for j in range(n):
-            part = work[scene[at.IMPULSES] + i] * gradients[i * n + j]
+            part = room.impulses[i] * gradients[i * n + j]
             lost -= part * (x[n + j] + 0.5 * change[j])
-    row[scene[at.TO_LOST]] = lost
-    copy(work[scene[at.IMPULSES] :], row[scene[at.TO_IMPULSE] :], k)
+    row.lost = lost
+    copy(room.impulses, row.impulse, k)
     for j in range(2 * n):
-        offset[j] = shift[j] if scene[at.CORNERS] > 0 else 0.0
+        offset[j] = shift[j] if scene.corners > 0 else 0.0
         x[j] += offset[j]
         largest[j] = max(largest[j], abs(x[j]))
     for i in range(k):
@@ -1053,12 +1053,12 @@ def move(scene: Wholes, memory: Floats, first: int, meets: Floats, row: Floats, 
             values[total + i] = max(values[total + i], least)
             rates[total + i] = max(rates[total + i], least / longest)
         noise = values[i] + lasts * rates[i]
-        memory[scene[at.FORCE_NOISE] + i] = 2.0 * TIED_MOVES * noise / (own * lasts**2)
-        if i == first and work[scene[at.CLOSED] + i] > 0:
+        member.force_noise[i] = 2.0 * TIED_MOVES * noise / (own * lasts**2)
+        if i == first and room.closed[i] > 0:
             rates[i] = max(rates[i], longest * own * values[total + i])
-        if meets[i] > 0 and i < scene[at.GAPS]:
+        if meets[i] > 0 and i < scene.gaps:
             for j in range(n):
-                x[j] -= work[scene[at.VALUES] + i] / own * responses[i * n + j]
+                x[j] -= room.values[i] / own * responses[i * n + j]
     for j in range(n):
         x[n + j] += change[j]
     for j in range(2 * n):
@@ -1074,9 +1074,9 @@ def move(scene: Wholes, memory: Floats, first: int, meets: Floats, row: Floats, 
 
 
 @loop
-def name_change(scene: Wholes, first: int, hits: bool, did: Floats, row: Floats, work: Floats):
+def name_change(scene: Scene, first: int, hits: bool, did: Floats, row: Entry, room: Room):
     """Put the contact of watch `first`, and the kind of its change, into the row."""
-    k, r, rough = scene[at.K], scene[at.R], scene[scene[at.ROUGH] :]
+    k, r, rough = scene.k, scene.r, scene.rough
     contact, change = -1, -1
     if first < k:
         contact, change = first, CLOSES if did[first] > 0 else (BOUNCES if hits else OPENS)
@@ -1084,88 +1084,88 @@ def name_change(scene: Wholes, first: int, hits: bool, did: Floats, row: Floats,
         contact, change = rough[first - k], STICKS if did[first] > 0 else SLIDES
     else:
         for i in range(k - 1, -1, -1):
-            if work[scene[at.OPENING] + i] > 0:
+            if room.opening[i] > 0:
                 contact, change = i, OPENS
-    row[scene[at.TO_CONTACT]], row[scene[at.TO_CHANGE]] = float(contact), float(change)
+    row.contact, row.change = float(contact), float(change)
 
 
 # ---- all members ----
 
 
 @loop
-def start(scene: Wholes, memory: Floats, ts: Floats, path: Floats, did: Floats, work: Floats):
+def start(scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, room: Room):
     """Begin a member, whose outputs are at `ts`: those that lie before its corner are there."""
-    n, x, first = scene[at.N], memory[scene[at.X] :], memory[scene[at.FIRST]]
-    memory[scene[at.RESULT]] = float(begin(scene, memory, work))
-    copy(x, memory[scene[at.BEGUN] :], 2 * n + 1)
-    for j in range(scene[at.TIMES]):
+    n, x, first = scene.n, member.x, member.first
+    member.result = float(begin(scene, member, room))
+    copy(x, member.begun, 2 * n + 1)
+    for j in range(scene.times):
         if x[2 * n] > first and ts[j] <= x[2 * n]:
             copy(x, path[j * 2 * n :], 2 * n)
-            copy(x[2 * n + 1 + scene[at.NUMBERS] :], did[j * scene[at.DOING] :], scene[at.DOING])
+            copy(x[2 * n + 1 + scene.numbers :], did[j * scene.doing :], scene.doing)
 
 
 @loop
 def follow(
-    scene: Wholes, members: int, ts: Floats, path: Floats, did: Floats, record: Floats, memory: Floats, work: Floats
+    scene: Scene, members: int, ts: Floats, path: Floats, did: Floats, record: Entry, memory: Member, room: Room
 ):
     """Follow members that go on to their ends, or to a stretch that the kernel does not finish (`ASKS`).
 
     `ts` (T,) are the same for all if `scene` has one row of them, or (members, T). Members run side by side: those
     that are going are packed for one call of the kernel, those with open contacts alone apart.
     """
-    size, times, states = scene[at.MEMORY], scene[at.TIMES], 2 * scene[at.N]
+    size, times, states = scene.memory, scene.times, 2 * scene.n
     for m in range(members):
-        if memory[m * size + scene[at.RESULT]] == NEW:
-            ours = did[m * times * scene[at.DOING] :]
-            start(scene, memory[m * size :], ts[m * scene[at.STRIDE] :], path[m * times * states :], ours, work)
+        if memory[m * size :].result == NEW:
+            ours = did[m * times * scene.doing :]
+            start(scene, memory[m * size :], ts[m * scene.stride :], path[m * times * states :], ours, room)
     while True:
         any_going = False
         for held in range(2):
-            count, places = 0, work[scene[at.ORDER] :]
+            count, places = 0, room.order
             for m in range(members):
                 mine = memory[m * size :]
-                if mine[scene[at.RESULT]] == GOING and is_held(scene, mine[scene[at.X] :]) == (held > 0):
-                    if mine[scene[at.ROWS]] >= scene[at.ROOM]:
+                if mine.result == GOING and is_held(scene, mine.x) == (held > 0):
+                    if mine.rows >= scene.room:
                         continue
                     places[count] = float(m)
                     count += 1
             if count > 0:
                 any_going = True
-                follow_stretch(scene, held, count, ts, path, did, record, memory, work)
+                follow_stretch(scene, held, count, ts, path, did, record, memory, room)
         if not any_going:
             return
 
 
 @loop
 def follow_stretch(
-    scene: Wholes, held: int, count: int, ts: Floats, path: Floats, did: Floats, record: Floats, memory: Floats,
-    work: Floats
+    scene: Scene, held: int, count: int, ts: Floats, path: Floats, did: Floats, record: Entry, memory: Member,
+    room: Room
 ):  # fmt: skip
     """Follow a stretch of `count` members, whose numbers are in `ORDER`, by one call of the kernel."""
-    size, times, states = scene[at.MEMORY], scene[at.TIMES], 2 * scene[at.N]
-    outputs, numbers, each = times + 2, scene[at.INPUTS] - states - 1 + 2 * scene[at.WATCHES], scene[at.ROOM] * scene[at.ROW]
-    places, job = work[scene[at.ORDER] :], work[scene[at.JOBS] :]
+    size, times, states = scene.memory, scene.times, 2 * scene.n
+    outputs, numbers, each = times + 2, scene.inputs - states - 1 + 2 * scene.watches, scene.room * scene.row
+    places, job = room.order, room.jobs
     given_y, given_numbers = job[count * outputs :], job[count * (outputs + states) :]
     found = given_numbers[count * numbers :]
     y_end, t_end = found[count * outputs * states :], found[count * (outputs + 1) * states :]
     code, steps, rejected, left = t_end[count:], t_end[2 * count :], t_end[3 * count :], t_end[4 * count :]
-    plan = scene[at.OPEN_ONE] if count == 1 else scene[at.OPEN_MANY]
+    plan = scene.open_one if count == 1 else scene.open_many
     if held > 0:
-        plan = scene[at.HELD_ONE] if count == 1 else scene[at.HELD_MANY]
+        plan = scene.held_one if count == 1 else scene.held_many
     for i in range(count):
         m = int(places[i])
         mine = memory[m * size :]
         if plan != 0:
             prepare(
-                scene, mine, ts[m * scene[at.STRIDE] :], job[i * outputs :], given_y[i * states :],
-                given_numbers[i * numbers :], work
+                scene, mine, ts[m * scene.stride :], job[i * outputs :], given_y[i * states :],
+                given_numbers[i * numbers :], room
             )  # fmt: skip
         else:
-            mine[scene[at.RESULT]] = float(ASKS)
+            mine.result = float(ASKS)
     if plan == 0:
         return
-    integrate(scene[at.BEGIN], plan, job, given_y, given_numbers, found, y_end, t_end, code, steps, rejected, left, count, outputs)
-    undone = left[scene[at.REST] - 1] != 0
+    integrate(scene.begin, plan, job, given_y, given_numbers, found, y_end, t_end, code, steps, rejected, left, count, outputs)
+    undone = left[scene.rest - 1] != 0
     for i in range(count):
         m = int(places[i])
         mine, result = memory[m * size :], int(code[i])
@@ -1173,10 +1173,10 @@ def follow_stretch(
         for j in range(states):
             sound = sound and isfinite(y_end[i * states + j])
         if undone or not sound:
-            mine[scene[at.RESULT]] = float(ASKS)
+            mine.result = float(ASKS)
         else:
             finish(
-                scene, mine, ts[m * scene[at.STRIDE] :], path[m * times * states :], did[m * times * scene[at.DOING] :],
+                scene, mine, ts[m * scene.stride :], path[m * times * states :], did[m * times * scene.doing :],
                 record[m * each :], found[i * outputs * states :], y_end[i * states :], t_end[i],
-                result - EVENT if result >= EVENT else 0, SUCCESSFUL, steps[i], rejected[i], work
+                result - EVENT if result >= EVENT else 0, SUCCESSFUL, steps[i], rejected[i], room
             )  # fmt: skip
