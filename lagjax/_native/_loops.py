@@ -451,7 +451,6 @@ class _Writer:
         place = self.builder.inttoptr(address[1].it, kind.as_pointer())
         return None, Value(self.code, self.builder.call(place, [x[1].it, out[1].it, ir.Constant(INTEGER, 1)]))
 
-
     def call_integrate(self, node, begin, plan, *given):
         arrays, (members, times) = [x.it for _, x in given[:-2]], [x.it for _, x in given[-2:]]
         kind = ir.FunctionType(ir.VoidType(), [POINTER] * 11 + [INTEGER] * 4)

@@ -1,6 +1,6 @@
 """The motion of a scene with contacts: a search for what happens, without derivatives, and a replay, which has them.
 
-    ContactPlan, start ─► SceneCode.search ─► Found ─► attach_derivative(Replay) ─► Ending, RoundRecord, impacts
+ContactPlan, start ─► SceneCode.search ─► Found ─► attach_derivative(Replay) ─► Ending, RoundRecord, impacts
 """
 
 import functools
@@ -26,8 +26,8 @@ from lagjax._interface import Function, Layout, compile_for_one_call, halves
 from lagjax._primitives import attach_derivative, lost_unless
 from lagjax._program import Program, Unlowerable, lower
 from lagjax._run.contacts._corners import append_sides, corners_of
-from lagjax._run.contacts._places import ARRAYS
-from lagjax._run.contacts._replay import Played, Replay, Row
+from lagjax._run.contacts._places import ARRAYS, SAID
+from lagjax._run.contacts._replay import Played, Replay, read_rows
 from lagjax._run.contacts._scene_code import Found, SceneCode, sizes_of_fields
 from lagjax._scene import Contacts, ContactScene, Flat, InContact
 
@@ -113,8 +113,7 @@ def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) ->
     given = ts, y0, vector, *coefficients
     found = scene.code.search(*map(still, given))
     row, played = _read(scene, found)
-    start = found.ending[-2 * layout.size - 1 :]
-    played = Played(*attach_derivative(scene.replay, tuple(played), *given, found.record, start))
+    played = Played(*attach_derivative(scene.replay, tuple(played), *given))
     return _arrange(scene, found, row, played, given[:3])
 
 
@@ -146,13 +145,14 @@ def _coefficients_at(flat: Flat, params: PyTree, vector) -> list[np.ndarray]:
     return [np.asarray(flat.restitution(given)), np.asarray(flat.friction(given))]
 
 
-def _read(scene: Scene, found: Found) -> tuple[Row, Played]:
-    row, n = Row.read(found.record, sizes_of_fields(scene.code.sizes)), scene.code.sizes["N"]
+def _read(scene: Scene, found: Found) -> tuple[Any, Played]:
+    fields, n = sizes_of_fields(scene.code.sizes), scene.code.sizes["N"]
+    row = read_rows(found.record[..., : sum(fields[name] for name in SAID)], fields, SAID)
     t, y = found.ending[..., 0], found.ending[..., 1 : 2 * n + 1]
     return row, Played(found.path, row.at, row.before, row.behind, row.t_impact, row.impulse, row.lost, t, y)
 
 
-def _arrange(scene: Scene, found: Found, row: Row, played: Played, inputs: tuple) -> tuple:
+def _arrange(scene: Scene, found: Found, row, played: Played, inputs: tuple) -> tuple:
     """The ending, the changes, and the impacts in front; of what varies with `inputs`, if it is traced."""
     library = jnp if inputs else np
 
@@ -177,7 +177,11 @@ def _arrange(scene: Scene, found: Found, row: Row, played: Played, inputs: tuple
         places = front[(..., *[None] * (x.ndim - hits.ndim))]
         impacts.append(library.take_along_axis(lost(hits, x), places, axis=hits.ndim - 1))
     t_impact, impulse, energy = impacts
-    return ending, RoundRecord(*changes, *kinds), (t_impact, scene.flat.shapes.name_numbers(impulse), energy, hits.sum(-1))
+    return (
+        ending,
+        RoundRecord(*changes, *kinds),
+        (t_impact, scene.flat.shapes.name_numbers(impulse), energy, hits.sum(-1)),
+    )
 
 
 # ---- what is made once -----------------------------------------------------------------------------------------------
@@ -241,8 +245,7 @@ def _make_scene(
     multipliers = functools.cache(lambda: line_of(derivation.multipliers))
     searched = SceneCode(sizes, arrays, flows, surfaces, lines, multipliers, tolerances)
     flow = functools.cache(functools.partial(make_flow, derivation, scene.path, None))
-    replay = Replay(flow, surfaces["HELD"], lines, sizes, flat.rough, tolerances)
-    return Scene(searched, replay, flat, _lower_coefficients(flat, derivation.numbers.params))
+    return Scene(searched, Replay(searched, flow), flat, _lower_coefficients(flat, derivation.numbers.params))
 
 
 def _lower_coefficients(flat: Flat, numbers: PyTree) -> np.ndarray | Program | None:

@@ -366,10 +366,6 @@ def find_pattern(
         push[0], sticks[0] = 1.0, float(abs(rest[5]) <= mu[0] * rest[4])
         direction[0] = -1.0 if rest[5] > 0 else 1.0
     elif d == 1:
-        find_pattern_in_plane(
-            k, r, rough, mu, coupling, rates, touches, targets, push, sticks, direction, rest
-        )
+        find_pattern_in_plane(k, r, rough, mu, coupling, rates, touches, targets, push, sticks, direction, rest)
     else:
-        find_pattern_in_space(
-            k, r, d, rough, mu, coupling, rates, touches, targets, push, sticks, direction, rest
-        )
+        find_pattern_in_space(k, r, d, rough, mu, coupling, rates, touches, targets, push, sticks, direction, rest)

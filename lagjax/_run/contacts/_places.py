@@ -24,7 +24,8 @@ SIZES = (
     "MAY_MISS",  # 1 if an operation of the watches may hide a corner from a series
     "HEIGHT", "MULTIPLIERS_COUNT",  # rows of contacts, and of all constraints
     "MEMORY", "ROW", "WORK",  # doubles of a memory, of a row of the record, of the room of a thread
-    "REST",  # doubles of what a kernel leaves behind
+    # Doubles of what kernels leave behind, of which the last says whether a run is done; and the most of these.
+    "OPEN_ONE_REST", "OPEN_MANY_REST", "HELD_ONE_REST", "HELD_MANY_REST", "REST",
 )  # fmt: skip
 # Addresses of machine code; 0 where there is none yet. Of open contacts alone, and of all.
 CODES = (
@@ -76,14 +77,17 @@ WORK = (
     "FREE",  # for what is not named
     "ORDER", "JOBS",  # the members whose stretch comes next, and what the kernel is given and gives
 )  # fmt: skip
-RECORD = (
-    "RAN",  # 1 if there was such a stretch
-    "END",  # of the stretch
-    "WATCH", "CROSSES", "HAPPENS", "DECIDES",
-    "DID",  # what the contacts did during it, as the inputs of lines have it
-    "CONTACT", "CHANGE", "HITS",
+SAID = (  # of a row of the record, what a user is told
+    "HAPPENS", "CONTACT", "CHANGE", "HITS",
     "AT", "BEFORE", "BEHIND",  # the time of the change, q̇ before it, the state behind it
     "T_IMPACT", "IMPULSE", "LOST",
+)  # fmt: skip
+RECORD = (
+    *SAID,
+    "RAN",  # 1 if there was such a stretch
+    "END",  # of the stretch
+    "WATCH", "CROSSES", "DECIDES",
+    "DID",  # what the contacts did during it, as the inputs of lines have it
     "HELD", "SLIDES", "DIRECTION",  # of the impulses: rows (k + r d,), the contacts that slide (r,), and where (r d,)
     "COMPRESSED", "RETURNED",  # (k,), rows of the phases of Poisson's law
     "ENDS", "MEETS",  # (k,), whose bounces end, whose gaps close

@@ -8,6 +8,7 @@ a function of the start, the output times and the parameters that has derivative
 Its derivatives are those of the motion that the search found; its values are not used.
 """
 
+import collections
 import functools
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -16,64 +17,31 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._engine.taylor import Line, Surfaces, stretch_variation
+from lagjax._engine.taylor import stretch_variation
 from lagjax._interface import halves
 from lagjax._primitives import differentiable_where, keep_together, start_alike
 from lagjax._run._rounds import run_rounds
 from lagjax._run.contacts._impact_law import Held, ImpactRows, construct_impulses, find_impulses, rates_behind
 from lagjax._run.contacts._places import RECORD
-from lagjax._run.contacts._scene_code import sizes_of_fields
+from lagjax._run.contacts._scene_code import SceneCode, sizes_of_fields
 from lagjax._run.contacts._search import POISSON
 
 # By how much the instants of contacts that share an impact may vary apart, for a tangent of length one: rounding.
 TOGETHER = 1e-8
 
 
-class Row(NamedTuple):
-    """A row of the record, by the names of its fields (`_places.RECORD`), or N of them."""
-
-    ran: Any
-    end: Any
-    watch: Any
-    crosses: Any
-    happens: Any
-    decides: Any
-    did: Any
-    contact: Any
-    change: Any
-    hits: Any
-    at: Any
-    before: Any
-    behind: Any
-    t_impact: Any
-    impulse: Any
-    lost: Any
-    held: Any
-    slides: Any
-    direction: Any
-    compressed: Any
-    returned: Any
-    ends: Any
-    meets: Any
-    shares: Any
-    starts: Any
-    leaves_rest: Any
-    offset: Any
-    later_on: Any
-
-    @classmethod
-    def read(cls, record, fields: dict[str, int]) -> "Row":
-        """The fields of rows (…, doubles); those of one double without an axis of their own."""
-        ends = np.cumsum([fields[name] for name in RECORD])
-        parts = [record[..., end - fields[name] : end] for name, end in zip(RECORD, ends, strict=True)]
-        scalars = set(RECORD) - _VECTORS
-        return cls(*(x[..., 0] if name in scalars else x for name, x in zip(RECORD, parts, strict=True)))
-
-
-_VECTORS = {
+_VECTORS = frozenset((
     "DID", "BEFORE", "BEHIND", "IMPULSE", "HELD", "SLIDES", "DIRECTION", "COMPRESSED", "RETURNED", "ENDS", "MEETS",
     "SHARES", "STARTS", "OFFSET",
-}  # fmt: skip
+))  # fmt: skip
+
+
+def read_rows(record, fields: dict[str, int], names: tuple[str, ...] = RECORD) -> Any:
+    """The fields of rows (…, doubles) by their names in small letters, those of one double without an axis."""
+    ends = np.cumsum([fields[name] for name in names])
+    parts = [record[..., end - fields[name] : end] for name, end in zip(names, ends, strict=True)]
+    of = collections.namedtuple("Rows", [name.lower() for name in names])  # noqa: PYI024
+    return of(*(x if name in _VECTORS else x[..., 0] for name, x in zip(names, parts, strict=True)))
 
 
 class Played(NamedTuple):
@@ -94,21 +62,23 @@ class Played(NamedTuple):
 class Replay:
     """The replay of a scene; it is known by identity.
 
-    `make_flow` gives the flow of all contacts, `surfaces` are their watches, `lines` those of the response to impulses,
-    of how gaps bend, and of the acceleration, and `rough` the contacts with friction.
+    Of its `code` it takes the search and the lines; `make_flow` gives the flow of all contacts without watches.
     """
 
-    def __init__(self, make_flow: Callable, surfaces: Surfaces, lines: dict[str, Line], sizes: dict, rough, tolerances):
+    def __init__(self, code: SceneCode, make_flow: Callable):
+        surfaces, tolerances = code.surfaces["HELD"], code.tolerances
         self._vary = functools.cache(lambda: stretch_variation(make_flow(), surfaces, tolerances))
-        self._lines, self._sizes, self._rough = lines, sizes, rough
+        self._code, self._lines, self._sizes, self._rough = code, code.lines, code.sizes, code.arrays["ROUGH"]
 
-    def __call__(self, ts, y0, vector, restitution, friction, record, start) -> tuple:
-        """The parts of `Played`, by the `record` (N, …) of a motion that goes on from y0 by `start`, (y, t) there."""
+    def __call__(self, ts, y0, vector, restitution, friction) -> tuple:
+        """The parts of `Played`."""
+        given = ts, y0, vector, restitution, friction
+        found = self._code.search(*jax.lax.stop_gradient(given), is_replayed=True)
+        start = found.ending[-y0.size - 1 :]
         y = y0 + jax.lax.stop_gradient(start[:-1] - y0)
         t = ts[0] + jax.lax.stop_gradient(start[-1] - ts[0])
         path = jnp.where((ts <= start[-1])[:, None], y, 0.0)
-        given = ts, y0, vector, restitution, friction
-        first = start_alike((t, y, path), given, record)
+        first = start_alike((t, y, path), given, found.record)
 
         def run_round(carry, row):
             return self._play(given, carry, row)
@@ -119,11 +89,11 @@ class Replay:
         k, n = self._sizes["K"], y0.size // 2
         absent = 0.0, jnp.zeros(n), jnp.zeros(2 * n), 0.0, jnp.zeros(k), 0.0
         fields = sizes_of_fields(self._sizes)
-        played = run_rounds(run_round, first, start_alike(absent, given), Row.read(record, fields), ran)
+        played = run_rounds(run_round, first, start_alike(absent, given), read_rows(found.record, fields), ran)
         (t, y, path), rows = played
         return path, *rows, t, y
 
-    def _play(self, given, carry, row: Row):
+    def _play(self, given, carry, row):
         ts, y0, vector, restitution, friction = given
         (t, y, path), still = carry, jax.lax.stop_gradient
         begun, last = still(t), still(ts[-1])
@@ -151,7 +121,7 @@ class Replay:
         k, doing = self._sizes["K"], self._sizes["DOING"]
         return jnp.concatenate([y, t[None], vector, jnp.zeros(k), jnp.ones(doing - k - 1), jnp.zeros(1)])
 
-    def _jump(self, at, row: Row, vector, restitution, friction, first_velocity):
+    def _jump(self, at, row, vector, restitution, friction, first_velocity):
         """The time of an impact, impulses (k,), the energy lost, and the state (2n,) behind a change at (t, y)."""
         (t, y), k, hits = at, self._sizes["K"], row.hits > 0
         rows, v = self.rows_at(t, y, vector), halves(y)[1]
@@ -185,7 +155,7 @@ class Replay:
         uneven = -later * bounced / (b**2 * rest)
         return jnp.sum(jnp.where(ends, 2.0 * bounced / (b * rest) * (1.0 - 2.0 / 3.0 * uneven), 0.0))
 
-    def _limit_variations(self, y, rows: ImpactRows, row: Row, first_velocity):
+    def _limit_variations(self, y, rows: ImpactRows, row, first_velocity):
         """The state, which has no derivatives in directions that take apart what happens at one instant.
 
         Contacts that share an impact and close by themselves do so along directions in which their gaps stay closed.

@@ -1,7 +1,7 @@
 """A scene with contacts as the search takes it: machine code by address, sizes, and the places of numbers; its runs.
 
-    SceneCode.search(ts, y0, numbers, e, μ) ─► search_p ─► rows of NumPy ─► `_search.follow` ─► Found
-                                                              └─ a stretch that the kernel gives up: `Flow.run`
+SceneCode.search(ts, y0, numbers, e, μ) ─► search_p ─► rows of NumPy ─► `_search.follow` ─► Found
+                                                          └─ a stretch that the kernel gives up: `Flow.run`
 """
 
 import ctypes
@@ -20,7 +20,7 @@ from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL
 from lagjax._native import SINGLE_NOISE, LineCode, compile_loops, cores, handler, make_once
 from lagjax._primitives import LinearMap, compute_on_host
 from lagjax._run.contacts import _search
-from lagjax._run.contacts._places import ARRAYS, MEMORY, NAMES, RECORD, WORK, at
+from lagjax._run.contacts._places import ARRAYS, MEMORY, NAMES, RECORD, SAID, WORK, at
 from lagjax._run.contacts._search import ASKS, GOING, NEW
 
 _TOGETHER = 256  # members that one call follows side by side: what it remembers of them fits into a processor's cache
@@ -52,7 +52,7 @@ class SceneCode:
     def __init__(self, sizes: dict, arrays: dict, flows: dict, surfaces: dict, lines: dict, multipliers, tolerances):
         self.sizes, self.arrays, self.surfaces, self.tolerances = sizes, arrays, surfaces, tolerances
         self.flows = {kind: functools.cache(make) for kind, make in flows.items()}
-        self._lines, self._multipliers, self._keep = lines, multipliers, []  # what the addresses point to
+        self.lines, self._multipliers, self._keep = lines, multipliers, []  # what the addresses point to
         self.scene = functools.cache(self._scene)
 
     def _scene(self, many: bool) -> np.ndarray:
@@ -71,7 +71,7 @@ class SceneCode:
                 scene[getattr(at, prefix + name)] = begin
             scene[getattr(at, whole)] = ends[-1]
         scene[at.BEGIN] = ctypes.cast(handler().begin, ctypes.c_void_p).value
-        self._add_codes(scene, self._lines)
+        self._add_codes(scene, self.lines)
         self.add_kind(scene, "OPEN", many)
         return scene
 
@@ -93,8 +93,9 @@ class SceneCode:
             plan = kernel.plan(*self.tolerances[:3])
             plan = type(plan)(*(_ROUNDS if field == "rounds" else getattr(plan, field) for field, *_ in plan._fields_))
             self._keep.append((plan, kernel))
-            scene[at.REST] = max(scene[at.REST], kernel.rest_size)
             scene[getattr(at, f"{kind}_{name}")] = ctypes.addressof(plan)
+            scene[getattr(at, f"{kind}_{name}_REST")] = kernel.rest_size
+            scene[at.REST] = max(scene[at.REST], kernel.rest_size)
 
     def _add_codes(self, scene: np.ndarray, lines: dict[str, Line]) -> None:
         for name, of in lines.items():
@@ -104,14 +105,13 @@ class SceneCode:
 
     # ---- runs ----
 
-    def search(self, ts, y0, numbers, restitution, friction, room: int | None = None) -> Found:
-        """What contacts do from `y0` (…, 2n) on, at `ts` (…, T) with `numbers` (…, P), e (…, k) and μ (…, r).
+    def search(self, ts, y0, numbers, restitution, friction, is_replayed: bool = False) -> Found:
+        """What contacts do from `y0` (2n,) on, at `ts` (T,) with `numbers` (P,), e (k,) and μ (r,), without derivatives.
 
-        With `room` the record has that many rows, without as many as there are. It has no derivatives.
+        Rows of the record are whole where it `is_replayed`, else they have what is `SAID`.
         """
-        given = ts, y0, numbers, restitution, friction
-        room = self.sizes["MOST"] if room is None else room
-        return Found(*search_p.bind(*map(jnp.asarray, given), code=self, room=room))
+        given = map(jnp.asarray, (ts, y0, numbers, restitution, friction))
+        return Found(*search_p.bind(*given, code=self, names=RECORD if is_replayed else SAID))
 
     def run(self, ts, y0, numbers, restitution, friction, room: int | None) -> Found:
         """`search` on arrays of NumPy with members in front; with no `room` its records are as long as the longest."""
@@ -228,17 +228,24 @@ def _loops() -> _Loops:
 # ---- as a primitive --------------------------------------------------------------------------------------------------
 
 
-def _shapes(ts, y0, numbers, restitution, friction, *, code: SceneCode, room: int):
+def _shapes(ts, y0, numbers, restitution, friction, *, code: SceneCode, names: tuple[str, ...]):
     batch, states = y0.shape[:-1], y0.shape[-1]
-    row = sum(sizes_of_fields(code.sizes)[name] for name in RECORD)
-    shapes = (ts.shape[-1], states), (ts.shape[-1], code.sizes["DOING"]), (room, row), (2 * states + 12,)
+    row = _width(code, names)
+    shapes = (ts.shape[-1], states), (ts.shape[-1], code.sizes["DOING"]), (code.sizes["MOST"], row), (2 * states + 12,)
     return [ShapedArray((*batch, *shape), np.dtype(float)) for shape in shapes]
 
 
-def _search_rows(*arrays, code: SceneCode, room: int):
+def _width(code: SceneCode, names: tuple[str, ...]) -> int:
+    fields = sizes_of_fields(code.sizes)
+    return sum(fields[name] for name in names)
+
+
+def _search_rows(*arrays, code: SceneCode, names: tuple[str, ...]):
     batch = arrays[1].shape[:-1]
     rows = [np.asarray(x, float).reshape(math.prod(batch), x.shape[-1]) for x in arrays]
-    return [x.reshape(*batch, *x.shape[1:]) for x in code.run(*rows, room)]
+    found = code.run(*rows, code.sizes["MOST"])
+    found = found._replace(record=found.record[..., : _width(code, names)])
+    return [x.reshape(*batch, *x.shape[1:]) for x in found]
 
 
 def _never_varies(*_, **__):
@@ -249,9 +256,8 @@ search_p = LinearMap("lagjax_search", _shapes, _never_varies)
 compute_on_host(search_p, _search_rows)
 
 
-def _call_host(*arrays, code: SceneCode, room: int):
-    shapes = _shapes(*arrays, code=code, room=room)
-    return call_host(functools.partial(_search_rows, code=code, room=room), shapes, *arrays)
+def _call_host(*arrays, **settings):
+    return call_host(functools.partial(_search_rows, **settings), _shapes(*arrays, **settings), *arrays)
 
 
 mlir.register_lowering(search_p, mlir.lower_fun(_call_host, multiple_results=True), platform="cpu")
@@ -273,12 +279,16 @@ def sizes_of_fields(sizes: dict[str, int]) -> dict[str, int]:
         "RESTITUTION", "REFUTED", "FORCE_NOISE", "TOUCHES", "PARTING", "NOISE", "INVOLVED", "CLOSED", "PUSH", "STAY",
         "PARTS", "CHANGED", "TARGETS", "OPENING", "IMPULSE", "COMPRESSED", "RETURNED", "ENDS", "MEETS", "SHARES",
     )  # fmt: skip
-    fields |= dict.fromkeys(per_contact, k) | dict.fromkeys(("MU", "SLIP", "STUCK", "TURNS_BACK", "SLIDES", "STARTS"), r)
+    fields |= dict.fromkeys(per_contact, k) | dict.fromkeys(
+        ("MU", "SLIP", "STUCK", "TURNS_BACK", "SLIDES", "STARTS"), r
+    )
     fields |= dict.fromkeys(("VALUES", "RATES", "BENDS", "IMPULSES", "APART", "HELD"), size)
     fields |= dict.fromkeys(("LARGEST", "SHIFT", "BEHIND", "OFFSET"), 2 * n)
     fields |= dict.fromkeys(("X", "OPENED"), inputs) | dict.fromkeys(("DOUBTS", "DOUBTED"), 3)
     fields |= dict.fromkeys(("FRESH", "KINDS", "STAYS", "FELL"), watches)
-    fields |= dict.fromkeys(("ROUNDING", "RATE_ROUNDING"), 2 * watches) | dict.fromkeys(("GUARDS", "WATCHED"), 5 * watches)
+    fields |= dict.fromkeys(("ROUNDING", "RATE_ROUNDING"), 2 * watches) | dict.fromkeys(
+        ("GUARDS", "WATCHED"), 5 * watches
+    )
     fields |= dict.fromkeys(("GRADIENTS", "RESPONSES"), size * n) | dict.fromkeys(("SLIPS", "SLIPS_BEHIND"), 2 * r)
     fields |= {
         "WIDTHS": inputs, "TIED": k + r, "CAME": sizes["SECTIONS"], "COUPLING": size**2, "FORCES": d, "CHANGE": n,

@@ -200,7 +200,7 @@ def locate_corners(scene: Scene, member: Member, x: Floats, room: Room) -> float
     """
     n, count, inputs, found = scene.n, scene.corners, scene.inputs, room.corner
     t, largest, near = x[2 * n], member.largest, 0.0
-    terms, along = room.free, room.free[count :]
+    terms, along = room.free, room.free[count:]
     slopes = along[2 * inputs :]
     evaluate(scene.sides, x, found)
     for p in range(count):
@@ -285,7 +285,7 @@ def begin(scene: Scene, member: Member, room: Room) -> int:
         for i in range(k):
             still = abs(room.parting[i]) <= room.noise[i]
             push[i] = float(room.touches[i] > 0 and still)
-        write_directions(scene, room.rates[k :], room.free)
+        write_directions(scene, room.rates[k:], room.free)
         if has_paradox(scene, member, push, slips, room.free, room):
             result = UNDECIDED
     if scene.corners > 0:  # a contact that starts on its corner goes where the motion does
@@ -344,9 +344,7 @@ def write_directions(scene: Scene, vectors: Floats, units: Floats):
 
 
 @loop
-def has_paradox(
-    scene: Scene, member: Member, push: Floats, sticks: Floats, direction: Floats, room: Room
-) -> bool:
+def has_paradox(scene: Scene, member: Member, push: Floats, sticks: Floats, direction: Floats, room: Room) -> bool:
     """True where friction leaves nothing of a contact's response to its normal force.
 
     There no force, or more than one, keeps it closed: Painlevé's paradox.
@@ -611,9 +609,7 @@ def decide(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> 
     leaves_rest = False
     for c in range(r):
         leaves_rest = leaves_rest or (first == k + c and was_stuck[c] > 0 and d > 1)
-        row.starts[c] = float(
-            first == k + c and was_stuck[c] > 0 and x[2 * n] == member.first
-        )
+        row.starts[c] = float(first == k + c and was_stuck[c] > 0 and x[2 * n] == member.first)
     if r > 0:
         rub(scene, member, first, hits, room)
         write_directions(scene, sticks[r:], room.free)
@@ -1149,9 +1145,12 @@ def follow_stretch(
     found = given_numbers[count * numbers :]
     y_end, t_end = found[count * outputs * states :], found[count * (outputs + 1) * states :]
     code, steps, rejected, left = t_end[count:], t_end[2 * count :], t_end[3 * count :], t_end[4 * count :]
-    plan = scene.open_one if count == 1 else scene.open_many
+    plan, rest = scene.open_many, scene.open_many_rest
     if held > 0:
-        plan = scene.held_one if count == 1 else scene.held_many
+        plan, rest = scene.held_many, scene.held_many_rest
+    if count == 1:
+        plan = scene.held_one if held > 0 else scene.open_one
+        rest = scene.held_one_rest if held > 0 else scene.open_one_rest
     for i in range(count):
         m = int(places[i])
         mine = memory[m * size :]
@@ -1164,8 +1163,10 @@ def follow_stretch(
             mine.result = float(ASKS)
     if plan == 0:
         return
-    integrate(scene.begin, plan, job, given_y, given_numbers, found, y_end, t_end, code, steps, rejected, left, count, outputs)
-    undone = left[scene.rest - 1] != 0
+    integrate(
+        scene.begin, plan, job, given_y, given_numbers, found, y_end, t_end, code, steps, rejected, left, count, outputs
+    )
+    undone = left[rest - 1] != 0
     for i in range(count):
         m = int(places[i])
         mine, result = memory[m * size :], int(code[i])
