@@ -28,3 +28,4 @@ from lagjax._primitives._linear_map import (
     start_alike,
     vary_alike,
 )
+from lagjax._primitives._repetition import Repetition

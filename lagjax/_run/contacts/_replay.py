@@ -19,8 +19,7 @@ import numpy as np
 
 from lagjax._engine.taylor import stretch_variation
 from lagjax._interface import halves
-from lagjax._primitives import differentiable_where, keep_together, start_alike
-from lagjax._run._rounds import run_rounds
+from lagjax._primitives import Repetition, differentiable_where, keep_together
 from lagjax._run.contacts._impact_law import Held, ImpactRows, construct_impulses, find_impulses, rates_behind
 from lagjax._run.contacts._places import RECORD
 from lagjax._run.contacts._scene_code import SceneCode, sizes_of_fields
@@ -78,32 +77,31 @@ class Replay:
         y = y0 + jax.lax.stop_gradient(start[:-1] - y0)
         t = ts[0] + jax.lax.stop_gradient(start[-1] - ts[0])
         path = jnp.where((ts <= start[-1])[:, None], y, 0.0)
-        first = start_alike((t, y, path), given, found.record)
+        count = jnp.sum(self._read(found.record).ran > 0)
+        (t, y), written, (more,) = self._rounds(given, (t, y), (found.record,), count)
+        return path + more, *written, t, y
 
-        def run_round(carry, row):
-            return self._play(given, carry, row)
+    def _read(self, record):
+        return read_rows(record, sizes_of_fields(self._sizes))
 
-        def ran(_, row):
-            return row.ran > 0
-
-        k, n = self._sizes["K"], y0.size // 2
-        absent = 0.0, jnp.zeros(n), jnp.zeros(2 * n), 0.0, jnp.zeros(k), 0.0
-        fields = sizes_of_fields(self._sizes)
-        played = run_rounds(run_round, first, start_alike(absent, given), read_rows(found.record, fields), ran)
-        (t, y, path), rows = played
-        return path, *rows, t, y
+    @functools.cached_property
+    def _rounds(self) -> Repetition:
+        k, n = self._sizes["K"], self._sizes["N"]
+        written = (), (n,), (2 * n,), (), (k,), ()
+        return Repetition(self._play, 5, written, ((self._sizes["TIMES"], 2 * n),))
 
     def _play(self, given, carry, row):
         ts, y0, vector, restitution, friction = given
-        (t, y, path), still = carry, jax.lax.stop_gradient
+        (t, y), row, still = carry, self._read(*row), jax.lax.stop_gradient
         begun, last = still(t), still(ts[-1])
         ahead = (ts > begun) | (ts == jnp.where(begun == ts[0], begun, jnp.nan))
         happens, crosses, decides = row.happens > 0, row.crosses > 0, row.decides > 0
         end = jnp.where(~happens & (row.end == last), ts[-1], row.end)
+        end = jnp.where(row.ran > 0, end, begun)
         times = jnp.concatenate([t[None], jnp.where(ahead, ts, begun), ts[-1:]])
         numbers = jnp.concatenate([vector, row.did])
         found, t_end, y_end = self._vary()(times, y, numbers, end, row.watch.astype(int), crosses)
-        path = jnp.where((ahead & (ts <= row.end))[:, None], found[1:-1], path)
+        path = jnp.where((ahead & (ts <= row.end))[:, None], found[1:-1], 0.0)
         stays = happens & ~crosses
         t, y = jnp.where(stays, t, t_end), jnp.where(stays, y, y_end)
         t_impact, impulse, lost, behind = self._jump((t, y), row, vector, restitution, friction, halves(y0)[1])
@@ -111,7 +109,7 @@ class Replay:
         later = t + jnp.where(decides, row.later_on, 0.0)
         late = decides & (ts > row.end) & (ts <= still(later))
         path = jnp.where(late[:, None], behind, path)
-        return (later, behind, path), (t, halves(y)[1], behind, t_impact, impulse, lost)
+        return [later, behind], [t, halves(y)[1], behind, t_impact, impulse, lost], [path]
 
     def rows_at(self, t, y, vector) -> ImpactRows:
         """The rows of all contacts at a state, with all open."""
