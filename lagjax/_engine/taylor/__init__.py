@@ -26,6 +26,7 @@ from lagjax._engine.taylor._crossing import (
     changes_of,
     motion_to_event,
     motion_with_crossings,
+    run_stretch,
     stretch_variation,
     surfaces_of,
     surfaces_of_event,
@@ -34,7 +35,7 @@ from lagjax._engine.taylor._derivatives import Motions, jvp, portions, project_s
 from lagjax._engine.taylor._flow import Flow, Tolerances, require_fit
 from lagjax._engine.taylor._line_functions import Line, line_of
 from lagjax._engine.taylor._lowered_motion import lowered_motion
-from lagjax._engine.taylor._surfaces import Guarded, Surfaces, rate_errors, require_one_number, vector_of
+from lagjax._engine.taylor._surfaces import Guarded, Surfaces, move_to_zero, rate_errors, require_one_number, vector_of
 from lagjax._equations import Derivation
 from lagjax._interface import EVENT_OCCURRED, default_platform, has_nvidia_gpu, is_concrete
 from lagjax._native import Guards, Nesting, append_guards, pieces_of

@@ -215,43 +215,50 @@ def require_one_number(value, what: str) -> jax.Array:
 
 
 def crossing_variation(surfaces: Surfaces) -> Callable:
-    """`(k, taken, t, y, numbers)` → (t, y): the state at t, where guard k is zero, moved to where it is zero then.
+    """`(k, taken, t, y, numbers)` → (t, y), as `move_to_zero`; where g′ is zero there are no derivatives: NaN."""
 
-    With δg the variation of the guard, f the rate of the state, and ′ the derivative along the motion, time moves by
+    def move(k, taken, *at):
+        crosses, *there = move_to_zero(surfaces, k, taken, at, jax.lax.stop_gradient(at))
+        return tuple(differentiable_where(crosses, x, *at) for x in there)
+
+    return move
+
+
+def move_to_zero(surfaces: Surfaces, k, taken, at: tuple, still: tuple) -> tuple:
+    """Whether guard k crosses, and (t, y): the state `at` (t, y, numbers), where it is zero, moved to where it is zero.
+
+    What is `still` is the same, and does not vary. With δg the variation of the guard, f the rate of the state, and ′
+    the derivative along the motion, time moves by
 
         s = −ε − ½ (g″/g′) ε²,  ε = δg/g′        and the state by   f s + ½ f′ s²,
 
     up to third order in δg, which is zero itself: first and second derivatives are right. Where it is not `taken`
     nothing moves. Where the guard jumps through zero, δg is that of the number whose border is there: the one that is
-    nearest in time. Where g′ is zero there are no derivatives: NaN.
+    nearest in time.
     """
-    still, count = jax.lax.stop_gradient, len(surfaces.directions)
+    program, n, count = surfaces.followed(), still[1].shape[0] // 2, len(surfaces.directions)
 
     def follow(t, y, numbers):
-        program, n = surfaces.followed(), y.shape[0] // 2
         found = outputs(program, len(program.line.outputs), jnp.append(y, t), numbers)
         return jnp.split(found, [len(found) // 2 - n, len(found) - 2 * n])
 
-    def move_to_zero(k, taken, t, y, numbers):
-        numbers_there = still(numbers)
-        values, rates, slope = follow(t, y, numbers)
-        along, here = (jnp.ones_like(t), still(slope)), still((t, y))
-        _, (_, bends, turn) = jax.jvp(lambda t, y: follow(t, y, numbers_there), here, along)
-        at = k
-        if surfaces.borders is not None:
-            times = jnp.abs(still(values / rates))
-            times = jnp.where(jnp.isnan(times), jnp.inf, times).at[count:].multiply(_LATER)
-            number = jnp.arange(times.size)
-            at = jnp.argmin(jnp.where((number >= count) | (number == k), times, jnp.inf))
-        value, rate, bend = (jnp.where(np.arange(len(values)) == at, x, 0.0).sum() for x in (values, rates, bends))
-        crosses = ~taken | (rate != 0)
-        rate = jnp.where(taken & crosses, rate, 1.0)
-        part = jnp.where(taken, value - still(value), 0.0) / rate
-        later = -part - 0.5 * still(bend / rate) * part**2
-        there = t + later, y + slope * later + 0.5 * turn * later**2
-        return tuple(differentiable_where(crosses, x, t, y, numbers) for x in there)
-
-    return move_to_zero
+    (t, y, _), (values, rates, slope) = at, follow(*at)
+    zeros, still_rates, still_slope = follow(*still)
+    along = jnp.ones_like(t), still_slope
+    _, (_, bends, turn) = jax.jvp(lambda t, y: follow(t, y, still[2]), still[:2], along)
+    place, number = k, np.arange(len(values))
+    if surfaces.borders is not None:
+        times = jnp.abs(zeros / still_rates) * np.where(number >= count, _LATER, 1.0)
+        place = jnp.argmin(jnp.where(((number >= count) | (number == k)) & ~jnp.isnan(times), times, jnp.inf))
+    here = number == place
+    varied, rate, still_rate, bend = (
+        jnp.where(here, x, 0.0).sum() for x in (values - zeros, rates, still_rates, bends)
+    )
+    crosses = ~taken | (still_rate != 0)
+    moves = taken & crosses
+    part = jnp.where(taken, varied, 0.0) / jnp.where(moves, rate, 1.0)
+    later = -part - 0.5 * bend / jnp.where(moves, still_rate, 1.0) * part**2
+    return crosses, t + later, y + slope * later + 0.5 * turn * later**2
 
 
 # A guard that jumps at a border is not zero there: of the times to both that to the guard's own zero is by many orders

@@ -17,7 +17,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._equations import factorize_general
 from lagjax._primitives import start_alike
 
 
@@ -70,8 +69,9 @@ def find_impulses(rows: ImpactRows, held: Held, targets):
         mixed = jnp.eye(len(held.rows))
         if held.rough.size:
             mixed = mixed.at[held.places, held.rough[:, None]].add(-held.slides[:, None] * direction)
-        solve = factorize_general(held.rows[:, None] * (rows.coupling @ mixed) + jnp.diag(1.0 - held.rows))
-        return mixed @ solve(held.rows * (jnp.pad(targets, (0, held.places.size)) - rows.rates))
+        system = held.rows[:, None] * (rows.coupling @ mixed) + jnp.diag(1.0 - held.rows)
+        right = held.rows * (jnp.pad(targets, (0, held.places.size)) - rows.rates)
+        return mixed @ jnp.linalg.solve(system, right)
 
     if held.direction.shape[1] == 1 or not held.rough.size:
         return impulses_along(held.direction)
@@ -97,7 +97,7 @@ def _turn_directions(rows: ImpactRows, held: Held, impulses_along):
     def turn(_, carry):
         slopes, (turned, impulses) = jax.jacfwd(off, has_aux=True)(carry[0])
         still = jnp.diag(jnp.where(jnp.diagonal(slopes) == 0, 1.0, 0.0))
-        return carry[0] - factorize_general(slopes + still)(turned), impulses
+        return carry[0] - jnp.linalg.solve(slopes + still, turned), impulses
 
     # XLA compiles one loop sooner than its rounds; the third one has the impulses behind two steps.
     angles = jax.lax.stop_gradient(jnp.arctan2(held.direction[:, 1], held.direction[:, 0]))

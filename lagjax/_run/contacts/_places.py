@@ -91,8 +91,9 @@ RECORD = (
     "HELD", "SLIDES", "DIRECTION",  # of the impulses: rows (k + r d,), the contacts that slide (r,), and where (r d,)
     "COMPRESSED", "RETURNED",  # (k,), rows of the phases of Poisson's law
     "ENDS", "MEETS",  # (k,), whose bounces end, whose gaps close
-    "SHARES",  # (k,), of contacts that share an impact and close by themselves
-    "STARTS",  # (r,), that break away where the motion starts
+    # By how much what they share may vary apart, 0 of others: (k,) of contacts that share an impact and close by
+    # themselves, (r,) of those that break away where the motion starts.
+    "SHARES", "STARTS",
     "LEAVES_REST",
     "OFFSET", "LATER_ON",  # (2n,), by how much the state is moved besides; and the time
 )  # fmt: skip

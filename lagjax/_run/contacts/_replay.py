@@ -10,6 +10,7 @@ Its derivatives are those of the motion that the search found; its values are no
 
 import collections
 import functools
+import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
@@ -17,17 +18,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._engine.taylor import stretch_variation
+from lagjax._engine.taylor import Line, move_to_zero, run_stretch
 from lagjax._interface import halves
 from lagjax._primitives import Repetition, differentiable_where, keep_together
+from lagjax._program import Unlowerable, lower
 from lagjax._run.contacts._impact_law import Held, ImpactRows, construct_impulses, find_impulses, rates_behind
 from lagjax._run.contacts._places import RECORD
 from lagjax._run.contacts._scene_code import SceneCode, sizes_of_fields
 from lagjax._run.contacts._search import POISSON
 
-# By how much the instants of contacts that share an impact may vary apart, for a tangent of length one: rounding.
-TOGETHER = 1e-8
-
+# Operations of the line of the end of a stretch: a longer one takes XLA as long as its parts.
+LONGEST = 5000
 
 _VECTORS = frozenset((
     "DID", "BEFORE", "BEHIND", "IMPULSE", "HELD", "SLIDES", "DIRECTION", "COMPRESSED", "RETURNED", "ENDS", "MEETS",
@@ -58,6 +59,19 @@ class Played(NamedTuple):
     y: Any
 
 
+class Ended(NamedTuple):
+    """The end of a stretch: as in `Played`, then the time behind it, and what contacts of one instant share (k + r d,)."""
+
+    at: Any
+    before: Any
+    behind: Any
+    t_impact: Any
+    impulse: Any
+    lost: Any
+    later: Any
+    shared: Any
+
+
 class Replay:
     """The replay of a scene; it is known by identity.
 
@@ -65,8 +79,7 @@ class Replay:
     """
 
     def __init__(self, code: SceneCode, make_flow: Callable):
-        surfaces, tolerances = code.surfaces["HELD"], code.tolerances
-        self._vary = functools.cache(lambda: stretch_variation(make_flow(), surfaces, tolerances))
+        self._make_flow, self._watches, self._tolerances = functools.cache(make_flow), code.surfaces["HELD"], code.tolerances
         self._code, self._lines, self._sizes, self._rough = code, code.lines, code.sizes, code.arrays["ROUGH"]
 
     def __call__(self, ts, y0, vector, restitution, friction) -> tuple:
@@ -90,26 +103,75 @@ class Replay:
         written = (), (n,), (2 * n,), (), (k,), ()
         return Repetition(self._play, 5, written, ((self._sizes["TIMES"], 2 * n),))
 
-    def _play(self, given, carry, row):
+    def _play(self, given, carry, rows):
         ts, y0, vector, restitution, friction = given
-        (t, y), row, still = carry, self._read(*row), jax.lax.stop_gradient
-        begun, last = still(t), still(ts[-1])
-        ahead = (ts > begun) | (ts == jnp.where(begun == ts[0], begun, jnp.nan))
-        happens, crosses, decides = row.happens > 0, row.crosses > 0, row.decides > 0
-        end = jnp.where(~happens & (row.end == last), ts[-1], row.end)
+        (t, y), (record,), still = carry, rows, jax.lax.stop_gradient
+        row, begun = self._read(record), still(t)
+        ahead, decides = (ts > begun) | (ts == jnp.where(begun == ts[0], begun, jnp.nan)), row.decides > 0
+        end = jnp.where((row.happens == 0) & (row.end == still(ts[-1])), ts[-1], row.end)
         end = jnp.where(row.ran > 0, end, begun)
         times = jnp.concatenate([t[None], jnp.where(ahead, ts, begun), ts[-1:]])
         numbers = jnp.concatenate([vector, row.did])
-        found, t_end, y_end = self._vary()(times, y, numbers, end, row.watch.astype(int), crosses)
-        path = jnp.where((ahead & (ts <= row.end))[:, None], found[1:-1], 0.0)
-        stays = happens & ~crosses
-        t, y = jnp.where(stays, t, t_end), jnp.where(stays, y, y_end)
-        t_impact, impulse, lost, behind = self._jump((t, y), row, vector, restitution, friction, halves(y0)[1])
-        behind = jnp.where(decides, behind, y)
-        later = t + jnp.where(decides, row.later_on, 0.0)
-        late = decides & (ts > row.end) & (ts <= still(later))
-        path = jnp.where(late[:, None], behind, path)
-        return [later, behind], [t, halves(y)[1], behind, t_impact, impulse, lost], [path]
+        path, *stop = run_stretch(self._make_flow(), self._tolerances, times, y, numbers, end, row.crosses > 0)
+        ended, smooth = self._end((*stop, vector, t, y, halves(y0)[1], restitution, friction), record)
+        ended = Ended(*(differentiable_where(smooth, x, *stop, vector) for x in ended))
+        limits = jnp.append(row.shares, jnp.repeat(row.starts, self._sizes["D"]))
+        limits = jnp.where(decides & (limits > 0), limits, jnp.inf)
+        behind = keep_together(ended.behind, ended.shared - still(ended.shared), limits)  # only how they vary matters
+        behind = differentiable_where(~decides | (row.leaves_rest == 0), behind, *stop, vector)
+        last = row.end + jnp.where(decides, row.later_on, 0.0)
+        later = ended.later + still(last - ended.later)
+        path = jnp.where((ahead & (ts <= row.end))[:, None], path[1:-1], 0.0)
+        path = jnp.where((decides & (ts > row.end) & (ts <= last))[:, None], behind, path)
+        return [later, behind], [*ended._replace(behind=behind)[:6]], [path]
+
+    def _end(self, given: tuple, record) -> tuple[Ended, Any]:
+        """What the end of a stretch does, and whether it varies smoothly: as one straight line, if that is not long."""
+        still = jax.lax.stop_gradient(given[:3])
+        if self._line is None:
+            return self._end_in_parts(given, still, record)
+        line, shapes = self._line
+        x = jnp.concatenate([jnp.ravel(x) for x in (record, *still, *given)])
+        parts = jnp.split(line(x), np.cumsum([math.prod(shape) for shape in shapes])[:-1])
+        *ended, smooth = (part.reshape(shape) for part, shape in zip(parts, shapes, strict=True))
+        return Ended(*ended), smooth > 0
+
+    @functools.cached_property
+    def _line(self) -> tuple[Line, list] | None:
+        """The line of `_end_in_parts` of all numbers side by side, and the shapes of what it gives; or None."""
+        k, r, n = (self._sizes[name] for name in "KRN")
+        numbers = self._sizes["NUMBERS"]
+        at, fields = [(), (2 * n,), (numbers,)], sizes_of_fields(self._sizes)
+        fixed = [(sum(fields[name] for name in RECORD),), *at]
+        given = [jax.ShapeDtypeStruct(shape, float) for shape in (*fixed, *at, (), (2 * n,), (n,), (k,), (r,))]
+        ended = (), (n,), (2 * n,), (), (k,), (), (), (k + r * self._sizes["D"],), ()
+
+        def end(record, *given):
+            found, smooth = self._end_in_parts(given[3:], given[:3], record)
+            return jnp.concatenate([jnp.ravel(x) for x in (*found, jnp.where(smooth, 1.0, 0.0))])
+
+        try:
+            program = lower(end, *given, budget=LONGEST)
+        except Unlowerable:
+            return None
+        line = Line(program.line, program.size, program.size, sum(map(math.prod, fixed)))
+        return None if program.looks_up else (line, ended)
+
+    def _end_in_parts(self, given: tuple, still: tuple, record) -> tuple[Ended, Any]:
+        t_end, y_end, vector, t, y, first_velocity, restitution, friction = given
+        row = self._read(record)
+        crosses, decides = row.crosses > 0, row.decides > 0
+        at, still = ((*x[:2], jnp.append(x[2], row.did)) for x in (given, still))
+        smooth, *moved = move_to_zero(self._watches, row.watch.astype(int), crosses, at, still)
+        stays = (row.happens > 0) & ~crosses
+        t, y = (
+            jnp.where(stays, a, jnp.where(crosses, b, c)) for a, b, c in zip((t, y), moved, (t_end, y_end), strict=True)
+        )
+        rows = self.rows_at(t, y, vector)
+        t_impact, impulse, lost, behind = self._jump((t, y), rows, row, vector, restitution, friction)
+        shared = jnp.append(rows.values[: self._sizes["K"]], rows.gradients[self._sizes["K"] :] @ first_velocity)
+        behind, later = jnp.where(decides, behind, y), t + jnp.where(decides, row.later_on, 0.0)
+        return Ended(t, halves(y)[1], behind, t_impact, impulse, lost, later, shared), smooth
 
     def rows_at(self, t, y, vector) -> ImpactRows:
         """The rows of all contacts at a state, with all open."""
@@ -119,10 +181,10 @@ class Replay:
         k, doing = self._sizes["K"], self._sizes["DOING"]
         return jnp.concatenate([y, t[None], vector, jnp.zeros(k), jnp.ones(doing - k - 1), jnp.zeros(1)])
 
-    def _jump(self, at, row, vector, restitution, friction, first_velocity):
+    def _jump(self, at, rows: ImpactRows, row, vector, restitution, friction):
         """The time of an impact, impulses (k,), the energy lost, and the state (2n,) behind a change at (t, y)."""
         (t, y), k, hits = at, self._sizes["K"], row.hits > 0
-        rows, v = self.rows_at(t, y, vector), halves(y)[1]
+        v = halves(y)[1]
         direction = row.direction.reshape(-1, self._sizes["D"])
         if self._sizes["LAW"] == POISSON and self._rough.size:
             bounced, along = construct_impulses(rows, restitution, friction)
@@ -138,8 +200,6 @@ class Replay:
         back = jnp.where(row.meets > 0, -rows.values[:k] / jnp.diagonal(rows.coupling)[:k], 0.0)
         back = jnp.where(np.arange(k) < self._sizes["GAPS"], back, 0.0)
         behind = y + jnp.concatenate([back @ rows.responses[:k], change]) + row.offset
-        behind = self._limit_variations(behind, rows, row, first_velocity)
-        behind = differentiable_where(row.leaves_rest == 0, behind, t, y, vector)
         lost = -impulses @ (rows.gradients @ (v + 0.5 * change))
         left = self._time_left(t, y + jnp.concatenate([jnp.zeros_like(v), change]), bounced, ends, vector, restitution)
         return t + left, impulses[:k], lost, behind
@@ -152,16 +212,3 @@ class Replay:
         b, rest = jnp.where(ends, -bends, 1.0), jnp.where(ends, 1.0 - restitution, 1.0)
         uneven = -later * bounced / (b**2 * rest)
         return jnp.sum(jnp.where(ends, 2.0 * bounced / (b * rest) * (1.0 - 2.0 / 3.0 * uneven), 0.0))
-
-    def _limit_variations(self, y, rows: ImpactRows, row, first_velocity):
-        """The state, which has no derivatives in directions that take apart what happens at one instant.
-
-        Contacts that share an impact and close by themselves do so along directions in which their gaps stay closed.
-        By the least slip of a start at rest friction turns.
-        """
-        still, k = jax.lax.stop_gradient(rows), self._sizes["K"]
-        limits = jnp.where(row.shares > 0, TOGETHER * jnp.abs(still.rates[:k]), jnp.inf)
-        begun, gradients = jnp.repeat(row.starts > 0, self._sizes["D"]), still.gradients[k:]
-        limits = jnp.append(limits, jnp.where(begun, TOGETHER * jnp.abs(gradients).sum(axis=1), jnp.inf))
-        offsets = jnp.append(rows.values[:k], gradients @ first_velocity)
-        return keep_together(y, offsets - jax.lax.stop_gradient(offsets), limits)  # only how they vary matters

@@ -76,6 +76,8 @@ TIED_MOVES = 1e3
 # breaks away brings about in a step. Half of that takes √2 times the steps, of some ten thousand: at rest friction
 # turns a slip at once, and steps are as short as that takes.
 NO_SLIP, AT_REST = 1e-11, 1e-8
+# By how much what happens at one instant may vary apart, for a tangent of length one: rounding.
+TOGETHER = 1e-8
 HARDLY = 1e-6  # of the largest velocities so far: a contact that moves apart slower may close
 GAINED = 1e-12  # of the room of an impact: a gain of energy beyond rounding
 # Of the largest slip so far: what is more, where the slip along its first direction ends, has turned.
@@ -609,7 +611,10 @@ def decide(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> 
     leaves_rest = False
     for c in range(r):
         leaves_rest = leaves_rest or (first == k + c and was_stuck[c] > 0 and d > 1)
-        row.starts[c] = float(first == k + c and was_stuck[c] > 0 and x[2 * n] == member.first)
+        row.starts[c] = 0.0
+        if first == k + c and was_stuck[c] > 0 and x[2 * n] == member.first:
+            for j in range(d * n):
+                row.starts[c] += TOGETHER * abs(room.gradients[(k + c * d) * n + j])
     if r > 0:
         rub(scene, member, first, hits, room)
         write_directions(scene, sticks[r:], room.free)
@@ -684,7 +689,7 @@ def meet(scene: Scene, member: Member, meets: Floats, row: Entry, room: Room) ->
         presses = parting[i] > noise[i] and push[i] > 0 and i < scene.gaps
         closes = parting[i] < -noise[i] or presses
         alone = linked[i] > 0 and meets[i] == 0 and closed[i] == 0 and member.fresh[i] == 0
-        row.shares[i] = float(hits and alone and closes)
+        row.shares[i] = TOGETHER * abs(room.rates[i]) if hits and alone and closes else 0.0
         fastest = max(fastest, abs(parting[i]))
     for i in range(k):
         noise[i] = max(noise[i], 1e-12 * fastest)
