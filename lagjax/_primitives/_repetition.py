@@ -11,85 +11,96 @@ that a derivative needs of all rounds, and skip those that there are not by bran
 """
 
 import functools
+import itertools
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.core import ShapedArray
 from jax.interpreters import ad, mlir
 
-from lagjax._primitives._linear_map import LinearMap, start_alike
-
-PyTree = object
+from lagjax._primitives._linear_map import LinearMap, is_zero, start_alike
 
 
 class Repetition:
-    """`step(x, carry, row)` → (carry, of the round, parts of sums), lists of arrays; it is known by identity.
+    """`step(x, carry, still, row)` → (carry, of the round, parts of sums), lists of arrays; it is known by identity.
 
-    `of_round` and `sums` are shapes of doubles: what is written down of each round, and what is summed over all.
+    There are so many arrays (`inputs`) x, and `fixed` of those that are still; the rest are rows. `of_round` and `sums`
+    are shapes of doubles: what is written down of each round, and what is summed over all.
     """
 
-    def __init__(self, step: Callable, inputs: int, of_round: tuple, sums: tuple):
-        self.step, self.inputs, self.of_round, self.sums = step, inputs, of_round, sums
+    def __init__(self, step: Callable, inputs: int, carried: int, fixed: int, of_round: tuple, sums: tuple):
+        self.step, self.inputs, self.carried, self.fixed = step, inputs, carried, fixed
+        self.of_round, self.sums = of_round, sums
 
     def __call__(self, x: tuple, first: tuple, rows: tuple, count) -> tuple[list, list, list]:
         """The last carry, what was written down (N, …), and the sums, of the first `count` of the rows (N, …)."""
-        found = value_p.bind(*x, *first, *rows, count, of=self, rows=len(rows), batch=0)
-        ends = len(first), len(first) + len(self.of_round)
-        return found[: ends[0]], found[ends[0] : ends[1]], found[ends[1] :]
+        found = value_p.bind(*x, *first, *rows, count, of=self, axes=())
+        return self.split_results(found)
+
+    def split_results(self, found) -> tuple[list, list, list]:
+        return _split(found, self.carried, len(self.of_round))
+
+    @functools.lru_cache(maxsize=16)  # noqa: B019  # those of a few
+    def hold_still(self, varies: tuple[bool, ...]) -> "Repetition":
+        """The repetition whose x are only those that vary; the others come first among what is still."""
+
+        def step(x, carry, still, row):
+            moving, others = iter(x), iter(still)
+            return self.step([next(moving if here else others) for here in varies], carry, list(others), row)
+
+        moving = sum(varies)
+        more = len(varies) - moving
+        return Repetition(step, moving, self.carried, self.fixed + more, self.of_round, self.sums)
 
     @functools.cached_property
     def tangent(self) -> "Repetition":
         """The repetition of R′, with x, δx side by side, and so the others."""
 
-        def step(x, carry, row):
+        def step(x, carry, still, row):
             (x, dx), (carry, dcarry) = _halves(x), _halves(carry)
-            found, moved = jax.jvp(lambda x, carry: self.step(x, carry, row), (x, carry), (dx, dcarry))
+            found, moved = jax.jvp(lambda x, carry: self.step(x, carry, still, row), (x, carry), (dx, dcarry))
             return [[*a, *b] for a, b in zip(found, moved, strict=True)]
 
-        return Repetition(step, 2 * self.inputs, 2 * self.of_round, 2 * self.sums)
+        return Repetition(step, 2 * self.inputs, 2 * self.carried, self.fixed, 2 * self.of_round, 2 * self.sums)
 
-    def split(self, given: tuple, rows: int) -> tuple[list, list, list]:
-        """x, the first carry, and the rows, of all that is given; the count is left."""
-        return list(given[: self.inputs]), list(given[self.inputs : -1 - rows]), list(given[-1 - rows : -1])
-
-    def _one(self, x, carry, row, there):
+    def _one(self, x, carry, still, row, there):
         """A round; none where it is not `there`."""
-        behind, *found = self.step(x, carry, row)
+        behind, *found = self.step(x, carry, still, row)
         behind = [jnp.where(there, new, old) for new, old in zip(behind, carry, strict=True)]
         return behind, *([jnp.where(there, a, 0.0) for a in some] for some in found)
 
-    def run(self, most, x, first, rows, count, keeps: bool = False):
-        """All rounds, `most` of them of whichever member; if it `keeps` them, the carries before each as well."""
+    def run(self, most, x, first, still, rows, count, keeps: bool = False):
+        """All rounds, `most` of them of whichever member; if it `keeps` them, the carries before each and no more."""
         length = len(rows[0])
         empty = [jnp.zeros((length, *shape)) for shape in self.of_round], [jnp.zeros(shape) for shape in self.sums]
-        before = [jnp.zeros((length, *c.shape)) for c in first] if keeps else []
+        if keeps:
+            empty = [jnp.zeros((length, *c.shape)) for c in first], []
 
         def go(i, state):
-            carry, written, sums, before = state
-            before = [_put(kept, c, i) for kept, c in zip(before, carry, strict=keeps)]
-            carry, new, parts = self._one(x, carry, [_at(row, i) for row in rows], i < count)
-            written = [_put(kept, a, i) for kept, a in zip(written, new, strict=True)]
-            return carry, written, [a + b for a, b in zip(sums, parts, strict=True)], before
+            carry, written, sums = state
+            behind, new, parts = self._one(x, carry, still, [_at(row, i) for row in rows], i < count)
+            written = [_put(kept, a, i) for kept, a in zip(written, carry if keeps else new, strict=True)]
+            return behind, written, [] if keeps else [a + b for a, b in zip(sums, parts, strict=True)]
 
-        state = start_alike((first, *empty, before), x, first, rows, count)
-        carry, written, sums, before = jax.lax.fori_loop(0, most, go, state)
-        return before if keeps else [*carry, *written, *sums]
+        state = start_alike((first, *empty), x, first, still, rows, count)
+        carry, written, sums = jax.lax.fori_loop(0, most, go, state)
+        return written if keeps else [*carry, *written, *sums]
 
-    def go_back(self, most, x, first, rows, count, cotangents):
+    def go_back(self, most, x, first, still, rows, count, cotangents):
         """The cotangents of x and of the first carry."""
-        before = self.run(most, x, first, rows, count, keeps=True)
-        ends = len(first), len(first) + len(self.of_round)
-        last, written, sums = cotangents[: ends[0]], cotangents[ends[0] : ends[1]], cotangents[ends[1] :]
+        before = self.run(most, x, first, still, rows, count, keeps=True)
+        last, written, sums = self.split_results(cotangents)
 
         def go(k, state):
             i, (x_ct, carry_ct) = most - 1 - k, state
             row, here = [_at(row, i) for row in rows], [_at(kept, i) for kept in before]
-            _, pull = jax.vjp(lambda x, carry: self._one(x, carry, row, i < count), x, here)
+            _, pull = jax.vjp(lambda x, carry: self._one(x, carry, still, row, i < count), x, here)
             more, carry_ct = pull((carry_ct, [_at(ct, i) for ct in written], sums))
             return [a + b for a, b in zip(x_ct, more, strict=True)], carry_ct
 
-        state = start_alike(([jnp.zeros_like(a) for a in x], last), x, first, rows, count, cotangents)
+        state = start_alike(([jnp.zeros_like(a) for a in x], last), x, first, still, rows, count, cotangents)
         x_ct, first_ct = jax.lax.fori_loop(0, most, go, state)
         return [*x_ct, *first_ct]
 
@@ -103,115 +114,144 @@ def _put(array, x, i):
 
 
 def _halves(arrays) -> tuple[list, list]:
-    half = len(arrays) // 2
-    return list(arrays[:half]), list(arrays[half:])
+    return tuple(_split(arrays, len(arrays) // 2))
 
 
-# ---- primitives: (x, first carry, rows, count) and what they are linear in -------------------------------------------
+def _split(arrays, *sizes: int) -> list[list]:
+    """The first ones, so many, and so on, and those that are left."""
+    ends = [0, *itertools.accumulate(sizes), len(arrays)]
+    return [list(arrays[a:b]) for a, b in itertools.pairwise(ends)]
 
 
-def _shapes(*given, of: Repetition, rows: int, batch: int, linear: int = 0):
-    given = given[: len(given) - linear]
-    x, first, _ = of.split(given, rows)
-    in_front, length = first[0].shape[:batch], given[-2].shape[batch]
-    written = [ShapedArray((*in_front, length, *shape), first[0].dtype) for shape in of.of_round]
-    return [*(ShapedArray(c.shape, c.dtype) for c in first), *written, *(ShapedArray((*in_front, *s), first[0].dtype) for s in of.sums)]
+# ---- primitives: (*x, *first carry, *still, *rows, count, *what they are linear in) ----------------------------------
 
 
-def _back_shapes(*given, of: Repetition, rows: int, batch: int, linear: int):
-    x, first, _ = of.split(given[: len(given) - linear], rows)
-    return [ShapedArray(a.shape, a.dtype) for a in (*x, *first)]
+def _parts(given, of: Repetition, linear: int = 0) -> list:
+    """x, the first carry, what is still, the rows, (count,), and what is linear."""
+    x, first, still, rest = _split(given, of.inputs, of.carried, of.fixed)
+    rows, (count, *along) = _split(rest, len(rest) - 1 - linear)
+    return [x, first, still, rows, count, along]
 
 
-def _over_batch(function: Callable) -> Callable:
-    """`function(of, most, x, first, rows, count, linear)` of all members."""
-
-    def run(*given, of: Repetition, rows: int, batch: int, linear: int = 0):
-        given, along = given[: len(given) - linear], list(given[len(given) - linear :])
-        call = functools.partial(function, of, jnp.max(given[-1]))
-        for _ in range(batch):
-            call = jax.vmap(call)
-        return call(*of.split(given, rows), given[-1], along)
-
-    return run
+def _run(*given, function, of: Repetition, axes: tuple, linear: int = 0):
+    """`function` of all members, in front of which some arrays have these axes."""
+    x, first, still, rows, count, along = _parts(given, of, linear)
+    call = functools.partial(function, of, jnp.max(count))
+    for in_front in axes:
+        x_in, first_in, still_in, rows_in, count_in, along_in = _parts(in_front, of, linear)
+        call = jax.vmap(call, in_axes=(x_in, first_in, still_in, rows_in, count_in, along_in))
+    return call(x, first, still, rows, count, along)
 
 
-def _value(of, most, x, first, rows, count, _):
-    return of.run(most, x, first, rows, count)
+def _value(of, most, x, first, still, rows, count, _):
+    return of.run(most, x, first, still, rows, count)
 
 
-def _forward(of, most, x, first, rows, count, along):
-    dx, dfirst = along[: len(x)], along[len(x) :]
-    found = of.tangent.run(most, [*x, *dx], [*first, *dfirst], rows, count)
-    return _moved(found, len(first), of)
+def _forward(of, most, x, first, still, rows, count, along):
+    dx, dfirst = along[: of.inputs], along[of.inputs :]
+    return _later_halves(of.tangent.run(most, [*x, *dx], [*first, *dfirst], still, rows, count), of.tangent)
 
 
-def _moved(found, carried: int, of: Repetition) -> list:
-    """Of what a repetition of R′ gives what belongs to the tangents."""
-    parts, place = [], 0
-    for size in (carried, len(of.of_round), len(of.sums)):
-        parts += found[place + size : place + 2 * size]
-        place += 2 * size
-    return parts
+def _back(of, most, x, first, still, rows, count, cotangents):
+    return of.go_back(most, x, first, still, rows, count, cotangents)
 
 
-def _back(of, most, x, first, rows, count, cotangents):
-    return of.go_back(most, x, first, rows, count, cotangents)
+def _later_halves(found, of: Repetition) -> list:
+    return [a for part in of.split_results(found) for a in _halves(part)[1]]
 
 
-def _vary_value(primals, tangents, _, **settings):
-    of, rows = settings["of"], settings["rows"]
-    moving = [ad.instantiate_zeros(t) for t in tangents[: len(tangents) - 1 - rows]]
-    return forward_p.bind(*primals, *moving, **settings, linear=len(moving))
+def _vary_value(primals, tangents, _, *, of: Repetition, axes: tuple):
+    varies = tuple(not is_zero(t) for t in tangents[: of.inputs])
+
+    def sort(given):
+        x, first, *rest, count, _ = _parts(given, of)
+        others = itertools.compress(x, (not here for here in varies))
+        return [*itertools.compress(x, varies), *first, *others, *itertools.chain(*rest), count]
+
+    def along(given):
+        return [*itertools.compress(given, varies), *given[of.inputs : of.inputs + of.carried]]
+
+    moving = [ad.instantiate_zeros(t) for t in along(tangents)]
+    axes = tuple((*sort(of_level), *along(of_level)) for of_level in axes)
+    return forward_p.bind(*sort(primals), *moving, of=of.hold_still(varies), axes=axes, linear=len(moving))
 
 
-def _beside(primals, tangents, settings) -> tuple[list, list, list, list, dict]:
-    """x and the first carry, how these vary, all that follows, what is linear; and settings of R′."""
-    of, rows, linear = settings["of"], settings["rows"], settings["linear"]
-    given = primals[: len(primals) - linear]
-    x, first, _ = of.split(given, rows)
-    moving = [ad.instantiate_zeros(t) for t in tangents[: len(x) + len(first)]]
-    dx, dfirst = moving[: len(x)], moving[len(x) :]
-    return [x, dx, first, dfirst], list(given[-1 - rows :]), list(primals[len(given) :]), settings | {"of": of.tangent}
+def _vary_forward(primals, tangents, _, *, of: Repetition, axes: tuple, linear: int):
+    def double(given, moved, still):
+        x, first, *rest, count, along = _parts(given, of, linear)
+        (vx, vfirst), (dx, dfirst, _) = _split(along, of.inputs), _split(moved, of.inputs, of.carried)
+        moves = [*dx, *map(still, vx), *dfirst, *map(still, vfirst)]
+        return [*x, *vx, *first, *vfirst, *itertools.chain(*rest), count, *moves]
+
+    moved = [ad.instantiate_zeros(t) for t in tangents[:linear]]
+    axes = tuple(tuple(double(of_level, of_level, lambda axis: axis)) for of_level in axes)
+    found = forward_p.bind(*double(primals, moved, jnp.zeros_like), of=of.tangent, axes=axes, linear=2 * linear)
+    return _later_halves(found, of.tangent)
 
 
-def _vary_forward(primals, tangents, _, **settings):
-    (x, dx, first, dfirst), rest, along, settings_of = _beside(primals, tangents, settings)
-    still = [jnp.zeros_like(a) for a in along]
-    vx, vfirst = along[: len(x)], along[len(x) :]
-    moved = [*dx, *still[: len(x)], *dfirst, *still[len(x) :]]
-    found = forward_p.bind(*x, *vx, *first, *vfirst, *rest, *moved, **settings_of | {"linear": len(moved)})
-    return _moved(found, len(first), settings["of"])
+def _vary_back(primals, tangents, _, *, of: Repetition, axes: tuple, linear: int):
+    def double(given, moved, still):
+        x, first, *rest, count, cts = _parts(given, of, linear)
+        dx, dfirst, _ = _split(moved, of.inputs, of.carried)
+        doubled = [a for part in of.split_results(cts) for a in (*map(still, part), *part)]
+        return [*x, *dx, *first, *dfirst, *itertools.chain(*rest), count, *doubled]
 
-
-def _vary_back(primals, tangents, _, **settings):
-    (x, dx, first, dfirst), rest, cts, settings_of = _beside(primals, tangents, settings)
-    of, doubled, place = settings["of"], [], 0
-    for size in (len(first), len(of.of_round), len(of.sums)):
-        some = cts[place : place + size]
-        doubled, place = [*doubled, *(jnp.zeros_like(a) for a in some), *some], place + size
-    found = back_p.bind(*x, *dx, *first, *dfirst, *rest, *doubled, **settings_of | {"linear": len(doubled)})
-    return [*found[: len(x)], *found[2 * len(x) : 2 * len(x) + len(first)]]
-
-
-def _pull(primitive_name: str):
-    def transpose(known, cotangents, moving, **settings):
-        primitive = back_p if primitive_name == "back" else forward_p
-        return primitive.bind(*known, *cotangents, **settings | {"linear": len(cotangents)})
-
-    return transpose
+    moved = [ad.instantiate_zeros(t) for t in tangents[: of.inputs + of.carried]]
+    axes = tuple(tuple(double(of_level, of_level, lambda axis: axis)) for of_level in axes)
+    found = back_p.bind(*double(primals, moved, jnp.zeros_like), of=of.tangent, axes=axes, linear=2 * linear)
+    x, first = _split(found, 2 * of.inputs)
+    return [*_halves(x)[0], *_halves(first)[0]]
 
 
 class _Loops(LinearMap):
-    def __init__(self, name: str, shapes: Callable, function: Callable, vary: Callable, transposed: str | None = None):
-        linear = (lambda linear, **_: linear) if transposed else 0
-        super().__init__(f"lagjax_repetition_{name}", shapes, vary, linear, transposed and _pull(transposed))
-        run = _over_batch(function)
+    """A loop; of each axis of a batch, the first one innermost, `axes` says which arrays have it."""
+
+    def __init__(self, name: str, shapes: Callable, function: Callable, vary: Callable, transposed: str = ""):
+        of_linear = (lambda linear, **_: linear) if transposed else 0
+        pull = functools.partial(_pull, transposed) if transposed else None
+        run = functools.partial(_run, function=function)
+
+        def shape(*given, **settings):
+            batch, given = _without_batch(given, settings["axes"])
+            return [ShapedArray((*batch, *shape), np.dtype(float)) for shape in shapes(given, **settings)]
+
+        super().__init__(f"lagjax_repetition_{name}", shape, vary, of_linear, pull)
         self.def_impl(lambda *given, **settings: jax.jit(functools.partial(run, **settings))(*given))
         mlir.register_lowering(self, mlir.lower_fun(run, multiple_results=True))
 
-    def _batch(self, arrays, axes, *, batch: int, **settings):
-        return super()._batch(arrays, axes, batch=batch + 1, **settings)
+    def _batch(self, arrays, places, *, axes: tuple, **settings):
+        arrays = [x if at is None else jnp.moveaxis(x, at, 0) for x, at in zip(arrays, places, strict=True)]
+        more = tuple(None if at is None else 0 for at in places)
+        outs = self.bind(*arrays, axes=(*axes, more), **settings)
+        return outs, [0] * len(outs)
+
+
+def _without_batch(given, axes: tuple) -> tuple[tuple[int, ...], list[tuple[int, ...]]]:
+    """The axes of a batch, the outermost one first, and the shapes of arrays without them."""
+    shapes, batch = [x.shape for x in given], []
+    for of_level in reversed(axes):
+        batch.append(next(shape[0] for shape, axis in zip(shapes, of_level, strict=True) if axis == 0))
+        shapes = [shape if axis is None else shape[1:] for shape, axis in zip(shapes, of_level, strict=True)]
+    return tuple(batch), shapes
+
+
+def _shapes(given, *, of: Repetition, axes: tuple, linear: int = 0) -> list:
+    _, first, _, rows, *_ = _parts(given, of, linear)
+    return [*first, *((rows[0][0], *shape) for shape in of.of_round), *of.sums]
+
+
+def _back_shapes(given, *, of: Repetition, axes: tuple, linear: int) -> list:
+    return given[: of.inputs + of.carried]
+
+
+def _pull(transposed: str, known, cotangents, moving, *, axes: tuple, linear: int, **settings):
+    """The other loop, whose results are summed over those axes that what moves does not have."""
+    primitive = back_p if transposed == "back" else forward_p
+    size = len(axes) and len(axes[0]) - linear
+    of_others = tuple((*of_level[:size], *[0] * len(cotangents)) for of_level in axes)
+    found = primitive.bind(*known, *cotangents, axes=of_others, linear=len(cotangents), **settings)
+    absent = zip(*(of_level[size:] for of_level in reversed(axes)), strict=True) if axes else [()] * linear
+    return [x.sum([i for i, axis in enumerate(of) if axis is None]) for x, of in zip(found, absent, strict=True)]
 
 
 value_p = _Loops("value", _shapes, _value, _vary_value)

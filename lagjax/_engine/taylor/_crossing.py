@@ -172,7 +172,7 @@ def run_stretch(flow: Flow, tolerances: Tolerances, ts, y0, params, t_end, cross
     varies takes the motion with it: how long motions last varies by what they are, not by when they are.
     """
     still = jax.lax.stop_gradient
-    reached = jnp.where(ts <= t_end, ts, still(jnp.clip(ts, ts[0], t_end)))
+    reached = jnp.where(ts <= t_end, ts, jnp.clip(still(ts), still(ts[0]), still(t_end)))
     later = 0.0 if flow.reads_time else ts[0] - still(ts[0])
     end = t_end + jnp.where(crosses, later, 0.0)
     times = jnp.concatenate([ts[:1], reached[1:-1], end[None]]) - later

@@ -59,17 +59,8 @@ class Played(NamedTuple):
     y: Any
 
 
-class Ended(NamedTuple):
-    """The end of a stretch: as in `Played`, then the time behind it, and what contacts of one instant share (k + r d,)."""
-
-    at: Any
-    before: Any
-    behind: Any
-    t_impact: Any
-    impulse: Any
-    lost: Any
-    later: Any
-    shared: Any
+def join(*arrays):
+    return jnp.concatenate([jnp.ravel(x) for x in arrays])
 
 
 class Replay:
@@ -91,19 +82,25 @@ class Replay:
         t = ts[0] + jax.lax.stop_gradient(start[-1] - ts[0])
         path = jnp.where((ts <= start[-1])[:, None], y, 0.0)
         count = jnp.sum(self._read(found.record).ran > 0)
-        (t, y), written, (more,) = self._rounds(given, (t, y), (found.record,), count)
-        return path + more, *written, t, y
+        (t, y), (said, behind), (more,) = self._rounds(given, (t, y), (found.record,), count)
+        at, before, t_impact, impulse, lost = jnp.split(said, self._ends[1:5] - 1, axis=1)
+        return path + more, at[:, 0], before, behind, t_impact[:, 0], impulse, lost[:, 0], t, y
 
     def _read(self, record):
         return read_rows(record, sizes_of_fields(self._sizes))
 
     @functools.cached_property
-    def _rounds(self) -> Repetition:
-        k, n = self._sizes["K"], self._sizes["N"]
-        written = (), (n,), (2 * n,), (), (k,), ()
-        return Repetition(self._play, 5, written, ((self._sizes["TIMES"], 2 * n),))
+    def _ends(self) -> np.ndarray:
+        """Where the parts of what `_end` gives end, but the last."""
+        n, k = self._sizes["N"], self._sizes["K"]
+        return np.cumsum([1, 1, n, 1, k, 1, 2 * n, 1])
 
-    def _play(self, given, carry, rows):
+    @functools.cached_property
+    def _rounds(self) -> Repetition:
+        states = 2 * self._sizes["N"]
+        return Repetition(self._play, 5, 2, 0, ((int(self._ends[5]) - 1,), (states,)), ((self._sizes["TIMES"], states),))
+
+    def _play(self, given, carry, _, rows):
         ts, y0, vector, restitution, friction = given
         (t, y), (record,), still = carry, rows, jax.lax.stop_gradient
         row, begun = self._read(record), still(t)
@@ -113,65 +110,52 @@ class Replay:
         times = jnp.concatenate([t[None], jnp.where(ahead, ts, begun), ts[-1:]])
         numbers = jnp.concatenate([vector, row.did])
         path, *stop = run_stretch(self._make_flow(), self._tolerances, times, y, numbers, end, row.crosses > 0)
-        ended, smooth = self._end((*stop, vector, t, y, halves(y0)[1], restitution, friction), record)
-        ended = Ended(*(differentiable_where(smooth, x, *stop, vector) for x in ended))
+        ended = self._end((*stop, vector, t, y, halves(y0)[1], restitution, friction), record)
+        is_behind = np.isin(np.arange(ended.size), np.arange(*self._ends[5:7]))
+        smooth = (still(ended[0]) > 0) & (~is_behind | ~decides | (row.leaves_rest == 0))
+        ended = differentiable_where(smooth, ended, *stop, vector)
+        _, said, behind, later, shared = jnp.split(ended, self._ends[[0, 5, 6, 7]])
         limits = jnp.append(row.shares, jnp.repeat(row.starts, self._sizes["D"]))
         limits = jnp.where(decides & (limits > 0), limits, jnp.inf)
-        behind = keep_together(ended.behind, ended.shared - still(ended.shared), limits)  # only how they vary matters
-        behind = differentiable_where(~decides | (row.leaves_rest == 0), behind, *stop, vector)
+        behind = keep_together(behind, shared - still(shared), limits)  # only how they vary matters
         last = row.end + jnp.where(decides, row.later_on, 0.0)
-        later = ended.later + still(last - ended.later)
+        later = later[0] + still(last - later[0])
         path = jnp.where((ahead & (ts <= row.end))[:, None], path[1:-1], 0.0)
         path = jnp.where((decides & (ts > row.end) & (ts <= last))[:, None], behind, path)
-        return [later, behind], [*ended._replace(behind=behind)[:6]], [path]
+        return [later, behind], [said, behind], [path]
 
-    def _end(self, given: tuple, record) -> tuple[Ended, Any]:
-        """What the end of a stretch does, and whether it varies smoothly: as one straight line, if that is not long."""
-        still = jax.lax.stop_gradient(given[:3])
-        if self._line is None:
-            return self._end_in_parts(given, still, record)
-        line, shapes = self._line
-        x = jnp.concatenate([jnp.ravel(x) for x in (record, *still, *given)])
-        parts = jnp.split(line(x), np.cumsum([math.prod(shape) for shape in shapes])[:-1])
-        *ended, smooth = (part.reshape(shape) for part, shape in zip(parts, shapes, strict=True))
-        return Ended(*ended), smooth > 0
+    def _end(self, given: tuple, record):
+        """What happens at the end of a stretch: as one straight line, if that is not long."""
+        given = (record, *jax.lax.stop_gradient(given[:3]), *given)
+        return self._end_in_parts(*given) if self._line is None else self._line(join(*given))
 
     @functools.cached_property
-    def _line(self) -> tuple[Line, list] | None:
-        """The line of `_end_in_parts` of all numbers side by side, and the shapes of what it gives; or None."""
-        k, r, n = (self._sizes[name] for name in "KRN")
-        numbers = self._sizes["NUMBERS"]
+    def _line(self) -> Line | None:
+        n, k, r, numbers = (self._sizes[name] for name in ("N", "K", "R", "NUMBERS"))
         at, fields = [(), (2 * n,), (numbers,)], sizes_of_fields(self._sizes)
         fixed = [(sum(fields[name] for name in RECORD),), *at]
         given = [jax.ShapeDtypeStruct(shape, float) for shape in (*fixed, *at, (), (2 * n,), (n,), (k,), (r,))]
-        ended = (), (n,), (2 * n,), (), (k,), (), (), (k + r * self._sizes["D"],), ()
-
-        def end(record, *given):
-            found, smooth = self._end_in_parts(given[3:], given[:3], record)
-            return jnp.concatenate([jnp.ravel(x) for x in (*found, jnp.where(smooth, 1.0, 0.0))])
-
         try:
-            program = lower(end, *given, budget=LONGEST)
+            program = lower(self._end_in_parts, *given, budget=LONGEST)
         except Unlowerable:
             return None
-        line = Line(program.line, program.size, program.size, sum(map(math.prod, fixed)))
-        return None if program.looks_up else (line, ended)
+        return None if program.looks_up else Line(program.line, program.size, program.size, sum(map(math.prod, fixed)))
 
-    def _end_in_parts(self, given: tuple, still: tuple, record) -> tuple[Ended, Any]:
-        t_end, y_end, vector, t, y, first_velocity, restitution, friction = given
-        row = self._read(record)
-        crosses, decides = row.crosses > 0, row.decides > 0
-        at, still = ((*x[:2], jnp.append(x[2], row.did)) for x in (given, still))
-        smooth, *moved = move_to_zero(self._watches, row.watch.astype(int), crosses, at, still)
-        stays = (row.happens > 0) & ~crosses
-        t, y = (
-            jnp.where(stays, a, jnp.where(crosses, b, c)) for a, b, c in zip((t, y), moved, (t_end, y_end), strict=True)
-        )
-        rows = self.rows_at(t, y, vector)
-        t_impact, impulse, lost, behind = self._jump((t, y), rows, row, vector, restitution, friction)
-        shared = jnp.append(rows.values[: self._sizes["K"]], rows.gradients[self._sizes["K"] :] @ first_velocity)
+    def _end_in_parts(self, record, *given):
+        """Whether it varies smoothly; the time, the velocities, and of an impact its time, impulses and the energy lost;
+        the state and the time behind; and what contacts of one instant share (k + r d,)."""
+        *given, t, y, v0, restitution, friction = given
+        row, k = self._read(record), self._sizes["K"]
+        crosses, decides, stays = row.crosses > 0, row.decides > 0, (row.happens > 0) & (row.crosses == 0)
+        still, moving = ((*some[:2], jnp.append(some[2], row.did)) for some in (given[:3], given[3:]))
+        smooth, *moved = move_to_zero(self._watches, row.watch.astype(int), crosses, moving, still)
+        ends = zip(moved, moving[:2], strict=True)
+        t, y = (jnp.where(stays, start, jnp.where(crosses, *end)) for start, end in zip((t, y), ends, strict=True))
+        rows, vector = self.rows_at(t, y, given[5]), given[5]
+        *impact, behind = self._jump((t, y), rows, row, vector, restitution, friction)
         behind, later = jnp.where(decides, behind, y), t + jnp.where(decides, row.later_on, 0.0)
-        return Ended(t, halves(y)[1], behind, t_impact, impulse, lost, later, shared), smooth
+        shared = rows.values[:k], rows.gradients[k:] @ v0
+        return join(jnp.where(smooth, 1.0, 0.0), t, halves(y)[1], *impact, behind, later, *shared)
 
     def rows_at(self, t, y, vector) -> ImpactRows:
         """The rows of all contacts at a state, with all open."""
