@@ -176,29 +176,32 @@ def _vary_value(primals, tangents, _, *, of: Repetition, axes: tuple):
     return forward_p.bind(*sort(primals), *moving, of=of.hold_still(varies), axes=axes, linear=len(moving))
 
 
-def _vary_forward(primals, tangents, _, *, of: Repetition, axes: tuple, linear: int):
-    def double(given, moved, still):
-        x, first, *rest, count, along = _parts(given, of, linear)
-        (vx, vfirst), (dx, dfirst, _) = _split(along, of.inputs), _split(moved, of.inputs, of.carried)
-        moves = [*dx, *map(still, vx), *dfirst, *map(still, vfirst)]
-        return [*x, *vx, *first, *vfirst, *itertools.chain(*rest), count, *moves]
+def _vary_forward(primals, tangents, *, of: Repetition, axes: tuple, linear: int):
+    """J(x) v along (dx, dv): what belongs to v in the derivative of R′, of (x, v), along these."""
 
-    moved = [ad.instantiate_zeros(t) for t in tangents[:linear]]
-    axes = tuple(tuple(double(of_level, of_level, lambda axis: axis)) for of_level in axes)
-    found = forward_p.bind(*double(primals, moved, jnp.zeros_like), of=of.tangent, axes=axes, linear=2 * linear)
+    def double(given, moved):
+        x, first, *rest, count, along = _parts(given, of, linear)
+        dx, dfirst, *_, more = _parts(moved, of, linear)
+        (vx, vfirst), (dvx, dvfirst) = _split(along, of.inputs), _split(more, of.inputs)
+        return [*x, *vx, *first, *vfirst, *itertools.chain(*rest), count, *dx, *dvx, *dfirst, *dvfirst]
+
+    axes = tuple(tuple(double(of_level, of_level)) for of_level in axes)
+    found = forward_p.bind(*double(primals, tangents), of=of.tangent, axes=axes, linear=2 * linear)
     return _later_halves(found, of.tangent)
 
 
-def _vary_back(primals, tangents, _, *, of: Repetition, axes: tuple, linear: int):
-    def double(given, moved, still):
+def _vary_back(primals, tangents, *, of: Repetition, axes: tuple, linear: int):
+    """J(x)ᵀ w along (dx, dw): what belongs to x in the transposed derivative of R′ at (x, dx), of (dw, w)."""
+
+    def double(given, moved):
         x, first, *rest, count, cts = _parts(given, of, linear)
-        dx, dfirst, _ = _split(moved, of.inputs, of.carried)
-        doubled = [a for part in of.split_results(cts) for a in (*map(still, part), *part)]
+        dx, dfirst, *_, dcts = _parts(moved, of, linear)
+        parts = zip(of.split_results(dcts), of.split_results(cts), strict=True)
+        doubled = itertools.chain(*(itertools.chain(*part) for part in parts))
         return [*x, *dx, *first, *dfirst, *itertools.chain(*rest), count, *doubled]
 
-    moved = [ad.instantiate_zeros(t) for t in tangents[: of.inputs + of.carried]]
-    axes = tuple(tuple(double(of_level, of_level, lambda axis: axis)) for of_level in axes)
-    found = back_p.bind(*double(primals, moved, jnp.zeros_like), of=of.tangent, axes=axes, linear=2 * linear)
+    axes = tuple(tuple(double(of_level, of_level)) for of_level in axes)
+    found = back_p.bind(*double(primals, tangents), of=of.tangent, axes=axes, linear=2 * linear)
     x, first = _split(found, 2 * of.inputs)
     return [*_halves(x)[0], *_halves(first)[0]]
 
@@ -216,8 +219,15 @@ class _Loops(LinearMap):
             return [ShapedArray((*batch, *shape), np.dtype(float)) for shape in shapes(given, **settings)]
 
         super().__init__(f"lagjax_repetition_{name}", shape, vary, of_linear, pull)
+        self.vary = vary
         self.def_impl(lambda *given, **settings: jax.jit(functools.partial(run, **settings))(*given))
         mlir.register_lowering(self, mlir.lower_fun(run, multiple_results=True))
+
+    def _derive(self, primals, tangents, **settings):
+        if not settings.get("linear") or all(map(is_zero, tangents[: -settings["linear"]])):
+            return super()._derive(primals, tangents, **settings)
+        along = list(map(ad.instantiate_zeros, tangents))  # what varies with x and what is linear takes one loop
+        return self.bind(*primals, **settings), self.vary(primals, along, **settings)
 
     def _batch(self, arrays, places, *, axes: tuple, **settings):
         arrays = [x if at is None else jnp.moveaxis(x, at, 0) for x, at in zip(arrays, places, strict=True)]
