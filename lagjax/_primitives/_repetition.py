@@ -1,10 +1,11 @@
 """`Repetition`: a step that is repeated as often as there are rows, with loops for its derivatives.
 
-With R the step, (x, c) ↦ c behind it, three primitives are loops of as many rounds as there are,
+With R the step, (x, c) ↦ c behind it, and J the derivative of all rounds, four primitives are loops,
 
     value      c₀ ↦ c₁ ↦ … ↦ cₙ
-    forward    along δx, δc₀                     linear in these, transposed: back
-    back       from cotangents, from cₙ on       linear in these, transposed: forward
+    forward    J v                          linear in v, transposed: back
+    back       Jᵀ w, from cₙ on             linear in w, transposed: forward
+    turn       (∂/∂x Jᵀ w) d + Jᵀ dw        linear in d and dw, symmetric in d
 
 and their derivatives are these again, of the step R′: (x, δx; c, δc) ↦ (R, DR (δx, δc)). `jax.lax.scan` would keep all
 that a derivative needs of all rounds, and skip those that there are not by branches: XLA takes twice as long for it.
@@ -26,13 +27,13 @@ from lagjax._primitives._linear_map import LinearMap, is_zero, start_alike
 class Repetition:
     """`step(x, carry, still, row)` → (carry, of the round, parts of sums), lists of arrays; it is known by identity.
 
-    There are so many arrays (`inputs`) x, and `fixed` of those that are still; the rest are rows. `of_round` and `sums`
+    There are so many arrays x (`inputs`), `carried`, `rows`, and `fixed` of those that are still. `of_round` and `sums`
     are shapes of doubles: what is written down of each round, and what is summed over all.
     """
 
-    def __init__(self, step: Callable, inputs: int, carried: int, fixed: int, of_round: tuple, sums: tuple):
-        self.step, self.inputs, self.carried, self.fixed = step, inputs, carried, fixed
-        self.of_round, self.sums = of_round, sums
+    def __init__(self, step: Callable, inputs: int, carried: int, of_round: tuple, sums: tuple, rows=1, fixed=0):
+        self.step, self.inputs, self.carried, self.of_round, self.sums = step, inputs, carried, of_round, sums
+        self.rows, self.fixed, self.results = rows, fixed, carried + len(of_round) + len(sums)
 
     def __call__(self, x: tuple, first: tuple, rows: tuple, count) -> tuple[list, list, list]:
         """The last carry, what was written down (N, …), and the sums, of the first `count` of the rows (N, …)."""
@@ -51,8 +52,8 @@ class Repetition:
             return self.step([next(moving if here else others) for here in varies], carry, list(others), row)
 
         moving = sum(varies)
-        more = len(varies) - moving
-        return Repetition(step, moving, self.carried, self.fixed + more, self.of_round, self.sums)
+        fixed = self.fixed + len(varies) - moving
+        return Repetition(step, moving, self.carried, self.of_round, self.sums, self.rows, fixed)
 
     @functools.cached_property
     def tangent(self) -> "Repetition":
@@ -63,7 +64,8 @@ class Repetition:
             found, moved = jax.jvp(lambda x, carry: self.step(x, carry, still, row), (x, carry), (dx, dcarry))
             return [[*a, *b] for a, b in zip(found, moved, strict=True)]
 
-        return Repetition(step, 2 * self.inputs, 2 * self.carried, self.fixed, 2 * self.of_round, 2 * self.sums)
+        doubled = 2 * self.inputs, 2 * self.carried, 2 * self.of_round, 2 * self.sums
+        return Repetition(step, *doubled, self.rows, self.fixed)
 
     def _one(self, x, carry, still, row, there):
         """A round; none where it is not `there`."""
@@ -123,24 +125,22 @@ def _split(arrays, *sizes: int) -> list[list]:
     return [list(arrays[a:b]) for a, b in itertools.pairwise(ends)]
 
 
-# ---- primitives: (*x, *first carry, *still, *rows, count, *what they are linear in) ----------------------------------
+# ---- primitives: (*x, *first carry, *still, *rows, count, *what follows) ---------------------------------------------
 
 
-def _parts(given, of: Repetition, linear: int = 0) -> list:
-    """x, the first carry, what is still, the rows, (count,), and what is linear."""
-    x, first, still, rest = _split(given, of.inputs, of.carried, of.fixed)
-    rows, (count, *along) = _split(rest, len(rest) - 1 - linear)
+def _parts(given, of: Repetition) -> list:
+    """x, the first carry, what is still, the rows, the count, and what follows."""
+    x, first, still, rows, (count, *along) = _split(given, of.inputs, of.carried, of.fixed, of.rows)
     return [x, first, still, rows, count, along]
 
 
-def _run(*given, function, of: Repetition, axes: tuple, linear: int = 0):
+def _run(*given, function, of: Repetition, axes: tuple, **_):
     """`function` of all members, in front of which some arrays have these axes."""
-    x, first, still, rows, count, along = _parts(given, of, linear)
-    call = functools.partial(function, of, jnp.max(count))
-    for in_front in axes:
-        x_in, first_in, still_in, rows_in, count_in, along_in = _parts(in_front, of, linear)
-        call = jax.vmap(call, in_axes=(x_in, first_in, still_in, rows_in, count_in, along_in))
-    return call(x, first, still, rows, count, along)
+    parts = _parts(given, of)
+    call = functools.partial(function, of, jnp.max(parts[-2]))
+    for of_level in axes:
+        call = jax.vmap(call, in_axes=tuple(_parts(of_level, of)))
+    return call(*parts)
 
 
 def _value(of, most, x, first, still, rows, count, _):
@@ -148,12 +148,30 @@ def _value(of, most, x, first, still, rows, count, _):
 
 
 def _forward(of, most, x, first, still, rows, count, along):
-    dx, dfirst = along[: of.inputs], along[of.inputs :]
+    dx, dfirst = _split(along, of.inputs)
     return _later_halves(of.tangent.run(most, [*x, *dx], [*first, *dfirst], still, rows, count), of.tangent)
 
 
 def _back(of, most, x, first, still, rows, count, cotangents):
     return of.go_back(most, x, first, still, rows, count, cotangents)
+
+
+def _turn(of, most, x, first, still, rows, count, along):
+    cts, dx, dfirst, dcts = _split(along, of.results, of.inputs, of.carried)
+    doubled = _interleave(of, dcts, cts)
+    found = of.tangent.go_back(most, [*x, *dx], [*first, *dfirst], still, rows, count, doubled)
+    return _first_halves(found, of)
+
+
+def _interleave(of: Repetition, first, second) -> list:
+    """Results of a repetition of R′ from those for R and those for the tangents."""
+    parts = zip(of.split_results(first), of.split_results(second), strict=True)
+    return [a for both in parts for some in both for a in some]
+
+
+def _first_halves(found, of: Repetition) -> list:
+    x, first = _split(found, 2 * of.inputs)
+    return [*_halves(x)[0], *_halves(first)[0]]
 
 
 def _later_halves(found, of: Repetition) -> list:
@@ -164,9 +182,9 @@ def _vary_value(primals, tangents, _, *, of: Repetition, axes: tuple):
     varies = tuple(not is_zero(t) for t in tangents[: of.inputs])
 
     def sort(given):
-        x, first, *rest, count, _ = _parts(given, of)
+        x, first, still, rows, count, _ = _parts(given, of)
         others = itertools.compress(x, (not here for here in varies))
-        return [*itertools.compress(x, varies), *first, *others, *itertools.chain(*rest), count]
+        return [*itertools.compress(x, varies), *first, *others, *still, *rows, count]
 
     def along(given):
         return [*itertools.compress(given, varies), *given[of.inputs : of.inputs + of.carried]]
@@ -177,13 +195,13 @@ def _vary_value(primals, tangents, _, *, of: Repetition, axes: tuple):
 
 
 def _vary_forward(primals, tangents, *, of: Repetition, axes: tuple, linear: int):
-    """J(x) v along (dx, dv): what belongs to v in the derivative of R′, of (x, v), along these."""
+    """J(x) v along (dx, dv): what belongs to v in the derivative of R′ at (x, v), along these."""
 
     def double(given, moved):
-        x, first, *rest, count, along = _parts(given, of, linear)
-        dx, dfirst, *_, more = _parts(moved, of, linear)
-        (vx, vfirst), (dvx, dvfirst) = _split(along, of.inputs), _split(more, of.inputs)
-        return [*x, *vx, *first, *vfirst, *itertools.chain(*rest), count, *dx, *dvx, *dfirst, *dvfirst]
+        x, first, still, rows, count, v = _parts(given, of)
+        dx, dfirst, _, _, _, dv = _parts(moved, of)
+        (vx, vfirst), (dvx, dvfirst) = _split(v, of.inputs), _split(dv, of.inputs)
+        return [*x, *vx, *first, *vfirst, *still, *rows, count, *dx, *dvx, *dfirst, *dvfirst]
 
     axes = tuple(tuple(double(of_level, of_level)) for of_level in axes)
     found = forward_p.bind(*double(primals, tangents), of=of.tangent, axes=axes, linear=2 * linear)
@@ -191,34 +209,50 @@ def _vary_forward(primals, tangents, *, of: Repetition, axes: tuple, linear: int
 
 
 def _vary_back(primals, tangents, *, of: Repetition, axes: tuple, linear: int):
-    """J(x)ᵀ w along (dx, dw): what belongs to x in the transposed derivative of R′ at (x, dx), of (dw, w)."""
+    def extend(given, moved):
+        dx, dfirst, _, _, _, dcts = _parts(moved, of)
+        return [*given, *dx, *dfirst, *dcts]
+
+    axes = tuple(tuple(extend(of_level, of_level)) for of_level in axes)
+    size = of.inputs + of.carried + of.results
+    return turn_p.bind(*extend(primals, tangents), of=of, axes=axes, linear=size)
+
+
+def _vary_turn(primals, tangents, *, of: Repetition, axes: tuple, linear: int):
+    """It along all at once: what belongs to x in `turn` of R′ at (x, dx) and (dw, w), along what these vary."""
 
     def double(given, moved):
-        x, first, *rest, count, cts = _parts(given, of, linear)
-        dx, dfirst, *_, dcts = _parts(moved, of, linear)
-        parts = zip(of.split_results(dcts), of.split_results(cts), strict=True)
-        doubled = itertools.chain(*(itertools.chain(*part) for part in parts))
-        return [*x, *dx, *first, *dfirst, *itertools.chain(*rest), count, *doubled]
+        x, first, still, rows, count, along = _parts(given, of)
+        parts = [_split(some, of.results, of.inputs, of.carried) for some in (along, _parts(moved, of)[-1])]
+        (cts, dx, dfirst, dcts), (ects, edx, edfirst, edcts) = parts
+        ex, efirst, *_ = _parts(moved, of)
+        at = [*x, *dx, *first, *dfirst, *still, *rows, count, *_interleave(of, dcts, cts)]
+        return [*at, *ex, *edx, *efirst, *edfirst, *_interleave(of, edcts, ects)]
 
     axes = tuple(tuple(double(of_level, of_level)) for of_level in axes)
-    found = back_p.bind(*double(primals, tangents), of=of.tangent, axes=axes, linear=2 * linear)
-    x, first = _split(found, 2 * of.inputs)
-    return [*_halves(x)[0], *_halves(first)[0]]
+    found = turn_p.bind(*double(primals, tangents), of=of.tangent, axes=axes, linear=2 * linear)
+    return _first_halves(found, of)
 
 
 class _Loops(LinearMap):
     """A loop; of each axis of a batch, the first one innermost, `axes` says which arrays have it."""
 
-    def __init__(self, name: str, shapes: Callable, function: Callable, vary: Callable, transposed: str = ""):
-        of_linear = (lambda linear, **_: linear) if transposed else 0
-        pull = functools.partial(_pull, transposed) if transposed else None
-        run = functools.partial(_run, function=function)
+    def __init__(self, name: str, shapes: Callable, function: Callable, vary: Callable, pull: Callable | None = None):
+        def transpose(known, cotangents, moving, *, axes: tuple, linear: int, of: Repetition):
+            """The cotangents, summed over those axes that what moves does not have."""
+            assert pull is not None
+            size = len(known)
+            known_axes = [(*of_level[:size], *[0] * len(cotangents)) for of_level in axes]
+            found = pull([*known, *cotangents], of, known_axes)
+            absent = zip(*(of_level[size:] for of_level in reversed(axes)), strict=True) if axes else [()] * linear
+            return [x.sum([i for i, axis in enumerate(a) if axis is None]) for x, a in zip(found, absent, strict=True)]
 
         def shape(*given, **settings):
             batch, given = _without_batch(given, settings["axes"])
-            return [ShapedArray((*batch, *shape), np.dtype(float)) for shape in shapes(given, **settings)]
+            return [ShapedArray((*batch, *shape), np.dtype(float)) for shape in shapes(given, settings["of"])]
 
-        super().__init__(f"lagjax_repetition_{name}", shape, vary, of_linear, pull)
+        linear, run = (lambda linear, **_: linear) if pull else 0, functools.partial(_run, function=function)
+        super().__init__(f"lagjax_repetition_{name}", shape, vary, linear, transpose if pull else None)
         self.vary = vary
         self.def_impl(lambda *given, **settings: jax.jit(functools.partial(run, **settings))(*given))
         mlir.register_lowering(self, mlir.lower_fun(run, multiple_results=True))
@@ -245,25 +279,36 @@ def _without_batch(given, axes: tuple) -> tuple[tuple[int, ...], list[tuple[int,
     return tuple(batch), shapes
 
 
-def _shapes(given, *, of: Repetition, axes: tuple, linear: int = 0) -> list:
-    _, first, _, rows, *_ = _parts(given, of, linear)
+def _shapes(given, of: Repetition) -> list:
+    _, first, _, rows, *_ = _parts(given, of)
     return [*first, *((rows[0][0], *shape) for shape in of.of_round), *of.sums]
 
 
-def _back_shapes(given, *, of: Repetition, axes: tuple, linear: int) -> list:
+def _back_shapes(given, of: Repetition) -> list:
     return given[: of.inputs + of.carried]
 
 
-def _pull(transposed: str, known, cotangents, moving, *, axes: tuple, linear: int, **settings):
-    """The other loop, whose results are summed over those axes that what moves does not have."""
-    primitive = back_p if transposed == "back" else forward_p
-    size = len(axes) and len(axes[0]) - linear
-    of_others = tuple((*of_level[:size], *[0] * len(cotangents)) for of_level in axes)
-    found = primitive.bind(*known, *cotangents, axes=of_others, linear=len(cotangents), **settings)
-    absent = zip(*(of_level[size:] for of_level in reversed(axes)), strict=True) if axes else [()] * linear
-    return [x.sum([i for i, axis in enumerate(of) if axis is None]) for x, of in zip(found, absent, strict=True)]
+def _pull_forward(given, of: Repetition, axes):
+    return back_p.bind(*given, of=of, axes=tuple(axes), linear=of.results)
+
+
+def _pull_back(given, of: Repetition, axes):
+    return forward_p.bind(*given, of=of, axes=tuple(axes), linear=of.inputs + of.carried)
+
+
+def _pull_turn(given, of: Repetition, axes):
+    """It is symmetric in dx; and J(x)ᵀ dw is transposed to J(x)."""
+    size = of.inputs + of.carried
+    known, cts, moved = _split(given, size + of.fixed + of.rows + 1, of.results)
+    still = list(map(jnp.zeros_like, cts))
+    count = len(known) + of.results
+    wide = tuple((*of_level, *of_level[len(known) : count]) for of_level in axes)
+    of_x = turn_p.bind(*given, *still, of=of, axes=wide, linear=size + of.results)
+    narrow = [(*of_level[: len(known)], *of_level[count:]) for of_level in axes]
+    return [*of_x, *_pull_back([*known, *moved], of, narrow)]
 
 
 value_p = _Loops("value", _shapes, _value, _vary_value)
-forward_p = _Loops("forward", _shapes, _forward, _vary_forward, "back")
-back_p = _Loops("back", _back_shapes, _back, _vary_back, "forward")
+forward_p = _Loops("forward", _shapes, _forward, _vary_forward, _pull_forward)
+back_p = _Loops("back", _back_shapes, _back, _vary_back, _pull_back)
+turn_p = _Loops("turn", _back_shapes, _turn, _vary_turn, _pull_turn)

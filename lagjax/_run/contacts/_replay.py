@@ -80,8 +80,9 @@ class Replay:
         start = found.ending[-y0.size - 1 :]
         y = y0 + jax.lax.stop_gradient(start[:-1] - y0)
         t = ts[0] + jax.lax.stop_gradient(start[-1] - ts[0])
-        path = jnp.where((ts <= start[-1])[:, None], y, 0.0)
         count = jnp.sum(self._read(found.record).ran > 0)
+        before = (ts <= start[-1]) & ((start[-1] > ts[0]) | (count == 0))  # an output at the start is the first round's
+        path = jnp.where(before[:, None], y, 0.0)
         (t, y), (said, behind), (more,) = self._rounds(given, (t, y), (found.record,), count)
         at, before, t_impact, impulse, lost = jnp.split(said, self._ends[1:5] - 1, axis=1)
         return path + more, at[:, 0], before, behind, t_impact[:, 0], impulse, lost[:, 0], t, y
@@ -98,7 +99,7 @@ class Replay:
     @functools.cached_property
     def _rounds(self) -> Repetition:
         states = 2 * self._sizes["N"]
-        return Repetition(self._play, 5, 2, 0, ((int(self._ends[5]) - 1,), (states,)), ((self._sizes["TIMES"], states),))
+        return Repetition(self._play, 5, 2, ((int(self._ends[5]) - 1,), (states,)), ((self._sizes["TIMES"], states),))
 
     def _play(self, given, carry, _, rows):
         ts, y0, vector, restitution, friction = given
