@@ -35,12 +35,13 @@ class Repetition:
         self.step, self.inputs, self.carried, self.of_round, self.sums = step, inputs, carried, of_round, sums
         self.rows, self.fixed, self.results = rows, fixed, carried + len(of_round) + len(sums)
 
-    def __call__(self, x: tuple, first: tuple, rows: tuple, count) -> tuple[list, list, list]:
+    def __call__(self, x: tuple, first: tuple, rows: tuple, count) -> list[list]:
         """The last carry, what was written down (N, …), and the sums, of the first `count` of the rows (N, …)."""
         found = value_p.bind(*x, *first, *rows, count, of=self, axes=())
         return self.split_results(found)
 
-    def split_results(self, found) -> tuple[list, list, list]:
+    def split_results(self, found) -> list[list]:
+        """The last carry, what was written down, and the sums."""
         return _split(found, self.carried, len(self.of_round))
 
     @functools.lru_cache(maxsize=16)  # noqa: B019  # those of a few
@@ -115,8 +116,8 @@ def _put(array, x, i):
     return jax.lax.dynamic_update_index_in_dim(array, x, i, 0)
 
 
-def _halves(arrays) -> tuple[list, list]:
-    return tuple(_split(arrays, len(arrays) // 2))
+def _halves(arrays) -> list[list]:
+    return _split(arrays, len(arrays) // 2)
 
 
 def _split(arrays, *sizes: int) -> list[list]:

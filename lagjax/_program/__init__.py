@@ -70,7 +70,14 @@ from lagjax._program._series import LinearSystem, series
 from lagjax._program._sliding import MOST_COUPLED, eliminate, sparse_row, substitute
 from lagjax._program.lowering import _complex
 from lagjax._program.lowering._matrices import orthogonalize, row_weights, solve_orthogonalized
-from lagjax._program.lowering._rules import LARGEST_UNFOLDED, Expansion, expand_primitive, has_own_rules, inputs_of, lowers
+from lagjax._program.lowering._rules import (
+    LARGEST_UNFOLDED,
+    Expansion,
+    expand_primitive,
+    has_own_rules,
+    inputs_of,
+    lowers,
+)
 
 
 def lower(function: Callable, *examples, budget: int = 20_000, moving: int = 0) -> "Program":

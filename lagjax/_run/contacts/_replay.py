@@ -40,7 +40,7 @@ def read_rows(record, fields: dict[str, int], names: tuple[str, ...] = RECORD) -
     """The fields of rows (…, doubles) by their names in small letters, those of one double without an axis."""
     ends = np.cumsum([fields[name] for name in names])
     parts = [record[..., end - fields[name] : end] for name, end in zip(names, ends, strict=True)]
-    of = collections.namedtuple("Rows", [name.lower() for name in names])  # noqa: PYI024
+    of = collections.namedtuple("Rows", [name.lower() for name in names])
     return of(*(x if name in _VECTORS else x[..., 0] for name, x in zip(names, parts, strict=True)))
 
 
@@ -70,7 +70,11 @@ class Replay:
     """
 
     def __init__(self, code: SceneCode, make_flow: Callable):
-        self._make_flow, self._watches, self._tolerances = functools.cache(make_flow), code.surfaces["HELD"], code.tolerances
+        self._make_flow, self._watches, self._tolerances = (
+            functools.cache(make_flow),
+            code.surfaces["HELD"],
+            code.tolerances,
+        )
         self._code, self._lines, self._sizes, self._rough = code, code.lines, code.sizes, code.arrays["ROUGH"]
 
     def __call__(self, ts, y0, vector, restitution, friction) -> tuple:
@@ -143,8 +147,11 @@ class Replay:
         return None if program.looks_up else Line(program.line, program.size, program.size, sum(map(math.prod, fixed)))
 
     def _end_in_parts(self, record, *given):
-        """Whether it varies smoothly; the time, the velocities, and of an impact its time, impulses and the energy lost;
-        the state and the time behind; and what contacts of one instant share (k + r d,)."""
+        """What the end of a stretch does, all numbers side by side.
+
+        Whether it varies smoothly; time and velocities; of an impact its time, impulses and the energy lost; the state
+        and the time behind; and what contacts of one instant share (k + r d,).
+        """
         *given, t, y, v0, restitution, friction = given
         row, k = self._read(record), self._sizes["K"]
         crosses, decides, stays = row.crosses > 0, row.decides > 0, (row.happens > 0) & (row.crosses == 0)
@@ -191,7 +198,7 @@ class Replay:
 
     def _time_left(self, t, y, bounced, ends, vector, restitution):
         """The time that bounces still take which end at once, by `_search.end_bounces`."""
-        x, k = self._opened(t, y, vector), self._sizes["K"]
+        x = self._opened(t, y, vector)
         along = jnp.concatenate([halves(y)[1], self._lines["ACCELERATION"](x), jnp.ones(1)])
         bends, later = jnp.split(self._lines["BENDS"](jnp.concatenate([x, along, jnp.zeros(x.size - along.size)])), 2)
         b, rest = jnp.where(ends, -bends, 1.0), jnp.where(ends, 1.0 - restitution, 1.0)
