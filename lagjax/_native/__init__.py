@@ -30,6 +30,7 @@ one Taylor series, of the order that the tolerance asks for.
     _kernel              motions and derivatives as functions of arrays;  _threads: on several cores, interruptible
     _handler             the motion as a call of XLA;  _derivative_handler: derivatives of short motions
     _line_handler        any straight line as a call of XLA
+    _loops               loops and decisions over numbers, written in Python, as machine code
     _gpu                 the modules of one lane as programs for NVIDIA GPUs;  _gpu_entry: what a thread of these does
 
 Nothing here knows JAX: arrays are NumPy's, and a program is data (`_program._series.Recurrent`).

@@ -283,7 +283,7 @@ class _Writer:
         return self.code.as_value(x, INTEGER if isinstance(x, int) else DOUBLE)
 
     def value(self, node) -> tuple[str, Value]:
-        return getattr(self, "of_" + type(node).__name__)(node)
+        return getattr(self, "read_" + type(node).__name__)(node)
 
     def condition(self, node) -> Value:
         kind, value = self.value(node)
@@ -308,13 +308,13 @@ class _Writer:
         kind = "float" if any(kind == "float" for kind, _ in found) else found[0][0]
         return kind, [self.convert(node, *x, kind) for x in found]
 
-    def of_Constant(self, node: ast.Constant):
+    def read_Constant(self, node: ast.Constant):
         x: Any = node.value
         if isinstance(x, bool):
             return "bool", Value(self.code, ir.Constant(BIT, x))
         return type(x).__name__, self.number(x)
 
-    def of_Name(self, node: ast.Name):
+    def read_Name(self, node: ast.Name):
         if node.id in self.variables:
             kind, place = self.variables[node.id]
             return kind, Value(self.code, self.builder.load(place.it, typ=_KINDS.get(kind, POINTER)))
@@ -322,7 +322,7 @@ class _Writer:
             raise self.fail(node, "it has no value yet")
         return self.constant(self.of.names[node.id])
 
-    def of_Attribute(self, node: ast.Attribute):
+    def read_Attribute(self, node: ast.Attribute):
         kind, address = self.field(node)
         is_scalar = kind in ("int", "float")
         return kind, self.code.load(address, _KINDS[kind]) if is_scalar else address
@@ -353,7 +353,7 @@ class _Writer:
             raise self.fail(node, "an index is an integer")
         return element, self.code.element(base, index[1], _KINDS[element])
 
-    def of_Subscript(self, node: ast.Subscript):
+    def read_Subscript(self, node: ast.Subscript):
         if isinstance(node.slice, ast.Slice):
             assert node.slice.lower is not None and node.slice.upper is None
             kind, base = self.value(node.value)
@@ -362,7 +362,7 @@ class _Writer:
         kind, address = self.element(node)
         return kind, self.code.load(address, _KINDS[kind])
 
-    def of_BinOp(self, node: ast.BinOp):
+    def read_BinOp(self, node: ast.BinOp):
         kind, (a, b) = self.same_kind(node, self.value(node.left), self.value(node.right))
         if isinstance(node.op, ast.Pow):
             assert isinstance(node.right, ast.Constant) and node.right.value == 2
@@ -371,20 +371,20 @@ class _Writer:
             kind, a, b = "float", self.convert(node, kind, a, "float"), self.convert(node, kind, b, "float")
         return kind, self.code.arithmetic(_OPERATORS[type(node.op)], a, b)
 
-    def of_UnaryOp(self, node: ast.UnaryOp):
+    def read_UnaryOp(self, node: ast.UnaryOp):
         if isinstance(node.op, ast.Not):
             return "bool", ~self.condition(node.operand)
         kind, x = self.value(node.operand)
         return kind, -x if kind == "float" else 0 - x
 
-    def of_Compare(self, node: ast.Compare):
+    def read_Compare(self, node: ast.Compare):
         found, bits = [self.value(x) for x in (node.left, *node.comparators)], []
         for op, a, b in zip(node.ops, found, found[1:], strict=False):
             _, (x, y) = self.same_kind(node, a, b)
             bits.append(self.code.compare(_COMPARISONS[type(op)], x, y))
         return "bool", functools.reduce(Value.__and__, bits)
 
-    def of_BoolOp(self, node: ast.BoolOp):
+    def read_BoolOp(self, node: ast.BoolOp):
         """What comes behind is evaluated only where it matters."""
         result = self.code.variable(self.condition(node.values[0]))
         for x in node.values[1:]:
@@ -393,11 +393,11 @@ class _Writer:
                 result.value = self.condition(x)
         return "bool", result.value
 
-    def of_IfExp(self, node: ast.IfExp):
+    def read_IfExp(self, node: ast.IfExp):
         kind, (a, b) = self.same_kind(node, self.value(node.body), self.value(node.orelse))
         return kind, self.code.select(self.condition(node.test), a, b)
 
-    def of_Call(self, node: ast.Call):
+    def read_Call(self, node: ast.Call):
         assert isinstance(node.func, ast.Name)
         name = node.func.id
         given = [self.value(x) for x in node.args]

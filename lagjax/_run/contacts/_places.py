@@ -1,4 +1,4 @@
-"""The places of what the search for contacts reads and writes (`_search`): in its scene, a member's memory, a record.
+"""The places of what the search for contacts reads and writes (`_contact_search`): in its scene, a member's memory, a record.
 
 A scene is a row of integers: first those that are named here, then arrays. Of memories and records it holds at which
 double each field begins.
@@ -54,7 +54,7 @@ MEMORY = (
     "CAME",  # (sections,), the sides from which the motion comes
     "SLIP",  # (r,), the largest so far
     "LARGEST",  # (2n,), the largest numbers of the state so far
-    "GUARDS", "KINDS", "STAYS",  # of the stretch: the watches where it begins, (5, G), of which kind, what does not cross
+    "GUARDS", "KINDS", "STAYS",  # of the stretch: the watches where it begins (5, G), their kinds, what does not cross
     "MISSED", "TURNS", "LONGEST", "RESULT", "ROUNDS", "ROWS", "ACCEPTED", "REJECTED",
     "DOUBTS", "DOUBTED",  # (3,), as in `ContactChanges`
 )  # fmt: skip

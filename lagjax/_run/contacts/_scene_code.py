@@ -1,6 +1,6 @@
 """A scene with contacts as the search takes it: machine code by address, sizes, and the places of numbers; its runs.
 
-SceneCode.search(ts, y0, numbers, e, μ) ─► search_p ─► rows of NumPy ─► `_search.follow` ─► Found
+SceneCode.search(ts, y0, numbers, e, μ) ─► search_p ─► rows of NumPy ─► `_contact_search.follow` ─► Found
                                                           └─ a stretch that the kernel gives up: `Flow.run`
 """
 
@@ -19,9 +19,9 @@ from lagjax._engine.taylor import Line, call_host, line_of, rate_errors
 from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL
 from lagjax._native import SINGLE_NOISE, LineCode, compile_loops, cores, handler, make_once
 from lagjax._primitives import LinearMap, compute_on_host
-from lagjax._run.contacts import _search
+from lagjax._run.contacts import _contact_search
+from lagjax._run.contacts._contact_search import ASKS, GOING, NEW
 from lagjax._run.contacts._places import ARRAYS, MEMORY, NAMES, RECORD, SAID, WORK, at
-from lagjax._run.contacts._search import ASKS, GOING, NEW
 
 _TOGETHER = 256  # members that one call follows side by side: what it remembers of them fits into a processor's cache
 _ROOM = 32  # rows of a record, at first
@@ -221,8 +221,8 @@ class _Loops(NamedTuple):
 
 @make_once
 def _loops() -> _Loops:
-    entries = _search.follow, _search.prepare, _search.finish
-    return _Loops(*compile_loops(*entries))
+    search = _contact_search
+    return _Loops(*compile_loops(search.follow, search.prepare, search.finish))
 
 
 # ---- as a primitive --------------------------------------------------------------------------------------------------
