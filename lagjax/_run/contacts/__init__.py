@@ -53,7 +53,7 @@ def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int | Non
     """The motions of a batch whose system has contacts."""
     plan, _ = _plan(batch.member, max_transitions)
     if batch.is_known:
-        found = _follow_known(plan, batch.member, batch.y0, batch.vectors)
+        found = jax.device_put(_follow_known(plan, batch.member, batch.y0, batch.vectors))
     else:
         found = batch.map_members(lambda problem: follow_in_doubles(functools.partial(contact_motion, plan), problem))
     return _trajectory(given.member, batch.member, *found, params, params_axes)
@@ -63,7 +63,7 @@ def _motion(plan: ContactPlan, problem: Problem) -> tuple[ContactEnding, RoundRe
     if not problem.is_known:
         return follow_in_doubles(functools.partial(contact_motion, plan), problem)
     found = _follow_known(plan, problem, np.asarray(problem.y0)[None], np.asarray(problem.vector)[None])
-    return jax.tree.map(lambda x: x[0], found)
+    return jax.device_put(jax.tree.map(lambda x: np.asarray(x)[0], found))
 
 
 def _follow_known(plan: ContactPlan, member: Problem, y0, vectors) -> tuple[ContactEnding, RoundRecord, tuple]:

@@ -1002,8 +1002,8 @@ def count_doubts(scene: Scene, member: Member, hits: bool, leaves_rest: bool, ro
     k, r, d, n = scene.k, scene.r, scene.d, scene.n
     total, terms, shares, starts = 0.0, 0.0, False, leaves_rest
     for i in range(k + r * d):
-        part = room.impulses[i] * (room.rates[i] + room.apart[i])
-        total, terms = total + part, terms + abs(part)
+        total += room.impulses[i] * (room.rates[i] + room.apart[i])
+        terms += abs(room.impulses[i]) * (abs(room.rates[i]) + abs(room.apart[i]))
     for i in range(k):
         shares = shares or row.shares[i] > 0
     for c in range(r):
