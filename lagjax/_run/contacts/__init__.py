@@ -1,7 +1,7 @@
 """Motions with contacts: gaps and velocities that stay ≥ 0, impacts, rest and friction.
 
     System(contacts=…) ─► ContactPlan ─► _contact_motion ─► ContactEnding, RoundRecord ─► Trajectory
-                                          ├─ _contact_search: what happens, in loops over numbers; _places: of what where
+                                          ├─ _contact_search: what happens, by loops over numbers, which _places names
                                           │    ├─ _law: which contacts push, stick and slide in an impact
                                           │    └─ _scene_code: a scene as the search takes it, and its runs
                                           ├─ _replay: the same with derivatives;  _impact_law: those of impulses
@@ -12,7 +12,6 @@ Source: Moreau, *Unilateral contact and dry friction* (1988); Brogliato, *Nonsmo
 
 import dataclasses
 import functools
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -56,7 +55,8 @@ def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int | Non
         found = jax.device_put(_follow_known(plan, batch.member, batch.y0, batch.vectors))
     else:
         found = batch.map_members(lambda problem: follow_in_doubles(functools.partial(contact_motion, plan), problem))
-    return _trajectory(given.member, batch.member, *found, params, params_axes)
+    ending, record, impacts = found
+    return _trajectory(given.member, batch.member, ending, record, impacts, params, params_axes)
 
 
 def _motion(plan: ContactPlan, problem: Problem) -> tuple[ContactEnding, RoundRecord, tuple]:

@@ -95,7 +95,9 @@ class SearchedScene(NamedTuple):
 
 
 @compile_for_one_call
-def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) -> tuple[ContactEnding, RoundRecord, tuple]:
+def contact_motion(
+    plan: ContactPlan, layout: Layout, ts, y0, params: PyTree
+) -> tuple[ContactEnding, RoundRecord, tuple]:
     """The motion from y0 (2n,) at ts[0], its changes, of which there may be `max_transitions`, and its impacts.
 
     Those are their times, the normal impulses, the energy that was lost, and their count.
@@ -110,8 +112,9 @@ def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) ->
         coefficients = scene.split_coefficients(line_of(scene.coefficients)(vector))
     else:
         coefficients = map(jnp.asarray, scene.split_coefficients(scene.coefficients))
-    given = ts, y0, vector, *coefficients
-    found = scene.code.search(*map(still, given))
+    restitution, friction = coefficients
+    given = ts, y0, vector, restitution, friction
+    found = scene.code.search(*still(given))
     row, played = _read(scene, found)
     played = Played(*attach_derivative(scene.replay, tuple(played), *given))
     return _arrange(scene, found, row, played, given[:3])
@@ -133,8 +136,9 @@ def follow_known(plan: ContactPlan, layout: Layout, params: PyTree, ts, y0, vect
     else:
         values = scene.split_coefficients(scene.coefficients)
         coefficients = [np.broadcast_to(x, (members, x.size)) for x in values]
-    found = scene.code.run(np.asarray(ts, float)[None], np.asarray(y0, float), vectors, *coefficients, None)
-    return _arrange(scene, found, *_read(scene, found), ())
+    found = scene.code.run(np.asarray(ts, float)[None], np.asarray(y0, float), vectors, *coefficients, room=None)
+    row, played = _read(scene, found)
+    return _arrange(scene, found, row, played, ())
 
 
 def _coefficients_at(flat: Flat, params: PyTree, vector) -> list[np.ndarray]:
@@ -154,7 +158,7 @@ def _read(scene: SearchedScene, found: Found) -> tuple[Any, Played]:
 
 def _arrange(scene: SearchedScene, found: Found, row, played: Played, inputs: tuple) -> tuple:
     """The ending, the changes, and the impacts in front; of what varies with `inputs`, if it is traced."""
-    library = jnp if inputs else np
+    library: Any = jnp if inputs else np
 
     def lost(there, x):
         there = there[(..., *[None] * (x.ndim - there.ndim))]
@@ -264,7 +268,7 @@ def _flat_of(derivation: Derivation, scene: ContactScene, structure, code: tuple
 
 
 def opened(flat: Flat) -> Contacts:
-    """What contacts do that are all open."""
+    """Contacts that are all open."""
     r, d = flat.rough.size, flat.shapes.directions
     return Contacts(jnp.zeros(flat.shapes.count), jnp.ones(r), jnp.ones((r, d)), jnp.zeros(()))
 

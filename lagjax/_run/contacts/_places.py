@@ -1,10 +1,11 @@
-"""The places of what the search for contacts reads and writes (`_contact_search`): in its scene, a member's memory, a record.
+"""The places of what the search for contacts reads and writes: in its scene, a member's memory, a row of a record.
 
 A scene is a row of integers: first those that are named here, then arrays. Of memories and records it holds at which
 double each field begins.
 """
 
 from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 from lagjax._native import Struct
 
@@ -113,6 +114,9 @@ def _struct(names: tuple[str, ...], scalars: tuple[str, ...] = _SCALARS, prefix:
     return Struct(places, frozenset(name.lower() for name in names if name in scalars), table)
 
 
-Scene = _struct((*SIZES, *CODES, *ARRAYS), (*SIZES, *CODES), table=None)
-Member, Entry = _struct(MEMORY), _struct(RECORD, prefix="TO_")
-Room = _struct(WORK, ("LATER",))
+if TYPE_CHECKING:  # whose fields are known at run time
+    Scene = Member = Entry = Room = Any
+else:
+    Scene = _struct((*SIZES, *CODES, *ARRAYS), (*SIZES, *CODES), table=None)
+    Member, Entry = _struct(MEMORY), _struct(RECORD, prefix="TO_")
+    Room = _struct(WORK, ("LATER",))
