@@ -55,7 +55,7 @@ from lagjax._native._constants import (
     STEP_TOO_SMALL,
 )
 from lagjax._native._derivative_handler import derivative_handler
-from lagjax._native._guards import Guards, Released, append_guards
+from lagjax._native._guards import Guards, append_guards
 from lagjax._native._handler import Plan, handler, make_once, unavailable
 from lagjax._native._ir import lanes
 from lagjax._native._kernel import Begun, Kernel, StepRecord, cores, floor_of

@@ -245,7 +245,7 @@ def _make_scene(
         "MULTIPLIERS_COUNT": len(derivation.multipliers.line.outputs),
     }  # fmt: skip
     touch = np.zeros((0, k)) if corners is None else corners.touch
-    arrays = dict(zip(ARRAYS, (flat.rough, places.normal, places.tangential, touch), strict=True))
+    arrays = dict(zip(ARRAYS, (flat.rough, places.tangential, touch), strict=True))
     multipliers = functools.cache(lambda: line_of(derivation.multipliers))
     searched = SceneCode(sizes, arrays, flows, surfaces, lines, multipliers, tolerances)
     flow = functools.cache(functools.partial(make_flow, derivation, scene.path, None))

@@ -37,7 +37,7 @@ CODES = (
 )  # fmt: skip
 ARRAYS = (
     "ROUGH",  # (r,), the contacts with friction
-    "NORMAL", "TANGENTIAL",  # (k,), (r d,), their rows among all multipliers
+    "TANGENTIAL",  # (r d,), the rows of slips among all multipliers
     "TOUCH",  # (corners, k), which corner touches which contact
 )  # fmt: skip
 MEMORY = (
@@ -60,7 +60,7 @@ MEMORY = (
     "DOUBTS", "DOUBTED",  # (3,), as in `ContactChanges`
 )  # fmt: skip
 WORK = (
-    "GRADIENTS", "RESPONSES", "COUPLING", "VALUES", "RATES", "BENDS",  # the rows of contacts, as `ImpactRows`
+    "GRADIENTS", "RESPONSES", "COUPLING", "VALUES", "RATES", "BEND",  # the rows of contacts, as `ImpactRows`
     "WATCHED",  # (5, G), the watches of open contacts
     "TOUCHES", "PARTING", "NOISE",  # (k,) each: which touch, how fast they move apart, and the rounding of that
     "INVOLVED",  # (k,), which take part in an impact
@@ -101,6 +101,7 @@ RECORD = (
 
 NAMES = (*SIZES, *CODES, *ARRAYS, *MEMORY, *WORK, *(f"TO_{name}" for name in RECORD))
 _PLACES = {name: i for i, name in enumerate(NAMES)}
+assert len(_PLACES) == len(NAMES), "two fields of one name"
 at = SimpleNamespace(**_PLACES)
 _SCALARS = (
     "RTOL", "FIRST", "LAST", "MISSED", "TURNS", "LONGEST", "RESULT", "ROUNDS", "ROWS", "ACCEPTED", "REJECTED", "LATER",

@@ -283,7 +283,7 @@ def sizes_of_fields(sizes: dict[str, int]) -> dict[str, int]:
     fields |= dict.fromkeys(per_contact, k) | dict.fromkeys(
         ("MU", "SLIP", "STUCK", "TURNS_BACK", "SLIDES", "STARTS"), r
     )
-    fields |= dict.fromkeys(("VALUES", "RATES", "BENDS", "IMPULSES", "APART", "HELD"), size)
+    fields |= dict.fromkeys(("VALUES", "RATES", "BEND", "IMPULSES", "APART", "HELD"), size)
     fields |= dict.fromkeys(("LARGEST", "SHIFT", "BEHIND", "OFFSET"), 2 * n)
     fields |= dict.fromkeys(("X", "OPENED"), inputs) | dict.fromkeys(("DOUBTS", "DOUBTED"), 3)
     fields |= dict.fromkeys(("FRESH", "KINDS", "STAYS", "FELL"), watches)
