@@ -51,6 +51,7 @@ class Struct:
 
 _KINDS = {"float": DOUBLE, "int": INTEGER, "Floats": POINTER, "Wholes": POINTER, "bool": BIT}
 _ELEMENTS = {"Floats": "float", "Wholes": "int"}
+_NUMBERS = ("float", "int", "bool")
 _COMPARISONS = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 _OPERATORS = {ast.Add: "add", ast.Sub: "sub", ast.Mult: "mul", ast.FloorDiv: "div", ast.Mod: "srem", ast.Div: "div"}
 _FUNCTIONS = ("abs", "min", "max", "float", "int", "sqrt", "cos", "sin", "atan2", "isfinite", "evaluate",
@@ -110,7 +111,7 @@ def compile_loops(*entries: Loop) -> tuple[Callable, ...]:
     """Loops as functions in machine code, which take numbers and addresses of arrays."""
     names = tuple(entry.name for entry in entries)
     level = LEVELS[0]
-    engine, places = compile_text(lambda: _write_module(entries), names, f"{_digest_sources()} {names}", level)
+    engine, places = compile_text(lambda: _write_module(entries), names, f"{_digest_sources(entries)} {names}", level)
     _engines.append(engine)
     kinds = [[_C_KINDS.get(kind, ctypes.c_void_p) for kind in entry.arguments.values()] for entry in entries]
     results = [_C_KINDS[entry.result] if entry.result else None for entry in entries]
@@ -123,10 +124,10 @@ def compile_loops(*entries: Loop) -> tuple[Callable, ...]:
 _engines: list = []  # which hold the code
 
 
-def _digest_sources() -> str:
-    """A digest of this package's text, in which are all loops and all constants that they know."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+def _digest_sources(entries: tuple[Loop, ...]) -> str:
+    """A digest of the text of this package, and of the files of these: there are all loops, and constants they know."""
+    digest, own = hashlib.sha256(), {Path(inspect.getfile(entry.function)) for entry in entries}
+    for path in sorted({*Path(__file__).parents[1].rglob("*.py"), *own}):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 
@@ -218,10 +219,11 @@ class _Writer:
         self.builder.store(self.convert(None, (kind, value), wanted).it, place.it)
 
     def do_Return(self, node: ast.Return):
-        if node.value is None:
+        if (node.value is None) != (self.of.result is None):
+            raise self.fail(node, f"the result is {self.of.result}")
+        if node.value is None or self.of.result is None:
             self.builder.ret_void()
         else:
-            assert self.of.result is not None
             self.builder.ret(self.convert(node, self.value(node.value), self.of.result).it)
 
     def do_If(self, node: ast.If):
@@ -236,7 +238,7 @@ class _Writer:
         self.builder.position_at_end(behind)
 
     def do_While(self, node: ast.While):
-        self.repeat(lambda: self.condition(node.test), node.body, lambda: None)
+        self.repeat(lambda: self.condition(node.test), lambda: self.statements(node.body), lambda: None)
 
     def do_For(self, node: ast.For):
         of = node.iter
@@ -255,20 +257,24 @@ class _Writer:
         self.builder.store(stop[1].it, last.it)
         load = lambda place: self.code.load(place, INTEGER)  # noqa: E731
 
-        def goes_on():
+        def run():
             self.assign(name, "int", load(counter))
-            return self.code.compare("<" if step > 0 else ">", load(counter), load(last))
+            self.statements(node.body)
 
-        self.repeat(goes_on, node.body, lambda: self.builder.store((load(counter) + step).it, counter.it))
+        self.repeat(
+            lambda: self.code.compare("<" if step > 0 else ">", load(counter), load(last)),
+            run,
+            lambda: self.builder.store((load(counter) + step).it, counter.it),
+        )
 
-    def repeat(self, goes_on: Callable, body, move_on: Callable) -> None:
+    def repeat(self, goes_on: Callable, run: Callable, move_on: Callable) -> None:
         head, inside, latch, behind = (self.code.function.append_basic_block(name) for name in ("", "", "", ""))
         self.builder.branch(head)
         self.builder.position_at_end(head)
         self.builder.cbranch(goes_on().it, inside, behind)
         self.builder.position_at_end(inside)
         self.targets.append((latch, behind))
-        self.statements(body)
+        run()
         self.targets.pop()
         if not self.builder.block.is_terminated:
             self.builder.branch(latch)
@@ -312,6 +318,8 @@ class _Writer:
         raise self.fail(node, f"{kind} is no {wanted}")
 
     def same_kind(self, node, *found: tuple[str, Value]) -> tuple[str, list[Value]]:
+        if any(kind not in _NUMBERS for kind, _ in found):
+            raise self.fail(node, "it is of numbers")
         kind = "float" if any(kind == "float" for kind, _ in found) else found[0][0]
         return kind, [self.convert(node, x, kind) for x in found]
 
@@ -392,8 +400,8 @@ class _Writer:
     def read_Compare(self, node: ast.Compare):
         found, bits = [self.value(x) for x in (node.left, *node.comparators)], []
         for op, a, b in zip(node.ops, found, found[1:], strict=False):
-            if type(op) not in _COMPARISONS or {a[0], b[0]} - {"int", "float", "bool"}:
-                raise self.fail(node, "loops compare numbers")
+            if type(op) not in _COMPARISONS:
+                raise self.fail(node, "there is no such comparison")
             _, (x, y) = self.same_kind(node, a, b)
             bits.append(self.code.compare(_COMPARISONS[type(op)], x, y))
         return "bool", functools.reduce(Value.__and__, bits)
