@@ -19,7 +19,7 @@ import numpy as np
 
 from lagjax._engine.taylor._line_functions import outputs
 from lagjax._equations import OPERATION_BUDGET, Derivation
-from lagjax._native import GUARD_NOISE, INSTANT, SINGLE_NOISE, SMALLEST_STEP, Guards, Released
+from lagjax._native import GUARD_NOISE, INSTANT, SINGLE_NOISE, SMALLEST_STEP, Guards
 from lagjax._primitives import differentiable_where
 from lagjax._program import (
     Program,
@@ -72,14 +72,13 @@ class Surfaces(NamedTuple):
     is_rounded: bool = False
     borders: StraightLine | None = None
     holds: tuple[bool, ...] = ()
-    released: Released | None = None
 
     def guards(self, notes: bool = False, remembers: bool = False) -> Guards:
         """The surfaces as guards of machine code: a change ends the motion or, with `notes`, is written down.
 
         A motion that `remembers` is given the side of each surface from which it comes (see `Guards`).
         """
-        given = notes, remembers, self.is_rounded, self.holds, self.released
+        given = notes, remembers, self.is_rounded, self.holds
         return Guards(self.values, self.complete, self.directions, *given)
 
     @property

@@ -21,10 +21,10 @@ from lagjax._engine.taylor import stretch_variation
 from lagjax._interface import halves
 from lagjax._primitives import differentiable_where, keep_together, start_alike
 from lagjax._run._rounds import run_rounds
+from lagjax._run.contacts._contact_search import POISSON
 from lagjax._run.contacts._impact_law import Held, ImpactRows, construct_impulses, find_impulses, rates_behind
 from lagjax._run.contacts._places import RECORD
 from lagjax._run.contacts._scene_code import SceneCode, sizes_of_fields
-from lagjax._run.contacts._search import POISSON
 
 # By how much the instants of contacts that share an impact may vary apart, for a tangent of length one: rounding.
 TOGETHER = 1e-8

@@ -26,13 +26,11 @@ from math import isfinite, sqrt
 
 from lagjax._interface import RESULTS, SUCCESSFUL, code_of
 from lagjax._native import (
-    CHANGE_BITS,
     EVENT,
     GUARD_NOISE,
     INSTANT,
     SMALLEST_STEP,
     Floats,
-    Wholes,
     evaluate,
     integrate,
     loop,
@@ -46,7 +44,6 @@ from lagjax._run.contacts._law import (
     find_pattern,
     find_violations,
     hold_rows,
-    solve,
 )
 from lagjax._run.contacts._places import Entry, Member, Room, Scene
 
@@ -520,7 +517,7 @@ def finish(
 @loop
 def note_stretch(scene: Scene, member: Member, first: int, at_once: bool, duration: float, accepted: float):
     """Note behind a stretch what is tied, its longest step, and what rounding it had; `first` fell where it ended."""
-    k, r, total, x = scene.k, scene.r, scene.watches, member.x
+    k, r, total = scene.k, scene.r, scene.watches
     tied, refuted, did = member.tied, member.refuted, member.kinds
     member.turns = member.turns + 1.0 if at_once else 0.0
     turns_in_plane = scene.d == 1 and member.turns > total
@@ -579,12 +576,12 @@ def find_first(scene: Scene, fell: Floats, at_once: bool, did: Floats) -> int:
 
 @loop
 def decide(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> int:
-    """The result behind watch `first`, which fell: state and contacts of the member go on there, and the row says it."""
+    """The result behind watch `first`, which fell: state and contacts of the member go on there, as the row says."""
     n, k, r, d, total = scene.n, scene.k, scene.r, scene.d, scene.watches
-    x, opened, size, rough = member.x, member.opened, k + r * d, scene.rough
+    x, opened = member.x, member.opened
     closed, was_closed, was_stuck = x[2 * n + 1 + scene.numbers :], room.closed, room.stuck
     sticks, meets, opening = closed[k:], row.meets, room.opening
-    v, change, apart, flags = x[n:], room.change, room.apart, room.changed
+    v, flags = x[n:], room.changed
     copy(closed, was_closed, k)
     copy(sticks, was_stuck, r)
     for i in range(k):
@@ -601,7 +598,6 @@ def decide(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> 
     close_contacts(scene, member, first, hits, meets, room)
     undecided = find_change(scene, member, hits, row, room)
     stay_closed(scene, member, hits, room)
-    slips = room.slips
     for i in range(k):
         flags[i] = float(closed[i] != was_closed[i] or (hits and room.involved[i] > 0))
         if flags[i] > 0:
@@ -638,7 +634,7 @@ def meet_corners(scene: Scene, member: Member, first: int, meets: Floats, room: 
 
     Returns 2 where one is struck at its corner, or stays there, 1 where one meets behind its corner, else 0.
     """
-    n, k, count, x, touches = scene.n, scene.k, scene.corners, member.x, scene.touch
+    k, count, x, touches = scene.k, scene.corners, member.x, scene.touch
     corners, passed, opening = room.corner, room.passed, room.opening
     near, answer, closed = x[scene.inputs - 1], 0, room.closed
     locate_corners(scene, member, x, room)
@@ -664,8 +660,7 @@ def meet(scene: Scene, member: Member, meets: Floats, row: Entry, room: Room) ->
 
     Returns whether it was missed before.
     """
-    k, r, d, total = scene.k, scene.r, scene.d, scene.watches
-    touches, involved, noise = room.touches, room.involved, room.noise
+    k, touches, involved, noise = scene.k, room.touches, room.involved, room.noise
     parting, push, linked = room.parting, room.push, room.stay
     closed, fastest, hits, missed = room.closed, 0.0, False, False
     touch(scene, member, member.opened, room)
