@@ -487,6 +487,7 @@ def finish(
     reached = SUCCESSFUL if happens else result
     row.at = x[2 * n]
     copy(x[n:], row.before, n)
+    copy(x, row.stop, 2 * n)
     if decides:
         reached = decide(scene, member, first, row, room)
     elif happens:  # a section, of which a note is made

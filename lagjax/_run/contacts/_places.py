@@ -86,7 +86,7 @@ SAID = (  # of a row of the record, what a user is told
 RECORD = (
     *SAID,
     "RAN",  # 1 if there was such a stretch
-    "END",  # of the stretch
+    "END", "STOP",  # of the stretch, and the state there (2n,)
     "WATCH", "CROSSES", "DECIDES",
     "DID",  # what the contacts did during it, as the inputs of lines have it
     "HELD", "SLIDES", "DIRECTION",  # of the impulses: rows (k + r d,), the contacts that slide (r,), and where (r d,)

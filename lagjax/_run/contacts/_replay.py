@@ -32,7 +32,7 @@ TOGETHER = 1e-8
 
 _VECTORS = frozenset((
     "DID", "BEFORE", "BEHIND", "IMPULSE", "HELD", "SLIDES", "DIRECTION", "COMPRESSED", "RETURNED", "ENDS", "MEETS",
-    "SHARES", "STARTS", "OFFSET",
+    "SHARES", "STARTS", "OFFSET", "STOP",
 ))  # fmt: skip
 
 
@@ -102,7 +102,7 @@ class Replay:
         end = jnp.where(ran, jnp.where(~happens & (row.end == still(ts[-1])), ts[-1], row.end), begun)
         times = jnp.concatenate([t[None], jnp.where(ahead, ts, begun), jnp.where(ran, ts[-1], begun)[None]])
         numbers = jnp.concatenate([vector, row.did])
-        found, t_end, y_end = self._vary()(times, y, numbers, end, row.watch.astype(int), crosses)
+        found, t_end, y_end = self._vary()(times, y, numbers, end, row.stop, row.watch.astype(int), crosses)
         path = jnp.where((ahead & (ts <= row.end))[:, None], found[1:-1], path)
         stays = ~ran | (happens & ~crosses)
         t, y = jnp.where(stays, t, t_end), jnp.where(stays, y, y_end)

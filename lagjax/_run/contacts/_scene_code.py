@@ -301,7 +301,7 @@ def sizes_of_fields(sizes: dict[str, int]) -> dict[str, int]:
         ("MU", "SLIP", "STUCK", "TURNS_BACK", "SLIDES", "STARTS"), r
     )
     fields |= dict.fromkeys(("VALUES", "RATES", "BEND", "IMPULSES", "APART", "HELD"), size)
-    fields |= dict.fromkeys(("LARGEST", "SHIFT", "BEHIND", "OFFSET"), 2 * n)
+    fields |= dict.fromkeys(("LARGEST", "SHIFT", "BEHIND", "OFFSET", "STOP"), 2 * n)
     fields |= dict.fromkeys(("X", "OPENED"), inputs) | dict.fromkeys(("DOUBTS", "DOUBTED"), 3)
     fields |= dict.fromkeys(("FRESH", "KINDS", "STAYS", "FELL"), watches)
     fields |= dict.fromkeys(("ROUNDING", "RATE_ROUNDING"), 2 * watches) | dict.fromkeys(
