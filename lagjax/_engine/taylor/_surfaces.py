@@ -224,24 +224,14 @@ def crossing_variation(surfaces: Surfaces) -> Callable:
     nothing moves. Where the guard jumps through zero, δg is that of the number whose border is there: the one that is
     nearest in time. Where g′ is zero there are no derivatives: NaN.
     """
-    still, count = jax.lax.stop_gradient, len(surfaces.directions)
-
-    def follow(t, y, numbers):
-        program, n = surfaces.followed(), y.shape[0] // 2
-        found = outputs(program, len(program.line.outputs), jnp.append(y, t), numbers)
-        return jnp.split(found, [len(found) // 2 - n, len(found) - 2 * n])
+    still, follow = jax.lax.stop_gradient, functools.partial(_follow, surfaces)
 
     def move_to_zero(k, taken, t, y, numbers):
         numbers_there = still(numbers)
         values, rates, slope = follow(t, y, numbers)
         along, here = (jnp.ones_like(t), still(slope)), still((t, y))
         _, (_, bends, turn) = jax.jvp(lambda t, y: follow(t, y, numbers_there), here, along)
-        at = k
-        if surfaces.borders is not None:
-            times = jnp.abs(still(values / rates))
-            times = jnp.where(jnp.isnan(times), jnp.inf, times).at[count:].multiply(_LATER)
-            number = jnp.arange(times.size)
-            at = jnp.argmin(jnp.where((number >= count) | (number == k), times, jnp.inf))
+        at = k if surfaces.borders is None else _find_zero(surfaces, k, still(values), still(rates))
         value, rate, bend = (jnp.where(np.arange(len(values)) == at, x, 0.0).sum() for x in (values, rates, bends))
         crosses = ~taken | (rate != 0)
         rate = jnp.where(taken & crosses, rate, 1.0)
@@ -251,6 +241,28 @@ def crossing_variation(surfaces: Surfaces) -> Callable:
         return tuple(differentiable_where(crosses, x, t, y, numbers) for x in there)
 
     return move_to_zero
+
+
+def jumps_through_zero(surfaces: Surfaces, k, t, y, numbers):
+    """True if guard k changes its sign at (t, y) by a jump, at a border of its own."""
+    if surfaces.borders is None:
+        return np.array(False)
+    values, rates, _ = _follow(surfaces, *jax.lax.stop_gradient((t, y, numbers)))
+    return _find_zero(surfaces, k, values, rates) >= len(surfaces.directions)
+
+
+def _follow(surfaces: Surfaces, t, y, numbers) -> list:
+    """The guards and the distances of their borders, how fast both change, and the rate of the state."""
+    program, n = surfaces.followed(), y.shape[0] // 2
+    found = outputs(program, len(program.line.outputs), jnp.append(y, t), numbers)
+    return jnp.split(found, [len(found) // 2 - n, len(found) - 2 * n])
+
+
+def _find_zero(surfaces: Surfaces, k, values, rates):
+    """The number that is zero where guard k changes: that of the guard, or of the border that is nearest in time."""
+    times, number, count = jnp.abs(values / rates), jnp.arange(values.size), len(surfaces.directions)
+    times = jnp.where(jnp.isnan(times), jnp.inf, times).at[count:].multiply(_LATER)
+    return jnp.argmin(jnp.where((number >= count) | (number == k), times, jnp.inf))
 
 
 # A guard that jumps at a border is not zero there: of the times to both that to the guard's own zero is by many orders

@@ -96,15 +96,15 @@ class Replay:
     def _play(self, given, carry, row):
         ts, y0, vector, restitution, friction = given
         (t, y, path), still = carry, jax.lax.stop_gradient
-        begun, last = still(t), still(ts[-1])
-        ahead = (ts > begun) | (ts == jnp.where(begun == ts[0], begun, jnp.nan))
+        begun, ran = still(t), row.ran > 0  # in a batch a member that is done has no row, and stays where it is
+        ahead = ran & ((ts > begun) | (ts == jnp.where(begun == ts[0], begun, jnp.nan)))
         happens, crosses, decides = row.happens > 0, row.crosses > 0, row.decides > 0
-        end = jnp.where(~happens & (row.end == last), ts[-1], row.end)
-        times = jnp.concatenate([t[None], jnp.where(ahead, ts, begun), ts[-1:]])
+        end = jnp.where(ran, jnp.where(~happens & (row.end == still(ts[-1])), ts[-1], row.end), begun)
+        times = jnp.concatenate([t[None], jnp.where(ahead, ts, begun), jnp.where(ran, ts[-1], begun)[None]])
         numbers = jnp.concatenate([vector, row.did])
         found, t_end, y_end = self._vary()(times, y, numbers, end, row.watch.astype(int), crosses)
         path = jnp.where((ahead & (ts <= row.end))[:, None], found[1:-1], path)
-        stays = happens & ~crosses
+        stays = ~ran | (happens & ~crosses)
         t, y = jnp.where(stays, t, t_end), jnp.where(stays, y, y_end)
         t_impact, impulse, lost, behind = self._jump((t, y), row, vector, restitution, friction, halves(y0)[1])
         behind = jnp.where(decides, behind, y)

@@ -17,7 +17,7 @@ from jax.interpreters import mlir
 
 from lagjax._engine.taylor import Line, call_host, line_of, rate_errors
 from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL
-from lagjax._native import SINGLE_NOISE, LineCode, compile_loops, cores, handler, make_once
+from lagjax._native import LARGEST_LINE, SINGLE_NOISE, compile_loops, cores, handler, make_once
 from lagjax._primitives import LinearMap, compute_on_host
 from lagjax._run.contacts import _contact_search
 from lagjax._run.contacts._contact_search import ASKS, GOING, NEW
@@ -99,9 +99,10 @@ class SceneCode:
 
     def _add_codes(self, scene: np.ndarray, lines: dict[str, Line]) -> None:
         for name, of in lines.items():
-            code = LineCode(of.line, of.size)
-            self._keep.append(code)
-            scene[getattr(at, name)] = code.address
+            code = of.code if len(of.line.nodes) <= LARGEST_LINE else None
+            keep, address = _call_numpy(of) if code is None else (code, code.address)
+            self._keep.append(keep)
+            scene[getattr(at, name)] = address
 
     # ---- runs ----
 
@@ -140,6 +141,22 @@ class SceneCode:
         ending += [*memory[:, scene[at.DOUBTS] : scene[at.DOUBTS] + 3].T, *memory[:, scene[at.DOUBTED] :][:, :3].T]
         ending += [*memory[:, scene[at.BEGUN] : scene[at.BEGUN] + begin + 1].T]
         return Found(path, did, run.record, np.stack(ending, axis=-1))
+
+
+def _call_numpy(line: Line) -> tuple[Any, int]:
+    """A function that evaluates a line by NumPy, called as machine code is, and its address: for tables and long lines."""
+
+    def evaluate(x: int, out: int, _rows: int) -> None:
+        given, found = (
+            np.ctypeslib.as_array((ctypes.c_double * size).from_address(place))
+            for place, size in ((x, line.size), (out, line.outputs))
+        )
+        found[:] = line.line.evaluate(list(given[:, None]))[:, 0]
+
+    function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(evaluate)
+    address = ctypes.cast(function, ctypes.c_void_p).value
+    assert address is not None
+    return function, address
 
 
 class _Run:
