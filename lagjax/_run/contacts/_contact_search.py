@@ -285,22 +285,27 @@ def begin(scene: Scene, member: Member, room: Room) -> int:
         write_directions(scene, room.rates[k:], room.free)
         if has_paradox(scene, member, push, slips, room.free, room):
             result = UNDECIDED
-    if scene.corners > 0:  # a contact that starts on its corner goes where the motion does
-        corners, touches, passed = room.corner, scene.touch, room.passed
-        locate_corners(scene, member, x, room)
-        for p in range(scene.corners):
-            passed[p] = 0.0
-            for i in range(k):
-                is_there = abs(corners[p]) <= corners[2 * scene.corners + p]
-                if touches[p * k + i] > 0 and room.touches[i] > 0 and is_there:
-                    passed[p] = 1.0
-        later = go_beyond(scene, member, x, room)
-        if later < 0 and result == GOING:
-            result = AT_CORNER
-        for i in range(2 * n):
-            x[i] += room.shift[i]
-        x[2 * n] += later if later > 0 else 0.0
+    if scene.corners > 0 and rests_on_corner(scene, member, room) and result == GOING:
+        result = AT_CORNER
     return result
+
+
+@loop
+def rests_on_corner(scene: Scene, member: Member, room: Room) -> bool:
+    """True where a contact that starts on its corner rests there; else the state goes where the motion does."""
+    n, k, x, corners, passed = scene.n, scene.k, member.x, room.corner, room.passed
+    locate_corners(scene, member, x, room)
+    for p in range(scene.corners):
+        passed[p] = 0.0
+        for i in range(k):
+            is_there = abs(corners[p]) <= corners[2 * scene.corners + p]
+            if scene.touch[p * k + i] > 0 and room.touches[i] > 0 and is_there:
+                passed[p] = 1.0
+    later = go_beyond(scene, member, x, room)
+    for i in range(2 * n):
+        x[i] += room.shift[i]
+    x[2 * n] += max(later, 0.0)
+    return later < 0
 
 
 @loop
@@ -593,55 +598,59 @@ def find_first(scene: Scene, fell: Floats, at_once: bool, did: Floats) -> int:
 @loop
 def decide(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> int:
     """The result behind watch `first`, which fell: state and contacts of the member go on there, as the row says."""
-    n, k, r, d, total = scene.n, scene.k, scene.r, scene.d, scene.watches
-    x, opened = member.x, member.opened
-    closed, was_closed, was_stuck = x[2 * n + 1 + scene.numbers :], room.closed, room.stuck
-    sticks, meets, opening = closed[k:], row.meets, room.opening
-    v, flags = x[n:], room.changed
-    copy(closed, was_closed, k)
-    copy(sticks, was_stuck, r)
+    n, k, r, x, meets, opening = scene.n, scene.k, scene.r, member.x, row.meets, room.opening
+    closed = x[2 * n + 1 + scene.numbers :]
+    copy(closed, room.closed, k)
+    copy(closed[k:], room.stuck, r)
     for i in range(k):
         meets[i], opening[i] = float(i == first and closed[i] == 0), 0.0
     later, at_corner = 0.0, 0
     if scene.corners > 0:
         at_corner = meet_corners(scene, member, first, meets, room)
         later = room.later
-    open_all(scene, x, opened)
-    evaluate(scene.response, opened, room.gradients)
+    open_all(scene, x, member.opened)
+    evaluate(scene.response, member.opened, room.gradients)
     missed = meet(scene, member, meets, row, room)
     hits = row.hits > 0
-    measure_slips(scene, member, room.rates, v, room.slips, room)
+    measure_slips(scene, member, room.rates, x[n:], room.slips, room)
     close_contacts(scene, member, first, hits, meets, room)
     undecided = find_change(scene, member, hits, row, room)
     stay_closed(scene, member, hits, room)
-    for i in range(k):
-        flags[i] = float(closed[i] != was_closed[i] or (hits and room.involved[i] > 0))
-        if flags[i] > 0:
-            member.fresh[i] = 1.0
-    leaves_rest = False
-    for c in range(r):
-        leaves_rest = leaves_rest or (first == k + c and was_stuck[c] > 0 and d > 1)
-        row.starts[c] = float(first == k + c and was_stuck[c] > 0 and x[2 * n] == member.first)
+    note_changes(scene, member, first, hits, row, room)
     if r > 0:
         rub(scene, member, first, hits, room)
-        write_directions(scene, sticks[r:], room.free)
-        if has_paradox(scene, member, closed, sticks, room.free, room):
+        write_directions(scene, closed[k + r :], room.free)
+        if has_paradox(scene, member, closed, closed[k:], room.free, room):
             undecided = True
-    row.leaves_rest = float(leaves_rest)
-    count_doubts(scene, member, hits, leaves_rest, row, room)
+    count_doubts(scene, member, hits, row, room)
     move(scene, member, first, meets, row, room)
     x[2 * n] += later
     row.later_on = later
     name_change(scene, first, hits, closed, row, room)
-    for g in range(k + r, total):
-        for i in range(k):
-            if opening[i] > 0:
-                member.fresh[g] = 1.0
     if at_corner == 2 or (missed and at_corner == 1):
         return AT_CORNER
     if missed:
         return MISSED
     return UNDECIDED if undecided else SUCCESSFUL
+
+
+@loop
+def note_changes(scene: Scene, member: Member, first: int, hits: bool, row: Entry, room: Room):
+    """Note which contacts have changed, as `CHANGED`, what begins anew there, and which slips begin at rest."""
+    n, k, x, leaves_rest = scene.n, scene.k, member.x, False
+    closed = x[2 * n + 1 + scene.numbers :]
+    for i in range(k):
+        room.changed[i] = float(closed[i] != room.closed[i] or (hits and room.involved[i] > 0))
+        if room.changed[i] > 0:
+            member.fresh[i] = 1.0
+        if room.opening[i] > 0:  # at a corner
+            for g in range(k + scene.r, scene.watches):
+                member.fresh[g] = 1.0
+    for c in range(scene.r):
+        breaks = first == k + c and room.stuck[c] > 0
+        leaves_rest = leaves_rest or (breaks and scene.d > 1)
+        row.starts[c] = float(breaks and x[2 * n] == member.first)
+    row.leaves_rest = float(leaves_rest)
 
 
 @loop
@@ -1026,10 +1035,10 @@ def write_held_force(scene: Scene, member: Member, c: int, x: Floats, room: Room
 
 
 @loop
-def count_doubts(scene: Scene, member: Member, hits: bool, leaves_rest: bool, row: Entry, room: Room):
+def count_doubts(scene: Scene, member: Member, hits: bool, row: Entry, room: Room):
     """Count what is doubtful here: an impact that gains energy, one that is shared, derivatives that are lost."""
     k, r, d, n = scene.k, scene.r, scene.d, scene.n
-    total, terms, shares, starts = 0.0, 0.0, False, leaves_rest
+    total, terms, shares, starts = 0.0, 0.0, False, row.leaves_rest > 0
     for i in range(k + r * d):
         total += room.impulses[i] * (room.rates[i] + room.apart[i])
         terms += abs(room.impulses[i]) * (abs(room.rates[i]) + abs(room.apart[i]))
