@@ -144,7 +144,7 @@ class SceneCode:
 
 
 def _call_numpy(line: Line) -> tuple[Any, int]:
-    """A function that evaluates a line by NumPy, called as machine code is, and its address: for tables and long lines."""
+    """A function that evaluates a line by NumPy, called as machine code is, and its address: for tables, long lines."""
 
     def evaluate(x: int, out: int, _rows: int) -> None:
         given, found = (
