@@ -30,7 +30,10 @@ from llvmlite import ir
 
 from lagjax._native._ir import BIT, DOUBLE, INTEGER, LEVELS, POINTER, Code, Value, compile_text
 
-Floats = Wholes = np.ndarray  # arrays of doubles, and of integers, as annotations name them
+if TYPE_CHECKING:
+    Floats = Wholes = Any
+else:
+    Floats = Wholes = np.ndarray  # arrays of doubles, and of integers, as annotations name them
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,20 +48,17 @@ class Struct:
     scalars: frozenset[str]
     table: str | None
 
-    if TYPE_CHECKING:
-
-        def __getattr__(self, name: str) -> Any: ...
-
 
 _KINDS = {"float": DOUBLE, "int": INTEGER, "Floats": POINTER, "Wholes": POINTER, "bool": BIT}
 _ELEMENTS = {"Floats": "float", "Wholes": "int"}
+_NUMBERS = ("float", "int", "bool")
 _COMPARISONS = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 _OPERATORS = {ast.Add: "add", ast.Sub: "sub", ast.Mult: "mul", ast.FloorDiv: "div", ast.Mod: "srem", ast.Div: "div"}
 _FUNCTIONS = ("abs", "min", "max", "float", "int", "sqrt", "cos", "sin", "atan2", "isfinite", "evaluate",
               "integrate")  # fmt: skip
 
 
-def evaluate(address: int, x: Floats, out: Floats) -> None:
+def evaluate(address: int, x: np.ndarray, out: np.ndarray) -> None:
     """Call machine code `(x, out, rows)`, as of a straight line, on one row."""
     call = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(int(address))
     call(x.ctypes.data, out.ctypes.data, 1)
@@ -75,7 +75,7 @@ class Loop:
     """A function of Python that may become machine code (`compile_loop`); a call runs it in Python."""
 
     def __init__(self, function: Callable):
-        self.function = function
+        self.function, self.name = function, function.__name__
         functools.update_wrapper(self, function)
 
     def __call__(self, *arguments):
@@ -109,14 +109,14 @@ _C_KINDS = {"int": ctypes.c_int64, "float": ctypes.c_double}
 @functools.cache
 def compile_loops(*entries: Loop) -> tuple[Callable, ...]:
     """Loops as functions in machine code, which take numbers and addresses of arrays."""
-    names = tuple(entry.__name__ for entry in entries)
+    names = tuple(entry.name for entry in entries)
     level = LEVELS[0]
-    engine, places = compile_text(lambda: _write_module(entries), names, f"{_digest_sources()} {names}", level)
+    engine, places = compile_text(lambda: _write_module(entries), names, f"{_digest_sources(entries)} {names}", level)
     _engines.append(engine)
     kinds = [[_C_KINDS.get(kind, ctypes.c_void_p) for kind in entry.arguments.values()] for entry in entries]
-    results = [entry.result and _C_KINDS[entry.result] for entry in entries]
+    results = [_C_KINDS[entry.result] if entry.result else None for entry in entries]
     return tuple(
-        ctypes.CFUNCTYPE(result, *of)(places[entry.__name__])
+        ctypes.CFUNCTYPE(result, *of)(places[entry.name])
         for entry, of, result in zip(entries, kinds, results, strict=True)
     )
 
@@ -124,10 +124,10 @@ def compile_loops(*entries: Loop) -> tuple[Callable, ...]:
 _engines: list = []  # which hold the code
 
 
-def _digest_sources() -> str:
-    """A digest of this package's text, in which are all loops and all constants that they know."""
-    digest = hashlib.sha256()
-    for path in sorted(Path(__file__).parents[1].rglob("*.py")):
+def _digest_sources(entries: tuple[Loop, ...]) -> str:
+    """A digest of the text of this package, and of the files of these: there are all loops, and constants they know."""
+    digest, own = hashlib.sha256(), {Path(inspect.getfile(entry.function)) for entry in entries}
+    for path in sorted({*Path(__file__).parents[1].rglob("*.py"), *own}):
         digest.update(path.read_bytes())
     return digest.hexdigest()
 
@@ -143,7 +143,7 @@ def _write_module(entries: tuple[Loop, ...]) -> str:
 def _write(module: ir.Module, of: Loop, written: dict) -> Code:
     if of not in written:
         kinds = [_KINDS.get(kind, POINTER) for kind in of.arguments.values()]
-        code = Code(module, of.__name__, kinds, 1, _KINDS[of.result] if of.result else None)
+        code = Code(module, of.name, kinds, 1, _KINDS[of.result] if of.result else None)
         written[of] = code
         _Writer(code, of, lambda other: _write(module, other, written)).write_all()
     return written[of]
@@ -165,7 +165,13 @@ class _Writer:
             self.builder.ret_void() if self.of.result is None else self.builder.unreachable()
 
     def fail(self, node: ast.AST, why: str):
-        return TypeError(f"{self.of.__name__}: {ast.unparse(node)}: {why}")
+        return TypeError(f"{self.of.name}: {ast.unparse(node)}: {why}")
+
+    def find_writer(self, prefix: str, node: ast.AST) -> Callable:
+        found = getattr(self, prefix + type(node).__name__, None)
+        if found is None:
+            raise self.fail(node, "a loop has no such thing")
+        return found
 
     # ---- statements ----
 
@@ -173,7 +179,7 @@ class _Writer:
         for node in nodes:
             if isinstance(node, ast.Pass) or (isinstance(node, ast.Expr) and isinstance(node.value, ast.Constant)):
                 continue  # a docstring
-            getattr(self, "do_" + type(node).__name__)(node)
+            self.find_writer("do_", node)(node)
             if self.builder.block.is_terminated:
                 return
 
@@ -182,27 +188,25 @@ class _Writer:
 
     def do_Assign(self, node: ast.Assign):
         (target,) = node.targets
-        if isinstance(target, ast.Tuple):
-            assert isinstance(node.value, ast.Tuple)
+        if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
             found = [self.value(x) for x in node.value.elts]
             for place, x in zip(target.elts, found, strict=True):
-                self.store(place, *x)
+                self.store(place, x)
         else:
-            self.store(target, *self.value(node.value))
+            self.store(target, self.value(node.value))
 
     def do_AugAssign(self, node: ast.AugAssign):
         read = ast.parse(ast.unparse(node.target), mode="eval").body
-        self.store(node.target, *self.value(ast.BinOp(read, node.op, node.value)))
+        self.store(node.target, self.value(ast.BinOp(read, node.op, node.value)))
 
-    def store(self, target, kind: str, value: Value) -> None:
+    def store(self, target, found: tuple[str, Value]) -> None:
         if isinstance(target, ast.Name):
-            self.assign(target.id, kind, value)
-        elif isinstance(target, ast.Attribute):
-            wanted, address = self.field(target)
-            self.code.store(self.convert(target, kind, value, wanted), address)
+            self.assign(target.id, *found)
+        elif isinstance(target, ast.Attribute | ast.Subscript):
+            wanted, address = self.field(target) if isinstance(target, ast.Attribute) else self.element(target)
+            self.code.store(self.convert(target, found, wanted), address)
         else:
-            wanted, address = self.element(target)
-            self.code.store(self.convert(target, kind, value, wanted), address)
+            raise self.fail(target, "it is no place for a number")
 
     def assign(self, name: str, kind: str, value: Value) -> None:
         if name not in self.variables:
@@ -211,16 +215,16 @@ class _Writer:
             self.variables[name] = kind, place
         wanted, place = self.variables[name]
         if kind != wanted and not (kind, wanted) == ("int", "float"):
-            raise TypeError(f"{self.of.__name__}: {name} begins as {wanted}, and becomes {kind}")
-        value = self.convert(None, kind, value, wanted)
-        self.builder.store(value.it, place.it)
+            raise TypeError(f"{self.of.name}: {name} begins as {wanted}, and becomes {kind}")
+        self.builder.store(self.convert(None, (kind, value), wanted).it, place.it)
 
     def do_Return(self, node: ast.Return):
-        if node.value is None:
+        if (node.value is None) != (self.of.result is None):
+            raise self.fail(node, f"the result is {self.of.result}")
+        if node.value is None or self.of.result is None:
             self.builder.ret_void()
         else:
-            assert self.of.result is not None
-            self.builder.ret(self.convert(node, *self.value(node.value), self.of.result).it)
+            self.builder.ret(self.convert(node, self.value(node.value), self.of.result).it)
 
     def do_If(self, node: ast.If):
         names = "then", "otherwise", "behind"
@@ -234,13 +238,17 @@ class _Writer:
         self.builder.position_at_end(behind)
 
     def do_While(self, node: ast.While):
-        self.repeat(lambda: self.condition(node.test), node.body, lambda: None)
+        self.repeat(lambda: self.condition(node.test), lambda: self.statements(node.body), lambda: None)
 
     def do_For(self, node: ast.For):
-        assert isinstance(node.iter, ast.Call) and isinstance(node.target, ast.Name)
-        bounds, step = [self.value(x) for x in node.iter.args[:2]], 1
-        if len(node.iter.args) == 3:
-            step = ast.literal_eval(node.iter.args[2])
+        of = node.iter
+        if not (isinstance(of, ast.Call) and ast.unparse(of.func) == "range" and isinstance(node.target, ast.Name)):
+            raise self.fail(of, "`for` goes over a range")
+        bounds, step = [self.value(x) for x in of.args[:2]], 1
+        if any(kind != "int" for kind, _ in bounds):
+            raise self.fail(of, "a range is of integers")
+        if len(of.args) == 3:
+            step = ast.literal_eval(of.args[2])
         begin, stop = bounds if len(bounds) == 2 else (("int", self.number(0)), bounds[0])
         name = node.target.id
         with self.builder.goto_entry_block():
@@ -249,20 +257,24 @@ class _Writer:
         self.builder.store(stop[1].it, last.it)
         load = lambda place: self.code.load(place, INTEGER)  # noqa: E731
 
-        def goes_on():
+        def run():
             self.assign(name, "int", load(counter))
-            return self.code.compare("<" if step > 0 else ">", load(counter), load(last))
+            self.statements(node.body)
 
-        self.repeat(goes_on, node.body, lambda: self.builder.store((load(counter) + step).it, counter.it))
+        self.repeat(
+            lambda: self.code.compare("<" if step > 0 else ">", load(counter), load(last)),
+            run,
+            lambda: self.builder.store((load(counter) + step).it, counter.it),
+        )
 
-    def repeat(self, goes_on: Callable, body, move_on: Callable) -> None:
+    def repeat(self, goes_on: Callable, run: Callable, move_on: Callable) -> None:
         head, inside, latch, behind = (self.code.function.append_basic_block(name) for name in ("", "", "", ""))
         self.builder.branch(head)
         self.builder.position_at_end(head)
         self.builder.cbranch(goes_on().it, inside, behind)
         self.builder.position_at_end(inside)
         self.targets.append((latch, behind))
-        self.statements(body)
+        run()
         self.targets.pop()
         if not self.builder.block.is_terminated:
             self.builder.branch(latch)
@@ -283,7 +295,7 @@ class _Writer:
         return self.code.as_value(x, INTEGER if isinstance(x, int) else DOUBLE)
 
     def value(self, node) -> tuple[str, Value]:
-        return getattr(self, "of_" + type(node).__name__)(node)
+        return self.find_writer("read_", node)(node)
 
     def condition(self, node) -> Value:
         kind, value = self.value(node)
@@ -293,7 +305,8 @@ class _Writer:
             raise self.fail(node, "an array is no condition")
         return value
 
-    def convert(self, node, kind: str, value: Value, wanted: str) -> Value:
+    def convert(self, node, found: tuple[str, Value], wanted: str) -> Value:
+        kind, value = found
         if kind == wanted or (kind == "Floats" and isinstance(self.of.names.get(wanted), Struct)):
             return value
         if kind == "int" and wanted == "float":
@@ -305,16 +318,18 @@ class _Writer:
         raise self.fail(node, f"{kind} is no {wanted}")
 
     def same_kind(self, node, *found: tuple[str, Value]) -> tuple[str, list[Value]]:
+        if any(kind not in _NUMBERS for kind, _ in found):
+            raise self.fail(node, "it is of numbers")
         kind = "float" if any(kind == "float" for kind, _ in found) else found[0][0]
-        return kind, [self.convert(node, *x, kind) for x in found]
+        return kind, [self.convert(node, x, kind) for x in found]
 
-    def of_Constant(self, node: ast.Constant):
+    def read_Constant(self, node: ast.Constant):
         x: Any = node.value
         if isinstance(x, bool):
             return "bool", Value(self.code, ir.Constant(BIT, x))
         return type(x).__name__, self.number(x)
 
-    def of_Name(self, node: ast.Name):
+    def read_Name(self, node: ast.Name):
         if node.id in self.variables:
             kind, place = self.variables[node.id]
             return kind, Value(self.code, self.builder.load(place.it, typ=_KINDS.get(kind, POINTER)))
@@ -322,7 +337,7 @@ class _Writer:
             raise self.fail(node, "it has no value yet")
         return self.constant(self.of.names[node.id])
 
-    def of_Attribute(self, node: ast.Attribute):
+    def read_Attribute(self, node: ast.Attribute):
         kind, address = self.field(node)
         is_scalar = kind in ("int", "float")
         return kind, self.code.load(address, _KINDS[kind]) if is_scalar else address
@@ -353,39 +368,46 @@ class _Writer:
             raise self.fail(node, "an index is an integer")
         return element, self.code.element(base, index[1], _KINDS[element])
 
-    def of_Subscript(self, node: ast.Subscript):
+    def read_Subscript(self, node: ast.Subscript):
         if isinstance(node.slice, ast.Slice):
-            assert node.slice.lower is not None and node.slice.upper is None
-            kind, base = self.value(node.value)
-            element = _KINDS[_ELEMENTS.get(kind, "float")]
-            return kind, self.code.element(base, self.value(node.slice.lower)[1], element)
+            if node.slice.lower is None or node.slice.upper is not None:
+                raise self.fail(node, "a part of an array goes from an index on")
+            begin = ast.Subscript(node.value, node.slice.lower)
+            return self.value(node.value)[0], self.element(begin)[1]
         kind, address = self.element(node)
         return kind, self.code.load(address, _KINDS[kind])
 
-    def of_BinOp(self, node: ast.BinOp):
+    def read_BinOp(self, node: ast.BinOp):
         kind, (a, b) = self.same_kind(node, self.value(node.left), self.value(node.right))
         if isinstance(node.op, ast.Pow):
-            assert isinstance(node.right, ast.Constant) and node.right.value == 2
+            if not (isinstance(node.right, ast.Constant) and node.right.value == 2):
+                raise self.fail(node, "the only power is the second")
             return kind, a * a
         if isinstance(node.op, ast.Div) and kind != "float":
-            kind, a, b = "float", self.convert(node, kind, a, "float"), self.convert(node, kind, b, "float")
+            a, b, kind = self.convert(node, (kind, a), "float"), self.convert(node, (kind, b), "float"), "float"
+        if type(node.op) not in _OPERATORS or kind not in _C_KINDS:
+            raise self.fail(node, f"there is no such operation of a {kind}")
+        if isinstance(node.op, ast.FloorDiv | ast.Mod) and kind != "int":
+            raise self.fail(node, "only integers divide with a rest")
         return kind, self.code.arithmetic(_OPERATORS[type(node.op)], a, b)
 
-    def of_UnaryOp(self, node: ast.UnaryOp):
+    def read_UnaryOp(self, node: ast.UnaryOp):
         if isinstance(node.op, ast.Not):
             return "bool", ~self.condition(node.operand)
         kind, x = self.value(node.operand)
         return kind, -x if kind == "float" else 0 - x
 
-    def of_Compare(self, node: ast.Compare):
+    def read_Compare(self, node: ast.Compare):
         found, bits = [self.value(x) for x in (node.left, *node.comparators)], []
         for op, a, b in zip(node.ops, found, found[1:], strict=False):
+            if type(op) not in _COMPARISONS:
+                raise self.fail(node, "there is no such comparison")
             _, (x, y) = self.same_kind(node, a, b)
             bits.append(self.code.compare(_COMPARISONS[type(op)], x, y))
         return "bool", functools.reduce(Value.__and__, bits)
 
-    def of_BoolOp(self, node: ast.BoolOp):
-        """What comes behind is evaluated only where it matters."""
+    def read_BoolOp(self, node: ast.BoolOp):
+        """Later parts are evaluated only where they matter."""
         result = self.code.variable(self.condition(node.values[0]))
         for x in node.values[1:]:
             goes_on = result.value if isinstance(node.op, ast.And) else ~result.value
@@ -393,20 +415,36 @@ class _Writer:
                 result.value = self.condition(x)
         return "bool", result.value
 
-    def of_IfExp(self, node: ast.IfExp):
-        kind, (a, b) = self.same_kind(node, self.value(node.body), self.value(node.orelse))
-        return kind, self.code.select(self.condition(node.test), a, b)
+    def read_IfExp(self, node: ast.IfExp):
+        """One of both is evaluated: the other may lie outside of an array."""
+        begins, ends, found = [], [], []
+        blocks = [self.code.function.append_basic_block() for _ in range(3)]
+        self.builder.cbranch(self.condition(node.test).it, *blocks[:2])
+        for block, x in zip(blocks, (node.body, node.orelse), strict=False):
+            self.builder.position_at_end(block)
+            found.append(self.value(x))
+            ends.append(self.builder.block)
+        kind = "float" if "float" in (found[0][0], found[1][0]) else found[0][0]
+        for end, x in zip(ends, found, strict=True):
+            self.builder.position_at_end(end)
+            begins.append(self.convert(node, x, kind).it)
+            self.builder.branch(blocks[2])
+        self.builder.position_at_end(blocks[2])
+        chosen = self.builder.phi(begins[0].type)
+        for end, it in zip(ends, begins, strict=True):
+            chosen.add_incoming(it, end)
+        return kind, Value(self.code, chosen)
 
-    def of_Call(self, node: ast.Call):
-        assert isinstance(node.func, ast.Name)
-        name = node.func.id
+    def read_Call(self, node: ast.Call):
+        name = ast.unparse(node.func)
         given = [self.value(x) for x in node.args]
         other = self.of.names.get(name)
         if isinstance(other, Loop):
-            kinds = other.arguments.values()
-            values = [self.convert(node, *x, kind) for x, kind in zip(given, kinds, strict=True)]
+            if len(given) != len(other.arguments):
+                raise self.fail(node, f"it takes {len(other.arguments)} arguments")
+            values = [self.convert(node, x, kind) for x, kind in zip(given, other.arguments.values(), strict=True)]
             return other.result, self.code.call(self.write(other), *values)
-        if name not in _FUNCTIONS:
+        if name not in _FUNCTIONS or node.keywords:
             raise self.fail(node, "it is no loop")
         return getattr(self, "call_" + name)(node, *given)
 
@@ -426,25 +464,26 @@ class _Writer:
         return kind, first
 
     def call_float(self, node, x):
-        return "float", self.convert(node, *x, "float")
+        return "float", self.convert(node, x, "float")
 
     def call_int(self, node, x):
-        return "int", self.convert(node, *x, "int")
+        return "int", self.convert(node, x, "int")
 
     def call_sqrt(self, node, x):
-        return "float", self.code.intrinsic("sqrt", self.convert(node, *x, "float"))
+        return "float", self.code.intrinsic("sqrt", self.convert(node, x, "float"))
 
     def call_cos(self, node, x):
-        return "float", self.code.library("cos", x[1])
+        return "float", self.code.library("cos", self.convert(node, x, "float"))
 
     def call_sin(self, node, x):
-        return "float", self.code.library("sin", x[1])
+        return "float", self.code.library("sin", self.convert(node, x, "float"))
 
     def call_atan2(self, node, y, x):
-        return "float", self.code.library("atan2", y[1], x[1])
+        return "float", self.code.library("atan2", self.convert(node, y, "float"), self.convert(node, x, "float"))
 
     def call_isfinite(self, node, x):
-        return "bool", self.code.compare("==", x[1] - x[1], 0.0)
+        x = self.convert(node, x, "float")
+        return "bool", self.code.compare("==", x - x, 0.0)
 
     def call_evaluate(self, node, address, x, out):
         kind = ir.FunctionType(ir.VoidType(), [POINTER, POINTER, INTEGER])

@@ -278,7 +278,11 @@ class SeriesSum:
 
 
 class ProjectedEnd:
-    """The state at the end of a step on the constraints, from the end of its series."""
+    """The state at the end of a step on the constraints, from the end of its series.
+
+    At a border from which the motion goes on, derivatives are those of the series: the curvature of a constraint may
+    jump there, and rounding would decide of which side the projection is.
+    """
 
     def __init__(self, motion: TaylorSeries, parts: MotionParts):
         assert parts.projection is not None
@@ -301,8 +305,12 @@ class ProjectedEnd:
         out = form.run(frame, line, *directions.inputs(frame, moved, t, frame.vectors("end", states)))
         for i in form.each(frame.code, states):
             frame["between", i] = out[i]
-        for i in form.each(frame.code, states):
-            frame["end", i] = frame["between", i]
+        code, goes_on = frame.code, frame.constant(0.0) > 0.0
+        if self.motion.pieces:
+            is_last = ~(abs(directions.number_of(frame, "next_begin")) < float("inf"))
+            goes_on = (directions.number_of(frame, "crossed") > 0.0) & ~is_last
+        for i in form.each(code, states):
+            frame["end", i] = code.select(goes_on, frame["end", i], frame["between", i])
         return frame.finish()
 
     def pull(self, cotangents: Cotangents) -> Code:
@@ -313,8 +321,13 @@ class ProjectedEnd:
         h = frame["h"]
         moved = motion.move_state(frame, motion.increments(frame, frame.job("order"), h)[0])
         _, _, params = motion.state_inputs(frame)
-        state_ct = frame.vectors("state_ct", motion.states)
-        out = motion.form.run(frame, line, moved, [frame["t"] + h], params, state_ct)
-        cotangents.store(frame, out)
+        through, past = (motion.form.room(frame, motion.states) for _ in range(2))
+        goes_on = frame["crossed"] > 0.0 if motion.pieces else frame.constant(0.0) > 0.0  # where a step follows
+        for i in motion.form.each(frame.code, motion.states):
+            cotangent = frame["state_ct", i]
+            through[i] = frame.code.select(goes_on, 0.0, cotangent)
+            past[i] = frame.code.select(goes_on, cotangent, 0.0)
+        out = motion.form.run(frame, line, moved, [frame["t"] + h], params, through)
+        cotangents.store(frame, out, past)
         cotangents.store_entries(frame, tables, out, len(cotangents.varied))
         return frame.finish()

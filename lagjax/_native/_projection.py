@@ -9,6 +9,7 @@ from lagjax._native._constants import PROJECTION_TOLERANCES, START
 from lagjax._native._frame import Fields, Frame, Index, Numbers
 from lagjax._native._ir import Code, Value
 from lagjax._native._taylor import TaylorSeries
+from lagjax._native._watch import reaches_border
 from lagjax._program._series import Recurrent
 
 
@@ -63,6 +64,10 @@ class Projector:
         projected, off = self.project_state(frame, sums, frame.vectors("increment", states), h)
         for i in form.each(code, states):
             frame["projected", i] = projected[i]
+        if self.motion.pieces and self.base_size < self.motion.n:  # as in `ProjectedEnd`
+            at_border = (frame["crossed"] > 0.0) & reaches_border(frame)
+            for i in (i + half for half in (0, self.motion.n) for i in range(self.base_size, self.motion.n)):
+                frame.assign(at_border, i, projected=sums[i])
         scales = self.motion.evaluate(frame, self.velocity_scale, projected, h)
         for i in form.each(code, self.base_size):
             frame["velocity_scale", i] = scales[i]

@@ -235,16 +235,23 @@ def borders(program: Recurrent, size: int, slides: bool = True, watched: int = 0
     Along borders that depend on velocities the motion may slide (`slides`; see `_sliding`). As many of the last outputs
     are `watched` along the motion: what they decide on has borders too.
     """
+    found = _borders(program, size, slides, watched)
+    is_refused = found is not None and found.kick is not None and bool(found.kick.refused)
+    return _borders(program, size, slides, watched, beside=True) if is_refused else found
+
+
+def _borders(program: Recurrent, size: int, slides: bool, watched: int, beside: bool = False) -> Borders | None:
     if (mechanics := getattr(program, "mechanics", None)) is not None:
         whole = with_outputs(program, mechanics)
         with np.errstate(all="ignore"):
-            rewriting = _Rewriting(whole, size, slides, watched + len(mechanics.outputs), len(mechanics.outputs))
+            count = len(mechanics.outputs)
+            rewriting = _Rewriting(whole, size, slides, watched + count, count, beside)
             if rewriting.switches and (found := rewriting.build()).kicking:
                 return found
     if _WITHOUT_ANY.issuperset(op for op, *_ in program.line.nodes):
         return None
     with np.errstate(all="ignore"):
-        rewriting = _Rewriting(program, size, slides, watched)
+        rewriting = _Rewriting(program, size, slides, watched, beside=beside)
         return rewriting.build() if rewriting.switches or rewriting.features else None
 
 
@@ -263,7 +270,7 @@ class FoundCorners(NamedTuple):
 def find_corners(program: Recurrent, size: int) -> FoundCorners | None:
     """The borders that depend on positions and time, of `size` coordinates; None where no output jumps."""
     with np.errstate(all="ignore"):
-        rewriting = _Rewriting(program, size, False, len(program.line.outputs))
+        rewriting = _Rewriting(program, size, False, len(program.line.outputs), beside=True)
         return rewriting.find_corners() if rewriting.switches else None
 
 
@@ -282,7 +289,8 @@ class _Rewriting:
     """The program anew, with an input for every piece where the program decides.
 
     As many of its last outputs are the `mechanics` (`_kick.Mechanics`), which the result does not have. What the piece
-    `apart` jumps with is there for both of its sides, each with pieces of its own, from where it begins to q̈.
+    `apart` jumps with is there for both of its sides, each with pieces of its own, from where it begins to q̈. Where a
+    root is of what is chosen, that border is no piece and steps end `beside` it, even if the root is not zero there.
     """
 
     def __init__(
@@ -292,9 +300,11 @@ class _Rewriting:
         slides: bool,
         watched: int = 0,
         mechanics: int = 0,
+        beside: bool = False,
         apart: int | None = None,
     ):
-        self.mechanics, self._again = mechanics, (program, size, slides, watched, mechanics)
+        self.mechanics, self._again = mechanics, (program, size, slides, watched, mechanics, beside)
+        self.beside = beside
         self.program, self.size, self.moving, self.slides = program, size, 2 * size + 1, slides
         self.watched = program.line.outputs[len(program.line.outputs) - watched :]
         self._jumping: set[int] = set()  # pieces that something may jump with
@@ -355,8 +365,16 @@ class _Rewriting:
         at_zero, at_one = bases_of(_SINGULAR_AT_ZERO), bases_of(_SINGULAR_AT_ONE)
         if not at_zero | at_one:
             return set()
-        of_selects = [nodes[i][1][0] for i in at_zero | at_one if nodes[i][0] == "select"]
-        out = _below(self.program.line, of_selects)
+        selects = [i for i in at_zero if nodes[i][0] == "select"]
+        below = at_one | at_zero if self.beside else at_one
+        out = _below(self.program.line, [nodes[i][1][0] for i in below if nodes[i][0] == "select"])
+        for i in selects:
+            condition, *branches = nodes[i][1]
+            deciding = {j: self._compared(j) for j in _below(self.program.line, [condition])}
+            out |= {j for j, equal in deciding.items() if equal and any(self._vanishes(x, equal) for x in branches)}
+            bases = {self._base(x) for x in branches} - at_zero
+            at_zero |= bases
+            selects += [x for x in bases if nodes[x][0] == "select"]
         for i in needed:
             op, operands, _ = nodes[i]
             if op in (*_COMPARISONS, "abs", "max", "min", "sign"):
@@ -367,6 +385,15 @@ class _Rewriting:
         # What else is decided at the same border is decided beside it: no step may end where the root has no series.
         abrupt = {self._compared(i) for i in out} - {None}
         return {i for i in needed if i in out or self._compared(i) in abrupt} - self.cones.keys()
+
+    def _vanishes(self, i: int, equal: frozenset[int]) -> bool:
+        """True if a node may be zero where these numbers are `equal`, or where the only one is zero."""
+        op, operands, attribute = self.program.line.nodes[i]
+        if op in ("input", "constant"):
+            return equal == {i} or (attribute == 0.0 and op == "constant")
+        if equal in ({self._base(i)}, {self._base(x) for x in operands}):
+            return True
+        return (all if op in ("add", "sub") else any)(self._vanishes(x, equal) for x in operands)
 
     def _compared(self, i: int) -> frozenset[int] | None:
         """The numbers that are equal at the border of a node, but for factors and zero; None of other nodes."""

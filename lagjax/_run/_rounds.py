@@ -23,7 +23,7 @@ BLOCK = 32  # rounds that are left out together where no motion goes on: what go
 
 
 def run_rounds(run_round: Callable, first, absent: PyTree, rows: PyTree, goes_on: Callable) -> tuple[Any, PyTree]:
-    """The last carry, and the records (N, …), of `run_round(carry, row)` for `rows` (N, …) while one `goes_on(carry, row)`.
+    """The last carry, and the records (N, …), of `run_round(carry, row)` for `rows` (N, …) while `goes_on(carry, row)`.
 
     In a batch it runs while any member goes on. The records of rounds that are left out are `absent`.
     """

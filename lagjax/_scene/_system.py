@@ -161,8 +161,12 @@ class System(eqx.Module):
             setattr(self, role, accepted)
         if self.reads_multipliers and (self.touches or not self._constraint_roles):
             raise ValueError(
-                "forces asks for `multipliers`, those of constraints=... and velocity_constraints=..., which this "
-                + ("scene has beside contacts: their friction is friction=..." if self.touches else "System has not.")
+                "forces asks for `multipliers`, and no force may read the normal force of a contact: sliding friction "
+                "is friction=... with slip=.... For rolling resistance or a brake on what stays in touch write that "
+                "contact as one of constraints=..., whose multiplier forces may read."
+                if self.touches
+                else "forces asks for `multipliers`, those of constraints=... and velocity_constraints=..., which this "
+                "System has not."
             )
 
     def __repr__(self) -> str:

@@ -258,3 +258,45 @@ def test_a_gap_is_infinite_while_it_is_off():
     np.testing.assert_allclose(run.q[0, 1:], [[2.0, 0.0], [5.0, 0.0]], atol=1e-12)
     np.testing.assert_allclose(run.q[1, 2], [-1.5, -(1.5**2)], atol=1e-9)
     np.testing.assert_allclose(run.contact_forces["floor"][0], [0.0, 2.0, 2.0], atol=1e-12)
+
+
+EDGE = 0.05  # the radius of a ball, about the edge of a table at x = params
+
+
+def over_edge(q, params):
+    x = q[0] - params
+    return jnp.where(x < 0, q[1], jnp.sqrt(jnp.where(x < 0, 1.0, x**2 + q[1] ** 2))) - EDGE
+
+
+@pytest.mark.parametrize("edge", [0.0, 0.3])
+def test_a_ball_rolls_over_an_edge_or_flies_off_it(edge):
+    """The curvature of the gap jumps under the closed contact, and λ with it: at 0.3 from mg to mg cos θ − mv²/r, which
+    ends where cos θ = (2 + v²/gr) / 3; at 1 and more below zero, where the ball flies on by itself."""
+    table = lagjax.System(
+        lambda q, v: 0.5 * v @ v - G * q[1], contacts=lambda q, params: {"table": over_edge(q, params)}
+    )
+
+    def end(x, duration, rtol):
+        speed, edge, begin = x
+        start = jnp.stack([begin, EDGE]), jnp.stack([speed, 0.0])
+        return lagjax.simulate(table, *start, jnp.stack([0.0, duration]), edge, rtol=rtol).q[-1]
+
+    def flight(x, duration):
+        speed, edge, begin = x
+        return jnp.stack([begin + speed * duration, EDGE - 0.5 * G * (duration - (edge - begin) / speed) ** 2])
+
+    for rtol in (1e-6, 1e-9, 1e-11, 1e-13):
+        follow = jax.jit(lambda x, duration, rtol=rtol: end(x, duration, rtol))
+        for speed in (1.0, 2.0, 10.0):
+            x, duration = jnp.array([speed, edge, edge - 0.06]), 0.09 / speed
+            np.testing.assert_allclose(follow(x, duration), flight(x, duration), rtol=0, atol=1e-13)
+        slow = lagjax.simulate(
+            table, jnp.array([edge - 0.06, EDGE]), jnp.array([0.3, 0.0]), jnp.array([0.0, 0.8]), edge, rtol=rtol
+        )
+        (leaves,) = np.flatnonzero(np.asarray(slow.contact_changes.change) == 1)
+        place = (slow.contact_changes.q[leaves] - jnp.array([edge, 0.0])) / EDGE
+        assert place[1] == pytest.approx((2 + 0.09 / (G * EDGE)) / 3, abs=max(1e-13, 30 * rtol))
+    x, duration = jnp.array([1.0, edge, edge - 0.06]), 0.09
+    for mode in (jax.jacfwd, jax.jacrev):
+        slopes = jax.jit(mode(lambda x: end(x, duration, 1e-12)))(x)
+        np.testing.assert_allclose(slopes, jax.jacfwd(flight)(x, duration), rtol=0, atol=1e-11)

@@ -441,5 +441,30 @@ def test_a_law_that_is_linear_in_several_multipliers_needs_no_sign():
 def test_forces_ask_for_multipliers_of_constraints_alone():
     with pytest.raises(ValueError, match="which this System has not"):
         lagjax.System(gravity, forces=rub)
-    with pytest.raises(ValueError, match="their friction is friction="):
+    with pytest.raises(ValueError, match="one of constraints="):
         lagjax.System(gravity, forces=rub, constraints=lambda q: q @ q - 1.0, contacts=lambda q: q[1] + 2.0)
+
+
+def test_rolling_resistance_stops_a_disc_whose_floor_is_a_constraint():
+    """c N against the rotation: the disc slows by 2 c g / 3 R, and rests; of a contact no force may read N."""
+
+    def resist(q, v, params, multipliers):
+        return jnp.array([0.0, 0.0, -params * multipliers["floor"] * jnp.sign(v[2])])
+
+    def disc(q, v):
+        return v[:2] @ v[:2] + 0.5 * RADIUS**2 * v[2] ** 2 - 2 * G * q[1]
+
+    rolling = lagjax.System(
+        disc, forces=resist, constraints=lambda q: {"floor": q[1] - RADIUS},
+        velocity_constraints=lambda q, v: {"rolls": v[0] + RADIUS * v[2]},
+    )  # fmt: skip
+
+    def places(c):
+        ts, start = jnp.array([0.0, 2.0, 20.0]), (jnp.array([0.0, RADIUS, 0.0]), jnp.array([1.0, 0.0, -1 / RADIUS]))
+        return lagjax.simulate(rolling, *start, ts, c).q[1:, 0]
+
+    c, slows = 0.003, 2 * 0.003 * G / (3 * RADIUS)
+    np.testing.assert_allclose(places(c), [2 - 2 * slows, 1 / (2 * slows)], rtol=1e-12)
+    np.testing.assert_allclose(jax.jacfwd(places)(c), [-2 * slows / c, -1 / (2 * slows * c)], rtol=1e-11)
+    with pytest.raises(ValueError, match=r"no force may read the normal force of a contact.*one of constraints=\.\.\."):
+        lagjax.System(disc, forces=resist, contacts=lambda q: {"floor": q[1] - RADIUS})

@@ -292,3 +292,28 @@ def test_a_jump_beside_a_root_that_is_singular_elsewhere(slow):
         differences = [(end(x + d) - end(x - d)) / 2e-5 for d in step]
         for mode in (jax.grad, jax.jacfwd):
             np.testing.assert_allclose(mode(end)(x), differences, rtol=1e-7, atol=1e-7)
+
+
+@pytest.mark.parametrize("kind", ["constraints", "contacts"])
+def test_a_bead_passes_where_the_curvature_of_its_wire_jumps(kind):
+    """As in its one coordinate, where no projection decides by rounding on which side of the border it is."""
+
+    def height(x):
+        return jnp.where(x < 0.3, 0.0, (x - 0.3) ** 2)
+
+    def slope(x):
+        return jnp.where(x < 0.3, 0.0, 2 * (x - 0.3))
+
+    wire = lagjax.System(lambda q, v: 0.5 * v @ v - 9.81 * q[1], **{kind: lambda q: q[1] - height(q[0])})
+    alone = lagjax.System(lambda x, v: 0.5 * (1 + slope(x) ** 2) * v**2 - 9.81 * height(x))
+
+    def ends(speed, duration):
+        ts, still = jnp.stack([0.0 * duration, duration]), 0.0 * speed
+        bead = lagjax.simulate(wire, jnp.array([0.24, 0.0]), jnp.stack([speed, still]), ts, rtol=1e-13)
+        return jnp.stack([bead.q[-1, 0], lagjax.simulate(alone, 0.24, speed, ts, rtol=1e-13).q[-1]])
+
+    durations = jnp.array([0.205, 0.21, 0.22, 0.24, 0.25, 0.28, 0.3])
+    modes = [jax.jacfwd, jax.jacrev] if kind == "contacts" else [jax.jacfwd, jax.jacrev, jax.hessian]
+    for derivative in modes:
+        along = jax.jit(jax.vmap(derivative(ends), (None, 0)))(0.3, durations)
+        np.testing.assert_allclose(along[:, 0], along[:, 1], rtol=0, atol=1e-10)

@@ -164,7 +164,7 @@ class MachineCode(AbstractEngine):
         flow, tolerances = _unguarded_flow(problem), tolerances_of(problem)
         values, given = (located.path, located.t_end, located.y_end), (problem.ts, problem.y0, problem.vector)
         varied = stretch_variation(flow, surfaces, tolerances)
-        return attach_derivative(varied, values, *given, located.t_end, k, crosses)
+        return attach_derivative(varied, values, *given, located.t_end, located.y_end, k, crosses)
 
     def refuses_crossings(self, problem: Problem, surfaces: Surfaces) -> str | None:
         """Why it cannot find the crossings of these surfaces, as the end of a sentence; None where it can."""

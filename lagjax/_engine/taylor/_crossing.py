@@ -19,7 +19,7 @@ import numpy as np
 from lagjax._engine._problem import Problem, Solution, evaluate_condition, has_own_root_finder, signs_of_event
 from lagjax._engine.taylor import _primitives
 from lagjax._engine.taylor._flow import Flow, Tolerances
-from lagjax._engine.taylor._surfaces import Surfaces, crossing_variation, require_one_number
+from lagjax._engine.taylor._surfaces import Surfaces, crossing_variation, jumps_through_zero, require_one_number
 from lagjax._equations import Derivation
 from lagjax._interface import ENDED_WELL, EVENT_OCCURRED, halves
 from lagjax._native import CHANGE_BITS
@@ -148,12 +148,12 @@ def _event_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
 
 @functools.lru_cache(maxsize=64)
 def stretch_variation(flow: Flow, surfaces: Surfaces | None, tolerances: Tolerances):
-    """`(ts, y0, params, t_end, k, crosses)` → path, t, y, for the sake of their derivatives."""
+    """`(ts, y0, params, t_end, y_end, k, crosses)` → path, t, y, for the sake of their derivatives."""
     moves, still = surfaces and crossing_variation(surfaces), jax.lax.stop_gradient
 
     @jax.jit
-    def run_unguarded(ts, y0, params, t_end, k, crosses):
-        path, *stop = run_stretch(flow, tolerances, ts, y0, params, t_end, crosses)
+    def run_unguarded(ts, y0, params, t_end, y_end, k, crosses):
+        path, *stop = run_stretch(flow, surfaces, tolerances, ts, y0, params, t_end, y_end, k, crosses)
         if moves is None:
             return path, *stop
         # A surface that is not crossed may have no derivative here.
@@ -164,14 +164,20 @@ def stretch_variation(flow: Flow, surfaces: Surfaces | None, tolerances: Toleran
     return run_unguarded
 
 
-def run_stretch(flow: Flow, tolerances: Tolerances, ts, y0, params, t_end, crosses) -> tuple:
-    """The path, the end, and the state there, of a motion from ts[0] to `t_end`, where a surface `crosses` or none.
+def run_stretch(
+    flow: Flow, surfaces: Surfaces | None, tolerances: Tolerances, ts, y0, params, t_end, y_end, k, crosses
+) -> tuple:
+    """The path, the end, and the state there, of a motion from ts[0] to `t_end`, where surface k `crosses` or none.
 
     The run goes to the rounded time of the event, and its state there is the one whose crossing varies: so the rates of
     short motions between late events cancel to the last digit. And where nothing depends on the time, a start that
     varies takes the motion with it: how long motions last varies by what they are, not by when they are.
+    To a surface that jumps through zero the run goes not quite: the acceleration may jump there.
     """
     still = jax.lax.stop_gradient
+    if surfaces is not None and surfaces.borders is not None:
+        jumps = crosses & jumps_through_zero(surfaces, k, t_end, y_end, params)
+        t_end = jnp.where(jumps, _shortly_before(ts, t_end), t_end)
     reached = jnp.where(ts <= t_end, ts, jnp.clip(still(ts), still(ts[0]), still(t_end)))
     later = 0.0 if flow.reads_time else ts[0] - still(ts[0])
     end = t_end + jnp.where(crosses, later, 0.0)

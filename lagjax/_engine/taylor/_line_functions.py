@@ -117,7 +117,7 @@ class Line:
         return self._derivative(pullback, self.outputs)
 
     @functools.cached_property
-    def beside_derivative(self) -> "Line":
+    def with_derivative(self) -> "Line":
         """(x, v) ↦ g(x), D(x) v, one behind the other."""
         line, size = self.forward.line, self.forward.size
         graph = Graph(2 * len(line.nodes) + len(self.line.nodes) + size)

@@ -19,7 +19,7 @@ import numpy as np
 
 from lagjax._engine.taylor._line_functions import outputs
 from lagjax._equations import OPERATION_BUDGET, Derivation
-from lagjax._native import GUARD_NOISE, INSTANT, SINGLE_NOISE, SMALLEST_STEP, Guards, Released
+from lagjax._native import GUARD_NOISE, INSTANT, SINGLE_NOISE, SMALLEST_STEP, Guards
 from lagjax._primitives import differentiable_where
 from lagjax._program import (
     Program,
@@ -72,14 +72,13 @@ class Surfaces(NamedTuple):
     is_rounded: bool = False
     borders: StraightLine | None = None
     holds: tuple[bool, ...] = ()
-    released: Released | None = None
 
     def guards(self, notes: bool = False, remembers: bool = False) -> Guards:
         """The surfaces as guards of machine code: a change ends the motion or, with `notes`, is written down.
 
         A motion that `remembers` is given the side of each surface from which it comes (see `Guards`).
         """
-        given = notes, remembers, self.is_rounded, self.holds, self.released
+        given = notes, remembers, self.is_rounded, self.holds
         return Guards(self.values, self.complete, self.directions, *given)
 
     @property
@@ -236,21 +235,12 @@ def move_to_zero(surfaces: Surfaces, k, taken, at: tuple, still: tuple) -> tuple
     nothing moves. Where the guard jumps through zero, δg is that of the number whose border is there: the one that is
     nearest in time.
     """
-    program, n, count = surfaces.followed(), still[1].shape[0] // 2, len(surfaces.directions)
-
-    def follow(t, y, numbers):
-        found = outputs(program, len(program.line.outputs), jnp.append(y, t), numbers)
-        return jnp.split(found, [len(found) // 2 - n, len(found) - 2 * n])
-
+    follow = functools.partial(_follow, surfaces)
     (t, y, _), (values, rates, slope) = at, follow(*at)
     zeros, still_rates, still_slope = follow(*still)
     along = jnp.ones_like(t), still_slope
     _, (_, bends, turn) = jax.jvp(lambda t, y: follow(t, y, still[2]), still[:2], along)
-    place, number = k, np.arange(len(values))
-    if surfaces.borders is not None:
-        times = jnp.abs(zeros / still_rates) * np.where(number >= count, _LATER, 1.0)
-        place = jnp.argmin(jnp.where(((number >= count) | (number == k)) & ~jnp.isnan(times), times, jnp.inf))
-    here = number == place
+    here = np.arange(len(values)) == (k if surfaces.borders is None else _find_zero(surfaces, k, zeros, still_rates))
     varied, rate, still_rate, bend = (
         jnp.where(here, x, 0.0).sum() for x in (values - zeros, rates, still_rates, bends)
     )
@@ -259,6 +249,29 @@ def move_to_zero(surfaces: Surfaces, k, taken, at: tuple, still: tuple) -> tuple
     part = jnp.where(taken, varied, 0.0) / jnp.where(moves, rate, 1.0)
     later = -part - 0.5 * bend / jnp.where(moves, still_rate, 1.0) * part**2
     return crosses, t + later, y + slope * later + 0.5 * turn * later**2
+
+
+def jumps_through_zero(surfaces: Surfaces, k, t, y, numbers):
+    """True if guard k changes its sign at (t, y) by a jump, at a border of its own."""
+    if surfaces.borders is None:
+        return np.array(False)
+    values, rates, _ = _follow(surfaces, *jax.lax.stop_gradient((t, y, numbers)))
+    return _find_zero(surfaces, k, values, rates) >= len(surfaces.directions)
+
+
+def _follow(surfaces: Surfaces, t, y, numbers) -> list:
+    """The guards and the distances of their borders, how fast both change, and the rate of the state."""
+    program, n = surfaces.followed(), y.shape[0] // 2
+    found = outputs(program, len(program.line.outputs), jnp.append(y, t), numbers)
+    return jnp.split(found, [len(found) // 2 - n, len(found) - 2 * n])
+
+
+def _find_zero(surfaces: Surfaces, k, values, rates):
+    """The number that is zero where guard k changes: that of the guard, or of the border that is nearest in time."""
+    number, count = np.arange(values.size), len(surfaces.directions)
+    times = jnp.abs(values / rates) * np.where(number >= count, _LATER, 1.0)
+    times = jnp.where(jnp.isnan(times), jnp.inf, times)
+    return jnp.argmin(jnp.where((number >= count) | (number == k), times, jnp.inf))
 
 
 # A guard that jumps at a border is not zero there: of the times to both that to the guard's own zero is by many orders

@@ -1,12 +1,13 @@
 """`Timings`: instants at which a motion crossed sections, as data; and the times that a scene gives, with derivatives.
 
 A residual is the time of a crossing less the measured one. The crossings, and their derivatives, are those of
-`lagjax.crossings`; of hybrid motion (`lagjax.Hybrid`) the instants are those of its transitions, with their
-derivatives.
+`lagjax.crossings`; of hybrid motion (`lagjax.Hybrid`) the instants are those of its transitions, of a contact those of
+its impacts, with the derivatives of `lagjax.simulate`.
 """
 
 import dataclasses
 import functools
+import re
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -22,8 +23,8 @@ from lagjax._fit.model._records import Guess, MeasuredSignal, real_numbers, requ
 from lagjax._interface import Layout, halves
 from lagjax._primitives import sentence
 from lagjax._program import Unlowerable
-from lagjax._run import directions_of, sections_of, simulate
-from lagjax._run.hybrid import Hybrid, Scene, Transition, jumps
+from lagjax._run import crossings, directions_of, sections_of, simulate
+from lagjax._run.hybrid import Hybrid, Scene, Transition
 from lagjax._scene import System
 
 PyTree = Any
@@ -33,10 +34,7 @@ _PATIENCE = 2.0  # mean times between crossings that are waited for behind the l
 # Of the tolerance of a fit, for the motion itself: its error grows with the square of the time, and after a thousand
 # periods of seven planets is a thirtieth of what they are measured to. Derivatives then need no shorter steps either.
 _SHARPER = 0.1
-_TOUCHES = (
-    " A section that only touches zero, as a gap does at an impact, is not crossed there. For times of impacts write "
-    "the scene as a lagjax.Hybrid with a Transition at the impact, and time that: Timings(transition, times, …)."
-)
+_CHANGES = 256  # the least budget of changes of a motion with contacts, four for each measured impact
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +43,8 @@ class Timings(MeasuredSignal):
 
     - `section`: a function of (q, qdot), and of `t` and `params` by name, that returns one real number; a crossing is
       where that changes sign. A dict of functions for several sections of the same motion. Of a `lagjax.Hybrid` one of
-      its transitions, or a dict of them: the times are those at which it happened.
+      its transitions, or a dict of them: the times are those at which it happened. In a scene with contacts also the
+      name of one, "floor", "wheels[1]" in an array, or a dict of names: the times are those at which it was struck.
     - `times`: when it was crossed, (K,), or a dict of such arrays by the names of the sections. NaN where missing.
     - `t0`: the time at which the motion begins, before all `times`. Crossings are counted from there.
     - `start`: the state at `t0`: (q0, qdot0) if it is known, `lagjax.Guess(q0, qdot0)` to fit it, or a function of the
@@ -65,7 +64,7 @@ class Timings(MeasuredSignal):
     ```
     """
 
-    section: Callable | Transition | dict[str, Callable] | dict[str, Transition]
+    section: Callable | Transition | str | dict[str, Callable] | dict[str, Transition] | dict[str, str]
     times: Any
     t0: float
     start: tuple[PyTree, PyTree] | Guess | Callable
@@ -77,8 +76,8 @@ class Timings(MeasuredSignal):
 
     def __post_init__(self):
         keys, functions = _sections(self.section)
-        if isinstance(functions[0], Transition) and self.direction != 0:
-            raise ValueError("direction is for functions: a transition has its own. Leave it at 0.")
+        if isinstance(functions[0], Transition | str) and self.direction != 0:
+            raise ValueError("direction is for functions: a transition, or a contact, has its own. Leave it at 0.")
         if self.start is None:
             raise TypeError("A lagjax.Timings needs a start: (q0, qdot0), lagjax.Guess(q0, qdot0), or a function.")
         require_start(self.start)
@@ -140,13 +139,15 @@ class FlatTimings(NamedTuple):
 
 
 def _sections(section) -> tuple[tuple[str, ...] | None, tuple]:
-    """The names of a dict of sections, or None, and the functions or the transitions."""
+    """The names of a dict of sections, or None, and the functions, the transitions or the names of contacts."""
     parts = tuple(section.values()) if isinstance(section, dict) else (section,)
-    which = [isinstance(part, Transition) for part in parts]
-    if not any(which):
+    kinds = {next((kind for kind in (Transition, str) if isinstance(part, kind)), None) for part in parts}
+    if kinds <= {None}:
         return sections_of(section)
-    if not all(which):
-        raise TypeError("section must hold functions, or transitions of a lagjax.Hybrid, and not both.")
+    if len(kinds) > 1:
+        raise TypeError(
+            "section must hold functions, transitions of a lagjax.Hybrid or names of contacts, and all of one kind."
+        )
     return tuple(section) if isinstance(section, dict) else None, parts
 
 
@@ -207,14 +208,19 @@ class Clock:
 
 
 def build_clock(scene: Scene, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> Clock:
-    """The clock of a scene. Raises `ValueError` for functions of a hybrid one, and for transitions of others."""
-    is_of_transitions = isinstance(_sections(timings.section)[1][0], Transition)
+    """The clock of a scene. Raises `ValueError` for functions of a hybrid one, and for what is of another scene."""
+    first = _sections(timings.section)[1][0]
     if isinstance(scene, Hybrid):
-        if not is_of_transitions:
+        if not isinstance(first, Transition):
             raise ValueError("Of a lagjax.Hybrid only the times of its transitions are data: Timings(transition, …).")
-        return _build_transition_clock(scene, layout, parameters, timings, rtol)
-    if is_of_transitions:
+        return _build_jump_clock(scene, layout, parameters, timings, rtol, _transitions_in)
+    if isinstance(first, Transition):
         raise ValueError("Times of transitions are of a lagjax.Hybrid: give that to `fit` in the place of the System.")
+    if scene.touches:
+        find = _impacts_in if isinstance(first, str) else _crossings_in
+        return _build_jump_clock(scene, layout, parameters, timings, rtol, find)
+    if isinstance(first, str):
+        raise ValueError(f"Timings names the contact {first!r}, and this System has none: give it contacts=....")
     return _build_section_clock(scene, layout, parameters, timings, rtol)
 
 
@@ -251,54 +257,103 @@ def _build_section_clock(
         first = int(np.argmax(missing))
         which = flat.which[first]
         name = "" if keys is None else f" of section[{keys[which]!r}]"
-        text = (
+        return (
             f"There are {int(noted.count[which])} crossings{name} up to t = {span[1]:g}, but number "
             f"{flat.numbers[first]}, counted from 0, was measured."
         )
-        return text + _TOUCHES * jumps(system)
 
     return Clock(times, describe_failure)
 
 
-def _build_transition_clock(
-    scene: Hybrid, layout: Layout, parameters: Parameters, timings: Timings, rtol: float
+def _build_jump_clock(
+    scene: Scene, layout: Layout, parameters: Parameters, timings: Timings, rtol: float, find: Callable
 ) -> Clock:
+    """The clock of a motion that jumps.
+
+    `find` gives a function of a motion's arguments that returns which of its instants are those of each time (M, K),
+    and when these are; and what was timed as text, before and behind its count.
+    """
     flat, span = timings.flat, np.array([float(timings.t0), _last_time(timings)])
-    _, transitions = _sections(timings.section)
+    instants, happens, advice = find(scene, layout, parameters, timings, rtol)
+
+    def given(y0, numbers):
+        return *map(layout.restore, halves(y0)), span, parameters.restore(numbers)
+
+    def times(y0, numbers):
+        mine, t = instants(*given(y0, numbers))
+        mine = mine & (jnp.cumsum(mine, axis=1) == flat.numbers[:, None] + 1)
+        return jnp.where(mine.any(axis=1), jnp.where(mine, t, 0.0).sum(axis=1), jnp.nan)
+
+    def describe_failure(y0, numbers) -> str:
+        first = int(np.argmax(~np.isfinite(np.asarray(times(y0, numbers)))))
+        motion = simulate(scene, *given(y0, numbers), rtol=rtol, throw=False)
+        t_end, happened = float(motion.end.t), int(instants(*given(y0, numbers))[0][first].sum())
+        y_end = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves((motion.end.q, motion.end.qdot))])
+        text = sentence(int(motion.result._value), t_end, span[1], y_end, layout.names)
+        return (
+            f"There are {happened} {happens(first)} up to t = {t_end:g}, but number "
+            f"{flat.numbers[first]}, counted from 0, was measured.{advice}" + (f" {text}" if text else "")
+        )
+
+    return Clock(times, describe_failure)
+
+
+def _transitions_in(scene: Hybrid, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> tuple:
+    flat, (_, transitions) = timings.flat, _sections(timings.section)
     ways = np.array([_mode_places(scene, one) for one in transitions])[flat.which]
     if scene.max_transitions < len(flat.times):
         raise ValueError(
             f"{len(flat.times)} transitions were timed, but Hybrid(max_transitions={scene.max_transitions}) "
             "follows no more than that: give a larger budget."
         )
-    source, target = (jnp.asarray(ways[:, k, None]) for k in (0, 1))
-    number = jnp.asarray(flat.numbers[:, None])
 
-    def run(y0, numbers):
-        q, qdot = map(layout.restore, halves(y0))
-        return simulate(scene, q, qdot, span, parameters.restore(numbers), rtol=rtol, throw=False)
-
-    def times(y0, numbers):
-        happened = run(y0, numbers).transitions
+    def instants(*given):
+        happened = simulate(scene, *given, rtol=rtol, throw=False).transitions
         assert happened is not None
-        mine = (happened.source == source) & (happened.target == target)  # (M, K)
-        mine = mine & (jnp.cumsum(mine, axis=1) == number + 1)
-        return jnp.where(mine.any(axis=1), happened.t[jnp.argmax(mine, axis=1)], jnp.nan)
+        return (happened.source == ways[:, :1]) & (happened.target == ways[:, 1:]), happened.t
 
-    def describe_failure(y0, numbers) -> str:
-        missing, motion = ~np.isfinite(np.asarray(times(y0, numbers))), run(y0, numbers)
-        assert motion.transitions is not None
-        t_end, first = float(motion.end.t), int(np.argmax(missing))
-        y_end = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves((motion.end.q, motion.end.qdot))])
-        pairs = np.stack([motion.transitions.source, motion.transitions.target], axis=1)
-        happened, between = (pairs == ways[first]).all(axis=1).sum(), [repr([*scene.modes][k]) for k in ways[first]]
-        text = sentence(int(motion.result._value), t_end, span[1], y_end, layout.names)
-        return (
-            f"There are {happened} transitions from {' to '.join(between)} up to t = {t_end:g}, but number "
-            f"{flat.numbers[first]}, counted from 0, was measured." + (f" {text}" if text else "")
-        )
+    return instants, lambda m: f"transitions from {' to '.join(repr([*scene.modes][k]) for k in ways[m])}", ""
 
-    return Clock(times, describe_failure)
+
+def _impacts_in(system: System, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> tuple:
+    """A contact is struck where it gives an impulse. Raises `ValueError` for a name that no contact has."""
+    flat, (_, struck) = timings.flat, _sections(timings.section)
+    names = system.contact_names(layout, parameters.restore(parameters.first))
+    short = list(map(_shorten, names))
+    for name in struck:
+        if name not in (*short, *names):
+            raise ValueError(f"Timings names the contact {name!r}, and the contacts are {', '.join(map(repr, short))}.")
+    places = np.array([(short if name in short else names).index(name) for name in struck])[flat.which]
+    budget = max(_CHANGES, 4 * int(flat.numbers.max() + 1))
+
+    def instants(*given):
+        impacts = simulate(system, *given, rtol=rtol, throw=False, max_transitions=budget).impacts
+        assert impacts is not None
+        leaves = jax.tree.leaves(impacts.impulse)
+        impulses = jnp.concatenate([leaf.reshape(len(impacts.t), -1) for leaf in leaves], axis=1)
+        return impulses.T[places] > 0, impacts.t
+
+    return instants, lambda m: f"impacts of {struck[flat.which[m]]!r}", ""
+
+
+def _crossings_in(system: System, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> tuple:
+    flat, (keys, _) = timings.flat, _sections(timings.section)
+    names = system.contact_names(layout, parameters.restore(parameters.first))
+    room, name = int(flat.numbers.max()) + 1, _shorten(names[0])
+
+    def instants(*given):
+        limits = {"direction": timings.direction, "count": room, "rtol": rtol}
+        found = crossings(system, timings.section, *given, **limits, throw=False)
+        t = jnp.stack([of.t for of in ([found] if keys is None else [found[key] for key in keys])])[flat.which]
+        return jnp.isfinite(t), t
+
+    advice = f" An impact that closes a gap is no crossing: Timings({name!r}, times, …) are those of a contact."
+    return instants, lambda m: "crossings" + ("" if keys is None else f" of section[{keys[flat.which[m]]!r}]"), advice
+
+
+def _shorten(name: str) -> str:
+    """A contact's name without its role: floor of contacts['floor']."""
+    return re.sub(r"^\w+\['(.*?)'\]", r"\1", name)
 
 
 def _mode_places(scene: Hybrid, transition: Transition) -> tuple[int, int]:

@@ -1,7 +1,7 @@
 """Motions with contacts: gaps and velocities that stay ≥ 0, impacts, rest and friction.
 
-    System(contacts=…) ─► ContactPlan ─► _contact_motion ─► Ending, RoundRecord ─► Trajectory
-                                          ├─ _search: what happens, in loops over numbers; _places: of what where
+    System(contacts=…) ─► ContactPlan ─► _contact_motion ─► ContactEnding, RoundRecord ─► Trajectory
+                                          ├─ _contact_search: what happens, by loops over numbers, which _places names
                                           │    ├─ _law: which contacts push, stick and slide in an impact
                                           │    └─ _scene_code: a scene as the search takes it, and its runs
                                           ├─ _replay: the same with derivatives;  _impact_law: those of impulses
@@ -12,7 +12,6 @@ Source: Moreau, *Unilateral contact and dry friction* (1988); Brogliato, *Nonsmo
 
 import dataclasses
 import functools
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -27,8 +26,8 @@ from lagjax._native import GUARD_NOISE
 from lagjax._primitives import compute_in_doubles
 from lagjax._run._trajectory import ContactChanges, Impacts, Names, State, Trajectory, follow_in_doubles, step_counts
 from lagjax._run.contacts._contact_motion import (
+    ContactEnding,
     ContactPlan,
-    Ending,
     RoundRecord,
     RowPlaces,
     contact_motion,
@@ -53,20 +52,21 @@ def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int | Non
     """The motions of a batch whose system has contacts."""
     plan, _ = _plan(batch.member, max_transitions)
     if batch.is_known:
-        found = _follow_known(plan, batch.member, batch.y0, batch.vectors)
+        found = jax.device_put(_follow_known(plan, batch.member, batch.y0, batch.vectors))
     else:
         found = batch.map_members(lambda problem: follow_in_doubles(functools.partial(contact_motion, plan), problem))
-    return _trajectory(given.member, batch.member, *found, params, params_axes)
+    ending, record, impacts = found
+    return _trajectory(given.member, batch.member, ending, record, impacts, params, params_axes)
 
 
-def _motion(plan: ContactPlan, problem: Problem) -> tuple[Ending, RoundRecord, tuple]:
+def _motion(plan: ContactPlan, problem: Problem) -> tuple[ContactEnding, RoundRecord, tuple]:
     if not problem.is_known:
         return follow_in_doubles(functools.partial(contact_motion, plan), problem)
     found = _follow_known(plan, problem, np.asarray(problem.y0)[None], np.asarray(problem.vector)[None])
-    return jax.tree.map(lambda x: x[0], found)
+    return jax.device_put(jax.tree.map(lambda x: np.asarray(x)[0], found))
 
 
-def _follow_known(plan: ContactPlan, member: Problem, y0, vectors) -> tuple[Ending, RoundRecord, tuple]:
+def _follow_known(plan: ContactPlan, member: Problem, y0, vectors) -> tuple[ContactEnding, RoundRecord, tuple]:
     """The motions of members whose numbers are known, in the precision of `member`: `y0` (N, 2n), `vectors` (N, P)."""
 
     def follow(ts, y0, vectors):
@@ -176,7 +176,7 @@ def start_width(slopes, y0, acceleration, ts) -> np.ndarray:
 
 
 def _trajectory(
-    given: Problem, problem: Problem, ending: Ending, record: RoundRecord, impacts, params, axes=None
+    given: Problem, problem: Problem, ending: ContactEnding, record: RoundRecord, impacts, params, axes=None
 ) -> Trajectory:
     restore = problem.layout.restore
     (q, qdot), end, (at, behind) = (tuple(map(restore, halves(y))) for y in (ending.path, ending.y, record.y_next))

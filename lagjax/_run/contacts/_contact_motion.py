@@ -1,6 +1,6 @@
 """The motion of a scene with contacts: a search for what happens, without derivatives, and a replay, which has them.
 
-ContactPlan, start ─► SceneCode.search ─► Found ─► attach_derivative(Replay) ─► Ending, RoundRecord, impacts
+ContactPlan, start ─► SceneCode.search ─► Found ─► attach_derivative(Replay) ─► ContactEnding, RoundRecord, impacts
 """
 
 import functools
@@ -54,7 +54,7 @@ class ContactPlan(eqx.Module):
     directions: tuple[int, ...] = eqx.field(static=True, default=())
 
 
-class Ending(NamedTuple):
+class ContactEnding(NamedTuple):
     """A motion as a whole: its outputs, where and how it ended, and what is doubtful (as in `ContactChanges`)."""
 
     path: Any  # (T, 2n), NaN where not reached
@@ -78,8 +78,8 @@ class RoundRecord(NamedTuple):
     change: Any  # its kind
 
 
-class Scene(NamedTuple):
-    """What is made once of a scene: its search, its replay, its functions in flat coordinates.
+class SearchedScene(NamedTuple):
+    """A scene that has been made ready: its search, its replay, its functions in flat coordinates.
 
     `coefficients` are e and μ, (k + r,), or their program of the numbers of params; None where they have none.
     """
@@ -95,7 +95,9 @@ class Scene(NamedTuple):
 
 
 @compile_for_one_call
-def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) -> tuple[Ending, RoundRecord, tuple]:
+def contact_motion(
+    plan: ContactPlan, layout: Layout, ts, y0, params: PyTree
+) -> tuple[ContactEnding, RoundRecord, tuple]:
     """The motion from y0 (2n,) at ts[0], its changes, of which there may be `max_transitions`, and its impacts.
 
     Those are their times, the normal impulses, the energy that was lost, and their count.
@@ -110,8 +112,9 @@ def contact_motion(plan: ContactPlan, layout: Layout, ts, y0, params: PyTree) ->
         coefficients = scene.split_coefficients(line_of(scene.coefficients)(vector))
     else:
         coefficients = map(jnp.asarray, scene.split_coefficients(scene.coefficients))
-    given = ts, y0, vector, *coefficients
-    found = scene.code.search(*map(still, given))
+    restitution, friction = coefficients
+    given = ts, y0, vector, restitution, friction
+    found = scene.code.search(*still(given))
     row, played = _read(scene, found)
     played = Played(*attach_derivative(scene.replay, tuple(played), *given))
     return _arrange(scene, found, row, played, given[:3])
@@ -133,8 +136,9 @@ def follow_known(plan: ContactPlan, layout: Layout, params: PyTree, ts, y0, vect
     else:
         values = scene.split_coefficients(scene.coefficients)
         coefficients = [np.broadcast_to(x, (members, x.size)) for x in values]
-    found = scene.code.run(np.asarray(ts, float)[None], np.asarray(y0, float), vectors, *coefficients, None)
-    return _arrange(scene, found, *_read(scene, found), ())
+    found = scene.code.run(np.asarray(ts, float)[None], np.asarray(y0, float), vectors, *coefficients, room=None)
+    row, played = _read(scene, found)
+    return _arrange(scene, found, row, played, ())
 
 
 def _coefficients_at(flat: Flat, params: PyTree, vector) -> list[np.ndarray]:
@@ -145,16 +149,16 @@ def _coefficients_at(flat: Flat, params: PyTree, vector) -> list[np.ndarray]:
     return [np.asarray(flat.restitution(given)), np.asarray(flat.friction(given))]
 
 
-def _read(scene: Scene, found: Found) -> tuple[Any, Played]:
+def _read(scene: SearchedScene, found: Found) -> tuple[Any, Played]:
     fields, n = sizes_of_fields(scene.code.sizes), scene.code.sizes["N"]
     row = read_rows(found.record[..., : sum(fields[name] for name in SAID)], fields, SAID)
     t, y = found.ending[..., 0], found.ending[..., 1 : 2 * n + 1]
     return row, Played(found.path, row.at, row.before, row.behind, row.t_impact, row.impulse, row.lost, t, y)
 
 
-def _arrange(scene: Scene, found: Found, row, played: Played, inputs: tuple) -> tuple:
+def _arrange(scene: SearchedScene, found: Found, row, played: Played, inputs: tuple) -> tuple:
     """The ending, the changes, and the impacts in front; of what varies with `inputs`, if it is traced."""
-    library = jnp if inputs else np
+    library: Any = jnp if inputs else np
 
     def lost(there, x):
         there = there[(..., *[None] * (x.ndim - there.ndim))]
@@ -166,7 +170,7 @@ def _arrange(scene: Scene, found: Found, row, played: Played, inputs: tuple) -> 
     of_path = Contacts(closed, sticks, direction.reshape(*direction.shape[:-1], r, d), near[..., 0])
     rest = found.ending[..., 2 * n + 1 :]
     result, rounds, accepted, rejected = (rest[..., i].astype(int) for i in range(4))
-    ending = Ending(
+    ending = ContactEnding(
         lost((closed >= 0).all(axis=-1), played.path), of_path, played.t, played.y, result, rounds,
         (accepted, rejected), rest[..., 4:7].astype(int), rest[..., 7:10],
     )  # fmt: skip
@@ -187,7 +191,7 @@ def _arrange(scene: Scene, found: Found, row, played: Played, inputs: tuple) -> 
 # ---- what is made once -----------------------------------------------------------------------------------------------
 
 
-def scene_of(plan: ContactPlan, layout: Layout, params: PyTree, times: int) -> Scene:
+def scene_of(plan: ContactPlan, layout: Layout, params: PyTree, times: int) -> SearchedScene:
     """The scene for parameters of this structure and so many outputs. Raises `ValueError` for too many watches."""
     flat = Flat.from_system(plan.scene.system, layout, params)
     inside = InContact(params, opened(flat))
@@ -206,7 +210,7 @@ def scene_of(plan: ContactPlan, layout: Layout, params: PyTree, times: int) -> S
 def _make_scene(
     derivation: Derivation, open_derivation: Derivation, scene: ContactScene, tolerances: Tolerances, most: int,
     single: bool, sections: tuple, ways: tuple, code: tuple, structure, times: int
-) -> Scene:  # fmt: skip
+) -> SearchedScene:  # fmt: skip
     flat = _flat_of(derivation, scene, structure, code)
     places, shapes, n = RowPlaces.from_derivation(derivation, flat), flat.shapes, derivation.layout.size
     corners = corners_of(derivation, places.all, shapes)
@@ -229,7 +233,7 @@ def _make_scene(
     response = line_of(derivation.impact_response(places.all, doing))
     bends = response.line.replace(outputs=response.line.outputs[-len(places.all) :][:k])
     acceleration = line_of(derivation.acceleration, n)
-    lines = {"RESPONSE": response, "BENDS": Line(bends, inputs, inputs).beside_derivative, "ACCELERATION": acceleration}
+    lines = {"RESPONSE": response, "BENDS": Line(bends, inputs, inputs).with_derivative, "ACCELERATION": acceleration}
     if corners is not None:
         lines["SIDES"] = line_of(corners.sides)
         lines["SIDE_SLOPES"] = lines["SIDES"].forward
@@ -241,11 +245,11 @@ def _make_scene(
         "MULTIPLIERS_COUNT": len(derivation.multipliers.line.outputs),
     }  # fmt: skip
     touch = np.zeros((0, k)) if corners is None else corners.touch
-    arrays = dict(zip(ARRAYS, (flat.rough, places.normal, places.tangential, touch), strict=True))
+    arrays = dict(zip(ARRAYS, (flat.rough, places.tangential, touch), strict=True))
     multipliers = functools.cache(lambda: line_of(derivation.multipliers))
     searched = SceneCode(sizes, arrays, flows, surfaces, lines, multipliers, tolerances)
     flow = functools.cache(functools.partial(make_flow, derivation, scene.path, None))
-    return Scene(searched, Replay(searched, flow), flat, _lower_coefficients(flat, derivation.numbers.params))
+    return SearchedScene(searched, Replay(searched, flow), flat, _lower_coefficients(flat, derivation.numbers.params))
 
 
 def _lower_coefficients(flat: Flat, numbers: PyTree) -> np.ndarray | Program | None:
@@ -264,7 +268,7 @@ def _flat_of(derivation: Derivation, scene: ContactScene, structure, code: tuple
 
 
 def opened(flat: Flat) -> Contacts:
-    """What contacts do that are all open."""
+    """Contacts that are all open."""
     r, d = flat.rough.size, flat.shapes.directions
     return Contacts(jnp.zeros(flat.shapes.count), jnp.ones(r), jnp.ones((r, d)), jnp.zeros(()))
 

@@ -58,4 +58,4 @@ def _corners_of(derivation, places: tuple[int, ...], rough: tuple[int, ...], gap
 
 def append_sides(program: Program, corners: Corners) -> Program:
     """The program with the sides of corners behind its outputs."""
-    return dataclasses.replace(program, line=with_outputs(program, corners.sides.line).line)
+    return dataclasses.replace(program, line=with_outputs(program, corners.sides.line).line)  # type: ignore

@@ -44,7 +44,7 @@ class ImpactRows(NamedTuple):
 
 
 class Held(NamedTuple):
-    """What contacts do in an impact: the `rows` that are held (K,), 1 or 0, and of the r contacts with friction, which
+    """The contacts in an impact: the `rows` that are held (K,), 1 or 0, and of the r contacts with friction, which
     are `rough`, by which coefficient they slide (r,), 0 of others, and in which `direction` (r, d)."""
 
     rows: Any

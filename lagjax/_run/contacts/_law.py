@@ -17,6 +17,8 @@ MISSES = 1e-11
 SMALL_PIVOT, TINY = 1e-12, 1e-300
 # Pivots for each condition before the law counts as undecided: as many as there are take a few in all.
 PIVOTS = 16
+# Steps of Newton's method, of which there are some four, and the turn, an angle, below which they end.
+TURNS, ALIGNED = 30, 1e-9
 LINKED = 1e-14  # a coupling, as a part of what two contacts respond to their own impulses, that is none
 
 
@@ -109,32 +111,34 @@ def find_impulses(
 ):  # fmt: skip
     """Put the impulses (size,) by which rates of contacts that push become `targets` (k,), and slips that stick 0.
 
-    In space the directions of slips that slide are those behind the impact, by two steps of Newton's method.
+    In space the directions of slips that slide become those behind the impact, by Newton's method.
     """
-    size = k + r * d
-    held, slides, along, system = work, work[size:], work[size + r :], work[size + r + r * d :]
+    size, off = k + r * d, 1.0
+    held, slides, system = work, work[size:], work[size + r :]
     rest = system[size * size :]
     hold_rows(k, r, d, rough, coupling, push, sticks, held, system)
     for c in range(r):
         slides[c] = mu[c] * push[rough[c]] * (1.0 - sticks[c])
-        for x in range(d):
-            along[c * d + x] = direction[c * d + x]
-    for turn in range(3 if d == 2 and r > 0 else 1):
-        if turn > 0:
-            turn_directions(k, r, rough, coupling, rates, slides, along, held, impulses, rest)
-        write_held_system(k, r, d, rough, coupling, slides, along, held, system)
+    for _ in range(TURNS):
+        write_held_system(k, r, d, rough, coupling, slides, direction, held, system)
         for i in range(size):
             impulses[i] = held[i] * ((targets[i] if i < k else 0.0) - rates[i])
         solve(system, impulses, size)
-        mix_friction(k, r, d, rough, slides, along, impulses)
+        mix_friction(k, r, d, rough, slides, direction, impulses)
+        if d == 1 or r == 0 or off <= ALIGNED:
+            break
+        off = turn_directions(k, r, rough, coupling, rates, slides, direction, held, impulses, rest)
 
 
 @loop
 def turn_directions(
     k: int, r: int, rough: Wholes, coupling: Floats, rates: Floats, slides: Floats, along: Floats, held: Floats,
     impulses: Floats, work: Floats
-):  # fmt: skip
-    """Turn the directions (r, 2) of contacts that slide, along which there were `impulses`: one step of Newton's."""
+) -> float:  # fmt: skip
+    """Turn the directions (r, 2) of contacts that slide, along which there were `impulses`: one step of Newton's.
+
+    Returns the largest of these angles.
+    """
     size = k + 2 * r
     after, moved, system = work, work[size:], work[2 * size :]
     across, slopes = system[size * size :], system[size * size + r :]
@@ -169,9 +173,12 @@ def turn_directions(
         if slopes[c * r + c] == 0:
             slopes[c * r + c] = 1.0
     solve(slopes, across, r)
+    off = 0.0
     for c in range(r):
-        angle = atan2(along[2 * c + 1], along[2 * c]) - across[c]
-        along[2 * c], along[2 * c + 1] = cos(angle), sin(angle)
+        if slides[c] > 0:
+            angle, off = atan2(along[2 * c + 1], along[2 * c]) - across[c], max(off, abs(across[c]))
+            along[2 * c], along[2 * c + 1] = cos(angle), sin(angle)
+    return off
 
 
 @loop

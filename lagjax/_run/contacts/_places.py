@@ -1,10 +1,11 @@
-"""The places of what the search for contacts reads and writes (`_search`): in its scene, a member's memory, a record.
+"""The places of what the search for contacts reads and writes: in its scene, a member's memory, a row of a record.
 
 A scene is a row of integers: first those that are named here, then arrays. Of memories and records it holds at which
 double each field begins.
 """
 
 from types import SimpleNamespace
+from typing import TYPE_CHECKING, Any
 
 from lagjax._native import Struct
 
@@ -36,7 +37,7 @@ CODES = (
 )  # fmt: skip
 ARRAYS = (
     "ROUGH",  # (r,), the contacts with friction
-    "NORMAL", "TANGENTIAL",  # (k,), (r d,), their rows among all multipliers
+    "TANGENTIAL",  # (r d,), the rows of slips among all multipliers
     "TOUCH",  # (corners, k), which corner touches which contact
 )  # fmt: skip
 MEMORY = (
@@ -54,12 +55,12 @@ MEMORY = (
     "CAME",  # (sections,), the sides from which the motion comes
     "SLIP",  # (r,), the largest so far
     "LARGEST",  # (2n,), the largest numbers of the state so far
-    "GUARDS", "KINDS", "STAYS",  # of the stretch: the watches where it begins, (5, G), of which kind, what does not cross
+    "GUARDS", "KINDS", "STAYS",  # of the stretch: the watches where it begins (5, G), their kinds, what does not cross
     "MISSED", "TURNS", "LONGEST", "RESULT", "ROUNDS", "ROWS", "ACCEPTED", "REJECTED",
     "DOUBTS", "DOUBTED",  # (3,), as in `ContactChanges`
 )  # fmt: skip
 WORK = (
-    "GRADIENTS", "RESPONSES", "COUPLING", "VALUES", "RATES", "BENDS",  # the rows of contacts, as `ImpactRows`
+    "GRADIENTS", "RESPONSES", "COUPLING", "VALUES", "RATES", "BEND",  # the rows of contacts, as `ImpactRows`
     "WATCHED",  # (5, G), the watches of open contacts
     "TOUCHES", "PARTING", "NOISE",  # (k,) each: which touch, how fast they move apart, and the rounding of that
     "INVOLVED",  # (k,), which take part in an impact
@@ -85,7 +86,7 @@ SAID = (  # of a row of the record, what a user is told
 RECORD = (
     *SAID,
     "RAN",  # 1 if there was such a stretch
-    "END",  # of the stretch
+    "END", "STOP",  # of the stretch, and the state there (2n,)
     "WATCH", "CROSSES", "DECIDES",
     "DID",  # what the contacts did during it, as the inputs of lines have it
     "HELD", "SLIDES", "DIRECTION",  # of the impulses: rows (k + r d,), the contacts that slide (r,), and where (r d,)
@@ -101,6 +102,7 @@ RECORD = (
 
 NAMES = (*SIZES, *CODES, *ARRAYS, *MEMORY, *WORK, *(f"TO_{name}" for name in RECORD))
 _PLACES = {name: i for i, name in enumerate(NAMES)}
+assert len(_PLACES) == len(NAMES), "two fields of one name"
 at = SimpleNamespace(**_PLACES)
 _SCALARS = (
     "RTOL", "FIRST", "LAST", "MISSED", "TURNS", "LONGEST", "RESULT", "ROUNDS", "ROWS", "ACCEPTED", "REJECTED", "LATER",
@@ -114,6 +116,9 @@ def _struct(names: tuple[str, ...], scalars: tuple[str, ...] = _SCALARS, prefix:
     return Struct(places, frozenset(name.lower() for name in names if name in scalars), table)
 
 
-Scene = _struct((*SIZES, *CODES, *ARRAYS), (*SIZES, *CODES), table=None)
-Member, Entry = _struct(MEMORY), _struct(RECORD, prefix="TO_")
-Room = _struct(WORK, ("LATER",))
+if TYPE_CHECKING:  # whose fields are known at run time
+    Scene = Member = Entry = Room = Any
+else:
+    Scene = _struct((*SIZES, *CODES, *ARRAYS), (*SIZES, *CODES), table=None)
+    Member, Entry = _struct(MEMORY), _struct(RECORD, prefix="TO_")
+    Room = _struct(WORK, ("LATER",))

@@ -22,17 +22,17 @@ from lagjax._engine.taylor import Line, move_to_zero, run_stretch
 from lagjax._interface import halves
 from lagjax._primitives import Repetition, differentiable_where, keep_together
 from lagjax._program import Unlowerable, lower
+from lagjax._run.contacts._contact_search import POISSON
 from lagjax._run.contacts._impact_law import Held, ImpactRows, construct_impulses, find_impulses, rates_behind
 from lagjax._run.contacts._places import RECORD
 from lagjax._run.contacts._scene_code import SceneCode, sizes_of_fields
-from lagjax._run.contacts._search import POISSON
 
 # Operations of the line of the end of a stretch: a longer one takes XLA as long as its parts.
 LONGEST = 5000
 
 _VECTORS = frozenset((
     "DID", "BEFORE", "BEHIND", "IMPULSE", "HELD", "SLIDES", "DIRECTION", "COMPRESSED", "RETURNED", "ENDS", "MEETS",
-    "SHARES", "STARTS", "OFFSET",
+    "SHARES", "STARTS", "OFFSET", "STOP",
 ))  # fmt: skip
 
 
@@ -114,7 +114,9 @@ class Replay:
         end = jnp.where(row.ran > 0, end, begun)
         times = jnp.concatenate([t[None], jnp.where(ahead, ts, begun), ts[-1:]])
         numbers = jnp.concatenate([vector, row.did])
-        path, *stop = run_stretch(self._make_flow(), self._tolerances, times, y, numbers, end, row.crosses > 0)
+        event = end, row.stop, row.watch.astype(int), row.crosses > 0
+        of_flow = self._make_flow(), self._watches, self._tolerances
+        path, *stop = run_stretch(*of_flow, times, y, numbers, *event)
         ended = self._end((*stop, vector, t, y, halves(y0)[1], restitution, friction), record)
         is_behind = np.isin(np.arange(ended.size), np.arange(*self._ends[5:7]))
         smooth = (still(ended[0]) > 0) & (~is_behind | ~decides | (row.leaves_rest == 0))

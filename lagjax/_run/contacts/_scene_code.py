@@ -1,6 +1,6 @@
 """A scene with contacts as the search takes it: machine code by address, sizes, and the places of numbers; its runs.
 
-SceneCode.search(ts, y0, numbers, e, μ) ─► search_p ─► rows of NumPy ─► `_search.follow` ─► Found
+SceneCode.search(ts, y0, numbers, e, μ) ─► search_p ─► rows of NumPy ─► `_contact_search.follow` ─► Found
                                                           └─ a stretch that the kernel gives up: `Flow.run`
 """
 
@@ -17,11 +17,11 @@ from jax.interpreters import mlir
 
 from lagjax._engine.taylor import Line, call_host, line_of, rate_errors
 from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL
-from lagjax._native import SINGLE_NOISE, LineCode, compile_loops, cores, handler, make_once
+from lagjax._native import LARGEST_LINE, SINGLE_NOISE, compile_loops, cores, handler, make_once
 from lagjax._primitives import LinearMap, compute_on_host
-from lagjax._run.contacts import _search
+from lagjax._run.contacts import _contact_search
+from lagjax._run.contacts._contact_search import ASKS, GOING, NEW
 from lagjax._run.contacts._places import ARRAYS, MEMORY, NAMES, RECORD, SAID, WORK, at
-from lagjax._run.contacts._search import ASKS, GOING, NEW
 
 _TOGETHER = 256  # members that one call follows side by side: what it remembers of them fits into a processor's cache
 _ROOM = 32  # rows of a record, at first
@@ -29,7 +29,7 @@ _ROUNDS = 10**6  # of a kernel, for a stretch: beyond that it continues on the h
 
 
 class Found(NamedTuple):
-    """What a search found, of one member or with members in front.
+    """The findings of a search, of one member or with members in front.
 
     The outputs `path` (T, 2n), what contacts `did` there (T, …), −1 where the motion did not come, the `record` (N, …),
     whose rows `_places` declares, and the `ending`: t and y, result, rounds, accepted and rejected steps, doubts (3,)
@@ -70,7 +70,7 @@ class SceneCode:
             for name, begin in zip(names, ends, strict=False):
                 scene[getattr(at, prefix + name)] = begin
             scene[getattr(at, whole)] = ends[-1]
-        scene[at.BEGIN] = ctypes.cast(handler().begin, ctypes.c_void_p).value
+        scene[at.BEGIN] = ctypes.cast(handler().begin, ctypes.c_void_p).value or 0
         self._add_codes(scene, self.lines)
         self.add_kind(scene, "OPEN", many)
         return scene
@@ -99,14 +99,15 @@ class SceneCode:
 
     def _add_codes(self, scene: np.ndarray, lines: dict[str, Line]) -> None:
         for name, of in lines.items():
-            code = LineCode(of.line, of.size)
-            self._keep.append(code)
-            scene[getattr(at, name)] = code.address
+            code = of.code if len(of.line.nodes) <= LARGEST_LINE else None
+            keep, address = _call_numpy(of) if code is None else (code, code.address)
+            self._keep.append(keep)
+            scene[getattr(at, name)] = address
 
     # ---- runs ----
 
     def search(self, ts, y0, numbers, restitution, friction, is_replayed: bool = False) -> Found:
-        """What contacts do from `y0` (2n,) on, at `ts` (T,) with `numbers` (P,), e (k,) and μ (r,), without derivatives.
+        """The motion from `y0` (2n,) on, at `ts` (T,) with `numbers` (P,), e (k,) and μ (r,), without derivatives.
 
         Rows of the record are whole where it `is_replayed`, else they have what is `SAID`.
         """
@@ -119,8 +120,9 @@ class SceneCode:
         memory = np.zeros((members, scene[at.MEMORY]))
         is_open = np.zeros(self.sizes["DOING"])
         is_open[self.sizes["K"] : -1] = 1.0
+        first = np.broadcast_to(ts[:, :1], (members, 1))
         parts = {
-            "X": np.concatenate([y0, *np.broadcast_arrays(ts[:, :1], y0[:, :1])[:1], numbers, np.tile(is_open, (members, 1))], axis=1),
+            "X": np.concatenate([y0, first, numbers, np.tile(is_open, (members, 1))], axis=1),
             "RESTITUTION": restitution, "MU": friction, "RTOL": np.full((members, 1), self.tolerances.rtol),
             "FIRST": ts[:, :1], "LAST": ts[:, -1:], "RESULT": np.full((members, 1), float(NEW)),
             "DOUBTED": np.full((members, 3), np.nan),
@@ -139,6 +141,22 @@ class SceneCode:
         ending += [*memory[:, scene[at.DOUBTS] : scene[at.DOUBTS] + 3].T, *memory[:, scene[at.DOUBTED] :][:, :3].T]
         ending += [*memory[:, scene[at.BEGUN] : scene[at.BEGUN] + begin + 1].T]
         return Found(path, did, run.record, np.stack(ending, axis=-1))
+
+
+def _call_numpy(line: Line) -> tuple[Any, int]:
+    """A function that evaluates a line by NumPy, called as machine code is, and its address: for tables, long lines."""
+
+    def evaluate(x: int, out: int, _rows: int) -> None:
+        given, found = (
+            np.ctypeslib.as_array((ctypes.c_double * size).from_address(place))
+            for place, size in ((x, line.size), (out, line.outputs))
+        )
+        found[:] = line.line.evaluate(list(given[:, None]))[:, 0]
+
+    function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(evaluate)
+    address = ctypes.cast(function, ctypes.c_void_p).value
+    assert address is not None
+    return function, address
 
 
 class _Run:
@@ -164,7 +182,7 @@ class _Run:
                     list(pool.map(self._follow_some, places))
             if (self.results == ASKS).any() and self.scene[at.HELD_ONE] == 0:
                 self._add_held()
-            for member in np.flatnonzero(self.results == ASKS):
+            for member in np.flatnonzero(self.results == ASKS).tolist():
                 self._continue(member)
             if not (self.results == GOING).any():
                 break
@@ -221,8 +239,8 @@ class _Loops(NamedTuple):
 
 @make_once
 def _loops() -> _Loops:
-    entries = _search.follow, _search.prepare, _search.finish
-    return _Loops(*compile_loops(*entries))
+    search = _contact_search
+    return _Loops(*compile_loops(search.follow, search.prepare, search.finish))
 
 
 # ---- as a primitive --------------------------------------------------------------------------------------------------
@@ -243,7 +261,7 @@ def _width(code: SceneCode, names: tuple[str, ...]) -> int:
 def _search_rows(*arrays, code: SceneCode, names: tuple[str, ...]):
     batch = arrays[1].shape[:-1]
     rows = [np.asarray(x, float).reshape(math.prod(batch), x.shape[-1]) for x in arrays]
-    found = code.run(*rows, code.sizes["MOST"])
+    found = code.run(*rows, room=code.sizes["MOST"])
     found = found._replace(record=found.record[..., : _width(code, names)])
     return [x.reshape(*batch, *x.shape[1:]) for x in found]
 
@@ -267,14 +285,14 @@ mlir.register_lowering(search_p, mlir.lower_fun(_call_host, multiple_results=Tru
 
 
 def sizes_of_fields(sizes: dict[str, int]) -> dict[str, int]:
-    """How many doubles each field of a memory, of the room of a thread and of a row has."""
+    """The count of doubles in each field of a memory, of the room of a thread and of a row."""
     n, k, r, d, corners, watches, inputs, doing = (
         sizes[name] for name in ("N", "K", "R", "D", "CORNERS", "WATCHES", "INPUTS", "DOING")
     )
     size = k + r * d
     law = 12 * size**2 + 40 * size + 40
     lines = 4 * inputs + 2 * size * n + size**2 + 3 * size + 20 * watches + 4 * corners + sizes["MULTIPLIERS_COUNT"]
-    fields = dict.fromkeys((*MEMORY, *WORK, *RECORD), 1)
+    fields: dict[str, int] = dict.fromkeys((*MEMORY, *WORK, *RECORD), 1)
     per_contact = (
         "RESTITUTION", "REFUTED", "FORCE_NOISE", "TOUCHES", "PARTING", "NOISE", "INVOLVED", "CLOSED", "PUSH", "STAY",
         "PARTS", "CHANGED", "TARGETS", "OPENING", "IMPULSE", "COMPRESSED", "RETURNED", "ENDS", "MEETS", "SHARES",
@@ -282,8 +300,8 @@ def sizes_of_fields(sizes: dict[str, int]) -> dict[str, int]:
     fields |= dict.fromkeys(per_contact, k) | dict.fromkeys(
         ("MU", "SLIP", "STUCK", "TURNS_BACK", "SLIDES", "STARTS"), r
     )
-    fields |= dict.fromkeys(("VALUES", "RATES", "BENDS", "IMPULSES", "APART", "HELD"), size)
-    fields |= dict.fromkeys(("LARGEST", "SHIFT", "BEHIND", "OFFSET"), 2 * n)
+    fields |= dict.fromkeys(("VALUES", "RATES", "BEND", "IMPULSES", "APART", "HELD"), size)
+    fields |= dict.fromkeys(("LARGEST", "SHIFT", "BEHIND", "OFFSET", "STOP"), 2 * n)
     fields |= dict.fromkeys(("X", "OPENED"), inputs) | dict.fromkeys(("DOUBTS", "DOUBTED"), 3)
     fields |= dict.fromkeys(("FRESH", "KINDS", "STAYS", "FELL"), watches)
     fields |= dict.fromkeys(("ROUNDING", "RATE_ROUNDING"), 2 * watches) | dict.fromkeys(

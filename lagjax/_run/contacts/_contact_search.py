@@ -26,13 +26,11 @@ from math import isfinite, sqrt
 
 from lagjax._interface import RESULTS, SUCCESSFUL, code_of
 from lagjax._native import (
-    CHANGE_BITS,
     EVENT,
     GUARD_NOISE,
     INSTANT,
     SMALLEST_STEP,
     Floats,
-    Wholes,
     evaluate,
     integrate,
     loop,
@@ -46,7 +44,6 @@ from lagjax._run.contacts._law import (
     find_pattern,
     find_violations,
     hold_rows,
-    solve,
 )
 from lagjax._run.contacts._places import Entry, Member, Room, Scene
 
@@ -290,22 +287,27 @@ def begin(scene: Scene, member: Member, room: Room) -> int:
         write_directions(scene, room.rates[k:], room.free)
         if has_paradox(scene, member, push, slips, room.free, room):
             result = UNDECIDED
-    if scene.corners > 0:  # a contact that starts on its corner goes where the motion does
-        corners, touches, passed = room.corner, scene.touch, room.passed
-        locate_corners(scene, member, x, room)
-        for p in range(scene.corners):
-            passed[p] = 0.0
-            for i in range(k):
-                is_there = abs(corners[p]) <= corners[2 * scene.corners + p]
-                if touches[p * k + i] > 0 and room.touches[i] > 0 and is_there:
-                    passed[p] = 1.0
-        later = go_beyond(scene, member, x, room)
-        if later < 0 and result == GOING:
-            result = AT_CORNER
-        for i in range(2 * n):
-            x[i] += room.shift[i]
-        x[2 * n] += later if later > 0 else 0.0
+    if scene.corners > 0 and rests_on_corner(scene, member, room) and result == GOING:
+        result = AT_CORNER
     return result
+
+
+@loop
+def rests_on_corner(scene: Scene, member: Member, room: Room) -> bool:
+    """True where a contact that starts on its corner rests there; else the state goes where the motion does."""
+    n, k, x, corners, passed = scene.n, scene.k, member.x, room.corner, room.passed
+    locate_corners(scene, member, x, room)
+    for p in range(scene.corners):
+        passed[p] = 0.0
+        for i in range(k):
+            is_there = abs(corners[p]) <= corners[2 * scene.corners + p]
+            if scene.touch[p * k + i] > 0 and room.touches[i] > 0 and is_there:
+                passed[p] = 1.0
+    later = go_beyond(scene, member, x, room)
+    for i in range(2 * n):
+        x[i] += room.shift[i]
+    x[2 * n] += max(later, 0.0)
+    return later < 0
 
 
 @loop
@@ -469,10 +471,7 @@ def finish(
     if not happens and result == SUCCESSFUL:
         t_end = ts[times - 1]
     at_once = t_end == start
-    for j in range(times):
-        if is_ahead(ts[j], start, ts[0]) and ts[j] <= t_end:
-            copy(found[(1 + j) * 2 * n :], path[j * 2 * n :], 2 * n)
-            copy(begun, did[j * doing :], doing)
+    write_outputs(scene, ts, start, t_end, found[2 * n :], begun, path, did)
     if decides:
         first = find_first(scene, fell, at_once, begun)
     elif happens:
@@ -492,37 +491,57 @@ def finish(
     reached = SUCCESSFUL if happens else result
     row.at = x[2 * n]
     copy(x[n:], row.before, n)
+    copy(x, row.stop, 2 * n)
     if decides:
         reached = decide(scene, member, first, row, room)
     elif happens:  # a section, of which a note is made
         member.came[first - deciding] = 2.0 * fell[first] - 3.0
         row.contact, row.change = float(k + first - deciding), -1.0
     copy(x, row.behind, 2 * n)
-    if member.missed > 0:
-        reached = MISSED
-    if happens and member.turns > 16 + 8 * total:
-        reached = IN_TURN
     if scene.corners > 0 and happens:  # time itself may go beyond its corner
         for j in range(times):
             if ts[j] <= x[2 * n] and did[j * doing] < 0:
                 copy(x, path[j * 2 * n :], 2 * n)
                 copy(row.did, did[j * doing :], doing)
-    for i in range(2 * n):
-        if not isfinite(x[i]) and reached == SUCCESSFUL:
-            reached = NOT_FINITE
     member.rounds += float(happens)
     member.rows += 1.0
-    if happens and reached == SUCCESSFUL:
-        reached = TOO_MANY if member.rounds >= scene.most else GOING
+    reached = find_result(scene, member, reached, happens)
     member.result = float(reached)
     if reached == SUCCESSFUL:
         check_outputs(scene, member, ts, path, did, room)
 
 
 @loop
+def write_outputs(
+    scene: Scene, ts: Floats, start: float, end: float, found: Floats, doing: Floats, path: Floats, did: Floats
+):
+    """Put the outputs of a stretch, `found` (T, 2n), and what contacts are `doing` then."""
+    states = 2 * scene.n
+    for j in range(scene.times):
+        if is_ahead(ts[j], start, ts[0]) and ts[j] <= end:
+            copy(found[j * states :], path[j * states :], states)
+            copy(doing, did[j * scene.doing :], scene.doing)
+
+
+@loop
+def find_result(scene: Scene, member: Member, reached: int, happens: bool) -> int:
+    """The result of a motion so far, behind a stretch that `reached` this one: `GOING` if all is well."""
+    if happens and member.turns > 16 + 8 * scene.watches:
+        return IN_TURN
+    if member.missed > 0:
+        return MISSED
+    for i in range(2 * scene.n):
+        if not isfinite(member.x[i]) and reached == SUCCESSFUL:
+            return NOT_FINITE
+    if happens and reached == SUCCESSFUL:
+        return TOO_MANY if member.rounds >= scene.most else GOING
+    return reached
+
+
+@loop
 def note_stretch(scene: Scene, member: Member, first: int, at_once: bool, duration: float, accepted: float):
     """Note behind a stretch what is tied, its longest step, and what rounding it had; `first` fell where it ended."""
-    k, r, total, x = scene.k, scene.r, scene.watches, member.x
+    k, r, total = scene.k, scene.r, scene.watches
     tied, refuted, did = member.tied, member.refuted, member.kinds
     member.turns = member.turns + 1.0 if at_once else 0.0
     turns_in_plane = scene.d == 1 and member.turns > total
@@ -581,55 +600,36 @@ def find_first(scene: Scene, fell: Floats, at_once: bool, did: Floats) -> int:
 
 @loop
 def decide(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> int:
-    """The result behind watch `first`, which fell: state and contacts of the member go on there, and the row says it."""
-    n, k, r, d, total = scene.n, scene.k, scene.r, scene.d, scene.watches
-    x, opened, size, rough = member.x, member.opened, k + r * d, scene.rough
-    closed, was_closed, was_stuck = x[2 * n + 1 + scene.numbers :], room.closed, room.stuck
-    sticks, meets, opening = closed[k:], row.meets, room.opening
-    v, change, apart, flags = x[n:], room.change, room.apart, room.changed
-    copy(closed, was_closed, k)
-    copy(sticks, was_stuck, r)
+    """The result behind watch `first`, which fell: state and contacts of the member go on there, as the row says."""
+    n, k, r, x, meets, opening = scene.n, scene.k, scene.r, member.x, row.meets, room.opening
+    closed = x[2 * n + 1 + scene.numbers :]
+    copy(closed, room.closed, k)
+    copy(closed[k:], room.stuck, r)
     for i in range(k):
         meets[i], opening[i] = float(i == first and closed[i] == 0), 0.0
     later, at_corner = 0.0, 0
     if scene.corners > 0:
         at_corner = meet_corners(scene, member, first, meets, room)
         later = room.later
-    open_all(scene, x, opened)
-    evaluate(scene.response, opened, room.gradients)
+    open_all(scene, x, member.opened)
+    evaluate(scene.response, member.opened, room.gradients)
     missed = meet(scene, member, meets, row, room)
     hits = row.hits > 0
-    measure_slips(scene, member, room.rates, v, room.slips, room)
+    measure_slips(scene, member, room.rates, x[n:], room.slips, room)
     close_contacts(scene, member, first, hits, meets, room)
     undecided = find_change(scene, member, hits, row, room)
     stay_closed(scene, member, hits, room)
-    slips = room.slips
-    for i in range(k):
-        flags[i] = float(closed[i] != was_closed[i] or (hits and room.involved[i] > 0))
-        if flags[i] > 0:
-            member.fresh[i] = 1.0
-    leaves_rest = False
-    for c in range(r):
-        leaves_rest = leaves_rest or (first == k + c and was_stuck[c] > 0 and d > 1)
-        row.starts[c] = 0.0
-        if first == k + c and was_stuck[c] > 0 and x[2 * n] == member.first:
-            for j in range(d * n):
-                row.starts[c] += TOGETHER * abs(room.gradients[(k + c * d) * n + j])
+    note_changes(scene, member, first, hits, row, room)
     if r > 0:
         rub(scene, member, first, hits, room)
-        write_directions(scene, sticks[r:], room.free)
-        if has_paradox(scene, member, closed, sticks, room.free, room):
+        write_directions(scene, closed[k + r :], room.free)
+        if has_paradox(scene, member, closed, closed[k:], room.free, room):
             undecided = True
-    row.leaves_rest = float(leaves_rest)
-    count_doubts(scene, member, hits, leaves_rest, row, room)
+    count_doubts(scene, member, hits, row, room)
     move(scene, member, first, meets, row, room)
     x[2 * n] += later
     row.later_on = later
     name_change(scene, first, hits, closed, row, room)
-    for g in range(k + r, total):
-        for i in range(k):
-            if opening[i] > 0:
-                member.fresh[g] = 1.0
     if at_corner == 2 or (missed and at_corner == 1):
         return AT_CORNER
     if missed:
@@ -638,12 +638,34 @@ def decide(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> 
 
 
 @loop
+def note_changes(scene: Scene, member: Member, first: int, hits: bool, row: Entry, room: Room):
+    """Note which contacts have changed, as `CHANGED`, what begins anew there, and which slips begin at rest."""
+    n, k, x, leaves_rest = scene.n, scene.k, member.x, False
+    closed = x[2 * n + 1 + scene.numbers :]
+    for i in range(k):
+        room.changed[i] = float(closed[i] != room.closed[i] or (hits and room.involved[i] > 0))
+        if room.changed[i] > 0:
+            member.fresh[i] = 1.0
+        if room.opening[i] > 0:  # at a corner
+            for g in range(k + scene.r, scene.watches):
+                member.fresh[g] = 1.0
+    for c in range(scene.r):
+        breaks = first == k + c and room.stuck[c] > 0
+        leaves_rest = leaves_rest or (breaks and scene.d > 1)
+        row.starts[c] = 0.0
+        if breaks and x[2 * n] == member.first:
+            for j in range(scene.d * n):
+                row.starts[c] += TOGETHER * abs(room.gradients[(k + c * scene.d) * n + j])
+    row.leaves_rest = float(leaves_rest)
+
+
+@loop
 def meet_corners(scene: Scene, member: Member, first: int, meets: Floats, room: Room) -> int:
     """Put which contacts come to a corner where watch `first` fell, and open there; the state and time go beyond it.
 
     Returns 2 where one is struck at its corner, or stays there, 1 where one meets behind its corner, else 0.
     """
-    n, k, count, x, touches = scene.n, scene.k, scene.corners, member.x, scene.touch
+    k, count, x, touches = scene.k, scene.corners, member.x, scene.touch
     corners, passed, opening = room.corner, room.passed, room.opening
     near, answer, closed = x[scene.inputs - 1], 0, room.closed
     locate_corners(scene, member, x, room)
@@ -669,8 +691,7 @@ def meet(scene: Scene, member: Member, meets: Floats, row: Entry, room: Room) ->
 
     Returns whether it was missed before.
     """
-    k, r, d, total = scene.k, scene.r, scene.d, scene.watches
-    touches, involved, noise = room.touches, room.involved, room.noise
+    k, touches, involved, noise = scene.k, room.touches, room.involved, room.noise
     parting, push, linked = room.parting, room.push, room.stay
     closed, fastest, hits, missed = room.closed, 0.0, False, False
     touch(scene, member, member.opened, room)
@@ -795,43 +816,22 @@ def find_change(scene: Scene, member: Member, hits: bool, row: Entry, room: Room
 
     Behind an impact they follow its law; else velocities become those that what is held allows.
     """
-    n, k, r, d, x = scene.n, scene.k, scene.r, scene.d, member.x
-    rough, coupling, rates, e = scene.rough, room.coupling, room.rates, member.restitution
-    closed, push, targets, impulses = x[2 * n + 1 + scene.numbers :], room.push, room.targets, room.impulses
-    stuck, direction, rest, mu = row.slides, row.direction, room.free, member.mu
-    size, wrong, ends = k + r * d, False, row.ends
-    constructs = hits and r > 0 and scene.law == POISSON
+    n, k, r, d, rough = scene.n, scene.k, scene.r, scene.d, scene.rough
+    coupling, rates, push, targets, impulses = room.coupling, room.rates, room.push, room.targets, room.impulses
+    stuck, direction, size, wrong = row.slides, row.direction, k + r * d, False
+    mu, rest = member.mu, room.free
     if not hits:
-        mu = rest
-        for i in range(k):
-            push[i], targets[i] = closed[i], 0.0
+        mu, rest = room.free, room.free[r:]
         for c in range(r):
-            stuck[c], mu[c] = closed[k + c], 0.0
-            for i in range(d):
-                direction[c * d + i] = 0.0
-        rest = rest[r:]
-    elif constructs:
-        construct(e[0], mu[0], coupling, rates, targets, direction)
-    elif scene.law != POISSON:
-        for i in range(k):
-            targets[i] = -e[i] * rates[i]
+            mu[c] = 0.0
+    ask_rates(scene, member, hits, row, room)
     find_impulses(k, r, d, rough, mu, coupling, rates, push, stuck, direction, targets, impulses, rest)
     if hits:
-        if not constructs:
-            none = rest
-            for i in range(k):
-                none[i] = 0.0
-            asked, flags = none if scene.law == POISSON else targets, rest[k:]
-            find_violations(
-                k, r, d, rough, mu, coupling, rates, room.involved, push, stuck, direction, asked,
-                impulses, flags, rest[k + k + r :]
-            )  # fmt: skip
-            for i in range(k + r):
-                wrong = wrong or flags[i] > 0
-        row.t_impact = x[2 * n]
+        wrong = is_violated(scene, member, row, room)
+        row.t_impact = member.x[2 * n]
         if end_bounces(scene, member, row, room):
             for i in range(k):
-                targets[i] = 0.0 if ends[i] > 0 else targets[i]
+                targets[i] = 0.0 if row.ends[i] > 0 else targets[i]
             find_impulses(k, r, d, rough, mu, coupling, rates, push, stuck, direction, targets, impulses, rest)
     hold_rows(k, r, d, rough, coupling, push, stuck, row.held, rest)
     for c in range(r):
@@ -842,6 +842,45 @@ def find_change(scene: Scene, member: Member, hits: bool, row: Entry, room: Room
         for i in range(size):
             room.change[j] += impulses[i] * room.responses[i * n + j]
     return wrong
+
+
+@loop
+def ask_rates(scene: Scene, member: Member, hits: bool, row: Entry, room: Room):
+    """Put the rates behind an impact by its law, unless they are there; else zero, of what is closed and sticks."""
+    k, d, e, targets = scene.k, scene.d, member.restitution, room.targets
+    did = member.x[2 * scene.n + 1 + scene.numbers :]
+    if not hits:
+        for i in range(k):
+            room.push[i], targets[i] = did[i], 0.0
+        for c in range(scene.r):
+            row.slides[c] = did[k + c]
+            for i in range(d):
+                row.direction[c * d + i] = 0.0
+    elif scene.law != POISSON:
+        for i in range(k):
+            targets[i] = -e[i] * room.rates[i]
+    elif scene.r > 0:
+        construct(e[0], member.mu[0], room.coupling, room.rates, targets, row.direction)
+
+
+@loop
+def is_violated(scene: Scene, member: Member, row: Entry, room: Room) -> bool:
+    """True where the impulses of an impact do not obey the law; of Poisson's the rates are what compression leaves."""
+    k, r, targets, flags, rest = scene.k, scene.r, room.targets, room.free, room.free[scene.k + scene.r :]
+    if scene.law == POISSON:
+        if r > 0:  # by construction
+            return False
+        targets, rest = rest, rest[k:]
+        for i in range(k):
+            targets[i] = 0.0
+    find_violations(
+        k, r, scene.d, scene.rough, member.mu, room.coupling, room.rates, room.involved, room.push, row.slides,
+        row.direction, targets, room.impulses, flags, rest
+    )  # fmt: skip
+    for i in range(k + r):
+        if flags[i] > 0:
+            return True
+    return False
 
 
 @loop
@@ -1002,13 +1041,13 @@ def write_held_force(scene: Scene, member: Member, c: int, x: Floats, room: Room
 
 
 @loop
-def count_doubts(scene: Scene, member: Member, hits: bool, leaves_rest: bool, row: Entry, room: Room):
+def count_doubts(scene: Scene, member: Member, hits: bool, row: Entry, room: Room):
     """Count what is doubtful here: an impact that gains energy, one that is shared, derivatives that are lost."""
     k, r, d, n = scene.k, scene.r, scene.d, scene.n
-    total, terms, shares, starts = 0.0, 0.0, False, leaves_rest
+    total, terms, shares, starts = 0.0, 0.0, False, row.leaves_rest > 0
     for i in range(k + r * d):
-        part = room.impulses[i] * (room.rates[i] + room.apart[i])
-        total, terms = total + part, terms + abs(part)
+        total += room.impulses[i] * (room.rates[i] + room.apart[i])
+        terms += abs(room.impulses[i]) * (abs(room.rates[i]) + abs(room.apart[i]))
     for i in range(k):
         shares = shares or row.shares[i] > 0
     for c in range(r):
@@ -1029,26 +1068,47 @@ def move(scene: Scene, member: Member, first: int, meets: Floats, row: Entry, ro
     less than its own rounding is zero: steps would be as short as to follow it.
     """
     n, k, size, x = scene.n, scene.k, scene.k + scene.r * scene.d, member.x
-    gradients, responses, coupling = room.gradients, room.responses, room.coupling
-    largest, offset, change, shift = member.largest, row.offset, room.change, room.shift
-    values, rates, total = member.rounding, member.rate_rounding, scene.watches
-    span = member.last - member.first
-    longest = member.longest
-    lasts, parts, lost = longest if longest > 0 else span, room.parts, 0.0
+    responses, coupling, largest = room.responses, room.coupling, member.largest
+    offset, change, lost = row.offset, room.change, 0.0
     for i in range(size):
         for j in range(n):
-            part = room.impulses[i] * gradients[i * n + j]
+            part = room.impulses[i] * room.gradients[i * n + j]
             lost -= part * (x[n + j] + 0.5 * change[j])
     row.lost = lost
     copy(room.impulses, row.impulse, k)
     for j in range(2 * n):
-        offset[j] = shift[j] if scene.corners > 0 else 0.0
+        offset[j] = room.shift[j] if scene.corners > 0 else 0.0
         x[j] += offset[j]
         largest[j] = max(largest[j], abs(x[j]))
+    note_force_noise(scene, member, first, room)
     for i in range(k):
-        own, fast = coupling[i * size + i], 0.0
+        if meets[i] > 0 and i < scene.gaps:
+            for j in range(n):
+                x[j] -= room.values[i] / coupling[i * size + i] * responses[i * n + j]
+    for j in range(n):
+        x[n + j] += change[j]
+    for j in range(2 * n):
+        if abs(x[j]) <= 2.0 * EPS * largest[j]:
+            offset[j] -= x[j]
+            x[j] = 0.0
+    for i in range(k):
+        if room.parts[i] > 0:
+            for j in range(n):
+                beyond = 4.0 * member.rounding[i] / coupling[i * size + i] * responses[i * n + j]
+                x[j] += beyond
+                offset[j] += beyond
+
+
+@loop
+def note_force_noise(scene: Scene, member: Member, first: int, room: Room):
+    """Note which forces are none before a change of velocities, and by which rounding could make some."""
+    n, total, x, longest = scene.n, scene.watches, member.x, member.longest
+    values, rates = member.rounding, member.rate_rounding
+    lasts = longest if longest > 0 else member.last - member.first
+    for i in range(scene.k):
+        own, fast = room.coupling[i * (scene.k + scene.r * scene.d) + i], 0.0
         for j in range(n):
-            fast += abs(gradients[i * n + j]) * max(abs(x[n + j]), abs(x[n + j] + change[j]))
+            fast += abs(room.gradients[i * n + j]) * max(abs(x[n + j]), abs(x[n + j] + room.change[j]))
         if longest > 0:
             least = FORCELESS * (fast / own) / longest
             values[total + i] = max(values[total + i], least)
@@ -1057,21 +1117,6 @@ def move(scene: Scene, member: Member, first: int, meets: Floats, row: Entry, ro
         member.force_noise[i] = 2.0 * TIED_MOVES * noise / (own * lasts**2)
         if i == first and room.closed[i] > 0:
             rates[i] = max(rates[i], longest * own * values[total + i])
-        if meets[i] > 0 and i < scene.gaps:
-            for j in range(n):
-                x[j] -= room.values[i] / own * responses[i * n + j]
-    for j in range(n):
-        x[n + j] += change[j]
-    for j in range(2 * n):
-        if abs(x[j]) <= 2.0 * EPS * largest[j]:
-            offset[j] -= x[j]
-            x[j] = 0.0
-    for i in range(k):
-        if parts[i] > 0:
-            for j in range(n):
-                beyond = 4.0 * values[i] / coupling[i * size + i] * responses[i * n + j]
-                x[j] += beyond
-                offset[j] += beyond
 
 
 @loop
