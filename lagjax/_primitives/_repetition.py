@@ -83,7 +83,7 @@ class Repetition:
 
         def go(i, state):
             carry, written, sums = state
-            behind, new, parts = self._one(x, carry, still, [_at(row, i) for row in rows], i < count)
+            behind, new, parts = self._one(x, carry, still, [_take(row, i) for row in rows], i < count)
             written = [_put(kept, a, i) for kept, a in zip(written, carry if keeps else new, strict=True)]
             return behind, written, [] if keeps else [a + b for a, b in zip(sums, parts, strict=True)]
 
@@ -98,9 +98,9 @@ class Repetition:
 
         def go(k, state):
             i, (x_ct, carry_ct) = most - 1 - k, state
-            row, here = [_at(row, i) for row in rows], [_at(kept, i) for kept in before]
+            row, here = [_take(row, i) for row in rows], [_take(kept, i) for kept in before]
             _, pull = jax.vjp(lambda x, carry: self._one(x, carry, still, row, i < count), x, here)
-            more, carry_ct = pull((carry_ct, [_at(ct, i) for ct in written], sums))
+            more, carry_ct = pull((carry_ct, [_take(ct, i) for ct in written], sums))
             return [a + b for a, b in zip(x_ct, more, strict=True)], carry_ct
 
         state = start_alike(([jnp.zeros_like(a) for a in x], last), x, first, still, rows, count, cotangents)
@@ -108,7 +108,7 @@ class Repetition:
         return [*x_ct, *first_ct]
 
 
-def _at(array, i):
+def _take(array, i):
     return jax.lax.dynamic_index_in_dim(array, i, keepdims=False)
 
 
@@ -235,7 +235,7 @@ def _vary_turn(primals, tangents, *, of: Repetition, axes: tuple, linear: int):
     return _first_halves(found, of)
 
 
-class _Loops(LinearMap):
+class _RepeatedMap(LinearMap):
     """A loop; of each axis of a batch, the first one innermost, `axes` says which arrays have it."""
 
     def __init__(self, name: str, shapes: Callable, function: Callable, vary: Callable, pull: Callable | None = None):
@@ -309,7 +309,7 @@ def _pull_turn(given, of: Repetition, axes):
     return [*of_x, *_pull_back([*known, *moved], of, narrow)]
 
 
-value_p = _Loops("value", _shapes, _value, _vary_value)
-forward_p = _Loops("forward", _shapes, _forward, _vary_forward, _pull_forward)
-back_p = _Loops("back", _back_shapes, _back, _vary_back, _pull_back)
-turn_p = _Loops("turn", _back_shapes, _turn, _vary_turn, _pull_turn)
+value_p = _RepeatedMap("value", _shapes, _value, _vary_value)
+forward_p = _RepeatedMap("forward", _shapes, _forward, _vary_forward, _pull_forward)
+back_p = _RepeatedMap("back", _back_shapes, _back, _vary_back, _pull_back)
+turn_p = _RepeatedMap("turn", _back_shapes, _turn, _vary_turn, _pull_turn)

@@ -45,8 +45,10 @@ def read_rows(record, fields: dict[str, int], names: tuple[str, ...] = RECORD) -
 
 
 class Played(NamedTuple):
-    """What has derivatives: the outputs (T, 2n), of each row its time, velocities and state behind it; of an impact its
-    time, impulses and the energy lost; and the end."""
+    """The parts that have derivatives: the outputs (T, 2n), of each row its time, velocities and state behind it.
+
+    Of an impact its time, impulses and the energy lost; and the end.
+    """
 
     path: Any
     at: Any
@@ -199,7 +201,7 @@ class Replay:
         return t + left, impulses[:k], lost, behind
 
     def _time_left(self, t, y, bounced, ends, vector, restitution):
-        """The time that bounces still take which end at once, by `_search.end_bounces`."""
+        """The time that bounces still take which end at once, by `_contact_search.end_bounces`."""
         x = self._opened(t, y, vector)
         along = jnp.concatenate([halves(y)[1], self._lines["ACCELERATION"](x), jnp.ones(1)])
         bends, later = jnp.split(self._lines["BENDS"](jnp.concatenate([x, along, jnp.zeros(x.size - along.size)])), 2)
