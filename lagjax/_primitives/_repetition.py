@@ -187,11 +187,11 @@ def _vary_value(primals, tangents, _, *, of: Repetition, axes: tuple):
         others = itertools.compress(x, (not here for here in varies))
         return [*itertools.compress(x, varies), *first, *others, *still, *rows, count]
 
-    def along(given):
+    def push(given):
         return [*itertools.compress(given, varies), *given[of.inputs : of.inputs + of.carried]]
 
-    moving = [ad.instantiate_zeros(t) for t in along(tangents)]
-    axes = tuple((*sort(of_level), *along(of_level)) for of_level in axes)
+    moving = [ad.instantiate_zeros(t) for t in push(tangents)]
+    axes = tuple((*sort(of_level), *push(of_level)) for of_level in axes)
     return forward_p.bind(*sort(primals), *moving, of=of.hold_still(varies), axes=axes, linear=len(moving))
 
 
@@ -249,7 +249,7 @@ class _RepeatedMap(LinearMap):
             return [x.sum([i for i, axis in enumerate(a) if axis is None]) for x, a in zip(found, absent, strict=True)]
 
         def shape(*given, **settings):
-            batch, given = _without_batch(given, settings["axes"])
+            batch, given = _drop_batch(given, settings["axes"])
             return [ShapedArray((*batch, *shape), np.dtype(float)) for shape in shapes(given, settings["of"])]
 
         linear, run = (lambda linear, **_: linear) if pull else 0, functools.partial(_run, function=function)
@@ -271,7 +271,7 @@ class _RepeatedMap(LinearMap):
         return outs, [0] * len(outs)
 
 
-def _without_batch(given, axes: tuple) -> tuple[tuple[int, ...], list[tuple[int, ...]]]:
+def _drop_batch(given, axes: tuple) -> tuple[tuple[int, ...], list[tuple[int, ...]]]:
     """The axes of a batch, the outermost one first, and the shapes of arrays without them."""
     shapes, batch = [x.shape for x in given], []
     for of_level in reversed(axes):

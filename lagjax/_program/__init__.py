@@ -235,8 +235,12 @@ class Program:
     def size(self) -> int:
         return len(self.dtypes)
 
-    @functools.cached_property
+    @property
     def dtypes(self) -> tuple[np.dtype, ...]:
+        return self._dtypes  # a property, as the protocol of what has recurrences has it
+
+    @functools.cached_property
+    def _dtypes(self) -> tuple[np.dtype, ...]:
         return tuple(dtype for shape in self.shapes for dtype in [shape.dtype] * math.prod(shape.shape))
 
     def evaluate(self, *numbers) -> np.ndarray:

@@ -98,7 +98,7 @@ class Replay:
 
     @functools.cached_property
     def _ends(self) -> np.ndarray:
-        """Where the parts of what `_end` gives end, but the last."""
+        """The places at which the parts of what `_end` gives end, but the last."""
         n, k = self._sizes["N"], self._sizes["K"]
         return np.cumsum([1, 1, n, 1, k, 1, 2 * n, 1])
 
@@ -134,7 +134,7 @@ class Replay:
         return [later, behind], [said, behind], [path]
 
     def _end(self, given: tuple, record):
-        """What happens at the end of a stretch: as one straight line, if that is not long."""
+        """The end of a stretch, as one straight line if that is not long."""
         given = (record, *jax.lax.stop_gradient(given[:3]), *given)
         return self._end_in_parts(*given) if self._line is None else self._line(join(*given))
 
@@ -151,7 +151,7 @@ class Replay:
         return None if program.looks_up else Line(program.line, program.size, program.size, sum(map(math.prod, fixed)))
 
     def _end_in_parts(self, record, *given):
-        """What the end of a stretch does, all numbers side by side.
+        """The effects of the end of a stretch, all numbers side by side.
 
         Whether it varies smoothly; time and velocities; of an impact its time, impulses and the energy lost; the state
         and the time behind; and what contacts of one instant share (k + r d,).
