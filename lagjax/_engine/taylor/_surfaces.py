@@ -224,7 +224,7 @@ def crossing_variation(surfaces: Surfaces) -> Callable:
 
 
 def move_to_zero(surfaces: Surfaces, k, taken, at: tuple, still: tuple) -> tuple:
-    """The truth of whether guard k crosses, and (t, y): the state `at` (t, y, numbers), where it is zero, moved to where it is zero.
+    """True if guard k crosses, and (t, y): the state `at` (t, y, numbers), moved to where the guard is zero.
 
     What is `still` is the same, and does not vary. With δg the variation of the guard, f the rate of the state, and ′
     the derivative along the motion, time moves by
