@@ -26,7 +26,7 @@ _CLOSED = 1e-6
 _UNLOADED = 1e-9  # of the largest force: one that is rounding
 
 
-class Held(NamedTuple):
+class HeldScene(NamedTuple):
     """The scene with the gaps at the `places` (c,) among its constraints; and with contacts, as the user gave it."""
 
     system: System
@@ -99,7 +99,7 @@ class Held(NamedTuple):
         )
 
 
-def hold_closed(system: Any, q: PyTree, qdot: PyTree, params: PyTree, what: str) -> Held | None:
+def hold_closed(system: Any, q: PyTree, qdot: PyTree, params: PyTree, what: str) -> HeldScene | None:
     """The scene with the gaps held that are zero at the state; None for one without contacts.
 
     Raises `ValueError` where a gap is negative or closes with a velocity, where a closed contact has friction, and
@@ -135,7 +135,7 @@ def hold_closed(system: Any, q: PyTree, qdot: PyTree, params: PyTree, what: str)
     own = 0 if system.constraints is None else sum(
         leaf.size for leaf in jax.tree.leaves(system._output_shapes("constraints", layout, params))
     )  # fmt: skip
-    return Held(_hold(system, places), system, flat, places, own)
+    return HeldScene(_hold(system, places), system, flat, places, own)
 
 
 def _pressing_shares(jacobian: np.ndarray, force: np.ndarray, rows: np.ndarray) -> np.ndarray | None:

@@ -22,7 +22,6 @@ from lagjax._equations._linear import (
     diagonal_scale,
     eigen,
     factorize,
-    factorize_general,
     invert,
     least_norm,
     null_directions,

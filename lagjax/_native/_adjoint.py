@@ -20,7 +20,7 @@ from lagjax._native._frame import Frame, Lane, job
 from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._maps import CauchyProducts, OrderRecursion, ProjectedEnd, SeriesSum, ZerothOrder
 from lagjax._native._motion_parts import MotionParts
-from lagjax._native._recorded_steps import Replay
+from lagjax._native._recorded_steps import StepReplay
 
 # `y_ct` is the cotangent of the end, and becomes that of the start.
 JOB = job(
@@ -38,7 +38,7 @@ class Adjoint:
     def __init__(self, parts: MotionParts, *, width: int):
         fields = Cotangents.fields(parts) | {"before": 2 * parts.series.size, "active": 1, "excess": 1}
         at_borders = {"pieces_after": parts.pieces, "has_after": 1}
-        self.replay = Replay("adjoint", parts, JOB, fields, at_borders, width, jumps=2)
+        self.replay = StepReplay("adjoint", parts, JOB, fields, at_borders, width, jumps=2)
         self.motion = motion = self.replay.motion
         self.start_next = self.replay.start_next(self._begin_lane, self._take_member)
         cotangents = Cotangents(motion, parts)

@@ -1,8 +1,7 @@
 """Guards: functions of the state that are watched along a motion, as part of the program of its acceleration."""
 
 import functools
-from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 from lagjax._native._lanes import INTEGERS
 from lagjax._program._borders import Borders, borders, with_outputs
@@ -21,7 +20,6 @@ class Guards(NamedTuple):
     that is beyond the surface has changed its side wherever it goes; then how far rounding may have moved their rates.
     Of a start that `is_rounded`, more coarsely than the motion, a guard that is zero to rounding is zero: its surface
     passes through the start. A guard that `holds` ends a motion at once that begins beyond it, in its direction.
-    Another flow follows members that are `released`, by a shorter program.
     """
 
     values: Recurrent
@@ -31,19 +29,11 @@ class Guards(NamedTuple):
     remembers: bool = False
     is_rounded: bool = False
     holds: tuple[bool, ...] = ()
-    released: "Released | None" = None
 
     @property
     def inputs(self) -> int:
         """The count of numbers of a member that are remembered."""
         return 2 * len(self.directions) if self.remembers else 0
-
-
-class Released(NamedTuple):
-    """The flow that `make()` returns, which follows members of whom the numbers at the places `held` are all zero."""
-
-    held: tuple[int, ...]
-    make: Callable[[], Any]
 
 
 class Watched(NamedTuple):

@@ -80,11 +80,17 @@ _PASSES = ("sroa", "dead_code_elimination")
 def compile_module(module: ir.Module, functions: tuple[str, ...]) -> tuple[llvm.ExecutionEngine, dict[str, int]]:
     """Machine code for a module, and where its functions are. It lives as long as the engine."""
     text = str(module)
-    level = LEVELS[len(text) > _LARGE]
+    return compile_text(lambda: text, functions, text, LEVELS[len(text) > _LARGE])
+
+
+def compile_text(
+    write: Callable[[], str], functions: tuple[str, ...], known_by: str, level: int
+) -> tuple[llvm.ExecutionEngine, dict[str, int]]:
+    """Machine code for the text of a module, which is written only where no object is kept that is known by this."""
     machine = _machine(level)
     by = llvm.llvm_version_info, llvmlite.__version__, machine.triple, _PASSES, level
     processor = llvm.get_host_cpu_name(), llvm.get_host_cpu_features().flatten()
-    made = load_or_make(lambda: _object(text, level), text, repr(by), *processor)
+    made = load_or_make(lambda: _object(write(), level), known_by, repr(by), *processor)
     engine = llvm.create_mcjit_compiler(llvm.parse_assembly(""), machine)
     engine.add_object_file(llvm.ObjectFileRef.from_data(made))
     engine.finalize_object()

@@ -18,7 +18,7 @@ from lagjax._native._taylor import AT_BORDER, TaylorSeries, is_large
 from lagjax._native._watch import GuardTable
 
 
-class Replay:
+class StepReplay:
     """The members and the recorded steps of a motion; a lane's `step` numbers the one that it is at.
 
     `fields` are those of a derivative in a thread's memory, `at_borders` more of them where the motion has borders. The

@@ -17,7 +17,7 @@ from lagjax._native._frame import Frame, Lane, job
 from lagjax._native._ir import INTEGER, Code, Value
 from lagjax._native._maps import CauchyProducts, OrderRecursion, ProjectedEnd, SeriesSum, ZerothOrder
 from lagjax._native._motion_parts import MotionParts
-from lagjax._native._recorded_steps import Replay
+from lagjax._native._recorded_steps import StepReplay
 from lagjax._native._run_records import NUMBER, instant_about
 from lagjax._native._tangent_memory import Directions
 
@@ -38,7 +38,7 @@ class Tangent:
     def __init__(self, parts: MotionParts, *, width: int, lanes: int):
         fields = {"active": 1, "next_begin": 1}
         fields |= {"moved": 2 * parts.series.size} if parts.projection is not None else {}
-        self.replay = Replay("tangent", parts, JOB, fields, {}, width, jumps=1)
+        self.replay = StepReplay("tangent", parts, JOB, fields, {}, width, jumps=1)
         self.motion = motion = self.replay.motion
         self.saltation, self.retraction = self.replay.saltation(), self.replay.retraction
         self.note_border = self.saltation and self.saltation.note_end()

@@ -181,14 +181,13 @@ def _values(*arrays, function, count):
 
 def _vary_expression(primals, tangents, _, *, function, count):
     arguments, moving = primals[count:], tangents[count:]
-    floats = [i for i, x in enumerate(arguments) if jnp.issubdtype(x.dtype, jnp.floating)]
+    floats = [i for i, x in enumerate(arguments) if jnp.issubdtype(x.dtype, jnp.floating) and not is_zero(moving[i])]
 
     def call_with_floats(*some):
         given = dict(zip(floats, some, strict=True))
         return function(*(given.get(i, x) for i, x in enumerate(arguments)))
 
-    along = tuple(ad.instantiate_zeros(moving[i]) for i in floats)
-    return jax.jvp(call_with_floats, tuple(arguments[i] for i in floats), along)[1]
+    return jax.jvp(call_with_floats, tuple(arguments[i] for i in floats), tuple(moving[i] for i in floats))[1]
 
 
 def _batch_expression(arrays, axes, *, function, count):

@@ -70,7 +70,14 @@ from lagjax._program._series import LinearSystem, series
 from lagjax._program._sliding import MOST_COUPLED, eliminate, sparse_row, substitute
 from lagjax._program.lowering import _complex
 from lagjax._program.lowering._matrices import orthogonalize, row_weights, solve_orthogonalized
-from lagjax._program.lowering._rules import LARGEST_UNFOLDED, Expansion, expand_primitive, has_own_rules, inputs_of
+from lagjax._program.lowering._rules import (
+    LARGEST_UNFOLDED,
+    Expansion,
+    expand_primitive,
+    has_own_rules,
+    inputs_of,
+    lowers,
+)
 
 
 def lower(function: Callable, *examples, budget: int = 20_000, moving: int = 0) -> "Program":
@@ -228,8 +235,12 @@ class Program:
     def size(self) -> int:
         return len(self.dtypes)
 
-    @functools.cached_property
+    @property
     def dtypes(self) -> tuple[np.dtype, ...]:
+        return self._dtypes  # a property, as the protocol of what has recurrences has it
+
+    @functools.cached_property
+    def _dtypes(self) -> tuple[np.dtype, ...]:
         return tuple(dtype for shape in self.shapes for dtype in [shape.dtype] * math.prod(shape.shape))
 
     def evaluate(self, *numbers) -> np.ndarray:

@@ -11,8 +11,8 @@ from collections.abc import Callable
 
 _BITS = 4  # of whole exponents that are not known before a motion begins
 # Of a base: below it terms of log u overflow in a long step, and the derivative by the exponent is infinite or NaN.
-# Steps that come from beside zero begin at some 1e-6.
-_NEAR_ZERO = 1e-7
+# Parts of a step past zero begin at some 1e-12.
+_NEAR_ZERO = 1e-14
 LARGEST_WHOLE = 2**_BITS  # beyond which a power is watched by its logarithm, which has no series where the base is zero
 
 

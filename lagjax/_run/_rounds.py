@@ -22,27 +22,34 @@ PyTree = Any
 BLOCK = 32  # rounds that are left out together where no motion goes on: what goes on is copied for each
 
 
-def run_rounds(run_round: Callable, first, absent: PyTree, count: int) -> tuple[Any, PyTree]:
-    """The last carry, and the records (count, …), of `run_round(carry, number)` while a carry is `going`.
+def run_rounds(run_round: Callable, first, absent: PyTree, rows: PyTree, goes_on: Callable) -> tuple[Any, PyTree]:
+    """The last carry, and the records (N, …), of `run_round(carry, row)` for `rows` (N, …) while `goes_on(carry, row)`.
 
     In a batch it runs while any member goes on. The records of rounds that are left out are `absent`.
     """
+    count = len(jax.tree.leaves(rows)[0])
 
-    def while_going(run, idle):
+    def while_going(run, idle, first_of):
         def keep(carry, _):
             return carry, idle
 
-        return lambda carry, numbers: cond_alike(any_member(carry.going), run, keep, carry, numbers)
+        return lambda carry, rows: cond_alike(any_member(goes_on(carry, first_of(rows))), run, keep, carry, rows)
 
-    def run_block(carry, numbers):
-        return jax.lax.scan(while_going(run_round, absent), carry, numbers)
+    run_one = while_going(run_round, absent, lambda row: row)
+
+    def run_block(carry, rows):
+        return jax.lax.scan(run_one, carry, rows)
 
     if count <= 2 * BLOCK:
-        return run_block(first, jnp.arange(count))
+        return run_block(first, rows)
     blocks = -(-count // BLOCK)
-    idle = jax.tree.map(lambda x: jnp.broadcast_to(x, (BLOCK, *x.shape)), absent)
-    numbers = jnp.arange(blocks * BLOCK).reshape(blocks, BLOCK)
-    ending, record = jax.lax.scan(while_going(run_block, idle), first, numbers)
+    idle = jax.tree.map(lambda x: jnp.broadcast_to(x, (BLOCK, *jnp.shape(x))), absent)
+
+    def split(x):
+        return jnp.pad(x, [(0, blocks * BLOCK - count)] + [(0, 0)] * (x.ndim - 1)).reshape(blocks, BLOCK, *x.shape[1:])
+
+    of_block = while_going(run_block, idle, lambda rows: jax.tree.map(lambda x: x[0], rows))
+    ending, record = jax.lax.scan(of_block, first, jax.tree.map(split, rows))
     return ending, jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:])[:count], record)
 
 

@@ -429,7 +429,7 @@ def constant_unless(varies, tree: PyTree) -> PyTree:
     return jax.tree.map(constant, tree)
 
 
-def vary_with(first, *inputs, varying: tuple[str, ...] = ("t", "y", "path")):
+def vary_with(first, *inputs):
     """The state before the first round, with derivatives, a batch and mesh axes where later ones have them."""
     # Else JAX writes the rounds down once more for numbers that get these in a round. The derivatives of a sine vary
     # with the inputs, too, in every order.
@@ -439,7 +439,8 @@ def vary_with(first, *inputs, varying: tuple[str, ...] = ("t", "y", "path")):
     def vary(x, like=still):
         return jnp.where(False, like.astype(jnp.asarray(x).dtype), x)
 
-    return jax.tree.map(vary, first)._replace(**{name: vary(getattr(first, name), moving) for name in varying})
+    varying = {name: vary(getattr(first, name), moving) for name in ("t", "y", "path")}
+    return jax.tree.map(vary, first)._replace(**varying)
 
 
 def follow_in_doubles(motion: Callable, problem: Problem, *more) -> Any:

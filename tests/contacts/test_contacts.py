@@ -634,14 +634,14 @@ def test_poissons_law_with_friction_is_for_one_contact_in_a_plane():
         lagjax.simulate(system, state(x=1.0, y=1.0), state(x=0.0, y=0.0), jnp.array([0.0, 0.1]))
 
 
-@pytest.mark.parametrize("duration", [3.0, 30.0])
+@pytest.mark.parametrize("duration", [5.9, 30.0])
 def test_a_gap_that_hides_a_corner_is_named(duration):
     """1 - sqrt(y**2) below y = 0 is 1 + y on its series: a wall at y = 1 is nowhere on it."""
     hidden = lagjax.System(
         lambda q, v: 0.5 * v @ v, restitution=1.0,
         contacts=lambda q: 1 - jnp.sqrt(jnp.maximum(jnp.abs(q[0]) - 1, 0.0) ** 2 + q[1] ** 2),
     )  # fmt: skip
-    q, v = jnp.array([0.85816433, -1.0]), jnp.array([-0.39057011, 0.92057318])
+    q, v = jnp.array([0.24765335, -1.0]), jnp.array([0.02608, 1.54014415])
     run = lagjax.simulate(hidden, q, v, jnp.array([0.0, duration]), throw=False)
     assert run.result == lagjax.RESULTS.contact_missed
 

@@ -108,6 +108,34 @@ def pushed_exactly(x):
     return 2.0 * (force - mu * G) * jnp.array([jnp.cos(angle), jnp.sin(angle), 0.0])
 
 
+def test_friction_is_against_the_slip_behind_an_impact():
+    """In space, where masses couple the slip with the gap: what an impact gives is M (q̇⁺ − q̇⁻)."""
+    rng, mu = np.random.default_rng(0), 0.3
+    coupled = lagjax.System(
+        lambda q, v, params: 0.5 * jnp.sum((params @ v) ** 2) + 0.05 * v @ v - q[2],
+        contacts=lambda q: q[2], slip=lambda q, v: v[:2], friction=mu, restitution=0.5,
+    )  # fmt: skip
+    q0, v0, factors, ts = np.array([0.0, 0.0, 0.05]), rng.normal(size=(60, 3)), rng.normal(size=(60, 3, 3)), [0.0, 0.05]
+    v0[:, 2] = -abs(v0[:, 2])
+    starts = np.broadcast_to(q0, v0.shape), v0, jnp.array(ts), factors
+    runs = lagjax.simulate_batch(coupled, *starts, batch_axes=(0, 0, 0), max_transitions=4)
+    masses = factors.transpose(0, 2, 1) @ factors + 0.1 * np.eye(3)
+    before, behind = runs.contact_changes.qdot[:, 0], runs.contact_changes.qdot_next[:, 0]
+    given = np.einsum("nij,nj->ni", masses, behind - before)
+    force, most, slip = given[:, :2], mu * given[:, 2], behind[:, :2]
+    slides = np.flatnonzero((runs.impacts.count > 0) & (np.linalg.norm(slip, axis=1) > 1e-6))
+    against = -most[:, None] * slip / np.linalg.norm(slip, axis=1, keepdims=True)
+    assert len(slides) > 10
+    np.testing.assert_allclose(force[slides], against[slides], atol=1e-11)
+
+    def end(v):
+        return lagjax.simulate(coupled, q0, v, jnp.array(ts), factors[slides[0]], max_transitions=4).qdot[-1]
+
+    v, h = v0[slides[0]], 1e-5
+    slopes = np.stack([(end(v + h * e) - end(v - h * e)) / (2 * h) for e in np.eye(3)], axis=1)
+    np.testing.assert_allclose(jax.jacfwd(end)(v), slopes, atol=1e-8)
+
+
 @pytest.mark.slow
 def test_a_slip_in_space_that_a_force_begins_has_no_derivatives_yet():
     np.testing.assert_allclose(pushed(PUSH), pushed_exactly(PUSH), atol=1e-9)

@@ -157,9 +157,9 @@ def test_what_a_fit_of_hybrid_motion_cannot_do_is_a_sentence(system, records, op
 
 
 def test_timings_of_transitions_and_functions_do_not_mix():
-    with pytest.raises(TypeError, match="and not both"):
+    with pytest.raises(TypeError, match="all of one kind"):
         lagjax.Timings({"a": BOUNCE, "b": lambda q, v: q}, {"a": [1.0], "b": [2.0]}, 0.0, thrown)
-    with pytest.raises(ValueError, match="a transition has its own"):
+    with pytest.raises(ValueError, match="a transition, or a contact, has its own"):
         heard(BOUNCE, direction=-1)
     with pytest.raises(ValueError, match="is no mode"):
         lagjax.Hybrid({"flight": FLIGHT}, [BOUNCE], "rest")

@@ -19,21 +19,23 @@ import numpy as np
 
 from lagjax._engine._problem import AbstractEngine, Batch, Problem, Solution, solve_in_doubles
 from lagjax._engine.taylor import _primitives
+from lagjax._engine.taylor._call import call_host
 from lagjax._engine.taylor._crossing import (
     MOST_GUARDS,
     Noted,
     changes_of,
     motion_to_event,
     motion_with_crossings,
+    run_stretch,
     stretch_variation,
     surfaces_of,
     surfaces_of_event,
 )
 from lagjax._engine.taylor._derivatives import Motions, jvp, portions, project_start_tangents, vjp
 from lagjax._engine.taylor._flow import Flow, Tolerances, require_fit
-from lagjax._engine.taylor._line_functions import line_of
+from lagjax._engine.taylor._line_functions import Line, line_of
 from lagjax._engine.taylor._lowered_motion import lowered_motion
-from lagjax._engine.taylor._surfaces import Guarded, Surfaces, require_one_number, vector_of
+from lagjax._engine.taylor._surfaces import Guarded, Surfaces, move_to_zero, rate_errors, require_one_number, vector_of
 from lagjax._equations import Derivation
 from lagjax._interface import EVENT_OCCURRED, default_platform, has_nvidia_gpu, is_concrete
 from lagjax._native import Guards, Nesting, append_guards, pieces_of
@@ -221,6 +223,14 @@ def flow_of(problem: Problem) -> Flow:
         return _find_flow(problem)
     except Unlowerable as reason:
         raise ValueError(f"There is no machine code for this scene: {reason}.") from None
+
+
+def make_flow(derivation: Derivation, path: str, guards: Guards | None) -> Flow:
+    """The flow of a scene with these guards. Raises `ValueError` where it has none, saying why."""
+    flow = _make_flow(derivation, path, guards)
+    if isinstance(flow, Unlowerable):
+        raise ValueError(f"There is no machine code for this scene: {flow}.")
+    return flow
 
 
 def _note_crossings(problem: Problem, surfaces: Surfaces) -> Problem:

@@ -148,35 +148,42 @@ def _event_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
 
 @functools.lru_cache(maxsize=64)
 def stretch_variation(flow: Flow, surfaces: Surfaces | None, tolerances: Tolerances):
-    """`(ts, y0, params, t_end, y_end, k, crosses)` → path, t, y, for the sake of their derivatives.
+    """`(ts, y0, params, t_end, y_end, k, crosses)` → path, t, y, for the sake of their derivatives."""
+    moves, still = surfaces and crossing_variation(surfaces), jax.lax.stop_gradient
+
+    @jax.jit
+    def run_unguarded(ts, y0, params, t_end, y_end, k, crosses):
+        path, *stop = run_stretch(flow, surfaces, tolerances, ts, y0, params, t_end, y_end, k, crosses)
+        if moves is None:
+            return path, *stop
+        # A surface that is not crossed may have no derivative here.
+        at, numbers = jax.tree.map(lambda x: jnp.where(crosses, x, still(x)), (stop, params))
+        moved = moves(k, crosses, *at, numbers)
+        return path, *(jnp.where(crosses, new, old) for new, old in zip(moved, stop, strict=True))
+
+    return run_unguarded
+
+
+def run_stretch(
+    flow: Flow, surfaces: Surfaces | None, tolerances: Tolerances, ts, y0, params, t_end, y_end, k, crosses
+) -> tuple:
+    """The path, the end, and the state there, of a motion from ts[0] to `t_end`, where surface k `crosses` or none.
 
     The run goes to the rounded time of the event, and its state there is the one whose crossing varies: so the rates of
     short motions between late events cancel to the last digit. And where nothing depends on the time, a start that
     varies takes the motion with it: how long motions last varies by what they are, not by when they are.
     To a surface that jumps through zero the run goes not quite: the acceleration may jump there.
     """
-    move_to_zero, still = surfaces and crossing_variation(surfaces), jax.lax.stop_gradient
-    follows_start = not flow.reads_time
-
-    @jax.jit
-    def run_unguarded(ts, y0, params, t_end, y_end, k, crosses):
-        if surfaces is not None and surfaces.borders is not None:
-            jumps = crosses & jumps_through_zero(surfaces, k, t_end, y_end, params)
-            t_end = jnp.where(jumps, _shortly_before(ts, t_end), t_end)
-        reached = jnp.where(ts <= t_end, ts, still(jnp.clip(ts, ts[0], t_end)))
-        later = ts[0] - still(ts[0]) if follows_start else 0.0
-        end = t_end + jnp.where(crosses, later, 0.0)
-        times = jnp.concatenate([ts[:1], reached[1:-1], end[None]]) - later
-        solution = _primitives.run(flow, tolerances, times, y0, params)
-        stop = end, solution.y_end
-        if move_to_zero is None:
-            return solution.path, *stop
-        # A surface that is not crossed may have no derivative here.
-        at, numbers = jax.tree.map(lambda x: jnp.where(crosses, x, still(x)), (stop, params))
-        moved = move_to_zero(k, crosses, *at, numbers)
-        return solution.path, *(jnp.where(crosses, new, old) for new, old in zip(moved, stop, strict=True))
-
-    return run_unguarded
+    still = jax.lax.stop_gradient
+    if surfaces is not None and surfaces.borders is not None:
+        jumps = crosses & jumps_through_zero(surfaces, k, t_end, y_end, params)
+        t_end = jnp.where(jumps, _shortly_before(ts, t_end), t_end)
+    reached = jnp.where(ts <= t_end, ts, jnp.clip(still(ts), still(ts[0]), still(t_end)))
+    later = 0.0 if flow.reads_time else ts[0] - still(ts[0])
+    end = t_end + jnp.where(crosses, later, 0.0)
+    times = jnp.concatenate([ts[:1], reached[1:-1], end[None]]) - later
+    solution = _primitives.run(flow, tolerances, times, y0, params)
+    return solution.path, end, solution.y_end
 
 
 # ---- all crossings ---------------------------------------------------------------------------------------------------

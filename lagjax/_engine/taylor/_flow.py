@@ -205,28 +205,6 @@ class Flow:
         Results say what stopped a member, and not only that its steps became too small, or too many. A run that a
         handler has `begun` is continued.
         """
-        released = self.guards and self.guards.released
-        if released and begun is None:
-            held = np.broadcast_to((params[:, released.held] != 0).any(axis=1), len(y0))
-            if not held.all():
-                return self._run_apart(held, released.make(), (ts, y0, params), tolerances)
-        return self._run(ts, y0, params, tolerances, begun)
-
-    def _run_apart(self, held: np.ndarray, other: "Flow", given: tuple, tolerances: Tolerances) -> Solution:
-        """The motions of members, of which those that are not `held` follow the `other` flow."""
-        ts, y0, params = given
-        if not held.any():
-            return other.run(ts, y0, params, tolerances)
-        whole, idle = None, 0
-        for which, flow in ((~held, other), (held, self)):
-            ts, y0, params = members(which, *given)
-            *found, more = flow._run(ts, y0, params, tolerances)
-            whole, idle = whole or [np.empty((len(held), *x.shape[1:]), x.dtype) for x in found], idle + more
-            for values, new in zip(whole, found, strict=True):
-                values[which] = new
-        return Solution._make([*whole, idle])
-
-    def _run(self, ts, y0, params, tolerances: Tolerances, begun: _native.Begun | None = None) -> Solution:
         solution, _ = self.follow(ts, y0, params, tolerances, begun=begun)
         if (solution.result != SUCCESSFUL).any():
             solution = self._explain_stops(solution, ts, params)

@@ -24,12 +24,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.core import ShapedArray
-from jax.interpreters import mlir
+from jax.interpreters import ad, mlir
 
 from lagjax._engine.taylor._call import NO_HANDLER, call_host, capsule
 from lagjax._native import LARGEST_LINE, LineCode, line_handler, make_once
 from lagjax._primitives import LinearMap, compute_on_host
-from lagjax._program import Graph, Program, StraightLine, Unlowerable, copy_nodes, emit, pullback, pushforward
+from lagjax._program import Graph, Program, StraightLine, Unlowerable, copy_nodes, emit, lowers, pullback, pushforward
 
 _TARGET = "lagjax_line"
 # Operations of a line on a GPU that XLA compiles; NumPy on the host evaluates a longer one. Twice as many would cost
@@ -75,15 +75,21 @@ def _line_of(line: StraightLine, count: int | None, dtypes: tuple[np.dtype, ...]
 class Line:
     """A straight line from `size` floats x, with the lines of its derivatives by the first `count`; by identity.
 
-    What a line of derivatives is linear in comes after its first `count` inputs.
+    What a line of derivatives is linear in comes after its first `count` inputs. By the first that are `fixed` there
+    are no derivatives.
     """
 
-    def __init__(self, line: StraightLine, size: int, count: int):
-        self.line, self.size, self.count, self._calls = line, size, count, 0
+    def __init__(self, line: StraightLine, size: int, count: int, fixed: int = 0):
+        self.line, self.size, self.count, self.fixed, self._calls = line, size, count, fixed, 0
 
     @property
     def outputs(self) -> int:
         return len(self.line.outputs)
+
+    @property
+    def width(self) -> int:
+        """The number of inputs by which there are derivatives."""
+        return self.count - self.fixed
 
     @functools.cached_property
     def code(self) -> LineCode | None:
@@ -102,17 +108,28 @@ class Line:
 
     @functools.cached_property
     def forward(self) -> "Line":
-        """(x, v) ↦ D(x) v, v (count,)."""
-        return self._derivative(pushforward, self.count)
+        """(x, v) ↦ D(x) v, v (width,)."""
+        return self._derivative(pushforward, self.width)
 
     @functools.cached_property
     def back(self) -> "Line":
         """(x, w) ↦ D(x)ᵀ w, w (outputs,)."""
         return self._derivative(pullback, self.outputs)
 
+    @functools.cached_property
+    def with_derivative(self) -> "Line":
+        """(x, v) ↦ g(x), D(x) v, one behind the other."""
+        line, size = self.forward.line, self.forward.size
+        graph = Graph(2 * len(line.nodes) + len(self.line.nodes) + size)
+        ids = [graph.input(i, "float") for i in range(size)]
+        copies = [(of, copy_nodes(graph, of, ids[:count])) for of, count in ((self.line, self.size), (line, size))]
+        found = tuple(nodes[i] for of, nodes in copies for i in of.outputs)
+        return Line(StraightLine(tuple(graph.nodes), tuple(graph.kinds), found), size, size)
+
     def _derivative(self, differentiate: Callable, linear: int) -> "Line":
-        line = differentiate(self.line, [np.dtype(float)] * self.size, range(self.count), range(self.outputs))
-        return Line(line, self.size + linear, self.size)
+        by = range(self.fixed, self.count)
+        line = differentiate(self.line, [np.dtype(float)] * self.size, by, range(self.outputs))
+        return Line(line, self.size + linear, self.size, self.fixed)
 
     def __call__(self, x):
         """g(x) of rows x (…, inputs), under every transformation of JAX."""
@@ -130,13 +147,24 @@ class _LineMap(LinearMap):
             return [ShapedArray((*x.shape[:-1], width(line)), np.dtype(float))]
 
         def vary(primals, tangents, _, *, line: Line):
-            return forward_p.bind(jnp.concatenate(primals, axis=-1), tangents[0], line=of(line))
+            along = ad.instantiate_zeros(tangents[0])[..., line.fixed :]
+            return forward_p.bind(jnp.concatenate(primals, axis=-1), along, line=of(line))
 
         super().__init__(f"lagjax_line_{name}", shape, vary, linear, transpose)
         self.of, self.shape = of, shape
         compute_on_host(self, self.evaluate)
+        lowers(self.name)(self._place)
         mlir.register_lowering(self, self._lower_on_cpu, platform="cpu")
         mlir.register_lowering(self, mlir.lower_fun(self._call_from_gpu, multiple_results=True), platform="cuda")
+
+    def _place(self, expansion, params: dict, *arrays):
+        """Its nodes in the graph of a function that is lowered."""
+        of, batch = self.of(params["line"]), arrays[0].shape[:-1]
+        rows = np.concatenate([expansion.real(x).reshape(math.prod(batch), -1) for x in arrays], axis=1)
+        expansion.work(len(rows) * len(of.line.nodes))
+        nodes = [copy_nodes(expansion.graph, of.line, row.tolist()) for row in rows]
+        found = np.array([[of_row[i] for i in of.line.outputs] for of_row in nodes], dtype=np.int64)
+        return [found.reshape(*batch, of.outputs)]
 
     def evaluate(self, *arrays, line: Line):
         """By NumPy, or machine code, at once."""
@@ -193,4 +221,4 @@ def _pull(x, w, _, line: Line):
 
 value_p = _LineMap("value", lambda line: line, lambda line: line.outputs)
 forward_p = _LineMap("forward", lambda line: line.forward, lambda line: line.outputs, 1, _pull)
-back_p = _LineMap("back", lambda line: line.back, lambda line: line.count, 1, _push)
+back_p = _LineMap("back", lambda line: line.back, lambda line: line.width, 1, _push)

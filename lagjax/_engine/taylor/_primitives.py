@@ -389,8 +389,6 @@ def _run_compiled(ts, y0, params, *, flow, tolerances):
     rows, batch = _rows((ts, y0, params), _RUN, library=jnp)
     with jax.enable_x64(True):  # where the kernel is made, and whatever was set where this is lowered
         if not begins_in_handler(flow, math.prod(batch)):
-            if flow.guards is not None and flow.guards.released:
-                flow.guards.released.make()  # here, where JAX may be used
             return call_host(functools.partial(_run_on_host, **settings), shapes, ts, y0, params)
         of_rows = [jax.ShapeDtypeStruct((len(rows[1]), *x.shape[len(batch) :]), x.dtype) for x in shapes]
 

@@ -19,7 +19,7 @@ import numpy as np
 
 from lagjax._engine.taylor._line_functions import outputs
 from lagjax._equations import OPERATION_BUDGET, Derivation
-from lagjax._native import GUARD_NOISE, INSTANT, SINGLE_NOISE, SMALLEST_STEP, Guards, Released
+from lagjax._native import GUARD_NOISE, INSTANT, SINGLE_NOISE, SMALLEST_STEP, Guards
 from lagjax._primitives import differentiable_where
 from lagjax._program import (
     Program,
@@ -72,14 +72,13 @@ class Surfaces(NamedTuple):
     is_rounded: bool = False
     borders: StraightLine | None = None
     holds: tuple[bool, ...] = ()
-    released: Released | None = None
 
     def guards(self, notes: bool = False, remembers: bool = False) -> Guards:
         """The surfaces as guards of machine code: a change ends the motion or, with `notes`, is written down.
 
         A motion that `remembers` is given the side of each surface from which it comes (see `Guards`).
         """
-        given = notes, remembers, self.is_rounded, self.holds, self.released
+        given = notes, remembers, self.is_rounded, self.holds
         return Guards(self.values, self.complete, self.directions, *given)
 
     @property
@@ -98,7 +97,7 @@ class Surfaces(NamedTuple):
         given = jnp.append(y, t), numbers
         out = outputs(self.complete, 4 * count, *given)
         values, rates, sizes, rate_sizes = out.reshape(4, count)
-        errors = outputs(_rate_errors(self.complete, count), count, *given)
+        errors = outputs(rate_errors(self.complete, count), count, *given)
         errors = jnp.where(jnp.isfinite(errors), errors, 0.0)  # a root at zero has no slope
         instant = INSTANT * SMALLEST_STEP * jnp.maximum(jnp.abs(t), jnp.abs(latest))
         rounding, rate_rounding = GUARD_NOISE * sizes, GUARD_NOISE * (rate_sizes + errors)
@@ -185,7 +184,7 @@ def _rate(motion: Program, expansion, ids: np.ndarray, moving: int) -> Scalars:
 
 
 @functools.lru_cache(maxsize=64)
-def _rate_errors(complete: Program, count: int) -> Program:
+def rate_errors(complete: Program, count: int) -> Program:
     """The running errors of all ġ in units of round-off: what is left of terms that cancel is not seen in its size."""
     return complete.rounding_of(range(count, 2 * count), complete.shapes[0].size)
 
@@ -215,33 +214,41 @@ def require_one_number(value, what: str) -> jax.Array:
 
 
 def crossing_variation(surfaces: Surfaces) -> Callable:
-    """`(k, taken, t, y, numbers)` → (t, y): the state at t, where guard k is zero, moved to where it is zero then.
+    """`(k, taken, t, y, numbers)` → (t, y), as `move_to_zero`; where g′ is zero there are no derivatives: NaN."""
 
-    With δg the variation of the guard, f the rate of the state, and ′ the derivative along the motion, time moves by
+    def move(k, taken, *at):
+        crosses, *there = move_to_zero(surfaces, k, taken, at, jax.lax.stop_gradient(at))
+        return tuple(differentiable_where(crosses, x, *at) for x in there)
+
+    return move
+
+
+def move_to_zero(surfaces: Surfaces, k, taken, at: tuple, still: tuple) -> tuple:
+    """True if guard k crosses, and (t, y): the state `at` (t, y, numbers), moved to where the guard is zero.
+
+    What is `still` is the same, and does not vary. With δg the variation of the guard, f the rate of the state, and ′
+    the derivative along the motion, time moves by
 
         s = −ε − ½ (g″/g′) ε²,  ε = δg/g′        and the state by   f s + ½ f′ s²,
 
     up to third order in δg, which is zero itself: first and second derivatives are right. Where it is not `taken`
     nothing moves. Where the guard jumps through zero, δg is that of the number whose border is there: the one that is
-    nearest in time. Where g′ is zero there are no derivatives: NaN.
+    nearest in time.
     """
-    still, follow = jax.lax.stop_gradient, functools.partial(_follow, surfaces)
-
-    def move_to_zero(k, taken, t, y, numbers):
-        numbers_there = still(numbers)
-        values, rates, slope = follow(t, y, numbers)
-        along, here = (jnp.ones_like(t), still(slope)), still((t, y))
-        _, (_, bends, turn) = jax.jvp(lambda t, y: follow(t, y, numbers_there), here, along)
-        at = k if surfaces.borders is None else _find_zero(surfaces, k, still(values), still(rates))
-        value, rate, bend = (jnp.where(np.arange(len(values)) == at, x, 0.0).sum() for x in (values, rates, bends))
-        crosses = ~taken | (rate != 0)
-        rate = jnp.where(taken & crosses, rate, 1.0)
-        part = jnp.where(taken, value - still(value), 0.0) / rate
-        later = -part - 0.5 * still(bend / rate) * part**2
-        there = t + later, y + slope * later + 0.5 * turn * later**2
-        return tuple(differentiable_where(crosses, x, t, y, numbers) for x in there)
-
-    return move_to_zero
+    follow = functools.partial(_follow, surfaces)
+    (t, y, _), (values, rates, slope) = at, follow(*at)
+    zeros, still_rates, still_slope = follow(*still)
+    along = jnp.ones_like(t), still_slope
+    _, (_, bends, turn) = jax.jvp(lambda t, y: follow(t, y, still[2]), still[:2], along)
+    here = np.arange(len(values)) == (k if surfaces.borders is None else _find_zero(surfaces, k, zeros, still_rates))
+    varied, rate, still_rate, bend = (
+        jnp.where(here, x, 0.0).sum() for x in (values - zeros, rates, still_rates, bends)
+    )
+    crosses = ~taken | (still_rate != 0)
+    moves = taken & crosses
+    part = jnp.where(taken, varied, 0.0) / jnp.where(moves, rate, 1.0)
+    later = -part - 0.5 * bend / jnp.where(moves, still_rate, 1.0) * part**2
+    return crosses, t + later, y + slope * later + 0.5 * turn * later**2
 
 
 def jumps_through_zero(surfaces: Surfaces, k, t, y, numbers):
@@ -261,8 +268,9 @@ def _follow(surfaces: Surfaces, t, y, numbers) -> list:
 
 def _find_zero(surfaces: Surfaces, k, values, rates):
     """The number that is zero where guard k changes: that of the guard, or of the border that is nearest in time."""
-    times, number, count = jnp.abs(values / rates), jnp.arange(values.size), len(surfaces.directions)
-    times = jnp.where(jnp.isnan(times), jnp.inf, times).at[count:].multiply(_LATER)
+    number, count = np.arange(values.size), len(surfaces.directions)
+    times = jnp.abs(values / rates) * np.where(number >= count, _LATER, 1.0)
+    times = jnp.where(jnp.isnan(times), jnp.inf, times)
     return jnp.argmin(jnp.where((number >= count) | (number == k), times, jnp.inf))
 
 

@@ -1,7 +1,10 @@
 """Motions with contacts: gaps and velocities that stay ≥ 0, impacts, rest and friction.
 
-    System(contacts=…) ─► ContactPlan ─► _contact_rounds: round after round ─► Carry, RoundRecord ─► Trajectory
-                                          ├─ _impact_law: what impulses do to velocities at an instant
+    System(contacts=…) ─► ContactPlan ─► _contact_motion ─► ContactEnding, RoundRecord ─► Trajectory
+                                          ├─ _contact_search: what happens, by loops over numbers, which _places names
+                                          │    ├─ _law: which contacts push, stick and slide in an impact
+                                          │    └─ _scene_code: a scene as the search takes it, and its runs
+                                          ├─ _replay: the same with derivatives;  _impact_law: those of impulses
                                           └─ _corners: where gaps change their direction
 
 Source: Moreau, *Unilateral contact and dry friction* (1988); Brogliato, *Nonsmooth Mechanics* (2016).
@@ -9,7 +12,6 @@ Source: Moreau, *Unilateral contact and dry friction* (1988); Brogliato, *Nonsmo
 
 import dataclasses
 import functools
-from typing import Any
 
 import equinox as eqx
 import jax
@@ -19,11 +21,18 @@ import numpy as np
 from lagjax._engine import Batch, Problem
 from lagjax._engine.taylor import MOST_GUARDS, MachineCode, line_of
 from lagjax._equations import ROUNDINGS, derivation_of, has_constraints, require_consistent
-from lagjax._interface import Layout, compile_for_one_call, halves, is_concrete, require_budget, result_from
-from lagjax._primitives import DOUBLE, compute_in_doubles
-from lagjax._run._rounds import BLOCK
+from lagjax._interface import Layout, halves, is_concrete, require_budget, result_from
+from lagjax._native import GUARD_NOISE
+from lagjax._primitives import compute_in_doubles
 from lagjax._run._trajectory import ContactChanges, Impacts, Names, State, Trajectory, follow_in_doubles, step_counts
-from lagjax._run.contacts._contact_rounds import Carry, ContactPlan, RoundRecord, RowPlaces, contact_motion, start_width
+from lagjax._run.contacts._contact_motion import (
+    ContactEnding,
+    ContactPlan,
+    RoundRecord,
+    RowPlaces,
+    contact_motion,
+    follow_known,
+)
 from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes, System, require_coefficients
 
 CHANGES = 1024  # the budget of changes of a motion whose crossings are asked for; what they record takes memory
@@ -43,45 +52,29 @@ def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int | Non
     """The motions of a batch whose system has contacts."""
     plan, _ = _plan(batch.member, max_transitions)
     if batch.is_known:
-        ending, record, impacts = _follow_known(plan, batch)
+        found = jax.device_put(_follow_known(plan, batch.member, batch.y0, batch.vectors))
     else:
-        ending, record, impacts = batch.map_members(lambda problem: _motion(plan, problem))
+        found = batch.map_members(lambda problem: follow_in_doubles(functools.partial(contact_motion, plan), problem))
+    ending, record, impacts = found
     return _trajectory(given.member, batch.member, ending, record, impacts, params, params_axes)
 
 
-def _follow_known(plan: ContactPlan, batch: Batch) -> tuple:
-    """The rounds of all members, block by block: what is recorded has no more room than they need."""
-    if batch.member.is_single:
-        member = dataclasses.replace(batch.member, layout=dataclasses.replace(batch.member.layout, dtype=DOUBLE))
-
-        def follow_wide(ts, y0, params):
-            return _follow_known(plan, Batch(dataclasses.replace(member, ts=ts), y0, params, batch.axes))
-
-        return compute_in_doubles(follow_wide, member.ts, batch.y0, batch.params)
-    ending, *found = _follow_block(plan, batch)
-    blocks = [found]
-    while np.asarray(ending.going).any():
-        ending, *found = _follow_block(plan, batch, ending)
-        blocks.append(found)
-    if len(blocks) == 1:
-        return ending, *found
-    counts = [impacts[-1] for _, impacts in blocks]
-    found = [(record, impacts[:-1]) for record, impacts in blocks]
-    record, impacts = jax.tree.map(lambda *parts: jnp.concatenate(parts, axis=1), *found)
-    in_front = jnp.argsort(jnp.isnan(impacts[0]), axis=1, stable=True)
-    take = jax.vmap(lambda x, places: x[places])
-    impacts = jax.tree.map(lambda x: take(x, in_front), impacts)
-    record, impacts = jax.tree.map(lambda x: x[:, : plan.max_transitions], (record, impacts))
-    return ending, record, (*impacts, sum(counts))
+def _motion(plan: ContactPlan, problem: Problem) -> tuple[ContactEnding, RoundRecord, tuple]:
+    if not problem.is_known:
+        return follow_in_doubles(functools.partial(contact_motion, plan), problem)
+    found = _follow_known(plan, problem, np.asarray(problem.y0)[None], np.asarray(problem.vector)[None])
+    return jax.device_put(jax.tree.map(lambda x: np.asarray(x)[0], found))
 
 
-@eqx.filter_jit
-def _follow_block(plan: ContactPlan, batch: Batch, *begun: Carry) -> Any:
-    def follow_member(problem, *begun):
-        given = problem.ts, problem.y0, problem.params
-        return contact_motion(plan, problem.layout, *given, min(BLOCK, plan.max_transitions), *begun)
+def _follow_known(plan: ContactPlan, member: Problem, y0, vectors) -> tuple[ContactEnding, RoundRecord, tuple]:
+    """The motions of members whose numbers are known, in the precision of `member`: `y0` (N, 2n), `vectors` (N, P)."""
 
-    return batch.map_members(follow_member, *begun)
+    def follow(ts, y0, vectors):
+        wide = member.double_precision if member.is_single else member
+        return follow_known(plan, wide.layout, wide.params, ts, y0, vectors)
+
+    given = np.asarray(member.ts), np.asarray(y0), np.asarray(vectors)
+    return compute_in_doubles(follow, *given) if member.is_single else follow(*given)
 
 
 def note_sections(problem: Problem, functions: tuple, directions: tuple[int, ...], room: int) -> tuple:
@@ -160,7 +153,7 @@ def _require_open(problem: Problem, closed: Problem) -> None:
     noise = ROUNDINGS * np.finfo(problem.layout.dtype).eps * (np.asarray(terms)[rows] + np.abs(slopes) @ np.abs(y0[:n]))
     columns[columns.size - sum(x.size for x in closed.params.contacts) :][: shapes.count] = 0.0  # all contacts open
     acceleration = derivation.acceleration.evaluate_many(list(columns))[:n, 0]
-    noise = noise + np.asarray(start_width(slopes, y0, acceleration, np.asarray(closed.ts)))
+    noise = noise + start_width(slopes, y0, acceleration, np.asarray(closed.ts))
     for name, gap, slope, near in zip(shapes.names, gaps, slopes, noise, strict=False):
         if gap < -near:
             raise ValueError(
@@ -173,14 +166,21 @@ def _require_open(problem: Problem, closed: Problem) -> None:
             )
 
 
-def _motion(plan: ContactPlan, problem: Problem) -> tuple[Carry, RoundRecord, tuple]:
-    return follow_in_doubles(functools.partial(contact_motion, plan), problem)
+def start_width(slopes, y0, acceleration, ts) -> np.ndarray:
+    """The depths at which gaps (k,) with these `slopes` (k, n) may begin: the rounding of what leads a motion there.
+
+    A gap that is a coordinate is 1e-16 where it closes, and its rounding that of the height from which it fell.
+    """
+    (q, v), span, latest = halves(abs(y0)), ts[-1] - ts[0], np.maximum(abs(ts[0]), abs(ts[-1]))
+    return GUARD_NOISE * (abs(slopes) @ (q.max() + v * latest + abs(acceleration) * span**2 / 8))
 
 
 def _trajectory(
-    given: Problem, problem: Problem, ending: Carry, record: RoundRecord, impacts, params, axes=None
+    given: Problem, problem: Problem, ending: ContactEnding, record: RoundRecord, impacts, params, axes=None
 ) -> Trajectory:
-    (q, qdot), end, (at, behind), before = _restore(problem.layout, ending, record)
+    restore = problem.layout.restore
+    (q, qdot), end, (at, behind) = (tuple(map(restore, halves(y))) for y in (ending.path, ending.y, record.y_next))
+    before = restore(record.qdot)
     known = record.contact, record.change, ending.rounds, ending.doubts, ending.doubted
     names = Shapes.from_system(problem.system, problem.layout, problem.params).names
     changes = ContactChanges(record.t, at, before, at, behind, *known, Names(names))
@@ -190,13 +190,6 @@ def _trajectory(
         tolerances=MachineCode().tolerances(problem, problem.y0), engine="MachineCode", impacts=Impacts(*impacts),
         contacts=ending.of_path, contact_changes=changes, contact_names=names,
     )  # fmt: skip
-
-
-@compile_for_one_call
-def _restore(layout: Layout, ending: Carry, record: RoundRecord) -> tuple:
-    """(q, q̇) in the user's structure: at the outputs, the end, behind changes; and the velocities before these."""
-    states = [tuple(map(layout.restore, halves(y))) for y in (ending.path, ending.y, record.y_next)]
-    return *states, layout.restore(record.qdot)
 
 
 def contact_forces(trajectory: Trajectory):

@@ -10,21 +10,10 @@ import dataclasses
 import functools
 from typing import NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from lagjax._engine.taylor import line_of
-from lagjax._interface import halves
-from lagjax._native import SMALLEST_STEP
 from lagjax._program import Program, Unlowerable, find_corners, is_smooth, with_outputs
 from lagjax._scene import Shapes
-
-# How far beyond a corner a motion goes on, in parts of the terms that say where it is; and how many of the smallest
-# steps before it an event stops it: steps that end at a border may be refused, and halve what is left.
-BEYOND, BEFORE = 16.0 * float(np.finfo(float).eps), 64.0 * SMALLEST_STEP
-# The time that it takes to go beyond, in parts of the motion, from which on a contact rests on its corner.
-AT_REST = 1e-10
 
 
 class Corners(NamedTuple):
@@ -32,38 +21,6 @@ class Corners(NamedTuple):
 
     touch: np.ndarray
     sides: Program
-
-    def evaluate(self, t, y, numbers, largest, latest) -> "AtCorners":
-        """The corners at a state, in a motion whose largest coordinates and velocities so far are these (2n,)."""
-        n, line = y.size // 2, line_of(self.sides)
-        t, y, numbers, largest = jax.lax.stop_gradient((t, y, numbers, jnp.maximum(largest, jnp.abs(y))))
-
-        def sides_at(state):
-            return line(jnp.concatenate([state[:n], y[n:], state[n:], numbers]))
-
-        state = jnp.append(y[:n], t)
-        values, slopes = sides_at(state), jax.jacfwd(sides_at)(state)
-        far = BEYOND * (jnp.abs(slopes) @ jnp.append(largest[:n], jnp.abs(t)) + jnp.abs(values))
-        soon = BEFORE * jnp.maximum(jnp.abs(t), jnp.abs(latest)) * (jnp.abs(slopes) @ jnp.append(largest[n:], 1.0))
-        return AtCorners(values, slopes @ jnp.append(y[n:], 1.0), far, jnp.max(far + soon))
-
-
-class AtCorners(NamedTuple):
-    """The sides of corners at a state (P,), their rates, how `far` beyond it goes on, and how `near` they count."""
-
-    values: jax.Array
-    rates: jax.Array
-    far: jax.Array
-    near: jax.Array
-
-    def go_beyond(self, passed, t, y, acceleration, ts) -> tuple:
-        """The time and the state beyond the corners that are `passed` (P,); and whether the motion rests on one."""
-        moves = self.rates != 0
-        left = (self.far - self.values * jnp.sign(self.rates)) / jnp.where(moves, jnp.abs(self.rates), 1.0)
-        rests = passed & (~moves | (left > AT_REST * (ts[-1] - ts[0])))
-        later = jnp.max(jnp.where(passed & ~rests, left, 0.0), initial=0.0)
-        v, a = halves(jax.lax.stop_gradient(y))[1], jax.lax.stop_gradient(acceleration)
-        return t + later, y + jnp.concatenate([later * (v + 0.5 * later * a), later * a]), rests.any()
 
 
 def corners_of(derivation, rows: tuple[int, ...], shapes: Shapes) -> Corners | None:
@@ -101,4 +58,4 @@ def _corners_of(derivation, places: tuple[int, ...], rough: tuple[int, ...], gap
 
 def append_sides(program: Program, corners: Corners) -> Program:
     """The program with the sides of corners behind its outputs."""
-    return dataclasses.replace(program, line=with_outputs(program, corners.sides.line).line)
+    return dataclasses.replace(program, line=with_outputs(program, corners.sides.line).line)  # type: ignore

@@ -151,7 +151,8 @@ def hybrid_motion(plan: RoundPlan, layout: Layout, ts, y0, params: PyTree, start
         let_out=jnp.full(len(plan.transitions), jnp.nan),
     )  # fmt: skip
     first = vary_with(first, ts, y0, rounds.modes[0].vector)
-    ending, record = run_rounds(rounds.run_round, first, TransitionRecord.absent(y0.size), plan.max_transitions + 1)
+    absent, numbers = TransitionRecord.absent(y0.size), jnp.arange(plan.max_transitions + 1)
+    ending, record = run_rounds(rounds.run_round, first, absent, numbers, lambda carry, _: carry.going)
     record = jax.tree.map(lambda x: x[: plan.max_transitions], record)
     still = jax.lax.stop_gradient(record)
     named = jnp.where(_go_in_turn(still), IN_TURN, jnp.where(_pile_up(still.t, ts[-1]), ZENO, TOO_MANY))

@@ -1,0 +1,338 @@
+"""The motion of a scene with contacts: a search for what happens, without derivatives, and a replay, which has them.
+
+ContactPlan, start ─► SceneCode.search ─► Found ─► attach_derivative(Replay) ─► ContactEnding, RoundRecord, impacts
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._engine.taylor import (
+    MOST_GUARDS,
+    Line,
+    Surfaces,
+    Tolerances,
+    line_of,
+    make_flow,
+    require_one_number,
+    vector_of,
+)
+from lagjax._equations import Derivation, derivation_of
+from lagjax._interface import Function, Layout, compile_for_one_call, halves
+from lagjax._primitives import attach_derivative, lost_unless
+from lagjax._program import Program, Unlowerable, lower
+from lagjax._run.contacts._corners import append_sides, corners_of
+from lagjax._run.contacts._places import ARRAYS, SAID
+from lagjax._run.contacts._replay import Played, Replay, read_rows
+from lagjax._run.contacts._scene_code import Found, SceneCode, sizes_of_fields
+from lagjax._scene import Contacts, ContactScene, Flat, InContact
+
+PyTree = Any
+
+LAWS = "simultaneous", "sequential", "poisson"
+# Operations that have a series everywhere, which hides nothing.
+_SEEN = frozenset(("input", "constant", "convert", "add", "sub", "mul", "neg", "sin", "cos", "exp", "tanh"))
+
+
+class ContactPlan(eqx.Module):
+    """The constants of a run: the scene, its budgets, and whether the start came in float32.
+
+    The `sections` are watched, too, each for changes of its sign in its direction, of which a round makes a note.
+    """
+
+    scene: ContactScene
+    rtol: float = eqx.field(static=True)
+    atol: float | None = eqx.field(static=True)
+    max_steps: int = eqx.field(static=True)
+    max_transitions: int = eqx.field(static=True)
+    is_single: bool = eqx.field(static=True)
+    sections: tuple[Function, ...] = ()
+    directions: tuple[int, ...] = eqx.field(static=True, default=())
+
+
+class ContactEnding(NamedTuple):
+    """A motion as a whole: its outputs, where and how it ended, and what is doubtful (as in `ContactChanges`)."""
+
+    path: Any  # (T, 2n), NaN where not reached
+    of_path: Contacts  # what the contacts did at the outputs, −1 where not reached
+    t: Any
+    y: Any  # (2n,)
+    result: Any
+    rounds: Any  # how many ended with a change
+    steps: tuple[Any, Any]  # accepted, rejected
+    doubts: Any  # (3,)
+    doubted: Any
+
+
+class RoundRecord(NamedTuple):
+    """The changes of a motion (N, …), NaN and −1 where there is none: times, velocities before, states behind them."""
+
+    t: Any
+    qdot: Any
+    y_next: Any
+    contact: Any  # behind the contacts, a section that was crossed
+    change: Any  # its kind
+
+
+class SearchedScene(NamedTuple):
+    """A scene that has been made ready: its search, its replay, its functions in flat coordinates.
+
+    `coefficients` are e and μ, (k + r,), or their program of the numbers of params; None where they have none.
+    """
+
+    code: SceneCode
+    replay: Replay
+    flat: Flat
+    coefficients: np.ndarray | Program | None
+
+    def split_coefficients(self, values):
+        """e (…, k) and μ (…, r) of the coefficients (…, k + r)."""
+        return values[..., : self.code.sizes["K"]], values[..., self.code.sizes["K"] :]
+
+
+@compile_for_one_call
+def contact_motion(
+    plan: ContactPlan, layout: Layout, ts, y0, params: PyTree
+) -> tuple[ContactEnding, RoundRecord, tuple]:
+    """The motion from y0 (2n,) at ts[0], its changes, of which there may be `max_transitions`, and its impacts.
+
+    Those are their times, the normal impulses, the energy that was lost, and their count.
+    """
+    ts, y0 = jnp.asarray(ts), jnp.asarray(y0)
+    numbers, still = eqx.filter(params, eqx.is_array_like), jax.lax.stop_gradient
+    scene = scene_of(plan, layout, params, len(ts))
+    vector = vector_of(numbers).astype(float)
+    if scene.coefficients is None:
+        coefficients = scene.flat.restitution(numbers), scene.flat.friction(numbers)
+    elif isinstance(scene.coefficients, Program):
+        coefficients = scene.split_coefficients(line_of(scene.coefficients)(vector))
+    else:
+        coefficients = map(jnp.asarray, scene.split_coefficients(scene.coefficients))
+    restitution, friction = coefficients
+    given = ts, y0, vector, restitution, friction
+    found = scene.code.search(*still(given))
+    row, played = _read(scene, found)
+    played = Played(*attach_derivative(scene.replay, tuple(played), *given))
+    return _arrange(scene, found, row, played, given[:3])
+
+
+def follow_known(plan: ContactPlan, layout: Layout, params: PyTree, ts, y0, vectors) -> tuple:
+    """The motions of members whose numbers are known, with members in front: `y0` (N, 2n), `vectors` (N or 1, P).
+
+    `params` are those of one member. There is room for as many changes as there were.
+    """
+    scene, members = scene_of(plan, layout, params, len(ts)), len(y0)
+    vectors = np.broadcast_to(np.asarray(vectors, float), (members, np.shape(vectors)[-1]))
+    if scene.coefficients is None:
+        rows = [_coefficients_at(scene.flat, params, vector) for vector in vectors]
+        coefficients = [np.stack(column) for column in zip(*rows, strict=True)]
+    elif isinstance(scene.coefficients, Program):
+        values = scene.coefficients.evaluate_many(list(vectors.T))
+        coefficients = scene.split_coefficients(np.stack([np.broadcast_to(x, members) for x in values], axis=-1))
+    else:
+        values = scene.split_coefficients(scene.coefficients)
+        coefficients = [np.broadcast_to(x, (members, x.size)) for x in values]
+    found = scene.code.run(np.asarray(ts, float)[None], np.asarray(y0, float), vectors, *coefficients, room=None)
+    row, played = _read(scene, found)
+    return _arrange(scene, found, row, played, ())
+
+
+def _coefficients_at(flat: Flat, params: PyTree, vector) -> list[np.ndarray]:
+    """e and μ for the numbers (P,) of parameters of this structure."""
+    numbers, structure = jax.tree.flatten(eqx.filter(params, eqx.is_array_like))
+    parts = np.split(vector, np.cumsum([np.size(x) for x in numbers])[:-1])
+    given = structure.unflatten([part.reshape(np.shape(x)) for part, x in zip(parts, numbers, strict=True)])
+    return [np.asarray(flat.restitution(given)), np.asarray(flat.friction(given))]
+
+
+def _read(scene: SearchedScene, found: Found) -> tuple[Any, Played]:
+    fields, n = sizes_of_fields(scene.code.sizes), scene.code.sizes["N"]
+    row = read_rows(found.record[..., : sum(fields[name] for name in SAID)], fields, SAID)
+    t, y = found.ending[..., 0], found.ending[..., 1 : 2 * n + 1]
+    return row, Played(found.path, row.at, row.before, row.behind, row.t_impact, row.impulse, row.lost, t, y)
+
+
+def _arrange(scene: SearchedScene, found: Found, row, played: Played, inputs: tuple) -> tuple:
+    """The ending, the changes, and the impacts in front; of what varies with `inputs`, if it is traced."""
+    library: Any = jnp if inputs else np
+
+    def lost(there, x):
+        there = there[(..., *[None] * (x.ndim - there.ndim))]
+        return lost_unless(there, x, inputs) if inputs else np.where(there, x, np.nan)
+
+    k, r, n, d = (scene.code.sizes[name] for name in "KRND")
+    happened, hits = row.happens > 0, row.hits > 0
+    closed, sticks, direction, near = library.split(found.did, [k, k + r, k + r + r * d], axis=-1)
+    of_path = Contacts(closed, sticks, direction.reshape(*direction.shape[:-1], r, d), near[..., 0])
+    rest = found.ending[..., 2 * n + 1 :]
+    result, rounds, accepted, rejected = (rest[..., i].astype(int) for i in range(4))
+    ending = ContactEnding(
+        lost((closed >= 0).all(axis=-1), played.path), of_path, played.t, played.y, result, rounds,
+        (accepted, rejected), rest[..., 4:7].astype(int), rest[..., 7:10],
+    )  # fmt: skip
+    changes = (lost(happened, x) for x in (played.at, played.before, played.behind))
+    kinds = (library.where(happened, x, -1).astype(int) for x in (row.contact, row.change))
+    impacts, front = [], library.argsort(~hits, axis=-1, stable=True)
+    for x in (played.t_impact, played.impulse, played.lost):
+        places = front[(..., *[None] * (x.ndim - hits.ndim))]
+        impacts.append(library.take_along_axis(lost(hits, x), places, axis=hits.ndim - 1))
+    t_impact, impulse, energy = impacts
+    return (
+        ending,
+        RoundRecord(*changes, *kinds),
+        (t_impact, scene.flat.shapes.name_numbers(impulse), energy, hits.sum(-1)),
+    )
+
+
+# ---- what is made once -----------------------------------------------------------------------------------------------
+
+
+def scene_of(plan: ContactPlan, layout: Layout, params: PyTree, times: int) -> SearchedScene:
+    """The scene for parameters of this structure and so many outputs. Raises `ValueError` for too many watches."""
+    flat = Flat.from_system(plan.scene.system, layout, params)
+    inside = InContact(params, opened(flat))
+    numbers = vector_of(eqx.filter(inside, eqx.is_array_like))
+    closed, other = (
+        derivation_of(of, layout, inside).with_numbers(numbers)
+        for of in (plan.scene, ContactScene(plan.scene.system, is_open=True))
+    )
+    code, structure = jax.tree.flatten(eqx.filter(inside, eqx.is_array_like, inverse=True))
+    tolerances = Tolerances(plan.rtol, plan.atol or 0.0, plan.max_steps)
+    given = plan.max_transitions, plan.is_single, plan.sections, plan.directions, tuple(code), structure, times
+    return _make_scene(closed.lowered, other.lowered, plan.scene, tolerances, *given)
+
+
+@functools.lru_cache(maxsize=64)
+def _make_scene(
+    derivation: Derivation, open_derivation: Derivation, scene: ContactScene, tolerances: Tolerances, most: int,
+    single: bool, sections: tuple, ways: tuple, code: tuple, structure, times: int
+) -> SearchedScene:  # fmt: skip
+    flat = _flat_of(derivation, scene, structure, code)
+    places, shapes, n = RowPlaces.from_derivation(derivation, flat), flat.shapes, derivation.layout.size
+    corners = corners_of(derivation, places.all, shapes)
+    turns, r, d, k = 0 if corners is None else len(corners.touch), flat.rough.size, shapes.directions, shapes.count
+    if (watches := k + r + 2 * turns + len(sections)) > MOST_GUARDS:
+        raise ValueError(
+            f"The contacts, with {turns} corners of their gaps, make {watches} watches, and {MOST_GUARDS} are "
+            "possible: one a contact, one more with friction, two a corner. A table (jnp.interp) is one corner."
+        )
+    watched = turns, sections, ways, code, structure, single
+    surfaces = {
+        "HELD": _watches(derivation, scene, *watched),
+        "OPEN": _watches(open_derivation, ContactScene(scene.system, is_open=True), *watched),
+    }
+    flows = {
+        kind: functools.partial(make_flow, of, scene.path, surfaces[kind].guards(remembers=True))
+        for kind, of in (("HELD", derivation), ("OPEN", open_derivation))
+    }
+    doing, inputs = k + r + r * d + 1, derivation.acceleration.size
+    response = line_of(derivation.impact_response(places.all, doing))
+    bends = response.line.replace(outputs=response.line.outputs[-len(places.all) :][:k])
+    acceleration = line_of(derivation.acceleration, n)
+    lines = {"RESPONSE": response, "BENDS": Line(bends, inputs, inputs).with_derivative, "ACCELERATION": acceleration}
+    if corners is not None:
+        lines["SIDES"] = line_of(corners.sides)
+        lines["SIDE_SLOPES"] = lines["SIDES"].forward
+    sizes = {
+        "N": n, "K": k, "R": r, "D": d, "GAPS": flat.gap_count, "CORNERS": turns, "SECTIONS": len(sections),
+        "WATCHES": watches, "NUMBERS": inputs - 2 * n - 1 - doing, "INPUTS": inputs, "TIMES": times, "DOING": doing,
+        "MOST": most, "LAW": LAWS.index(scene.system.impacts), "SINGLE": int(single), "HEIGHT": len(places.all),
+        "MAY_MISS": int(not {op for op, _, _ in surfaces["OPEN"].values.line.nodes} <= _SEEN),
+        "MULTIPLIERS_COUNT": len(derivation.multipliers.line.outputs),
+    }  # fmt: skip
+    touch = np.zeros((0, k)) if corners is None else corners.touch
+    arrays = dict(zip(ARRAYS, (flat.rough, places.tangential, touch), strict=True))
+    multipliers = functools.cache(lambda: line_of(derivation.multipliers))
+    searched = SceneCode(sizes, arrays, flows, surfaces, lines, multipliers, tolerances)
+    flow = functools.cache(functools.partial(make_flow, derivation, scene.path, None))
+    return SearchedScene(searched, Replay(searched, flow), flat, _lower_coefficients(flat, derivation.numbers.params))
+
+
+def _lower_coefficients(flat: Flat, numbers: PyTree) -> np.ndarray | Program | None:
+    try:
+        program = lower(lambda p: jnp.concatenate([flat.restitution(p), flat.friction(p)]), numbers)
+    except Unlowerable:
+        return None
+    constants = [program.constant(i) for i in range(len(program.line.outputs))]
+    return program if None in constants else np.array(constants, float)
+
+
+def _flat_of(derivation: Derivation, scene: ContactScene, structure, code: tuple) -> Flat:
+    """The functions of contacts for parameters of which `code` and `structure` are what is not a number."""
+    zeros = jax.tree.map(lambda x: np.zeros(x.shape, x.dtype), derivation.numbers)
+    return Flat.from_system(scene.system, derivation.layout, eqx.combine(zeros, structure.unflatten(code)).params)
+
+
+def opened(flat: Flat) -> Contacts:
+    """Contacts that are all open."""
+    r, d = flat.rough.size, flat.shapes.directions
+    return Contacts(jnp.zeros(flat.shapes.count), jnp.ones(r), jnp.ones((r, d)), jnp.zeros(()))
+
+
+class RowPlaces(NamedTuple):
+    """The places of the rows of contacts among all: those of the normals (k,) and of the slips (r, d)."""
+
+    normal: np.ndarray
+    tangential: np.ndarray
+
+    @property
+    def all(self) -> tuple[int, ...]:
+        return (*self.normal.tolist(), *self.tangential.ravel().tolist())
+
+    @classmethod
+    def from_derivation(cls, derivation, flat: Flat) -> "RowPlaces":
+        total, (r, d) = derivation.shape("jacobian")[0], (flat.rough.size, flat.shapes.directions)
+        gaps_end, slips = derivation.position_count, total - r * d
+        one_way = flat.shapes.count - flat.gap_count
+        normal = [*range(gaps_end - flat.gap_count, gaps_end), *range(slips - one_way, slips)]
+        return cls(np.array(normal, int), slips + np.arange(r * d).reshape(r, d))
+
+
+@functools.lru_cache(maxsize=64)
+def _watches(
+    derivation, scene: ContactScene, turns: int, sections: tuple, ways: tuple, code: tuple, structure, single
+) -> Surfaces:
+    """The watches of all contacts as programs: the k normal ones, those of friction, r, of corners, and the sections.
+
+    `code` and `structure` are what the parameters hold that is not a number.
+    """
+    flat = _flat_of(derivation, scene, structure, code)
+    shapes, rough = flat.shapes, flat.rough
+    places = None if scene.is_open else RowPlaces.from_derivation(derivation, flat)
+    corners = corners_of(derivation, places.all, shapes) if turns and places is not None else None
+
+    def values_at(y, inside: InContact, *forces):
+        user, (closed, sticks, direction, near) = eqx.filter(inside.params, eqx.is_array_like), inside.contacts
+        state = (*halves(y[:-1]), y[-1])
+        open_values = jnp.concatenate([flat.gaps(state[0], state[2], user), flat.one_way(*state, user)])
+        user_state = (*map(derivation.layout.restore, state[:2]),)
+        more = [require_one_number(of(*user_state, t=y[-1], params=inside.params), "A section") for of in sections]
+        if places is None:
+            return jnp.concatenate([open_values, jnp.ones(rough.size + 2 * turns), jnp.array(more)])
+        normal = forces[0][places.normal]
+        if corners is not None:
+            matters = [1.0 - jnp.prod(1.0 - closed[np.flatnonzero(row)]) for row in corners.touch]
+            sides = forces[0][-turns:] * jnp.stack(matters)  # 0 where all that is closed is elsewhere
+            more = [*(sides - near), *(sides + near), *more]
+        watches = jnp.concatenate([normal + (1.0 - closed) * open_values, jnp.array(more)])
+        if not rough.size:
+            return watches
+        held, most = forces[0][places.tangential], flat.friction(user) * normal[rough]
+        if shapes.directions == 1:
+            slides = jnp.sum(flat.slips(*state, user) * direction, axis=1)
+        else:  # zero where it stops, and where it has turned by 60°: at 90° its direction has a pole
+            unit, along, across = flat.turning_slips(*state, inside._replace(params=user))
+            slides = jnp.sum(flat.slips(*state, user) * unit, axis=1) - across**2 / (3.0 * along)
+        of_friction = sticks * (most**2 - jnp.sum(held**2, axis=1)) + (1.0 - sticks) * slides
+        of_friction = closed[rough] * of_friction + (1.0 - closed[rough])
+        return jnp.concatenate([watches[: shapes.count], of_friction, watches[shapes.count :]])
+
+    directions = (-1,) * (shapes.count + rough.size + turns) + (1,) * turns + ways
+    forces = None if scene.is_open else derivation.multipliers
+    forces = forces if corners is None or forces is None else append_sides(forces, corners)
+    surfaces = Surfaces.from_function(derivation, values_at, directions, code, structure, given=forces)
+    return surfaces._replace(is_rounded=single)

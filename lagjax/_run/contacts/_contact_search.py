@@ -1,0 +1,1233 @@
+"""The search for what contacts do: from stretch to stretch of a motion, on numbers, without derivatives.
+
+A contact has watches that stay positive: its gap, or one-way velocity, while it is open, its normal force λ while it is
+closed; with friction the slip in its direction while it slides, μ²λ² − f² while it sticks. One program serves all
+contacts, whatever they do (`InContact`). Where a watch falls,
+
+    a gap             impulses, where the contact moves inwards (`_law`); else the contact closes
+    λ                 it opens
+    the slip          it sticks
+    what friction has left    it slides, against the force that held it
+
+A guess that is wrong is a watch that begins beyond zero, or whose first coefficient that is not rounding is negative:
+it falls at once, and the next round takes it back (`_native._events`). That is Murty's principal pivoting, over series
+in place of numbers (Murty, Linear Algebra Appl. 5 (1972) 65; Heemels, Schumacher & Weiland, ibid. 294 (1999) 93).
+Bounces that accumulate end at a closed form of their limit (`end_bounces`).
+
+    follow ─► begin ─► prepare: sides and rounding of all watches ─► the kernel ─► finish ─► decide: a row of the record
+                          ▲                                                                     │
+                          └─────────────────────────────────────────────────────────────────────┘
+
+`scene` holds sizes, addresses of machine code, and the places of what is remembered of a member, its `member`, and of
+what a `row` of the record says; they are declared in `_places`. A flag is 0 or 1. `work` is room that nobody else has.
+"""
+
+from math import isfinite, sqrt
+
+from lagjax._interface import RESULTS, SUCCESSFUL, code_of
+from lagjax._native import (
+    EVENT,
+    GUARD_NOISE,
+    INSTANT,
+    SMALLEST_STEP,
+    Floats,
+    evaluate,
+    integrate,
+    loop,
+)
+from lagjax._run.contacts._law import (
+    EPS,
+    LINKED,
+    add_rates,
+    drop_dependent,
+    find_impulses,
+    find_pattern,
+    find_violations,
+    hold_rows,
+)
+from lagjax._run.contacts._places import Entry, Member, Room, Scene
+
+# Results of a motion that goes on, of one whose stretch the kernel did not finish, and of one that has not begun.
+GOING, ASKS, NEW = -1, -2, -3
+(TOO_MANY, UNDECIDED, IN_TURN, MISSED, AT_CORNER, NOT_FINITE, INCONSISTENT, BACKWARDS, NO_RESTITUTION,
+ NO_FRICTION) = map(
+    code_of,
+    (RESULTS.max_transitions_reached, RESULTS.contact_undecided, RESULTS.contacts_in_turn, RESULTS.contact_missed,
+     RESULTS.contact_at_corner, RESULTS.nonfinite_state, RESULTS.inconsistent_start, RESULTS.contact_backwards,
+     RESULTS.restitution_out_of_range, RESULTS.friction_out_of_range),
+)  # fmt: skip
+CLOSES, OPENS, BOUNCES, STICKS, SLIDES = range(5)  # the kinds of `ContactChanges`
+SEQUENTIAL, POISSON = 1, 2
+# The time that bounces still take, in parts of a step of the motion between them, below which they end in closed form,
+# and what that leaves out: twice as long, heights of 4e-9 of those of a step are left out.
+SHORT, LEFT_OUT = 1e-4, 1e-14
+# Forces that are none, in parts of those that stop the bodies within a step: some fifty roundings.
+FORCELESS = 1e-14
+# How far below zero a gap counts as gone through: a hundred local errors, of its largest terms.
+THROUGH = 100.0
+# What sliding leaves of a contact's response at which it is lost: a paradox, to rounding.
+PARADOX = 1e-12
+# How many of its roundings a gap may move in a step by a force that counts as none, where no other choice is left.
+TIED_MOVES = 1e3
+# The slip in space that has no direction of its own, in parts of the largest one; and in parts of what a force that
+# breaks away brings about in a step. Half of that takes √2 times the steps, of some ten thousand: at rest friction
+# turns a slip at once, and steps are as short as that takes.
+NO_SLIP, AT_REST = 1e-11, 1e-8
+# By how much what happens at one instant may vary apart, for a tangent of length one: rounding.
+TOGETHER = 1e-8
+HARDLY = 1e-6  # of the largest velocities so far: a contact that moves apart slower may close
+GAINED = 1e-12  # of the room of an impact: a gain of energy beyond rounding
+# Of the largest slip so far: what is more, where the slip along its first direction ends, has turned.
+TURNED = 1e-6
+LEAST = 1e-300  # a side that is exactly zero still has a sign
+# How far beyond a corner a motion goes on, in parts of the terms that say where it is; and how many of the smallest
+# steps before it an event stops it: steps that end at a border may be refused, and halve what is left.
+BEYOND, BEFORE = 16.0 * EPS, 64.0 * SMALLEST_STEP
+# The time that it takes to go beyond, in parts of the motion, from which on a contact rests on its corner.
+ON_CORNER = 1e-10
+INFINITY, MISSING = float("inf"), float("nan")
+
+
+# ---- what is known at a state ----
+
+
+@loop
+def copy(given: Floats, into: Floats, count: int):
+    """Put the first `count` numbers of one array into another."""
+    for i in range(count):
+        into[i] = given[i]
+
+
+@loop
+def find_length(x: Floats, count: int) -> float:
+    """The length of a vector (count,)."""
+    total = 0.0
+    for i in range(count):
+        total += x[i] ** 2
+    return sqrt(total)
+
+
+@loop
+def open_all(scene: Scene, x: Floats, opened: Floats):
+    """Put the inputs of lines at the state of inputs x with all contacts open."""
+    k, r, d = scene.k, scene.r, scene.d
+    first = 2 * scene.n + 1 + scene.numbers
+    copy(x, opened, first)
+    for i in range(k + r + r * d + 1):
+        opened[first + i] = 1.0 if k <= i and i < k + r + r * d else 0.0
+
+
+@loop
+def is_held(scene: Scene, x: Floats) -> bool:
+    """True where a contact is closed, at inputs x."""
+    for i in range(scene.k):
+        if x[2 * scene.n + 1 + scene.numbers + i] > 0:
+            return True
+    return False
+
+
+@loop
+def watch(scene: Scene, member: Member, x: Floats, held: bool, out: Floats, work: Floats):
+    """Put the watches at inputs x, G each: values, rates, how far rounding moves a value, that of time, and a rate."""
+    n, total = scene.n, scene.watches
+    evaluate(scene.held_watch if held else scene.open_watch, x, work)
+    evaluate(scene.held_errors if held else scene.open_errors, x, work[4 * total :])
+    instant = INSTANT * SMALLEST_STEP * max(abs(x[2 * n]), abs(member.last))
+    for g in range(total):
+        more = work[4 * total + g]
+        out[g], out[total + g] = work[g], work[total + g]
+        out[2 * total + g] = GUARD_NOISE * work[2 * total + g]
+        out[3 * total + g] = abs(work[total + g]) * instant
+        out[4 * total + g] = GUARD_NOISE * (work[3 * total + g] + (more if isfinite(more) else 0.0))
+    if scene.single > 0:  # the start is known to the rounding of float32
+        inputs, widths = scene.inputs, member.widths
+        for g in range(total):
+            copy(x, work, inputs)
+            for j in range(total):
+                work[inputs + j] = float(j == g)
+            evaluate(scene.held_slopes if held else scene.open_slopes, work, work[inputs + total :])
+            for i in range(2 * n + 1 + scene.numbers):
+                if widths[i] > 0:
+                    out[2 * total + g] += abs(work[inputs + total + i]) * widths[i]
+
+
+@loop
+def has_missed(scene: Scene, member: Member, watches: Floats, i: int, closed: bool) -> bool:
+    """True for a gap that is negative though it was followed, and open: its series did not show that."""
+    if scene.may_miss == 0 or i >= scene.gaps or closed:
+        return False
+    total = scene.watches
+    rounding = max(watches[2 * total + i], watches[3 * total + i], member.rounding[i])
+    return watches[i] < -rounding * max(1.0, THROUGH * member.rtol / GUARD_NOISE)
+
+
+@loop
+def touch(scene: Scene, member: Member, opened: Floats, room: Room):
+    """Put which contacts touch, how fast they move apart, and the rounding of that; inputs have all contacts open."""
+    total, watches = scene.watches, room.watched
+    watch(scene, member, opened, False, watches, room.free)
+    for i in range(scene.k):
+        value, noise, is_gap = watches[i], watches[2 * total + i] + watches[3 * total + i], i < scene.gaps
+        room.touches[i] = float((abs(value) if is_gap else value) <= noise)
+        room.parting[i] = watches[total + i] if is_gap else value
+        room.noise[i] = watches[4 * total + i] if is_gap else noise
+
+
+@loop
+def measure_slips(scene: Scene, member: Member, rates: Floats, v: Floats, slips: Floats, room: Room):
+    """Put 1 for each slip that is none, beside the largest so far, then the lengths of all: (r,) each."""
+    k, r, d, n, gradients = scene.k, scene.r, scene.d, scene.n, room.gradients
+    for c in range(r):
+        terms = 0.0
+        for i in range(k + c * d, k + c * d + d):
+            moves = 0.0
+            for j in range(n):
+                moves += abs(gradients[i * n + j]) * abs(v[j])
+            terms = max(terms, moves)
+        slips[r + c] = find_length(rates[k + c * d :], d)
+        slips[c] = float(slips[r + c] <= max(1e-12 * terms, 1e-13 * member.slip[c]))
+
+
+# ---- corners of gaps ----
+
+
+@loop
+def locate_corners(scene: Scene, member: Member, x: Floats, room: Room) -> float:
+    """Put the sides of corners at inputs x, their rates, and how far beyond them it goes on: (corners,) each.
+
+    Returns how near they count.
+    """
+    n, count, inputs, found = scene.n, scene.corners, scene.inputs, room.corner
+    t, largest, near = x[2 * n], member.largest, 0.0
+    terms, along = room.free, room.free[count:]
+    slopes = along[2 * inputs :]
+    evaluate(scene.sides, x, found)
+    for p in range(count):
+        found[count + p], found[2 * count + p], terms[p] = 0.0, abs(found[p]), 0.0
+    copy(x, along, inputs)
+    for i in range(n + 1):  # by each coordinate, and by time
+        for j in range(inputs):
+            along[inputs + j] = float(j == (i if i < n else 2 * n))
+        evaluate(scene.side_slopes, along, slopes)
+        size, rate, speed = abs(t), 1.0, 1.0
+        if i < n:
+            size, rate, speed = max(largest[i], abs(x[i])), x[n + i], max(largest[n + i], abs(x[n + i]))
+        for p in range(count):
+            found[count + p] += slopes[p] * rate
+            found[2 * count + p] += abs(slopes[p]) * size
+            terms[p] += abs(slopes[p]) * speed
+    for p in range(count):
+        found[2 * count + p] = BEYOND * found[2 * count + p]
+        soon = BEFORE * max(abs(t), abs(member.last)) * terms[p]
+        near = max(near, found[2 * count + p] + soon)
+    return near
+
+
+@loop
+def go_beyond(scene: Scene, member: Member, x: Floats, room: Room) -> float:
+    """Put by how much the state at inputs x moves beyond the corners that are passed; returns by when.
+
+    Negative where the motion rests on one.
+    """
+    n, count, corners, shift = scene.n, scene.corners, room.corner, room.shift
+    later, rests = 0.0, False
+    for p in range(count):
+        if room.passed[p] > 0:
+            rate = corners[count + p]
+            left = corners[2 * count + p] - corners[p] * find_sign(rate)
+            if rate != 0:
+                left = left / abs(rate)
+            if rate == 0 or left > ON_CORNER * (member.last - member.first):
+                rests = True
+            else:
+                later = max(later, left)
+    evaluate(scene.acceleration, x, shift[n:])
+    for i in range(n):
+        a = shift[n + i]
+        shift[i], shift[n + i] = later * (x[n + i] + 0.5 * later * a), later * a
+    return -1.0 if rests else later
+
+
+# ---- a round ----
+
+
+@loop
+def begin(scene: Scene, member: Member, room: Room) -> int:
+    """The result of a start, whose inputs and coefficients are there, with all contacts open: `GOING` if it is sound.
+
+    Those that touch and do not move apart fall at once.
+    """
+    n, k, r, total = scene.n, scene.k, scene.r, scene.watches
+    x, watches, deciding = member.x, room.watched, total - scene.sections
+    for g in range(total):
+        member.fresh[g] = 1.0
+    for i in range(2 * n):
+        member.largest[i] = abs(x[i])
+    touch(scene, member, x, room)
+    for s in range(scene.sections):
+        member.came[s] = find_sign(watches[total + deciding + s])
+    evaluate(scene.response, x, room.gradients)
+    if member.last < member.first:
+        return BACKWARDS
+    for i in range(k):
+        if not (member.restitution[i] >= 0 and member.restitution[i] <= 1):
+            return NO_RESTITUTION
+    for c in range(r):
+        if not (member.mu[c] >= 0 and isfinite(member.mu[c])):
+            return NO_FRICTION
+    if starts_inside(scene, member, room):
+        return INCONSISTENT
+    result = GOING
+    if r > 0:  # one that slides and touches may stay or leave
+        push, slips = room.push, room.slips
+        measure_slips(scene, member, room.rates, x[n:], slips, room)
+        for i in range(k):
+            still = abs(room.parting[i]) <= room.noise[i]
+            push[i] = float(room.touches[i] > 0 and still)
+        write_directions(scene, room.rates[k:], room.free)
+        if has_paradox(scene, member, push, slips, room.free, room):
+            result = UNDECIDED
+    if scene.corners > 0 and rests_on_corner(scene, member, room) and result == GOING:
+        result = AT_CORNER
+    return result
+
+
+@loop
+def rests_on_corner(scene: Scene, member: Member, room: Room) -> bool:
+    """True where a contact that starts on its corner rests there; else the state goes where the motion does."""
+    n, k, x, corners, passed = scene.n, scene.k, member.x, room.corner, room.passed
+    locate_corners(scene, member, x, room)
+    for p in range(scene.corners):
+        passed[p] = 0.0
+        for i in range(k):
+            is_there = abs(corners[p]) <= corners[2 * scene.corners + p]
+            if scene.touch[p * k + i] > 0 and room.touches[i] > 0 and is_there:
+                passed[p] = 1.0
+    later = go_beyond(scene, member, x, room)
+    for i in range(2 * n):
+        x[i] += room.shift[i]
+    x[2 * n] += max(later, 0.0)
+    return later < 0
+
+
+@loop
+def find_sign(x: float) -> float:
+    """1, −1, or 0."""
+    return 1.0 if x > 0 else (-1.0 if x < 0 else 0.0)
+
+
+@loop
+def starts_inside(scene: Scene, member: Member, room: Room) -> bool:
+    """True where a gap is negative at the start, by more than the rounding of what leads a motion there.
+
+    A gap that is a coordinate is 1e-16 where it closes, and its rounding that of the height from which it fell.
+    """
+    n, total, x, rises = scene.n, scene.watches, member.x, room.free
+    first, last, furthest, watches = member.first, member.last, 0.0, room.watched
+    evaluate(scene.acceleration, x, rises)
+    for j in range(n):
+        furthest = max(furthest, abs(x[j]))
+    for i in range(scene.gaps):
+        width = 0.0
+        for j in range(n):
+            reach = abs(x[n + j]) * max(abs(first), abs(last)) + abs(rises[j]) * (last - first) ** 2 / 8.0
+            width += abs(room.gradients[i * n + j]) * (furthest + reach)
+        if watches[i] + watches[2 * total + i] < -GUARD_NOISE * width:
+            return True
+    return False
+
+
+@loop
+def write_directions(scene: Scene, vectors: Floats, units: Floats):
+    """Put the unit vectors along `vectors` (r, d), zero of none."""
+    d = scene.d
+    for c in range(scene.r):
+        length = find_length(vectors[c * d :], d)
+        for i in range(c * d, c * d + d):
+            units[i] = vectors[i] / length if length > 0 else 0.0
+
+
+@loop
+def has_paradox(scene: Scene, member: Member, push: Floats, sticks: Floats, direction: Floats, room: Room) -> bool:
+    """True where friction leaves nothing of a contact's response to its normal force.
+
+    There no force, or more than one, keeps it closed: Painlevé's paradox.
+    """
+    k, r, d, rough, coupling = scene.k, scene.r, scene.d, scene.rough, room.coupling
+    size = k + r * d
+    for c in range(r):
+        if push[rough[c]] > 0 and sticks[c] == 0:
+            own, brought = coupling[rough[c] * size + rough[c]], 0.0
+            for i in range(d):
+                brought += coupling[rough[c] * size + k + c * d + i] * direction[c * d + i]
+            if not 1.0 - member.mu[c] * brought / (own if own > 0 else 1.0) > PARADOX:
+                return True
+    return False
+
+
+@loop
+def note_rounding(scene: Scene, member: Member, duration: float):
+    """Note the largest rounding of the watches: of one that went away and came back that between them."""
+    total, watches, kinds = scene.watches, member.guards, member.kinds
+    values, rates = member.rounding, member.rate_rounding
+    for g in range(total):
+        place = g + (total if kinds[g] > 0 else 0)
+        value, rate = watches[2 * total + g], watches[4 * total + g]
+        value = value if isfinite(value) else 0.0
+        rate = rate if isfinite(rate) else 0.0
+        values[place] = max(values[place], value, rate * duration)
+        rates[place] = max(rates[place], rate)
+
+
+@loop
+def write_sides(scene: Scene, member: Member, sides: Floats, rates: Floats):
+    """Put the sides (G,) of all watches from which the motion comes, and the rounding of their rates, (G,).
+
+    A tie is a contact that turns at an instant without end: closed, its force is none if rounding of the gap could make
+    it; it sticks until its value falls, a rate is no reason.
+    """
+    k, r, total, rough = scene.k, scene.r, scene.watches, scene.rough
+    watches, kinds, tied = member.guards, member.kinds, member.tied
+    came, deciding = member.came, total - scene.sections
+    lasts = member.longest if member.longest > 0 else 1.0
+    for g in range(total):
+        place = g + (total if kinds[g] > 0 else 0)
+        rounding, of_rate = member.rounding[place], member.rate_rounding[place]
+        if g < k + r and kinds[g] > 0 and tied[g] > 0:
+            if g < k:
+                none = member.force_noise[g]
+                rounding, of_rate = max(rounding, none), max(of_rate, 3.0 * none / lasts)
+            else:
+                most = member.mu[g - k] * watches[rough[g - k]]
+                rounding = GUARD_NOISE * most**2
+                of_rate = max(watches[4 * total + g], -2.0 * watches[total + g])
+        rounding = max(rounding, watches[3 * total + g])
+        sides[g], rates[g] = max(rounding, LEAST), of_rate
+        if g < k + r:
+            if watches[g] < -rounding:
+                sides[g] = INFINITY
+        elif g < deciding:
+            sides[g] = 0.0  # where a corner is met first tells the motion
+        else:
+            if abs(watches[g]) > rounding:
+                came[g - deciding] = 1.0 if watches[g] > 0 else -1.0
+            sides[g] *= came[g - deciding]
+
+
+@loop
+def prepare(scene: Scene, member: Member, ts: Floats, times: Floats, y: Floats, numbers: Floats, room: Room):
+    """Put the run of a member's next stretch: its times (T + 2,), its start, and its numbers with the sides."""
+    n, k, r, total = scene.n, scene.k, scene.r, scene.watches
+    x, kinds, stays = member.x, member.kinds, member.stays
+    did, t = x[2 * n + 1 + scene.numbers :], x[2 * n]
+    if scene.corners > 0:
+        x[scene.inputs - 1] = locate_corners(scene, member, x, room)
+    watches = member.guards
+    watch(scene, member, x, is_held(scene, x), watches, room.free)
+    member.missed = 0.0
+    for g in range(total):
+        kinds[g] = did[g] if g < k + r else 0.0
+        if g < k and member.fresh[g] == 0 and has_missed(scene, member, watches, g, did[g] > 0):
+            member.missed = 1.0
+    note_rounding(scene, member, 0.0)
+    used = scene.inputs - 2 * n - 1
+    copy(x[2 * n + 1 :], numbers, used)
+    sides, rates = numbers[used:], numbers[used + total :]
+    write_sides(scene, member, sides, rates)
+    for g in range(total):  # what starts on a gap and moves inwards comes from in front of it
+        falls = g < k and t == ts[0] and watches[total + g] < -rates[g] and kinds[g] == 0
+        beyond = g < k + r and sides[g] == INFINITY
+        stays[g] = float((member.fresh[g] > 0 or beyond) and not falls)
+    copy(x, y, 2 * n)
+    times[0], times[scene.times + 1] = t, ts[scene.times - 1]
+    for j in range(scene.times):
+        times[1 + j] = ts[j] if is_ahead(ts[j], t, ts[0]) else t
+
+
+@loop
+def is_ahead(output: float, t: float, first: float) -> bool:
+    """True for an output time that a stretch from t on may cover; at the first time all that are there."""
+    return output > t or (output == t and t == first)
+
+
+@loop
+def finish(
+    scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, record: Entry, found: Floats, y_end: Floats,
+    t_end: float, event: int, result: int, accepted: float, rejected: float, room: Room
+):  # fmt: skip
+    """Take a stretch, its outputs `found` (T + 2, 2n) and its end: what the contacts do there, and a row of the record.
+
+    `event` is the mask of the watches that fell or rose, `result` that of a run without one.
+    """
+    n, k, total, times, x = scene.n, scene.k, scene.watches, scene.times, member.x
+    row, fell, doing = record[int(member.rounds) * scene.row :], room.fell, scene.doing
+    deciding, start, begun = total - scene.sections, x[2 * n], x[2 * n + 1 + scene.numbers :]
+    for i in range(scene.row):
+        row[i] = 0.0
+    happens, decides, first = event > 0, False, deciding
+    for g in range(total):
+        fell[g], event = float(event % 4), event // 4
+        decides = decides or (g < deciding and fell[g] > 0)
+    if not happens and result == SUCCESSFUL:
+        t_end = ts[times - 1]
+    at_once = t_end == start
+    write_outputs(scene, ts, start, t_end, found[2 * n :], begun, path, did)
+    if decides:
+        first = find_first(scene, fell, at_once, begun)
+    elif happens:
+        while fell[first] == 0:
+            first += 1
+    crosses = happens and not (at_once and member.stays[first] > 0)
+    row.end, row.watch, row.crosses = t_end, float(first), float(crosses)
+    row.happens, row.decides = float(happens), float(decides)
+    row.ran, row.t_impact = 1.0, MISSING
+    copy(begun, row.did, doing)
+    if crosses or not happens:
+        copy(y_end, x, 2 * n)
+        x[2 * n] = t_end
+    note_stretch(scene, member, first if happens else -1, at_once, t_end - start, accepted)
+    member.accepted += accepted
+    member.rejected += rejected
+    reached = SUCCESSFUL if happens else result
+    row.at = x[2 * n]
+    copy(x[n:], row.before, n)
+    copy(x, row.stop, 2 * n)
+    if decides:
+        reached = decide(scene, member, first, row, room)
+    elif happens:  # a section, of which a note is made
+        member.came[first - deciding] = 2.0 * fell[first] - 3.0
+        row.contact, row.change = float(k + first - deciding), -1.0
+    copy(x, row.behind, 2 * n)
+    if scene.corners > 0 and happens:  # time itself may go beyond its corner
+        for j in range(times):
+            if ts[j] <= x[2 * n] and did[j * doing] < 0:
+                copy(x, path[j * 2 * n :], 2 * n)
+                copy(row.did, did[j * doing :], doing)
+    member.rounds += float(happens)
+    member.rows += 1.0
+    reached = find_result(scene, member, reached, happens)
+    member.result = float(reached)
+    if reached == SUCCESSFUL:
+        check_outputs(scene, member, ts, path, did, room)
+
+
+@loop
+def write_outputs(
+    scene: Scene, ts: Floats, start: float, end: float, found: Floats, doing: Floats, path: Floats, did: Floats
+):
+    """Put the outputs of a stretch, `found` (T, 2n), and what contacts are `doing` then."""
+    states = 2 * scene.n
+    for j in range(scene.times):
+        if is_ahead(ts[j], start, ts[0]) and ts[j] <= end:
+            copy(found[j * states :], path[j * states :], states)
+            copy(doing, did[j * scene.doing :], scene.doing)
+
+
+@loop
+def find_result(scene: Scene, member: Member, reached: int, happens: bool) -> int:
+    """The result of a motion so far, behind a stretch that `reached` this one: `GOING` if all is well."""
+    if happens and member.turns > 16 + 8 * scene.watches:
+        return IN_TURN
+    if member.missed > 0:
+        return MISSED
+    for i in range(2 * scene.n):
+        if not isfinite(member.x[i]) and reached == SUCCESSFUL:
+            return NOT_FINITE
+    if happens and reached == SUCCESSFUL:
+        return TOO_MANY if member.rounds >= scene.most else GOING
+    return reached
+
+
+@loop
+def note_stretch(scene: Scene, member: Member, first: int, at_once: bool, duration: float, accepted: float):
+    """Note behind a stretch what is tied, its longest step, and what rounding it had; `first` fell where it ended."""
+    k, r, total = scene.k, scene.r, scene.watches
+    tied, refuted, did = member.tied, member.refuted, member.kinds
+    member.turns = member.turns + 1.0 if at_once else 0.0
+    turns_in_plane = scene.d == 1 and member.turns > total
+    for g in range(k + r):
+        ties = g == first and did[g] == 0 and (refuted[g] > 0 if g < k else turns_in_plane)
+        tied[g] = float(at_once and (tied[g] > 0 or ties))
+    for i in range(k):
+        refuted[i] = float(at_once and (refuted[i] > 0 or (i == first and did[i] > 0)))
+    note_rounding(scene, member, duration)
+    for g in range(total):
+        member.fresh[g] *= float(at_once)
+    if not at_once:
+        member.longest = max(member.longest, duration / max(accepted, 1.0))
+
+
+@loop
+def check_outputs(scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, room: Room):
+    """Note as the result of a motion that outputs are missing, or that a gap is negative at one."""
+    n, k, times, doing = scene.n, scene.k, scene.times, scene.doing
+    x, watches = room.free, room.free[scene.inputs :]
+    copy(member.x, x, scene.inputs)
+    for j in range(times):
+        for i in range(2 * n):
+            if did[j * doing] < 0 or not isfinite(path[j * 2 * n + i]):
+                member.result = float(NOT_FINITE)
+                return
+        if scene.may_miss > 0:
+            copy(path[j * 2 * n :], x, 2 * n)
+            x[2 * n] = ts[j]
+            copy(did[j * doing :], x[2 * n + 1 + scene.numbers :], doing)
+            watch(scene, member, x, is_held(scene, x), watches, watches[5 * scene.watches :])
+            for i in range(k):
+                if has_missed(scene, member, watches, i, did[j * doing + i] > 0):
+                    member.result = float(MISSED)
+                    return
+
+
+@loop
+def find_first(scene: Scene, fell: Floats, at_once: bool, did: Floats) -> int:
+    """The watch that is taken of those that `fell` (G,): of corners, then of friction, as one that jams is."""
+    k, r, rough = scene.k, scene.r, scene.rough
+    for g in range(k + r, k + r + 2 * scene.corners):
+        if fell[g] > 0:
+            return g
+    for c in range(r):
+        if fell[k + c] > 0 or (at_once and fell[rough[c]] > 0 and did[rough[c]] > 0 and did[k + c] > 0):
+            return k + c
+    for i in range(k):
+        if fell[i] > 0:
+            return i
+    return 0
+
+
+# ---- what happens at a watch that fell ----
+
+
+@loop
+def decide(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> int:
+    """The result behind watch `first`, which fell: state and contacts of the member go on there, as the row says."""
+    n, k, r, x, meets, opening = scene.n, scene.k, scene.r, member.x, row.meets, room.opening
+    closed = x[2 * n + 1 + scene.numbers :]
+    copy(closed, room.closed, k)
+    copy(closed[k:], room.stuck, r)
+    for i in range(k):
+        meets[i], opening[i] = float(i == first and closed[i] == 0), 0.0
+    later, at_corner = 0.0, 0
+    if scene.corners > 0:
+        at_corner = meet_corners(scene, member, first, meets, room)
+        later = room.later
+    open_all(scene, x, member.opened)
+    evaluate(scene.response, member.opened, room.gradients)
+    missed = meet(scene, member, meets, row, room)
+    hits = row.hits > 0
+    measure_slips(scene, member, room.rates, x[n:], room.slips, room)
+    close_contacts(scene, member, first, hits, meets, room)
+    undecided = find_change(scene, member, hits, row, room)
+    stay_closed(scene, member, hits, room)
+    note_changes(scene, member, first, hits, row, room)
+    if r > 0:
+        rub(scene, member, first, hits, room)
+        write_directions(scene, closed[k + r :], room.free)
+        if has_paradox(scene, member, closed, closed[k:], room.free, room):
+            undecided = True
+    count_doubts(scene, member, hits, row, room)
+    move(scene, member, first, meets, row, room)
+    x[2 * n] += later
+    row.later_on = later
+    name_change(scene, first, hits, closed, row, room)
+    if at_corner == 2 or (missed and at_corner == 1):
+        return AT_CORNER
+    if missed:
+        return MISSED
+    return UNDECIDED if undecided else SUCCESSFUL
+
+
+@loop
+def note_changes(scene: Scene, member: Member, first: int, hits: bool, row: Entry, room: Room):
+    """Note which contacts have changed, as `CHANGED`, what begins anew there, and which slips begin at rest."""
+    n, k, x, leaves_rest = scene.n, scene.k, member.x, False
+    closed = x[2 * n + 1 + scene.numbers :]
+    for i in range(k):
+        room.changed[i] = float(closed[i] != room.closed[i] or (hits and room.involved[i] > 0))
+        if room.changed[i] > 0:
+            member.fresh[i] = 1.0
+        if room.opening[i] > 0:  # at a corner
+            for g in range(k + scene.r, scene.watches):
+                member.fresh[g] = 1.0
+    for c in range(scene.r):
+        breaks = first == k + c and room.stuck[c] > 0
+        leaves_rest = leaves_rest or (breaks and scene.d > 1)
+        row.starts[c] = 0.0
+        if breaks and x[2 * n] == member.first:
+            for j in range(scene.d * n):
+                row.starts[c] += TOGETHER * abs(room.gradients[(k + c * scene.d) * n + j])
+    row.leaves_rest = float(leaves_rest)
+
+
+@loop
+def meet_corners(scene: Scene, member: Member, first: int, meets: Floats, room: Room) -> int:
+    """Put which contacts come to a corner where watch `first` fell, and open there; the state and time go beyond it.
+
+    Returns 2 where one is struck at its corner, or stays there, 1 where one meets behind its corner, else 0.
+    """
+    k, count, x, touches = scene.k, scene.corners, member.x, scene.touch
+    corners, passed, opening = room.corner, room.passed, room.opening
+    near, answer, closed = x[scene.inputs - 1], 0, room.closed
+    locate_corners(scene, member, x, room)
+    for p in range(count):
+        away, new, is_closed, is_met = abs(corners[p]), member.fresh[k + scene.r + p] == 0, False, False
+        for i in range(k):
+            if touches[p * k + i] > 0:
+                is_closed, is_met = is_closed or closed[i] > 0, is_met or meets[i] > 0
+        passed[p] = float(away <= 2.0 * near and new and is_closed)
+        if is_met and away <= 4.0 * corners[2 * count + p]:
+            answer = max(answer, 2 if new else 1)
+        for i in range(k):
+            if passed[p] > 0 and touches[p * k + i] > 0 and closed[i] > 0:
+                opening[i] = 1.0
+    later = go_beyond(scene, member, x, room)
+    room.later = max(later, 0.0)
+    return 2 if later < 0 else answer
+
+
+@loop
+def meet(scene: Scene, member: Member, meets: Floats, row: Entry, room: Room) -> bool:
+    """Put which contacts take part where some meet, and what they do: the row says whether it is an impact.
+
+    Returns whether it was missed before.
+    """
+    k, touches, involved, noise = scene.k, room.touches, room.involved, room.noise
+    parting, push, linked = room.parting, room.push, room.stay
+    closed, fastest, hits, missed = room.closed, 0.0, False, False
+    touch(scene, member, member.opened, room)
+    for i in range(k):
+        if meets[i] > 0 or closed[i] > 0 or i >= scene.gaps:
+            touches[i] = 1.0
+        noise[i] = max(noise[i], 0.01 * member.rate_rounding[i])
+        hits = hits or (meets[i] > 0 and parting[i] < -noise[i])
+        missed = missed or (meets[i] > 0 and has_missed(scene, member, room.watched, i, closed[i] > 0))
+    reach(scene, meets, linked, room)
+    for i in range(k):
+        involved[i] = meets[i] if scene.law == SEQUENTIAL else linked[i]
+    if hits:
+        find_pushes(scene, member, row, room)
+    for i in range(k):
+        presses = parting[i] > noise[i] and push[i] > 0 and i < scene.gaps
+        closes = parting[i] < -noise[i] or presses
+        alone = linked[i] > 0 and meets[i] == 0 and closed[i] == 0 and member.fresh[i] == 0
+        row.shares[i] = TOGETHER * abs(room.rates[i]) if hits and alone and closes else 0.0
+        fastest = max(fastest, abs(parting[i]))
+    for i in range(k):
+        noise[i] = max(noise[i], 1e-12 * fastest)
+    row.hits = float(hits)
+    return missed
+
+
+@loop
+def reach(scene: Scene, meets: Floats, found: Floats, room: Room):
+    """Put the contacts that touch and that an impulse at those that meet reaches, one through the other."""
+    k, r, d, coupling, rough = scene.k, scene.r, scene.d, room.coupling, scene.rough
+    size, touches = k + r * d, room.touches
+    copy(meets, found, k)
+    for _ in range(k - 1):
+        more = False
+        for a in range(size):
+            for b in range(size):
+                i, j = a if a < k else rough[(a - k) // d], b if b < k else rough[(b - k) // d]
+                if found[j] > 0 and found[i] == 0 and touches[i] > 0 and touches[j] > 0:
+                    own = sqrt(abs(coupling[a * size + a])) * sqrt(abs(coupling[b * size + b]))
+                    if abs(coupling[a * size + b]) > LINKED * own:
+                        found[i], more = 1.0, True
+        if not more:
+            break
+
+
+@loop
+def find_pushes(scene: Scene, member: Member, row: Entry, room: Room):
+    """Put the pattern of an impact: which contacts push, which slips stick, and in which directions others slide."""
+    k, r, d, rough = scene.k, scene.r, scene.d, scene.rough
+    mu, e, coupling, rates = member.mu, member.restitution, room.coupling, room.rates
+    involved, push = room.involved, room.push
+    stuck, direction = row.slides, row.direction
+    rest = room.free
+    if scene.law != POISSON:
+        find_pattern(k, r, d, rough, mu, coupling, rates, involved, e, push, stuck, direction, rest)
+        return
+    if r > 0:  # one contact in a plane
+        push[0], stuck[0], direction[0] = 1.0, 0.0, 0.0
+        return
+    none, second, impulses, behind = rest, rest[k:], rest[2 * k :], rest[3 * k :]
+    more = rest[4 * k :]
+    for i in range(k):
+        none[i] = 0.0
+    find_pattern(k, r, d, rough, mu, coupling, rates, involved, none, push, stuck, direction, more)
+    hold_rows(k, r, d, rough, coupling, push, stuck, row.compressed, more)
+    find_impulses(k, r, d, rough, mu, coupling, rates, push, stuck, direction, none, impulses, more)
+    for i in range(k):
+        impulses[i] *= 1.0 + e[i]
+    add_rates(rates, coupling, impulses, behind, k)
+    find_pattern(k, r, d, rough, mu, coupling, behind, involved, none, second, stuck, direction, more)
+    hold_rows(k, r, d, rough, coupling, second, stuck, row.returned, more)
+    find_impulses(k, r, d, rough, mu, coupling, behind, second, stuck, direction, none, impulses, more)
+    add_rates(behind, coupling, impulses, room.targets, k)
+    for i in range(k):
+        push[i] = max(push[i], second[i])
+
+
+@loop
+def close_contacts(scene: Scene, member: Member, first: int, hits: bool, meets: Floats, room: Room):
+    """Close and open what watch `first` says, and stick and slide; of contacts that meet, `PARTS` are those that go on.
+
+    A gap that falls while it moves apart is zero to more than the rounding of its terms: it goes on beyond that. Where
+    it hardly moves, as at the end of many bounces, it closes. A slip in space that has turned goes on. Where one stops
+    others of the same body may, which then stick as well. Where parts align, a slip that gaps hold passes through zero,
+    and turns.
+    """
+    n, k, r, d, x, rough = scene.n, scene.k, scene.r, scene.d, member.x, scene.rough
+    closed, was_closed, was_stuck = x[2 * n + 1 + scene.numbers :], room.closed, room.stuck
+    sticks, parts, slips, turns = closed[k:], room.parts, room.slips, room.turns_back
+    for i in range(k):
+        moves = 0.0
+        for j in range(n):
+            moves += abs(room.gradients[i * n + j]) * member.largest[n + j]
+        away = room.rates[i] > max(room.noise[i], HARDLY * moves)
+        parts[i] = float(meets[i] > 0 and not hits and i < scene.gaps and away)
+        stays = was_closed[i] > 0 and i != first and room.opening[i] == 0
+        closed[i] = float(stays or (meets[i] > 0 and parts[i] == 0))
+    stops = False
+    for c in range(r):
+        if k + c == first and was_stuck[c] == 0 and (d == 1 or slips[r + c] <= TURNED * member.slip[c]):
+            stops = True
+    for c in range(r):
+        fell = k + c == first and (was_stuck[c] > 0 or d == 1 or slips[r + c] <= TURNED * member.slip[c])
+        if closed[rough[c]] != was_closed[rough[c]]:
+            sticks[c] = slips[c]
+        else:
+            does = was_stuck[c] > 0 or fell or (stops and slips[c] > 0)
+            sticks[c] = float(does and not (fell and was_stuck[c] > 0))
+        turns[c] = 0.0
+    if d == 1 and first >= k and first < k + r and sticks[first - k] > 0:
+        held, rest = room.free, room.free[k + r :]
+        for i in range(k + r):
+            held[i] = closed[i] if i < k else float(i == first)
+        drop_dependent(room.coupling, held, k + r, rest)
+        if held[first] == 0:
+            turns[first - k], sticks[first - k] = 1.0, 0.0
+
+
+@loop
+def find_change(scene: Scene, member: Member, hits: bool, row: Entry, room: Room) -> bool:
+    """Put the impulses, the rates behind them, and the change of velocities; returns whether the law is not obeyed.
+
+    Behind an impact they follow its law; else velocities become those that what is held allows.
+    """
+    n, k, r, d, rough = scene.n, scene.k, scene.r, scene.d, scene.rough
+    coupling, rates, push, targets, impulses = room.coupling, room.rates, room.push, room.targets, room.impulses
+    stuck, direction, size, wrong = row.slides, row.direction, k + r * d, False
+    mu, rest = member.mu, room.free
+    if not hits:
+        mu, rest = room.free, room.free[r:]
+        for c in range(r):
+            mu[c] = 0.0
+    ask_rates(scene, member, hits, row, room)
+    find_impulses(k, r, d, rough, mu, coupling, rates, push, stuck, direction, targets, impulses, rest)
+    if hits:
+        wrong = is_violated(scene, member, row, room)
+        row.t_impact = member.x[2 * n]
+        if end_bounces(scene, member, row, room):
+            for i in range(k):
+                targets[i] = 0.0 if row.ends[i] > 0 else targets[i]
+            find_impulses(k, r, d, rough, mu, coupling, rates, push, stuck, direction, targets, impulses, rest)
+    hold_rows(k, r, d, rough, coupling, push, stuck, row.held, rest)
+    for c in range(r):
+        stuck[c] = (1.0 - stuck[c]) * push[rough[c]] if hits else 0.0  # from here on those that slide
+    add_rates(rates, coupling, impulses, room.apart, size)
+    for j in range(n):
+        room.change[j] = 0.0
+        for i in range(size):
+            room.change[j] += impulses[i] * room.responses[i * n + j]
+    return wrong
+
+
+@loop
+def ask_rates(scene: Scene, member: Member, hits: bool, row: Entry, room: Room):
+    """Put the rates behind an impact by its law, unless they are there; else zero, of what is closed and sticks."""
+    k, d, e, targets = scene.k, scene.d, member.restitution, room.targets
+    did = member.x[2 * scene.n + 1 + scene.numbers :]
+    if not hits:
+        for i in range(k):
+            room.push[i], targets[i] = did[i], 0.0
+        for c in range(scene.r):
+            row.slides[c] = did[k + c]
+            for i in range(d):
+                row.direction[c * d + i] = 0.0
+    elif scene.law != POISSON:
+        for i in range(k):
+            targets[i] = -e[i] * room.rates[i]
+    elif scene.r > 0:
+        construct(e[0], member.mu[0], room.coupling, room.rates, targets, row.direction)
+
+
+@loop
+def is_violated(scene: Scene, member: Member, row: Entry, room: Room) -> bool:
+    """True where the impulses of an impact do not obey the law; of Poisson's the rates are what compression leaves."""
+    k, r, targets, flags, rest = scene.k, scene.r, room.targets, room.free, room.free[scene.k + scene.r :]
+    if scene.law == POISSON:
+        if r > 0:  # by construction
+            return False
+        targets, rest = rest, rest[k:]
+        for i in range(k):
+            targets[i] = 0.0
+    find_violations(
+        k, r, scene.d, scene.rough, member.mu, room.coupling, room.rates, room.involved, room.push, row.slides,
+        row.direction, targets, room.impulses, flags, rest
+    )  # fmt: skip
+    for i in range(k + r):
+        if flags[i] > 0:
+            return True
+    return False
+
+
+@loop
+def construct(e: float, mu: float, coupling: Floats, rates: Floats, target: Floats, direction: Floats):
+    """Put the rate behind an impact of one contact in a plane, and −F/μΛ, by Routh's construction.
+
+    As the normal impulse Λ grows, friction acts against the slip of that moment. Where that has stopped the contact
+    sticks, if friction suffices, or slides on the other way. Compression ends where the rate is zero, the impact at
+    1 + e times its impulse (Wang & Mason, J. Appl. Mech. 59 (1992) 635).
+    """
+    normal, mixed, tangential, rate, slip = coupling[0], coupling[1], coupling[3], rates[0], rates[1]
+    side = -1.0 if slip < 0 else 1.0
+    slows = mu * tangential - side * mixed  # of the slip, by Λ; it is positive where friction could jam
+    stops = INFINITY
+    if slip == 0 or slows > 0:
+        stops = abs(slip) / (slows if slows > 0 else 1.0)
+    held = min(max(mixed / tangential, -mu), mu)  # −dF/dΛ from there on
+    slope, then = normal - mu * side * mixed, normal - held * mixed
+    compression = -rate / slope
+    if not slope * stops >= -rate:  # the slip ends before compression does
+        compression = stops + (-rate - slope * stops) / then
+    impulse = (1.0 + e) * compression
+    slides = min(impulse, stops)
+    force = -mu * side * slides - held * (impulse - slides)
+    target[0] = rate + normal * impulse + mixed * force
+    direction[0] = -force / (mu * impulse) if mu * impulse > 0 else 0.0
+
+
+@loop
+def end_bounces(scene: Scene, member: Member, row: Entry, room: Room) -> bool:
+    """Put the contacts that bounce and come to rest at once, and add the time that it takes; returns whether any does.
+
+    With gap″ = −b − b′ s the bounces take 2u/(b (1 − e)) (1 − ⅔ k), k = b′ u / b² (1 − e), up to k².
+    """
+    n, k, size, inputs = scene.n, scene.k, scene.k + scene.r * scene.d, scene.inputs
+    e, targets, ends, any_ends = member.restitution, room.targets, row.ends, False
+    x, behind = room.free, room.free[2 * inputs :]
+    may_end = False
+    for i in range(k):
+        ends[i] = 0.0
+        may_end = may_end or (e[i] < 1 and room.push[i] > 0 and i < scene.gaps)
+    if not may_end:
+        return False
+    copy(member.opened, x, inputs)
+    for j in range(n):
+        for i in range(size):
+            x[n + j] += room.impulses[i] * room.responses[i * n + j]
+    for j in range(inputs):
+        x[inputs + j] = 0.0
+    copy(x[n:], x[inputs:], n)
+    evaluate(scene.acceleration, x, x[inputs + n :])
+    x[inputs + 2 * n] = 1.0
+    evaluate(scene.bends, x, behind)  # how gaps bend, and how that changes
+    for i in range(k):
+        b, bounced, rest = -behind[i], targets[i], 1.0 - e[i] if e[i] < 1 else 1.0
+        if b > 0 and e[i] < 1 and i < scene.gaps and room.push[i] > 0:
+            uneven = -behind[k + i] * bounced / (b**2 * rest)
+            left = 2.0 * bounced / (b * rest) * (1.0 - 2.0 / 3.0 * uneven)
+            short = left >= 0 and left <= SHORT * member.longest
+            if short and uneven**2 * left <= LEFT_OUT * (1.0 + abs(x[2 * n])):
+                ends[i], any_ends = 1.0, True
+                row.t_impact += left
+    return any_ends
+
+
+@loop
+def stay_closed(scene: Scene, member: Member, hits: bool, room: Room):
+    """Close those that stay in touch behind an impact, and press upon each other there.
+
+    Their accelerations decide, without friction; with it, or where these are zero, the rounds that follow do. Of
+    contacts that are redundant all stay.
+    """
+    n, k, r, coupling = scene.n, scene.k, scene.r, room.coupling
+    closed, stay, rest = member.x[2 * n + 1 + scene.numbers :], room.stay, room.free
+    if not hits:
+        return
+    count = 0
+    for i in range(k):
+        still = abs(room.apart[i]) <= room.noise[i]
+        stay[i] = float(room.touches[i] > 0 and still)
+        closed[i] = stay[i]
+        count += int(stay[i])
+    if r > 0 or k == 1 or count == 0:
+        return
+    held, more, none = rest, rest[k:], rest[2 * k :]
+    x, behind = rest[3 * k :], rest[3 * k + scene.inputs :]
+    copy(stay, held, k)
+    left = behind[2 * k * n + k * k + 3 * k :]
+    drop_dependent(coupling, held, k, left)
+    for i in range(k):
+        none[i] = 0.0
+        if held[i] < stay[i]:
+            return
+    copy(member.opened, x, scene.inputs)
+    for j in range(n):
+        x[n + j] += room.change[j]
+    evaluate(scene.response, x, behind)
+    bends = behind[2 * k * n + k * k + 2 * k :]
+    find_pattern(
+        k, 0, 1, scene.rough, none, coupling, bends, stay, none, more, none, none, left
+    )  # fmt: skip
+    for i in range(k):
+        closed[i] = float(stay[i] > 0 and more[i] > 0)
+
+
+@loop
+def rub(scene: Scene, member: Member, first: int, hits: bool, room: Room):
+    """Put which contacts stick behind what happened, and where others slide; `CHANGED` are contacts that have.
+
+    They slide against what held those that break away, or along the slip.
+    """
+    n, k, r, d, x, rough = scene.n, scene.k, scene.r, scene.d, member.x, scene.rough
+    did, flags, behind = x[2 * n + 1 + scene.numbers :], room.changed, room.slips_behind
+    sticks, direction, apart = did[k:], did[k + r :], room.apart
+    slip, v, forces, was_stuck = member.slip, room.free, room.forces, room.stuck
+    if first >= k and first < k + r and was_stuck[first - k] > 0:
+        write_held_force(scene, member, first - k, v, room)
+    for j in range(n):
+        v[j] = x[n + j] + room.change[j]
+    measure_slips(scene, member, apart, v, behind, room)
+    lasts = member.longest if member.longest > 0 else member.last - member.first
+    for c in range(r):
+        renewed, breaks = flags[rough[c]] > 0, first == k + c and was_stuck[c] > 0
+        if hits and renewed:
+            sticks[c] = behind[c]
+        if breaks or ((renewed or d > 1) and behind[c] == 0):
+            moving = forces if breaks else apart[k + c * d :]
+            if d == 1:
+                direction[c] = -1.0 if moving[0] < 0 else 1.0
+            else:
+                length, soon = NO_SLIP * find_length(moving, d), 0.0
+                if breaks:
+                    for i in range(d):
+                        place = k + c * d + i
+                        soon = max(soon, room.coupling[place * (k + r * d) + place])
+                    length = AT_REST * max(slip[c], find_length(moving, d) * soon * lasts)
+                whole = find_length(moving, d)
+                for i in range(d):
+                    direction[c * d + i] = moving[i] / (whole if whole > 0 else 1.0) * (length if length > 0 else LEAST)
+        if room.turns_back[c] > 0:
+            for i in range(d):
+                direction[c * d + i] = -direction[c * d + i]
+        slip[c] = max(slip[c], room.slips[r + c])
+        if renewed or first == k + c or sticks[c] != was_stuck[c]:
+            member.fresh[k + c] = 1.0
+
+
+@loop
+def write_held_force(scene: Scene, member: Member, c: int, x: Floats, room: Room):
+    """Put the force against which contact c breaks away, that held it before: −f (d,)."""
+    n, k, r, d, inputs, rows = scene.n, scene.k, scene.r, scene.d, scene.inputs, scene.tangential
+    copy(member.x, x, inputs)
+    copy(room.closed, x[2 * n + 1 + scene.numbers :], k)
+    copy(room.stuck, x[2 * n + 1 + scene.numbers + k :], r)
+    evaluate(scene.multipliers, x, x[inputs:])
+    for i in range(d):
+        room.forces[i] = -x[inputs + rows[c * d + i]]
+
+
+@loop
+def count_doubts(scene: Scene, member: Member, hits: bool, row: Entry, room: Room):
+    """Count what is doubtful here: an impact that gains energy, one that is shared, derivatives that are lost."""
+    k, r, d, n = scene.k, scene.r, scene.d, scene.n
+    total, terms, shares, starts = 0.0, 0.0, False, row.leaves_rest > 0
+    for i in range(k + r * d):
+        total += room.impulses[i] * (room.rates[i] + room.apart[i])
+        terms += abs(room.impulses[i]) * (abs(room.rates[i]) + abs(room.apart[i]))
+    for i in range(k):
+        shares = shares or row.shares[i] > 0
+    for c in range(r):
+        starts = starts or row.starts[c] > 0
+    for i in range(3):
+        doubt = (hits and total > GAINED * terms) if i == 0 else ((hits and shares) if i == 1 else starts)
+        if doubt:
+            if member.doubts[i] == 0:
+                member.doubted[i] = member.x[2 * n]
+            member.doubts[i] += 1.0
+
+
+@loop
+def move(scene: Scene, member: Member, first: int, meets: Floats, row: Entry, room: Room):
+    """Move the state behind a change of velocities, where contacts `meets` close; note what rounding leaves there.
+
+    The gap that closes is zero, also as what went in varies: what rounding leaves of it grows with each bounce. What is
+    less than its own rounding is zero: steps would be as short as to follow it.
+    """
+    n, k, size, x = scene.n, scene.k, scene.k + scene.r * scene.d, member.x
+    responses, coupling, largest = room.responses, room.coupling, member.largest
+    offset, change, lost = row.offset, room.change, 0.0
+    for i in range(size):
+        for j in range(n):
+            part = room.impulses[i] * room.gradients[i * n + j]
+            lost -= part * (x[n + j] + 0.5 * change[j])
+    row.lost = lost
+    copy(room.impulses, row.impulse, k)
+    for j in range(2 * n):
+        offset[j] = room.shift[j] if scene.corners > 0 else 0.0
+        x[j] += offset[j]
+        largest[j] = max(largest[j], abs(x[j]))
+    note_force_noise(scene, member, first, room)
+    for i in range(k):
+        if meets[i] > 0 and i < scene.gaps:
+            for j in range(n):
+                x[j] -= room.values[i] / coupling[i * size + i] * responses[i * n + j]
+    for j in range(n):
+        x[n + j] += change[j]
+    for j in range(2 * n):
+        if abs(x[j]) <= 2.0 * EPS * largest[j]:
+            offset[j] -= x[j]
+            x[j] = 0.0
+    for i in range(k):
+        if room.parts[i] > 0:
+            for j in range(n):
+                beyond = 4.0 * member.rounding[i] / coupling[i * size + i] * responses[i * n + j]
+                x[j] += beyond
+                offset[j] += beyond
+
+
+@loop
+def note_force_noise(scene: Scene, member: Member, first: int, room: Room):
+    """Note which forces are none before a change of velocities, and by which rounding could make some."""
+    n, total, x, longest = scene.n, scene.watches, member.x, member.longest
+    values, rates = member.rounding, member.rate_rounding
+    lasts = longest if longest > 0 else member.last - member.first
+    for i in range(scene.k):
+        own, fast = room.coupling[i * (scene.k + scene.r * scene.d) + i], 0.0
+        for j in range(n):
+            fast += abs(room.gradients[i * n + j]) * max(abs(x[n + j]), abs(x[n + j] + room.change[j]))
+        if longest > 0:
+            least = FORCELESS * (fast / own) / longest
+            values[total + i] = max(values[total + i], least)
+            rates[total + i] = max(rates[total + i], least / longest)
+        noise = values[i] + lasts * rates[i]
+        member.force_noise[i] = 2.0 * TIED_MOVES * noise / (own * lasts**2)
+        if i == first and room.closed[i] > 0:
+            rates[i] = max(rates[i], longest * own * values[total + i])
+
+
+@loop
+def name_change(scene: Scene, first: int, hits: bool, did: Floats, row: Entry, room: Room):
+    """Put the contact of watch `first`, and the kind of its change, into the row."""
+    k, r, rough = scene.k, scene.r, scene.rough
+    contact, change = -1, -1
+    if first < k:
+        contact, change = first, CLOSES if did[first] > 0 else (BOUNCES if hits else OPENS)
+    elif first < k + r:
+        contact, change = rough[first - k], STICKS if did[first] > 0 else SLIDES
+    else:
+        for i in range(k - 1, -1, -1):
+            if room.opening[i] > 0:
+                contact, change = i, OPENS
+    row.contact, row.change = float(contact), float(change)
+
+
+# ---- all members ----
+
+
+@loop
+def start(scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, room: Room):
+    """Begin a member, whose outputs are at `ts`: those that lie before its corner are there."""
+    n, x, first = scene.n, member.x, member.first
+    member.result = float(begin(scene, member, room))
+    copy(x, member.begun, 2 * n + 1)
+    for j in range(scene.times):
+        if x[2 * n] > first and ts[j] <= x[2 * n]:
+            copy(x, path[j * 2 * n :], 2 * n)
+            copy(x[2 * n + 1 + scene.numbers :], did[j * scene.doing :], scene.doing)
+
+
+@loop
+def follow(
+    scene: Scene, members: int, ts: Floats, path: Floats, did: Floats, record: Entry, memory: Member, room: Room
+):
+    """Follow members that go on to their ends, or to a stretch that the kernel does not finish (`ASKS`).
+
+    `ts` (T,) are the same for all if `scene` has one row of them, or (members, T). Members run side by side: those
+    that are going are packed for one call of the kernel, those with open contacts alone apart.
+    """
+    size, times, states = scene.memory, scene.times, 2 * scene.n
+    for m in range(members):
+        if memory[m * size :].result == NEW:
+            ours = did[m * times * scene.doing :]
+            start(scene, memory[m * size :], ts[m * scene.stride :], path[m * times * states :], ours, room)
+    while True:
+        any_going = False
+        for held in range(2):
+            count, places = 0, room.order
+            for m in range(members):
+                mine = memory[m * size :]
+                if mine.result == GOING and is_held(scene, mine.x) == (held > 0):
+                    if mine.rows >= scene.room:
+                        continue
+                    places[count] = float(m)
+                    count += 1
+            if count > 0:
+                any_going = True
+                follow_stretch(scene, held, count, ts, path, did, record, memory, room)
+        if not any_going:
+            return
+
+
+@loop
+def follow_stretch(
+    scene: Scene, held: int, count: int, ts: Floats, path: Floats, did: Floats, record: Entry, memory: Member,
+    room: Room
+):  # fmt: skip
+    """Follow a stretch of `count` members, whose numbers are in `ORDER`, by one call of the kernel."""
+    size, times, states = scene.memory, scene.times, 2 * scene.n
+    outputs, numbers, each = times + 2, scene.inputs - states - 1 + 2 * scene.watches, scene.room * scene.row
+    places, job = room.order, room.jobs
+    given_y, given_numbers = job[count * outputs :], job[count * (outputs + states) :]
+    found = given_numbers[count * numbers :]
+    y_end, t_end = found[count * outputs * states :], found[count * (outputs + 1) * states :]
+    code, steps, rejected, left = t_end[count:], t_end[2 * count :], t_end[3 * count :], t_end[4 * count :]
+    plan, rest = scene.open_many, scene.open_many_rest
+    if held > 0:
+        plan, rest = scene.held_many, scene.held_many_rest
+    if count == 1:
+        plan = scene.held_one if held > 0 else scene.open_one
+        rest = scene.held_one_rest if held > 0 else scene.open_one_rest
+    for i in range(count):
+        m = int(places[i])
+        mine = memory[m * size :]
+        if plan != 0:
+            prepare(
+                scene, mine, ts[m * scene.stride :], job[i * outputs :], given_y[i * states :],
+                given_numbers[i * numbers :], room
+            )  # fmt: skip
+        else:
+            mine.result = float(ASKS)
+    if plan == 0:
+        return
+    integrate(
+        scene.begin, plan, job, given_y, given_numbers, found, y_end, t_end, code, steps, rejected, left, count, outputs
+    )
+    undone = left[rest - 1] != 0
+    for i in range(count):
+        m = int(places[i])
+        mine, result = memory[m * size :], int(code[i])
+        sound = result == SUCCESSFUL or result >= EVENT
+        for j in range(states):
+            sound = sound and isfinite(y_end[i * states + j])
+        if undone or not sound:
+            mine.result = float(ASKS)
+        else:
+            finish(
+                scene, mine, ts[m * scene.stride :], path[m * times * states :], did[m * times * scene.doing :],
+                record[m * each :], found[i * outputs * states :], y_end[i * states :], t_end[i],
+                result - EVENT if result >= EVENT else 0, SUCCESSFUL, steps[i], rejected[i], room
+            )  # fmt: skip
