@@ -178,8 +178,11 @@ class _Run:
             if len(places) == 1:
                 self._follow_some(places[0])
             else:
-                with ThreadPoolExecutor(cores()) as pool:
+                pool = ThreadPoolExecutor(cores())
+                try:
                     list(pool.map(self._follow_some, places))
+                finally:  # who is interrupted waits for those that run, and for no others
+                    pool.shutdown(cancel_futures=True)
             if (self.results == ASKS).any() and self.scene[at.HELD_ONE] == 0:
                 self._add_held()
             for member in np.flatnonzero(self.results == ASKS).tolist():
