@@ -19,7 +19,6 @@ is `vmap`ped is for the caller to decide, so all of it is written in array opera
 fast as LAPACK in a batch of up to about 12 coordinates; a single matrix of 128 takes four times as long, under 1 ms.
 """
 
-from collections.abc import Callable
 
 import equinox as eqx
 import jax
@@ -164,36 +163,6 @@ def invert(matrix: Matrix) -> tuple[Matrix, Int[Array, " n"], Vector]:
     start = start_alike((a, jnp.ones(size, bool), jnp.zeros(size, np.int32), jnp.zeros(size, a.dtype)))
     a, _, order, pivots = jax.lax.fori_loop(0, count, one_panel, start) if count > 1 else one_panel(0, start)
     return _permute_rows(a, order[:n])[:, :n], order[:n], pivots[:n]
-
-
-def factorize_general(matrix: Matrix) -> Callable[[Vector], Vector]:
-    """b ↦ x with A x = b, for an A that need not be symmetric, as `Factorization.solve`: NaN where it is singular."""
-    if len(matrix) == 1:
-        return lambda b: b / jnp.where(matrix[0] == 0, jnp.nan, matrix[0])
-    if len(matrix) == 2:  # XLA compiles loops for as long as all else around them
-        (a, b), (c, d) = matrix
-        ad, bc = a * d, b * c
-        lost = jnp.abs(ad - bc) <= singular_threshold(2, matrix.dtype) * (jnp.abs(ad) + jnp.abs(bc))
-        inverse = 1 / jnp.where(lost, jnp.nan, ad - bc)
-        return lambda y: jnp.stack([(d * y[0] - b * y[1]) * inverse, (a * y[1] - c * y[0]) * inverse])
-    scale = jax.lax.stop_gradient(1 / jnp.max(jnp.abs(matrix), axis=1))
-    scaled = scale[:, None] * matrix
-    columns, order, pivots = invert(jax.lax.stop_gradient(scaled))
-    inverse, pivots = jnp.zeros_like(columns).at[:, order].set(columns), jnp.abs(pivots)
-    lost = jnp.min(pivots) <= singular_threshold(len(matrix), matrix.dtype) * jnp.max(pivots)
-
-    def solve_by(inverse):
-        def solve(times, b):
-            x = inverse @ b
-            return x + inverse @ (b - times(x))  # one step of refinement, as in `Factorization`
-
-        return solve
-
-    def solve(b):
-        x = jax.lax.custom_linear_solve(lambda y: scaled @ y, scale * b, solve_by(inverse), solve_by(inverse.T))
-        return jnp.where(lost, jnp.nan, x)
-
-    return solve
 
 
 def _eliminate(panel: Array, free: Array) -> tuple[Array, Array, Array, Array]:
