@@ -71,7 +71,7 @@ attempt there is a mistake of a kind that happens to everybody:
 
 # %%
 def first_attempt(q, v):
-    return 0.5 * jnp.linalg.norm(v) ** 2 - 9.81 * q[1]
+    return 0.5 * jnp.linalg.norm(v) * jnp.linalg.norm(v) - 9.81 * q[1]
 
 
 def wire(q):
