@@ -19,7 +19,6 @@ is `vmap`ped is for the caller to decide, so all of it is written in array opera
 fast as LAPACK in a batch of up to about 12 coordinates; a single matrix of 128 takes four times as long, under 1 ms.
 """
 
-
 import equinox as eqx
 import jax
 import jax.numpy as jnp

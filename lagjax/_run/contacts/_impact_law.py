@@ -43,7 +43,7 @@ class ImpactRows(NamedTuple):
         return cls(*(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))
 
 
-class Held(NamedTuple):
+class HeldRows(NamedTuple):
     """The contacts in an impact: the `rows` that are held (K,), 1 or 0, and of the r contacts with friction, which
     are `rough`, by which coefficient they slide (r,), 0 of others, and in which `direction` (r, d)."""
 
@@ -59,7 +59,7 @@ class Held(NamedTuple):
         return len(self.rows) - size + np.arange(size).reshape(self.direction.shape)
 
 
-def find_impulses(rows: ImpactRows, held: Held, targets):
+def find_impulses(rows: ImpactRows, held: HeldRows, targets):
     """The impulses (K,) by which the rates of contacts that push become these `targets` (k,), and slips that stick 0.
 
     The impulse of a row that is free is zero, that of a contact that slides brings its friction.
@@ -78,7 +78,7 @@ def find_impulses(rows: ImpactRows, held: Held, targets):
     return _turn_directions(rows, held, impulses_along)
 
 
-def _turn_directions(rows: ImpactRows, held: Held, impulses_along):
+def _turn_directions(rows: ImpactRows, held: HeldRows, impulses_along):
     """The impulses (K,) along directions which are those of the slips behind the impact, also as the state varies.
 
     Two steps of Newton's method from where they are give derivatives of first and second order.
@@ -114,7 +114,7 @@ def rates_behind(rows: ImpactRows, compressed, returned, restitution):
 
     def phase(rates, held):
         none = jnp.zeros_like(rates)
-        free = Held(held, none[:0], jnp.zeros((0, 1)), np.zeros(0, int))
+        free = HeldRows(held, none[:0], jnp.zeros((0, 1)), np.zeros(0, int))
         return find_impulses(rows._replace(rates=rates), free, none)
 
     rates = rows.rates + rows.coupling @ ((1.0 + restitution) * phase(rows.rates, compressed))

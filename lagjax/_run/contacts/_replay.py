@@ -23,7 +23,7 @@ from lagjax._interface import halves
 from lagjax._primitives import Repetition, differentiable_where, keep_together
 from lagjax._program import Unlowerable, lower
 from lagjax._run.contacts._contact_search import POISSON
-from lagjax._run.contacts._impact_law import Held, ImpactRows, construct_impulses, find_impulses, rates_behind
+from lagjax._run.contacts._impact_law import HeldRows, ImpactRows, construct_impulses, find_impulses, rates_behind
 from lagjax._run.contacts._places import RECORD
 from lagjax._run.contacts._scene_code import SceneCode, sizes_of_fields
 
@@ -72,11 +72,8 @@ class Replay:
     """
 
     def __init__(self, code: SceneCode, make_flow: Callable):
-        self._make_flow, self._watches, self._tolerances = (
-            functools.cache(make_flow),
-            code.surfaces["HELD"],
-            code.tolerances,
-        )
+        self._make_flow = functools.cache(make_flow)
+        self._watches, self._tolerances = code.surfaces["HELD"], code.tolerances
         self._code, self._lines, self._sizes, self._rough = code, code.lines, code.sizes, code.arrays["ROUGH"]
 
     def __call__(self, ts, y0, vector, restitution, friction) -> tuple:
@@ -190,7 +187,7 @@ class Replay:
         else:
             bounced = -restitution * rows.rates[:k]
         bounced, ends = jnp.where(hits, bounced, 0.0), row.ends > 0
-        held = Held(row.held, row.slides * friction, direction, self._rough)
+        held = HeldRows(row.held, row.slides * friction, direction, self._rough)
         impulses = find_impulses(rows, held, jnp.where(ends, 0.0, bounced))
         change = impulses @ rows.responses
         back = jnp.where(row.meets > 0, -rows.values[:k] / jnp.diagonal(rows.coupling)[:k], 0.0)
