@@ -584,7 +584,7 @@ class BorderControl:
                     frame.assign(where, self.motion.parameters + guard.slide, params=0.0)
 
     def _decide_others(self, frame: Frame, going: Value) -> None:
-        """Decide the pieces anew that touch no border and have left none, where one is crossed on which others depend."""
+        """Decide the pieces anew that touch no border and have left none, where one is crossed that others read."""
         if not self.borders.nested:
             return
         with frame.code.loop(self.pieces) as j:

@@ -946,7 +946,8 @@ class _Rewriting:
         def copy(decide: Callable) -> list[int]:
             return _copy_deciding(graph, line, first, self.switches, self.kinds, self.tables, decide)
 
-        nodes, signs = copy(decide_or_keep), {i for i, kind in zip(self.pieces, self.kinds, strict=True) if kind == SIGN}
+        nodes = copy(decide_or_keep)
+        signs = {piece for piece, kind in zip(self.pieces, self.kinds, strict=True) if kind == SIGN}
         nested = any(slide.order > 1 and _below(line, [self.switches[slide.piece]]) & signs for slide in slides)
         sides = [copy(functools.partial(decide_ahead, way)) for way in (1.0, -1.0)] if nested else [nodes]
         pieces = [nodes[i] for i in self.pieces]
