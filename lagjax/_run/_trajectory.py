@@ -452,6 +452,26 @@ def follow_in_doubles(motion: Callable, problem: Problem, *more) -> Any:
     return compute_in_doubles(functools.partial(motion, layout), *given)
 
 
+def follow_in_numbers(follow: Callable, problem: Problem, *more) -> Any:
+    """`follow_rows` of the one member of a problem, without the axis of members."""
+    found = follow_rows(follow, problem, np.asarray(problem.y0)[None], np.asarray(problem.vector)[None], *more)
+    return jax.tree.map(lambda x: np.asarray(x)[0], found)
+
+
+def follow_rows(follow: Callable, member: Problem, y0, vectors, *more) -> Any:
+    """`follow(layout, params, ts, y0, vectors, *more)` of members whose numbers are known, in the own precision.
+
+    There are `y0` (N, 2n) and `vectors` (N, P), or (1, P); the rest is that of one `member`.
+    """
+
+    def run(ts, y0, vectors):
+        wide = member.double_precision if member.is_single else member
+        return follow(wide.layout, wide.params, ts, y0, vectors, *more)
+
+    given = np.asarray(member.ts), np.asarray(y0), np.asarray(vectors)
+    return compute_in_doubles(run, *given) if member.is_single else run(*given)
+
+
 def step_counts(accepted, rejected) -> dict:
     return {"num_steps": accepted + rejected, "num_accepted_steps": accepted, "num_rejected_steps": rejected}
 

@@ -8,14 +8,11 @@ the output times and the parameters that has derivatives of every order:
 Its derivatives are those of the motion that the search found; its values are not used.
 """
 
-import functools
 import math
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 
 from lagjax._engine.taylor import Line
 from lagjax._primitives import Repetition
