@@ -429,20 +429,6 @@ def constant_unless(varies, tree: PyTree) -> PyTree:
     return jax.tree.map(constant, tree)
 
 
-def vary_with(first, *inputs):
-    """The state before the first round, with derivatives, a batch and mesh axes where later ones have them."""
-    # Else JAX writes the rounds down once more for numbers that get these in a round. The derivatives of a sine vary
-    # with the inputs, too, in every order.
-    moving = jnp.sin(sum(x.ravel()[0] for x in inputs if x.size))
-    still = jax.lax.stop_gradient(moving)
-
-    def vary(x, like=still):
-        return jnp.where(False, like.astype(jnp.asarray(x).dtype), x)
-
-    varying = {name: vary(getattr(first, name), moving) for name in ("t", "y", "path")}
-    return jax.tree.map(vary, first)._replace(**varying)
-
-
 def follow_in_doubles(motion: Callable, problem: Problem, *more) -> Any:
     """`motion(layout, ts, y0, params, *more)` of a problem, in float64, in the problem's own precision."""
     given = problem.ts, problem.y0, problem.params, *more

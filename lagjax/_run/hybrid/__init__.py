@@ -156,7 +156,7 @@ def follow_modes(
     limits = scene.max_transitions, rtol, atol, max_steps, problem.is_single
     plan = HybridPlan(tuple(modes), tuple(modes.values()), tuple(scene.transitions), *limits)
     if problem.is_known and is_concrete(start):
-        ending, record = follow_in_numbers(functools.partial(follow_known, plan), problem, start)
+        ending, record = jax.device_put(follow_in_numbers(functools.partial(follow_known, plan), problem, start))
     else:
         ending, record = follow_in_doubles(functools.partial(hybrid_motion, plan), problem, start)
     trajectory = _trajectory(modes, problem, ending, record)
@@ -164,24 +164,18 @@ def follow_modes(
 
 
 def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, record: TransitionRecord) -> Trajectory:
-    states = ending.path, ending.y, record.y, record.y_next
-    parts = (
-        [tuple(map(problem.layout.restore, halves(y))) for y in states],
-        ending,
-        record,
-        (record.source >= 0).sum(-1),
-    )
-    ((q, qdot), end, (q_at, qdot_at), (q_next, qdot_next)), ending, record, count = (
-        jax.device_put(parts) if isinstance(ending.y, np.ndarray) else parts
-    )
+    (q_at, qdot_at), (q_next, qdot_next) = record.state, record.behind
     transitions = Transitions(
         t=record.t, q=q_at, qdot=qdot_at, source=record.source, target=record.target, number=record.number,
-        count=count, order_matters=record.order_matters, let_out=ending.let_out, q_next=q_next, qdot_next=qdot_next,
+        count=record.count, order_matters=record.order_matters, let_out=ending.let_out, q_next=q_next,
+        qdot_next=qdot_next,
     )  # fmt: skip
+    known = dataclasses.replace(problem, ts=jax.lax.stop_gradient(problem.ts))
     return Trajectory(
-        ts=jnp.asarray(problem.ts), q=q, qdot=qdot, result=result_from(ending.result), end=State(ending.t, *end),
-        stats=step_counts(*ending.steps), system=dict(modes), params=problem.params, mode=ending.modes,
-        transitions=transitions, mode_names=tuple(modes), tolerances=MachineCode().tolerances(problem, problem.y0),
+        ts=jnp.asarray(problem.ts), q=ending.path[0], qdot=ending.path[1], result=result_from(ending.result),
+        end=State(ending.t, *ending.state), stats=step_counts(*ending.steps), system=dict(modes), params=problem.params,
+        mode=ending.modes, transitions=transitions, mode_names=tuple(modes),
+        tolerances=MachineCode().tolerances(known, jax.lax.stop_gradient(problem.y0)),
     )  # fmt: skip
 
 

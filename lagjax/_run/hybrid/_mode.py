@@ -104,8 +104,8 @@ class Transition(eqx.Module):
 class ModeParts:
     """One mode that is ready to run: its flow, its guards, the transitions that leave it; it is known by identity.
 
-    `numbers` are the places of these transitions in the list. A reset is None where the state is kept. `reset_lines` and
-    `check`, which is 1 off the constraints, are lines of (q, q̇, t) and the numbers of params.
+    `numbers` are the places of these transitions in the list. A reset is None where the state is kept. `reset_lines`
+    and `check`, which is 1 off the constraints, are lines of (q, q̇, t) and the numbers of params.
     """
 
     def __init__(

@@ -14,7 +14,7 @@ import numpy as np
 
 from lagjax._engine import Problem
 from lagjax._engine.taylor import Tolerances, vector_of
-from lagjax._interface import Layout, compile_for_one_call
+from lagjax._interface import Layout, compile_for_one_call, halves
 from lagjax._primitives import attach_derivative, lost_unless
 from lagjax._run.hybrid._mode import FIRES, ModeParts, Transition, make_mode
 from lagjax._run.hybrid._places import PLACES, sizes_of
@@ -45,10 +45,10 @@ class Ending(NamedTuple):
     """A motion as a whole: its outputs, where and how it ended."""
 
     t: Any
-    y: Any  # (2n,)
+    state: tuple[PyTree, PyTree]  # q and q̇, as all states here
     mode: Any  # its place in `HybridPlan.names`
     result: Any  # the integer of a `lagjax.RESULTS`
-    path: Any  # (T, 2n), NaN where not reached
+    path: tuple[PyTree, PyTree]  # (T, …), NaN where not reached
     modes: Any  # (T,), −1 where not reached
     steps: tuple[Any, Any]  # accepted, rejected
     let_out: Any  # (K,), see `Transitions`
@@ -58,12 +58,13 @@ class TransitionRecord(NamedTuple):
     """The transitions (N, …): time, states around the reset, both modes, the place in the list; else NaN and −1."""
 
     t: Any
-    y: Any
-    y_next: Any
+    state: tuple[PyTree, PyTree]
+    behind: tuple[PyTree, PyTree]
     source: Any
     target: Any
     number: Any
     order_matters: Any  # whether another order of the list leads to another state, where blows meet
+    count: Any
 
 
 class SearchedModes(NamedTuple):
@@ -83,7 +84,7 @@ def hybrid_motion(plan: HybridPlan, layout: Layout, ts, y0, params: PyTree, star
     found = scene.code.search(*still(given))
     row, played = _read(scene, found)
     played = Played(*attach_derivative(scene.replay, tuple(played), *given))
-    return _arrange(plan, scene, found, row, played, given[:3])
+    return _arrange(plan, layout, scene, found, row, played, given[:3])
 
 
 def follow_known(plan: HybridPlan, layout: Layout, params: PyTree, ts, y0, vectors, start) -> tuple:
@@ -95,7 +96,7 @@ def follow_known(plan: HybridPlan, layout: Layout, params: PyTree, ts, y0, vecto
     given = (np.asarray(x, float) for x in (ts[None], y0, vectors))
     found = scene.code.run(*given, starts, room=plan.max_transitions + 1)
     row, played = _read(scene, found)
-    return _arrange(plan, scene, found, row, played, ())
+    return _arrange(plan, layout, scene, found, row, played, ())
 
 
 def _read(scene: SearchedModes, found: Found) -> tuple[Any, Played]:
@@ -105,7 +106,9 @@ def _read(scene: SearchedModes, found: Found) -> tuple[Any, Played]:
     return row, Played(found.path, row.at, row.before, row.behind, t, y)
 
 
-def _arrange(plan: HybridPlan, scene: SearchedModes, found: Found, row, played: Played, inputs: tuple) -> tuple:
+def _arrange(
+    plan: HybridPlan, layout: Layout, scene: SearchedModes, found: Found, row, played: Played, inputs: tuple
+) -> tuple[Ending, TransitionRecord]:
     """The ending, and the transitions; of what varies with `inputs`, if it is traced."""
     library: Any = jnp if inputs else np
 
@@ -116,16 +119,20 @@ def _arrange(plan: HybridPlan, scene: SearchedModes, found: Found, row, played: 
     def cut(x):
         return x[(*[slice(None)] * (row.happens.ndim - 1), slice(plan.max_transitions))]
 
+    def restore(y):
+        return tuple(map(layout.restore, halves(y)))
+
     modes, of, happened = found.did[..., 0].astype(int), scene.code.read_ending(found.ending), cut(row.happens > 0)
     result, _, accepted, rejected = (x.astype(int) for x in of[:4])
-    numbers = np.argsort([transition_place for mode in scene.replay.parts for transition_place in mode.numbers])
+    in_list = np.argsort(np.concatenate([mode.numbers for mode in scene.replay.parts]))
     ending = Ending(
-        played.t, played.y, of.mode[..., 0].astype(int), result, lost(modes >= 0, played.path), modes,
-        (accepted, rejected), of.let_out[..., numbers],
+        played.t, restore(played.y), of.mode[..., 0].astype(int), result, restore(lost(modes >= 0, played.path)), modes,
+        (accepted, rejected), of.let_out[..., in_list],
     )  # fmt: skip
-    changes = (lost(happened, cut(x)) for x in (played.at, played.before, played.behind))
-    kinds = (library.where(happened, cut(x), -1).astype(int) for x in (row.mode[..., 0], row.target, row.number))
-    return ending, TransitionRecord(*changes, *kinds, cut(row.order_matters > 0))
+    t, before, behind = (lost(happened, cut(x)) for x in (played.at, played.before, played.behind))
+    kinds = [library.where(happened, cut(x), -1).astype(int) for x in (row.mode[..., 0], row.target, row.number)]
+    known = *kinds, cut(row.order_matters > 0), happened.sum(axis=-1)
+    return ending, TransitionRecord(t, restore(before), restore(behind), *known)
 
 
 # ---- what is made once -----------------------------------------------------------------------------------------------

@@ -4,22 +4,21 @@
                           ▲                                                           │
                           └───────────────────────────────────────────────────────────┘
 
-A law declares its places, and gives the four loops `start`, `prepare`, `finish` and `find_mode` (`bind_law`). A flag is
+A law declares its places, and gives the loops `start`, `prepare`, `finish` and `find_mode` (`bind_law`). A flag is
 0 or 1. `work` is room that nobody else has.
 """
 
-from collections.abc import Callable
 from math import isfinite
-from typing import Any
+from typing import TYPE_CHECKING, Any, cast
 
 from lagjax._interface import SUCCESSFUL
 from lagjax._native import EVENT, GUARD_NOISE, INSTANT, SMALLEST_STEP, Floats, Loop, evaluate, integrate, loop
 
-Scene = Member = Entry = Room = Any
-start: Callable
-prepare: Callable
-finish: Callable
-find_mode: Callable
+if TYPE_CHECKING:  # what a law gives
+    Scene = Member = Entry = Room = Any
+else:
+    Scene = Member = Entry = Room = None
+start = prepare = finish = find_mode = cast(Any, None)
 
 # Results of a motion that goes on, of one whose stretch the kernel did not finish, and of one that has not begun.
 GOING, ASKS, NEW = -1, -2, -3
