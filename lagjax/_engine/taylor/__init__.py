@@ -38,7 +38,7 @@ from lagjax._engine.taylor._surfaces import Surfaces, move_to_zero, rate_errors,
 from lagjax._equations import Derivation
 from lagjax._interface import EVENT_OCCURRED, default_platform, has_nvidia_gpu, is_concrete
 from lagjax._native import Guards, Nesting, append_guards, pieces_of
-from lagjax._primitives import attach_derivative, compute_in_doubles
+from lagjax._primitives import compute_in_doubles
 from lagjax._program import Program, Unlowerable
 
 

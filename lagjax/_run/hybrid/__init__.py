@@ -1,8 +1,8 @@
 """Motion that changes its laws: modes, each a `System` of its own, and transitions between them.
 
     Hybrid ─► HybridPlan ─► _transition_motion ─► Ending, TransitionRecord ─► Trajectory
-                             ├─ _transition_search: what happens, by loops over numbers, which _places names
-                             ├─ _replay: the same with derivatives
+                             ├─ _transition_search: what happens, by loops over numbers, which _transition_places names
+                             ├─ _transition_replay: the same with derivatives
                              └─ _mode: one mode, its flow, its guards, the resets
 
 Source: Aizerman & Gantmakher, Q. J. Mech. Appl. Math. 11 (1958) 225; Hiskens & Pai, IEEE Trans. Circuits Syst. I 47
@@ -27,7 +27,6 @@ from lagjax._interface import (
     Layout,
     SimulationError,
     as_arrays,
-    halves,
     is_concrete,
     require_budget,
     require_flag,

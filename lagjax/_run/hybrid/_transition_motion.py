@@ -17,15 +17,15 @@ from lagjax._engine.taylor import Tolerances, vector_of
 from lagjax._interface import Layout, compile_for_one_call, halves
 from lagjax._primitives import attach_derivative, lost_unless
 from lagjax._run.hybrid._mode import FIRES, ModeParts, Transition, make_mode
-from lagjax._run.hybrid._places import PLACES, sizes_of
-from lagjax._run.hybrid._replay import HybridReplay, Played
+from lagjax._run.hybrid._transition_places import PLACES, sizes_of
+from lagjax._run.hybrid._transition_replay import HybridReplay, PlayedModes
 from lagjax._run.hybrid._transition_search import LOOPS
-from lagjax._run.jumps import Found, Law, Mode, SceneCode
+from lagjax._run.jumps import Found, JumpLaw, Mode, SceneCode
 from lagjax._scene import System
 
 PyTree = Any
 
-LAW = Law(PLACES, LOOPS, sizes_of, ("MODE",), ("LET_OUT", "MODE"))
+LAW = JumpLaw(PLACES, LOOPS, sizes_of, ("MODE",), ("LET_OUT", "MODE"))
 
 
 class HybridPlan(eqx.Module):
@@ -83,7 +83,7 @@ def hybrid_motion(plan: HybridPlan, layout: Layout, ts, y0, params: PyTree, star
     given = ts, y0, vector, still(jnp.asarray(start, float))[None]
     found = scene.code.search(*still(given))
     row, played = _read(scene, found)
-    played = Played(*attach_derivative(scene.replay, tuple(played), *given))
+    played = PlayedModes(*attach_derivative(scene.replay, tuple(played), *given))
     return _arrange(plan, layout, scene, found, row, played, given[:3])
 
 
@@ -99,15 +99,15 @@ def follow_known(plan: HybridPlan, layout: Layout, params: PyTree, ts, y0, vecto
     return _arrange(plan, layout, scene, found, row, played, ())
 
 
-def _read(scene: SearchedModes, found: Found) -> tuple[Any, Played]:
+def _read(scene: SearchedModes, found: Found) -> tuple[Any, PlayedModes]:
     n = scene.code.sizes["N"]
     row = scene.code.read(found.record[..., : scene.code.width(PLACES.said)], PLACES.said)
     t, y = found.ending[..., 0], found.ending[..., 1 : 2 * n + 1]
-    return row, Played(found.path, row.at, row.before, row.behind, t, y)
+    return row, PlayedModes(found.path, row.at, row.before, row.behind, t, y)
 
 
 def _arrange(
-    plan: HybridPlan, layout: Layout, scene: SearchedModes, found: Found, row, played: Played, inputs: tuple
+    plan: HybridPlan, layout: Layout, scene: SearchedModes, found: Found, row, played: PlayedModes, inputs: tuple
 ) -> tuple[Ending, TransitionRecord]:
     """The ending, and the transitions; of what varies with `inputs`, if it is traced."""
     library: Any = jnp if inputs else np

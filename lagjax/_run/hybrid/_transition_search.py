@@ -1,14 +1,14 @@
 """The search for transitions: from stretch to stretch of a hybrid motion, on numbers, without derivatives.
 
 A stretch ends at the next zero of a guard of its mode. The first transition of the list whose guard changes there
-happens: its reset, then the other mode. What a guard was just before is remembered (see `_places`).
+happens: its reset, then the other mode. What a guard was just before is remembered (see `_transition_places`).
 """
 
 from math import isfinite, log
 
 from lagjax._interface import RESULTS, SUCCESSFUL, code_of
 from lagjax._native import Floats, evaluate, loop
-from lagjax._run.hybrid._places import Entry, Member, Room, Scene
+from lagjax._run.hybrid._transition_places import Entry, Member, Room, Scene
 from lagjax._run.jumps import GOING, LEAST, bind_law, bind_loops, copy, find_sign
 
 TOO_MANY, INCONSISTENT, ZENO, IN_TURN, NOT_FINITE = map(

@@ -1,4 +1,4 @@
-"""What every search does, whatever its law: members side by side, from stretch to stretch.
+"""The loops of every search, whatever its law: members side by side, from stretch to stretch.
 
     follow ─► start ─► prepare: sides and rounding of all watches ─► the kernel ─► finish: what happens there, a row
                           ▲                                                           │

@@ -22,14 +22,14 @@ from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL
 from lagjax._native import LARGEST_LINE, SINGLE_NOISE, Loop, compile_loops, cores, handler
 from lagjax._primitives import LinearMap, compute_on_host
 from lagjax._run.jumps._driver import ASKS, GOING, NEW
-from lagjax._run.jumps._places import Places
+from lagjax._run.jumps._field_places import Places
 
 _TOGETHER = 256  # members that one call follows side by side: what it remembers of them fits into a processor's cache
 _ROOM = 32  # rows of a record, at first
 _ROUNDS = 10**6  # of a kernel, for a stretch: beyond that it continues on the host, where it can be interrupted
 
 
-class Law(NamedTuple):
+class JumpLaw(NamedTuple):
     """What happens where a watch falls: `loops` over numbers at `places`, of which `sizes_of` gives the doubles.
 
     A search is `given` fields of a member's memory beside the state, and tells those of its `ending`.
@@ -81,7 +81,14 @@ class SceneCode:
     """
 
     def __init__(
-        self, law: Law, sizes: dict, arrays: dict, modes: Sequence[Mode], lines: dict, tolerances: Tolerances, first=1
+        self,
+        law: JumpLaw,
+        sizes: dict,
+        arrays: dict,
+        modes: Sequence[Mode],
+        lines: dict,
+        tolerances: Tolerances,
+        first=1,
     ):
         self.law, self.modes, self.lines, self.tolerances, self._first = law, modes, lines, tolerances, first
         counts = np.array([0 if mode.surfaces is None else len(mode.surfaces.directions) for mode in modes])

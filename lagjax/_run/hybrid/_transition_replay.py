@@ -1,4 +1,4 @@
-"""The replay of a hybrid motion: its stretches, crossings and resets, with derivatives (see `jumps._replay`).
+"""The replay of a hybrid motion: its stretches, crossings and resets, with derivatives (see `jumps._round_replay`).
 
 The reset is differentiated like any function. Together with the crossing of the guard (`taylor._surfaces`) this is the
 jump of a sensitivity at an event ("saltation matrix").
@@ -17,7 +17,7 @@ from lagjax._run.hybrid._mode import ModeParts
 from lagjax._run.jumps import Replay, SceneCode, join
 
 
-class Played(NamedTuple):
+class PlayedModes(NamedTuple):
     """The parts that have derivatives: the outputs (T, 2n), of each row its time, the states around it; and the end."""
 
     path: Any
@@ -38,7 +38,7 @@ class HybridReplay(Replay):
         super().__init__(code, 3)
 
     def __call__(self, *given) -> tuple:
-        """The parts of `Played`, of the output times, the start, the numbers, and the mode in which it begins."""
+        """The parts of `PlayedModes`, of the output times, the start, the numbers, and the mode in which it begins."""
         path, said, behind, t, y = self.play(*given)
         return path, said[:, 0], said[:, 1:], behind, t, y
 
@@ -72,7 +72,7 @@ class HybridReplay(Replay):
         return self.line_of_end(function, (), (states,), (numbers,), (), (states,))
 
     def _end_in_parts(self, place: int, record, *given):
-        """Whether the end of a stretch varies smoothly, then the time and the state there, and the state behind it."""
+        """The effects of the end of a stretch: 1 if it varies smoothly, the time and state there, the state behind it."""
         parts, row, still, moving, start = self.parts[place], self._read(record), given[:3], given[3:6], given[6:]
         k, crosses, smooth, (t, y, numbers) = row.watch.astype(int), row.crosses > 0, jnp.array(True), moving
         if parts.surfaces is not None:  # one that is not crossed may have no derivative here
