@@ -1,4 +1,4 @@
-"""The places of what the search for contacts reads and writes, beside those that every search has (`jumps._field_places`)."""
+"""The places of what the search for contacts reads and writes, beside those that every search has."""
 
 from typing import TYPE_CHECKING, Any
 

@@ -95,6 +95,7 @@ class ContactReplay(Replay):
         row, k = self._read(record), self.sizes["K"]
         crosses, decides, stays = row.crosses > 0, row.decides > 0, (row.happens > 0) & (row.crosses == 0)
         still, moving = ((*some[:2], jnp.append(some[2], row.did)) for some in (given[:3], given[3:]))
+        assert self._watches is not None
         smooth, *moved = move_to_zero(self._watches, row.watch.astype(int), crosses, moving, still)
         ends = zip(moved, moving[:2], strict=True)
         t, y = (jnp.where(stays, start, jnp.where(crosses, *end)) for start, end in zip((t, y), ends, strict=True))

@@ -131,8 +131,9 @@ def _arrange(
     )  # fmt: skip
     t, before, behind = (lost(happened, cut(x)) for x in (played.at, played.before, played.behind))
     kinds = [library.where(happened, cut(x), -1).astype(int) for x in (row.mode[..., 0], row.target, row.number)]
-    known = *kinds, cut(row.order_matters > 0), happened.sum(axis=-1)
-    return ending, TransitionRecord(t, restore(before), restore(behind), *known)
+    source, target, number = kinds
+    orders, count = cut(row.order_matters > 0), happened.sum(axis=-1)
+    return ending, TransitionRecord(t, restore(before), restore(behind), source, target, number, orders, count)
 
 
 # ---- what is made once -----------------------------------------------------------------------------------------------

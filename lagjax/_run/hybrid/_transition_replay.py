@@ -72,7 +72,7 @@ class HybridReplay(Replay):
         return self.line_of_end(function, (), (states,), (numbers,), (), (states,))
 
     def _end_in_parts(self, place: int, record, *given):
-        """The effects of the end of a stretch: 1 if it varies smoothly, the time and state there, the state behind it."""
+        """The effects of the end of a stretch: 1 if it is smooth, the time and state there, the state behind."""
         parts, row, still, moving, start = self.parts[place], self._read(record), given[:3], given[3:6], given[6:]
         k, crosses, smooth, (t, y, numbers) = row.watch.astype(int), row.crosses > 0, jnp.array(True), moving
         if parts.surfaces is not None:  # one that is not crossed may have no derivative here

@@ -30,7 +30,7 @@ _ROUNDS = 10**6  # of a kernel, for a stretch: beyond that it continues on the h
 
 
 class JumpLaw(NamedTuple):
-    """What happens where a watch falls: `loops` over numbers at `places`, of which `sizes_of` gives the doubles.
+    """A law of what happens where a watch falls: `loops` over numbers at `places`, of which `sizes_of` gives the doubles.
 
     A search is `given` fields of a member's memory beside the state, and tells those of its `ending`.
     """
