@@ -4,8 +4,8 @@
 
 One to three coordinates, whose forces are sums of `floor`, `sign`, `where`, `heaviside`, tables, … of few of the
 coordinates, velocities and the time; starts are whole numbers and zero, at rest or not. The reference takes 20 000
-steps of Euler's symplectic method, whose first one is by the forces as they are written at the start. Members are compared
-where the reference, begun 1e-7 away, ends at the same place: elsewhere more than one motion begins.
+steps of Euler's symplectic method, whose first one is by the forces as they are written at the start. Members are
+compared where the reference, begun 1e-7 away, ends at the same place: elsewhere more than one motion begins.
 """
 
 import argparse
