@@ -58,7 +58,7 @@ class ContactScene(eqx.Module):
 
     @property
     def path(self) -> str:
-        return self.system.path
+        return "array" if self.system.path == "array" else "scalar"  # arrays do not jump, however large the scene is
 
     def _motion(self, layout: Layout, params: InContact) -> Motion:
         """The motion while the contacts are as `params` say."""
@@ -90,7 +90,7 @@ class ContactScene(eqx.Module):
         def drag(q, qdot, t, p):
             (f, _), slides = counts(p), flat.friction(p.params) * (1.0 - p.contacts.sticks)
             along = flat.slip_direction(q, qdot, t, p)
-            slopes = jax.jacfwd(flat.slips, argnums=1)(q, qdot, t, p.params)  # (r, d, n)
+            slopes = jax.jacrev(flat.slips, argnums=1)(q, qdot, t, p.params)  # (r, d, n), few rows
             forces = -slides[:, None] * jnp.einsum("rd,rdn->rn", along, slopes)
             return jnp.zeros((layout.size, held(p).size), q.dtype).at[:, f + flat.rough].set(forces.T)
 
