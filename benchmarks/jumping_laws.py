@@ -72,8 +72,9 @@ def judge(seed: int) -> collections.Counter:
     system = lagjax.System(lambda q, v: 0.5 * v @ v, forces=forces)
     run = lagjax.simulate_batch(system, q, v, np.array([0.0, T]))
     found = np.concatenate([run.q[:, -1], run.qdot[:, -1]], axis=1)
-    verdicts = np.where(np.abs(found - ends).max(axis=1) < ALLOWED, "right", "wrong")
-    verdicts = np.where(moved > ALLOWED / 4, "ambiguous", verdicts)
+    allowed = ALLOWED * (1.0 + np.abs(ends).max(axis=1))
+    verdicts = np.where(np.abs(found - ends).max(axis=1) < allowed, "right", "wrong")
+    verdicts = np.where(moved > allowed / 4, "ambiguous", verdicts)
     verdicts = np.where(np.asarray(run.ok), verdicts, "stopped")
     for kind in ("wrong", "stopped"):
         for k in np.flatnonzero(verdicts == kind)[:1]:
