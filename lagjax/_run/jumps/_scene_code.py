@@ -17,7 +17,7 @@ import numpy as np
 from jax.core import ShapedArray
 from jax.interpreters import mlir
 
-from lagjax._engine.taylor import Line, Surfaces, Tolerances, call_host, line_of, rate_errors
+from lagjax._engine.taylor import Line, Surfaces, call_host, line_of, rate_errors
 from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL
 from lagjax._native import LARGEST_LINE, SINGLE_NOISE, Loop, compile_loops, cores, handler
 from lagjax._primitives import LinearMap, compute_on_host
@@ -30,7 +30,7 @@ _ROUNDS = 10**6  # of a kernel, for a stretch: beyond that it continues on the h
 
 
 class JumpLaw(NamedTuple):
-    """A law of what happens where a watch falls: `loops` over numbers at `places`, of which `sizes_of` gives the doubles.
+    """A law of what happens where a watch falls: `loops` over numbers at `places`; `sizes_of` gives the doubles.
 
     A search is `given` fields of a member's memory beside the state, and tells those of its `ending`.
     """
@@ -81,14 +81,7 @@ class SceneCode:
     """
 
     def __init__(
-        self,
-        law: JumpLaw,
-        sizes: dict,
-        arrays: dict,
-        modes: Sequence[Mode],
-        lines: dict,
-        tolerances: Tolerances,
-        first=1,
+        self, law: JumpLaw, sizes: dict, arrays: dict, modes: Sequence[Mode], lines: dict, tolerances, first: int = 1
     ):
         self.law, self.modes, self.lines, self.tolerances, self._first = law, modes, lines, tolerances, first
         counts = np.array([0 if mode.surfaces is None else len(mode.surfaces.directions) for mode in modes])
