@@ -40,6 +40,7 @@ class Transition(eqx.Module):
       both directions, has to leave zero first. Where it goes is decided by the first coefficient of its series that is
       not rounding. Give contacts a direction.
     - `reset(q, qdot)` → (q, qdot): the state after the transition; it may also ask for `t` and `params`. None keeps it.
+      It runs in machine code: `linalg.solve` is possible, a loop whose end depends on the state, or `eigh`, is not.
     - `fires`: what happens where the guard is beyond zero in its direction when the mode begins, at the start or
       behind a transition. "beyond": it happens at once. "crossing": it waits until the guard has come back and crosses.
       None decides by the target. To another mode, beyond zero is where `source` ends: at once, whatever the rate. Back
@@ -119,12 +120,18 @@ class ModeParts:
         self.make_flow = functools.partial(make_flow, derivation, system.path, None)
         self.make_guarded = functools.partial(make_flow, derivation, system.path, guards)
         self._resets = [transition if transition.reset else None for transition in leaving.values()]
-        self.reset_lines = [of and self._lower(functools.partial(self._reset, of)) for of in self._resets]
+        self.reset_lines = [of and self._lower_reset(of) for of in self._resets]
         self.check = self._lower(functools.partial(self._is_off, system)) if has_constraints(system) else None
 
     def _lower(self, function: Callable) -> Line:
         y = jax.ShapeDtypeStruct((2 * self._derivation.layout.size + 1,), float)
         return line_of(lower(function, y, self._derivation.numbers, budget=OPERATION_BUDGET))
+
+    def _lower_reset(self, transition: Transition) -> Line:
+        try:
+            return self._lower(functools.partial(self._reset, transition))
+        except Unlowerable as why:
+            raise Unlowerable(f"of {transition!r}, {why}") from None
 
     def _reset(self, transition: Transition, y, numbers):
         return state_after(transition, self._derivation.layout, y[-1], y[:-1], self._restore(numbers))
