@@ -382,6 +382,8 @@ class Derivation:
         system, solve = self._system(_VELOCITY_STEP)
         n, m = self.layout.size, self.shape("jacobian")[0]
         parts, acceleration = self.program("jacobian", "residual", "rates", "gamma"), self.acceleration
+        moves = ~self.absent("jacobian")[list(rows)]
+        touched = [np.flatnonzero(of_row if of_row.any() else ~of_row) for of_row in moves]
 
         def response(*scalars):
             first = scalars[: len(scalars) - states]
@@ -389,10 +391,13 @@ class Derivation:
             values, factors = parts.vector(*held), system(*free)[3]
             gradients = [values[n * i : n * (i + 1)] for i in rows]
             moved = [solve(factors, scatter(row, np.arange(n), n + m))[:n] for row in gradients]
-            free = acceleration.vector(*free)[:n]
-            couplings = [fold("add", row * x) for row in gradients for x in moved]
+            along = [*moved, acceleration.vector(*free)[:n]]
+            products = [
+                [fold("add", row[some] * x[some]) for x in along] for row, some in zip(gradients, touched, strict=True)
+            ]
             residuals, rates, gammas = ([values[(n + part) * m + i] for i in rows] for part in range(3))
-            bends = [fold("add", row * free) - gamma for row, gamma in zip(gradients, gammas, strict=True)]
+            couplings = [x for of_row in products for x in of_row[:-1]]
+            bends = [of_row[-1] - gamma for of_row, gamma in zip(products, gammas, strict=True)]
             return concatenate([*gradients, *moved, stack([*couplings, *residuals, *rates, *bends])])
 
         self._programs[key] = lower_formula(response, *self.scalar_shapes, budget=OPERATION_BUDGET)
