@@ -353,8 +353,8 @@ class Derivation:
         Constraints that numbers release, those of contacts, are left out: they push, and do not pull.
         """
         count, n = self.shape("rates")[0], self.layout.size
-        holds = range(count) if self.motion.constraints.held is None else np.flatnonzero(self.absent("release"))
-        of, holds = self._positions, list(holds)
+        holds = np.arange(count) if self.motion.constraints.held is None else np.flatnonzero(self.absent("release"))
+        of = self._positions
         first, rates = [*of("lagrangian"), *of("momentum")], of("rates")[holds]
         if is_smooth(self._whole.select_outputs([*first, *rates]).line):
             return None
