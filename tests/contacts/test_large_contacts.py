@@ -83,8 +83,8 @@ def test_derivatives_of_a_thousand_springs_that_meet_a_wall():
     def differ(by, step):
         ends = []
         for sign in (1.0, -1.0):
-            given = [x + sign * step * change for x, change in zip((K, WALL, E, v0), by, strict=True)]
-            times, y = reference(*given, TS[-1])
+            k, wall, e, v = (x + sign * step * change for x, change in zip((K, WALL, E, v0), by, strict=True))
+            times, y = reference(k, wall, e, v, TS[-1])
             ends.append(weights @ y[:FAR] + times[1])
         return (ends[0] - ends[1]) / (2 * step)
 
