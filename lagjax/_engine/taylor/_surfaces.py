@@ -114,9 +114,10 @@ def _complete(values: Program, motion: Program, moving: int, rounding: Program |
         nodes, y = values.place(expansion, ids).tolist(), Scalars(expansion, ids[:moving])
         outputs = values.line.outputs
         one, zero = graph.number(1.0), graph.number(0.0)
-        by_y = [tangents_in(graph, values.line, nodes, {j: one}, {}) for j in range(moving)]
+        read = sorted(i for i in values.find_inputs(range(len(outputs))) if i < moving) or [0]
+        by_y = [tangents_in(graph, values.line, nodes, {j: one}, {}) for j in read]
         slopes = Scalars(expansion, np.array([[by.get(i, zero) for by in by_y] for i in outputs]))
-        terms, moves = slopes * y, slopes * _rate(motion, expansion, ids, moving)
+        terms, moves = slopes * y[read], slopes * _rate(motion, expansion, ids, moving)[read]
         found = [[fold("add", row) for row in x] for x in (moves, absolute(terms), absolute(moves))]
         more = [] if rounding is None else [rounding.place(expansion, ids)[list(rounding.line.outputs)]]
         return [np.array([nodes[i] for i in outputs]), *(stack(x).ids for x in found), *more]
