@@ -1,6 +1,6 @@
 """Motion that changes its laws: modes, each a `System` of its own, and transitions between them.
 
-    Hybrid ─► HybridPlan ─► _transition_motion ─► Ending, TransitionRecord ─► Trajectory
+    Hybrid ─► HybridPlan ─► _transition_motion ─► Ending ─► Trajectory
                              ├─ _transition_search: what happens, by loops over numbers, which _transition_places names
                              ├─ _transition_replay: the same with derivatives
                              └─ _mode: one mode, its flow, its guards, the resets
@@ -33,16 +33,14 @@ from lagjax._interface import (
     result_from,
 )
 from lagjax._run._trajectory import (
-    State,
     Trajectory,
-    Transitions,
     follow_in_doubles,
     follow_in_numbers,
     raise_unless_ok,
     step_counts,
 )
 from lagjax._run.hybrid._mode import Transition
-from lagjax._run.hybrid._transition_motion import Ending, HybridPlan, TransitionRecord, follow_known, hybrid_motion
+from lagjax._run.hybrid._transition_motion import HybridPlan, follow_known, hybrid_motion
 from lagjax._run.hybrid._transition_search import IN_ONE_PLACE
 from lagjax._scene import System, present_system, require_system
 
@@ -155,27 +153,17 @@ def follow_modes(
     limits = scene.max_transitions, rtol, atol, max_steps, problem.is_single
     plan = HybridPlan(tuple(modes), tuple(modes.values()), tuple(scene.transitions), *limits)
     if problem.is_known and is_concrete(start):
-        ending, record = jax.device_put(follow_in_numbers(functools.partial(follow_known, plan), problem, start))
+        found = jax.device_put(follow_in_numbers(functools.partial(follow_known, plan), problem, start))
     else:
-        ending, record = follow_in_doubles(functools.partial(hybrid_motion, plan), problem, start)
-    trajectory = _trajectory(modes, problem, ending, record)
-    return _raise_unless_ok(modes, trajectory, layout, ending.mode) if throw else trajectory
-
-
-def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, record: TransitionRecord) -> Trajectory:
-    (q_at, qdot_at), (q_next, qdot_next) = record.state, record.behind
-    transitions = Transitions(
-        t=record.t, q=q_at, qdot=qdot_at, source=record.source, target=record.target, number=record.number,
-        count=record.count, order_matters=record.order_matters, let_out=ending.let_out, q_next=q_next,
-        qdot_next=qdot_next,
-    )  # fmt: skip
+        found = follow_in_doubles(functools.partial(hybrid_motion, plan), problem, start)
     known = dataclasses.replace(problem, ts=jax.lax.stop_gradient(problem.ts))
-    return Trajectory(
-        ts=jnp.asarray(problem.ts), q=ending.path[0], qdot=ending.path[1], result=result_from(ending.result),
-        end=State(ending.t, *ending.state), stats=step_counts(*ending.steps), system=dict(modes), params=problem.params,
-        mode=ending.modes, transitions=transitions, mode_names=tuple(modes),
+    trajectory = Trajectory(
+        ts=jnp.asarray(problem.ts), q=found.path[0], qdot=found.path[1], result=result_from(found.result),
+        end=found.end, stats=step_counts(*found.steps), system=dict(modes), params=problem.params, mode=found.modes,
+        transitions=found.transitions, mode_names=tuple(modes),
         tolerances=MachineCode().tolerances(known, jax.lax.stop_gradient(problem.y0)),
     )  # fmt: skip
+    return _raise_unless_ok(modes, trajectory, layout, found.mode) if throw else trajectory
 
 
 def _raise_unless_ok(modes: dict[str, System], trajectory: Trajectory, layout: Layout, last) -> Trajectory:

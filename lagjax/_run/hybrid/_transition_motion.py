@@ -1,6 +1,6 @@
 """The motion of a hybrid scene: a search for what happens, without derivatives, and a replay, which has them.
 
-HybridPlan, start ─► SceneCode.search ─► Found ─► attach_derivative(HybridReplay) ─► Ending, TransitionRecord
+HybridPlan, start ─► SceneCode.search ─► Found ─► attach_derivative(HybridReplay) ─► Ending
 """
 
 import dataclasses
@@ -16,6 +16,7 @@ from lagjax._engine import Problem
 from lagjax._engine.taylor import Tolerances, vector_of
 from lagjax._interface import Layout, compile_for_one_call, halves
 from lagjax._primitives import attach_derivative, lost_unless
+from lagjax._run._trajectory import State, Transitions
 from lagjax._run.hybrid._mode import FIRES, ModeParts, Transition, make_mode
 from lagjax._run.hybrid._transition_places import PLACES, sizes_of
 from lagjax._run.hybrid._transition_replay import HybridReplay, PlayedModes
@@ -42,29 +43,15 @@ class HybridPlan(eqx.Module):
 
 
 class Ending(NamedTuple):
-    """A motion as a whole: its outputs, where and how it ended."""
+    """A motion as a whole: its outputs, where and how it ended, its transitions."""
 
-    t: Any
-    state: tuple[PyTree, PyTree]  # q and q̇, as all states here
+    end: State
     mode: Any  # its place in `HybridPlan.names`
     result: Any  # the integer of a `lagjax.RESULTS`
-    path: tuple[PyTree, PyTree]  # (T, …), NaN where not reached
+    path: tuple[PyTree, PyTree]  # q and q̇, (T, …), NaN where not reached
     modes: Any  # (T,), −1 where not reached
     steps: tuple[Any, Any]  # accepted, rejected
-    let_out: Any  # (K,), see `Transitions`
-
-
-class TransitionRecord(NamedTuple):
-    """The transitions (N, …): time, states around the reset, both modes, the place in the list; else NaN and −1."""
-
-    t: Any
-    state: tuple[PyTree, PyTree]
-    behind: tuple[PyTree, PyTree]
-    source: Any
-    target: Any
-    number: Any
-    order_matters: Any  # whether another order of the list leads to another state, where blows meet
-    count: Any
+    transitions: Transitions
 
 
 class SearchedModes(NamedTuple):
@@ -75,7 +62,7 @@ class SearchedModes(NamedTuple):
 
 
 @compile_for_one_call
-def hybrid_motion(plan: HybridPlan, layout: Layout, ts, y0, params: PyTree, start) -> tuple[Ending, TransitionRecord]:
+def hybrid_motion(plan: HybridPlan, layout: Layout, ts, y0, params: PyTree, start) -> Ending:
     """The motion from y0 (2n,) at ts[0] in the mode of place `start`, and its `max_transitions` transitions."""
     ts, y0, still = jnp.asarray(ts), jnp.asarray(y0), jax.lax.stop_gradient
     scene = scene_of(plan, layout, params, len(ts))
@@ -87,7 +74,7 @@ def hybrid_motion(plan: HybridPlan, layout: Layout, ts, y0, params: PyTree, star
     return _arrange(plan, layout, scene, found, row, played, given[:3])
 
 
-def follow_known(plan: HybridPlan, layout: Layout, params: PyTree, ts, y0, vectors, start) -> tuple:
+def follow_known(plan: HybridPlan, layout: Layout, params: PyTree, ts, y0, vectors, start) -> Ending:
     """The motions of members whose numbers are known, with members in front: `y0` (N, 2n), `vectors` (N, P).
 
     `params` are those of one member; all begin in the mode of place `start`.
@@ -108,8 +95,8 @@ def _read(scene: SearchedModes, found: Found) -> tuple[Any, PlayedModes]:
 
 def _arrange(
     plan: HybridPlan, layout: Layout, scene: SearchedModes, found: Found, row, played: PlayedModes, inputs: tuple
-) -> tuple[Ending, TransitionRecord]:
-    """The ending, and the transitions; of what varies with `inputs`, if it is traced."""
+) -> Ending:
+    """The motion as a whole; of what varies with `inputs`, if it is traced."""
     library: Any = jnp if inputs else np
 
     def lost(there, x):
@@ -125,15 +112,12 @@ def _arrange(
     modes, of, happened = found.did[..., 0].astype(int), scene.code.read_ending(found.ending), cut(row.happens > 0)
     result, _, accepted, rejected = (x.astype(int) for x in of[:4])
     in_list = np.argsort(np.concatenate([mode.numbers for mode in scene.replay.parts]))
-    ending = Ending(
-        played.t, restore(played.y), of.mode[..., 0].astype(int), result, restore(lost(modes >= 0, played.path)), modes,
-        (accepted, rejected), of.let_out[..., in_list],
-    )  # fmt: skip
     t, before, behind = (lost(happened, cut(x)) for x in (played.at, played.before, played.behind))
     kinds = [library.where(happened, cut(x), -1).astype(int) for x in (row.mode[..., 0], row.target, row.number)]
-    source, target, number = kinds
-    orders, count = cut(row.order_matters > 0), happened.sum(axis=-1)
-    return ending, TransitionRecord(t, restore(before), restore(behind), source, target, number, orders, count)
+    known = happened.sum(axis=-1), cut(row.order_matters > 0), of.let_out[..., in_list]
+    transitions = Transitions._make((t, *restore(before), *kinds, *known, *restore(behind)))
+    end, path = State(played.t, *restore(played.y)), restore(lost(modes >= 0, played.path))
+    return Ending(end, of.mode[..., 0].astype(int), result, path, modes, (accepted, rejected), transitions)
 
 
 # ---- what is made once -----------------------------------------------------------------------------------------------
