@@ -28,4 +28,5 @@ from lagjax._primitives._linear_map import (
     start_alike,
     vary_alike,
 )
+from lagjax._primitives._on_host import call_host, share_rows
 from lagjax._primitives._repetition import Repetition

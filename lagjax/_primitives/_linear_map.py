@@ -12,6 +12,7 @@ instead, without a word; tests/equations/test_custom.py keeps the case). A primi
 
 import functools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -133,6 +134,7 @@ def compute_on_host(primitive: Primitive, function: Callable) -> None:
         with jax.enable_x64(True):
             return jax.device_put([np.asarray(x) for x in function(*map(np.asarray, arrays), **settings)])
 
+    primitive.on_host = function  # type: ignore[attr-defined]
     primitive.def_impl(evaluate)
 
 
@@ -211,9 +213,9 @@ def keep_together(y, offsets, limits):
     return together_p.bind(limits, y, offsets)[0]
 
 
-def _together(limits, y, offsets):
-    near = jnp.all(jnp.abs(offsets) <= limits, axis=-1, keepdims=True)
-    return [jnp.where(near, y, jnp.nan)]
+def _together(limits, y, offsets, library: Any = jnp):
+    near = library.all(library.abs(offsets) <= limits, axis=-1, keepdims=True)
+    return [library.where(near, y, jnp.nan)]
 
 
 def _pull_together(known, cotangents, moving):
@@ -224,4 +226,5 @@ def _pull_together(known, cotangents, moving):
 
 together_p = LinearMap("lagjax_together", lambda limits, y, _: [y], lambda *_: [None], 2, _pull_together)
 together_p.def_impl(_together)
+together_p.on_host = functools.partial(_together, library=np)
 mlir.register_lowering(together_p, mlir.lower_fun(_together, multiple_results=True))

@@ -17,10 +17,11 @@ import numpy as np
 from lagjax import _native
 from lagjax._engine._problem import Solution
 from lagjax._engine.taylor._flow import EXCESS, Flow, Steps, Tolerances
+from lagjax._engine.taylor._line_functions import Line
 from lagjax._engine.taylor._passages import cut_steps, has_passages, part_passages
 from lagjax._interface import SUCCESSFUL
 from lagjax._native import Projection
-from lagjax._program import Program, StraightLine, pullback, pushforward
+from lagjax._program import Program, pullback, pushforward
 
 LARGEST_PORTION = 2**23  # numbers of the steps that are written down at once: 64 MiB
 _ROOM_AGAIN = 2  # times the steps that were taken: those of a first try are written, too
@@ -243,15 +244,16 @@ def _differentiate_projection(differentiate: Callable, projection: Projection, s
     `parts` (…, numbers) are the states, times and parameters, then tangents or cotangents.
     """
     line = _projection_line(differentiate, projection.state, parts[0].shape[-1])
-    columns = [np.broadcast_to(x, (*shape, x.shape[-1])).reshape(math.prod(shape), x.shape[-1]).T for x in parts]
-    return line.evaluate(list(np.concatenate(columns))).T.reshape(*shape, -1)
+    return line.evaluate(*(np.broadcast_to(x, (*shape, x.shape[-1])) for x in parts))
 
 
 @functools.lru_cache(maxsize=64)
-def _projection_line(differentiate: Callable, program: Program, t: int) -> StraightLine:
+def _projection_line(differentiate: Callable, program: Program, t: int) -> Line:
     """The derivative of a projection, from its inputs and what moves; by all of these but the time, input `t`."""
     by = [i for i in range(program.size) if i != t]
-    return differentiate(program.line, [np.dtype(float)] * program.size, by, range(t))
+    line = differentiate(program.line, [np.dtype(float)] * program.size, by, range(t))
+    size = program.size + (len(by) if differentiate is pushforward else t)
+    return Line(line, size, size)
 
 
 # ---- the steps that a derivative goes over ---------------------------------------------------------------------------

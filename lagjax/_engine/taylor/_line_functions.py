@@ -26,9 +26,9 @@ import numpy as np
 from jax.core import ShapedArray
 from jax.interpreters import ad, mlir
 
-from lagjax._engine.taylor._call import NO_HANDLER, call_host, capsule
+from lagjax._engine.taylor._call import NO_HANDLER, capsule
 from lagjax._native import LARGEST_LINE, LineCode, line_handler, make_once
-from lagjax._primitives import LinearMap, compute_on_host
+from lagjax._primitives import LinearMap, call_host, compute_on_host, share_rows
 from lagjax._program import Graph, Program, StraightLine, Unlowerable, copy_nodes, emit, lowers, pullback, pushforward
 
 _TARGET = "lagjax_line"
@@ -168,7 +168,7 @@ class _LineMap(LinearMap):
 
     def evaluate(self, *arrays, line: Line):
         """By NumPy, or machine code, at once."""
-        return [self.of(line).evaluate(*map(np.asarray, arrays))]
+        return [self.of(line).evaluate(*share_rows(*map(np.asarray, arrays)))]
 
     def _lower_on_cpu(self, context, *arrays, line: Line):
         of, call = self.of(line), self._compile_operations

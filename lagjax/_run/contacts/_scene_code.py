@@ -15,10 +15,10 @@ import numpy as np
 from jax.core import ShapedArray
 from jax.interpreters import mlir
 
-from lagjax._engine.taylor import Line, call_host, line_of, rate_errors
+from lagjax._engine.taylor import Line, line_of, rate_errors
 from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL
 from lagjax._native import LARGEST_LINE, SINGLE_NOISE, compile_loops, cores, handler, make_once
-from lagjax._primitives import LinearMap, compute_on_host
+from lagjax._primitives import LinearMap, call_host, compute_on_host
 from lagjax._run.contacts import _contact_search
 from lagjax._run.contacts._contact_search import ASKS, GOING, NEW
 from lagjax._run.contacts._places import ARRAYS, MEMORY, NAMES, RECORD, SAID, WORK, at
