@@ -25,8 +25,10 @@ from lagjax._primitives._linear_map import (
     cotangent_of,
     is_zero,
     keep_together,
+    solve,
+    solve_composed,
     start_alike,
     vary_alike,
 )
-from lagjax._primitives._on_host import call_host, share_rows
+from lagjax._primitives._on_host import HostFunction, call_host, share_rows
 from lagjax._primitives._repetition import Repetition

@@ -228,3 +228,38 @@ together_p = LinearMap("lagjax_together", lambda limits, y, _: [y], lambda *_: [
 together_p.def_impl(_together)
 together_p.on_host = functools.partial(_together, library=np)
 mlir.register_lowering(together_p, mlir.lower_fun(_together, multiple_results=True))
+
+
+# ---- linear systems --------------------------------------------------------------------------------------------------
+
+
+def solve(a, b):
+    """X with A X = B, for A (…, n, n) and B (…, n); NaN where A is singular."""
+    return solve_p.bind(a, b)[0]
+
+
+def _solve_on_host(a, b):
+    a, b = (np.broadcast_to(x, (max(len(a), len(b)), *x.shape[1:])) for x in (a, b))
+    try:
+        return [np.linalg.solve(a, b[..., None])[..., 0]]
+    except np.linalg.LinAlgError:
+        regular = np.linalg.slogdet(a)[0] != 0
+        unit = np.where(regular[..., None, None], a, np.eye(a.shape[-1]))
+        return [np.where(regular[..., None], np.linalg.solve(unit, b[..., None])[..., 0], np.nan)]
+
+
+def _vary_solution(primals, tangents, outs):
+    return [] if is_zero(tangents[0]) else [-solve(primals[0], (tangents[0] @ outs[0][..., None])[..., 0])]
+
+
+def _transpose_solution(known, cotangents, _):
+    return [solve(jnp.swapaxes(known[0], -1, -2), cotangents[0])]
+
+
+def solve_composed(a, b):
+    return [jnp.linalg.solve(a, b[..., None])[..., 0]]
+
+
+solve_p = LinearMap("lagjax_solve", lambda _, b: [b], _vary_solution, 1, _transpose_solution)
+compute_on_host(solve_p, _solve_on_host)
+mlir.register_lowering(solve_p, mlir.lower_fun(solve_composed, multiple_results=True))

@@ -22,15 +22,14 @@ _UFUNCS: dict[str, Callable] = {
 }  # fmt: skip
 _SAME = ("stop_gradient", "copy", "copy_p", "pvary", "pcast")
 _FOLDS: dict[str, Callable] = {
-    "reduce_sum": np.sum, "reduce_max": np.max, "reduce_min": np.min, "reduce_or": np.any, "reduce_and": np.all,
+    "reduce_sum": lambda x, axis: np.sum(x, axis=axis, dtype=x.dtype), "reduce_max": np.max, "reduce_min": np.min, "reduce_or": np.any, "reduce_and": np.all,
 }  # fmt: skip
 
 
 class HostFunction:
-    """A function of arrays and lists of arrays, traced for arguments of these `examples`, whose leaves it takes.
+    """A function of arrays and lists of arrays, traced for arguments of these `examples`, whose leaves it takes."""
 
-    Raises `NotImplementedError` where there is an operation that NumPy is not told about.
-    """
+    others: Callable  # an operation ↦ its function, where none is below: as scalars (`_engine.taylor`)
 
     def __init__(self, function: Callable, *examples):
         with jax.enable_x64(True):
@@ -114,7 +113,7 @@ def _rule(equation) -> Callable:
     axes, shape = [x.aval.ndim for x in equation.invars], equation.outvars[0].aval.shape
     if function := getattr(equation.primitive, "on_host", None):
         return lambda *xs: function(*xs, **params)
-    if name in _UFUNCS:
+    if name in _UFUNCS and not (name == "div" and np.issubdtype(equation.outvars[0].aval.dtype, np.integer)):
         call, most = _UFUNCS[name], max(axes)
         wide = [(slice(None), *[None] * (most - count)) for count in axes]  # a number of each member stands for all
         return call if min(axes) == most else lambda *xs: call(*(x[at] for x, at in zip(xs, wide, strict=True)))
@@ -127,9 +126,7 @@ def _rule(equation) -> Callable:
         return _broadcast(equation.invars[0].aval.shape, shape, params["broadcast_dimensions"])
     if name == "pad":
         return _pad(equation.invars[0].aval.shape, shape, params["padding_config"])
-    if name not in _RULES:
-        raise NotImplementedError(f"{name} has no form of NumPy")
-    return _RULES[name](**params)
+    return _RULES[name](**params) if name in _RULES else HostFunction.others(equation)
 
 
 def _broadcast(begin: tuple, shape: tuple, places: tuple) -> Callable:

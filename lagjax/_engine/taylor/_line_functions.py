@@ -28,8 +28,19 @@ from jax.interpreters import ad, mlir
 
 from lagjax._engine.taylor._call import NO_HANDLER, capsule
 from lagjax._native import LARGEST_LINE, LineCode, line_handler, make_once
-from lagjax._primitives import LinearMap, call_host, compute_on_host, share_rows
-from lagjax._program import Graph, Program, StraightLine, Unlowerable, copy_nodes, emit, lowers, pullback, pushforward
+from lagjax._primitives import HostFunction, LinearMap, call_host, compute_on_host, share_rows
+from lagjax._program import (
+    Graph,
+    Program,
+    StraightLine,
+    Unlowerable,
+    copy_nodes,
+    emit,
+    lower,
+    lowers,
+    pullback,
+    pushforward,
+)
 
 _TARGET = "lagjax_line"
 # Operations of a line on a GPU that XLA compiles; NumPy on the host evaluates a longer one. Twice as many would cost
@@ -222,3 +233,25 @@ def _pull(x, w, _, line: Line):
 value_p = _LineMap("value", lambda line: line, lambda line: line.outputs)
 forward_p = _LineMap("forward", lambda line: line.forward, lambda line: line.outputs, 1, _pull)
 back_p = _LineMap("back", lambda line: line.back, lambda line: line.width, 1, _push)
+
+
+# ---- operations of functions on the host -----------------------------------------------------------------------------
+
+
+def _evaluate_scalars(equation) -> Callable:
+    """An operation as scalars, for rows of NumPy: what reads tables, and all that is rare."""
+    shapes = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in equation.invars]
+    results = [x.aval for x in equation.outvars]
+    program = lower(lambda *xs: equation.primitive.bind(*xs, **equation.params), *shapes)
+    ends = np.cumsum([math.prod(x.shape) for x in results])[:-1]
+
+    def evaluate(*arrays):
+        arrays = share_rows(*arrays)
+        columns = [column for x in arrays for column in x.reshape(len(x), -1).T]
+        parts = np.split(program.evaluate_many(columns).T, ends, axis=-1)
+        return [x.reshape(-1, *of.shape).astype(of.dtype) for x, of in zip(parts, results, strict=True)]
+
+    return evaluate
+
+
+HostFunction.others = staticmethod(_evaluate_scalars)
