@@ -21,8 +21,10 @@ _UFUNCS: dict[str, Callable] = {
     "or": np.bitwise_or, "not": np.invert,
 }  # fmt: skip
 _SAME = ("stop_gradient", "copy", "copy_p", "pvary", "pcast")
+_CALLS = ("jit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "remat", "checkpoint")
 _FOLDS: dict[str, Callable] = {
-    "reduce_sum": lambda x, axis: np.sum(x, axis=axis, dtype=x.dtype), "reduce_max": np.max, "reduce_min": np.min, "reduce_or": np.any, "reduce_and": np.all,
+    "reduce_sum": lambda x, axis: np.sum(x, axis=axis, dtype=x.dtype),
+    "reduce_max": np.max, "reduce_min": np.min, "reduce_or": np.any, "reduce_and": np.all,
 }  # fmt: skip
 
 
@@ -78,7 +80,7 @@ class HostFunction:
 
         for equation in traced.jaxpr.eqns:
             primitive, params, given = equation.primitive, equation.params, [slot(x) for x in equation.invars]
-            inner = params.get("jaxpr", params.get("call_jaxpr"))
+            inner = params.get("jaxpr", params.get("call_jaxpr")) if primitive.name in _CALLS else None
             if composed := getattr(primitive, "composed", None):
                 avals = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in equation.invars]
                 inner = jax.make_jaxpr(lambda *xs, of=composed, params=params: of(*xs, **params))(*avals)

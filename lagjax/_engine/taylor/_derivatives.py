@@ -72,7 +72,7 @@ def jvp(flow: Flow, motions: Motions, dy0, dparams, tolerances: Tolerances) -> t
     if flow.projection is not None and path.shape[1] > 2:
         inner = path_dot[:, :, 1:-1]
         given = *_inner_states(motions), inner, dparams[:, :, None]
-        inner[:] = _differentiate_projection(pushforward, flow.projection, inner.shape[:-1], *given)
+        inner[:] = _differentiate_projection(pushforward, flow.projection, *given)
     path_dot[:, :, -1] = y_dot
     path_dot[~np.broadcast_to(np.isfinite(path)[:, None], path_dot.shape)] = np.nan
     y_dot[result != SUCCESSFUL] = np.nan
@@ -136,7 +136,7 @@ def vjp(flow: Flow, motions: Motions, path_ct, end_ct, tolerances: Tolerances) -
     params_ct = np.zeros((members, m, flow.numbers))
     if flow.projection is not None and path.shape[1] > 2:
         inner = path_ct[:, :, 1:-1]
-        back = _differentiate_projection(pullback, flow.projection, inner.shape[:-1], *_inner_states(motions), inner)
+        back = _differentiate_projection(pullback, flow.projection, *_inner_states(motions), inner)
         inner[:], params_ct = back[..., : flow.states], back[..., flow.states :].sum(axis=2)
 
     of_rows = motions.take(np.repeat(np.arange(members), m))
@@ -146,7 +146,7 @@ def vjp(flow: Flow, motions: Motions, path_ct, end_ct, tolerances: Tolerances) -
     params_ct = params_ct + more
     if flow.projection is not None:
         start = y0[:, None], ts[:, None, :1], params[:, None]
-        back = _differentiate_projection(pullback, flow.projection, (members, m), *start, y_ct)
+        back = _differentiate_projection(pullback, flow.projection, *start, y_ct)
         y_ct, params_ct = back[..., : flow.states], params_ct + back[..., flow.states :]
     y_ct[lost], params_ct[lost] = np.nan, np.nan
     return y_ct, params_ct
@@ -229,7 +229,7 @@ def _vjp_by_jacobian(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) 
 def project_start_tangents(projection: Projection, t, y0, params, dy0, dparams) -> np.ndarray:
     """The tangents (N, m, 2n) of the projection of the starts."""
     start = y0[:, None], t[:, None], params[:, None]
-    return _differentiate_projection(pushforward, projection, dy0.shape[:2], *start, dy0, dparams)
+    return _differentiate_projection(pushforward, projection, *start, dy0, dparams)
 
 
 def _inner_states(motions: Motions) -> tuple:
@@ -238,13 +238,13 @@ def _inner_states(motions: Motions) -> tuple:
     return path[:, None, 1:-1], motions.ts[:, None, 1:-1, None], motions.params[:, None, None]
 
 
-def _differentiate_projection(differentiate: Callable, projection: Projection, shape: tuple, *parts) -> np.ndarray:
-    """The pushforward or the pullback of a projection, at states of this `shape`, one after the other.
+def _differentiate_projection(differentiate: Callable, projection: Projection, *parts) -> np.ndarray:
+    """The pushforward or the pullback of a projection, at many states.
 
     `parts` (…, numbers) are the states, times and parameters, then tangents or cotangents.
     """
     line = _projection_line(differentiate, projection.state, parts[0].shape[-1])
-    return line.evaluate(*(np.broadcast_to(x, (*shape, x.shape[-1])) for x in parts))
+    return line.evaluate(*parts)
 
 
 @functools.lru_cache(maxsize=64)

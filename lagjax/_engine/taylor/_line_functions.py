@@ -111,11 +111,13 @@ class Line:
 
     def evaluate(self, *parts: np.ndarray) -> np.ndarray:
         """Outputs (…, outputs) at inputs in parts (…, some): by NumPy until that took as long as to make code."""
-        rows = np.concatenate([part.reshape(-1, part.shape[-1]) for part in parts], axis=1)
+        batch = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        parts = tuple(np.broadcast_to(part, (*batch, part.shape[-1])) for part in parts)
+        rows = np.concatenate([part.reshape(math.prod(batch), part.shape[-1]) for part in parts], axis=1)
         self._calls += 1
         code = self.code if self._calls >= _CALLS else None
         found = self.line.evaluate(list(rows.T)).T if code is None else code(rows)
-        return found.reshape(*parts[0].shape[:-1], self.outputs)
+        return found.reshape(*batch, self.outputs)
 
     @functools.cached_property
     def forward(self) -> "Line":
@@ -179,7 +181,7 @@ class _LineMap(LinearMap):
 
     def evaluate(self, *arrays, line: Line):
         """By NumPy, or machine code, at once."""
-        return [self.of(line).evaluate(*share_rows(*map(np.asarray, arrays)))]
+        return [self.of(line).evaluate(*map(np.asarray, arrays))]
 
     def _lower_on_cpu(self, context, *arrays, line: Line):
         of, call = self.of(line), self._compile_operations
