@@ -314,7 +314,8 @@ def pullback_and_entries(
     with np.errstate(all="ignore"):
         cotangents: dict[int, int] = {}
         for k, output in enumerate(of):
-            placed._add(cotangents, line.outputs[output], placed.graph.input(len(dtypes) + k, "float"))
+            if line.nodes[line.outputs[output]][0] != "constant":  # rows of contacts are zeros but for a few numbers
+                placed._add(cotangents, line.outputs[output], placed.graph.input(len(dtypes) + k, "float"))
         results = placed.cotangents(cotangents, by, tables, varies, is_linear)
         results += [i for _, *entry in tables for i in entry]
         done = placed.finish_line(results, known, len(dtypes) + len(of))
@@ -352,7 +353,7 @@ def with_tangents(
         return eliminate_dead_code(*sink_negations(*factor(graph, results)))
 
 
-def gradient_in(graph: Graph, line: StraightLine, nodes: list[int], node: int, by: Sequence[int]) -> list[int]:
+def gradient_in(graph: Graph, line: Any, nodes: list[int], node: int, by: Sequence[int]) -> list[int]:
     """The derivatives of one node of a line by the inputs `by`, as nodes of the graph in which the line is `nodes`."""
     slopes = slopes_in(graph, line, nodes, node, by)
     return [slopes[i] if i in slopes else graph.number(0.0) for i in by]
