@@ -31,7 +31,7 @@ _FOLDS: dict[str, Callable] = {
 class HostFunction:
     """A function of arrays and lists of arrays, traced for arguments of these `examples`, whose leaves it takes."""
 
-    others: Callable  # an operation ↦ its function, where none is below: as scalars (`_engine.taylor`)
+    others: Callable  # of an operation, and what it is given that is known: its function, where none is below
 
     def __init__(self, function: Callable, *examples):
         with jax.enable_x64(True):
@@ -98,7 +98,8 @@ class HostFunction:
         key = equation.primitive.name, str(equation.params), *given
         if key in self._made:
             return self._made[key]
-        call, found = _rule(equation), [self._slot() for _ in equation.outvars]
+        known = {k: self._values[i][0] for k, i in enumerate(given) if i in self._known}
+        call, found = _rule(equation, known), [self._slot() for _ in equation.outvars]
         if self._known.issuperset(given):
             results = call(*[self._values[i] for i in given])
             for i, x in zip(found, results if isinstance(results, list | tuple) else [results], strict=True):
@@ -109,8 +110,8 @@ class HostFunction:
         return self._made.setdefault(key, found)
 
 
-def _rule(equation) -> Callable:
-    """The function of arrays, with an axis of members in front, that an operation is."""
+def _rule(equation, known: dict) -> Callable:
+    """The function of arrays, with an axis of members in front, that an operation is; some of them are `known`."""
     name, params = equation.primitive.name, equation.params
     axes, shape = [x.aval.ndim for x in equation.invars], equation.outvars[0].aval.shape
     if function := getattr(equation.primitive, "on_host", None):
@@ -128,7 +129,7 @@ def _rule(equation) -> Callable:
         return _broadcast(equation.invars[0].aval.shape, shape, params["broadcast_dimensions"])
     if name == "pad":
         return _pad(equation.invars[0].aval.shape, shape, params["padding_config"])
-    return _RULES[name](**params) if name in _RULES else HostFunction.others(equation)
+    return _RULES[name](**params) if name in _RULES else HostFunction.others(equation, known)
 
 
 def _broadcast(begin: tuple, shape: tuple, places: tuple) -> Callable:
@@ -235,7 +236,7 @@ _RULES: dict[str, Callable] = {
 
 def share_rows(*arrays) -> list[np.ndarray]:
     """The arrays, all with as many rows as the longest."""
-    rows = max(map(len, arrays))
+    rows = max(map(len, arrays), default=1)
     return [x if len(x) == rows else np.broadcast_to(x, (rows, *x.shape[1:])) for x in arrays]
 
 

@@ -240,15 +240,20 @@ back_p = _LineMap("back", lambda line: line.back, lambda line: line.width, 1, _p
 # ---- operations of functions on the host -----------------------------------------------------------------------------
 
 
-def _evaluate_scalars(equation) -> Callable:
+def _evaluate_scalars(equation, known: dict) -> Callable:
     """An operation as scalars, for rows of NumPy: what reads tables, and all that is rare."""
-    shapes = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in equation.invars]
-    results = [x.aval for x in equation.outvars]
-    program = lower(lambda *xs: equation.primitive.bind(*xs, **equation.params), *shapes)
+    avals = [x.aval for x in equation.invars]
+    moving, results = [k for k in range(len(avals)) if k not in known], [x.aval for x in equation.outvars]
     ends = np.cumsum([math.prod(x.shape) for x in results])[:-1]
 
+    def apply(*arrays):
+        given = known | dict(zip(moving, arrays, strict=True))
+        return equation.primitive.bind(*(jnp.asarray(given[k]) for k in range(len(avals))), **equation.params)
+
+    program = lower(apply, *(jax.ShapeDtypeStruct(avals[k].shape, avals[k].dtype) for k in moving))
+
     def evaluate(*arrays):
-        arrays = share_rows(*arrays)
+        arrays = share_rows(*(arrays[k] for k in moving))
         columns = [column for x in arrays for column in x.reshape(len(x), -1).T]
         parts = np.split(program.evaluate_many(columns).T, ends, axis=-1)
         return [x.reshape(-1, *of.shape).astype(of.dtype) for x, of in zip(parts, results, strict=True)]
