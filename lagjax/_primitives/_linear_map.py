@@ -30,6 +30,9 @@ class VaryingPrimitive(Primitive):
     JAX writes that into the types of arrays, and reads off them which cotangents are summed over the devices.
     """
 
+    on_host: Callable  # (*arrays, **settings) by NumPy, with members in front
+    composed: Callable  # or the same of other primitives
+
     def bind(self, *args, **settings):
         return super().bind(*vary_alike(args), **settings)
 
@@ -134,7 +137,7 @@ def compute_on_host(primitive: Primitive, function: Callable) -> None:
         with jax.enable_x64(True):
             return jax.device_put([np.asarray(x) for x in function(*map(np.asarray, arrays), **settings)])
 
-    primitive.on_host = function  # type: ignore[attr-defined]
+    primitive.on_host = function  # pyright: ignore[reportAttributeAccessIssue]
     primitive.def_impl(evaluate)
 
 

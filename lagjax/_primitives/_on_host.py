@@ -75,7 +75,7 @@ class HostFunction:
         def slot(of) -> int:
             if not isinstance(of, core.Literal):
                 return slots[of]
-            key = of.aval.dtype, repr(of.val)
+            key = str(of.aval), repr(of.val)
             return (self._made.get(key) or self._made.setdefault(key, [self._slot(of.val)]))[0]
 
         for equation in traced.jaxpr.eqns:

@@ -115,7 +115,8 @@ class Line:
         parts = tuple(np.broadcast_to(part, (*batch, part.shape[-1])) for part in parts)
         rows = np.concatenate([part.reshape(math.prod(batch), part.shape[-1]) for part in parts], axis=1)
         self._calls += 1
-        code = self.code if self._calls >= _CALLS else None
+        is_short = len(self.line.nodes) <= LARGEST_LINE
+        code = self.code if is_short and self._calls >= _CALLS else None
         found = self.line.evaluate(list(rows.T)).T if code is None else code(rows)
         return found.reshape(*batch, self.outputs)
 

@@ -27,7 +27,7 @@ from lagjax._run.contacts._impact_law import HeldRows, ImpactRows, construct_imp
 from lagjax._run.contacts._places import RECORD
 from lagjax._run.contacts._scene_code import SceneCode, sizes_of_fields
 
-# Operations of the line of the end of a stretch: a longer one takes XLA as long as its parts.
+# Operations of the line of the end of a stretch; instead of a longer one NumPy solves for the impulses.
 LONGEST = 5000
 
 _VECTORS = frozenset((
