@@ -82,6 +82,7 @@ def halves(y):
     return y[..., :n], y[..., n:]
 
 
+@functools.partial(jax.jit, static_argnums=1, inline=True)  # outside of `jit` one program
 def flatten_numbers(numbers: PyTree, dtype) -> Float[Array, " P"]:
     """All numbers of a pytree end to end, in the order of its leaves."""
     leaves = [jnp.ravel(jnp.asarray(leaf)).astype(dtype) for leaf in jax.tree.leaves(numbers)]

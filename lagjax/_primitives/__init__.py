@@ -2,7 +2,8 @@
 
 `_linear_map` defines all of these by their mathematics, and gives values the derivatives of another expression.
 `_failures` raises where a motion failed, or gives NaN in values and derivatives. `_doubles` computes in float64 for
-callers whose numbers are float32. `_repetition` repeats a step, and has loops for its derivatives.
+callers whose numbers are float32. `_on_host` evaluates functions of JAX by NumPy, without XLA; so `_repetition` repeats
+a step and its derivatives.
 """
 
 from lagjax._primitives._doubles import DOUBLE, SINGLE, accepts_singles, compute_in_doubles, widen, with_doubles
@@ -25,7 +26,10 @@ from lagjax._primitives._linear_map import (
     cotangent_of,
     is_zero,
     keep_together,
+    solve,
+    solve_composed,
     start_alike,
     vary_alike,
 )
+from lagjax._primitives._on_host import HostFunction, call_host, share_rows
 from lagjax._primitives._repetition import Repetition

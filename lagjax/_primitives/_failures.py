@@ -10,6 +10,7 @@ branch is a constant; `nan_unless` makes it NaN wherever its cotangent is not ze
 
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -180,8 +181,8 @@ def _floats(tree) -> list:
     return [x for x in jax.tree.leaves(tree) if jnp.issubdtype(jnp.result_type(x), jnp.floating)]
 
 
-def _nan_unless(reached, x, *_, marks, batch):
-    return jnp.where(reached, x, jnp.nan) if marks else x
+def _nan_unless(reached, x, *_, marks, batch, library: Any = jnp):
+    return library.where(reached, x, jnp.nan) if marks else x
 
 
 def _nan_unless_transpose(cotangent, reached, x, *inputs, marks, batch):
@@ -219,6 +220,7 @@ def _nan_unless_batch(args, axes, *, marks, batch):
 nan_unless_p = VaryingPrimitive("lagjax_nan_unless")
 nan_unless_p.def_abstract_eval(lambda reached, x, *_, **__: ShapedArray(x.shape, x.dtype))
 nan_unless_p.def_impl(_nan_unless)
+nan_unless_p.on_host = functools.partial(_nan_unless, library=np)
 mlir.register_lowering(nan_unless_p, mlir.lower_fun(_nan_unless, multiple_results=False))
 ad.primitive_jvps[nan_unless_p] = _nan_unless_jvp
 ad.primitive_transposes[nan_unless_p] = _nan_unless_transpose

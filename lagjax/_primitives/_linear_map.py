@@ -12,6 +12,7 @@ instead, without a word; tests/equations/test_custom.py keeps the case). A primi
 
 import functools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -28,6 +29,9 @@ class VaryingPrimitive(Primitive):
 
     JAX writes that into the types of arrays, and reads off them which cotangents are summed over the devices.
     """
+
+    on_host: Callable  # (*arrays, **settings) by NumPy, with members in front
+    composed: Callable  # or the same of other primitives
 
     def bind(self, *args, **settings):
         return super().bind(*vary_alike(args), **settings)
@@ -133,6 +137,7 @@ def compute_on_host(primitive: Primitive, function: Callable) -> None:
         with jax.enable_x64(True):
             return jax.device_put([np.asarray(x) for x in function(*map(np.asarray, arrays), **settings)])
 
+    primitive.on_host = function  # pyright: ignore[reportAttributeAccessIssue]
     primitive.def_impl(evaluate)
 
 
@@ -211,9 +216,9 @@ def keep_together(y, offsets, limits):
     return together_p.bind(limits, y, offsets)[0]
 
 
-def _together(limits, y, offsets):
-    near = jnp.all(jnp.abs(offsets) <= limits, axis=-1, keepdims=True)
-    return [jnp.where(near, y, jnp.nan)]
+def _together(limits, y, offsets, library: Any = jnp):
+    near = library.all(library.abs(offsets) <= limits, axis=-1, keepdims=True)
+    return [library.where(near, y, jnp.nan)]
 
 
 def _pull_together(known, cotangents, moving):
@@ -224,4 +229,40 @@ def _pull_together(known, cotangents, moving):
 
 together_p = LinearMap("lagjax_together", lambda limits, y, _: [y], lambda *_: [None], 2, _pull_together)
 together_p.def_impl(_together)
+together_p.on_host = functools.partial(_together, library=np)
 mlir.register_lowering(together_p, mlir.lower_fun(_together, multiple_results=True))
+
+
+# ---- linear systems --------------------------------------------------------------------------------------------------
+
+
+def solve(a, b):
+    """X with A X = B, for A (…, n, n) and B (…, n); NaN where A is singular."""
+    return solve_p.bind(a, b)[0]
+
+
+def _solve_on_host(a, b):
+    a, b = (np.broadcast_to(x, (max(len(a), len(b)), *x.shape[1:])) for x in (a, b))
+    try:
+        return [np.linalg.solve(a, b[..., None])[..., 0]]
+    except np.linalg.LinAlgError:
+        regular = np.linalg.slogdet(a)[0] != 0
+        unit = np.where(regular[..., None, None], a, np.eye(a.shape[-1]))
+        return [np.where(regular[..., None], np.linalg.solve(unit, b[..., None])[..., 0], np.nan)]
+
+
+def _vary_solution(primals, tangents, outs):
+    return [] if is_zero(tangents[0]) else [-solve(primals[0], (tangents[0] @ outs[0][..., None])[..., 0])]
+
+
+def _transpose_solution(known, cotangents, _):
+    return [solve(jnp.swapaxes(known[0], -1, -2), cotangents[0])]
+
+
+def solve_composed(a, b):
+    return [jnp.linalg.solve(a, b[..., None])[..., 0]]
+
+
+solve_p = LinearMap("lagjax_solve", lambda _, b: [b], _vary_solution, 1, _transpose_solution)
+compute_on_host(solve_p, _solve_on_host)
+mlir.register_lowering(solve_p, mlir.lower_fun(solve_composed, multiple_results=True))

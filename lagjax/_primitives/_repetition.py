@@ -1,4 +1,4 @@
-"""`Repetition`: a step that is repeated as often as there are rows, with loops for its derivatives.
+"""`Repetition`: a step that is repeated as often as there are rows, on the host, with loops for its derivatives.
 
 With R the step, (x, c) ↦ c behind it, and J the derivative of all rounds, four primitives are loops,
 
@@ -7,12 +7,13 @@ With R the step, (x, c) ↦ c behind it, and J the derivative of all rounds, fou
     back       Jᵀ w, from cₙ on             linear in w, transposed: forward
     turn       (∂/∂x Jᵀ w) d + Jᵀ dw        linear in d and dw, symmetric in d
 
-and their derivatives are these again, of the step R′: (x, δx; c, δc) ↦ (R, DR (δx, δc)). `jax.lax.scan` would keep all
-that a derivative needs of all rounds, and skip those that there are not by branches: XLA takes twice as long for it.
+and their derivatives are these again, of the step R′: (x, δx; c, δc) ↦ (R, DR (δx, δc)). A round is traced once, and
+NumPy evaluates it for all members: XLA would compile a loop for a second, and its derivatives for three.
 """
 
 import functools
 import itertools
+import math
 from collections.abc import Callable
 
 import jax
@@ -21,7 +22,8 @@ import numpy as np
 from jax.core import ShapedArray
 from jax.interpreters import ad, mlir
 
-from lagjax._primitives._linear_map import LinearMap, is_zero, start_alike
+from lagjax._primitives._linear_map import LinearMap, compute_on_host, is_zero
+from lagjax._primitives._on_host import HostFunction, call_host
 
 
 class Repetition:
@@ -68,52 +70,78 @@ class Repetition:
         doubled = 2 * self.inputs, 2 * self.carried, 2 * self.of_round, 2 * self.sums
         return Repetition(step, *doubled, self.rows, self.fixed)
 
-    def _one(self, x, carry, still, row, there):
-        """A round; none where it is not `there`."""
-        behind, *found = self.step(x, carry, still, row)
-        behind = [jnp.where(there, new, old) for new, old in zip(behind, carry, strict=True)]
-        return behind, *([jnp.where(there, a, 0.0) for a in some] for some in found)
+    @functools.lru_cache(maxsize=8)  # noqa: B019  # those of a few
+    def _trace(self, shapes: tuple, goes_back: bool) -> HostFunction:
+        """A round, or the cotangents of its x and carry, for arrays of these shapes."""
 
-    def run(self, most, x, first, still, rows, count, keeps: bool = False):
-        """All rounds, `most` of them of whichever member; if it `keeps` them, the carries before each and no more."""
-        length = len(rows[0])
-        empty = [jnp.zeros((length, *shape)) for shape in self.of_round], [jnp.zeros(shape) for shape in self.sums]
-        if keeps:
-            empty = [jnp.zeros((length, *c.shape)) for c in first], []
+        def pull(x, carry, still, row, cotangents):
+            return jax.vjp(lambda x, carry: list(self.step(x, carry, still, row)), x, carry)[1](cotangents)
 
-        def go(i, state):
-            carry, written, sums = state
-            behind, new, parts = self._one(x, carry, still, [_take(row, i) for row in rows], i < count)
-            written = [_put(kept, a, i) for kept, a in zip(written, carry if keeps else new, strict=True)]
-            return behind, written, [] if keeps else [a + b for a, b in zip(sums, parts, strict=True)]
+        arrays = [jax.ShapeDtypeStruct(shape, float) for shape in shapes]
+        *given, cotangents = _split(arrays, self.inputs, self.carried, self.fixed, self.rows)
+        if goes_back:
+            return HostFunction(pull, *given, self.split_results(cotangents))
+        return HostFunction(self.step, *given)
 
-        state = start_alike((first, *empty), x, first, still, rows, count)
-        carry, written, sums = jax.lax.fori_loop(0, most, go, state)
+    def _round(self, *parts, goes_back: bool = False) -> Callable:
+        x, first, still, rows, *more = parts
+        shapes = [a.shape[1:] for a in (*x, *first, *still)] + [row.shape[2:] for row in rows]
+        for last, written, sums in more:
+            shapes += [a.shape[1:] for a in last] + [a.shape[2:] for a in written] + [a.shape[1:] for a in sums]
+        return self._trace(tuple(shapes), goes_back)
+
+    # The arrays of NumPy that follow have members in front, or one row that all share.
+
+    def run(self, x, first, still, rows, count, keeps: bool = False) -> list:
+        """The results of all rounds; if it `keeps` them, the carries before each and no more."""
+        go, length = self._round(x, first, still, rows), rows[0].shape[1]
+        members = max(map(len, (*x, *first, *still, *rows, count)))
+        carry = [np.repeat(c, members // len(c), axis=0) for c in first]
+        of_round = [c.shape[1:] for c in first] if keeps else self.of_round
+        written = [np.zeros((members, length, *shape)) for shape in of_round]
+        sums = [np.zeros((members, *shape)) for shape in self.sums]
+        for i, some in _rounds(count, members):
+            before = _take(carry, some)
+            found = go(*_take(x, some), *before, *_take(still, some), *_take(rows, some, i))
+            behind, new, parts = self.split_results(found)
+            for arrays, values in ((written, before if keeps else new), (carry, behind)):
+                for kept, a in zip(arrays, values, strict=True):
+                    kept[(some, i) if arrays is written else some] = a
+            for total, a in zip(sums, parts, strict=True):
+                total[some] += a
         return written if keeps else [*carry, *written, *sums]
 
-    def go_back(self, most, x, first, still, rows, count, cotangents):
+    def go_back(self, x, first, still, rows, count, cotangents) -> list:
         """The cotangents of x and of the first carry."""
-        before = self.run(most, x, first, still, rows, count, keeps=True)
-        last, written, sums = self.split_results(cotangents)
-
-        def go(k, state):
-            i, (x_ct, carry_ct) = most - 1 - k, state
-            row, here = [_take(row, i) for row in rows], [_take(kept, i) for kept in before]
-            _, pull = jax.vjp(lambda x, carry: self._one(x, carry, still, row, i < count), x, here)
-            more, carry_ct = pull((carry_ct, [_take(ct, i) for ct in written], sums))
-            return [a + b for a, b in zip(x_ct, more, strict=True)], carry_ct
-
-        state = start_alike(([jnp.zeros_like(a) for a in x], last), x, first, still, rows, count, cotangents)
-        x_ct, first_ct = jax.lax.fori_loop(0, most, go, state)
-        return [*x_ct, *first_ct]
-
-
-def _take(array, i):
-    return jax.lax.dynamic_index_in_dim(array, i, keepdims=False)
+        before = self.run(x, first, still, rows, count, keeps=True)
+        last, written, sums = split = self.split_results(cotangents)
+        go = self._round(x, first, still, rows, split, goes_back=True)
+        members = max(map(len, (*x, *first, *still, *rows, count, *cotangents)))
+        x_ct = [np.zeros((members, *a.shape[1:])) for a in x]
+        carry_ct = [np.repeat(ct, members // len(ct), axis=0) for ct in last]
+        for i, some in reversed(_rounds(count, members)):
+            given = *_take(x, some), *_take(before, some, i), *_take(still, some), *_take(rows, some, i)
+            found = go(*given, *_take(carry_ct, some), *_take(written, some, i), *_take(sums, some))
+            more, behind = _split(found, self.inputs)
+            for total, a in zip(x_ct, more, strict=True):
+                total[some] += a
+            for ct, a in zip(carry_ct, behind, strict=True):
+                ct[some] = a
+        return [*x_ct, *carry_ct]
 
 
-def _put(array, x, i):
-    return jax.lax.dynamic_update_index_in_dim(array, x, i, 0)
+def _rounds(count, members: int) -> list[tuple]:
+    """The rounds, and which members have each: a slice where all have."""
+    count = np.broadcast_to(count, members)
+    of_all = range(int(count.max(initial=0)))
+    return [(i, slice(None) if (i < count).all() else np.flatnonzero(i < count)) for i in of_all]
+
+
+def _take(arrays, some, i=slice(None)) -> list:
+    """Of some members, unless all share the one row, what belongs to round i."""
+    return [x[some, i] if len(x) > 1 else x[:, i] for x in arrays] if isinstance(i, int) else [
+        x[some] if len(x) > 1 else x for x in arrays
+    ]  # fmt: skip
 
 
 def _halves(arrays) -> list[list]:
@@ -137,30 +165,40 @@ def _parts(given, of: Repetition) -> list:
 
 def _run(*given, function, of: Repetition, axes: tuple, **_):
     """`function` of all members, in front of which some arrays have these axes."""
-    parts = _parts(given, of)
-    call = functools.partial(function, of, jnp.max(parts[-2]))
-    for of_level in axes:
-        call = jax.vmap(call, in_axes=tuple(_parts(of_level, of)))
-    return call(*parts)
+    batch, shapes = _drop_batch(given, axes)
+    rows = [
+        _as_rows(np.asarray(x), batch, [of_level[j] for of_level in reversed(axes)], shape)
+        for j, (x, shape) in enumerate(zip(given, shapes, strict=True))
+    ]
+    found, members = function(of, *_parts(rows, of)), math.prod(batch)
+    return [np.broadcast_to(x, (members, *x.shape[1:])).reshape((*batch, *x.shape[1:])) for x in found]
 
 
-def _value(of, most, x, first, still, rows, count, _):
-    return of.run(most, x, first, still, rows, count)
+def _as_rows(x, batch: tuple, places: list, shape: tuple):
+    """An array with one row a member; with one for all where it has no axis of these."""
+    if all(place is None for place in places):
+        return x[None]
+    wide = [1 if place is None else size for place, size in zip(places, batch, strict=True)]
+    return np.broadcast_to(x.reshape((*wide, *shape)), (*batch, *shape)).reshape((math.prod(batch), *shape))
 
 
-def _forward(of, most, x, first, still, rows, count, along):
+def _value(of, x, first, still, rows, count, _):
+    return of.run(x, first, still, rows, count)
+
+
+def _forward(of, x, first, still, rows, count, along):
     dx, dfirst = _split(along, of.inputs)
-    return _later_halves(of.tangent.run(most, [*x, *dx], [*first, *dfirst], still, rows, count), of.tangent)
+    return _later_halves(of.tangent.run([*x, *dx], [*first, *dfirst], still, rows, count), of.tangent)
 
 
-def _back(of, most, x, first, still, rows, count, cotangents):
-    return of.go_back(most, x, first, still, rows, count, cotangents)
+def _back(of, x, first, still, rows, count, cotangents):
+    return of.go_back(x, first, still, rows, count, cotangents)
 
 
-def _turn(of, most, x, first, still, rows, count, along):
+def _turn(of, x, first, still, rows, count, along):
     cts, dx, dfirst, dcts = _split(along, of.results, of.inputs, of.carried)
     doubled = _interleave(of, dcts, cts)
-    found = of.tangent.go_back(most, [*x, *dx], [*first, *dfirst], still, rows, count, doubled)
+    found = of.tangent.go_back([*x, *dx], [*first, *dfirst], still, rows, count, doubled)
     return _first_halves(found, of)
 
 
@@ -255,8 +293,12 @@ class _RepeatedMap(LinearMap):
         linear, run = (lambda linear, **_: linear) if pull else 0, functools.partial(_run, function=function)
         super().__init__(f"lagjax_repetition_{name}", shape, vary, linear, transpose if pull else None)
         self.vary = vary
-        self.def_impl(lambda *given, **settings: jax.jit(functools.partial(run, **settings))(*given))
-        mlir.register_lowering(self, mlir.lower_fun(run, multiple_results=True))
+        compute_on_host(self, run)
+
+        def call(*given, **settings):
+            return call_host(functools.partial(run, **settings), shape(*given, **settings), *given)
+
+        mlir.register_lowering(self, mlir.lower_fun(call, multiple_results=True), platform="cpu")
 
     def _derive(self, primals, tangents, **settings):
         if not settings.get("linear") or all(map(is_zero, tangents[: -settings["linear"]])):

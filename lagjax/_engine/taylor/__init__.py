@@ -19,7 +19,6 @@ import numpy as np
 
 from lagjax._engine._problem import AbstractEngine, Batch, Problem, Solution, solve_in_doubles
 from lagjax._engine.taylor import _primitives
-from lagjax._engine.taylor._call import call_host
 from lagjax._engine.taylor._crossing import (
     MOST_GUARDS,
     Noted,

@@ -15,29 +15,14 @@ from collections.abc import Callable
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.experimental.buffer_callback import buffer_callback
 
 from lagjax import _native
 from lagjax._engine.taylor._flow import Flow, Tolerances
 from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL
-from lagjax._primitives import cond_alike, vary_alike
+from lagjax._primitives import call_host, cond_alike, vary_alike
 
 NO_HANDLER = _native.unavailable(jax.ffi.include_dir())
 _TARGET = "lagjax_integrate"
-
-
-def call_host(host: Callable, shapes, *arrays) -> tuple:
-    """Call `host` on NumPy arrays, in a callback of what XLA compiles; `shapes` are those of its results."""
-
-    # Not `jax.pure_callback`: it puts its arguments on the device once more and waits for that, on the threads that
-    # the callbacks themselves may occupy.
-    def callback(_, places, *arrays):
-        with jax.enable_x64(True):  # another thread; a program may be made here
-            results = host(*map(np.asarray, arrays))
-        for place, values in zip(places, results, strict=True):
-            np.asarray(place)[...] = values
-
-    return tuple(buffer_callback(callback, tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in shapes))(*arrays))
 
 
 def begins_in_handler(flow: Flow, members: int) -> bool:

@@ -17,10 +17,11 @@ import numpy as np
 from lagjax import _native
 from lagjax._engine._problem import Solution
 from lagjax._engine.taylor._flow import EXCESS, Flow, Steps, Tolerances
+from lagjax._engine.taylor._line_functions import Line
 from lagjax._engine.taylor._passages import cut_steps, has_passages, part_passages
 from lagjax._interface import SUCCESSFUL
 from lagjax._native import Projection
-from lagjax._program import Program, StraightLine, pullback, pushforward
+from lagjax._program import Program, pullback, pushforward
 
 LARGEST_PORTION = 2**23  # numbers of the steps that are written down at once: 64 MiB
 _ROOM_AGAIN = 2  # times the steps that were taken: those of a first try are written, too
@@ -71,7 +72,7 @@ def jvp(flow: Flow, motions: Motions, dy0, dparams, tolerances: Tolerances) -> t
     if flow.projection is not None and path.shape[1] > 2:
         inner = path_dot[:, :, 1:-1]
         given = *_inner_states(motions), inner, dparams[:, :, None]
-        inner[:] = _differentiate_projection(pushforward, flow.projection, inner.shape[:-1], *given)
+        inner[:] = _differentiate_projection(pushforward, flow.projection, *given)
     path_dot[:, :, -1] = y_dot
     path_dot[~np.broadcast_to(np.isfinite(path)[:, None], path_dot.shape)] = np.nan
     y_dot[result != SUCCESSFUL] = np.nan
@@ -135,7 +136,7 @@ def vjp(flow: Flow, motions: Motions, path_ct, end_ct, tolerances: Tolerances) -
     params_ct = np.zeros((members, m, flow.numbers))
     if flow.projection is not None and path.shape[1] > 2:
         inner = path_ct[:, :, 1:-1]
-        back = _differentiate_projection(pullback, flow.projection, inner.shape[:-1], *_inner_states(motions), inner)
+        back = _differentiate_projection(pullback, flow.projection, *_inner_states(motions), inner)
         inner[:], params_ct = back[..., : flow.states], back[..., flow.states :].sum(axis=2)
 
     of_rows = motions.take(np.repeat(np.arange(members), m))
@@ -145,7 +146,7 @@ def vjp(flow: Flow, motions: Motions, path_ct, end_ct, tolerances: Tolerances) -
     params_ct = params_ct + more
     if flow.projection is not None:
         start = y0[:, None], ts[:, None, :1], params[:, None]
-        back = _differentiate_projection(pullback, flow.projection, (members, m), *start, y_ct)
+        back = _differentiate_projection(pullback, flow.projection, *start, y_ct)
         y_ct, params_ct = back[..., : flow.states], params_ct + back[..., flow.states :]
     y_ct[lost], params_ct[lost] = np.nan, np.nan
     return y_ct, params_ct
@@ -228,7 +229,7 @@ def _vjp_by_jacobian(flow: Flow, motions: Motions, path_ct, end_ct, tolerances) 
 def project_start_tangents(projection: Projection, t, y0, params, dy0, dparams) -> np.ndarray:
     """The tangents (N, m, 2n) of the projection of the starts."""
     start = y0[:, None], t[:, None], params[:, None]
-    return _differentiate_projection(pushforward, projection, dy0.shape[:2], *start, dy0, dparams)
+    return _differentiate_projection(pushforward, projection, *start, dy0, dparams)
 
 
 def _inner_states(motions: Motions) -> tuple:
@@ -237,21 +238,22 @@ def _inner_states(motions: Motions) -> tuple:
     return path[:, None, 1:-1], motions.ts[:, None, 1:-1, None], motions.params[:, None, None]
 
 
-def _differentiate_projection(differentiate: Callable, projection: Projection, shape: tuple, *parts) -> np.ndarray:
-    """The pushforward or the pullback of a projection, at states of this `shape`, one after the other.
+def _differentiate_projection(differentiate: Callable, projection: Projection, *parts) -> np.ndarray:
+    """The pushforward or the pullback of a projection, at many states.
 
     `parts` (…, numbers) are the states, times and parameters, then tangents or cotangents.
     """
     line = _projection_line(differentiate, projection.state, parts[0].shape[-1])
-    columns = [np.broadcast_to(x, (*shape, x.shape[-1])).reshape(math.prod(shape), x.shape[-1]).T for x in parts]
-    return line.evaluate(list(np.concatenate(columns))).T.reshape(*shape, -1)
+    return line.evaluate(*parts)
 
 
 @functools.lru_cache(maxsize=64)
-def _projection_line(differentiate: Callable, program: Program, t: int) -> StraightLine:
+def _projection_line(differentiate: Callable, program: Program, t: int) -> Line:
     """The derivative of a projection, from its inputs and what moves; by all of these but the time, input `t`."""
     by = [i for i in range(program.size) if i != t]
-    return differentiate(program.line, [np.dtype(float)] * program.size, by, range(t))
+    line = differentiate(program.line, [np.dtype(float)] * program.size, by, range(t))
+    size = program.size + (len(by) if differentiate is pushforward else t)
+    return Line(line, size, size)
 
 
 # ---- the steps that a derivative goes over ---------------------------------------------------------------------------

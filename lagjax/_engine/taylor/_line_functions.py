@@ -26,10 +26,21 @@ import numpy as np
 from jax.core import ShapedArray
 from jax.interpreters import ad, mlir
 
-from lagjax._engine.taylor._call import NO_HANDLER, call_host, capsule
+from lagjax._engine.taylor._call import NO_HANDLER, capsule
 from lagjax._native import LARGEST_LINE, LineCode, line_handler, make_once
-from lagjax._primitives import LinearMap, compute_on_host
-from lagjax._program import Graph, Program, StraightLine, Unlowerable, copy_nodes, emit, lowers, pullback, pushforward
+from lagjax._primitives import HostFunction, LinearMap, call_host, compute_on_host, share_rows
+from lagjax._program import (
+    Graph,
+    Program,
+    StraightLine,
+    Unlowerable,
+    copy_nodes,
+    emit,
+    lower,
+    lowers,
+    pullback,
+    pushforward,
+)
 
 _TARGET = "lagjax_line"
 # Operations of a line on a GPU that XLA compiles; NumPy on the host evaluates a longer one. Twice as many would cost
@@ -100,11 +111,14 @@ class Line:
 
     def evaluate(self, *parts: np.ndarray) -> np.ndarray:
         """Outputs (…, outputs) at inputs in parts (…, some): by NumPy until that took as long as to make code."""
-        rows = np.concatenate([part.reshape(-1, part.shape[-1]) for part in parts], axis=1)
+        batch = np.broadcast_shapes(*(part.shape[:-1] for part in parts))
+        parts = tuple(np.broadcast_to(part, (*batch, part.shape[-1])) for part in parts)
+        rows = np.concatenate([part.reshape(math.prod(batch), part.shape[-1]) for part in parts], axis=1)
         self._calls += 1
-        code = self.code if self._calls >= _CALLS else None
+        is_short = len(self.line.nodes) <= LARGEST_LINE
+        code = self.code if is_short and self._calls >= _CALLS else None
         found = self.line.evaluate(list(rows.T)).T if code is None else code(rows)
-        return found.reshape(*parts[0].shape[:-1], self.outputs)
+        return found.reshape(*batch, self.outputs)
 
     @functools.cached_property
     def forward(self) -> "Line":
@@ -222,3 +236,30 @@ def _pull(x, w, _, line: Line):
 value_p = _LineMap("value", lambda line: line, lambda line: line.outputs)
 forward_p = _LineMap("forward", lambda line: line.forward, lambda line: line.outputs, 1, _pull)
 back_p = _LineMap("back", lambda line: line.back, lambda line: line.width, 1, _push)
+
+
+# ---- operations of functions on the host -----------------------------------------------------------------------------
+
+
+def _evaluate_scalars(equation, known: dict) -> Callable:
+    """An operation as scalars, for rows of NumPy: what reads tables, and all that is rare."""
+    avals = [x.aval for x in equation.invars]
+    moving, results = [k for k in range(len(avals)) if k not in known], [x.aval for x in equation.outvars]
+    ends = np.cumsum([math.prod(x.shape) for x in results])[:-1]
+
+    def apply(*arrays):
+        given = known | dict(zip(moving, arrays, strict=True))
+        return equation.primitive.bind(*(jnp.asarray(given[k]) for k in range(len(avals))), **equation.params)
+
+    program = lower(apply, *(jax.ShapeDtypeStruct(avals[k].shape, avals[k].dtype) for k in moving))
+
+    def evaluate(*arrays):
+        arrays = share_rows(*(arrays[k] for k in moving))
+        columns = [column for x in arrays for column in x.reshape(len(x), -1).T]
+        parts = np.split(program.evaluate_many(columns).T, ends, axis=-1)
+        return [x.reshape(-1, *of.shape).astype(of.dtype) for x, of in zip(parts, results, strict=True)]
+
+    return evaluate
+
+
+HostFunction.others = staticmethod(_evaluate_scalars)

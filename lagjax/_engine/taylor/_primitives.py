@@ -34,7 +34,6 @@ from lagjax._engine._problem import Solution
 from lagjax._engine.taylor import _derivatives
 from lagjax._engine.taylor._call import (
     begins_in_handler,
-    call_host,
     derivative_by_handler,
     derivatives_begin_in_handler,
     run_by_handler,
@@ -51,6 +50,7 @@ from lagjax._native import Begun, Projection
 from lagjax._primitives import (
     NOT_EXPORTED,
     LinearMap,
+    call_host,
     compute_on_host,
     cond_alike,
     cotangent_of,
@@ -532,6 +532,7 @@ for _primitive, _host, _on_cpus, _on_gpus in (
     compute_on_host(_primitive, _host)
     mlir.register_lowering(_primitive, _lowering_rule(_on_cpus), platform="cpu")
     mlir.register_lowering(_primitive, mlir.lower_fun(_on_gpus, multiple_results=True), platform="cuda")
+curvature_p.composed = _curvature_composed
 curvature_p.def_impl(lambda *args, **settings: compile_once(_curvature_composed, **settings)(*args))
 for _platform in ("cpu", "cuda"):
     _rule = mlir.lower_fun(_curvature_composed, multiple_results=True)

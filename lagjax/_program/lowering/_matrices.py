@@ -22,9 +22,11 @@ import operator
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
 import numpy as np
 from scipy.sparse.csgraph import connected_components
 
+from lagjax._primitives import solve_composed
 from lagjax._program import _scalars as xp
 from lagjax._program._differentiation import Derivatives, copy_nodes
 from lagjax._program._graph import Graph, Unlowerable
@@ -235,6 +237,12 @@ def _lu(expansion, params, a):
         "`lu` chooses rows by comparing numbers; `jnp.linalg.solve`, `inv`, `det` and `slogdet` are written out as "
         "scalars without a choice"
     )
+
+
+@lowers("lagjax_solve")
+def _solve(expansion, params, a, b):
+    shapes = (jax.ShapeDtypeStruct(x.shape, float) for x in (a, b))
+    return expansion.run_closed(jax.make_jaxpr(solve_composed)(*shapes), (a, b))
 
 
 @lowers("triangular_solve")

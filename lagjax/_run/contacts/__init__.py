@@ -21,7 +21,7 @@ import numpy as np
 from lagjax._engine import Batch, Problem
 from lagjax._engine.taylor import MOST_GUARDS, MachineCode, line_of
 from lagjax._equations import ROUNDINGS, derivation_of, has_constraints, require_consistent
-from lagjax._interface import Layout, halves, is_concrete, require_budget, result_from
+from lagjax._interface import Layout, compile_for_one_call, halves, is_concrete, require_budget, result_from
 from lagjax._native import GUARD_NOISE
 from lagjax._run._trajectory import (
     ContactChanges,
@@ -54,7 +54,15 @@ def follow_contacts(given: Problem, problem: Problem, max_transitions: int | Non
     if has_constraints(problem.system):
         q0, qdot0 = map(problem.layout.restore, halves(jnp.asarray(problem.y0)))
         require_consistent(problem.system, problem.layout, problem.ts, q0, qdot0, problem.params)
-    return _trajectory(given, problem, *_motion(plan, problem), given.params)
+    follow = _follow_at_once if problem.is_known else _follow_compiled
+    return dataclasses.replace(follow(plan, problem), ts=given.ts, system=given.system, params=given.params)
+
+
+def _follow_at_once(plan: ContactPlan, problem: Problem) -> Trajectory:
+    return _trajectory(problem, problem, *_motion(plan, problem), problem.params)
+
+
+_follow_compiled = compile_for_one_call(_follow_at_once)  # outside of `jit` one program, and not one an operation
 
 
 def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int | None, params, params_axes) -> Trajectory:

@@ -17,7 +17,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._primitives import start_alike
+from lagjax._primitives import solve
 
 
 class ImpactRows(NamedTuple):
@@ -66,12 +66,14 @@ def find_impulses(rows: ImpactRows, held: HeldRows, targets):
     """
 
     def impulses_along(direction):
-        mixed = jnp.eye(len(held.rows))
+        mixed = unit = np.eye(len(held.rows))
         if held.rough.size:
-            mixed = mixed.at[held.places, held.rough[:, None]].add(-held.slides[:, None] * direction)
-        system = held.rows[:, None] * (rows.coupling @ mixed) + jnp.diag(1.0 - held.rows)
+            frictions = -held.slides[:, None] * direction
+            of_slips = jnp.where(unit[held.rough][:, None] > 0, frictions[..., None], 0.0)
+            mixed = unit + jnp.pad(of_slips.reshape(-1, len(unit)), ((len(unit) - held.places.size, 0), (0, 0)))
+        system = held.rows[:, None] * (rows.coupling @ mixed) + jnp.where(unit > 0, 1.0 - held.rows, 0.0)
         right = held.rows * (jnp.pad(targets, (0, held.places.size)) - rows.rates)
-        return mixed @ jnp.linalg.solve(system, right)
+        return mixed @ solve(system, right)
 
     if held.direction.shape[1] == 1 or not held.rough.size:
         return impulses_along(held.direction)
@@ -88,21 +90,18 @@ def _turn_directions(rows: ImpactRows, held: HeldRows, impulses_along):
     def off(angles):
         along = jnp.stack([jnp.cos(angles), jnp.sin(angles)], axis=1)
         impulses = impulses_along(along)
-        after = (rows.rates + rows.coupling @ impulses)[held.places]
+        after = (rows.rates + rows.coupling @ impulses)[-held.places.size :].reshape(held.direction.shape)
         across = after[:, 0] * along[:, 1] - after[:, 1] * along[:, 0]
         size = jax.lax.stop_gradient(jnp.abs(after).max(axis=1))
         turned = jnp.where(slides & (size > 0), across / jnp.where(size > 0, size, 1.0), 0.0)
         return turned, (turned, impulses)
 
-    def turn(_, carry):
-        slopes, (turned, impulses) = jax.jacfwd(off, has_aux=True)(carry[0])
-        still = jnp.diag(jnp.where(jnp.diagonal(slopes) == 0, 1.0, 0.0))
-        return carry[0] - jnp.linalg.solve(slopes + still, turned), impulses
-
-    # XLA compiles one loop sooner than its rounds; the third one has the impulses behind two steps.
     angles = jax.lax.stop_gradient(jnp.arctan2(held.direction[:, 1], held.direction[:, 0]))
-    first = angles, jnp.zeros_like(rows.rates)
-    return jax.lax.fori_loop(0, 3, turn, start_alike(first, rows))[1]
+    for _ in range(2):
+        slopes, (turned, _) = jax.jacfwd(off, has_aux=True)(angles)
+        still = jnp.where(np.eye(len(angles)) * (slopes == 0) > 0, 1.0, 0.0)  # of those that do not slide, and stay
+        angles = angles - solve(slopes + still, turned)
+    return off(angles)[1][1]
 
 
 def rates_behind(rows: ImpactRows, compressed, returned, restitution):

@@ -129,7 +129,8 @@ class ContactReplay(Replay):
         held = HeldRows(row.held, row.slides * friction, direction, self._rough)
         impulses = find_impulses(rows, held, jnp.where(ends, 0.0, bounced))
         change = impulses @ rows.responses
-        back = jnp.where(row.meets > 0, -rows.values[:k] / jnp.diagonal(rows.coupling)[:k], 0.0)
+        own = jnp.sum(jnp.where(np.eye(k) > 0, rows.coupling[:k, :k], 0.0), axis=0)
+        back = jnp.where(row.meets > 0, -rows.values[:k] / own, 0.0)
         back = jnp.where(np.arange(k) < self.sizes["GAPS"], back, 0.0)
         behind = y + jnp.concatenate([back @ rows.responses[:k], change]) + row.offset
         lost = -impulses @ (rows.gradients @ (v + 0.5 * change))

@@ -19,7 +19,7 @@ from lagjax._primitives import Repetition
 from lagjax._program import Unlowerable, lower
 from lagjax._run.jumps._scene_code import SceneCode
 
-# Operations of the line of the end of a stretch: a longer one takes XLA as long as its parts.
+# Operations of the line of the end of a stretch; instead of a longer one NumPy evaluates its parts.
 LONGEST = 5000
 
 

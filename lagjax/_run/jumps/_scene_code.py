@@ -17,10 +17,10 @@ import numpy as np
 from jax.core import ShapedArray
 from jax.interpreters import mlir
 
-from lagjax._engine.taylor import Line, Surfaces, call_host, line_of, rate_errors
+from lagjax._engine.taylor import Line, Surfaces, line_of, rate_errors
 from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL
 from lagjax._native import LARGEST_LINE, SINGLE_NOISE, Loop, compile_loops, cores, handler
-from lagjax._primitives import LinearMap, compute_on_host
+from lagjax._primitives import LinearMap, call_host, compute_on_host
 from lagjax._run.jumps._driver import ASKS, GOING, NEW
 from lagjax._run.jumps._field_places import Places
 

@@ -1,0 +1,254 @@
+"""Functions of JAX on the host: traced once, then evaluated by NumPy for all members of a batch, without XLA.
+
+What XLA compiles for a second runs here at once, a microsecond an operation and array. Every array has the members in
+front, or one row that all share; an operation acts behind that axis. Primitives of ours are evaluated by the functions
+that `compute_on_host` was given.
+"""
+
+from collections.abc import Callable
+from typing import Any
+
+import jax
+import numpy as np
+from jax.experimental.buffer_callback import buffer_callback
+from jax.extend import core
+
+_UFUNCS: dict[str, Callable] = {
+    "add": np.add, "add_any": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative,
+    "abs": np.abs, "sign": np.sign, "max": np.maximum, "min": np.minimum, "sqrt": np.sqrt, "cos": np.cos,
+    "sin": np.sin, "atan2": np.arctan2, "square": np.square, "is_finite": np.isfinite, "gt": np.greater, "lt": np.less,
+    "ge": np.greater_equal, "le": np.less_equal, "eq": np.equal, "ne": np.not_equal, "and": np.bitwise_and,
+    "or": np.bitwise_or, "not": np.invert,
+}  # fmt: skip
+_SAME = ("stop_gradient", "copy", "copy_p", "pvary", "pcast")
+_CALLS = ("jit", "closed_call", "core_call", "custom_jvp_call", "custom_vjp_call", "remat", "checkpoint")
+_FOLDS: dict[str, Callable] = {
+    "reduce_sum": lambda x, axis: np.sum(x, axis=axis, dtype=x.dtype),
+    "reduce_max": np.max, "reduce_min": np.min, "reduce_or": np.any, "reduce_and": np.all,
+}  # fmt: skip
+
+
+class HostFunction:
+    """A function of arrays and lists of arrays, traced for arguments of these `examples`, whose leaves it takes."""
+
+    others: Callable  # of an operation, and what it is given that is known: its function, where none is below
+
+    def __init__(self, function: Callable, *examples):
+        with jax.enable_x64(True):
+            traced = jax.make_jaxpr(function)(*examples)
+        self._values: list[Any] = []
+        self._known: set[int] = set()  # the slots of constants
+        self._made: dict[tuple, list[int]] = {}  # the slots of what was computed
+        calls: list[tuple] = []
+        self._outputs = self._write(traced, [self._slot() for _ in traced.jaxpr.invars], calls)
+        needed, self._calls = set(self._outputs), []
+        for call, given, found in reversed(calls):
+            if needed.intersection(found):
+                needed.update(given)
+                self._calls.append((call, given, found))
+        self._calls.reverse()
+
+    def __call__(self, *arrays) -> list[np.ndarray]:
+        values = self._values.copy()
+        values[: len(arrays)] = arrays
+        with np.errstate(all="ignore"):
+            for call, given, found in self._calls:
+                results = call(*[values[i] for i in given])
+                if len(found) == 1:
+                    values[found[0]] = results[0] if type(results) is list else results
+                else:
+                    for i, x in zip(found, results, strict=True):
+                        values[i] = x
+        return [values[i] for i in self._outputs]
+
+    def _slot(self, value=None) -> int:
+        self._values.append(None if value is None else np.asarray(value)[None])
+        if value is not None:
+            self._known.add(len(self._values) - 1)
+        return len(self._values) - 1
+
+    def _write(self, traced, inputs: list[int], calls: list) -> list[int]:
+        """Add the calls of what was traced; the slots of its results."""
+        slots = dict(zip(traced.jaxpr.invars, inputs, strict=True))
+        slots |= {of: self._slot(x) for of, x in zip(traced.jaxpr.constvars, traced.consts, strict=True)}
+
+        def slot(of) -> int:
+            if not isinstance(of, core.Literal):
+                return slots[of]
+            key = str(of.aval), repr(of.val)
+            return (self._made.get(key) or self._made.setdefault(key, [self._slot(of.val)]))[0]
+
+        for equation in traced.jaxpr.eqns:
+            primitive, params, given = equation.primitive, equation.params, [slot(x) for x in equation.invars]
+            inner = params.get("jaxpr", params.get("call_jaxpr")) if primitive.name in _CALLS else None
+            if composed := getattr(primitive, "composed", None):
+                avals = [jax.ShapeDtypeStruct(x.aval.shape, x.aval.dtype) for x in equation.invars]
+                inner = jax.make_jaxpr(lambda *xs, of=composed, params=params: of(*xs, **params))(*avals)
+            if primitive.name in _SAME:
+                found = given
+            elif inner is not None:
+                found = self._write(inner, given, calls)
+            else:
+                found = self._add(equation, given, calls)
+            slots.update(zip(equation.outvars, found, strict=True))
+        return [slot(x) for x in traced.jaxpr.outvars]
+
+    def _add(self, equation, given: list[int], calls: list) -> list[int]:
+        """The slots of the results of an operation: at once of constants, known ones of what was computed before."""
+        key = equation.primitive.name, str(equation.params), *given
+        if key in self._made:
+            return self._made[key]
+        known = {k: self._values[i][0] for k, i in enumerate(given) if i in self._known}
+        call, found = _rule(equation, known), [self._slot() for _ in equation.outvars]
+        if self._known.issuperset(given):
+            results = call(*[self._values[i] for i in given])
+            for i, x in zip(found, results if isinstance(results, list | tuple) else [results], strict=True):
+                self._values[i] = x
+            self._known.update(found)
+        else:
+            calls.append((call, given, found))
+        return self._made.setdefault(key, found)
+
+
+def _rule(equation, known: dict) -> Callable:
+    """The function of arrays, with an axis of members in front, that an operation is; some of them are `known`."""
+    name, params = equation.primitive.name, equation.params
+    axes, shape = [x.aval.ndim for x in equation.invars], equation.outvars[0].aval.shape
+    if function := getattr(equation.primitive, "on_host", None):
+        return lambda *xs: function(*xs, **params)
+    if name in _UFUNCS and not (name == "div" and np.issubdtype(equation.outvars[0].aval.dtype, np.integer)):
+        call, most = _UFUNCS[name], max(axes)
+        wide = [(slice(None), *[None] * (most - count)) for count in axes]  # a number of each member stands for all
+        return call if min(axes) == most else lambda *xs: call(*(x[at] for x, at in zip(xs, wide, strict=True)))
+    if name in _FOLDS:
+        fold, over = _FOLDS[name], tuple(axis + 1 for axis in params["axes"])
+        return lambda x: fold(x, axis=over)
+    if name in ("reshape", "squeeze", "expand_dims"):
+        return lambda x: x.reshape((len(x), *shape))
+    if name == "broadcast_in_dim":
+        return _broadcast(equation.invars[0].aval.shape, shape, params["broadcast_dimensions"])
+    if name == "pad":
+        return _pad(equation.invars[0].aval.shape, shape, params["padding_config"])
+    return _RULES[name](**params) if name in _RULES else HostFunction.others(equation, known)
+
+
+def _broadcast(begin: tuple, shape: tuple, places: tuple) -> Callable:
+    wide = [1] * len(shape)
+    for axis, size in zip(places, begin, strict=True):
+        wide[axis] = size
+    if tuple(wide) == shape:
+        return lambda x: x.reshape((len(x), *shape))
+
+    def rule(x):
+        out = np.empty((len(x), *shape), x.dtype)
+        out[...] = x.reshape((len(x), *wide))
+        return out
+
+    return rule
+
+
+def _select(**_):
+    def rule(which, *cases):
+        which = which.reshape(*which.shape, *[1] * (cases[0].ndim - which.ndim))
+        return np.where(which, cases[1], cases[0]) if len(cases) == 2 else np.choose(which, cases)
+
+    return rule
+
+
+def _slice(start_indices, limit_indices, strides, **_):
+    steps = strides or [1] * len(start_indices)
+    place = (slice(None), *map(slice, start_indices, limit_indices, steps))
+    return lambda x: x[place]
+
+
+def _join(axis: int, together: Callable):
+    def rule(*xs):
+        rows = max(map(len, xs))
+        return together([x if len(x) == rows else np.broadcast_to(x, (rows, *x.shape[1:])) for x in xs], axis=axis + 1)
+
+    return rule
+
+
+def _split(axis: int, sizes, **_):
+    ends = np.cumsum(sizes)[:-1]
+    return lambda x: np.split(x, ends, axis=axis + 1)
+
+
+def _unstack(axis: int, **_):
+    return lambda x: list(np.moveaxis(x, axis + 1, 0))
+
+
+def _pad(begin: tuple, shape: tuple, config) -> Callable:
+    """Of each axis, numbers go to `low` + j (`inner` + 1), as far as that lies within."""
+    taken, placed = [slice(None)], [slice(None)]
+    for size, total, (low, _, inner) in zip(begin, shape, config, strict=True):
+        step = int(inner) + 1
+        first, last = max(0, -(int(low) // step)), min(size, -((int(low) - total) // step))
+        taken.append(slice(first, max(first, last)))
+        placed.append(slice(low + first * step, low + first * step + (max(first, last) - first) * step, step))
+    source, target = tuple(taken), tuple(placed)
+
+    def rule(x, value):
+        out = np.full((len(x), *shape), value.ravel()[0], x.dtype)
+        out[target] = x[source]
+        return out
+
+    return rule
+
+
+def _product(dimension_numbers, **_):
+    (left, right), (left_batch, right_batch) = dimension_numbers
+
+    def rule(a, b):
+        names = iter("abcdefghijklmnopqrstuvwxy")
+        of_a = [next(names) for _ in a.shape[1:]]
+        of_b = [next(names) for _ in b.shape[1:]]
+        for i, j in [*zip(left_batch, right_batch, strict=True), *zip(left, right, strict=True)]:
+            of_b[j] = of_a[i]
+        batch = [of_a[i] for i in left_batch]
+        free = [x for i, x in enumerate(of_a) if i not in (*left, *left_batch)]
+        free += [x for i, x in enumerate(of_b) if i not in (*right, *right_batch)]
+        return np.einsum(f"z{''.join(of_a)},z{''.join(of_b)}->z{''.join(batch + free)}", a, b)
+
+    return rule
+
+
+_RULES: dict[str, Callable] = {
+    "select_n": _select,
+    "slice": _slice,
+    "split": _split,
+    "unstack": _unstack,
+    "dot_general": _product,
+    "concatenate": lambda dimension, **_: _join(dimension, np.concatenate),
+    "stack": lambda axis, **_: _join(axis, np.stack),
+    "transpose": lambda permutation, **_: lambda x: x.transpose(0, *(axis + 1 for axis in permutation)),
+    "convert_element_type": lambda new_dtype, **_: lambda x: x.astype(new_dtype),
+    "integer_pow": lambda y, **_: lambda x: x**y,
+    "iota": lambda dtype, shape, dimension, **_: (
+        lambda: np.broadcast_to(
+            np.arange(shape[dimension], dtype=dtype).reshape([-1 if i == dimension else 1 for i in range(len(shape))]),
+            shape,
+        )[None]
+    ),
+    "argmin": lambda axes, index_dtype, **_: lambda x: np.argmin(x, axis=axes[0] + 1).astype(index_dtype),
+}
+
+
+def share_rows(*arrays) -> list[np.ndarray]:
+    """The arrays, all with as many rows as the longest."""
+    rows = max(map(len, arrays), default=1)
+    return [x if len(x) == rows else np.broadcast_to(x, (rows, *x.shape[1:])) for x in arrays]
+
+
+def call_host(host: Callable, shapes, *arrays) -> tuple:
+    """Call `host` on NumPy arrays, in a callback of what XLA compiles; `shapes` are those of its results."""
+
+    # Not `jax.pure_callback`: it puts its arguments on the device once more and waits for that, on the threads that
+    # the callbacks themselves may occupy.
+    def callback(_, places, *arrays):
+        with jax.enable_x64(True):  # another thread; a program may be made here
+            results = host(*map(np.asarray, arrays))
+        for place, values in zip(places, results, strict=True):
+            np.asarray(place)[...] = values
+
+    return tuple(buffer_callback(callback, tuple(jax.ShapeDtypeStruct(x.shape, x.dtype) for x in shapes))(*arrays))
