@@ -44,13 +44,13 @@ from lagjax._program import (
     apply_function,
     borders,
     concatenate,
-    fold,
     is_smooth,
     lack_of_memory,
     lower,
     lower_formula,
     lower_scalars,
     lower_solution,
+    multiply,
     operations_that_fit,
     scatter,
     stack,
@@ -390,10 +390,9 @@ class Derivation:
             gradients = [values[n * i : n * (i + 1)] for i in rows]
             moved = [solve(factors, scatter(row, np.arange(n), n + m))[:n] for row in gradients]
             free = acceleration.vector(*free)[:n]
-            couplings = [fold("add", row * x) for row in gradients for x in moved]
-            residuals, rates, gammas = ([values[(n + part) * m + i] for i in rows] for part in range(3))
-            bends = [fold("add", row * free) - gamma for row, gamma in zip(gradients, gammas, strict=True)]
-            return concatenate([*gradients, *moved, stack([*couplings, *residuals, *rates, *bends])])
+            residuals, rates, gammas = (values[[(n + part) * m + i for i in rows]] for part in range(3))
+            bends = multiply(gradients, [free]) - gammas
+            return concatenate([*gradients, *moved, multiply(gradients, moved), residuals, rates, bends])
 
         self._programs[key] = lower_formula(response, *self.scalar_shapes, budget=OPERATION_BUDGET)
         return self._programs[key]

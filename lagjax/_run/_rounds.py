@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from lagjax._engine import Problem, Solution
-from lagjax._engine.taylor import MachineCode, Surfaces, changes_of
+from lagjax._engine.taylor import MachineCode, Surfaces
 from lagjax._interface import SUCCESSFUL
 from lagjax._primitives import cond_alike
 
@@ -80,10 +80,8 @@ class Stretch(NamedTuple):
     at_once: jax.Array
 
     @classmethod
-    def locate(
-        cls, problem: Problem, surfaces: Surfaces | None, start: tuple, ts, here, noted, count: int
-    ) -> "Stretch":
-        """The stretch from `start`, (t, y), with `count` guards, of which the motion has `noted` (see `Guards`)."""
+    def locate(cls, problem: Problem, surfaces: Surfaces | None, start: tuple, ts, here, noted) -> "Stretch":
+        """The stretch from `start`, (t, y), of whose guards the motion has `noted` (see `Guards`)."""
         t, y = start
         t_start = jax.lax.stop_gradient(t)
         ahead = here & ((ts > t_start) | (ts == jnp.where(t_start == ts[0], t_start, jnp.nan)))
@@ -93,7 +91,7 @@ class Stretch(NamedTuple):
         problem = dataclasses.replace(problem, ts=times, y0=y, guards=guards)
         located = MachineCode().solve_to_event(problem, noted)
         t_end = jnp.where(here & (located.result == SUCCESSFUL), ts[-1], located.t_end)
-        kinds = changes_of(jnp.where(here, located.event, 0), count)
+        kinds = jnp.where(here, located.event, 0)
         return cls(problem, surfaces, located._replace(t_end=t_end), kinds, ahead & (ts <= t_end), t_end == t_start)
 
     def vary(self, k, crosses) -> tuple:

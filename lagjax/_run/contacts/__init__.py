@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine import Batch, Problem
-from lagjax._engine.taylor import MOST_GUARDS, MachineCode, line_of
+from lagjax._engine.taylor import MachineCode, line_of
 from lagjax._equations import ROUNDINGS, derivation_of, has_constraints, require_consistent
 from lagjax._interface import Layout, halves, is_concrete, require_budget, result_from
 from lagjax._native import GUARD_NOISE
@@ -80,9 +80,9 @@ def _follow_known(plan: ContactPlan, member: Problem, y0, vectors) -> tuple[Cont
 def note_sections(problem: Problem, functions: tuple, directions: tuple[int, ...], room: int) -> tuple:
     """The changes of a motion with contacts: which section each is, or −1; its time and state; how it all ended.
 
-    Raises `ValueError` as `follow_contacts` does, and for more sections than there is room for beside the contacts.
+    Raises `ValueError` as `follow_contacts` does.
     """
-    plan, closed = _plan(problem, CHANGES + len(functions) * (room + 1), len(functions))
+    plan, closed = _plan(problem, CHANGES + len(functions) * (room + 1))
     _require_sound(problem, closed)
     plan = dataclasses.replace(plan, sections=functions, directions=directions)
     ending, record, _ = _motion(plan, problem)
@@ -91,7 +91,7 @@ def note_sections(problem: Problem, functions: tuple, directions: tuple[int, ...
     return (which, record.t, record.y_next), ending.result, (ending.t, ending.y)
 
 
-def _plan(problem: Problem, max_transitions: int | None, sections: int = 0) -> tuple[ContactPlan, Problem]:
+def _plan(problem: Problem, max_transitions: int | None) -> tuple[ContactPlan, Problem]:
     """The plan, and the problem of machine code with all contacts closed, in float64.
 
     Raises `ValueError` where the scene has no machine code, or the motion goes back in time.
@@ -109,11 +109,6 @@ def _plan(problem: Problem, max_transitions: int | None, sections: int = 0) -> t
     with jax.enable_x64(True):
         shapes = Shapes.from_system(problem.system, wide.layout, wide.params)
         r, d = shapes.rough.size, shapes.directions
-        if (watches := shapes.count + r + sections) > MOST_GUARDS:
-            raise ValueError(
-                f"{shapes.count} contacts, {r} of them with friction, and {sections} sections make {watches} watches, "
-                f"and {MOST_GUARDS} are possible: one for each, and one more with friction. MuJoCo takes more."
-            )
         if problem.system.impacts == "poisson" and r and (shapes.count, d) != (1, 1):
             raise ValueError(
                 "With friction impacts='poisson' is for one contact in a plane: leave out slip, or take Newton's law, "

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine.taylor import (
-    MOST_GUARDS,
     Line,
     Surfaces,
     Tolerances,
@@ -192,7 +191,7 @@ def _arrange(scene: SearchedScene, found: Found, row, played: Played, inputs: tu
 
 
 def scene_of(plan: ContactPlan, layout: Layout, params: PyTree, times: int) -> SearchedScene:
-    """The scene for parameters of this structure and so many outputs. Raises `ValueError` for too many watches."""
+    """The scene for parameters of this structure and so many outputs."""
     flat = Flat.from_system(plan.scene.system, layout, params)
     inside = InContact(params, opened(flat))
     numbers = vector_of(eqx.filter(inside, eqx.is_array_like))
@@ -215,11 +214,6 @@ def _make_scene(
     places, shapes, n = RowPlaces.from_derivation(derivation, flat), flat.shapes, derivation.layout.size
     corners = corners_of(derivation, places.all, shapes)
     turns, r, d, k = 0 if corners is None else len(corners.touch), flat.rough.size, shapes.directions, shapes.count
-    if (watches := k + r + 2 * turns + len(sections)) > MOST_GUARDS:
-        raise ValueError(
-            f"The contacts, with {turns} corners of their gaps, make {watches} watches, and {MOST_GUARDS} are "
-            "possible: one a contact, one more with friction, two a corner. A table (jnp.interp) is one corner."
-        )
     watched = turns, sections, ways, code, structure, single
     surfaces = {
         "HELD": _watches(derivation, scene, *watched),
@@ -239,7 +233,8 @@ def _make_scene(
         lines["SIDE_SLOPES"] = lines["SIDES"].forward
     sizes = {
         "N": n, "K": k, "R": r, "D": d, "GAPS": flat.gap_count, "CORNERS": turns, "SECTIONS": len(sections),
-        "WATCHES": watches, "NUMBERS": inputs - 2 * n - 1 - doing, "INPUTS": inputs, "TIMES": times, "DOING": doing,
+        "WATCHES": k + r + 2 * turns + len(sections), "NUMBERS": inputs - 2 * n - 1 - doing, "INPUTS": inputs,
+        "TIMES": times, "DOING": doing,
         "MOST": most, "LAW": LAWS.index(scene.system.impacts), "SINGLE": int(single), "HEIGHT": len(places.all),
         "MAY_MISS": int(not {op for op, _, _ in surfaces["OPEN"].values.line.nodes} <= _SEEN),
         "MULTIPLIERS_COUNT": len(derivation.multipliers.line.outputs),

@@ -453,21 +453,20 @@ def is_ahead(output: float, t: float, first: float) -> bool:
 @loop
 def finish(
     scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, record: Entry, found: Floats, y_end: Floats,
-    t_end: float, event: int, result: int, accepted: float, rejected: float, room: Room
+    t_end: float, fell: Floats, event: int, result: int, accepted: float, rejected: float, room: Room
 ):  # fmt: skip
     """Take a stretch, its outputs `found` (T + 2, 2n) and its end: what the contacts do there, and a row of the record.
 
-    `event` is the mask of the watches that fell or rose, `result` that of a run without one.
+    `fell` (G,) says which watches fell or rose, if it is an `event`; `result` is that of a run without one.
     """
     n, k, total, times, x = scene.n, scene.k, scene.watches, scene.times, member.x
-    row, fell, doing = record[int(member.rounds) * scene.row :], room.fell, scene.doing
+    row, doing = record[int(member.rounds) * scene.row :], scene.doing
     deciding, start, begun = total - scene.sections, x[2 * n], x[2 * n + 1 + scene.numbers :]
     for i in range(scene.row):
         row[i] = 0.0
     happens, decides, first = event > 0, False, deciding
-    for g in range(total):
-        fell[g], event = float(event % 4), event // 4
-        decides = decides or (g < deciding and fell[g] > 0)
+    for g in range(deciding):
+        decides = decides or (happens and fell[g] > 0)
     if not happens and result == SUCCESSFUL:
         t_end = ts[times - 1]
     at_once = t_end == start
@@ -1194,7 +1193,8 @@ def follow_stretch(
     given_y, given_numbers = job[count * outputs :], job[count * (outputs + states) :]
     found = given_numbers[count * numbers :]
     y_end, t_end = found[count * outputs * states :], found[count * (outputs + 1) * states :]
-    code, steps, rejected, left = t_end[count:], t_end[2 * count :], t_end[3 * count :], t_end[4 * count :]
+    code, steps, rejected, fell = t_end[count:], t_end[2 * count :], t_end[3 * count :], t_end[4 * count :]
+    left = fell[count * scene.watches :]
     plan, rest = scene.open_many, scene.open_many_rest
     if held > 0:
         plan, rest = scene.held_many, scene.held_many_rest
@@ -1214,13 +1214,14 @@ def follow_stretch(
     if plan == 0:
         return
     integrate(
-        scene.begin, plan, job, given_y, given_numbers, found, y_end, t_end, code, steps, rejected, left, count, outputs
-    )
+        scene.begin, plan, job, given_y, given_numbers, found, y_end, t_end, code, steps, rejected, fell, left, count,
+        outputs
+    )  # fmt: skip
     undone = left[rest - 1] != 0
     for i in range(count):
         m = int(places[i])
         mine, result = memory[m * size :], int(code[i])
-        sound = result == SUCCESSFUL or result >= EVENT
+        sound = result == SUCCESSFUL or result == EVENT
         for j in range(states):
             sound = sound and isfinite(y_end[i * states + j])
         if undone or not sound:
@@ -1229,5 +1230,5 @@ def follow_stretch(
             finish(
                 scene, mine, ts[m * scene.stride :], path[m * times * states :], did[m * times * scene.doing :],
                 record[m * each :], found[i * outputs * states :], y_end[i * states :], t_end[i],
-                result - EVENT if result >= EVENT else 0, SUCCESSFUL, steps[i], rejected[i], room
+                fell[i * scene.watches :], int(result == EVENT), SUCCESSFUL, steps[i], rejected[i], room
             )  # fmt: skip

@@ -74,7 +74,6 @@ WORK = (
     "CHANGE",  # (n,), of velocities
     "CORNER", "PASSED", "OPENING",  # (3, corners), (corners,), (k,)
     "SHIFT", "LATER",  # (2n,), by how much the state and the time go beyond corners
-    "FELL",  # (G,), 1 for watches that fell, 2 for those that rose
     "FREE",  # for what is not named
     "ORDER", "JOBS",  # the members whose stretch comes next, and what the kernel is given and gives
 )  # fmt: skip

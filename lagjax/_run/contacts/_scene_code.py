@@ -202,7 +202,7 @@ class _Run:
         outputs, states = scene[at.TIMES] + 2, 2 * scene[at.N]
         numbers = scene[at.INPUTS] - states - 1 + 2 * scene[at.WATCHES]
         scene[at.JOBS] = scene[at.ORDER] + len(memory)
-        each = outputs + states + numbers + outputs * states + states + 4
+        each = outputs + states + numbers + outputs * states + states + 4 + scene[at.WATCHES]
         work = np.zeros(scene[at.JOBS] + len(memory) * each + scene[at.REST])
         ts = self.ts[members] if scene[at.STRIDE] else self.ts
         arrays = ts, self.path[members], self.did[members], self.record[members], memory, work
@@ -229,9 +229,17 @@ class _Run:
         happened = bool(done.result[0] == EVENT_OCCURRED)
         of_member = self.path[member], self.did[member], self.record[member]
         given = scene, memory, ts, *of_member, np.ascontiguousarray(done.path[0]), np.ascontiguousarray(done.y_end[0])
-        event, result = (int(done.event[0]), SUCCESSFUL) if happened else (0, int(done.result[0]))
+        result, fell = SUCCESSFUL if happened else int(done.result[0]), done.event[0].astype(float)
         steps = float(done.accepted[0]), float(done.rejected[0])
-        _loops().finish(*(x.ctypes.data for x in given), float(done.t_end[0]), event, result, *steps, work.ctypes.data)
+        _loops().finish(
+            *(x.ctypes.data for x in given),
+            float(done.t_end[0]),
+            fell.ctypes.data,
+            int(happened),
+            result,
+            *steps,
+            work.ctypes.data,
+        )
 
 
 class _Loops(NamedTuple):
@@ -306,7 +314,7 @@ def sizes_of_fields(sizes: dict[str, int]) -> dict[str, int]:
     fields |= dict.fromkeys(("VALUES", "RATES", "BEND", "IMPULSES", "APART", "HELD"), size)
     fields |= dict.fromkeys(("LARGEST", "SHIFT", "BEHIND", "OFFSET", "STOP"), 2 * n)
     fields |= dict.fromkeys(("X", "OPENED"), inputs) | dict.fromkeys(("DOUBTS", "DOUBTED"), 3)
-    fields |= dict.fromkeys(("FRESH", "KINDS", "STAYS", "FELL"), watches)
+    fields |= dict.fromkeys(("FRESH", "KINDS", "STAYS"), watches)
     fields |= dict.fromkeys(("ROUNDING", "RATE_ROUNDING"), 2 * watches) | dict.fromkeys(
         ("GUARDS", "WATCHED"), 5 * watches
     )

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine import Problem
-from lagjax._engine.taylor import MOST_GUARDS, Guarded, MachineCode, Surfaces, require_one_number
+from lagjax._engine.taylor import Guarded, MachineCode, Surfaces, require_one_number
 from lagjax._equations import Derivation, has_constraints, is_inconsistent
 from lagjax._interface import Function, Layout, accept, halves, present
 from lagjax._primitives import DOUBLE, SINGLE
@@ -111,11 +111,6 @@ class Mode(NamedTuple):
     @classmethod
     def from_problem(cls, name: str, problem: Problem, leaving: tuple[Transition, ...], numbers, targets) -> "Mode":
         """A mode that is ready to run. Raises `ValueError` where it has no machine code."""
-        if len(leaving) > MOST_GUARDS:
-            raise ValueError(
-                f"{len(leaving)} transitions leave the mode {name!r}, and {MOST_GUARDS} are possible: join the guards "
-                "of those that lead to the same mode, with jnp.minimum for instance."
-            )
         code, structure = jax.tree.flatten(eqx.filter(problem.params, eqx.is_array_like, inverse=True))
         try:
             if refusal := MachineCode().refuses(problem):

@@ -195,8 +195,7 @@ class _Rounds(NamedTuple):
         """One round in the mode of this `place` for members that are `here`, and whether a transition ended it."""
         mode, outset = self.modes[place], self._outset(place, guarded, before)
         noted = jnp.concatenate([outset.sides, _pick(before.memory.rate_rounding, self._places_of(mode))])
-        start, count = (before.t, before.y), len(mode.leaving)
-        stretch = Stretch.locate(mode.problem, mode.surfaces, start, self.ts, here, noted, count)
+        stretch = Stretch.locate(mode.problem, mode.surfaces, (before.t, before.y), self.ts, here, noted)
         located, covered, at_once, kinds = stretch.located, stretch.covers, stretch.at_once, stretch.kinds
         # One that the motion was put beyond is no crossing: it happens when the mode begins, however that varies.
         put, k = outset.beyond & at_once, jnp.argmax(jnp.append(kinds, 0) > 0)
