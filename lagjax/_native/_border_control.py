@@ -30,6 +30,7 @@ from lagjax._program._jump import Jump, Nesting
 from lagjax._program._passes import eliminate_dead_code
 
 NOWHERE = 1e300  # a level that no switching number comes to
+_UNHELD = 1e6  # a share of a border that both sides do not push onto: those of others are near 0 … 1
 _AT_END = 16.0  # roundings of the time by which the end of a motion may miss an instant and is still taken to be there
 
 
@@ -583,7 +584,7 @@ class BorderControl:
                     frame.assign(where, self.motion.parameters + guard.slide, params=0.0)
 
     def _decide_others(self, frame: Frame, going: Value) -> None:
-        """Decide the pieces anew that touch no border, where one is crossed on which others depend."""
+        """Decide the pieces anew that touch no border and have left none, where one is crossed that others read."""
         if not self.borders.nested:
             return
         with frame.code.loop(self.pieces) as j:
@@ -591,7 +592,7 @@ class BorderControl:
         for j in self.borders.clocks:
             frame["stays", j] = 1.0
         for border in self.table.each(frame):
-            frame.assign(border.touch > Touch.NONE, border["piece"], stays=1)
+            frame.assign(frame.code.compare("!=", border.touch, float(Touch.NONE)), border["piece"], stays=1)
         self._decide_again(frame, going)
 
     def _take_beyond(self, frame: Frame, border: Border) -> None:
@@ -617,8 +618,7 @@ class BorderControl:
         frame.assign(hit, back, touch=code.select(border.has("on"), Touch.NONE, Touch.VALUE))
         with code.only_if(slide >= 0):
             below = code.select(border.piece < beyond, border.piece, beyond)
-            is_sign = code.lanes_of(border.rule("beyond").slope) <= 0.0
-            frame.assign(slides, place, params=code.select(is_sign, -1.0, below))
+            frame.assign(slides, place, params=code.select(border.is_sign, -1.0, below))
             frame.assign(slides, slide + self.motion.parameters, params=1)
             for g, touch in ((border.g, Touch.NONE), (back, Touch.NONE), (border["rest"], Touch.SLIDING)):
                 frame.assign(slides, g, touch=touch)
@@ -627,15 +627,22 @@ class BorderControl:
     def _leave(self, frame: Frame, border: Border, hit: Value, again: Value) -> None:
         """Let a sliding motion go on along one side, where its share of that side comes to 0 or 1.
 
-        The rate of u that was kept at zero is zero there after a slide, and not where it did not slide at all.
+        The rate of u that was kept at zero is zero there after a slide, and not where it did not slide at all. Where
+        both sides do not push onto the border, it goes on as the function is written at the border itself.
         """
         code, on = frame.code, Border(frame, self.table, border["on"])
         with code.only_if(on.g >= 0):
             order = code.lanes_of(code.as_double(on["order"]))
             gains = code.as_double(border["gains"])
-            frame.assign(hit, on["piece"] + self.motion.parameters, params=on.piece + gains)
+            share, below, level = self.motion.followed_value(frame, border["piece"]), on.piece, on.rule("level")
+            unheld = hit & (abs(share) > _UNHELD) & ~on.is_cone
+            toward_zero = (code.lanes_of(abs(level.below) + abs(level.above)) > 0.0) & (below < 0.0)
+            as_written = code.select(on.is_sign, 0.0, below + code.select(toward_zero, 0.0, 1.0))
+            place = on["piece"] + self.motion.parameters
+            frame.assign(hit, place, params=code.select(unheld, as_written, below + gains))
             frame.assign(hit, border["rest"], touch=Touch.NONE)
             on.remember(hit, touch=code.select(again, order, order + Touch.VALUE))
+            on.remember(unheld, touch=Touch.CONTINUES)
             if self.borders.releases:  # the vector of a cone has been given a length beyond its level
                 on.remember(hit & on.is_cone, touch=Touch.NONE)
 

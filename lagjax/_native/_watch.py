@@ -46,7 +46,7 @@ class Touch(IntEnum):
 
     Numbers between count the rates that are zero, and one for the value. A root that is there already is none to be
     found, and rounding must not make one of it. A guard that `CONTINUES` was zero at the end of the last step, and is
-    so still if it has not jumped.
+    so still if it has not jumped; a border is as it is written, since both sides do not push onto it.
     """
 
     CONTINUES = -1
@@ -147,6 +147,11 @@ class Border(Watch):
         if not self.table.groups:
             return is_first
         return is_first | (self.table.crosses(self.frame, Crossed.GUARD) & (self.recall("joins") > 0.0))
+
+    @property
+    def is_sign(self) -> Value:
+        """True, in all lanes, if this is the guard of a sign, or of a cone."""
+        return self.code.lanes_of(self.rule("beyond").slope) <= 0.0
 
     @property
     def is_cone(self) -> Value:

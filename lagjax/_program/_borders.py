@@ -20,6 +20,7 @@ power that is not whole begins right at a border, as in max(q, 0)**1.5, there is
 a border is no piece but a feature, and a step that is to pass it begins next to it.
 """
 
+import functools
 import math
 from collections.abc import Callable, Container, Sequence
 from dataclasses import dataclass
@@ -758,7 +759,7 @@ class _Rewriting:
         vanish = np.array([search.find_zeros(pieces, i, self._levels) for i in line.outputs], bool).T
         graph = Graph(_LARGEST * len(nodes) + 1000)
         args = line, self.program.size, self.switches, self.kinds, self.tables
-        places = _copy_deciding(graph, *args, lambda j, piece: piece)
+        places = _copy_deciding(graph, *args, lambda j, piece, _: piece)
         sides = [self._side(graph, j, places) for j in pieces]
         return FoundCorners(eliminate_dead_code(graph, sides), jumps, vanish)
 
@@ -910,10 +911,10 @@ class _Rewriting:
 
         return level
 
-    def _rate(self, graph: Graph, nodes: list[int], slide: Slide) -> int:
-        """u̇ of a border, in a graph in which those of the program are `nodes`."""
+    def _rate(self, graph: Graph, nodes: list[int], j: int) -> int:
+        """u̇ of the switching number of piece j, in a graph in which the nodes of the program are `nodes`."""
         n, line = self.size, StraightLine(tuple(self.graph.nodes), tuple(self.graph.kinds), ())
-        slopes = gradient_in(graph, line, nodes, self.switches[slide.piece], range(2 * n + 1))
+        slopes = gradient_in(graph, line, nodes, self.switches[j], range(2 * n + 1))
         velocities = [graph.input(n + i, "float") for i in range(n)]
         return graph.apply("add", dot(graph, slopes[:n], velocities), slopes[2 * n])
 
@@ -926,13 +927,29 @@ class _Rewriting:
         """
         graph, first = Graph(2 * self.graph.budget), self.program.size
 
-        def decide_or_keep(j: int, piece: int) -> int:
-            stays = graph.apply("gt", graph.input(first + count + j, "float"), graph.constant(0.5, "float"))
-            return graph.apply("select", stays, piece, graph.input(first + j, "float"))
+        def stays(j: int) -> int:
+            return graph.apply("gt", graph.input(first + count + j, "float"), graph.constant(0.5, "float"))
+
+        def decide_or_keep(j: int, piece: int, _) -> int:
+            return graph.apply("select", stays(j), piece, graph.input(first + j, "float"))
 
         line = StraightLine(tuple(self.graph.nodes), tuple(self.graph.kinds), ())
-        nodes = _copy_deciding(graph, line, first, self.switches, self.kinds, self.tables, decide_or_keep)
         goes_on, zero, one = [], graph.constant(0.0, "float"), graph.constant(1.0, "float")
+
+        def decide_ahead(way: float, j: int, piece: int, nodes: list[int]) -> int:
+            """The piece forward or back in time, of what is at its border and has a rate there."""
+            if self.kinds[j] == SIGN:
+                ahead = graph.apply("sign", graph.apply("mul", graph.number(way), self._rate(graph, nodes, j)))
+                piece = graph.apply("select", graph.apply("eq", piece, zero), piece, ahead)
+            return decide_or_keep(j, piece, nodes)
+
+        def copy(decide: Callable) -> list[int]:
+            return _copy_deciding(graph, line, first, self.switches, self.kinds, self.tables, decide)
+
+        nodes = copy(decide_or_keep)
+        signs = {piece for piece, kind in zip(self.pieces, self.kinds, strict=True) if kind == SIGN}
+        nested = any(slide.order > 1 and _below(line, [self.switches[slide.piece]]) & signs for slide in slides)
+        sides = [copy(functools.partial(decide_ahead, way)) for way in (1.0, -1.0)] if nested else [nodes]
         pieces = [nodes[i] for i in self.pieces]
         for k, slide in enumerate(slides):
             flag = graph.input(first + len(self.pieces) + k, "float")
@@ -945,12 +962,12 @@ class _Rewriting:
                 x, lower = nodes[self.switches[slide.piece]], graph.apply("sub", piece, one)
                 begins, is_lower = (graph.apply("eq", x, slide.level(graph, i)) for i in (lower, piece))
                 begins, below = graph.apply("or", begins, is_lower), graph.apply("select", is_lower, lower, piece)
-                stays = graph.apply(
-                    "gt", graph.input(first + count + slide.piece, "float"), graph.constant(0.5, "float")
-                )
-                begins = graph.apply("and", begins, graph.apply("not", stays))
+            if not slide.parts:  # a border that the motion has left does not hold it
+                begins = graph.apply("and", begins, graph.apply("not", stays(slide.piece)))
             if slide.order > 1:
-                begins = graph.apply("and", begins, graph.apply("eq", self._rate(graph, nodes, slide), zero))
+                for side in sides:
+                    rests = graph.apply("eq", self._rate(graph, side, slide.piece), zero)
+                    begins = graph.apply("and", begins, rests)
             goes_on.append(graph.apply("select", begins, flag, one))
             pieces[slide.piece] = graph.apply("select", begins, pieces[slide.piece], below)
         for j, kind in enumerate(self.kinds):  # what cannot rest moves
@@ -1108,7 +1125,7 @@ def distances(found: Borders) -> StraightLine:
     """The differences of all switching numbers from the nearest level of their piece; of the inputs but the pieces."""
     line, first = found.program.line, found.program.size - len(found.switches)
     graph, results = Graph(_LARGEST * len(line.nodes) + 1000), []
-    places = _copy_deciding(graph, line, first, found.switches, found.kinds, found.tables, lambda j, piece: piece)
+    places = _copy_deciding(graph, line, first, found.switches, found.kinds, found.tables, lambda j, piece, _: piece)
     for switch, kind, located in zip(found.switches, found.kinds, found.tables, strict=True):
         x, level = places[switch], graph.constant(0.0, "float")
         if located is not None:
@@ -1127,16 +1144,19 @@ def distances(found: Borders) -> StraightLine:
 
 
 def _copy_deciding(
-    graph: Graph, line: StraightLine, first: int, switches, kinds, tables, decide: Callable[[int, int], int]
+    graph: Graph, line: StraightLine, first: int, switches, kinds, tables, decide: Callable[[int, int, list[int]], int]
 ) -> list[int]:
-    """The nodes of a line with pieces, its inputs from number `first` on, in a graph; piece j is `decide(j, piece)`."""
+    """The nodes of a line with pieces, its inputs from number `first` on, in a graph.
+
+    Piece j is `decide(j, piece, nodes)`, of the piece that it is as it is written.
+    """
     of_inputs = {node[2]: kind for node, kind in zip(line.nodes, line.kinds, strict=True) if node[0] == "input"}
 
     def find_input(i: int, nodes: list[int]) -> int:
         j = i - first
         if j < 0:
             return graph.input(i, of_inputs[i])
-        return decide(j, _raw(graph, kinds[j], nodes[switches[j]], tables[j]))
+        return decide(j, _raw(graph, kinds[j], nodes[switches[j]], tables[j]), nodes)
 
     return copy_nodes(graph, line, find_input)
 

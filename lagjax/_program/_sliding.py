@@ -183,7 +183,7 @@ class _SlidingForces:
             unknown = self._add(unknown, more)
             z = self._add(z, [self._dot(of, more) for of in _transpose(responses, len(z))])
         z = held.hold(z, rates)
-        shares = [self._share(k, unknown, slopes, rates, all_pushed[k], z) for k in range(len(self.slides))]
+        shares = [self._share(k, unknown, slopes, rates, all_pushed[k], z, effects) for k in range(len(self.slides))]
         directions = [
             self.f("select", p, self.f("neg", x), y) for p, x, y in zip(pushed, missing, unknown, strict=True)
         ]
@@ -352,7 +352,7 @@ class _SlidingForces:
                 return True
         return False
 
-    def _share(self, k: int, unknown: Sequence[int], slopes: Sequence, rates: Sequence, pushed: int, z) -> int:
+    def _share(self, k: int, unknown: Sequence[int], slopes, rates, pushed: int, z, effects) -> int:
         """The share of the upper side: μ/2, and far beyond 0 or 1 where both sides do not push.
 
         Of a cone, which holds up to a length of 1, it is what is left of the square of that, of 1/4: never 1.
@@ -363,7 +363,8 @@ class _SlidingForces:
         if self.slides[k].parts:
             left = f("sub", self.one, dot(self.graph, mu, mu))
             return f("select", pushed, self.number(-FAR), f("mul", self.number(0.25), left))
-        moves = f("sub", self._dot(slopes[rows[0]], z), rates[rows[0]])
+        moves, own = f("sub", self._dot(slopes[rows[0]], z), rates[rows[0]]), effects[rows[0]].get(rows[0], self.zero)
+        moves = f("select", f("eq", moves, self.zero), moves, own)  # at rest below, the side above alone moves
         beyond = f("select", self.flags[k], half, f("add", half, f("mul", self.number(FAR), moves)))
         return f("select", pushed, beyond, f("mul", half, mu[0]))
 

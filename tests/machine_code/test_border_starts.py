@@ -177,3 +177,57 @@ def test_what_has_come_to_rest_stays_there():
     params = jnp.array([0.7, 1.1])  # it stops after v²/2 (g + μ)
     np.testing.assert_allclose(end(params, 1e8), 0.5 / 1.8, rtol=1e-12)
     np.testing.assert_allclose(jax.grad(end)(params, 1e8), -0.5 / 1.8**2 * np.ones(2), rtol=1e-9)
+
+
+# A law, where it is at rest, and 2 (q(1) − q(0)): both sides do not push onto the border, and the law is as it is
+# written there, or moves on to where it is as it is written beyond.
+LAWS = [
+    (lambda q: jnp.where(q >= 0, 1.0, -1.0), 0.0, 1.0),
+    (lambda q: jnp.where(q > 0, 1.0, -1.0), 0.0, -1.0),
+    (lambda q: jnp.where(q >= 1, 1.0, 0.0), 1.0, 1.0),
+    (lambda q: jnp.where(q > 1, 1.0, 0.0), 1.0, 0.0),
+    (lambda q: jnp.where(q >= 0, 0.0, -1.0), 0.0, 0.0),
+    (lambda q: jnp.sign(q), 0.0, 0.0),
+    (lambda q: jnp.heaviside(q, 1.0), 0.0, 1.0),
+    (lambda q: jnp.heaviside(q, 0.5), 0.0, 1.0),
+    (lambda q: jnp.floor(q), 0.0, 0.0),
+    (lambda q: 2 + jnp.floor(q), -1.0, 1.0),
+    (lambda q: jnp.ceil(q), 0.0, 0.0),
+    (lambda q: jnp.ceil(q), -1.0, -1.0),
+    (lambda q: jnp.trunc(q), 1.0, 1.0),
+    (lambda q: jnp.trunc(q), -1.0, -1.0),
+    (lambda q: -jnp.floor(q), 1.0, 0.0),  # pushed onto it from both sides
+    (lambda q: jnp.array([0.0, 1.0, 1.0])[q.astype(int)], 1.0, 1.0),
+]
+
+
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_a_law_that_jumps_is_as_it_is_written_where_a_motion_begins_at_rest(dtype):
+    """Compiles one motion."""
+    with jax.enable_x64(dtype == np.float64):
+        system = lagjax.System(
+            lambda q, v: 0.5 * v @ v, forces=lambda q, v: jnp.stack([f(q[i]) for i, (f, *_) in enumerate(LAWS)])
+        )
+        starts, moves = np.array([[start, moved] for _, start, moved in LAWS], dtype).T
+        run = lagjax.simulate(system, starts, 0 * starts, np.array([0.0, 1.0], dtype))
+    np.testing.assert_allclose(2 * (run.q[-1] - starts), moves, atol=100 * np.finfo(dtype).eps)
+
+
+TIES = {
+    "max |q|": (lambda q: jnp.max(jnp.abs(q)), [1.0, 0.3, -0.2], [0.5, 0.3, -0.2]),
+    "max": (lambda q: jnp.max(q), [0.0, 1.0, 0.0], [0.0, 0.5, 0.0]),
+    "−max": (lambda q: -jnp.max(q), [1.0, 0.0, 0.5], [1.5, 0.0, 0.5]),
+    "min |q|": (lambda q: jnp.min(jnp.abs(q)), [1.0, -0.3, 2.0], [1.0, 0.04, 2.0]),
+    "|max|": (lambda q: jnp.abs(jnp.max(q)), [1.0, 0.3, 0.2], [0.5, 0.3, 0.2]),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("potential", TIES)
+@pytest.mark.parametrize("way", [1.0, -1.0])
+def test_a_tie_that_a_motion_leaves_does_not_hold_it(potential, way):
+    """Compiles one motion, forwards and back: one border reads what is decided at another one, all at q = 0."""
+    V, speeds, ends = TIES[potential]
+    run = lagjax.simulate(
+        lagjax.System(lambda q, v: 0.5 * v @ v - V(q)), np.zeros(3), way * np.array(speeds), way * np.array([0.0, 1.0])
+    )
+    np.testing.assert_allclose(run.q[-1], ends, atol=1e-12)
