@@ -370,28 +370,26 @@ class Derivation:
 
         return lower_formula(multipliers, *self.scalar_shapes, budget=OPERATION_BUDGET)
 
-    def impact_response(self, rows: tuple[int, ...], states: int) -> Program:
+    def impact_response(self, rows: tuple[int, ...], states: int, free: "Derivation") -> Program:
         """The response to impulses at K `rows` of G: G, G M⁻¹ (K, n), G M⁻¹ Gᵀ (K, K), values, rates, G q̈ − γ (K,).
 
-        The last `states` parameters say what is held. G is that where everything is, q̈ that where nothing is; M⁻¹
-        leaves the other constraints as they are.
+        The last `states` parameters say what is held, and G is that where everything is. The motion where nothing is,
+        with q̈ and M⁻¹, which leaves the other constraints as they are, is that of `free`.
         """
         key = "impact_response", *map(str, rows)
         if key in self._programs:
             return self._programs[key]
-        system, solve = self._system(_VELOCITY_STEP)
-        n, m = self.layout.size, self.shape("jacobian")[0]
-        parts, acceleration = self.program("jacobian", "residual", "rates", "gamma"), self.acceleration
+        system, solve = free._system(_VELOCITY_STEP)
+        n, (m, _), (others, _) = self.layout.size, self.shape("jacobian"), free.shape("jacobian")
+        parts, acceleration = self.program("jacobian", "residual", "rates", "gamma"), free.acceleration
 
         def response(*scalars):
-            first = scalars[: len(scalars) - states]
-            held, free = (*first, *[0.0 * scalars[0] + 1.0] * states), (*first, *[0.0 * scalars[0]] * states)
-            values, factors = parts.vector(*held), system(*free)[3]
+            values = parts.vector(*scalars[: len(scalars) - states], *[0.0 * scalars[0] + 1.0] * states)
+            factors, accelerations = system(*scalars)[3], acceleration.vector(*scalars)[:n]
             gradients = [values[n * i : n * (i + 1)] for i in rows]
-            moved = [solve(factors, scatter(row, np.arange(n), n + m))[:n] for row in gradients]
-            free = acceleration.vector(*free)[:n]
+            moved = [solve(factors, scatter(row, np.arange(n), n + others))[:n] for row in gradients]
             residuals, rates, gammas = (values[[(n + part) * m + i for i in rows]] for part in range(3))
-            bends = multiply(gradients, [free]) - gammas
+            bends = multiply(gradients, [accelerations]) - gammas
             return concatenate([*gradients, *moved, multiply(gradients, moved), residuals, rates, bends])
 
         self._programs[key] = lower_formula(response, *self.scalar_shapes, budget=OPERATION_BUDGET)
@@ -549,6 +547,14 @@ class Derivation:
         """x of a linear system, and then whether it is singular."""
         system, solve = self._system(saddle, regular_only)
         return lower_solution(system, solve, self.layout.size, *self.scalar_shapes, budget=OPERATION_BUDGET)
+
+    @_lowered_once
+    def lacks_elimination(self) -> str | None:
+        """Why its accelerations are not solved for on scalars, as the end of a sentence; None where they are."""
+        try:
+            self._system(_ACCELERATION)
+        except Unlowerable as why:
+            return str(why)
 
     def _system(self, saddle: _Saddle, regular_only: bool = False) -> tuple[Callable, Callable]:
         """A z = r with z = (x, −λ), as two functions of scalars.

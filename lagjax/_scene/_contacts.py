@@ -232,7 +232,9 @@ class Shapes(NamedTuple):
         if isinstance(value, dict) and isinstance(tree, dict):
             if unknown := [name for name in value if name not in tree]:
                 raise ValueError(f"{role} names {unknown[0]!r}, and the contacts are {', '.join(map(repr, tree))}.")
-            parts = [_spread_over(leaf.shape, value.get(name, 0.0), role).ravel() for name, leaf in sorted(tree.items())]
+            parts = [
+                _spread_over(leaf.shape, value.get(name, 0.0), role).ravel() for name, leaf in sorted(tree.items())
+            ]
             return jnp.concatenate([*parts, none])
         if len(jax.tree.leaves(value)) != 1:
             raise TypeError(f"{role} must be a number for all contacts, or a dict by the names of the contacts.")

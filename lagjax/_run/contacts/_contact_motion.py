@@ -215,18 +215,19 @@ def _make_scene(
     corners = corners_of(derivation, places.all, shapes)
     turns, r, d, k = 0 if corners is None else len(corners.touch), flat.rough.size, shapes.directions, shapes.count
     watched = turns, sections, ways, code, structure, single
+    open_scene = ContactScene(scene.system, is_open=True)
+    doing, inputs = k + r + r * d + 1, len(derivation.scalar_shapes)
     surfaces = {
-        "HELD": _watches(derivation, scene, *watched),
-        "OPEN": _watches(open_derivation, ContactScene(scene.system, is_open=True), *watched),
+        "HELD": functools.partial(_watches, derivation, scene, *watched),
+        "OPEN": functools.partial(_watches, open_derivation, open_scene, *watched),
     }
     flows = {
-        kind: functools.partial(make_flow, of, scene.path, surfaces[kind].guards(remembers=True))
+        kind: lambda of=of, kind=kind: make_flow(of, scene.path, surfaces[kind]().guards(remembers=True))
         for kind, of in (("HELD", derivation), ("OPEN", open_derivation))
     }
-    doing, inputs = k + r + r * d + 1, derivation.acceleration.size
-    response = line_of(derivation.impact_response(places.all, doing))
+    response = line_of(derivation.impact_response(places.all, doing, open_derivation))
     bends = response.line.replace(outputs=response.line.outputs[-len(places.all) :][:k])
-    acceleration = line_of(derivation.acceleration, n)
+    acceleration = line_of((open_derivation if corners is None else derivation).acceleration, n)
     lines = {"RESPONSE": response, "BENDS": Line(bends, inputs, inputs).with_derivative, "ACCELERATION": acceleration}
     if corners is not None:
         lines["SIDES"] = line_of(corners.sides)
@@ -236,8 +237,8 @@ def _make_scene(
         "WATCHES": k + r + 2 * turns + len(sections), "NUMBERS": inputs - 2 * n - 1 - doing, "INPUTS": inputs,
         "TIMES": times, "DOING": doing,
         "MOST": most, "LAW": LAWS.index(scene.system.impacts), "SINGLE": int(single), "HEIGHT": len(places.all),
-        "MAY_MISS": int(not {op for op, _, _ in surfaces["OPEN"].values.line.nodes} <= _SEEN),
-        "MULTIPLIERS_COUNT": len(derivation.multipliers.line.outputs),
+        "MAY_MISS": int(not {op for op, _, _ in surfaces["OPEN"]().values.line.nodes} <= _SEEN),
+        "MULTIPLIERS_COUNT": derivation.shape("jacobian")[0],
     }  # fmt: skip
     touch = np.zeros((0, k)) if corners is None else corners.touch
     arrays = dict(zip(ARRAYS, (flat.rough, places.tangential, touch), strict=True))

@@ -73,7 +73,7 @@ class Replay:
 
     def __init__(self, code: SceneCode, make_flow: Callable):
         self._make_flow = functools.cache(make_flow)
-        self._watches, self._tolerances = code.surfaces["HELD"], code.tolerances
+        self._find_watches, self._tolerances = code.surfaces["HELD"], code.tolerances
         self._code, self._lines, self._sizes, self._rough = code, code.lines, code.sizes, code.arrays["ROUGH"]
 
     def __call__(self, ts, y0, vector, restitution, friction) -> tuple:
@@ -114,7 +114,7 @@ class Replay:
         times = jnp.concatenate([t[None], jnp.where(ahead, ts, begun), ts[-1:]])
         numbers = jnp.concatenate([vector, row.did])
         event = end, row.stop, row.watch.astype(int), row.crosses > 0
-        of_flow = self._make_flow(), self._watches, self._tolerances
+        of_flow = self._make_flow(), self._find_watches(), self._tolerances
         path, *stop = run_stretch(*of_flow, times, y, numbers, *event)
         ended = self._end((*stop, vector, t, y, halves(y0)[1], restitution, friction), record)
         is_behind = np.isin(np.arange(ended.size), np.arange(*self._ends[5:7]))
@@ -157,7 +157,7 @@ class Replay:
         row, k = self._read(record), self._sizes["K"]
         crosses, decides, stays = row.crosses > 0, row.decides > 0, (row.happens > 0) & (row.crosses == 0)
         still, moving = ((*some[:2], jnp.append(some[2], row.did)) for some in (given[:3], given[3:]))
-        smooth, *moved = move_to_zero(self._watches, row.watch.astype(int), crosses, moving, still)
+        smooth, *moved = move_to_zero(self._find_watches(), row.watch.astype(int), crosses, moving, still)
         ends = zip(moved, moving[:2], strict=True)
         t, y = (jnp.where(stays, start, jnp.where(crosses, *end)) for start, end in zip((t, y), ends, strict=True))
         rows, vector = self.rows_at(t, y, given[5]), given[5]

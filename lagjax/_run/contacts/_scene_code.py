@@ -17,7 +17,7 @@ from jax.interpreters import mlir
 
 from lagjax._engine.taylor import Line, call_host, line_of, rate_errors
 from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL
-from lagjax._native import LARGEST_LINE, SINGLE_NOISE, compile_loops, cores, handler, make_once
+from lagjax._native import SINGLE_NOISE, compile_loops, cores, handler, make_once
 from lagjax._primitives import LinearMap, compute_on_host
 from lagjax._run.contacts import _contact_search
 from lagjax._run.contacts._contact_search import ASKS, GOING, NEW
@@ -45,7 +45,7 @@ class Found(NamedTuple):
 class SceneCode:
     """The machine code of a scene of these `sizes` and `arrays` (see `_places`); it is known by identity.
 
-    Where contacts are closed ("HELD") and where all are "OPEN", `flows` make the flow, and `surfaces` are the watches.
+    Where contacts are closed ("HELD") and where all are "OPEN", `flows` make the flow, and `surfaces` the watches.
     `lines` do not depend on that; `multipliers` makes the line of those.
     """
 
@@ -77,7 +77,7 @@ class SceneCode:
 
     def add_kind(self, scene: np.ndarray, kind: str, many: bool) -> None:
         """Add to a scene the kernel and the watches of closed contacts, or of open ones."""
-        surfaces, flow = self.surfaces[kind], self.flows[kind]()
+        surfaces, flow = self.surfaces[kind](), self.flows[kind]()
         count = len(surfaces.directions)
         lines = {
             f"{kind}_WATCH": line_of(surfaces.complete, 4 * count),
@@ -99,8 +99,7 @@ class SceneCode:
 
     def _add_codes(self, scene: np.ndarray, lines: dict[str, Line]) -> None:
         for name, of in lines.items():
-            code = of.code if len(of.line.nodes) <= LARGEST_LINE else None
-            keep, address = _call_numpy(of) if code is None else (code, code.address)
+            keep, address = _call_numpy(of) if of.code is None else (of.code, of.code.address)
             self._keep.append(keep)
             scene[getattr(at, name)] = address
 
@@ -144,7 +143,7 @@ class SceneCode:
 
 
 def _call_numpy(line: Line) -> tuple[Any, int]:
-    """A function that evaluates a line by NumPy, called as machine code is, and its address: for tables, long lines."""
+    """A function that evaluates a line by NumPy, called as machine code is, and its address: for tables."""
 
     def evaluate(x: int, out: int, _rows: int) -> None:
         given, found = (
