@@ -5,7 +5,7 @@ One handler serves all lines: the attribute of a call is where the machine code 
 
 import ctypes
 import functools
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from llvmlite import ir
@@ -65,32 +65,43 @@ def _split(line: StraightLine, inputs: int) -> Iterator[tuple[StraightLine, list
 
     Beside each the places of its outputs: of those that later parts need, then below zero those of the line, −1 − k.
     """
-    size, last_use, wanted = len(line.nodes), {}, {}
+    last_use, at_once, size = {}, [], len(line.nodes)
+    given = [op in ("input", "constant") for op, _, _ in line.nodes]
+    wanted = [[] for _ in line.nodes]
     for k, i in enumerate(line.outputs):
         if not _is_zero(line, k):
-            wanted.setdefault(i, []).append(-1 - k)
+            (at_once if given[i] else wanted[i]).append((i, -1 - k) if given[i] else -1 - k)
     for i in reversed(range(size)):
-        if i in wanted or i in last_use:
+        if wanted[i] or i in last_use:
             for j in line.nodes[i][1]:
                 last_use.setdefault(j, i)
+    for begin in range(0, len(at_once), _PART):
+        yield _select(line, inputs, range(0), at_once[begin : begin + _PART])
     for begin in range(0, size, _PART):
-        end, nodes, kinds, at = min(begin + _PART, size), [], [], {}
+        own = [i for i in range(begin, min(begin + _PART, size)) if not given[i] and (wanted[i] or i in last_use)]
+        lasting = ((i, [i] if last_use.get(i, 0) >= begin + _PART else []) for i in own)
+        yield _select(line, inputs, own, [(i, to) for i, needed in lasting for to in needed + wanted[i]])
 
-        def place(i, begin=begin, nodes=nodes, kinds=kinds, at=at):
-            if i not in at:
-                op, operands, attribute = line.nodes[i]
-                if i < begin and op not in ("input", "constant"):
-                    op, operands, attribute = "input", (), inputs + i
-                operands = tuple(map(place, operands))
-                at[i] = len(nodes)
-                nodes.append((op, operands, attribute))
-                kinds.append(line.kinds[i])
-            return at[i]
 
-        own = [i for i in range(begin, end) if i in wanted or line.nodes[i][0] not in ("input", "constant")]
-        found = [(place(i), to) for i in own for to in [i] * (last_use.get(i, 0) >= end) + wanted.get(i, [])]
-        if found:
-            yield StraightLine(tuple(nodes), tuple(kinds), tuple(i for i, _ in found)), [to for _, to in found]
+def _select(line: StraightLine, inputs: int, own: Sequence[int], found: list) -> tuple[StraightLine, list[int]]:
+    """The nodes that are a part's `own` as a line, with the outputs that are `found` (node, place)."""
+    nodes, kinds, at, own_too = [], [], {}, set(own)
+
+    def place(i: int) -> int:
+        if i not in at:
+            op, operands, attribute = line.nodes[i]
+            if operands and i not in own_too:
+                op, operands, attribute = "input", (), inputs + i
+            here = tuple(map(place, operands))
+            at[i] = len(nodes)
+            nodes.append((op, here, attribute))
+            kinds.append(line.kinds[i])
+        return at[i]
+
+    for i in own:
+        place(i)
+    places = tuple(place(i) for i, _ in found)
+    return StraightLine(tuple(nodes), tuple(kinds), places), [to for _, to in found]
 
 
 def _write_part(module: ir.Module, sincos: Code | None, inputs: int, line: StraightLine, places: list[int]) -> Code:

@@ -721,19 +721,22 @@ def meet(scene: Scene, member: Member, meets: Floats, row: Entry, room: Room) ->
 def reach(scene: Scene, meets: Floats, found: Floats, room: Room):
     """Put the contacts that touch and that an impulse at those that meet reaches, one through the other."""
     k, r, d, coupling, rough = scene.k, scene.r, scene.d, room.coupling, scene.rough
-    size, touches = k + r * d, room.touches
+    size, touches, reached, done, count = k + r * d, room.touches, room.free, 0, 0
     copy(meets, found, k)
-    for _ in range(k - 1):
-        more = False
-        for a in range(size):
-            for b in range(size):
-                i, j = a if a < k else rough[(a - k) // d], b if b < k else rough[(b - k) // d]
-                if found[j] > 0 and found[i] == 0 and touches[i] > 0 and touches[j] > 0:
+    for i in range(k):
+        if meets[i] > 0 and touches[i] > 0:
+            reached[count] = float(i)
+            count += 1
+    while done < count:
+        for b in range(size):
+            if (b if b < k else rough[(b - k) // d]) == int(reached[done]):
+                for a in range(size):
+                    i = a if a < k else rough[(a - k) // d]
                     own = sqrt(abs(coupling[a * size + a])) * sqrt(abs(coupling[b * size + b]))
-                    if abs(coupling[a * size + b]) > LINKED * own:
-                        found[i], more = 1.0, True
-        if not more:
-            break
+                    if found[i] == 0 and touches[i] > 0 and abs(coupling[a * size + b]) > LINKED * own:
+                        found[i], reached[count] = 1.0, float(i)
+                        count += 1
+        done += 1
 
 
 @loop
