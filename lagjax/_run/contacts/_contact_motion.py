@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine.taylor import (
-    Line,
     Surfaces,
     Tolerances,
     line_of,
@@ -225,10 +224,10 @@ def _make_scene(
         kind: lambda of=of, kind=kind: make_flow(of, scene.path, surfaces[kind]().guards(remembers=True))
         for kind, of in (("HELD", derivation), ("OPEN", open_derivation))
     }
-    response = line_of(derivation.impact_response(places.all, doing, open_derivation))
-    bends = response.line.replace(outputs=response.line.outputs[-len(places.all) :][:k])
+    response = derivation.impact_response(places.all, doing, open_derivation)
+    bends = response.select_outputs(range(len(response.line.outputs))[-len(places.all) :][:k])
     acceleration = line_of((open_derivation if corners is None else derivation).acceleration, n)
-    lines = {"RESPONSE": response, "BENDS": Line(bends, inputs, inputs).with_derivative, "ACCELERATION": acceleration}
+    lines = {"RESPONSE": line_of(response), "BENDS": line_of(bends).with_derivative, "ACCELERATION": acceleration}
     if corners is not None:
         lines["SIDES"] = line_of(corners.sides)
         lines["SIDE_SLOPES"] = lines["SIDES"].forward
