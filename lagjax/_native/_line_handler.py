@@ -5,25 +5,26 @@ One handler serves all lines: the attribute of a call is where the machine code 
 
 import ctypes
 import functools
-from collections.abc import Iterator, Sequence
+import math
+from typing import Any
 
 import numpy as np
 from llvmlite import ir
 
+from lagjax._native._constants import LARGEST_LINE
 from lagjax._native._handler import call, compile_handler, load_at, make_once
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value, compile_module
 from lagjax._native._lanes import emit, sincos_function
 from lagjax._program._series import StraightLine
 
-# Operations of a function, for LLVM takes the square of their number. Measured with 800 and 8000 operations: 0.3 s each
-# thousand; doubled, a quarter more, and calls take as long.
-_PART = 400
+_SET_ROWS = "set_rows"
 
 
 class LineCode:
     """A straight line of `inputs` floats in machine code, for as long as this object lives.
 
-    At its `address` is `evaluate(x, out, rows)`, with x (rows, inputs) and out (rows, outputs). Raises `Unlowerable`.
+    At its `address` is `evaluate(x, out, rows)`, with x (rows, inputs) and out (rows, outputs). A long line is a walk
+    along rows of integers, for which LLVM takes no longer. Raises `Unlowerable`.
     """
 
     def __init__(self, line: StraightLine, inputs: int):
@@ -31,21 +32,26 @@ class LineCode:
         module.triple = ""
         turns = any(op in ("sin", "cos") for op, _, _ in line.nodes)
         sincos = sincos_function(module, 1) if turns else None
-        parts = [_write_part(module, sincos, inputs, *part) for part in _split(line, inputs)]
+        filled = [k for k in range(outputs) if line.constant(k) != 0]
+        long = len(line.nodes) + len(filled) > LARGEST_LINE
+        write = _Walk(line, inputs, filled) if long else None
+        room = 1 if write is None else 2 ** math.ceil(math.log2(write.size))
         code = Code(module, "evaluate", [POINTER, POINTER, INTEGER], 1, public=True)
-        x, out, rows = code.arguments
-        zeros, room = (
-            any(_is_zero(line, k) for k in range(outputs)),
-            code.stack(len(line.nodes) if len(parts) > 1 else 1),
-        )
+        (x, out, rows), room = code.arguments, code.stack(room)
         with code.loop(rows) as row:
             here, there = code.element(x, row * inputs), code.element(out, row * outputs)
-            with code.loop(outputs if zeros else 0) as k:
+            with code.loop(outputs if len(filled) < outputs else 0) as k:
                 code.store(code.as_value(0.0, DOUBLE), code.element(there, k))
-            for part in parts:
-                code.call(part, here, there, room)
+            if write is not None:
+                write(code, sincos, here, there, room)
+            else:
+                _write_line(code, sincos, line, filled, here, there)
         code.finish()
-        self._engine, places = compile_module(module, ("evaluate",))
+        names = ("evaluate",) if write is None else ("evaluate", _SET_ROWS)
+        self._engine, places = compile_module(module, names)
+        if write is not None:
+            self._numbers = write.numbers
+            ctypes.CFUNCTYPE(None, ctypes.c_void_p)(places[_SET_ROWS])(self._numbers.ctypes.data)
         self.address, self._outputs = places["evaluate"], outputs
         self._evaluate = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(self.address)
 
@@ -56,66 +62,89 @@ class LineCode:
         return found
 
 
-def _is_zero(line: StraightLine, output: int) -> bool:
-    return line.constant(output) == 0
+def _write_line(code: Code, sincos: Code | None, line: StraightLine, filled: list[int], x: Value, out: Value) -> None:
+    """Write the outputs that are `filled` of a line, operation by operation."""
+    read = functools.cache(lambda i: code.load(code.element(x, i), code.vector))
+    line = line.replace(outputs=tuple(line.outputs[k] for k in filled))
+    for k, i, value in zip(filled, line.outputs, emit(code, line, read, sincos, None), strict=True):
+        number = code.as_number(value) if line.kinds[i] == "bool" else value
+        code.store(code.lanes_of(number), code.element(out, k))
 
 
-def _split(line: StraightLine, inputs: int) -> Iterator[tuple[StraightLine, list[int]]]:
-    """The line in parts: what comes from parts before stands behind the `inputs`, at the number of its node.
+class _Walk:
+    """A line as `numbers`: how many rows, constants and outputs, then these.
 
-    Beside each the places of its outputs: of those that later parts need, then below zero those of the line, −1 − k.
+    A row is the case of an operation, its operands and its result, places in a room of `size` doubles, where constants
+    and inputs stand first. Where nobody needs a number any more another one stands; an output is its place and there.
     """
-    last_use, at_once, size = {}, [], len(line.nodes)
-    given = [op in ("input", "constant") for op, _, _ in line.nodes]
-    wanted = [[] for _ in line.nodes]
-    for k, i in enumerate(line.outputs):
-        if not _is_zero(line, k):
-            (at_once if given[i] else wanted[i]).append((i, -1 - k) if given[i] else -1 - k)
-    for i in reversed(range(size)):
-        if wanted[i] or i in last_use:
-            for j in line.nodes[i][1]:
+
+    def __init__(self, line: StraightLine, inputs: int, filled: list[int]):
+        self.inputs, self.cases, last_use = (
+            inputs,
+            {},
+            dict.fromkeys((line.outputs[k] for k in filled), len(line.nodes)),
+        )
+        for i in reversed(range(len(line.nodes))):
+            for j in line.nodes[i][1] if i in last_use else ():
                 last_use.setdefault(j, i)
-    for begin in range(0, len(at_once), _PART):
-        yield _select(line, inputs, range(0), at_once[begin : begin + _PART])
-    for begin in range(0, size, _PART):
-        own = [i for i in range(begin, min(begin + _PART, size)) if not given[i] and (wanted[i] or i in last_use)]
-        lasting = ((i, [i] if last_use.get(i, 0) >= begin + _PART else []) for i in own)
-        yield _select(line, inputs, own, [(i, to) for i, needed in lasting for to in needed + wanted[i]])
-
-
-def _select(line: StraightLine, inputs: int, own: Sequence[int], found: list) -> tuple[StraightLine, list[int]]:
-    """The nodes that are a part's `own` as a line, with the outputs that are `found` (node, place)."""
-    nodes, kinds, at, own_too = [], [], {}, set(own)
-
-    def place(i: int) -> int:
-        if i not in at:
+        constants = [i for i, (op, _, _) in enumerate(line.nodes) if op == "constant" and i in last_use]
+        at, free, rows = {i: k for k, i in enumerate(constants)}, [], []
+        self.size = len(constants) + inputs
+        for i in sorted(last_use):
             op, operands, attribute = line.nodes[i]
-            if operands and i not in own_too:
-                op, operands, attribute = "input", (), inputs + i
-            here = tuple(map(place, operands))
-            at[i] = len(nodes)
-            nodes.append((op, here, attribute))
-            kinds.append(line.kinds[i])
-        return at[i]
+            if op == "input" and line.kinds[i] == "float":
+                at[i] = len(constants) + attribute
+            if i in at:
+                continue
+            own = (len(constants) + attribute,) if op == "input" else tuple(at[j] for j in operands)
+            kinds = *(line.kinds[j] for j in operands), line.kinds[i]
+            case = self.cases.setdefault((op, 0 if op == "input" else attribute, kinds), len(self.cases))
+            for j in set(operands):
+                if last_use[j] == i and at[j] >= len(constants) + inputs:
+                    free.append(at[j])
+            if not free:
+                free.append(self.size)
+                self.size += 1
+            at[i] = free.pop()
+            rows.append((case, at[i], *own, *[0] * (3 - len(own))))
+        found = [(k, at[line.outputs[k]]) for k in filled]
+        values = np.array([line.nodes[i][2] for i in constants], float).view(np.int64)
+        counts = len(rows), len(constants), len(found)
+        self.numbers = np.concatenate([np.array(x, np.int64).ravel() for x in (counts, rows, values, found)])
 
-    for i in own:
-        place(i)
-    places = tuple(place(i) for i, _ in found)
-    return StraightLine(tuple(nodes), tuple(kinds), places), [to for _, to in found]
-
-
-def _write_part(module: ir.Module, sincos: Code | None, inputs: int, line: StraightLine, places: list[int]) -> Code:
-    code = Code(module, module.get_unique_name("part"), [POINTER, POINTER, POINTER], 1)
-    x, out, room = code.arguments
-
-    @functools.cache
-    def read(i: int) -> Value:
-        return code.load(code.element(x, i) if i < inputs else code.element(room, i - inputs), code.vector)
-
-    for i, value, place in zip(line.outputs, emit(code, line, read, sincos, None), places, strict=True):
-        number = code.lanes_of(code.as_number(value) if line.kinds[i] == "bool" else value)
-        code.store(number, code.element(room, place) if place >= 0 else code.element(out, -1 - place))
-    return code.finish()
+    def __call__(self, code: Code, sincos: Code | None, x: Value, out: Value, room: Value) -> None:
+        """Write the walk."""
+        module = code.module
+        place: Any = ir.GlobalVariable(module, POINTER, "rows")
+        place.linkage, place.initializer = "internal", ir.Constant(POINTER, None)
+        begin = Code(module, _SET_ROWS, [POINTER], 1, public=True)
+        begin.builder.store(begin.arguments[0].it, place, align=8)
+        begin.finish()
+        table = code.load(Value(code, place), POINTER)
+        rows, constants, outputs = (code.load(code.element(table, i, INTEGER), INTEGER) for i in range(3))
+        first = rows * 5 + 3
+        with code.loop(constants) as i:
+            code.store(code.load(code.element(table, first + i), DOUBLE), code.element(room, i))
+        with code.loop(self.inputs) as i:
+            code.store(code.load(code.element(x, i), DOUBLE), code.element(room, constants + i))
+        with code.loop(rows) as i:
+            case, to, *places = (code.load(code.element(table, i * 5 + (3 + k), INTEGER), INTEGER) for k in range(5))
+            keys = list(self.cases)
+            for k in code.cases(case, range(len(keys))):
+                op, attribute, (*kinds, kind) = keys[k]
+                nodes = [("input", (), j) for j in range(len(kinds))]
+                if op != "input":
+                    nodes.append((op, tuple(range(len(kinds))), attribute))
+                else:
+                    nodes.append(("input", (), 0))
+                line = StraightLine(tuple(nodes), (*kinds, kind), (len(nodes) - 1,))
+                read = functools.cache(lambda j, at=places: code.load(code.element(room, at[j]), code.vector))
+                (value,) = emit(code, line, read, sincos, None)
+                code.store(code.lanes_of(code.as_number(value) if kind == "bool" else value), code.element(room, to))
+        with code.loop(outputs) as i:
+            pair = first + constants + i * 2
+            k, at = (code.load(code.element(table, pair + j, INTEGER), INTEGER) for j in range(2))
+            code.store(code.load(code.element(room, at), DOUBLE), code.element(out, k))
 
 
 @make_once

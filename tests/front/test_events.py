@@ -207,7 +207,7 @@ def test_which_of_thirty_events_ended_the_motion():
     """More than a whole number has bits: of what comes at the same instant all are named, under jit as well."""
     scene, ts = lagjax.System(lambda q, v: 0.5 * v**2), jnp.linspace(0.0, 40.0, 3)
     events = [lambda q, v, at=at: q - at for at in [*np.arange(35.0, 7.0, -1.0), 7.5, 7.5]]
-    follow = lambda start: lagjax.simulate(scene, start, 1.0, ts, event=events)  # noqa: E731
+    follow = lambda start: lagjax.simulate(scene, start, 1.0, ts, event=events)
     for run, t in ((follow(0.0), 7.5), (jax.jit(follow)(8.25), 0.75)):
         there = [bool(x) for x in run.event]
         np.testing.assert_array_equal(np.flatnonzero(there), [28, 29] if t == 7.5 else [26])
