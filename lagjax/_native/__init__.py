@@ -44,7 +44,6 @@ from lagjax._native._constants import (
     EVENT,
     GUARD_NOISE,
     INSTANT,
-    LARGEST_LINE,
     LEAST_ORDER,
     NOT_FINITE,
     OUT_OF_STEPS,

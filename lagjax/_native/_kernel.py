@@ -221,7 +221,7 @@ class Kernel:
         handler().begin(ctypes.addressof(plan), *arguments, *results, members, times, len(ts), len(params))
         path, y_end, *others, changes, rest = (block[begin:end] for begin, end in itertools.pairwise(ends))
         shaped = path.reshape(members, times, states), y_end.reshape(members, states)
-        return Begun(*shaped, *others, changes.reshape(members, guards), rest)
+        return Begun._make([*shaped, *others, changes.reshape(members, guards), rest])
 
     def vjp(self, ts, params, record: StepRecord, path_ct, y_ct) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The transposed derivative of a run, over the steps it wrote down.

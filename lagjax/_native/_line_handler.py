@@ -132,11 +132,8 @@ class _Walk:
             keys = list(self.cases)
             for k in code.cases(case, range(len(keys))):
                 op, attribute, (*kinds, kind) = keys[k]
-                nodes = [("input", (), j) for j in range(len(kinds))]
-                if op != "input":
-                    nodes.append((op, tuple(range(len(kinds))), attribute))
-                else:
-                    nodes.append(("input", (), 0))
+                nodes: list[Any] = [("input", (), j) for j in range(len(kinds))]
+                nodes.append((op, tuple(range(len(kinds))), attribute))
                 line = StraightLine(tuple(nodes), (*kinds, kind), (len(nodes) - 1,))
                 read = functools.cache(lambda j, at=places: code.load(code.element(room, at[j]), code.vector))
                 (value,) = emit(code, line, read, sincos, None)

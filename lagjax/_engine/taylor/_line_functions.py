@@ -27,7 +27,7 @@ from jax.core import ShapedArray
 from jax.interpreters import ad, mlir
 
 from lagjax._engine.taylor._call import NO_HANDLER, call_host, capsule
-from lagjax._native import LARGEST_LINE, LineCode, line_handler, make_once
+from lagjax._native import LineCode, line_handler, make_once
 from lagjax._primitives import LinearMap, compute_on_host
 from lagjax._program import Graph, Program, StraightLine, Unlowerable, copy_nodes, emit, lowers, pullback, pushforward
 
@@ -173,7 +173,7 @@ class _LineMap(LinearMap):
     def _lower_on_cpu(self, context, *arrays, line: Line):
         of, call = self.of(line), self._compile_operations
         if not context.module_context.lowering_parameters.for_export:  # where it runs elsewhere
-            code = of.code if len(of.line.nodes) <= LARGEST_LINE else None
+            code = of.code
             call = self._call_host if code is None else self._call_code
             if code is not None:
                 _register_handler()
