@@ -78,3 +78,17 @@ def test_a_long_line_is_what_its_operations_are():
     code, expected = LineCode(program.line, 20), program.line.evaluate(list(rows.T)).T
     assert len(program.line.nodes) > 2000
     np.testing.assert_allclose(code(rows), expected, rtol=1e-13, atol=1e-13)
+
+
+def test_long_runs_of_one_output_are_written_by_a_loop():
+    """As rows of contacts have: zeros beside a few numbers, and a number that is repeated."""
+
+    def rows(x):
+        repeated = jnp.broadcast_to(x[0] * x[1], (50,))
+        return jnp.concatenate([jnp.zeros(100), x[:1] > 0.5, jnp.zeros(40), repeated, x[1:], jnp.zeros(3)])
+
+    program = lower(rows, jnp.ones(3))
+    code = Line(program.line, 3, 3).code
+    assert code is not None
+    inputs = np.array([[0.3, 1.1, 0.4], [0.7, -2.0, 3.0]])
+    np.testing.assert_array_equal(code(inputs), [rows(x) for x in inputs])
