@@ -255,8 +255,8 @@ class Solution(NamedTuple):
     result: Int[Any, "*N"]  # how it ended, as the integer of a `lagjax.RESULTS`
     accepted: Int[Any, "*N"]  # steps
     rejected: Int[Any, "*N"]
-    # Of an event, which of its functions ended the motion, (*N, G); of guards, which of them changed sign at the end, a
-    # mask (`taylor.changes_of`).
+    # Of an event, which of its functions ended the motion, (*N, G); of guards, which of them changed sign at the end: 1
+    # where it fell, 2 where it rose, else 0.
     event: Any = None
     idle: Int[Any, ""] = None  # of a batch as a whole, the steps for which a lane was idle
 

@@ -44,13 +44,13 @@ from lagjax._program import (
     apply_function,
     borders,
     concatenate,
-    fold,
     is_smooth,
     lack_of_memory,
     lower,
     lower_formula,
     lower_scalars,
     lower_solution,
+    multiply,
     operations_that_fit,
     scatter,
     stack,
@@ -375,35 +375,27 @@ class Derivation:
 
         return lower_formula(multipliers, *self.scalar_shapes, budget=OPERATION_BUDGET)
 
-    def impact_response(self, rows: tuple[int, ...], states: int) -> Program:
+    def impact_response(self, rows: tuple[int, ...], states: int, free: "Derivation") -> Program:
         """The response to impulses at K `rows` of G: G, G M⁻¹ (K, n), G M⁻¹ Gᵀ (K, K), values, rates, G q̈ − γ (K,).
 
-        The last `states` parameters say what is held. G is that where everything is, q̈ that where nothing is; M⁻¹
-        leaves the other constraints as they are.
+        The last `states` parameters say what is held, and G is that where everything is. The motion where nothing is,
+        with q̈ and M⁻¹, which leaves the other constraints as they are, is that of `free`.
         """
         key = "impact_response", *map(str, rows)
         if key in self._programs:
             return self._programs[key]
-        system, solve = self._system(_VELOCITY_STEP)
-        n, m = self.layout.size, self.shape("jacobian")[0]
-        parts, acceleration = self.program("jacobian", "residual", "rates", "gamma"), self.acceleration
-        moves = ~self.absent("jacobian")[list(rows)]
-        touched = [np.flatnonzero(of_row if of_row.any() else ~of_row) for of_row in moves]
+        system, solve = free._system(_VELOCITY_STEP)
+        n, (m, _), (others, _) = self.layout.size, self.shape("jacobian"), free.shape("jacobian")
+        parts, acceleration = self.program("jacobian", "residual", "rates", "gamma"), free.acceleration
 
         def response(*scalars):
-            first = scalars[: len(scalars) - states]
-            held, free = (*first, *[0.0 * scalars[0] + 1.0] * states), (*first, *[0.0 * scalars[0]] * states)
-            values, factors = parts.vector(*held), system(*free)[3]
+            values = parts.vector(*scalars[: len(scalars) - states], *[0.0 * scalars[0] + 1.0] * states)
+            factors, accelerations = system(*scalars)[3], acceleration.vector(*scalars)[:n]
             gradients = [values[n * i : n * (i + 1)] for i in rows]
-            moved = [solve(factors, scatter(row, np.arange(n), n + m))[:n] for row in gradients]
-            along = [*moved, acceleration.vector(*free)[:n]]
-            products = [
-                [fold("add", row[some] * x[some]) for x in along] for row, some in zip(gradients, touched, strict=True)
-            ]
-            residuals, rates, gammas = ([values[(n + part) * m + i] for i in rows] for part in range(3))
-            couplings = [x for of_row in products for x in of_row[:-1]]
-            bends = [of_row[-1] - gamma for of_row, gamma in zip(products, gammas, strict=True)]
-            return concatenate([*gradients, *moved, stack([*couplings, *residuals, *rates, *bends])])
+            moved = [solve(factors, scatter(row, np.arange(n), n + others))[:n] for row in gradients]
+            residuals, rates, gammas = (values[[(n + part) * m + i for i in rows]] for part in range(3))
+            bends = multiply(gradients, [accelerations]) - gammas
+            return concatenate([*gradients, *moved, multiply(gradients, moved), residuals, rates, bends])
 
         self._programs[key] = lower_formula(response, *self.scalar_shapes, budget=OPERATION_BUDGET)
         return self._programs[key]
@@ -560,6 +552,14 @@ class Derivation:
         """x of a linear system, and then whether it is singular."""
         system, solve = self._system(saddle, regular_only)
         return lower_solution(system, solve, self.layout.size, *self.scalar_shapes, budget=OPERATION_BUDGET)
+
+    @_lowered_once
+    def lacks_elimination(self) -> str | None:
+        """Why its accelerations are not solved for on scalars, as the end of a sentence; None where they are."""
+        try:
+            self._system(_ACCELERATION)
+        except Unlowerable as why:
+            return str(why)
 
     def _system(self, saddle: _Saddle, regular_only: bool = False) -> tuple[Callable, Callable]:
         """A z = r with z = (x, −λ), as two functions of scalars.

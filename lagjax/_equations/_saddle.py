@@ -21,7 +21,6 @@ all that is left, at once.
 
 import functools
 import operator
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -186,23 +185,25 @@ class SaddleElimination:
         start = 0
         for j in self.order:
             rows = self.below[j]
-            if len(rows):
+            if len(rows) and xp.filled(z[j]):
                 z = xp.replace_entries(z, rows, z[rows] - lower[start : start + len(rows)] * z[j])
             start += len(rows)
-        z = z * inverse
-        for i, (columns, places) in reversed(list(zip(self.order, self._rows_of_lower(), strict=True))):
-            if len(columns):
+        there = np.flatnonzero(xp.filled(z))
+        z = xp.replace_entries(z, there, z[there] * inverse[there])
+        for i, (columns, places) in reversed(self._rows_of_lower):
+            if len(columns) and xp.filled(z[i]):
                 z = xp.replace_entries(z, columns, z[columns] - lower[places] * z[i])
         return z
 
-    def _rows_of_lower(self) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """The columns in which L has an entry in each row, in the order of elimination, and the entries' places."""
+    @functools.cached_property
+    def _rows_of_lower(self) -> list[tuple[int, tuple[np.ndarray, np.ndarray]]]:
+        """Each row, in the order of elimination, the columns in which L has an entry there, and the entries' places."""
         total, columns = len(self.order), {i: [] for i in self.order}
         for j in self.order:
             for i in self.below[j].tolist():
                 columns[i].append(j)
-        for i in self.order:
-            yield (before := np.array(columns[i], int)), self.slots[i, before] - total
+        of = {i: np.array(before, int) for i, before in columns.items()}
+        return [(i, (before, self.slots[i, before] - total)) for i, before in of.items()]
 
 
 class DraggedElimination:

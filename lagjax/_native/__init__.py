@@ -40,7 +40,6 @@ from lagjax._native import _gpu as gpu
 from lagjax._native._constants import (
     ATOL_OVER_MOTION,
     ATOL_OVER_RTOL,
-    CHANGE_BITS,
     DONE,
     EVENT,
     GUARD_NOISE,

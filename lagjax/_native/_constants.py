@@ -38,8 +38,7 @@ DIGITS = Digits(256 * EPS, 16 * EPS, 1e-6, 2.0**-400, 2.0**-960)
 
 DONE, OUT_OF_STEPS, STEP_TOO_SMALL, NOT_FINITE, SINGULAR, PROJECTION_FAILED, DISCONTINUOUS, EVENT = range(8)
 # The kernel itself does not give `DISCONTINUOUS`: `_stop_reason` finds it about the state where it stopped.
-# EVENT + a mask with `CHANGE_BITS` of each guard, the lowest of guard 0: how it changes at that instant (`Change`).
-RUNNING, CHANGE_BITS = -1, 2
+RUNNING = -1
 
 # ---- series ----------------------------------------------------------------------------------------------------------
 

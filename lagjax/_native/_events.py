@@ -46,9 +46,8 @@ class Events:
         piecewise = [max(inputs_below(program.line, [i]), default=-1) >= first_piece for i in outputs]
         holds = [*guards.holds, *[False] * self.count]
         self.can_jump = any(piecewise)
-        bits = [1 << limits.CHANGE_BITS * g for g in range(self.count)]
-        rows = list(zip(guards.directions, piecewise, holds, bits, strict=False))
-        self.table = Columns(motion.module, ("direction", "piecewise", "holds", "bits"), rows)
+        rows = list(zip(guards.directions, piecewise, holds, strict=False))
+        self.table = Columns(motion.module, ("direction", "piecewise", "holds"), rows)
         self.guard = self._guard()
         self.begin_sides = self._begin_sides()
         self.note = self._note() if self.notes else None
@@ -66,7 +65,7 @@ class Events:
             **{f"{name}_end": guards for name in MEMORY},  # these three where the step ends
             "met": guards,  # the `Change` at the start; 0 without any
             "root_at": guards,  # how far from the beginning of the step it changes
-            "change": guards,  # the `Change` there
+            "change": guards,  # the `Change` there; where the step ends there, 0 of those that come later
             **END_OF_STEP,
         }
 
@@ -215,13 +214,12 @@ class Events:
                 frame.call(self.step.projector.project)
 
     def _end_at_first(self, frame: Frame) -> None:
-        """The step ends at the earliest change, and the motion there; `event` tells of all at that instant."""
-        code, event = frame.code, frame.code.variable(frame.constant(0.0))
+        """The step ends at the earliest change, and the motion there; `change` tells of all at that instant."""
         happens = frame["first_at"] < float("inf")
         for watch in self.table.each(frame):
-            now = happens & (watch.recall("root_at") <= frame["first_at"] + frame["smallest"])
-            event.value += code.select(now, watch.recall("change") * watch.number("bits"), 0.0)
-        frame["event"] = code.select(happens, event.value, -1.0)
+            later = watch.recall("root_at") > frame["first_at"] + frame["smallest"]
+            watch.remember(later | ~happens, change=0.0)
+        frame["event"] = frame.code.select(happens, frame.constant(0.0), -1.0)
         frame.assign(happens, last=0.0, h=frame["first_at"] * frame["forward"])
 
     def _look(self) -> Code:
@@ -419,11 +417,14 @@ class Events:
                         frame.write("path", row + 1 + i, lane["between", i])
         return frame.finish()
 
-    def write_counts(self, frame: Frame, lane: Lane) -> None:
-        """Write, at the end of a member, the number of times each guard was noted behind its notes."""
+    def write_end(self, frame: Frame, lane: Lane) -> None:
+        """Write how each guard changes at the end of a member; or, behind its notes, how many there were."""
         with frame.code.loop(self.count) as g:
-            row = self._row(frame, lane["member"], g, frame.job("room_of_notes"))
-            frame.write("path", row, lane["noted", g])
+            if self.notes:
+                row = self._row(frame, lane["member"], g, frame.job("room_of_notes"))
+                frame.write("path", row, lane["noted", g])
+            else:
+                frame.write("changes", lane["member"] * self.count + g, lane["change", g])
 
     def _row(self, frame: Frame, member: Value, g: Value, number: Value) -> Value:
         rows = frame.job("room_of_notes") + 1

@@ -34,12 +34,15 @@ CACHE_LINE = 8  # doubles
 KINDS = {ctypes.c_void_p: POINTER, ctypes.c_int64: INTEGER, ctypes.c_double: DOUBLE}
 
 
-def job(name: str, pointers: tuple[str, ...], integers: tuple[str, ...], doubles: tuple[str, ...] = ()) -> type:
-    """The structure of what all threads work on: eight bytes for each field."""
+def job(
+    name: str, pointers: tuple[str, ...], integers: tuple[str, ...], doubles: tuple[str, ...] = (), *others: str
+) -> type:
+    """The structure of what all threads work on: eight bytes for each field; the `others` are pointers, too."""
     fields = [
         *((field, ctypes.c_void_p) for field in pointers),
         *((field, ctypes.c_int64) for field in integers),
         *((field, ctypes.c_double) for field in doubles),
+        *((field, ctypes.c_void_p) for field in others),
     ]
     return type(name, (ctypes.Structure,), {"_fields_": fields})
 

@@ -51,7 +51,7 @@ class Entry(NamedTuple):
 _SIZES = ("members", "times", "ts_stride", "params_stride", "max_steps")
 MOTION = Entry(
     ("ts", "y0", "params", "numbers", "next_member", "path"),
-    ("next_member", "path", "y_end", "t_end", "code", "steps", "rejected"),
+    ("next_member", "path", "y_end", "t_end", "code", "steps", "rejected", "changes"),
     (*_SIZES, "room_of_notes", "rtol", "atol"),
 )
 TRANSPOSE = Entry(

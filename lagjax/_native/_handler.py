@@ -101,15 +101,15 @@ def allocate_aligned(size: int) -> np.ndarray:
 
 
 ARGUMENTS: tuple[str, ...] = ("ts", "y0", "params")
-RESULTS: tuple[str, ...] = ("path", "y_end", "t_end", "code", "steps", "rejected", "rest")
+RESULTS: tuple[str, ...] = ("path", "y_end", "t_end", "code", "steps", "rejected", "changes", "rest")
 
 
 class Handler:
     """Two functions in machine code: `address` is where XLA's handler is.
 
     Its arguments are `ts` (1 or N, T), `y0` (N, 2n) and `params` (1 or N, P), its results `path` (N, T, 2n), `y_end`
-    (N, 2n), then `t_end`, `code`, `steps` and `rejected`, each (N,), and the `rest` of the run (`Rest.size`), all of
-    doubles. `path` is NaN where a member did not come.
+    (N, 2n), then `t_end`, `code`, `steps` and `rejected`, each (N,), the `changes` of guards (N, G), and the `rest` of
+    the run (`Rest.size`), all of doubles. `path` is NaN where a member did not come.
 
     `begin` does the same for Python: it takes the addresses of a plan, of the arguments and of the results, then N, T
     and how many rows `ts` and `params` have.

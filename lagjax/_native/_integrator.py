@@ -35,6 +35,7 @@ JOB = job(
     # Strides from one member to the next: 0 where all share the output times, or the parameters.
     ("ts_stride", "params_stride", "members", "times", "order", "max_steps", "room", "room_of_notes"),
     ("rtol", "atol"),
+    "changes",
 )
 
 
@@ -180,6 +181,6 @@ class Integrator:
                 code.store(code.load(idle, INTEGER) + 1, idle)
             with code.only_if((member >= 0) & (lane["code"] >= 0.0)):
                 self.output.write_end(frame, lane, states=not self.notes)
-                if self.events is not None and self.notes:
-                    self.events.write_counts(frame, lane)
+                if self.events is not None:
+                    self.events.write_end(frame, lane)
                 frame.call(self.start_next, j)

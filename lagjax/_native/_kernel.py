@@ -50,6 +50,7 @@ class Outcome(NamedTuple):
     code: np.ndarray  # (N,), how it ended
     steps: np.ndarray  # (N,)
     rejected: np.ndarray  # (N,), steps that were too long
+    changes: np.ndarray  # (N, G), how each guard changes where an event ended a member (`Change`)
     idle: int  # steps for which lanes were idle
     table: np.ndarray | None
     complete: np.ndarray | None  # (N,), whether all steps of a member are there, Σ steps of such members before it on
@@ -73,6 +74,7 @@ class Begun(NamedTuple):
     code: Any
     steps: Any
     rejected: Any
+    changes: Any
     rest: Any
 
 
@@ -81,11 +83,11 @@ class Kernel:
 
     The outputs of the program are the n accelerations, then whether the mass matrix is singular. `projection` is
     applied to the state after every step, and to the outputs after the first. `guards`, again from the same inputs, end
-    the motion of a member with the code `EVENT` + a mask of bits (`CHANGE_BITS`); or they are noted and the motion goes
-    on: then there are notes in the place of states at output times. Errors are relative to each coordinate, or to the
-    largest one of those with the same number in `error_groups` (n,). The coordinates may be those of a motion with its
-    tangents (`nesting`); then `motion` is the program of the motion alone. Vectors have `width` lanes, by default those
-    of the processor. Raises `Unlowerable` where an operation has no Taylor series or is not one of doubles.
+    the motion of a member with the code `EVENT`; or they are noted and the motion goes on: then there are notes in the
+    place of states at output times. Errors are relative to each coordinate, or to the largest one of those with the
+    same number in `error_groups` (n,). The coordinates may be those of a motion with its tangents (`nesting`); then
+    `motion` is the program of the motion alone. Vectors have `width` lanes, by default those of the processor. Raises
+    `Unlowerable` where an operation has no Taylor series or is not one of doubles.
     """
 
     def __init__(
@@ -152,6 +154,11 @@ class Kernel:
         return self._guards is not None and self._guards.notes
 
     @property
+    def ending_guards(self) -> int:
+        """The number of guards that end a motion."""
+        return 0 if self._guards is None or self._notes else len(self._guards.directions)
+
+    @property
     def rest_size(self) -> int:
         """The doubles of the `rest` that a handler leaves behind."""
         return Rest.size(self._forward.layout)
@@ -179,19 +186,20 @@ class Kernel:
                 shape = len(guards.directions) * (room_of_notes + 1), self.states + 1
             path, y_end = np.full((members, *shape), np.nan), np.empty((members, self.states))
             t_end, code, steps, rejected = np.empty((4, members))
+            changes = np.zeros((members, self.ending_guards))
         else:
-            path, y_end, t_end, code, steps, rejected, rest = begun
+            path, y_end, t_end, code, steps, rejected, changes, rest = begun
             idle, _, more = Rest.counts(rest)
             if not more:
-                return _outcome(path, y_end, t_end, code, steps, rejected, idle)
+                return _outcome(path, y_end, t_end, code, steps, rejected, changes, idle)
         rest = None if begun is None else Rest.from_array(begun.rest, self._forward.layout)
         table, rows = None, np.zeros(1, np.int64)
         if room:  # the system provides pages when they are written to
             table = np.empty((room, self.states + RECORDED + self._forward.more))
         arrays = dict(
             next_member=np.zeros(1, np.int64) if rest is None else rest.next_member, ts=ts, y0=y0, params=params,
-            path=path, y_end=y_end, t_end=t_end, code=code, steps=steps, rejected=rejected, record=table,
-            next_row=rows,
+            path=path, y_end=y_end, t_end=t_end, code=code, steps=steps, rejected=rejected, changes=changes,
+            record=table, next_row=rows,
         )  # fmt: skip
         numbers = dict(
             **self._strides(ts, params), members=members, times=times, order=order or order_for(rtol),
@@ -199,19 +207,21 @@ class Kernel:
         )  # fmt: skip
         idle = self._forward(arrays, numbers, self.threads(members) if rest is None else 1, rest)
         table = None if table is None else table[: rows[0]]
-        return _outcome(path, y_end, t_end, code, steps, rejected, idle, table)
+        return _outcome(path, y_end, t_end, code, steps, rejected, changes, idle, table)
 
     def _begin_run(self, ts, y0, params, plan: Plan) -> Begun:
         """Run few members for a slice of time, by one call of machine code."""
         members, times, states = len(y0), ts.shape[1], self.states
-        block, ends = np.empty(members * (times * states + states + 4) + self.rest_size), [0]
-        for size in (members * times * states, members * states, *[members] * 4, self.rest_size):
+        guards = self.ending_guards
+        block, ends = np.empty(members * (times * states + states + 4 + guards) + self.rest_size), [0]
+        for size in (members * times * states, members * states, *[members] * 4, members * guards, self.rest_size):
             ends.append(ends[-1] + size)
         first, arguments = block.ctypes.data, (x.ctypes.data for x in (ts, y0, params))
         results = (first + 8 * end for end in ends[:-1])
         handler().begin(ctypes.addressof(plan), *arguments, *results, members, times, len(ts), len(params))
-        path, y_end, *others = (block[begin:end] for begin, end in itertools.pairwise(ends))
-        return Begun(path.reshape(members, times, states), y_end.reshape(members, states), *others)
+        path, y_end, *others, changes, rest = (block[begin:end] for begin, end in itertools.pairwise(ends))
+        shaped = path.reshape(members, times, states), y_end.reshape(members, states)
+        return Begun._make([*shaped, *others, changes.reshape(members, guards), rest])
 
     def vjp(self, ts, params, record: StepRecord, path_ct, y_ct) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """The transposed derivative of a run, over the steps it wrote down.
@@ -369,7 +379,7 @@ class _Compiled:
         return run_on_threads(work, threads)
 
 
-def _outcome(path, y_end, t_end, code, steps, rejected, idle: int, table=None) -> Outcome:
+def _outcome(path, y_end, t_end, code, steps, rejected, changes, idle: int, table=None) -> Outcome:
     """The results in the arrays of a finished run; NaN in the path where a member did not come."""
     ended_badly = code != DONE
     if ended_badly.any() and path.shape[2] == y_end.shape[1]:  # a start that is infinite was not reached either
@@ -377,7 +387,7 @@ def _outcome(path, y_end, t_end, code, steps, rejected, idle: int, table=None) -
         path[ended_badly] = np.where(reached, path[ended_badly], np.nan)
     code, steps, rejected = (numbers.astype(int) for numbers in (code, steps, rejected))
     recorded = (None, None) if table is None else _sort_by_member(table, steps)
-    return Outcome(path, y_end, t_end, code, steps, rejected, idle, *recorded)
+    return Outcome(path, y_end, t_end, code, steps, rejected, changes.astype(int), idle, *recorded)
 
 
 def _sort_by_member(table: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

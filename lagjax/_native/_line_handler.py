@@ -3,27 +3,28 @@
 One handler serves all lines: the attribute of a call is where the machine code of its line is.
 """
 
-import contextlib
 import ctypes
 import functools
-import itertools
+import math
+from typing import Any
 
 import numpy as np
 from llvmlite import ir
 
+from lagjax._native._constants import LARGEST_LINE
 from lagjax._native._handler import call, compile_handler, load_at, make_once
-from lagjax._native._ir import INTEGER, POINTER, Code, Value, compile_module
+from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value, compile_module
 from lagjax._native._lanes import emit, sincos_function
 from lagjax._program._series import StraightLine
 
-# Equal outputs, side by side, that are written out: LLVM takes 16 s for the 4000 zeros of a row of 2000 springs.
-_LONGEST = 32
+_SET_ROWS = "set_rows"
 
 
 class LineCode:
     """A straight line of `inputs` floats in machine code, for as long as this object lives.
 
-    At its `address` is `evaluate(x, out, rows)`, with x (rows, inputs) and out (rows, outputs). Raises `Unlowerable`.
+    At its `address` is `evaluate(x, out, rows)`, with x (rows, inputs) and out (rows, outputs). A long line is a walk
+    along rows of integers, for which LLVM takes no longer. Raises `Unlowerable`.
     """
 
     def __init__(self, line: StraightLine, inputs: int):
@@ -31,21 +32,26 @@ class LineCode:
         module.triple = ""
         turns = any(op in ("sin", "cos") for op, _, _ in line.nodes)
         sincos = sincos_function(module, 1) if turns else None
+        filled = [k for k in range(outputs) if line.constant(k) != 0]
+        long = len(line.nodes) + len(filled) > LARGEST_LINE
+        write = _Walk(line, inputs, filled) if long else None
+        room = 1 if write is None else 2 ** math.ceil(math.log2(write.size))
         code = Code(module, "evaluate", [POINTER, POINTER, INTEGER], 1, public=True)
-        x, out, rows = code.arguments
+        (x, out, rows), room = code.arguments, code.stack(room)
         with code.loop(rows) as row:
-            read = functools.cache(lambda i: code.load(code.element(x, row * inputs + i), code.vector))
-            values, begin = emit(code, line, read, sincos, None), 0
-            for node, alike in itertools.groupby(line.outputs):
-                number = code.as_number(values[begin]) if line.kinds[node] == "bool" else values[begin]
-                end = begin + len(list(alike))
-                long = end - begin > _LONGEST
-                for k in [code.loop(end, begin)] if long else map(contextlib.nullcontext, range(begin, end)):
-                    with k as place:
-                        code.store(code.lanes_of(number), code.element(out, row * outputs + place))
-                begin = end
+            here, there = code.element(x, row * inputs), code.element(out, row * outputs)
+            with code.loop(outputs if len(filled) < outputs else 0) as k:
+                code.store(code.as_value(0.0, DOUBLE), code.element(there, k))
+            if write is not None:
+                write(code, sincos, here, there, room)
+            else:
+                _write_line(code, sincos, line, filled, here, there)
         code.finish()
-        self._engine, places = compile_module(module, ("evaluate",))
+        names = ("evaluate",) if write is None else ("evaluate", _SET_ROWS)
+        self._engine, places = compile_module(module, names)
+        if write is not None:
+            self._numbers = write.numbers
+            ctypes.CFUNCTYPE(None, ctypes.c_void_p)(places[_SET_ROWS])(self._numbers.ctypes.data)
         self.address, self._outputs = places["evaluate"], outputs
         self._evaluate = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(self.address)
 
@@ -54,6 +60,88 @@ class LineCode:
         rows, found = np.ascontiguousarray(rows, float), np.empty((len(rows), self._outputs))
         self._evaluate(rows.ctypes.data, found.ctypes.data, len(rows))
         return found
+
+
+def _write_line(code: Code, sincos: Code | None, line: StraightLine, filled: list[int], x: Value, out: Value) -> None:
+    """Write the outputs that are `filled` of a line, operation by operation."""
+    read = functools.cache(lambda i: code.load(code.element(x, i), code.vector))
+    line = line.replace(outputs=tuple(line.outputs[k] for k in filled))
+    for k, i, value in zip(filled, line.outputs, emit(code, line, read, sincos, None), strict=True):
+        number = code.as_number(value) if line.kinds[i] == "bool" else value
+        code.store(code.lanes_of(number), code.element(out, k))
+
+
+class _Walk:
+    """A line as `numbers`: how many rows, constants and outputs, then these.
+
+    A row is the case of an operation, its operands and its result, places in a room of `size` doubles, where constants
+    and inputs stand first. Where nobody needs a number any more another one stands; an output is its place and there.
+    """
+
+    def __init__(self, line: StraightLine, inputs: int, filled: list[int]):
+        self.inputs, self.cases, last_use = (
+            inputs,
+            {},
+            dict.fromkeys((line.outputs[k] for k in filled), len(line.nodes)),
+        )
+        for i in reversed(range(len(line.nodes))):
+            for j in line.nodes[i][1] if i in last_use else ():
+                last_use.setdefault(j, i)
+        constants = [i for i, (op, _, _) in enumerate(line.nodes) if op == "constant" and i in last_use]
+        at, free, rows = {i: k for k, i in enumerate(constants)}, [], []
+        self.size = len(constants) + inputs
+        for i in sorted(last_use):
+            op, operands, attribute = line.nodes[i]
+            if op == "input" and line.kinds[i] == "float":
+                at[i] = len(constants) + attribute
+            if i in at:
+                continue
+            own = (len(constants) + attribute,) if op == "input" else tuple(at[j] for j in operands)
+            kinds = *(line.kinds[j] for j in operands), line.kinds[i]
+            case = self.cases.setdefault((op, 0 if op == "input" else attribute, kinds), len(self.cases))
+            for j in set(operands):
+                if last_use[j] == i and at[j] >= len(constants) + inputs:
+                    free.append(at[j])
+            if not free:
+                free.append(self.size)
+                self.size += 1
+            at[i] = free.pop()
+            rows.append((case, at[i], *own, *[0] * (3 - len(own))))
+        found = [(k, at[line.outputs[k]]) for k in filled]
+        values = np.array([line.nodes[i][2] for i in constants], float).view(np.int64)
+        counts = len(rows), len(constants), len(found)
+        self.numbers = np.concatenate([np.array(x, np.int64).ravel() for x in (counts, rows, values, found)])
+
+    def __call__(self, code: Code, sincos: Code | None, x: Value, out: Value, room: Value) -> None:
+        """Write the walk."""
+        module = code.module
+        place: Any = ir.GlobalVariable(module, POINTER, "rows")
+        place.linkage, place.initializer = "internal", ir.Constant(POINTER, None)
+        begin = Code(module, _SET_ROWS, [POINTER], 1, public=True)
+        begin.builder.store(begin.arguments[0].it, place, align=8)
+        begin.finish()
+        table = code.load(Value(code, place), POINTER)
+        rows, constants, outputs = (code.load(code.element(table, i, INTEGER), INTEGER) for i in range(3))
+        first = rows * 5 + 3
+        with code.loop(constants) as i:
+            code.store(code.load(code.element(table, first + i), DOUBLE), code.element(room, i))
+        with code.loop(self.inputs) as i:
+            code.store(code.load(code.element(x, i), DOUBLE), code.element(room, constants + i))
+        with code.loop(rows) as i:
+            case, to, *places = (code.load(code.element(table, i * 5 + (3 + k), INTEGER), INTEGER) for k in range(5))
+            keys = list(self.cases)
+            for k in code.cases(case, range(len(keys))):
+                op, attribute, (*kinds, kind) = keys[k]
+                nodes: list[Any] = [("input", (), j) for j in range(len(kinds))]
+                nodes.append((op, tuple(range(len(kinds))), attribute))
+                line = StraightLine(tuple(nodes), (*kinds, kind), (len(nodes) - 1,))
+                read = functools.cache(lambda j, at=places: code.load(code.element(room, at[j]), code.vector))
+                (value,) = emit(code, line, read, sincos, None)
+                code.store(code.lanes_of(code.as_number(value) if kind == "bool" else value), code.element(room, to))
+        with code.loop(outputs) as i:
+            pair = first + constants + i * 2
+            k, at = (code.load(code.element(table, pair + j, INTEGER), INTEGER) for j in range(2))
+            code.store(code.load(code.element(room, at), DOUBLE), code.element(out, k))
 
 
 @make_once

@@ -65,10 +65,12 @@ def evaluate(address: int, x: np.ndarray, out: np.ndarray) -> None:
     call(x.ctypes.data, out.ctypes.data, 1)
 
 
-def integrate(begin, plan, ts, y0, numbers, path, y_end, t_end, code, steps, rejected, rest, members, times) -> None:
+def integrate(
+    begin, plan, ts, y0, numbers, path, y_end, t_end, code, steps, rejected, changes, rest, members, times
+) -> None:
     """Run a kernel by its plan, with a row of times and of numbers for each member (`_handler.Handler.begin`)."""
-    arrays = ts, y0, numbers, path, y_end, t_end, code, steps, rejected, rest
-    kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 11, *[ctypes.c_int64] * 4)
+    arrays = ts, y0, numbers, path, y_end, t_end, code, steps, rejected, changes, rest
+    kind = ctypes.CFUNCTYPE(None, *[ctypes.c_void_p] * 12, *[ctypes.c_int64] * 4)
     kind(int(begin))(int(plan), *(x.ctypes.data for x in arrays), members, times, members, members)
 
 
@@ -501,7 +503,7 @@ class _Writer:
 
     def call_integrate(self, node, begin, plan, *given):
         arrays, (members, times) = [x.it for _, x in given[:-2]], [x.it for _, x in given[-2:]]
-        kind = ir.FunctionType(ir.VoidType(), [POINTER] * 11 + [INTEGER] * 4)
+        kind = ir.FunctionType(ir.VoidType(), [POINTER] * 12 + [INTEGER] * 4)
         place = self.builder.inttoptr(begin[1].it, kind.as_pointer())
         to_plan = self.builder.inttoptr(plan[1].it, POINTER)
         call = self.builder.call(place, [to_plan, *arrays, members, times, members, members])

@@ -27,7 +27,7 @@ END_OF_STEP: Fields = {
     "nearest": 1,  # the first border, as a part of it
     "seen": 1,  # up to which part of the step all guards can be seen
     "first_at": 1,  # how far from the beginning of the step the first change of a guard is
-    "event": 1,  # the mask of the changes of guards, a whole number; −1 without any
+    "event": 1,  # 0 where changes of guards end the motion, −1 without any
 }
 
 

@@ -65,7 +65,7 @@ from lagjax._program._memory import lack_of_memory, machine_memory, operations_t
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, factor, sink_negations
 from lagjax._program._rounding import rounding
-from lagjax._program._scalars import Scalars, absolute, apply_function, concatenate, fold, scatter, stack
+from lagjax._program._scalars import Scalars, absolute, apply_function, concatenate, fold, multiply, scatter, stack
 from lagjax._program._series import LinearSystem, series
 from lagjax._program._sliding import MOST_COUPLED, eliminate, sparse_row, substitute
 from lagjax._program.lowering import _complex

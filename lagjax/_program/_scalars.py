@@ -93,6 +93,22 @@ def scatter(x: Scalars, index, size: int) -> Scalars:
     return replace_entries(Scalars(x.expansion, zeros), index, x)
 
 
+def filled(x: Scalars) -> np.ndarray:
+    """True for the entries that are not zero as they are derived."""
+    return x.ids != x.expansion.graph.number(0.0)
+
+
+def multiply(a: Sequence[Scalars], b: Sequence[Scalars]) -> Scalars:
+    """The inner products of vectors a with vectors b, one row after the other: of few entries, as most are zero."""
+    rows, columns = (np.stack([filled(x) for x in xs]) for xs in (a, b))
+    found = scatter(a[0][:0], np.zeros(0, int), len(a) * len(b))
+    meet = rows.astype(float) @ columns.T.astype(float) > 0
+    for i, j in np.argwhere(meet).tolist():
+        at = np.flatnonzero(rows[i] & columns[j])
+        found.ids[i * len(b) + j] = fold("add", a[i][at] * b[j][at]).ids
+    return found
+
+
 def stack(parts: Sequence) -> Scalars:
     """Scalars as a vector, or vectors as the rows of a matrix."""
     first = _first(parts)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine import Problem, Solution
-from lagjax._engine.taylor import MOST_GUARDS, MachineCode, Noted, Surfaces, surfaces_of
+from lagjax._engine.taylor import MachineCode, Noted, Surfaces, surfaces_of
 from lagjax._equations import has_constraints, require_consistent
 from lagjax._interface import (
     RESULTS,
@@ -220,8 +220,6 @@ def sections_of(section) -> tuple[tuple[str, ...] | None, tuple]:
         return None, (accept(section, "section"),)
     if not section:
         raise ValueError("section is an empty dict: give a function, or a dict of functions by name.")
-    if len(section) > MOST_GUARDS:
-        raise ValueError(f"There are {len(section)} sections, and a run watches {MOST_GUARDS}: divide them among runs.")
     return tuple(section), tuple(accept(function, f"section[{name!r}]") for name, function in section.items())
 
 

@@ -725,3 +725,59 @@ def test_what_rests_at_zero_is_lifted():
     aloft, omega = jnp.maximum(ts - (weights[:, None] + 0.07) / 3, 0.0), np.sqrt(0.7 / 0.3)
     assert run.ok.all()
     np.testing.assert_allclose(run.q, 3 / 0.7 * (aloft - jnp.sin(omega * aloft) / omega), atol=1e-8)
+
+
+def exchange(starts, speeds, restitution, end, wall=np.inf):
+    """Where equal beads in a row, of one length, are at the end: from collision to collision, of two each."""
+    q, v, t = np.array(starts, float), np.array(speeds, float), 0.0
+    while True:
+        closing = v[:-1] - v[1:]
+        with np.errstate(divide="ignore", invalid="ignore"):
+            times = np.where(closing > 0, (q[1:] - q[:-1] - 0.5) / closing, np.inf)
+        first = int(np.argmin(times))
+        if t + times[first] > end:
+            return q + v * (end - t), v
+        t, q = t + times[first], q + v * times[first]
+        mean, half = 0.5 * (v[first] + v[first + 1]), 0.5 * restitution * closing[first]
+        v[first], v[first + 1] = mean - half, mean + half
+
+
+@pytest.mark.parametrize("restitution", [1.0, 0.9])
+def test_thirty_beads_in_a_row(restitution):
+    """Equal ones that do not lose energy exchange velocities; more contacts than a whole number has bits."""
+    n, rng = 30, np.random.default_rng(3)
+    row = lagjax.System(
+        lambda q, v: 0.5 * jnp.sum(v**2), contacts=lambda q: q[1:] - q[:-1] - 0.5, restitution=lambda params: params
+    )
+    start, speeds = np.arange(n) + rng.uniform(-0.2, 0.2, n), rng.normal(size=n)
+    run = lagjax.simulate(row, start, speeds, np.array([0.0, 1.5]), restitution, max_transitions=1024)
+    q, v = exchange(start, speeds, restitution, 1.5)
+    np.testing.assert_allclose(run.q[-1], q, atol=1e-12)
+    np.testing.assert_allclose(run.qdot[-1], v, atol=1e-12)
+    if restitution == 1:
+        np.testing.assert_allclose(np.sort(run.qdot[-1]), np.sort(speeds), atol=1e-12)
+
+
+def test_beads_that_do_not_rebound_share_their_momentum():
+    n = 40
+    row = lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2), contacts=lambda q: q[1:] - q[:-1] - 0.5)
+    run = lagjax.simulate(row, np.arange(n) * 1.0, np.eye(n)[0], np.array([0.0, 1000.0]))
+    moving = 0.5 * np.arange(1, n)  # k beads take 0.5 k for the next gap
+    np.testing.assert_allclose(run.impacts.t[: n - 1], np.cumsum(moving), rtol=1e-12)
+    np.testing.assert_allclose(run.qdot[-1], np.full(n, 1 / n), atol=1e-14)
+
+
+def test_derivatives_of_thirty_contacts():
+    """The last bead of a row that passes a blow on has a speed in closed form, ((1 + e)/2)ⁿ⁻¹."""
+    n = 26
+    row = lagjax.System(
+        lambda q, v: 0.5 * jnp.sum(v**2), contacts=lambda q: q[1:] - q[:-1] - 0.5, restitution=lambda params: params
+    )
+
+    def last(e):
+        return lagjax.simulate(row, jnp.arange(n) * 1.0, jnp.eye(n)[0], jnp.array([0.0, 20.0]), e).qdot[-1, -1]
+
+    e, blows = 0.95, n - 1
+    value, slope = jax.value_and_grad(last)(e)
+    np.testing.assert_allclose(value, ((1 + e) / 2) ** blows, rtol=1e-12)
+    np.testing.assert_allclose(slope, blows / 2 * ((1 + e) / 2) ** (blows - 1), rtol=1e-10)

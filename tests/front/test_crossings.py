@@ -321,6 +321,15 @@ def test_more_crossings_than_room():
         jax.block_until_ready(jax.jit(lambda k: lagjax.crossings(OSCILLATOR, height, 1.0, 0.0, ts, k, count=3).t)(1.0))
 
 
+def test_thirty_sections_in_one_run():
+    """More than a whole number has bits: a mass that moves by cos t comes to each height at its arc cosine."""
+    heights = np.linspace(-0.9, 0.9, 30)
+    sections = {f"{k:02d}": lambda q, v, height=height: q - height for k, height in enumerate(heights)}
+    found = lagjax.crossings(OSCILLATOR, sections, 1.0, 0.0, jnp.array([0.0, 3.0]), 1.0, count=1)
+    times = [float(found[name].t[0]) for name in sorted(sections)]
+    np.testing.assert_allclose(times, np.arccos(heights), atol=1e-11)
+
+
 def test_a_motion_that_fails():
     wall = lagjax.System(lambda q, v: 0.5 * v**2 - jnp.sqrt(q))
     with pytest.raises(lagjax.SimulationError, match="NaN or infinite"):

@@ -203,6 +203,18 @@ def test_bits_of_events_do_not_depend_on_neighbours():
     np.testing.assert_array_equal(*runs)
 
 
+def test_which_of_thirty_events_ended_the_motion():
+    """More than a whole number has bits: of what comes at the same instant all are named, under jit as well."""
+    scene, ts = lagjax.System(lambda q, v: 0.5 * v**2), jnp.linspace(0.0, 40.0, 3)
+    events = [lambda q, v, at=at: q - at for at in [*np.arange(35.0, 7.0, -1.0), 7.5, 7.5]]
+    follow = lambda start: lagjax.simulate(scene, start, 1.0, ts, event=events)
+    for run, t in ((follow(0.0), 7.5), (jax.jit(follow)(8.25), 0.75)):
+        there = [bool(x) for x in run.event]
+        np.testing.assert_array_equal(np.flatnonzero(there), [28, 29] if t == 7.5 else [26])
+        assert abs(run.end.t - t) < 1e-12
+    assert abs(jax.grad(lambda start: follow(start).end.t)(0.0) + 1.0) < 1e-12
+
+
 def test_the_result_says_which_of_several_events_ended_the_motion():
     scene, ts = lagjax.System(lambda q, v: 0.5 * v**2), jnp.linspace(0.0, 10.0, 3)
     event = {"far": lambda q, v: q - 3.0, "near": lambda q, v: q - 2.0, "held": lambda q, v: q < -1.0}

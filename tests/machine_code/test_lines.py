@@ -7,6 +7,7 @@ import pytest
 from sweeps import sweep
 
 from lagjax._engine.taylor._line_functions import Line
+from lagjax._native import LineCode
 from lagjax._program import lower
 
 
@@ -60,6 +61,23 @@ def test_a_root_bends_where_its_argument_stands_still():
         lambda f: jax.jacrev(jax.jacrev(f))(x),
     ):
         np.testing.assert_allclose(derivative(line), derivative(root), atol=1e-14)
+
+
+def test_a_long_line_is_what_its_operations_are():
+    """Beyond the border machine code walks along rows; NumPy evaluates the same operations."""
+
+    def steps(x):
+        y, whole = x, jnp.arange(20)
+        for k in range(25):
+            turned, up = jnp.sin(0.3 * y) * jnp.roll(y, 1), y > 0.1 * k
+            whole = jnp.where(up, whole + k, whole // 2) ^ 3
+            y = 0.3 * (turned + jnp.where(up & (y < 2.0), jnp.exp(-y), jnp.sqrt(abs(y)))) + 0.2 * jnp.cos(y) ** 3
+        return jnp.concatenate([y, jnp.zeros(3), y > 0.2, jnp.array([2.5]), x[:2], whole + 0.0])
+
+    program, rows = lower(steps, jnp.zeros(20)), np.random.default_rng(0).normal(size=(5, 20))
+    code, expected = LineCode(program.line, 20), program.line.evaluate(list(rows.T)).T
+    assert len(program.line.nodes) > 2000
+    np.testing.assert_allclose(code(rows), expected, rtol=1e-13, atol=1e-13)
 
 
 def test_long_runs_of_one_output_are_written_by_a_loop():

@@ -20,9 +20,7 @@ import numpy as np
 from lagjax._engine._problem import AbstractEngine, Batch, Problem, Solution, solve_in_doubles
 from lagjax._engine.taylor import _primitives
 from lagjax._engine.taylor._crossing import (
-    MOST_GUARDS,
     Noted,
-    changes_of,
     motion_to_event,
     motion_with_crossings,
     run_stretch,
@@ -179,11 +177,10 @@ class MachineCode(AbstractEngine):
 
 
 def _name_events(problem: Problem, solution: Solution) -> Solution:
-    """The solution with the functions of the event that ended the motion in place of the mask of guards."""
+    """The solution with which functions of the event ended the motion, in place of how they changed."""
     if problem.event is None:
         return solution
-    changes = changes_of(solution.event[..., None], len(surfaces_of_event(problem).directions))
-    return solution._replace(event=(changes > 0) & (solution.result == EVENT_OCCURRED)[..., None])
+    return solution._replace(event=(solution.event > 0) & (solution.result == EVENT_OCCURRED)[..., None])
 
 
 def _run_one(flow: Flow, problem: Problem, tolerances: Tolerances) -> Solution:

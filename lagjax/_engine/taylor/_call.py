@@ -46,23 +46,21 @@ def run_by_handler(flow: Flow, tolerances: Tolerances, host: Callable, shapes, t
     kernel = flow.kernel.select_width(members)
     plan = kernel.plan(tolerances.rtol, tolerances.atol, tolerances.max_steps)
     rows, size = (members,), (kernel.rest_size,)
-    of_handler = [(members, ts.shape[1], states), (members, states), *[rows] * 4, size]
+    of_handler = [(members, ts.shape[1], states), (members, states), *[rows] * 4, (members, kernel.ending_guards), size]
     call = jax.ffi.ffi_call(_TARGET, [jax.ShapeDtypeStruct(shape, np.float64) for shape in of_handler])
     begun = call(ts, y0, params, plan=np.int64(ctypes.addressof(plan)))
     begun = _native.Begun(*vary_alike(begun, like=(ts, y0, params)))
 
-    def convert_results(ts, y0, params, path, y_end, t_end, code, steps, rejected, rest):
-        happened = code >= _native.EVENT
-        result = jnp.where(happened, EVENT_OCCURRED, SUCCESSFUL)
-        event = jnp.where(happened, code - _native.EVENT, 0.0)
-        return path, y_end, t_end, *(x.astype(int) for x in (result, steps, rejected, event))
+    def convert_results(ts, y0, params, path, y_end, t_end, code, steps, rejected, changes, rest):
+        result = jnp.where(code == _native.EVENT, EVENT_OCCURRED, SUCCESSFUL)
+        return path, y_end, t_end, *(x.astype(int) for x in (result, steps, rejected, changes))
 
     def continue_on_host(*arrays):
         # The callback lives as long as the compiled program, and with it what the handler needs.
         return call_host(lambda *arrays, _needed=(plan, kernel): host(*arrays), shapes, *arrays)
 
     more = jax.lax.bitcast_convert_type(begun.rest[-1], np.int64)
-    ended = (begun.code == _native.DONE) | (begun.code >= _native.EVENT)
+    ended = (begun.code == _native.DONE) | (begun.code == _native.EVENT)
     well = (more == 0) & jnp.all(ended) & jnp.all(jnp.isfinite(begun.y_end))
     return tuple(cond_alike(well, convert_results, continue_on_host, ts, y0, params, *begun))
 

@@ -22,12 +22,10 @@ from lagjax._engine.taylor._flow import Flow, Tolerances
 from lagjax._engine.taylor._surfaces import Surfaces, crossing_variation, jumps_through_zero, require_one_number
 from lagjax._equations import Derivation
 from lagjax._interface import ENDED_WELL, EVENT_OCCURRED, halves
-from lagjax._native import CHANGE_BITS
 from lagjax._primitives import attach_derivative, differentiable_where, lost_unless
 from lagjax._program import Unlowerable
 
 _BEFORE = 64 * np.finfo(np.float64).eps  # of the largest time: more than the rounding of a time, and of a border's
-MOST_GUARDS = 24  # `CHANGE_BITS` each in the code of an event, a whole number that the kernel keeps in a double of 53
 
 
 class Noted(NamedTuple):
@@ -62,8 +60,6 @@ def _surfaces_of_event(problem: Problem) -> Surfaces:
     conditions = jax.tree.leaves(event.cond_fn, is_leaf=lambda leaf: callable(leaf))
     if any(eqx.is_array(leaf) for leaf in jax.tree.leaves(conditions)):
         raise Unlowerable("the event holds arrays of its own")
-    if len(conditions) > MOST_GUARDS:
-        raise Unlowerable(f"the event has {len(conditions)} functions, more than {MOST_GUARDS}")
     signs = signs_of_event(problem)
     if None in signs:
         raise Unlowerable("the event is true or false, and no comparison of two numbers")
@@ -99,11 +95,6 @@ def _lower_surfaces(derivation: Derivation, functions, directions, code, structu
     return Surfaces.from_function(derivation, values_at, directions, code, structure, is_rounded)
 
 
-def changes_of(event, count: int):
-    """The change of each guard, (G,), by the mask of an event: 1 where it fell, 2 where it rose, else 0."""
-    return (event >> (CHANGE_BITS * np.arange(count))) & (2**CHANGE_BITS - 1)
-
-
 # ---- to the first event ----------------------------------------------------------------------------------------------
 
 
@@ -135,7 +126,7 @@ def _event_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
         times = jnp.where((end - ts) * (ts[-1] - ts[0]) >= 0, ts, end)
         times = jnp.concatenate([ts[:1], times[1:-1], end[None]])
         solution = _primitives.run(flow, tolerances, times, y0, params)
-        first = jnp.argmax(changes_of(event, len(surfaces.directions)) > 0)
+        first = jnp.argmax(event > 0)
         moves = fired
         if any(surfaces.holds):  # what holds at the start ends the motion there
             at_once = jnp.asarray(surfaces.holds)[first] & (t_stop == ts[0])

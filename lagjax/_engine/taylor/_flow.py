@@ -22,7 +22,7 @@ LARGEST_PROGRAM = operations_that_fit(10_000)
 # The last terms that the series of a tangent may have, relative to the tangent, in tolerances. What the series leaves
 # out is smaller by e² at least. Measured on all scenes: a motion that has its own scale takes steps with at most 300.
 EXCESS = 1000.0
-# The codes of the kernel, in their order, as results. Beyond `EVENT` they say which guards changed sign.
+# The codes of the kernel, in their order, as results.
 RESULT_OF_CODE = np.array([code_of(result) for result in (
     RESULTS.successful, RESULTS.max_steps_reached, RESULTS.dt_min_reached, RESULTS.nonfinite_state,
     RESULTS.mass_matrix_singular, RESULTS.projection_failed, RESULTS.acceleration_discontinuous, RESULTS.event_occurred,
@@ -217,8 +217,8 @@ class Flow:
         """`run` without a look at what stopped a member; and the steps of members that there was `room` for."""
         rtol, atol, max_steps, notes, order = *tolerances[:3], tolerances.notes, tolerances.order
         done = self.kernel.select_width(len(y0))(ts, y0, params, rtol, atol, max_steps, room, begun, notes, order)
-        result, event = RESULT_OF_CODE[np.minimum(done.code, _native.EVENT)], np.maximum(done.code - _native.EVENT, 0)
-        solution, found = Solution(*done[:3], result, done.steps, done.rejected, event, done.idle), []
+        result, found = RESULT_OF_CODE[done.code], []
+        solution = Solution(*done[:3], result, done.steps, done.rejected, done.changes, done.idle)
         if done.table is not None and done.complete is not None:
             rows = np.flatnonzero(done.complete)
             counts, order = done.steps[rows], order or _native.order_for(rtol)

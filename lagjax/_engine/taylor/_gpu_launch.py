@@ -32,8 +32,11 @@ def run_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params) -> tuple:
         raise ValueError(f"solver=lagjax.MachineCode() cannot integrate this scene on a GPU: {reason}.") from None
     members, path = len(y0), jnp.full((len(y0), *flow.path_shape(ts.shape[1], notes)), jnp.nan)
     arrays = _inputs(gpu.MOTION, ts, y0, params, flow, tolerances, room_of_notes=notes) | {"path": path}
-    shapes = [path.shape, y0.shape, *[(members,)] * 4]
-    return _solution(*launch(gpu.MOTION, program, members, arrays, shapes), states=not notes)
+    guards = flow.kernel.ending_guards
+    shapes = [path.shape, y0.shape, *[(members,)] * 4, (members, max(1, guards))]  # an array that has an address
+    results = launch(gpu.MOTION, program, members, arrays, shapes)
+    results[-1] = results[-1][:, :guards]
+    return _solution(*results, states=not notes)
 
 
 def transpose_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params, path_ct, end_ct) -> tuple:
@@ -78,12 +81,12 @@ def launch(entry: gpu.Entry, program: str, members: int, arrays: dict[str, Any],
     return list(call(*given, name="integrate", kernel_type="ptx", kernel_data=program, **attributes))[1:]
 
 
-def _solution(path, y_end, t_end, code, steps, rejected, states: bool) -> tuple:
+def _solution(path, y_end, t_end, code, steps, rejected, changes, states: bool) -> tuple:
     """The results of the kernel as the fields of a `Solution`; NaN in the path where a member did not come."""
-    code, steps, rejected = (x.astype(int) for x in (code, steps, rejected))
-    result = jnp.asarray(RESULT_OF_CODE)[jnp.minimum(code, _native.EVENT)]
+    code, steps, rejected, changes = (x.astype(int) for x in (code, steps, rejected, changes))
+    result = jnp.asarray(RESULT_OF_CODE)[code]
     result = jnp.where(jnp.isfinite(y_end).all(axis=1), result, NOT_FINITE_RESULT)
     if states:
         reached = (code == _native.DONE)[:, None, None] | jnp.isfinite(path).all(axis=2, keepdims=True)
         path = jnp.where(reached, path, jnp.nan)
-    return path, y_end, t_end, result, steps, rejected, jnp.maximum(code - _native.EVENT, 0)
+    return path, y_end, t_end, result, steps, rejected, changes

@@ -187,7 +187,7 @@ class _LineMap(LinearMap):
     def _lower_on_cpu(self, context, *arrays, line: Line):
         of, call = self.of(line), self._compile_operations
         if not context.module_context.lowering_parameters.for_export:  # where it runs elsewhere
-            code = of.code if len(of.line.nodes) <= LARGEST_LINE else None
+            code = of.code
             call = self._call_host if code is None else self._call_code
             if code is not None:
                 _register_handler()

@@ -138,7 +138,8 @@ def _floats(*shapes):
 
 def _run_shapes(ts, y0, params, *, flow, tolerances, **_):
     batch = _batch_of((ts, y0, params), _RUN)
-    counts = [ShapedArray(batch, np.dtype(int))] * (_OUTPUTS - 3)
+    shapes = *[batch] * 3, (*batch, flow.kernel.ending_guards)
+    counts = [ShapedArray(shape, np.dtype(int)) for shape in shapes]
     floats = _floats((*batch, *flow.path_shape(ts.shape[-1], tolerances.notes)), (*batch, flow.states), batch)
     return [*floats, *counts]
 

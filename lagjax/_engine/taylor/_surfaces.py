@@ -115,12 +115,15 @@ def _complete(values: Program, motion: Program, moving: int, rounding: Program |
         outputs = values.line.outputs
         one, zero = graph.number(1.0), graph.number(0.0)
         read = sorted(i for i in values.find_inputs(range(len(outputs))) if i < moving) or [0]
-        by_y = [tangents_in(graph, values.line, nodes, {j: one}, {}) for j in read]
-        slopes = Scalars(expansion, np.array([[by.get(i, zero) for by in by_y] for i in outputs]))
-        terms, moves = slopes * y[read], slopes * _rate(motion, expansion, ids, moving)[read]
-        found = [[fold("add", row) for row in x] for x in (moves, absolute(terms), absolute(moves))]
+        by_y = {j: tangents_in(graph, values.line, nodes, {j: one}, {}) for j in read}
+        rate, found = _rate(motion, expansion, ids, moving), []
+        for i in outputs:
+            at = [j for j, by in by_y.items() if by.get(i, zero) != zero] or read[:1]  # most are zero, of many watches
+            slopes = Scalars(expansion, np.array([by_y[j].get(i, zero) for j in at]))
+            terms, moves = slopes * y[at], slopes * rate[at]
+            found.append([fold("add", x) for x in (moves, absolute(terms), absolute(moves))])
         more = [] if rounding is None else [rounding.place(expansion, ids)[list(rounding.line.outputs)]]
-        return [np.array([nodes[i] for i in outputs]), *(stack(x).ids for x in found), *more]
+        return [np.array([nodes[i] for i in outputs]), *(stack(x).ids for x in zip(*found, strict=True)), *more]
 
     return lower_scalars(scalars, values.shapes, OPERATION_BUDGET, moving)
 

@@ -19,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine import Batch, Problem
-from lagjax._engine.taylor import MOST_GUARDS, MachineCode, line_of
+from lagjax._engine.taylor import MachineCode, line_of
 from lagjax._equations import ROUNDINGS, derivation_of, has_constraints, require_consistent
 from lagjax._interface import Layout, compile_for_one_call, halves, is_concrete, require_budget, result_from
 from lagjax._native import GUARD_NOISE
@@ -49,8 +49,8 @@ CHANGES = 1024  # the budget of changes of a motion whose crossings are asked fo
 
 def follow_contacts(given: Problem, problem: Problem, max_transitions: int | None) -> Trajectory:
     """The motion of a problem whose system has contacts; `problem` is `given` with what it closes over lifted."""
-    plan, closed = _plan(problem, max_transitions)
-    _require_sound(problem, closed)
+    plan, *scenes = _plan(problem, max_transitions)
+    _require_sound(problem, *scenes)
     if has_constraints(problem.system):
         q0, qdot0 = map(problem.layout.restore, halves(jnp.asarray(problem.y0)))
         require_consistent(problem.system, problem.layout, problem.ts, q0, qdot0, problem.params)
@@ -67,7 +67,7 @@ _follow_compiled = compile_for_one_call(_follow_at_once)  # outside of `jit` one
 
 def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int | None, params, params_axes) -> Trajectory:
     """The motions of a batch whose system has contacts."""
-    plan, _ = _plan(batch.member, max_transitions)
+    plan, *_ = _plan(batch.member, max_transitions)
     if batch.is_known:
         found = jax.device_put(
             follow_rows(functools.partial(follow_known, plan), batch.member, batch.y0, batch.vectors)
@@ -87,10 +87,10 @@ def _motion(plan: ContactPlan, problem: Problem) -> tuple[ContactEnding, RoundRe
 def note_sections(problem: Problem, functions: tuple, directions: tuple[int, ...], room: int) -> tuple:
     """The changes of a motion with contacts: which section each is, or −1; its time and state; how it all ended.
 
-    Raises `ValueError` as `follow_contacts` does, and for more sections than there is room for beside the contacts.
+    Raises `ValueError` as `follow_contacts` does.
     """
-    plan, closed = _plan(problem, CHANGES + len(functions) * (room + 1), len(functions))
-    _require_sound(problem, closed)
+    plan, *scenes = _plan(problem, CHANGES + len(functions) * (room + 1))
+    _require_sound(problem, *scenes)
     plan = dataclasses.replace(plan, sections=functions, directions=directions)
     ending, record, _ = _motion(plan, problem)
     count = Shapes.from_system(problem.system, problem.layout, problem.params).count
@@ -98,8 +98,8 @@ def note_sections(problem: Problem, functions: tuple, directions: tuple[int, ...
     return (which, record.t, record.y_next), ending.result, (ending.t, ending.y)
 
 
-def _plan(problem: Problem, max_transitions: int | None, sections: int = 0) -> tuple[ContactPlan, Problem]:
-    """The plan, and the problem of machine code with all contacts closed, in float64.
+def _plan(problem: Problem, max_transitions: int | None) -> tuple[ContactPlan, Problem, Problem]:
+    """The plan, and the problems of machine code with all contacts closed, and without contacts, in float64.
 
     Raises `ValueError` where the scene has no machine code, or the motion goes back in time.
     """
@@ -116,19 +116,17 @@ def _plan(problem: Problem, max_transitions: int | None, sections: int = 0) -> t
     with jax.enable_x64(True):
         shapes = Shapes.from_system(problem.system, wide.layout, wide.params)
         r, d = shapes.rough.size, shapes.directions
-        if (watches := shapes.count + r + sections) > MOST_GUARDS:
-            raise ValueError(
-                f"{shapes.count} contacts, {r} of them with friction, and {sections} sections make {watches} watches, "
-                f"and {MOST_GUARDS} are possible: one for each, and one more with friction. MuJoCo takes more."
-            )
         if problem.system.impacts == "poisson" and r and (shapes.count, d) != (1, 1):
             raise ValueError(
                 "With friction impacts='poisson' is for one contact in a plane: leave out slip, or take Newton's law, "
                 "impacts='simultaneous'."
             )
         contacts = Contacts(np.ones(shapes.count), np.ones(r), np.ones((r, d)), np.ones(()))
-        closed = Problem.from_system(plan.scene, wide.layout, InContact(wide.params, contacts))
-        if refusal := MachineCode().refuses(closed):
+        closed, free = (
+            Problem.from_system(scene, wide.layout, InContact(wide.params, contacts))
+            for scene in (plan.scene, ContactScene(problem.system, is_open=True))
+        )
+        if refusal := MachineCode().refuses(free) or closed.derivation.lowered.lacks_elimination:
             raise ValueError(f"A scene with contacts needs machine code, and has none: {refusal}.")
         lowered, flat = closed.derivation.lowered, Flat.from_system(problem.system, wide.layout, wide.params)
         rows = RowPlaces.from_derivation(lowered, flat).normal[shapes.of_gaps :]
@@ -136,18 +134,18 @@ def _plan(problem: Problem, max_transitions: int | None, sections: int = 0) -> t
         for name, still in zip(shapes.names[shapes.of_gaps :], stays, strict=True):
             if still:
                 raise ValueError(f"{name} does not depend on qdot: one_way returns velocities, contacts returns gaps.")
-    return plan, dataclasses.replace(closed, ts=wide.ts, y0=wide.y0)
+    return plan, dataclasses.replace(closed, ts=wide.ts, y0=wide.y0), free
 
 
-def _require_sound(problem: Problem, closed: Problem) -> None:
+def _require_sound(problem: Problem, closed: Problem, free: Problem) -> None:
     """Raise `ValueError` for what can be known to be wrong of the gaps at the start and of the coefficients."""
     if problem.is_known:
         with jax.enable_x64(True):
-            _require_open(problem, closed)
+            _require_open(problem, closed, free)
         require_coefficients(problem.system, problem.params)
 
 
-def _require_open(problem: Problem, closed: Problem) -> None:
+def _require_open(problem: Problem, closed: Problem, free: Problem) -> None:
     """Raise `ValueError` where the motion starts with a negative gap, beyond the rounding of its numbers."""
     derivation, n = closed.derivation.lowered, problem.layout.size
     shapes = Shapes.from_system(problem.system, problem.layout, problem.params)
@@ -158,8 +156,7 @@ def _require_open(problem: Problem, closed: Problem) -> None:
     gaps, slopes = of["residual"][0, rows], of["jacobian"][0, rows]
     terms = derivation.term_sizes(y0[:n], y0[n:], columns[2 * n], closed.numbers, names=("residual",))
     noise = ROUNDINGS * np.finfo(problem.layout.dtype).eps * (np.asarray(terms)[rows] + np.abs(slopes) @ np.abs(y0[:n]))
-    columns[columns.size - sum(x.size for x in closed.params.contacts) :][: shapes.count] = 0.0  # all contacts open
-    acceleration = derivation.acceleration.evaluate_many(list(columns))[:n, 0]
+    acceleration = free.derivation.lowered.acceleration.evaluate_many(list(columns))[:n, 0]
     noise = noise + start_width(slopes, y0, acceleration, np.asarray(closed.ts))
     for name, gap, slope, near in zip(shapes.names, gaps, slopes, noise, strict=False):
         if gap < -near:

@@ -12,8 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine.taylor import (
-    MOST_GUARDS,
-    Line,
     Surfaces,
     Tolerances,
     line_of,
@@ -194,7 +192,7 @@ def _arrange(scene: SearchedScene, found: Found, row, played: Played, inputs: tu
 
 
 def scene_of(plan: ContactPlan, layout: Layout, params: PyTree, times: int) -> SearchedScene:
-    """The scene for parameters of this structure and so many outputs. Raises `ValueError` for too many watches."""
+    """The scene for parameters of this structure and so many outputs."""
     flat = Flat.from_system(plan.scene.system, layout, params)
     inside = InContact(params, opened(flat))
     numbers = vector_of(eqx.filter(inside, eqx.is_array_like))
@@ -217,25 +215,21 @@ def _make_scene(
     places, shapes, n = RowPlaces.from_derivation(derivation, flat), flat.shapes, derivation.layout.size
     corners = corners_of(derivation, places.all, shapes)
     turns, r, d, k = 0 if corners is None else len(corners.touch), flat.rough.size, shapes.directions, shapes.count
-    if (watches := k + r + 2 * turns + len(sections)) > MOST_GUARDS:
-        raise ValueError(
-            f"The contacts, with {turns} corners of their gaps, make {watches} watches, and {MOST_GUARDS} are "
-            "possible: one a contact, one more with friction, two a corner. A table (jnp.interp) is one corner."
-        )
     watched = turns, sections, ways, code, structure, single
+    open_scene, watches = ContactScene(scene.system, is_open=True), k + r + 2 * turns + len(sections)
     modes, more = [], lambda: {"MULTIPLIERS": line_of(derivation.multipliers)}
-    for of, law, make_lines in (
-        (open_derivation, ContactScene(scene.system, is_open=True), dict),
-        (derivation, scene, more),
-    ):
-        surfaces = _watches(of, law, *watched)
-        make = functools.partial(make_flow, of, scene.path, surfaces.guards(remembers=True))
-        modes.append(Mode(make, surfaces, make_lines))
-    doing, inputs = k + r + r * d + 1, derivation.acceleration.size
-    response = line_of(derivation.impact_response(places.all, doing))
-    bends = response.line.replace(outputs=response.line.outputs[-len(places.all) :][:k])
-    acceleration = line_of(derivation.acceleration, n)
-    lines = {"RESPONSE": response, "BENDS": Line(bends, inputs, inputs).with_derivative, "ACCELERATION": acceleration}
+    for of, law, make_lines in ((open_derivation, open_scene, dict), (derivation, scene, more)):
+        find = functools.partial(_watches, of, law, *watched)
+
+        def make(of=of, find=find):
+            return make_flow(of, scene.path, find().guards(remembers=True))
+
+        modes.append(Mode(make, watches, find, make_lines))
+    doing, inputs = k + r + r * d + 1, len(derivation.scalar_shapes)
+    response = derivation.impact_response(places.all, doing, open_derivation)
+    bends = response.select_outputs(range(len(response.line.outputs))[-len(places.all) :][:k])
+    acceleration = line_of((open_derivation if corners is None else derivation).acceleration, n)
+    lines = {"RESPONSE": line_of(response), "BENDS": line_of(bends).with_derivative, "ACCELERATION": acceleration}
     if corners is not None:
         lines["SIDES"] = line_of(corners.sides)
         lines["SIDE_SLOPES"] = lines["SIDES"].forward
@@ -243,8 +237,8 @@ def _make_scene(
         "N": n, "K": k, "R": r, "D": d, "GAPS": flat.gap_count, "CORNERS": turns, "SECTIONS": len(sections),
         "NUMBERS": inputs - 2 * n - 1 - doing, "INPUTS": inputs, "TIMES": times, "DOING": doing,
         "MOST": most, "LAW": LAWS.index(scene.system.impacts), "SINGLE": int(single), "HEIGHT": len(places.all),
-        "MAY_MISS": int(not {op for op, _, _ in modes[0].surfaces.values.line.nodes} <= _SEEN),
-        "MULTIPLIERS_COUNT": len(derivation.multipliers.line.outputs),
+        "MAY_MISS": int(not {op for op, _, _ in modes[0].find_surfaces().values.line.nodes} <= _SEEN),
+        "MULTIPLIERS_COUNT": derivation.shape("jacobian")[0],
     }  # fmt: skip
     touch = np.zeros((0, k)) if corners is None else corners.touch
     arrays = dict(zip(ARRAYS, (flat.rough, places.tangential, touch), strict=True))

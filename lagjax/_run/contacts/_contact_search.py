@@ -410,21 +410,20 @@ def prepare(scene: Scene, member: Member, ts: Floats, times: Floats, y: Floats, 
 @loop
 def finish(
     scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, record: Entry, found: Floats, y_end: Floats,
-    t_end: float, event: int, result: int, accepted: float, rejected: float, room: Room
+    t_end: float, fell: Floats, event: int, result: int, accepted: float, rejected: float, room: Room
 ):  # fmt: skip
     """Take a stretch, its outputs `found` (T + 2, 2n) and its end: what the contacts do there, and a row of the record.
 
-    `event` is the mask of the watches that fell or rose, `result` that of a run without one.
+    `fell` (G,) says which watches fell or rose, if it is an `event`; `result` is that of a run without one.
     """
     n, k, total, times, x = scene.n, scene.k, scene.watches, scene.times, member.x
-    row, fell, doing = record[int(member.rounds) * scene.row :], room.fell, scene.doing
+    row, doing = record[int(member.rounds) * scene.row :], scene.doing
     deciding, start, begun = total - scene.sections, x[2 * n], x[2 * n + 1 + scene.numbers :]
     for i in range(scene.row):
         row[i] = 0.0
     happens, decides, first = event > 0, False, deciding
-    for g in range(total):
-        fell[g], event = float(event % 4), event // 4
-        decides = decides or (g < deciding and fell[g] > 0)
+    for g in range(deciding):
+        decides = decides or (happens and fell[g] > 0)
     if not happens and result == SUCCESSFUL:
         t_end = ts[times - 1]
     at_once = t_end == start
@@ -667,19 +666,22 @@ def meet(scene: Scene, member: Member, meets: Floats, row: Entry, room: Room) ->
 def reach(scene: Scene, meets: Floats, found: Floats, room: Room):
     """Put the contacts that touch and that an impulse at those that meet reaches, one through the other."""
     k, r, d, coupling, rough = scene.k, scene.r, scene.d, room.coupling, scene.rough
-    size, touches = k + r * d, room.touches
+    size, touches, reached, done, count = k + r * d, room.touches, room.free, 0, 0
     copy(meets, found, k)
-    for _ in range(k - 1):
-        more = False
-        for a in range(size):
-            for b in range(size):
-                i, j = a if a < k else rough[(a - k) // d], b if b < k else rough[(b - k) // d]
-                if found[j] > 0 and found[i] == 0 and touches[i] > 0 and touches[j] > 0:
+    for i in range(k):
+        if meets[i] > 0 and touches[i] > 0:
+            reached[count] = float(i)
+            count += 1
+    while done < count:
+        for b in range(size):
+            if (b if b < k else rough[(b - k) // d]) == int(reached[done]):
+                for a in range(size):
+                    i = a if a < k else rough[(a - k) // d]
                     own = sqrt(abs(coupling[a * size + a])) * sqrt(abs(coupling[b * size + b]))
-                    if abs(coupling[a * size + b]) > LINKED * own:
-                        found[i], more = 1.0, True
-        if not more:
-            break
+                    if found[i] == 0 and touches[i] > 0 and abs(coupling[a * size + b]) > LINKED * own:
+                        found[i], reached[count] = 1.0, float(i)
+                        count += 1
+        done += 1
 
 
 @loop

@@ -48,7 +48,6 @@ WORK = (
     "CHANGE",  # (n,), of velocities
     "CORNER", "PASSED", "OPENING",  # (3, corners), (corners,), (k,)
     "SHIFT", "LATER",  # (2n,), by how much the state and the time go beyond corners
-    "FELL",  # (G,), 1 for watches that fell, 2 for those that rose
 )  # fmt: skip
 SAID = (
     "CONTACT", "CHANGE", "HITS",
@@ -92,7 +91,7 @@ def sizes_of(sizes: dict[str, int]) -> dict[str, int]:
     fields |= dict.fromkeys(("VALUES", "RATES", "BEND", "IMPULSES", "APART", "HELD"), size)
     fields |= dict.fromkeys(("LARGEST", "SHIFT", "BEHIND", "OFFSET"), 2 * n)
     fields |= {"OPENED": inputs} | dict.fromkeys(("DOUBTS", "DOUBTED"), 3)
-    fields |= dict.fromkeys(("FRESH", "KINDS", "STAYS", "FELL"), watches)
+    fields |= dict.fromkeys(("FRESH", "KINDS", "STAYS"), watches)
     fields |= dict.fromkeys(("ROUNDING", "RATE_ROUNDING"), 2 * watches)
     fields |= dict.fromkeys(("GRADIENTS", "RESPONSES"), size * n) | dict.fromkeys(("SLIPS", "SLIPS_BEHIND"), 2 * r)
     fields |= {

@@ -46,7 +46,7 @@ class ContactReplay(Replay):
 
     def __init__(self, code: SceneCode, flow: Callable):
         n, k = code.sizes["N"], code.sizes["K"]
-        self._flow, self._watches, self._lines = flow, code.modes[HELD].surfaces, code.lines
+        self._flow, self._find_watches, self._lines = flow, code.modes[HELD].find_surfaces, code.lines
         # The places at which the parts of what `_end` gives end, but the last.
         self._ends, self._rough = np.cumsum([1, 1, n, 1, k, 1, 2 * n, 1]), code.arrays["ROUGH"]
         self.said = int(self._ends[5]) - 1
@@ -62,7 +62,7 @@ class ContactReplay(Replay):
         ts, y0, vector, restitution, friction = given
         (t, y), decides, still = start, row.decides > 0, jax.lax.stop_gradient
         numbers = jnp.concatenate([vector, row.did])
-        path, *stop = run_stretch(self._flow(), self._watches, self.code.tolerances, times, y, numbers, *event)
+        path, *stop = run_stretch(self._flow(), self._find_watches(), self.code.tolerances, times, y, numbers, *event)
         ended = self._end((*stop, vector, t, y, halves(y0)[1], restitution, friction), record)
         is_behind = np.isin(np.arange(ended.size), np.arange(*self._ends[5:7]))
         smooth = (still(ended[0]) > 0) & (~is_behind | ~decides | (row.leaves_rest == 0))
@@ -95,8 +95,7 @@ class ContactReplay(Replay):
         row, k = self._read(record), self.sizes["K"]
         crosses, decides, stays = row.crosses > 0, row.decides > 0, (row.happens > 0) & (row.crosses == 0)
         still, moving = ((*some[:2], jnp.append(some[2], row.did)) for some in (given[:3], given[3:]))
-        assert self._watches is not None
-        smooth, *moved = move_to_zero(self._watches, row.watch.astype(int), crosses, moving, still)
+        smooth, *moved = move_to_zero(self._find_watches(), row.watch.astype(int), crosses, moving, still)
         ends = zip(moved, moving[:2], strict=True)
         t, y = (jnp.where(stays, start, jnp.where(crosses, *end)) for start, end in zip((t, y), ends, strict=True))
         rows, vector = self.rows_at(t, y, given[5]), given[5]

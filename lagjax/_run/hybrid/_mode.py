@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine import Problem
-from lagjax._engine.taylor import MOST_GUARDS, Line, MachineCode, Surfaces, line_of, make_flow, require_one_number
+from lagjax._engine.taylor import Line, MachineCode, Surfaces, line_of, make_flow, require_one_number
 from lagjax._equations import OPERATION_BUDGET, Derivation, has_constraints, is_inconsistent
 from lagjax._interface import Function, Layout, accept, halves, present
 from lagjax._primitives import DOUBLE, SINGLE
@@ -158,11 +158,6 @@ class ModeParts:
 def make_mode(name: str, transitions: tuple[Transition, ...], problem: Problem) -> ModeParts:
     """A mode that is ready to run. Raises `ValueError` where it has no machine code."""
     leaving = {k: transition for k, transition in enumerate(transitions) if transition.source == name}
-    if len(leaving) > MOST_GUARDS:
-        raise ValueError(
-            f"{len(leaving)} transitions leave the mode {name!r}, and {MOST_GUARDS} are possible: join the guards "
-            "of those that lead to the same mode, with jnp.minimum for instance."
-        )
     code, structure = jax.tree.flatten(eqx.filter(problem.params, eqx.is_array_like, inverse=True))
     of_guards = problem.derivation.lowered, problem.system, tuple(leaving.values()), tuple(code), structure
     try:

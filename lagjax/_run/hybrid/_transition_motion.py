@@ -150,7 +150,7 @@ def _make_scene(plan: HybridPlan, parts: tuple[ModeParts, ...], times: int) -> S
     sizes = parts[0].sizes | {
         "K": len(leaving), "TIMES": times, "DOING": 1, "MOST": plan.max_transitions + 1, "SINGLE": int(plan.is_single),
     }  # fmt: skip
-    modes = [Mode(mode.make_guarded, mode.surfaces) for mode in parts]
+    modes = [Mode(mode.make_guarded, len(mode.numbers), lambda mode=mode: mode.surfaces) for mode in parts]
     tolerances = Tolerances(plan.rtol, plan.atol or 0.0, plan.max_steps)
     code = SceneCode(LAW, sizes, arrays, modes, lines, tolerances, first=len(modes))
     return SearchedModes(code, HybridReplay(code, parts))

@@ -162,18 +162,18 @@ def turns_round(scene: Scene, member: Member, mode: int, g: int, rate: float, ro
 @loop
 def finish(
     scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, record: Entry, found: Floats, y_end: Floats,
-    t_end: float, event: int, result: int, accepted: float, rejected: float, room: Room
+    t_end: float, changes: Floats, event: int, result: int, accepted: float, rejected: float, room: Room
 ):  # fmt: skip
     """Take a stretch, its outputs `found` (T + 2, 2n) and its end: the mode behind it, and a row of the record.
 
-    `event` is the mask of the guards that fell or rose, `result` that of a run without one.
+    `changes` say which guards fell or rose, if it is an `event`; `result` is that of a run without one.
     """
     n, x, mode, fell, k = scene.n, member.x, find_mode(scene, member), room.fell, -1
     row, begun, first = record[int(member.rounds) * scene.row :], x[2 * n], scene.first_of[mode]
     for i in range(scene.row):
         row[i] = 0.0
     for g in range(scene.counts[mode]):
-        fell[g], event = float(event % 4), event // 4
+        fell[g] = changes[g] if event > 0 else 0.0
         if fell[g] > 0 and k < 0:
             k = g
     if k < 0 and result == SUCCESSFUL:

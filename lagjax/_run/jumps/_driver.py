@@ -134,7 +134,8 @@ def follow_stretch(
     given_y, given_numbers = job[count * outputs :], job[count * (outputs + states) :]
     found = given_numbers[count * numbers :]
     y_end, t_end = found[count * outputs * states :], found[count * (outputs + 1) * states :]
-    code, steps, rejected, left = t_end[count:], t_end[2 * count :], t_end[3 * count :], t_end[4 * count :]
+    code, steps, rejected, fell = t_end[count:], t_end[2 * count :], t_end[3 * count :], t_end[4 * count :]
+    left = fell[count * scene.counts[mode] :]
     which = 2 * mode + (0 if count == 1 else 1)
     plan, rest = scene.plans[which], scene.rests[which]
     for i in range(count):
@@ -150,13 +151,14 @@ def follow_stretch(
     if plan == 0:
         return
     integrate(
-        scene.begin, plan, job, given_y, given_numbers, found, y_end, t_end, code, steps, rejected, left, count, outputs
-    )
+        scene.begin, plan, job, given_y, given_numbers, found, y_end, t_end, code, steps, rejected, fell, left, count,
+        outputs
+    )  # fmt: skip
     undone = left[rest - 1] != 0
     for i in range(count):
         m = int(places[i])
         mine, result = memory[m * size :], int(code[i])
-        sound = result == SUCCESSFUL or result >= EVENT
+        sound = result == SUCCESSFUL or result == EVENT
         for j in range(states):
             sound = sound and isfinite(y_end[i * states + j])
         if undone or not sound:
@@ -165,7 +167,7 @@ def follow_stretch(
             finish(
                 scene, mine, ts[m * scene.stride :], path[m * times * states :], did[m * times * scene.doing :],
                 record[m * each :], found[i * outputs * states :], y_end[i * states :], t_end[i],
-                result - EVENT if result >= EVENT else 0, SUCCESSFUL, steps[i], rejected[i], room
+                fell[i * scene.counts[mode] :], int(result == EVENT), SUCCESSFUL, steps[i], rejected[i], room
             )  # fmt: skip
 
 

@@ -19,7 +19,7 @@ from jax.interpreters import mlir
 
 from lagjax._engine.taylor import Line, Surfaces, line_of, rate_errors
 from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL
-from lagjax._native import LARGEST_LINE, SINGLE_NOISE, Loop, compile_loops, cores, handler
+from lagjax._native import SINGLE_NOISE, Loop, compile_loops, cores, handler
 from lagjax._primitives import LinearMap, call_host, compute_on_host
 from lagjax._run.jumps._driver import ASKS, GOING, NEW
 from lagjax._run.jumps._field_places import Places
@@ -50,10 +50,11 @@ class JumpLaw(NamedTuple):
 
 
 class Mode(NamedTuple):
-    """A mode: its flow, which `make` makes, its watches, if there are any, and more lines by their names in a scene."""
+    """A mode: its flow, its `count` watches, and more lines by their names in a scene; each made where it is needed."""
 
     make: Callable
-    surfaces: Surfaces | None
+    count: int
+    find_surfaces: Callable[[], Surfaces | None]
     make_lines: Callable[[], dict] = dict
 
 
@@ -84,7 +85,7 @@ class SceneCode:
         self, law: JumpLaw, sizes: dict, arrays: dict, modes: Sequence[Mode], lines: dict, tolerances, first: int = 1
     ):
         self.law, self.modes, self.lines, self.tolerances, self._first = law, modes, lines, tolerances, first
-        counts = np.array([0 if mode.surfaces is None else len(mode.surfaces.directions) for mode in modes])
+        counts = np.array([mode.count for mode in modes])
         self.sizes = sizes | {"MODES": len(modes), "WATCHES": int(counts.max())}
         empty = dict.fromkeys(("WATCH", "ERRORS", "SLOPES"), np.zeros(len(modes)))
         empty |= dict.fromkeys(("PLANS", "RESTS"), np.zeros(2 * len(modes)))
@@ -100,8 +101,8 @@ class SceneCode:
         scene[places.at.BEGIN] = ctypes.cast(handler().begin, ctypes.c_void_p).value or 0
         self._add_codes(scene, self.lines)
         for mode, of in enumerate(self.modes):
-            if mode < self._first and of.surfaces is not None:
-                self._add_watches(scene, mode, of.surfaces)
+            if mode < self._first and (surfaces := of.find_surfaces()) is not None:
+                self._add_watches(scene, mode, surfaces)
         return scene
 
     def _add_watches(self, scene: np.ndarray, mode: int, surfaces: Surfaces) -> None:
@@ -116,8 +117,8 @@ class SceneCode:
 
     def add_mode(self, scene: np.ndarray, mode: int, many: bool) -> None:
         """Add to a scene what a mode needs."""
-        at, surfaces = self.law.places.at, self.modes[mode].surfaces
-        if mode >= self._first and surfaces is not None:
+        at = self.law.places.at
+        if mode >= self._first and (surfaces := self.modes[mode].find_surfaces()) is not None:
             self._add_watches(scene, mode, surfaces)
         self._add_codes(scene, self.modes[mode].make_lines())
         for wide, members in ((0, 1), (1, 1000 if many else 1)):
@@ -131,8 +132,7 @@ class SceneCode:
 
     def _add_codes(self, scene: np.ndarray, lines: dict[Any, Line]) -> None:
         for name, of in lines.items():
-            code = of.code if len(of.line.nodes) <= LARGEST_LINE else None
-            keep, address = _call_numpy(of) if code is None else (code, code.address)
+            keep, address = _call_numpy(of) if of.code is None else (of.code, of.code.address)
             self._keep.append(keep)
             place = self.law.places.of[name] if isinstance(name, str) else scene[self.law.places.of[name[0]]] + name[1]
             scene[place] = address
@@ -250,7 +250,7 @@ class _Run:
         outputs, states = scene[self.at.TIMES] + 2, 2 * scene[self.at.N]
         numbers = scene[self.at.INPUTS] - states - 1 + 2 * scene[self.at.WATCHES]
         scene[self.at.JOBS] = scene[self.at.ORDER] + len(memory)
-        each = outputs + states + numbers + outputs * states + states + 4
+        each = outputs + states + numbers + outputs * states + states + 4 + scene[self.at.WATCHES]
         work = np.zeros(scene[self.at.JOBS] + len(memory) * each + scene[self.at.REST])
         ts = self.ts[members] if scene[self.at.STRIDE] else self.ts
         arrays = ts, self.path[members], self.did[members], self.record[members], memory, work
@@ -283,9 +283,17 @@ class _Run:
         happened = bool(done.result[0] == EVENT_OCCURRED)
         of_member = self.path[member], self.did[member], self.record[member]
         given = scene, memory, ts, *of_member, np.ascontiguousarray(done.path[0]), np.ascontiguousarray(done.y_end[0])
-        event, result = (int(done.event[0]), SUCCESSFUL) if happened else (0, int(done.result[0]))
+        result, fell = SUCCESSFUL if happened else int(done.result[0]), done.event[0].astype(float)
         steps = float(done.accepted[0]), float(done.rejected[0])
-        loops[2](*(x.ctypes.data for x in given), float(done.t_end[0]), event, result, *steps, work.ctypes.data)
+        loops[2](
+            *(x.ctypes.data for x in given),
+            float(done.t_end[0]),
+            fell.ctypes.data,
+            int(happened),
+            result,
+            *steps,
+            work.ctypes.data,
+        )
 
 
 # ---- as a primitive --------------------------------------------------------------------------------------------------
