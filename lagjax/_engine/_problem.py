@@ -72,7 +72,7 @@ class Problem:
       (`AbstractEngine.tolerances`).
     - `max_steps`: the budget of steps, rejected ones included.
     - `event`: functions of the user's state that end the motion.
-    - `guards`: the same as a program for machine code (`_native.Guards`), whose signs end the motion; of hybrid motion.
+    - `guards`: the same as a program for machine code (`_native.Guards`), whose signs end the motion.
     - `is_rounded`: whether the solution, in float64, is rounded to float32 in the end.
     """
 

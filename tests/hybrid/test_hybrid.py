@@ -992,3 +992,35 @@ def test_modes_of_a_ladder_keep_their_targets_and_constraints():
     said = r"Behind the transition '3' → 'line' .* the constraints of 'line': qdot does not .* rate of change is 1.59 "
     with pytest.raises(lagjax.SimulationError, match=said + ".* reset=lambda q, v: "):
         hybrid(modes, edges, v0=0.2, ts=(0.0, 1.0, 6.0), params=1.3, rtol=1e-12)
+
+
+def test_a_reset_without_machine_code_is_named():
+    def shorten(q, v):
+        return q, jax.lax.while_loop(lambda v: jnp.abs(v) > 1.0, lambda v: 0.5 * v, -v)
+
+    bounce = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=shorten)
+    scene = lagjax.Hybrid({"flight": lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q)}, [bounce], "flight")
+    with pytest.raises(ValueError, match=r"with the reset .*shorten.*while"):
+        lagjax.simulate(scene, 1.0, 0.0, jnp.linspace(0.0, 1.0, 3))
+
+
+def test_short_motions_from_a_traced_mode_on_are_one_motion_in_a_batch():
+    flight, soft = (lagjax.System(lambda q, v, k=k: 0.5 * v**2 - 9.81 * q - k * q**2) for k in (0.0, 500.0))
+    enter = lagjax.Transition("flight", "soft", lambda q, v: q, direction=-1)
+    leave = lagjax.Transition("soft", "flight", lambda q, v: q, direction=1, reset=lambda q, v: (q, 0.9 * v))
+    scene = lagjax.Hybrid({"flight": flight, "soft": soft}, [enter, leave], "flight")
+
+    def follow_part(carry, _):
+        begun = lagjax.Hybrid(scene.modes, scene.transitions, carry[2])
+        run = lagjax.simulate(begun, *carry[:2], jnp.array([0.0, 0.5]), throw=False)
+        return (run.q[-1], run.qdot[-1], run.mode[-1]), run.q[-1]
+
+    def in_parts(q0):
+        return jax.lax.scan(follow_part, (q0, 0.0, 0), None, length=6)[1][-1]
+
+    def whole(q0):
+        return lagjax.simulate(scene, q0, 0.0, jnp.array([0.0, 3.0]), throw=False).q[-1]
+
+    starts = jnp.linspace(0.8, 1.2, 4)
+    given, expected = (jax.vmap(jax.value_and_grad(of))(starts) for of in (in_parts, whole))
+    np.testing.assert_allclose(given, expected, rtol=1e-9)

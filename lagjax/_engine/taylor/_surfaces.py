@@ -19,7 +19,7 @@ import numpy as np
 
 from lagjax._engine.taylor._line_functions import outputs
 from lagjax._equations import OPERATION_BUDGET, Derivation
-from lagjax._native import GUARD_NOISE, INSTANT, SINGLE_NOISE, SMALLEST_STEP, Guards
+from lagjax._native import SINGLE_NOISE, Guards
 from lagjax._primitives import differentiable_where
 from lagjax._program import (
     Program,
@@ -39,20 +39,6 @@ from lagjax._program import (
 )
 
 PyTree = Any
-
-
-class Guarded(NamedTuple):
-    """The guards at a state, all (G,), their rates along the motion, and how far rounding moves both."""
-
-    values: jax.Array
-    rates: jax.Array
-    rounding: jax.Array  # by how much its own moves a value
-    of_time: jax.Array  # by how much that of the time moves it
-    rate_rounding: jax.Array
-
-    def clear_rates(self, largest: jax.Array | float = 0.0) -> jax.Array:
-        """The rates, 0 where their rounding, or the `largest` one so far, decides them."""
-        return jnp.where(jnp.abs(self.rates) > jnp.maximum(self.rate_rounding, largest), self.rates, 0.0)
 
 
 class Surfaces(NamedTuple):
@@ -86,26 +72,6 @@ class Surfaces(NamedTuple):
         """True for every guard, (G,), that has no rate anywhere: it changes its sign by jumps."""
         count = len(self.directions)
         return np.array([self.complete.constant(count + k) == 0.0 for k in range(count)])
-
-    def evaluate_guards(self, t, y, numbers, latest, widths) -> Guarded:
-        """The guards at a state (2n,), as machine code takes a start there in a run that ends at `latest`.
-
-        Where the start `is_rounded`, what came in, (q, q̇, t) and `numbers`, is known to these `widths`.
-        """
-        count, still = len(self.directions), jax.lax.stop_gradient
-        t, y, numbers, latest = still((t, y, numbers, latest))
-        given = jnp.append(y, t), numbers
-        out = outputs(self.complete, 4 * count, *given)
-        values, rates, sizes, rate_sizes = out.reshape(4, count)
-        errors = outputs(rate_errors(self.complete, count), count, *given)
-        errors = jnp.where(jnp.isfinite(errors), errors, 0.0)  # a root at zero has no slope
-        instant = INSTANT * SMALLEST_STEP * jnp.maximum(jnp.abs(t), jnp.abs(latest))
-        rounding, rate_rounding = GUARD_NOISE * sizes, GUARD_NOISE * (rate_sizes + errors)
-        if self.is_rounded:
-            slopes = jax.jacrev(lambda *given: outputs(self.values, count, *given), (0, 1))(*given)
-            terms = [jnp.where(width > 0, jnp.abs(by) * width, 0.0) for by, width in zip(slopes, widths, strict=True)]
-            rounding += sum(term.sum(1) for term in terms)
-        return Guarded(values, rates, rounding, jnp.abs(rates) * instant, rate_rounding)
 
     @classmethod
     def from_function(
