@@ -232,7 +232,7 @@ class Shapes(NamedTuple):
         if isinstance(value, dict) and isinstance(tree, dict):
             if unknown := [name for name in value if name not in tree]:
                 raise ValueError(f"{role} names {unknown[0]!r}, and the contacts are {', '.join(map(repr, tree))}.")
-            parts = [jnp.broadcast_to(value.get(name, 0.0), leaf.shape).ravel() for name, leaf in sorted(tree.items())]
+            parts = [_spread_over(leaf.shape, value.get(name, 0.0), role).ravel() for name, leaf in sorted(tree.items())]
             return jnp.concatenate([*parts, none])
         if len(jax.tree.leaves(value)) != 1:
             raise TypeError(f"{role} must be a number for all contacts, or a dict by the names of the contacts.")
@@ -241,8 +241,8 @@ class Shapes(NamedTuple):
             raise ValueError(
                 f"{role} must be a dict by the names of the contacts, which are {', '.join(map(repr, tree))}."
             )
-        flat = jnp.broadcast_to(leaf, (self.of_gaps,)) if jnp.ndim(leaf) < 2 else jnp.ravel(leaf)
-        return jnp.concatenate([flat, none])
+        flat = leaf if jnp.ndim(leaf) < 2 else jnp.ravel(leaf)
+        return jnp.concatenate([_spread_over((self.of_gaps,), flat, role), none])
 
     def name_numbers(self, numbers) -> PyTree:
         """Numbers of all contacts, (…, k), in the structure that the user's functions return."""
@@ -257,6 +257,17 @@ class Shapes(NamedTuple):
         if len(parts) == 1:
             return parts[0]
         return {**parts[0], **parts[1]} if all(isinstance(part, dict) for part in parts) else tuple(parts)
+
+
+def _spread_over(shape: tuple[int, ...], value, role: str):
+    """A coefficient for each of some contacts."""
+    try:
+        return jnp.broadcast_to(value, shape)
+    except ValueError:
+        raise ValueError(
+            f"{role} has the shape {jnp.shape(value)} where the contacts have {shape}: give one number, or one for each "
+            "contact. Where params have one for each member of a batch, say so: simulate_batch(…, batch_axes=(0, 0, 0))."
+        ) from None
 
 
 def _rough(system: System, layout: Layout, params: PyTree, tree: PyTree) -> tuple[np.ndarray, int]:

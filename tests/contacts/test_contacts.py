@@ -178,6 +178,7 @@ def test_the_budget_of_events_is_named():
         ({"restitution": 1.5}, "restitution"),
         ({"friction": -0.1, "slip": lambda q, v: {"floor": v["x"]}}, "friction"),
         ({"impacts": "at once"}, "sequential"),
+        ({"restitution": {"floor": np.full(3, 0.5)}}, "one for each contact"),
     ],
 )
 def test_what_cannot_be_a_contact(options, sentence):

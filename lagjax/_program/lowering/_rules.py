@@ -223,6 +223,7 @@ def formula_of(equation) -> str | None:
 
 
 # How many operands they have.
+_WORK_OF_EXCHANGE = 20  # of two numbers of a sort, each in arrays of its own
 _FORMULAS = {"remainder": 2, "floor_divide": 2, "divmod": 2, "trunc": 1, "signbit": 1, "hypot": 2}
 
 
@@ -595,6 +596,7 @@ def _sort(expansion, params, *operands):
     if params["num_keys"] != 1:
         raise Unlowerable("the primitive `sort` by several keys has no scalar form here")
     rows = [list(np.moveaxis(x, params["dimension"], 0)) for x in operands]
+    expansion.work(_WORK_OF_EXCHANGE * len(rows[0]) ** 2 * len(rows))
     for end in range(len(rows[0]) - 1, 0, -1):
         for k in range(end):
             wrong = expansion.map("lt", rows[0][k + 1], rows[0][k])
