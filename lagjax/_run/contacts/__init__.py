@@ -181,7 +181,7 @@ def _trajectory(
     restore = problem.layout.restore
     (q, qdot), end, (at, behind) = (tuple(map(restore, halves(y))) for y in (ending.path, ending.y, record.y_next))
     before = restore(record.qdot)
-    known = record.contact, record.change, ending.rounds, ending.doubts, ending.doubted
+    known = record.contact, record.change, ending.rounds, ending.doubts, ending.doubted, record.impulse
     names = Shapes.from_system(problem.system, problem.layout, problem.params).names
     changes = ContactChanges(record.t, at, before, at, behind, *known, Names(names))
     return Trajectory(

@@ -69,11 +69,15 @@ class ContactEnding(NamedTuple):
 
 
 class RoundRecord(NamedTuple):
-    """The changes of a motion (N, …), NaN and −1 where there is none: times, velocities before, states behind them."""
+    """The changes of a motion (N, …), NaN and −1 where there is none: times, velocities before, states behind them.
+
+    The impulses (N, k) are normal ones.
+    """
 
     t: Any
     qdot: Any
     y_next: Any
+    impulse: Any
     contact: Any  # behind the contacts, a section that was crossed
     change: Any  # its kind
 
@@ -174,7 +178,7 @@ def _arrange(scene: SearchedScene, found: Found, row, played: Played, inputs: tu
         lost((closed >= 0).all(axis=-1), played.path), of_path, played.t, played.y, result, rounds,
         (accepted, rejected), rest[..., 4:7].astype(int), rest[..., 7:10],
     )  # fmt: skip
-    changes = (lost(happened, x) for x in (played.at, played.before, played.behind))
+    changes = (lost(happened, x) for x in (played.at, played.before, played.behind, played.impulse))
     kinds = (library.where(happened, x, -1).astype(int) for x in (row.contact, row.change))
     impacts, front = [], library.argsort(~hits, axis=-1, stable=True)
     for x in (played.t_impact, played.impulse, played.lost):
