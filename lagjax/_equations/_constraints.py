@@ -14,7 +14,7 @@ Lagrangian: the mass matrix M, by which distances between states are measured, i
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -157,18 +157,18 @@ def rows_of_terms(terms, shape: tuple[int, ...]):
     return xp.reshape(xp.broadcast_to(terms, math.prod(shape)), shape)
 
 
-def velocity_scales(matrix: Float[Array, "n n"], jacobian: Float[Array, "m n"], qdot: Vector) -> Vector:
-    """The velocity scale of every coordinate for an error norm: how fast the others make it move through G.
+def velocity_scales(diagonal: Vector, jacobian: Float[Array, "m k"], qdot: Vector, touched: Sequence[int]) -> Vector:
+    """The velocity scales (k,) of the `touched` coordinates for an error norm: how fast others make them move by G.
 
     In constraint k, coordinate j contributes Gₖⱼ q̇ⱼ, which is as large as the velocity |Gₖⱼ q̇ⱼ / Gₖᵢ| of coordinate i;
     the largest over j is the scale that k gives to i, and the smallest over k counts. So a coupler that does not turn
     is as exact as the cranks that carry it, and not relative to its own velocity, which is rounding. Where Gₖᵢ happens
     to pass through zero that grows without bound; it is therefore limited by maxⱼ √(Mⱼⱼ/Mᵢᵢ) |q̇ⱼ|, the velocity of
-    equal kinetic energy. Zero for coordinates in no constraint.
+    equal kinetic energy. Zero for coordinates in no constraint. `diagonal` (n,) is that of M.
     """
-    by_constraints = jnp.min(_largest_term(jacobian * qdot, jacobian), axis=0)
-    root = jnp.sqrt(jnp.abs(jnp.diagonal(matrix)))[None]
-    by_energy = _largest_term(root * qdot, root)[0]
+    by_constraints = jnp.min(_largest_term(jacobian * qdot[touched], jacobian), axis=0)
+    root = jnp.sqrt(jnp.abs(diagonal))[None]
+    by_energy = _largest_term(root * qdot, root[:, touched])[0]
     return jnp.where(by_constraints < jnp.inf, jnp.minimum(by_constraints, by_energy), 0.0)
 
 

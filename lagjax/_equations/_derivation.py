@@ -349,12 +349,12 @@ class Derivation:
         """
         count, n = self.shape("rates")[0], self.layout.size
         holds = range(count) if self.motion.constraints.held is None else np.flatnonzero(self.absent("release"))
-        of = {name: self._positions(name) for name in self._shapes}
-        rates, driving = ([of[name][k] for k in holds] for name in ("rates", "driving"))
-        if is_smooth(self._whole.select_outputs([*of["lagrangian"], *of["momentum"], *rates]).line):
+        of, holds = self._positions, list(holds)
+        first, rates = [*of("lagrangian"), *of("momentum")], of("rates")[holds]
+        if is_smooth(self._whole.select_outputs([*first, *rates]).line):
             return None
-        rows = [of["jacobian"][n * k + i] for k in holds for i in range(n)]
-        outputs = [*of["lagrangian"], *of["momentum"], *of["mass_matrix"], *rows, *rates, *driving]
+        rows = of("jacobian").reshape(-1, n)[holds].ravel()
+        outputs = [*first, *of("mass_matrix"), *rows, *rates, *of("driving")[holds]]
         return self._whole.select_outputs(outputs).line
 
     @_lowered_once
@@ -420,13 +420,16 @@ class Derivation:
         """The `velocity_scales` of a state, (n,); None without constraints."""
         if not self.motion.constrained:
             return None
-        n, parts = self.layout.size, self.program("mass_matrix", "jacobian")
+        n, (mass, rows) = self.layout.size, map(self._positions, _MATRICES)
+        touched = np.flatnonzero(~self.absent("jacobian").all(axis=0))
+        parts = self._whole.select_outputs([*mass[:: n + 1], *rows.reshape(-1, n)[:, touched].ravel()])
 
         def scale_arrays(values, qdot):
-            return velocity_scales(values[: n * n].reshape(n, n), values[n * n :].reshape(-1, n), qdot)
+            return velocity_scales(values[:n], values[n:].reshape(-1, len(touched)), qdot, touched)
 
         def scales(*scalars):
-            return apply_function(scale_arrays, parts.vector(*scalars), stack(scalars[n : 2 * n]))
+            of_touched = apply_function(scale_arrays, parts.vector(*scalars), stack(scalars[n : 2 * n]))
+            return scatter(of_touched, touched, n)
 
         return lower_formula(scales, *self.scalar_shapes, budget=OPERATION_BUDGET)
 
@@ -448,11 +451,11 @@ class Derivation:
         absent[self._filled[name]] = [op == "constant" and number == 0 for op, _, number in of]
         return absent.reshape(self.shape(name))
 
-    def _positions(self, name: str) -> list[int]:
+    def _positions(self, name: str) -> np.ndarray:
         """The outputs of the program of all quantities that are this one, in C order."""
         positions = np.zeros(self.count(name), int)
         positions[self._filled[name]] = self._filled_positions(name)
-        return positions.tolist()
+        return positions
 
     def _filled_positions(self, name: str) -> range:
         """The outputs that are numbers of this quantity which are not zero as they are derived."""
@@ -625,11 +628,8 @@ class Derivation:
         outputs = np.concatenate([self._filled_positions(name) for name in names]).astype(int)
         at = np.searchsorted(filled, place)
         found = np.append(filled, -1)[at] == place
-        positions = np.where(found, np.append(outputs, 0)[at], 0).tolist()
-        positions += self._positions(saddle.c)[:constraints]
-        if saddle.b is not None:
-            positions += self._positions(saddle.b)
-
+        given = np.where(found, np.append(outputs, 0)[at], 0), self._positions(saddle.c)[:constraints]
+        positions = np.concatenate([*given, *([] if saddle.b is None else [self._positions(saddle.b)])])
         cut = functools.cache(lambda: self._whole.select_outputs(positions))
         return lambda *scalars: cut().vector(*scalars)
 

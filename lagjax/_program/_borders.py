@@ -905,8 +905,9 @@ class _Rewriting:
             zero, above = graph.constant(0.0, "float"), graph.apply("add", piece, graph.constant(1.0, "float"))
             if kind == SIGN:
                 return zero
-            if located is not None:
-                return graph.apply("take", above, attribute=located.table)
+            if located is not None:  # no piece follows the last one
+                ends, entry = graph.apply("lt", above, graph.number(float(located.table.count))), located.table
+                return graph.apply("select", ends, graph.number(math.inf), graph.apply("take", above, attribute=entry))
             return above if kind == FLOOR else graph.apply("select", graph.apply("lt", piece, zero), above, piece)
 
         return level

@@ -314,7 +314,8 @@ def pullback_and_entries(
     with np.errstate(all="ignore"):
         cotangents: dict[int, int] = {}
         for k, output in enumerate(of):
-            placed._add(cotangents, line.outputs[output], placed.graph.input(len(dtypes) + k, "float"))
+            if line.nodes[line.outputs[output]][0] != "constant":  # rows of contacts are zeros but for a few numbers
+                placed._add(cotangents, line.outputs[output], placed.graph.input(len(dtypes) + k, "float"))
         results = placed.cotangents(cotangents, by, tables, varies, is_linear)
         results += [i for _, *entry in tables for i in entry]
         done = placed.finish_line(results, known, len(dtypes) + len(of))

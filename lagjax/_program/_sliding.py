@@ -589,7 +589,9 @@ class _Held:
         multiples = dict(zip(which, changes, strict=True))
         for i, of in enumerate(self.of_coordinates):
             some = [k for k in of if k in multiples]
-            moves = dot(self.graph, [of[k] for k in some], [multiples[k] for k in some])
+            # A force that pushes onto no border may have no value beyond it, as sign(u) √(|u| + c) away from u = 0.
+            along = [f("select", pushed_of[k], self.zero, of[k]) for k in some]
+            moves = dot(self.graph, along, [multiples[k] for k in some])
             state[first + i] = f("sub", state[first + i], moves)
         left, moved = dict(zip(which, self._evaluate(levels), strict=True)), [self.zero] * n
         for k, i, divisor in self.divisors:

@@ -58,7 +58,7 @@ class ContactScene(eqx.Module):
 
     @property
     def path(self) -> str:
-        return self.system.path
+        return "array" if self.system.path == "array" else "scalar"  # arrays do not jump, however large the scene is
 
     def _motion(self, layout: Layout, params: InContact) -> Motion:
         """The motion while the contacts are as `params` say."""
@@ -90,7 +90,7 @@ class ContactScene(eqx.Module):
         def drag(q, qdot, t, p):
             (f, _), slides = counts(p), flat.friction(p.params) * (1.0 - p.contacts.sticks)
             along = flat.slip_direction(q, qdot, t, p)
-            slopes = jax.jacfwd(flat.slips, argnums=1)(q, qdot, t, p.params)  # (r, d, n)
+            slopes = jax.jacrev(flat.slips, argnums=1)(q, qdot, t, p.params)  # (r, d, n), few rows
             forces = -slides[:, None] * jnp.einsum("rd,rdn->rn", along, slopes)
             return jnp.zeros((layout.size, held(p).size), q.dtype).at[:, f + flat.rough].set(forces.T)
 
@@ -232,8 +232,8 @@ class Shapes(NamedTuple):
         if isinstance(value, dict) and isinstance(tree, dict):
             if unknown := [name for name in value if name not in tree]:
                 raise ValueError(f"{role} names {unknown[0]!r}, and the contacts are {', '.join(map(repr, tree))}.")
-            parts = [_spread_over(leaf.shape, value.get(name, 0.0), role).ravel() for name, leaf in sorted(tree.items())]
-            return jnp.concatenate([*parts, none])
+            of = [_spread_over(leaf.shape, value.get(name, 0.0), role) for name, leaf in sorted(tree.items())]
+            return jnp.concatenate([*map(jnp.ravel, of), none])
         if len(jax.tree.leaves(value)) != 1:
             raise TypeError(f"{role} must be a number for all contacts, or a dict by the names of the contacts.")
         (leaf,) = jax.tree.leaves(value)
@@ -265,8 +265,8 @@ def _spread_over(shape: tuple[int, ...], value, role: str):
         return jnp.broadcast_to(value, shape)
     except ValueError:
         raise ValueError(
-            f"{role} has the shape {jnp.shape(value)} where the contacts have {shape}: give one number, or one for each "
-            "contact. Where params have one for each member of a batch, say so: simulate_batch(…, batch_axes=(0, 0, 0))."
+            f"{role} has the shape {jnp.shape(value)} where the contacts have {shape}: give one number, or one for "
+            "each contact. Where params have one for each member of a batch, say so by batch_axes=(0, 0, 0)."
         ) from None
 
 

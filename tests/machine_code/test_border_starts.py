@@ -198,6 +198,7 @@ LAWS = [
     (lambda q: jnp.trunc(q), -1.0, -1.0),
     (lambda q: -jnp.floor(q), 1.0, 0.0),  # pushed onto it from both sides
     (lambda q: jnp.array([0.0, 1.0, 1.0])[q.astype(int)], 1.0, 1.0),
+    (lambda q: 1.0 * jnp.searchsorted(jnp.array([0.0, 1.0]), q, side="right"), 1.0, 2.0),  # at the last entry
 ]
 
 
@@ -231,3 +232,15 @@ def test_a_tie_that_a_motion_leaves_does_not_hold_it(potential, way):
         lagjax.System(lambda q, v: 0.5 * v @ v - V(q)), np.zeros(3), way * np.array(speeds), way * np.array([0.0, 1.0])
     )
     np.testing.assert_allclose(run.q[-1], ends, atol=1e-12)
+
+
+def test_a_force_without_a_value_beyond_its_border_leaves_friction_alone():
+    """Compiles one motion: sign(q) √(|q| + c), on its other side, is the root of what is negative there."""
+    system = lagjax.System(
+        lambda q, v: 0.5 * v**2,
+        forces=lambda q, v, params: params * jnp.sign(v) - jnp.sign(q) * jnp.sqrt(jnp.abs(q) + 0.1),
+    )
+    held = lagjax.simulate(system, 0.25, 0.0, np.array([0.0, 1.0]), -0.75)
+    assert held.q[-1] == 0.25
+    rough, smooth = (lagjax.simulate(system, 0.25, 0.5, np.array([0.0, 0.2]), mu).q[-1] for mu in (-0.75, 0.0))
+    assert 0.9 * 0.02 * 0.75 < smooth - rough < 1.1 * 0.02 * 0.75  # ½ μ t², but for what the spring does beside it

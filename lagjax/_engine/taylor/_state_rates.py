@@ -25,11 +25,11 @@ def rate(flow: Flow, t, y, params):
     if borders is not None and any(guard.slide >= 0 for guard in borders.guards):
         chosen = params if flow.kernel.chosen is None else params[..., jnp.array(flow.kernel.chosen.positions, int)]
         rows = rows._replace(first=join_columns(rows.first, chosen))
-        acceleration = _evaluate_pieces(borders, rows, _pieces(borders, rows, n))[0][:n]
+        found = _evaluate_pieces(borders, rows, _pieces(borders, rows, n))[0][:n]
+        acceleration = jnp.stack(jnp.broadcast_arrays(*found), axis=-1)
     else:
-        acceleration = jnp.moveaxis(outputs(program, n, rows.first, params), -1, 0)
-    velocity = (y[..., n + i] for i in range(n))
-    slope = jnp.stack(jnp.broadcast_arrays(*velocity, *acceleration), axis=-1)
+        acceleration = outputs(program, n, rows.first, params)
+    slope = join_columns(y[..., n:], acceleration)
     return jnp.where(jnp.isfinite(slope), slope, 0.0)
 
 
