@@ -370,29 +370,29 @@ class Derivation:
 
         return lower_formula(multipliers, *self.scalar_shapes, budget=OPERATION_BUDGET)
 
-    def impact_response(self, rows: tuple[int, ...], states: int) -> Program:
+    def impact_response(self, rows: tuple[int, ...], states: int, free: Program) -> Program:
         """The response to impulses at K `rows` of G: G, G M⁻¹ (K, n), G M⁻¹ Gᵀ (K, K), values, rates, G q̈ − γ (K,).
 
-        The last `states` parameters say what is held. G is that where everything is, q̈ that where nothing is; M⁻¹
-        leaves the other constraints as they are.
+        The last `states` parameters say what is held. G is that where everything is, q̈ that of `free`, where nothing is;
+        M⁻¹ leaves the other constraints as they are.
         """
         key = "impact_response", *map(str, rows)
         if key in self._programs:
             return self._programs[key]
         system, solve = self._system(_VELOCITY_STEP)
         n, m = self.layout.size, self.shape("jacobian")[0]
-        parts, acceleration = self.program("jacobian", "residual", "rates", "gamma"), self.acceleration
+        parts = self.program("jacobian", "residual", "rates", "gamma")
 
         def response(*scalars):
             first = scalars[: len(scalars) - states]
-            held, free = (*first, *[0.0 * scalars[0] + 1.0] * states), (*first, *[0.0 * scalars[0]] * states)
-            values, factors = parts.vector(*held), system(*free)[3]
+            held, opened = (*first, *[0.0 * scalars[0] + 1.0] * states), (*first, *[0.0 * scalars[0]] * states)
+            values, factors = parts.vector(*held), system(*opened)[3]
             gradients = [values[n * i : n * (i + 1)] for i in rows]
             moved = [solve(factors, scatter(row, np.arange(n), n + m))[:n] for row in gradients]
-            free = acceleration.vector(*free)[:n]
+            qddot = free.vector(*opened)[:n]
             couplings = [fold("add", row * x) for row in gradients for x in moved]
             residuals, rates, gammas = ([values[(n + part) * m + i] for i in rows] for part in range(3))
-            bends = [fold("add", row * free) - gamma for row, gamma in zip(gradients, gammas, strict=True)]
+            bends = [fold("add", row * qddot) - gamma for row, gamma in zip(gradients, gammas, strict=True)]
             return concatenate([*gradients, *moved, stack([*couplings, *residuals, *rates, *bends])])
 
         self._programs[key] = lower_formula(response, *self.scalar_shapes, budget=OPERATION_BUDGET)
@@ -644,6 +644,11 @@ class Derivation:
     @_lowered_once
     def _constant_mass(self) -> bool:
         return not self.reads("mass_matrix")
+
+    @property
+    def samples(self) -> list[tuple[csr_array, csr_array]]:
+        """M and G at a few states that nothing speaks for, where they are finite."""
+        return self._samples(1.0)
 
     def _samples(self, reach: float, numbers: Any = None) -> list[tuple[csr_array, csr_array]]:
         """M and G at a few states that nothing speaks for, where they are finite; `numbers` are those of params."""

@@ -151,7 +151,7 @@ class ContactChanges(NamedTuple):
     def __repr__(self) -> str:
         def describe(t, contact, change, impulse, wait):
             why = "is 0" if wait > 0 else "would fall below 0 at once"
-            blows = [f"{x:.4g} at {self.names[i]}" for i, x in enumerate(impulse) if x]
+            blows = [f"{x:.4g} at {self.names[i]}" for i, x in enumerate(impulse) if x > 1e-12 * impulse.max()]
             more = f"; impulse {', '.join(blows)}" if blows else ""
             return f"t = {t:<10.6g} {self.names[contact]} {CHANGE_WORDS[change]}: its {_WATCHED[change]} {why}{more}"
 

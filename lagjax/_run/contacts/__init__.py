@@ -32,6 +32,9 @@ from lagjax._run.contacts._contact_motion import (
     RowPlaces,
     contact_motion,
     follow_known,
+    held_size,
+    slots_of,
+    spread_forces,
 )
 from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes, System, require_coefficients
 
@@ -105,7 +108,7 @@ def _plan(problem: Problem, max_transitions: int | None, sections: int = 0) -> t
     wide = problem.double_precision if problem.is_single else problem
     rtol, atol = float(MachineCode().rtol(wide)), problem.tolerances[1]
     limits = rtol, None if atol is None else float(atol), problem.max_steps, max_transitions, problem.is_single
-    plan = ContactPlan(ContactScene(problem.system), *limits)
+    scene = ContactScene(problem.system)
     with jax.enable_x64(True):
         shapes = Shapes.from_system(problem.system, wide.layout, wide.params)
         r, d = shapes.rough.size, shapes.directions
@@ -119,11 +122,15 @@ def _plan(problem: Problem, max_transitions: int | None, sections: int = 0) -> t
                 "With friction impacts='poisson' is for one contact in a plane: leave out slip, or take Newton's law, "
                 "impacts='simultaneous'."
             )
-        contacts = Contacts(np.ones(shapes.count), np.ones(r), np.ones((r, d)), np.ones(()))
-        closed = Problem.from_system(plan.scene, wide.layout, InContact(wide.params, contacts))
-        if refusal := MachineCode().refuses(closed):
+        held = np.ones(held_size(shapes, wide.layout.size))
+        inside = InContact(wide.params, Contacts(np.ones(shapes.count), np.ones(r), np.ones((r, d)), held, np.ones(())))
+        closed = Problem.from_system(scene, wide.layout, inside)
+        flat = Flat.from_system(problem.system, wide.layout, wide.params)
+        if held.size and (slots := slots_of(closed.derivation.lowered, flat)):
+            scene = dataclasses.replace(scene, slots=slots)
+        if refusal := MachineCode().refuses(Problem.from_system(scene, wide.layout, inside)):
             raise ValueError(f"A scene with contacts needs machine code, and has none: {refusal}.")
-        lowered, flat = closed.derivation.lowered, Flat.from_system(problem.system, wide.layout, wide.params)
+        plan, lowered = ContactPlan(scene, *limits), closed.derivation.lowered
         rows = RowPlaces.from_derivation(lowered, flat).normal[shapes.of_gaps :]
         stays = [not moves.any() for moves in ~lowered.absent("jacobian")[rows]]
         for name, still in zip(shapes.names[shapes.of_gaps :], stays, strict=True):
@@ -152,7 +159,8 @@ def _require_open(problem: Problem, closed: Problem) -> None:
     terms = derivation.term_sizes(y0[:n], y0[n:], columns[2 * n], closed.numbers, names=("residual",))
     noise = ROUNDINGS * np.finfo(problem.layout.dtype).eps * (np.asarray(terms)[rows] + np.abs(slopes) @ np.abs(y0[:n]))
     columns[columns.size - sum(x.size for x in closed.params.contacts) :][: shapes.count] = 0.0  # all contacts open
-    acceleration = derivation.acceleration.evaluate_many(list(columns))[:n, 0]
+    opened = Problem.from_system(ContactScene(problem.system, is_open=True), closed.layout, closed.params)
+    acceleration = opened.derivation.lowered.acceleration.complete.evaluate_many(list(columns))[:n, 0]
     noise = noise + start_width(slopes, y0, acceleration, np.asarray(closed.ts))
     for name, gap, slope, near in zip(shapes.names, gaps, slopes, noise, strict=False):
         if gap < -near:
@@ -198,17 +206,21 @@ def contact_forces(trajectory: Trajectory):
     assert isinstance(system, System)
 
     def normal_forces(q, qdot, times, params, _, contacts: Contacts):
-        scene = ContactScene(system)
         layout = Layout.from_state(*jax.tree.map(lambda x: x[0], (q, qdot)))
         flat = Flat.from_system(system, layout, params)
         inside = InContact(params, jax.tree.map(lambda x: x[0], contacts))
+        scene = ContactScene(system)
+        if contacts.held.shape[-1]:
+            whole = derivation_of(scene, layout, inside).lowered
+            scene = dataclasses.replace(scene, slots=slots_of(whole, flat))
         derivation = derivation_of(scene, layout, inside).with_numbers().lowered
-        program, places = line_of(derivation.multipliers), RowPlaces.from_derivation(derivation, flat)
+        program = line_of(derivation.multipliers)
         numbers = [jnp.ravel(x) for x in jax.tree.leaves(eqx.filter(params, eqx.is_array_like))]
 
         def evaluate_output(q, qdot, t, contacts):
             parts = layout.flatten(q), layout.flatten(qdot), t[None], *numbers, *map(jnp.ravel, contacts)
-            forces = program(jnp.concatenate([jnp.asarray(x, layout.dtype) for x in parts]))[places.normal]
+            forces = program(jnp.concatenate([jnp.asarray(x, layout.dtype) for x in parts]))
+            forces, _ = spread_forces(scene, flat, derivation, forces, InContact(params, contacts))
             return jnp.where(contacts.closed > 0, forces, jnp.where(contacts.closed == 0, 0.0, jnp.nan))
 
         return flat.shapes.name_numbers(jax.vmap(evaluate_output)(q, qdot, times[0], contacts))

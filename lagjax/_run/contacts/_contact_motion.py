@@ -4,6 +4,7 @@ ContactPlan, start ─► SceneCode.search ─► Found ─► attach_derivative
 """
 
 import functools
+import itertools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -21,15 +22,15 @@ from lagjax._engine.taylor import (
     require_one_number,
     vector_of,
 )
-from lagjax._equations import Derivation, derivation_of
+from lagjax._equations import OPERATION_BUDGET, Derivation, derivation_of
 from lagjax._interface import Function, Layout, compile_for_one_call, halves
 from lagjax._primitives import attach_derivative, lost_unless
-from lagjax._program import Program, Unlowerable, lower
+from lagjax._program import Program, Unlowerable, compose, lower
 from lagjax._run.contacts._corners import append_sides, corners_of
 from lagjax._run.contacts._places import ARRAYS, SAID
 from lagjax._run.contacts._replay import Played, Replay, read_rows
 from lagjax._run.contacts._scene_code import Found, SceneCode, sizes_of_fields
-from lagjax._scene import Contacts, ContactScene, Flat, InContact
+from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes
 
 PyTree = Any
 
@@ -170,8 +171,9 @@ def _arrange(scene: SearchedScene, found: Found, row, played: Played, inputs: tu
 
     k, r, n, d = (scene.code.sizes[name] for name in "KRND")
     happened, hits = row.happens > 0, row.hits > 0
-    closed, sticks, direction, near = library.split(found.did, [k, k + r, k + r + r * d], axis=-1)
-    of_path = Contacts(closed, sticks, direction.reshape(*direction.shape[:-1], r, d), near[..., 0])
+    ends = [k, k + r, k + r + r * d, scene.code.sizes["DOING"] - 1]
+    closed, sticks, direction, held, near = library.split(found.did, ends, axis=-1)
+    of_path = Contacts(closed, sticks, direction.reshape(*direction.shape[:-1], r, d), held, near[..., 0])
     rest = found.ending[..., 2 * n + 1 :]
     result, rounds, accepted, rejected = (rest[..., i].astype(int) for i in range(4))
     ending = ContactEnding(
@@ -198,26 +200,27 @@ def _arrange(scene: SearchedScene, found: Found, row, played: Played, inputs: tu
 def scene_of(plan: ContactPlan, layout: Layout, params: PyTree, times: int) -> SearchedScene:
     """The scene for parameters of this structure and so many outputs. Raises `ValueError` for too many watches."""
     flat = Flat.from_system(plan.scene.system, layout, params)
-    inside = InContact(params, opened(flat))
+    inside = InContact(params, opened(flat, layout.size))
     numbers = vector_of(eqx.filter(inside, eqx.is_array_like))
-    closed, other = (
-        derivation_of(of, layout, inside).with_numbers(numbers)
-        for of in (plan.scene, ContactScene(plan.scene.system, is_open=True))
+    system = plan.scene.system
+    closed, other, whole = (
+        derivation_of(of, layout, inside).with_numbers(numbers).lowered
+        for of in (plan.scene, ContactScene(system, is_open=True), ContactScene(system))
     )
     code, structure = jax.tree.flatten(eqx.filter(inside, eqx.is_array_like, inverse=True))
     tolerances = Tolerances(plan.rtol, plan.atol or 0.0, plan.max_steps)
     given = plan.max_transitions, plan.is_single, plan.sections, plan.directions, tuple(code), structure, times
-    return _make_scene(closed.lowered, other.lowered, plan.scene, tolerances, *given)
+    return _make_scene(closed, other, whole, plan.scene, tolerances, *given)
 
 
 @functools.lru_cache(maxsize=64)
 def _make_scene(
-    derivation: Derivation, open_derivation: Derivation, scene: ContactScene, tolerances: Tolerances, most: int,
-    single: bool, sections: tuple, ways: tuple, code: tuple, structure, times: int
+    derivation: Derivation, open_derivation: Derivation, whole: Derivation, scene: ContactScene,
+    tolerances: Tolerances, most: int, single: bool, sections: tuple, ways: tuple, code: tuple, structure, times: int
 ) -> SearchedScene:  # fmt: skip
     flat = _flat_of(derivation, scene, structure, code)
-    places, shapes, n = RowPlaces.from_derivation(derivation, flat), flat.shapes, derivation.layout.size
-    corners = corners_of(derivation, places.all, shapes)
+    places, shapes, n = RowPlaces.from_derivation(whole, flat), flat.shapes, derivation.layout.size
+    corners = corners_of(whole, places.all, shapes)
     turns, r, d, k = 0 if corners is None else len(corners.touch), flat.rough.size, shapes.directions, shapes.count
     if (watches := k + r + 2 * turns + len(sections)) > MOST_GUARDS:
         raise ValueError(
@@ -233,8 +236,10 @@ def _make_scene(
         kind: functools.partial(make_flow, of, scene.path, surfaces[kind].guards(remembers=True))
         for kind, of in (("HELD", derivation), ("OPEN", open_derivation))
     }
-    doing, inputs = k + r + r * d + 1, derivation.acceleration.size
-    response = line_of(derivation.impact_response(places.all, doing))
+    doing = k + r + r * d + held_size(shapes, n) + 1
+    inputs = derivation.acceleration.size
+    free = derivation.acceleration if scene.slots is None else open_derivation.acceleration.complete
+    response = line_of(whole.impact_response(places.all, doing, free))
     bends = response.line.replace(outputs=response.line.outputs[-len(places.all) :][:k])
     acceleration = line_of(derivation.acceleration, n)
     lines = {"RESPONSE": response, "BENDS": Line(bends, inputs, inputs).with_derivative, "ACCELERATION": acceleration}
@@ -246,11 +251,13 @@ def _make_scene(
         "WATCHES": watches, "NUMBERS": inputs - 2 * n - 1 - doing, "INPUTS": inputs, "TIMES": times, "DOING": doing,
         "MOST": most, "LAW": LAWS.index(scene.system.impacts), "SINGLE": int(single), "HEIGHT": len(places.all),
         "MAY_MISS": int(not {op for op, _, _ in surfaces["OPEN"].values.line.nodes} <= _SEEN),
-        "MULTIPLIERS_COUNT": len(derivation.multipliers.line.outputs),
+        "MULTIPLIERS_COUNT": max(len(derivation.multipliers.line.outputs), k + r * d),
+        "GAP_SLOTS": (scene.slots or (0, 0))[0], "SLOTS": (scene.slots or (0, 0))[1],
     }  # fmt: skip
     touch = np.zeros((0, k)) if corners is None else corners.touch
-    arrays = dict(zip(ARRAYS, (flat.rough, places.tangential, touch), strict=True))
-    multipliers = functools.cache(lambda: line_of(derivation.multipliers))
+    tangential = places.tangential if scene.slots is None else k + np.arange(r * d)
+    arrays = dict(zip(ARRAYS, (flat.rough, tangential, touch), strict=True))
+    multipliers = functools.cache(lambda: line_of(_forces_of(derivation, scene, flat)))
     searched = SceneCode(sizes, arrays, flows, surfaces, lines, multipliers, tolerances)
     flow = functools.cache(functools.partial(make_flow, derivation, scene.path, None))
     return SearchedScene(searched, Replay(searched, flow), flat, _lower_coefficients(flat, derivation.numbers.params))
@@ -271,10 +278,70 @@ def _flat_of(derivation: Derivation, scene: ContactScene, structure, code: tuple
     return Flat.from_system(scene.system, derivation.layout, eqx.combine(zeros, structure.unflatten(code)).params)
 
 
-def opened(flat: Flat) -> Contacts:
-    """Contacts that are all open."""
-    r, d = flat.rough.size, flat.shapes.directions
-    return Contacts(jnp.zeros(flat.shapes.count), jnp.ones(r), jnp.ones((r, d)), jnp.zeros(()))
+def opened(flat: Flat, n: int) -> Contacts:
+    """Contacts of n coordinates that are all open."""
+    (k, r), d, held = (flat.shapes.count, flat.rough.size), flat.shapes.directions, held_size(flat.shapes, n)
+    return Contacts(jnp.zeros(k), jnp.ones(r), jnp.ones((r, d)), jnp.zeros(held), jnp.zeros(()))
+
+
+def held_size(shapes: Shapes, n: int) -> int:
+    """The size of `Contacts.held` for n coordinates."""
+    rows = shapes.count + shapes.rough.size * shapes.directions
+    return rows if rows > n else 0
+
+
+def slots_of(whole: Derivation, flat: Flat) -> tuple[int, int] | None:
+    """The largest numbers of independent rows of gaps and of velocities that hold at once; None to hold rows as they are.
+
+    Ranks at states that nothing speaks for, where rows have no corners. The slips of fewer contacts than gaps can be
+    independent may hold more than all do: those of each pair are looked at.
+    """
+    places, shapes, n = RowPlaces.from_derivation(whole, flat), flat.shapes, whole.layout.size
+    if not held_size(shapes, n) or shapes.count > flat.gap_count or corners_of(whole, places.all, shapes) is not None:
+        return None
+    rows = [sample.toarray() for _, sample in whole.samples]
+    own = np.setdiff1d(np.arange(len(rows[0])), places.all)
+
+    def rank(*some) -> int:
+        chosen = np.concatenate([own, *some]).astype(int)
+        return max(int(np.linalg.matrix_rank(row[chosen], 1e-9 * abs(row).max())) for row in rows) - len(own)
+
+    gaps = rank(places.normal)
+    if gaps > 3:
+        return None
+    normal, slips = places.normal[flat.rough], places.tangential
+    sets = [list(x) for size in range(1, gaps) for x in itertools.combinations(range(len(slips)), size)]
+    most = [rank(normal[x], slips[x].ravel()) - rank(normal[x]) for x in sets]
+    slots = gaps, max(most, default=0)
+    slots = gaps, max(slots[1], rank(places.normal, slips.ravel()) - gaps)
+    return slots if sum(slots) < held_size(shapes, n) else None
+
+
+def spread_forces(scene: ContactScene, flat: Flat, derivation: Derivation, forces, inside: InContact) -> tuple:
+    """The forces of the normals (k,) and of the slips (r, d) among those of all constraints."""
+    if scene.slots is None:
+        places = RowPlaces.from_derivation(derivation, flat)
+        return forces[places.normal], forces[places.tangential]
+    gaps, velocities = scene.rows(flat, inside)
+    end, start = derivation.position_count, len(forces) - len(velocities)
+    normal, along = forces[end - len(gaps) : end] @ gaps, forces[start:] @ velocities
+    one_way = flat.shapes.count - flat.gap_count
+    return jnp.append(normal, along[:one_way]), along[one_way:].reshape(-1, flat.shapes.directions)
+
+
+def _forces_of(derivation: Derivation, scene: ContactScene, flat: Flat) -> Program:
+    """All multipliers; with slots those of the contacts, (k + r d,)."""
+    if scene.slots is None:
+        return derivation.multipliers
+    moving = 2 * derivation.layout.size + 1
+
+    def spread(_, inside, forces):
+        return jnp.concatenate([x.ravel() for x in spread_forces(scene, flat, derivation, forces, inside)])
+
+    given = (jax.ShapeDtypeStruct((size,), float) for size in (moving, len(derivation.multipliers.line.outputs)))
+    y, forces = given
+    program = lower(spread, y, derivation.numbers, forces, moving=moving)
+    return compose(program, derivation.multipliers, OPERATION_BUDGET, moving)
 
 
 class RowPlaces(NamedTuple):
@@ -306,18 +373,19 @@ def _watches(
     """
     flat = _flat_of(derivation, scene, structure, code)
     shapes, rough = flat.shapes, flat.rough
-    places = None if scene.is_open else RowPlaces.from_derivation(derivation, flat)
-    corners = corners_of(derivation, places.all, shapes) if turns and places is not None else None
+    corners = None
+    if turns and not scene.is_open:
+        corners = corners_of(derivation, RowPlaces.from_derivation(derivation, flat).all, shapes)
 
     def values_at(y, inside: InContact, *forces):
-        user, (closed, sticks, direction, near) = eqx.filter(inside.params, eqx.is_array_like), inside.contacts
+        user, (closed, sticks, direction, _, near) = eqx.filter(inside.params, eqx.is_array_like), inside.contacts
         state = (*halves(y[:-1]), y[-1])
         open_values = jnp.concatenate([flat.gaps(state[0], state[2], user), flat.one_way(*state, user)])
         user_state = (*map(derivation.layout.restore, state[:2]),)
         more = [require_one_number(of(*user_state, t=y[-1], params=inside.params), "A section") for of in sections]
-        if places is None:
+        if scene.is_open:
             return jnp.concatenate([open_values, jnp.ones(rough.size + 2 * turns), jnp.array(more)])
-        normal = forces[0][places.normal]
+        normal, held = spread_forces(scene, flat, derivation, forces[0], inside._replace(params=user))
         if corners is not None:
             matters = [1.0 - jnp.prod(1.0 - closed[np.flatnonzero(row)]) for row in corners.touch]
             sides = forces[0][-turns:] * jnp.stack(matters)  # 0 where all that is closed is elsewhere
@@ -325,7 +393,7 @@ def _watches(
         watches = jnp.concatenate([normal + (1.0 - closed) * open_values, jnp.array(more)])
         if not rough.size:
             return watches
-        held, most = forces[0][places.tangential], flat.friction(user) * normal[rough]
+        most = flat.friction(user) * normal[rough]
         if shapes.directions == 1:
             slides = jnp.sum(flat.slips(*state, user) * direction, axis=1)
         else:  # zero where it stops, and where it has turned by 60°: at 90° its direction has a pole

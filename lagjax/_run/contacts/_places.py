@@ -24,6 +24,7 @@ SIZES = (
     "SINGLE",  # 1 if the start came in float32
     "MAY_MISS",  # 1 if an operation of the watches may hide a corner from a series
     "HEIGHT", "MULTIPLIERS_COUNT",  # rows of contacts, and of all constraints
+    "GAP_SLOTS", "SLOTS",  # rows of gaps and of velocities for which there is room; 0 where rows are as they are
     "MEMORY", "ROW", "WORK",  # doubles of a memory, of a row of the record, of the room of a thread
     # Doubles of what kernels leave behind, of which the last says whether a run is done; and the most of these.
     "OPEN_ONE_REST", "OPEN_MANY_REST", "HELD_ONE_REST", "HELD_MANY_REST", "REST",

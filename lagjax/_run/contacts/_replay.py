@@ -171,8 +171,9 @@ class Replay:
         return ImpactRows.split(self._lines["RESPONSE"](self._opened(t, y, vector)), self._sizes["HEIGHT"], y.size // 2)
 
     def _opened(self, t, y, vector):
-        k, doing = self._sizes["K"], self._sizes["DOING"]
-        return jnp.concatenate([y, t[None], vector, jnp.zeros(k), jnp.ones(doing - k - 1), jnp.zeros(1)])
+        k, r, d, doing = (self._sizes[name] for name in ("K", "R", "D", "DOING"))
+        ones = jnp.ones(r + r * d)
+        return jnp.concatenate([y, t[None], vector, jnp.zeros(k), ones, jnp.zeros(doing - k - ones.size)])
 
     def _jump(self, at, rows: ImpactRows, row, vector, restitution, friction):
         """The time of an impact, impulses (k,), the energy lost, and the state (2n,) behind a change at (t, y)."""

@@ -119,7 +119,7 @@ class SceneCode:
         members, scene, begin = len(y0), self.scene(len(y0) > 1).copy(), 2 * self.sizes["N"]
         memory = np.zeros((members, scene[at.MEMORY]))
         is_open = np.zeros(self.sizes["DOING"])
-        is_open[self.sizes["K"] : -1] = 1.0
+        is_open[self.sizes["K"] :][: self.sizes["R"] * (1 + self.sizes["D"])] = 1.0
         first = np.broadcast_to(ts[:, :1], (members, 1))
         parts = {
             "X": np.concatenate([y0, first, numbers, np.tile(is_open, (members, 1))], axis=1),
