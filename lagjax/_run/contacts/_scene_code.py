@@ -7,6 +7,7 @@ SceneCode.search(ts, y0, numbers, e, μ) ─► search_p ─► rows of NumPy �
 import ctypes
 import functools
 import math
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -17,7 +18,7 @@ from jax.interpreters import mlir
 
 from lagjax._engine.taylor import Line, call_host, line_of, rate_errors
 from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL
-from lagjax._native import LARGEST_LINE, SINGLE_NOISE, compile_loops, cores, handler, make_once
+from lagjax._native import LARGEST_LINE, SINGLE_NOISE, Walk, compile_loops, cores, handler, make_once
 from lagjax._primitives import LinearMap, compute_on_host
 from lagjax._run.contacts import _contact_search
 from lagjax._run.contacts._contact_search import ASKS, GOING, NEW
@@ -79,10 +80,14 @@ class SceneCode:
         """Add to a scene the kernel and the watches of closed contacts, or of open ones."""
         surfaces, flow = self.surfaces[kind], self.flows[kind]()
         count = len(surfaces.directions)
-        lines = {
-            f"{kind}_WATCH": line_of(surfaces.complete, 4 * count),
-            f"{kind}_ERRORS": line_of(rate_errors(surfaces.complete, count), count),
-        }
+        lines = {f"{kind}_WATCH": line_of(surfaces.complete, 4 * count)}
+        walk, moving = Walk(lines[f"{kind}_WATCH"].line, lines[f"{kind}_WATCH"].size), 2 * self.sizes["N"] + 1
+        if len(walk) > LARGEST_LINE and walk.is_known:  # whose errors would be five times as many operations
+            function, address = _call_back(lambda x: walk(x, moving)[1][count : 2 * count], walk.inputs, count)
+            self._keep.append(function)
+            scene[getattr(at, f"{kind}_ERRORS")] = address
+        else:
+            lines[f"{kind}_ERRORS"] = line_of(rate_errors(surfaces.complete, count), count)
         if surfaces.is_rounded:
             lines[f"{kind}_SLOPES"] = line_of(surfaces.values, count).back
         if kind == "HELD":
@@ -100,7 +105,7 @@ class SceneCode:
     def _add_codes(self, scene: np.ndarray, lines: dict[str, Line]) -> None:
         for name, of in lines.items():
             code = of.code if len(of.line.nodes) <= LARGEST_LINE else None
-            keep, address = _call_numpy(of) if code is None else (code, code.address)
+            keep, address = _evaluate_long(of) if code is None else (code, code.address)
             self._keep.append(keep)
             scene[getattr(at, name)] = address
 
@@ -143,15 +148,23 @@ class SceneCode:
         return Found(path, did, run.record, np.stack(ending, axis=-1))
 
 
-def _call_numpy(line: Line) -> tuple[Any, int]:
-    """A function that evaluates a line by NumPy, called as machine code is, and its address: for tables, long lines."""
+def _evaluate_long(line: Line) -> tuple[Any, int]:
+    """A function for a long line, or one of tables, which NumPy evaluates, and its address."""
+    walk = Walk(line.line, line.size)
+    if walk.is_known:
+        return _call_back(lambda x: walk(x)[0], line.size, line.outputs)
+    return _call_back(lambda x: line.line.evaluate(list(x[:, None]))[:, 0], line.size, line.outputs)
+
+
+def _call_back(of: Callable, inputs: int, outputs: int) -> tuple[Any, int]:
+    """A function of an array, called as machine code is, and its address."""
 
     def evaluate(x: int, out: int, _rows: int) -> None:
         given, found = (
             np.ctypeslib.as_array((ctypes.c_double * size).from_address(place))
-            for place, size in ((x, line.size), (out, line.outputs))
+            for place, size in ((x, inputs), (out, outputs))
         )
-        found[:] = line.line.evaluate(list(given[:, None]))[:, 0]
+        found[:] = of(given)
 
     function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(evaluate)
     address = ctypes.cast(function, ctypes.c_void_p).value
