@@ -221,8 +221,9 @@ def _modes(slopes: bool) -> tuple:
     flight = lagjax.System(lambda q, v: 0.5 * v**2 - G * q)
     spring = lagjax.System(lambda q, v, params: 0.5 * v**2 - G * q - 0.5 * params * q**2)
     over = [
-        lagjax.Transition("flight", "spring", lambda q, v: q, -1), lagjax.Transition("spring", "flight", lambda q, v: q, 1)
-    ]  # fmt: skip
+        lagjax.Transition("flight", "spring", lambda q, v: q, -1),
+        lagjax.Transition("spring", "flight", lambda q, v: q, 1),
+    ]
     scene, ts = lagjax.Hybrid({"flight": flight, "spring": spring}, over, "flight"), jnp.array([0.0, 1.0])
 
     def end(x):

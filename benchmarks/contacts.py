@@ -326,7 +326,7 @@ def main() -> None:
     parser.add_argument("--only", nargs="+", choices=tuple(PARTS), default=tuple(PARTS))
     parser.add_argument("--peers", type=Path, help="what `_contact_peers.py` printed; nothing else is run")
     parser.add_argument("--first", action="store_true", help="first results, each in a fresh process; nothing else")
-    parser.add_argument("--count", type=int, default=3, help="processes for each first result, of which the least counts")
+    parser.add_argument("--count", type=int, default=3, help="processes for a first result: the least counts")
     parser.add_argument("--write", action="store_true", help="store the first results; other parts are always stored")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)

@@ -92,7 +92,7 @@ def picture(q):
         return jnp.stack([x - 0.45 * y, z + 0.25 * y - 0.12 * x], axis=-1)
 
     c = corners(q)
-    board = jnp.array([[-3.0, -4, 0], [14, -4, 0], [14, 8, 0], [-3, 8, 0], [-3, -4, 0]])
+    board = jnp.array([[-2.0, -3, 0], [9, -3, 0], [9, 5, 0], [-2, 5, 0], [-2, -3, 0]])
     edges = {f"edge {k}": seen(jnp.stack([c[i], c[j]])) for k, (i, j) in enumerate(EDGES)}
     return edges | {"board": seen(board)}
 
@@ -101,14 +101,16 @@ def draw(run):
     """The film, and some of its pictures in one."""
     Path("out").mkdir(exist_ok=True)
     run.animate(picture, speed=0.3).save("out/cube.gif")
-    figure, axes = plt.subplots(figsize=(7.6, 4.2))
+    figure, axes = plt.subplots(figsize=(7.6, 3.6))
     axes.plot(*np.asarray(picture(run.end.q)["board"]).T, color="0.6")
     for k in range(0, len(run.ts), 8):
         lines = picture(jax.tree.map(lambda x, k=k: x[k], run.q))
+        color = plt.colormaps["viridis"](0.9 * k / len(run.ts))
         for name in lines:
             if name != "board":
-                axes.plot(*np.asarray(lines[name]).T, color=plt.colormaps["viridis"](0.9 * k / len(run.ts)), linewidth=1)
-    axes.set(aspect="equal", title="Tossed, and at rest on a face", xticks=[], yticks=[])
+                axes.plot(*np.asarray(lines[name]).T, color=color, linewidth=1)
+    axes.set(aspect="equal", title="Tossed, and at rest on a face")
+    axes.axis("off")
     figure.savefig("out/cube.png")
 
 

@@ -373,8 +373,8 @@ class Derivation:
     def impact_response(self, rows: tuple[int, ...], states: int, free: Program) -> Program:
         """The response to impulses at K `rows` of G: G, G M⁻¹ (K, n), G M⁻¹ Gᵀ (K, K), values, rates, G q̈ − γ (K,).
 
-        The last `states` parameters say what is held. G is that where everything is, q̈ that of `free`, where nothing is;
-        M⁻¹ leaves the other constraints as they are.
+        The last `states` parameters say what is held. G is that where everything is, q̈ that of `free`, where nothing
+        is; M⁻¹ leaves the other constraints as they are.
         """
         key = "impact_response", *map(str, rows)
         if key in self._programs:

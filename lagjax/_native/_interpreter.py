@@ -11,8 +11,8 @@ from lagjax._native._loops import Floats, Wholes, compile_loops, loop
 from lagjax._program._operations import OPERATIONS
 from lagjax._program._series import StraightLine
 
-_NAMES = ("input", "constant", "add", "sub", "mul", "div", "neg", "select", "convert", "sqrt", "sin", "cos", "abs", "eq",
-          "lt", "le", "gt", "ge", "is_finite")  # fmt: skip
+_NAMES = ("input", "constant", "add", "sub", "mul", "div", "neg", "select", "convert", "sqrt", "sin", "cos", "abs",
+          "eq", "lt", "le", "gt", "ge", "is_finite")  # fmt: skip
 (INPUT, CONSTANT, ADD, SUB, MUL, DIV, NEG, SELECT, CONVERT, SQRT, SIN, COS, ABS, EQ, LT, LE, GT, GE,
  IS_FINITE) = range(len(_NAMES))  # fmt: skip
 

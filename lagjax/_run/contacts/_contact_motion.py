@@ -291,10 +291,10 @@ def held_size(shapes: Shapes, n: int) -> int:
 
 
 def slots_of(whole: Derivation, flat: Flat) -> tuple[int, int] | None:
-    """The largest numbers of independent rows of gaps and of velocities that hold at once; None to hold rows as they are.
+    """The most independent rows of gaps, and of velocities, that hold at once; None to hold all rows as they are.
 
-    Ranks at states that nothing speaks for, where rows have no corners. The slips of fewer contacts than gaps can be
-    independent may hold more than all do: those of each pair are looked at.
+    They are ranks at states that nothing speaks for, where rows have no corners. The slips of few contacts may hold
+    more beside their gaps than those of all do: all sets are looked at whose gaps leave some rank.
     """
     places, shapes, n = RowPlaces.from_derivation(whole, flat), flat.shapes, whole.layout.size
     if not held_size(shapes, n) or shapes.count > flat.gap_count or corners_of(whole, places.all, shapes) is not None:
@@ -312,8 +312,7 @@ def slots_of(whole: Derivation, flat: Flat) -> tuple[int, int] | None:
     normal, slips = places.normal[flat.rough], places.tangential
     sets = [list(x) for size in range(1, gaps) for x in itertools.combinations(range(len(slips)), size)]
     most = [rank(normal[x], slips[x].ravel()) - rank(normal[x]) for x in sets]
-    slots = gaps, max(most, default=0)
-    slots = gaps, max(slots[1], rank(places.normal, slips.ravel()) - gaps)
+    slots = gaps, max([*most, rank(places.normal, slips.ravel()) - gaps])
     return slots if sum(slots) < held_size(shapes, n) else None
 
 
