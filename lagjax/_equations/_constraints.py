@@ -14,7 +14,7 @@ Lagrangian: the mass matrix M, by which distances between states are measured, i
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from typing import Any
 
 import equinox as eqx
@@ -157,7 +157,7 @@ def rows_of_terms(terms, shape: tuple[int, ...]):
     return xp.reshape(xp.broadcast_to(terms, math.prod(shape)), shape)
 
 
-def velocity_scales(diagonal: Vector, jacobian: Float[Array, "m k"], qdot: Vector, touched: Sequence[int]) -> Vector:
+def velocity_scales(diagonal: Vector, jacobian: Float[Array, "m k"], qdot: Vector, touched: np.ndarray) -> Vector:
     """The velocity scales (k,) of the `touched` coordinates for an error norm: how fast others make them move by G.
 
     In constraint k, coordinate j contributes Gₖⱼ q̇ⱼ, which is as large as the velocity |Gₖⱼ q̇ⱼ / Gₖᵢ| of coordinate i;

@@ -61,6 +61,9 @@ PyTree = Any
 # While it is lowered, an operation takes about a kilobyte, and two where it is written anew.
 OPERATION_BUDGET = operations_that_fit(2000)
 
+# Bytes that an entry of M takes while it is derived on scalars, zero or not: 2 GB of 10 000 coordinates.
+_ENTRY = 20
+
 # Operations of all quantities beyond which JAX differentiates arrays. Derivatives of programs take 100 µs for each;
 # those of arrays 2 s for what is vectorised, as 60 bodies are (39 000: 4 s), and 13 s for an arm that is written joint
 # by joint (7600: 1 s). Doubled, the first kind loses 3 s more; halved, arms of 12 joints compile for half a minute.
@@ -223,6 +226,8 @@ class Derivation:
         """
         if self.refusal is not None:
             raise Unlowerable(self.refusal)
+        if lack := lack_of_memory(_ENTRY * self.layout.size**2):
+            raise Unlowerable(f"its mass matrix {lack}")
 
         def order_values(values, zero):
             self._shapes = {name: values[name].shape for name in sorted(values)}
@@ -348,8 +353,8 @@ class Derivation:
         Constraints that numbers release, those of contacts, are left out: they push, and do not pull.
         """
         count, n = self.shape("rates")[0], self.layout.size
-        holds = range(count) if self.motion.constraints.held is None else np.flatnonzero(self.absent("release"))
-        of, holds = self._positions, list(holds)
+        holds = np.arange(count) if self.motion.constraints.held is None else np.flatnonzero(self.absent("release"))
+        of = self._positions
         first, rates = [*of("lagrangian"), *of("momentum")], of("rates")[holds]
         if is_smooth(self._whole.select_outputs([*first, *rates]).line):
             return None
@@ -382,6 +387,8 @@ class Derivation:
         system, solve = self._system(_VELOCITY_STEP)
         n, m = self.layout.size, self.shape("jacobian")[0]
         parts = self.program("jacobian", "residual", "rates", "gamma")
+        moves = ~self.absent("jacobian")[list(rows)]
+        touched = [np.flatnonzero(of_row if of_row.any() else ~of_row) for of_row in moves]
 
         def response(*scalars):
             first = scalars[: len(scalars) - states]
@@ -389,10 +396,13 @@ class Derivation:
             values, factors = parts.vector(*held), system(*opened)[3]
             gradients = [values[n * i : n * (i + 1)] for i in rows]
             moved = [solve(factors, scatter(row, np.arange(n), n + m))[:n] for row in gradients]
-            qddot = free.vector(*opened)[:n]
-            couplings = [fold("add", row * x) for row in gradients for x in moved]
+            along = [*moved, free.vector(*opened)[:n]]
+            products = [
+                [fold("add", row[some] * x[some]) for x in along] for row, some in zip(gradients, touched, strict=True)
+            ]
             residuals, rates, gammas = ([values[(n + part) * m + i] for i in rows] for part in range(3))
-            bends = [fold("add", row * qddot) - gamma for row, gamma in zip(gradients, gammas, strict=True)]
+            couplings = [x for of_row in products for x in of_row[:-1]]
+            bends = [of_row[-1] - gamma for of_row, gamma in zip(products, gammas, strict=True)]
             return concatenate([*gradients, *moved, stack([*couplings, *residuals, *rates, *bends])])
 
         self._programs[key] = lower_formula(response, *self.scalar_shapes, budget=OPERATION_BUDGET)

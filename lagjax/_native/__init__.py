@@ -62,7 +62,7 @@ from lagjax._native._interpreter import Walk
 from lagjax._native._ir import lanes
 from lagjax._native._kernel import Begun, Kernel, StepRecord, cores, floor_of
 from lagjax._native._line_handler import LineCode, line_handler
-from lagjax._native._loops import Floats, Struct, Wholes, compile_loops, evaluate, integrate, loop
+from lagjax._native._loops import Floats, Loop, Struct, Wholes, compile_loops, evaluate, integrate, loop
 from lagjax._native._motion_parts import Projection, pieces_of, recurrences
 from lagjax._native._taylor import is_large, order_for
 from lagjax._native._watch import Crossed

@@ -16,7 +16,7 @@ from lagjax._native._ir import INTEGER, POINTER, Code, Value, compile_module
 from lagjax._native._lanes import emit, sincos_function
 from lagjax._program._series import StraightLine
 
-# Outputs of one value, side by side, which are written out: LLVM takes 16 s for the 4000 zeros of a row of 2000 springs.
+# Equal outputs, side by side, that are written out: LLVM takes 16 s for the 4000 zeros of a row of 2000 springs.
 _LONGEST = 32
 
 

@@ -20,6 +20,7 @@ import functools
 import hashlib
 import inspect
 import textwrap
+import types
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -54,7 +55,7 @@ _ELEMENTS = {"Floats": "float", "Wholes": "int"}
 _NUMBERS = ("float", "int", "bool")
 _COMPARISONS = {ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!="}
 _OPERATORS = {ast.Add: "add", ast.Sub: "sub", ast.Mult: "mul", ast.FloorDiv: "div", ast.Mod: "srem", ast.Div: "div"}
-_FUNCTIONS = ("abs", "min", "max", "float", "int", "sqrt", "cos", "sin", "atan2", "isfinite", "evaluate",
+_FUNCTIONS = ("abs", "min", "max", "float", "int", "sqrt", "cos", "sin", "log", "atan2", "isfinite", "evaluate",
               "integrate")  # fmt: skip
 
 
@@ -80,6 +81,11 @@ class Loop:
 
     def __call__(self, *arguments):
         return self.function(*arguments)
+
+    def bind(self, **names) -> "Loop":
+        """The same loop with other values of some names of its module."""
+        code, known = self.function.__code__, {**self.names, **names}
+        return Loop(types.FunctionType(code, known, self.name, self.function.__defaults__))
 
     @functools.cached_property
     def tree(self) -> ast.FunctionDef:
@@ -110,8 +116,8 @@ _C_KINDS = {"int": ctypes.c_int64, "float": ctypes.c_double}
 def compile_loops(*entries: Loop) -> tuple[Callable, ...]:
     """Loops as functions in machine code, which take numbers and addresses of arrays."""
     names = tuple(entry.name for entry in entries)
-    level = LEVELS[0]
-    engine, places = compile_text(lambda: _write_module(entries), names, f"{_digest_sources(entries)} {names}", level)
+    level, laws = LEVELS[0], [(entry.function.__module__, entry.name) for entry in entries]
+    engine, places = compile_text(lambda: _write_module(entries), names, f"{_digest_sources(entries)} {laws}", level)
     _engines.append(engine)
     kinds = [[_C_KINDS.get(kind, ctypes.c_void_p) for kind in entry.arguments.values()] for entry in entries]
     results = [_C_KINDS[entry.result] if entry.result else None for entry in entries]
@@ -477,6 +483,9 @@ class _Writer:
 
     def call_sin(self, node, x):
         return "float", self.code.library("sin", self.convert(node, x, "float"))
+
+    def call_log(self, node, x):
+        return "float", self.code.library("log", self.convert(node, x, "float"))
 
     def call_atan2(self, node, y, x):
         return "float", self.code.library("atan2", self.convert(node, y, "float"), self.convert(node, x, "float"))

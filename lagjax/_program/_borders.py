@@ -56,6 +56,7 @@ _FEATURES = {
 _EXPONENTIALS = ("exp", "exp2", "expm1", "sinh", "cosh")
 # The length of a vector at rest, whose square is there, and the longest one that a guard against zero may put there.
 _NOTHING, _NO_LENGTH = 2.0**-500, 1e-12
+_BENT = 1e-9  # of a ratio that is the same at all states: a million roundings
 _LARGEST = 10  # operations that one may become: a bound for errors, three are usual
 _COMPARISONS = ("lt", "le", "gt", "ge")
 _PIECEWISE = {
@@ -316,6 +317,7 @@ class _Rewriting:
         self.tables: list[Located | None] = []
         self._known: dict[tuple, int] = {}
         self._extremes: dict[int, tuple] = {}  # the operations that have been decided
+        self._signs: dict[frozenset[int], dict[int, Any]] = {}  # the switching numbers of signs, by what moves them
         self._one = self.graph.constant(1.0, "float")
         self._moves: list[bool] = []
         self.features: dict[tuple[int, int], Feature] = {}  # by the argument, and the kind
@@ -638,8 +640,34 @@ class _Rewriting:
             piece = self.graph.apply("mul", piece, piece)
         else:
             coefficient, base = self.graph.term(u)
-            piece = self._piece(SIGN, base)
+            piece = self._find_multiple(base) or self._piece(SIGN, base)
         return piece if piece is None or coefficient > 0 else self.graph.apply("neg", piece)
+
+    def _find_multiple(self, x: int) -> int | None:
+        """The sign of a number that is a multiple of a switching number by what does not move, by the piece of that.
+
+        Two pieces with one border would each push onto it, or not, as if the other one stayed as it is.
+        """
+        if not self._is_moving(x) or (SIGN, x) in self._known:
+            return None
+        f, nodes, inputs = self.graph.apply, list(range(len(self.graph.nodes))), inputs_below(self.graph, [x])
+        # Of two draws of params, and four states each.
+        columns = {i: np.random.default_rng(i).uniform(0.3, 1.2, (2, 4)) for i in inputs}
+        columns |= {i: np.repeat(columns[i][:, :1], 4, 1) for i in inputs if self.moving <= i < self.program.size}
+        given = [columns.get(i, columns[min(inputs)]).ravel() for i in range(1 + max(inputs))]
+        values = eliminate_dead_code(self.graph, [x]).evaluate(given).reshape(2, 4)
+        others = self._signs.setdefault(frozenset(i for i in inputs if i < self.moving), {})
+        for y, ratio in ((y, values / of) for y, of in others.items()):
+            if not np.ptp(ratio, axis=1).max() <= _BENT * np.abs(ratio).min():
+                continue
+            product = f("mul", *(gradient_in(self.graph, self.graph, nodes, z, [min(inputs)])[0] for z in (x, y)))
+            if self._is_moving(product) and np.ptp(ratio) > _BENT * np.abs(ratio).max():
+                continue
+            sign = math.copysign(1.0, ratio[0, 0])
+            sign = self.graph.number(sign) if self._is_moving(product) else f("sign", product)
+            return f("mul", sign, self._known[SIGN, y])
+        others[x] = values
+        return None
 
     def _piece(self, kind: int, x: int, table: Located | None = None) -> int | None:
         """The input that says which piece a number is on; None where the number stays as it is along the motion."""
@@ -1033,12 +1061,12 @@ def _guards(kinds: Sequence[int], slides: Sequence[Slide]) -> tuple[Guard, ...]:
     return tuple(guards)
 
 
-def _below(line: StraightLine, roots: Sequence[int]) -> set[int]:
+def _below(line: StraightLine | Graph, roots: Sequence[int]) -> set[int]:
     """The nodes that some nodes depend on, and these."""
     return set(find_ancestors(line.nodes, roots))
 
 
-def inputs_below(line: StraightLine, roots: Sequence[int]) -> frozenset[int]:
+def inputs_below(line: StraightLine | Graph, roots: Sequence[int]) -> frozenset[int]:
     """The inputs that some nodes depend on."""
     return frozenset(line.nodes[i][2] for i in _below(line, roots) if line.nodes[i][0] == "input")
 

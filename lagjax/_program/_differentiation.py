@@ -353,7 +353,7 @@ def with_tangents(
         return eliminate_dead_code(*sink_negations(*factor(graph, results)))
 
 
-def gradient_in(graph: Graph, line: StraightLine, nodes: list[int], node: int, by: Sequence[int]) -> list[int]:
+def gradient_in(graph: Graph, line: Any, nodes: list[int], node: int, by: Sequence[int]) -> list[int]:
     """The derivatives of one node of a line by the inputs `by`, as nodes of the graph in which the line is `nodes`."""
     slopes = slopes_in(graph, line, nodes, node, by)
     return [slopes[i] if i in slopes else graph.number(0.0) for i in by]

@@ -72,7 +72,8 @@ def where(condition, yes, no) -> Scalars:
 
 def fold(op: str, x: Scalars) -> Scalars:
     """The sum ("add"), smallest ("min"), largest ("max") or disjunction ("or") of a vector that is not empty."""
-    return Scalars(x.expansion, x.expansion.fold(op, x.ids))
+    nonzero = x.ids[x.ids != x.expansion.graph.number(0.0)]
+    return Scalars(x.expansion, x.expansion.fold(op, nonzero if op == "add" and nonzero.size else x.ids))
 
 
 def concatenate(parts: Sequence) -> Scalars:

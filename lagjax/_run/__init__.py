@@ -1,7 +1,7 @@
 """From a scene and its start to a motion in the user's own pytree.
 
 `_simulate` holds `simulate` and `simulate_batch`, `_crossings` the instants at which a function of the state changes
-sign, `hybrid/` motions through modes, `contacts/` those with contacts, `_rounds` what these two share. `_trajectory` is
+sign, `hybrid/` motions through modes, `contacts/` those with contacts, `jumps/` what these two share. `_trajectory` is
 what they return, `_batch_members` its members along one axis.
 """
 

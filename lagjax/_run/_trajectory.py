@@ -437,20 +437,6 @@ def constant_unless(varies, tree: PyTree) -> PyTree:
     return jax.tree.map(constant, tree)
 
 
-def vary_with(first, *inputs):
-    """The state before the first round, with derivatives, a batch and mesh axes where later ones have them."""
-    # Else JAX writes the rounds down once more for numbers that get these in a round. The derivatives of a sine vary
-    # with the inputs, too, in every order.
-    moving = jnp.sin(sum(x.ravel()[0] for x in inputs if x.size))
-    still = jax.lax.stop_gradient(moving)
-
-    def vary(x, like=still):
-        return jnp.where(False, like.astype(jnp.asarray(x).dtype), x)
-
-    varying = {name: vary(getattr(first, name), moving) for name in ("t", "y", "path")}
-    return jax.tree.map(vary, first)._replace(**varying)
-
-
 def follow_in_doubles(motion: Callable, problem: Problem, *more) -> Any:
     """`motion(layout, ts, y0, params, *more)` of a problem, in float64, in the problem's own precision."""
     given = problem.ts, problem.y0, problem.params, *more
@@ -458,6 +444,26 @@ def follow_in_doubles(motion: Callable, problem: Problem, *more) -> Any:
         return motion(problem.layout, *given)
     layout = dataclasses.replace(problem.layout, dtype=DOUBLE)
     return compute_in_doubles(functools.partial(motion, layout), *given)
+
+
+def follow_in_numbers(follow: Callable, problem: Problem, *more) -> Any:
+    """`follow_rows` of the one member of a problem, without the axis of members."""
+    found = follow_rows(follow, problem, np.asarray(problem.y0)[None], np.asarray(problem.vector)[None], *more)
+    return jax.tree.map(lambda x: np.asarray(x)[0], found)
+
+
+def follow_rows(follow: Callable, member: Problem, y0, vectors, *more) -> Any:
+    """`follow(layout, params, ts, y0, vectors, *more)` of members whose numbers are known, in the own precision.
+
+    There are `y0` (N, 2n) and `vectors` (N, P), or (1, P); the rest is that of one `member`.
+    """
+
+    def run(ts, y0, vectors):
+        wide = member.double_precision if member.is_single else member
+        return follow(wide.layout, wide.params, ts, y0, vectors, *more)
+
+    given = np.asarray(member.ts), np.asarray(y0), np.asarray(vectors)
+    return compute_in_doubles(run, *given) if member.is_single else run(*given)
 
 
 def step_counts(accepted, rejected) -> dict:

@@ -15,6 +15,7 @@ from jax.interpreters.partial_eval import dce_jaxpr
 
 from lagjax._engine import Problem, choose
 from lagjax._engine.diffrax import form_of
+from lagjax._engine.taylor import MachineCode
 from lagjax._equations import Derivation, SparseStructure, dependent_rows, pieces_of_motion
 from lagjax._interface import join_names, show_str
 from lagjax._native import Nesting, is_large, pieces_of
@@ -114,7 +115,8 @@ class Explanation:
         for name, others in (self.dependent_constraints or {}).items():
             rows.append(("dependent", f"{name} on {join_names(others, _LISTED)}"))
         if self.operations is not None:
-            rows.append(("operations", f"{self.operations} per acceleration, {self.traced_operations} as derived"))
+            traced = "" if self.traced_operations is None else f", {self.traced_operations} as derived"
+            rows.append(("operations", f"{self.operations} per acceleration{traced}"))
         if self.projection_operations is not None:
             rows.append(("", f"{self.projection_operations} per projection to the constraints"))
         rows.append(("path", self.path + (f", because {self.reason}" if self.reason else "")))
@@ -180,6 +182,8 @@ def _facts_of_arrays(derivation: Derivation, structure: SparseStructure) -> dict
 def _engine(problem: Problem) -> dict[str, Any]:
     """The default solver of a motion, the form in which it evaluates the equations, and the cost of that."""
     derivation, refusal = problem.derivation, choose(problem).refusal
+    if problem.system.touches and MachineCode().refuses(problem) is None:  # however large: arrays do not jump
+        derivation, refusal = derivation.lowered, None
     if refusal is None:
         solver, program = "Taylor series in machine code", derivation.acceleration
         if is_large(program, derivation.projection):

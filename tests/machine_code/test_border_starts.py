@@ -244,3 +244,14 @@ def test_a_force_without_a_value_beyond_its_border_leaves_friction_alone():
     assert held.q[-1] == 0.25
     rough, smooth = (lagjax.simulate(system, 0.25, 0.5, np.array([0.0, 0.2]), mu).q[-1] for mu in (-0.75, 0.0))
     assert 0.9 * 0.02 * 0.75 < smooth - rough < 1.1 * 0.02 * 0.75  # ½ μ t², but for what the spring does beside it
+
+
+@pytest.mark.parametrize(("scale", "moved"), [(2.0, 0.4), (-2.0, 0.0)])
+def test_two_spellings_of_one_border_push_together(scale, moved):
+    """Compiles one motion: v = 0 and v / scale = 0 are one border, and 0.8 − 1 + 0.6 is left above it."""
+    system = lagjax.System(
+        lambda q, v: 0.5 * v**2,
+        forces=lambda q, v, params: 0.8 - jnp.sign(v) + 0.6 * jnp.where(v / params > 0, 1.0, 0.0),
+    )
+    run = lagjax.simulate(system, 0.0, 0.0, np.array([0.0, 1.0]), scale)
+    np.testing.assert_allclose(2 * run.q[-1], moved, atol=1e-14)

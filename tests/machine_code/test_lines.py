@@ -60,3 +60,17 @@ def test_a_root_bends_where_its_argument_stands_still():
         lambda f: jax.jacrev(jax.jacrev(f))(x),
     ):
         np.testing.assert_allclose(derivative(line), derivative(root), atol=1e-14)
+
+
+def test_long_runs_of_one_output_are_written_by_a_loop():
+    """As rows of contacts have: zeros beside a few numbers, and a number that is repeated."""
+
+    def rows(x):
+        repeated = jnp.broadcast_to(x[0] * x[1], (50,))
+        return jnp.concatenate([jnp.zeros(100), x[:1] > 0.5, jnp.zeros(40), repeated, x[1:], jnp.zeros(3)])
+
+    program = lower(rows, jnp.ones(3))
+    code = Line(program.line, 3, 3).code
+    assert code is not None
+    inputs = np.array([[0.3, 1.1, 0.4], [0.7, -2.0, 3.0]])
+    np.testing.assert_array_equal(code(inputs), [rows(x) for x in inputs])

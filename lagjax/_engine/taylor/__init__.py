@@ -27,7 +27,6 @@ from lagjax._engine.taylor._crossing import (
     motion_to_event,
     motion_with_crossings,
     run_stretch,
-    stretch_variation,
     surfaces_of,
     surfaces_of_event,
 )
@@ -35,11 +34,11 @@ from lagjax._engine.taylor._derivatives import Motions, jvp, portions, project_s
 from lagjax._engine.taylor._flow import Flow, Tolerances, require_fit
 from lagjax._engine.taylor._line_functions import Line, line_of
 from lagjax._engine.taylor._lowered_motion import lowered_motion
-from lagjax._engine.taylor._surfaces import Guarded, Surfaces, move_to_zero, rate_errors, require_one_number, vector_of
+from lagjax._engine.taylor._surfaces import Surfaces, move_to_zero, rate_errors, require_one_number, vector_of
 from lagjax._equations import Derivation
 from lagjax._interface import EVENT_OCCURRED, default_platform, has_nvidia_gpu, is_concrete
 from lagjax._native import Guards, Nesting, append_guards, pieces_of
-from lagjax._primitives import attach_derivative, compute_in_doubles
+from lagjax._primitives import compute_in_doubles
 from lagjax._program import Program, Unlowerable
 
 
@@ -145,26 +144,6 @@ class MachineCode(AbstractEngine):
             return _primitives.run(flow, tolerances, ts, y0, params)
         given = flow, _unguarded_flow(problem), surfaces_of_event(problem), tolerances
         return _name_events(problem, _primitives.compile_once(motion_to_event, *given)(ts, y0, params))
-
-    def solve_to_event(self, problem: Problem, sides) -> Solution:
-        """The motion of one member to the first change of its guards; it remembers `sides` (see `Guards`).
-
-        It has no derivatives.
-        """
-        ts, y0, numbers = map(jax.lax.stop_gradient, (problem.ts, problem.y0, problem.vector))
-        numbers = jnp.concatenate([numbers, jnp.asarray(sides, float)])
-        return _primitives.run(flow_of(problem), tolerances_of(problem), ts, y0, numbers)
-
-    def vary_to_event(self, problem: Problem, surfaces: Surfaces | None, located: Solution, k, crosses) -> tuple:
-        """(path, t, y): what `solve_to_event` has `located`, of the same problem, with first and second derivatives.
-
-        They are those of outputs up to the event, and of the event, where surface k is zero if it `crosses`; else the
-        time at which the motion ended does not vary.
-        """
-        flow, tolerances = _unguarded_flow(problem), tolerances_of(problem)
-        values, given = (located.path, located.t_end, located.y_end), (problem.ts, problem.y0, problem.vector)
-        varied = stretch_variation(flow, surfaces, tolerances)
-        return attach_derivative(varied, values, *given, located.t_end, located.y_end, k, crosses)
 
     def refuses_crossings(self, problem: Problem, surfaces: Surfaces) -> str | None:
         """Why it cannot find the crossings of these surfaces, as the end of a sentence; None where it can."""

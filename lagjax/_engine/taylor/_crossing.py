@@ -146,24 +146,6 @@ def _event_variation(flow: Flow, surfaces: Surfaces, tolerances: Tolerances):
     return run_unguarded
 
 
-@functools.lru_cache(maxsize=64)
-def stretch_variation(flow: Flow, surfaces: Surfaces | None, tolerances: Tolerances):
-    """`(ts, y0, params, t_end, y_end, k, crosses)` → path, t, y, for the sake of their derivatives."""
-    moves, still = surfaces and crossing_variation(surfaces), jax.lax.stop_gradient
-
-    @jax.jit
-    def run_unguarded(ts, y0, params, t_end, y_end, k, crosses):
-        path, *stop = run_stretch(flow, surfaces, tolerances, ts, y0, params, t_end, y_end, k, crosses)
-        if moves is None:
-            return path, *stop
-        # A surface that is not crossed may have no derivative here.
-        at, numbers = jax.tree.map(lambda x: jnp.where(crosses, x, still(x)), (stop, params))
-        moved = moves(k, crosses, *at, numbers)
-        return path, *(jnp.where(crosses, new, old) for new, old in zip(moved, stop, strict=True))
-
-    return run_unguarded
-
-
 def run_stretch(
     flow: Flow, surfaces: Surfaces | None, tolerances: Tolerances, ts, y0, params, t_end, y_end, k, crosses
 ) -> tuple:

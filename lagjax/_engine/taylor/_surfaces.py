@@ -19,7 +19,7 @@ import numpy as np
 
 from lagjax._engine.taylor._line_functions import outputs
 from lagjax._equations import OPERATION_BUDGET, Derivation
-from lagjax._native import GUARD_NOISE, INSTANT, SINGLE_NOISE, SMALLEST_STEP, Guards
+from lagjax._native import SINGLE_NOISE, Guards
 from lagjax._primitives import differentiable_where
 from lagjax._program import (
     Program,
@@ -39,20 +39,6 @@ from lagjax._program import (
 )
 
 PyTree = Any
-
-
-class Guarded(NamedTuple):
-    """The guards at a state, all (G,), their rates along the motion, and how far rounding moves both."""
-
-    values: jax.Array
-    rates: jax.Array
-    rounding: jax.Array  # by how much its own moves a value
-    of_time: jax.Array  # by how much that of the time moves it
-    rate_rounding: jax.Array
-
-    def clear_rates(self, largest: jax.Array | float = 0.0) -> jax.Array:
-        """The rates, 0 where their rounding, or the `largest` one so far, decides them."""
-        return jnp.where(jnp.abs(self.rates) > jnp.maximum(self.rate_rounding, largest), self.rates, 0.0)
 
 
 class Surfaces(NamedTuple):
@@ -86,26 +72,6 @@ class Surfaces(NamedTuple):
         """True for every guard, (G,), that has no rate anywhere: it changes its sign by jumps."""
         count = len(self.directions)
         return np.array([self.complete.constant(count + k) == 0.0 for k in range(count)])
-
-    def evaluate_guards(self, t, y, numbers, latest, widths) -> Guarded:
-        """The guards at a state (2n,), as machine code takes a start there in a run that ends at `latest`.
-
-        Where the start `is_rounded`, what came in, (q, q̇, t) and `numbers`, is known to these `widths`.
-        """
-        count, still = len(self.directions), jax.lax.stop_gradient
-        t, y, numbers, latest = still((t, y, numbers, latest))
-        given = jnp.append(y, t), numbers
-        out = outputs(self.complete, 4 * count, *given)
-        values, rates, sizes, rate_sizes = out.reshape(4, count)
-        errors = outputs(rate_errors(self.complete, count), count, *given)
-        errors = jnp.where(jnp.isfinite(errors), errors, 0.0)  # a root at zero has no slope
-        instant = INSTANT * SMALLEST_STEP * jnp.maximum(jnp.abs(t), jnp.abs(latest))
-        rounding, rate_rounding = GUARD_NOISE * sizes, GUARD_NOISE * (rate_sizes + errors)
-        if self.is_rounded:
-            slopes = jax.jacrev(lambda *given: outputs(self.values, count, *given), (0, 1))(*given)
-            terms = [jnp.where(width > 0, jnp.abs(by) * width, 0.0) for by, width in zip(slopes, widths, strict=True)]
-            rounding += sum(term.sum(1) for term in terms)
-        return Guarded(values, rates, rounding, jnp.abs(rates) * instant, rate_rounding)
 
     @classmethod
     def from_function(
@@ -148,9 +114,10 @@ def _complete(values: Program, motion: Program, moving: int, rounding: Program |
         nodes, y = values.place(expansion, ids).tolist(), Scalars(expansion, ids[:moving])
         outputs = values.line.outputs
         one, zero = graph.number(1.0), graph.number(0.0)
-        by_y = [tangents_in(graph, values.line, nodes, {j: one}, {}) for j in range(moving)]
+        read = sorted(i for i in values.find_inputs(range(len(outputs))) if i < moving) or [0]
+        by_y = [tangents_in(graph, values.line, nodes, {j: one}, {}) for j in read]
         slopes = Scalars(expansion, np.array([[by.get(i, zero) for by in by_y] for i in outputs]))
-        terms, moves = slopes * y, slopes * _rate(motion, expansion, ids, moving)
+        terms, moves = slopes * y[read], slopes * _rate(motion, expansion, ids, moving)[read]
         found = [[fold("add", row) for row in x] for x in (moves, absolute(terms), absolute(moves))]
         more = [] if rounding is None else [rounding.place(expansion, ids)[list(rounding.line.outputs)]]
         return [np.array([nodes[i] for i in outputs]), *(stack(x).ids for x in found), *more]

@@ -23,8 +23,17 @@ from lagjax._engine.taylor import MOST_GUARDS, MachineCode, line_of
 from lagjax._equations import ROUNDINGS, derivation_of, has_constraints, require_consistent
 from lagjax._interface import Layout, halves, is_concrete, require_budget, result_from
 from lagjax._native import GUARD_NOISE
-from lagjax._primitives import compute_in_doubles
-from lagjax._run._trajectory import ContactChanges, Impacts, Names, State, Trajectory, follow_in_doubles, step_counts
+from lagjax._run._trajectory import (
+    ContactChanges,
+    Impacts,
+    Names,
+    State,
+    Trajectory,
+    follow_in_doubles,
+    follow_in_numbers,
+    follow_rows,
+    step_counts,
+)
 from lagjax._run.contacts._contact_motion import (
     ContactEnding,
     ContactPlan,
@@ -55,7 +64,9 @@ def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int | Non
     """The motions of a batch whose system has contacts."""
     plan, _ = _plan(batch.member, max_transitions)
     if batch.is_known:
-        found = jax.device_put(_follow_known(plan, batch.member, batch.y0, batch.vectors))
+        found = jax.device_put(
+            follow_rows(functools.partial(follow_known, plan), batch.member, batch.y0, batch.vectors)
+        )
     else:
         found = batch.map_members(lambda problem: follow_in_doubles(functools.partial(contact_motion, plan), problem))
     ending, record, impacts = found
@@ -65,19 +76,7 @@ def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int | Non
 def _motion(plan: ContactPlan, problem: Problem) -> tuple[ContactEnding, RoundRecord, tuple]:
     if not problem.is_known:
         return follow_in_doubles(functools.partial(contact_motion, plan), problem)
-    found = _follow_known(plan, problem, np.asarray(problem.y0)[None], np.asarray(problem.vector)[None])
-    return jax.device_put(jax.tree.map(lambda x: np.asarray(x)[0], found))
-
-
-def _follow_known(plan: ContactPlan, member: Problem, y0, vectors) -> tuple[ContactEnding, RoundRecord, tuple]:
-    """The motions of members whose numbers are known, in the precision of `member`: `y0` (N, 2n), `vectors` (N, P)."""
-
-    def follow(ts, y0, vectors):
-        wide = member.double_precision if member.is_single else member
-        return follow_known(plan, wide.layout, wide.params, ts, y0, vectors)
-
-    given = np.asarray(member.ts), np.asarray(y0), np.asarray(vectors)
-    return compute_in_doubles(follow, *given) if member.is_single else follow(*given)
+    return jax.device_put(follow_in_numbers(functools.partial(follow_known, plan), problem))
 
 
 def note_sections(problem: Problem, functions: tuple, directions: tuple[int, ...], room: int) -> tuple:

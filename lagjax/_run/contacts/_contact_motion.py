@@ -26,14 +26,16 @@ from lagjax._equations import OPERATION_BUDGET, Derivation, derivation_of
 from lagjax._interface import Function, Layout, compile_for_one_call, halves
 from lagjax._primitives import attach_derivative, lost_unless
 from lagjax._program import Program, Unlowerable, compose, lower
+from lagjax._run.contacts._contact_search import LOOPS
 from lagjax._run.contacts._corners import append_sides, corners_of
-from lagjax._run.contacts._places import ARRAYS, SAID
-from lagjax._run.contacts._replay import Played, Replay, read_rows
-from lagjax._run.contacts._scene_code import Found, SceneCode, sizes_of_fields
+from lagjax._run.contacts._places import ARRAYS, PLACES, sizes_of
+from lagjax._run.contacts._replay import ContactReplay, Played
+from lagjax._run.jumps import Found, JumpLaw, Mode, SceneCode
 from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes
 
 PyTree = Any
 
+LAW = JumpLaw(PLACES, LOOPS, sizes_of, ("RESTITUTION", "MU"), ("DOUBTS", "DOUBTED"))
 LAWS = "simultaneous", "sequential", "poisson"
 # Operations that have a series everywhere, which hides nothing.
 _SEEN = frozenset(("input", "constant", "convert", "add", "sub", "mul", "neg", "sin", "cos", "exp", "tanh"))
@@ -90,7 +92,7 @@ class SearchedScene(NamedTuple):
     """
 
     code: SceneCode
-    replay: Replay
+    replay: ContactReplay
     flat: Flat
     coefficients: np.ndarray | Program | None
 
@@ -155,8 +157,8 @@ def _coefficients_at(flat: Flat, params: PyTree, vector) -> list[np.ndarray]:
 
 
 def _read(scene: SearchedScene, found: Found) -> tuple[Any, Played]:
-    fields, n = sizes_of_fields(scene.code.sizes), scene.code.sizes["N"]
-    row = read_rows(found.record[..., : sum(fields[name] for name in SAID)], fields, SAID)
+    n = scene.code.sizes["N"]
+    row = scene.code.read(found.record[..., : scene.code.width(PLACES.said)], PLACES.said)
     t, y = found.ending[..., 0], found.ending[..., 1 : 2 * n + 1]
     return row, Played(found.path, row.at, row.before, row.behind, row.t_impact, row.impulse, row.lost, t, y)
 
@@ -169,16 +171,16 @@ def _arrange(scene: SearchedScene, found: Found, row, played: Played, inputs: tu
         there = there[(..., *[None] * (x.ndim - there.ndim))]
         return lost_unless(there, x, inputs) if inputs else np.where(there, x, np.nan)
 
-    k, r, n, d = (scene.code.sizes[name] for name in "KRND")
+    k, r, d = (scene.code.sizes[name] for name in "KRD")
     happened, hits = row.happens > 0, row.hits > 0
     ends = [k, k + r, k + r + r * d, scene.code.sizes["DOING"] - 1]
     closed, sticks, direction, held, near = library.split(found.did, ends, axis=-1)
     of_path = Contacts(closed, sticks, direction.reshape(*direction.shape[:-1], r, d), held, near[..., 0])
-    rest = found.ending[..., 2 * n + 1 :]
-    result, rounds, accepted, rejected = (rest[..., i].astype(int) for i in range(4))
+    of = scene.code.read_ending(found.ending)
+    result, rounds, accepted, rejected = (x.astype(int) for x in of[:4])
     ending = ContactEnding(
         lost((closed >= 0).all(axis=-1), played.path), of_path, played.t, played.y, result, rounds,
-        (accepted, rejected), rest[..., 4:7].astype(int), rest[..., 7:10],
+        (accepted, rejected), of.doubts.astype(int), of.doubted,
     )  # fmt: skip
     changes = (lost(happened, x) for x in (played.at, played.before, played.behind, played.impulse))
     kinds = (library.where(happened, x, -1).astype(int) for x in (row.contact, row.change))
@@ -228,16 +230,15 @@ def _make_scene(
             "possible: one a contact, one more with friction, two a corner. A table (jnp.interp) is one corner."
         )
     watched = turns, sections, ways, code, structure, single
-    surfaces = {
-        "HELD": _watches(derivation, scene, *watched),
-        "OPEN": _watches(open_derivation, ContactScene(scene.system, is_open=True), *watched),
-    }
-    flows = {
-        kind: functools.partial(make_flow, of, scene.path, surfaces[kind].guards(remembers=True))
-        for kind, of in (("HELD", derivation), ("OPEN", open_derivation))
-    }
-    doing = k + r + r * d + held_size(shapes, n) + 1
-    inputs = derivation.acceleration.size
+    modes, more = [], lambda: {"MULTIPLIERS": line_of(_forces_of(derivation, scene, flat))}
+    for of, law, make_lines in (
+        (open_derivation, ContactScene(scene.system, is_open=True), dict),
+        (derivation, scene, more),
+    ):
+        surfaces = _watches(of, law, *watched)
+        make = functools.partial(make_flow, of, scene.path, surfaces.guards(remembers=True))
+        modes.append(Mode(make, surfaces, make_lines))
+    doing, inputs = k + r + r * d + held_size(shapes, n) + 1, derivation.acceleration.size
     free = derivation.acceleration if scene.slots is None else open_derivation.acceleration.complete
     response = line_of(whole.impact_response(places.all, doing, free))
     bends = response.line.replace(outputs=response.line.outputs[-len(places.all) :][:k])
@@ -248,19 +249,20 @@ def _make_scene(
         lines["SIDE_SLOPES"] = lines["SIDES"].forward
     sizes = {
         "N": n, "K": k, "R": r, "D": d, "GAPS": flat.gap_count, "CORNERS": turns, "SECTIONS": len(sections),
-        "WATCHES": watches, "NUMBERS": inputs - 2 * n - 1 - doing, "INPUTS": inputs, "TIMES": times, "DOING": doing,
+        "NUMBERS": inputs - 2 * n - 1 - doing, "INPUTS": inputs, "TIMES": times, "DOING": doing,
         "MOST": most, "LAW": LAWS.index(scene.system.impacts), "SINGLE": int(single), "HEIGHT": len(places.all),
-        "MAY_MISS": int(not {op for op, _, _ in surfaces["OPEN"].values.line.nodes} <= _SEEN),
+        "MAY_MISS": int(not {op for op, _, _ in modes[0].surfaces.values.line.nodes} <= _SEEN),
         "MULTIPLIERS_COUNT": max(len(derivation.multipliers.line.outputs), k + r * d),
         "GAP_SLOTS": (scene.slots or (0, 0))[0], "SLOTS": (scene.slots or (0, 0))[1],
     }  # fmt: skip
     touch = np.zeros((0, k)) if corners is None else corners.touch
     tangential = places.tangential if scene.slots is None else k + np.arange(r * d)
     arrays = dict(zip(ARRAYS, (flat.rough, tangential, touch), strict=True))
-    multipliers = functools.cache(lambda: line_of(_forces_of(derivation, scene, flat)))
-    searched = SceneCode(sizes, arrays, flows, surfaces, lines, multipliers, tolerances)
+    searched = SceneCode(LAW, sizes, arrays, modes, lines, tolerances)
     flow = functools.cache(functools.partial(make_flow, derivation, scene.path, None))
-    return SearchedScene(searched, Replay(searched, flow), flat, _lower_coefficients(flat, derivation.numbers.params))
+    return SearchedScene(
+        searched, ContactReplay(searched, flow), flat, _lower_coefficients(flat, derivation.numbers.params)
+    )
 
 
 def _lower_coefficients(flat: Flat, numbers: PyTree) -> np.ndarray | Program | None:

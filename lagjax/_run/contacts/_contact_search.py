@@ -26,13 +26,10 @@ from math import isfinite, sqrt
 
 from lagjax._interface import RESULTS, SUCCESSFUL, code_of
 from lagjax._native import (
-    EVENT,
     GUARD_NOISE,
-    INSTANT,
     SMALLEST_STEP,
     Floats,
     evaluate,
-    integrate,
     loop,
 )
 from lagjax._run.contacts._law import (
@@ -46,9 +43,8 @@ from lagjax._run.contacts._law import (
     hold_rows,
 )
 from lagjax._run.contacts._places import Entry, Member, Room, Scene
+from lagjax._run.jumps import GOING, LEAST, bind_law, bind_loops, copy, find_sign
 
-# Results of a motion that goes on, of one whose stretch the kernel did not finish, and of one that has not begun.
-GOING, ASKS, NEW = -1, -2, -3
 (TOO_MANY, UNDECIDED, IN_TURN, MISSED, AT_CORNER, NOT_FINITE, INCONSISTENT, BACKWARDS, NO_RESTITUTION,
  NO_FRICTION) = map(
     code_of,
@@ -79,23 +75,17 @@ HARDLY = 1e-6  # of the largest velocities so far: a contact that moves apart sl
 GAINED = 1e-12  # of the room of an impact: a gain of energy beyond rounding
 # Of the largest slip so far: what is more, where the slip along its first direction ends, has turned.
 TURNED = 1e-6
-LEAST = 1e-300  # a side that is exactly zero still has a sign
 # How far beyond a corner a motion goes on, in parts of the terms that say where it is; and how many of the smallest
 # steps before it an event stops it: steps that end at a border may be refused, and halve what is left.
 BEYOND, BEFORE = 16.0 * EPS, 64.0 * SMALLEST_STEP
 # The time that it takes to go beyond, in parts of the motion, from which on a contact rests on its corner.
 ON_CORNER = 1e-10
 INFINITY, MISSING = float("inf"), float("nan")
+OPEN, HELD = range(2)  # the modes
+watch, write_times, write_outputs = bind_loops(globals())
 
 
 # ---- what is known at a state ----
-
-
-@loop
-def copy(given: Floats, into: Floats, count: int):
-    """Put the first `count` numbers of one array into another."""
-    for i in range(count):
-        into[i] = given[i]
 
 
 @loop
@@ -118,37 +108,18 @@ def open_all(scene: Scene, x: Floats, opened: Floats):
 
 
 @loop
-def is_held(scene: Scene, x: Floats) -> bool:
-    """True where a contact is closed, at inputs x."""
+def find_held(scene: Scene, x: Floats) -> int:
+    """The mode at inputs x: whether any contact is closed."""
     for i in range(scene.k):
         if x[2 * scene.n + 1 + scene.numbers + i] > 0:
-            return True
-    return False
+            return HELD
+    return OPEN
 
 
 @loop
-def watch(scene: Scene, member: Member, x: Floats, held: bool, out: Floats, work: Floats):
-    """Put the watches at inputs x, G each: values, rates, how far rounding moves a value, that of time, and a rate."""
-    n, total = scene.n, scene.watches
-    evaluate(scene.held_watch if held else scene.open_watch, x, work)
-    evaluate(scene.held_errors if held else scene.open_errors, x, work[4 * total :])
-    instant = INSTANT * SMALLEST_STEP * max(abs(x[2 * n]), abs(member.last))
-    for g in range(total):
-        more = work[4 * total + g]
-        out[g], out[total + g] = work[g], work[total + g]
-        out[2 * total + g] = GUARD_NOISE * work[2 * total + g]
-        out[3 * total + g] = abs(work[total + g]) * instant
-        out[4 * total + g] = GUARD_NOISE * (work[3 * total + g] + (more if isfinite(more) else 0.0))
-    if scene.single > 0:  # the start is known to the rounding of float32
-        inputs, widths = scene.inputs, member.widths
-        for g in range(total):
-            copy(x, work, inputs)
-            for j in range(total):
-                work[inputs + j] = float(j == g)
-            evaluate(scene.held_slopes if held else scene.open_slopes, work, work[inputs + total :])
-            for i in range(2 * n + 1 + scene.numbers):
-                if widths[i] > 0:
-                    out[2 * total + g] += abs(work[inputs + total + i]) * widths[i]
+def find_mode(scene: Scene, member: Member) -> int:
+    """The mode of the next stretch of a member."""
+    return find_held(scene, member.x)
 
 
 @loop
@@ -165,7 +136,7 @@ def has_missed(scene: Scene, member: Member, watches: Floats, i: int, closed: bo
 def touch(scene: Scene, member: Member, opened: Floats, room: Room):
     """Put which contacts touch, how fast they move apart, and the rounding of that; inputs have all contacts open."""
     total, watches = scene.watches, room.watched
-    watch(scene, member, opened, False, watches, room.free)
+    watch(scene, member, opened, OPEN, watches, room.free)
     for i in range(scene.k):
         value, noise, is_gap = watches[i], watches[2 * total + i] + watches[3 * total + i], i < scene.gaps
         room.touches[i] = float((abs(value) if is_gap else value) <= noise)
@@ -311,12 +282,6 @@ def rests_on_corner(scene: Scene, member: Member, room: Room) -> bool:
 
 
 @loop
-def find_sign(x: float) -> float:
-    """1, −1, or 0."""
-    return 1.0 if x > 0 else (-1.0 if x < 0 else 0.0)
-
-
-@loop
 def starts_inside(scene: Scene, member: Member, room: Room) -> bool:
     """True where a gap is negative at the start, by more than the rounding of what leads a motion there.
 
@@ -423,7 +388,7 @@ def prepare(scene: Scene, member: Member, ts: Floats, times: Floats, y: Floats, 
     if scene.corners > 0:
         x[scene.inputs - 1] = locate_corners(scene, member, x, room)
     watches = member.guards
-    watch(scene, member, x, is_held(scene, x), watches, room.free)
+    watch(scene, member, x, find_held(scene, x), watches, room.free)
     member.missed = 0.0
     for g in range(total):
         kinds[g] = did[g] if g < k + r else 0.0
@@ -439,15 +404,7 @@ def prepare(scene: Scene, member: Member, ts: Floats, times: Floats, y: Floats, 
         beyond = g < k + r and sides[g] == INFINITY
         stays[g] = float((member.fresh[g] > 0 or beyond) and not falls)
     copy(x, y, 2 * n)
-    times[0], times[scene.times + 1] = t, ts[scene.times - 1]
-    for j in range(scene.times):
-        times[1 + j] = ts[j] if is_ahead(ts[j], t, ts[0]) else t
-
-
-@loop
-def is_ahead(output: float, t: float, first: float) -> bool:
-    """True for an output time that a stretch from t on may cover; at the first time all that are there."""
-    return output > t or (output == t and t == first)
+    write_times(scene, t, ts, times)
 
 
 @loop
@@ -512,18 +469,6 @@ def finish(
 
 
 @loop
-def write_outputs(
-    scene: Scene, ts: Floats, start: float, end: float, found: Floats, doing: Floats, path: Floats, did: Floats
-):
-    """Put the outputs of a stretch, `found` (T, 2n), and what contacts are `doing` then."""
-    states = 2 * scene.n
-    for j in range(scene.times):
-        if is_ahead(ts[j], start, ts[0]) and ts[j] <= end:
-            copy(found[j * states :], path[j * states :], states)
-            copy(doing, did[j * scene.doing :], scene.doing)
-
-
-@loop
 def find_result(scene: Scene, member: Member, reached: int, happens: bool) -> int:
     """The result of a motion so far, behind a stretch that `reached` this one: `GOING` if all is well."""
     if happens and member.turns > 16 + 8 * scene.watches:
@@ -572,7 +517,7 @@ def check_outputs(scene: Scene, member: Member, ts: Floats, path: Floats, did: F
             copy(path[j * 2 * n :], x, 2 * n)
             x[2 * n] = ts[j]
             copy(did[j * doing :], x[2 * n + 1 + scene.numbers :], doing)
-            watch(scene, member, x, is_held(scene, x), watches, watches[5 * scene.watches :])
+            watch(scene, member, x, find_held(scene, x), watches, watches[5 * scene.watches :])
             for i in range(k):
                 if has_missed(scene, member, watches, i, did[j * doing + i] > 0):
                     member.result = float(MISSED)
@@ -1155,13 +1100,16 @@ def name_change(scene: Scene, first: int, hits: bool, did: Floats, row: Entry, r
     row.contact, row.change = float(contact), float(change)
 
 
-# ---- all members ----
+# ---- a member ----
 
 
 @loop
 def start(scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, room: Room):
     """Begin a member, whose outputs are at `ts`: those that lie before its corner are there."""
     n, x, first = scene.n, member.x, member.first
+    open_all(scene, x, x)
+    for i in range(3):
+        member.doubted[i] = MISSING
     member.result = float(begin(scene, member, room))
     copy(x, member.begun, 2 * n + 1)
     for j in range(scene.times):
@@ -1170,84 +1118,4 @@ def start(scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, r
             copy(x[2 * n + 1 + scene.numbers :], did[j * scene.doing :], scene.doing)
 
 
-@loop
-def follow(
-    scene: Scene, members: int, ts: Floats, path: Floats, did: Floats, record: Entry, memory: Member, room: Room
-):
-    """Follow members that go on to their ends, or to a stretch that the kernel does not finish (`ASKS`).
-
-    `ts` (T,) are the same for all if `scene` has one row of them, or (members, T). Members run side by side: those
-    that are going are packed for one call of the kernel, those with open contacts alone apart.
-    """
-    size, times, states = scene.memory, scene.times, 2 * scene.n
-    for m in range(members):
-        if memory[m * size :].result == NEW:
-            ours = did[m * times * scene.doing :]
-            start(scene, memory[m * size :], ts[m * scene.stride :], path[m * times * states :], ours, room)
-    while True:
-        any_going = False
-        for held in range(2):
-            count, places = 0, room.order
-            for m in range(members):
-                mine = memory[m * size :]
-                if mine.result == GOING and is_held(scene, mine.x) == (held > 0):
-                    if mine.rows >= scene.room:
-                        continue
-                    places[count] = float(m)
-                    count += 1
-            if count > 0:
-                any_going = True
-                follow_stretch(scene, held, count, ts, path, did, record, memory, room)
-        if not any_going:
-            return
-
-
-@loop
-def follow_stretch(
-    scene: Scene, held: int, count: int, ts: Floats, path: Floats, did: Floats, record: Entry, memory: Member,
-    room: Room
-):  # fmt: skip
-    """Follow a stretch of `count` members, whose numbers are in `ORDER`, by one call of the kernel."""
-    size, times, states = scene.memory, scene.times, 2 * scene.n
-    outputs, numbers, each = times + 2, scene.inputs - states - 1 + 2 * scene.watches, scene.room * scene.row
-    places, job = room.order, room.jobs
-    given_y, given_numbers = job[count * outputs :], job[count * (outputs + states) :]
-    found = given_numbers[count * numbers :]
-    y_end, t_end = found[count * outputs * states :], found[count * (outputs + 1) * states :]
-    code, steps, rejected, left = t_end[count:], t_end[2 * count :], t_end[3 * count :], t_end[4 * count :]
-    plan, rest = scene.open_many, scene.open_many_rest
-    if held > 0:
-        plan, rest = scene.held_many, scene.held_many_rest
-    if count == 1:
-        plan = scene.held_one if held > 0 else scene.open_one
-        rest = scene.held_one_rest if held > 0 else scene.open_one_rest
-    for i in range(count):
-        m = int(places[i])
-        mine = memory[m * size :]
-        if plan != 0:
-            prepare(
-                scene, mine, ts[m * scene.stride :], job[i * outputs :], given_y[i * states :],
-                given_numbers[i * numbers :], room
-            )  # fmt: skip
-        else:
-            mine.result = float(ASKS)
-    if plan == 0:
-        return
-    integrate(
-        scene.begin, plan, job, given_y, given_numbers, found, y_end, t_end, code, steps, rejected, left, count, outputs
-    )
-    undone = left[rest - 1] != 0
-    for i in range(count):
-        m = int(places[i])
-        mine, result = memory[m * size :], int(code[i])
-        sound = result == SUCCESSFUL or result >= EVENT
-        for j in range(states):
-            sound = sound and isfinite(y_end[i * states + j])
-        if undone or not sound:
-            mine.result = float(ASKS)
-        else:
-            finish(
-                scene, mine, ts[m * scene.stride :], path[m * times * states :], did[m * times * scene.doing :],
-                record[m * each :], found[i * outputs * states :], y_end[i * states :], t_end[i],
-                result - EVENT if result >= EVENT else 0, SUCCESSFUL, steps[i], rejected[i], room
-            )  # fmt: skip
+LOOPS = bind_law(globals())

@@ -1,40 +1,18 @@
-"""The places of what the search for contacts reads and writes: in its scene, a member's memory, a row of a record.
+"""The places of what the search for contacts reads and writes, beside those that every search has."""
 
-A scene is a row of integers: first those that are named here, then arrays. Of memories and records it holds at which
-double each field begins.
-"""
-
-from types import SimpleNamespace
 from typing import TYPE_CHECKING, Any
 
-from lagjax._native import Struct
+from lagjax._run.jumps import Places
 
 SIZES = (
-    "N",  # coordinates
     "K", "R", "D",  # contacts, those with friction, the directions in which these slip
     "GAPS",  # contacts with a gap; the others are one-way velocities
-    "CORNERS", "SECTIONS",
-    "WATCHES",  # k normal ones, r of friction, two a corner, sections
-    "NUMBERS", "INPUTS",  # of the user's parameters; of lines: the state, the numbers, and what contacts do
-    "TIMES", "STRIDE",  # outputs, and from those of one member to those of the next
-    "DOING",  # numbers that say what contacts do
-    "ROOM",  # rounds that a record has room for
-    "MOST",  # rounds of a whole motion
+    "CORNERS", "SECTIONS",  # of watches there are k normal ones, r of friction, two a corner, sections
     "LAW",  # 0 simultaneous, 1 sequential, 2 Poisson's
-    "SINGLE",  # 1 if the start came in float32
     "MAY_MISS",  # 1 if an operation of the watches may hide a corner from a series
     "HEIGHT", "MULTIPLIERS_COUNT",  # rows of contacts, and of all constraints
     "GAP_SLOTS", "SLOTS",  # rows of gaps and of velocities for which there is room; 0 where rows are as they are
-    "MEMORY", "ROW", "WORK",  # doubles of a memory, of a row of the record, of the room of a thread
-    # Doubles of what kernels leave behind, of which the last says whether a run is done; and the most of these.
-    "OPEN_ONE_REST", "OPEN_MANY_REST", "HELD_ONE_REST", "HELD_MANY_REST", "REST",
-)  # fmt: skip
-# Addresses of machine code; 0 where there is none yet. Of open contacts alone, and of all.
-CODES = (
-    "BEGIN",  # of kernels
-    "OPEN_ONE", "OPEN_MANY", "HELD_ONE", "HELD_MANY",  # plans of kernels
-    "OPEN_WATCH", "HELD_WATCH", "OPEN_ERRORS", "HELD_ERRORS", "OPEN_SLOPES", "HELD_SLOPES",
-    "RESPONSE", "BENDS", "ACCELERATION", "MULTIPLIERS", "SIDES", "SIDE_SLOPES",
+    "RESPONSE", "BENDS", "ACCELERATION", "MULTIPLIERS", "SIDES", "SIDE_SLOPES",  # addresses of lines
 )  # fmt: skip
 ARRAYS = (
     "ROUGH",  # (r,), the contacts with friction
@@ -42,12 +20,8 @@ ARRAYS = (
     "TOUCH",  # (corners, k), which corner touches which contact
 )  # fmt: skip
 MEMORY = (
-    "X",  # the inputs of lines: q, q̇, t, the user's numbers, then what the contacts do
-    "OPENED",  # the same with all contacts open
+    "OPENED",  # the inputs of lines, q, q̇, t, the user's numbers, then what contacts do, with all contacts open
     "RESTITUTION", "MU",  # (k,), (r,)
-    "WIDTHS",  # how far the start, t and the numbers are known, where they came in float32
-    "RTOL", "FIRST", "LAST",  # the first and the last of the output times
-    "BEGUN",  # y and t where it began
     "FRESH",  # (G,), whether what a watch follows has begun at this instant
     "TIED",  # (k + r,), whether it turns at this instant by rounding between open and closed, sticking and sliding
     "REFUTED",  # (k,), whether a contact has opened there
@@ -56,8 +30,8 @@ MEMORY = (
     "CAME",  # (sections,), the sides from which the motion comes
     "SLIP",  # (r,), the largest so far
     "LARGEST",  # (2n,), the largest numbers of the state so far
-    "GUARDS", "KINDS", "STAYS",  # of the stretch: the watches where it begins (5, G), their kinds, what does not cross
-    "MISSED", "TURNS", "LONGEST", "RESULT", "ROUNDS", "ROWS", "ACCEPTED", "REJECTED",
+    "KINDS", "STAYS",  # (G,) of the stretch: what contacts do, and what does not cross
+    "MISSED", "TURNS", "LONGEST",
     "DOUBTS", "DOUBTED",  # (3,), as in `ContactChanges`
 )  # fmt: skip
 WORK = (
@@ -76,19 +50,13 @@ WORK = (
     "CORNER", "PASSED", "OPENING",  # (3, corners), (corners,), (k,)
     "SHIFT", "LATER",  # (2n,), by how much the state and the time go beyond corners
     "FELL",  # (G,), 1 for watches that fell, 2 for those that rose
-    "FREE",  # for what is not named
-    "ORDER", "JOBS",  # the members whose stretch comes next, and what the kernel is given and gives
 )  # fmt: skip
-SAID = (  # of a row of the record, what a user is told
-    "HAPPENS", "CONTACT", "CHANGE", "HITS",
+SAID = (
+    "CONTACT", "CHANGE", "HITS",
     "AT", "BEFORE", "BEHIND",  # the time of the change, q̇ before it, the state behind it
     "T_IMPACT", "IMPULSE", "LOST",
 )  # fmt: skip
 RECORD = (
-    *SAID,
-    "RAN",  # 1 if there was such a stretch
-    "END", "STOP",  # of the stretch, and the state there (2n,)
-    "WATCH", "CROSSES", "DECIDES",
     "DID",  # what the contacts did during it, as the inputs of lines have it
     "HELD", "SLIDES", "DIRECTION",  # of the impulses: rows (k + r d,), the contacts that slide (r,), and where (r d,)
     "COMPRESSED", "RETURNED",  # (k,), rows of the phases of Poisson's law
@@ -99,27 +67,38 @@ RECORD = (
     "LEAVES_REST",
     "OFFSET", "LATER_ON",  # (2n,), by how much the state is moved besides; and the time
 )  # fmt: skip
-
-
-NAMES = (*SIZES, *CODES, *ARRAYS, *MEMORY, *WORK, *(f"TO_{name}" for name in RECORD))
-_PLACES = {name: i for i, name in enumerate(NAMES)}
-assert len(_PLACES) == len(NAMES), "two fields of one name"
-at = SimpleNamespace(**_PLACES)
-_SCALARS = (
-    "RTOL", "FIRST", "LAST", "MISSED", "TURNS", "LONGEST", "RESULT", "ROUNDS", "ROWS", "ACCEPTED", "REJECTED", "LATER",
-    "RAN", "END", "WATCH", "CROSSES", "HAPPENS", "DECIDES", "CONTACT", "CHANGE", "HITS", "AT", "T_IMPACT", "LOST",
-    "LEAVES_REST", "LATER_ON",
-)  # fmt: skip
-
-
-def _struct(names: tuple[str, ...], scalars: tuple[str, ...] = _SCALARS, prefix: str = "", table: str | None = "scene"):
-    places = {name.lower(): _PLACES[prefix + name] for name in names}
-    return Struct(places, frozenset(name.lower() for name in names if name in scalars), table)
-
+_SCALARS = ("MISSED", "TURNS", "LONGEST", "CONTACT", "CHANGE", "HITS", "AT", "T_IMPACT", "LOST",
+            "LEAVES_REST", "LATER_ON")  # fmt: skip
+PLACES = Places(SIZES, ARRAYS, MEMORY, WORK, SAID, RECORD, _SCALARS, in_room=("LATER",))
 
 if TYPE_CHECKING:  # whose fields are known at run time
     Scene = Member = Entry = Room = Any
 else:
-    Scene = _struct((*SIZES, *CODES, *ARRAYS), (*SIZES, *CODES), table=None)
-    Member, Entry = _struct(MEMORY), _struct(RECORD, prefix="TO_")
-    Room = _struct(WORK, ("LATER",))
+    Scene, Member, Room, Entry = (PLACES.structs[name] for name in ("Scene", "Member", "Room", "Entry"))
+
+
+def sizes_of(sizes: dict[str, int]) -> dict[str, int]:
+    """The count of doubles in each field that has not one, beside those of every search."""
+    n, k, r, d, corners, watches, inputs, doing = (
+        sizes[name] for name in ("N", "K", "R", "D", "CORNERS", "WATCHES", "INPUTS", "DOING")
+    )
+    size = k + r * d
+    law = 12 * size**2 + 40 * size + 40
+    lines = 4 * inputs + 2 * size * n + size**2 + 3 * size + 20 * watches + 4 * corners + sizes["MULTIPLIERS_COUNT"]
+    per_contact = (
+        "RESTITUTION", "REFUTED", "FORCE_NOISE", "TOUCHES", "PARTING", "NOISE", "INVOLVED", "CLOSED", "PUSH", "STAY",
+        "PARTS", "CHANGED", "TARGETS", "OPENING", "IMPULSE", "COMPRESSED", "RETURNED", "ENDS", "MEETS", "SHARES",
+    )  # fmt: skip
+    fields = dict.fromkeys(per_contact, k) | dict.fromkeys(("MU", "SLIP", "STUCK", "TURNS_BACK", "SLIDES", "STARTS"), r)
+    fields |= dict.fromkeys(("VALUES", "RATES", "BEND", "IMPULSES", "APART", "HELD"), size)
+    fields |= dict.fromkeys(("LARGEST", "SHIFT", "BEHIND", "OFFSET"), 2 * n)
+    fields |= {"OPENED": inputs} | dict.fromkeys(("DOUBTS", "DOUBTED"), 3)
+    fields |= dict.fromkeys(("FRESH", "KINDS", "STAYS", "FELL"), watches)
+    fields |= dict.fromkeys(("ROUNDING", "RATE_ROUNDING"), 2 * watches)
+    fields |= dict.fromkeys(("GRADIENTS", "RESPONSES"), size * n) | dict.fromkeys(("SLIPS", "SLIPS_BEHIND"), 2 * r)
+    fields |= {
+        "WATCHED": 5 * watches, "TIED": k + r, "CAME": sizes["SECTIONS"], "COUPLING": size**2, "FORCES": d, "CHANGE": n,
+        "CORNER": 3 * corners, "PASSED": corners, "FREE": law + lines, "DID": doing,
+        "BEFORE": n, "DIRECTION": r * d,
+    }  # fmt: skip
+    return fields

@@ -1,7 +1,9 @@
 """Motion that changes its laws: modes, each a `System` of its own, and transitions between them.
 
-    Hybrid ─► RoundPlan ─► _transition_rounds: a scan, round after round ─► Ending, Record ─► Trajectory
-                          └─ _mode: the problem of one mode, its guards, the crossing of a guard, the reset
+    Hybrid ─► HybridPlan ─► _transition_motion ─► Ending, TransitionRecord ─► Trajectory
+                             ├─ _transition_search: what happens, by loops over numbers, which _transition_places names
+                             ├─ _transition_replay: the same with derivatives
+                             └─ _mode: one mode, its flow, its guards, the resets
 
 Source: Aizerman & Gantmakher, Q. J. Mech. Appl. Math. 11 (1958) 225; Hiskens & Pai, IEEE Trans. Circuits Syst. I 47
 (2000) 204, §III.
@@ -25,16 +27,23 @@ from lagjax._interface import (
     Layout,
     SimulationError,
     as_arrays,
-    compile_for_one_call,
-    halves,
     is_concrete,
     require_budget,
     require_flag,
     result_from,
 )
-from lagjax._run._trajectory import State, Trajectory, Transitions, follow_in_doubles, raise_unless_ok, step_counts
+from lagjax._run._trajectory import (
+    State,
+    Trajectory,
+    Transitions,
+    follow_in_doubles,
+    follow_in_numbers,
+    raise_unless_ok,
+    step_counts,
+)
 from lagjax._run.hybrid._mode import Transition
-from lagjax._run.hybrid._transition_rounds import IN_ONE_PLACE, Ending, RoundPlan, TransitionRecord, hybrid_motion
+from lagjax._run.hybrid._transition_motion import Ending, HybridPlan, TransitionRecord, follow_known, hybrid_motion
+from lagjax._run.hybrid._transition_search import IN_ONE_PLACE
 from lagjax._scene import System, present_system, require_system
 
 PyTree = Any
@@ -144,31 +153,29 @@ def follow_modes(
         require_consistent(first, layout, problem.ts, q0, qdot0, problem.params)
     rtol, atol = float(MachineCode().rtol(problem.double_precision)), None if atol is None else float(atol)
     limits = scene.max_transitions, rtol, atol, max_steps, problem.is_single
-    plan = RoundPlan(tuple(modes), tuple(modes.values()), tuple(scene.transitions), *limits)
-    ending, record = follow_in_doubles(functools.partial(hybrid_motion, plan), problem, start)
+    plan = HybridPlan(tuple(modes), tuple(modes.values()), tuple(scene.transitions), *limits)
+    if problem.is_known and is_concrete(start):
+        ending, record = jax.device_put(follow_in_numbers(functools.partial(follow_known, plan), problem, start))
+    else:
+        ending, record = follow_in_doubles(functools.partial(hybrid_motion, plan), problem, start)
     trajectory = _trajectory(modes, problem, ending, record)
     return _raise_unless_ok(modes, trajectory, layout, ending.mode) if throw else trajectory
 
 
 def _trajectory(modes: dict[str, System], problem: Problem, ending: Ending, record: TransitionRecord) -> Trajectory:
-    (q, qdot), end, (q_at, qdot_at), (q_next, qdot_next) = _restore(problem.layout, ending, record)
+    (q_at, qdot_at), (q_next, qdot_next) = record.state, record.behind
     transitions = Transitions(
         t=record.t, q=q_at, qdot=qdot_at, source=record.source, target=record.target, number=record.number,
-        count=jnp.sum(record.source >= 0), order_matters=record.order_matters, let_out=ending.let_out,
-        q_next=q_next, qdot_next=qdot_next,
+        count=record.count, order_matters=record.order_matters, let_out=ending.let_out, q_next=q_next,
+        qdot_next=qdot_next,
     )  # fmt: skip
+    known = dataclasses.replace(problem, ts=jax.lax.stop_gradient(problem.ts))
     return Trajectory(
-        ts=jnp.asarray(problem.ts), q=q, qdot=qdot, result=result_from(ending.result), end=State(ending.t, *end),
-        stats=step_counts(*ending.steps), system=dict(modes), params=problem.params, mode=ending.modes,
-        transitions=transitions, mode_names=tuple(modes), tolerances=MachineCode().tolerances(problem, problem.y0),
+        ts=jnp.asarray(problem.ts), q=ending.path[0], qdot=ending.path[1], result=result_from(ending.result),
+        end=State(ending.t, *ending.state), stats=step_counts(*ending.steps), system=dict(modes), params=problem.params,
+        mode=ending.modes, transitions=transitions, mode_names=tuple(modes),
+        tolerances=MachineCode().tolerances(known, jax.lax.stop_gradient(problem.y0)),
     )  # fmt: skip
-
-
-@compile_for_one_call
-def _restore(layout: Layout, ending: Ending, record: TransitionRecord) -> list:
-    """(q, q̇) in the user's structure: at the outputs, the end, before and behind transitions."""
-    states = ending.path, ending.y, record.y, record.y_next
-    return [tuple(map(layout.restore, halves(y))) for y in states]
 
 
 def _raise_unless_ok(modes: dict[str, System], trajectory: Trajectory, layout: Layout, last) -> Trajectory:

@@ -6,8 +6,9 @@ this is the jump of a sensitivity at an event ("saltation matrix").
 
 import dataclasses
 import functools
+import math
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -15,14 +16,17 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine import Problem
-from lagjax._engine.taylor import MOST_GUARDS, Guarded, MachineCode, Surfaces, require_one_number
-from lagjax._equations import Derivation, has_constraints, is_inconsistent
+from lagjax._engine.taylor import MOST_GUARDS, Line, MachineCode, Surfaces, line_of, make_flow, require_one_number
+from lagjax._equations import OPERATION_BUDGET, Derivation, has_constraints, is_inconsistent
 from lagjax._interface import Function, Layout, accept, halves, present
 from lagjax._primitives import DOUBLE, SINGLE
-from lagjax._program import Unlowerable
+from lagjax._program import Unlowerable, lower
 from lagjax._scene import System
 
 PyTree = Any
+
+
+FIRES = None, "beyond", "crossing"
 
 
 class Transition(eqx.Module):
@@ -75,7 +79,7 @@ class Transition(eqx.Module):
             raise ValueError(f"direction must be -1 (falling), +1 (rising) or 0 (both); got {direction!r}.")
         if guard is None:
             raise TypeError(f"The transition from {source!r} to {target!r} has no guard: say where it happens.")
-        if fires not in (None, "beyond", "crossing"):
+        if fires not in FIRES:
             raise ValueError(f'fires must be "beyond", "crossing" or None; got {fires!r}.')
         if fires == "beyond" and not direction:
             raise ValueError('fires="beyond" needs a direction, -1 or +1: zero is left on both sides.')
@@ -97,60 +101,83 @@ class Transition(eqx.Module):
         return eqx.tree_at(lambda t: (t.guard, t.reset), self, (guard, reset), is_leaf=lambda x: x is None)
 
 
-class Mode(NamedTuple):
-    """One mode: a problem that lacks a state and times, and the K transitions that leave it."""
+class ModeParts:
+    """One mode that is ready to run: its flow, its guards, the transitions that leave it; it is known by identity.
 
-    problem: Problem
-    leaving: tuple[Transition, ...]
-    numbers: np.ndarray  # their places among all transitions, (K,)
-    targets: np.ndarray  # the places of the modes that they lead to, (K,)
-    surfaces: Any  # their guards, a `Surfaces`; None where none leaves
-    vector: jax.Array  # every number in params, (P,)
-    widths: tuple = ()  # of the first (q, q̇, t), and of params: their rounding, where the start came in float32
+    `numbers` are the places of these transitions in the list. A reset is None where the state is kept. `reset_lines`
+    and `check`, which is 1 off the constraints, are lines of (q, q̇, t) and the numbers of params.
+    """
 
-    @classmethod
-    def from_problem(cls, name: str, problem: Problem, leaving: tuple[Transition, ...], numbers, targets) -> "Mode":
-        """A mode that is ready to run. Raises `ValueError` where it has no machine code."""
-        if len(leaving) > MOST_GUARDS:
-            raise ValueError(
-                f"{len(leaving)} transitions leave the mode {name!r}, and {MOST_GUARDS} are possible: join the guards "
-                "of those that lead to the same mode, with jnp.minimum for instance."
-            )
-        code, structure = jax.tree.flatten(eqx.filter(problem.params, eqx.is_array_like, inverse=True))
-        try:
-            if refusal := MachineCode().refuses(problem):
-                raise Unlowerable(refusal)
-            surfaces = _surfaces(problem.derivation.lowered, problem.system, leaving, tuple(code), structure)
-            surfaces = surfaces and surfaces._replace(is_rounded=problem.is_rounded)
-            guarded = dataclasses.replace(problem, guards=surfaces and surfaces.guards(remembers=True))
-            if refusal := MachineCode().refuses(guarded):
-                raise Unlowerable(refusal)
-        except Unlowerable as why:
-            raise ValueError(f"The mode {name!r} has no machine code: {why}.") from None
-        return cls(problem, leaving, numbers, targets, surfaces, jnp.asarray(problem.vector))
+    def __init__(
+        self, derivation: Derivation, system: System, leaving: dict[int, Transition], surfaces, restore, is_rounded
+    ):
+        self._dtype = SINGLE if is_rounded else DOUBLE
+        self.numbers, self.surfaces, self._derivation, self._restore = tuple(leaving), surfaces, derivation, restore
+        n, size = derivation.layout.size, derivation.acceleration.size
+        self.sizes = {"N": n, "NUMBERS": size - 2 * n - 1, "INPUTS": size}
+        guards = surfaces and surfaces.guards(remembers=True)
+        self.make_flow = functools.partial(make_flow, derivation, system.path, None)
+        self.make_guarded = functools.partial(make_flow, derivation, system.path, guards)
+        self._resets = [transition if transition.reset else None for transition in leaving.values()]
+        self.reset_lines = [of and self._lower(functools.partial(self._reset, of)) for of in self._resets]
+        self.check = self._lower(functools.partial(self._is_off, system)) if has_constraints(system) else None
 
-    def blows(self, place: int) -> tuple[np.ndarray, np.ndarray]:
-        """The transitions that lead back into this mode, of this `place`, with a direction and a reset; and these."""
-        own = [k for k, x in enumerate(self.leaving) if self.targets[k] == place and x.reset and x.direction]
-        return np.array(own, int), np.array([self.leaving[k].direction for k in own])
+    def _lower(self, function: Callable) -> Line:
+        y = jax.ShapeDtypeStruct((2 * self._derivation.layout.size + 1,), float)
+        return line_of(lower(function, y, self._derivation.numbers, budget=OPERATION_BUDGET))
 
-    @property
-    def layout(self) -> Layout:
-        return self.problem.layout
+    def _reset(self, transition: Transition, y, numbers):
+        return state_after(transition, self._derivation.layout, y[-1], y[:-1], self._restore(numbers))
 
-    def guards_at(self, t, y, latest) -> Guarded:
-        """The guards at a state, without derivatives, of a run that ends at `latest`."""
-        return self.surfaces.evaluate_guards(t, y, self.vector, latest, self.widths)
+    def _is_off(self, system: System, y, numbers):
+        layout, state = self._derivation.layout, (*halves(y[:-1]), y[-1], numbers)
+        terms = self._derivation.term_sizes(*state)
+        off = is_inconsistent(system._motion(layout, self._restore(numbers)), state, jnp.inf, self._dtype, terms)
+        return jnp.where(off, 1.0, 0.0)
 
-    def is_inconsistent(self, t, y):
-        system, params = self.problem.system, self.problem.params
-        if not has_constraints(system):
-            return jnp.asarray(False)
-        motion = system._motion(self.layout, params)
-        t, y, numbers = jax.lax.stop_gradient((t, y, eqx.filter(params, eqx.is_array_like)))
-        state, dtype = (*halves(y), t, numbers), SINGLE if self.problem.is_rounded else DOUBLE
-        terms = self.problem.derivation.term_sizes(*state)
-        return is_inconsistent(motion, state, jnp.inf, dtype, terms)
+    def resets(self) -> list[Callable | None]:
+        """The resets as functions of t, y and all numbers in params, (P,)."""
+        leaves, structure = jax.tree.flatten(self._derivation.numbers)
+        ends = np.cumsum([math.prod(leaf.shape) for leaf in leaves], dtype=int)
+
+        def reset(transition: Transition, t, y, vector):
+            parts = zip(jnp.split(vector, ends)[: len(leaves)], leaves, strict=True)
+            numbers = structure.unflatten([part.reshape(leaf.shape).astype(leaf.dtype) for part, leaf in parts])
+            return self._reset(transition, jnp.append(y, t), numbers)
+
+        return [of and functools.partial(reset, of) for of in self._resets]
+
+
+def make_mode(name: str, transitions: tuple[Transition, ...], problem: Problem) -> ModeParts:
+    """A mode that is ready to run. Raises `ValueError` where it has no machine code."""
+    leaving = {k: transition for k, transition in enumerate(transitions) if transition.source == name}
+    if len(leaving) > MOST_GUARDS:
+        raise ValueError(
+            f"{len(leaving)} transitions leave the mode {name!r}, and {MOST_GUARDS} are possible: join the guards "
+            "of those that lead to the same mode, with jnp.minimum for instance."
+        )
+    code, structure = jax.tree.flatten(eqx.filter(problem.params, eqx.is_array_like, inverse=True))
+    of_guards = problem.derivation.lowered, problem.system, tuple(leaving.values()), tuple(code), structure
+    try:
+        if refusal := MachineCode().refuses(problem):
+            raise Unlowerable(refusal)
+        surfaces = _surfaces(*of_guards)
+        surfaces = surfaces and surfaces._replace(is_rounded=problem.is_rounded)
+        guarded = dataclasses.replace(problem, guards=surfaces and surfaces.guards(remembers=True))
+        if refusal := MachineCode().refuses(guarded):
+            raise Unlowerable(refusal)
+        return _make_parts(*of_guards, tuple(leaving), problem.is_rounded)
+    except Unlowerable as why:
+        raise ValueError(f"The mode {name!r} has no machine code: {why}.") from None
+
+
+@functools.lru_cache(maxsize=64)
+def _make_parts(derivation: Derivation, system: System, leaving, code, structure, numbers, is_rounded) -> ModeParts:
+    surfaces = _surfaces(derivation, system, leaving, code, structure)
+    surfaces = surfaces and surfaces._replace(is_rounded=is_rounded)
+    others = structure.unflatten(code)
+    of = dict(zip(numbers, leaving, strict=True))
+    return ModeParts(derivation, system, of, surfaces, lambda numbers: eqx.combine(numbers, others), is_rounded)
 
 
 @functools.lru_cache(maxsize=64)
@@ -178,8 +205,7 @@ def _surfaces(derivation: Derivation, system: System, leaving: tuple, code: tupl
 
 def state_after(transition: Transition, layout: Layout, t, y, params) -> jax.Array:
     """The state (2n,) after the reset of a transition. Raises `TypeError` where that is no state of this layout."""
-    if transition.reset is None:
-        return y
+    assert transition.reset is not None
     result = transition.reset(*map(layout.restore, halves(y)), t=t, params=params)
     where = f"The reset from {transition.source!r} to {transition.target!r}"
     if not isinstance(result, tuple) or len(result) != 2:

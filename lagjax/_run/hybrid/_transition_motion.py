@@ -1,0 +1,172 @@
+"""The motion of a hybrid scene: a search for what happens, without derivatives, and a replay, which has them.
+
+HybridPlan, start ─► SceneCode.search ─► Found ─► attach_derivative(HybridReplay) ─► Ending, TransitionRecord
+"""
+
+import dataclasses
+import functools
+from typing import Any, NamedTuple
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from lagjax._engine import Problem
+from lagjax._engine.taylor import Tolerances, vector_of
+from lagjax._interface import Layout, compile_for_one_call, halves
+from lagjax._primitives import attach_derivative, lost_unless
+from lagjax._run.hybrid._mode import FIRES, ModeParts, Transition, make_mode
+from lagjax._run.hybrid._transition_places import PLACES, sizes_of
+from lagjax._run.hybrid._transition_replay import HybridReplay, PlayedModes
+from lagjax._run.hybrid._transition_search import LOOPS
+from lagjax._run.jumps import Found, JumpLaw, Mode, SceneCode
+from lagjax._scene import System
+
+PyTree = Any
+
+LAW = JumpLaw(PLACES, LOOPS, sizes_of, ("MODE",), ("LET_OUT", "MODE"))
+
+
+class HybridPlan(eqx.Module):
+    """The constants of a run: the modes by name, their transitions, and what a run may cost."""
+
+    names: tuple[str, ...] = eqx.field(static=True)
+    systems: tuple[System, ...]
+    transitions: tuple[Transition, ...]
+    max_transitions: int = eqx.field(static=True)
+    rtol: float = eqx.field(static=True)
+    atol: float | None = eqx.field(static=True)
+    max_steps: int = eqx.field(static=True)
+    is_single: bool = eqx.field(static=True)  # whether the start came in float32
+
+
+class Ending(NamedTuple):
+    """A motion as a whole: its outputs, where and how it ended."""
+
+    t: Any
+    state: tuple[PyTree, PyTree]  # q and q̇, as all states here
+    mode: Any  # its place in `HybridPlan.names`
+    result: Any  # the integer of a `lagjax.RESULTS`
+    path: tuple[PyTree, PyTree]  # (T, …), NaN where not reached
+    modes: Any  # (T,), −1 where not reached
+    steps: tuple[Any, Any]  # accepted, rejected
+    let_out: Any  # (K,), see `Transitions`
+
+
+class TransitionRecord(NamedTuple):
+    """The transitions (N, …): time, states around the reset, both modes, the place in the list; else NaN and −1."""
+
+    t: Any
+    state: tuple[PyTree, PyTree]
+    behind: tuple[PyTree, PyTree]
+    source: Any
+    target: Any
+    number: Any
+    order_matters: Any  # whether another order of the list leads to another state, where blows meet
+    count: Any
+
+
+class SearchedModes(NamedTuple):
+    """A scene that has been made ready: its search, its replay."""
+
+    code: SceneCode
+    replay: HybridReplay
+
+
+@compile_for_one_call
+def hybrid_motion(plan: HybridPlan, layout: Layout, ts, y0, params: PyTree, start) -> tuple[Ending, TransitionRecord]:
+    """The motion from y0 (2n,) at ts[0] in the mode of place `start`, and its `max_transitions` transitions."""
+    ts, y0, still = jnp.asarray(ts), jnp.asarray(y0), jax.lax.stop_gradient
+    scene = scene_of(plan, layout, params, len(ts))
+    vector = vector_of(eqx.filter(params, eqx.is_array_like)).astype(float)
+    given = ts, y0, vector, still(jnp.asarray(start, float))[None]
+    found = scene.code.search(*still(given))
+    row, played = _read(scene, found)
+    played = PlayedModes(*attach_derivative(scene.replay, tuple(played), *given))
+    return _arrange(plan, layout, scene, found, row, played, given[:3])
+
+
+def follow_known(plan: HybridPlan, layout: Layout, params: PyTree, ts, y0, vectors, start) -> tuple:
+    """The motions of members whose numbers are known, with members in front: `y0` (N, 2n), `vectors` (N, P).
+
+    `params` are those of one member; all begin in the mode of place `start`.
+    """
+    scene, starts = scene_of(plan, layout, params, len(ts)), np.full((len(y0), 1), float(start))
+    given = (np.asarray(x, float) for x in (ts[None], y0, vectors))
+    found = scene.code.run(*given, starts, room=plan.max_transitions + 1)
+    row, played = _read(scene, found)
+    return _arrange(plan, layout, scene, found, row, played, ())
+
+
+def _read(scene: SearchedModes, found: Found) -> tuple[Any, PlayedModes]:
+    n = scene.code.sizes["N"]
+    row = scene.code.read(found.record[..., : scene.code.width(PLACES.said)], PLACES.said)
+    t, y = found.ending[..., 0], found.ending[..., 1 : 2 * n + 1]
+    return row, PlayedModes(found.path, row.at, row.before, row.behind, t, y)
+
+
+def _arrange(
+    plan: HybridPlan, layout: Layout, scene: SearchedModes, found: Found, row, played: PlayedModes, inputs: tuple
+) -> tuple[Ending, TransitionRecord]:
+    """The ending, and the transitions; of what varies with `inputs`, if it is traced."""
+    library: Any = jnp if inputs else np
+
+    def lost(there, x):
+        there = there[(..., *[None] * (x.ndim - there.ndim))]
+        return lost_unless(there, x, inputs) if inputs else np.where(there, x, np.nan)
+
+    def cut(x):
+        return x[(*[slice(None)] * (row.happens.ndim - 1), slice(plan.max_transitions))]
+
+    def restore(y):
+        return tuple(map(layout.restore, halves(y)))
+
+    modes, of, happened = found.did[..., 0].astype(int), scene.code.read_ending(found.ending), cut(row.happens > 0)
+    result, _, accepted, rejected = (x.astype(int) for x in of[:4])
+    in_list = np.argsort(np.concatenate([mode.numbers for mode in scene.replay.parts]))
+    ending = Ending(
+        played.t, restore(played.y), of.mode[..., 0].astype(int), result, restore(lost(modes >= 0, played.path)), modes,
+        (accepted, rejected), of.let_out[..., in_list],
+    )  # fmt: skip
+    t, before, behind = (lost(happened, cut(x)) for x in (played.at, played.before, played.behind))
+    kinds = [library.where(happened, cut(x), -1).astype(int) for x in (row.mode[..., 0], row.target, row.number)]
+    source, target, number = kinds
+    orders, count = cut(row.order_matters > 0), happened.sum(axis=-1)
+    return ending, TransitionRecord(t, restore(before), restore(behind), source, target, number, orders, count)
+
+
+# ---- what is made once -----------------------------------------------------------------------------------------------
+
+
+def scene_of(plan: HybridPlan, layout: Layout, params: PyTree, times: int) -> SearchedModes:
+    """The scene for parameters of this structure and so many outputs. Raises `ValueError` without machine code."""
+    limits = {"rtol": plan.rtol, "atol": plan.atol, "max_steps": plan.max_steps}
+    made = (Problem.from_system(system, layout, params, **limits) for system in plan.systems)
+    problems = [dataclasses.replace(problem, is_rounded=plan.is_single) for problem in made]
+    modes = (make_mode(name, plan.transitions, of) for name, of in zip(plan.names, problems, strict=True))
+    return _make_scene(plan, tuple(modes), times)
+
+
+@functools.lru_cache(maxsize=64)
+def _make_scene(plan: HybridPlan, parts: tuple[ModeParts, ...], times: int) -> SearchedModes:
+    numbers = [k for mode in parts for k in mode.numbers]
+    leaving = [plan.transitions[k] for k in numbers]
+    lines = {("RESETS", j): of for j, of in enumerate(of for mode in parts for of in mode.reset_lines) if of}
+    lines |= {("CHECKS", place): mode.check for place, mode in enumerate(parts) if mode.check}
+    still = [no_rate for mode in parts for no_rate in (mode.surfaces.have_no_rate if mode.surfaces else ())]
+    arrays = {
+        "FIRST_OF": np.cumsum([0, *(len(mode.numbers) for mode in parts)])[:-1], "NUMBER": numbers,
+        "TARGET": [plan.names.index(of.target) for of in leaving], "WAY": [of.direction for of in leaving],
+        "FIRES": [FIRES.index(of.fires) for of in leaving],
+        "PASSES": [int(of.reset is None or no_rate) for of, no_rate in zip(leaving, still, strict=True)],
+        "ALIKE": [int("multipliers" not in of.guard.extras) for of in leaving],
+        "RESETS": np.zeros(len(leaving)), "CHECKS": np.zeros(len(parts)),
+    }  # fmt: skip
+    sizes = parts[0].sizes | {
+        "K": len(leaving), "TIMES": times, "DOING": 1, "MOST": plan.max_transitions + 1, "SINGLE": int(plan.is_single),
+    }  # fmt: skip
+    modes = [Mode(mode.make_guarded, mode.surfaces) for mode in parts]
+    tolerances = Tolerances(plan.rtol, plan.atol or 0.0, plan.max_steps)
+    code = SceneCode(LAW, sizes, arrays, modes, lines, tolerances, first=len(modes))
+    return SearchedModes(code, HybridReplay(code, parts))

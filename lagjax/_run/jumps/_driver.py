@@ -1,0 +1,183 @@
+"""The loops of every search, whatever its law: members side by side, from stretch to stretch.
+
+    follow ─► start ─► prepare: sides and rounding of all watches ─► the kernel ─► finish: what happens there, a row
+                          ▲                                                           │
+                          └───────────────────────────────────────────────────────────┘
+
+A law declares its places, and gives the loops `start`, `prepare`, `finish` and `find_mode` (`bind_law`). A flag is
+0 or 1. `work` is room that nobody else has.
+"""
+
+from math import isfinite
+from typing import Any, TypeAlias, cast
+
+from lagjax._interface import SUCCESSFUL
+from lagjax._native import EVENT, GUARD_NOISE, INSTANT, SMALLEST_STEP, Floats, Loop, evaluate, integrate, loop
+
+Scene: TypeAlias = Any  # this and the names that follow are what a law gives
+Member: TypeAlias = Any
+Entry: TypeAlias = Any
+Room: TypeAlias = Any
+start = prepare = finish = find_mode = cast(Any, None)
+
+# Results of a motion that goes on, of one whose stretch the kernel did not finish, and of one that has not begun.
+GOING, ASKS, NEW = -1, -2, -3
+LEAST = 1e-300  # a side that is exactly zero still has a sign
+
+
+@loop
+def copy(given: Floats, into: Floats, count: int):
+    """Put the first `count` numbers of one array into another."""
+    for i in range(count):
+        into[i] = given[i]
+
+
+@loop
+def find_sign(x: float) -> float:
+    """1, −1, or 0."""
+    return 1.0 if x > 0 else (-1.0 if x < 0 else 0.0)
+
+
+@loop
+def watch(scene: Scene, member: Member, x: Floats, mode: int, out: Floats, work: Floats):
+    """Put the watches at inputs x, G each: values, rates, how far rounding moves a value, that of time, and a rate."""
+    n, total = scene.n, scene.counts[mode]
+    evaluate(scene.watch[mode], x, work)
+    evaluate(scene.errors[mode], x, work[4 * total :])
+    instant = INSTANT * SMALLEST_STEP * max(abs(x[2 * n]), abs(member.last))
+    for g in range(total):
+        more = work[4 * total + g]
+        out[g], out[total + g] = work[g], work[total + g]
+        out[2 * total + g] = GUARD_NOISE * work[2 * total + g]
+        out[3 * total + g] = abs(work[total + g]) * instant
+        out[4 * total + g] = GUARD_NOISE * (work[3 * total + g] + (more if isfinite(more) else 0.0))
+    if scene.single > 0:  # the start is known to the rounding of float32
+        inputs, widths = scene.inputs, member.widths
+        for g in range(total):
+            copy(x, work, inputs)
+            for j in range(total):
+                work[inputs + j] = float(j == g)
+            evaluate(scene.slopes[mode], work, work[inputs + total :])
+            for i in range(2 * n + 1 + scene.numbers):
+                if widths[i] > 0:
+                    out[2 * total + g] += abs(work[inputs + total + i]) * widths[i]
+
+
+@loop
+def is_ahead(output: float, t: float, first: float) -> bool:
+    """True for an output time that a stretch from t on may cover; at the first time all that are there."""
+    return output > t or (output == t and t == first)
+
+
+@loop
+def write_times(scene: Scene, t: float, ts: Floats, times: Floats):
+    """Put the times (T + 2,) of a stretch from t on: where it begins, its outputs, and the last one."""
+    times[0], times[scene.times + 1] = t, ts[scene.times - 1]
+    for j in range(scene.times):
+        times[1 + j] = ts[j] if is_ahead(ts[j], t, ts[0]) else t
+
+
+@loop
+def write_outputs(
+    scene: Scene, ts: Floats, begun: float, end: float, found: Floats, doing: Floats, path: Floats, did: Floats
+):
+    """Put the outputs of a stretch, `found` (T, 2n), and what the motion is `doing` then."""
+    states = 2 * scene.n
+    for j in range(scene.times):
+        if is_ahead(ts[j], begun, ts[0]) and ts[j] <= end:
+            copy(found[j * states :], path[j * states :], states)
+            copy(doing, did[j * scene.doing :], scene.doing)
+
+
+@loop
+def follow(
+    scene: Scene, members: int, ts: Floats, path: Floats, did: Floats, record: Entry, memory: Member, room: Room
+):
+    """Follow members that go on to their ends, or to a stretch that the kernel does not finish (`ASKS`).
+
+    `ts` (T,) are the same for all if `scene` has one row of them, or (members, T). Members run side by side: those
+    that are going are packed for one call of the kernel, those of each mode apart.
+    """
+    size, times, states = scene.memory, scene.times, 2 * scene.n
+    for m in range(members):
+        if memory[m * size :].result == NEW:
+            ours = did[m * times * scene.doing :]
+            start(scene, memory[m * size :], ts[m * scene.stride :], path[m * times * states :], ours, room)
+    while True:
+        any_going = False
+        for mode in range(scene.modes):
+            count, places = 0, room.order
+            for m in range(members):
+                mine = memory[m * size :]
+                if mine.result == GOING and find_mode(scene, mine) == mode:
+                    if mine.rows >= scene.room:
+                        continue
+                    places[count] = float(m)
+                    count += 1
+            if count > 0:
+                any_going = True
+                follow_stretch(scene, mode, count, ts, path, did, record, memory, room)
+        if not any_going:
+            return
+
+
+@loop
+def follow_stretch(
+    scene: Scene, mode: int, count: int, ts: Floats, path: Floats, did: Floats, record: Entry, memory: Member,
+    room: Room
+):  # fmt: skip
+    """Follow a stretch of `count` members, whose numbers are in `ORDER`, by one call of the kernel."""
+    size, times, states = scene.memory, scene.times, 2 * scene.n
+    outputs, each = times + 2, scene.room * scene.row
+    numbers = scene.inputs - states - 1 + 2 * scene.counts[mode]
+    places, job = room.order, room.jobs
+    given_y, given_numbers = job[count * outputs :], job[count * (outputs + states) :]
+    found = given_numbers[count * numbers :]
+    y_end, t_end = found[count * outputs * states :], found[count * (outputs + 1) * states :]
+    code, steps, rejected, left = t_end[count:], t_end[2 * count :], t_end[3 * count :], t_end[4 * count :]
+    which = 2 * mode + (0 if count == 1 else 1)
+    plan, rest = scene.plans[which], scene.rests[which]
+    for i in range(count):
+        m = int(places[i])
+        mine = memory[m * size :]
+        if plan != 0:
+            prepare(
+                scene, mine, ts[m * scene.stride :], job[i * outputs :], given_y[i * states :],
+                given_numbers[i * numbers :], room
+            )  # fmt: skip
+        else:
+            mine.result = float(ASKS)
+    if plan == 0:
+        return
+    integrate(
+        scene.begin, plan, job, given_y, given_numbers, found, y_end, t_end, code, steps, rejected, left, count, outputs
+    )
+    undone = left[rest - 1] != 0
+    for i in range(count):
+        m = int(places[i])
+        mine, result = memory[m * size :], int(code[i])
+        sound = result == SUCCESSFUL or result >= EVENT
+        for j in range(states):
+            sound = sound and isfinite(y_end[i * states + j])
+        if undone or not sound:
+            mine.result = float(ASKS)
+        else:
+            finish(
+                scene, mine, ts[m * scene.stride :], path[m * times * states :], did[m * times * scene.doing :],
+                record[m * each :], found[i * outputs * states :], y_end[i * states :], t_end[i],
+                result - EVENT if result >= EVENT else 0, SUCCESSFUL, steps[i], rejected[i], room
+            )  # fmt: skip
+
+
+def bind_loops(names: dict[str, Any]) -> tuple[Loop, ...]:
+    """`watch`, `write_times` and `write_outputs` for the places of a law, whose module has these `names`."""
+    given = {name: names[name] for name in ("Scene", "Member")}
+    return tuple(of.bind(**given) for of in (watch, write_times, write_outputs))
+
+
+def bind_law(names: dict[str, Any]) -> tuple[Loop, ...]:
+    """`follow`, `prepare`, `finish` and `find_mode` of a law, whose module has these `names`."""
+    known = "Scene", "Member", "Entry", "Room", "__name__", "start", "prepare", "finish", "find_mode"
+    given = {name: names[name] for name in known}
+    whole = follow.bind(**given, follow_stretch=follow_stretch.bind(**given))
+    return whole, names["prepare"], names["finish"], names["find_mode"]

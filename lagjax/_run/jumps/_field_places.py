@@ -1,0 +1,97 @@
+"""The places of what a search reads and writes: in its scene, a member's memory, a row of its record, a thread's room.
+
+A scene is a row of integers: first those that are named, then arrays. Of memories, records and rooms it holds at which
+double each field begins. A law declares its own fields behind those that all have.
+"""
+
+from types import SimpleNamespace
+
+import numpy as np
+
+from lagjax._native import Struct
+
+SIZES = (
+    "N",  # coordinates
+    "MODES",  # each with a kernel and watches of its own
+    "WATCHES",  # the most of a mode
+    "NUMBERS", "INPUTS",  # of the user's parameters; of lines: the state, the time, the numbers, and what a law adds
+    "TIMES", "STRIDE",  # outputs, and from those of one member to those of the next
+    "DOING",  # numbers that say what goes on at an output
+    "ROOM",  # rounds that a record has room for
+    "MOST",  # rounds of a whole motion
+    "SINGLE",  # 1 if the start came in float32
+    "MEMORY", "ROW", "WORK",  # doubles of a memory, of a row of the record, of the room of a thread
+    "REST",  # the most doubles that a kernel leaves behind
+    "BEGIN",  # the address of what runs kernels
+)  # fmt: skip
+ARRAYS = (
+    "COUNTS",  # (modes,), the watches of each
+    # Addresses of machine code, 0 where there is none yet, of each mode: plans of its kernel for one and many members,
+    # doubles of what this leaves behind, of which the last says whether a run is done; its watches.
+    "PLANS", "RESTS", "WATCH", "ERRORS", "SLOPES",
+)  # fmt: skip
+MEMORY = (
+    "X",  # the inputs of lines
+    "WIDTHS",  # how far the start, t and the numbers are known, where they came in float32
+    "RTOL", "FIRST", "LAST",  # the first and the last of the output times
+    "BEGUN",  # y and t where it began
+    "GUARDS",  # (5, G), the watches where the stretch begins
+    "RESULT", "ROUNDS", "ROWS", "ACCEPTED", "REJECTED",
+)  # fmt: skip
+WORK = (
+    "FREE",  # for what is not named
+    "ORDER", "JOBS",  # the members whose stretch comes next, and what the kernel is given and gives
+)  # fmt: skip
+RECORD = (
+    "RAN",  # 1 if there was such a stretch
+    "END", "STOP",  # of the stretch, and the state there (2n,)
+    "WATCH", "CROSSES", "DECIDES",
+)  # fmt: skip
+_SCALARS = ("HAPPENS", "RTOL", "FIRST", "LAST", "RESULT", "ROUNDS", "ROWS", "ACCEPTED", "REJECTED",
+            "RAN", "END", "WATCH", "CROSSES", "DECIDES")  # fmt: skip
+
+
+class Places:
+    """The places of a law. Of a row of the record `said` is what a user is told.
+
+    Of each `scalars` of a memory or a row, and `in_room`, there is one double.
+    """
+
+    def __init__(self, sizes=(), arrays=(), memory=(), work=(), said=(), record=(), scalars=(), in_room=()):
+        numbers, self.arrays = (*SIZES, *sizes), (*ARRAYS, *arrays)
+        self.memory, self.work, self.said = (*MEMORY, *memory), (*work, *WORK), ("HAPPENS", *said)
+        self.record, self.scalars = (*self.said, *RECORD, *record), {*_SCALARS, *scalars}
+        to_record = [f"TO_{name}" for name in self.record]
+        self.names = (*numbers, *self.arrays, *self.memory, *self.work, *to_record)
+        self.of = {name: i for i, name in enumerate(self.names)}
+        assert len(self.of) == len(self.names), "two fields of one name"
+        self.at = SimpleNamespace(**self.of)
+        self.structs = {
+            "Scene": Struct({x.lower(): self.of[x] for x in (*numbers, *self.arrays)}, _lower(numbers), None),
+            "Member": self._struct(self.memory, self.scalars), "Room": self._struct(self.work, in_room),
+            "Entry": self._struct(self.record, self.scalars, "TO_"),
+        }  # fmt: skip
+
+    def _struct(self, names: tuple[str, ...], scalars, prefix: str = "") -> Struct:
+        places = {name.lower(): self.of[prefix + name] for name in names}
+        return Struct(places, _lower(name for name in names if name in scalars), "scene")
+
+    def write_scene(self, sizes: dict[str, int], arrays: dict[str, np.ndarray], fields: dict[str, int]) -> np.ndarray:
+        """The row of integers, without addresses; `fields` are the doubles of each field."""
+        scene = np.zeros(len(self.names) + sum(np.size(x) for x in arrays.values()), np.int64)
+        for name, size in sizes.items():
+            scene[self.of[name]] = size
+        place = len(self.names)
+        for name in self.arrays:
+            scene[self.of[name]], numbers = place, np.ravel(arrays[name])
+            scene[place : place + numbers.size], place = numbers, place + numbers.size
+        for names, whole, prefix in ((self.memory, "MEMORY", ""), (self.work, "WORK", ""), (self.record, "ROW", "TO_")):
+            ends = np.cumsum([0, *(fields[name] for name in names)])
+            for name, begin in zip(names, ends, strict=False):
+                scene[self.of[prefix + name]] = begin
+            scene[self.of[whole]] = ends[-1]
+        return scene
+
+
+def _lower(names) -> frozenset[str]:
+    return frozenset(name.lower() for name in names)

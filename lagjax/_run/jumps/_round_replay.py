@@ -1,0 +1,92 @@
+"""The replay of a motion that jumps: the same stretches and jumps, with all that was decided given as numbers.
+
+A row of the record says which watch ended a stretch, and what happens there. What is left is a function of the start,
+the output times and the parameters that has derivatives of every order:
+
+    (t, y) ─► a stretch to the watch ─► what happens there ─► (t, y) behind it
+
+Its derivatives are those of the motion that the search found; its values are not used.
+"""
+
+import math
+from collections.abc import Callable
+
+import jax
+import jax.numpy as jnp
+
+from lagjax._engine.taylor import Line
+from lagjax._primitives import Repetition
+from lagjax._program import Unlowerable, lower
+from lagjax._run.jumps._scene_code import SceneCode
+
+# Operations of the line of the end of a stretch: a longer one takes XLA as long as its parts.
+LONGEST = 5000
+
+
+def join(*arrays):
+    return jnp.concatenate([jnp.ravel(x) for x in arrays])
+
+
+class Replay:
+    """The replay of a scene, whose search is `code`; it is known by identity.
+
+    A law passes a stretch (`pass_stretch`), and says how many numbers it tells of one, beside the state behind it.
+    """
+
+    said: int  # how many numbers a law tells of a stretch
+
+    def __init__(self, code: SceneCode, varying: int):
+        states = 2 * code.sizes["N"]
+        shapes = ((self.said,), (states,)), ((code.sizes["TIMES"], states),)
+        self.code, self.sizes = code, code.sizes
+        self._rounds = Repetition(self._play, varying, 2, *shapes)
+
+    def pass_stretch(self, given: tuple, start: tuple, row, record, ahead, times, event) -> tuple:
+        """The outputs (T, 2n), zero where there are none; what is said, the state behind it, and the time then.
+
+        A stretch begins at `start`, (t, y), and has these `times` (T + 2,), of which outputs lie `ahead`. Its `event`
+        are the time and the state where it ends, the watch that is zero there, and whether it crosses.
+        """
+        raise NotImplementedError
+
+    def play(self, ts, y0, *given) -> tuple:
+        """The path (T, 2n), what is said of each round, (N, …), the states behind them, and t and y at the end.
+
+        What is `given` last and does not vary is for the search alone.
+        """
+        found = self.code.search(*jax.lax.stop_gradient((ts, y0, *given)), is_replayed=True)
+        begun = self.code.read_ending(found.ending).begun
+        y, t = (x + jax.lax.stop_gradient(at - x) for x, at in ((y0, begun[:-1]), (ts[0], begun[-1])))
+        count = jnp.sum(self._read(found.record).ran > 0)
+        before = (ts <= begun[-1]) & ((begun[-1] > ts[0]) | (count == 0))  # one at the start is the first round's
+        path, varying = jnp.where(before[:, None], y, 0.0), (ts, y0, *given)[: self._rounds.inputs]
+        (t, y), (said, behind), (more,) = self._rounds(varying, (t, y), (found.record,), count)
+        return path + more, said, behind, t, y
+
+    def _read(self, record):
+        return self.code.read(record, self.code.law.places.record)
+
+    def _play(self, given, carry, _, rows):
+        ts, (t, y), (record,), still = given[0], carry, rows, jax.lax.stop_gradient
+        row, begun = self._read(record), still(t)
+        ahead = (ts > begun) | (ts == jnp.where(begun == ts[0], begun, jnp.nan))
+        end = jnp.where((row.happens == 0) & (row.end == still(ts[-1])), ts[-1], row.end)
+        end = jnp.where(row.ran > 0, end, begun)
+        times = jnp.concatenate([t[None], jnp.where(ahead, ts, begun), ts[-1:]])
+        event = end, row.stop, row.watch.astype(int), row.crosses > 0
+        path, said, behind, later = self.pass_stretch(given, (t, y), row, record, ahead, times, event)
+        return [later, behind], [said, behind], [path]
+
+    def line_of_end(self, function: Callable, *shapes: tuple[int, ...]) -> Line | None:
+        """The end of a stretch as one straight line if that is not long.
+
+        Its `function` is of a record, the time, state and numbers of the end, which do not vary, and of these `shapes`.
+        """
+        record = self.code.width(self.code.law.places.record)
+        fixed = [(record,), (), (2 * self.sizes["N"],), (self.sizes["NUMBERS"],)]
+        given = [jax.ShapeDtypeStruct(shape, float) for shape in (*fixed, *shapes)]
+        try:
+            program = lower(function, *given, budget=LONGEST)
+        except Unlowerable:
+            return None
+        return None if program.looks_up else Line(program.line, program.size, program.size, sum(map(math.prod, fixed)))

@@ -1,0 +1,333 @@
+"""A scene as its search takes it: machine code by address, sizes, and the places of numbers; its runs.
+
+SceneCode.search(ts, y0, numbers, …) ─► search_p ─► rows of NumPy ─► `_driver.follow` by a law ─► Found
+                                          └─ a stretch that the kernel gives up: `Flow.run`
+"""
+
+import collections
+import ctypes
+import functools
+import math
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jax.core import ShapedArray
+from jax.interpreters import mlir
+
+from lagjax._engine.taylor import Line, Surfaces, call_host, line_of, rate_errors
+from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL
+from lagjax._native import LARGEST_LINE, SINGLE_NOISE, Loop, Walk, compile_loops, cores, handler
+from lagjax._primitives import LinearMap, compute_on_host
+from lagjax._run.jumps._driver import ASKS, GOING, NEW
+from lagjax._run.jumps._field_places import Places
+
+_TOGETHER = 256  # members that one call follows side by side: what it remembers of them fits into a processor's cache
+_ROOM = 32  # rows of a record, at first
+_ROUNDS = 10**6  # of a kernel, for a stretch: beyond that it continues on the host, where it can be interrupted
+
+
+class JumpLaw(NamedTuple):
+    """A law of what happens where a watch falls: `loops` over numbers at `places`; `sizes_of` gives the doubles.
+
+    A search is `given` fields of a member's memory beside the state, and tells those of its `ending`.
+    """
+
+    places: Places
+    loops: tuple[Loop, ...]  # those of `bind_law`
+    sizes_of: Callable[[dict[str, int]], dict[str, int]]
+    given: tuple[str, ...]
+    ending: tuple[str, ...]
+
+    def fields(self, sizes: dict[str, int]) -> dict[str, int]:
+        """The count of doubles in each field of a memory, of the room of a thread and of a row."""
+        n, watches = sizes["N"], sizes["WATCHES"]
+        fields = dict.fromkeys((*self.places.memory, *self.places.work, *self.places.record), 1)
+        fields |= {"X": sizes["INPUTS"], "WIDTHS": sizes["INPUTS"], "BEGUN": 2 * n + 1, "GUARDS": 5 * watches}
+        return fields | {"STOP": 2 * n, "ORDER": 0, "JOBS": 0} | self.sizes_of(sizes)
+
+
+class Mode(NamedTuple):
+    """A mode: its flow, which `make` makes, its watches, if there are any, and more lines by their names in a scene."""
+
+    make: Callable
+    surfaces: Surfaces | None
+    make_lines: Callable[[], dict] = dict
+
+
+class Found(NamedTuple):
+    """The findings of a search, of one member or with members in front.
+
+    The outputs `path` (T, 2n), what it `did` there (T, …), −1 where the motion did not come, the `record` (N, …), whose
+    rows `Places` declares, and the `ending`: t and y, result, rounds, accepted and rejected steps, what the law tells
+    there, and y and t where it began.
+    """
+
+    path: Any
+    did: Any
+    record: Any
+    ending: Any
+
+
+ENDING = "RESULT", "ROUNDS", "ACCEPTED", "REJECTED"
+
+
+class SceneCode:
+    """The machine code of a scene of these `sizes` and `arrays` (see `Places`); it is known by identity.
+
+    `lines` by their names in a scene do not depend on the mode. Watches of the `first` modes are made at once.
+    """
+
+    def __init__(
+        self, law: JumpLaw, sizes: dict, arrays: dict, modes: Sequence[Mode], lines: dict, tolerances, first: int = 1
+    ):
+        self.law, self.modes, self.lines, self.tolerances, self._first = law, modes, lines, tolerances, first
+        counts = np.array([0 if mode.surfaces is None else len(mode.surfaces.directions) for mode in modes])
+        self.sizes = sizes | {"MODES": len(modes), "WATCHES": int(counts.max())}
+        empty = dict.fromkeys(("WATCH", "ERRORS", "SLOPES"), np.zeros(len(modes)))
+        empty |= dict.fromkeys(("PLANS", "RESTS"), np.zeros(2 * len(modes)))
+        self.arrays, self.fields = {"COUNTS": counts, **empty, **arrays}, law.fields(self.sizes)
+        self._keep = []  # what the addresses point to
+        self.flow_of = functools.cache(lambda mode: modes[mode].make())
+        self.scene = functools.cache(self._scene)
+
+    def _scene(self, many: bool) -> np.ndarray:
+        """The row of integers that the search takes, without what modes need; for one member, or for many."""
+        places = self.law.places
+        scene = places.write_scene(self.sizes, self.arrays, self.fields)
+        scene[places.at.BEGIN] = ctypes.cast(handler().begin, ctypes.c_void_p).value or 0
+        self._add_codes(scene, self.lines)
+        for mode, of in enumerate(self.modes):
+            if mode < self._first and of.surfaces is not None:
+                self._add_watches(scene, mode, of.surfaces)
+        return scene
+
+    def _add_watches(self, scene: np.ndarray, mode: int, surfaces: Surfaces) -> None:
+        count = len(surfaces.directions)
+        lines = {("WATCH", mode): line_of(surfaces.complete, 4 * count)}
+        walk, moving = Walk(lines["WATCH", mode].line, lines["WATCH", mode].size), 2 * self.sizes["N"] + 1
+        if len(walk) > LARGEST_LINE and walk.is_known:  # whose errors would be five times as many operations
+            function, address = _call_back(lambda x: walk(x, moving)[1][count : 2 * count], walk.inputs, count)
+            self._keep.append(function)
+            scene[scene[self.law.places.of["ERRORS"]] + mode] = address
+        else:
+            lines["ERRORS", mode] = line_of(rate_errors(surfaces.complete, count), count)
+        if surfaces.is_rounded:
+            lines["SLOPES", mode] = line_of(surfaces.values, count).back
+        self._add_codes(scene, lines)
+
+    def add_mode(self, scene: np.ndarray, mode: int, many: bool) -> None:
+        """Add to a scene what a mode needs."""
+        at, surfaces = self.law.places.at, self.modes[mode].surfaces
+        if mode >= self._first and surfaces is not None:
+            self._add_watches(scene, mode, surfaces)
+        self._add_codes(scene, self.modes[mode].make_lines())
+        for wide, members in ((0, 1), (1, 1000 if many else 1)):
+            kernel = self.flow_of(mode).kernel.select_width(members)
+            plan = kernel.plan(*self.tolerances[:3])
+            plan = type(plan)(*(_ROUNDS if field == "rounds" else getattr(plan, field) for field, *_ in plan._fields_))
+            self._keep.append((plan, kernel))
+            scene[scene[at.PLANS] + 2 * mode + wide] = ctypes.addressof(plan)
+            scene[scene[at.RESTS] + 2 * mode + wide] = kernel.rest_size
+            scene[at.REST] = max(scene[at.REST], kernel.rest_size)
+
+    def _add_codes(self, scene: np.ndarray, lines: dict[Any, Line]) -> None:
+        for name, of in lines.items():
+            code = of.code if len(of.line.nodes) <= LARGEST_LINE else None
+            keep, address = _evaluate_long(of) if code is None else (code, code.address)
+            self._keep.append(keep)
+            place = self.law.places.of[name] if isinstance(name, str) else scene[self.law.places.of[name[0]]] + name[1]
+            scene[place] = address
+
+    def width(self, names: Sequence[str]) -> int:
+        """The count of doubles of these fields."""
+        return sum(self.fields[name] for name in names)
+
+    def read(self, rows, names: Sequence[str]) -> Any:
+        """The fields of rows (…, doubles) by their names in small letters, those of one double without an axis."""
+        ends = np.cumsum([self.fields[name] for name in names])
+        parts = [rows[..., end - self.fields[name] : end] for name, end in zip(names, ends, strict=True)]
+        of = collections.namedtuple("Rows", [name.lower() for name in names])
+        scalars = self.law.places.scalars
+        return of(*(x[..., 0] if name in scalars else x for name, x in zip(names, parts, strict=True)))
+
+    def read_ending(self, ending) -> Any:
+        """The fields of the `ending` of a search, but for t and y in front."""
+        return self.read(ending[..., 2 * self.sizes["N"] + 1 :], (*ENDING, *self.law.ending, "BEGUN"))
+
+    # ---- runs ----
+
+    def search(self, ts, y0, numbers, *given, is_replayed: bool = False) -> Found:
+        """The motion from `y0` (2n,) on, at `ts` (T,) with `numbers` (P,), and what else is `given`: no derivatives.
+
+        Rows of the record are whole where it `is_replayed`, else they have what is `said`.
+        """
+        given = map(jnp.asarray, (ts, y0, numbers, *given))
+        places = self.law.places
+        return Found(*search_p.bind(*given, code=self, names=places.record if is_replayed else places.said))
+
+    def run(self, ts, y0, numbers, *given, room: int | None) -> Found:
+        """`search` on arrays of NumPy with members in front; with no `room` its records are as long as the longest."""
+        members, scene, states = len(y0), self.scene(len(y0) > 1).copy(), 2 * self.sizes["N"]
+        memory, at = np.zeros((members, scene[self.law.places.at.MEMORY])), self.law.places.of
+        first = np.broadcast_to(ts[:, :1], (members, 1))
+        x = np.concatenate([y0, first, numbers], axis=1)
+        parts = {
+            "X": x, "RTOL": np.full((members, 1), self.tolerances.rtol), "FIRST": ts[:, :1], "LAST": ts[:, -1:],
+            "RESULT": np.full((members, 1), float(NEW)), **dict(zip(self.law.given, given, strict=True)),
+        }  # fmt: skip
+        if self.sizes["SINGLE"]:
+            parts["WIDTHS"] = SINGLE_NOISE * np.abs(x[:, : states + 1 + self.sizes["NUMBERS"]])
+        for name, of in parts.items():
+            memory[:, scene[at[name]] : scene[at[name]] + of.shape[1]] = of
+        path = np.full((members, self.sizes["TIMES"], states), np.nan)
+        did = np.full((members, self.sizes["TIMES"], self.sizes["DOING"]), -1.0)
+        run = _Run(self, scene, np.ascontiguousarray(ts), memory, path, did, room)
+        run.follow()
+        x = memory[:, scene[at["X"]] :]
+        ending = [x[:, states : states + 1], x[:, :states]]
+        names = *ENDING, *self.law.ending, "BEGUN"
+        ending += [memory[:, scene[at[name]] : scene[at[name]] + self.fields[name]] for name in names]
+        return Found(path, did, run.record, np.concatenate(ending, axis=1))
+
+
+def _evaluate_long(line: Line) -> tuple[Any, int]:
+    """A function for a long line, or one of tables, which NumPy evaluates, and its address."""
+    walk = Walk(line.line, line.size)
+    if walk.is_known:
+        return _call_back(lambda x: walk(x)[0], line.size, line.outputs)
+    return _call_back(lambda x: line.line.evaluate(list(x[:, None]))[:, 0], line.size, line.outputs)
+
+
+def _call_back(of: Callable, inputs: int, outputs: int) -> tuple[Any, int]:
+    """A function of an array, called as machine code is, and its address."""
+
+    def evaluate(x: int, out: int, _rows: int) -> None:
+        given, found = (
+            np.ctypeslib.as_array((ctypes.c_double * size).from_address(place))
+            for place, size in ((x, inputs), (out, outputs))
+        )
+        found[:] = of(given)
+
+    function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(evaluate)
+    address = ctypes.cast(function, ctypes.c_void_p).value
+    assert address is not None
+    return function, address
+
+
+class _Run:
+    """A run of members, which is followed until none goes on."""
+
+    def __init__(self, code: SceneCode, scene, ts, memory, path, did, room: int | None):
+        self.code, self.scene, self.ts, self.memory, self.path, self.did = code, scene, ts, memory, path, did
+        self.at = at = code.law.places.at
+        self.record, self._fixed = np.zeros((len(memory), room or _ROOM, scene[at.ROW])), room is not None
+        scene[at.STRIDE] = ts.shape[1] if len(ts) > 1 else 0
+        self.results = memory[:, scene[at.RESULT]]
+
+    def follow(self) -> None:
+        """Follow all to their ends."""
+        members = len(self.memory)
+        together = min(_TOGETHER, max(1, -(-members // cores())))
+        places = [slice(begin, begin + together) for begin in range(0, members, together)]
+        while True:
+            self.scene[self.at.ROOM] = self.record.shape[1]
+            if len(places) == 1:
+                self._follow_some(places[0])
+            else:
+                pool = ThreadPoolExecutor(cores())
+                try:
+                    list(pool.map(self._follow_some, places))
+                finally:  # who is interrupted waits for those that run, and for no others
+                    pool.shutdown(cancel_futures=True)
+            self._answer(np.flatnonzero(self.results == ASKS).tolist())
+            if not (self.results == GOING).any():
+                break
+            if (self.memory[self.results == GOING, self.scene[self.at.ROWS]] >= self.record.shape[1]).any():
+                if self._fixed:
+                    break
+                self.record = np.concatenate([self.record, np.zeros_like(self.record)], axis=1)
+        if not self._fixed:
+            used = int(self.memory[:, self.scene[self.at.ROWS]].max(initial=1))
+            self.record = np.ascontiguousarray(self.record[:, : max(used, 1)])
+
+    @property
+    def _loops(self) -> tuple[Callable, ...]:
+        return compile_loops(*self.code.law.loops)
+
+    def _follow_some(self, members: slice) -> None:
+        scene, memory = self.scene.copy(), self.memory[members]
+        outputs, states = scene[self.at.TIMES] + 2, 2 * scene[self.at.N]
+        numbers = scene[self.at.INPUTS] - states - 1 + 2 * scene[self.at.WATCHES]
+        scene[self.at.JOBS] = scene[self.at.ORDER] + len(memory)
+        each = outputs + states + numbers + outputs * states + states + 4
+        work = np.zeros(scene[self.at.JOBS] + len(memory) * each + scene[self.at.REST])
+        ts = self.ts[members] if scene[self.at.STRIDE] else self.ts
+        arrays = ts, self.path[members], self.did[members], self.record[members], memory, work
+        self._loops[0](scene.ctypes.data, len(memory), *(x.ctypes.data for x in arrays))
+
+    def _answer(self, asking: list[int]) -> None:
+        """Make the modes that members ask for, or follow stretches that the kernel did not finish."""
+        code, at, many = self.code, self.at, len(self.memory) > 1
+        known = self.scene.copy()
+        for member in asking:
+            mode = self._loops[3](known.ctypes.data, self.memory[member].ctypes.data)
+            if known[known[at.PLANS] + 2 * mode]:
+                self._continue(member, mode)
+                continue
+            whole = code.scene(many)
+            if whole[whole[at.PLANS] + 2 * mode] == 0:
+                code.add_mode(whole, mode, many)
+            self.scene = whole.copy()
+            self.scene[at.STRIDE], self.scene[at.ROOM] = known[at.STRIDE], known[at.ROOM]
+            self.results[member] = GOING
+
+    def _continue(self, member: int, mode: int) -> None:
+        """Follow a stretch that the kernel did not finish."""
+        code, scene, memory, at, loops = self.code, self.scene, self.memory[member], self.at, self._loops
+        states, ts = 2 * scene[at.N], self.ts[member if scene[at.STRIDE] else 0]
+        times, y, work = np.zeros(ts.size + 2), np.zeros(states), np.zeros(scene[at.ORDER])
+        numbers = np.zeros(scene[at.INPUTS] - states - 1 + 2 * scene[scene[at.COUNTS] + mode])
+        loops[1](*(x.ctypes.data for x in (scene, memory, ts, times, y, numbers, work)))
+        done = code.flow_of(mode).run(times[None], y[None], numbers[None], code.tolerances)
+        happened = bool(done.result[0] == EVENT_OCCURRED)
+        of_member = self.path[member], self.did[member], self.record[member]
+        given = scene, memory, ts, *of_member, np.ascontiguousarray(done.path[0]), np.ascontiguousarray(done.y_end[0])
+        event, result = (int(done.event[0]), SUCCESSFUL) if happened else (0, int(done.result[0]))
+        steps = float(done.accepted[0]), float(done.rejected[0])
+        loops[2](*(x.ctypes.data for x in given), float(done.t_end[0]), event, result, *steps, work.ctypes.data)
+
+
+# ---- as a primitive --------------------------------------------------------------------------------------------------
+
+
+def _shapes(ts, y0, *_, code: SceneCode, names: tuple[str, ...]):
+    batch, states = y0.shape[:-1], y0.shape[-1]
+    row, ending = code.width(names), states + 1 + code.width((*ENDING, *code.law.ending, "BEGUN"))
+    shapes = (ts.shape[-1], states), (ts.shape[-1], code.sizes["DOING"]), (code.sizes["MOST"], row), (ending,)
+    return [ShapedArray((*batch, *shape), np.dtype(float)) for shape in shapes]
+
+
+def _search_rows(*arrays, code: SceneCode, names: tuple[str, ...]):
+    batch = arrays[1].shape[:-1]
+    rows = [np.asarray(x, float).reshape(math.prod(batch), x.shape[-1]) for x in arrays]
+    found = code.run(*rows, room=code.sizes["MOST"])
+    found = found._replace(record=found.record[..., : code.width(names)])
+    return [x.reshape(*batch, *x.shape[1:]) for x in found]
+
+
+def _never_varies(*_, **__):
+    raise AssertionError("A search has no derivatives.")
+
+
+search_p = LinearMap("lagjax_search", _shapes, _never_varies)
+compute_on_host(search_p, _search_rows)
+
+
+def _call_host(*arrays, **settings):
+    return call_host(functools.partial(_search_rows, **settings), _shapes(*arrays, **settings), *arrays)
+
+
+mlir.register_lowering(search_p, mlir.lower_fun(_call_host, multiple_results=True), platform="cpu")
