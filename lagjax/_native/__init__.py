@@ -58,7 +58,7 @@ from lagjax._native._constants import (
 from lagjax._native._derivative_handler import derivative_handler
 from lagjax._native._guards import Guards, append_guards
 from lagjax._native._handler import Plan, handler, make_once, unavailable
-from lagjax._native._interpreter import Walk
+from lagjax._native._interpreter import LineWalk
 from lagjax._native._ir import lanes
 from lagjax._native._kernel import Begun, Kernel, StepRecord, cores, floor_of
 from lagjax._native._line_handler import LineCode, line_handler

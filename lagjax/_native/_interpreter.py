@@ -79,7 +79,7 @@ def walk(codes: Wholes, constants: Floats, x: Floats, size: int, moving: int, va
             errors[i] += errors[c] * abs(by_c)
 
 
-class Walk:
+class LineWalk:
     """A straight line of `inputs` doubles as a walk; `is_known` is false where it has other operations than these."""
 
     def __init__(self, line: StraightLine, inputs: int):

@@ -3,7 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._native import Walk
+from lagjax._native import LineWalk
 from lagjax._program import lower
 
 
@@ -18,7 +18,7 @@ def function(x):
 
 def test_values_and_running_errors():
     program = lower(function, jnp.zeros(3), moving=2)
-    walk = Walk(program.line, 3)
+    walk = LineWalk(program.line, 3)
     assert walk.is_known and len(walk) == len(program.line.nodes)
     errors = program.rounding_of(range(5), 2)
     for x in (np.array([0.7, 0.25, -1.2]), np.array([0.25, 0.25, 0.25]), np.array([-2.0, 3.0, 0.0])):
@@ -29,4 +29,4 @@ def test_values_and_running_errors():
 
 
 def test_a_line_with_other_operations_is_not_walked():
-    assert not Walk(lower(lambda x: jnp.exp(x), jnp.zeros(())).line, 1).is_known
+    assert not LineWalk(lower(lambda x: jnp.exp(x), jnp.zeros(())).line, 1).is_known

@@ -19,7 +19,7 @@ from jax.interpreters import mlir
 
 from lagjax._engine.taylor import Line, Surfaces, call_host, line_of, rate_errors
 from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL
-from lagjax._native import LARGEST_LINE, SINGLE_NOISE, Loop, Walk, compile_loops, cores, handler
+from lagjax._native import LARGEST_LINE, SINGLE_NOISE, LineWalk, Loop, compile_loops, cores, handler
 from lagjax._primitives import LinearMap, compute_on_host
 from lagjax._run.jumps._driver import ASKS, GOING, NEW
 from lagjax._run.jumps._field_places import Places
@@ -107,7 +107,7 @@ class SceneCode:
     def _add_watches(self, scene: np.ndarray, mode: int, surfaces: Surfaces) -> None:
         count = len(surfaces.directions)
         lines = {("WATCH", mode): line_of(surfaces.complete, 4 * count)}
-        walk, moving = Walk(lines["WATCH", mode].line, lines["WATCH", mode].size), 2 * self.sizes["N"] + 1
+        walk, moving = LineWalk(lines["WATCH", mode].line, lines["WATCH", mode].size), 2 * self.sizes["N"] + 1
         if len(walk) > LARGEST_LINE and walk.is_known:  # whose errors would be five times as many operations
             function, address = _call_back(lambda x: walk(x, moving)[1][count : 2 * count], walk.inputs, count)
             self._keep.append(function)
@@ -195,7 +195,7 @@ class SceneCode:
 
 def _evaluate_long(line: Line) -> tuple[Any, int]:
     """A function for a long line, or one of tables, which NumPy evaluates, and its address."""
-    walk = Walk(line.line, line.size)
+    walk = LineWalk(line.line, line.size)
     if walk.is_known:
         return _call_back(lambda x: walk(x)[0], line.size, line.outputs)
     return _call_back(lambda x: line.line.evaluate(list(x[:, None]))[:, 0], line.size, line.outputs)
