@@ -204,13 +204,14 @@ def _cube(rough: bool, slopes: bool = False) -> tuple:
         """From central differences, by the laws and by the first number of each part of the start."""
         errors, (leaves, structure) = [], jax.tree.flatten((laws, start))
         for k, by in enumerate(jax.tree.leaves(found)):
+            if structure.unflatten(range(len(leaves)))[1][0]["turn"] == k:  # a quaternion stays on its sphere
+                continue
             ends = []
             for step in (CUBE_STEP, -CUBE_STEP):
                 moved = [np.array(x, float) for x in leaves]
                 moved[k].flat[0] += step
                 ends.append(place(*structure.unflatten(moved)))
-            if structure.unflatten(range(len(leaves)))[1][0].get("turn") != k:  # a quaternion stays on its sphere
-                errors.append(_off(np.ravel(by)[0], (ends[0] - ends[1]) / (2 * CUBE_STEP)))
+            errors.append(_off(np.ravel(by)[0], (ends[0] - ends[1]) / (2 * CUBE_STEP)))
         return max(errors)
 
     return lambda: jax.grad(place, (0, 1))(laws, start), off_slopes
