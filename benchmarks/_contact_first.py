@@ -184,10 +184,10 @@ def _chain(count: int) -> tuple:
 
 
 def _cube(rough: bool, slopes: bool = False) -> tuple:
-    """The toss of the example: the cube comes to rest on a face; slopes at 0.3 s, behind its first impacts."""
+    """The toss of the example: the cube comes to rest on a face; slopes at 0.2 s, behind its first impacts."""
     scene, start = cube_scene(rough), toss()
     laws = LAWS if rough else {"restitution": LAWS["restitution"]}
-    ts = np.linspace(0.0, 0.3 if slopes else 1.2, 46)
+    ts = np.linspace(0.0, 0.2 if slopes else 1.2, 46)
 
     def place(laws, start):
         return lagjax.simulate(scene, *start, ts, laws).q["place"][-1, 0]
