@@ -204,7 +204,7 @@ def _cube(rough: bool, slopes: bool = False) -> tuple:
         """From central differences, by the laws and by the first number of each part of the start."""
         errors, (leaves, structure) = [], jax.tree.flatten((laws, start))
         for k, by in enumerate(jax.tree.leaves(found)):
-            if structure.unflatten(range(len(leaves)))[1][0]["turn"] == k:  # a quaternion stays on its sphere
+            if k in (of["turn"] for of in structure.unflatten(range(len(leaves)))[1]):  # these stay on a sphere
                 continue
             ends = []
             for step in (CUBE_STEP, -CUBE_STEP):
