@@ -2,15 +2,18 @@
 
     python -m benchmarks.contacts                       # all parts, benchmarks/results/contacts.json
     python -m benchmarks.contacts puck --only rows      # of one part what begins so
+    python -m benchmarks.contacts --first --write       # first results in fresh processes; a scene by its beginning
     python -m benchmarks.contacts --peers peers.json    # stores what `python benchmarks/_contact_peers.py` printed
 
 *First* is a motion as a user waits for it, with its compilation; *again* the same once more. Errors of derivatives are
 in parts of the largest. *Rows* are motions in closed form, *many* random ones of one scene, *sizes* long motions, large
 batches and many contacts, *problems* worked ones, *coverage* intervals of fits, *by_hand* the same scenes as modes and
-guards. Their docstrings say what they are measured against.
+guards. Their docstrings say what they are measured against. *First* alone (`_contact_first`) counts CPU seconds, not
+those of a clock on the wall.
 """
 
 import argparse
+import functools
 import gc
 import json
 import sys
@@ -26,6 +29,7 @@ import numpy as np
 import lagjax
 from benchmarks import _report
 from benchmarks._contact_by_hand import PAIRS, lines
+from benchmarks._contact_first import first
 from benchmarks._contact_problems import PROBLEMS
 from benchmarks._contacts import (
     BRAX,
@@ -321,6 +325,9 @@ def main() -> None:
     parser.add_argument("begins", nargs="?", default="", help="scenes whose names begin so")
     parser.add_argument("--only", nargs="+", choices=tuple(PARTS), default=tuple(PARTS))
     parser.add_argument("--peers", type=Path, help="what `_contact_peers.py` printed; nothing else is run")
+    parser.add_argument("--first", action="store_true", help="first results, each in a fresh process; nothing else")
+    parser.add_argument("--count", type=int, default=3, help="processes for a first result: the least counts")
+    parser.add_argument("--write", action="store_true", help="store the first results; other parts are always stored")
     options = parser.parse_args()
     jax.config.update("jax_enable_x64", True)
     jax.block_until_ready(jax.jit(lambda x: x @ x)(jnp.ones(3)))  # XLA is there
@@ -328,9 +335,12 @@ def main() -> None:
     if options.peers:
         _report.write_json(STORE, record | {"peers": json.loads(options.peers.read_text())})
         return
-    for part in options.only:
+    parts = PARTS
+    if options.first:
+        parts = {"first": functools.partial(first, count=options.count)}
+    for part in parts if options.first else options.only:
         found = []
-        for line in PARTS[part](options.begins):
+        for line in parts[part](options.begins):
             found.append(line)
             print(
                 json.dumps({k: float(f"{v:.3g}") if isinstance(v, float) else v for k, v in line.items()}), flush=True
@@ -341,7 +351,8 @@ def main() -> None:
         names = [line["scene"] for line in found]
         others = [line for line in record.get(part, {}).get("rows", []) if line["scene"] not in names]
         record[part] = {"circumstances": _report.circumstances(), "rows": [*others, *found]}
-        _report.write_json(STORE, record)
+        if options.write or not options.first:
+            _report.write_json(STORE, record)
         print(_report.table(record[part]["rows"]), file=sys.stderr)
 
 

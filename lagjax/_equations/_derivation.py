@@ -655,6 +655,11 @@ class Derivation:
     def _constant_mass(self) -> bool:
         return not self.reads("mass_matrix")
 
+    @property
+    def samples(self) -> list[tuple[csr_array, csr_array]]:
+        """M and G at a few states that nothing speaks for, where they are finite."""
+        return self._samples(1.0)
+
     def _samples(self, reach: float, numbers: Any = None) -> list[tuple[csr_array, csr_array]]:
         """M and G at a few states that nothing speaks for, where they are finite; `numbers` are those of params."""
         if numbers is not None:

@@ -116,6 +116,7 @@ class Names(tuple):
 
 
 CHANGE_WORDS = ("closes", "opens", "bounces", "sticks", "slides")  # in words
+_WATCHED = ("gap", "force", "gap", "slip", "friction left")  # what vanishes there
 
 
 class ContactChanges(NamedTuple):
@@ -126,9 +127,10 @@ class ContactChanges(NamedTuple):
     sticks, 4 where it slides. Several at one instant lead from one guess to the next. `doubts` (3,) are how many
     impacts gained energy, and how many changes lack derivatives: where contacts that share an impact close at one
     instant by themselves, or bounced less than rounding before it, and where a slip begins at a start at rest (by the
-    slip there), or in space; `doubted` (3,) are the first times.
+    slip there), or in space; `doubted` (3,) are the first times. `impulse` (N, k) are the normal ones of an impact, in
+    the order of `contact_names`, zero without one.
 
-    Printed, they are lines of text. `to_pandas()` makes a table of them.
+    Printed, they are lines of text: when, what changes and why, by which impulses. `to_pandas()` makes a table of them.
     """
 
     t: jax.Array
@@ -141,15 +143,21 @@ class ContactChanges(NamedTuple):
     count: jax.Array
     doubts: jax.Array
     doubted: jax.Array
+    impulse: jax.Array
     names: tuple[str, ...] = Names()  # `Trajectory.contact_names`
 
     _repr_pretty_ = show_str
 
     def __repr__(self) -> str:
-        def describe(t, contact, change):
-            return f"t = {t:<10.6g} {self.names[contact]} {CHANGE_WORDS[change]}"
+        def describe(t, contact, change, impulse, wait):
+            why = "is 0" if wait > 0 else "would fall below 0 at once"
+            blows = [f"{x:.4g} at {self.names[i]}" for i, x in enumerate(impulse) if x > 1e-12 * impulse.max()]
+            more = f"; impulse {', '.join(blows)}" if blows else ""
+            return f"t = {t:<10.6g} {self.names[contact]} {CHANGE_WORDS[change]}: its {_WATCHED[change]} {why}{more}"
 
-        numbers = self.t, self.contact, self.change
+        numbers = self.t, self.contact, self.change, self.impulse
+        if is_known(self.t):
+            numbers = *numbers, np.diff(np.asarray(self.t), prepend=-np.inf)
         return _list_first(self, "changes of contacts", ":\n  ", describe, numbers, "\n  ")
 
     def to_pandas(self):

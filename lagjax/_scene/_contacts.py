@@ -31,12 +31,15 @@ class Contacts(NamedTuple):
     - `closed` (k,): 1 where the contact is closed, else 0; `sticks` (r,): 1 where it does not slide.
     - `direction` (r, d): the direction of a slip that begins; in a plane its sign. In space its length is a velocity
       far below those of the motion, which is added to the slip: its direction is then defined at rest, too.
+    - `held`: 1 for each row that holds a contact, of gaps, one-way velocities and slips, (k + r d,), where these are
+      more than coordinates and so depend on each other; else (0,).
     - `near` (): how near a corner of a gap counts as there (`_run.contacts._corners`).
     """
 
     closed: Any
     sticks: Any
     direction: Any
+    held: Any
     near: Any
 
 
@@ -50,11 +53,14 @@ class InContact(NamedTuple):
 class ContactScene(eqx.Module):
     """A system with contacts, as machine code follows it: a scene whose parameters are `InContact`.
 
-    Where it `is_open` no contact is closed, whatever the parameters say: the motion of the system by itself.
+    Where it `is_open` no contact is closed, whatever the parameters say: the motion of the system by itself. A body is
+    held by few independent rows, however many contacts it has: with `slots` there are so many rows, of gaps and of
+    velocities, which are those that `Contacts.held` chooses.
     """
 
     system: System
     is_open: bool = eqx.field(static=True, default=False)
+    slots: tuple[int, int] | None = eqx.field(static=True, default=None)
 
     @property
     def path(self) -> str:
@@ -68,13 +74,16 @@ class ContactScene(eqx.Module):
             return function and (lambda *arguments: function(*arguments[:-1], arguments[-1].params))
 
         def held_positions(q, t, p):
-            own = free.constraints.f(q, t, p.params)
-            return jnp.concatenate([own, p.contacts.closed[: flat.gap_count] * flat.gaps(q, t, p.params)])
+            own, gaps = free.constraints.f(q, t, p.params), flat.gaps(q, t, p.params)
+            held = p.contacts.closed[: flat.gap_count] * gaps if self.slots is None else self.rows(flat, p)[0] @ gaps
+            return jnp.concatenate([own, held])
 
         def held_velocities(q, qdot, t, p):
-            one_way = p.contacts.closed[flat.gap_count :] * flat.one_way(q, qdot, t, p.params)
-            slips = flat.held_slips(p.contacts) * flat.slips(q, qdot, t, p.params).ravel()
-            return jnp.concatenate([free.constraints.a(q, qdot, t, p.params), one_way, slips])
+            one_way, slips = flat.one_way(q, qdot, t, p.params), flat.slips(q, qdot, t, p.params).ravel()
+            held = [p.contacts.closed[flat.gap_count :] * one_way, flat.held_slips(p.contacts) * slips]
+            if self.slots is not None:
+                held = [self.rows(flat, p)[1] @ jnp.concatenate([one_way, slips])]
+            return jnp.concatenate([free.constraints.a(q, qdot, t, p.params), *held])
 
         def counts(p):
             q, t = jnp.zeros(layout.size, layout.dtype), jnp.zeros((), layout.dtype)
@@ -83,16 +92,20 @@ class ContactScene(eqx.Module):
 
         def held(p):
             (f, a), closed = counts(p), p.contacts.closed
-            ones = jnp.ones_like
-            rows = ones(closed, shape=f), closed[: flat.gap_count], ones(closed, shape=a), closed[flat.gap_count :]
-            return jnp.concatenate([*rows, flat.held_slips(p.contacts)])
+            gaps, velocities = jnp.split(jnp.append(closed, flat.held_slips(p.contacts)), [flat.gap_count])
+            if self.slots is not None:
+                gaps, velocities = (rows.sum(axis=1) for rows in self.rows(flat, p))
+            return jnp.concatenate([jnp.ones_like(closed, shape=f), gaps, jnp.ones_like(closed, shape=a), velocities])
 
         def drag(q, qdot, t, p):
             (f, _), slides = counts(p), flat.friction(p.params) * (1.0 - p.contacts.sticks)
             along = flat.slip_direction(q, qdot, t, p)
             slopes = jax.jacrev(flat.slips, argnums=1)(q, qdot, t, p.params)  # (r, d, n), few rows
             forces = -slides[:, None] * jnp.einsum("rd,rdn->rn", along, slopes)
-            return jnp.zeros((layout.size, held(p).size), q.dtype).at[:, f + flat.rough].set(forces.T)
+            places = f + flat.rough
+            if self.slots is not None:
+                places, forces = f + np.arange(self.slots[0]), self.rows(flat, p)[0][:, flat.rough] @ forces
+            return jnp.zeros((layout.size, held(p).size), q.dtype).at[:, places].set(forces.T)
 
         drags = drag if flat.rough.size else None, flat.shapes.directions > 1
         constraints = Constraints(held_positions, held_velocities, held, *drags)
@@ -101,6 +114,15 @@ class ContactScene(eqx.Module):
             constraints = Constraints(ask_user(own.on_positions), ask_user(own.on_velocities))
         lagrangian, forces, dissipation = map(ask_user, (free.lagrangian, free.forces, free.dissipation))
         return Motion(cast(Callable, lagrangian), forces, dissipation, constraints)
+
+    def rows(self, flat: "Flat", p: InContact) -> list:
+        """The rows of `slots` as sums over those of all gaps and of all velocities: matrices of 0 and 1."""
+        assert self.slots is not None
+        found = []
+        for held, count in zip(jnp.split(p.contacts.held, [flat.gap_count]), self.slots, strict=True):
+            place = np.tri(held.size) @ held
+            found.append(jnp.where(place == np.arange(1.0, count + 1)[:, None], held, 0.0))
+        return found
 
 
 class Flat(NamedTuple):

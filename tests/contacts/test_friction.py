@@ -4,6 +4,8 @@ A slider-crank through its dead centres, against the motion of its crank alone; 
 block that friction barely holds, against the law of its rocking.
 """
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -247,3 +249,34 @@ def test_a_particle_slides_up_a_drum_while_another_coordinate_stops():
     np.testing.assert_allclose(np.sum(run.qdot[:, :2] ** 2, axis=1), square, atol=1e-9)
     np.testing.assert_allclose(run.q[4:, 2], 0.02, atol=1e-12)
     assert run.stats["num_steps"] < 50
+
+
+def test_a_box_on_more_corners_than_it_needs_slides_to_rest():
+    """Eight corners in space, 24 rows for 7 coordinates: it slides for v² / 2μg, and stays.
+
+    The four on the floor depend on each other; three normal forces and three slips hold the box.
+    """
+    corners, half = np.array(list(itertools.product((-1.0, 1.0), repeat=3))), 0.5
+
+    def places(q):
+        w, u = q[3], q[4:]
+        turned = (w**2 - u @ u) * corners + 2 * (corners @ u)[:, None] * u + 2 * w * jnp.cross(u, corners)
+        return q[:3] + half * turned
+
+    box = lagjax.System(
+        lambda q, v: 0.5 * v[:3] @ v[:3] + v[3:] @ v[3:] / 3 - G * q[2], contacts=lambda q: places(q)[:, 2],
+        constraints=lambda q: q[3:] @ q[3:] - 1.0, slip=lambda q, v: jax.jvp(places, (q,), (v,))[1][:, :2],
+        friction=lambda params: params,
+    )  # fmt: skip
+    q0, v0 = jnp.array([0.0, 0.0, half, 1.0, 0.0, 0.0, 0.0]), jnp.zeros(7).at[0].set(2.0)
+    ts, mu = jnp.array([0.0, 0.3, 5.0]), 0.3
+    run = lagjax.simulate(box, q0, v0, ts, mu)
+    q = np.asarray(run.q)
+    sliding, stops = 2.0 * 0.3 - mu * G * 0.3**2 / 2, 2.0**2 / (2 * mu * G)
+    np.testing.assert_allclose(q[:, 0], [0.0, sliding, stops], atol=1e-10)
+    np.testing.assert_allclose(q[:, 1:], np.tile(q0[1:], (3, 1)), atol=1e-10)
+    forces = np.asarray(run.contact_forces)
+    np.testing.assert_allclose(forces.sum(axis=1), G, rtol=1e-10)  # of contacts that depend one has none
+    assert run.contacts.closed[-1].sum() == 4 and run.contacts.held[-1].sum() == 6
+    steep = jax.jacfwd(lambda mu: lagjax.simulate(box, q0, v0, ts, mu).q[1, 0])(mu)
+    np.testing.assert_allclose(steep, -G * 0.3**2 / 2, rtol=1e-9)

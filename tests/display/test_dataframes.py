@@ -128,10 +128,27 @@ def test_changes_and_impacts_print_in_words(struck):
     run, batch = struck
     lines = repr(run.contact_changes).splitlines()
     assert lines[0] == f"{run.contact_changes.count} changes of contacts:" and len(lines) == 12
-    assert lines[1].split() == ["t", "=", "1", "contacts['floor']", "bounces"] and lines[-1].endswith("more)")
+    text = "t = 1          contacts['floor'] bounces: its gap is 0; impulse 3 at contacts['floor']"
+    assert lines[1].strip() == text and lines[-1].endswith("more)")
     assert repr(run.impacts).startswith(f"{run.impacts.count} impacts, at t = 1, 2, 2.5,")
     assert repr(batch.contact_changes).endswith(" changes of contacts of 2 motions")
     assert "which took an energy of 2 away" in str(run.health())
+
+
+def test_changes_say_what_vanished_and_which_guess_was_taken_back():
+    """A block slides up a slope, stops and stays; where that is steeper than friction holds it slides at once."""
+    block = lagjax.System(
+        lambda q, v, params: 0.5 * v @ v - q[1] - params * q[0], contacts=lambda q: q[1], slip=lambda q, v: v[0],
+        friction=0.5,
+    )  # fmt: skip
+    for slope, speed, last in (
+        (0.2, 0.7, "t = 1          contacts sticks: its slip is 0"),
+        (0.7, 0.0, "t = 0          contacts slides: its friction left would fall below 0 at once"),
+    ):
+        run = lagjax.simulate(block, jnp.zeros(2), jnp.array([speed, 0.0]), jnp.array([0.0, 2.0]), slope)
+        assert [line.strip() for line in repr(run.contact_changes).splitlines()[1:]] == [
+            "t = 0          contacts closes: its gap is 0", last
+        ]  # fmt: skip
 
 
 def test_a_picture_marks_impacts(struck):

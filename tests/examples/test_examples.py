@@ -61,3 +61,27 @@ def test_tour(tmp_path, monkeypatch, capsys):
     assert tour.main(tmp_path) == [tmp_path / "a.png", tmp_path / "b.png"]
     assert all(argv[:2] == ["--out", str(tmp_path)] for argv in calls) and len(calls) == 2
     assert str(tmp_path) in capsys.readouterr().out
+
+
+TOSSES = Path(__file__).parents[3] / "shared" / "data" / "cube_tosses_identification.npz"
+
+
+@pytest.mark.slow
+def test_a_cube_comes_to_rest_on_a_face(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    run = importlib.import_module("cube").main([])
+    np.testing.assert_allclose(run.q["place"][-1, 2], 1.0, atol=1e-12)
+    np.testing.assert_allclose(run.qdot["place"][-1], 0.0, atol=1e-12)
+    assert (tmp_path / "out" / "cube.gif").exists()
+    assert_pictures([tmp_path / "out" / "cube.png"], tmp_path / "out", 1)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not TOSSES.exists(), reason="the recorded tosses are not here")
+def test_recorded_tosses_of_a_cube(tmp_path, monkeypatch, capsys):
+    """By published numbers alone: half a side and 20° would be those of another face in a third of the tosses."""
+    monkeypatch.chdir(tmp_path)
+    off = importlib.import_module("cube").main([str(TOSSES), "--count", "8"])
+    place, angle = np.median(off[:, :2], axis=0)
+    assert place < 0.5 and angle < 0.35 and off[:, 2].all()
+    assert capsys.readouterr().out.splitlines()[-1].startswith("rolled out: 8 tosses, place ")

@@ -41,6 +41,9 @@ from lagjax._run.contacts._contact_motion import (
     RowPlaces,
     contact_motion,
     follow_known,
+    held_size,
+    slots_of,
+    spread_forces,
 )
 from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes, System, require_coefficients
 
@@ -112,7 +115,7 @@ def _plan(problem: Problem, max_transitions: int | None) -> tuple[ContactPlan, P
     wide = problem.double_precision if problem.is_single else problem
     rtol, atol = float(MachineCode().rtol(wide)), problem.tolerances[1]
     limits = rtol, None if atol is None else float(atol), problem.max_steps, max_transitions, problem.is_single
-    plan = ContactPlan(ContactScene(problem.system), *limits)
+    scene = ContactScene(problem.system)
     with jax.enable_x64(True):
         shapes = Shapes.from_system(problem.system, wide.layout, wide.params)
         r, d = shapes.rough.size, shapes.directions
@@ -121,14 +124,18 @@ def _plan(problem: Problem, max_transitions: int | None) -> tuple[ContactPlan, P
                 "With friction impacts='poisson' is for one contact in a plane: leave out slip, or take Newton's law, "
                 "impacts='simultaneous'."
             )
-        contacts = Contacts(np.ones(shapes.count), np.ones(r), np.ones((r, d)), np.ones(()))
+        held = np.ones(held_size(shapes, wide.layout.size))
+        inside = InContact(wide.params, Contacts(np.ones(shapes.count), np.ones(r), np.ones((r, d)), held, np.ones(())))
         closed, free = (
-            Problem.from_system(scene, wide.layout, InContact(wide.params, contacts))
-            for scene in (plan.scene, ContactScene(problem.system, is_open=True))
+            Problem.from_system(of, wide.layout, inside) for of in (scene, ContactScene(problem.system, is_open=True))
         )
-        if refusal := MachineCode().refuses(free) or closed.derivation.lowered.lacks_elimination:
+        flat, holds = Flat.from_system(problem.system, wide.layout, wide.params), closed
+        if held.size and (slots := slots_of(closed.derivation.lowered, flat)):
+            scene = dataclasses.replace(scene, slots=slots)
+            holds = Problem.from_system(scene, wide.layout, inside)
+        if refusal := MachineCode().refuses(free) or holds.derivation.lowered.lacks_elimination:
             raise ValueError(f"A scene with contacts needs machine code, and has none: {refusal}.")
-        lowered, flat = closed.derivation.lowered, Flat.from_system(problem.system, wide.layout, wide.params)
+        plan, lowered = ContactPlan(scene, *limits), closed.derivation.lowered
         rows = RowPlaces.from_derivation(lowered, flat).normal[shapes.of_gaps :]
         stays = [not moves.any() for moves in ~lowered.absent("jacobian")[rows]]
         for name, still in zip(shapes.names[shapes.of_gaps :], stays, strict=True):
@@ -185,7 +192,7 @@ def _trajectory(
     restore = problem.layout.restore
     (q, qdot), end, (at, behind) = (tuple(map(restore, halves(y))) for y in (ending.path, ending.y, record.y_next))
     before = restore(record.qdot)
-    known = record.contact, record.change, ending.rounds, ending.doubts, ending.doubted
+    known = record.contact, record.change, ending.rounds, ending.doubts, ending.doubted, record.impulse
     names = Shapes.from_system(problem.system, problem.layout, problem.params).names
     changes = ContactChanges(record.t, at, before, at, behind, *known, Names(names))
     return Trajectory(
@@ -202,17 +209,21 @@ def contact_forces(trajectory: Trajectory):
     assert isinstance(system, System)
 
     def normal_forces(q, qdot, times, params, _, contacts: Contacts):
-        scene = ContactScene(system)
         layout = Layout.from_state(*jax.tree.map(lambda x: x[0], (q, qdot)))
         flat = Flat.from_system(system, layout, params)
         inside = InContact(params, jax.tree.map(lambda x: x[0], contacts))
+        scene = ContactScene(system)
+        if contacts.held.shape[-1]:
+            whole = derivation_of(scene, layout, inside).lowered
+            scene = dataclasses.replace(scene, slots=slots_of(whole, flat))
         derivation = derivation_of(scene, layout, inside).with_numbers().lowered
-        program, places = line_of(derivation.multipliers), RowPlaces.from_derivation(derivation, flat)
+        program = line_of(derivation.multipliers)
         numbers = [jnp.ravel(x) for x in jax.tree.leaves(eqx.filter(params, eqx.is_array_like))]
 
         def evaluate_output(q, qdot, t, contacts):
             parts = layout.flatten(q), layout.flatten(qdot), t[None], *numbers, *map(jnp.ravel, contacts)
-            forces = program(jnp.concatenate([jnp.asarray(x, layout.dtype) for x in parts]))[places.normal]
+            forces = program(jnp.concatenate([jnp.asarray(x, layout.dtype) for x in parts]))
+            forces, _ = spread_forces(scene, flat, derivation, forces, InContact(params, contacts))
             return jnp.where(contacts.closed > 0, forces, jnp.where(contacts.closed == 0, 0.0, jnp.nan))
 
         return flat.shapes.name_numbers(jax.vmap(evaluate_output)(q, qdot, times[0], contacts))

@@ -4,6 +4,7 @@ ContactPlan, start ─► SceneCode.search ─► Found ─► attach_derivative
 """
 
 import functools
+import itertools
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -19,16 +20,16 @@ from lagjax._engine.taylor import (
     require_one_number,
     vector_of,
 )
-from lagjax._equations import Derivation, derivation_of
+from lagjax._equations import OPERATION_BUDGET, Derivation, derivation_of
 from lagjax._interface import Function, Layout, compile_for_one_call, halves
 from lagjax._primitives import attach_derivative, lost_unless
-from lagjax._program import Program, Unlowerable, lower
+from lagjax._program import Program, Unlowerable, compose, lower
 from lagjax._run.contacts._contact_search import LOOPS
 from lagjax._run.contacts._corners import append_sides, corners_of
 from lagjax._run.contacts._places import ARRAYS, PLACES, sizes_of
 from lagjax._run.contacts._replay import ContactReplay, Played
 from lagjax._run.jumps import Found, JumpLaw, Mode, SceneCode
-from lagjax._scene import Contacts, ContactScene, Flat, InContact
+from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes
 
 PyTree = Any
 
@@ -69,11 +70,15 @@ class ContactEnding(NamedTuple):
 
 
 class RoundRecord(NamedTuple):
-    """The changes of a motion (N, …), NaN and −1 where there is none: times, velocities before, states behind them."""
+    """The changes of a motion (N, …), NaN and −1 where there is none: times, velocities before, states behind them.
+
+    The impulses (N, k) are normal ones.
+    """
 
     t: Any
     qdot: Any
     y_next: Any
+    impulse: Any
     contact: Any  # behind the contacts, a section that was crossed
     change: Any  # its kind
 
@@ -166,15 +171,16 @@ def _arrange(scene: SearchedScene, found: Found, row, played: Played, inputs: tu
 
     k, r, d = (scene.code.sizes[name] for name in "KRD")
     happened, hits = row.happens > 0, row.hits > 0
-    closed, sticks, direction, near = library.split(found.did, [k, k + r, k + r + r * d], axis=-1)
-    of_path = Contacts(closed, sticks, direction.reshape(*direction.shape[:-1], r, d), near[..., 0])
+    ends = [k, k + r, k + r + r * d, scene.code.sizes["DOING"] - 1]
+    closed, sticks, direction, held, near = library.split(found.did, ends, axis=-1)
+    of_path = Contacts(closed, sticks, direction.reshape(*direction.shape[:-1], r, d), held, near[..., 0])
     of = scene.code.read_ending(found.ending)
     result, rounds, accepted, rejected = (x.astype(int) for x in of[:4])
     ending = ContactEnding(
         lost((closed >= 0).all(axis=-1), played.path), of_path, played.t, played.y, result, rounds,
         (accepted, rejected), of.doubts.astype(int), of.doubted,
     )  # fmt: skip
-    changes = (lost(happened, x) for x in (played.at, played.before, played.behind))
+    changes = (lost(happened, x) for x in (played.at, played.before, played.behind, played.impulse))
     kinds = (library.where(happened, x, -1).astype(int) for x in (row.contact, row.change))
     impacts, front = [], library.argsort(~hits, axis=-1, stable=True)
     for x in (played.t_impact, played.impulse, played.lost):
@@ -194,30 +200,31 @@ def _arrange(scene: SearchedScene, found: Found, row, played: Played, inputs: tu
 def scene_of(plan: ContactPlan, layout: Layout, params: PyTree, times: int) -> SearchedScene:
     """The scene for parameters of this structure and so many outputs."""
     flat = Flat.from_system(plan.scene.system, layout, params)
-    inside = InContact(params, opened(flat))
+    inside = InContact(params, opened(flat, layout.size))
     numbers = vector_of(eqx.filter(inside, eqx.is_array_like))
-    closed, other = (
-        derivation_of(of, layout, inside).with_numbers(numbers)
-        for of in (plan.scene, ContactScene(plan.scene.system, is_open=True))
+    system = plan.scene.system
+    closed, other, whole = (
+        derivation_of(of, layout, inside).with_numbers(numbers).lowered
+        for of in (plan.scene, ContactScene(system, is_open=True), ContactScene(system))
     )
     code, structure = jax.tree.flatten(eqx.filter(inside, eqx.is_array_like, inverse=True))
     tolerances = Tolerances(plan.rtol, plan.atol or 0.0, plan.max_steps)
     given = plan.max_transitions, plan.is_single, plan.sections, plan.directions, tuple(code), structure, times
-    return _make_scene(closed.lowered, other.lowered, plan.scene, tolerances, *given)
+    return _make_scene(closed, other, whole, plan.scene, tolerances, *given)
 
 
 @functools.lru_cache(maxsize=64)
 def _make_scene(
-    derivation: Derivation, open_derivation: Derivation, scene: ContactScene, tolerances: Tolerances, most: int,
-    single: bool, sections: tuple, ways: tuple, code: tuple, structure, times: int
+    derivation: Derivation, open_derivation: Derivation, whole: Derivation, scene: ContactScene,
+    tolerances: Tolerances, most: int, single: bool, sections: tuple, ways: tuple, code: tuple, structure, times: int
 ) -> SearchedScene:  # fmt: skip
     flat = _flat_of(derivation, scene, structure, code)
-    places, shapes, n = RowPlaces.from_derivation(derivation, flat), flat.shapes, derivation.layout.size
-    corners = corners_of(derivation, places.all, shapes)
+    places, shapes, n = RowPlaces.from_derivation(whole, flat), flat.shapes, derivation.layout.size
+    corners = corners_of(whole, places.all, shapes)
     turns, r, d, k = 0 if corners is None else len(corners.touch), flat.rough.size, shapes.directions, shapes.count
     watched = turns, sections, ways, code, structure, single
     open_scene, watches = ContactScene(scene.system, is_open=True), k + r + 2 * turns + len(sections)
-    modes, more = [], lambda: {"MULTIPLIERS": line_of(derivation.multipliers)}
+    modes, more = [], lambda: {"MULTIPLIERS": line_of(_forces_of(derivation, scene, flat))}
     for of, law, make_lines in ((open_derivation, open_scene, dict), (derivation, scene, more)):
         find = functools.partial(_watches, of, law, *watched)
 
@@ -225,8 +232,8 @@ def _make_scene(
             return make_flow(of, scene.path, find().guards(remembers=True))
 
         modes.append(Mode(make, watches, find, make_lines))
-    doing, inputs = k + r + r * d + 1, len(derivation.scalar_shapes)
-    response = derivation.impact_response(places.all, doing, open_derivation)
+    doing, inputs = k + r + r * d + held_size(shapes, n) + 1, len(derivation.scalar_shapes)
+    response = whole.impact_response(places.all, doing, open_derivation)
     bends = response.select_outputs(range(len(response.line.outputs))[-len(places.all) :][:k])
     acceleration = line_of((open_derivation if corners is None else derivation).acceleration, n)
     lines = {"RESPONSE": line_of(response), "BENDS": line_of(bends).with_derivative, "ACCELERATION": acceleration}
@@ -238,10 +245,12 @@ def _make_scene(
         "NUMBERS": inputs - 2 * n - 1 - doing, "INPUTS": inputs, "TIMES": times, "DOING": doing,
         "MOST": most, "LAW": LAWS.index(scene.system.impacts), "SINGLE": int(single), "HEIGHT": len(places.all),
         "MAY_MISS": int(not {op for op, _, _ in modes[0].find_surfaces().values.line.nodes} <= _SEEN),
-        "MULTIPLIERS_COUNT": derivation.shape("jacobian")[0],
+        "MULTIPLIERS_COUNT": max(derivation.shape("jacobian")[0], k + r * d),
+        "GAP_SLOTS": (scene.slots or (0, 0))[0], "SLOTS": (scene.slots or (0, 0))[1],
     }  # fmt: skip
     touch = np.zeros((0, k)) if corners is None else corners.touch
-    arrays = dict(zip(ARRAYS, (flat.rough, places.tangential, touch), strict=True))
+    tangential = places.tangential if scene.slots is None else k + np.arange(r * d)
+    arrays = dict(zip(ARRAYS, (flat.rough, tangential, touch), strict=True))
     searched = SceneCode(LAW, sizes, arrays, modes, lines, tolerances)
     flow = functools.cache(functools.partial(make_flow, derivation, scene.path, None))
     return SearchedScene(
@@ -264,10 +273,69 @@ def _flat_of(derivation: Derivation, scene: ContactScene, structure, code: tuple
     return Flat.from_system(scene.system, derivation.layout, eqx.combine(zeros, structure.unflatten(code)).params)
 
 
-def opened(flat: Flat) -> Contacts:
-    """Contacts that are all open."""
-    r, d = flat.rough.size, flat.shapes.directions
-    return Contacts(jnp.zeros(flat.shapes.count), jnp.ones(r), jnp.ones((r, d)), jnp.zeros(()))
+def opened(flat: Flat, n: int) -> Contacts:
+    """Contacts of n coordinates that are all open."""
+    (k, r), d, held = (flat.shapes.count, flat.rough.size), flat.shapes.directions, held_size(flat.shapes, n)
+    return Contacts(jnp.zeros(k), jnp.ones(r), jnp.ones((r, d)), jnp.zeros(held), jnp.zeros(()))
+
+
+def held_size(shapes: Shapes, n: int) -> int:
+    """The size of `Contacts.held` for n coordinates."""
+    rows = shapes.count + shapes.rough.size * shapes.directions
+    return rows if rows > n else 0
+
+
+def slots_of(whole: Derivation, flat: Flat) -> tuple[int, int] | None:
+    """The most independent rows of gaps, and of velocities, that hold at once; None to hold all rows as they are.
+
+    They are ranks at states that nothing speaks for, where rows have no corners. The slips of few contacts may hold
+    more beside their gaps than those of all do: all sets are looked at whose gaps leave some rank.
+    """
+    places, shapes, n = RowPlaces.from_derivation(whole, flat), flat.shapes, whole.layout.size
+    if not held_size(shapes, n) or shapes.count > flat.gap_count or corners_of(whole, places.all, shapes) is not None:
+        return None
+    rows = [sample.toarray() for _, sample in whole.samples]
+    own = np.setdiff1d(np.arange(len(rows[0])), places.all)
+
+    def rank(*some) -> int:
+        chosen = np.concatenate([own, *some]).astype(int)
+        return max(int(np.linalg.matrix_rank(row[chosen], 1e-9 * abs(row).max())) for row in rows) - len(own)
+
+    gaps = rank(places.normal)
+    if gaps > 3:
+        return None
+    normal, slips = places.normal[flat.rough], places.tangential
+    sets = [list(x) for size in range(1, gaps) for x in itertools.combinations(range(len(slips)), size)]
+    most = [rank(normal[x], slips[x].ravel()) - rank(normal[x]) for x in sets]
+    slots = gaps, max([*most, rank(places.normal, slips.ravel()) - gaps])
+    return slots if sum(slots) < held_size(shapes, n) else None
+
+
+def spread_forces(scene: ContactScene, flat: Flat, derivation: Derivation, forces, inside: InContact) -> tuple:
+    """The forces of the normals (k,) and of the slips (r, d) among those of all constraints."""
+    if scene.slots is None:
+        places = RowPlaces.from_derivation(derivation, flat)
+        return forces[places.normal], forces[places.tangential]
+    gaps, velocities = scene.rows(flat, inside)
+    end, start = derivation.position_count, len(forces) - len(velocities)
+    normal, along = forces[end - len(gaps) : end] @ gaps, forces[start:] @ velocities
+    one_way = flat.shapes.count - flat.gap_count
+    return jnp.append(normal, along[:one_way]), along[one_way:].reshape(-1, flat.shapes.directions)
+
+
+def _forces_of(derivation: Derivation, scene: ContactScene, flat: Flat) -> Program:
+    """All multipliers; with slots those of the contacts, (k + r d,)."""
+    if scene.slots is None:
+        return derivation.multipliers
+    moving = 2 * derivation.layout.size + 1
+
+    def spread(_, inside, forces):
+        return jnp.concatenate([x.ravel() for x in spread_forces(scene, flat, derivation, forces, inside)])
+
+    given = (jax.ShapeDtypeStruct((size,), float) for size in (moving, len(derivation.multipliers.line.outputs)))
+    y, forces = given
+    program = lower(spread, y, derivation.numbers, forces, moving=moving)
+    return compose(program, derivation.multipliers, OPERATION_BUDGET, moving)
 
 
 class RowPlaces(NamedTuple):
@@ -299,18 +367,19 @@ def _watches(
     """
     flat = _flat_of(derivation, scene, structure, code)
     shapes, rough = flat.shapes, flat.rough
-    places = None if scene.is_open else RowPlaces.from_derivation(derivation, flat)
-    corners = corners_of(derivation, places.all, shapes) if turns and places is not None else None
+    corners = None
+    if turns and not scene.is_open:
+        corners = corners_of(derivation, RowPlaces.from_derivation(derivation, flat).all, shapes)
 
     def values_at(y, inside: InContact, *forces):
-        user, (closed, sticks, direction, near) = eqx.filter(inside.params, eqx.is_array_like), inside.contacts
+        user, (closed, sticks, direction, _, near) = eqx.filter(inside.params, eqx.is_array_like), inside.contacts
         state = (*halves(y[:-1]), y[-1])
         open_values = jnp.concatenate([flat.gaps(state[0], state[2], user), flat.one_way(*state, user)])
         user_state = (*map(derivation.layout.restore, state[:2]),)
         more = [require_one_number(of(*user_state, t=y[-1], params=inside.params), "A section") for of in sections]
-        if places is None:
+        if scene.is_open:
             return jnp.concatenate([open_values, jnp.ones(rough.size + 2 * turns), jnp.array(more)])
-        normal = forces[0][places.normal]
+        normal, held = spread_forces(scene, flat, derivation, forces[0], inside._replace(params=user))
         if corners is not None:
             matters = [1.0 - jnp.prod(1.0 - closed[np.flatnonzero(row)]) for row in corners.touch]
             sides = forces[0][-turns:] * jnp.stack(matters)  # 0 where all that is closed is elsewhere
@@ -318,7 +387,7 @@ def _watches(
         watches = jnp.concatenate([normal + (1.0 - closed) * open_values, jnp.array(more)])
         if not rough.size:
             return watches
-        held, most = forces[0][places.tangential], flat.friction(user) * normal[rough]
+        most = flat.friction(user) * normal[rough]
         if shapes.directions == 1:
             slides = jnp.sum(flat.slips(*state, user) * direction, axis=1)
         else:  # zero where it stops, and where it has turned by 60°: at 90° its direction has a pole

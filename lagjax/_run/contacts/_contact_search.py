@@ -103,7 +103,7 @@ def open_all(scene: Scene, x: Floats, opened: Floats):
     k, r, d = scene.k, scene.r, scene.d
     first = 2 * scene.n + 1 + scene.numbers
     copy(x, opened, first)
-    for i in range(k + r + r * d + 1):
+    for i in range(scene.doing):
         opened[first + i] = 1.0 if k <= i and i < k + r + r * d else 0.0
 
 
@@ -569,6 +569,7 @@ def decide(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> 
         write_directions(scene, closed[k + r :], room.free)
         if has_paradox(scene, member, closed, closed[k:], room.free, room):
             undecided = True
+    fits = hold_independent(scene, closed, room)
     count_doubts(scene, member, hits, row, room)
     move(scene, member, first, meets, row, room)
     x[2 * n] += later
@@ -578,7 +579,26 @@ def decide(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> 
         return AT_CORNER
     if missed:
         return MISSED
-    return UNDECIDED if undecided else SUCCESSFUL
+    return UNDECIDED if undecided or not fits else SUCCESSFUL
+
+
+@loop
+def hold_independent(scene: Scene, did: Floats, room: Room) -> bool:
+    """Put the rows by which contacts are held that do not depend on each other; returns whether there is room for them.
+
+    `did` says what the contacts do. Scenes with fewer rows than coordinates hold all.
+    """
+    k, r, d, gaps = scene.k, scene.r, scene.d, 0
+    if scene.gap_slots + scene.slots == 0:
+        return True
+    held, velocities = did[k + r + r * d :], 0
+    hold_rows(k, r, d, scene.rough, room.coupling, did, did[k:], held, room.free)
+    for i in range(k + r * d):
+        if i < scene.gaps:
+            gaps += int(held[i])
+        else:
+            velocities += int(held[i])
+    return gaps <= scene.gap_slots and velocities <= scene.slots
 
 
 @loop

@@ -321,16 +321,24 @@ def find_pattern_in_space(
     k: int, r: int, d: int, rough: Wholes, mu: Floats, coupling: Floats, rates: Floats, touches: Floats,
     targets: Floats, push: Floats, sticks: Floats, direction: Floats, work: Floats
 ):  # fmt: skip
-    """Put the pattern of contacts in space, by principal pivoting: what its solution violates first is taken back."""
+    """Put the pattern of contacts in space, by principal pivoting: what its solution violates first is taken back.
+
+    It begins where all stick; where that goes in circles, as among contacts that depend on each other, where all slide
+    on as they come.
+    """
     size = k + r * d
     impulses, wrong, rest = work, work[size:], work[size + k + r :]
-    for i in range(k):
-        push[i] = float(touches[i] > 0 and rates[i] <= 0)
-    for c in range(r):
-        sticks[c] = 1.0
-        for x in range(d):
-            direction[c * d + x] = float(x == 0)
-    for _ in range(PIVOTS * (k + r)):
+    for step in range(2 * PIVOTS * (k + r)):
+        if step % (PIVOTS * (k + r)) == 0:
+            for i in range(k):
+                push[i] = float(touches[i] > 0 and rates[i] <= 0)
+            for c in range(r):
+                length = 0.0
+                for x in range(d):
+                    length += rates[k + c * d + x] ** 2
+                sticks[c] = float(step == 0 or length == 0)
+                for x in range(d):
+                    direction[c * d + x] = float(x == 0) if sticks[c] > 0 else rates[k + c * d + x] / sqrt(length)
         find_impulses(k, r, d, rough, mu, coupling, rates, push, sticks, direction, targets, impulses, rest)
         find_violations(
             k, r, d, rough, mu, coupling, rates, touches, push, sticks, direction, targets, impulses, wrong, rest

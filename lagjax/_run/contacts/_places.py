@@ -11,6 +11,7 @@ SIZES = (
     "LAW",  # 0 simultaneous, 1 sequential, 2 Poisson's
     "MAY_MISS",  # 1 if an operation of the watches may hide a corner from a series
     "HEIGHT", "MULTIPLIERS_COUNT",  # rows of contacts, and of all constraints
+    "GAP_SLOTS", "SLOTS",  # rows of gaps and of velocities for which there is room; 0 where rows are as they are
     "RESPONSE", "BENDS", "ACCELERATION", "MULTIPLIERS", "SIDES", "SIDE_SLOPES",  # addresses of lines
 )  # fmt: skip
 ARRAYS = (

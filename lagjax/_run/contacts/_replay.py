@@ -10,13 +10,13 @@ Its derivatives are those of the motion that the search found; its values are no
 
 import functools
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._engine.taylor import Line, move_to_zero, run_stretch
+from lagjax._engine.taylor import Line, Surfaces, move_to_zero, run_stretch
 from lagjax._interface import halves
 from lagjax._primitives import differentiable_where, keep_together
 from lagjax._run.contacts._contact_search import HELD, POISSON
@@ -46,7 +46,8 @@ class ContactReplay(Replay):
 
     def __init__(self, code: SceneCode, flow: Callable):
         n, k = code.sizes["N"], code.sizes["K"]
-        self._flow, self._find_watches, self._lines = flow, code.modes[HELD].find_surfaces, code.lines
+        self._flow, self._lines = flow, code.lines
+        self._find_watches = cast(Callable[[], Surfaces], code.modes[HELD].find_surfaces)
         # The places at which the parts of what `_end` gives end, but the last.
         self._ends, self._rough = np.cumsum([1, 1, n, 1, k, 1, 2 * n, 1]), code.arrays["ROUGH"]
         self.said = int(self._ends[5]) - 1
@@ -109,8 +110,9 @@ class ContactReplay(Replay):
         return ImpactRows.split(self._lines["RESPONSE"](self._opened(t, y, vector)), self.sizes["HEIGHT"], y.size // 2)
 
     def _opened(self, t, y, vector):
-        k, doing = self.sizes["K"], self.sizes["DOING"]
-        return jnp.concatenate([y, t[None], vector, jnp.zeros(k), jnp.ones(doing - k - 1), jnp.zeros(1)])
+        k, r, d, doing = (self.sizes[name] for name in ("K", "R", "D", "DOING"))
+        ones = jnp.ones(r + r * d)
+        return jnp.concatenate([y, t[None], vector, jnp.zeros(k), ones, jnp.zeros(doing - k - ones.size)])
 
     def _jump(self, at, rows: ImpactRows, row, vector, restitution, friction):
         """The time of an impact, impulses (k,), the energy lost, and the state (2n,) behind a change at (t, y)."""
