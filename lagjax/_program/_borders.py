@@ -32,7 +32,7 @@ from lagjax._program._differentiation import copy_nodes, gradient_in, pullback
 from lagjax._program._graph import Graph, find_ancestors
 from lagjax._program._kick import Jumping, Kick, Mechanics, kick_line
 from lagjax._program._look_ups import Located, Table
-from lagjax._program._operations import OPERATIONS
+from lagjax._program._operations import LOOK_UPS, OPERATIONS
 from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._powers import LEAST_POWER, find_powers
 from lagjax._program._recurrences import LARGEST_WHOLE
@@ -648,9 +648,11 @@ class _Rewriting:
 
         Two pieces with one border would each push onto it, or not, as if the other one stayed as it is.
         """
-        if not self._is_moving(x) or (SIGN, x) in self._known:
-            return None
         f, nodes, inputs = self.graph.apply, list(range(len(self.graph.nodes))), inputs_below(self.graph, [x])
+        steps = {"select", *LOOK_UPS, *_PIECEWISE}.intersection(self.graph.nodes[i][0] for i in _below(self.graph, [x]))
+        # A few states say nothing of numbers that are chosen.
+        if not self._is_moving(x) or (SIGN, x) in self._known or steps or max(inputs) >= self.program.size:
+            return None
         # Of two draws of params, and four states each.
         columns = {i: np.random.default_rng(i).uniform(0.3, 1.2, (2, 4)) for i in inputs}
         columns |= {i: np.repeat(columns[i][:, :1], 4, 1) for i in inputs if self.moving <= i < self.program.size}

@@ -88,8 +88,8 @@ def test_both_forms_find_a_singular_mass_matrix(lagrangian):
     motion = lagjax.System(lagrangian)._motion(layout)
     for path in ("scalar", "array"):
         form = form_of(Derivation(motion, layout, None), path)
-        acceleration, singular = form.acceleration(jnp.asarray(0.0), (jnp.zeros(n), jnp.ones(n)), None)
-        assert singular and not np.isfinite(acceleration).all()
+        _, singular = form.acceleration(jnp.asarray(0.0), (jnp.zeros(n), jnp.ones(n)), None)
+        assert singular  # what no force acts on may stay 0: the flag stops the motion
 
 
 def test_an_indefinite_mass_matrix():

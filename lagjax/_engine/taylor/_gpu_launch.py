@@ -34,8 +34,8 @@ def run_on_gpu(flow: Flow, tolerances: Tolerances, ts, y0, params) -> tuple:
     arrays = _inputs(gpu.MOTION, ts, y0, params, flow, tolerances, room_of_notes=notes) | {"path": path}
     guards = flow.kernel.ending_guards
     shapes = [path.shape, y0.shape, *[(members,)] * 4, (members, max(1, guards))]  # an array that has an address
-    results = launch(gpu.MOTION, program, members, arrays, shapes)
-    results[-1] = results[-1][:, :guards]
+    *results, changes = launch(gpu.MOTION, program, members, arrays, shapes)
+    results.append(changes[:, :guards])
     return _solution(*results, states=not notes)
 
 
