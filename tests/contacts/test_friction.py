@@ -251,6 +251,7 @@ def test_a_particle_slides_up_a_drum_while_another_coordinate_stops():
     assert run.stats["num_steps"] < 50
 
 
+@pytest.mark.slow
 def test_a_box_on_more_corners_than_it_needs_slides_to_rest():
     """Eight corners in space, 24 rows for 7 coordinates: it slides for v² / 2μg, and stays.
 
