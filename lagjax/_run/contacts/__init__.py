@@ -58,33 +58,41 @@ def follow_contacts(given: Problem, problem: Problem, max_transitions: int | Non
         q0, qdot0 = map(problem.layout.restore, halves(jnp.asarray(problem.y0)))
         require_consistent(problem.system, problem.layout, problem.ts, q0, qdot0, problem.params)
     follow = _follow_at_once if problem.is_known else _follow_compiled
-    return dataclasses.replace(follow(plan, problem), ts=given.ts, system=given.system, params=given.params)
+    found = follow(plan, problem)
+    return dataclasses.replace(found, ts=jnp.asarray(given.ts), system=given.system, params=given.params)
 
 
 def _follow_at_once(plan: ContactPlan, problem: Problem) -> Trajectory:
+    return _put_on_device(_trajectory(problem, problem, *_motion(plan, problem), None))
+
+
+@compile_for_one_call  # outside of `jit` one program, and not one an operation
+def _follow_compiled(plan: ContactPlan, problem: Problem) -> Trajectory:
     return _trajectory(problem, problem, *_motion(plan, problem), problem.params)
 
 
-_follow_compiled = compile_for_one_call(_follow_at_once)  # outside of `jit` one program, and not one an operation
+def _put_on_device(trajectory: Trajectory) -> Trajectory:
+    """The trajectory with arrays of JAX in place of all of NumPy: put together, and not each."""
+    numbers, rest = eqx.partition(trajectory, lambda x: isinstance(x, np.ndarray | np.generic))
+    return eqx.combine(jax.device_put(numbers), rest)
 
 
 def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int | None, params, params_axes) -> Trajectory:
     """The motions of a batch whose system has contacts."""
     plan, *_ = _plan(batch.member, max_transitions)
     if batch.is_known:
-        found = jax.device_put(
-            follow_rows(functools.partial(follow_known, plan), batch.member, batch.y0, batch.vectors)
-        )
+        found = follow_rows(functools.partial(follow_known, plan), batch.member, batch.y0, batch.vectors)
     else:
         found = batch.map_members(lambda problem: follow_in_doubles(functools.partial(contact_motion, plan), problem))
     ending, record, impacts = found
-    return _trajectory(given.member, batch.member, ending, record, impacts, params, params_axes)
+    trajectory = _trajectory(given.member, batch.member, ending, record, impacts, None, params_axes)
+    return dataclasses.replace(_put_on_device(trajectory), params=params)
 
 
 def _motion(plan: ContactPlan, problem: Problem) -> tuple[ContactEnding, RoundRecord, tuple]:
     if not problem.is_known:
         return follow_in_doubles(functools.partial(contact_motion, plan), problem)
-    return jax.device_put(follow_in_numbers(functools.partial(follow_known, plan), problem))
+    return follow_in_numbers(functools.partial(follow_known, plan), problem)
 
 
 def note_sections(problem: Problem, functions: tuple, directions: tuple[int, ...], room: int) -> tuple:
@@ -95,7 +103,7 @@ def note_sections(problem: Problem, functions: tuple, directions: tuple[int, ...
     plan, *scenes = _plan(problem, CHANGES + len(functions) * (room + 1))
     _require_sound(problem, *scenes)
     plan = dataclasses.replace(plan, sections=functions, directions=directions)
-    ending, record, _ = _motion(plan, problem)
+    ending, record, _ = jax.tree.map(jnp.asarray, _motion(plan, problem))
     count = Shapes.from_system(problem.system, problem.layout, problem.params).count
     which = jnp.maximum(record.contact - count, -1)
     return (which, record.t, record.y_next), ending.result, (ending.t, ending.y)

@@ -276,7 +276,7 @@ def _flat_of(derivation: Derivation, scene: ContactScene, structure, code: tuple
 def opened(flat: Flat, n: int) -> Contacts:
     """Contacts of n coordinates that are all open."""
     (k, r), d, held = (flat.shapes.count, flat.rough.size), flat.shapes.directions, held_size(flat.shapes, n)
-    return Contacts(jnp.zeros(k), jnp.ones(r), jnp.ones((r, d)), jnp.zeros(held), jnp.zeros(()))
+    return Contacts(np.zeros(k), np.ones(r), np.ones((r, d)), np.zeros(held), np.zeros(()))
 
 
 def held_size(shapes: Shapes, n: int) -> int:
