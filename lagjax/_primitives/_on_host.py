@@ -12,6 +12,7 @@ import jax
 import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 from jax.extend import core
+from jax.lax import GatherScatterMode
 
 _UFUNCS: dict[str, Callable] = {
     "add": np.add, "add_any": np.add, "sub": np.subtract, "mul": np.multiply, "div": np.divide, "neg": np.negative,
@@ -213,8 +214,90 @@ def _product(dimension_numbers, **_):
     return rule
 
 
+def _each(rule: Callable) -> Callable:
+    """A rule of one member for all of them."""
+
+    def of_all(*xs):
+        rows = share_rows(*xs)
+        return np.stack([rule(*(x[m] for x in rows)) for m in range(len(rows[0]))])
+
+    return of_all
+
+
+def _window(shape, sizes, starts) -> tuple[slice, ...]:
+    begins = [min(max(int(k), 0), whole - size) for k, whole, size in zip(starts, shape, sizes, strict=True)]
+    return tuple(slice(begin, begin + size) for begin, size in zip(begins, sizes, strict=True))
+
+
+def _dynamic_slice(slice_sizes, **_):
+    return _each(lambda x, *starts: x[_window(x.shape, slice_sizes, starts)])
+
+
+def _dynamic_update_slice(**_):
+    def rule(x, update, *starts):
+        out = x.copy()
+        out[_window(x.shape, update.shape, starts)] = update
+        return out
+
+    return _each(rule)
+
+
+def _window_places(shape, indices, sizes, of_index, batching, of_batch, mode) -> tuple[tuple, Any]:
+    """The places in an array of windows of these sizes, behind the axes of the `indices`; and which lie within."""
+    batch, k, places, inside = indices.shape[:-1], len(shape), [], np.array(True)
+    for d, (whole, size) in enumerate(zip(shape, sizes, strict=True)):
+        start = np.zeros(batch, int)
+        if d in of_index:
+            start = indices[..., of_index.index(d)].astype(int)
+        elif d in batching:
+            axis = of_batch[batching.index(d)]
+            start = start + np.arange(batch[axis]).reshape([-1 if i == axis else 1 for i in range(len(batch))])
+        if mode != GatherScatterMode.CLIP:
+            inside = inside & (start >= 0) & (start <= whole - size)
+        start = np.clip(start, 0, whole - size).reshape(*batch, *[1] * k)
+        places.append(start + np.arange(size).reshape([-1 if i == d else 1 for i in range(k)]))
+    return tuple(np.broadcast_arrays(*places)), np.broadcast_to(inside, batch).reshape(*batch, *[1] * k)
+
+
+def _gather(dimension_numbers, slice_sizes, mode, **_):
+    of = dimension_numbers
+    batching = of.operand_batching_dims, of.start_indices_batching_dims
+    lost = (*of.collapsed_slice_dims, *of.operand_batching_dims)
+
+    def rule(x, indices):
+        places, inside = _window_places(x.shape, indices, slice_sizes, of.start_index_map, *batching, mode)
+        count = indices.ndim - 1
+        found = np.where(inside, x[places], np.nan) if np.issubdtype(x.dtype, np.floating) else x[places]
+        found = found.squeeze(tuple(count + d for d in lost))
+        return np.moveaxis(found, range(count, found.ndim), of.offset_dims)
+
+    return _each(rule)
+
+
+def _scatter_add(dimension_numbers, mode, **_):
+    of = dimension_numbers
+    batching = of.operand_batching_dims, of.scatter_indices_batching_dims
+    lost = (*of.inserted_window_dims, *of.operand_batching_dims)
+
+    def rule(x, indices, updates):
+        count, out = indices.ndim - 1, x.copy()
+        updates = np.moveaxis(updates, of.update_window_dims, range(count, updates.ndim))
+        updates = np.expand_dims(updates, tuple(count + d for d in lost))
+        of_index = of.scatter_dims_to_operand_dims
+        places, inside = _window_places(x.shape, indices, updates.shape[count:], of_index, *batching, mode)
+        np.add.at(out, places, np.where(inside, updates, 0))
+        return out
+
+    return _each(rule)
+
+
 _RULES: dict[str, Callable] = {
     "select_n": _select,
+    "dynamic_slice": _dynamic_slice,
+    "dynamic_update_slice": _dynamic_update_slice,
+    "gather": _gather,
+    "scatter-add": _scatter_add,
+    "scatter_add": _scatter_add,
     "slice": _slice,
     "split": _split,
     "unstack": _unstack,

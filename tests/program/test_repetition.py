@@ -135,3 +135,29 @@ def test_singular_systems():
     a = jnp.stack([jnp.eye(2), jnp.zeros((2, 2))])
     found = jax.vmap(solve, (0, None))(a, jnp.ones(2))
     np.testing.assert_array_equal(found, [[1.0, 1.0], [np.nan, np.nan]])
+
+
+READS = {
+    "an entry": (lambda x, i: x[i], (5,), ()), "rows": (lambda x, i: x[i], (5, 3), (4,)),
+    "columns": (lambda x, i: x[:, i], (4, 5), (3,)), "a diagonal": (lambda x, i: x[i, i], (5, 5), (3,)),
+    "what may be nowhere": (lambda x, i: x.at[i].get(mode="fill"), (5,), (4,)),
+    "a window": (lambda x, i: jax.lax.dynamic_slice(x, (i,), (2,)), (5,), ()),
+    "along an axis": (lambda x, i: jnp.take_along_axis(x, i, 1), (3, 5), (3, 2)),
+    "an entry of each row": (lambda x, i: jax.vmap(lambda row, k: row[k])(x, i), (3, 5), (3,)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("read", READS)
+def test_places_that_are_known_at_run_time(read):
+    """What is read, and the cotangents of what it is read from, as XLA has them."""
+    function, shape, of_places = READS[read]
+    rng = np.random.default_rng(0)
+    x, places = rng.normal(size=(4, *shape)), rng.integers(-1 if "nowhere" in read else 0, 3, size=(4, *of_places))
+
+    def both(x, places):
+        found, pull = jax.vjp(lambda x: function(x, places), x)
+        return [found, *pull(jnp.sin(found))]
+
+    on_host = HostFunction(both, jax.ShapeDtypeStruct(shape, float), jax.ShapeDtypeStruct(of_places, int))
+    for found, right in zip(on_host(x, places), jax.vmap(both)(x, places), strict=True):
+        np.testing.assert_allclose(found, right, rtol=1e-14)
