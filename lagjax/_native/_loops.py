@@ -74,6 +74,15 @@ def integrate(
     kind(int(begin))(int(plan), *(x.ctypes.data for x in arrays), members, times, members, members)
 
 
+def _parse(text: str, mode: str) -> Any:
+    for _ in range(9):
+        try:
+            return ast.parse(text, mode=mode)
+        except SystemError:  # before CPython 3.11.8 two threads may count the depth of one another (issue 106905)
+            continue
+    return ast.parse(text, mode=mode)
+
+
 class Loop:
     """A function of Python that may become machine code (`compile_loop`); a call runs it in Python."""
 
@@ -91,7 +100,7 @@ class Loop:
 
     @functools.cached_property
     def tree(self) -> ast.FunctionDef:
-        found = ast.parse(textwrap.dedent(inspect.getsource(self.function))).body[0]
+        found = _parse(textwrap.dedent(inspect.getsource(self.function)), "exec").body[0]
         assert isinstance(found, ast.FunctionDef)
         return found
 
@@ -204,7 +213,7 @@ class _Writer:
             self.store(target, self.value(node.value))
 
     def do_AugAssign(self, node: ast.AugAssign):
-        read = ast.parse(ast.unparse(node.target), mode="eval").body
+        read = _parse(ast.unparse(node.target), "eval").body
         self.store(node.target, self.value(ast.BinOp(read, node.op, node.value)))
 
     def store(self, target, found: tuple[str, Value]) -> None:

@@ -224,6 +224,7 @@ class _Run:
     def __init__(self, code: SceneCode, scene, ts, memory, path, did, room: int | None):
         self.code, self.scene, self.ts, self.memory, self.path, self.did = code, scene, ts, memory, path, did
         self.at = at = code.law.places.at
+        self._loops = compile_loops(*code.law.loops)  # once, before there are threads
         self.record, self._fixed = np.zeros((len(memory), room or _ROOM, scene[at.ROW])), room is not None
         scene[at.STRIDE] = ts.shape[1] if len(ts) > 1 else 0
         self.results = memory[:, scene[at.RESULT]]
@@ -253,10 +254,6 @@ class _Run:
         if not self._fixed:
             used = int(self.memory[:, self.scene[self.at.ROWS]].max(initial=1))
             self.record = np.ascontiguousarray(self.record[:, : max(used, 1)])
-
-    @property
-    def _loops(self) -> tuple[Callable, ...]:
-        return compile_loops(*self.code.law.loops)
 
     def _follow_some(self, members: slice) -> None:
         scene, memory = self.scene.copy(), self.memory[members]
