@@ -217,11 +217,11 @@ def _product(dimension_numbers, **_):
 def _each(rule: Callable) -> Callable:
     """A rule of one member for all of them."""
 
-    def of_all(*xs):
+    def rule_of_all(*xs):
         rows = share_rows(*xs)
         return np.stack([rule(*(x[m] for x in rows)) for m in range(len(rows[0]))])
 
-    return of_all
+    return rule_of_all
 
 
 def _window(shape, sizes, starts) -> tuple[slice, ...]:
