@@ -97,6 +97,7 @@ def fork_during_a_batch(count=3):
 
 
 def leave_during_a_batch():
+    batch(SHORT)  # Python ends a daemon thread in the midst of a compiler's code by an abort of the process
     threading.Thread(target=batch, daemon=True).start()
     time.sleep(0.2)
 
