@@ -31,7 +31,6 @@ one Taylor series, of the order that the tolerance asks for.
     _handler             the motion as a call of XLA;  _derivative_handler: derivatives of short motions
     _line_handler        any straight line as a call of XLA
     _loops               loops and decisions over numbers, written in Python, as machine code
-    _interpreter         one of them: a walk along a long straight line, with its running errors
     _gpu                 the modules of one lane as programs for NVIDIA GPUs;  _gpu_entry: what a thread of these does
 
 Nothing here knows JAX: arrays are NumPy's, and a program is data (`_program._series.Recurrent`).
@@ -57,7 +56,6 @@ from lagjax._native._constants import (
 from lagjax._native._derivative_handler import derivative_handler
 from lagjax._native._guards import Guards, append_guards
 from lagjax._native._handler import Plan, handler, make_once, unavailable
-from lagjax._native._interpreter import LineWalk
 from lagjax._native._ir import lanes
 from lagjax._native._kernel import Begun, Kernel, StepRecord, cores, floor_of
 from lagjax._native._line_handler import LineCode, line_handler

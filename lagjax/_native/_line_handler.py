@@ -15,6 +15,8 @@ from lagjax._native._constants import LARGEST_LINE
 from lagjax._native._handler import call, compile_handler, load_at, make_once
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value, compile_module
 from lagjax._native._lanes import emit, sincos_function
+from lagjax._program._graph import Graph
+from lagjax._program._rounding import operation_error
 from lagjax._program._series import StraightLine
 
 _SET_ROWS = "set_rows"
@@ -24,18 +26,20 @@ class LineCode:
     """A straight line of `inputs` floats in machine code, for as long as this object lives.
 
     At its `address` is `evaluate(x, out, rows)`, with x (rows, inputs) and out (rows, outputs). A long line is a walk
-    along rows of integers, for which LLVM takes no longer. Raises `Unlowerable`.
+    along rows of integers, for which LLVM takes no longer. Where its first inputs, so many, are `moving`, that gives
+    the running errors of the outputs in their place (`_program._rounding`): a line of them would be five times as long.
+    Raises `Unlowerable`.
     """
 
-    def __init__(self, line: StraightLine, inputs: int):
+    def __init__(self, line: StraightLine, inputs: int, moving: int | None = None):
         module, outputs = ir.Module("line"), len(line.outputs)
         module.triple = ""
         turns = any(op in ("sin", "cos") for op, _, _ in line.nodes)
         sincos = sincos_function(module, 1) if turns else None
         filled = [k for k in range(outputs) if line.constant(k) != 0]
-        long = len(line.nodes) + len(filled) > LARGEST_LINE
-        write = _Walk(line, inputs, filled) if long else None
-        room = 1 if write is None else 2 ** math.ceil(math.log2(write.size))
+        long = moving is not None or len(line.nodes) + len(filled) > LARGEST_LINE
+        write = _RowWalk(line, inputs, filled, moving) if long else None
+        room = 1 if write is None else 2 ** math.ceil(math.log2(2 * write.size))
         code = Code(module, "evaluate", [POINTER, POINTER, INTEGER], 1, public=True)
         (x, out, rows), room = code.arguments, code.stack(room)
         with code.loop(rows) as row:
@@ -71,19 +75,17 @@ def _write_line(code: Code, sincos: Code | None, line: StraightLine, filled: lis
         code.store(code.lanes_of(number), code.element(out, k))
 
 
-class _Walk:
+class _RowWalk:
     """A line as `numbers`: how many rows, constants and outputs, then these.
 
     A row is the case of an operation, its operands and its result, places in a room of `size` doubles, where constants
     and inputs stand first. Where nobody needs a number any more another one stands; an output is its place and there.
+    Errors, where the first inputs are `moving`, stand behind the room, in the same order.
     """
 
-    def __init__(self, line: StraightLine, inputs: int, filled: list[int]):
-        self.inputs, self.cases, last_use = (
-            inputs,
-            {},
-            dict.fromkeys((line.outputs[k] for k in filled), len(line.nodes)),
-        )
+    def __init__(self, line: StraightLine, inputs: int, filled: list[int], moving: int | None):
+        self.inputs, self.moving, self.cases = inputs, moving, {}
+        last_use = dict.fromkeys((line.outputs[k] for k in filled), len(line.nodes))
         for i in reversed(range(len(line.nodes))):
             for j in line.nodes[i][1] if i in last_use else ():
                 last_use.setdefault(j, i)
@@ -123,25 +125,50 @@ class _Walk:
         table = code.load(Value(code, place), POINTER)
         rows, constants, outputs = (code.load(code.element(table, i, INTEGER), INTEGER) for i in range(3))
         first = rows * 5 + 3
+        rooms = [room] if self.moving is None else [room, code.element(room, self.size)]
         with code.loop(constants) as i:
             code.store(code.load(code.element(table, first + i), DOUBLE), code.element(room, i))
+            for errors in rooms[1:]:
+                code.store(code.as_value(0.0, DOUBLE), code.element(errors, i))
         with code.loop(self.inputs) as i:
             code.store(code.load(code.element(x, i), DOUBLE), code.element(room, constants + i))
+            for errors in rooms[1:]:
+                code.store(code.as_value(0.0, DOUBLE), code.element(errors, constants + i))
+        for errors in rooms[1:]:
+            with code.loop(self.moving) as i:
+                code.store(abs(code.load(code.element(x, i), DOUBLE)), code.element(errors, constants + i))
         with code.loop(rows) as i:
             case, to, *places = (code.load(code.element(table, i * 5 + (3 + k), INTEGER), INTEGER) for k in range(5))
             keys = list(self.cases)
             for k in code.cases(case, range(len(keys))):
-                op, attribute, (*kinds, kind) = keys[k]
-                nodes: list[Any] = [("input", (), j) for j in range(len(kinds))]
-                nodes.append((op, tuple(range(len(kinds))), attribute))
-                line = StraightLine(tuple(nodes), (*kinds, kind), (len(nodes) - 1,))
-                read = functools.cache(lambda j, at=places: code.load(code.element(room, at[j]), code.vector))
-                (value,) = emit(code, line, read, sincos, None)
-                code.store(code.lanes_of(code.as_number(value) if kind == "bool" else value), code.element(room, to))
+                line, count = self._write_case(*keys[k]), max(1, len(keys[k][2]) - 1)
+                read = functools.cache(
+                    lambda j, at=places, count=count: code.load(
+                        code.element(rooms[j // count], at[j % count]), code.vector
+                    )
+                )
+                for of, node, value in zip(rooms, line.outputs, emit(code, line, read, sincos, None), strict=True):
+                    number = code.as_number(value) if line.kinds[node] == "bool" else value
+                    code.store(code.lanes_of(number), code.element(of, to))
         with code.loop(outputs) as i:
             pair = first + constants + i * 2
             k, at = (code.load(code.element(table, pair + j, INTEGER), INTEGER) for j in range(2))
-            code.store(code.load(code.element(room, at), DOUBLE), code.element(out, k))
+            code.store(code.load(code.element(rooms[-1], at), DOUBLE), code.element(out, k))
+
+    def _write_case(self, op: str, attribute, kinds: tuple[str, ...]) -> StraightLine:
+        """An operation of operands of some kinds, the last of which is its own; behind these are their errors."""
+        *of_operands, kind = kinds
+        graph = Graph(1000)
+        operands = [graph.input(i, of) for i, of in enumerate(of_operands)]
+        node = graph.node(op, *operands, attribute=attribute) if operands else graph.input(0, kind)
+        outputs = [node]
+        if self.moving is not None:
+            errors = [graph.input(len(operands) + i, "float") for i in range(len(operands))]
+            is_exact = kind != "float" or not operands
+            outputs.append(
+                graph.number(0.0) if is_exact else operation_error(graph, op, node, operands, errors, to_zero=True)
+            )
+        return StraightLine(tuple(graph.nodes), tuple(graph.kinds), tuple(outputs))
 
 
 @make_once

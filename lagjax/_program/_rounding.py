@@ -21,14 +21,25 @@ def rounding(graph: Graph, line: StraightLine, nodes: Sequence[int], moving: int
     for (op, operands, attribute), kind, node in zip(line.nodes, line.kinds, nodes, strict=True):
         if kind != "float" or op == "constant" or (op == "input" and attribute >= moving):
             errors.append(zero)
-            continue
-        error = zero if op != "input" and OPERATIONS[op].exact else graph.apply("abs", node)
-        for i, rule in zip(operands, () if op == "input" else OPERATIONS[op].transpose(), strict=False):
-            if rule is not None and errors[i] != zero:
-                slope = rule(graph.apply, graph.number, graph.number(1.0), node, *(nodes[j] for j in operands))
-                part = graph.apply("mul", errors[i], graph.apply("abs", slope))
-                if to_zero and (OPERATIONS[op].steep or op == "div"):
-                    part = graph.apply("select", graph.apply("eq", errors[i], zero), part, zero)
-                error = graph.apply("add", error, part)
-        errors.append(error)
+        elif op == "input":
+            errors.append(graph.apply("abs", node))
+        else:
+            given = [nodes[j] for j in operands], [errors[j] for j in operands]
+            errors.append(operation_error(graph, op, node, *given, to_zero))
     return [errors[i] for i in line.outputs]
+
+
+def operation_error(
+    graph: Graph, op: str, node: int, operands: Sequence[int], errors: Sequence[int], to_zero: bool = False
+) -> int:
+    """The error of an operation, which is a node of a graph, from those of its operands (see `rounding`)."""
+    zero = graph.number(0.0)
+    error = zero if OPERATIONS[op].exact else graph.apply("abs", node)
+    for brought, rule in zip(errors, OPERATIONS[op].transpose(), strict=False):
+        if rule is not None and brought != zero:
+            slope = rule(graph.apply, graph.number, graph.number(1.0), node, *operands)
+            part = graph.apply("mul", brought, graph.apply("abs", slope))
+            if to_zero and (OPERATIONS[op].steep or op == "div"):
+                part = graph.apply("select", graph.apply("eq", brought, zero), part, zero)
+            error = graph.apply("add", error, part)
+    return error

@@ -80,6 +80,22 @@ def test_a_long_line_is_what_its_operations_are():
     np.testing.assert_allclose(code(rows), expected, rtol=1e-13, atol=1e-13)
 
 
+def test_running_errors_of_a_walk_are_those_of_a_program_of_their_own():
+    """Terms that cancel, ties, and what is exact beside an infinite slope; the last input is not rounded."""
+
+    def function(x):
+        u, v, w = x[0], x[1], x[2]
+        pieces = jnp.where(u > v, jnp.sqrt(v), -u) + jnp.where(v == 0.25, jnp.abs(w), w / v) + jnp.where(w <= v, u, 2.0)
+        finite = jnp.where(jnp.isfinite(1.0 / (v - 0.25)), 3.0 * u, 0.5)
+        more = jnp.where(w >= 1.0, u * v, w) + jnp.where(w < -3.0, 1.0, u)
+        return jnp.stack([pieces, finite, jnp.sin(u) * jnp.cos(w) - u, (u + 1e6) - 1e6, more, jnp.exp(w) * u])
+
+    program = lower(function, jnp.zeros(3), moving=2)
+    errors, walk = program.rounding_of(range(6), 2), LineCode(program.line, 3, moving=2)
+    rows = np.array([[0.7, 0.25, -1.2], [0.25, 0.25, 0.25], [-2.0, 3.0, 0.0]])
+    np.testing.assert_allclose(walk(rows), errors.line.evaluate(list(rows.T)).T, rtol=1e-14)
+
+
 def test_long_runs_of_one_output_are_written_by_a_loop():
     """As rows of contacts have: zeros beside a few numbers, and a number that is repeated."""
 

@@ -19,9 +19,8 @@ from jax.interpreters import mlir
 
 from lagjax._engine.taylor import Line, Surfaces, line_of, rate_errors
 from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL
-from lagjax._native import LARGEST_LINE, SINGLE_NOISE, LineWalk, Loop, compile_loops, cores, handler
+from lagjax._native import LARGEST_LINE, SINGLE_NOISE, LineCode, Loop, compile_loops, cores, handler
 from lagjax._primitives import LinearMap, call_host, compute_on_host
-from lagjax._program import StraightLine
 from lagjax._run.jumps._driver import ASKS, GOING, NEW
 from lagjax._run.jumps._field_places import Places
 
@@ -107,15 +106,15 @@ class SceneCode:
         return scene
 
     def _add_watches(self, scene: np.ndarray, mode: int, surfaces: Surfaces) -> None:
-        count = len(surfaces.directions)
-        lines = {("WATCH", mode): line_of(surfaces.complete, 4 * count)}
-        walk, moving = LineWalk(lines["WATCH", mode].line, lines["WATCH", mode].size), 2 * self.sizes["N"] + 1
-        if len(walk) > LARGEST_LINE and walk.is_known:  # whose errors would be five times as many operations
-            function, address = _call_back(lambda x: walk(x, moving)[1][count : 2 * count], walk.inputs, count)
-            self._keep.append(function)
-            scene[scene[self.law.places.of["ERRORS"]] + mode] = address
+        count, complete = len(surfaces.directions), surfaces.complete
+        lines = {("WATCH", mode): line_of(complete, 4 * count)}
+        if len(complete.line.nodes) > LARGEST_LINE and not complete.line.looks_up:
+            rates = complete.select_outputs(range(count, 2 * count)).line
+            code = LineCode(rates, lines["WATCH", mode].size, moving=2 * self.sizes["N"] + 1)
+            self._keep.append(code)
+            scene[scene[self.law.places.of["ERRORS"]] + mode] = code.address
         else:
-            lines["ERRORS", mode] = line_of(rate_errors(surfaces.complete, count), count)
+            lines["ERRORS", mode] = line_of(rate_errors(complete, count), count)
         if surfaces.is_rounded:
             lines["SLOPES", mode] = line_of(surfaces.values, count).back
         self._add_codes(scene, lines)
@@ -137,11 +136,7 @@ class SceneCode:
 
     def _add_codes(self, scene: np.ndarray, lines: dict[Any, Line]) -> None:
         for name, of in lines.items():
-            if of.code is None:  # one of tables
-                by_numpy = functools.partial(_evaluate_by_numpy, of.line)
-                keep, address = _call_back(by_numpy, of.size, of.outputs)
-            else:
-                keep, address = of.code, of.code.address
+            keep, address = _call_numpy(of) if of.code is None else (of.code, of.code.address)
             self._keep.append(keep)
             place = self.law.places.of[name] if isinstance(name, str) else scene[self.law.places.of[name[0]]] + name[1]
             scene[place] = address
@@ -198,19 +193,15 @@ class SceneCode:
         return Found(path, did, run.record, np.concatenate(ending, axis=1))
 
 
-def _evaluate_by_numpy(line: StraightLine, x: np.ndarray) -> np.ndarray:
-    return line.evaluate(list(x[:, None]))[:, 0]
-
-
-def _call_back(of: Callable, inputs: int, outputs: int) -> tuple[Any, int]:
-    """A function of an array, called as machine code is, and its address."""
+def _call_numpy(line: Line) -> tuple[Any, int]:
+    """A function that evaluates a line by NumPy, called as machine code is, and its address: for tables."""
 
     def evaluate(x: int, out: int, _rows: int) -> None:
         given, found = (
             np.ctypeslib.as_array((ctypes.c_double * size).from_address(place))
-            for place, size in ((x, inputs), (out, outputs))
+            for place, size in ((x, line.size), (out, line.outputs))
         )
-        found[:] = of(given)
+        found[:] = line.line.evaluate(list(given[:, None]))[:, 0]
 
     function = ctypes.CFUNCTYPE(None, ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int64)(evaluate)
     address = ctypes.cast(function, ctypes.c_void_p).value
