@@ -19,7 +19,7 @@ from lagjax._sweep._members import RESERVED, Axis, Grid, points_of
 from lagjax.designs import Design
 
 SECONDS = 20.0  # of a unit, by default: what a worker that dies loses
-UNIT_BYTES = 64 * 2**20  # of what is kept of a unit, by default; two of them are in memory, one being written
+UNIT_BYTES = 64 * 2**20  # of what is kept of a unit, by default
 _PROBED = 4096  # members by which the time of a member is estimated
 
 
