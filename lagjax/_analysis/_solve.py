@@ -20,8 +20,8 @@ Vector = Float[Array, " n"]
 
 
 def shortest_solution(matrix: Matrix, b: Vector, unit: Vector | float = 1.0) -> Vector:
-    """x with A x = b, the shortest one in these units (n,) where A is singular and b in its range. Linear in b, with
-    derivatives by both. A singular A is one whose pivots, of rows and columns of unit size, say so."""
+    """x of A x = b, the shortest in these units (n,) where pivots of the scaled A say that it is singular. Linear in b,
+    with derivatives by both."""
     matrix = matrix * unit
     rows, columns = (jax.lax.stop_gradient(scale) for scale in _scales(matrix))
     inverse, order, pivots = invert(jax.lax.stop_gradient(rows[:, None] * matrix * columns))
@@ -48,11 +48,8 @@ def shortest_preimage(linear: Callable[[Vector], Vector], right: Vector, unit: V
 
 
 def newton(f: Callable[[Vector], Vector], start: Vector, unit: Vector | float = 1.0) -> Vector:
-    """x with f(x) = 0 that Newton's method reaches from `start` (n,), for `jax.lax.custom_root`; look at f(x).
-
-    A step is halved until f is finite and smaller, or no larger but for rounding. Steps are the shortest ones in `unit`
-    (n,) where the derivatives are singular.
-    """
+    """x with f(x) = 0 that Newton's method reaches from `start` (n,), for `jax.lax.custom_root`; look at f(x). A step
+    is halved until f is finite and no larger but for rounding; steps are the shortest in `unit` (n,) where singular."""
 
     def moves(carry):
         _, moved, count = carry
@@ -73,11 +70,9 @@ def newton(f: Callable[[Vector], Vector], start: Vector, unit: Vector | float = 
 def is_root(
     f: Callable, x: Vector, given: Vector | float = 0.0, *, least: Vector | float = 0.0, power: float = 0.6
 ) -> Bool[Array, ""]:
-    """True if f(x) = 0: each number within eps^`power` of what x makes of it, or of a term that is `given` (n,).
-
-    `least` (n,) are the sizes below which numbers of x do not count. Newton's method comes to some eps; where it has
-    gone astray it is off by more than half of the digits, and where f only fades away with x by all of them.
-    """
+    """True if f(x) = 0: each number within eps^`power` of what x makes of it, or of a term that is `given` (n,);
+    `least` (n,) bounds sizes of x from below. Newton's method ends at some eps; an astray one is off by half of the
+    digits."""
     size = jnp.abs(jax.jacfwd(f)(x)) @ jnp.maximum(least, jnp.abs(x)) + jnp.abs(given)
     return jnp.all(jnp.abs(f(x)) <= jnp.finfo(x.dtype).eps ** power * size)
 

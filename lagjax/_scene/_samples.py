@@ -162,11 +162,8 @@ def _spacing(first, last, count: int) -> tuple:
 
 
 def continued(values: np.ndarray, count: int, hold: str) -> np.ndarray:
-    """`count` samples (count, …) behind the last of `values` (K, …), at even instants, which change nothing before it.
-
-    For "band" that takes 16 samples at least. It is what a table is filled up with: a parabola for "cubic", the
-    reflection for "band", else the last sample.
-    """
+    """`count` samples (count, …) behind the last of `values` (K, …), at even instants, which change nothing before it:
+    a parabola for "cubic", the reflection for "band" (of 16 samples at least), else the last sample."""
     last, behind = values[-1], np.arange(1, count + 1)
     if hold == "band":
         return 2.0 * last - values[np.maximum(len(values) - 1 - behind, 0)]

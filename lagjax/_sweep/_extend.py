@@ -137,8 +137,7 @@ def continues(other: Files, description: Description) -> bool:
 
 
 def later_end_of(other: Files, axes: tuple[Axis, ...], description: Description) -> LaterEnd | None:
-    """The last states in a store, if these motions continue its own; None if they begin at another time. Raises
-    `ValueError` where they continue, and cannot."""
+    """The last states in a store that these motions continue, None where they do not. Raises where they cannot."""
     if not continues(other, description):
         return None
     if isinstance(description.system, Hybrid):

@@ -38,8 +38,8 @@ def require_part(part: Any) -> slice:
 
 
 def units_to_compute(job: Job, part: slice) -> list[int]:
-    """The units of a part that are not done, or are damaged. Raises `OSError` where they could not be written. Nothing
-    is written where all are done: a finished store may lie on a disk that is read-only."""
+    """The units of a part that are not done, or damaged. Raises `OSError` where some are and nothing can be written: a
+    finished store may lie on a read-only disk."""
     store, chosen = job.store, set(range(job.grid.units)[part])
     store.require_arrays(job.spec)
     finished = {unit for unit in store.finished_units() if unit in chosen or unit >= job.grid.units}

@@ -141,11 +141,8 @@ def _parameter_index(params: PyTree, name: str) -> int:
 
 
 class _Member(NamedTuple):
-    """An orbit of a family, and what it tells: `found` (of one orbit), its multipliers, and what happens there.
-
-    `symmetries` counts those of the orbit; `tests` (4,) change sign at a fold, at a branch point or fold, at a
-    doubling, and at the value where the family is to end.
-    """
+    """An orbit of a family: `found` (of one orbit), the number of its `symmetries`, and `tests` (4,) that change sign
+    at a fold, at a branch point or fold, at a doubling, and at the value where the family ends."""
 
     point: FamilyPoint
     tangent: FamilyTangent
@@ -239,12 +236,9 @@ def _locate_events(follower: Follower, last: _Member, following: _Member, step: 
 
 
 def _locate_event(follower: Follower, last: _Member, following: _Member, step: float, k: int) -> tuple[float, _Member]:
-    """The zero of test k on the arc between two orbits, and the orbit there.
-
-    At a branch point the equations are singular, and about it Newton's method finds orbits of either family. So orbits
-    are computed beside it, nearer and nearer, from cubic guesses that are much nearer than the other family; the one
-    at the zero is then interpolated, and corrected in all directions but the singular one.
-    """
+    """The zero of test k on the arc between two orbits, and the orbit there. About a branch point Newton's method finds
+    orbits of either family: so orbits are computed beside it, ever nearer, from cubic guesses; that at the zero is
+    interpolated and corrected in all directions but the singular one."""
     across, found = last.tangent, {0.0: last, step: following}
     a, b = 0.0, step
     while b - a > _BRACKET * step:
@@ -383,10 +377,8 @@ def _numbers(arcs: Arcs, place: int | None, family: Family, k: int) -> np.ndarra
 
 
 def _branching_orbit(follower: Follower, here: FamilyPoint, before: FamilyTangent, size: float) -> FamilyPoint | None:
-    """The orbit at a distance from a branch point along the null vector that is no symmetry, nor of the old family.
-
-    Symmetries are known from a neighbour: at the branch point singular values do not tell them from the new direction.
-    """
+    """The orbit at a distance from a branch point along the null vector that is neither a symmetry nor of the old
+    family. Symmetries are known from a neighbour: at the branch point singular values do not tell."""
     states, count = here.matrix.shape[0], before.symmetries.shape[1]
     still = decide(here.matrix[:, :states]).right[:, states - count - 1 :]
     null = decide(here.matrix).right[:, before.rank - 1 :]

@@ -225,8 +225,8 @@ def arc_counts(arcs: Arcs, y0, period) -> np.ndarray:
 
 
 def assess_orbits(closing: Closing, chain: Chain, most: int | None = None) -> FlatOrbits:
-    """The orbits that the chains of a search are: multipliers, stability, and a sentence where one is no orbit. At most
-    `most` directions count as symmetries; None counts all that monodromy − 1 sends to zero."""
+    """The orbits that the chains of a search are, with multipliers and a sentence where one is none; at most `most`
+    directions count as symmetries, None for all that monodromy − 1 sends to zero."""
     message = np.array([_sentence(chain, k) for k in range(len(chain.period))], object)
     ok = np.array([not text for text in message])
     multipliers = np.full((len(ok), chain.y.shape[2]), np.nan, complex)

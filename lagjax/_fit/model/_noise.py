@@ -51,8 +51,7 @@ class NoiseScale(NamedTuple):
 
 
 class Sensor(NamedTuple):
-    """The sensors of S signals: the `step` (S,) that they round to, and the limits `low`, `high` (S,) that they cut off
-    at; NaN for none."""
+    """The sensors of S signals: their `step` (S,) of rounding and their limits `low`, `high` (S,); NaN for none."""
 
     step: np.ndarray
     low: np.ndarray
@@ -65,8 +64,7 @@ class Sensor(NamedTuple):
         return (values >= self.high).astype(float) - (values <= self.low)
 
     def bounds_shown(self, values: np.ndarray, weights: np.ndarray, sides: np.ndarray) -> np.ndarray:
-        """Samples (..., S) with those at a limit where the exact values that a rounding sensor shows so begin: half a
-        step before the first of its lines that is at the limit or beyond."""
+        """Samples (..., S) where those at a limit are the exact values from which a rounding sensor shows it."""
         shown = values.copy()
         for k in np.flatnonzero(np.isfinite(self.step)):
             inside = values[..., k][(sides[..., k] == 0) & (weights[..., k] > 0)]
@@ -272,8 +270,7 @@ _HARMONICS = 20  # of the errors' covariance: what they leave, 3 % of step²/12,
 
 
 def harmonics(step: float, sigma: float) -> tuple[np.ndarray, float, float]:
-    """aₖ (K,) for errors of the standard deviation `sigma` in all; the variance of rounding beside them, which counts
-    as independent, and that of the noise before rounding."""
+    """aₖ (K,) for errors of standard deviation `sigma`; the independent variance of rounding; that before rounding."""
     k, before = np.arange(1, _HARMONICS + 1), max(sigma**2 - step**2 / 12, 0.0)
     a = step**2 / (2 * (np.pi * k) ** 2) * np.exp(-((2 * np.pi * k) ** 2) * before / step**2)
     return a, step**2 / 12 - float(a.sum()), before
@@ -297,8 +294,7 @@ def worths(x: np.ndarray, step: float, sigma: float) -> np.ndarray:
 
 
 def rounding_square(rows: list[np.ndarray], x: list[np.ndarray], step: float, sigma: float) -> np.ndarray:
-    """E (Σ Gᵢ εᵢ)(Σ Gᵢ εᵢ)ᵀ of the common part of rounding errors, over rows (N, T, F) of batches whose values are near
-    x (N, T)."""
+    """E (Σ Gᵢ εᵢ)(Σ Gᵢ εᵢ)ᵀ of common rounding errors, over rows (N, T, F) of batches with values near x (N, T)."""
     total = np.zeros((rows[0].shape[-1],) * 2)
     for k, a in enumerate(harmonics(step, sigma)[0], start=1):
         each = [np.einsum("ntf,nt->f", g, np.exp(2j * np.pi * k / step * at)) for g, at in zip(rows, x, strict=True)]
@@ -372,11 +368,8 @@ def find_sensor(records: list[Record]) -> Sensor:
 
 
 def read_sensor(records: list[Record], noise: AbstractNoise, names: tuple[str, ...], periods: np.ndarray) -> Sensor:
-    """The sensors of some records, as the law says, and where it says nothing as the records show.
-
-    Wrapped signals turn round at their ends, which are no limits, and Student's t knows none. Raises `ValueError` where
-    values are not what the law says.
-    """
+    """The sensors as the law says and, where it says nothing, as the records show; wrapped signals have no limits,
+    Student's t knows none. Raises `ValueError` where values contradict the law."""
     if not records:
         return Sensor(*np.zeros((3, 0)))
     found, given = find_sensor(records), noise.sensor(records)
