@@ -125,7 +125,7 @@ def space_time(trajectory: Trajectory, *, label: str | None = None, cmap: str = 
 def phase(trajectory: Trajectory, *coordinates: str, members: int = 30, ax=None):
     """The phase portrait: the velocity of each coordinate against it, from the dot on; a colour for each coordinate.
 
-    The curves are those of `trajectory`: they end at a reset, and go on behind it.
+    The curves are those of `trajectory`: they end at a reset, and continue behind it.
 
     - `coordinates`: their names, as messages and tables have them: "q['theta']", "q[0]"; by default all, the first
       seven of more.
@@ -164,7 +164,7 @@ def _places(layout: Layout, coordinates: tuple[str, ...], most: int = len(COLORS
 def compare(one: Trajectory, other, *coordinates: str, figure=None):
     """Two motions, or a motion and data, above each other, and their difference below; a column for each coordinate.
 
-    - `one`: a motion. Where `other` has other times it follows the cubic through its outputs (Hermite).
+    - `one`: a motion. Where `other` has different times it follows the cubic through its outputs (Hermite).
     - `other`: a `Trajectory`, a `Record`, or a pair (ts, values) with values in the structure of q; NaN is missing.
     - `coordinates`: their names, as in `phase`; by default the first four.
 
@@ -196,7 +196,7 @@ def _other(other, layout: Layout) -> tuple[np.ndarray, np.ndarray, str]:
         _require_numbers(other, "other")
         of_other, course = course_of(other)
         if of_other.names != layout.names:
-            raise ValueError("The two motions have other coordinates: there is nothing to compare.")
+            raise ValueError("The two motions have different coordinates: there is nothing to compare.")
         t, q, _ = course.curve()
         q[1:][np.isnan(q[:-1]).any(axis=1)] = np.nan  # at the instant of a jump the difference is that before it
         return t, q, "--"
@@ -415,7 +415,7 @@ def energy_error(trajectory: Trajectory, *, scale: float | None = None, ax=None)
 
 
 def _loses_at_transitions(trajectory: Trajectory, h: np.ndarray) -> bool:
-    """True if a transition changes the energy by more than rounding, in parts of the largest one."""
+    """True if a transition changes the energy by more than rounding, as a fraction of the largest one."""
     if (changes := trajectory.transitions) is None:
         return False
     sides = (changes.q, changes.qdot, changes.source), (changes.q_next, changes.qdot_next, changes.target)

@@ -341,6 +341,6 @@ def _sentence(scene: SceneState, gradient: Sparse | None = None) -> str:
         )
     shown = ", ".join(f"{name} = {value:.6g}" for name, value in zip(names[:8], np.asarray(scene.q)[:8], strict=False))
     return (
-        f"No equilibrium was found from {shown}: Newton's method does not come to a point where the forces balance. "
+        f"No equilibrium was found from {shown}: Newton's method reaches no point where the forces balance. "
         "There may be none, or the force is largest at the guess (its slope vanishes): begin nearer to one."
     )

@@ -20,7 +20,7 @@ from lagjax._equations import decide
 
 Sparse = Any  # an array of scipy.sparse, of which type checkers do not know that it has two axes
 
-# The first shift, in parts of the largest entries of K: far above rounding, below the lowest mode of 10⁵ links, 1e-9.
+# The first shift, as a fraction of the largest entries of K: above rounding, below the lowest mode of 10⁵ links, 1e-9.
 # Closer to zero by a factor of ten, zero modes would cost other shapes a digit.
 _SHIFT = 1e-9
 # Trials to come closer; a failure costs as much as a success, which gains a factor of two to eight of the distance.
@@ -60,7 +60,7 @@ def lowest_modes(
         slices = [(shift, factorize_regular(bordered), count, "LM")]
         if slices[0][1] is None:
             raise ValueError(
-                f"The {rows} constraints depend on each other at q, or nearly: of so many coordinates modes are found "
+                f"The {rows} constraints depend on each other at q, or nearly: of large scenes modes are found "
                 "with independent ones. Drop those that follow from others."
             )
     counted = [] if rows else _slices(stiffness, mass, shift, factors, count)

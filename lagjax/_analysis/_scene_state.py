@@ -37,7 +37,7 @@ _LARGEST_MATRIX = 1000
 
 
 def require_matrices(size: int, what: str, advice: str) -> None:
-    """Raise `ValueError`, with the `advice`, where `what` takes matrices that are too large for so many coordinates."""
+    """Raise `ValueError`, with the `advice`, where `what` takes matrices too large for this number of coordinates."""
     if size > _LARGEST_MATRIX:
         raise ValueError(
             f"{what}: not tried for {size} coordinates, which takes matrices of n × n numbers, {8e-9 * size**2:.2g} GB "

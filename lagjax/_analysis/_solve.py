@@ -111,7 +111,7 @@ def levenberg_marquardt(f: Callable, start: Vector, least: Vector, unit: Vector)
         ratio = jnp.where(expected > 0, gain / jnp.where(expected > 0, expected, 1), 0.0)
         better = (gain > 0) & jnp.all(jnp.isfinite(new))
         damping = jnp.where(ratio > 0.75, damping / 4, jnp.where((ratio < 0.25) | ~better, damping * 4, damping))
-        # The most that a step makes of a number of f(z), in parts of what the numbers of z make of it.
+        # The most that a step makes of a number of f(z), as a fraction of what the numbers of z make of it.
         of_f, sizes = jnp.abs(jacobian), jnp.maximum(jnp.maximum(least, jnp.abs(z)), jnp.abs(step))
         length = jnp.max(of_f @ jnp.abs(step) * _reciprocal(of_f @ sizes))
         stuck = ~better & ((length < NO_STEP) | ~jnp.isfinite(length))
@@ -123,7 +123,7 @@ def levenberg_marquardt(f: Callable, start: Vector, least: Vector, unit: Vector)
     return jax.lax.while_loop(moves, once, carry)[0]
 
 
-# A step that is nothing, in parts of the numbers of z. Damped steps: 10 to 30 are usual, and twice as many change
+# A step that is nothing, as a fraction of the numbers of z. Damped steps: 10 to 30 are usual, and twice as many change
 # nothing where there is a solution.
 NO_STEP, DAMPED_STEPS = 1e-10, 200
 

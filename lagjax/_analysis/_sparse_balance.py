@@ -120,7 +120,7 @@ def falls(of: SparseBalance, z: Unknowns, unit: np.ndarray) -> bool:
     return shift < -_FALLS * abs(forces).sum(axis=1).max()
 
 
-# The lowest eigenvalue that is none, in parts of the largest: ten times how near its bound comes.
+# The lowest eigenvalue that is none, as a fraction of the largest: ten times how near its bound comes.
 _FALLS = 1e-7
 
 

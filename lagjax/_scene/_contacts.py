@@ -54,7 +54,7 @@ class ContactScene(eqx.Module):
     """A system with contacts, as machine code follows it: a scene whose parameters are `InContact`.
 
     Where it `is_open` no contact is closed, whatever the parameters say: the motion of the system by itself. A body is
-    held by few independent rows, however many contacts it has: with `slots` there are so many rows, of gaps and of
+    held by few independent rows, however many contacts it has: with `slots` there are this many rows, of gaps and of
     velocities, which are those that `Contacts.held` chooses.
     """
 
@@ -203,7 +203,7 @@ class Flat(NamedTuple):
 class Shapes(NamedTuple):
     """The structure of the contacts of a system: k of them, `of_gaps` with a gap, then those of one-way velocities.
 
-    `rough` (r,) are the places of those with friction, in so many `directions`; `names` (k,) are those of all.
+    `rough` (r,) are the places of those with friction, each in `directions` directions; `names` (k,) are those of all.
     """
 
     trees: tuple  # the structures that `contacts` and `one_way` return, None without any

@@ -207,7 +207,7 @@ class System(eqx.Module):
 
         The entry of two coordinates a and b has units energy·time²/({a}{b}).
 
-        **Raises** `ValueError` where so many numbers do not fit into memory.
+        **Raises** `ValueError` where n × n numbers do not fit into memory.
         """
         layout = Layout.from_state(q, qdot)
         if lack := lack_of_memory(4 * layout.size**2 * layout.dtype.itemsize):

@@ -60,7 +60,7 @@ _OVERSTEPPED = (
     "where the motion does. Leave dt out, and the message says what it runs into."
 )
 _AT_CORNER = (
-    "A constraint has a corner there: its gradient jumps, and no law says with what velocities the motion goes on. "
+    "A constraint has a corner there: its gradient jumps, and no law says with what velocities the motion continues. "
     "Round the corner off over a width w that the motion resolves, as in jnp.sqrt(x**2 + w**2) for abs(x)."
 )
 
@@ -363,7 +363,7 @@ def _run_check(system: System, derivation: Derivation, params, ended: Ended) -> 
     if jumps and (unheld := _count_unheld(derivation)):
         return (
             f"\nIt may rest, or slide, along {unheld} borders there, which dry friction makes: machine code follows at "
-            f"most {MOST_COUPLED} that M couples to each other, and none that change in other ways what others hold. "
+            f"most {MOST_COUPLED} that M couples to each other, and none that change differently what others hold. "
             "Round sign(v) off, as jnp.tanh(v / w) with a speed w that does not matter."
         )
     if ended.scene is None and derivation.layout.size > (LARGEST if is_lowered(derivation) else 16):

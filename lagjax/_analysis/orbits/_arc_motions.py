@@ -53,7 +53,7 @@ class Arc(NamedTuple):
 
     @property
     def ok(self) -> np.ndarray:
-        """True for each row that came to its last time, with finite derivatives, (R,)."""
+        """True for each row that reached its last time, with finite derivatives, (R,)."""
         return (self.result == SUCCESSFUL) & np.isfinite(self.by_start).all(axis=(1, 2))
 
 

@@ -10,7 +10,7 @@ corrections damped, as those of `_shooting` are: how they contract is what judge
 
 A step stands if Newton's method contracts, if its first correction is short beside the step, and if the chord lies
 midway between tangents that turned little. An orbit of another family that happens to be near fails one of these, or
-is as near as the family bends; how close each came to its bound says how long the next step may be.
+is as near as the family bends; how close each is to its bound says how long the next step may be.
 
 Source: Allgower & Georg, *Numerical Continuation Methods* (1990), §6.1 (steps by contraction, distance and angle), §8
 (branch points).

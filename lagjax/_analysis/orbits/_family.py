@@ -1,6 +1,6 @@
 """`family`: periodic orbits that belong together, by energy or by a parameter; `branch_off`: from one to another.
 
-A family goes on through folds, where its energy or parameter turns back, because it is followed by its own length of
+A family continues through folds, where its energy or parameter turns back, because it is followed by its own length of
 arc. Orbits of a conservative scene form families by energy at fixed parameters, and by a parameter at a fixed period;
 limit cycles and driven orbits form them by a parameter alone.
 
@@ -95,12 +95,12 @@ def family(
     - `by`: "energy"; or the name of a parameter, such as "g" for `params["g"]`, one number.
     - `until`: the energy or the parameter at which the family ends; it also fixes the direction of the first step.
       Without it the family begins towards larger values and ends after `count` orbits.
-    - `step`: the arc length of the first step, in parts of the size of `orbit` (of its coordinates, its velocities, its
-      period over 2π and the parameter); it and later steps adapt to how fast Newton's method contracts, how far it
+    - `step`: the first step's arc length, as a fraction of the size of `orbit` (of its coordinates, its velocities,
+      its period over 2π and the parameter); it and later steps adapt to how fast Newton's method contracts, how far it
       moves an orbit, and how much the family turns.
 
     Folds, branch points and doublings between two orbits are located on the arc between them, as well as multipliers
-    and slopes are known there, and are orbits of the family as others are. `branch_off` goes on from there.
+    and slopes are known there, and are orbits of the family as others are. `branch_off` continues from there.
 
     A nonlinear normal mode is the family by energy that begins at a linear mode: begin with the periodic orbit near
     q + a·shape at rest, whose period is 2π/frequency, for a small amplitude a (`lagjax.normal_modes`).
@@ -189,7 +189,7 @@ def _follow_family(follower: Follower, y0, period, step: float, count: int) -> t
             return members[:count], f"The family was followed until {until:.6g}."
         members.append(_refine_member(follower, following))
         step = next_step(step, there)
-    return members[:count], f"{count} orbits were found; the family goes on: raise count to follow it further."
+    return members[:count], f"{count} orbits were found; the family continues: raise count to follow it further."
 
 
 def _first_point(follower: Follower, y0: np.ndarray, period: np.ndarray, numbers: np.ndarray) -> FamilyPoint:
@@ -220,8 +220,8 @@ def _end(follower: Follower, last: FamilyPoint, stopped: bool) -> str:
 
 _SAME = 1e-3  # of a step: within, a fold and a branch point are one, where both tests change sign
 _NOISE = 1e-9  # of tests, which are of order one: what is all degenerate, as an isotropic oscillator, passes nothing
-# How far from a branch point orbits are computed, in parts of the bracket, and the bracket that ends that, in parts of
-# the step: the inverse polynomial through four orbits is then right to its fourth power.
+# How far from a branch point orbits are computed, as a fraction of the bracket, and the bracket that ends that, of the
+# step: the inverse polynomial through four orbits is then right to its fourth power.
 _BESIDE, _BRACKET = 0.02, 1e-3
 
 
@@ -319,7 +319,7 @@ def branch_off(
     - `index`: of an orbit where `family.branch` or `family.doubling` is True; of the latter the new orbits have twice
       the period.
     - `params`, `by`: those with which `family` was followed.
-    - `size`: how far off the new orbit is, in parts of the size of the old one, as `step` of `family`.
+    - `size`: how far off the new orbit is, as a fraction of the size of the old one, as `step` of `family`.
 
     By symmetry there often are two such families, mirror images, of which this is one.
 

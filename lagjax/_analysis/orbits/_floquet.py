@@ -93,7 +93,7 @@ def _product_eigenvalues(growth: np.ndarray) -> np.ndarray:
     count, roots = len(growth), np.linalg.eigvals(_cyclic_matrix(growth)).astype(complex)
     if count == 1:
         return roots
-    # The roots of one multiplier stand on a circle, a turn divided by K apart: one of each comes of sorting by power.
+    # The roots of one multiplier stand on a circle, a turn divided by K apart: sorting by power gives one of each.
     return _group_means(np.exp(count * np.log(np.where(roots == 0, 1e-300, roots))), count)
 
 

@@ -21,7 +21,7 @@ the motion lies is not known better than that, so over an offset that is equally
 
     E ε(x) = 0,    E ε(x) ε(y) = Σₖ aₖ cos(2πk (x − y)/h),    aₖ = h²/(2π²k²) exp(−(2πk s/h)²),    Σₖ aₖ ≤ h²/12
 
-with s the noise before rounding. At rest all errors are one and the same; where the motion goes on by a step or more
+with s the noise before rounding. At rest all errors are one and the same; where the motion advances by a step or more
 from sample to sample, or the noise is as large as half of one, they are independent. `worths` is what samples are
 worth, and `rounding_square` what least squares with any weights make of such errors: its intervals need no more.
 Source: Widrow & Kollár, *Quantization Noise* (2008), ch. 4 and 11.
@@ -305,8 +305,8 @@ def rounding_square(rows: list[np.ndarray], x: list[np.ndarray], step: float, si
 
 _LATTICE = 0.02  # of a step that a multiple may be off, in text of few digits or float32; chance is off by 0.25
 _EQUAL = 0.02  # of neighbours that are equal: with fewer, rounding errors are independent anyhow
-# Samples beside a limit at most, over which a motion that is cut off changes by so many times what one that turns does;
-# and the noise in steps from which on a run of so many equal samples at the end of all is none of chance.
+# Samples beside a limit at most, over which a motion that is cut off changes by this factor more than one that turns;
+# and the noise in steps from which on a run of _CUT equal samples at the end of all is none of chance.
 _BESIDE, _SHARP, _NOISY, _CUT = 10, 1.5, 0.4, 6
 _RUN, _AT_LIMIT = 3, 0.01  # equal values in a row at a limit of a sensor, and the share of all samples in such rows
 

@@ -223,7 +223,7 @@ class Fit:
         give that start to a `Record` of the whole. `system` is the name of the record's system, for a fit of several
         systems.
 
-        Raises `ValueError` where the record has other signals than those of the fit, or its motion fails.
+        Raises `ValueError` where the record has different signals from those of the fit, or its motion fails.
         """
         return predict_record(self, record, system)
 

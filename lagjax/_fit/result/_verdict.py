@@ -45,7 +45,7 @@ _OWN = 0.2  # of the motion left in a record, explained by parameters of its own
 def verdict(
     descent: Descent, unseen: tuple[str, ...], known: Information, left: Unexplained, law: AbstractNoise, starts: int
 ) -> tuple[bool, str]:
-    """Whether a fit can be relied upon, and why, in sentences; `left` is what the best of `starts` searches left."""
+    """Judge if a fit can be relied upon, and say why; `left` is what the best of `starts` searches left."""
     residuals, parts = descent.residuals, [descent.message]
     strikes = any(jumps(part.scene) for part in residuals.parts)
     more, astray = max(64, 4 * starts), strikes and _leaves_motion(known, left)
@@ -114,8 +114,8 @@ def _describe_missed_limits(residuals: Residuals, trial: Trial) -> list[str]:
                 beyond[f"{end}={last:.4g}"] = many
         if sum(beyond.values()) >= _FEWEST_BEYOND:
             found.append(
-                f"{name} is coarse, and the fit goes on beyond its last lines at {sum(beyond.values())} samples, where "
-                f"it shows no more: is it at a limit? Then take noise=lagjax.Clipped({', '.join(beyond)})."
+                f"{name} is coarse, and the fit continues beyond its last lines at {sum(beyond.values())} samples, "
+                f"where it shows no more: is it at a limit? Then take noise=lagjax.Clipped({', '.join(beyond)})."
             )
     return found
 

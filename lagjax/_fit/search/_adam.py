@@ -21,7 +21,7 @@ from lagjax._show import import_package
 
 _RATE, _WARM = 1e-2, 0.05  # the largest step, in units of each number; the share of steps over which it rises
 _PORTION = 100  # steps in one call: of them the best is kept
-_STILL = 1.0  # what log L may gain over the last tenth of the steps where the descent has come to its end
+_STILL = 1.0  # what log L may gain over the last tenth of the steps where the descent is at its end
 
 
 def descend_gradient(

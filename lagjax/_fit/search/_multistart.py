@@ -41,7 +41,7 @@ class Waterfall(NamedTuple):
         alike = int((above <= _ALIKE).sum())
         failed = int(np.isinf(self.misfits).sum())
         rest = self.misfits[alike : len(self.misfits) - failed]
-        text = f"{len(self.misfits)}, of which {alike} came to the least misfit, {self.misfits[0]:.3g} of the signals"
+        text = f"{len(self.misfits)}, of which {alike} reached the least misfit, {self.misfits[0]:.3g} of the signals"
         text += f"; the next to {rest[0]:.3g}, the last to {rest[-1]:.3g}" if len(rest) else ""
         return text + (f"; {failed} could not be followed." if failed else ".")
 
@@ -75,7 +75,7 @@ def run_multistart(
     short.watch = None
     trials = sorted((_search_shortly(short, one, point.starts) for one in u), key=lambda trial: trial[0])
     misfits, done, chosen = np.array([trial[0] for trial in trials]), [], []
-    for k in np.flatnonzero(np.isfinite(misfits)).tolist():  # the best that came to different misfits
+    for k in np.flatnonzero(np.isfinite(misfits)).tolist():  # the best of different misfits
         if all(abs(np.log(misfits[k] / misfits[j])) > 1e-3 for j in chosen):
             chosen.append(k)
     for place, begin in [*((k, trials[k][1]) for k in chosen[:_BEST]), (None, point)]:

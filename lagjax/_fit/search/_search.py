@@ -199,7 +199,7 @@ class Search:
         if not at_rest:
             text = (
                 f"The descent by gradients was stopped after {_GRADIENT_STEPS} steps, and the likelihood still grew: "
-                "go on from there, with fit.params in the place of params0."
+                "continue from there, with fit.params in place of params0."
             )
         return Descent(residuals, trial, residuals.noise_scale(trial, self.law), at_rest, _GRADIENT_STEPS, text)
 

@@ -98,8 +98,8 @@ def _blame(scene: CheckedScene, role: str, order: str) -> str:
 
 
 def _blocks(scene: CheckedScene, round_off):
-    """What is compared, in blocks: name, role, derivatives (directions, outputs), and which of the 2n + 1 directions
-    and of the outputs of `Measured.here` these are."""
+    """Blocks to compare: name, role, derivatives (directions, outputs), and which of the 2n + 1 directions and of the
+    outputs of `Measured.here` these are."""
     m, n = scene.measured, scene.layout.size
     first, dissipates = 1 + n, scene.motion.dissipation is not None
     constraint = first + dissipates

@@ -18,7 +18,7 @@ from lagjax._trust.checks._differences import ladder
 
 PyTree = Any
 
-_NEARBY = 4  # states with other positions, and as many with other velocities
+_NEARBY = 4  # states with different positions, and as many with different velocities
 
 
 class CheckedScene(NamedTuple):

@@ -27,7 +27,7 @@ PyTree = Any
 # The factor on the bound of what N steps may add up to, since the error of a step is estimated; √(2n) comes on top, for
 # solvers that measure a root mean square. Twice as large, drifts of 10 to 20 times the bound would go unreported.
 SLACK = 10.0
-# The drift of a conserved quantity, in parts of its size, that is reported however loose the tolerances were.
+# The drift of a conserved quantity, as a fraction of its size, that is reported however loose the tolerances were.
 VISIBLE = 1e-2
 # Units of round-off that are allowed for one evaluation of a conserved quantity.
 ROUND_OFF = 100.0
