@@ -206,7 +206,7 @@ class Clock:
 
 def build_clock(scene: Scene, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> Clock:
     """The clock of a scene. Raises `ValueError` for functions of a hybrid one, and for what is of another scene."""
-    find = _finder_for(scene, _sections(timings.section)[1][0])
+    find = _choose_finder(scene, _sections(timings.section)[1][0])
     flat, span = timings.flat, np.array([float(timings.t0), _last_time(timings)])
     instants, happens, advice = find(scene, layout, parameters, timings, rtol)
 
@@ -232,8 +232,8 @@ def build_clock(scene: Scene, layout: Layout, parameters: Parameters, timings: T
     return Clock(times, describe_failure)
 
 
-def _finder_for(scene: Scene, first: Callable | Transition | str) -> Callable:
-    """Which function finds the instants of sections like the first one.
+def _choose_finder(scene: Scene, first: Callable | Transition | str) -> Callable:
+    """The function that finds the instants of sections like the first one.
 
     It gives a function of a motion's arguments that returns which of its instants are those of each time (M, K), and
     when these are; and what was timed as text, before and behind its count.
