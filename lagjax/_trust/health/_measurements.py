@@ -402,7 +402,7 @@ def _work(path: SampledPath, samples: Measurements, measurable, between: Rates) 
     return xp.where(smooth, found[3], trapezoidal), xp.sum(xp.where(measurable, error, 0.0), axis=-1)
 
 
-def _combine(coefficients, powers):
+def _combine(coefficients, powers) -> Any:
     """Σ cₖ pₖ of coefficients (…, T − 1, n) and powers (S,), (…, T − 1, S, n)."""
     return sum(c[..., None, :] * x[:, None] for c, x in zip(coefficients, powers, strict=True))
 
