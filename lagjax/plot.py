@@ -177,7 +177,8 @@ def compare(one: Trajectory, other, *coordinates: str, figure=None):
     t, q, _ = course.curve()
     ts, values, style = _other(other, layout)
     places = _places(layout, coordinates, most=4)
-    axes = _two_rows(figure, len(places))
+    figure = _wide_figure(len(places)) if figure is None else figure
+    axes = figure.subplots(2, len(places), squeeze=False, sharex="col", gridspec_kw={"height_ratios": [2, 1]})
     left = course.states_at(ts)[0] - values
     for (above, below), i in zip(axes.T, places, strict=True):
         _axes(above).plot(t, q[:, i], color=COLORS[0], linewidth=1.5, label="motion")
@@ -456,9 +457,8 @@ def fit(fit: Fit, record: int = 0, *, figure=None):
     _require(fit, "fit", Fit, "fit")
     one, columns = fit.records[record], fit.residual_function.columns(record)
     names = fit.residual_function.names[columns]
-    axes = _two_rows(figure, len(names))
-    draw_record(axes, one, fit.residual_matrices[record], names, fit.noise_scale.sigma[columns])
-    return axes
+    figure = _wide_figure(len(names)) if figure is None else figure
+    return draw_record(figure, one, fit.residual_matrices[record], names, fit.noise_scale.sigma[columns])
 
 
 def profile(profile, *, ax=None):
@@ -516,11 +516,8 @@ def _axes(ax):
     return simplify_axes(ax)
 
 
-def _two_rows(figure, columns: int):
-    """Axes (2, columns) of `figure`, or of a new one: curves above, what is left of them below."""
-    if figure is None:
-        figure = _matplotlib().pyplot.figure(figsize=(max(6.4, 3.6 * columns), 4.6), layout="constrained")
-    return figure.subplots(2, columns, squeeze=False, sharex="col", gridspec_kw={"height_ratios": [2, 1]})
+def _wide_figure(columns: int):
+    return _matplotlib().pyplot.figure(figsize=(max(6.4, 3.6 * columns), 4.6), layout="constrained")
 
 
 def _legend(ax, shown: int = 0, layout: Layout | None = None):

@@ -177,7 +177,7 @@ def _reference(run: Callable[[float], Trajectory], dtype) -> tuple[np.ndarray, n
     """The path to compare with, shape (members, T, n), and for every member how far it can be trusted."""
     eps = float(jnp.finfo(dtype).eps)
     truth = _path(run(_REFERENCE * eps))
-    resolution = _largest_difference(_path(run(_CHECK * eps)), truth)
+    resolution = np.abs(_path(run(_CHECK * eps)) - truth).max(axis=(1, 2))
     if np.isnan(resolution).all():
         raise ValueError(
             "The reference reached the end for none of the members: look at the result of simulate_batch with a tight "
@@ -198,7 +198,7 @@ def _row(name: str, rtol: float, run: Callable[[], Trajectory], truth: np.ndarra
     counts = "num_accepted_steps", "num_rejected_steps", "num_steps"
     accepted, rejected, steps = (np.atleast_1d(trajectory.stats[key]) for key in counts)
     idle = trajectory.stats.get("num_wasted_lane_steps", 0)  # of a batch only
-    errors = _median_and_worst(_largest_difference(_path(trajectory), truth))
+    errors = _median_and_worst(np.abs(_path(trajectory) - truth).max(axis=(1, 2)))
     shares = map(float, (accepted.mean(), rejected.mean(), np.mean(trajectory.ok), idle / max(steps.sum(), 1)))
     return WorkPrecisionRow(name, float(rtol), seconds, seconds / len(truth), *errors, *shares)
 
@@ -206,11 +206,6 @@ def _row(name: str, rtol: float, run: Callable[[], Trajectory], truth: np.ndarra
 def _path(trajectory: Trajectory) -> np.ndarray:
     """All coordinates at all times, shape (members, T, n); NaN throughout for a member that did not reach its end."""
     return np.where(np.atleast_1d(trajectory.ok)[:, None, None], Members(trajectory).flat(trajectory.q), np.nan)
-
-
-def _largest_difference(path: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Per member; NaN where either has not reached its end."""
-    return np.abs(path - truth).max(axis=(1, 2))
 
 
 def _median_and_worst(errors: np.ndarray) -> tuple[float, float]:

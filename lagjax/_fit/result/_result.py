@@ -144,9 +144,7 @@ class Fit:
     def _draw_first(self, figure) -> None:
         parts = self.residual_function.parts
         part, pairs = next((part, pairs) for part in parts if (pairs := recordings(self, part)))
-        names = part.signals.names[:2]
-        axes = figure.subplots(2, len(names), squeeze=False, gridspec_kw={"height_ratios": [2, 1]})
-        draw_record(axes, *pairs[0], names, part.sensor_noise(self.noise_scale).sigma)
+        draw_record(figure, *pairs[0], part.signals.names[:2], part.sensor_noise(self.noise_scale).sigma)
 
     def to_pandas(self, level: float = LEVEL):
         """A `pandas.DataFrame` with a row per free number, by its name: value, and low and high of its interval.
