@@ -347,11 +347,8 @@ def first(begins: str, count: int = 3) -> Iterator[dict[str, Any]]:
             if "failed" in found[-1]:
                 break
         best = found[-1] if "failed" in found[-1] else min(found, key=lambda x: x["CPU s"])
-        kept = (
-            None
-            if "failed" in best or row.again or name.startswith("two modes")
-            else min(_measure_kept(name) for _ in range(count))
-        )
+        shares = "failed" not in best and not row.again and not name.startswith("two modes")
+        kept = min(_measure_kept(name) for _ in range(count)) if shares else None
         numbers = dict.fromkeys(("CPU s", "loops kept", "GiB", "error", "failed"))
         yield {"scene": name, "goal s": float(row.goal), "before s": row.before} | numbers | best | {"loops kept": kept}
 
