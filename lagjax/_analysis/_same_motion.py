@@ -48,7 +48,7 @@ class SameMotion(NamedTuple):
         left = f"{self.residual:.1g} of the terms are left, and {self.threshold:.1g} may be rounding"
         if self.same:
             return f"The same motions: E_a = {self.factor:.9g} E_b; {left}."
-        return f"Different motions: with the best factor, {self.factor:.9g}, {left}: {self.where}."
+        return f"Other motions: with the best factor, {self.factor:.9g}, {left}: {self.where}."
 
 
 @accepts_singles(("q", "qdot"), ("params",))

@@ -41,7 +41,7 @@ class Waterfall(NamedTuple):
         alike = int((above <= _ALIKE).sum())
         failed = int(np.isinf(self.misfits).sum())
         rest = self.misfits[alike : len(self.misfits) - failed]
-        text = f"{len(self.misfits)}, of which {alike} reached the least misfit, {self.misfits[0]:.3g} of the signals"
+        text = f"{len(self.misfits)}, of which {alike} came to the least misfit, {self.misfits[0]:.3g} of the signals"
         text += f"; the next to {rest[0]:.3g}, the last to {rest[-1]:.3g}" if len(rest) else ""
         return text + (f"; {failed} could not be followed." if failed else ".")
 
