@@ -10,6 +10,7 @@ for the length √(λ₁² + λ₂²) of a bearing's force, that is a few steps 
 and the last of which is tested. Where none is found, or a single multiplier has two (Painlevé's paradox), Q is NaN.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -45,14 +46,45 @@ class CoupledForces(eqx.Module):
 
     def solve(self, matrix, force, jacobian, gamma, *state):
         """Q from M, F, G and γ of the free motion."""
-        weights = jnp.trace(matrix) / jnp.sum(jacobian**2, axis=1)
+        squares, held = jnp.sum(jacobian**2, axis=1), self.free.constraints.held
+        released = None if held is None else 1.0 - held(state[-1])  # rows of G that are zero, with no multiplier
+        weights = jnp.trace(matrix) / (squares if released is None else squares + released)
         weighted = weights[:, None] * jacobian
         moved = eliminate(matrix + jacobian.T @ weighted, jacobian.T).T  # G K⁻¹
         right = jnp.concatenate([(gamma - moved @ (force + weighted.T @ gamma))[:, None], -moved], axis=1)
-        solved = eliminate(moved @ jacobian.T, right)
+        schur = moved @ jacobian.T
+        solved = eliminate(schur if released is None else schur + jnp.diag(released), right)
         read, zero = np.array(_multipliers_read(self.law, *state, solved[:, 0]), int), jnp.zeros_like(solved[:, 0])
         law = lambda some: self.law(*state, zero.at[read].set(some))  # noqa: E731
         return _solve_law(law, solved[read, 0], solved[read, 1:]) if read.size else self.law(*state, zero)
+
+
+def couple_forces(motion, law: Callable, layout, params: PyTree):
+    """The motion with forces by a `law` as of `CoupledForces`, of all multipliers.
+
+    Where rows may be released, as those of contacts, and the law is linear in multipliers, what each brings is a
+    `drag`: one linear system, which leaves out rows that depend on others.
+    """
+    constraints = motion.constraints
+    rest, numbers = jnp.zeros(layout.size, layout.dtype), eqx.filter(params, eqx.is_array_like)
+    state = rest, rest, jnp.zeros((), layout.dtype), numbers
+    zero = jnp.zeros(jax.eval_shape(constraints.residual, *state).size, layout.dtype)
+    if not zero.size:
+        return dataclasses.replace(motion, forces=lambda *state: law(*state, zero))
+    if constraints.held is None:
+        return dataclasses.replace(motion, forces=CoupledForces(law, motion))
+    own = constraints.drag
+    if any(_dependence(lambda some: law(*state, some), zero)):
+        free = dataclasses.replace(motion, constraints=dataclasses.replace(constraints, drag=None))
+        rubbing = law if own is None else (lambda *given: law(*given) + own(*given[:-1]) @ given[-1])
+        return dataclasses.replace(free, forces=CoupledForces(rubbing, free))
+
+    def drag(*state):
+        brought = jax.jacfwd(law, argnums=4)(*state, zero)
+        return brought if own is None else brought + own(*state)
+
+    both = dataclasses.replace(constraints, drag=drag)
+    return dataclasses.replace(motion, forces=lambda *state: law(*state, zero), constraints=both)
 
 
 def _solve_law(of_read: Callable, alone, responses):

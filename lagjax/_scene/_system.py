@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from lagjax._engine import Problem
 from lagjax._engine.taylor import lowered_motion
-from lagjax._equations import OF_QUANTITIES, Constraints, CoupledForces, Motion, Sample, derivation_of
+from lagjax._equations import OF_QUANTITIES, Constraints, Motion, Sample, couple_forces, derivation_of
 from lagjax._interface import Function, Layout, ValueNotKnown, accept, as_arrays, is_concrete, present, require_number
 from lagjax._primitives import SINGLE, compute_in_doubles
 from lagjax._program import Unlowerable, lack_of_memory
@@ -159,14 +159,10 @@ class System(eqx.Module):
             extras = (*extras, "multipliers") if role == "forces" else extras if ARGUMENTS[role] else ("params",)
             accepted = None if absent else accept(cast(Callable, function), role, ARGUMENTS[role], extras)
             setattr(self, role, accepted)
-        if self.reads_multipliers and (self.touches or not self._constraint_roles):
+        if self.reads_multipliers and not self._multiplier_roles:
             raise ValueError(
-                "forces asks for `multipliers`, and no force may read the normal force of a contact: sliding friction "
-                "is friction=... with slip=.... For rolling resistance or a brake on what stays in touch write that "
-                "contact as one of constraints=..., whose multiplier forces may read."
-                if self.touches
-                else "forces asks for `multipliers`, those of constraints=... and velocity_constraints=..., which this "
-                "System has not."
+                "forces asks for `multipliers`, those of constraints=..., velocity_constraints=..., contacts=... and "
+                "one_way=..., which this System has not."
             )
 
     def __repr__(self) -> str:
@@ -310,34 +306,48 @@ class System(eqx.Module):
         """The scene in the flat coordinates of `layout`, after a look at what its functions return there."""
         # The functions of the result take the numbers in `params` alone, with None in the place of everything else.
         self._check_outputs(layout, params)
-        code = eqx.filter(params, eqx.is_array_like, inverse=True)  # functions and strings: no part of the data
-
-        def flatten_function(function: Any, to_array: Callable) -> Any:
-            """The user's function in flat coordinates, the last of which are (t, params); `to_array` flattens it."""
-
-            def flat(*arguments, **more):
-                *vectors, t, numbers = arguments
-                trees = map(layout.restore, vectors)
-                return to_array(function(*trees, t=t, params=eqx.combine(numbers, code), **more))
-
-            return function and flat
 
         def concatenate(tree: PyTree) -> jax.Array:  # of float64, as constants may be, in a scene in float32
             return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(tree)]).astype(layout.dtype)
 
-        forces = flatten_function(self.forces, layout.flatten)
-        lagrangian, dissipation = (flatten_function(f, lambda x: x) for f in (self.lagrangian, self.dissipation))
-        of_constraints = (flatten_function(f, concatenate) for f in (self.constraints, self.velocity_constraints))
-        given = None if self.reads_multipliers else forces
-        motion = Motion(lagrangian, given, dissipation, Constraints(*of_constraints))
-        if not self.reads_multipliers:
-            return motion
+        def to_scalar(value):
+            return value
+
+        to_arrays = to_scalar, layout.flatten, to_scalar, concatenate, concatenate
+        lagrangian, forces, dissipation, *of_constraints = (
+            self._flat_function(role, layout, params, to_array)
+            for role, to_array in zip(ROLES, to_arrays, strict=False)
+        )
+        motion = Motion(lagrangian, None, dissipation, Constraints(*of_constraints))
+        if self.reads_multipliers:
+            return couple_forces(motion, self.multiplier_law(layout, params), layout, params)
+        return dataclasses.replace(motion, forces=forces)
+
+    def _flat_function(self, role: str, layout: Layout, params: PyTree, to_array: Callable) -> Any:
+        """The user's function in flat coordinates, the last of which are (t, params); `to_array` flattens its value."""
+        function: Any = getattr(self, role)
+        code = eqx.filter(params, eqx.is_array_like, inverse=True)  # functions and strings: no part of the data
+
+        def flat(*arguments, **more):
+            *vectors, t, numbers = arguments
+            trees = map(layout.restore, vectors)
+            return to_array(function(*trees, t=t, params=eqx.combine(numbers, code), **more))
+
+        return function and flat
+
+    def multiplier_law(self, layout: Layout, params: PyTree) -> Callable:
+        """Q(q, qdot, t, params, multipliers) of forces that read multipliers (m,), all flat.
+
+        They are those of constraints, then of contacts, which are open where there are no more.
+        """
+        forces, trees = self._flat_function("forces", layout, params, layout.flatten), self._multipliers(layout, params)
+        count = count_numbers(trees)
 
         def law(*state_and_multipliers):
             *state, flat = state_and_multipliers
-            return forces(*state, multipliers=self._split_by_constraint(flat, layout, params))
+            return forces(*state, multipliers=name_numbers(jnp.pad(flat, (0, count - flat.size)), trees))
 
-        return dataclasses.replace(motion, forces=CoupledForces(law, motion))
+        return law
 
     def _require_constraints(self) -> None:
         if not self._constraint_roles:
@@ -351,20 +361,30 @@ class System(eqx.Module):
 
     def _split_by_constraint(self, flat: jax.Array, layout: Layout, params: PyTree) -> PyTree:
         """`flat` (m,), a number for each constraint, in the structure of `multipliers`."""
-        leaves, tree = jax.tree.flatten(self._constraint_structure(layout, params))
-        pieces = jnp.split(flat, np.cumsum([leaf.size for leaf in leaves])[:-1])
-        parts = jax.tree.unflatten(tree, [x.reshape(leaf.shape) for x, leaf in zip(pieces, leaves, strict=True)])
-        if len(parts) == 1:
-            return parts[0]
-        return {**parts[0], **parts[1]} if all(isinstance(part, dict) for part in parts) else parts
+        return name_numbers(flat, self._constraint_structure(layout, params))
 
     def _constraint_structure(self, layout: Layout, params: PyTree) -> tuple:
         """The shapes that the constraint functions return, a tuple of one or two pytrees."""
         return tuple(self._output_shapes(role, layout, params) for role in self._constraint_roles)
 
+    def _multipliers(self, layout: Layout, params: PyTree) -> tuple:
+        """The shapes that constraint functions, contacts and one_way return, a tuple of as many pytrees."""
+        return tuple(self._output_shapes(role, layout, params) for role in self._multiplier_roles)
+
+    def _given(self, *roles: str) -> list[str]:
+        return [role for role in roles if getattr(self, role) is not None]
+
     @property
     def _constraint_roles(self) -> list[str]:
-        return [role for role in ("constraints", "velocity_constraints") if getattr(self, role) is not None]
+        return self._given("constraints", "velocity_constraints")
+
+    @property
+    def _contact_roles(self) -> list[str]:
+        return self._given("contacts", "one_way")
+
+    @property
+    def _multiplier_roles(self) -> list[str]:
+        return self._constraint_roles + self._contact_roles
 
     def constraint_names(self, layout: Layout, params: PyTree) -> list[str]:
         """A name for each of the m constraints, such as constraints['rod'] or velocity_constraints[1]."""
@@ -372,8 +392,7 @@ class System(eqx.Module):
 
     def contact_names(self, layout: Layout, params: PyTree) -> tuple[str, ...]:
         """A name for each gap and one-way velocity, such as contacts['floor'] or one_way[1]."""
-        roles = [role for role in ("contacts", "one_way") if getattr(self, role) is not None]
-        return tuple(self._output_names(roles, layout, params))
+        return tuple(self._output_names(self._contact_roles, layout, params))
 
     def _output_names(self, roles: list[str], layout: Layout, params: PyTree) -> list[str]:
         names = []
@@ -440,6 +459,7 @@ class System(eqx.Module):
             _require_structure(shapes, layout) if role == "forces" else _require_scalar(shapes, role)
         if self._constraint_roles:
             _require_constraints(self._constraint_structure(layout, params))
+        _require_own_names(self._multipliers(layout, params) if self.reads_multipliers else self._constraint_structure(layout, params))
 
     def _output_shapes(self, role: str, layout: Layout, params: PyTree) -> PyTree:
         """The shapes that the function of a role returns, traced on shapes alone."""
@@ -456,9 +476,28 @@ class System(eqx.Module):
         """The shapes of what the forces are called with beside t and params: of the multipliers, if they read them."""
         if not self.reads_multipliers:
             return {}
-        count = sum(x.size for x in jax.tree.leaves(self._constraint_structure(layout, params)))
-        flat = jnp.zeros(count, layout.dtype)
-        return {"multipliers": jax.eval_shape(lambda x: self._split_by_constraint(x, layout, params), flat)}
+        trees = self._multipliers(layout, params)
+        flat = jnp.zeros(count_numbers(trees), layout.dtype)
+        return {"multipliers": jax.eval_shape(lambda x: name_numbers(x, trees), flat)}
+
+
+def count_numbers(trees: PyTree) -> int:
+    """The count of numbers in arrays, or in their shapes."""
+    return sum(x.size for x in jax.tree.leaves(trees))
+
+
+def name_numbers(numbers, trees: tuple) -> PyTree:
+    """Numbers (…, m) in these structures, end to end: one dict where all are dicts, else a tuple of several."""
+    leaves, structure = jax.tree.flatten(trees)
+    ends = np.cumsum([leaf.size for leaf in leaves])
+    pieces = (numbers[..., end - leaf.size : end] for end, leaf in zip(ends, leaves, strict=True))
+    shaped = [x.reshape(*x.shape[:-1], *leaf.shape) for x, leaf in zip(pieces, leaves, strict=True)]
+    parts = structure.unflatten(shaped)
+    if len(parts) == 1:
+        return parts[0]
+    if not all(isinstance(part, dict) for part in parts):
+        return parts
+    return {name: x for part in parts for name, x in part.items()}
 
 
 def _coefficients(contacts, one_way, restitution, friction, slip) -> tuple:
@@ -570,10 +609,12 @@ def _require_constraints(structure: tuple) -> None:
         raise TypeError("constraints must return at least one number that is to be zero.")
     if not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
         raise TypeError("constraints must return real floating-point numbers.")
-    names = [set(part) for part in structure if isinstance(part, dict)]
-    if len(names) == 2 and names[0] & names[1]:
-        shared = ", ".join(sorted(names[0] & names[1]))
-        raise ValueError(f"A constraint and a velocity constraint have the same name: {shared}.")
+
+
+def _require_own_names(structure: tuple) -> None:
+    names = [name for part in structure if isinstance(part, dict) for name in part]
+    if shared := sorted({name for name in names if names.count(name) > 1}):
+        raise ValueError(f"Two of constraints, velocity_constraints, contacts and one_way have the same name: {', '.join(shared)}.")
 
 
 def _require_structure(value: PyTree, layout: Layout) -> None:

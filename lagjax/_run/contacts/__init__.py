@@ -43,7 +43,6 @@ from lagjax._run.contacts._contact_motion import (
     follow_known,
     held_size,
     slots_of,
-    spread_forces,
 )
 from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes, System, require_coefficients
 
@@ -231,7 +230,8 @@ def contact_forces(trajectory: Trajectory):
         def evaluate_output(q, qdot, t, contacts):
             parts = layout.flatten(q), layout.flatten(qdot), t[None], *numbers, *map(jnp.ravel, contacts)
             forces = program(jnp.concatenate([jnp.asarray(x, layout.dtype) for x in parts]))
-            forces, _ = spread_forces(scene, flat, derivation, forces, InContact(params, contacts))
+            positions = derivation.position_count
+            forces, _ = scene.spread_forces(flat, forces, positions, InContact(params, contacts))
             return jnp.where(contacts.closed > 0, forces, jnp.where(contacts.closed == 0, 0.0, jnp.nan))
 
         return flat.shapes.name_numbers(jax.vmap(evaluate_output)(q, qdot, times[0], contacts))
