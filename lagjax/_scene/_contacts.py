@@ -120,22 +120,23 @@ class ContactScene(eqx.Module):
         def law(*state_and_multipliers):
             *state, p, rows = state_and_multipliers
             if not self.is_open:
-                (f, a), gaps = counts(p), flat.gap_count if self.slots is None else self.slots[0]
-                normal, _ = self.spread_forces(flat, rows, f + gaps, p)
-                rows = jnp.concatenate([rows[:f], rows[f + gaps : f + gaps + a], normal])
+                gaps = flat.gap_count if self.slots is None else self.slots[0]
+                own, normal, _ = self.split_forces(flat, rows, counts(p)[0] + gaps, p)
+                rows = jnp.append(own, normal)
             return of_user(*state, p.params, rows)
 
         return couple_forces(motion, law, layout, params)
 
-    def spread_forces(self, flat: "Flat", forces, positions: int, p: InContact) -> tuple:
-        """The forces of the normals (k,) and of the slips (r, d), among those of all rows, `positions` on positions."""
+    def split_forces(self, flat: "Flat", forces, positions: int, p: InContact) -> tuple:
+        """The forces of all rows, `positions` of them on positions: of constraints, normals (k,) and slips (r, d)."""
         one_way, (r, d) = flat.shapes.count - flat.gap_count, (flat.rough.size, flat.shapes.directions)
         gaps, velocities = (flat.gap_count, one_way + r * d) if self.slots is None else self.slots
-        normal, along = forces[positions - gaps : positions], forces[forces.size - velocities :]
+        first, last = positions - gaps, forces.size - velocities
+        own, normal, along = jnp.append(forces[:first], forces[positions:last]), forces[first:positions], forces[last:]
         if self.slots is not None:
             of_gaps, of_velocities = self.rows(flat, p)
             normal, along = normal @ of_gaps, along @ of_velocities
-        return jnp.append(normal, along[:one_way]), along[one_way:].reshape(r, d)
+        return own, jnp.append(normal, along[:one_way]), along[one_way:].reshape(r, d)
 
     def rows(self, flat: "Flat", p: InContact) -> list:
         """The rows of `slots` as sums over those of all gaps and of all velocities: matrices of 0 and 1."""

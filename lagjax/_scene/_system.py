@@ -58,11 +58,11 @@ class System(eqx.Module):
     - `velocity_constraints(q, qdot)`: a(q, q̇, t) = 0 that cannot be integrated to such an f: rolling, skates.
 
     Each may also take, by name, the time `t` and the parameters `params` (any pytree), and in a scene that is fitted to
-    records their sampled `inputs` (`lagjax.Record`). Forces may also ask for the `multipliers` of the constraints, in
-    the structure of `System.multipliers`, as the friction μ|N| of a bead on a wire or of a bearing does: both are
-    solved for together, of constraints that are independent. No acceleration exists (it is NaN) where none, or of a
-    single multiplier more than one, satisfies the law. At rest such friction holds where its direction is that of a
-    speed, `jnp.sign(tangent @ v)`.
+    records their sampled `inputs` (`lagjax.Record`). Forces may also ask for the `multipliers` of constraints and
+    contacts, in the structure of `System.multipliers`, as the friction μ|N| of a bead on a wire or of a bearing does:
+    both are solved for together, of constraints that are independent. No acceleration exists (it is NaN) where none, or
+    of a single multiplier more than one, satisfies the law. At rest such friction holds where its direction is that of
+    a speed, `jnp.sign(tangent @ v)`.
 
     **Contacts**
 
@@ -75,6 +75,11 @@ class System(eqx.Module):
     - `friction`: Coulomb's μ ≥ 0, likewise: |f| ≤ μλ where the contact sticks, f = −μλ s/|s| where it slides. It needs
       `slip(q, qdot)`, the sliding velocity s at each contact in the structure of the gaps: a number in a plane, an
       array of two in space.
+    - `forces(q, qdot, multipliers)` may read the normal force λ of a contact by its name, beside the multipliers of
+      constraints (one dict where all are dicts, else a tuple): zero while it is open, λ ≥ 0 while it is closed, as
+      rolling resistance −c λ sign(ω) does, and a brake. What is linear in λ joins the equations of the contacts; other
+      laws, with finite slopes at λ = 0, are solved for, of contacts that are independent. An impact is none of a force:
+      its impulse brings nothing of such a law, not even where bounces accumulate.
     - `impacts`: several contacts that touch take a blow together, by the linear complementarity problem of all of them
       ("simultaneous", Moreau and Glocker), or one after the other ("sequential", as Newton's cradle does). "poisson":
       together, and each gives back the part e of the impulse of its compression; without friction, or for one contact
@@ -232,7 +237,8 @@ class System(eqx.Module):
         """λ, in the structure that the constraint functions return: a dict by name if they return dicts.
 
         With both kinds of constraints: one dict if both return dicts, else the pair (λ, μ). Where constraints are
-        redundant, their forces are shared by the multipliers of least norm. λ has units energy/{f}.
+        redundant, their forces are shared by the multipliers of least norm. λ has units energy/{f}. In a scene with
+        contacts they are those while none is closed; `Trajectory.multipliers` are those of the motion.
 
         **Raises** `ValueError` for a system without constraints.
         """
@@ -340,7 +346,8 @@ class System(eqx.Module):
 
         They are those of constraints, then of contacts, which are open where there are no more.
         """
-        forces, trees = self._flat_function("forces", layout, params, layout.flatten), self._multipliers(layout, params)
+        forces = self._flat_function("forces", layout, params, layout.flatten)
+        trees = self._role_shapes(self._multiplier_roles, layout, params)
         count = count_numbers(trees)
 
         def law(*state_and_multipliers):
@@ -365,11 +372,10 @@ class System(eqx.Module):
 
     def _constraint_structure(self, layout: Layout, params: PyTree) -> tuple:
         """The shapes that the constraint functions return, a tuple of one or two pytrees."""
-        return tuple(self._output_shapes(role, layout, params) for role in self._constraint_roles)
+        return self._role_shapes(self._constraint_roles, layout, params)
 
-    def _multipliers(self, layout: Layout, params: PyTree) -> tuple:
-        """The shapes that constraint functions, contacts and one_way return, a tuple of as many pytrees."""
-        return tuple(self._output_shapes(role, layout, params) for role in self._multiplier_roles)
+    def _role_shapes(self, roles: list[str], layout: Layout, params: PyTree) -> tuple:
+        return tuple(self._output_shapes(role, layout, params) for role in roles)
 
     def _given(self, *roles: str) -> list[str]:
         return [role for role in roles if getattr(self, role) is not None]
@@ -457,9 +463,11 @@ class System(eqx.Module):
                 error.add_note(f"{role} was called with {shown}. Give q, qdot and params the structure that it reads.")
                 raise
             _require_structure(shapes, layout) if role == "forces" else _require_scalar(shapes, role)
+        roles = self._multiplier_roles if self.reads_multipliers else self._constraint_roles
+        shapes = self._role_shapes(roles, layout, params)
         if self._constraint_roles:
-            _require_constraints(self._constraint_structure(layout, params))
-        _require_own_names(self._multipliers(layout, params) if self.reads_multipliers else self._constraint_structure(layout, params))
+            _require_constraints(shapes[: len(self._constraint_roles)])
+        _require_own_names(shapes)
 
     def _output_shapes(self, role: str, layout: Layout, params: PyTree) -> PyTree:
         """The shapes that the function of a role returns, traced on shapes alone."""
@@ -476,7 +484,7 @@ class System(eqx.Module):
         """The shapes of what the forces are called with beside t and params: of the multipliers, if they read them."""
         if not self.reads_multipliers:
             return {}
-        trees = self._multipliers(layout, params)
+        trees = self._role_shapes(self._multiplier_roles, layout, params)
         flat = jnp.zeros(count_numbers(trees), layout.dtype)
         return {"multipliers": jax.eval_shape(lambda x: name_numbers(x, trees), flat)}
 
@@ -614,7 +622,8 @@ def _require_constraints(structure: tuple) -> None:
 def _require_own_names(structure: tuple) -> None:
     names = [name for part in structure if isinstance(part, dict) for name in part]
     if shared := sorted({name for name in names if names.count(name) > 1}):
-        raise ValueError(f"Two of constraints, velocity_constraints, contacts and one_way have the same name: {', '.join(shared)}.")
+        two = "Two of constraints, velocity_constraints, contacts and one_way"
+        raise ValueError(f"{two} have the same name: {', '.join(shared)}.")
 
 
 def _require_structure(value: PyTree, layout: Layout) -> None:

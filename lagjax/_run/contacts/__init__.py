@@ -210,12 +210,17 @@ def _trajectory(
     )  # fmt: skip
 
 
-def contact_forces(trajectory: Trajectory):
-    """The normal forces at every output, by the names of the contacts; NaN where the motion did not come to."""
+def contact_forces(trajectory: Trajectory, name: str):
+    """At every output the `multipliers` of constraints, `constraint_force`, or the normal `contact_forces`, by name.
+
+    NaN where the motion did not come to.
+    """
     system = trajectory.system
     assert isinstance(system, System)
+    if name != "contact_forces":
+        system._require_constraints()
 
-    def normal_forces(q, qdot, times, params, _, contacts: Contacts):
+    def forces_of_member(q, qdot, times, params, _, contacts: Contacts):
         layout = Layout.from_state(*jax.tree.map(lambda x: x[0], (q, qdot)))
         flat = Flat.from_system(system, layout, params)
         inside = InContact(params, jax.tree.map(lambda x: x[0], contacts))
@@ -225,15 +230,23 @@ def contact_forces(trajectory: Trajectory):
             scene = dataclasses.replace(scene, slots=slots_of(whole, flat))
         derivation = derivation_of(scene, layout, inside).with_numbers().lowered
         program = line_of(derivation.multipliers)
-        numbers = [jnp.ravel(x) for x in jax.tree.leaves(eqx.filter(params, eqx.is_array_like))]
+        numbers = eqx.filter(params, eqx.is_array_like)
+        given = [jnp.ravel(x) for x in jax.tree.leaves(numbers)]
 
         def evaluate_output(q, qdot, t, contacts):
-            parts = layout.flatten(q), layout.flatten(qdot), t[None], *numbers, *map(jnp.ravel, contacts)
+            state, inside = (layout.flatten(q), layout.flatten(qdot), t), InContact(params, contacts)
+            parts = [*state[:2], t[None], *given, *map(jnp.ravel, contacts)]
             forces = program(jnp.concatenate([jnp.asarray(x, layout.dtype) for x in parts]))
-            positions = derivation.position_count
-            forces, _ = scene.spread_forces(flat, forces, positions, InContact(params, contacts))
-            return jnp.where(contacts.closed > 0, forces, jnp.where(contacts.closed == 0, 0.0, jnp.nan))
+            own, normal, _ = scene.split_forces(flat, forces, derivation.position_count, inside)
+            if name == "contact_forces":
+                return jnp.where(contacts.closed > 0, normal, jnp.where(contacts.closed == 0, 0.0, jnp.nan))
+            own = jnp.where((contacts.closed >= 0).all(), own, jnp.nan)
+            if name == "multipliers":
+                return system._split_by_constraint(own, layout, params)
+            _, pull = system._motion(layout, params).constraints.products(*state, numbers)
+            return layout.restore(pull(own))
 
-        return flat.shapes.name_numbers(jax.vmap(evaluate_output)(q, qdot, times[0], contacts))
+        found = jax.vmap(evaluate_output)(q, qdot, times[0], contacts)
+        return flat.shapes.name_numbers(found) if name == "contact_forces" else found
 
-    return trajectory.map_members(normal_forces, trajectory.contacts)
+    return trajectory.map_members(forces_of_member, trajectory.contacts)

@@ -318,7 +318,7 @@ def _forces_of(derivation: Derivation, scene: ContactScene, flat: Flat) -> Progr
     moving, positions = 2 * derivation.layout.size + 1, derivation.position_count
 
     def spread(_, inside, forces):
-        return jnp.concatenate([x.ravel() for x in scene.spread_forces(flat, forces, positions, inside)])
+        return jnp.concatenate([x.ravel() for x in scene.split_forces(flat, forces, positions, inside)[1:]])
 
     given = (jax.ShapeDtypeStruct((size,), float) for size in (moving, len(derivation.multipliers.line.outputs)))
     y, forces = given
@@ -368,7 +368,7 @@ def _watches(
         if scene.is_open:
             return jnp.concatenate([open_values, jnp.ones(rough.size + 2 * turns), jnp.array(more)])
         positions, own = derivation.position_count, len(forces[0]) - (0 if corners is None else turns)
-        normal, held = scene.spread_forces(flat, forces[0][:own], positions, inside._replace(params=user))
+        _, normal, held = scene.split_forces(flat, forces[0][:own], positions, inside._replace(params=user))
         if corners is not None:
             matters = [1.0 - jnp.prod(1.0 - closed[np.flatnonzero(row)]) for row in corners.touch]
             sides = forces[0][-turns:] * jnp.stack(matters)  # 0 where all that is closed is elsewhere
