@@ -29,18 +29,8 @@ from jax.interpreters import ad, mlir
 from lagjax._engine.taylor._call import NO_HANDLER, capsule
 from lagjax._native import LARGEST_LINE, LineCode, line_handler, make_once
 from lagjax._primitives import HostFunction, LinearMap, call_host, compute_on_host, share_rows
-from lagjax._program import (
-    Graph,
-    Program,
-    StraightLine,
-    Unlowerable,
-    copy_nodes,
-    emit,
-    lower,
-    lowers,
-    pullback,
-    pushforward,
-)
+from lagjax._program import Graph, StraightLine, Unlowerable, copy_nodes, pullback, pushforward
+from lagjax._tracing import Program, emit, lower, lowers
 
 _TARGET = "lagjax_line"
 # Operations of a line on a GPU that XLA compiles; NumPy on the host evaluates a longer one. Twice as many would cost
