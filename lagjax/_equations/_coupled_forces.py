@@ -4,9 +4,9 @@ M q̈ = F + Q + Gᵀλ and G q̈ = γ make the multipliers linear in the force, 
 
     λ = λ₀ + R Q(λ),    R = −S⁻¹ G K⁻¹,    S = G K⁻¹ Gᵀ,    K = M + Gᵀ W G        (see `_linear` for W)
 
-What is linear in λ is solved at once. So is what is linear in pieces of a single multiplier, as μ|λ|: as long as R Q
-grows more slowly than λ, the piece is that of λ₀, and none depends on the direction in which friction acts. Else, as
-for the length √(λ₁² + λ₂²) of a bearing's force, that is a few steps of Newton's method, the number of which is bounded
+What is linear in λ is solved at once. So is what is linear in pieces of a single multiplier that meet at zero, as μ|λ|:
+as long as R Q grows more slowly than λ, the piece is that of λ₀, and none depends on the direction in which friction
+acts. Else, as for the length √(λ₁² + λ₂²) of a bearing's force, and for min(μ|λ|, Q₁), that is a few steps of Newton's method, the number of which is bounded
 and the last of which is tested. Where none is found, or a single multiplier has two (Painlevé's paradox), Q is NaN.
 """
 
@@ -55,9 +55,11 @@ class CoupledForces(eqx.Module):
         right = jnp.concatenate([(gamma - moved @ (force + weighted.T @ gamma))[:, None], -moved], axis=1)
         schur = moved @ jacobian.T
         solved = eliminate(schur if released is None else schur + jnp.diag(released), right)
-        read, zero = np.array(_multipliers_read(self.law, *state, solved[:, 0]), int), jnp.zeros_like(solved[:, 0])
+        zero = jnp.zeros_like(solved[:, 0])
+        places, at_zero = _multipliers_read(self.law, *state, zero)
+        read = np.array(places, int)
         law = lambda some: self.law(*state, zero.at[read].set(some))  # noqa: E731
-        return _solve_law(law, solved[read, 0], solved[read, 1:]) if read.size else self.law(*state, zero)
+        return _solve_law(law, solved[read, 0], solved[read, 1:], at_zero) if read.size else self.law(*state, zero)
 
 
 def couple_forces(motion, law: Callable, layout, params: PyTree):
@@ -88,12 +90,12 @@ def couple_forces(motion, law: Callable, layout, params: PyTree):
     return dataclasses.replace(motion, forces=lambda *state: law(*state, zero), constraints=both)
 
 
-def _solve_law(of_read: Callable, alone, responses):
-    """Q(λ) with λ = λ₀ + R Q(λ), for λ₀ (m,) and R (m, n) of multipliers that are read."""
+def _solve_law(of_read: Callable, alone, responses, at_zero: bool):
+    """Q(λ) with λ = λ₀ + R Q(λ), for λ₀ (m,) and R (m, n) of multipliers that are read, by pieces that meet `at_zero`, or not."""
     decisive, curved = _dependence(of_read, alone)
     zero, unit, count = jnp.zeros_like(alone), jnp.eye(len(alone), dtype=alone.dtype), len(alone)
     some = alone + responses @ of_read(zero) if decisive else zero
-    before, single = some, count == 1 and not curved
+    before, single = some, count == 1 and at_zero and not curved
     for _ in range(1 if single or not decisive else STEPS if curved else STEPS_OF_PIECES):
         value, slopes = of_read(some), jax.jacfwd(of_read)(some)
         coupling = unit - responses @ slopes
@@ -111,15 +113,26 @@ def _solve_law(of_read: Callable, alone, responses):
     return jnp.where(1.0 + off < 2.0, force, jnp.nan)
 
 
-def _multipliers_read(law: Callable, *arguments) -> list[int]:
-    """The places of the multipliers, the last argument of a law, that it reads; all where it has no program."""
+def _multipliers_read(law: Callable, *arguments) -> tuple[list[int], bool]:
+    """The places of the multipliers, the last argument of a law, that it reads; all where it has no program.
+
+    And whether it is one of which all pieces meet where that is zero.
+    """
     m, inputs = arguments[-1].size, sum(jnp.size(x) for x in jax.tree.leaves(arguments))
     try:
         program = lower(law, *arguments)
     except Unlowerable:
-        return list(range(m))
+        return list(range(m)), False
     read = program.find_inputs(range(len(program.line.outputs)))
-    return [i for i in range(m) if inputs - m + i in read]
+    places = [i for i in range(m) if inputs - m + i in read]
+    if len(places) != 1:
+        return places, False
+    # Of pieces a few sizes tell, at a state that nothing speaks for.
+    sizes, columns = 2.0 ** np.arange(-20, 21), list(np.random.default_rng(0).uniform(0.3, 1.2, (inputs, 1)))
+    columns[inputs - m + places[0]] = sizes = np.concatenate([[0.0], sizes, -sizes])
+    values = program.evaluate_many(columns)
+    slopes = np.stack(np.split((values[:, 1:] - values[:, :1]) / sizes[1:], 2, axis=1))
+    return places, bool((np.ptp(slopes, axis=2) <= 1e-6 * np.abs(slopes).max()).all())
 
 
 def _dependence(law: Callable, multipliers) -> tuple[bool, bool]:
