@@ -6,8 +6,9 @@ M q̈ = F + Q + Gᵀλ and G q̈ = γ make the multipliers linear in the force, 
 
 What is linear in λ is solved at once. So is what is linear in pieces of a single multiplier that meet at zero, as μ|λ|:
 as long as R Q grows more slowly than λ, the piece is that of λ₀, and none depends on the direction in which friction
-acts. Else, as for the length √(λ₁² + λ₂²) of a bearing's force, and for min(μ|λ|, Q₁), that is a few steps of Newton's method, the number of which is bounded
-and the last of which is tested. Where none is found, or a single multiplier has two (Painlevé's paradox), Q is NaN.
+acts. Else, as for the length √(λ₁² + λ₂²) of a bearing's force, and for min(μ|λ|, Q₁), that is a few steps of Newton's
+method, the number of which is bounded and the last of which is tested. Where none is found, or a single multiplier has
+two (Painlevé's paradox), Q is NaN.
 """
 
 import dataclasses
@@ -91,7 +92,10 @@ def couple_forces(motion, law: Callable, layout, params: PyTree):
 
 
 def _solve_law(of_read: Callable, alone, responses, at_zero: bool):
-    """Q(λ) with λ = λ₀ + R Q(λ), for λ₀ (m,) and R (m, n) of multipliers that are read, by pieces that meet `at_zero`, or not."""
+    """Q(λ) with λ = λ₀ + R Q(λ), for λ₀ (m,) and R (m, n) of multipliers that are read.
+
+    `at_zero` says that it is one of which all pieces meet at zero.
+    """
     decisive, curved = _dependence(of_read, alone)
     zero, unit, count = jnp.zeros_like(alone), jnp.eye(len(alone), dtype=alone.dtype), len(alone)
     some = alone + responses @ of_read(zero) if decisive else zero
