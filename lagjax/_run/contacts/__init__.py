@@ -22,7 +22,6 @@ from lagjax._engine import Batch, Problem
 from lagjax._engine.taylor import MachineCode, line_of
 from lagjax._equations import ROUNDINGS, derivation_of, has_constraints, require_consistent
 from lagjax._interface import Layout, compile_for_one_call, halves, is_concrete, require_budget, result_from
-from lagjax._native import GUARD_NOISE
 from lagjax._run._trajectory import (
     ContactChanges,
     Impacts,
@@ -44,6 +43,7 @@ from lagjax._run.contacts._contact_motion import (
     held_size,
     slots_of,
 )
+from lagjax._run.contacts._contact_search import find_start_width
 from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes, System, require_coefficients
 
 CHANGES = 1024  # the budget of changes of a motion whose crossings are asked for; what they record takes memory
@@ -171,7 +171,8 @@ def _require_open(problem: Problem, closed: Problem, free: Problem) -> None:
     terms = derivation.term_sizes(y0[:n], y0[n:], columns[2 * n], closed.numbers, names=("residual",))
     noise = ROUNDINGS * np.finfo(problem.layout.dtype).eps * (np.asarray(terms)[rows] + np.abs(slopes) @ np.abs(y0[:n]))
     acceleration = free.derivation.lowered.acceleration.evaluate_many(list(columns))[:n, 0]
-    noise = noise + start_width(slopes, y0, acceleration, np.asarray(closed.ts))
+    ts = np.asarray(closed.ts, float)
+    noise = noise + [find_start_width(n, y0, slope, acceleration, ts[0], ts[-1]) for slope in slopes]
     for name, gap, slope, near in zip(shapes.names, gaps, slopes, noise, strict=False):
         if gap < -near:
             raise ValueError(
@@ -182,15 +183,6 @@ def _require_open(problem: Problem, closed: Problem, free: Problem) -> None:
                 f"The gap {name} is zero at the start, and so is its gradient there: it has no direction in which it "
                 "pushes. Write it as a distance, q, not as its square."
             )
-
-
-def start_width(slopes, y0, acceleration, ts) -> np.ndarray:
-    """The depths at which gaps (k,) with these `slopes` (k, n) may begin: the rounding of what leads a motion there.
-
-    A gap that is a coordinate is 1e-16 where it closes, and its rounding that of the height from which it fell.
-    """
-    (q, v), span, latest = halves(abs(y0)), ts[-1] - ts[0], np.maximum(abs(ts[0]), abs(ts[-1]))
-    return GUARD_NOISE * (abs(slopes) @ (q.max() + v * latest + abs(acceleration) * span**2 / 8))
 
 
 def _trajectory(
