@@ -108,6 +108,11 @@ def hold_closed(system: Any, q: PyTree, qdot: PyTree, params: PyTree, what: str)
     system = require_system(system, contacts=True)
     if system.one_way is not None:
         raise ValueError(f"{what} is for contacts without one_way=…: leave out what is open, hold what is closed.")
+    if system.reads_multipliers:
+        raise ValueError(
+            f"{what} of a scene with contacts is for forces that read no multipliers: write the contacts that stay "
+            "closed as constraints=…, whose multipliers they may read there."
+        )
     with jax.ensure_compile_time_eval():
         rest = _velocities(q, qdot)
         layout = Layout.from_state(q, rest)
