@@ -449,7 +449,7 @@ def _vjp_compiled(*args, **settings):
             return derivative_by_handler("vjp", **settings, rows=(ts, y0, params, path_ct, end_ct))
 
         *found, excess, done, needed = _derivatives.transpose_outputs(go_back, ts, path_ct, end_ct, library=jnp)
-        return *(x.reshape(-1, copies, x.shape[-1]) for x in found), excess, done, needed
+        return *(x.reshape(x.shape[0] // copies, copies, x.shape[-1]) for x in found), excess, done, needed
 
     if settings["flow"].turns:
         return call_host(functools.partial(_vjp_on_host, **settings), _vjp_shapes(*args, **settings), *args)
