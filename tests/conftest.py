@@ -53,7 +53,7 @@ jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
 
 # Machine code is made fast instead of well, too; the bits stay, as sweeps in other processes are compared with.
-_ir.LEVELS[:] = [1, 1]
+_ir.LEVELS[:] = [0, 0]
 
 
 # Every program of XLA takes some entries of the table of memory that a process has, 65 530 by Linux's default. Without
