@@ -3,7 +3,6 @@
 from pathlib import Path
 
 import diffrax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from lagrangians import spring
@@ -306,4 +305,4 @@ def test_what_is_wrong_with_inputs_is_a_sentence():
     with pytest.raises(TypeError, match=r"start must be .*a function of the parameters"):
         lagjax.Record(TS, u, start=3.0)
     with pytest.raises(TypeError, match=r"driven asks for `inputs`, which only the records of lagjax.fit have"):
-        lagjax.simulate(SCENE, 0.0, 0.0, jnp.array([0.0, 1.0]), TRUTH)
+        lagjax.simulate(SCENE, 0.0, 0.0, np.array([0.0, 1.0]), TRUTH)
