@@ -17,10 +17,10 @@ from sweeps import sweep
 
 import lagjax
 from lagjax import scenes
-from lagjax._engine.diffrax._equations import form_of
-from lagjax._equations._derivation import Derivation, derivation_of
+from lagjax._engine.diffrax import form_of
+from lagjax._equations import Derivation, derivation_of
 from lagjax._equations._linear import rank_tolerance
-from lagjax._interface._layout import Layout
+from lagjax._interface import Layout
 
 WAYS = pytest.mark.parametrize(
     "path", [pytest.param("auto", id="machine code"), pytest.param("array", id="diffrax", marks=pytest.mark.slow)]

@@ -14,11 +14,11 @@ import lagjax
 from lagjax import scenes
 from lagjax._engine import diffrax as _diffrax
 from lagjax._engine import taylor as _machine_code
-from lagjax._engine.diffrax._equations import form_of
+from lagjax._engine.diffrax import form_of
 from lagjax._equations import _derivation
 from lagjax._equations import _many_states as many_states
 from lagjax._equations._derivation import Derivation, columns_of, derivation_of, numbers_of
-from lagjax._interface._layout import Layout
+from lagjax._interface import Layout
 from lagjax._program import OPERATIONS, Unlowerable, pullback
 from lagjax._program._line import CHUNK
 from lagjax._tracing import lower

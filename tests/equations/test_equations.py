@@ -11,9 +11,9 @@ from sweeps import KINDS, sweep
 
 import lagjax
 from lagjax import scenes
-from lagjax._engine.diffrax._equations import form_of
-from lagjax._equations._derivation import Derivation
-from lagjax._interface._layout import Layout
+from lagjax._engine.diffrax import form_of
+from lagjax._equations import Derivation
+from lagjax._interface import Layout
 
 
 def forms(scene, *paths):

@@ -12,7 +12,7 @@ from sweeps import sweep
 
 import lagjax
 from lagjax._equations import _linear
-from lagjax._interface._layout import Layout
+from lagjax._interface import Layout
 
 
 def symmetric(n, eigenvalues, seed=0):

@@ -8,7 +8,7 @@ import pytest
 import lagjax
 from lagjax import scenes
 from lagjax._equations._derivation import Derivation, columns_of, derivation_of, numbers_of
-from lagjax._interface._layout import Layout
+from lagjax._interface import Layout
 
 
 def of(system, q, qdot, params=None):

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 import lagjax
-from lagjax._equations import derivation_of
-from lagjax._equations._patterns import jacobian_pattern
+from lagjax._equations import derivation_of, jacobian_pattern
 from lagjax._equations._sparse import Band, Blocks, Diagonal, MatrixFree, Sparse
 from lagjax._interface import Layout
 

@@ -12,7 +12,7 @@ from scenes import SADDLE
 from sweeps import sweep
 
 import lagjax
-from lagjax._interface._layout import Layout
+from lagjax._interface import Layout
 
 
 class Polar(NamedTuple):

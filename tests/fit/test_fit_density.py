@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import lagjax
-from lagjax._fit.model._residuals import Point
+from lagjax._fit import Point
 
 TS = np.linspace(0.0, 3.0, 31)
 TRUTH, FREE = {"k": 4.0, "c": 1.5}, {"k": True, "c": False}

@@ -9,7 +9,7 @@ from scenes import FREE
 from scipy.optimize import least_squares
 
 import lagjax
-from lagjax._fit.model._residuals import Point
+from lagjax._fit import Point
 
 G, E, V0 = 9.81, 0.9, 3.0
 

@@ -9,10 +9,9 @@ from lagrangians import spring
 from scipy.signal import lsim
 
 import lagjax
+from lagjax._fit import Parameters, Point
 from lagjax._fit.model import _inputs, _motions
-from lagjax._fit.model._parameters import Parameters
-from lagjax._fit.model._residuals import Point
-from lagjax._interface._layout import Layout
+from lagjax._interface import Layout
 
 TRUTH = {"k": 4.0, "c": 0.3, "gain": 1.5}
 TS = 0.02 * np.arange(200)

@@ -10,8 +10,8 @@ import numpy as np
 import pytest
 
 import lagjax
+from lagjax._fit import Parameters
 from lagjax._fit.model import _transforms
-from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._transforms import Unbounded
 
 TS = np.linspace(0.0, 4.0, 101)

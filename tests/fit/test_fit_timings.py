@@ -10,7 +10,7 @@ import pytest
 from lagrangians import damping, pendulum_in_gravity
 
 import lagjax
-from lagjax._fit.model._residuals import Point
+from lagjax._fit import Point
 
 TRUTH = {"g": 9.81, "c": 0.05}
 START = (1.0, 0.0)

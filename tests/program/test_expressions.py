@@ -10,8 +10,8 @@ from sweeps import sweep
 import lagjax
 from benchmarks import expression_population
 from lagjax._equations import derivation_of
-from lagjax._interface._layout import Layout
-from lagjax._program._differentiation import pullback, pushforward
+from lagjax._interface import Layout
+from lagjax._program import pullback, pushforward
 from lagjax._tracing import lower
 
 

@@ -12,8 +12,8 @@ from jax import lax
 from sweeps import sweep
 
 import lagjax
-from lagjax._equations._derivation import derivation_of
-from lagjax._interface._layout import Layout
+from lagjax._equations import derivation_of
+from lagjax._interface import Layout
 from lagjax._program import Unlowerable, pullback
 from lagjax._tracing import lower
 
