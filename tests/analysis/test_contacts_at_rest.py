@@ -20,7 +20,7 @@ PULLED, PRESSED = {"k": 50.0, "a": 1.0}, {"k": 50.0, "a": -0.2}
 
 
 def test_closed_contacts_hold_a_scene_at_rest():
-    rest = lagjax.equilibrium(BLOCK, jnp.array([0.3, 0.0]), PULLED)
+    rest = lagjax.equilibrium(BLOCK, np.array([0.3, 0.0]), PULLED)
     np.testing.assert_allclose(rest.q, [1.0, 0.0], atol=1e-12)
     np.testing.assert_allclose([rest.contact_forces["floor"], rest.contact_forces["wall"]], [G, 0.0], rtol=1e-12)
     assert rest.multipliers is None and str(rest).endswith("contact_forces['floor'] = 9.81, contact_forces['wall'] = 0")
@@ -28,13 +28,13 @@ def test_closed_contacts_hold_a_scene_at_rest():
 
 @pytest.mark.slow
 def test_small_motions_of_what_rests_on_contacts():
-    rest = jnp.array([1.0, 0.0])
+    rest = np.array([1.0, 0.0])
     np.testing.assert_allclose(lagjax.normal_modes(BLOCK, rest, PULLED).frequencies, [50**0.5], rtol=1e-12)
     linear = lagjax.linearize(BLOCK, rest, params=PULLED)
     np.testing.assert_allclose(linear.A[2:], [[-50, 0, 0, 0], [0, 0, 0, 0]], atol=1e-9)
     np.testing.assert_allclose(linear.constraint_jacobian, [[0, 1]])
-    assert "without load is linear on one side" in say(lagjax.normal_modes, jnp.zeros(2), {"k": 50.0, "a": 0.0})
-    falling = jnp.array([1.0, 0.0]), jnp.array([0.0, -1.0]), PULLED
+    assert "without load is linear on one side" in say(lagjax.normal_modes, np.zeros(2), {"k": 50.0, "a": 0.0})
+    falling = np.array([1.0, 0.0]), np.array([0.0, -1.0]), PULLED
     assert "contacts['floor'] is struck" in say(lagjax.linearize, *falling)
     rising = lagjax.linearize(BLOCK, falling[0], -falling[1], PULLED)
     np.testing.assert_allclose(rising.B[3], [0, 1])  # it is open an instant later
@@ -42,12 +42,12 @@ def test_small_motions_of_what_rests_on_contacts():
 
 @pytest.mark.slow
 def test_derivatives_of_the_forces_of_contacts_at_rest():
-    corner = lagjax.equilibrium(BLOCK, jnp.zeros(2), PRESSED)
+    corner = lagjax.equilibrium(BLOCK, np.zeros(2), PRESSED)
     np.testing.assert_allclose(corner.contact_forces["wall"], 10.0, rtol=1e-12)
     force = jax.grad(lambda k: lagjax.equilibrium(BLOCK, jnp.zeros(2), {"k": k, "a": -0.2}).contact_forces["wall"])
     np.testing.assert_allclose(force(50.0), 0.2, rtol=1e-12)
     at = np.array([0.0, 0.0])  # which contacts are closed is known inside of jit, too, where q and gaps are
-    traced = jax.jit(jax.vmap(lambda a: lagjax.equilibrium(BLOCK, at, {"k": 50.0, "a": a})))(jnp.array([-0.2, 0.2]))
+    traced = jax.jit(jax.vmap(lambda a: lagjax.equilibrium(BLOCK, at, {"k": 50.0, "a": a})))(np.array([-0.2, 0.2]))
     assert traced.ok.tolist() == [True, False] and np.isnan(traced.q[1]).all()
 
 
@@ -59,33 +59,33 @@ def say(call, *given, **more) -> str:
 
 @pytest.mark.slow
 def test_the_sentence_says_which_contact_opens():
-    assert "contacts['wall'] would have to pull" in say(lagjax.equilibrium, jnp.zeros(2), PULLED)
-    assert not lagjax.equilibrium(BLOCK, jnp.zeros(2), PULLED, throw=False).ok
-    assert "begin at a q with a gap of zero" in say(lagjax.equilibrium, jnp.array([0.3, 0.1]), PULLED)
+    assert "contacts['wall'] would have to pull" in say(lagjax.equilibrium, np.zeros(2), PULLED)
+    assert not lagjax.equilibrium(BLOCK, np.zeros(2), PULLED, throw=False).ok
+    assert "begin at a q with a gap of zero" in say(lagjax.equilibrium, np.array([0.3, 0.1]), PULLED)
 
 
 def test_the_sentence_says_which_contact_closes():
-    assert "contacts['wall'] is -0.2: this contact closes" in say(lagjax.equilibrium, jnp.array([0.3, 0.0]), PRESSED)
-    assert "is negative at q" in say(lagjax.equilibrium, jnp.array([0.3, -0.1]), PULLED)
-    assert "simulate this one" in say(lagjax.equilibrium, jnp.zeros(2), PRESSED, stable=True)
+    assert "contacts['wall'] is -0.2: this contact closes" in say(lagjax.equilibrium, np.array([0.3, 0.0]), PRESSED)
+    assert "is negative at q" in say(lagjax.equilibrium, np.array([0.3, -0.1]), PULLED)
+    assert "simulate this one" in say(lagjax.equilibrium, np.zeros(2), PRESSED, stable=True)
     rough = lagjax.System(block, contacts=lambda q: q[1], friction=0.3, slip=lambda q, v: v[0])
     with pytest.raises(ValueError, match="closed contacts with friction"):
-        lagjax.equilibrium(rough, jnp.array([1.0, 0.0]), PULLED)
+        lagjax.equilibrium(rough, np.array([1.0, 0.0]), PULLED)
 
 
 @pytest.mark.slow
 def test_four_feet_carry_a_load_wherever_they_can():
     """A table of height and two tilts: least-norm shares of a load far off its middle would pull at one foot."""
-    feet = jnp.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
+    feet = np.array([[1.0, 1.0], [1.0, -1.0], [-1.0, 1.0], [-1.0, -1.0]])
     table = lagjax.System(
         lambda q, v, params: 0.5 * v @ v - q[0] - params @ q[1:], contacts=lambda q: q[0] + feet @ q[1:]
     )
     for load in ([0.0, 0.0], [0.3, 0.1], [0.6, 0.3]):
-        forces = lagjax.equilibrium(table, jnp.zeros(3), jnp.array(load)).contact_forces
+        forces = lagjax.equilibrium(table, np.zeros(3), np.array(load)).contact_forces
         assert (forces >= -1e-12).all()
         np.testing.assert_allclose([forces.sum(), *(forces @ feet)], [1.0, *load], atol=1e-9)
     with pytest.raises(ValueError, match="would have to pull"):
-        lagjax.equilibrium(table, jnp.zeros(3), jnp.array([1.2, 0.0]))
+        lagjax.equilibrium(table, np.zeros(3), np.array([1.2, 0.0]))
 
 
 @pytest.mark.slow

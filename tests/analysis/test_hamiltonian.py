@@ -4,16 +4,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from lagrangians import free_particle, free_particles, kepler
+from lagrangians import free_particles
+from scenes import FREE, KEPLER
 from scipy.integrate import solve_ivp
 
 import lagjax
 
 TIGHT = {"rtol": 1e-13, "atol": 1e-15}
-TS = jnp.linspace(0.0, 5.0, 6)
-START = jnp.array([1.0, 0.2]), jnp.array([0.0, 1.1])
+TS = np.linspace(0.0, 5.0, 6)
+START = np.array([1.0, 0.2]), np.array([0.0, 1.1])
 
-PLANE = lagjax.System(kepler)
 CENTRAL = lagjax.System(lambda q, v: 0.5 * (v["r"] ** 2 + (q["r"] * v["phi"]) ** 2) + 1 / q["r"])
 
 
@@ -29,13 +29,13 @@ def turned(p, t):
 
 
 def test_the_energy_in_polar_coordinates():
-    changed = lagjax.change_coordinates(PLANE, polar)
+    changed = lagjax.change_coordinates(KEPLER, polar)
     state = {"r": 2.0, "phi": 0.3}, {"r": 0.5, "phi": 0.7}
     np.testing.assert_allclose(changed.system.energy(*state), CENTRAL.energy(*state), rtol=1e-14)
 
 
 def test_three_lines_each():
-    for one in (lagjax.change_coordinates(PLANE, polar), lagjax.hamiltonian(PLANE)):
+    for one in (lagjax.change_coordinates(KEPLER, polar), lagjax.hamiltonian(KEPLER)):
         assert len(repr(one).splitlines()) == 3 and "0x" not in repr(one)
 
 
@@ -44,9 +44,9 @@ def test_three_lines_each():
 
 @pytest.mark.slow
 def test_one_motion_in_polar_and_in_turning_coordinates():
-    plain = lagjax.simulate(PLANE, *START, TS, **TIGHT)
-    for place, guess in ((polar, {"r": 1.0, "phi": 0.1}), (turned, jnp.ones(2))):
-        changed = lagjax.change_coordinates(PLANE, place)
+    plain = lagjax.simulate(KEPLER, *START, TS, **TIGHT)
+    for place, guess in ((polar, {"r": 1.0, "phi": 0.1}), (turned, np.ones(2))):
+        changed = lagjax.change_coordinates(KEPLER, place)
         run = lagjax.simulate(changed.system, *changed.new_from_old(*START, guess), TS, **TIGHT)
         q, qdot = jax.vmap(changed.old_from_new)(run.q, run.qdot, TS)
         np.testing.assert_allclose(q, plain.q, atol=1e-11)
@@ -64,9 +64,9 @@ def test_forces_and_constraints_come_along():
     kinetic = {"r": 2.0 * 0.7**2, "phi": 0.0}  # ∂L/∂Q
     np.testing.assert_allclose(sum((force[k] - kinetic[k]) * state[1][k] for k in force), power, rtol=1e-13)
     circle = lagjax.System(free_particles, constraints=lambda q: q @ q - 4.0)
-    assert jnp.abs(lagjax.change_coordinates(circle, polar).system.constraint_residual(*state)) < 1e-14
+    assert np.abs(lagjax.change_coordinates(circle, polar).system.constraint_residual(*state)) < 1e-14
     with pytest.raises(ValueError, match="There are 1 new coordinates for 2 old ones"):
-        lagjax.change_coordinates(PLANE, lambda a: jnp.array([a, a])).new_from_old(*START, 1.0)
+        lagjax.change_coordinates(KEPLER, lambda a: jnp.array([a, a])).new_from_old(*START, 1.0)
     lost, _ = changed.new_from_old(*START, {"r": 0.0, "phi": 0.1})
     assert not np.isfinite(lost["r"]) or np.isclose(abs(lost["r"]), np.sqrt(1.04))
 
@@ -100,7 +100,7 @@ def test_legendre_where_velocities_are_bounded():
     q, v = jnp.array([1.0, 0.5]), jnp.array([0.9, -0.4])
     p = canonical.momentum(q, v)
     np.testing.assert_allclose(canonical.velocity(q, p), v, rtol=1e-12)
-    np.testing.assert_allclose(canonical.energy(q, p), jnp.sqrt(1 + p @ p) + 0.5 * q @ q, rtol=1e-12)
+    np.testing.assert_allclose(canonical.energy(q, p), np.sqrt(1 + p @ p) + 0.5 * q @ q, rtol=1e-12)
     by_q, by_p = jax.grad(canonical.energy, argnums=(0, 1))(q, p)
     rate, force = canonical.equations(q, p)
     np.testing.assert_allclose(rate, by_p, rtol=1e-11)
@@ -132,9 +132,9 @@ def test_the_central_problem_is_one_dimensional():
 @pytest.mark.slow
 def test_what_cannot_be_reduced_is_said():
     with pytest.raises(ValueError, match="no coordinate is cyclic"):
-        lagjax.routhian(PLANE, *START)
+        lagjax.routhian(KEPLER, *START)
     with pytest.raises(ValueError, match="every coordinate is cyclic"):
-        lagjax.routhian(lagjax.System(free_particle), 0.0, 1.0)
+        lagjax.routhian(FREE, 0.0, 1.0)
     drag = lagjax.System(free_particles, forces=lambda q, v: -v)
     with pytest.raises(ValueError, match="without constraints, forces"):
         lagjax.routhian(drag, *START)

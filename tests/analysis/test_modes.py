@@ -5,13 +5,14 @@ import jax.numpy as jnp
 import lagrangians
 import numpy as np
 import pytest
+from scenes import PENDULUM, PENDULUM_G, RAMP
 from scipy.special import roots_laguerre
 from sweeps import sweep
 
 import lagjax
 from lagjax._analysis._eigen import exponents_and_modes
-from lagjax._equations._derivation import derivation_of
-from lagjax._interface._layout import Layout
+from lagjax._equations import derivation_of
+from lagjax._interface import Layout
 
 G = 9.81
 
@@ -23,7 +24,7 @@ def double_pendulum(q, v, params):
 
 
 DOUBLE = lagjax.System(double_pendulum)
-EQUAL = jnp.array([1.0, 1.0, 1.0, 1.0, G])
+EQUAL = np.array([1.0, 1.0, 1.0, 1.0, G])
 
 
 def double_frequencies(params):
@@ -59,12 +60,12 @@ ROD = lagjax.System(lagrangians.weight_g, constraints=lambda q: {"rod": q @ q - 
 
 
 def test_equal_pendulums():
-    modes = lagjax.normal_modes(DOUBLE, jnp.zeros(2), EQUAL)
+    modes = lagjax.normal_modes(DOUBLE, np.zeros(2), EQUAL)
     np.testing.assert_allclose(modes.frequencies**2 / G, [2 - np.sqrt(2), 2 + np.sqrt(2)], rtol=1e-13)
     np.testing.assert_allclose(modes.shapes[:, 0] / modes.shapes[:, 1], [1 / np.sqrt(2), -1 / np.sqrt(2)], rtol=1e-13)
     assert modes.stable and "oscillates" in str(modes)
     with pytest.raises(ValueError, match=r"q is not an equilibrium.*lagjax\.equilibrium"):
-        lagjax.normal_modes(DOUBLE, jnp.array([0.1, 0.0]), EQUAL)
+        lagjax.normal_modes(DOUBLE, np.array([0.1, 0.0]), EQUAL)
 
 
 def test_bead_on_a_hoop():
@@ -81,13 +82,13 @@ def test_derivatives_of_an_equilibrium():
     np.testing.assert_allclose(jax.jacfwd(hoop_rest)(5.0), slope, rtol=1e-13)
     closed = jax.grad(jax.grad(lambda w: jnp.arccos(G / w**2)))(5.0)
     np.testing.assert_allclose(jax.grad(jax.grad(hoop_rest))(5.0), closed, rtol=1e-12)
-    speeds = jnp.linspace(4.0, 6.0, 3)
+    speeds = np.linspace(4.0, 6.0, 3)
     np.testing.assert_allclose(jax.jit(jax.vmap(hoop_rest))(speeds), np.arccos(G / speeds**2), rtol=1e-13)
 
 
 @pytest.mark.slow
 def test_equilibrium_on_a_constraint():
-    down = lagjax.equilibrium(ROD, jnp.array([0.6, -0.8]), G)
+    down = lagjax.equilibrium(ROD, np.array([0.6, -0.8]), G)
     np.testing.assert_allclose(down.q, [0.0, -1.0], atol=1e-15)
     np.testing.assert_allclose(down.multipliers["rod"], -G / 2, rtol=1e-14)
 
@@ -97,7 +98,7 @@ def test_a_family_of_equilibria_is_met_where_it_is_nearest():
     bond = lagjax.System(lambda q, v, params: 0.5 * v @ v - 0.5 * (q[1] - q[0] - params) ** 2)
     rest = lambda length: lagjax.equilibrium(bond, jnp.array([0.0, 2.0]), length).q
     np.testing.assert_allclose(rest(1.0), [0.5, 1.5], atol=1e-12)
-    np.testing.assert_allclose(jax.jacfwd(rest)(1.0), [-0.5, 0.5], atol=1e-12)
+    np.testing.assert_allclose(jax.jit(jax.jacfwd(rest))(1.0), [-0.5, 0.5], atol=1e-12)
 
 
 @pytest.mark.slow
@@ -142,7 +143,7 @@ def test_sleeping_top(spin):
         turns = (x * v[1] - y * v[0]) / (1 + z)  # of the figure axis, at constant spin
         return 0.5 * (v[0] ** 2 + v[1] ** 2 + vz**2) - spin * turns - z
 
-    modes = lagjax.normal_modes(lagjax.System(top), jnp.zeros(2))
+    modes = lagjax.normal_modes(lagjax.System(top), np.zeros(2))
     assert bool(modes.stable) == (spin > 2)
     s = np.roots([1, 0, spin**2 - 2, 0, 1])
     np.testing.assert_allclose(modes.frequencies, np.sort(s.imag)[2:], atol=2e-8)
@@ -158,13 +159,13 @@ def test_double_pendulums_and_their_derivatives():
     np.testing.assert_allclose(many(params), exact(params), rtol=1e-13)
     first, first_exact = (jax.vmap(jax.jacrev(f))(params) for f in (double_frequencies, closed_form))
     np.testing.assert_allclose(first, first_exact, atol=1e-12)
-    over = lagjax.normal_modes(DOUBLE, jnp.array([np.pi, 0.0]), EQUAL)
+    over = lagjax.normal_modes(DOUBLE, np.array([np.pi, 0.0]), EQUAL)
     assert not over.stable and "grows" in str(over) and over.frequencies[0] == 0
 
 
 @pytest.mark.slow
 def test_design_for_a_frequency_by_gradient_descent():
-    wanted = jnp.array([2.0, 7.0])
+    wanted = np.array([2.0, 7.0])
 
     @jax.jit
     def down(logs, _):
@@ -172,8 +173,8 @@ def test_design_for_a_frequency_by_gradient_descent():
         value, slope = jax.value_and_grad(miss)(logs)
         return logs - 0.3 * slope, value
 
-    logs, _ = jax.lax.scan(down, jnp.zeros(2), length=2000)
-    designed = jnp.array([1.0, *jnp.exp(logs), 1.0, G])
+    logs, _ = jax.lax.scan(down, np.zeros(2), length=2000)
+    designed = np.array([1.0, *np.exp(logs), 1.0, G])
     np.testing.assert_allclose(closed_form(designed), wanted, rtol=1e-6)
 
 
@@ -182,7 +183,7 @@ def test_design_for_a_frequency_by_gradient_descent():
 def test_hanging_chain_of_beads(n):
     """ω² are the zeros of Laguerre's polynomial of degree n, in units of g/l."""
     zeros = np.sort(roots_laguerre(n)[0])
-    modes = lagjax.normal_modes(CHAIN, jnp.zeros(n), 1.0)
+    modes = lagjax.normal_modes(CHAIN, np.zeros(n), 1.0)
     np.testing.assert_allclose(modes.frequencies**2, zeros, rtol=1e-12)
     if n == 10:
         lowest = jax.grad(lambda g: lagjax.normal_modes(CHAIN, jnp.zeros(n), g).frequencies[0])(1.0)
@@ -195,17 +196,17 @@ def test_equal_frequencies_have_derivatives():
         lambda q, v, params: 0.5 * v @ v - 0.5 * q @ jnp.array([[params[0], params[2]], [params[2], params[1]]]) @ q
     )
     total = lambda params: lagjax.normal_modes(plane, jnp.zeros(2), params).frequencies.sum()
-    both = jnp.array([2.0, 2.0, 0.0])
+    both = np.array([2.0, 2.0, 0.0])
     np.testing.assert_allclose(jax.grad(total)(both), np.array([1, 1, 0]) / np.sqrt(8), atol=1e-14)
     squares = lambda params: jnp.sum(lagjax.normal_modes(plane, jnp.zeros(2), params).frequencies ** 2)
-    np.testing.assert_allclose(jax.hessian(squares)(jnp.array([2.0, 2.0, 0.0])), np.zeros((3, 3)), atol=1e-13)
+    np.testing.assert_allclose(jax.hessian(squares)(np.array([2.0, 2.0, 0.0])), np.zeros((3, 3)), atol=1e-13)
 
 
 @pytest.mark.slow
 def test_gyroscopic_and_damped_modes():
     field = lagjax.System(lambda q, v: 0.5 * v @ v + q[0] * v[1] - q[1] * v[0] - 0.5 * q @ q)
     np.testing.assert_allclose(
-        lagjax.normal_modes(field, jnp.zeros(2)).frequencies, np.sqrt(2) + np.array([-1, 1]), rtol=1e-13
+        lagjax.normal_modes(field, np.zeros(2)).frequencies, np.sqrt(2) + np.array([-1, 1]), rtol=1e-13
     )
     damped = lagjax.System(lagrangians.oscillators, dissipation=lambda q, v, params: 0.5 * params * v @ v)
 
@@ -228,7 +229,7 @@ def test_modes_on_constraints():
     np.testing.assert_allclose(frequency(G), np.sqrt(G), rtol=1e-13)
     np.testing.assert_allclose(jax.grad(frequency)(G), 0.5 / np.sqrt(G), rtol=1e-12)
     twice = lagjax.System(ROD.lagrangian.code.function, constraints=lambda q: [q @ q - 1.0, 2 * (q @ q) - 2.0])
-    np.testing.assert_allclose(lagjax.normal_modes(twice, jnp.array([0.0, -1.0]), G).frequencies, [np.sqrt(G)])
+    np.testing.assert_allclose(lagjax.normal_modes(twice, np.array([0.0, -1.0]), G).frequencies, [np.sqrt(G)])
 
 
 @pytest.mark.slow
@@ -244,8 +245,8 @@ def test_zero_modes_of_cyclic_coordinates():
 def test_what_has_no_modes_is_said():
     sliding = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 - 0.5 * q @ q)
     with pytest.raises(ValueError, match="mass matrix is singular or not positive definite"):
-        lagjax.normal_modes(sliding, jnp.zeros(2))
-    down, twice = jnp.array([0.0, -1.0]), lambda q: [q @ q - 1.0, 2 * (q @ q) - 2.0]
+        lagjax.normal_modes(sliding, np.zeros(2))
+    down, twice = np.array([0.0, -1.0]), lambda q: [q @ q - 1.0, 2 * (q @ q) - 2.0]
     redundant = lagjax.System(lagrangians.weight_g, constraints=twice)
     with pytest.raises(ValueError, match="Drop the redundant ones"):
         jax.jit(lambda g: lagjax.normal_modes(redundant, down, g).frequencies)(G)
@@ -258,7 +259,7 @@ def test_a_molecule_has_three_zero_modes_in_the_plane():
         stretched = [jnp.sqrt(jnp.sum((q[i] - q[j]) ** 2)) - r for i, j, r in ((0, 1, 1.0), (0, 2, 1.0), (1, 2, 1.5))]
         return 0.5 * jnp.sum(masses[:, None] * v**2) - 0.5 * params * sum(x**2 for x in stretched)
 
-    system, guess = lagjax.System(molecule), jnp.array([[0.0, 0.0], [0.8, 0.7], [-0.8, 0.6]])
+    system, guess = lagjax.System(molecule), np.array([[0.0, 0.0], [0.8, 0.7], [-0.8, 0.6]])
 
     def frequencies(stiffness):
         return lagjax.normal_modes(system, lagjax.equilibrium(system, guess, stiffness).q, stiffness).frequencies
@@ -276,7 +277,7 @@ def test_linearization():
     def rate(y):
         return jnp.concatenate([y[2:], DOUBLE.acceleration(y[:2], y[2:], params=EQUAL)])
 
-    np.testing.assert_allclose(linear.A, jax.jacfwd(rate)(jnp.concatenate([q, v])), atol=1e-13)
+    np.testing.assert_allclose(linear.A, jax.jacfwd(rate)(np.concatenate([q, v])), atol=1e-13)
     np.testing.assert_allclose(linear.B[2:] @ linear.mass_matrix, np.eye(2), atol=1e-14)
     lower = np.linalg.solve(linear.mass_matrix, -linear.stiffness)
     np.testing.assert_allclose(linear.A[2:, :2], lower, atol=1e-13)
@@ -298,19 +299,19 @@ def test_sympy_agrees():
     mass = sympy.Matrix([[2, sympy.Rational(7, 10)], [sympy.Rational(7, 10), sympy.Rational(49, 100)]])
     stiffness = sympy.hessian(height, (a, b)).subs({a: 0, b: 0})
     squares = sorted(complex(x).real for x in sympy.roots((stiffness - sympy.Symbol("w") * mass).det()))
-    found = double_frequencies(jnp.array([1.0, 1.0, 1.0, 0.7, 1.0]))
+    found = double_frequencies(np.array([1.0, 1.0, 1.0, 0.7, 1.0]))
     np.testing.assert_allclose(found**2, squares, rtol=1e-13)
 
 
 @pytest.mark.slow
 def test_more_coordinates_in_one_array_than_are_unfolded():
     """Scenes of more than 256 coordinates in one array had no equations: an IndexError."""
-    derivation = derivation_of(CHAIN, Layout.from_state(jnp.zeros(300), jnp.zeros(300)), np.ones(()))
+    derivation = derivation_of(CHAIN, Layout.from_state(np.zeros(300), np.zeros(300)), np.ones(()))
     assert derivation.shape("mass_matrix") == (300, 300)
 
 
 def test_a_structure_that_the_lagrangian_does_not_read():
-    pendulum = lagjax.System(lagrangians.pendulum)
+    pendulum = PENDULUM
     with pytest.raises(TypeError, match=r"lagrangian was called with q\['th'\] of shape \(\)"):
         lagjax.equilibrium(pendulum, {"th": 1.0})
 
@@ -363,15 +364,15 @@ def test_borders_that_linearization_does_not_mind(force, frequency):
 
 
 def test_a_pendulum_comes_to_rest_below():
-    pendulum = lagjax.System(lagrangians.pendulum_g)
+    pendulum = PENDULUM_G
     np.testing.assert_allclose(lagjax.equilibrium(pendulum, np.pi, 9.81).q, np.pi)  # where it is, upright
-    np.testing.assert_allclose(jnp.cos(lagjax.equilibrium(pendulum, np.pi, 9.81, stable=True).q), 1.0)
+    np.testing.assert_allclose(np.cos(lagjax.equilibrium(pendulum, np.pi, 9.81, stable=True).q), 1.0)
     with pytest.raises(ValueError, match="leave qdot out"):
         lagjax.equilibrium(pendulum, 0.1, 9.81, qdot=0.0, stable=True)
     with pytest.raises(ValueError, match="cannot be traced"):
         jax.jit(lambda q: lagjax.equilibrium(pendulum, q, 9.81, stable=True).q)(0.1)
     with pytest.raises(ValueError, match="not come to rest"):
-        lagjax.equilibrium(lagjax.System(lagrangians.ramp), 0.3, stable=True)
+        lagjax.equilibrium(RAMP, 0.3, stable=True)
 
 
 @pytest.mark.slow

@@ -77,7 +77,7 @@ def crank_alone(mu, end):
 @pytest.mark.slow
 def test_a_slip_that_gaps_hold_turns():
     rod, turns, _ = rod_of(START, SPEED)
-    start, ts = (jnp.array([START, rod]), jnp.array([SPEED, turns])), jnp.array([0.0, 3.0])
+    start, ts = (np.array([START, rod]), np.array([SPEED, turns])), np.array([0.0, 3.0])
 
     def run(mu):
         return lagjax.simulate(CRANKED, *start, ts, mu, rtol=1e-12)
@@ -119,7 +119,7 @@ def test_friction_is_against_the_slip_behind_an_impact():
     )  # fmt: skip
     q0, v0, factors, ts = np.array([0.0, 0.0, 0.05]), rng.normal(size=(60, 3)), rng.normal(size=(60, 3, 3)), [0.0, 0.05]
     v0[:, 2] = -abs(v0[:, 2])
-    starts = np.broadcast_to(q0, v0.shape), v0, jnp.array(ts), factors
+    starts = np.broadcast_to(q0, v0.shape), v0, np.array(ts), factors
     runs = lagjax.simulate_batch(coupled, *starts, batch_axes=(0, 0, 0), max_transitions=4)
     masses = factors.transpose(0, 2, 1) @ factors + 0.1 * np.eye(3)
     before, behind = runs.contact_changes.qdot[:, 0], runs.contact_changes.qdot_next[:, 0]
@@ -166,7 +166,7 @@ def test_a_start_at_rest_that_slides_at_once_has_no_derivative_by_its_slip():
         lambda q, v, params: 0.5 * v @ v - G * (jnp.cos(params) * q[1] + jnp.sin(params) * q[0]),
         contacts=lambda q: q[1], slip=lambda q, v: v[0], friction=0.3,
     )  # fmt: skip
-    rest = jnp.zeros(2)
+    rest = np.zeros(2)
 
     def run(v, tilt):
         return lagjax.simulate(block, rest, v, jnp.array([0.0, 2.0]), tilt)
@@ -218,9 +218,9 @@ def test_a_block_that_friction_barely_holds_rocks_to_rest():
     )  # fmt: skip
     for a, b in [(0.5, 0.5), (0.5, 0.4297574176026187), (0.5, 0.4708918362156634), (0.5, 0.40696801), (0.5, 0.37)]:
         squares = a**2 + b**2
-        params = {"sides": jnp.array([a, b]), "mu": a * b / (4 / 3 * squares - a**2)}
+        params = {"sides": np.array([a, b]), "mu": a * b / (4 / 3 * squares - a**2)}
         rate, part = 0.2, 1 - 1.5 * a**2 / squares
-        run = lagjax.simulate(system, [0.0, b, 0.0], [-b * rate, a * rate, rate], jnp.array([0.0, 1.0]), params)
+        run = lagjax.simulate(system, [0.0, b, 0.0], [-b * rate, a * rate, rate], np.array([0.0, 1.0]), params)
         expected = sum(time_of_rocking(rate * abs(part) ** k, a, b) for k in range(40) if abs(part) ** k > 1e-14)
         changes = run.contact_changes
         closes = np.asarray(changes.t)[np.asarray(changes.change) == 0]
@@ -241,7 +241,7 @@ def test_a_particle_slides_up_a_drum_while_another_coordinate_stops():
         friction=mu,
         slip=lambda q, v: (q[0] * v[1] - q[1] * v[0]) / jnp.hypot(q[0], q[1]),
     )
-    run = lagjax.simulate(drum, jnp.array([0.0, -1.0, 0.0]), jnp.array([speed, 0.0, 0.2]), jnp.linspace(0.0, 0.35, 8))
+    run = lagjax.simulate(drum, np.array([0.0, -1.0, 0.0]), np.array([speed, 0.0, 0.2]), np.linspace(0.0, 0.35, 8))
     angle = np.arctan2(run.q[:, 0], -run.q[:, 1])
     b = -6 * mu * G / (1 + 4 * mu**2)
     a = 2 * G + 2 * mu * b

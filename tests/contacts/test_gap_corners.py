@@ -43,13 +43,13 @@ def test_a_ball_between_walls_bounces_at_both(name):
     one = lambda x: end_of(WALLS[name], 0.9, *x)
     alone, expected, wanted = jax.jit(one), *two_walls_apart()
     for x in ([0.0, 1.0], [0.2, -1.0]):
-        (state, count), (right, number) = alone(jnp.array(x)), expected(jnp.array([x]))
+        (state, count), (right, number) = alone(np.array(x)), expected(np.array([x]))
         assert count == number[0] >= 2
         np.testing.assert_allclose(state, right[0], rtol=0, atol=1e-13)
-    x = jnp.array([0.0, 1.0])
+    x = np.array([0.0, 1.0])
     for mode in (jax.jacfwd, jax.jacrev):
         np.testing.assert_allclose(jax.jit(mode(lambda x: one(x)[0]))(x), wanted(x), rtol=0, atol=1e-12)
-    states = jnp.array([[0.0, 1.0], [0.0, -2.0], [-0.5, 0.3]])
+    states = np.array([[0.0, 1.0], [0.0, -2.0], [-0.5, 0.3]])
     np.testing.assert_allclose(jax.jit(jax.vmap(one))(states)[0], expected(states)[0], rtol=0, atol=1e-13)
 
 
@@ -95,7 +95,7 @@ def with_slopes(mode, function):
 
 def test_a_block_that_slides_into_a_slope_strikes_it():
     """As with the slope for a contact of its own; it comes back, and strikes the floor."""
-    x = jnp.array([-1.0, 0.0, 0.5, 0.0])
+    x = np.array([-1.0, 0.0, 0.5, 0.0])
 
     def rising(q, params):
         return q["y"] - params["slope"] * jnp.maximum(q["x"], 0.0)
@@ -125,7 +125,7 @@ EDGES = {
 
 @pytest.mark.parametrize("name", sweep(EDGES, kept=["steep"]))
 def test_a_block_slides_off_the_edge_of_a_table(name):
-    x = jnp.array([-1.0, 0.0, 0.5, 0.0])
+    x = np.array([-1.0, 0.0, 0.5, 0.0])
     fall = 1.3
     state, slopes = with_slopes(jax.jacrev, lambda x: slide(EDGES[name], x, 2.0 + fall))(x)
     np.testing.assert_allclose(state, [0.65, -G * fall**2 / 2, 0.5, -G * fall], rtol=0, atol=1e-11)
@@ -138,7 +138,7 @@ def test_a_step_in_time_strikes_what_rests_on_it():
     system = lagjax.System(
         lambda q, v: 0.5 * v**2 - G * q, contacts=lambda q, t: q - 2.0 * jnp.maximum(t - 1.0, 0.0), restitution=1.0
     )
-    run = lagjax.simulate(system, 0.0, 0.0, jnp.array([0.0, 1.0, 1.2]))
+    run = lagjax.simulate(system, 0.0, 0.0, np.array([0.0, 1.0, 1.2]))
     np.testing.assert_allclose(run.q, [0.0, 0.0, 4 * 0.2 - G * 0.2**2 / 2], rtol=0, atol=1e-12)
 
 
@@ -148,7 +148,7 @@ def test_a_belt_that_ends_lets_slip_what_sticks_to_it():
         planar, contacts=lambda q: q["y"], friction=0.2,
         slip=lambda q, v, t: v["x"] - jnp.where(t > 1.0, 3.0, 0.0),
     )  # fmt: skip
-    run = lagjax.simulate(system, {"x": 0.0, "y": 0.0}, {"x": 0.0, "y": 0.0}, jnp.array([0.0, 1.0, 2.0]))
+    run = lagjax.simulate(system, {"x": 0.0, "y": 0.0}, {"x": 0.0, "y": 0.0}, np.array([0.0, 1.0, 2.0]))
     np.testing.assert_allclose(run.qdot["x"], [0.0, 0.0, 0.2 * G], rtol=0, atol=1e-11)
 
 
@@ -163,7 +163,7 @@ def test_a_belt_that_ends_lets_slip_what_sticks_to_it():
 def test_what_is_struck_or_rests_on_a_corner_is_named(gap, x):
     system = lagjax.System(planar, contacts=gap, restitution=0.5)
     q, v = {"x": x[0], "y": x[1]}, {"x": x[2], "y": x[3]}
-    ts = jnp.array([0.0, 1.5])
+    ts = np.array([0.0, 1.5])
     assert lagjax.simulate(system, q, v, ts, throw=False).result == lagjax.RESULTS.contact_at_corner
     with pytest.raises(lagjax.SimulationError, match=r"corner or a jump of its gap.*a gap of its own"):
         lagjax.simulate(system, q, v, ts)
@@ -174,7 +174,7 @@ def test_a_gap_that_is_zero_at_its_corner_is_refused(gap):
     """It would be passed, or struck, as rounding has it."""
     system = lagjax.System(lambda q, v: 0.5 * v**2, contacts=lambda q: {"wall": gap(q)}, restitution=1.0)
     with pytest.raises(ValueError, match=r"contacts\['wall'\] is zero where two of its pieces meet.*a gap of its own"):
-        lagjax.simulate(system, 0.3, 1.0, jnp.array([0.0, 1.0]))
+        lagjax.simulate(system, 0.3, 1.0, np.array([0.0, 1.0]))
 
 
 def test_a_potential_step_beside_a_contact():
@@ -182,7 +182,7 @@ def test_a_potential_step_beside_a_contact():
     system = lagjax.System(
         lambda q, v: 0.5 * v**2 - jnp.where(q > 0, 0.1, 0.0), contacts=lambda q: 1 - q, restitution=1.0
     )
-    run = lagjax.simulate(system, -0.5, 1.0, jnp.array([0.0, 1.0, 3.0]))
+    run = lagjax.simulate(system, -0.5, 1.0, np.array([0.0, 1.0, 3.0]))
     slow = np.sqrt(0.8)
     np.testing.assert_allclose(run.q[1], 0.5 * slow, rtol=0, atol=1e-13)
     np.testing.assert_allclose(run.qdot[2], -1.0, rtol=0, atol=1e-13)
@@ -197,7 +197,7 @@ def test_a_table_beside_a_contact_has_derivatives_by_its_entries():
         )  # fmt: skip
         return lagjax.simulate(system, 0.2, 1.0, jnp.array([0.0, 2.0]), entries).q[-1]
 
-    entries, moved = jnp.array([0.1, 0.0, 1.0]), 1e-6 * jnp.eye(3)
+    entries, moved = np.array([0.1, 0.0, 1.0]), 1e-6 * np.eye(3)
     above, below = (jax.jit(jax.vmap(end))(entries + side * moved) for side in (1, -1))
     np.testing.assert_allclose(jax.jit(jax.grad(end))(entries), (above - below) / 2e-6, atol=1e-8)
 
@@ -243,15 +243,15 @@ def test_what_newcomers_write_is_named(options, kind, match):
     }  # fmt: skip
     with pytest.raises(kind, match=match):
         system = lagjax.System(planar, **given)
-        lagjax.simulate(system, {"x": 0.0, "y": 1.0}, {"x": 0.0, "y": 0.0}, jnp.array([0.0, 0.1]))
+        lagjax.simulate(system, {"x": 0.0, "y": 1.0}, {"x": 0.0, "y": 0.0}, np.array([0.0, 0.1]))
 
 
 @pytest.mark.slow
 def test_a_gap_is_infinite_while_it_is_off():
     """A stone over a floor that begins at x = 0, or at x = 0 ends: where it is on, off, and on too late."""
     gap = lambda q: {"floor": jnp.where(q[0] > 0, q[1], jnp.inf)}
-    stone, ts = lagjax.System(lambda q, v: 0.5 * v @ v - 2 * q[1], contacts=gap), jnp.array([0.0, 1.5, 3.0])
-    q0, v0 = jnp.array([[-1.0, 1.0], [1.5, 1.0], [-1.5, 1.0]]), jnp.array([[2.0, 0.0], [-1.0, 0.0], [1.0, 0.0]])
+    stone, ts = lagjax.System(lambda q, v: 0.5 * v @ v - 2 * q[1], contacts=gap), np.array([0.0, 1.5, 3.0])
+    q0, v0 = np.array([[-1.0, 1.0], [1.5, 1.0], [-1.5, 1.0]]), np.array([[2.0, 0.0], [-1.0, 0.0], [1.0, 0.0]])
     run = lagjax.simulate_batch(stone, q0, v0, ts)
     assert repr(run.result) == "lagjax.RESULTS<2 successful, 1 contact_at_corner>"
     # The first lands at t = 1 and rests; the second rests from t = 1 to 1.5 and falls on.
@@ -268,35 +268,35 @@ def over_edge(q, params):
     return jnp.where(x < 0, q[1], jnp.sqrt(jnp.where(x < 0, 1.0, x**2 + q[1] ** 2))) - EDGE
 
 
+ROLLING = lagjax.System(lambda q, v: 0.5 * v @ v - G * q[1], contacts=lambda q, params: {"table": over_edge(q, params)})
+
+
 @pytest.mark.parametrize("edge", [0.0, 0.3])
 def test_a_ball_rolls_over_an_edge_or_flies_off_it(edge):
     """The curvature of the gap jumps under the closed contact, and λ with it: at 0.3 from mg to mg cos θ − mv²/r, which
     ends where cos θ = (2 + v²/gr) / 3; at 1 and more below zero, where the ball flies on by itself."""
-    table = lagjax.System(
-        lambda q, v: 0.5 * v @ v - G * q[1], contacts=lambda q, params: {"table": over_edge(q, params)}
-    )
 
     def end(x, duration, rtol):
         speed, edge, begin = x
         start = jnp.stack([begin, EDGE]), jnp.stack([speed, 0.0])
-        return lagjax.simulate(table, *start, jnp.stack([0.0, duration]), edge, rtol=rtol).q[-1]
+        return lagjax.simulate(ROLLING, *start, jnp.stack([0.0, duration]), edge, rtol=rtol).q[-1]
 
     def flight(x, duration):
         speed, edge, begin = x
         return jnp.stack([begin + speed * duration, EDGE - 0.5 * G * (duration - (edge - begin) / speed) ** 2])
 
-    for rtol in (1e-6, 1e-9, 1e-11, 1e-13):
+    for rtol in (1e-6, 1e-13):
         follow = jax.jit(lambda x, duration, rtol=rtol: end(x, duration, rtol))
         for speed in (1.0, 2.0, 10.0):
-            x, duration = jnp.array([speed, edge, edge - 0.06]), 0.09 / speed
+            x, duration = np.array([speed, edge, edge - 0.06]), 0.09 / speed
             np.testing.assert_allclose(follow(x, duration), flight(x, duration), rtol=0, atol=1e-13)
         slow = lagjax.simulate(
-            table, jnp.array([edge - 0.06, EDGE]), jnp.array([0.3, 0.0]), jnp.array([0.0, 0.8]), edge, rtol=rtol
+            ROLLING, np.array([edge - 0.06, EDGE]), np.array([0.3, 0.0]), np.array([0.0, 0.8]), edge, rtol=rtol
         )
         (leaves,) = np.flatnonzero(np.asarray(slow.contact_changes.change) == 1)
-        place = (slow.contact_changes.q[leaves] - jnp.array([edge, 0.0])) / EDGE
+        place = (slow.contact_changes.q[leaves] - np.array([edge, 0.0])) / EDGE
         assert place[1] == pytest.approx((2 + 0.09 / (G * EDGE)) / 3, abs=max(1e-13, 30 * rtol))
-    x, duration = jnp.array([1.0, edge, edge - 0.06]), 0.09
+    x, duration = np.array([1.0, edge, edge - 0.06]), 0.09
     for mode in (jax.jacfwd, jax.jacrev):
         slopes = jax.jit(mode(lambda x: end(x, duration, 1e-12)))(x)
         np.testing.assert_allclose(slopes, jax.jacfwd(flight)(x, duration), rtol=0, atol=1e-11)

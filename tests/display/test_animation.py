@@ -5,13 +5,13 @@ import jax.numpy as jnp
 import matplotlib
 import numpy as np
 import pytest
-from lagrangians import radial_fall
+from scenes import RADIAL_FALL
 
 import lagjax
 from lagjax._show import _animation, course_of
 
 SPRING = lagjax.System(lambda q, v, params: 0.5 * v["x"] ** 2 - 0.5 * params * q["x"] ** 2)
-TS = jnp.linspace(0.0, 6.0, 31)
+TS = np.linspace(0.0, 6.0, 31)
 
 
 def stick(q, t, params):
@@ -43,9 +43,9 @@ def test_speed_and_backward_motions():
 
 
 def test_members_of_a_batch_have_their_own_parameters():
-    rates = jnp.linspace(1.0, 2.0, 60)
-    start = {"x": jnp.ones(60)}
-    batch = lagjax.simulate_batch(SPRING, start, {"x": jnp.zeros(60)}, TS, rates, batch_axes=(0, 0, 0))
+    rates = np.linspace(1.0, 2.0, 60)
+    start = {"x": np.ones(60)}
+    batch = lagjax.simulate_batch(SPRING, start, {"x": np.zeros(60)}, TS, rates, batch_axes=(0, 0, 0))
     positions = batch.animate(stick).positions(np.array([0.0, 3.0]))
     assert len(positions["bob"]) == 50
     np.testing.assert_allclose(positions["bob"][:, 1, 0, 0], np.cos(3 * np.sqrt(rates[:50])), atol=1e-4)
@@ -53,13 +53,13 @@ def test_members_of_a_batch_have_their_own_parameters():
 
 
 def test_a_motion_that_fails_is_shown_as_far_as_it_came():
-    fall = lagjax.System(radial_fall)  # into the centre at π/√8
-    batch = lagjax.simulate_batch(fall, jnp.array([1.0, jnp.nan]), jnp.zeros(2), jnp.linspace(0.0, 2.0, 41))
+    fall = RADIAL_FALL  # into the centre at π/√8
+    batch = lagjax.simulate_batch(fall, np.array([1.0, np.nan]), np.zeros(2), np.linspace(0.0, 2.0, 41))
     film = batch.animate(lambda q: jnp.stack([q, 0 * q]))
     assert film.span == (0.0, pytest.approx(1.1))
     assert np.isfinite(film.positions(film.times())[""][0]).all()
     with pytest.raises(ValueError, match="nothing to show"):
-        lagjax.simulate_batch(fall, jnp.full(2, jnp.nan), jnp.zeros(2), TS).animate(lambda q: jnp.zeros(2))
+        lagjax.simulate_batch(fall, np.full(2, np.nan), np.zeros(2), TS).animate(lambda q: jnp.zeros(2))
 
 
 def test_files(run, tmp_path, monkeypatch):
@@ -116,7 +116,7 @@ def test_beyond_the_outputs_nothing_is_known(run):
 
 
 def test_points_in_a_list_and_by_a_whole_number():
-    params = {"k": jnp.array([1.0, 2.0]), "which": jnp.array(1)}
+    params = {"k": np.array([1.0, 2.0]), "which": np.array(1)}
     scene = lagjax.System(lambda q, v, params: 0.5 * v["x"] ** 2 - 0.5 * params["k"][0] * q["x"] ** 2)
     run = lagjax.simulate(scene, {"x": 1.0}, {"x": 0.0}, TS, params)
     film = run.animate(lambda q, params: [[0.0, 0.0], [q["x"], params["k"][params["which"]]]])

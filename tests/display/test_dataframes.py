@@ -6,16 +6,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from lagrangians import free_particle, ramp
+from scenes import FREE, RAMP
 
 import lagjax
 
 pytest.importorskip("pandas")
 pytest.importorskip("xarray")
 
-TS = jnp.linspace(0.0, 1.0, 5)
+TS = np.linspace(0.0, 1.0, 5)
 SCENE = lagjax.System(lambda q, v: 0.5 * v["x"] ** 2 + 0.5 * v["y"] @ v["y"] - 0.5 * q["x"] ** 2)
-START = {"x": 1.0, "y": jnp.array([1.0, 2.0])}, {"x": 0.0, "y": jnp.array([0.0, 1.0])}
+START = {"x": 1.0, "y": np.array([1.0, 2.0])}, {"x": 0.0, "y": np.array([0.0, 1.0])}
 UNITS = {"x": "rad", "y": None}
 
 
@@ -37,7 +37,7 @@ def test_columns_are_named_as_messages_name_them(run):
     np.testing.assert_array_equal(table["q['x']"], run.q["x"])
     np.testing.assert_array_equal(table["qdot['y'][1]"], run.qdot["y"][:, 1])
     assert table.attrs == {} and table.index.name == "t"
-    one = lagjax.simulate(lagjax.System(free_particle), 0.0, 1.0, TS).to_pandas()
+    one = lagjax.simulate(FREE, 0.0, 1.0, TS).to_pandas()
     assert list(one.columns) == ["q", "qdot"]
 
 
@@ -64,8 +64,8 @@ def test_units(run):
 
 
 def test_batches_of_batches_and_times_of_their_own():
-    free = lagjax.System(free_particle)
-    run = jax.vmap(lambda size: lagjax.simulate_batch(free, jnp.zeros(3), jnp.ones(3), TS * size))(jnp.arange(1.0, 3.0))
+    free = FREE
+    run = jax.vmap(lambda size: lagjax.simulate_batch(free, jnp.zeros(3), jnp.ones(3), TS * size))(np.arange(1.0, 3.0))
     table, arrays = run.to_pandas(), run.to_xarray()
     assert table.index.names == ["member_0", "member_1", "t"] and len(table) == 30
     np.testing.assert_allclose(table["q"], table.index.get_level_values("t"))
@@ -76,7 +76,7 @@ def test_batches_of_batches_and_times_of_their_own():
 @pytest.mark.slow
 def test_hybrid_motions_have_their_modes_by_name():
     bounce = lagjax.Transition("fall", "rest", guard=lambda q, v: q, direction=-1, reset=lambda q, v: (q, 0 * v))
-    modes = {"fall": lagjax.System(ramp), "rest": lagjax.System(free_particle)}
+    modes = {"fall": RAMP, "rest": FREE}
     run = lagjax.simulate(lagjax.Hybrid(modes, [bounce], "fall"), 0.25, 0.0, TS)
     assert list(run.to_pandas()["mode"]) == ["fall"] * 3 + ["rest"] * 2
 
@@ -145,7 +145,7 @@ def test_changes_say_what_vanished_and_which_guess_was_taken_back():
         (0.2, 0.7, "t = 1          contacts sticks: its slip is 0"),
         (0.7, 0.0, "t = 0          contacts slides: its friction left would fall below 0 at once"),
     ):
-        run = lagjax.simulate(block, jnp.zeros(2), jnp.array([speed, 0.0]), jnp.array([0.0, 2.0]), slope)
+        run = lagjax.simulate(block, np.zeros(2), np.array([speed, 0.0]), np.array([0.0, 2.0]), slope)
         assert [line.strip() for line in repr(run.contact_changes).splitlines()[1:]] == [
             "t = 0          contacts closes: its gap is 0", last
         ]  # fmt: skip

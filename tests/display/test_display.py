@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import BALL, FREE, PENDULUM
 
 import lagjax
 
@@ -18,7 +19,7 @@ def falling(q, qdot):
 
 
 FALL = lagjax.System(falling)
-TS = jnp.linspace(0.0, 2.0, 5)
+TS = np.linspace(0.0, 2.0, 5)
 
 
 def lines(thing):
@@ -33,7 +34,7 @@ def fallen():
 
 def test_one_motion():
     scene = lagjax.System(lambda q, v: 0.5 * v["x"] ** 2 + 0.5 * v["y"] @ v["y"] - 0.5 * q["x"] ** 2)
-    q0 = {"x": 1.0, "y": jnp.zeros(2)}
+    q0 = {"x": 1.0, "y": np.zeros(2)}
     run = lagjax.simulate(scene, q0, jax.tree.map(jnp.zeros_like, q0), TS)
     steps = int(run.stats["num_steps"])
     assert lines(run) == [
@@ -59,7 +60,7 @@ def test_a_batch(fallen):
 
 def test_a_hybrid_motion():
     bounce = lagjax.Transition("flight", "flight", guard=lambda q, v: q, direction=-1, reset=lambda q, v: (q, -0.5 * v))
-    ball = lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q)
+    ball = BALL
     run = lagjax.simulate(lagjax.Hybrid({"flight": ball}, [bounce], "flight"), 1.0, 0.0, TS, throw=False)
     first, second, third = lines(run)
     assert first.endswith("; modes flight") and second.endswith("32 transitions") and third.endswith(": zeno")
@@ -81,7 +82,7 @@ def test_what_has_no_numbers(fallen):
 
     traced = ["the steps are being traced", "the result is being traced"]
     assert lines(jax.eval_shape(run, 2.0))[2] == traced[1]
-    jax.vmap(run)(jnp.full(2, 9.0))
+    jax.vmap(run)(np.full(2, 9.0))
     for first, second, third in seen:
         assert first == "Trajectory, float64: q (5,), and qdot"
         assert [second.split("; ")[1], third] == traced
@@ -90,9 +91,7 @@ def test_what_has_no_numbers(fallen):
 
 
 def test_batches_of_batches_and_times_of_their_own():
-    run = jax.vmap(lambda size: lagjax.simulate_batch(FALL, jnp.full(3, 9.0), jnp.zeros(3), TS * size))(
-        jnp.arange(1, 3)
-    )
+    run = jax.vmap(lambda size: lagjax.simulate_batch(FALL, jnp.full(3, 9.0), jnp.zeros(3), TS * size))(np.arange(1, 3))
     first, second, third = lines(run)
     assert first.startswith("Trajectory of 2 × 3 members") and second.startswith("t from 0 to 2 … 4 at 5 outputs")
     assert third == "6 of 6 reached the end"
@@ -108,7 +107,7 @@ def test_a_notebook_shows_the_lines_and_a_picture(fallen):
     for run in (fallen, lagjax.simulate(FALL, 9.0, 0.0, TS)):
         shown = run._repr_html_()
         assert repr(run).splitlines()[0] in shown and "data:image/png;base64," in shown
-    assert "png" in jax.vmap(lambda z: lagjax.simulate(FALL, 9.0, 0.0, TS * z))(jnp.ones(2))._repr_html_()
+    assert "png" in jax.vmap(lambda z: lagjax.simulate(FALL, 9.0, 0.0, TS * z))(np.ones(2))._repr_html_()
 
 
 def test_names_that_are_html_are_shown_as_they_are():
@@ -124,8 +123,8 @@ def test_a_picture_of_a_large_batch_is_of_a_few_members(fallen, monkeypatch):
     monkeypatch.setattr(
         _notebook, "courses_of", lambda run, some: places.append(len(some)) or (course[0], course[1] * 30)
     )
-    wide = eqx.tree_at(lambda t: t.result._value, fallen, jnp.zeros(100_000, int))
-    wide = eqx.tree_at(lambda t: (t.q, t.end.t), wide, (jnp.zeros((100_000, 5)), jnp.zeros(100_000)))
+    wide = eqx.tree_at(lambda t: t.result._value, fallen, np.zeros(100_000, int))
+    wide = eqx.tree_at(lambda t: (t.q, t.end.t), wide, (np.zeros((100_000, 5)), np.zeros(100_000)))
     assert wide._repr_html_() is not None and places == [30]
 
 
@@ -146,7 +145,7 @@ def test_no_picture_where_there_is_nothing_to_draw(fallen, monkeypatch):
 def test_results_show_in_a_notebook_what_they_print():
     pretty = pytest.importorskip("IPython.lib.pretty").pretty
 
-    crossed = lagjax.crossings(lagjax.System(lambda q, v: 0.5 * v**2), lambda q, v: q, -1.0, 1.0, TS)
+    crossed = lagjax.crossings(FREE, lambda q, v: q, -1.0, 1.0, TS)
     findings = lagjax.check(FALL, 1.0, 0.0)
     modes = lagjax.normal_modes(lagjax.System(lambda q, v: 0.5 * v**2 - 2 * q**2), 0.0)
     for result in (crossed, findings, modes, FALL.explain(1.0, 0.0)):
@@ -161,14 +160,14 @@ def test_a_newcomer_sees_that_the_switch_for_doubles_is_off(fallen):
 
 
 def test_results_of_the_analysis_read_as_sentences():
-    pendulum = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.cos(q))
+    pendulum = PENDULUM
     same = lagjax.same_motion(pendulum, pendulum, 0.5, 0.1)
     assert str(same).startswith("The same motions: E_a = 1 E_b; ")
-    other = lagjax.same_motion(pendulum, lagjax.System(lambda q, v: 0.5 * v**2), 0.5, 0.1)
+    other = lagjax.same_motion(pendulum, FREE, 0.5, 0.1)
     assert str(other).startswith("Other motions: with the best factor") and "the equation of q at q" in str(other)
     assert repr(list(lagjax.conserved_quantities(pendulum, 0.5, 0.1))) == "[Conserved('energy')]"
     assert str(lagjax.equilibrium(pendulum, 0.1)) == "Equilibrium at q = 0"
-    found = lagjax.results.Equilibrium({"x": jnp.array([0.0, -1.0])}, {"rod": jnp.array(0.5)}, jnp.array(True))
+    found = lagjax.results.Equilibrium({"x": np.array([0.0, -1.0])}, {"rod": np.array(0.5)}, np.array(True))
     assert str(found) == "Equilibrium at q['x'][0] = 0, q['x'][1] = -1; multipliers['rod'] = 0.5"
     assert str(lagjax.linearize(pendulum, 0.0)) == "δq'' = -1 δq +1 u"
     assert str(lagjax.lyapunov_exponent(pendulum, 0.5, 0.0, 5.0)).startswith("Lyapunov exponent -0.0")
@@ -181,7 +180,7 @@ def test_results_of_the_analysis_read_as_sentences():
 def test_an_integer_of_params_and_an_unknown_dataclass_are_explained():
     counted = lagjax.System(lambda q, v, params: 0.5 * v**2 - sum(q**2 for _ in range(params["n"])))
     with pytest.raises(TypeError) as error:
-        lagjax.simulate(counted, 1.0, 0.0, jnp.array([0.0, 1.0]), {"n": 3})
+        lagjax.simulate(counted, 1.0, 0.0, np.array([0.0, 1.0]), {"n": 3})
     assert "let the function close over that integer" in str(error.value)
 
     @dataclasses.dataclass
@@ -189,7 +188,7 @@ def test_an_integer_of_params_and_an_unknown_dataclass_are_explained():
         x: float
 
     with pytest.raises(TypeError, match=r"call jax.tree_util.register_dataclass\(Place\) once"):
-        lagjax.simulate(lagjax.System(lambda q, v: 0.5 * v.x**2), Place(1.0), Place(0.0), jnp.array([0.0, 1.0]))
+        lagjax.simulate(lagjax.System(lambda q, v: 0.5 * v.x**2), Place(1.0), Place(0.0), np.array([0.0, 1.0]))
 
 
 def test_results_are_printed_by_name(fallen):

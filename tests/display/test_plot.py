@@ -3,6 +3,7 @@
 import sys
 
 import matplotlib
+from scenes import DAMPED_OSCILLATOR, OSCILLATOR, OSCILLATORS, RAMP
 
 matplotlib.use("agg")
 
@@ -13,25 +14,23 @@ import jax.numpy as jnp
 import matplotlib.pyplot as plt
 import numpy as np
 import pytest
-from lagrangians import oscillator
 from matplotlib.axes import Axes
 
 import lagjax
 import lagjax.plot
 
-SCENE = lagjax.System(lambda q, qdot: 0.5 * qdot @ qdot - 0.5 * q @ q)
-TS = jnp.linspace(0.0, 5.0, 41)
+TS = np.linspace(0.0, 5.0, 41)
 
 
 @pytest.fixture(scope="module")
 def single():
-    return lagjax.simulate(SCENE, jnp.array([1.0, 0.0]), jnp.array([0.0, 0.5]), TS)
+    return lagjax.simulate(OSCILLATORS, jnp.array([1.0, 0.0]), jnp.array([0.0, 0.5]), TS)
 
 
 @pytest.fixture(scope="module")
 def batch():
     q0 = jnp.linspace(0.5, 1.0, 80).reshape(40, 2).at[7].set(jnp.nan)
-    return lagjax.simulate_batch(SCENE, q0, jnp.zeros((40, 2)), TS)
+    return lagjax.simulate_batch(OSCILLATORS, q0, jnp.zeros((40, 2)), TS)
 
 
 @pytest.fixture(autouse=True)
@@ -73,7 +72,7 @@ def test_path(single):
     np.testing.assert_array_equal(line.get_xydata(), single.q)
 
 
-SPEEDS, FALL = jnp.linspace(0.1, 1.3, 20), jnp.linspace(0.0, 2.2, 12)
+SPEEDS, FALL = np.linspace(0.1, 1.3, 20), np.linspace(0.0, 2.2, 12)
 
 
 @pytest.fixture(scope="module")
@@ -142,14 +141,14 @@ def test_films_of_bounces(balls):
 def test_energy_that_is_lost_by_design_is_no_error(balls):
     labels = [lagjax.plot.energy_error(balls(restitution)).get_ylabel() for restitution in (1.0, 0.5)]
     assert labels == ["relative error of the energy", "relative change of the energy"]
-    rubbing = lagjax.System(oscillator, dissipation=lambda q, v: 0.1 * v**2)
+    rubbing = DAMPED_OSCILLATOR
     ax = lagjax.plot.energy_error(lagjax.simulate(rubbing, 1.0, 0.0, TS))
     assert ax.get_ylabel() == "relative change of the energy"
 
 
 def test_a_curve_ends_at_its_event():
-    fall = lagjax.System(lambda q, v: 0.5 * v**2 - q)
-    run = lagjax.simulate(fall, 0.5, 0.0, jnp.linspace(0.0, 3.0, 4) * 0.7, event=lambda q, v: q)
+    fall = RAMP
+    run = lagjax.simulate(fall, 0.5, 0.0, np.linspace(0.0, 3.0, 4) * 0.7, event=lambda q, v: q)
     (line,) = lagjax.plot.trajectory(run).lines
     t, q = line.get_data()
     np.testing.assert_allclose(q, np.where(t <= 1 + 1e-12, 0.5 * (1 - t**2), np.nan), atol=1e-9)
@@ -173,26 +172,26 @@ def test_energy_error(single, batch):
 
 
 def test_energy_error_needs_a_scale_and_a_member():
-    at_rest = lagjax.simulate(SCENE, jnp.zeros(2), jnp.zeros(2), TS)
+    at_rest = lagjax.simulate(OSCILLATORS, np.zeros(2), np.zeros(2), TS)
     with pytest.raises(ValueError, match="scale="):
         lagjax.plot.energy_error(at_rest)
-    failed = lagjax.simulate_batch(SCENE, jnp.full((2, 2), jnp.nan), jnp.zeros((2, 2)), TS)
+    failed = lagjax.simulate_batch(OSCILLATORS, np.full((2, 2), np.nan), np.zeros((2, 2)), TS)
     with pytest.raises(ValueError, match="None of the members"):
         lagjax.plot.energy_error(failed)
 
 
 @pytest.mark.slow
 def test_energy_of_members_that_an_event_ends():
-    q0 = jnp.array([[1.0, 0.0], [0.9, 0.1]])
-    ended = lagjax.simulate_batch(SCENE, q0, jnp.zeros((2, 2)), TS, event=lambda q, qdot: q[0] < 0.5)
+    q0 = np.array([[1.0, 0.0], [0.9, 0.1]])
+    ended = lagjax.simulate_batch(OSCILLATORS, q0, np.zeros((2, 2)), TS, event=lambda q, qdot: q[0] < 0.5)
     assert ended.ok.all()
     assert lagjax.plot.energy_error(ended).lines[0].get_xdata().max() < 2.0
 
 
 @pytest.mark.slow
 def test_work_precision():
-    start, solvers = (jnp.array([1.0, 0.0]), jnp.array([0.0, 0.5])), {"default": None, "fifth order": diffrax.Tsit5()}
-    result = lagjax.work_precision(SCENE, *start, TS, solvers=solvers, tolerances=[1e-5, 1e-8], repeats=1)
+    start, solvers = (np.array([1.0, 0.0]), np.array([0.0, 0.5])), {"default": None, "fifth order": diffrax.Tsit5()}
+    result = lagjax.work_precision(OSCILLATORS, *start, TS, solvers=solvers, tolerances=[1e-5, 1e-8], repeats=1)
     ax = lagjax.plot.work_precision(result)
     assert [line.get_label() for line in ax.lines] == list(solvers)
     np.testing.assert_array_equal(ax.lines[0].get_xdata(), [row.error for row in result.rows[:2]])
@@ -263,7 +262,7 @@ def test_motions_and_data_are_compared(single, batch):
 
 def test_shapes_of_modes():
     scene = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q @ q - 0.5 * (q[0] - q[1]) ** 2)
-    modes = lagjax.normal_modes(scene, jnp.zeros(2))  # 1, in step, and √3, against each other
+    modes = lagjax.normal_modes(scene, np.zeros(2))  # 1, in step, and √3, against each other
     axes = lagjax.plot.modes(modes)
     assert [ax.get_title() for ax in axes] == ["ω = 1", "ω = 1.732"]
     heights = [[bar.get_height() for bar in ax.patches] for ax in axes]
@@ -273,7 +272,7 @@ def test_shapes_of_modes():
     def points(q):
         return jnp.stack([jnp.arange(2.0) + q, jnp.zeros(2)], axis=1)
 
-    axes = lagjax.plot.modes(modes, points, jnp.zeros(2), largest=0.2, count=1)
+    axes = lagjax.plot.modes(modes, points, np.zeros(2), largest=0.2, count=1)
     moved = [line.get_xdata() for line in axes[0].lines]
     np.testing.assert_allclose(moved[0], [0, 1])
     np.testing.assert_allclose(np.abs(moved[2] - moved[0]), 0.2, atol=1e-12)
@@ -283,8 +282,8 @@ def test_shapes_of_modes():
 
 @pytest.mark.slow
 def test_members_are_drawn_at_times_of_their_own():
-    spring = lagjax.System(oscillator)
-    ends, ts = jnp.arange(1.0, 4.0), jnp.linspace(0.0, 1.0, 9)
+    spring = OSCILLATOR
+    ends, ts = np.arange(1.0, 4.0), np.linspace(0.0, 1.0, 9)
     runs = jax.vmap(lambda end: lagjax.simulate(spring, 1.0, 0.0, end * ts))(ends)
     ax = lagjax.plot.trajectory(runs)
     for line, times in zip(ax.lines, runs.ts, strict=True):
@@ -299,7 +298,7 @@ def test_members_are_drawn_at_times_of_their_own():
 @pytest.mark.slow
 def test_modes_tell_what_grows_and_are_drawn_at_their_largest():
     saddle = lagjax.System(lambda q, v: 0.5 * v @ v + 0.5 * q[0] ** 2 - 2 * q[1] ** 2)
-    modes = lagjax.normal_modes(saddle, jnp.zeros(2))
+    modes = lagjax.normal_modes(saddle, np.zeros(2))
     titles = [ax.get_title() for ax in lagjax.plot.modes(modes)]
     assert titles == ["grows as exp(1 t)", "ω = 2"]
     # The phase of a complex shape is anybody's choice: i times a shape is the shape.
@@ -307,14 +306,14 @@ def test_modes_tell_what_grows_and_are_drawn_at_their_largest():
     for one, other in zip(lagjax.plot.modes(modes), lagjax.plot.modes(turned), strict=True):
         heights = [[bar.get_height() for bar in ax.patches] for ax in (one, other)]
         np.testing.assert_allclose(np.abs(heights[1]), np.abs(heights[0]), atol=1e-12)
-    rubbing = lagjax.System(oscillator, dissipation=lambda q, v: 0.1 * v**2)
+    rubbing = DAMPED_OSCILLATOR
     assert lagjax.plot.modes(lagjax.normal_modes(rubbing, 0.0))[0].get_title() == "ω = 0.995, ζ = 0.1"
 
 
 @pytest.mark.parametrize(
     ("draw", "said"),
     [
-        (lambda run: lagjax.plot.trajectory(SCENE), "must be what lagjax.simulate returns; got System"),
+        (lambda run: lagjax.plot.trajectory(OSCILLATORS), "must be what lagjax.simulate returns; got System"),
         (lambda run: lagjax.plot.phase(run, members=0), "members must be a whole number, one at least; got 0"),
         (lambda run: lagjax.plot.compare((run.ts, run.q), run), "one must be what lagjax.simulate returns; got tuple"),
         (lambda run: lagjax.plot.trajectory(run, lambda q, v: q[0]), "two numbers, .* for one state; got shapes"),

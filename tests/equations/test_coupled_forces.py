@@ -24,7 +24,7 @@ def rub(q, v, params, multipliers):
 
 
 BEAD = lagjax.System(gravity, forces=rub, constraints=lambda q: q @ q - 1.0)
-BOTTOM = jnp.array([0.0, -1.0])
+BOTTOM = np.array([0.0, -1.0])
 
 
 def follow_bead(friction, speed, duration, **options):
@@ -66,7 +66,7 @@ def test_bead_on_hoop_stops_where_the_closed_form_does_and_rests(friction, speed
     assert float(angle_of(run)) == pytest.approx(
         (angle_of_rest(friction, speed) + np.pi) % (2 * np.pi) - np.pi, abs=2e-11
     )
-    assert jnp.abs(run.qdot[-1]).max() < 1e-28
+    assert np.abs(run.qdot[-1]).max() < 1e-28
     # As exactly as the constraint brings it back.
     np.testing.assert_allclose(run.q[-1], run.q[-2], atol=1e-15)
 
@@ -84,7 +84,7 @@ def test_bead_has_first_and_second_derivatives_by_its_friction():
     assert float(jax.jvp(angle, (0.3,), (1.0,))[1]) == pytest.approx(slope, rel=1e-9)
     assert float(jax.hessian(angle)(0.3)) == pytest.approx(bend, rel=1e-5)  # of the differences: eps / step²
     assert float(jax.jit(angle)(0.3)) == float(angle(0.3))
-    frictions = jnp.array([0.1, 0.3])
+    frictions = np.array([0.1, 0.3])
     np.testing.assert_allclose(jax.vmap(angle)(frictions), [angle(x) for x in frictions], atol=1e-14)
 
 
@@ -233,8 +233,8 @@ def test_pendulum_with_a_bearing_that_rubs(size, motion):
     *numbers, phi, rate, duration = MOTIONS[motion]
     exact = ExactPendulum(size, *numbers)
     end = exact.follow(phi, rate, duration)
-    ts = jnp.array([0.0, duration])
-    run = lagjax.simulate(RUBBING[size], *state_of(phi, rate), ts, jnp.array(numbers), rtol=1e-13)
+    ts = np.array([0.0, duration])
+    run = lagjax.simulate(RUBBING[size], *state_of(phi, rate), ts, np.array(numbers), rtol=1e-13)
     assert (len(exact.changes) > 10) == (motion in ("sticks and slips", "is shaken"))
     np.testing.assert_allclose([run.q["phi"][-1], run.qdot["phi"][-1]], end, atol=1e-11, rtol=0)
 
@@ -252,12 +252,12 @@ def end_when_shaken_hard(numbers, rtol):
 def test_a_step_that_is_taken_once_more_begins_where_it_began():
     exact = ExactPendulum(length, *SHAKEN_HARD).follow(-0.9, 0.0, 0.17)
     for rtol in (1e-9, 1e-10, 1e-13):
-        np.testing.assert_allclose(end_when_shaken_hard(jnp.array(SHAKEN_HARD), rtol), exact, rtol=10 * rtol + 1e-11)
+        np.testing.assert_allclose(end_when_shaken_hard(np.array(SHAKEN_HARD), rtol), exact, rtol=10 * rtol + 1e-11)
 
 
 @pytest.mark.slow
 def test_derivatives_pass_steps_that_are_taken_once_more():
-    at, along, step = jnp.array(SHAKEN_HARD), jnp.array([1.0, 0.0, 0.0]), 1e-4
+    at, along, step = np.array(SHAKEN_HARD), np.array([1.0, 0.0, 0.0]), 1e-4
     ends = [end_when_shaken_hard(at + k * step * along, 1e-13) for k in (-2, -1, 0, 1, 2)]
     slopes = np.dot([1, -8, 0, 8, -1], ends) / (12 * step)
     forward = jax.jvp(lambda x: end_when_shaken_hard(x, 1e-12), (at,), (along,))[1]
@@ -290,7 +290,7 @@ def test_bearing_that_sticks_and_slips_has_derivatives(size):
             -1
         ]
 
-    at, step = jnp.array([2.0, 6.0]), 1e-4
+    at, step = np.array([2.0, 6.0]), 1e-4
     slopes = [
         np.dot([1, -8, 0, 8, -1], [
             ExactPendulum(size, *(np.array(at) + k * step * along), 3.0).follow(0.0, 0.0, 4.0)[0]
@@ -301,11 +301,11 @@ def test_bearing_that_sticks_and_slips_has_derivatives(size):
     np.testing.assert_allclose(jax.jacfwd(end)(at), slopes, rtol=1e-8)
     bends = [
         np.dot([1, -8, 0, 8, -1], [jax.grad(end)(at + k * step * along) for k in (-2, -1, 0, 1, 2)]) / (12 * step)
-        for along in jnp.eye(2)
+        for along in np.eye(2)
     ]
     np.testing.assert_allclose(jax.hessian(end)(at), bends, rtol=1e-6)
     assert float(jax.jit(end)(at)) == float(end(at))
-    several = jnp.stack([at, 1.1 * at])
+    several = np.stack([at, 1.1 * at])
     np.testing.assert_allclose(jax.vmap(end)(several), [end(x) for x in several], atol=1e-14)
 
 
@@ -363,21 +363,21 @@ def rod_forces(phi, rate, friction, side):
 def test_friction_that_changes_its_normal_force(friction, side):
     for phi, rate in [(0.4, 0.0), (1.2, 3.0), (3.0, 6.0), (-2.0, 8.0)]:
         (exact,) = rod_forces(phi, rate, friction, side)
-        state = jnp.array([0.0, 0.0, phi]), jnp.array([side, 0.0, rate])
-        np.testing.assert_allclose(ROD.acceleration(*state, params=friction)[jnp.array([0, 2])], exact[:2], rtol=1e-12)
+        state = np.array([0.0, 0.0, phi]), np.array([side, 0.0, rate])
+        np.testing.assert_allclose(ROD.acceleration(*state, params=friction)[np.array([0, 2])], exact[:2], rtol=1e-12)
         assert float(ROD.multipliers(*state, params=friction)) == pytest.approx(exact[2], rel=1e-12)
 
 
 def test_paradox_of_a_rod_on_a_wire_is_not_a_number():
     """With none or two solutions the law says nothing: Painlevé's paradox."""
-    state, friction = jnp.array([0.0, 0.0, 0.785]), 4.0
+    state, friction = np.array([0.0, 0.0, 0.785]), 4.0
     counts = [len(list(rod_forces(0.785, 0.0, friction, side))) for side in (1.0, -1.0)]
     assert sorted(counts) == [0, 2]
     for side in (1.0, -1.0):
-        velocity = jnp.array([side, 0.0, 0.0])
-        assert jnp.isnan(ROD.acceleration(state, velocity, params=friction)).all()
+        velocity = np.array([side, 0.0, 0.0])
+        assert np.isnan(ROD.acceleration(state, velocity, params=friction)).all()
     with pytest.raises(lagjax.SimulationError, match="Painlevé"):
-        lagjax.simulate(ROD, state, velocity, jnp.array([0.0, 0.1]), friction)
+        lagjax.simulate(ROD, state, velocity, np.array([0.0, 0.1]), friction)
 
 
 # ---- two at once, and what has no multipliers ------------------------------------------------------------------------
@@ -392,8 +392,8 @@ def test_two_beads_rub_as_each_does_alone():
         lambda q, v: gravity(q[0], v[0]) + gravity(q[1], v[1]), forces=forces,
         constraints=lambda q: jnp.sum(q * q, axis=1) - 1.0,
     )  # fmt: skip
-    qdot0 = jnp.array([[3.0, 0.0], [7.0, 0.0]])
-    run = lagjax.simulate(both, jnp.stack([BOTTOM] * 2), qdot0, jnp.linspace(0.0, 8.0, 3), 0.3)
+    qdot0 = np.array([[3.0, 0.0], [7.0, 0.0]])
+    run = lagjax.simulate(both, np.stack([BOTTOM] * 2), qdot0, np.linspace(0.0, 8.0, 3), 0.3)
     for k in range(2):
         np.testing.assert_allclose(run.q[-1, k], follow_bead(0.3, float(qdot0[k, 0]), 8.0).q[-1], atol=2e-11)
 

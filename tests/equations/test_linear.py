@@ -12,7 +12,7 @@ from sweeps import sweep
 
 import lagjax
 from lagjax._equations import _linear
-from lagjax._interface._layout import Layout
+from lagjax._interface import Layout
 
 
 def symmetric(n, eigenvalues, seed=0):
@@ -66,7 +66,7 @@ def test_masses_of_very_different_size_cost_no_accuracy():
 def test_pivots_that_are_zero_at_first_are_passed_over():
     for matrix in ([[0.0, 1.0], [1.0, 0.0]], [[0.0, 2.0, 1.0], [2.0, 0.0, 3.0], [1.0, 3.0, 0.0]]):
         matrix, b = np.array(matrix), np.arange(1.0, 1 + len(matrix))
-        np.testing.assert_allclose(solved(jnp.asarray(matrix), jnp.asarray(b)), np.linalg.solve(matrix, b), rtol=1e-14)
+        np.testing.assert_allclose(solved(np.asarray(matrix), np.asarray(b)), np.linalg.solve(matrix, b), rtol=1e-14)
 
 
 @pytest.mark.parametrize("n", sweep([1, 5, 33], kept=[1, 5]))
@@ -100,7 +100,7 @@ def test_derivatives_of_the_solution(n):
     def derivatives(s):
         return jax.jacfwd(number)(s), jax.grad(number)(s), jax.hessian(number)(s), jax.grad(jax.grad(number))(s)
 
-    found = jax.jit(jax.vmap(derivatives))(jnp.array([0.0, 1e-3]))
+    found = jax.jit(jax.vmap(derivatives))(np.array([0.0, 1e-3]))
     exact = [weights @ first] * 2 + [weights @ second] * 2
     np.testing.assert_allclose([x[0] for x in found], exact, rtol=1e-10)  # cond = 100, squared by the second
 
@@ -129,7 +129,7 @@ def test_the_shortest_multipliers(name):
     rows = REDUNDANT[name]
     matrix = gram(rows)
     truth = rows @ np.linspace(1.0, 2.0, rows.shape[1])  # in the range of S: no part in the kernel
-    found = np.asarray(jax.jit(_linear.least_norm)(jnp.asarray(matrix), jnp.asarray(matrix @ truth)))
+    found = np.asarray(jax.jit(_linear.least_norm)(np.asarray(matrix), np.asarray(matrix @ truth)))
     rounding = np.finfo(float).eps * np.abs(matrix) @ np.abs(truth)  # of b alone
     assert (np.abs(found - truth) * np.diag(matrix) <= 100 * rounding).all()
 
@@ -137,7 +137,7 @@ def test_the_shortest_multipliers(name):
 def test_multipliers_of_an_indefinite_mass_matrix():
     """M = diag(1, −1) with one constraint along (1, 2), whose S = G K⁻¹ Gᵀ is negative."""
     matrix, rows = jnp.diag(jnp.array([1.0, -1.0])), jnp.array([[1.0, 2.0]])
-    b, c = jnp.array([0.3, 0.7]), jnp.array([0.5])
+    b, c = np.array([0.3, 0.7]), np.array([0.5])
     x, multipliers, singular = jax.jit(_linear.saddle)(matrix, b, rows, c)
     full = np.block([[np.asarray(matrix), -np.asarray(rows).T], [np.asarray(rows), np.zeros((1, 1))]])
     np.testing.assert_allclose(np.append(x, multipliers), np.linalg.solve(full, np.append(b, c)), rtol=1e-13)

@@ -133,7 +133,7 @@ def test_the_example_conserves_energy_and_differentiates(robot):
     arm = robot.read(robot.ARM)
     lossless = arm._replace(joints=tuple(joint._replace(damping=0.0) for joint in arm.joints))
     scene, params = robot.system(lossless), robot.parameters(arm)
-    starts, ts = np.random.default_rng(0).uniform(-1, 1, (3, 7)), jnp.linspace(0.0, 0.5, 6)
+    starts, ts = np.random.default_rng(0).uniform(-1, 1, (3, 7)), np.linspace(0.0, 0.5, 6)
     batch = lagjax.simulate_batch(scene, starts, np.ones_like(starts), ts, params)
     assert bool(batch.ok.all())
     # Local errors of 1e-9 of the state over some 25 steps, of an energy of some 100 J with masses of up to 20 kg.

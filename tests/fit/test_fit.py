@@ -18,13 +18,13 @@ from lagrangians import spring
 from scipy.optimize import least_squares
 
 import lagjax
+from lagjax._fit import Parameters
 from lagjax._fit.model import _autocorrelation, _residuals, _signals, _transforms
 from lagjax._fit.model._motions import _JaxMotions, choose_motions
-from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.result._verdict import shifts_without
 from lagjax._fit.search import _descent
 from lagjax._fit.search._reader import Reader
-from lagjax._interface._layout import Layout
+from lagjax._interface import Layout
 
 SIGMA = 5e-3
 EXAMPLES = Path(__file__).parents[2] / "examples"

@@ -6,7 +6,7 @@ import pytest
 from lagrangians import weight_in_gravity
 
 import lagjax
-from lagjax._fit.model._residuals import Point
+from lagjax._fit import Point
 
 TRUTH = {"g": 9.81, "c": 0.2, "length": 0.8}
 TS = np.linspace(0.0, 3.0, 61)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import lagjax
-from lagjax._fit.model._residuals import Point
+from lagjax._fit import Point
 
 TS = np.linspace(0.0, 3.0, 31)
 TRUTH, FREE = {"k": 4.0, "c": 1.5}, {"k": True, "c": False}
@@ -82,12 +82,12 @@ def test_the_density_of_several_systems_and_its_derivatives_are_those_of_closed_
     rng, width = np.random.default_rng(1), np.sqrt(np.diag(density.covariance()))
     value_and_grad = jax.jit(jax.value_and_grad(density))
     for x in density.first + 2 * width * rng.normal(size=(3, len(density))):
-        expected, slope = jax.value_and_grad(by_hand)(jnp.asarray(x), density.shares)
+        expected, slope = jax.jit(jax.value_and_grad(by_hand))(jnp.asarray(x), density.shares)
         value, gradient = value_and_grad(x)
         # Motions are right to rtol 1e-9, residuals of σ = 0.05 to 1e-7 of it.
         assert value == pytest.approx(float(expected), rel=1e-6)
         np.testing.assert_allclose(gradient * width, slope * width, rtol=1e-5, atol=1e-5)
-    hessian = jax.hessian(by_hand)(jnp.asarray(density.first), density.shares)
+    hessian = jax.jit(jax.hessian(by_hand))(np.asarray(density.first), density.shares)
     # Expected and observed information differ by what residuals and curvature have in common: a few times 1/√31.
     scale = np.outer(width, width)
     np.testing.assert_allclose(density.covariance() / scale, np.linalg.inv(-hessian) / scale, atol=0.2)
@@ -103,7 +103,7 @@ def test_draws_by_blackjax_are_those_of_a_quadrature():
     metric = density.covariance()
     axes = [x + np.linspace(-6.0, 6.0, 161) * w for x, w in zip(density.first, np.sqrt(np.diag(metric)), strict=True)]
     grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
-    log = np.asarray(jax.jit(jax.vmap(density))(jnp.asarray(grid.reshape(-1, 2)))).reshape(grid.shape[:2])
+    log = np.asarray(jax.jit(jax.vmap(density))(np.asarray(grid.reshape(-1, 2)))).reshape(grid.shape[:2])
     share = np.cumsum(np.exp(log - log.max()).sum(axis=1))
     expected = np.exp(np.interp([0.1, 0.5, 0.9], share / share[-1], axes[0]))
 

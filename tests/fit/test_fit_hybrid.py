@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from lagrangians import free_particle, spring
+from scenes import FREE
 from scipy.optimize import least_squares
 
 import lagjax
-from lagjax._fit.model._residuals import Point
+from lagjax._fit import Point
 
 G, E, V0 = 9.81, 0.9, 3.0
 
@@ -32,10 +33,9 @@ def times_of(e, v0, count=12):
 # A block on a belt of speed BELT, held by a spring: it sticks until the spring wins, and slips until it is as fast.
 BELT, BEGIN = 0.5, (-0.2, 0.0)
 SLIP = lagjax.System(spring, forces=lambda q, v, params: params["kinetic"])
-STICK = lagjax.System(free_particle)
 STICKS = lagjax.Transition("slip", "stick", lambda q, v: v - BELT, direction=1, reset=lambda q, v: (q, BELT + 0 * v))
 SLIPS = lagjax.Transition("stick", "slip", lambda q, v, params: params["k"] * q - params["static"], direction=1)
-BLOCK = lagjax.Hybrid({"slip": SLIP, "stick": STICK}, [STICKS, SLIPS], "slip")
+BLOCK = lagjax.Hybrid({"slip": SLIP, "stick": FREE}, [STICKS, SLIPS], "slip")
 FRICTION = {"k": 4.0, "kinetic": 0.6, "static": 1.2}
 TS = np.linspace(0.0, 8.0, 161)
 

@@ -3,17 +3,15 @@
 from pathlib import Path
 
 import diffrax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from lagrangians import spring
 from scipy.signal import lsim
 
 import lagjax
+from lagjax._fit import Parameters, Point
 from lagjax._fit.model import _inputs, _motions
-from lagjax._fit.model._parameters import Parameters
-from lagjax._fit.model._residuals import Point
-from lagjax._interface._layout import Layout
+from lagjax._interface import Layout
 
 TRUTH = {"k": 4.0, "c": 0.3, "gain": 1.5}
 TS = 0.02 * np.arange(200)
@@ -306,4 +304,4 @@ def test_what_is_wrong_with_inputs_is_a_sentence():
     with pytest.raises(TypeError, match=r"start must be .*a function of the parameters"):
         lagjax.Record(TS, u, start=3.0)
     with pytest.raises(TypeError, match=r"driven asks for `inputs`, which only the records of lagjax.fit have"):
-        lagjax.simulate(SCENE, 0.0, 0.0, jnp.array([0.0, 1.0]), TRUTH)
+        lagjax.simulate(SCENE, 0.0, 0.0, np.array([0.0, 1.0]), TRUTH)

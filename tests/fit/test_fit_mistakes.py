@@ -3,13 +3,12 @@
 import jax
 import numpy as np
 import pytest
-from lagrangians import spring
+from scenes import SPRING
 
 import lagjax
 
 TS = np.linspace(0.0, 3.0, 61)
 Q = np.cos(2.0 * TS)
-SPRING = lagjax.System(spring)
 DATES = np.datetime64("2020-01-01") + np.arange(61) * np.timedelta64(50, "ms")
 
 

@@ -6,7 +6,7 @@ from lagrangians import mass_on_a_spring
 from scipy.special import stdtrit
 
 import lagjax
-from lagjax._fit.model._parameters import Parameters
+from lagjax._fit import Parameters
 
 SIGMA = 0.02
 TS = np.linspace(0.0, 6.0, 121)

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from lagrangians import pendulum_in_gravity, weight_in_gravity
+from scenes import PENDULUM_IN_GRAVITY
 from scipy.integrate import solve_ivp
 
 import lagjax
@@ -199,9 +200,9 @@ def test_profiles_reports_and_plots_know_of_several_systems(joint, tmp_path):
 
 @pytest.mark.slow
 def test_crossing_times_of_one_system_and_constraints_of_another():
-    gates = lagjax.System(pendulum_in_gravity)
+    gates = PENDULUM_IN_GRAVITY
     rod = lagjax.System(weight_in_gravity, constraints=lambda q: q @ q - 0.64)
-    sections, span = {"bottom": lambda q, qdot: q}, jnp.array([0.0, 6.0])
+    sections, span = {"bottom": lambda q, qdot: q}, np.array([0.0, 6.0])
     times = lagjax.crossings(gates, sections, 1.0, 0.0, span, {"g": 9.81})["bottom"]
     passed = np.asarray(times.t)[: int(times.count)]
     q0 = 0.8 * np.array([np.sin(0.9), -np.cos(0.9)])

@@ -10,7 +10,7 @@ import pytest
 from lagrangians import damping, pendulum_in_gravity
 
 import lagjax
-from lagjax._fit.model._residuals import Point
+from lagjax._fit import Point
 
 TRUTH = {"g": 9.81, "c": 0.05}
 START = (1.0, 0.0)
@@ -207,7 +207,7 @@ def test_a_ball_tells_its_restitution_by_the_times_of_its_bounces():
     """By name, or in a dict beside a contact in an array; and by the times between, of a section."""
     fit = lagjax.fit(BALL, lagjax.Timings("floor", bounces(0.8, 5), t0=0.0, start=(1.0, 0.0)), {"e": 0.7})
     assert fit.ok and fit.params["e"] == pytest.approx(0.8, abs=1e-8)
-    up = lagjax.simulate(BALL, 1.0, 3.0, jnp.array([0.0, 2.5]), {"e": 0.8})
+    up = lagjax.simulate(BALL, 1.0, 3.0, np.array([0.0, 2.5]), {"e": 0.8})
     t, on_lid = np.asarray(up.impacts.t), np.asarray(up.impacts.impulse["lids"][:, 0]) > 0
     assert on_lid.sum() == 1
     names, times = {"low": "floor", "high": "lids[0]"}, {"low": t[:4][~on_lid[:4]], "high": t[on_lid]}

@@ -227,7 +227,7 @@ SEEN = {
 def test_of_scenes_that_show_everything_nothing_is_said_to_be_unseen(name):
     lagrangian, params, more, observe, start = SEEN[name]
     scene = lagjax.System(lambda q, v, params: lagrangian(q, v, params), **more)
-    q0, qdot0 = (jnp.asarray(half) for half in start)
+    q0, qdot0 = (np.asarray(half) for half in start)
     run = lagjax.simulate(scene, q0, qdot0, TS, params)
     pairs = zip(run.q, run.qdot, strict=True)
     shown = np.asarray(run.q if observe is None else [observe(q, v, params) for q, v in pairs])
@@ -249,8 +249,8 @@ def two_pendulums(q, qdot, params):
 
 
 CHAOTIC = lagjax.System(two_pendulums)
-TRUTH = {"l": jnp.array([1.0, 0.8]), "m": jnp.array([1.0, 0.6]), "more": 0.0}
-HIGH = jnp.array([2.0, 2.5]), jnp.zeros(2)
+TRUTH = {"l": np.array([1.0, 0.8]), "m": np.array([1.0, 0.6]), "more": 0.0}
+HIGH = np.array([2.0, 2.5]), np.zeros(2)
 
 
 def chaotic_record(end, start):

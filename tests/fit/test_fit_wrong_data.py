@@ -91,7 +91,7 @@ def test_wrapped_data_give_the_parameters_of_continuous_ones(q0):
 def test_wrapped_sensors_of_their_own_and_gaps():
     holes = np.where((TS > 2.0) & (TS < 2.6), np.nan, modulo(2 * np.pi))
     observe = lambda q, qdot: jnp.arctan2(jnp.sin(q), jnp.cos(q))
-    assert is_right(fit(holes, observe=lagjax.wrapped(2 * jnp.pi, observe)))
+    assert is_right(fit(holes, observe=lagjax.wrapped(2 * np.pi, observe)))
 
 
 def test_samples_too_far_apart_to_tell_a_turn_ask_for_a_start():

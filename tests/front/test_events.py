@@ -8,13 +8,11 @@ import jax.numpy as jnp
 import numpy as np
 import optimistix as optx
 import pytest
-from lagrangians import ball_g, free_particle, pendulum
+from scenes import BALL_G, FREE, PENDULUM
 
 import lagjax
 
-FALL = lagjax.System(ball_g)
-FREE = lagjax.System(free_particle)
-TS = jnp.linspace(0.0, 2.0, 9)
+TS = np.linspace(0.0, 2.0, 9)
 
 
 def floor(q, v):
@@ -22,7 +20,7 @@ def floor(q, v):
 
 
 def fall(h, g=9.81, ts=TS, event=floor, **options):
-    return lagjax.simulate(FALL, h, 0.0, ts, g, event=event, solver=lagjax.MachineCode(), **options)
+    return lagjax.simulate(BALL_G, h, 0.0, ts, g, event=event, solver=lagjax.MachineCode(), **options)
 
 
 def flight(event, end=1.0, **options):
@@ -46,9 +44,9 @@ def test_outputs_and_the_end():
 
 
 def test_batches_are_one_run():
-    h = jnp.array([0.5, 1.0, 2.0, 200.0])
+    h = np.array([0.5, 1.0, 2.0, 200.0])
     landing = np.where(h < 100, np.sqrt(2 * h / 9.81), 2.0)
-    runs = lagjax.simulate_batch(FALL, h, jnp.zeros(4), TS, 9.81, event=floor, solver=lagjax.MachineCode())
+    runs = lagjax.simulate_batch(BALL_G, h, np.zeros(4), TS, 9.81, event=floor, solver=lagjax.MachineCode())
     np.testing.assert_allclose(runs.end.t, landing, rtol=1e-14)
     assert runs.ok.all()
     mapped = jax.jit(jax.vmap(fall))(h)
@@ -66,7 +64,7 @@ def test_how_the_end_varies():
         t = jnp.sqrt(2 * x[0] / x[1])
         return jnp.stack([t, 0 * t, -x[1] * t, x[0] - x[1] * TS[2] ** 2 / 2, -x[1] * TS[2]])
 
-    x = jnp.array([2.0, 9.81])
+    x = np.array([2.0, 9.81])
     for mode in (jax.jacrev, jax.jacfwd):
         np.testing.assert_allclose(mode(outcome)(x), mode(closed)(x), atol=1e-12)
     assert np.isnan(jax.grad(lambda h: fall(h).q[-1])(2.0)), "it was not reached"
@@ -75,7 +73,7 @@ def test_how_the_end_varies():
 @pytest.mark.slow
 def test_second_derivatives_of_the_end():
     # A pendulum to the bottom: the time is K(sin(q⁰/2)).
-    scene = lagjax.System(pendulum)
+    scene = PENDULUM
 
     def bottom(q0):
         return lagjax.simulate(scene, q0, 0.0, jnp.array([0.0, 5.0]), event=floor, rtol=1e-13).end.t
@@ -124,7 +122,7 @@ def test_a_start_on_an_event_ends_at_once_where_it_moves_on_in_the_direction():
 
 
 def test_an_interval_of_a_few_roundings_of_the_time():
-    ts = jnp.array([20.0 - 1e-14, 20.0])
+    ts = np.array([20.0 - 1e-14, 20.0])
     assert lagjax.simulate(FREE, 0.0, 1.0, ts, solver=lagjax.MachineCode()).end.t == 20.0
 
 
@@ -133,7 +131,7 @@ def test_an_interval_of_a_few_roundings_of_the_time():
     [
         (lambda q, v: (q < 0.0) & (v < 0.0), "the event is true or false"),
         (diffrax.Event(floor, optx.Newton(1e-8, 1e-8)), "a root finder of its own"),
-        (jax.tree_util.Partial(lambda w, q, v: q - w, jnp.ones(())), "holds arrays of its own"),
+        (jax.tree_util.Partial(lambda w, q, v: q - w, np.ones(())), "holds arrays of its own"),
     ],
 )
 def test_what_goes_to_diffrax(event, reason):
@@ -162,7 +160,7 @@ def test_a_comparison_is_located(name):
 def test_booleans_of_diffrax():
     # The instant of a comparison is located there, too; that of another Boolean is the end of a step.
     def land(g, event):
-        return lagjax.simulate(FALL, 1.0, 0.0, TS, g, event=event, solver=diffrax.Dopri8()).end.t
+        return lagjax.simulate(BALL_G, 1.0, 0.0, TS, g, event=event, solver=diffrax.Dopri8()).end.t
 
     t, slope = jax.value_and_grad(land)(9.81, COMPARISONS["q < 0"])
     np.testing.assert_allclose([t, slope], [np.sqrt(2 / 9.81), -np.sqrt(2 / 9.81) / (2 * 9.81)], rtol=1e-8)
@@ -179,7 +177,7 @@ def test_guards_of_a_large_scene():
     # As tables: twelve pendulums in a chain; alone and in a batch, with and without an event.
     scene = lagjax.scenes.chain()
     first = lambda q, v: jax.tree.leaves(q)[0].ravel()[0] - 0.1
-    run = functools.partial(lagjax.simulate, scene.system, scene.q0, scene.qdot0, jnp.linspace(0.0, 1.0, 101))
+    run = functools.partial(lagjax.simulate, scene.system, scene.q0, scene.qdot0, np.linspace(0.0, 1.0, 101))
     plain, ended = run(scene.params), run(scene.params, event=first, solver=lagjax.MachineCode())
     angle = np.asarray(jax.tree.leaves(plain.q)[0]).reshape(101, -1)[:, 0] - 0.1
     changes = np.flatnonzero(np.sign(angle[1:]) != np.sign(angle[:-1]))
@@ -205,7 +203,7 @@ def test_bits_of_events_do_not_depend_on_neighbours():
 
 def test_which_of_thirty_events_ended_the_motion():
     """More than a whole number has bits: of what comes at the same instant all are named, under jit as well."""
-    scene, ts = lagjax.System(lambda q, v: 0.5 * v**2), jnp.linspace(0.0, 40.0, 3)
+    scene, ts = FREE, np.linspace(0.0, 40.0, 3)
     events = [lambda q, v, at=at: q - at for at in [*np.arange(35.0, 7.0, -1.0), 7.5, 7.5]]
     follow = lambda start: lagjax.simulate(scene, start, 1.0, ts, event=events)
     for run, t in ((follow(0.0), 7.5), (jax.jit(follow)(8.25), 0.75)):
@@ -216,13 +214,13 @@ def test_which_of_thirty_events_ended_the_motion():
 
 
 def test_the_result_says_which_of_several_events_ended_the_motion():
-    scene, ts = lagjax.System(lambda q, v: 0.5 * v**2), jnp.linspace(0.0, 10.0, 3)
+    scene, ts = FREE, np.linspace(0.0, 10.0, 3)
     event = {"far": lambda q, v: q - 3.0, "near": lambda q, v: q - 2.0, "held": lambda q, v: q < -1.0}
     run = lagjax.simulate(scene, 0.0, 1.0, ts, event=event)
     assert {name: bool(x) for name, x in run.event.items()} == {"far": False, "near": True, "held": False}
     assert repr(run).endswith("ended at t = 2: event_occurred, by event['near']")
     assert bool(lagjax.simulate(scene, -2.0, 1.0, ts, event=event).event["held"])  # at once
-    many = lagjax.simulate_batch(scene, jnp.array([0.0, 2.5, -0.5]), jnp.array([1.0, 1.0, -0.01]), ts, event=event)
+    many = lagjax.simulate_batch(scene, np.array([0.0, 2.5, -0.5]), np.array([1.0, 1.0, -0.01]), ts, event=event)
     np.testing.assert_array_equal(np.stack([many.event[x] for x in event]), [[0, 1, 0], [1, 0, 0], [0, 0, 0]])
     assert lagjax.simulate(scene, 0.0, 1.0, ts).event is None
     with pytest.raises(ValueError, match=r"of 3 functions is for machine code.*jnp.minimum"):

@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import VALLEY
 from sweeps import sweep
 
 import lagjax
@@ -42,7 +43,7 @@ def top(q, v):  # Euler angles θ, φ, ψ
 
 FREE, SPRING = lagjax.System(free), lagjax.System(spring)
 PARAMS = {"m": 1.0, "k": 4.0}
-ONES, ZEROS = jnp.ones(2), jnp.zeros(2)
+ONES, ZEROS = np.ones(2), np.zeros(2)
 
 
 # ---- refused ---------------------------------------------------------------------------------------------------------
@@ -219,7 +220,7 @@ FOUND = {
         lagjax.System(lambda q, v: v @ v + jnp.linalg.norm(v)), ONES, ZEROS, "derivative_not_finite",
         ("dq[0]", "dq[1]"),
     ),
-    "abs at its kink": (lagjax.System(lambda q, v: 0.5 * v**2 - jnp.abs(q)), 0.0, 1.0, "kink", ("q",)),
+    "abs at its kink": (VALLEY, 0.0, 1.0, "kink", ("q",)),
     "a stopped gradient": (
         lagjax.System(lambda q, v: 0.5 * v**2 - jax.lax.stop_gradient(q) ** 2), 1.0, 0.0, "wrong_derivative", ("q",),
     ),
@@ -334,9 +335,9 @@ def test_stopped(name):
 
 
 def test_members_of_a_batch_are_named():
-    q0 = jnp.array([1.0, jnp.nan, 1.0, 1.0])
-    params = {"m": jnp.array([1.0, 1.0, 0.0, 1.0]), "k": jnp.array([4.0, 4.0, 4.0, jnp.inf])}
-    mixed = lagjax.simulate_batch(SPRING, q0, jnp.zeros(4), TS, params, batch_axes=(0, 0, 0))
+    q0 = np.array([1.0, np.nan, 1.0, 1.0])
+    params = {"m": np.array([1.0, 1.0, 0.0, 1.0]), "k": np.array([4.0, 4.0, 4.0, np.inf])}
+    mixed = lagjax.simulate_batch(SPRING, q0, np.zeros(4), TS, params, batch_axes=(0, 0, 0))
     assert mixed.ok.tolist() == [True, False, False, False]
     clean = lagjax.simulate(SPRING, 1.0, 0.0, TS, PARAMS)
     np.testing.assert_array_equal(mixed.q[0], clean.q)

@@ -536,7 +536,7 @@ def end_of(k, c):
 def test_numbers_that_are_closed_over_while_they_are_traced_are_parameters(derived):
     for k, c in ((4.0, 0.1), (9.0, 0.3)):
         found = jax.value_and_grad(end_of, argnums=(0, 1))(k, c)
-        expected = jax.value_and_grad(exact, argnums=(0, 1))(k, c)
+        expected = jax.jit(jax.value_and_grad(exact, argnums=(0, 1)))(k, c)
         np.testing.assert_allclose(jax.tree.leaves(found), jax.tree.leaves(expected), atol=1e-8)
     assert len(derived) == 1  # for both values, and the functions of all calls, with machine code
 
@@ -545,7 +545,7 @@ def test_numbers_that_are_closed_over_while_they_are_traced_are_parameters(deriv
 def test_closed_over_tracers_under_every_transformation(derived):
     both, (ks, cs) = {"argnums": (0, 1)}, (np.array([1.0, 4.0, 9.0]), np.array([0.1, 0.2, 0.3]))
     np.testing.assert_allclose(
-        jax.hessian(end_of, **both)(ks[1], cs[1]), jax.hessian(exact, **both)(ks[1], cs[1]), atol=1e-7
+        jax.hessian(end_of, **both)(ks[1], cs[1]), jax.jit(jax.hessian(exact, **both))(ks[1], cs[1]), atol=1e-7
     )
     np.testing.assert_allclose(jax.vmap(end_of)(ks, cs), exact(ks, cs), atol=1e-8)
     compiled, of_exact = (jax.vmap(jax.grad(f, **both)) for f in (end_of, exact))

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import OSCILLATOR
 
 import lagjax
 
@@ -15,7 +16,7 @@ def pendulum(q, qdot, params):
 
 SCENE = lagjax.System(pendulum)
 PARAMS = {"l": 0.7, "g": 9.81}
-TS = jnp.linspace(0.0, 2.0, 5)
+TS = np.linspace(0.0, 2.0, 5)
 Q0, QDOT0 = jnp.linspace(-2.5, 2.5, 8), jnp.linspace(-1.0, 1.0, 8)
 
 
@@ -49,7 +50,7 @@ def test_batch_is_loop():
 
 
 def test_batch_over_parameters_only():
-    params = {"l": jnp.linspace(0.5, 1.0, 8), "g": 9.81}
+    params = {"l": np.linspace(0.5, 1.0, 8), "g": 9.81}
     run = lambda p: lagjax.simulate(SCENE, 0.3, 0.0, TS, p)
     reference = jax.vmap(run, in_axes=({"l": 0, "g": None},))(params)
     batch = lagjax.simulate_batch(SCENE, 0.3, 0.0, TS, params, batch_axes=(None, None, {"l": 0, "g": None}))
@@ -58,8 +59,8 @@ def test_batch_over_parameters_only():
 
 def test_batch_axis_in_the_middle_of_arrays():
     scene = lagjax.System(lambda q, qdot: 0.5 * jnp.sum(qdot**2) - 0.5 * jnp.sum(jnp.array([1.0, 4.0]) * q**2))
-    q0 = jnp.stack([Q0, QDOT0])  # coordinates first, members second
-    batch = lagjax.simulate_batch(scene, q0, jnp.zeros((8, 2)), TS, batch_axes=(1, 0, None))
+    q0 = np.stack([Q0, QDOT0])  # coordinates first, members second
+    batch = lagjax.simulate_batch(scene, q0, np.zeros((8, 2)), TS, batch_axes=(1, 0, None))
     expected = q0.T[:, None, :] * np.cos(np.array([1.0, 2.0]) * TS[:, None])
     np.testing.assert_allclose(batch.q, expected, atol=1e-8)
 
@@ -77,8 +78,8 @@ def test_a_bad_member_is_reported_and_changes_nothing_for_the_others():
 
 def test_a_bad_parameter_and_a_member_that_fails_on_the_way():
     scene = lagjax.System(lambda q, qdot, params: 0.5 * params * qdot**2 - jnp.sqrt(q))
-    q0, params = jnp.array([1.0, 1.0, 9.0, 9.0]), jnp.array([0.0, 1.0, 1.0, jnp.nan])
-    batch = lagjax.simulate_batch(scene, q0, -jnp.ones(4), TS, params, batch_axes=(0, 0, 0))
+    q0, params = np.array([1.0, 1.0, 9.0, 9.0]), np.array([0.0, 1.0, 1.0, np.nan])
+    batch = lagjax.simulate_batch(scene, q0, -np.ones(4), TS, params, batch_axes=(0, 0, 0))
     np.testing.assert_array_equal(batch.ok, [False, False, True, False])
     assert (batch.result == lagjax.RESULTS.mass_matrix_singular)[0]
     assert (batch.result == lagjax.RESULTS.nonfinite_state)[1] and 0 < batch.end.t[1] < 2  # the root of less than zero
@@ -93,7 +94,7 @@ def test_large_batches_of_products_are_right(members, n):
     jacobian = np.random.default_rng(0).normal(size=(n, n))
     scene = lagjax.System(lambda q, qdot: 0.5 * jnp.sum((jnp.asarray(jacobian) @ qdot) ** 2))
     qdot = np.random.default_rng(1).normal(size=(members, n))
-    energy = jax.jit(jax.vmap(scene.energy))(jnp.zeros((members, n)), jnp.asarray(qdot))
+    energy = jax.jit(jax.vmap(scene.energy))(np.zeros((members, n)), np.asarray(qdot))
     np.testing.assert_allclose(energy, 0.5 * np.sum((qdot @ jacobian.T) ** 2, axis=1), rtol=1e-12)
 
 
@@ -115,12 +116,12 @@ def test_to_xarray():
         ({"batch_axes": (None, None, None)}, "maps over nothing"),
         ({"batch_axes": (0, 0)}, "tuple of three"),
         ({"batch_axes": (1, 0, None)}, "q0 has shape \\(8,\\): it has no axis 1"),
-        ({"qdot0": jnp.zeros(7)}, "same number of members; q0 has 8, qdot0 has 7"),
+        ({"qdot0": np.zeros(7)}, "same number of members; q0 has 8, qdot0 has 7"),
         ({"batch_axes": (0, 0, {"mass": 0})}, "batch_axes for params"),
-        ({"params": {"l": jnp.nan, "g": 9.81}}, r"params\['l'\] is nan"),
+        ({"params": {"l": np.nan, "g": 9.81}}, r"params\['l'\] is nan"),
         ({"q0": 0.1}, "q0 has shape \\(\\)"),
-        ({"q0": jnp.zeros(0), "qdot0": jnp.zeros(0)}, "batch is empty"),
-        ({"ts": jnp.array([0.0])}, "at least two"),
+        ({"q0": np.zeros(0), "qdot0": np.zeros(0)}, "batch is empty"),
+        ({"ts": np.array([0.0])}, "at least two"),
     ],
 )
 def test_bad_input_gets_a_sentence(changes, sentence):
@@ -131,7 +132,7 @@ def test_bad_input_gets_a_sentence(changes, sentence):
 
 def test_a_batch_that_comes_again_and_again_stays_what_it_is():
     """After some calls its arrays are sent to JAX by a compiled function (`_simulate._device_arrays`)."""
-    scene = lagjax.System(lambda q, qdot: 0.5 * qdot**2 - 0.5 * q**2)
+    scene = OSCILLATOR
     q0, ts = np.linspace(0.1, 0.4, 3), np.linspace(0.0, 1.0, 5)
     first, *_, last = (lagjax.simulate_batch(scene, q0 + k, np.zeros(3), ts) for k in (*[0.0] * 60, 1.0))
     np.testing.assert_allclose(first.q, q0[:, None] * np.cos(ts), atol=1e-8)

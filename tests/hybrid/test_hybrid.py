@@ -6,23 +6,23 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from lagrangians import ball_in_gravity, free_particle, oscillator
+from lagrangians import free_particle
+from scenes import BALL_IN_GRAVITY, BALL_ON_THE_FLOOR, EDGE, FREE, FREE_POINTS, HENON_HEILES, OSCILLATOR
 from sweeps import sweep
 
 import lagjax
 
 G = 9.81
-BALL = lagjax.System(ball_in_gravity)
 BOUNCE = lagjax.Transition(
     "flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v, params: (q, -params["e"] * v)
 )
-FREE = lagjax.System(free_particle)
-OSCILLATOR = lagjax.System(oscillator)
 
 
 def bouncing(h, e, g=G, v=0.0, ts=None, **options):
     ts = jnp.linspace(0.0, 2.0, 9) if ts is None else ts
-    return lagjax.simulate(lagjax.Hybrid({"flight": BALL}, [BOUNCE], "flight"), h, v, ts, {"e": e, "g": g}, **options)
+    return lagjax.simulate(
+        lagjax.Hybrid({"flight": BALL_IN_GRAVITY}, [BOUNCE], "flight"), h, v, ts, {"e": e, "g": g}, **options
+    )
 
 
 def hybrid(modes, transitions, q0=0.0, v0=1.0, ts=(0.0, 1.0), params=None, **options):
@@ -62,7 +62,7 @@ ROLLING = {
     "flight": lagjax.System(cylinder),
 }
 LEAVE = lagjax.Transition("rolling", "flight", lambda q, v, multipliers: multipliers["contact"], direction=-1)
-ROLL_TS = jnp.linspace(0.0, 3.0, 13)
+ROLL_TS = np.linspace(0.0, 3.0, 13)
 
 
 def rolling(alpha, theta, **options):
@@ -128,7 +128,7 @@ def test_the_departure_and_the_flight_vary_as_they_must():
         run = rolling(x[0], x[1])
         return jnp.stack([run.transitions.q[0, 1], run.transitions.t[0], run.q[-1, 0], run.end.q[1], run.q[1, 1]])
 
-    places = jnp.stack([alpha, theta], 1)
+    places = np.stack([alpha, theta], 1)
     slopes = jax.jit(jax.vmap(jax.jacrev(outcome)))(places)
     # cos θ* = x = 2 cos θ⁰ / (3 + α).
     x = 2 * np.cos(theta) / (3 + alpha)
@@ -154,7 +154,7 @@ def test_a_force_read_off_samples_of_parameters_in_a_mode():
 
     wall = lagjax.Transition("free", "free", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -v))
     modes = {"free": lagjax.System(free_particle, forces=force)}
-    run = lagjax.simulate(lagjax.Hybrid(modes, [wall], "free"), 1.0, -1.0, jnp.array([0.0, 3.0]), {"u": a * knots})
+    run = lagjax.simulate(lagjax.Hybrid(modes, [wall], "free"), 1.0, -1.0, np.array([0.0, 3.0]), {"u": a * knots})
     met = min(root.real for root in np.roots([a / 6, 0.0, -1.0, 1.0]) if abs(root.imag) < 1e-12 and root.real > 0)
     back, left = 1.0 - 0.5 * a * met**2, 3.0 - met
     np.testing.assert_allclose(run.q[-1], (back - 0.5 * a * met**2) * left + a / 6 * (27.0 - met**3), rtol=1e-8)
@@ -162,7 +162,7 @@ def test_a_force_read_off_samples_of_parameters_in_a_mode():
 
 def test_every_bounce_of_a_ball():
     h, e = np.array([1.0, 0.4, 2.5]), np.array([0.9, 1.0, 0.5])
-    ts = jnp.linspace(0.0, 2.0, 45)
+    ts = np.linspace(0.0, 2.0, 45)
     runs = jax.jit(jax.vmap(lambda h, e: bouncing(h, e, ts=ts, rtol=1e-12)))(h, e)
     assert runs.ok.all()
     for i in range(3):
@@ -196,7 +196,7 @@ def test_bounces_that_pile_up_are_reported_and_never_fall_through(direction):
     )  # fmt: skip
     ts, floor, e = jnp.linspace(0.0, 6.0, 25), np.array([0.0, 0.0, 0.37, 0.37]), np.array([0.5, 0.8, 0.5, 0.8])
     run = lambda floor, e: hybrid(
-        {"flight": BALL}, [bounce], 1.0 + floor, 0.0, ts, {"e": e, "g": G, "floor": floor},
+        {"flight": BALL_IN_GRAVITY}, [bounce], 1.0 + floor, 0.0, ts, {"e": e, "g": G, "floor": floor},
         max_transitions=200, throw=False,
     )  # fmt: skip
     runs = jax.jit(jax.vmap(run))(floor, e)
@@ -247,15 +247,15 @@ def test_a_spent_budget_is_told_from_bounces_that_pile_up():
     assert run(0.8, 4.2, max_transitions=8).result == zeno
     assert run(0.8, 4.0, max_transitions=8).result == spent, "a larger budget reaches the end"
     assert run(0.8, 4.0).ok
-    found = jax.vmap(lambda e: run(e, 200.0).result._value)(jnp.array([0.5, 0.9, 0.95, 1.0]))
+    found = jax.vmap(lambda e: run(e, 200.0).result._value)(np.array([0.5, 0.9, 0.95, 1.0]))
     assert found.tolist() == [zeno._value] * 3 + [spent._value]
     with pytest.raises(lagjax.SimulationError, match=r"ever shorter times .* let it come to rest") as caught:
-        bouncing(1.0, 0.8, ts=jnp.array([0.0, 5.0]))
+        bouncing(1.0, 0.8, ts=np.array([0.0, 5.0]))
     assert caught.value.trajectory.result == zeno
     # What the sentence says, and one who resets a slow ball to rest, which gravity pushes onto the floor at once.
     line = str(caught.value).partition("its surface: ")[2].partition(".\n")[0]
     to_rest = eval(line, {"Transition": lagjax.Transition, "jnp": jnp})
-    modes = {"flight": BALL, "rest": lagjax.System(ball_in_gravity, constraints=lambda q: q)}
+    modes = {"flight": BALL_IN_GRAVITY, "rest": BALL_ON_THE_FLOOR}
 
     def stopped(q, v, params):
         return q, jnp.where(jnp.abs(v) < params["stop"], 0.0, -0.8 * v)
@@ -265,12 +265,14 @@ def test_a_spent_budget_is_told_from_bounces_that_pile_up():
         run = hybrid(modes, [to_rest, bounce], 1.0, 0.0, (0.0, 5.0), {"g": G, "stop": stop})
         assert run.mode[-1] == 1 and abs(run.q[-1]) < 1e-12
     with pytest.raises(lagjax.SimulationError, match=r"^(?!.*ever shorter).*The guard is pushed at its surface"):
-        hybrid({"flight": BALL}, [bounce], 1.0, 0.0, (0.0, 5.0), {"g": G, "stop": 1.0})
+        hybrid({"flight": BALL_IN_GRAVITY}, [bounce], 1.0, 0.0, (0.0, 5.0), {"g": G, "stop": 1.0})
     # Two modes that take turns, one above and one below the floor, which is soft: flight and contact alternate.
     soft = lagjax.System(lambda q, v, params: 0.5 * v**2 - params["g"] * q - 0.5 * 1e3 * q**2)
     land = lagjax.Transition("flight", "floor", lambda q, v: q, direction=-1)
     leave = lagjax.Transition("floor", "flight", lambda q, v: q, direction=1, reset=lambda q, v: (q, 0.7 * v))
-    run = hybrid({"flight": BALL, "floor": soft}, [land, leave], 1.0, 0.0, (0.0, 20.0), {"g": G}, throw=False)
+    run = hybrid(
+        {"flight": BALL_IN_GRAVITY, "floor": soft}, [land, leave], 1.0, 0.0, (0.0, 20.0), {"g": G}, throw=False
+    )
     assert run.result == spent, "a contact lasts as long for a small bounce as for a large one: no sum is finite"
 
 
@@ -301,8 +303,8 @@ def test_derivatives_of_the_bouncing_ball():
     batch = jnp.stack([x, x.at[0].set(1.0), x.at[2].set(0.82)])
     outcomes = jax.vmap(lambda x: (outcome(x), jax.jacrev(outcome)(x), jax.jacfwd(outcome)(x)))
     values, reverse, forward = jax.jit(outcomes)(batch)
-    np.testing.assert_allclose(values, jax.vmap(closed)(batch), atol=1e-11)
-    np.testing.assert_allclose(reverse, jax.vmap(jax.jacfwd(closed))(batch), atol=1e-10)
+    np.testing.assert_allclose(values, jax.jit(jax.vmap(closed))(batch), atol=1e-11)
+    np.testing.assert_allclose(reverse, jax.jit(jax.vmap(jax.jacfwd(closed)))(batch), atol=1e-10)
     np.testing.assert_allclose(forward, reverse, atol=1e-12)
     np.testing.assert_allclose(reverse[0], central(outcome, x), atol=1e-6)
 
@@ -314,7 +316,7 @@ def test_derivatives_by_the_times():
         run = bouncing(1.0, 0.9, ts=ts, rtol=1e-12)
         return jnp.concatenate([run.q, run.end.q[None], run.transitions.t[:1], run.end.t[None]]), run.qdot
 
-    slopes, rates = jax.jit(jax.jacrev(outcome, has_aux=True))(jnp.linspace(0.2, 1.7, 4))
+    slopes, rates = jax.jit(jax.jacrev(outcome, has_aux=True))(np.linspace(0.2, 1.7, 4))
     expected = np.diag(rates)
     expected[:, 0] -= rates
     expected = np.concatenate([expected, [[-rates[-1], 0, 0, rates[-1]], [1, 0, 0, 0], [0, 0, 0, 1]]])
@@ -347,18 +349,16 @@ def test_a_particle_leaves_a_smooth_sphere():
 
 @pytest.mark.slow
 def test_poincare_section_of_henon_heiles():
-    scene = lagjax.System(
-        lambda q, v: 0.5 * (v @ v) - 0.5 * (q @ q) - q[0] ** 2 * q[1] + q[1] ** 3 / 3,
-    )
+    scene = HENON_HEILES
     section = lagjax.Transition("all", "all", lambda q, v: q[0], direction=1)
-    q0, v0 = jnp.array([0.0, 0.1]), jnp.array([0.4, 0.05])
+    q0, v0 = np.array([0.0, 0.1]), np.array([0.4, 0.05])
     run = hybrid({"all": scene}, [section], q0, v0, (0.0, 60.0), rtol=1e-12)
     # All of them, and no other; the start, on the section and rising, is the first.
-    dense = lagjax.simulate(scene, q0, v0, jnp.linspace(0.0, 60.0, 3001), rtol=1e-12)
+    dense = lagjax.simulate(scene, q0, v0, np.linspace(0.0, 60.0, 3001), rtol=1e-12)
     x = np.asarray(dense.q[1:, 0])
     assert run.transitions.count == 1 + np.sum((x[:-1] < 0) & (x[1:] >= 0)) > 6 and run.transitions.t[0] == 0.0
     ts = np.concatenate([times(run), [60.0]])
-    plain = lagjax.simulate(scene, q0, v0, jnp.asarray(ts), rtol=1e-12)
+    plain = lagjax.simulate(scene, q0, v0, np.asarray(ts), rtol=1e-12)
     count = int(run.transitions.count)
     np.testing.assert_allclose(run.transitions.q[:count], plain.q[:-1], atol=1e-10)
     np.testing.assert_allclose(run.transitions.qdot[:count], plain.qdot[:-1], atol=1e-10)
@@ -372,7 +372,7 @@ def test_a_kicked_rotor_is_the_standard_map():
     kick = lagjax.Transition(
         "free", "free", lambda q, v, t: jnp.sin(2 * jnp.pi * t), 1, lambda q, v, params: (q, v + params * jnp.sin(q))
     )
-    ts = jnp.arange(0.5, 100.0)
+    ts = np.arange(0.5, 100.0)
     run = hybrid({"free": FREE}, [kick], 0.3, 0.2, ts, 0.9, max_transitions=100)
     q, p, expected = 0.3 + 0.5 * 0.2, 0.2, []
     for _ in range(99):
@@ -436,7 +436,7 @@ def at(name, source, target, scale=1.0, **options):
 @pytest.mark.slow
 def test_the_earliest_wins_and_of_several_at_once_the_first_listed():
     # Within what would be one step; the last two at one instant, to rounding.
-    places = {"x": jnp.array([0.5, 0.3, 0.3, 0.2]), "y": jnp.array([0.3, 0.5, 0.3, 0.2 + 1e-16])}
+    places = {"x": np.array([0.5, 0.3, 0.3, 0.2]), "y": np.array([0.3, 0.5, 0.3, 0.2 + 1e-16])}
     both = [at("x", "a", "b"), at("y", "a", "c", -1 / 3)]
     runs = jax.vmap(lambda p: hybrid(THREE, both, params=p))(places)
     np.testing.assert_allclose(runs.transitions.t[:, 0], [0.3, 0.3, 0.3, 0.2], rtol=1e-15)
@@ -452,7 +452,7 @@ def test_the_earliest_wins_and_of_several_at_once_the_first_listed():
 def test_a_surface_crossed_twice_within_a_step(direction):
     # Two crossings 2e-3, 2e-6 apart in a step of 0.06: between them the guard has the other sign.
     band = lambda q, v, params: (q - params["middle"]) ** 2 - params["half"] ** 2
-    half, middle = jnp.array([1e-3, 1e-6, 1e-3, 1e-6]), jnp.array([0.47, 0.47, 0.499, 1e-4])
+    half, middle = np.array([1e-3, 1e-6, 1e-3, 1e-6]), np.array([0.47, 0.47, 0.499, 1e-4])
     leave = lagjax.Transition("a", "b", band, direction, fires="crossing")  # +1 is where it starts
     run = lambda half, middle: hybrid({"a": FREE, "b": FREE}, [leave], params={"half": half, "middle": middle})
     found = jax.jit(jax.vmap(run))(half, middle).transitions
@@ -492,10 +492,10 @@ def test_a_start_on_the_surface_fires_where_it_moves_on_in_the_direction(directi
 
 @pytest.mark.slow
 def test_a_start_along_the_surface_does_not_fire():
-    plane = lagjax.System(lambda q, v: 0.5 * v @ v)
+    plane = FREE_POINTS
     circle = lagjax.Transition("all", "all", lambda q, v: q @ q - 1)
-    angle = jnp.linspace(0.0, 6.0, 50)
-    q0, v0 = jnp.stack([jnp.cos(angle), jnp.sin(angle)], 1), jnp.stack([-jnp.sin(angle), jnp.cos(angle)], 1)
+    angle = np.linspace(0.0, 6.0, 50)
+    q0, v0 = np.stack([np.cos(angle), np.sin(angle)], 1), np.stack([-np.sin(angle), np.cos(angle)], 1)
     runs = jax.vmap(lambda q, v: hybrid({"all": plane}, [circle], q, v, max_transitions=2))(q0, v0)
     assert (runs.transitions.count == 0).all()
 
@@ -511,7 +511,7 @@ def unit_box(direction, q, v, end):
     walls = [lambda q, v: 1 - q[0], lambda q, v: 1 - q[1], lambda q, v: q[0], lambda q, v: q[1]]
     walls = [lagjax.Transition("a", "a", wall, direction, flip(k % 2)) for k, wall in enumerate(walls)]
     ts = jnp.stack([jnp.zeros(()), end])
-    return lagjax.simulate(lagjax.Hybrid({"a": PLANE}, walls, "a"), q, v, ts, max_transitions=100, throw=False)
+    return lagjax.simulate(lagjax.Hybrid({"a": FREE_POINTS}, walls, "a"), q, v, ts, max_transitions=100, throw=False)
 
 
 @pytest.mark.parametrize("direction", sweep([-1, 0], kept=[-1]))
@@ -536,7 +536,7 @@ def test_beads_that_touch_pass_the_blow_on():
         return lambda q, v: (q, v.at[i].set(v[i + 1]).at[i + 1].set(v[i]))
 
     row = [lagjax.Transition("a", "a", _gap(i), -1, exchange(i)) for i in range(4)]
-    run = lambda q, v: hybrid({"a": PLANE}, row, q, v)
+    run = lambda q, v: hybrid({"a": FREE_POINTS}, row, q, v)
     q = [[-0.5, 0, 0, 0, 0], [0, 0, 0, 0, 0], [-0.3, 0, 0, 0, 0.3], [-0.3, -0.3, 0, 0, 0], [0.1, 0.1, 0.1, 0.1, 0.1]]
     v = [[1, 0, 0, 0, 0], [1, 0, 0, 0, -1], [1, 0, 0, 0, -1], [1, 1, 0, 0, 0], [0.7, 0.7, 0.7, 0.7, 0.7]]
     q, v = (np.array(x, float) for x in (q, v))
@@ -589,9 +589,9 @@ def test_derivatives_through_transitions_at_one_instant():
 
     np.testing.assert_allclose(outcome(x), closed(x), atol=1e-14)
     for mode in (jax.jacfwd, jax.jacrev):
-        np.testing.assert_allclose(jax.jit(mode(outcome))(x), jax.jacfwd(closed)(x), atol=1e-11)
-        second = jax.jit(jax.vmap(jax.jacfwd(mode(outcome))))(jnp.stack([x, x]))
-        np.testing.assert_allclose(second, jnp.stack([jax.hessian(closed)(x)] * 2), atol=1e-10)
+        np.testing.assert_allclose(jax.jit(mode(outcome))(x), jax.jit(jax.jacfwd(closed))(x), atol=1e-11)
+        second = jax.jit(jax.vmap(jax.jacfwd(mode(outcome))))(np.stack([x, x]))
+        np.testing.assert_allclose(second, np.stack([jax.jit(jax.hessian(closed))(x)] * 2), atol=1e-10)
 
 
 # ---- members in different modes -------------------------------------------------------------------------------------
@@ -604,7 +604,7 @@ CROSS = [
     lagjax.Transition("right", "left", lambda q, v: q, -1),
     lagjax.Transition("left", "right", lambda q, v: q, 1),
 ]
-SIDE_TS = jnp.linspace(0.0, 6.0, 25)
+SIDE_TS = np.linspace(0.0, 6.0, 25)
 
 
 def two_springs(right, left, v=1.0):
@@ -668,7 +668,7 @@ def test_laws_that_are_singular_elsewhere_leave_no_nan_in_derivatives():
         run = hybrid({"pole": pole, "free": FREE}, [transition], 0.0, 0.5, ts, p[0], rtol=1e-12, max_transitions=2)
         return jnp.stack([run.q[-1], jnp.sum(run.energy()), run.transitions.t[0], run.end.q])
 
-    p = jnp.array([0.1])
+    p = np.array([0.1])
     assert outcome(p)[0] > 1
     np.testing.assert_allclose(jax.jit(jax.jacrev(outcome))(p), central(outcome, p), rtol=1e-6, atol=1e-9)
     late = lagjax.Transition("free", "pole", lambda q, v: q - 2.0)
@@ -705,8 +705,8 @@ def test_pytrees_and_quantities_of_like_constraints():
     }
     catch = lagjax.Transition("long", "short", lambda q, v: q["x"], -1)
     angle = 0.4
-    q0 = {"x": jnp.sin(angle), "y": -jnp.cos(angle)}
-    run = hybrid(modes, [catch], q0, {"x": 0.0, "y": 0.0}, jnp.linspace(0.0, 0.9, 10), rtol=1e-12, max_transitions=1)
+    q0 = {"x": np.sin(angle), "y": -np.cos(angle)}
+    run = hybrid(modes, [catch], q0, {"x": 0.0, "y": 0.0}, np.linspace(0.0, 0.9, 10), rtol=1e-12, max_transitions=1)
     quantities = lambda run: (run.energy(), run.multipliers["rod"], run.constraint_residual(), run.constraint_force())
     energy, multiplier, residual, force = jax.jit(quantities)(run)
     assert run.transitions.count == 1 and set(run.mode.tolist()) == {0, 1}
@@ -768,7 +768,6 @@ def stay(source="a", target="a", guard=lambda q, v: q - 0.5, **options):
 
 
 ROD = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q: q[1])
-PLANE = lagjax.System(lambda q, v: 0.5 * v @ v)
 
 
 @pytest.mark.parametrize(
@@ -793,7 +792,7 @@ PLANE = lagjax.System(lambda q, v: 0.5 * v @ v)
         ({"q0": np.nan}, ValueError, "q0 is nan"),
         (
             {"modes": {"a": lagjax.System(lambda q, v: v @ v + jax.scipy.special.betainc(2.0, 3.0, q[0]))},
-             "q0": jnp.zeros(2), "qdot0": jnp.zeros(2), "transitions": [stay(guard=lambda q, v: q[0])]},
+             "q0": np.zeros(2), "qdot0": np.zeros(2), "transitions": [stay(guard=lambda q, v: q[0])]},
             ValueError, "'a' has no machine code: .*regularized_incomplete_beta",
         ),
         ({"transitions": [stay(guard=lambda q, v: jnp.stack([q, v]))]}, TypeError, "one real number; got shape .2,."),
@@ -805,9 +804,9 @@ PLANE = lagjax.System(lambda q, v: 0.5 * v @ v)
         ({"transitions": [stay(reset=lambda q, v: (jnp.stack([q, q]), v))]}, TypeError, "must agree"),
         ({"transitions": [stay(reset=lambda q, v: (q[None], v[None]))]}, TypeError, "the shapes of the initial state"),
         ({"transitions": [stay(reset=lambda q, v: ({"x": q}, {"x": v}))]}, TypeError, "structure and the shapes"),
-        ({"modes": {"a": ROD}, "q0": jnp.ones(2), "qdot0": jnp.zeros(2)}, ValueError, "q0 does not satisfy constr"),
+        ({"modes": {"a": ROD}, "q0": np.ones(2), "qdot0": np.zeros(2)}, ValueError, "q0 does not satisfy constr"),
         (
-            {"transitions": [stay(guard=jax.tree_util.Partial(lambda w, q, v: q - w, jnp.ones(())))]},
+            {"transitions": [stay(guard=jax.tree_util.Partial(lambda w, q, v: q - w, np.ones(())))]},
             ValueError, "holds arrays of its own",
         ),
     ],
@@ -839,7 +838,7 @@ def test_what_cannot_be_a_transition(arguments, error, sentence):
 @pytest.mark.slow
 def test_a_reset_that_leaves_the_constraints_of_the_mode_is_not_repaired():
     # Onto the rod y = 0: with a velocity across it, to a place beside it, or rightly.
-    flight = {"flight": PLANE, "rod": ROD}
+    flight = {"flight": FREE_POINTS, "rod": ROD}
     q0, v0 = jnp.array([0.0, 1.0]), jnp.array([1.0, -1.0])
 
     landing = lagjax.Transition(
@@ -871,9 +870,9 @@ def test_a_reset_that_leaves_the_constraints_of_the_mode_is_not_repaired():
 def test_a_failure_names_the_mode():
     with pytest.raises(lagjax.SimulationError, match=r"off the constraints of 'rod'[^$]*mode 'rod'"):
         stuck = lagjax.Transition("flight", "rod", lambda q, v: q[1], -1)
-        start = jnp.array([0.0, 1.0]), jnp.array([1.0, -1.0])
-        hybrid({"flight": PLANE, "rod": ROD}, [stuck], *start, (0.0, 2.0), max_transitions=1)
-    wall = lagjax.System(lambda q, v: 0.5 * v**2 - jnp.sqrt(q))
+        start = np.array([0.0, 1.0]), np.array([1.0, -1.0])
+        hybrid({"flight": FREE_POINTS, "rod": ROD}, [stuck], *start, (0.0, 2.0), max_transitions=1)
+    wall = EDGE
     with pytest.raises(lagjax.SimulationError, match=r"just ahead: the derivative of L by q[^$]*mode 'wall'") as caught:
         hybrid({"a": FREE, "wall": wall}, [lagjax.Transition("a", "wall", lambda q, v: q - 1.0)], 2.0, -1.0, (0.0, 3.0))
     assert caught.value.trajectory.system["wall"] is wall
@@ -884,7 +883,7 @@ def test_a_failure_names_the_coordinate_without_mass_and_the_mode():
     massless = lagjax.System(lambda q, v: 0.5 * v[0] ** 2 - q[1] ** 2)
     with pytest.raises(lagjax.SimulationError, match=r"q\[1\][^$]*mode 'b'"):
         pass_on = lagjax.Transition("a", "b", lambda q, v: q[0] - 0.5)
-        hybrid({"a": PLANE, "b": massless}, [pass_on], jnp.zeros(2), jnp.array([1.0, 0.0]))
+        hybrid({"a": FREE_POINTS, "b": massless}, [pass_on], np.zeros(2), np.array([1.0, 0.0]))
 
 
 @pytest.mark.slow
@@ -919,9 +918,9 @@ def test_a_new_value_never_recompiles():
     first = fall(1.0, 0.9)
     count = len(traces)
     np.testing.assert_array_equal(first.q, fall(1.0, 0.9).q)
-    fall(1.1, 0.5, ts=jnp.linspace(0.1, 1.0, 9))
+    fall(1.1, 0.5, ts=np.linspace(0.1, 1.0, 9))
     assert len(traces) == count > 0
-    fall(1.0, 0.9, ts=jnp.array([0.0, 1.0]))  # machine code serves any number of output times
+    fall(1.0, 0.9, ts=np.array([0.0, 1.0]))  # machine code serves any number of output times
     assert len(traces) == count
 
 
@@ -975,8 +974,8 @@ def test_derivatives_through_modes_that_differ_by_numbers():
     for derivative, tolerance in ((jax.jacrev, 1e-10), (jax.hessian, 1e-8)):
         found, right = (derivative(lambda g, f=f: f(g)[3])(1.3) for f in (at_edges, exact))
         np.testing.assert_allclose(found, right, rtol=tolerance)
-    many = jnp.array([0.5, 1.3, 2.9])
-    np.testing.assert_allclose(jax.vmap(at_edges)(many), jax.vmap(exact)(many), rtol=1e-12)
+    many = np.array([0.5, 1.3, 2.9])
+    np.testing.assert_allclose(jax.vmap(at_edges)(many), jax.jit(jax.vmap(exact))(many), rtol=1e-12)
 
 
 def test_modes_of_a_ladder_keep_their_targets_and_constraints():
@@ -1001,7 +1000,7 @@ def test_a_reset_without_machine_code_is_named():
     bounce = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=shorten)
     scene = lagjax.Hybrid({"flight": lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q)}, [bounce], "flight")
     with pytest.raises(ValueError, match=r"with the reset .*shorten.*while"):
-        lagjax.simulate(scene, 1.0, 0.0, jnp.linspace(0.0, 1.0, 3))
+        lagjax.simulate(scene, 1.0, 0.0, np.linspace(0.0, 1.0, 3))
 
 
 def test_short_motions_from_a_traced_mode_on_are_one_motion_in_a_batch():
@@ -1021,6 +1020,6 @@ def test_short_motions_from_a_traced_mode_on_are_one_motion_in_a_batch():
     def whole(q0):
         return lagjax.simulate(scene, q0, 0.0, jnp.array([0.0, 3.0]), throw=False).q[-1]
 
-    starts = jnp.linspace(0.8, 1.2, 4)
+    starts = np.linspace(0.8, 1.2, 4)
     given, expected = (jax.vmap(jax.value_and_grad(of))(starts) for of in (in_parts, whole))
     np.testing.assert_allclose(given, expected, rtol=1e-9)

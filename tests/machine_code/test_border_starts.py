@@ -11,15 +11,15 @@ import pytest
 import lagjax
 
 T = 3.0
-TS = jnp.array([0.0, T])
+TS = np.array([0.0, T])
 # Three bodies of unit mass: one on a belt, one with the sliding mode v = −c q, one whose friction is at its limit.
 SCENE = lagjax.System(
     lambda q, v: 0.5 * v @ v,
     forces=lambda q, v, params: -jnp.sign(v - params["belt"] * jnp.array([1.0, 0.0, 0.0]) + params["c"] * q)
     * jnp.array([1.0, 4.0, 2.0]) + jnp.array([params["load"], 0.0, 2.0]),
 )  # fmt: skip
-X = {"v": jnp.array([0.5, -1.0, 0.0]), "belt": 0.5, "c": jnp.array([0.0, 1.0, 0.0]), "load": 0.25}
-Q = jnp.array([0.0, 1.0, 0.0])
+X = {"v": np.array([0.5, -1.0, 0.0]), "belt": 0.5, "c": np.array([0.0, 1.0, 0.0]), "load": 0.25}
+Q = np.array([0.0, 1.0, 0.0])
 
 
 def ends(x, ts=TS):
@@ -85,7 +85,7 @@ def test_a_second_run_from_the_end_of_the_first():
         lambda q, v: 0.5 * v @ v,
         forces=lambda q, v, params: -params[0] * jnp.sign(v + params[1] * q) - 0.3 * q[::-1],
     )
-    q0, v0 = jnp.array([0.5, -0.3]), jnp.array([0.7, 0.1])
+    q0, v0 = np.array([0.5, -0.3]), np.array([0.7, 0.1])
 
     def once(x):
         return jnp.sum(lagjax.simulate(scene, q0, v0, 2 * TS, x).q[-1] ** 2)
@@ -157,9 +157,9 @@ def test_nothing_that_rests_creeps():
     scene, count = lagjax.System(lambda q, v: 0.5 * v @ (jnp.array([1.0, 2.0, 0.7]) * v), forces=stack), 200
     mu = random.uniform(0.5, 5.0, count)
     speeds = np.where(np.arange(count) < 100, 0.0, random.uniform(-2.0, 2.0, count))
-    params = jnp.asarray(np.stack([mu, 0.9 * mu * random.uniform(-1.0, 1.0, count), speeds], axis=1))
+    params = np.asarray(np.stack([mu, 0.9 * mu * random.uniform(-1.0, 1.0, count), speeds], axis=1))
     q0, v0 = random.uniform(-1.0, 1.0, (count, 3)), np.repeat(speeds[:, None], 3, axis=1)
-    run = lagjax.simulate_batch(scene, q0, v0, jnp.array([0.0, 1e4, 1e8]), params, batch_axes=(0, 0, 0))
+    run = lagjax.simulate_batch(scene, q0, v0, np.array([0.0, 1e4, 1e8]), params, batch_axes=(0, 0, 0))
     np.testing.assert_array_equal(run.q[:100, -1], q0[:100])
     np.testing.assert_allclose(run.q[100:, -1], q0[100:] + 1e8 * v0[100:], rtol=1e-15)
     np.testing.assert_array_equal(run.qdot[:, -1], v0)
@@ -174,7 +174,7 @@ def test_what_has_come_to_rest_stays_there():
     def end(params, t):
         return lagjax.simulate(scene, 0.0, 1.0, jnp.stack([0.0 * t, t]), params).q[-1]
 
-    params = jnp.array([0.7, 1.1])  # it stops after v²/2 (g + μ)
+    params = np.array([0.7, 1.1])  # it stops after v²/2 (g + μ)
     np.testing.assert_allclose(end(params, 1e8), 0.5 / 1.8, rtol=1e-12)
     np.testing.assert_allclose(jax.grad(end)(params, 1e8), -0.5 / 1.8**2 * np.ones(2), rtol=1e-9)
 

@@ -25,7 +25,7 @@ def particle(potential=None, force=None):
 
 def end(scene, q0, v0, T, params=None, rtol=1e-9, **options):
     """The end state, and the trajectory."""
-    run = lagjax.simulate(scene, q0, v0, jnp.array([0.0, T]), params, rtol=rtol, throw=False, **options)
+    run = lagjax.simulate(scene, q0, v0, np.array([0.0, T]), params, rtol=rtol, throw=False, **options)
     return np.array([float(run.end.q), float(run.end.qdot)]), run
 
 
@@ -233,7 +233,7 @@ def test_an_atom_is_hit_from_any_distance():
         return [*y[2:], *(48 * (y[:2] @ y[:2]) ** -7 - 24 * (y[:2] @ y[:2]) ** -4) * y[:2]]
 
     for distance in (1e2, 1e4, 1e6):
-        run = lagjax.simulate(system, jnp.array([-distance, 0.7]), jnp.array([2.0, 0.0]), jnp.array([0.0, distance]))
+        run = lagjax.simulate(system, np.array([-distance, 0.7]), np.array([2.0, 0.0]), np.array([0.0, distance]))
         # A hundred diameters away the force is 24e-14.
         exact = solve_ivp(rate, (0, 100), [-100, 0.7, 2.0, 0.0], "DOP853", rtol=1e-12, atol=1e-12, max_step=0.5)
         np.testing.assert_allclose(run.qdot[-1], exact.y[2:, -1], atol=1e-8)
@@ -241,8 +241,8 @@ def test_an_atom_is_hit_from_any_distance():
 
 def test_which_powers_are_watched():
     """What every motion sees from afar, or cannot change by much, costs nothing."""
-    three = (jnp.arange(9.0) ** 1.5).reshape(3, 3)
-    pairs = jnp.array([0, 0, 1]), jnp.array([1, 2, 2])
+    three = (np.arange(9.0) ** 1.5).reshape(3, 3)
+    pairs = np.array([0, 0, 1]), np.array([1, 2, 2])
 
     def count(potential, q):
         return len(lagjax.System(lambda q, v: 0.5 * jnp.sum(v * v) - potential(q)).explain(q, q).narrow)
@@ -257,7 +257,7 @@ def test_which_powers_are_watched():
     def of_two(q):
         return -0.9 / jnp.sqrt((q[0] + 0.1) ** 2 + q[1] ** 2) - 0.1 / jnp.sqrt((q[0] - 0.9) ** 2 + q[1] ** 2)
 
-    assert count(of_two, jnp.ones(2)) == 0
+    assert count(of_two, np.ones(2)) == 0
     assert count(lambda q: jnp.cos(q) / (2 - jnp.cos(q) ** 2), 1.0) == 0
     assert count(lambda q: jnp.cos(q) / (1 + 1e-4 - jnp.cos(q) ** 2), 1.0) == 1
     assert count(lambda q: q**4 + q**6, 1.0) == 0
@@ -267,7 +267,7 @@ def test_which_powers_are_watched():
 
 
 def last_q(scene, q0, v0, T, params=None):
-    return lagjax.simulate(scene, q0, v0, jnp.array([0.0, T]), params).q[-1]
+    return lagjax.simulate(scene, q0, v0, np.array([0.0, T]), params).q[-1]
 
 
 REGION = particle(force=lambda q, v: jnp.where(q > 1.0, -0.3, 0.0))
@@ -300,9 +300,9 @@ def difference(f, x, h):
 def test_first_derivatives_through_borders(name):
     f, x, exact = DERIVATIVES[name]
     exact = difference(f, x, 1e-4) if exact is None else exact
-    forward, reverse = jax.jvp(f, (x,), (1.0,))[1], jax.grad(f)(x)
-    np.testing.assert_allclose([forward, reverse], exact, rtol=2e-7)
-    both = jax.jit(jax.vmap(jax.grad(f)))(jnp.array([x, x]))
+    both = jax.jit(lambda x: (jax.jvp(f, (x,), (1.0,))[1], jax.grad(f)(x)))(x)
+    np.testing.assert_allclose(both, exact, rtol=2e-7)
+    both = jax.jit(jax.vmap(jax.grad(f)))(np.array([x, x]))
     np.testing.assert_allclose(both, exact, rtol=2e-7)
 
 
@@ -340,7 +340,7 @@ def test_friction_that_sticks(rtol):
 def test_friction_is_overcome():
     # At rest until sin(t)/2 > 0.3.
     scene = particle(force=lambda q, v, t: 0.5 * jnp.sin(t) - 0.3 * jnp.sign(v))
-    run = lagjax.simulate(scene, 0.0, 0.0, jnp.array([0.0, 0.6, 1.0, 10.0]))
+    run = lagjax.simulate(scene, 0.0, 0.0, np.array([0.0, 0.6, 1.0, 10.0]))
     begin = np.arcsin(0.6)
     np.testing.assert_allclose(run.qdot[1:3], [0.0, 0.5 * (0.8 - np.cos(1.0)) - 0.3 * (1 - begin)], atol=1e-9)
 
@@ -373,15 +373,15 @@ def test_derivatives_of_a_motion_that_sticks():
 
 
 def test_two_pieces_slide_in_both_forms(monkeypatch):
-    ts, start = jnp.array([0.0, 40.0]), (jnp.array([1.0, 3.0]), jnp.zeros(2))
-    by_line = lagjax.simulate(two_blocks(), *start, ts, jnp.array([0.2, 0.1]))
+    ts, start = np.array([0.0, 40.0]), (np.array([1.0, 3.0]), np.zeros(2))
+    by_line = lagjax.simulate(two_blocks(), *start, ts, np.array([0.2, 0.1]))
     monkeypatch.setattr(lagjax._native._taylor, "LARGEST_LINE", -1)
     scene = two_blocks()
 
     def at_end(mu):
         return lagjax.simulate(scene, *start, ts, mu).q[-1]
 
-    mu = jnp.array([0.2, 0.1])
+    mu = np.array([0.2, 0.1])
     np.testing.assert_allclose(at_end(mu), by_line.q[-1], atol=1e-12)
     assert abs(by_line.qdot[-1]).max() < 1e-12 and by_line.stats["num_steps"] < 60
     by_mu = jax.jacrev(at_end)(mu)
@@ -406,15 +406,15 @@ def test_borders_and_features_in_tables(monkeypatch):
 
 
 def test_every_member_of_a_batch_has_its_own_borders():
-    q0 = jnp.linspace(0.5, 3.0, 37)
-    run = lagjax.simulate_batch(BLOCK, q0, jnp.zeros(37), jnp.array([0.0, 7.0, 50.0]), 0.3, batch_axes=(0, 0, None))
-    alone = jnp.stack([lagjax.simulate(BLOCK, x, 0.0, jnp.array([0.0, 7.0, 50.0]), 0.3).q for x in q0[::6]])
+    q0 = np.linspace(0.5, 3.0, 37)
+    run = lagjax.simulate_batch(BLOCK, q0, np.zeros(37), np.array([0.0, 7.0, 50.0]), 0.3, batch_axes=(0, 0, None))
+    alone = np.stack([lagjax.simulate(BLOCK, x, 0.0, np.array([0.0, 7.0, 50.0]), 0.3).q for x in q0[::6]])
     np.testing.assert_allclose(run.q[::6], alone, atol=1e-12)
 
 
 def test_back_in_time_through_borders():
-    forth = lagjax.simulate(SWITCHED, 0.0, 1.0, jnp.array([0.0, 3.0]), 1.7)
-    back = lagjax.simulate(SWITCHED, forth.q[-1], forth.qdot[-1], jnp.array([3.0, 0.0]), 1.7)
+    forth = lagjax.simulate(SWITCHED, 0.0, 1.0, np.array([0.0, 3.0]), 1.7)
+    back = lagjax.simulate(SWITCHED, forth.q[-1], forth.qdot[-1], np.array([3.0, 0.0]), 1.7)
     np.testing.assert_allclose([back.q[-1], back.qdot[-1]], [0.0, 1.0], atol=1e-12)
 
 
@@ -427,17 +427,17 @@ def test_friction_on_a_constrained_motion():
     angle = lagjax.System(
         lambda a, w: 0.5 * w * w + 9.81 * jnp.cos(a), forces=lambda a, w: -0.5 * jnp.sign(w) * jnp.cos(a)
     )
-    ts = jnp.array([0.0, 5.0, 30.0])
-    one = lagjax.simulate(cartesian, jnp.array([0.6, -0.8]), jnp.zeros(2), ts)
-    other = lagjax.simulate(angle, jnp.arcsin(0.6), 0.0, ts)
-    np.testing.assert_allclose(one.q[:, 0], jnp.sin(other.q), atol=1e-7)
+    ts = np.array([0.0, 5.0, 30.0])
+    one = lagjax.simulate(cartesian, np.array([0.6, -0.8]), np.zeros(2), ts)
+    other = lagjax.simulate(angle, np.arcsin(0.6), 0.0, ts)
+    np.testing.assert_allclose(one.q[:, 0], np.sin(other.q), atol=1e-7)
     assert abs(one.qdot[-1]).max() < 1e-12 and one.stats["num_steps"] < 150
 
 
 def test_pulses_over_a_hundred_thousand_periods():
     # v' = u − v with u = 1 over the first fifth of every period 0.01: v is what it was a period before.
     scene = particle(force=lambda q, v, t: jnp.where(jnp.mod(t, 0.01) < 0.002, 1.0, 0.0) - v)
-    run = lagjax.simulate(scene, 0.0, 0.0, jnp.array([0.0, 200.0, 1000.0]), max_steps=400_000)
+    run = lagjax.simulate(scene, 0.0, 0.0, np.array([0.0, 200.0, 1000.0]), max_steps=400_000)
     v = (1 - np.exp(-0.002)) * np.exp(-0.008) / (1 - np.exp(-0.01))
     np.testing.assert_allclose(run.qdot[1:], v, atol=1e-10)
     assert run.stats["num_rejected_steps"] == 0
@@ -487,20 +487,24 @@ def test_a_cradle_of_hertzian_contacts_that_touch_is_struck(rtol, unit):
     first, rest = np.eye(count)[0], np.zeros(count)
     start = np.append(rest, 0.05 * omega * first)  # a quarter of a swing later
     v = solve_ivp(rate, (0, after), start, method="DOP853", rtol=1e-12, atol=1e-15).y[count:, -1]
-    scene, times = lagjax.System(lagrangian), jnp.array([0.0, 0.5 * np.pi / omega + after])
+    scene, times = lagjax.System(lagrangian), np.array([0.0, 0.5 * np.pi / omega + after])
     run = lagjax.simulate(scene, -0.05 * unit * first, rest, times, 1e9 / np.sqrt(unit), rtol=rtol)
     np.testing.assert_allclose(run.qdot[-1] / unit, v, atol=100 * rtol)
 
 
 @pytest.mark.parametrize(
-    ("count", "gap", "power"), [(2, 0.0, 1.5), (3, 0.0, 1.5), (3, 1e-6, 1.5), (3, 0.0, 1.0), (3, 0.0, 2.0)]
+    ("count", "gap", "power"),
+    sweep(
+        [(2, 0.0, 1.5), (3, 0.0, 1.5), (3, 1e-6, 1.5), (3, 0.0, 1.0), (3, 0.0, 2.0)],
+        kept=[(2, 0.0, 1.5), (3, 0.0, 1.0)],
+    ),
 )
 def test_derivatives_of_a_cradle_that_is_struck(count, gap, power):
     """They rise to thousands while balls touch, and fall to one: steps past a corner are those of the tangents.
 
     Balls at rest that touch stand at a corner; by the speed of the one that comes there is a derivative all the same.
     """
-    mass, stiffness, first = 0.1, 1e6 if power == 1 else 1e9, jnp.eye(count)[0]
+    mass, stiffness, first = 0.1, 1e6 if power == 1 else 1e9, np.eye(count)[0]
 
     def potential(q):
         return stiffness / (power + 1) * jnp.sum(jnp.maximum(q[:-1] - q[1:] - gap, 0.0) ** (power + 1))
@@ -529,5 +533,5 @@ def test_balls_at_rest_that_touch_have_derivatives_by_where_they_are():
     """By Hertz's law, whose slope is zero there."""
     scene = lagjax.System(lambda q, v: 0.5 * v @ v - jnp.maximum(q[0] - q[1], 0.0) ** 2.5)
     for of in (jax.jacfwd, jax.jacrev):
-        found = of(lambda q: lagjax.simulate(scene, q, jnp.zeros(2), jnp.array([0.0, 1.0])).q[-1])(jnp.zeros(2))
+        found = of(lambda q: lagjax.simulate(scene, q, jnp.zeros(2), jnp.array([0.0, 1.0])).q[-1])(np.zeros(2))
         np.testing.assert_array_equal(found, np.eye(2))

@@ -40,17 +40,17 @@ def test_motions_that_die_out_towards_a_corner():
         return jnp.array([jnp.log1p(b / a) / b, 0.5, 0.5 + width, 0.0])
 
     system = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q[3] ** 2, forces=drag)
-    start, params = (jnp.array([0.0, 1.0, 0.0, 1.0]), jnp.array([1.0, 0.0, 1.0, 0.0])), jnp.array([1.0, 0.7, 0.1])
+    start, params = (np.array([0.0, 1.0, 0.0, 1.0]), np.array([1.0, 0.0, 1.0, 0.0])), np.array([1.0, 0.7, 0.1])
     found = end(params, 1000.0)
     np.testing.assert_allclose(found.q[-1], rest(params), atol=1e-9)
     assert found.stats["num_steps"] < 4000
     slopes = jax.jacrev(lambda params: end(params, 250.0).q[-1])(params)
-    np.testing.assert_allclose(slopes, jax.jacobian(rest)(params), atol=1e-8)
+    np.testing.assert_allclose(slopes, jax.jit(jax.jacobian(rest))(params), atol=1e-8)
 
 
 def test_a_motion_that_died_out_long_ago():
     system = lagjax.System(lambda q, v: 0.5 * v**2, forces=lambda q, v: -v - jnp.abs(v) * v)
-    found = lagjax.simulate(system, 0.0, 1.0, jnp.array([0.0, 1e6]))
+    found = lagjax.simulate(system, 0.0, 1.0, np.array([0.0, 1e6]))
     np.testing.assert_allclose(found.q[-1], np.log(2.0), atol=1e-9)
     assert found.stats["num_steps"] < 1000
 
@@ -58,7 +58,7 @@ def test_a_motion_that_died_out_long_ago():
 @pytest.mark.parametrize("size", [1e-30, 1e-200])
 def test_a_border_is_crossed_with_any_amplitude(size):
     system = lagjax.System(lambda q, v: 0.5 * v**2, forces=lambda q, v: -jnp.where(q > 0, 4 * q, q))
-    ts = jnp.array([0.0, 1.0, 10 * (np.pi / 2 + np.pi)])
+    ts = np.array([0.0, 1.0, 10 * (np.pi / 2 + np.pi)])
     found = lagjax.simulate(system, size, 0.0, ts, atol=1e-13 * size)
     np.testing.assert_allclose(found.q[1:], size * np.array([2 * np.sin(np.pi / 4 - 1.0), 1.0]), rtol=1e-9)
 
@@ -99,7 +99,7 @@ def test_rates_whose_powers_overflow():
 
     for rate, rtol in ((1e16, 1e-14), (1e20, 1e-12), (1e30, 1e-9)):
         np.testing.assert_allclose(end(1.0, rate, rtol).q[-1], np.cos(3.0), atol=100 * rtol)
-    rates = jnp.array([1.0, 1e20])
+    rates = np.array([1.0, 1e20])
     for slope in (jax.grad, jax.jacfwd):
         by_q, by_rate = jax.vmap(slope(lambda *x: end(*x).q[-1], (0, 1)), (None, 0))(1.0, rates)
         np.testing.assert_allclose(by_q, np.cos(3.0), atol=1e-10)
@@ -128,6 +128,6 @@ def test_slopes_over_borders_of_functions_of_exponentials():
         return lagjax.simulate(system, x[0], x[1], jnp.array([0.0, 3.0]), x[2]).q[-1]
 
     system = lagjax.System(lambda q, v: 0.5 * v**2 - 0.1 * jnp.log(1 + jnp.exp(q)), forces=force)
-    x = jnp.array([-0.4, 1.3, 1.0])
-    differences = [(end(x + 1e-6 * e) - end(x - 1e-6 * e)) / 2e-6 for e in jnp.eye(3)]
+    x = np.array([-0.4, 1.3, 1.0])
+    differences = [(end(x + 1e-6 * e) - end(x - 1e-6 * e)) / 2e-6 for e in np.eye(3)]
     np.testing.assert_allclose(jax.grad(end)(x), differences, rtol=1e-6)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from sweeps import sweep
 
-from lagjax._engine.taylor._line_functions import Line
+from lagjax._engine.taylor import Line
 from lagjax._native import LineCode
 from lagjax._tracing import lower
 
@@ -17,7 +17,7 @@ def function(x):
     return jnp.stack([a * jnp.sin(b) / (1.0 + c**2), jnp.sqrt(a + b * d) + jnp.abs(c - 2.0) * d, jnp.exp(-a * c) * d])
 
 
-PROGRAM = lower(function, jnp.ones(4))
+PROGRAM = lower(function, np.ones(4))
 LINE = Line(PROGRAM.line, 4, 4)
 X, D = np.array([0.7, 1.1, 0.4, 0.9]), np.array([0.3, -0.5, 0.2, 0.8])
 
@@ -52,7 +52,7 @@ def test_a_root_bends_where_its_argument_stands_still():
         return jnp.stack([h, x[2] * h, jnp.maximum(x[2], -h), jnp.arctan2(x[1], x[0])])
 
     x, across = np.array([0.6, 0.8, 0.0]), np.array([-0.8, 0.6, 0.0])
-    line = Line(lower(root, jnp.ones(3)).line, 3, 3)
+    line = Line(lower(root, np.ones(3)).line, 3, 3)
     for derivative in (
         lambda f: jax.jvp(lambda x: jax.jvp(f, (x,), (across,))[1], (x,), (across,))[1],
         lambda f: jax.jacfwd(jax.jacfwd(f))(x),
@@ -74,7 +74,7 @@ def test_a_long_line_is_what_its_operations_are():
             y = 0.3 * (turned + jnp.where(up & (y < 2.0), jnp.exp(-y), jnp.sqrt(abs(y)))) + 0.2 * jnp.cos(y) ** 3
         return jnp.concatenate([y, jnp.zeros(3), y > 0.2, jnp.array([2.5]), x[:2], whole + 0.0])
 
-    program, rows = lower(steps, jnp.zeros(20)), np.random.default_rng(0).normal(size=(21, 20))
+    program, rows = lower(steps, np.zeros(20)), np.random.default_rng(0).normal(size=(21, 20))
     expected = program.line.evaluate(list(rows.T)).T
     assert len(program.line.nodes) > 1700
     for made in ({}, {"largest": 20_000}, {"largest": 20_000, "lanes": 8}):
@@ -106,7 +106,7 @@ def test_running_errors_of_a_walk_are_those_of_a_program_of_their_own():
         more = jnp.where(w >= 1.0, u * v, w) + jnp.where(w < -3.0, 1.0, u)
         return jnp.stack([pieces, finite, jnp.sin(u) * jnp.cos(w) - u, (u + 1e6) - 1e6, more, jnp.exp(w) * u])
 
-    program = lower(function, jnp.zeros(3), moving=2)
+    program = lower(function, np.zeros(3), moving=2)
     errors, walk = program.rounding_of(range(6), 2), LineCode(program.line, 3, moving=2)
     rows = np.array([[0.7, 0.25, -1.2], [0.25, 0.25, 0.25], [-2.0, 3.0, 0.0]])
     np.testing.assert_allclose(walk(rows), errors.line.evaluate(list(rows.T)).T, rtol=1e-14)
@@ -119,7 +119,7 @@ def test_long_runs_of_one_output_are_written_by_a_loop():
         repeated = jnp.broadcast_to(x[0] * x[1], (50,))
         return jnp.concatenate([jnp.zeros(100), x[:1] > 0.5, jnp.zeros(40), repeated, x[1:], jnp.zeros(3)])
 
-    program = lower(rows, jnp.ones(3))
+    program = lower(rows, np.ones(3))
     code = Line(program.line, 3, 3).code
     assert code is not None
     inputs = np.array([[0.3, 1.1, 0.4], [0.7, -2.0, 3.0]])

@@ -8,13 +8,13 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from lagrangians import oscillator
+from scenes import OSCILLATOR
 
 import lagjax
 import lagjax._engine.taylor as machine_code
 
-OSCILLATOR = lagjax.System(oscillator)
 BY_ARRAYS = lagjax.System(oscillator, path="array")
-TS = jnp.linspace(0.0, 10.0, 21)
+TS = np.linspace(0.0, 10.0, 21)
 INSIST = {"solver": lagjax.MachineCode()}
 
 

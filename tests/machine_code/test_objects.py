@@ -14,9 +14,9 @@ import pytest
 
 import lagjax
 from lagjax import _native
-from lagjax._engine._problem import Problem
+from lagjax._engine import Problem
 from lagjax._engine.taylor import flow_of
-from lagjax._interface._layout import Layout
+from lagjax._interface import Layout
 from lagjax._native import _ir, _objects
 
 SCENE = lagjax.scenes.spherical_pendulum()

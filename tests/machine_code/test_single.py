@@ -15,6 +15,7 @@ import jax.numpy as jnp
 import lagrangians
 import numpy as np
 import pytest
+from scenes import BALL_G, FREE_POINTS, KEPLER, OSCILLATOR, RAMP
 from sweeps import sweep
 
 import lagjax
@@ -81,7 +82,7 @@ def agrees(found, truth, ulps):
 def test_an_oscillator_is_right_to_the_last_digit(off):
     """From the closed form: half a unit of rounding, and what the error of 1e-9 per step adds."""
     ts = np.linspace(0, 60, 61, dtype=np.float32)
-    run = lagjax.simulate(lagjax.System(lagrangians.oscillator), 1.0, 0.25, ts)
+    run = lagjax.simulate(OSCILLATOR, 1.0, 0.25, ts)
     t = ts.astype(np.float64)
     agrees(run.q, np.cos(t) + 0.25 * np.sin(t), 0.6)
     agrees(run.qdot, 0.25 * np.cos(t) - np.sin(t), 0.6)
@@ -196,7 +197,7 @@ def test_batches_of_gradients_loops_and_branches(off):
 # ---- starts on surfaces ----------------------------------------------------------------------------------------------
 
 # Levels are k/10 in float64, k a number of float32: the start float32(k/10) is up to half a rounding beside them.
-TENTHS, FREE = np.arange(1, 20, dtype=np.float32), lagjax.System(lambda q, v: 0.5 * jnp.sum(v**2))
+TENTHS, FREE = np.arange(1, 20, dtype=np.float32), FREE_POINTS
 SECOND = np.float32([0.0, 1.0])
 
 
@@ -246,7 +247,7 @@ def test_a_blow_goes_through_balls_that_touch(off, modes):
 @pytest.mark.slow
 def test_a_start_on_a_section_has_to_leave_it_first(off):
     """A throw returns to its level, once; with a direction a motion that goes that way ends where it starts."""
-    throw = lagjax.System(lambda q, v: 0.5 * v**2 - q)
+    throw = RAMP
 
     def section(q, v, params):
         return params / 10 - q
@@ -422,7 +423,7 @@ def test_what_is_computed_in_doubles_is_differentiated_and_batched(off):
     ],
 )
 def test_the_state_decides_about_the_precision(q0, qdot0, ts, params, dtype):
-    system = lagjax.System(lagrangians.ball_g)
+    system = BALL_G
     run = lagjax.simulate(system, q0, qdot0, ts, params)
     kinds = {x.dtype for x in jax.tree.leaves((run.q, run.qdot, run.ts, run.end.q, run.end.t))}
     assert kinds == {np.dtype(dtype)} and run.engine == "MachineCode"
@@ -458,7 +459,7 @@ def test_what_a_scene_does(off):
     assert rest.q.dtype == np.float32 and abs(rest.q) < 1e-7 and rest.ok
     flat = lagjax.linearize(SCENE, 0.0, params=params)
     agrees(flat.A, np.array([[0, 1], [-9.81 / float(LENGTH), 0]]), 1)
-    kepler = lagjax.System(lagrangians.kepler)
+    kepler = KEPLER
     found = lagjax.conserved_quantities(kepler, jnp.array([1.0, 0.0]), jnp.array([0.0, 1.2]))
     assert [charge.name for charge in found] == ["energy", "angular momentum in the plane 01"]
     orbit = lagjax.periodic_orbit(SCENE, 1.0, 0.0, 1.2, params)

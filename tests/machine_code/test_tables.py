@@ -7,8 +7,8 @@ import pytest
 
 import lagjax
 from lagjax import _native
-from lagjax._equations._derivation import derivation_of, numbers_of
-from lagjax._interface._layout import Layout
+from lagjax._equations import derivation_of, numbers_of
+from lagjax._interface import Layout
 from lagjax._native import _schedule, _taylor
 from lagjax._native._integrator import Integrator
 from lagjax._native._motion_parts import MotionParts
@@ -90,7 +90,7 @@ def test_piecewise_operations_parameters_that_are_integers_and_guards():
         turned = jnp.sin(jnp.mod(q[1], 2.0)) * jnp.cos(q[1]) / (1 + abs(v[1])) + jnp.tanh(v[0]) + n * jnp.cos(t)
         return wall, -turned, False
 
-    shapes = jnp.ones(2), jnp.ones(2), 1.0
+    shapes = np.ones(2), np.ones(2), 1.0
     program = lower(acceleration, *shapes, 1.0, 2)
 
     def value(q, v, t, k, n):
@@ -122,7 +122,7 @@ def everything(x, y, s):
 
 @pytest.mark.parametrize("stored", [0, 9, 30])
 def test_a_schedule_computes_the_program(stored):
-    program = lower(everything, jnp.ones(7), jnp.ones(7), 1.0)
+    program = lower(everything, np.ones(7), np.ones(7), 1.0)
     numbers = np.random.default_rng(0).uniform(0.5, 1.5, 15)
     plan, memory = _schedule.schedule(program.line, stored), {}
     count, nodes = len(program.line.outputs), len(program.line.nodes)
@@ -156,7 +156,7 @@ def test_a_schedule_computes_the_program(stored):
 
 
 def test_what_comes_often_is_one_operation():
-    program = lower(everything, jnp.ones(7), jnp.ones(7), 1.0)
+    program = lower(everything, np.ones(7), np.ones(7), 1.0)
     plan = _schedule.schedule(program.line, 0)
     done = [operation for group in plan.groups for operation in group]
     assert len(done) < 0.8 * program.operations

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import FREE
 
 import lagjax
 
@@ -92,7 +93,7 @@ def test_lyapunov_exponents_of_the_sinai_billiard_are_those_of_its_tangent_maps(
     scene = lagjax.System(lambda q, v: 0.5 * v @ v, contacts=gaps, restitution=1.0)
     q0, v0 = np.array([1.0, 0.3]), np.array([-1.0, 0.1])  # of size one: states are in their own units
     q, growth = billiard(q0, v0, end, radius, wall)
-    run = lagjax.simulate(scene, q0, v0, jnp.array([0.0, end]), rtol=1e-13)
+    run = lagjax.simulate(scene, q0, v0, np.array([0.0, end]), rtol=1e-13)
     np.testing.assert_allclose(run.q[-1], q, atol=1e-14 * np.linalg.norm(growth))
     order = [0, 1, 3, 2]  # q₁ q₂ p₂ p₁
     stretch = np.abs(np.diag(np.linalg.qr(growth[np.ix_(order, order)])[1]))
@@ -138,8 +139,8 @@ def test_crossings_of_a_ball_that_bounces_are_those_of_its_parabolas(kind):
     np.testing.assert_allclose(found["top"].t[:2], tops, rtol=1e-9)
     assert found["through"].count == 5 and found["floor"].count == 0, "a blow turns round: it is no crossing"
     np.testing.assert_allclose(found["through"].q[:5], 0.3, atol=1e-14)
-    by_both = jax.jit(jax.jacrev(lambda x: bounce_crossings(kind, *x)["through"].t))(jnp.array([h, e]))
-    exact = jax.jacfwd(lambda x: crossings_of_a_bounce(*x)[0])(jnp.array([h, e]))
+    by_both = jax.jit(jax.jacrev(lambda x: bounce_crossings(kind, *x)["through"].t))(np.array([h, e]))
+    exact = jax.jacfwd(lambda x: crossings_of_a_bounce(*x)[0])(np.array([h, e]))
     np.testing.assert_allclose(by_both[:5], exact, rtol=1e-7)
     assert np.isnan(by_both[5:]).all()
     little = bounce_crossings(kind, h, e, count=3)
@@ -148,7 +149,7 @@ def test_crossings_of_a_ball_that_bounces_are_those_of_its_parabolas(kind):
 
 def test_crossings_in_every_mode_and_where_the_mode_changes():
     """A particle goes round: out to q = 1, back to q = 0, at speed one."""
-    free = lagjax.System(lambda q, v: 0.5 * v**2)
+    free = FREE
     back = [
         lagjax.Transition("out", "in", lambda q, v: q - 1.0, 1, lambda q, v: (q, -v)),
         lagjax.Transition("in", "out", lambda q, v: q, -1, lambda q, v: (q, -v)),
@@ -156,7 +157,7 @@ def test_crossings_in_every_mode_and_where_the_mode_changes():
     scene = lagjax.Hybrid({"out": free, "in": free}, back, "out")
     sections = {"half": lambda q, v: q - 0.5, "rising": lambda q, v: q - 0.25, "clock": lambda q, v, t: t - 2.0}
     found = lagjax.crossings(
-        scene, sections, 0.5, 1.0, jnp.array([0.0, 5.1]), direction={"half": 0, "rising": 1, "clock": 1}
+        scene, sections, 0.5, 1.0, np.array([0.0, 5.1]), direction={"half": 0, "rising": 1, "clock": 1}
     )
     np.testing.assert_allclose(found["half"].t[:6], [1.0, 2.0, 3.0, 4.0, 5.0, np.nan], atol=1e-13)
     np.testing.assert_allclose(found["rising"].t[:3], [1.75, 3.75, np.nan], atol=1e-13)
@@ -185,4 +186,4 @@ def test_crossings_of_a_block_that_slides_and_stops():
     slope = jax.jacrev(lambda v: found(v, mu)["near"].t[0])(v)
     np.testing.assert_allclose(slope, (1 - v / root) / mu, rtol=1e-11)
     with pytest.raises(lagjax.SimulationError, match="more crossings"):
-        lagjax.crossings(falling_ball("contacts"), lambda q, v: q - 0.3, 1.0, 0.0, jnp.array([0.0, 6.0]), 0.8, count=4)
+        lagjax.crossings(falling_ball("contacts"), lambda q, v: q - 0.3, 1.0, 0.0, np.array([0.0, 6.0]), 0.8, count=4)

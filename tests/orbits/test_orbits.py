@@ -4,13 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from lagrangians import pendulum, pendulum_in_gravity
+from scenes import OSCILLATORS, PENDULUM, PENDULUM_IN_GRAVITY
 from scipy.special import ellipk
 
 import lagjax
 from lagjax._analysis.orbits import _floquet, _orbit
-
-PENDULUM = lagjax.System(pendulum)
 
 
 def _henon_heiles(q, v):
@@ -83,7 +81,7 @@ def test_a_search_is_not_traced():
     with pytest.raises(TypeError, match="search outside of jit"):
         jax.jit(lambda a: lagjax.periodic_orbit(PENDULUM, a, 0.0, 6.5).period)(1.0)
     with pytest.raises(TypeError, match=r"instead of jax\.vmap"):
-        jax.vmap(lambda a: lagjax.periodic_orbit(PENDULUM, a, 0.0, 6.5).period)(jnp.ones(2))
+        jax.vmap(lambda a: lagjax.periodic_orbit(PENDULUM, a, 0.0, 6.5).period)(np.ones(2))
 
 
 def test_an_orbit_in_three_lines():
@@ -110,9 +108,9 @@ def test_multipliers_of_henon_heiles():
     orbit = lagjax.periodic_orbit(HENON_HEILES, np.array([0.0, 0.3]), np.zeros(2), 6.6)
     first, second, *known = np.asarray(orbit.multipliers)
     assert orbit.ok and known == [1.0, 1.0] and abs(orbit.q0[0]) < 1e-15
-    ts = jnp.array([0.0, float(orbit.period)])
+    ts = np.array([0.0, float(orbit.period)])
     step = 1e-6  # a difference in x, whose square the motion feels
-    shift = jnp.array([step, 0.0])
+    shift = np.array([step, 0.0])
     displaced = lagjax.simulate(HENON_HEILES, orbit.q0 + shift, orbit.qdot0, ts, rtol=1e-14)
     pushed = lagjax.simulate(HENON_HEILES, orbit.q0, orbit.qdot0 + shift, ts, rtol=1e-14)
     trace = (displaced.q[-1, 0] + pushed.qdot[-1, 0]) / step
@@ -198,7 +196,7 @@ def test_nonlinear_normal_modes_of_a_double_pendulum():
 
 @pytest.mark.slow
 def test_a_family_by_a_parameter():
-    swing = lagjax.System(pendulum_in_gravity)
+    swing = PENDULUM_IN_GRAVITY
     begin = lagjax.periodic_orbit(swing, 1.0, 0.0, 6.5, {"g": 1.0})
     swings = lagjax.family(swing, begin, {"g": 1.0}, by="g", until=1.3, step=0.1)
     np.testing.assert_allclose(swings.period, begin.period)
@@ -216,7 +214,7 @@ def test_a_family_that_ends_says_where():
     assert swings.energy[-1] < 1.0 and swings.energy[-1] > 0.9
     assert "could not be followed beyond" in swings.message or "raise count" in swings.message
     with pytest.raises(ValueError, match="must be one periodic orbit that is ok"):
-        lagjax.family(PENDULUM, begin._replace(ok=jnp.asarray(False)))
+        lagjax.family(PENDULUM, begin._replace(ok=np.asarray(False)))
 
 
 def _probe(r, v, params):
@@ -294,7 +292,7 @@ def test_an_orbit_of_twice_the_period_branches_off():
     np.testing.assert_allclose(np.asarray(along.multipliers)[place, :2], -1.0, atol=1e-4)
     twice = lagjax.branch_off(HENON_HEILES, along, int(place))
     assert twice.ok and abs(twice.period / along.period[place] - 2) < 1e-2
-    halfway = lagjax.simulate(HENON_HEILES, twice.q0, twice.qdot0, jnp.linspace(0, twice.period, 3), rtol=1e-13)
+    halfway = lagjax.simulate(HENON_HEILES, twice.q0, twice.qdot0, np.linspace(0, twice.period, 3), rtol=1e-13)
     np.testing.assert_allclose(halfway.q[-1], twice.q0, atol=1e-11)
     assert np.abs(halfway.q[1] - twice.q0).max() > 1e-3
     with pytest.raises(ValueError, match="No family crosses at orbit 0"):
@@ -304,7 +302,7 @@ def test_an_orbit_of_twice_the_period_branches_off():
 @pytest.mark.slow
 def test_all_orbits_have_one_period():
     # Nothing but the energy tells the orbits of an oscillator apart: the family rises in it, and nothing branches.
-    oscillator = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * q @ q)
+    oscillator = OSCILLATORS
     begin = lagjax.periodic_orbit(oscillator, np.array([0.3, 0.1]), np.zeros(2), 6.3)
     orbits = lagjax.family(oscillator, begin, until=2.0)
     np.testing.assert_allclose(orbits.period, 2 * np.pi, rtol=1e-12)

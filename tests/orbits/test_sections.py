@@ -15,7 +15,7 @@ OSCILLATOR = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * (q[0] ** 2 + 2.0 * q
 def test_a_section_is_an_ellipse():
     matplotlib = pytest.importorskip("matplotlib")
     matplotlib.use("Agg")
-    amplitudes = jnp.array([0.5, 1.0])
+    amplitudes = np.array([0.5, 1.0])
 
     def section(a):
         start = jnp.array([0.0, a]), jnp.array([1.0, 0.0])
@@ -29,6 +29,6 @@ def test_a_section_is_an_ellipse():
     pairs = np.asarray(lagjax.plot.return_map(found, lambda q, v: q[1]).collections[0].get_offsets())
     assert len(pairs) == 10  # of each member one less than its crossings
     np.testing.assert_allclose(pairs[0], [0.5 * np.cos(np.sqrt(2) * 2 * np.pi * k) for k in (1, 2)], atol=1e-8)
-    never = lagjax.crossings(OSCILLATOR, lambda q, v: q[0] - 5.0, jnp.zeros(2), jnp.ones(2), jnp.array([0.0, 9.0]))
+    never = lagjax.crossings(OSCILLATOR, lambda q, v: q[0] - 5.0, np.zeros(2), np.ones(2), np.array([0.0, 9.0]))
     with pytest.raises(ValueError, match="never crossed"):
         lagjax.plot.poincare(never, lambda q, v: (q[1], v[1]))

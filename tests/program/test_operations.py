@@ -70,7 +70,7 @@ def test_a_new_operation_is_one_row(monkeypatch):
     np.testing.assert_allclose(program.line.vjp([x, y], [1.0]), exact, rtol=1e-11)
     # Its Taylor series in machine code: q = erf(s t) solves q̈ = −2 s² erf⁻¹(q) q̇ / s.
     s = 0.8
-    motion = lower(lambda q, v, t: (-2 * s * lax.erf_inv(q[0]) * v[0], False), jnp.ones(1), jnp.ones(1), 0.0)
+    motion = lower(lambda q, v, t: (-2 * s * lax.erf_inv(q[0]) * v[0], False), np.ones(1), np.ones(1), 0.0)
     ts = np.linspace(0.0, 1.5, 7)
     outcome = _native.Kernel(motion, 1)(ts[None], [[0.0, 2 * s / np.sqrt(np.pi)]], np.zeros((1, 0)), 1e-12, 1e-15, 100)
     assert outcome.code == _native.DONE

@@ -7,7 +7,7 @@ import pytest
 
 import lagjax
 
-EDGES = jnp.array([-0.2, 0.1, 0.5])
+EDGES = np.array([-0.2, 0.1, 0.5])
 # A force, and the same one as comparisons with `where`.
 PAIRS = {
     "a Boolean times a number": (lambda q, v: 2 * (q < 0) - 0.5 - q, lambda q, v: jnp.where(q < 0, 2.0, 0.0) - 0.5 - q),

@@ -12,8 +12,8 @@ from jax import lax
 from sweeps import sweep
 
 import lagjax
-from lagjax._equations._derivation import derivation_of
-from lagjax._interface._layout import Layout
+from lagjax._equations import derivation_of
+from lagjax._interface import Layout
 from lagjax._program import Unlowerable, pullback
 from lagjax._tracing import lower
 
@@ -52,11 +52,11 @@ def assert_same(function, *arguments, tolerance=TOLERANCE, in_jax=False):
     return program
 
 
-A = jnp.array([0.3, -0.7, 1.4])
-B = jnp.array([0.9, 0.4, -0.2])
-P = jnp.array([0.2, 0.5, 0.8])
-M = jnp.arange(12.0).reshape(3, 4) / 7 - 0.6
-SPREAD = jnp.array([[0.3, 1.2, -0.4, 0.7], [1.1, -0.2, 0.6, -0.9], [-0.5, 0.8, 1.3, 0.2]])
+A = np.array([0.3, -0.7, 1.4])
+B = np.array([0.9, 0.4, -0.2])
+P = np.array([0.2, 0.5, 0.8])
+M = np.arange(12.0).reshape(3, 4) / 7 - 0.6
+SPREAD = np.array([[0.3, 1.2, -0.4, 0.7], [1.1, -0.2, 0.6, -0.9], [-0.5, 0.8, 1.3, 0.2]])
 N = jnp.array([5, -3, 2], dtype=jnp.int32)
 
 
@@ -207,7 +207,7 @@ def test_all_families_in_jax():
     functions, arguments = zip(*((function, arguments) for function, *arguments in FAMILIES.values()), strict=True)
     program = lower(lambda *each: [f(*xs) for f, xs in zip(functions, each, strict=True)], *arguments)
     xs = scalars(*jax.tree.leaves(arguments))
-    lanes, expected = [jnp.stack([x, x, x]) for x in xs], flat(program.evaluate(*map(np.asarray, xs)))
+    lanes, expected = [np.stack([x, x, x]) for x in xs], flat(program.evaluate(*map(np.asarray, xs)))
     for outputs in (jax.jit(program.__call__)(*lanes), jax.jit(jax.vmap(program))(*lanes)):
         assert all(output.shape == (3,) for output in outputs)
         found = flat([output[1] for output in outputs])
@@ -251,7 +251,7 @@ def test_derivatives_of_the_sign_of_a_complex_number():
     """z/|z| = e^(iθ): for L = v²/2 + Re z/|z| of z = e^(x + iq) the force is −sin q, whatever x is."""
     scene = lagjax.System(lambda q, v: 0.5 * v**2 + jnp.real(jnp.sign(jnp.exp(0.7 + 1j * q))))
     derivation = derivation_of(scene, Layout.from_state(1.0, 0.0), None)
-    slope = derivation.evaluate(["lagrangian_by_q"], [jnp.array(1.0), jnp.array(0.0), 0.0])["lagrangian_by_q"]
+    slope = derivation.evaluate(["lagrangian_by_q"], [np.array(1.0), np.array(0.0), 0.0])["lagrangian_by_q"]
     np.testing.assert_allclose(np.ravel(slope), -np.sin(1.0), rtol=1e-15)
 
 
@@ -412,7 +412,7 @@ def test_masses_as_parameters_do_not_move_the_diagonal_of_a_chain():
         vx, vy = jnp.cumsum(jnp.cos(q) * v), jnp.cumsum(jnp.sin(q) * v)
         return 0.5 * jnp.sum(m * (vx**2 + vy**2)) + jnp.sum(m * jnp.cumsum(jnp.cos(q)))
 
-    mass = lower(jax.hessian(lagrangian, 1), *state(3), jnp.ones(3))
+    mass = lower(jax.hessian(lagrangian, 1), *state(3), np.ones(3))
     assert all(mass.depends(4 * i) <= {6, 7, 8} for i in range(3)) and mass.depends(1) >= {0, 1}
 
 
@@ -486,7 +486,7 @@ def test_functions_of_a_user_s_own_with_a_name_of_numpy_s_are_what_they_are(name
     assert_same(
         jax.vmap(name_like(name, function), (None, 0) if name == "searchsorted" else 0),
         *(
-            jnp.stack([x, x]) if k == len(arguments) - 1 or name != "searchsorted" else x
+            np.stack([x, x]) if k == len(arguments) - 1 or name != "searchsorted" else x
             for k, x in enumerate(arguments)
         ),
     )
@@ -632,9 +632,9 @@ def test_derivatives_of_some_inputs_and_mixed_outputs():
 
 def test_derivatives_on_lanes():
     program = lower(surface, A)
-    lanes = [jnp.linspace(0.1, 1.0, 4) * a for a in A]
+    lanes = [np.linspace(0.1, 1.0, 4) * a for a in A]
     slopes = jax.jit(jax.grad(lambda xs: jnp.sum(program(*xs)[0])))(lanes)
-    np.testing.assert_allclose(jnp.stack(slopes, 1), jax.vmap(jax.grad(surface))(jnp.stack(lanes, 1)), rtol=1e-13)
+    np.testing.assert_allclose(np.stack(slopes, 1), jax.vmap(jax.grad(surface))(np.stack(lanes, 1)), rtol=1e-13)
 
 
 # ---- precision ------------------------------------------------------------------------------------------------------
@@ -651,7 +651,7 @@ def test_precision_is_that_of_the_inputs():
 
 def test_lanes_broadcast():
     program = lower(lambda x, y: (x * y, x + 1, 3.0), 0.3, 0.4)
-    outputs = program(jnp.ones((2, 1)), jnp.ones(3))
+    outputs = program(np.ones((2, 1)), np.ones(3))
     assert [output.shape for output in outputs] == [(2, 3)] * 3
 
 

@@ -12,11 +12,10 @@ import pytest
 from jax import lax
 
 from lagjax import scenes
-from lagjax._equations._derivation import derivation_of
-from lagjax._interface._layout import Layout
+from lagjax._equations import derivation_of
+from lagjax._interface import Layout
 from lagjax._program import OPERATIONS, Unlowerable, pullback, series
-from lagjax._tracing import emit, lower, lower_solution
-from lagjax._tracing._scalars import apply_function, stack
+from lagjax._tracing import apply_function, emit, lower, lower_solution, stack
 
 ORDER = 10
 NAN = float("nan")

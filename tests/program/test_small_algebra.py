@@ -45,8 +45,8 @@ def by_cholesky(q, v):
     return 0.5 * jnp.trace(rate @ rate)
 
 
-Q, V = jnp.array([1.0, 1.5, 2.0, 0.1, 0.2, 0.3]), jnp.array([0.3, -0.2, 0.1, 0.4, -0.1, 0.2])
-TS = jnp.array([0.0, 0.5, 1.0])
+Q, V = np.array([1.0, 1.5, 2.0, 0.1, 0.2, 0.3]), np.array([0.3, -0.2, 0.1, 0.4, -0.1, 0.2])
+TS = np.array([0.0, 0.5, 1.0])
 
 
 def geodesic(scale):
@@ -61,7 +61,7 @@ def test_geodesics_of_positive_matrices(lagrangian):
     assert in_machine_code(system, Q, V)
     end = lambda scale: lagjax.simulate(system, Q, scale * V, TS, rtol=1e-12).q[-1]
     np.testing.assert_allclose(end(1.0), geodesic(1.0), rtol=1e-11)
-    batch = lagjax.simulate_batch(system, jnp.stack([Q, Q]), jnp.stack([V, -0.5 * V]), TS, rtol=1e-12)
+    batch = lagjax.simulate_batch(system, np.stack([Q, Q]), np.stack([V, -0.5 * V]), TS, rtol=1e-12)
     np.testing.assert_allclose(batch.q[:, -1], [geodesic(1.0), geodesic(-0.5)], rtol=1e-11)
 
 
@@ -83,7 +83,7 @@ def matrix_with_vanishing_minors(x):
 @pytest.mark.slow
 def test_a_motion_through_vanishing_minors():
     # The same potential by an adjugate, written out: no pivot, no border, the same steps.
-    b = jnp.array([1.0, -0.5, 0.3])
+    b = np.array([1.0, -0.5, 0.3])
 
     def by_solve(q, v):
         return 0.5 * v**2 - b @ jnp.linalg.solve(matrix_with_vanishing_minors(q), b) - 0.2 * q**2
@@ -93,7 +93,7 @@ def test_a_motion_through_vanishing_minors():
         inverse = jnp.stack([jnp.cross(second, third), jnp.cross(third, first), jnp.cross(first, second)], 1)
         return 0.5 * v**2 - b @ inverse @ b / (first @ jnp.cross(second, third)) - 0.2 * q**2
 
-    ts = jnp.linspace(0.0, 12.0, 13)
+    ts = np.linspace(0.0, 12.0, 13)
     one, other = (lagjax.simulate(lagjax.System(of), -1.0, 1.5, ts, rtol=1e-12) for of in (by_solve, by_adjugate))
     assert one.q.min() < 0 < one.q.max()
     np.testing.assert_allclose(one.q, other.q, rtol=1e-9, atol=1e-9)
@@ -164,7 +164,7 @@ def test_large_matrices_are_left_to_diffrax():
         mass = jnp.eye(30) + 0.1 * jnp.outer(q, q)
         return 0.5 * v @ v - 0.5 * q @ jnp.linalg.solve(mass, q)
 
-    facts = lagjax.System(lagrangian).explain(jnp.ones(30), jnp.zeros(30))
+    facts = lagjax.System(lagrangian).explain(np.ones(30), np.zeros(30))
     assert "a linear system of 30 rows is larger than the 8" in facts.solver and facts.path == "array"
 
 
@@ -189,9 +189,9 @@ def real_well(q, v):
 
 @pytest.mark.parametrize("q, v", [((0.3, 0.4), (0.1, -0.2)), ((1.0, 0.0), (0.3, 0.0))])  # the second in its minimum
 def test_a_complex_well_is_the_real_one(q, v):
-    ts, system = jnp.linspace(0.0, 5.0, 6), lagjax.System(well)
-    one, other = (lagjax.simulate(of, jnp.array(q), jnp.array(v), ts) for of in (system, lagjax.System(real_well)))
-    assert in_machine_code(system, jnp.array(q), jnp.array(v))
+    ts, system = np.linspace(0.0, 5.0, 6), lagjax.System(well)
+    one, other = (lagjax.simulate(of, np.array(q), np.array(v), ts) for of in (system, lagjax.System(real_well)))
+    assert in_machine_code(system, np.array(q), np.array(v))
     np.testing.assert_allclose(one.q, other.q, rtol=1e-11, atol=1e-12)
     slopes = [jax.grad(lambda a, of=of: lagjax.simulate(of, a * jnp.array(q), jnp.array(v), ts).q[-1, 0])(1.0)
               for of in (system, lagjax.System(real_well))]  # fmt: skip
@@ -205,7 +205,7 @@ def joukowski(q, v):
 
 
 def test_oscillators_behind_a_conformal_map():
-    ts, q, v = jnp.linspace(0.0, 3.0, 7), jnp.array([1.5, 0.7]), jnp.array([0.1, -0.2])
+    ts, q, v = np.linspace(0.0, 3.0, 7), np.array([1.5, 0.7]), np.array([0.1, -0.2])
     path = lagjax.simulate(lagjax.System(joukowski), q, v, ts, rtol=1e-12)
     z = path.q[:, 0] + 1j * path.q[:, 1]
     start = complex(q[0], q[1])
@@ -274,6 +274,6 @@ def test_functions_that_xla_has_run_on_arrays(name):
     facts = system.explain(1.5, -0.5)
     assert "diffrax" in facts.solver and reason in facts.solver
     assert float(system.acceleration(1.5, 0.0)) == pytest.approx(-slope(1.5), rel=1e-13)
-    path = lagjax.simulate(system, 1.5, 0.0, jnp.linspace(0.0, 0.5, 3), rtol=1e-10, atol=1e-12)
+    path = lagjax.simulate(system, 1.5, 0.0, np.linspace(0.0, 0.5, 3), rtol=1e-10, atol=1e-12)
     energy = 0.5 * path.qdot**2 + jax.vmap(potential)(path.q)
     np.testing.assert_allclose(energy, energy[0], rtol=1e-8)

@@ -243,3 +243,20 @@ def test_functions_are_no_prepositions():
         for node in nodes_of(path):
             if isinstance(node, ast.FunctionDef):
                 assert not begins.match(node.name), f"{path}: {node.name} is not verb + object, nor a noun"
+
+
+def test_every_file_of_tests_has_a_line():
+    listed = re.findall(r"^\| `(\w+)(?:\.py)?` \|", (TESTS / "README.md").read_text(), flags=re.MULTILINE)
+    files = [path.stem.removeprefix("test_") for path in TESTS.rglob("*.py")]
+    assert sorted(listed) == sorted(files)
+
+
+def test_systems_in_tests_are_shared():
+    """A test that any system serves takes one of `tests/scenes.py`; how many build one of their own may only fall."""
+    built = 0
+    for path in TESTS.glob("*/test_*.py"):
+        for test in tree_of(path).body:
+            if isinstance(test, ast.FunctionDef) and test.name.startswith("test_"):
+                calls = [node for node in ast.walk(test) if isinstance(node, ast.Call)]
+                built += sum(ast.unparse(call.func).endswith("System") for call in calls)
+    assert built <= 520

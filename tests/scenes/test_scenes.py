@@ -142,7 +142,7 @@ def test_a_total_derivative_changes_momenta_but_no_acceleration(seed):
     # Round-off of the added terms, some of them a hundred times larger than the result.
     np.testing.assert_allclose(there, here, rtol=1e-12)
     momenta = [jax.jit(s.momentum)(q, qdot, t, scene.params) for s in (scene.system, other)]
-    np.testing.assert_allclose(momenta[1] - momenta[0], jax.grad(G)(jnp.asarray(q), t), rtol=1e-13, atol=1e-13)
+    np.testing.assert_allclose(momenta[1] - momenta[0], jax.grad(G)(np.asarray(q), t), rtol=1e-13, atol=1e-13)
 
 
 def test_a_galilean_boost_moves_the_whole_path():
@@ -196,7 +196,7 @@ def test_the_action_of_a_path_is_stationary():
         eta, eta_dot = np.sin(np.outer(nodes, k)), k * np.cos(np.outer(nodes, k))
         return weights @ lagrangian(q + eta @ amplitudes, qdot + eta_dot @ amplitudes)
 
-    true_path = jnp.zeros((4, 2))
+    true_path = np.zeros((4, 2))
     slope = jax.jit(jax.grad(action))
     assert np.max(np.abs(slope(true_path))) < GOOD
     assert np.max(np.abs(slope(true_path + 0.01))) > 1e-2
@@ -275,7 +275,7 @@ def small_oscillations(scene, q0, params):
 def test_small_oscillations_of_the_double_pendulum(m2, l2):
     scene = scenes.double_pendulum()
     params = scene.params | {"m2": m2, "l2": l2}
-    squares, modes = small_oscillations(scene, jnp.zeros(2), params)
+    squares, modes = small_oscillations(scene, np.zeros(2), params)
     np.testing.assert_allclose(np.sqrt(squares), scenes.double_pendulum_frequencies(params), rtol=1e-13)
     assert modes[0, 0] * modes[1, 0] > 0 > modes[0, 1] * modes[1, 1], "in phase in the lower mode"
     if m2 == l2 == 1:
@@ -377,13 +377,13 @@ def vector_potential(x, t, params):
 
 def test_the_force_on_a_charge_is_lorentz():
     m, e, t = 1.7, -0.6, 0.4
-    x, v = jnp.array([0.3, -0.5, 0.8]), jnp.array([1.1, 0.4, -0.7])
+    x, v = np.array([0.3, -0.5, 0.8]), np.array([1.1, 0.4, -0.7])
     scene = scenes.charge_in_fields(phi, vector_potential, params={"m": m, "e": e})
     J = jax.jacobian(vector_potential)(x, t, None)
     E = -jax.grad(phi)(x, t, None) - jax.jacfwd(vector_potential, 1)(x, t, None)
-    B = jnp.array([J[2, 1] - J[1, 2], J[0, 2] - J[2, 0], J[1, 0] - J[0, 1]])
+    B = np.array([J[2, 1] - J[1, 2], J[0, 2] - J[2, 0], J[1, 0] - J[0, 1]])
     found = jax.jit(scene.system.acceleration)(x, v, t, scene.params)
-    np.testing.assert_allclose(found, e / m * (E + jnp.cross(v, B)), rtol=1e-13)
+    np.testing.assert_allclose(found, e / m * (E + np.cross(v, B)), rtol=1e-13)
     momentum = scene.system.momentum(x, v, t, scene.params)
     np.testing.assert_allclose(momentum, m * v + e * vector_potential(x, t, None), rtol=1e-15)
 

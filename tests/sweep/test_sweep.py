@@ -24,8 +24,7 @@ from stores import run_sweep
 import lagjax
 from lagjax import __main__ as command_line
 from lagjax import designs
-from lagjax._sweep import _files, _job, _statistics, _workers
-from lagjax._sweep._files import Files
+from lagjax._sweep import Files, _files, _job, _statistics, _workers
 from lagjax._sweep._members import Grid, axes_of
 
 GRAVITY = 9.81
@@ -48,7 +47,7 @@ def length_of(point):
 
 
 PENDULUM = lagjax.System(lagrangian)
-TS = jnp.linspace(0.0, 2.0, 5)
+TS = np.linspace(0.0, 2.0, 5)
 OVER = {"length": np.linspace(0.5, 1.5, 6), "angle": np.linspace(0.0, 3.0, 7)}
 RULE = dict(q0=angle_of, qdot0=0.0, params=length_of, keep=keep, unit=10, progress=False)  # units of one length
 
@@ -121,7 +120,7 @@ WITH_CROSSINGS = dict(keep=keep_end_and_crossings, crossings=BOTTOM)
 
 @pytest.mark.parametrize("times", [2, pytest.param(5, marks=pytest.mark.slow)])
 def test_last_state_and_first_crossing_from_one_sweep(tmp_path, times):
-    ts = jnp.linspace(0.0, 2.0, times)
+    ts = np.linspace(0.0, 2.0, times)
     data = run_sweep(PENDULUM, OVER, ts, **{**RULE, **WITH_CROSSINGS, "store": tmp_path / "store"}).open()
     length, angle = (x.ravel() for x in np.meshgrid(*OVER.values(), indexing="ij"))
     starts = (angle, np.zeros_like(angle), ts, length)
@@ -141,7 +140,7 @@ def test_last_state_and_first_crossing_from_one_sweep(tmp_path, times):
 @pytest.mark.slow
 @pytest.mark.parametrize("how", [dict(unit=1), dict(unit=42)])
 def test_crossings_do_not_depend_on_neighbours_and_workers(tmp_path, how, monkeypatch):
-    ts, rule = jnp.array([0.0, 2.0]), {**RULE, **WITH_CROSSINGS}
+    ts, rule = np.array([0.0, 2.0]), {**RULE, **WITH_CROSSINGS}
     whole = run_sweep(PENDULUM, OVER, ts, **{**rule, "store": tmp_path / "whole"}).open().load()
     store = tmp_path / "store"
     stopped = lambda job, left, tell: _workers.work(job, left[:2], tell)
@@ -170,7 +169,7 @@ def test_crossings_of_several_sections_under_constraints(tmp_path):
     q0 = lambda point: (1.0 + 1e-3 * (point["angle"] > 1.4)) * on_it(point["angle"])
     keep = lambda trajectory, crossings: {"times": {name: x.t for name, x in crossings.items()}}
     run = run_sweep(
-        disk, {"angle": angles}, jnp.array([0.0, 1.0]), q0=q0, qdot0=jnp.zeros(2), keep=keep,
+        disk, {"angle": angles}, np.array([0.0, 1.0]), q0=q0, qdot0=np.zeros(2), keep=keep,
         crossings={"section": sections, "count": 3}, store=tmp_path / "store", progress=False,
     )  # fmt: skip
     data = run.open()

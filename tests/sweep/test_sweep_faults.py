@@ -15,12 +15,10 @@ from stores import run_sweep
 
 import lagjax
 import lagjax.__main__
-from lagjax._sweep import _batch, _begin, _job
-from lagjax._sweep._files import Files
-from lagjax._sweep._members import axes_of
+from lagjax._sweep import Files, _batch, _begin, _job, axes_of
 
 PENDULUM = lagjax.System(lambda q, qdot, params: 0.5 * params**2 * qdot**2 + 9.81 * params * jnp.cos(q))
-TS = jnp.linspace(0.0, 2.0, 5)
+TS = np.linspace(0.0, 2.0, 5)
 OVER = {"length": np.linspace(0.5, 1.5, 6), "angle": np.linspace(0.0, 3.0, 7)}
 RULE = dict(
     q0=lambda point: point["angle"], qdot0=0.0, params=lambda point: point["length"], progress=False,
@@ -131,7 +129,7 @@ def test_the_first_look_stays_within_the_memory(tmp_path, monkeypatch):
     assert 64 < max(sizes) <= 2**20 / 8000
     sizes.clear()
     monkeypatch.setattr(_batch, "PATH_BYTES", 2**20)
-    swept(tmp_path / "path", over, jnp.linspace(0.0, 2.0, 1000))
+    swept(tmp_path / "path", over, np.linspace(0.0, 2.0, 1000))
     assert 32 < max(sizes) <= 2**20 / 16000
 
 

@@ -8,12 +8,12 @@ import jax.numpy as jnp
 import lagrangians
 import numpy as np
 import pytest
+from scenes import BALL, FREE, SPRING, WEIGHT
 from sweeps import KINDS, sweep
 
 import lagjax
 from lagjax import scenes
 
-OSCILLATOR = lagjax.System(lagrangians.spring)
 TS = jnp.linspace(0.0, 10.0, 41)
 
 
@@ -33,7 +33,7 @@ def flagged(health):
 
 
 def swinging(**options):
-    return lagjax.simulate(OSCILLATOR, 1.0, 0.5, TS, {"k": 1.3}, **options)
+    return lagjax.simulate(SPRING, 1.0, 0.5, TS, {"k": 1.3}, **options)
 
 
 # ---- no false alarm --------------------------------------------------------------------------------------------------
@@ -77,7 +77,7 @@ def test_energy_of_an_oscillator():
 def test_a_drift_beyond_the_tolerances_is_found():
     trajectory = swinging()
     late = TS > 6.0
-    health = moved(trajectory, qdot=jnp.where(late, 1.001, 1.0) * trajectory.qdot).health()
+    health = moved(trajectory, qdot=np.where(late, 1.001, 1.0) * trajectory.qdot).health()
     assert flagged(health) == {"energy"} and health.energy.t > 6.0
     assert "tighten rtol" in health.findings()[0] and "Energy" in str(health)
 
@@ -96,7 +96,7 @@ def test_power_balance_with_friction_and_a_driving_force():
     # A quintic is off by h⁶ q⁽⁶⁾/46080 at most: steps of 1/4, and frequencies up to 4 of the power.
     assert health.energy.value < health.work_error < 4e-4 * lost
     assert flagged(health) == set()
-    finer = lagjax.simulate(driven, 1.0, 0.0, jnp.linspace(0.0, 10.0, 401)).health()
+    finer = lagjax.simulate(driven, 1.0, 0.0, np.linspace(0.0, 10.0, 401)).health()
     assert finer.work_error < 1e-5 * health.work_error and flagged(finer) == set()
     assert finer.energy.value < finer.energy_allowed + finer.work_error
     L, forces = driven.lagrangian.code.function, driven.forces.code.function
@@ -143,7 +143,7 @@ def test_a_power_balance_that_so_few_outputs_cannot_tell():
         forces=lambda q, v, t: jnp.sin(7 * t),
         dissipation=lambda q, v: 0.05 * v**2,
     )
-    few, more = (lagjax.simulate(driven, 1.0, 0.0, jnp.linspace(0.0, 20.0, T)).health() for T in (3, 81))
+    few, more = (lagjax.simulate(driven, 1.0, 0.0, np.linspace(0.0, 20.0, T)).health() for T in (3, 81))
     assert few.energy.value > 1e3 * few.energy_allowed and flagged(few) == set()
     (sentence,) = few.findings()
     assert "cannot be told from 3 outputs" in sentence and f"about {few.outputs_needed:.0f} outputs" in sentence
@@ -154,7 +154,7 @@ def test_a_power_balance_that_so_few_outputs_cannot_tell():
 @pytest.mark.parametrize("amplitude", [1e-9, 1e-12, 1e-200])
 def test_a_motion_that_is_small_beside_atol(amplitude):
     def swung(**options):
-        run = lagjax.simulate(OSCILLATOR, amplitude, 0.0, TS, {"k": 1.0}, **options)
+        run = lagjax.simulate(SPRING, amplitude, 0.0, TS, {"k": 1.0}, **options)
         return np.abs(run.q - amplitude * np.cos(TS)).max() / amplitude, run.health()
 
     error, health = swung()
@@ -165,7 +165,7 @@ def test_a_motion_that_is_small_beside_atol(amplitude):
     error, health = swung(atol=float(advice.split("atol=")[1].rstrip(".")))
     assert error < 1e-9 and flagged(health) == set() and health.findings() == ()
     # What rests is not small, it is exact.
-    assert lagjax.simulate(OSCILLATOR, 0.0, 0.0, TS, {"k": 1.0}).health().findings() == ()
+    assert lagjax.simulate(SPRING, 0.0, 0.0, TS, {"k": 1.0}).health().findings() == ()
 
 
 def test_work_of_constraints_that_move():
@@ -174,8 +174,8 @@ def test_work_of_constraints_that_move():
     bead = lagjax.System(
         lagrangians.free_particles, constraints=lambda q, t: q[0] * jnp.sin(omega * t) - q[1] * jnp.cos(omega * t)
     )
-    ts = jnp.linspace(0.0, 2.0, 41)
-    trajectory = lagjax.simulate(bead, jnp.array([1.0, 0.0]), jnp.array([0.0, omega]), ts)
+    ts = np.linspace(0.0, 2.0, 41)
+    trajectory = lagjax.simulate(bead, np.array([1.0, 0.0]), np.array([0.0, omega]), ts)
     health = trajectory.health()
     gained = 0.5 * omega**2 * (np.cosh(2 * omega * 2.0) - 1)
     np.testing.assert_allclose(np.ptp(np.asarray(trajectory.energy())), gained, rtol=1e-7)
@@ -185,7 +185,7 @@ def test_work_of_constraints_that_move():
         lagrangians.free_particles, dissipation=lambda q, v: 0.1 * jnp.sum(v**2),
         velocity_constraints=lambda q, v, t: v[0] - jnp.sin(t),
     )  # fmt: skip
-    skating = lagjax.simulate(carried, jnp.zeros(2), jnp.array([0.0, 1.0]), ts).health()
+    skating = lagjax.simulate(carried, np.zeros(2), np.array([0.0, 1.0]), ts).health()
     assert skating.works and skating.energy.value < 1e-8 and flagged(skating) == set()
 
 
@@ -217,12 +217,12 @@ def test_distances_from_the_constraints():
     size = 1 + np.abs(trajectory.q).max()
     assert health.constraint_names == ("constraints['rod']",) or len(health.constraint_names) == 1
     assert health.constraint_distance.value[0] < 1e-14 * size and health.constraint_rate.value[0] < 1e-13 * size
-    late = jnp.arange(21)[:, None] == 13
-    off = moved(trajectory, q=jnp.where(late, 1 + 1e-6, 1.0) * trajectory.q).health()
+    late = np.arange(21)[:, None] == 13
+    off = moved(trajectory, q=np.where(late, 1 + 1e-6, 1.0) * trajectory.q).health()
     length = np.linalg.norm(trajectory.q[13])
     np.testing.assert_allclose(off.constraint_distance.value, [1e-6 * length], rtol=1e-5)
     assert off.constraint_distance.t == trajectory.ts[13] and "constraints" in flagged(off)
-    outward = jnp.where(late, 1e-5, 0.0) * trajectory.q  # along the rod
+    outward = np.where(late, 1e-5, 0.0) * trajectory.q  # along the rod
     off = moved(trajectory, qdot=trajectory.qdot + outward).health()
     np.testing.assert_allclose(off.constraint_rate.value, [1e-5 * length], rtol=1e-5)
     assert "constraints" in flagged(off)
@@ -289,8 +289,8 @@ def test_global_error_from_a_reference():
 
 
 def test_a_chaotic_motion_is_called_one():
-    scene = dataclasses.replace(scenes.double_pendulum(), q0=jnp.array([2.0, 2.5]))
-    loose, tight = (run(scene, jnp.linspace(0.0, 60.0, 61), rtol=rtol) for rtol in (1e-6, 1e-9))
+    scene = dataclasses.replace(scenes.double_pendulum(), q0=np.array([2.0, 2.5]))
+    loose, tight = (run(scene, np.linspace(0.0, 60.0, 61), rtol=rtol) for rtol in (1e-6, 1e-9))
     health = loose.health(tight)
     assert flagged(health) == {"global_error"} and "chaotic" in str(health)
 
@@ -299,10 +299,10 @@ def test_references_that_cannot_be_compared():
     given, params = swinging(rtol=1e-6), {"k": 1.3}
     tight = {"rtol": 1e-10}
     for reference, sentence in (
-        (lagjax.simulate(OSCILLATOR, 1.0, 0.5, TS[:-1], params, **tight), "shapes"),
-        (lagjax.simulate(OSCILLATOR, 1.0, 0.5, TS + 1e-3, params, **tight), "times"),
-        (lagjax.simulate(OSCILLATOR, 1.0, 0.5, TS, {"k": 1.4}, **tight), "params"),
-        (dataclasses.replace(given, system=lagjax.System(lagrangians.free_particle)), "another system"),
+        (lagjax.simulate(SPRING, 1.0, 0.5, TS[:-1], params, **tight), "shapes"),
+        (lagjax.simulate(SPRING, 1.0, 0.5, TS + 1e-3, params, **tight), "times"),
+        (lagjax.simulate(SPRING, 1.0, 0.5, TS, {"k": 1.4}, **tight), "params"),
+        (dataclasses.replace(given, system=FREE), "another system"),
         (swinging(rtol=2e-7), "at most 1e-07"),
     ):
         with pytest.raises(ValueError, match=sentence):
@@ -319,7 +319,7 @@ def test_members_that_failed_do_not_spoil_the_others():
     fall = lagjax.System(lambda q, v, params: 0.5 * v**2 - 0.5 * params["k"] * q**2 - jnp.log(2.0 - q) * params["c"])
     q0, k = jnp.array([0.1, 1.9, 0.2, 0.3]), jnp.array([1.0, 1.0, jnp.nan, 2.0])
     batch = lagjax.simulate_batch(
-        fall, q0, jnp.zeros(4), TS, {"k": k, "c": jnp.full(4, 0.5)}, batch_axes=(0, 0, {"k": 0, "c": 0})
+        fall, q0, np.zeros(4), TS, {"k": k, "c": np.full(4, 0.5)}, batch_axes=(0, 0, {"k": 0, "c": 0})
     )
     assert batch.ok.tolist() == [True, False, False, True]
     health = batch.health()
@@ -342,14 +342,14 @@ def test_batch_vmap_and_jit_agree():
     k = jnp.array([0.7, 1.3, 2.0])
 
     def one(k):
-        return lagjax.simulate(OSCILLATOR, 1.0, 0.5, TS, {"k": k}, throw=False)
+        return lagjax.simulate(SPRING, 1.0, 0.5, TS, {"k": k}, throw=False)
 
-    batch = lagjax.simulate_batch(OSCILLATOR, 1.0, 0.5, TS, {"k": k}, batch_axes=(None, None, 0)).health()
+    batch = lagjax.simulate_batch(SPRING, 1.0, 0.5, TS, {"k": k}, batch_axes=(None, None, 0)).health()
     mapped = jax.vmap(one)(k).health()
     inside = jax.jit(jax.vmap(lambda k: one(k).health()))(k)
     twice = jax.vmap(lambda c: lagjax.simulate_batch(
-        OSCILLATOR, c, 0.5, TS, {"k": k}, batch_axes=(None, None, 0)
-    ))(jnp.array([1.0, 2.0])).health()  # fmt: skip
+        SPRING, c, 0.5, TS, {"k": k}, batch_axes=(None, None, 0)
+    ))(np.array([1.0, 2.0])).health()  # fmt: skip
     for other in (mapped, inside, jax.tree.map(lambda leaf: leaf[0], twice)):
         for a, b in zip(jax.tree.leaves(batch), jax.tree.leaves(other), strict=True):
             np.testing.assert_allclose(np.asarray(a, float), np.asarray(b, float), rtol=1e-6, atol=1e-14)
@@ -364,12 +364,12 @@ def test_numbers_and_traced_values_are_measured_alike():
         constraints=lambda q, t: q[0] ** 2 + q[1] ** 2 - (1 + 0.1 * jnp.sin(t)) ** 2,
         dissipation=lambda q, v: 0.05 * v[0] ** 2,
     )
-    start = jnp.array([1.0, 0.0, 0.3]), jnp.array([0.1, 0.0, 1.0])
+    start = np.array([1.0, 0.0, 0.3]), np.array([0.1, 0.0, 1.0])
     ball = lagjax.System(lagrangians.ball, dissipation=lambda q, v: 0.1 * v**2)
     bounce = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -0.8 * v))
     for run in (
-        lagjax.simulate(held, *start, jnp.linspace(0.0, 2.0, 21)),
-        lagjax.simulate(lagjax.Hybrid({"flight": ball}, [bounce], "flight"), 1.0, 0.0, jnp.linspace(0.0, 1.5, 31)),
+        lagjax.simulate(held, *start, np.linspace(0.0, 2.0, 21)),
+        lagjax.simulate(lagjax.Hybrid({"flight": ball}, [bounce], "flight"), 1.0, 0.0, np.linspace(0.0, 1.5, 31)),
     ):
         eager, traced = run.health(), jax.jit(lambda run: run.health())(run)
         assert eager.works and (eager.work_error > 0).all() and flagged(eager) == set()
@@ -405,7 +405,7 @@ def test_a_new_value_never_recompiles():
 
 def test_energy_between_bounces():
     # Every bounce takes 0.36 of the energy; between them none is lost.
-    ball = lagjax.System(lagrangians.ball)
+    ball = BALL
     bounce = lagjax.Transition("flight", "flight", lambda q, v: q, direction=-1, reset=lambda q, v: (q, -0.8 * v))
     bouncing = lagjax.simulate(
         lagjax.Hybrid({"flight": ball}, [bounce], "flight"), 1.0, 0.0, jnp.linspace(0.0, 1.5, 31)
@@ -423,10 +423,10 @@ def test_energy_between_bounces():
 def test_constraints_of_one_mode_and_not_of_another():
     # Down the inside of a circle to its lowest place, then straight on.
     held = lagjax.System(lagrangians.weight, constraints=lambda q: {"rail": q @ q - 1.0})
-    free = lagjax.System(lagrangians.weight)
+    free = WEIGHT
     off = lagjax.Transition("rail", "air", lambda q, v: q[0])
-    modes, start = {"rail": held, "air": free}, (jnp.array([-1.0, 0.0]), jnp.zeros(2))
-    fallen = lagjax.simulate(lagjax.Hybrid(modes, [off], "rail"), *start, jnp.linspace(0.0, 1.0, 21))
+    modes, start = {"rail": held, "air": free}, (np.array([-1.0, 0.0]), np.zeros(2))
+    fallen = lagjax.simulate(lagjax.Hybrid(modes, [off], "rail"), *start, np.linspace(0.0, 1.0, 21))
     health = fallen.health()
     assert np.unique(fallen.mode).tolist() == [0, 1] and flagged(health) == set()
     assert health.constraint_names == ("rail: constraints['rail']",)
@@ -463,10 +463,10 @@ def test_a_constraint_that_loses_its_gradient():
 def test_steps_too_long_for_the_projection():
     scene = scenes.cartesian_pendulum()
     for dt in (1.0, 2.0):  # so far from the circle that Newton's method comes back half the way at best
-        failed = run(scene, jnp.linspace(0.0, 10.0, 5), dt=dt, throw=False)
+        failed = run(scene, np.linspace(0.0, 10.0, 5), dt=dt, throw=False)
         assert failed.result == lagjax.RESULTS.projection_failed and np.isnan(failed.q[1:]).all()
         assert "projection_failed" in str(failed.health())
-    fine = run(scene, jnp.linspace(0.0, 10.0, 5), dt=0.1)
+    fine = run(scene, np.linspace(0.0, 10.0, 5), dt=0.1)
     assert fine.ok and flagged(fine.health()) == set()
 
 

@@ -5,11 +5,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scenes import BALL, HILL, VALLEY
 
 import lagjax
 from lagjax._engine._stop_reason import End, what_stopped
 
-TS = jnp.linspace(0.0, 2.0, 5)
+TS = np.linspace(0.0, 2.0, 5)
 BUDGET = {"max_steps": 2000}
 NAMES = {
     # what befalls it, and q0, spring, kink, the time at which the force ends
@@ -129,7 +130,7 @@ def test_the_health_of_a_batch_tells_it_of_the_first_that_failed():
 
 @pytest.mark.slow
 def test_a_solver_that_goes_across_a_kink_names_its_line():
-    scene = lagjax.System(lambda q, v: 0.5 * v**2 - jnp.abs(q))
+    scene = VALLEY
     with pytest.raises(lagjax.SimulationError, match="abs at test_stopped"):
         lagjax.simulate(scene, 1.0, 0.0, TS, solver=diffrax.Tsit5(), max_steps=60)
 
@@ -146,7 +147,7 @@ def test_a_large_scene_that_fails_is_looked_at_in_no_more_time_than_it_ran():
 
     scene = lagjax.System(kinetic, forces=lambda q, v, t: fades(q, v, t) + 0 * lagrangian(q, v))
     with pytest.raises(lagjax.SimulationError, match=r"the force on q(.|\n)*from t = 0.5 on, whatever the state.$"):
-        lagjax.simulate(scene, jnp.ones(2), jnp.zeros(2), TS)
+        lagjax.simulate(scene, np.ones(2), np.zeros(2), TS)
 
 
 def test_jumps_that_spend_the_budget_are_called_jumps_and_not_stiff():
@@ -206,26 +207,26 @@ def fourier(q, v, t):  # no scalar program, and it takes arrays of JAX only
 def test_a_scene_without_programs_that_fails_keeps_its_error():
     scene = lagjax.System(lambda q, v: 0.5 * v @ v, forces=fourier)
     with pytest.raises(lagjax.SimulationError, match="could not be followed beyond t = 1"):
-        lagjax.simulate(scene, jnp.ones(2), jnp.zeros(2), jnp.linspace(0.0, 5.0, 6))
+        lagjax.simulate(scene, np.ones(2), np.zeros(2), np.linspace(0.0, 5.0, 6))
 
 
 def test_a_power_has_no_pole():
-    scene = lagjax.System(lambda q, v: 0.5 * v**2 + 0.25 * q**4)
+    scene = HILL
     with pytest.raises(lagjax.SimulationError, match="runs to infinity within a finite time"):
-        lagjax.simulate(scene, 1.0, 1.0, jnp.linspace(0.0, 5.0, 6))
+        lagjax.simulate(scene, 1.0, 1.0, np.linspace(0.0, 5.0, 6))
 
 
 @pytest.mark.slow
 def test_steps_of_a_fixed_length_do_not_blame_the_start():
-    scene = lagjax.System(lambda q, v: 0.5 * v**2 + 0.25 * q**4)
+    scene = HILL
     with pytest.raises(lagjax.SimulationError, match="a step of a fixed length") as caught:
-        lagjax.simulate(scene, 1.0, 1.0, jnp.linspace(0.0, 5.0, 6), dt=0.01)
+        lagjax.simulate(scene, 1.0, 1.0, np.linspace(0.0, 5.0, 6), dt=0.01)
     assert "q0 is" not in str(caught.value)
 
 
 @pytest.mark.slow
 def test_a_reset_that_is_not_finite_is_named():
-    ball = lagjax.System(lambda q, v: 0.5 * v**2 - 9.81 * q)
+    ball = BALL
     bounce = lagjax.Transition("fly", "fly", lambda q, v: q, direction=-1, reset=lambda q, v: (q, jnp.sqrt(v)))
     said = r"reset of the transition at t = 0.45\d* returned the velocity of q \(nan\): every number must be f"
     with pytest.raises(lagjax.SimulationError, match=said):
