@@ -103,7 +103,7 @@ def _in_machine_code(case: Case) -> Callable[[], None] | None:
     problem = Problem.from_system(case.scene.system, layout, case.scene.params)
     if MachineCode().refuses(problem) is not None:
         return None
-    acceleration = problem.derivation.acceleration
+    acceleration = problem.derivation.accelerations.program
     n, width = layout.size, lanes()
     numbers = [np.ravel(leaf) for leaf in jax.tree.leaves(eqx.filter(case.scene.params, eqx.is_array_like))]
     constants = [float(x) for leaf in numbers for x in leaf]  # as for the others: XLA knows them

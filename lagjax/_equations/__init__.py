@@ -6,9 +6,10 @@ Jacobian, right-hand side, distances and projection; `_consistency` tests a star
 symmetric systems and saddle points as arrays, and `_rank` decides which singular values count as zero; `_patterns`
 finds the patterns of a large scene's matrices, `_sparse` solves by them, `_structure` holds its motion; `_saddle` is
 the same elimination on scalars, which keeps the zeros of a scene, and `_recursion` the one for chains in O(n).
-`_derivation` keeps everything derived from a scene as scalar programs, each lowered once; `_many_states` evaluates them
-at many states. `_scales` says how large coordinates, velocities and time are at a state; `_blame` which operations of a
-user's function are not finite or make it piecewise, and in which line.
+`_derivation` keeps everything derived from a scene as scalar programs, each lowered once, `_accelerations` those of
+what is solved for; `_many_states` evaluates them at many states. `_scales` says how large coordinates, velocities and
+time are at a state; `_blame` which operations of a user's function are not finite or make it piecewise, and in which
+line.
 """
 
 from lagjax._equations._blame import borders_of_motion, describe_pieces, offenders, pieces_of_motion, poles

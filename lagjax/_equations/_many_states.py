@@ -81,7 +81,7 @@ class Sample(NamedTuple):
         """q̈ (S, n) by the program, or the arrays, with which a motion is followed. Raises `Unlowerable`."""
         if self.derivation.structure is not None:
             return self.quantities("acceleration")["acceleration"]
-        return self.evaluate(self.derivation.acceleration)[:, : self.derivation.layout.size]
+        return self.evaluate(self.derivation.accelerations.program)[:, : self.derivation.layout.size]
 
     def momenta_by_q(self, momenta: tuple[int, ...]) -> np.ndarray:
         """∂pᵢ/∂q of the coordinates i in `momenta`, (S, len(momenta), n)."""

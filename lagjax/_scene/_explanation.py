@@ -185,15 +185,16 @@ def _engine(problem: Problem) -> dict[str, Any]:
     if problem.system.touches and MachineCode().refuses(problem) is None:  # however large: arrays do not jump
         derivation, refusal = derivation.lowered, None
     if refusal is None:
-        solver, program = "Taylor series in machine code", derivation.acceleration
-        if is_large(program, derivation.projection):
+        solver, program = "Taylor series in machine code", derivation.accelerations.program
+        if is_large(program, derivation.accelerations.projection):
             solver += ", whose operations stand in tables: for code operation by operation they are too many"
     else:
         solver, form = f"diffrax.Dopri8, because {refusal}", form_of(derivation, problem.system.path)
         if form.reason is not None:
             return {"solver": solver, "path": "array", "reason": form.reason}
-        program = derivation.acceleration.complete
-    of_projection = None if derivation.projected is None else derivation.projected.operations
+        program = derivation.accelerations.program.complete
+    projected = derivation.accelerations.projected
+    of_projection = None if projected is None else projected.operations
     costs = {"operations": program.operations, "projection_operations": of_projection}
     return {"solver": solver, "path": "scalar", "reason": "", **costs}
 
@@ -212,11 +213,11 @@ def _borders(problem: Problem, inputs: tuple[str, ...]) -> dict[str, Any]:
         return join_names([inputs[i] for i in sorted(borders.read_by(node)) if i < len(inputs)], _LISTED) or "none"
 
     kinds = zip(borders.switches, borders.kinds, strict=True)
-    in_machine_code = choose(problem).refusal is None and pieces_of(derivation.acceleration, Nesting(n)) is not None
+    located = choose(problem).refusal is None and pieces_of(derivation.accelerations.program, Nesting(n)) is not None
     return {
         "borders": tuple(f"{_PIECES[kind]} {read_by(node)}" for node, kind in kinds if kind in _PIECES),
         "narrow": tuple(f"a function of {read_by(node)}" for node in borders.arguments),
-        "borders_located": in_machine_code or set(borders.kinds) <= {CLOCK},  # known times are diffrax's as well
+        "borders_located": located or set(borders.kinds) <= {CLOCK},  # known times are diffrax's as well
     }
 
 

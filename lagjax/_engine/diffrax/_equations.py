@@ -46,7 +46,7 @@ class MotionEquations(eqx.Module):
 
     @classmethod
     def from_programs(cls, motion: Motion, program: Program, projection: Program | None) -> "MotionEquations":
-        """The equations by programs of q, q̇, t and every number in params: `Derivation.acceleration`, `projected`."""
+        """The equations by programs of q, q̇, t and every number in params: `Accelerations.program`, `projected`."""
 
         def accelerate(q, qdot, t, params):
             *acceleration, singular = program(*q, *qdot, t, *_scalars(params))
@@ -75,7 +75,7 @@ def form_of(derivation: Derivation, path: str = "auto") -> MotionEquations:
     if path == "array":
         return MotionEquations.from_arrays(motion, "asked for")
     try:
-        program = derivation.acceleration.complete
+        program = derivation.accelerations.program.complete
     except Unlowerable as reason:
         if path == "scalar":
             raise ValueError(f"This scene has no scalar program: {reason}. Leave `path` at 'auto'.") from None
@@ -89,7 +89,7 @@ def form_of(derivation: Derivation, path: str = "auto") -> MotionEquations:
     if path == "auto" and program.operations > LARGEST_XLA_PROGRAM:
         reason = f"{program.operations} operations are more than the {LARGEST_XLA_PROGRAM} that XLA compiles quickly"
         return MotionEquations.from_arrays(motion, reason)
-    return MotionEquations.from_programs(motion, program, derivation.projected)
+    return MotionEquations.from_programs(motion, program, derivation.accelerations.projected)
 
 
 def _scalars(params: PyTree) -> list[jax.Array]:

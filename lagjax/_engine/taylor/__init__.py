@@ -234,7 +234,7 @@ def _make_flow(derivation: Derivation, path: str, guards: Guards | None) -> Flow
         return Unlowerable(f"the scene cannot be remembered: {derivation.unhashable}")
     n = derivation.layout.size
     try:
-        program, projection = derivation.acceleration, derivation.projection
+        program, projection = derivation.accelerations.program, derivation.accelerations.projection
         if guards is not None and guards.remembers:
             program = program.append_inputs(guards.inputs)
         require_fit(program, n)

@@ -82,7 +82,7 @@ class Surfaces(NamedTuple):
         It takes the outputs of `given` as well, where there is such a program of the same numbers. `code` and
         `structure` are what params hold that is not a number. Raises `Unlowerable`.
         """
-        moving, motion = 2 * derivation.layout.size + 1, derivation.acceleration.complete
+        moving, motion = 2 * derivation.layout.size + 1, derivation.accelerations.program.complete
         y, numbers = jax.ShapeDtypeStruct((moving,), derivation.layout.dtype), derivation.numbers
 
         def values_at(y, numbers, *more):

@@ -114,7 +114,7 @@ class ModeParts:
     ):
         self._dtype = SINGLE if is_rounded else DOUBLE
         self.numbers, self.surfaces, self._derivation, self._restore = tuple(leaving), surfaces, derivation, restore
-        n, size = derivation.layout.size, derivation.acceleration.size
+        n, size = derivation.layout.size, derivation.accelerations.program.size
         self.sizes = {"N": n, "NUMBERS": size - 2 * n - 1, "INPUTS": size}
         guards = surfaces and surfaces.guards(remembers=True)
         self.make_flow = functools.partial(make_flow, derivation, system.path, None)
@@ -188,7 +188,7 @@ def _surfaces(derivation: Derivation, system: System, leaving: tuple, code: tupl
     # `code` and `structure` are what params hold that is not a number. Raises `Unlowerable`.
     if not leaving:
         return None
-    layout, multipliers = derivation.layout, derivation.multipliers
+    layout, multipliers = derivation.layout, derivation.accelerations.multipliers
 
     guards = [transition.guard for transition in leaving]
     if multipliers is None and any("multipliers" in guard.extras for guard in guards):
