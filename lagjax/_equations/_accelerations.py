@@ -19,6 +19,7 @@ from scipy.sparse import csr_array
 
 from lagjax._equations import _saddle
 from lagjax._equations._constraints import velocity_scales
+from lagjax._equations._form import OPERATION_BUDGET
 from lagjax._equations._linear import eigen, is_definite, solve_many
 from lagjax._equations._recursion import RecursiveElimination
 from lagjax._native import Projection
@@ -32,16 +33,12 @@ from lagjax._program import (
     lower_formula,
     lower_solution,
     multiply,
-    operations_that_fit,
     scatter,
     stack,
 )
 
 if TYPE_CHECKING:
     from lagjax._equations._derivation import Derivation
-
-# While it is lowered, an operation takes about a kilobyte, and two where it is written anew.
-OPERATION_BUDGET = operations_that_fit(2000)
 
 # The order of coordinates of states far away, where a force between bodies is weak: its square is then a millionth.
 _FAR = 1e3

@@ -19,15 +19,27 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._equations._accelerations import OPERATION_BUDGET, Accelerations, lowered_once
-from lagjax._equations._blame import pieces_of, pieces_of_motion
+from lagjax._equations._accelerations import Accelerations, lowered_once
+from lagjax._equations._blame import pieces_of
 from lagjax._equations._coupled_forces import CoupledForces
+from lagjax._equations._form import (
+    BYTES_OF_ENTRY,
+    LARGEST_DIFFERENTIATED,
+    LARGEST_FOLLOWED,
+    LARGEST_LOWERED,
+    LEAST_COORDINATES,
+    OPERATION_BUDGET,
+    SCALAR,
+    Form,
+    derived_form,
+    form_in_xla,
+)
 from lagjax._equations._motion import Motion
 from lagjax._equations._patterns import gradient_memory, jacobian_pattern
 from lagjax._equations._quantities import OwnRules, quantities
 from lagjax._equations._recursion import Recursion
-from lagjax._equations._sparse import MOST_COLORS, MatrixFree
-from lagjax._equations._structure import LARGEST_LOWERED, LEAST_COORDINATES, SparseMotion, SparseStructure, structure_of
+from lagjax._equations._sparse import MOST_COLORS
+from lagjax._equations._structure import SparseMotion
 from lagjax._interface import Layout, dtype_of, is_concrete
 from lagjax._primitives import DOUBLE
 from lagjax._program import (
@@ -41,17 +53,6 @@ from lagjax._program import (
 )
 
 PyTree = Any
-
-# Bytes that an entry of M takes while it is derived on scalars, zero or not: 2 GB of 10 000 coordinates.
-_ENTRY = 20
-
-# Operations of all quantities beyond which JAX differentiates arrays. Derivatives of programs take 100 µs for each;
-# those of arrays 2 s for what is vectorised, as 60 bodies are (39 000: 4 s), and 13 s for an arm that is written joint
-# by joint (7600: 1 s). Doubled, the first kind loses 3 s more; halved, arms of 12 joints compile for half a minute.
-LARGEST_DIFFERENTIATED = 30_000
-
-# Operations of L up to which the coordinates that it reads are looked for, at 1 to 3 µs and up to 1 kB each.
-_FOLLOWED = 1_500_000
 
 
 class Derivation:
@@ -77,7 +78,7 @@ class Derivation:
         sparse matrices, whose functions are smooth, is not lowered: its motion is a `SparseMotion`. One that
         `counts_on_params` takes M for positive definite where some parameters make it so (`with_numbers`).
         """
-        self.motion, self.layout, self.refusal, self.unhashable = motion, layout, refusal, unhashable
+        self.motion, self.layout, self.unhashable = motion, layout, unhashable
         self.numbers = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), params)
         is_large = layout.size >= LEAST_COORDINATES and path != "scalar"
         self.memory = gradient_memory(motion.lagrangian, self.state_shapes) if is_large else 0
@@ -86,8 +87,7 @@ class Derivation:
                 f"The gradient of this L, of {layout.size} coordinates, {lack}: sum over fewer terms (neighbours, a "
                 "cut-off), or over parts of them by jax.lax.map with jax.checkpoint."
             )
-        self.structure = None
-        self._path, self.counts_on_params = path, counts_on_params
+        self.path, self.counts_on_params = path, counts_on_params
         self._made: dict[str, Any] = {}
         self._lock = threading.RLock()
         self._programs: dict[tuple[str, ...], Program] = {}
@@ -97,21 +97,12 @@ class Derivation:
         self.has_rules = False  # of its own for derivatives, in a function; known once the quantities are
         # Compiled functions are traced once for each of their derivatives, and all quantities share these.
         self._traced_once: Motion = jax.tree.map(jax.jit, motion)
-        self.structure = None if path == "scalar" else self._structure_of(motion, path == "array")
-        if self.structure is not None:
+        self.form = SCALAR if refusal is None else Form("arrays", refusal)
+        form = derived_form(motion, self.state_shapes, path, self._is_sparse_in_scalars)
+        if form.structure is not None:
             self._made.clear()
-            self.motion = SparseMotion(*vars(motion).values(), structure=self.structure)
-            self.refusal = f"it has {layout.size} coordinates, {self.structure}, and arrays suit that better"
+            self.form, self.motion = form, SparseMotion(*vars(motion).values(), structure=form.structure)
 
-    def _structure_of(self, motion: Motion, insists: bool) -> SparseStructure | None:
-        structure = structure_of(motion, self.state_shapes, insists)
-        if structure is None or insists or structure.operations > LARGEST_LOWERED:
-            return structure
-        if isinstance(structure.mass, MatrixFree):
-            return structure if structure.mass.known or not self._is_sparse_in_scalars else None
-        return None if pieces_of_motion(motion, *self.state_shapes) else structure  # steps end at borders there alone
-
-    @property
     def _is_sparse_in_scalars(self) -> bool:
         """True if the scene has scalar programs, and a mass matrix of few entries there."""
         try:
@@ -122,12 +113,12 @@ class Derivation:
     @functools.cached_property
     def lowered(self) -> "Derivation":
         """The derivation as scalar programs of a large scene too, as far as machine code takes it."""
-        if self.structure is None:
+        if not self.form.is_sparse:
             return self
         motion = Motion(*list(vars(self.motion).values())[:4])
         refusal = None
-        if self.structure.operations > LARGEST_LOWERED:
-            refusal = f"{self.structure.operations} operations of L would take minutes to compile"
+        if self.form.operations > LARGEST_LOWERED:
+            refusal = f"{self.form.operations} operations of L would take minutes to compile"
         return Derivation(motion, self.layout, self.numbers, refusal, self.unhashable, "scalar", self.counts_on_params)
 
     def with_numbers(self, numbers=None) -> "Derivation":
@@ -143,14 +134,27 @@ class Derivation:
     @functools.cached_property
     def _counting_on_params(self) -> "Derivation | None":
         """The derivation that counts on a positive definite M, where this one does not and needs to."""
-        if self._path == "array" or not self.accelerations.depend_on_params:
+        if self.path == "array" or not self.accelerations.depend_on_params:
             return None
-        return Derivation(self.motion, self.layout, self.numbers, self.refusal, self.unhashable, self._path, True)
+        return Derivation(self.motion, self.layout, self.numbers, self.form.reason, self.unhashable, self.path, True)
 
     @functools.cached_property
     def accelerations(self) -> Accelerations:
         """The programs of all that is solved for."""
         return Accelerations(self)
+
+    @functools.cached_property
+    def form_in_xla(self) -> Form:
+        """The form that XLA compiles; `ValueError` where the path "scalar" is impossible."""
+        return form_in_xla(self)
+
+    @property
+    def is_lowered(self) -> bool:
+        """True if there are programs of the quantities of a state."""
+        try:
+            return bool(self.whole.shapes)
+        except Unlowerable:
+            return False
 
     # ---- quantities of a state ----
 
@@ -160,9 +164,9 @@ class Derivation:
 
         The matrices of large scenes are zeros but for a few numbers.
         """
-        if self.refusal is not None:
-            raise Unlowerable(self.refusal)
-        if lack := lack_of_memory(_ENTRY * self.layout.size**2):
+        if self.form.reason is not None:
+            raise Unlowerable(self.form.reason)
+        if lack := lack_of_memory(BYTES_OF_ENTRY * self.layout.size**2):
             raise Unlowerable(f"its mass matrix {lack}")
 
         def order_values(values, zero):
@@ -295,12 +299,15 @@ class Derivation:
         return tuple(np.flatnonzero(untouched).tolist())
 
     @functools.cached_property
-    def cyclic(self) -> tuple[int, ...] | None:
-        """The coordinates that no operation of L reads, of a scene on arrays; None where a look takes long."""
-        if self.structure is not None and self.structure.operations > _FOLLOWED:
-            return None
+    def unread(self) -> tuple[int, ...] | None:
+        """The coordinates that no operation of L reads, of a scene on arrays; None where a function hides that."""
         pattern = jacobian_pattern(lambda *state: jnp.ravel(self.motion.lagrangian(*state)), self.state_shapes, by=0)
         return None if pattern is None else tuple(np.flatnonzero(pattern.sum(axis=0) == 0).tolist())
+
+    @property
+    def cyclic(self) -> tuple[int, ...] | None:
+        """The `unread` coordinates; None also where a look takes long."""
+        return None if self.form.operations > LARGEST_FOLLOWED else self.unread
 
     @lowered_once
     def borders(self) -> Borders | None:

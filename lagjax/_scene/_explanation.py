@@ -14,9 +14,8 @@ import numpy as np
 from jax.interpreters.partial_eval import dce_jaxpr
 
 from lagjax._engine import Problem, choose
-from lagjax._engine.diffrax import form_of
 from lagjax._engine.taylor import MachineCode
-from lagjax._equations import Derivation, SparseStructure, dependent_rows, pieces_of_motion
+from lagjax._equations import Derivation, dependent_rows, pieces_of_motion
 from lagjax._interface import join_names, show_str
 from lagjax._native import Nesting, is_large, pieces_of
 from lagjax._program import CLOCK, FLOOR, SIGN, TABLE, TRUNC, Program, Unlowerable
@@ -129,8 +128,8 @@ def explain(problem: Problem) -> Explanation:
     derivation = problem.derivation
     names, n, motion = derivation.layout.names, derivation.layout.size, derivation.motion
     known = {"coordinates": names, **_engine(problem)}
-    if derivation.structure is not None:
-        return Explanation(**known, **_borders_in_lines(problem), **_facts_of_arrays(derivation, derivation.structure))
+    if derivation.form.is_sparse:
+        return Explanation(**known, **_borders_in_lines(problem), **_facts_of_arrays(derivation))
     try:
         matrix, force = derivation.program("mass_matrix"), derivation.reads("force")
     except Unlowerable:
@@ -155,9 +154,9 @@ def explain(problem: Problem) -> Explanation:
     )
 
 
-def _facts_of_arrays(derivation: Derivation, structure: SparseStructure) -> dict[str, Any]:
+def _facts_of_arrays(derivation: Derivation) -> dict[str, Any]:
     """The facts about a large scene, from what the operations of its functions read, whether or not it cancels."""
-    motion, cyclic = derivation.motion, derivation.cyclic
+    motion, cyclic, form = derivation.motion, derivation.cyclic, derivation.form.mass
     names, inputs = derivation.layout.names, ("q", "dq", "t")
 
     def reads(function) -> set[str]:
@@ -171,7 +170,7 @@ def _facts_of_arrays(derivation: Derivation, structure: SparseStructure) -> dict
     works = timed or motion.forces is not None or motion.dissipation is not None
     return {
         "cyclic": None if cyclic is None else tuple(names[i] for i in cyclic),
-        "mass_matrix": f"{'varying' if mass else 'constant'}, {structure.mass.name}",
+        "mass_matrix": f"{'varying' if mass else 'constant'}, {form and form.name}",
         "mass_matrix_depends_on": tuple(name for name in inputs if name in mass),
         "velocity_terms": "dq" in reads(motion.force),
         "explicit_time": timed or "t" in reads(motion.force),
@@ -189,8 +188,8 @@ def _engine(problem: Problem) -> dict[str, Any]:
         if is_large(program, derivation.accelerations.projection):
             solver += ", whose operations stand in tables: for code operation by operation they are too many"
     else:
-        solver, form = f"diffrax.Dopri8, because {refusal}", form_of(derivation, problem.system.path)
-        if form.reason is not None:
+        solver, form = f"diffrax.Dopri8, because {refusal}", derivation.form_in_xla
+        if form.kind != "scalar":
             return {"solver": solver, "path": "array", "reason": form.reason}
         program = derivation.accelerations.program.complete
     projected = derivation.accelerations.projected

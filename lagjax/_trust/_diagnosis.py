@@ -6,7 +6,7 @@ comes from, a pole that was reached, a mass matrix that has become singular, an 
 finds at the last state: a kink, a jump, stiff terms.
 
 All but the line and `check` is read off the scene's programs in NumPy, which compiles nothing. These two have limits,
-`LONGEST` and `LARGEST`: a failure must not cost more than a motion does.
+`LONGEST` and `LARGEST_CHECKED`: a failure must not cost more than a motion does.
 """
 
 from collections.abc import Callable
@@ -19,13 +19,14 @@ import numpy as np
 
 from lagjax._engine import AHEAD
 from lagjax._equations import (
+    LARGEST_CHECKED,
+    LARGEST_CHECKED_BY_XLA,
     CoupledForces,
     Derivation,
     Sample,
     derivation_of,
     describe_pieces,
     eigen,
-    is_lowered,
     null_directions,
     numbers_of,
     offenders,
@@ -39,7 +40,6 @@ from lagjax._run import Trajectory
 from lagjax._scene import System
 from lagjax._trust.checks import check, describe_direction
 
-LARGEST = 128  # coordinates up to which `check` is called: it takes a second there
 LONGEST = 4000  # equations of a function up to which they are gone through one by one: some 50 µs each
 # A motion that runs away does so on a time scale |q̇|/|q̈| (or |q|/|q̇|) that has shrunk to less than this part of the
 # whole: steps have shrunk to 1e-15 of it when they are given up, and smooth motions are followed to 1e-5 in the budget.
@@ -94,7 +94,7 @@ def describe_failure(trajectory: Trajectory, layout: Layout, why: str | None) ->
     ended, params = motion_end(trajectory, layout), trajectory.params
     if trajectory.result == RESULTS.mass_matrix_singular:
         derivation = derivation_of(system, layout, params)
-        if derivation.structure is None:
+        if not derivation.form.is_sparse:
             mass = np.asarray(system.mass_matrix(end.q, end.qdot, end.t, params))
             unused = [name for name, row in zip(layout.names, mass, strict=True) if not row.any()]
             directions = [] if unused else null_directions(mass)
@@ -120,7 +120,7 @@ def diagnosis(system: System, layout: Layout, params, ended: Ended) -> str:
 
 def _find_cause(system: System, layout: Layout, params, ended: Ended) -> str:
     derivation = derivation_of(system, layout, params)
-    if derivation.structure is not None:
+    if derivation.form.is_sparse:
         ended = ended._replace(scene=(system, params))
     q0, qdot0 = map(layout.restore, halves(ended.y_first))
     if bad := not_finite(params, "params") + not_finite(q0, "q0") + not_finite(qdot0, "qdot0"):
@@ -192,7 +192,8 @@ def _quantities_ahead(derivation: Derivation, numbers, ended: Ended) -> tuple[np
     except Unlowerable:
         y, t = _states_ahead(ended, np.concatenate([v, np.zeros(len(v))]))
     for name, function in (("given_force", motion.forces), ("lagrangian_by_q", jax.grad(motion.lagrangian))):
-        if function is not None and len(v) <= LARGEST and _is_short(function, (*halves(ended.y), ended.t, numbers)):
+        state = *halves(ended.y), ended.t, numbers
+        if function is not None and len(v) <= LARGEST_CHECKED and _is_short(function, state):
             found = [function(*map(jnp.asarray, (*halves(y[k]), t[k])), numbers) for k in range(len(y))]
             values[name] = np.stack(found)
     return y, t, values
@@ -366,7 +367,8 @@ def _run_check(system: System, derivation: Derivation, params, ended: Ended) -> 
             f"most {MOST_COUPLED} that M couples to each other, and none that change in other ways what others hold. "
             "Round sign(v) off, as jnp.tanh(v / w) with a speed w that does not matter."
         )
-    if ended.scene is None and derivation.layout.size > (LARGEST if is_lowered(derivation) else 16):
+    largest = LARGEST_CHECKED if derivation.is_lowered else LARGEST_CHECKED_BY_XLA
+    if ended.scene is None and derivation.layout.size > largest:
         return ""
     q, qdot = map(derivation.layout.restore, halves(ended.y))
     found = {finding.kind: finding for finding in reversed(list(check(system, q, qdot, ended.t, params)))}

@@ -16,7 +16,7 @@ from sweeps import sweep
 
 import lagjax
 from lagjax import scenes
-from lagjax._engine.diffrax._equations import form_of
+from lagjax._engine.diffrax._equations import equations_of
 from lagjax._equations._derivation import Derivation, derivation_of
 from lagjax._equations._linear import rank_tolerance
 from lagjax._interface._layout import Layout
@@ -527,7 +527,7 @@ def test_accelerations_where_a_parallelogram_is_flat():
     layout = Layout.from_state(jnp.zeros(3), jnp.zeros(3))
     motion = lagjax.System(linkage, constraints=closed_linkage)._motion(layout)
     for path in ("scalar", "array"):
-        form = form_of(Derivation(motion, layout, None), path)
+        form = equations_of(Derivation(motion, layout, None, path=path))
 
         def accelerate(angle, form=form):
             state = jnp.stack([angle, GROUND[1] + 0 * angle, angle]), jnp.array([3.0, 0.0, 3.0])

@@ -13,8 +13,7 @@ import lagjax
 from lagjax import scenes
 from lagjax._engine import diffrax as _diffrax
 from lagjax._engine import taylor as _machine_code
-from lagjax._engine.diffrax._equations import form_of
-from lagjax._equations import _accelerations
+from lagjax._equations import _accelerations, _form
 from lagjax._equations import _many_states as many_states
 from lagjax._equations._derivation import Derivation, columns_of, derivation_of, numbers_of
 from lagjax._interface._layout import Layout
@@ -115,7 +114,7 @@ def test_derivatives_that_a_lagrangian_defines_itself():
     derivation = of(lagjax.System(lagrangian), q[0], v[0])
     force = derivation.evaluate(["force"], columns_of(q, v, 0.0, []))["force"][0]
     np.testing.assert_allclose(force, [-7 * 0.3 - 0.7, -7 * 0.7], rtol=1e-15)
-    assert form_of(derivation).reason is not None  # a program keeps the rules of two derivatives alone
+    assert derivation.form_in_xla.kind == "arrays"  # a program keeps the rules of two derivatives alone
 
 
 def test_powers_have_derivatives_where_their_products_and_roots_have_none():
@@ -288,7 +287,7 @@ def test_explain_names_the_engine_that_runs(name, monkeypatch):
     system, q, engine, words = SCENES[name]
     # Scenes of some thousands of operations take seconds to derive: smaller ones stand for them.
     monkeypatch.setattr(_machine_code._flow, "LARGEST_PROGRAM", 150)
-    monkeypatch.setattr(_diffrax._equations, "LARGEST_XLA_PROGRAM", 30)
+    monkeypatch.setattr(_form, "LARGEST_XLA_PROGRAM", 30)
     facts = system.explain(q, np.zeros_like(q))
 
     class Ran(Exception):

@@ -115,8 +115,8 @@ class MachineCode(AbstractEngine):
 
         An NVIDIA GPU is no reason where its threads can remember a motion.
         """
-        if problem.derivation.structure is not None and problem.guards is None and not problem.varies:
-            return problem.derivation.refusal
+        if problem.derivation.form.is_sparse and problem.guards is None and not problem.varies:
+            return problem.derivation.form.reason
         refusal = self.refuses(problem)
         if refusal is None or not has_nvidia_gpu() or self.lacks(problem) is not None:
             return refusal

@@ -14,11 +14,10 @@ from lagjax import _native
 from lagjax._engine._problem import Solution
 from lagjax._engine._stop_reason import End, what_stopped
 from lagjax._engine.taylor._variational import tangent_programs
+from lagjax._equations import LARGEST_PROGRAM
 from lagjax._interface import RESULTS, SUCCESSFUL, code_of
-from lagjax._program import Program, Unlowerable, machine_memory, operations_that_fit
+from lagjax._program import Program, Unlowerable, machine_memory
 
-# Operations of an acceleration: making its kernel takes some 4 KB for each, with the derivatives some 10 KB.
-LARGEST_PROGRAM = operations_that_fit(10_000)
 # The last terms that the series of a tangent may have, relative to the tangent, in tolerances. What the series leaves
 # out is smaller by e² at least. Measured on all scenes: a motion that has its own scale takes steps with at most 300.
 EXCESS = 1000.0

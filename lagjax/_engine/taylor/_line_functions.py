@@ -27,6 +27,7 @@ from jax.core import ShapedArray
 from jax.interpreters import ad, mlir
 
 from lagjax._engine.taylor._call import NO_HANDLER, capsule
+from lagjax._equations import LARGEST_COMPILED
 from lagjax._native import LARGEST_LINE, LineCode, line_handler, make_once
 from lagjax._primitives import HostFunction, LinearMap, call_host, compute_on_host, share_rows
 from lagjax._program import (
@@ -43,9 +44,6 @@ from lagjax._program import (
 )
 
 _TARGET = "lagjax_line"
-# Operations of a line on a GPU that XLA compiles; NumPy on the host evaluates a longer one. Twice as many would cost
-# several seconds of compilation.
-LARGEST_COMPILED = 100
 # Machine code takes some 20 µs a node to make, and NumPy 1 µs a node for a call: that of a line which XLA does not wait
 # for is made after as many calls as take that long, so that one call is not slow, and a thousand are not.
 _CALLS = 20

@@ -83,7 +83,7 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
 @accepts_singles(("q", "qdot"), ("t", "params"))
 def _scene_findings(system, q, qdot, t, params) -> tuple[list[Finding], str]:
     layout = Layout.from_state(q, qdot)
-    if layout.size > LARGEST_DENSE and derivation_of(system, layout, params).structure is None:
+    if layout.size > LARGEST_DENSE and not derivation_of(system, layout, params).form.is_sparse:
         system = replace_functions(system, {role: getattr(system, role) for role in ROLES}, "array")
     scene = CheckedScene.from_state(system, layout, q, qdot, t, params)
     reported = _derivative_checks.findings(scene) + _dissipation(scene) + _constraint_checks.findings(scene)
@@ -92,7 +92,7 @@ def _scene_findings(system, q, qdot, t, params) -> tuple[list[Finding], str]:
         reported += [] if any(finding.level == "error" for finding in reported) else _acceleration(scene)
         return [*reported, *_time(scene)], (
             f"Not looked at: time scales, jumps nearby, which constraints follow from others, and derivatives one by "
-            f"one. That would take long for {layout.size} coordinates ({scene.derivation.structure})."
+            f"one. That would take long for {layout.size} coordinates ({scene.derivation.form.structure})."
         )
     if not any(finding.level == "error" for finding in reported):
         known = {finding.where for finding in reported if finding.kind == "kink"}  # one finding for each direction

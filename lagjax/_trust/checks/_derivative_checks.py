@@ -22,7 +22,7 @@ def findings(scene: CheckedScene) -> list[Finding]:
         return reported
     if scene.is_large:
         return _compare_along_lines(scene)
-    if scene.layout.size > _ALL_AT_ONCE and scene.is_lowered and _agree(scene):
+    if scene.layout.size > _ALL_AT_ONCE and scene.derivation.is_lowered and _agree(scene):
         return []
     sides = scene.sides()
     return [found for block in _blocks(scene, sides.round_off) for found in _compare_derivatives(scene, sides, *block)]
