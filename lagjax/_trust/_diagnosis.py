@@ -6,7 +6,7 @@ comes from, a pole that was reached, a mass matrix that has become singular, an 
 finds at the last state: a kink, a jump, stiff terms.
 
 All but the line and `check` is read off the scene's programs in NumPy, which compiles nothing. These two have limits,
-`LONGEST` and `LARGEST_CHECKED`: a failure must not cost more than a motion does.
+`LONGEST_FUNCTION` and `LARGEST_CHECKED`: a failure must not cost more than a motion does.
 """
 
 from collections.abc import Callable
@@ -40,7 +40,7 @@ from lagjax._run import Trajectory
 from lagjax._scene import System
 from lagjax._trust.checks import check, describe_direction
 
-LONGEST = 4000  # equations of a function up to which they are gone through one by one: some 50 µs each
+LONGEST_FUNCTION = 4000  # equations of a function up to which they are gone through one by one: some 50 µs each
 # A motion that runs away does so on a time scale |q̇|/|q̈| (or |q|/|q̇|) that has shrunk to less than this part of the
 # whole: steps have shrunk to 1e-15 of it when they are given up, and smooth motions are followed to 1e-5 in the budget.
 RUNAWAY = 1e-8
@@ -48,7 +48,7 @@ RUNAWAY_SINGLE = 3e-6  # of float32, whose steps are given up at 5e-7 of the who
 SINGULAR = 1e-9  # the part of its first value to which an eigenvalue of M has come down where M is called singular
 # Steps beyond which a budget was spent on crossing borders: one that no step fits over is given up within a hundred
 # after those that led there. Twice as many say the same of most scenes.
-MANY = 1000
+MANY_CROSSINGS = 1000
 ESCAPED = 1e3  # times its largest coordinate at the start: a motion to infinity
 
 _CODES = {
@@ -242,7 +242,7 @@ def _short_functions(derivation: Derivation, params, ended: Ended) -> tuple[list
 
 
 def _is_short(function: Callable, arguments: tuple) -> bool:
-    return _equations(jax.make_jaxpr(function)(*arguments).jaxpr) <= LONGEST
+    return _equations(jax.make_jaxpr(function)(*arguments).jaxpr) <= LONGEST_FUNCTION
 
 
 def _equations(jaxpr) -> int:
@@ -389,7 +389,7 @@ def _count_unheld(derivation: Derivation) -> int:
 def _budget(ended: Ended) -> str:
     """The time that was reached when the budget of steps was spent."""
     reached, whole = abs(ended.t - ended.t_first), abs(ended.t_last - ended.t_first)
-    crossed = _CODES[ended.code] == "acceleration_discontinuous" and ended.steps > MANY
+    crossed = _CODES[ended.code] == "acceleration_discontinuous" and ended.steps > MANY_CROSSINGS
     if not (crossed or _CODES[ended.code] == "max_steps_reached") or not reached > 0:
         return ""
     needed = ended.steps * whole / reached

@@ -51,7 +51,7 @@ from lagjax._primitives import DOUBLE, SINGLE, differentiable_where, lost_unless
 from lagjax._program import CLOCK, Unlowerable, lack_of_memory, table_of
 
 # Solvers reject steps for the round-off of their error estimate where rtol is below some ten units of it.
-LEAST_RTOL = 10
+LEAST_RTOL_OF_DIFFRAX = 10
 
 
 def _explains_forward_mode(solve):
@@ -116,7 +116,7 @@ class Diffrax(AbstractEngine, eqx.Module):
         if problem.varies:
             return "diffrax does not know the types of jax.shard_map: give it check_vma=False"
         if self.dt is None:
-            return too_tight(self.rtol(problem), problem.layout.dtype, LEAST_RTOL)
+            return too_tight(self.rtol(problem), problem.layout.dtype, LEAST_RTOL_OF_DIFFRAX)
         if not (is_concrete(self.dt) and is_concrete(problem.ts)):
             return None
         ts = np.asarray(problem.ts)

@@ -14,12 +14,12 @@ from lagjax._fit.result._information import LEVEL
 from lagjax._show import even_places, import_package, render_picture, simplify_axes
 
 BLUE, RED, GREY = "#0072B2", "#D55E00", "0.55"
-_MOST = 4000  # samples in one curve: more do not show
+_MOST_DRAWN = 4000  # samples in one curve: more do not show
 
 
 def draw_record(axes, record: Record, residuals: np.ndarray, names: tuple[str, ...], sigma: np.ndarray) -> None:
     """Data over fit in the first row of `axes` (2, S), residuals (T, S) with ±2σ below, a column for each signal."""
-    some = even_places(len(record), _MOST)
+    some = even_places(len(record), _MOST_DRAWN)
     ts, measured, left = record.ts[some], record.matrix[some], residuals[some]
     for s, name in enumerate(names):
         above, below = axes[0][s], axes[1][s]

@@ -20,7 +20,7 @@ from lagjax._program import Unlowerable, lower
 from lagjax._run.jumps._scene_code import SceneCode
 
 # Operations of the line of the end of a stretch; instead of a longer one NumPy evaluates its parts.
-LONGEST = 5000
+LONGEST_REPLAYED = 5000
 
 
 def join(*arrays):
@@ -86,7 +86,7 @@ class Replay:
         fixed = [(record,), (), (2 * self.sizes["N"],), (self.sizes["NUMBERS"],)]
         given = [jax.ShapeDtypeStruct(shape, float) for shape in (*fixed, *shapes)]
         try:
-            program = lower(function, *given, budget=LONGEST)
+            program = lower(function, *given, budget=LONGEST_REPLAYED)
         except Unlowerable:
             return None
         return None if program.looks_up else Line(program.line, program.size, program.size, sum(map(math.prod, fixed)))

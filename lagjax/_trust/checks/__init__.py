@@ -29,7 +29,7 @@ from lagjax._trust.checks._scene_at_start import CheckedScene
 PyTree = Any
 
 # Units of atol: in a motion that is smaller, the errors that atol allows add up to a hundredth within a hundred steps.
-_SMALLEST = 1e4
+_SMALLEST_COORDINATE = 1e4
 
 
 def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0, params: PyTree = None) -> Findings:
@@ -122,7 +122,7 @@ def _small(layout: Layout, q) -> list[Finding]:
     largest = max(leaves.values(), default=0.0)
     atol = rtol * min(ATOL_OVER_RTOL, ATOL_OVER_MOTION * largest)
     # What is no more than the rounding of the others stands for zero.
-    small = tuple(name for name, size in leaves.items() if eps * largest < size < _SMALLEST * atol)
+    small = tuple(name for name, size in leaves.items() if eps * largest < size < _SMALLEST_COORDINATE * atol)
     if not small:
         return []
     size = max(leaves[name] for name in small)
