@@ -23,13 +23,11 @@ from lagjax._equations._form import OPERATION_BUDGET
 from lagjax._equations._linear import eigen, is_definite, solve_many
 from lagjax._equations._recursion import RecursiveElimination
 from lagjax._native import Projection
-from lagjax._program import (
+from lagjax._program import StraightLine, Unlowerable, is_smooth
+from lagjax._tracing import (
     Program,
-    StraightLine,
-    Unlowerable,
     apply_function,
     concatenate,
-    is_smooth,
     lower_formula,
     lower_solution,
     multiply,

@@ -42,15 +42,8 @@ from lagjax._equations._sparse import MOST_COLORS
 from lagjax._equations._structure import SparseMotion
 from lagjax._interface import Layout, dtype_of, is_concrete
 from lagjax._primitives import DOUBLE
-from lagjax._program import (
-    Borders,
-    Program,
-    Unlowerable,
-    borders,
-    lack_of_memory,
-    lower,
-    lower_scalars,
-)
+from lagjax._program import Borders, Unlowerable, borders, lack_of_memory
+from lagjax._tracing import Program, lower, lower_scalars
 
 PyTree = Any
 

@@ -25,19 +25,19 @@ _SET_ROWS = "set_rows"
 class LineCode:
     """A straight line of `inputs` floats in machine code, for as long as this object lives.
 
-    At its `address` is `evaluate(x, out, rows)`, with x (rows, inputs) and out (rows, outputs). A long line is a walk
-    along rows of integers, for which LLVM takes no longer. Where its first inputs, so many, are `moving`, that gives
-    the running errors of the outputs in their place (`_program._rounding`): a line of them would be five times as long.
-    Raises `Unlowerable`.
+    At its `address` is `evaluate(x, out, rows)`, with x (rows, inputs) and out (rows, outputs). A line of more than
+    `largest` operations is a walk along rows of integers, for which LLVM takes no longer. Where its first inputs, so
+    many, are `moving`, that gives the running errors of the outputs in their place (`_program._rounding`): a line of
+    them would be five times as long. Raises `Unlowerable`.
     """
 
-    def __init__(self, line: StraightLine, inputs: int, moving: int | None = None):
+    def __init__(self, line: StraightLine, inputs: int, moving: int | None = None, largest: int = LARGEST_LINE):
         module, outputs = ir.Module("line"), len(line.outputs)
         module.triple = ""
         turns = any(op in ("sin", "cos") for op, _, _ in line.nodes)
         sincos = sincos_function(module, 1) if turns else None
         filled = [k for k in range(outputs) if line.constant(k) != 0]
-        long = moving is not None or len(line.nodes) + len(filled) > LARGEST_LINE
+        long = moving is not None or len(line.nodes) + len(filled) > largest
         write = _RowWalk(line, inputs, filled, moving) if long else None
         room = 1 if write is None else 2 ** math.ceil(math.log2(2 * write.size))
         code = Code(module, "evaluate", [POINTER, POINTER, INTEGER], 1, public=True)

@@ -8,7 +8,7 @@ from sweeps import sweep
 
 from lagjax._engine.taylor._line_functions import Line
 from lagjax._native import LineCode
-from lagjax._program import lower
+from lagjax._tracing import lower
 
 
 def function(x):

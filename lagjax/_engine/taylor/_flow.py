@@ -16,7 +16,8 @@ from lagjax._engine._stop_reason import End, what_stopped
 from lagjax._engine.taylor._variational import tangent_programs
 from lagjax._equations import LARGEST_PROGRAM
 from lagjax._interface import RESULTS, SUCCESSFUL, code_of
-from lagjax._program import Program, Unlowerable, machine_memory
+from lagjax._program import Unlowerable, machine_memory
+from lagjax._tracing import Program
 
 # The last terms that the series of a tangent may have, relative to the tangent, in tolerances. What the series leaves
 # out is smaller by e² at least. Measured on all scenes: a motion that has its own scale takes steps with at most 300.

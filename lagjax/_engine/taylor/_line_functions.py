@@ -30,23 +30,16 @@ from lagjax._engine.taylor._call import NO_HANDLER, capsule
 from lagjax._equations import LARGEST_COMPILED
 from lagjax._native import LARGEST_LINE, LineCode, line_handler, make_once
 from lagjax._primitives import HostFunction, LinearMap, call_host, compute_on_host, share_rows
-from lagjax._program import (
-    Graph,
-    Program,
-    StraightLine,
-    Unlowerable,
-    copy_nodes,
-    emit,
-    lower,
-    lowers,
-    pullback,
-    pushforward,
-)
+from lagjax._program import Graph, StraightLine, Unlowerable, copy_nodes, pullback, pushforward
+from lagjax._tracing import Program, emit, lower, lowers
 
 _TARGET = "lagjax_line"
 # Machine code takes some 20 µs a node to make, and NumPy 1 µs a node for a call: that of a line which XLA does not wait
 # for is made after as many calls as take that long, so that one call is not slow, and a thousand are not.
 _CALLS = 20
+# Operations of a line that LLVM writes out for a program of XLA. For 4200 it takes 0.3 s, and a call then 0.5 µs in
+# place of 13; for 12 000 1 s, and 2 in place of 40.
+LARGEST_OF_JIT = 6000
 
 
 def outputs(program: Program, count: int, first, numbers):
@@ -102,8 +95,17 @@ class Line:
 
     @functools.cached_property
     def code(self) -> LineCode | None:
+        return self._make_code(LARGEST_LINE)
+
+    @functools.cached_property
+    def code_of_jit(self) -> LineCode | None:
+        """The code for a program of XLA, which is called often; LLVM may take longer for it."""
+        return self.code if len(self.line.nodes) <= LARGEST_LINE else self._make_code(LARGEST_OF_JIT)
+
+    def _make_code(self, largest: int) -> LineCode | None:
         try:
-            return None if NO_HANDLER is not None or self.line.looks_up else LineCode(self.line, self.size)
+            code = None if NO_HANDLER is not None or self.line.looks_up else LineCode
+            return code and code(self.line, self.size, largest=largest)
         except Unlowerable:
             return None
 
@@ -185,7 +187,7 @@ class _LineMap(LinearMap):
     def _lower_on_cpu(self, context, *arrays, line: Line):
         of, call = self.of(line), self._compile_operations
         if not context.module_context.lowering_parameters.for_export:  # where it runs elsewhere
-            code = of.code
+            code = of.code_of_jit
             call = self._call_host if code is None else self._call_code
             if code is not None:
                 _register_handler()
@@ -198,9 +200,9 @@ class _LineMap(LinearMap):
 
     def _call_code(self, *arrays, line: Line):
         x, of = jnp.concatenate(arrays, axis=-1), self.of(line)
-        assert of.code is not None
+        assert of.code_of_jit is not None
         rows = jax.ShapeDtypeStruct((math.prod(x.shape[:-1]), of.outputs), np.float64)
-        result = jax.ffi.ffi_call(_TARGET, rows)(x.reshape(-1, x.shape[-1]), line=np.int64(of.code.address))
+        result = jax.ffi.ffi_call(_TARGET, rows)(x.reshape(-1, x.shape[-1]), line=np.int64(of.code_of_jit.address))
         return [result.reshape(*x.shape[:-1], of.outputs)]
 
     def _compile_operations(self, *arrays, line: Line):

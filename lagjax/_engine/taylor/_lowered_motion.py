@@ -13,7 +13,8 @@ from jaxtyping import Array
 
 from lagjax._engine.taylor._line_functions import line_of
 from lagjax._equations import Constraints, Derivation, Motion
-from lagjax._program import Program, Unlowerable
+from lagjax._program import Unlowerable
+from lagjax._tracing import Program
 
 
 def lowered_motion(derivation: Derivation) -> Motion:
