@@ -10,8 +10,6 @@ from jaxtyping import Array, Float
 
 from lagjax._engine.taylor import lowered_motion
 from lagjax._equations import (
-    LARGEST_ANALYSED,
-    LARGEST_ANALYSED_DENSE,
     Derivation,
     MatrixFree,
     Motion,
@@ -19,6 +17,7 @@ from lagjax._equations import (
     Scales,
     borders_of,
     derivation_of,
+    forms,
     has_constraints,
     pieces_of_motion,
 )
@@ -31,7 +30,7 @@ Vector = Float[Array, " n"]
 
 def require_matrices(size: int, what: str, advice: str) -> None:
     """Raise `ValueError`, with the `advice`, where `what` takes matrices that are too large for so many coordinates."""
-    if size > LARGEST_ANALYSED:
+    if size > forms.LARGEST_ANALYSED:
         raise ValueError(
             f"{what}: not tried for {size} coordinates, which takes matrices of n × n numbers, {8e-9 * size**2:.2g} GB "
             f"each, and some n³ operations. {advice}"
@@ -62,7 +61,7 @@ class SceneState(NamedTuple):
         require_finite(rest, "qdot")
         _require_no_velocities(system, q, params)
         state = layout, layout.flatten(q), layout.flatten(rest), as_arrays(params, layout.dtype)
-        if sparse and layout.size > LARGEST_ANALYSED_DENSE and system.path == "auto":
+        if sparse and layout.size > forms.LARGEST_ANALYSED_DENSE and system.path == "auto":
             functions = {role: getattr(system, role) for role in ROLES}
             scene = cls.from_arguments(replace_functions(system, functions, "array"), *state)
             if scene.large:
@@ -88,7 +87,7 @@ class SceneState(NamedTuple):
     def large(self) -> bool:
         """True if matrices of n × n numbers are not written down, as those of the scene are sparse."""
         form = self.derivation.form
-        if not form.is_sparse or isinstance(form.mass, MatrixFree) or self.layout.size <= LARGEST_ANALYSED_DENSE:
+        if not form.is_sparse or isinstance(form.mass, MatrixFree) or self.layout.size <= forms.LARGEST_ANALYSED_DENSE:
             return False
         return not pieces_of_motion(self.motion, *self.derivation.state_shapes)
 

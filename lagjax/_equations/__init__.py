@@ -12,22 +12,12 @@ evaluates them at many states. `_scales` says how large coordinates, velocities 
 operations of a user's function are not finite or make it piecewise, and in which line.
 """
 
+from lagjax._equations import _form as forms
 from lagjax._equations._blame import borders_of_motion, describe_pieces, offenders, pieces_of_motion, poles
 from lagjax._equations._consistency import has_constraints, inconsistent_members, require_consistent
 from lagjax._equations._constraints import ROUNDINGS, Constraints, distances, is_inconsistent
 from lagjax._equations._coupled_forces import CoupledForces
 from lagjax._equations._derivation import Derivation, derivation_of, numbers_of, once_for_structure
-from lagjax._equations._form import (
-    LARGEST_ANALYSED,
-    LARGEST_ANALYSED_DENSE,
-    LARGEST_CHECKED,
-    LARGEST_CHECKED_BY_XLA,
-    LARGEST_COMPILED,
-    LARGEST_DENSE,
-    LARGEST_PROGRAM,
-    LEAST_COORDINATES,
-    OPERATION_BUDGET,
-)
 from lagjax._equations._linear import (
     augment,
     dependent_rows,

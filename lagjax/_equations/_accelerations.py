@@ -17,9 +17,9 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from scipy.sparse import csr_array
 
+from lagjax._equations import _form as forms
 from lagjax._equations import _saddle
 from lagjax._equations._constraints import velocity_scales
-from lagjax._equations._form import OPERATION_BUDGET
 from lagjax._equations._linear import eigen, is_definite, solve_many
 from lagjax._equations._recursion import RecursiveElimination
 from lagjax._native import Projection
@@ -146,7 +146,7 @@ class Accelerations:
             _, _, right, factors, _ = system(*scalars)
             return -solve(factors, right)[self.layout.size :]
 
-        return lower_formula(multipliers, *self.of.scalar_shapes, budget=OPERATION_BUDGET)
+        return lower_formula(multipliers, *self.of.scalar_shapes, budget=forms.OPERATION_BUDGET)
 
     def impact_response(self, rows: tuple[int, ...], states: int, free: "Derivation") -> Program:
         """The response to impulses at K `rows` of G: G, G M⁻¹ (K, n), G M⁻¹ Gᵀ (K, K), values, rates, G q̈ − γ (K,).
@@ -169,7 +169,7 @@ class Accelerations:
             bends = multiply(gradients, [accelerations]) - gammas
             return concatenate([*gradients, *moved, multiply(gradients, moved), residuals, rates, bends])
 
-        self._responses[rows] = lower_formula(response, *self.of.scalar_shapes, budget=OPERATION_BUDGET)
+        self._responses[rows] = lower_formula(response, *self.of.scalar_shapes, budget=forms.OPERATION_BUDGET)
         return self._responses[rows]
 
     @lowered_once
@@ -187,7 +187,7 @@ class Accelerations:
                 q = q + position.vector(*scalars)[:n]
             return concatenate([q, v + velocity.vector(*(q[i] for i in range(n)), *rest)[:n]])
 
-        return lower_formula(projected, *self.of.scalar_shapes, budget=OPERATION_BUDGET)
+        return lower_formula(projected, *self.of.scalar_shapes, budget=forms.OPERATION_BUDGET)
 
     @lowered_once
     def velocity_scales(self) -> Program | None:
@@ -205,7 +205,7 @@ class Accelerations:
             of_touched = apply_function(scale_arrays, parts.vector(*scalars), stack(scalars[n : 2 * n]))
             return scatter(of_touched, touched, n)
 
-        return lower_formula(scales, *self.of.scalar_shapes, budget=OPERATION_BUDGET)
+        return lower_formula(scales, *self.of.scalar_shapes, budget=forms.OPERATION_BUDGET)
 
     @lowered_once
     def projection(self) -> Projection | None:
@@ -215,7 +215,7 @@ class Accelerations:
     def _solution(self, saddle: _Saddle, regular_only: bool = False) -> Program:
         """x of a linear system, and then whether it is singular."""
         system, solve = self._system(saddle, regular_only)
-        return lower_solution(system, solve, self.layout.size, *self.of.scalar_shapes, budget=OPERATION_BUDGET)
+        return lower_solution(system, solve, self.layout.size, *self.of.scalar_shapes, budget=forms.OPERATION_BUDGET)
 
     @lowered_once
     def lacks(self) -> str | None:
@@ -244,10 +244,10 @@ class Accelerations:
             elimination = _saddle.SaddleElimination(zeros, self.layout.dtype, augmented, regular_only, released)
             if released and saddle.b is not None:
                 elimination = _saddle.DraggedElimination(elimination, self.of.absent("drag"))
-        if elimination.operations > OPERATION_BUDGET:
+        if elimination.operations > forms.OPERATION_BUDGET:
             raise Unlowerable(
                 f"to solve for the accelerations takes some {elimination.operations} operations, more than the "
-                f"{OPERATION_BUDGET} that are expected to fit in memory"
+                f"{forms.OPERATION_BUDGET} that are expected to fit in memory"
             )
         parts = self._parts(saddle, elimination, m)
         count, places = len(elimination.entries), elimination.entries
@@ -276,7 +276,7 @@ class Accelerations:
             right = scatter(values[count:], np.arange(n), n + 2 * elimination.velocities)
             return places, values[:count], right, *elimination.factors(values[:count])
 
-        program = lower_solution(system, elimination.solve, n, *self.of.scalar_shapes, budget=OPERATION_BUDGET)
+        program = lower_solution(system, elimination.solve, n, *self.of.scalar_shapes, budget=forms.OPERATION_BUDGET)
         return program if self._agrees(program) else None
 
     def _agrees(self, program: Program) -> bool:

@@ -19,21 +19,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from lagjax._equations import _form as forms
 from lagjax._equations._accelerations import Accelerations, lowered_once
 from lagjax._equations._blame import pieces_of
 from lagjax._equations._coupled_forces import CoupledForces
-from lagjax._equations._form import (
-    BYTES_OF_ENTRY,
-    LARGEST_DIFFERENTIATED,
-    LARGEST_FOLLOWED,
-    LARGEST_LOWERED,
-    LEAST_COORDINATES,
-    OPERATION_BUDGET,
-    SCALAR,
-    Form,
-    derived_form,
-    form_in_xla,
-)
+from lagjax._equations._form import SCALAR, Form, derived_form, form_in_xla
 from lagjax._equations._motion import Motion
 from lagjax._equations._patterns import gradient_memory, jacobian_pattern
 from lagjax._equations._quantities import OwnRules, quantities
@@ -73,7 +63,7 @@ class Derivation:
         """
         self.motion, self.layout, self.unhashable = motion, layout, unhashable
         self.numbers = jax.tree.map(lambda x: jax.ShapeDtypeStruct(jnp.shape(x), jnp.result_type(x)), params)
-        is_large = layout.size >= LEAST_COORDINATES and path != "scalar"
+        is_large = layout.size >= forms.LEAST_COORDINATES and path != "scalar"
         self.memory = gradient_memory(motion.lagrangian, self.state_shapes) if is_large else 0
         if lack := lack_of_memory(self.memory):
             raise ValueError(
@@ -110,7 +100,7 @@ class Derivation:
             return self
         motion = Motion(*list(vars(self.motion).values())[:4])
         refusal = None
-        if self.form.operations > LARGEST_LOWERED:
+        if self.form.operations > forms.LARGEST_LOWERED:
             refusal = f"{self.form.operations} operations of L would take minutes to compile"
         return Derivation(motion, self.layout, self.numbers, refusal, self.unhashable, "scalar", self.counts_on_params)
 
@@ -159,7 +149,7 @@ class Derivation:
         """
         if self.form.reason is not None:
             raise Unlowerable(self.form.reason)
-        if lack := lack_of_memory(BYTES_OF_ENTRY * self.layout.size**2):
+        if lack := lack_of_memory(forms.BYTES_OF_ENTRY * self.layout.size**2):
             raise Unlowerable(f"its mass matrix {lack}")
 
         def order_values(values, zero):
@@ -180,10 +170,10 @@ class Derivation:
 
         leaves, structure = jax.tree.flatten(self.state_shapes)
         try:
-            return lower_scalars(trace_scalars, tuple(leaves), OPERATION_BUDGET, 2 * self.layout.size + 1)
+            return lower_scalars(trace_scalars, tuple(leaves), forms.OPERATION_BUDGET, 2 * self.layout.size + 1)
         except OwnRules:
             self.has_rules = True
-            return lower(trace_arrays, *leaves, budget=OPERATION_BUDGET, moving=2 * self.layout.size + 1)
+            return lower(trace_arrays, *leaves, budget=forms.OPERATION_BUDGET, moving=2 * self.layout.size + 1)
 
     @property
     def recursion(self) -> Recursion | None:
@@ -253,7 +243,7 @@ class Derivation:
         if key not in self._programs:
             chosen = jax.jacrev(lambda *state: self._traced_once.momentum(*state)[jnp.asarray(momenta, int)])
             moving = 2 * self.layout.size + 1
-            self._programs[key] = lower(chosen, *self.state_shapes, budget=OPERATION_BUDGET, moving=moving)
+            self._programs[key] = lower(chosen, *self.state_shapes, budget=forms.OPERATION_BUDGET, moving=moving)
         return self._programs[key]
 
     # ---- facts ----
@@ -300,7 +290,7 @@ class Derivation:
     @property
     def cyclic(self) -> tuple[int, ...] | None:
         """The `unread` coordinates; None also where a look takes long."""
-        return None if self.form.operations > LARGEST_FOLLOWED else self.unread
+        return None if self.form.operations > forms.LARGEST_FOLLOWED else self.unread
 
     @lowered_once
     def borders(self) -> Borders | None:
@@ -339,7 +329,7 @@ class Derivation:
         programs are not large."""
         try:
             usual = not (self.whole.looks_up or self.has_rules)
-            return usual and self.layout.dtype == DOUBLE and self.whole.operations <= LARGEST_DIFFERENTIATED
+            return usual and self.layout.dtype == DOUBLE and self.whole.operations <= forms.LARGEST_DIFFERENTIATED
         except Unlowerable:
             return False
 

@@ -19,14 +19,13 @@ import numpy as np
 
 from lagjax._engine import AHEAD
 from lagjax._equations import (
-    LARGEST_CHECKED,
-    LARGEST_CHECKED_BY_XLA,
     CoupledForces,
     Derivation,
     Sample,
     derivation_of,
     describe_pieces,
     eigen,
+    forms,
     null_directions,
     numbers_of,
     offenders,
@@ -193,7 +192,7 @@ def _quantities_ahead(derivation: Derivation, numbers, ended: Ended) -> tuple[np
         y, t = _states_ahead(ended, np.concatenate([v, np.zeros(len(v))]))
     for name, function in (("given_force", motion.forces), ("lagrangian_by_q", jax.grad(motion.lagrangian))):
         state = *halves(ended.y), ended.t, numbers
-        if function is not None and len(v) <= LARGEST_CHECKED and _is_short(function, state):
+        if function is not None and len(v) <= forms.LARGEST_CHECKED and _is_short(function, state):
             found = [function(*map(jnp.asarray, (*halves(y[k]), t[k])), numbers) for k in range(len(y))]
             values[name] = np.stack(found)
     return y, t, values
@@ -367,7 +366,7 @@ def _run_check(system: System, derivation: Derivation, params, ended: Ended) -> 
             f"most {MOST_COUPLED} that M couples to each other, and none that change in other ways what others hold. "
             "Round sign(v) off, as jnp.tanh(v / w) with a speed w that does not matter."
         )
-    largest = LARGEST_CHECKED if derivation.is_lowered else LARGEST_CHECKED_BY_XLA
+    largest = forms.LARGEST_CHECKED if derivation.is_lowered else forms.LARGEST_CHECKED_BY_XLA
     if ended.scene is None and derivation.layout.size > largest:
         return ""
     q, qdot = map(derivation.layout.restore, halves(ended.y))

@@ -13,7 +13,7 @@ import lagjax
 from lagjax import scenes
 from lagjax._engine import diffrax as _diffrax
 from lagjax._engine import taylor as _machine_code
-from lagjax._equations import _accelerations, _form
+from lagjax._equations import _form
 from lagjax._equations import _many_states as many_states
 from lagjax._equations._derivation import Derivation, columns_of, derivation_of, numbers_of
 from lagjax._interface._layout import Layout
@@ -180,7 +180,7 @@ def test_what_does_not_fit_in_memory_is_refused_before_it_is_tried(monkeypatch):
     small = of(lagjax.System(lagrangian), np.ones(16), np.ones(16))
     large = Derivation(small.motion, small.layout, None)
     assert large.program("force").operations > 0
-    monkeypatch.setattr(_accelerations, "OPERATION_BUDGET", 1000)
+    monkeypatch.setattr(_form, "OPERATION_BUDGET", 1000)
     with pytest.raises(Unlowerable, match=r"some \d+ operations, more than the 1000 that are expected to fit"):
         large.accelerations.program  # noqa: B018
 
@@ -287,7 +287,7 @@ SCENES = {
 def test_explain_names_the_engine_that_runs(name, monkeypatch):
     system, q, engine, words = SCENES[name]
     # Scenes of some thousands of operations take seconds to derive: smaller ones stand for them.
-    monkeypatch.setattr(_machine_code._flow, "LARGEST_PROGRAM", 150)
+    monkeypatch.setattr(_form, "LARGEST_PROGRAM", 150)
     monkeypatch.setattr(_form, "LARGEST_XLA_PROGRAM", 30)
     facts = system.explain(q, np.zeros_like(q))
 

@@ -35,7 +35,7 @@ from lagjax._engine.diffrax._equations import MotionEquations, equations_of
 from lagjax._engine.diffrax._integrate import Converted, Jumps, Method, WithJumps, integrate
 from lagjax._engine.diffrax._jumps import freeze
 from lagjax._engine.diffrax._solvers import FineOutput, Projected
-from lagjax._equations import LEAST_COORDINATES
+from lagjax._equations import forms
 from lagjax._interface import (
     ENDED_WELL,
     EVENT_OCCURRED,
@@ -131,7 +131,7 @@ class Diffrax(AbstractEngine, eqx.Module):
         That are the arrays of L and its gradient, those of M where it is a matrix, some states of a step, and outputs.
         """
         derivation, n, count = problem.derivation, problem.layout.size, jnp.size(problem.ts)
-        if n < LEAST_COORDINATES:
+        if n < forms.LEAST_COORDINATES:
             return None
         size, in_turn = problem.layout.dtype.itemsize, derivation.form.is_sparse  # one member after the other
         at_once = derivation.memory + size * (2 * n * _STATES + (0 if in_turn else 3 * n * n))

@@ -27,7 +27,7 @@ from jax.core import ShapedArray
 from jax.interpreters import ad, mlir
 
 from lagjax._engine.taylor._call import NO_HANDLER, capsule
-from lagjax._equations import LARGEST_COMPILED
+from lagjax._equations import forms
 from lagjax._native import LARGEST_LINE, LineCode, line_handler, make_once
 from lagjax._primitives import HostFunction, LinearMap, call_host, compute_on_host, share_rows
 from lagjax._program import Graph, StraightLine, Unlowerable, copy_nodes, pullback, pushforward
@@ -210,7 +210,7 @@ class _LineMap(LinearMap):
         return [jnp.stack(emit(self.of(line).line, columns), axis=-1)]
 
     def _call_from_gpu(self, *arrays, line: Line):
-        if len(self.of(line).line.nodes) <= LARGEST_COMPILED:
+        if len(self.of(line).line.nodes) <= forms.LARGEST_COMPILED:
             return self._compile_operations(*arrays, line=line)
 
         def evaluate(*arrays):

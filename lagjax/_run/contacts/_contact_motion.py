@@ -20,7 +20,7 @@ from lagjax._engine.taylor import (
     require_one_number,
     vector_of,
 )
-from lagjax._equations import OPERATION_BUDGET, Derivation, derivation_of
+from lagjax._equations import Derivation, derivation_of, forms
 from lagjax._interface import Function, Layout, compile_for_one_call, halves
 from lagjax._primitives import attach_derivative, lost_unless
 from lagjax._program import Unlowerable
@@ -336,7 +336,7 @@ def _forces_of(derivation: Derivation, scene: ContactScene, flat: Flat) -> Progr
     multipliers = derivation.accelerations.multipliers
     y, forces = (jax.ShapeDtypeStruct((size,), float) for size in (moving, len(multipliers.line.outputs)))
     program = lower(spread, y, derivation.numbers, forces, moving=moving)
-    return compose(program, multipliers, OPERATION_BUDGET, moving)
+    return compose(program, multipliers, forms.OPERATION_BUDGET, moving)
 
 
 class RowPlaces(NamedTuple):

@@ -17,7 +17,7 @@ import numpy as np
 
 from lagjax._engine import Problem
 from lagjax._engine.taylor import Line, MachineCode, Surfaces, line_of, make_flow, require_one_number
-from lagjax._equations import OPERATION_BUDGET, Derivation, has_constraints, is_inconsistent
+from lagjax._equations import Derivation, forms, has_constraints, is_inconsistent
 from lagjax._interface import Function, Layout, accept, halves, present
 from lagjax._primitives import DOUBLE, SINGLE
 from lagjax._program import Unlowerable
@@ -126,7 +126,7 @@ class ModeParts:
 
     def _lower(self, function: Callable) -> Line:
         y = jax.ShapeDtypeStruct((2 * self._derivation.layout.size + 1,), float)
-        return line_of(lower(function, y, self._derivation.numbers, budget=OPERATION_BUDGET))
+        return line_of(lower(function, y, self._derivation.numbers, budget=forms.OPERATION_BUDGET))
 
     def _lower_reset(self, transition: Transition) -> Line:
         try:

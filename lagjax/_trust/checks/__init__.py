@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from lagjax._engine import DEFAULT_RTOL
-from lagjax._equations import LARGEST_DENSE, derivation_of
+from lagjax._equations import derivation_of, forms
 from lagjax._interface import Layout, is_concrete, join_names, not_finite, require_number
 from lagjax._native import ATOL_OVER_MOTION, ATOL_OVER_RTOL
 from lagjax._primitives import accepts_singles
@@ -83,7 +83,7 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
 @accepts_singles(("q", "qdot"), ("t", "params"))
 def _scene_findings(system, q, qdot, t, params) -> tuple[list[Finding], str]:
     layout = Layout.from_state(q, qdot)
-    if layout.size > LARGEST_DENSE and not derivation_of(system, layout, params).form.is_sparse:
+    if layout.size > forms.LARGEST_DENSE and not derivation_of(system, layout, params).form.is_sparse:
         system = replace_functions(system, {role: getattr(system, role) for role in ROLES}, "array")
     scene = CheckedScene.from_state(system, layout, q, qdot, t, params)
     reported = _derivative_checks.findings(scene) + _dissipation(scene) + _constraint_checks.findings(scene)
