@@ -80,7 +80,7 @@ LARGEST_TREE, OFTEN, ROUNDS = 10, 24, 12
 # eighty more; the larger it is, the fewer motions of ordinary size are touched by it: here those below 1/60.
 ATOL_OVER_RTOL, ATOL_OVER_MOTION = 1e-3, 1 / 16
 # What was at rest at zero, and has had so many steps refused, half as many as it took, moves by rounding (`_step`):
-# other steps hold at once, or after a halving or two. Doubled, such a motion takes six halvings more.
+# other steps hold at once, or after a halving or two. Meant, and measured, was 6; a limit of the same name made it 64.
 # A start below `NOTHING` counts as zero then, in any units: impulses at rest leave velocities of 1e-50.
 MOST_REFUSED, NOTHING = 64, 1e-30
 
