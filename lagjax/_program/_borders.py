@@ -335,7 +335,7 @@ class _Rewriting:
             i in self.cones or self._decides(i) or program.line.nodes[i][0] in (*_FEATURES, "pow") for i in relevant
         ):
             linear = program.linear
-            roots = {*program.line.outputs, *((*linear.right, *linear.entries.values()) if linear else ())}
+            roots = {*program.line.outputs, *(linear.read if linear else ())}
             for i in range(len(program.line.nodes)):
                 place = self._place(i)
                 self.places.append(self._join(place) if i in roots else place)
@@ -349,9 +349,11 @@ class _Rewriting:
     def _decisive(self) -> set[int]:
         """The nodes that q̈ depends on, without those of the elimination of a linear system."""
         linear, line = self.program.linear, self.program.line
-        # What friction of contacts adds to A does not decide: it stops, and turns, by watches of its own.
         roots = line.outputs[: self.size] if linear is None else [*linear.right, *linear.entries.values()]
         needed = _below(line, roots)
+        if linear is not None and linear.others:
+            # Of what contacts bring into A pieces decide; friction stops, and turns, by watches of its own.
+            needed |= {i for i in _below(line, linear.others.values()) if self._decides(i)}
         self._of_guards = _below(line, self.watched)
         if self.watched:  # which may read the solution of a linear system, but not decide on its elimination
             needed |= self._of_guards - (_below(line, line.outputs[: self.size]) - needed)

@@ -17,6 +17,7 @@ is the same with both sides alike and u̇⁺ = −u̇⁻. Source: Gelfand & Fomi
 With which pieces L jumps is found at random states of their borders: there a corner is zero to rounding, a jump not.
 """
 
+import functools
 import math
 from collections.abc import Callable, Container, Sequence
 from typing import NamedTuple
@@ -37,6 +38,9 @@ _STATES = 48  # at which a border is looked for: what jumps does so at nearly al
 _ROUNDS, _STEPS = 4, 6  # of Newton's method, with the pieces of the state decided anew in between
 # A difference of both sides counts as a jump where it is this many times as large as its rounding. The bound of the
 # rounding is to first order, and the border is hit to some roundings: a corner was seen at 4 at most.
+# The part of its terms by which the rate of a constraint has to jump: less is rounding of where the border is, and
+# the impulse that it asks for changes velocities by no more.
+TURNED = 1e-9
 _NOISE, _HIT, _EPS = 1e3, 100.0, float(np.finfo(float).eps)
 
 
@@ -87,7 +91,7 @@ def kick_line(
     """The line of a `Kick`. That of the program takes `size` inputs and the pieces; `more` numbers stand behind the hⱼ.
 
     The pieces `spatial` are those that jump where u depends on positions. At `corners` of a constraint velocities are
-    NaN behind it: no law says with what velocities the motion goes on.
+    NaN behind it where its rate jumps there: no law says with what velocities the motion goes on.
     """
     m, graph = len(switches), Graph(_LARGEST_KICK * (len(line.nodes) + (n + len(mechanics.rates)) ** 3) + 10_000)
     sides = _Sides(graph, line, size, m)
@@ -128,9 +132,23 @@ def kick_line(
     speed = f("select", forward, f("neg", speed), speed)
     mu = f("select", in_space, zero, f("div", f("sub", speed, b), c))
     kicked = [f("add", x, f("mul", mu, y)) for x, y in zip(w, across, strict=True)]
+    bent = f("and", bent, _turns(graph, sides, mechanics, v)) if corners else bent
     kicked = [f("select", bent, x, graph.number(math.nan)) for x in kicked]
     lacks = f("lt", squared, zero)
     return eliminate_dead_code(graph, [*kicked, f("select", lacks, one, zero)])
+
+
+def _turns(graph: Graph, sides: "_Sides", of: Mechanics, v: list[int]) -> int:
+    """True where a rate of a constraint jumps at this state: elsewhere a piece may bend it that is none of it here."""
+    f, turns = graph.apply, graph.constant(False, "bool")
+    for k, rate in enumerate(of.rates):
+        row = [sides.behind[i] for i in of.jacobian[k * len(v) : (k + 1) * len(v)]]
+        slope, speed = (
+            functools.reduce(lambda a, x: f("add", a, f("abs", x)), xs, graph.number(0.0)) for xs in (row, v)
+        )
+        bound = f("mul", graph.number(TURNED), f("mul", slope, speed))
+        turns = f("or", turns, f("lt", bound, f("abs", sides.difference(rate))))
+    return turns
 
 
 class _Sides:
