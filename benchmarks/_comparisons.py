@@ -24,7 +24,7 @@ from benchmarks._cases import CASES, Case, double_pendulum
 from benchmarks._contenders import Contender, autodiff_acceleration, named
 from benchmarks._measure import Comparison, compare, seconds
 from lagjax._engine._problem import Problem
-from lagjax._engine.diffrax._equations import MotionEquations, form_of
+from lagjax._engine.diffrax._equations import MotionEquations, equations_of
 from lagjax._engine.taylor import MachineCode
 from lagjax._equations._derivation import derivation_of
 from lagjax._interface._layout import Layout
@@ -103,7 +103,7 @@ def _in_machine_code(case: Case) -> Callable[[], None] | None:
     problem = Problem.from_system(case.scene.system, layout, case.scene.params)
     if MachineCode().refuses(problem) is not None:
         return None
-    acceleration = problem.derivation.acceleration
+    acceleration = problem.derivation.accelerations.program
     n, width = layout.size, lanes()
     numbers = [np.ravel(leaf) for leaf in jax.tree.leaves(eqx.filter(case.scene.params, eqx.is_array_like))]
     constants = [float(x) for leaf in numbers for x in leaf]  # as for the others: XLA knows them
@@ -135,7 +135,7 @@ def derived_equations(case: Case) -> tuple[MotionEquations, Any]:
     """The right-hand side as `lagjax.simulate` uses it, and the parameters as arrays."""
     params = jax.tree.map(jnp.asarray, case.scene.params)
     layout = Layout.from_state(case.tree(case.q0[0]), case.tree(case.qdot0[0]))
-    return form_of(derivation_of(case.scene.system, layout, params)), params
+    return equations_of(derivation_of(case.scene.system, layout, params)), params
 
 
 def _derived(case: Case):

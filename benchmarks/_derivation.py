@@ -63,7 +63,8 @@ def _stages(case: Case) -> tuple[float, float]:
     params = jax.tree.map(jnp.asarray, case.scene.params)
     layout = Layout.from_state(case.tree(case.q0[0]), case.tree(case.qdot0[0]))
     motion = case.scene.system._motion(layout, params)
-    derive, program = seconds(lambda: Derivation(motion, layout, eqx.filter(params, eqx.is_array_like)).acceleration)
+    numbers = eqx.filter(params, eqx.is_array_like)
+    derive, program = seconds(lambda: Derivation(motion, layout, numbers).accelerations.program)
     return derive, seconds(lambda: _native.Kernel(program, layout.size))[0]
 
 

@@ -59,7 +59,7 @@ import importlib
 import importlib.util
 from typing import TYPE_CHECKING, Any
 
-from lagjax._interface import PLACES
+from lagjax._interface import PLACES, VERSION
 from lagjax._scene import System
 
 if TYPE_CHECKING:  # each is imported on first use: all of them take as long as JAX itself
@@ -113,7 +113,7 @@ if TYPE_CHECKING:  # each is imported on first use: all of them take as long as 
     from lagjax._trust.checks import check
     from lagjax.results import *  # noqa: F403
 
-__version__ = "0.1.0"
+__version__ = VERSION
 __all__ = [
     "RESULTS", "Clipped", "Delayed", "FineOutput", "Gaussian", "Guess", "Hybrid", "MachineCode", "Quantised", "Record",
     "SimulationError", "Statistics", "Store", "StudentT", "Sweep", "System", "Timings", "Transition", "action", "angle",

@@ -45,8 +45,8 @@ def cyclic_coordinates(system: System, q: PyTree, qdot: PyTree, params: PyTree =
     ```
     """
     scene = SceneState.from_state(system, q, qdot, params)
-    if scene.derivation.structure is not None:
-        return tuple(scene.layout.names[i] for i in scene.unread)
+    if scene.derivation.form.is_sparse:
+        return tuple(scene.layout.names[i] for i in scene.derivation.unread or ())
     try:
         read = scene.derivation.reads("lagrangian")
     except Unlowerable as reason:

@@ -19,7 +19,7 @@ PyTree = Any
 # What may be left of the difference, beside the terms that cancel in it: rounding leaves some 1e-15 of them, and as
 # much of what the numbers of two scenes are made of. Where terms cancel within L more is left: this many times what it
 # is seen to change between states a few units in the last place apart, but never more than the last.
-_SAME, _CHANCE, _LARGEST = 1e-13, 100.0, 1e-8
+_SAME, _CHANCE, _LARGEST_ERROR = 1e-13, 100.0, 1e-8
 _STATES = 64  # random ones, of which rounding decides at none
 
 
@@ -93,7 +93,7 @@ def same_motion(a: System, b: System, q: PyTree, qdot: PyTree, params: PyTree = 
     factor, relative, well = differences
     beside = _compare_equations(scenes, perturb_last_digits(states))
     noise = 0.0 if beside is None else float(np.median(np.abs(relative - beside[1]).max(axis=1)[well & beside[2]]))
-    threshold = min(max(_SAME, _CHANCE * noise), _LARGEST)
+    threshold = min(max(_SAME, _CHANCE * noise), _LARGEST_ERROR)
     state, coordinate = map(int, np.unravel_index(np.argmax(relative), relative.shape))
     residual = float(relative[state, coordinate])
     same = residual <= threshold and np.isfinite(factor) and factor != 0

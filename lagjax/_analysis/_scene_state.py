@@ -17,28 +17,20 @@ from lagjax._equations import (
     Scales,
     borders_of,
     derivation_of,
+    forms,
     has_constraints,
-    jacobian_pattern,
     pieces_of_motion,
 )
 from lagjax._interface import Layout, as_arrays, is_concrete, require_finite
-from lagjax._program import Unlowerable
 from lagjax._scene import ROLES, System, replace_functions, require_system
 
 PyTree = Any
 Vector = Float[Array, " n"]
 
-# Coordinates up to which sparse matrices are treated as dense ones: eigenvalues and roots take 5 s there, and ten times
-# as long for twice as many.
-_LARGEST_DENSE = 200
-# Coordinates beyond which nothing is begun that takes n × n numbers, 8 MB a matrix, of which there may be a hundred,
-# and n³ operations, which take a minute. Doubled, ten.
-_LARGEST_MATRIX = 1000
-
 
 def require_matrices(size: int, what: str, advice: str) -> None:
     """Raise `ValueError`, with the `advice`, where `what` takes matrices too large for this number of coordinates."""
-    if size > _LARGEST_MATRIX:
+    if size > forms.LARGEST_ANALYSED:
         raise ValueError(
             f"{what}: not tried for {size} coordinates, which takes matrices of n × n numbers, {8e-9 * size**2:.2g} GB "
             f"each, and some n³ operations. {advice}"
@@ -69,7 +61,7 @@ class SceneState(NamedTuple):
         require_finite(rest, "qdot")
         _require_no_velocities(system, q, params)
         state = layout, layout.flatten(q), layout.flatten(rest), as_arrays(params, layout.dtype)
-        if sparse and layout.size > _LARGEST_DENSE and system.path == "auto":
+        if sparse and layout.size > forms.LARGEST_ANALYSED_DENSE and system.path == "auto":
             functions = {role: getattr(system, role) for role in ROLES}
             scene = cls.from_arguments(replace_functions(system, functions, "array"), *state)
             if scene.large:
@@ -94,8 +86,8 @@ class SceneState(NamedTuple):
     @property
     def large(self) -> bool:
         """True if matrices of n × n numbers are not written down, as those of the scene are sparse."""
-        structure = self.derivation.structure
-        if structure is None or isinstance(structure.mass, MatrixFree) or self.layout.size <= _LARGEST_DENSE:
+        form = self.derivation.form
+        if not form.is_sparse or isinstance(form.mass, MatrixFree) or self.layout.size <= forms.LARGEST_ANALYSED_DENSE:
             return False
         return not pieces_of_motion(self.motion, *self.derivation.state_shapes)
 
@@ -105,11 +97,7 @@ class SceneState(NamedTuple):
 
     @property
     def lowered(self) -> Derivation | None:
-        try:
-            self.derivation.shape("lagrangian")
-        except Unlowerable:
-            return None
-        return self.derivation
+        return self.derivation if self.derivation.is_lowered else None
 
     @property
     def piecewise(self) -> bool:
@@ -128,18 +116,11 @@ class SceneState(NamedTuple):
             )
 
     @property
-    def unread(self) -> tuple[int, ...]:
-        """The coordinates that L does not depend on, of a scene with a `SparseStructure`: by its pattern."""
-        lagrangian, shapes = self.derivation.motion.lagrangian, self.derivation.state_shapes
-        pattern = jacobian_pattern(lambda *state: lagrangian(*state)[None], shapes, by=0)
-        return () if pattern is None else tuple(np.setdiff1d(np.arange(self.layout.size), pattern.indices).tolist())
-
-    @property
     def conserved(self) -> tuple[int, ...]:
         """The coordinates that nothing depends on and nothing acts on, read off the scene's programs."""
-        if self.derivation.structure is not None:
+        if self.derivation.form.is_sparse:
             acts = self.constrained or self.motion.forces is not None or self.motion.dissipation is not None
-            return () if acts else self.unread
+            return () if acts else self.derivation.unread or ()
         if self.lowered is None:
             return ()
         read = set().union(*map(self.derivation.reads, ("lagrangian", "nonconservative_force", "residual")))
@@ -166,7 +147,7 @@ class SceneState(NamedTuple):
         """The sizes of coordinates, velocities and the time, of a scene of numbers."""
 
         def evaluated(name, q, qdot):
-            if name == "mass_matrix" and self.derivation.structure is not None:  # of which the diagonal alone is read
+            if name == "mass_matrix" and self.derivation.form.is_sparse:  # of which the diagonal alone is read
                 n, state = self.layout.size, (self.q, self.qdot, jnp.zeros((), self.q.dtype), self.numbers)
                 return np.broadcast_to(1 / np.asarray(jax.jit(self.motion.unit)(*state)) ** 2, (1, n, n))
             return Sample.from_scene(self.system, self.layout, q, qdot, 0.0, self.params).quantities(name)[name]

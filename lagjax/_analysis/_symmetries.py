@@ -37,7 +37,7 @@ _NULL = 1e-13
 # Where terms cancel inside of L rounding leaves more: this many times what it is seen to leave. A broken symmetry is
 # off by the same at a state and a few units in its last place beside it; one that holds is off by chance.
 _CHANCE = 30.0
-_LARGEST = 1e-8  # part of L that may be left: beyond, nothing is told from rounding, and no symmetry is reported
+_LARGEST_REST = 1e-8  # part of L that may be left: beyond, nothing is told from rounding, and none is reported
 _SLACK = 100.0  # times as much may be left of a symmetry at fresh states: the largest of many, not their mean
 _NEARLY = 1e-6  # is left of a near symmetry, at most: relativity in the solar system breaks those of Newton by 1e-8
 
@@ -213,7 +213,7 @@ def _measure_columns(scene: SceneState, fields: Fields, states: FlatState) -> _S
     here, beside = (_finite(*map(np.asarray, _columns(fields, at, *scene.arguments))) for at in both)
     pairs = [(a, b) for a, b in zip(here, beside, strict=True) if a.size and a.shape == b.shape]
     noise = max((float(np.sqrt(np.mean((a - b) ** 2))) for a, b in pairs), default=0.0)
-    return _SymmetryColumns(*here, min(max(_NULL, _CHANCE * noise), _LARGEST))
+    return _SymmetryColumns(*here, min(max(_NULL, _CHANCE * noise), _LARGEST_REST))
 
 
 def _flatten_generators(generators, layout: Layout) -> dict[str, Callable]:

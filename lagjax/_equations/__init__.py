@@ -5,17 +5,19 @@ on scalars, operation by operation; `_coupled_forces` are those that read multip
 Jacobian, right-hand side, distances and projection; `_consistency` tests a start against them. `_linear` solves
 symmetric systems and saddle points as arrays, and `_rank` decides which singular values count as zero; `_patterns`
 finds the patterns of a large scene's matrices, `_sparse` solves by them, `_structure` holds its motion; `_saddle` is
-the same elimination on scalars, which keeps the zeros of a scene, and `_recursion` the one for chains in O(n).
-`_derivation` keeps everything derived from a scene as scalar programs, each lowered once; `_many_states` evaluates them
-at many states. `_scales` says how large coordinates, velocities and time are at a state; `_blame` which operations of a
-user's function are not finite or make it piecewise, and in which line.
+the same elimination on scalars, which keeps the zeros of a scene, and `_recursion` the one for chains in O(n). `_form`
+decides in which form a scene is evaluated, and has every number that this takes. `_derivation` keeps everything derived
+from a scene as scalar programs, each lowered once, `_accelerations` those of what is solved for; `_many_states`
+evaluates them at many states. `_scales` says how large coordinates, velocities and time are at a state; `_blame` which
+operations of a user's function are not finite or make it piecewise, and in which line.
 """
 
+from lagjax._equations import _form as forms
 from lagjax._equations._blame import borders_of_motion, describe_pieces, offenders, pieces_of_motion, poles
 from lagjax._equations._consistency import has_constraints, inconsistent_members, require_consistent
 from lagjax._equations._constraints import ROUNDINGS, Constraints, distances, is_inconsistent
 from lagjax._equations._coupled_forces import CoupledForces, couple_forces
-from lagjax._equations._derivation import OPERATION_BUDGET, Derivation, derivation_of, numbers_of, once_for_structure
+from lagjax._equations._derivation import Derivation, derivation_of, numbers_of, once_for_structure
 from lagjax._equations._linear import (
     augment,
     dependent_rows,
@@ -37,15 +39,14 @@ from lagjax._equations._many_states import (
     SADDLE,
     Sample,
     borders_of,
-    is_lowered,
     map_in_chunks,
     numbers_of_state,
     solve_saddle,
     sparse_spectrum,
 )
 from lagjax._equations._motion import Motion
-from lagjax._equations._patterns import jacobian_pattern, sparse_jacobian
+from lagjax._equations._patterns import sparse_jacobian
 from lagjax._equations._rank import Decided, decide, echelon_form, null_space, span_outside
 from lagjax._equations._scales import Scales
-from lagjax._equations._sparse import MatrixFree
-from lagjax._equations._structure import LARGEST_DENSE, LEAST_COORDINATES, SparseMotion, SparseStructure
+from lagjax._equations._sparse import Diagonal, MatrixFree
+from lagjax._equations._structure import SparseMotion

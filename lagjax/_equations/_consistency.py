@@ -169,7 +169,7 @@ def _start(system, layout: Layout, ts, q0: PyTree, qdot0: PyTree, params: PyTree
     q, qdot = (np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(x)]) for x in (q0, qdot0))
     q, qdot, t = (np.asarray(x, layout.dtype) for x in (q, qdot, ts[0]))
     sample = Sample.from_scene(system, layout, q[None], qdot[None], t, params)
-    large = sample.derivation.structure is not None
+    large = sample.derivation.form.is_sparse
     of = {name: value[0] for name, value in sample.quantities(*_ASKED, *(_LENGTHS if large else _MATRICES)).items()}
     on_positions = np.arange(len(of["residual"])) < sample.derivation.position_count
     if not large:

@@ -80,9 +80,9 @@ class Sample(NamedTuple):
 
     def acceleration(self) -> np.ndarray:
         """q̈ (S, n) by the program, or the arrays, with which a motion is followed. Raises `Unlowerable`."""
-        if self.derivation.structure is not None:
+        if self.derivation.form.is_sparse:
             return self.quantities("acceleration")["acceleration"]
-        return self.evaluate(self.derivation.acceleration)[:, : self.derivation.layout.size]
+        return self.evaluate(self.derivation.accelerations.program)[:, : self.derivation.layout.size]
 
     def momenta_by_q(self, momenta: tuple[int, ...]) -> np.ndarray:
         """∂pᵢ/∂q of the coordinates i in `momenta`, (S, len(momenta), n)."""
@@ -112,13 +112,6 @@ class Sample(NamedTuple):
         flags = np.zeros(2 * len(borders.switches))
         found = borders.decide.evaluate([*self.columns, *flags])
         return np.sqrt(np.arange(2, 2 + len(found))) @ np.where(np.isfinite(found), found, 0.5)
-
-
-def is_lowered(derivation: Derivation) -> bool:
-    try:
-        return bool(derivation.program("mass_matrix").shapes)
-    except Unlowerable:
-        return False
 
 
 def borders_of(derivation: Derivation):
@@ -174,7 +167,7 @@ def _evaluate_compiled(names: tuple[str, ...], system: Any, layout: Layout, q, q
 
 def numbers_of_state(derivation: Derivation) -> int:
     """The numbers that the quantities of one state hold together: those of M, where it is a matrix."""
-    return derivation.layout.size ** (2 if derivation.structure is None else 1)
+    return derivation.layout.size ** (1 if derivation.form.is_sparse else 2)
 
 
 def map_in_chunks(function, arrays, size: int):
@@ -198,7 +191,7 @@ def sparse_spectrum(derivation: Derivation, state: tuple) -> tuple | None:
     from scipy.sparse import csc_array, eye_array
     from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, eigsh, splu
 
-    form = derivation.structure and derivation.structure.mass
+    form = derivation.form.mass
     if not isinstance(form, Entries):
         return None
     entries = np.asarray(_entries_of(derivation.motion, form, *state))

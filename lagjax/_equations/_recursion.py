@@ -190,7 +190,7 @@ def _pair(u: int, v: int) -> tuple[int, int]:
 # ---- elimination -----------------------------------------------------------------------------------------------------
 
 
-_LARGEST = 10_000_000  # operations that are counted
+_LARGEST_COUNT = 10_000_000  # operations that are counted
 
 
 class _Step(NamedTuple):
@@ -222,7 +222,7 @@ class RecursiveElimination:
     def operations(self, numbers: Sequence[float | None]) -> tuple[int, int]:
         """The operations of elimination and one solution, and of the solution of an order of a Taylor series."""
         # `numbers` has those of the entries that are known.
-        graph = Graph(_LARGEST)
+        graph = Graph(_LARGEST_COUNT)
         expansion = Expansion(graph)
 
         def inputs(count, start):

@@ -46,7 +46,7 @@ class SaddleElimination:
     `zeros` marks what is zero in M (n, n) and in G (m, n) whatever the state; m may be zero. M is `augmented` by GᵀW G,
     W diagonal, unless it is known to be regular: GᵀW G x = GᵀW c changes neither x nor λ. Redundant rows are left out
     of λ: the motion is the same, the multipliers are a solution but not the shortest. With `regular_only`, the
-    regular-M variant of `Derivation.acceleration`, the saddle point is called singular as soon as it loses digits:
+    regular-M variant of `Accelerations.program`, the saddle point is called singular as soon as it loses digits:
     where M, or what the constraints make of it, is within `REGULAR` of singular.
 
     Where rows may be `released`, −1 stands on the diagonal of one that is, beside a row of G that is zero: its λ is.

@@ -16,57 +16,34 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.sparse import csr_array, vstack
 
-from lagjax._equations._coupled_forces import CoupledForces
 from lagjax._equations._motion import Flag, Motion, PyTree, Row, Time, Vector
-from lagjax._equations._patterns import count_operations, jacobian_pattern
-from lagjax._equations._sparse import Blocks, Diagonal, MatrixForm, MatrixFree, Solver, form_of, refine
+from lagjax._equations._patterns import jacobian_pattern
+from lagjax._equations._sparse import Blocks, Diagonal, MatrixForm, Solver, form_of, refine
 from lagjax._interface import compiled_once
-
-# Coordinates from which arrays look for patterns, and the scalar operations of L from which a scene of so many runs on
-# arrays: a ring of 1000 (11 000 operations) takes 3.5 s to a first result by machine code, 2 s by arrays, whose time
-# hardly grows; a batch of 256 rings of 300 is 30 times faster in machine code. With constraints it is coordinates that
-# count: 100 rods (200) take machine code 4 s and 500 more than 240, arrays 8 s either way.
-LEAST_COORDINATES = 100
-LEAST_OPERATIONS, LEAST_LINKED = 6000, 300
-# Coordinates up to which a dense M is a matrix: elimination takes 1 ms there, and conjugate gradients seldom less.
-LARGEST_DENSE = 512
-# Operations of L up to which machine code takes a large scene that is asked of it, or has borders: a ring of 4000, with
-# 44 000 of them, compiles for 18 s, one of 10 000 for 340 s.
-LARGEST_LOWERED = 60_000
 
 
 class SparseStructure(NamedTuple):
     """The forms of M, of S = G M⁻¹ Gᵀ, and of S for the constraints on positions alone (None without any)."""
 
-    operations: int  # the scalar ones of L
     mass: MatrixForm
     schur: MatrixForm | None
     positions: MatrixForm | None
-
-    @property
-    def has_diagonal_mass(self) -> bool:
-        return isinstance(self.mass, Diagonal)
 
     def __str__(self) -> str:
         linked = "" if self.schur is None else f", G M⁻¹ Gᵀ is {self.schur.name}"
         return f"its mass matrix is {self.mass.name}{linked}"
 
 
-def structure_of(motion: Motion, shapes: tuple, insists: bool = False) -> SparseStructure | None:
-    """The structure of a large scene; None where it is small, or coupled so that other forms of the motion suit it."""
-    # `shapes` are those of (q, q̇, t, params). With `insists`, arrays were asked for, and size alone decides.
+def mass_form(motion: Motion, shapes: tuple) -> MatrixForm:
+    """The form of M, of a scene of these shapes of (q, q̇, t, params)."""
+    return form_of(jacobian_pattern(jax.grad(motion.lagrangian, argnums=1), shapes, by=1), shapes[0].size)
+
+
+def structure_of(motion: Motion, shapes: tuple, mass: MatrixForm) -> SparseStructure | None:
+    """The structure of a large scene; None where the operations of its constraints do not tell a pattern."""
     q, _, t, numbers = shapes
-    n = q.size
-    if n < LEAST_COORDINATES or isinstance(motion.forces, CoupledForces):
-        return None
-    operations = count_operations(jax.make_jaxpr(motion.lagrangian)(*shapes).jaxpr)
-    if not insists and not (operations >= LEAST_OPERATIONS or (motion.constrained and n >= LEAST_LINKED)):
-        return None
-    mass = form_of(jacobian_pattern(jax.grad(motion.lagrangian, argnums=1), shapes, by=1), n)
-    if isinstance(mass, MatrixFree) and n <= (LARGEST_DENSE if insists else 2 * LARGEST_DENSE):
-        return None
     if not motion.constrained:
-        return SparseStructure(operations, mass, None, None)
+        return SparseStructure(mass, None, None)
     constraints = motion.constraints
     count = jax.eval_shape(constraints.f, q, t, numbers).size
     rows = jacobian_pattern(lambda q, t, p: constraints.f(q, t, p), (q, t, numbers), by=0)
@@ -80,7 +57,7 @@ def structure_of(motion: Motion, shapes: tuple, insists: bool = False) -> Sparse
         return form_of(pattern, len(jacobian.indptr) - 1)
 
     both = csr_array(vstack([pattern.astype(np.int32) for pattern in (rows, on_velocities)]))
-    return SparseStructure(operations, mass, schur(both), schur(rows) if count else None)
+    return SparseStructure(mass, schur(both), schur(rows) if count else None)
 
 
 def _pattern_of_inverse(form: MatrixForm) -> csr_array | None:

@@ -50,7 +50,7 @@ PyTree = Any
 _METHODS = ("auto", "segments", "whole", "gradient")
 # Free numbers from which on a sentence says that another method may be meant. Of a network of 337 a trial takes half a
 # minute, and the gradient's whole descent as long; scenes of 50 need no such advice.
-_MANY = 100
+_MANY_UNKNOWNS = 100
 _MORE_STARTS = 16, 64  # of motion that sticks, or strikes, where one start leaves motion
 
 
@@ -145,7 +145,7 @@ def fit(
     given = read_systems(system, records, params0, observe, hold)
     parameters = Parameters.from_pytree(params0, free, transforms)
     search = _FitSearch(params0, parameters, noise, int(starts), method, int(seed), progress)
-    if len(parameters) > _MANY and method != "gradient":
+    if len(parameters) > _MANY_UNKNOWNS and method != "gradient":
         warnings.warn(
             f"{len(parameters)} numbers are free, and with method={method!r} every trial follows that many derivatives "
             "of every motion, which may take minutes each. method='gradient' takes all of them at once, in reverse: it "

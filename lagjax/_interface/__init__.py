@@ -4,7 +4,7 @@
 function reads, and whether that is still the same. `_layout` turns a pytree into a flat vector and back, and names
 coordinates. `_validate` holds what can be wrong with numbers, and the sentences for it; `_results` the result codes,
 what to try, and the exception; `_platform` the kind of device that JAX computes on, and the numbers of arrays on it.
-`_registered` is how a room calls a function of a room above.
+`_registered` is how a room calls a function of a room above, `_version` the version of the package.
 """
 
 from lagjax._interface._arguments import Function, ValueNotKnown, accept, find_params_expression, present
@@ -46,3 +46,4 @@ from lagjax._interface._validate import (
     require_numbers,
     require_tolerance,
 )
+from lagjax._interface._version import VERSION

@@ -80,9 +80,9 @@ LARGEST_TREE, OFTEN, ROUNDS = 10, 24, 12
 # eighty more; the larger it is, the fewer motions of ordinary size are touched by it: here those below 1/60.
 ATOL_OVER_RTOL, ATOL_OVER_MOTION = 1e-3, 1 / 16
 # What was at rest at zero, and has had so many steps refused, half as many as it took, moves by rounding (`_step`):
-# other steps hold at once, or after a halving or two. Doubled, such a motion takes six halvings more.
+# other steps hold at once, or after a halving or two. Meant, and measured, was 6; a limit of the same name made it 64.
 # A start below `NOTHING` counts as zero then, in any units: impulses at rest leave velocities of 1e-50.
-MOST_HALVINGS, NOTHING = 6, 1e-30
+MOST_REFUSED, NOTHING = 64, 1e-30
 
 # ---- step control ----------------------------------------------------------------------------------------------------
 
@@ -101,8 +101,8 @@ FIRST_STEP, GROWTH = 1 / 16, 5.0
 GROWTH_AFTER_REJECTION = 2.0
 # The smallest step, in parts of the largest time: a shorter one no longer moves the time reliably. Doubled, a motion
 # that falls into a singularity stops four steps earlier. It is never zero, nor less than what a processor may take for
-# zero: where `LEAST` is more than all the time there is, one step goes to its end.
-SMALLEST_STEP, LEAST = 4 * EPS, 2.0**-1022
+# zero: where `LEAST_STEP` is more than all the time there is, one step goes to its end.
+SMALLEST_STEP, LEAST_STEP = 4 * EPS, 2.0**-1022
 
 # ---- derivatives -----------------------------------------------------------------------------------------------------
 

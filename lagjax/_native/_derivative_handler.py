@@ -109,7 +109,7 @@ class _DerivativeCode(PlanCode):
             total = total + size
             if name == "counters":
                 zeros = total
-        self.clear(end, zeros)
+        code.fill(end, zeros)
 
     def _counter(self, i: int) -> Value:
         return self.code.element(self.at["counters"], i, INTEGER)
@@ -141,17 +141,13 @@ class _DerivativeCode(PlanCode):
             row = code.element(place["rows"], i * width)
             member, step = (code.as_integer(code.load(code.element(row, k), DOUBLE)) for k in (2, 3))
             to = code.load(code.element(place["first_step"], member, INTEGER), INTEGER) + step
-            with code.loop(width) as k:
-                number = code.load(code.element(row, k), DOUBLE)
-                code.store(number, code.element(place["record"], to * width + k))
+            code.copy(row, code.element(place["record"], to * width), width)
 
     def _begin_results(self) -> None:
         code, known = self.code, self.known
-        with code.loop(known["members"] * known["directions"] * known["states"]) as i:
-            code.store(code.load(code.element(known["start"], i), DOUBLE), code.element(known["first"], i))
-        with code.loop(known["members"] * known["others"]) as i:
-            code.store(code.as_value(self.kind.begin, DOUBLE), code.element(known["second"], i))
-        self.clear(known["excess"], known["members"])
+        code.copy(known["start"], known["first"], known["members"] * known["directions"] * known["states"])
+        code.fill(known["second"], known["members"] * known["others"], self.kind.begin)
+        code.fill(known["excess"], known["members"])
 
     def _differentiate(self) -> Value:
         """The derivative over the steps; 1 if there is more to do."""

@@ -187,10 +187,8 @@ class _Transpose(_Thread):
         ts, params = member_address("ts", numbers["ts_stride"]), member_address("params", numbers["params_stride"])
         y_ct, params_ct = member_address("y_ct", self.states), member_address("params_ct", self.motion.numbers)
         self._follow(ts, member_address("y0", self.states), params)
-        with code.loop(integer(self.code, self.states)) as i:
-            code.store(code.load(code.element(member_address("end_ct", self.states), i), DOUBLE), code.element(y_ct, i))
-        with code.loop(integer(self.code, self.motion.numbers)) as i:
-            code.store(code.as_value(0.0, DOUBLE), code.element(params_ct, i))
+        code.copy(member_address("end_ct", self.states), y_ct, self.states)
+        code.fill(params_ct, self.motion.numbers)
         code.store(code.as_value(0.0, DOUBLE), member_address("excess", 1))
         fits = code.load(self.own["next_row"], INTEGER) <= numbers["room"]
         code.store(code.flag(fits), member_address("done", 1))

@@ -222,12 +222,6 @@ class PlanCode:
         call(code, self.known[f"begin{kernel}"], ir.VoidType(), given, *memory[:2])
         return call(code, self.known[f"run{kernel}"], INTEGER, given, *memory, rounds)
 
-    def clear(self, address: Value, count: Value, zero: float | int = 0.0) -> None:
-        """Set this many doubles, or integers, to zero."""
-        code, kind = self.code, DOUBLE if isinstance(zero, float) else INTEGER
-        with code.loop(count) as i:
-            code.store(code.as_value(zero, kind), code.element(address, i))
-
     def skipped(self, address: Value) -> Value:
         """The doubles from an address to the next boundary of a cache line."""
         place = Value(self.code, self.code.builder.ptrtoint(address.it, INTEGER))
@@ -250,13 +244,12 @@ def _write_run(module: ir.Module) -> Callable:
     """`begin_run(plan, *arguments, *results, members, times, rows of ts, rows of params)`."""
     run = PlanCode(module, "begin_run", Plan, (*ARGUMENTS, *RESULTS))
     code, known = run.code, run.known
-    with code.loop(known["members"] * known["times"] * known["states"]) as i:
-        code.store(code.as_value(float("nan"), DOUBLE), code.element(known["path"], i))
+    code.fill(known["path"], known["members"] * known["times"] * known["states"], float("nan"))
     rest, size = known["rest"], known["memory"]
     skipped = run.skipped(rest)
     memory, integers = code.element(rest, skipped), code.element(rest, size + CACHE_LINE)
-    run.clear(memory, size)
-    run.clear(integers, code.as_value(_INTEGERS, INTEGER), 0)
+    code.fill(memory, size)
+    code.fill(integers, _INTEGERS, 0)
     of_skipped, idle, next_member, more = (code.element(integers, _INTEGERS - i, INTEGER) for i in (4, 3, 2, 1))
     code.store(skipped, of_skipped)
     there_is = run.run("", JOB, {"next_member": next_member}, memory, integers, idle, rounds=known["rounds"])

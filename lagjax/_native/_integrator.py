@@ -17,7 +17,16 @@ so that no lane waits for another. Several threads may do so at once: they share
 
 from lagjax._native import _rank_drops
 from lagjax._native._border_control import BorderControl
-from lagjax._native._constants import DONE, EVENT, FIRST_STEP, LEAST, MAX_ORDER, OUT_OF_STEPS, RUNNING, SMALLEST_STEP
+from lagjax._native._constants import (
+    DONE,
+    EVENT,
+    FIRST_STEP,
+    LEAST_STEP,
+    MAX_ORDER,
+    OUT_OF_STEPS,
+    RUNNING,
+    SMALLEST_STEP,
+)
 from lagjax._native._events import Events
 from lagjax._native._frame import Frame, Lane, job
 from lagjax._native._guards import Guards
@@ -101,7 +110,7 @@ class Integrator:
         lane["t"], lane["t_end"] = begin, end
         lane["forward"] = code.select(end < begin, double(code, -1.0), 1.0)
         largest = code.maximum(abs(begin), abs(end))
-        lane["smallest"] = code.maximum(SMALLEST_STEP * largest, double(code, LEAST))
+        lane["smallest"] = code.maximum(SMALLEST_STEP * largest, double(code, LEAST_STEP))
         lane["longest"] = code.maximum(abs(end - begin) * FIRST_STEP, lane["smallest"])
         self.output.await_next(frame, lane, integer(code, 1))
         for i in motion.form.each(code, self.base_size if self.projector else 0):

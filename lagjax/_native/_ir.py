@@ -341,6 +341,17 @@ class Code:
             yield i
             counter.value = i + 1
 
+    def fill(self, address: Value, count: "Value | int", number: float | int = 0.0) -> None:
+        """Set this many doubles, or integers, to a number."""
+        kind = DOUBLE if isinstance(number, float) else INTEGER
+        with self.loop(self.as_value(count, INTEGER)) as i:
+            self.store(self.as_value(number, kind), self.element(address, i))
+
+    def copy(self, source: Value, address: Value, count: "Value | int") -> None:
+        """Copy this many doubles."""
+        with self.loop(self.as_value(count, INTEGER)) as i:
+            self.store(self.load(self.element(source, i), DOUBLE), self.element(address, i))
+
     def cases(self, number: Value, values: range) -> Iterator[int]:
         """A switch: each of the `values` in turn, with the code written meanwhile for where `number` has it."""
         end = self.function.append_basic_block("end")

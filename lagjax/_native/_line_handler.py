@@ -52,8 +52,7 @@ class LineCode:
         else:
             with code.loop(rows) as row:
                 here, there = code.element(x, row * inputs), code.element(out, row * outputs)
-                with code.loop(outputs if len(filled) < outputs else 0) as k:
-                    code.store(code.as_value(0.0, DOUBLE), code.element(there, k))
+                code.fill(there, outputs if len(filled) < outputs else 0)
                 if write is not None:
                     write(code, sincos, here, there, room)
                 else:
@@ -178,15 +177,10 @@ class _RowWalk:
         rows, constants, outputs = (code.load(code.element(table, i, INTEGER), INTEGER) for i in range(3))
         first = rows * 5 + 3
         rooms = [room] if self.moving is None else [room, code.element(room, self.size)]
-        with code.loop(constants) as i:
-            code.store(code.load(code.element(table, first + i), DOUBLE), code.element(room, i))
-            for errors in rooms[1:]:
-                code.store(code.as_value(0.0, DOUBLE), code.element(errors, i))
-        with code.loop(self.inputs) as i:
-            code.store(code.load(code.element(x, i), DOUBLE), code.element(room, constants + i))
-            for errors in rooms[1:]:
-                code.store(code.as_value(0.0, DOUBLE), code.element(errors, constants + i))
+        code.copy(code.element(table, first), room, constants)
+        code.copy(x, code.element(room, constants), self.inputs)
         for errors in rooms[1:]:
+            code.fill(errors, constants + self.inputs)
             with code.loop(self.moving) as i:
                 code.store(abs(code.load(code.element(x, i), DOUBLE)), code.element(errors, constants + i))
         with code.loop(rows) as i:

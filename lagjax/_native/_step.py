@@ -261,7 +261,7 @@ class StepControl:
                     frame["code"] = self._reason(frame)
                 frame["rejected"] = frame["rejected"] + code.flag(bad)
                 frame.assign(bad, last=0.0, growth=limits.GROWTH_AFTER_REJECTION)  # nor is it the last one any more
-                often = (frame["rejected"] >= limits.MOST_HALVINGS) & (2.0 * frame["rejected"] >= frame["steps"])
+                often = (frame["rejected"] >= limits.MOST_REFUSED) & (2.0 * frame["rejected"] >= frame["steps"])
                 self._forget_promises(frame, bad & often)
 
     def _reason(self, frame: Frame) -> Value:

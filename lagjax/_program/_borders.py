@@ -57,7 +57,7 @@ _EXPONENTIALS = ("exp", "exp2", "expm1", "sinh", "cosh")
 # The length of a vector at rest, whose square is there, and the longest one that a guard against zero may put there.
 _NOTHING, _NO_LENGTH = 2.0**-500, 1e-12
 _BENT = 1e-9  # of a ratio that is the same at all states: a million roundings
-_LARGEST = 10  # operations that one may become: a bound for errors, three are usual
+_LARGEST_BORDERS = 10  # operations that one may become: a bound for errors, three are usual
 _COMPARISONS = ("lt", "le", "gt", "ge")
 _PIECEWISE = {
     *_COMPARISONS, "abs", "max", "min", "sign", "floor", "ceil", "trunc", "round", "rem", "convert", "locate", "atan2"
@@ -310,7 +310,7 @@ class _Rewriting:
         self.program, self.size, self.moving, self.slides = program, size, 2 * size + 1, slides
         self.watched = program.line.outputs[len(program.line.outputs) - watched :]
         self._jumping: set[int] = set()  # pieces that something may jump with
-        self.graph = Graph(_LARGEST * len(program.line.nodes) + 1000)
+        self.graph = Graph(_LARGEST_BORDERS * len(program.line.nodes) + 1000)
         self.switches: list[int] = []
         self.kinds: list[int] = []
         self.pieces: list[int] = []
@@ -789,7 +789,7 @@ class _Rewriting:
         if not pieces:
             return None
         vanish = np.array([search.find_zeros(pieces, i, self._levels) for i in line.outputs], bool).T
-        graph = Graph(_LARGEST * len(nodes) + 1000)
+        graph = Graph(_LARGEST_BORDERS * len(nodes) + 1000)
         args = line, self.program.size, self.switches, self.kinds, self.tables
         places = _copy_deciding(graph, *args, lambda j, piece, _: piece)
         sides = [self._side(graph, j, places) for j in pieces]
@@ -1081,7 +1081,7 @@ def with_outputs(program: Recurrent, more: StraightLine, moving: int | None = No
     Where its first inputs, so many, are `moving`, before these stands how far rounding may move each of them
     (`rounding`); zero for a line that is long.
     """
-    graph = Graph.from_line(program.line, len(program.line.nodes) + 2 * _LARGEST * len(more.nodes) + 1000)
+    graph = Graph.from_line(program.line, len(program.line.nodes) + 2 * _LARGEST_BORDERS * len(more.nodes) + 1000)
     kinds = ["float" if np.issubdtype(dtype, np.floating) else np.dtype(dtype).name for dtype in program.dtypes]
     with np.errstate(all="ignore"):
         places = copy_nodes(graph, more, [graph.input(i, kind) for i, kind in enumerate(kinds)])
@@ -1157,7 +1157,7 @@ def _find_cones(line: StraightLine, size: int, linear: Any) -> dict[int, int]:
 def distances(found: Borders) -> StraightLine:
     """The differences of all switching numbers from the nearest level of their piece; of the inputs but the pieces."""
     line, first = found.program.line, found.program.size - len(found.switches)
-    graph, results = Graph(_LARGEST * len(line.nodes) + 1000), []
+    graph, results = Graph(_LARGEST_BORDERS * len(line.nodes) + 1000), []
     places = _copy_deciding(graph, line, first, found.switches, found.kinds, found.tables, lambda j, piece, _: piece)
     for switch, kind, located in zip(found.switches, found.kinds, found.tables, strict=True):
         x, level = places[switch], graph.constant(0.0, "float")

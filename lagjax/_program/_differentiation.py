@@ -31,7 +31,7 @@ _Rule = Callable[[int], int]
 Tangents = dict[int, int]  # by the number of the direction; a direction that is not there has none
 TangentTable = Callable[[Table], Table]  # the table of the tangents of the entries of a table
 
-_LARGEST = 100  # operations of a derivative for one of a line: a bound for errors, three are usual
+_LARGEST_DERIVATIVE = 100  # operations of a derivative for one of a line: a bound for errors, three are usual
 
 
 def copy_nodes(
@@ -336,7 +336,7 @@ def with_tangents(
     input that is not there does not move. Of numbers of a member that are only looked up, `tables[d]` gives the table
     of tangents. The outputs are `of`, pairs of an output and a direction, or None for the output itself.
     """
-    graph, kinds = Graph(_LARGEST * len(line.nodes) * (1 + len(directions)) + 1000), [*map(_kind, dtypes)]
+    graph, kinds = Graph(_LARGEST_DERIVATIVE * len(line.nodes) * (1 + len(directions)) + 1000), [*map(_kind, dtypes)]
     with np.errstate(all="ignore"):
         ids = [
             place + INPUTS if kind == "float" else graph.input(place, kind)
@@ -386,7 +386,7 @@ class _PlacedLine(Derivatives):
     @classmethod
     def from_line(cls, line: StraightLine, dtypes: Sequence, more: int = 0) -> "_PlacedLine":
         """The line in a new graph, whose inputs have the types `dtypes`; `more` floats follow them."""
-        graph = Graph(_LARGEST * len(line.nodes) + 1000)
+        graph = Graph(_LARGEST_DERIVATIVE * len(line.nodes) + 1000)
         inputs = [graph.input(i, kind) for i, kind in enumerate([*map(_kind, dtypes), *["float"] * more])]
         with np.errstate(all="ignore"):
             return cls(graph, line, copy_nodes(graph, line, inputs))

@@ -35,7 +35,7 @@ class Unlowerable(Exception):
     """A function has no scalar program; the message is a sentence that says why."""
 
 
-LONGEST = 16  # terms of a sum, or factors of a product, that are compared with others
+LONGEST_SUM = 16  # terms of a sum, or factors of a product, that are compared with others
 
 # Ids from here on are inputs by their positions, and those from `NUMBERS` on numbers of long arrays, as long as nothing
 # computes with them: of an array that is only looked up in, no entry becomes a node.
@@ -337,7 +337,7 @@ class Graph:
     def product(self, a: int, b: int) -> int:
         """`a * b`, or an earlier product of the same factors."""
         factors = tuple(sorted(self._factors.get(a, (a,)) + self._factors.get(b, (b,))))
-        if len(factors) > LONGEST:
+        if len(factors) > LONGEST_SUM:
             return self.node("mul", a, b)
         if (product := self._products.get(factors)) is None:
             product = self._products[factors] = self.node("mul", a, b)
@@ -370,7 +370,7 @@ class Graph:
             terms = {base: coefficient for base, coefficient in terms.items() if coefficient != 0}
         if not terms:
             return self.constant(0, "float")
-        if len(terms) > LONGEST:
+        if len(terms) > LONGEST_SUM:
             return self._signed_sum(a, b, sign)
         if 2 * len(terms) <= len(left) + len(right):  # worth writing anew, though the old sums may live on elsewhere
             return self._add_terms(terms)

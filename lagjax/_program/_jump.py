@@ -41,7 +41,7 @@ _STAGES: tuple[tuple[tuple[float, ...], ...], ...] = (
     ((), (0.5,), (-1.0, 2.0), (1 / 6, 2 / 3, 1 / 6)),
     ((), (0.5,), (0.0, 0.5), (0.0, 0.0, 1.0), (1 / 6, 1 / 3, 1 / 3, 1 / 6)),
 )
-_LARGEST = 1000  # operations that one may become: a bound for errors
+_LARGEST_JUMP = 1000  # operations that one may become: a bound for errors
 
 
 class Nesting(NamedTuple):
@@ -246,7 +246,7 @@ class _OverBorder:
             kinds = [*program.dtypes[: self.moving], *[np.dtype(float)] * (self.pieces + fixed)]
             self.kick = self._add_rows(line, kinds, self.pieces + fixed)
             largest += len(self.kick.nodes)
-        self.graph = Graph(_LARGEST * largest + 10_000)
+        self.graph = Graph(_LARGEST_JUMP * largest + 10_000)
 
     def _leibniz(self) -> list[list[tuple[int, int]]]:
         """The pairs of rows whose products sum up to each row of a product of two numbers."""

@@ -33,7 +33,7 @@ from lagjax._program._rounding import rounding
 from lagjax._program._series import StraightLine
 from lagjax._program._sliding import dot, eliminate, sparse_row, substitute
 
-_LARGEST = 60  # operations that one may become: a bound for errors
+_LARGEST_KICK = 60  # operations that one may become: a bound for errors
 _STATES = 48  # at which a border is looked for: what jumps does so at nearly all of them
 _ROUNDS, _STEPS = 4, 6  # of Newton's method, with the pieces of the state decided anew in between
 # A difference of both sides counts as a jump where it is this many times as large as its rounding. The bound of the
@@ -93,7 +93,7 @@ def kick_line(
     The pieces `spatial` are those that jump where u depends on positions. At `corners` of a constraint velocities are
     NaN behind it where its rate jumps there: no law says with what velocities the motion goes on.
     """
-    m, graph = len(switches), Graph(_LARGEST * (len(line.nodes) + (n + len(mechanics.rates)) ** 3) + 10_000)
+    m, graph = len(switches), Graph(_LARGEST_KICK * (len(line.nodes) + (n + len(mechanics.rates)) ** 3) + 10_000)
     sides = _Sides(graph, line, size, m)
     f, zero, one = graph.apply, graph.constant(0.0, "float"), graph.constant(1.0, "float")
     before, behind = sides.before, sides.behind
@@ -336,7 +336,7 @@ class Jumping:
 
     def _differences(self, nodes: Sequence[int]) -> StraightLine:
         """The differences of nodes on both sides, and the rounding errors of these."""
-        graph = Graph(_LARGEST * len(self.line.nodes) + 10_000)
+        graph = Graph(_LARGEST_KICK * len(self.line.nodes) + 10_000)
         sides = _Sides(graph, self.line, self.size, self.m)
         changes = [sides.difference(i) for i in nodes]
         return self._with_rounding(eliminate_dead_code(graph, changes), len(changes))
@@ -347,7 +347,7 @@ class Jumping:
         return self._with_rounding(line, 1, range(self.moving))
 
     def _with_rounding(self, line: StraightLine, count: int, by: Sequence[int] = ()) -> StraightLine:
-        graph = Graph(_LARGEST * len(line.nodes) + 10_000)
+        graph = Graph(_LARGEST_KICK * len(line.nodes) + 10_000)
         kinds = {node[2]: kind for node, kind in zip(line.nodes, line.kinds, strict=True) if node[0] == "input"}
         inputs = [graph.input(i, kinds.get(i, "float")) for i in range(1 + max(kinds, default=-1))]
         places = copy_nodes(graph, line, inputs)

@@ -4,7 +4,7 @@ import functools
 from collections import Counter
 from collections.abc import Callable, Sequence
 
-from lagjax._program._graph import LONGEST, Graph, Node, find_ancestors
+from lagjax._program._graph import LONGEST_SUM, Graph, Node, find_ancestors
 from lagjax._program._line import StraightLine
 
 
@@ -35,7 +35,7 @@ def _rewritten(graph, outputs, uses, node_of: Callable, make: Callable) -> tuple
     `moved(x)` says where a node before i is. The others are made anew by `make`, so that all is compared once more.
     """
     new, places = Graph(graph.budget), {}
-    new.budget += LONGEST * len(uses)  # what a pass writes anew and drops again is not what the budget is for
+    new.budget += LONGEST_SUM * len(uses)  # what a pass writes anew and drops again is not what the budget is for
     for i in range(len(uses)):
         if not uses[i]:
             continue
@@ -53,7 +53,7 @@ def _factors(graph, uses, i) -> list[int]:
     factors, k = list(graph.nodes[i][1]), 0
     while k < len(factors):
         op, operands, _ = graph.nodes[factors[k]]
-        if op == "mul" and uses[factors[k]] == 1 and len(factors) < LONGEST:
+        if op == "mul" and uses[factors[k]] == 1 and len(factors) < LONGEST_SUM:
             factors[k : k + 1] = operands
         else:
             k += 1

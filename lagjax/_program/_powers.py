@@ -25,7 +25,7 @@ _SEEN = 3.0
 # on flights from 1e2 to 1e9 lengths with impact parameters of 0.01 to 2: none is missed at rtol = 1e-9 and 1e-12, and
 # at 1e-5 those from 1e6 on, whose place rtol leaves open by ten lengths. With 3, those of 1 / r² at 1e-9 as well.
 _SLOWEST = 2.0
-_LONGEST, _DEEPEST = 16, 8  # factors of a product; sums of products that one is looked for in
+_LONGEST_PRODUCT, _DEEPEST_SUM = 16, 8  # factors of a product; sums of products that one is looked for in
 _ROOTS = {"sqrt": 0.5, "rsqrt": -0.5, "cbrt": 1 / 3}
 _PRODUCTS = {"mul", "div", "neg", "abs", *_ROOTS}
 _BETWEEN = {"sin": 1.0, "cos": 1.0, "tanh": 1.0, "erf": 1.0, "atan": math.pi / 2, "sign": 1.0}
@@ -94,7 +94,7 @@ class _Products:
             factors = {base: e * power for base, e in factors.items()}
         if not all(factors.values()):
             factors = {base: e for base, e in factors.items() if e}
-        return factors if 0 < len(factors) <= _LONGEST else {i: 1.0}
+        return factors if 0 < len(factors) <= _LONGEST_PRODUCT else {i: 1.0}
 
     def is_hidden(self, base: int, i: int, of_guard: bool) -> bool:
         """True if a negative power in product i may change by much along a step, without a trace at its beginning."""
@@ -120,7 +120,7 @@ class _Products:
                     squares.update(factors)
         return squares
 
-    def degree(self, i: int, numbers: set[int], left: int = _DEEPEST) -> float:
+    def degree(self, i: int, numbers: set[int], left: int = _DEEPEST_SUM) -> float:
         """The degree in some numbers of what product i is multiplied with, itself included, where that is least."""
         own = sum(self.factors_of(i).get(x, 0.0) for x in numbers)
         sums = [u for u in self.users[i] if self.line.nodes[u][0] in ("add", "sub")]

@@ -37,7 +37,7 @@ from lagjax._program._operations import OPERATIONS
 from lagjax._program._passes import eliminate_dead_code, sink_negations
 from lagjax._program._recurrences import choose, finite
 
-_LARGEST = 100  # operations that the series of one may take: a bound for errors, ten are usual
+_LARGEST_SERIES = 100  # operations that the series of one may take: a bound for errors, ten are usual
 
 
 class LinearSystem(NamedTuple):
@@ -108,7 +108,7 @@ class _Recurrences:
 
     def __init__(self, program: Recurrent, size: int, moving: int, followed: tuple[int, ...]):
         self.size, self.moving, self.followed = size, moving, followed
-        budget = _LARGEST * len(program.line.nodes) + 1000
+        budget = _LARGEST_SERIES * len(program.line.nodes) + 1000
         self.zeroth_order, self.order_recursion = Graph.from_line(program.line, budget), Graph(budget)
         self.number = self.zeroth_order.number
         # What overflows where it no longer matters has no coefficients there: infinite ones would be no numbers.

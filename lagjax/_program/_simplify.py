@@ -226,7 +226,7 @@ def compare(graph, op, a, b):
 
 # ---- angles ----------------------------------------------------------------------------------------------------------
 
-_MOST_TURNS = 2.0**48  # of 2π: a quarter of a radian is rounding; doubled, a half
+_MOST_WHOLE_TURNS = 2.0**48  # of 2π: a quarter of a radian is rounding; doubled, a half
 _DEEPEST = 40  # operations one in the other, beyond which no sign and no quotient is looked for: a bound of the work
 _NEVER_NEGATIVE = frozenset(("exp", "exp2", "cosh", "logistic", "erfc", "sqrt", "rsqrt", "abs", "acos"))
 
@@ -305,7 +305,7 @@ def _wholes(graph, u: int, period: float) -> int:
     """
     f, number = graph.apply, lambda x: graph.constant(x, "float")
     wholes = f("floor", f("add", f("mul", number((1 - 2.0**-51) / period), u), number(0.5)))
-    return f("select", f("lt", f("abs", wholes), number(_MOST_TURNS)), number(math.nan), wholes)
+    return f("select", f("lt", f("abs", wholes), number(_MOST_WHOLE_TURNS)), number(math.nan), wholes)
 
 
 def _quotient(graph, i: int, depth: int) -> tuple[int, int | None]:

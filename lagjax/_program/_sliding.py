@@ -43,7 +43,7 @@ SOFT, MENDED = 1e-9, 2
 STILL = 1e-9
 _BENT, _STATES = 1e-9, 32  # of a chord, of which rounding is a thousandth; and random states, for pieces of all kinds
 FAR = 1e100  # of a rate: a share that is beyond 0 and 1; the search for its roots squares it
-_LARGEST = 10_000_000  # operations: a bound for errors
+_LARGEST_SLIDING = 10_000_000  # operations: a bound for errors
 # The length of the vector of a cone that is as good as none: forces change by so little beside it, and its square is
 # there. What friction does along each of its parts is read off there.
 _TINY = 2.0**-300
@@ -130,7 +130,7 @@ class _SlidingForces:
 
     def __init__(self, line, n, first, switches, slides, linear):
         self.line, self.n, self.slides, self.linear = line, n, slides, linear
-        self.graph = Graph.from_line(line, _LARGEST)
+        self.graph = Graph.from_line(line, _LARGEST_SLIDING)
         self.f, self.number = self.graph.apply, self.graph.number
         self.zero, self.one = self.number(0.0), self.number(1.0)
         self.pieces = [self.graph.input(first + slide.piece, "float") for slide in slides]
@@ -499,7 +499,7 @@ class _SlidingForces:
         factors = (*system.factors, *read)
 
         def solve():
-            graph = Graph(_LARGEST)
+            graph = Graph(_LARGEST_SLIDING)
             inputs = [graph.input(i, "float") for i in range(len(factors) + count + len(acts))]
             at = {x: inputs[len(system.factors) + i] for i, x in enumerate(read)}
             at |= {x: graph.number(value) for x, value in known.items() if value is not None}

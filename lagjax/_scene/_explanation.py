@@ -14,9 +14,8 @@ import numpy as np
 from jax.interpreters.partial_eval import dce_jaxpr
 
 from lagjax._engine import Problem, choose
-from lagjax._engine.diffrax import form_of
 from lagjax._engine.taylor import MachineCode
-from lagjax._equations import Derivation, SparseStructure, dependent_rows, pieces_of_motion
+from lagjax._equations import Derivation, dependent_rows, pieces_of_motion
 from lagjax._interface import join_names, show_str
 from lagjax._native import Nesting, is_large, pieces_of
 from lagjax._program import CLOCK, FLOOR, SIGN, TABLE, TRUNC, Unlowerable
@@ -130,8 +129,8 @@ def explain(problem: Problem) -> Explanation:
     derivation = problem.derivation
     names, n, motion = derivation.layout.names, derivation.layout.size, derivation.motion
     known = {"coordinates": names, **_engine(problem)}
-    if derivation.structure is not None:
-        return Explanation(**known, **_borders_in_lines(problem), **_facts_of_arrays(derivation, derivation.structure))
+    if derivation.form.is_sparse:
+        return Explanation(**known, **_borders_in_lines(problem), **_facts_of_arrays(derivation))
     try:
         matrix, force = derivation.program("mass_matrix"), derivation.reads("force")
     except Unlowerable:
@@ -156,9 +155,9 @@ def explain(problem: Problem) -> Explanation:
     )
 
 
-def _facts_of_arrays(derivation: Derivation, structure: SparseStructure) -> dict[str, Any]:
+def _facts_of_arrays(derivation: Derivation) -> dict[str, Any]:
     """The facts about a large scene, from what the operations of its functions read, whether or not it cancels."""
-    motion, cyclic = derivation.motion, derivation.cyclic
+    motion, cyclic, form = derivation.motion, derivation.cyclic, derivation.form.mass
     names, inputs = derivation.layout.names, ("q", "dq", "t")
 
     def reads(function) -> set[str]:
@@ -172,7 +171,7 @@ def _facts_of_arrays(derivation: Derivation, structure: SparseStructure) -> dict
     works = timed or motion.forces is not None or motion.dissipation is not None
     return {
         "cyclic": None if cyclic is None else tuple(names[i] for i in cyclic),
-        "mass_matrix": f"{'varying' if mass else 'constant'}, {structure.mass.name}",
+        "mass_matrix": f"{'varying' if mass else 'constant'}, {form and form.name}",
         "mass_matrix_depends_on": tuple(name for name in inputs if name in mass),
         "velocity_terms": "dq" in reads(motion.force),
         "explicit_time": timed or "t" in reads(motion.force),
@@ -186,15 +185,16 @@ def _engine(problem: Problem) -> dict[str, Any]:
     if problem.system.touches and MachineCode().refuses(problem) is None:  # however large: arrays do not jump
         derivation, refusal = derivation.lowered, None
     if refusal is None:
-        solver, program = "Taylor series in machine code", derivation.acceleration
-        if is_large(program, derivation.projection):
+        solver, program = "Taylor series in machine code", derivation.accelerations.program
+        if is_large(program, derivation.accelerations.projection):
             solver += ", whose operations stand in tables: for code operation by operation they are too many"
     else:
-        solver, form = f"diffrax.Dopri8, because {refusal}", form_of(derivation, problem.system.path)
-        if form.reason is not None:
+        solver, form = f"diffrax.Dopri8, because {refusal}", derivation.form_in_xla
+        if form.kind != "scalar":
             return {"solver": solver, "path": "array", "reason": form.reason}
-        program = derivation.acceleration.complete
-    of_projection = None if derivation.projected is None else derivation.projected.operations
+        program = derivation.accelerations.program.complete
+    projected = derivation.accelerations.projected
+    of_projection = None if projected is None else projected.operations
     costs = {"operations": program.operations, "projection_operations": of_projection}
     return {"solver": solver, "path": "scalar", "reason": "", **costs}
 
@@ -213,11 +213,11 @@ def _borders(problem: Problem, inputs: tuple[str, ...]) -> dict[str, Any]:
         return join_names([inputs[i] for i in sorted(borders.read_by(node)) if i < len(inputs)], _LISTED) or "none"
 
     kinds = zip(borders.switches, borders.kinds, strict=True)
-    in_machine_code = choose(problem).refusal is None and pieces_of(derivation.acceleration, Nesting(n)) is not None
+    located = choose(problem).refusal is None and pieces_of(derivation.accelerations.program, Nesting(n)) is not None
     return {
         "borders": tuple(f"{_PIECES[kind]} {read_by(node)}" for node, kind in kinds if kind in _PIECES),
         "narrow": tuple(f"a function of {read_by(node)}" for node in borders.arguments),
-        "borders_located": in_machine_code or set(borders.kinds) <= {CLOCK},  # known times are diffrax's as well
+        "borders_located": located or set(borders.kinds) <= {CLOCK},  # known times are diffrax's as well
     }
 
 

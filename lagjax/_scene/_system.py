@@ -303,7 +303,7 @@ class System(eqx.Module):
         if not self._constraint_roles:
             return facts
         names = self.constraint_names(layout, params)
-        if derivation_of(self, layout, params).structure is not None:
+        if derivation_of(self, layout, params).form.is_sparse:
             return facts.with_constraints(names, None)
         schur = self._evaluate_quantity(Motion.schur_complement, q, qdot, t, params)
         return facts.with_constraints(names, np.asarray(schur) if is_concrete(schur) else None)

@@ -27,7 +27,7 @@ FRAMES = 20_000  # of which a film has fewer
 TRAIL = 2.0  # seconds of the film over which a trace fades
 FINER = 8  # pieces of a trace from one frame to the next: half a turn in a frame is round, and half as many has corners
 _VIDEO, _PAGE = (".mp4", ".m4v", ".mov", ".webm"), (".html", ".htm")
-_LARGEST = 2000.0  # megabytes of a page, more than `FRAMES` make
+_LARGEST_PAGE = 2000.0  # megabytes of a page, more than `FRAMES` make
 _SIZE, _DPI = 4.8, 100  # inches of a side, and dots in one
 _INTERVALS = 8  # between numbers along a side of that length; twelve of six characters would touch
 
@@ -118,7 +118,7 @@ class Animation:
         """The film as HTML: a video where ffmpeg is there, else pictures and a few lines of JavaScript."""
         matplotlib, program = _matplotlib(), _ffmpeg()
         # Beyond its limit matplotlib leaves frames out, or the whole video.
-        options = {"animation.embed_limit": _LARGEST, "savefig.dpi": _DPI}
+        options = {"animation.embed_limit": _LARGEST_PAGE, "savefig.dpi": _DPI}
         with matplotlib.rc_context(options | ({} if program is None else {"animation.ffmpeg_path": program})):
             return self._film().to_jshtml(fps=self.fps) if program is None else self._film().to_html5_video()
 

@@ -38,8 +38,8 @@ PyTree = Any
 _Kept = tuple[dict[str, np.ndarray], np.ndarray | None, dict[int, str]]  # values, |h − h₀| and complaints
 KEEP_FAILED = 1001  # a result code of the sweep's own, far from those of `lagjax.RESULTS`
 NAMES = {KEEP_FAILED: "keep_failed"}
-MOST_CHANGES = 256  # of the contacts of a member: the default of `simulate_batch`
-MOST = 16_384  # members of a batch: more are no faster in machine code, and take more memory
+MOST_CONTACT_CHANGES = 256  # of the contacts of a member: the default of `simulate_batch`
+MOST_MEMBERS = 16_384  # members of a batch: more are no faster in machine code, and take more memory
 MOST_ON_DEVICES = 131_072
 PATH_BYTES = 64 * 2**20  # of the path of a batch
 _RAISED = re.compile(r"[\w.]+(Error|Exception|Warning|Interrupt): ")
@@ -259,7 +259,7 @@ def _fill_record(record: Any) -> Any:
     """The `Impacts` or `ContactChanges` of a batch, (B, N, …), with the room that all batches have."""
 
     def fill(x):
-        widths = [(0, 0), (0, MOST_CHANGES - x.shape[1]), *[(0, 0)] * (jnp.ndim(x) - 2)]
+        widths = [(0, 0), (0, MOST_CONTACT_CHANGES - x.shape[1]), *[(0, 0)] * (jnp.ndim(x) - 2)]
         return jnp.pad(x, widths, constant_values=jnp.nan if x.dtype.kind == "f" else -1)
 
     parts = {name: x for name, x in record._asdict().items() if name not in ("count", "doubts", "doubted")}

@@ -70,7 +70,7 @@ def begin(
     kept, seconds, conserves = _first_look(description, points, compiled)
     quantities = [Quantity(name, x.shape[1:], x.dtype) for name, x in kept.values.items()]
     _require_names(quantities, axes, description.reduce)
-    most = _batch.MOST if kept.engine == "MachineCode" else _batch.MOST_ON_DEVICES
+    most = _batch.MOST_MEMBERS if kept.engine == "MachineCode" else _batch.MOST_ON_DEVICES
     spec = {
         "format": FORMAT, "versions": versions(), "cpu": cpu(), "engine": kept.engine, "shape": shape,
         "chunk": Grid.from_shape(shape, _unit_size(unit, shape, seconds, quantities)).chunk,

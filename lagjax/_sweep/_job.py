@@ -22,8 +22,7 @@ import jax
 import numpy as np
 from llvmlite import binding as llvm
 
-import lagjax
-from lagjax._interface import ENDED_WELL
+from lagjax._interface import ENDED_WELL, VERSION
 from lagjax._sweep._batch import KEEP_FAILED, Batches, KeptResults, label
 from lagjax._sweep._description import Description, differences, texts, unpack_description, uses_doubles
 from lagjax._sweep._files import RESULT, Files
@@ -120,7 +119,7 @@ def cpu() -> str:
 def versions() -> dict[str, str]:
     """The versions that the bits of a store depend on, and that of Python, whose code travels."""
     of_packages = {name: metadata.version(name) for name in ("jax", "jaxlib", "diffrax", "numpy")}
-    return {"lagjax": lagjax.__version__, "python": ".".join(platform.python_version_tuple()[:2]), **of_packages}
+    return {"lagjax": VERSION, "python": ".".join(platform.python_version_tuple()[:2]), **of_packages}
 
 
 def require_versions(store: Files, spec: dict) -> None:

@@ -6,7 +6,7 @@ comes from, a pole that was reached, a mass matrix that has become singular, an 
 finds at the last state: a kink, a jump, stiff terms.
 
 All but the line and `check` is read off the scene's programs in NumPy, which compiles nothing. These two have limits,
-`LONGEST` and `LARGEST`: a failure must not cost more than a motion does.
+`LONGEST_FUNCTION` and `LARGEST_CHECKED`: a failure must not cost more than a motion does.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ from lagjax._equations import (
     derivation_of,
     describe_pieces,
     eigen,
-    is_lowered,
+    forms,
     null_directions,
     numbers_of,
     offenders,
@@ -39,8 +39,7 @@ from lagjax._run import Trajectory
 from lagjax._scene import Flat, System
 from lagjax._trust.checks import check, describe_direction
 
-LARGEST = 128  # coordinates up to which `check` is called: it takes a second there
-LONGEST = 4000  # equations of a function up to which they are gone through one by one: some 50 µs each
+LONGEST_FUNCTION = 4000  # equations of a function up to which they are gone through one by one: some 50 µs each
 # A motion that runs away does so on a time scale |q̇|/|q̈| (or |q|/|q̇|) that has shrunk to less than this part of the
 # whole: steps have shrunk to 1e-15 of it when they are given up, and smooth motions are followed to 1e-5 in the budget.
 RUNAWAY = 1e-8
@@ -48,7 +47,7 @@ RUNAWAY_SINGLE = 3e-6  # of float32, whose steps are given up at 5e-7 of the who
 SINGULAR = 1e-9  # the part of its first value to which an eigenvalue of M has come down where M is called singular
 # Steps beyond which a budget was spent on crossing borders: one that no step fits over is given up within a hundred
 # after those that led there. Twice as many say the same of most scenes.
-MANY = 1000
+MANY_CROSSINGS = 1000
 ESCAPED = 1e3  # times its largest coordinate at the start: a motion to infinity
 
 _CODES = {
@@ -99,7 +98,7 @@ def describe_failure(trajectory: Trajectory, layout: Layout, why: str | None) ->
     ended, params = motion_end(trajectory, layout), trajectory.params
     if trajectory.result == RESULTS.mass_matrix_singular:
         derivation = derivation_of(system, layout, params)
-        if derivation.structure is None:
+        if not derivation.form.is_sparse:
             mass = np.asarray(system.mass_matrix(end.q, end.qdot, end.t, params))
             unused = [name for name, row in zip(layout.names, mass, strict=True) if not row.any()]
             directions = [] if unused else null_directions(mass)
@@ -126,7 +125,7 @@ def diagnosis(system: System, layout: Layout, params, ended: Ended) -> str:
 
 def _find_cause(system: System, layout: Layout, params, ended: Ended) -> str:
     derivation = derivation_of(system, layout, params)
-    if derivation.structure is not None:
+    if derivation.form.is_sparse:
         ended = ended._replace(scene=(system, params))
     q0, qdot0 = map(layout.restore, halves(ended.y_first))
     of_start = [] if np.isfinite(ended.y).all() else not_finite(q0, "q0") + not_finite(qdot0, "qdot0")
@@ -210,7 +209,8 @@ def _quantities_ahead(derivation: Derivation, numbers, ended: Ended) -> tuple[np
     except Unlowerable:
         y, t = _states_ahead(ended, np.concatenate([v, np.zeros(len(v))]))
     for name, function in (("given_force", motion.forces), ("lagrangian_by_q", jax.grad(motion.lagrangian))):
-        if function is not None and len(v) <= LARGEST and _is_short(function, (*halves(ended.y), ended.t, numbers)):
+        state = *halves(ended.y), ended.t, numbers
+        if function is not None and len(v) <= forms.LARGEST_CHECKED and _is_short(function, state):
             found = [function(*map(jnp.asarray, (*halves(y[k]), t[k])), numbers) for k in range(len(y))]
             values[name] = np.stack(found)
     return y, t, values
@@ -256,7 +256,7 @@ def _short_functions(derivation: Derivation, params, ended: Ended) -> tuple[list
 
 
 def _is_short(function: Callable, arguments: tuple) -> bool:
-    return _equations(jax.make_jaxpr(function)(*arguments).jaxpr) <= LONGEST
+    return _equations(jax.make_jaxpr(function)(*arguments).jaxpr) <= LONGEST_FUNCTION
 
 
 def _equations(jaxpr) -> int:
@@ -381,7 +381,8 @@ def _run_check(system: System, derivation: Derivation, params, ended: Ended) -> 
             f"most {MOST_COUPLED} that M couples to each other, and none that change differently what others hold. "
             "Round sign(v) off, as jnp.tanh(v / w) with a speed w that does not matter."
         )
-    if ended.scene is None and derivation.layout.size > (LARGEST if is_lowered(derivation) else 16):
+    largest = forms.LARGEST_CHECKED if derivation.is_lowered else forms.LARGEST_CHECKED_BY_XLA
+    if ended.scene is None and derivation.layout.size > largest:
         return ""
     q, qdot = map(derivation.layout.restore, halves(ended.y))
     found = {finding.kind: finding for finding in reversed(list(check(system, q, qdot, ended.t, params)))}
@@ -407,7 +408,7 @@ def _count_unheld(derivation: Derivation) -> int:
 def _budget(ended: Ended) -> str:
     """The time that was reached when the budget of steps was spent."""
     reached, whole = abs(ended.t - ended.t_first), abs(ended.t_last - ended.t_first)
-    crossed = _CODES[ended.code] == "acceleration_discontinuous" and ended.steps > MANY
+    crossed = _CODES[ended.code] == "acceleration_discontinuous" and ended.steps > MANY_CROSSINGS
     if not (crossed or _CODES[ended.code] == "max_steps_reached") or not reached > 0:
         return ""
     needed = ended.steps * whole / reached

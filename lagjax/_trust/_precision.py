@@ -17,8 +17,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine import LEAST_RTOL
-from lagjax._engine.diffrax import LEAST_RTOL as LEAST_RTOL_OF_DIFFRAX
-from lagjax._engine.diffrax import FineOutput
+from lagjax._engine.diffrax import LEAST_RTOL_OF_DIFFRAX, FineOutput
 from lagjax._engine.taylor import MachineCode
 from lagjax._interface import as_arrays, show_str
 from lagjax._run import Members, Trajectory, simulate, simulate_batch

@@ -17,7 +17,7 @@ from sweeps import sweep
 
 import lagjax
 from lagjax import scenes
-from lagjax._engine.diffrax import form_of
+from lagjax._engine.diffrax import equations_of
 from lagjax._equations import Derivation, derivation_of
 from lagjax._equations._linear import rank_tolerance
 from lagjax._interface import Layout
@@ -299,7 +299,7 @@ def test_masses_in_params_are_taken_for_what_they_are():
     # takes over, also where JAX does not know them while it traces, and in derivatives.
     rods = scenes.cartesian_double_pendulum()
     layout = Layout.from_state(rods.q0, rods.qdot0)
-    lean = derivation_of(rods.system, layout, rods.params).acceleration
+    lean = derivation_of(rods.system, layout, rods.params).accelerations.program
     assert 2 * lean.operations < lean.complete.operations
     scene = scenes.rolling_cylinder()
     rest = scenes.Rolling(0.0, 0.0, 0.0)
@@ -528,7 +528,7 @@ def test_accelerations_where_a_parallelogram_is_flat():
     layout = Layout.from_state(np.zeros(3), np.zeros(3))
     motion = lagjax.System(linkage, constraints=closed_linkage)._motion(layout)
     for path in ("scalar", "array"):
-        form = form_of(Derivation(motion, layout, None), path)
+        form = equations_of(Derivation(motion, layout, None, path=path))
 
         def accelerate(angle, form=form):
             state = jnp.stack([angle, GROUND[1] + 0 * angle, angle]), jnp.array([3.0, 0.0, 3.0])

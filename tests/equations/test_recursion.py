@@ -7,7 +7,8 @@ import pytest
 
 import lagjax
 from lagjax import scenes
-from lagjax._equations._derivation import Derivation, columns_of, derivation_of, numbers_of
+from lagjax._equations._accelerations import Accelerations
+from lagjax._equations._derivation import columns_of, derivation_of, numbers_of
 from lagjax._interface import Layout
 
 
@@ -92,7 +93,7 @@ def test_accelerations_are_those_of_the_whole_mass_matrix(make):
     rng = np.random.default_rng(0)
     q, qdot, t = rng.uniform(-2, 2, (3, n)), rng.uniform(-1, 1, (3, n)), 0.3
     derivation = of(system, q[0], qdot[0], params)
-    program, columns = derivation.acceleration, columns_of(q, qdot, t, numbers_of(params))
+    program, columns = derivation.accelerations.program, columns_of(q, qdot, t, numbers_of(params))
     assert program.otherwise is not None  # M as a whole is what is left to others
     assert program.operations < program.complete.operations
     *found, singular = program.evaluate_many(columns)
@@ -115,7 +116,7 @@ def test_an_energy_of_products_alone_is_left_to_the_whole_mass_matrix():
 
 @pytest.mark.slow
 def test_operations_grow_as_the_number_of_links():
-    counts = [of(system, np.ones(n), np.ones(n), params).acceleration.operations
+    counts = [of(system, np.ones(n), np.ones(n), params).accelerations.program.operations
               for n in (16, 32, 48) for system, params in [chain(n)]]  # fmt: skip
     assert counts[2] - counts[1] == counts[1] - counts[0]
 
@@ -135,8 +136,8 @@ def test_motions_and_derivatives_are_those_of_a_small_scene_without_recursion():
     params = {"m": np.linspace(0.5, 1.5, n) / n, "l": np.full(n, 1 / n), "g": 9.81}
     q0, qdot0, ts = np.linspace(0.3, 1.2, n), np.zeros(n), np.linspace(0.0, 0.3, 3)
     one, other = lagjax.System(expanded), system
-    assert of(one, q0, qdot0, params).acceleration.otherwise is None
-    assert of(other, q0, qdot0, params).acceleration.otherwise is not None
+    assert of(one, q0, qdot0, params).accelerations.program.otherwise is None
+    assert of(other, q0, qdot0, params).accelerations.program.otherwise is not None
 
     def end(system, params, q0):
         return lagjax.simulate(system, q0, qdot0, ts, params, rtol=1e-11).q[-1]
@@ -151,7 +152,7 @@ def test_motions_and_derivatives_are_those_of_a_small_scene_without_recursion():
 def test_a_link_without_mass_is_singular_and_says_so():
     system, params = chain(8)
     params = params | {"m": np.where(np.arange(8) < 7, 0.1, 0.0)}
-    program = of(system, np.ones(8), np.ones(8), params).acceleration
+    program = of(system, np.ones(8), np.ones(8), params).accelerations.program
     columns = columns_of(np.linspace(0.1, 1.0, 8)[None], np.ones((1, 8)), 0.0, numbers_of(params))
     assert program.evaluate_many(columns)[-1, 0] == 1.0
     with pytest.raises(Exception, match="singular"):
@@ -165,7 +166,7 @@ def test_a_motion_that_fails_does_not_wait_for_the_elimination_of_the_whole_mass
     def asked_for(self):
         raise AssertionError("the program without the recursion was derived")
 
-    monkeypatch.setattr(Derivation, "_general_acceleration", property(asked_for))
+    monkeypatch.setattr(Accelerations, "general", property(asked_for))
     n, (system, params) = 8, chain(8)
     ends = lagjax.System(system.lagrangian.code.function, forces=lambda q, qdot, t: -jnp.sqrt(0.05 - t) * qdot)
     run = lagjax.simulate(ends, np.ones(n), np.zeros(n), np.linspace(0.0, 0.1, 3), params, throw=False)
@@ -181,8 +182,8 @@ def test_an_energy_of_parts_that_is_negative_leaves_the_mass_matrix_to_decide():
     n, rng = 8, np.random.default_rng(1)
     derivation = of(lagjax.System(lagrangian), np.ones(n), np.ones(n))
     columns = columns_of(rng.uniform(-1, 1, (5, n)), rng.uniform(-1, 1, (5, n)), 0.0, [])
-    *found, singular = derivation.acceleration.evaluate_many(columns)
-    exact = np.array(derivation.acceleration.complete.evaluate_many(columns)[:-1])
+    *found, singular = derivation.accelerations.program.evaluate_many(columns)
+    exact = np.array(derivation.accelerations.program.complete.evaluate_many(columns)[:-1])
     usable = np.asarray(singular) == 0
     np.testing.assert_allclose(np.array(found)[:, usable], exact[:, usable], rtol=1e-10, atol=1e-12)
     run = lagjax.simulate(lagjax.System(lagrangian), np.ones(n), np.ones(n), np.linspace(0.0, 1.0, 3))
@@ -191,7 +192,7 @@ def test_an_energy_of_parts_that_is_negative_leaves_the_mass_matrix_to_decide():
 
 def test_the_program_has_the_derivative_of_the_whole_mass_matrix_in_jax():
     system, params = chain(7)
-    program = of(system, np.ones(7), np.ones(7), params).acceleration
+    program = of(system, np.ones(7), np.ones(7), params).accelerations.program
     assert program.otherwise is not None
     rng = np.random.default_rng(2)
     x, direction = rng.uniform(0.3, 1.2, (2, program.size))

@@ -6,7 +6,8 @@ import numpy as np
 import pytest
 
 import lagjax
-from lagjax._equations import derivation_of, jacobian_pattern
+from lagjax._equations import derivation_of
+from lagjax._equations._patterns import jacobian_pattern
 from lagjax._equations._sparse import Band, Blocks, Diagonal, MatrixFree, Sparse
 from lagjax._interface import Layout
 
@@ -90,7 +91,7 @@ def both_forms(name: str):
 def test_both_forms_give_the_same_accelerations(name):
     sparse, scalar = both_forms(name)
     (q, v), params = start(name), {"m": 1.3}
-    structure = derivation_of(sparse, Layout.from_state(q, v), params).structure
+    structure = derivation_of(sparse, Layout.from_state(q, v), params).form.structure
     assert structure is not None and isinstance(structure.mass, SCENES[name][1])
     exact = scalar.acceleration(q, v, 0.7, params)
     scale = np.abs(exact).max()
@@ -186,7 +187,7 @@ def test_patterns_are_those_of_every_state():
         return 0.5 * jnp.sum(qdot**2) + 0.1 * coupled + 0.1 * jnp.where(q[0] > 5, qdot[0] * qdot[-1], 0.0)
 
     q = np.zeros(N)
-    structure = derivation_of(lagjax.System(lagrangian, path="array"), Layout.from_state(q, q), None).structure
+    structure = derivation_of(lagjax.System(lagrangian, path="array"), Layout.from_state(q, q), None).form.structure
     rows, columns = structure.mass.rows, structure.mass.columns
     assert ((rows == 0) & (columns == N - 1)).any() and ((rows == 3) & (columns == 4)).any()
 
@@ -199,7 +200,7 @@ def test_a_dense_mass_of_many_coordinates_is_solved_by_products():
         return 0.5 * jnp.sum(qdot**2) + 0.5 * (u @ qdot) ** 2 - jnp.sum(jnp.cos(q))
 
     system, q = lagjax.System(lagrangian, path="array"), 0.3 * rng.normal(size=n)
-    structure = derivation_of(system, Layout.from_state(q, q), None).structure
+    structure = derivation_of(system, Layout.from_state(q, q), None).form.structure
     assert isinstance(structure.mass, MatrixFree)
     force = np.sin(q)
     np.testing.assert_allclose(system.acceleration(q, 0 * q), force - u * (u @ force) / (1 + u @ u), rtol=0, atol=1e-14)
@@ -214,7 +215,7 @@ def test_a_coordinate_without_any_energy_makes_a_sparse_mass_singular():
         return plate(counts * q, counts * qdot, 0.0, {"m": 1.0})
 
     system, (q, v) = lagjax.System(lagrangian, path="array"), start("sparse")
-    structure = derivation_of(system, Layout.from_state(q, v), None).structure
+    structure = derivation_of(system, Layout.from_state(q, v), None).form.structure
     assert isinstance(structure.mass, Sparse)
     assert np.isnan(system.acceleration(q, v)).all()
 

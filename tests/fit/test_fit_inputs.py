@@ -89,7 +89,7 @@ def test_sensors_see_inputs_and_gain_and_bias_are_parameters():
 def test_machine_code_and_diffrax_agree_and_derivatives_are_those_of_differences():
     hold = "zero"
     layout, parameters = Layout.from_state(0.0, 0.0), Parameters.from_pytree(TRUTH)
-    form = _inputs.Form(*record_of(TS[:9], hold).input_structure, hold)
+    form = _inputs.InputForm(*record_of(TS[:9], hold).input_structure, hold)
     pieces = [(TS[:9], inputs_of(TS[:9])[:, None]), (TS[3:8], inputs_of(TS[:5], 1)[:, None])]
     table, ts = _inputs.build_table(pieces, hold), np.stack([TS[0:7:3], TS[3:8:2]])
     y0, numbers = np.array([[1.0, 0.0], [0.3, -1.0]]), parameters.first

@@ -75,7 +75,7 @@ def test_ready_scenes(scene):
     layout = Layout.from_state(made.q0, made.qdot0)
     derivation = derivation_of(made.system, layout, made.params)
     try:
-        parts = derivation.acceleration, layout.size, derivation.projection
+        parts = derivation.accelerations.program, layout.size, derivation.accelerations.projection
     except Unlowerable as reason:
         pytest.skip(str(reason))
     params = np.array([numbers_of(made.params)], float)

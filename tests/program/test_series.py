@@ -315,7 +315,7 @@ def test_the_solution_of_a_linear_system_without_its_elimination(name):
     make, by_elimination, by_system = SYSTEMS[name]
     scene = make()
     layout = Layout.from_state(scene.q0, scene.qdot0)
-    program = derivation_of(scene.system, layout, scene.params).acceleration
+    program = derivation_of(scene.system, layout, scene.params).accelerations.program
     rng, n = np.random.default_rng(3), layout.size
     states = np.concatenate([layout.flatten(scene.q0), layout.flatten(scene.qdot0)]) + rng.uniform(-0.1, 0.1, 2 * n)
     numbers = [*states, 0.2, *np.concatenate([np.ravel(p) for p in jax.tree.leaves(scene.params)])]

@@ -230,6 +230,17 @@ def test_files_and_classes_have_names_of_their_own():
         assert sorted(names) == sorted(set(names)), [name for name in set(names) if names.count(name) > 1]
 
 
+LIMITS = re.compile(r"_?(LARGEST|LEAST|LONGEST|SMALLEST|MOST|MANY|FEW|FEWEST|DEEPEST|WIDEST|NARROWEST)(_|$)")
+
+
+def test_limits_have_names_of_their_own():
+    """A limit is called as no other one is, in its own module neither: who reads its name finds one number."""
+    assigned = [node for path in PACKAGE.rglob("*.py") for node in tree_of(path).body if isinstance(node, ast.Assign)]
+    places = [place for node in assigned for target in node.targets for place in ast.walk(target)]
+    limits = [node.id.strip("_") for node in places if isinstance(node, ast.Name) and LIMITS.match(node.id)]
+    assert sorted(limits) == sorted(set(limits)), [name for name in set(limits) if limits.count(name) > 1]
+
+
 PREPOSITIONS = (
     "of at along in on by for after before behind beside apart around beyond under over through until within without "
     "across told asked seen"

@@ -24,7 +24,7 @@ import numpy as np
 from lagjax._analysis.orbits import _shooting
 from lagjax._analysis.orbits._arc_motions import Arcs
 from lagjax._analysis.orbits._condensation import Condensed, condense
-from lagjax._analysis.orbits._orbit import CLOSED
+from lagjax._analysis.orbits._orbit import CLOSED, MOST_ARCS
 from lagjax._analysis.orbits._shooting import Chain, Closing
 from lagjax._equations import decide, span_outside
 
@@ -33,7 +33,8 @@ _TRIALS = 8  # of Newton's method: beyond, the step along the family was too lon
 # parts of the step, the turn of the tangent, and how far the chord is from midway between the tangents.
 _CONTRACTION, _DISTANCE, _TURN, _ASKEW = 0.5, 0.4, 0.6, 0.1
 _USUAL = 0.4  # of them, for which the next step is chosen
-_LONGEST = 0.3  # of the largest number of a state: orbits of a family along a straight line are some way apart, no more
+# Of the largest number of a state: orbits of a family along a straight line are some way apart, no more.
+_LONGEST_STEP = 0.3
 # Singular values of closed orbits beyond this share of the largest are no rounding, whatever the rank was before: about
 # branch points they pass through zero.
 _ROUNDING = 1e-11
@@ -140,7 +141,7 @@ class Follower:
         count = point.chain.y.shape[1]
         growth = np.log(max(np.linalg.norm(one, 2) for one in point.chain.growth[0])) / np.log(_LONGEST_GROWTH)
         more = int(2 ** np.ceil(np.log2(max(growth, 1.0))))
-        if more == 1 or count * more > _MOST_ARCS:
+        if more == 1 or count * more > MOST_ARCS:
             return point
         return self.divide_orbit(point.chain.states(), point.chain.periods(), count * more, point.numbers)
 
@@ -166,9 +167,6 @@ class Follower:
 
     def energy(self, point: FamilyPoint) -> float:
         return float(self.arcs.with_numbers(point.numbers).energy(0.0, point.chain.states())[0])
-
-
-_MOST_ARCS = 128
 
 
 def tangent_at(
@@ -260,4 +258,4 @@ def _chord(follower: Follower, last: FamilyPoint, point: FamilyPoint, step: floa
 def next_step(step: float, there: FamilyStep) -> float:
     """The length of the next step: half to twice this one, so that it takes the usual share of its bounds."""
     longer = step * float(np.clip(_USUAL / max(there.share, 1e-300), 0.5, 2.0))
-    return min(longer, _LONGEST * there.point.chain.size()[0])
+    return min(longer, _LONGEST_STEP * there.point.chain.size()[0])

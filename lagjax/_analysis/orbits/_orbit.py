@@ -25,7 +25,7 @@ RTOL = 2.3e-16
 CLOSED = 1e-10
 WELL_CLOSED = 1e-12  # of the state, whose rounding a hundred steps magnify so far: more arcs are not tried then
 # Steps of one arc: with a series of order twenty some hundred of them make errors grow a thousandfold at most.
-_STEPS_OF_ARC, _MOST_ARCS, _MORE = 400, 128, 8
+_STEPS_OF_ARC, MOST_ARCS, _MORE = 400, 128, 8
 _PORTION = 2**13  # arcs that are followed together
 
 
@@ -194,7 +194,7 @@ def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> FlatOrbits:
     """The orbits near these guesses; what does not close well is tried with more arcs as long as that helps."""
     arcs = closing.arcs
     counts = arc_counts(arcs, y0, period)
-    most = counts if arcs.jumping else np.minimum(_MOST_ARCS, _MORE * counts)
+    most = counts if arcs.jumping else np.minimum(MOST_ARCS, _MORE * counts)
     nothing, never, texts = np.full(y0.shape, np.nan), np.zeros(len(y0), bool), np.full(len(y0), "", object)
     found = FlatOrbits(nothing, nothing[:, 0], nothing.astype(complex), nothing[:, 0], never, never, texts)
     waiting, gained = np.arange(len(y0)), np.ones(len(y0), bool)
@@ -210,7 +210,7 @@ def find(closing: Closing, y0: np.ndarray, period: np.ndarray) -> FlatOrbits:
                 found = _shooting.replace_members(found, some[better], FlatOrbits(*(x[better] for x in trial)))
         worse = ~(found.closure[waiting] <= WELL_CLOSED) & gained[waiting]
         waiting = waiting[worse & (counts[waiting] < most[waiting])]
-        counts[waiting] = np.minimum(_MOST_ARCS, 2 * counts[waiting])
+        counts[waiting] = np.minimum(MOST_ARCS, 2 * counts[waiting])
     return found
 
 
@@ -221,7 +221,7 @@ def arc_counts(arcs: Arcs, y0, period) -> np.ndarray:
     run = arcs.ends(np.stack([np.zeros(len(period)), period], axis=1), y0)
     share = np.where(run.result == SUCCESSFUL, 1.0, np.clip(run.t_end / period, 1e-3, 1.0))
     count = np.maximum(1.0, run.accepted / share / _STEPS_OF_ARC)
-    return np.minimum(_MOST_ARCS, 2 ** np.ceil(np.log2(count))).astype(int)
+    return np.minimum(MOST_ARCS, 2 ** np.ceil(np.log2(count))).astype(int)
 
 
 def assess_orbits(closing: Closing, chain: Chain, most: int | None = None) -> FlatOrbits:

@@ -31,11 +31,11 @@ from lagjax._engine._problem import (
     too_tight,
 )
 from lagjax._engine._stop_reason import End, what_stopped
-from lagjax._engine.diffrax._equations import MotionEquations, form_of
+from lagjax._engine.diffrax._equations import MotionEquations, equations_of
 from lagjax._engine.diffrax._integrate import Converted, Jumps, Method, WithJumps, integrate
 from lagjax._engine.diffrax._jumps import freeze
 from lagjax._engine.diffrax._solvers import FineOutput, Projected
-from lagjax._equations import LEAST_COORDINATES
+from lagjax._equations import forms
 from lagjax._interface import (
     ENDED_WELL,
     EVENT_OCCURRED,
@@ -51,7 +51,7 @@ from lagjax._primitives import DOUBLE, SINGLE, differentiable_where, lost_unless
 from lagjax._program import CLOCK, Unlowerable, lack_of_memory, table_of
 
 # Solvers reject steps for the round-off of their error estimate where rtol is below some ten units of it.
-LEAST_RTOL = 10
+LEAST_RTOL_OF_DIFFRAX = 10
 
 
 def _explains_forward_mode(solve):
@@ -116,7 +116,7 @@ class Diffrax(AbstractEngine, eqx.Module):
         if problem.varies:
             return "diffrax does not know the types of jax.shard_map: give it check_vma=False"
         if self.dt is None:
-            return too_tight(self.rtol(problem), problem.layout.dtype, LEAST_RTOL)
+            return too_tight(self.rtol(problem), problem.layout.dtype, LEAST_RTOL_OF_DIFFRAX)
         if not (is_concrete(self.dt) and is_concrete(problem.ts)):
             return None
         ts = np.asarray(problem.ts)
@@ -131,9 +131,9 @@ class Diffrax(AbstractEngine, eqx.Module):
         That are the arrays of L and its gradient, those of M where it is a matrix, some states of a step, and outputs.
         """
         derivation, n, count = problem.derivation, problem.layout.size, jnp.size(problem.ts)
-        if n < LEAST_COORDINATES:
+        if n < forms.LEAST_COORDINATES:
             return None
-        size, in_turn = problem.layout.dtype.itemsize, derivation.structure is not None  # one member after the other
+        size, in_turn = problem.layout.dtype.itemsize, derivation.form.is_sparse  # one member after the other
         at_once = derivation.memory + size * (2 * n * _STATES + (0 if in_turn else 3 * n * n))
         lack = lack_of_memory((1 if in_turn else members) * at_once + members * size * 2 * n * count)
         batch = f"{members} members of " if members > 1 else ""
@@ -143,7 +143,7 @@ class Diffrax(AbstractEngine, eqx.Module):
     def solve(self, problem: Problem) -> Solution:
         """The motion of one member, compiled once for all problems of its structure."""
         motion = problem.derivation.motion
-        if problem.is_single and motion.constrained and problem.derivation.structure is not None:
+        if problem.is_single and motion.constrained and problem.derivation.form.is_sparse:
             return solve_in_doubles(self.solve, problem)  # many links are as large as the roundings of float32
         return _solve(self, problem)
 
@@ -151,7 +151,7 @@ class Diffrax(AbstractEngine, eqx.Module):
     @eqx.filter_jit
     def solve_batch(self, batch: Batch) -> Solution:
         """The motions of all members, which step together until the slowest has arrived; of large scenes in turn."""
-        if batch.member.derivation.structure is not None:  # one by one they are in the caches of a core
+        if batch.member.derivation.form.is_sparse:  # one by one they are in the caches of a core
             return batch.map_in_turn(self.solve)
         solution = batch.map_members(lambda problem: _solve(self, problem))
         steps = solution.accepted + solution.rejected
@@ -214,7 +214,7 @@ def _norm_or_inf(error: PyTree) -> jax.Array:
 @eqx.filter_jit
 def _solve(engine: Diffrax, problem: Problem) -> Solution:
     derivation, numbers, given = problem.derivation, problem.numbers, jnp.asarray(problem.ts)
-    form, y0 = form_of(derivation, problem.system.path), jnp.asarray(problem.y0)
+    form, y0 = equations_of(derivation), jnp.asarray(problem.y0)
 
     # A member that cannot start is given no time to integrate over: it costs nothing, and the others do not wait.
     start = _state_result(y0, *form.acceleration(*freeze((given[0], halves(y0), numbers))))

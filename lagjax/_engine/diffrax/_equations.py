@@ -16,7 +16,6 @@ from jaxtyping import Array, Bool, Float
 
 from lagjax._equations import Derivation, Motion
 from lagjax._interface import compiled_once, halves
-from lagjax._program import Unlowerable
 from lagjax._tracing import Program
 
 PyTree = Any
@@ -25,29 +24,21 @@ State = tuple[Vector, Vector]  # q and q̇
 Time = Float[Array, ""]
 Acceleration = tuple[Vector, Bool[Array, ""]]  # q̈, and whether the matrix that it was solved with is singular: then NaN
 
-# Operations of a program beyond which XLA takes longer to compile it than it saves, and batched elimination on arrays
-# overtakes written-out elimination: measured on chains of pendulums, where it lies at 12 links.
-LARGEST_XLA_PROGRAM = 2_000
-
 
 class MotionEquations(eqx.Module):
-    """The equations of a scene by two functions of (q, q̇, t, params), each traced once, however often it is called.
-
-    `reason` says why they are M, F, G and γ as JAX arrays; it is None for scalar programs.
-    """
+    """The equations of a scene by two functions of (q, q̇, t, params), each traced once, however often it is called."""
 
     motion: Motion = eqx.field(static=True)
     accelerate: Any = eqx.field(static=True)
     project: Any = eqx.field(static=True)
-    reason: str | None = eqx.field(static=True)
 
     @classmethod
-    def from_arrays(cls, motion: Motion, reason: str) -> "MotionEquations":
-        return cls(motion, compiled_once(motion.solved_acceleration), compiled_once(motion.projected), reason)
+    def from_arrays(cls, motion: Motion) -> "MotionEquations":
+        return cls(motion, compiled_once(motion.solved_acceleration), compiled_once(motion.projected))
 
     @classmethod
     def from_programs(cls, motion: Motion, program: Program, projection: Program | None) -> "MotionEquations":
-        """The equations by programs of q, q̇, t and every number in params: `Derivation.acceleration`, `projected`."""
+        """The equations by programs of q, q̇, t and every number in params: `Accelerations.program`, `projected`."""
 
         def accelerate(q, qdot, t, params):
             *acceleration, singular = program(*q, *qdot, t, *_scalars(params))
@@ -57,7 +48,7 @@ class MotionEquations(eqx.Module):
             assert projection is not None
             return halves(jnp.stack(projection(*q, *qdot, t, *_scalars(params))))
 
-        return cls(motion, compiled_once(accelerate), compiled_once(project), None)
+        return cls(motion, compiled_once(accelerate), compiled_once(project))
 
     @property
     def constrained(self) -> bool:
@@ -70,27 +61,12 @@ class MotionEquations(eqx.Module):
         return self.accelerate(*y, t, params)
 
 
-def form_of(derivation: Derivation, path: str = "auto") -> MotionEquations:
-    """The form of its equations that suits a scene, or that `path` names; `ValueError` where "scalar" is impossible."""
-    motion = derivation.motion
-    if path == "array":
-        return MotionEquations.from_arrays(motion, "asked for")
-    try:
-        program = derivation.acceleration.complete
-    except Unlowerable as reason:
-        if path == "scalar":
-            raise ValueError(f"This scene has no scalar program: {reason}. Leave `path` at 'auto'.") from None
-        return MotionEquations.from_arrays(motion, str(reason))
-    if path == "auto" and program.looks_up:  # whose inputs would be the entries of tables, one by one
-        return MotionEquations.from_arrays(motion, "it looks up entries of tables")
-    if path == "auto" and derivation.counts_on_params:  # which may be traced here
-        return MotionEquations.from_arrays(motion, "its mass matrix may need pivoting")
-    if path == "auto" and derivation.has_rules:  # of which a program keeps the first two derivatives alone
-        return MotionEquations.from_arrays(motion, "a function has rules of its own for its derivatives")
-    if path == "auto" and program.operations > LARGEST_XLA_PROGRAM:
-        reason = f"{program.operations} operations are more than the {LARGEST_XLA_PROGRAM} that XLA compiles quickly"
-        return MotionEquations.from_arrays(motion, reason)
-    return MotionEquations.from_programs(motion, program, derivation.projected)
+def equations_of(derivation: Derivation) -> MotionEquations:
+    """The equations of a scene in the form that XLA compiles; `ValueError` where its path is an impossible "scalar"."""
+    if derivation.form_in_xla.kind != "scalar":
+        return MotionEquations.from_arrays(derivation.motion)
+    of = derivation.accelerations
+    return MotionEquations.from_programs(derivation.motion, of.program.complete, of.projected)
 
 
 def _scalars(params: PyTree) -> list[jax.Array]:

@@ -116,8 +116,8 @@ class MachineCode(AbstractEngine):
 
         An NVIDIA GPU is no reason where its threads can remember a motion.
         """
-        if problem.derivation.structure is not None and problem.guards is None and not problem.varies:
-            return problem.derivation.refusal
+        if problem.derivation.form.is_sparse and problem.guards is None and not problem.varies:
+            return problem.derivation.form.reason
         refusal = self.refuses(problem)
         if refusal is None or not has_nvidia_gpu() or self.lacks(problem) is not None:
             return refusal
@@ -235,7 +235,7 @@ def _make_flow(derivation: Derivation, path: str, guards: Guards | None) -> Flow
         return Unlowerable(f"the scene cannot be remembered: {derivation.unhashable}")
     n = derivation.layout.size
     try:
-        program, projection = derivation.acceleration, derivation.projection
+        program, projection = derivation.accelerations.program, derivation.accelerations.projection
         if guards is not None and guards.remembers:
             program = program.append_inputs(guards.inputs)
         require_fit(program, n)

@@ -14,12 +14,11 @@ from lagjax import _native
 from lagjax._engine._problem import Solution
 from lagjax._engine._stop_reason import End, what_stopped
 from lagjax._engine.taylor._variational import tangent_programs
+from lagjax._equations import forms
 from lagjax._interface import RESULTS, SUCCESSFUL, code_of
-from lagjax._program import Unlowerable, machine_memory, operations_that_fit
+from lagjax._program import Unlowerable, machine_memory
 from lagjax._tracing import Program
 
-# Operations of an acceleration: making its kernel takes some 4 KB for each, with the derivatives some 10 KB.
-LARGEST_PROGRAM = operations_that_fit(10_000)
 # The last terms that the series of a tangent may have, relative to the tangent, in tolerances. What the series leaves
 # out is smaller by e² at least. Measured on all scenes: a motion that has its own scale takes steps with at most 300.
 EXCESS = 1000.0
@@ -70,10 +69,10 @@ class Tolerances(NamedTuple):
 
 def require_fit(program: Program, size: int) -> None:
     """Raise `Unlowerable` where there is no machine code for the program of a scene."""
-    if program.operations > LARGEST_PROGRAM:
+    if program.operations > forms.LARGEST_PROGRAM:
         raise Unlowerable(
-            f"its acceleration takes {program.operations} operations, more than the {LARGEST_PROGRAM} whose kernel and "
-            f"derivatives fit into half of this machine's {machine_memory() / 1e9:.0f} GB of memory"
+            f"its acceleration takes {program.operations} operations, more than the {forms.LARGEST_PROGRAM} whose "
+            f"kernel and derivatives fit into half of this machine's {machine_memory() / 1e9:.0f} GB of memory"
         )
     _native.recurrences(program, size)  # raises where an operation has none
 
@@ -148,7 +147,7 @@ class Flow:
                 other = program.complete
             except Unlowerable:
                 return None
-            fits = other is not program and other.operations <= LARGEST_PROGRAM
+            fits = other is not program and other.operations <= forms.LARGEST_PROGRAM
             return cls.from_program(other, size, projection, guards, turns) if fits else None
 
         numbers = program.size - 2 * size - 1

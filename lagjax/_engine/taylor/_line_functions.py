@@ -27,15 +27,13 @@ from jax.core import ShapedArray
 from jax.interpreters import ad, mlir
 
 from lagjax._engine.taylor._call import NO_HANDLER, capsule
+from lagjax._equations import forms
 from lagjax._native import LARGEST_LINE, LineCode, compilation_work, line_handler, make_once
 from lagjax._primitives import HostFunction, LinearMap, call_host, compute_on_host, is_zero, share_rows
 from lagjax._program import Graph, StraightLine, Unlowerable, copy_nodes, pullback, pushforward
 from lagjax._tracing import Program, emit, lower, lowers
 
 _TARGET = "lagjax_line"
-# Operations of a line on a GPU that XLA compiles; NumPy on the host evaluates a longer one. Twice as many would cost
-# several seconds of compilation.
-LARGEST_COMPILED = 100
 # Machine code takes some 20 µs a node to make, and NumPy 1 µs a node for a call: that of a line which XLA does not wait
 # for is made after as many calls as take that long, so that one call is not slow, and a thousand are not.
 _CALLS = 20
@@ -228,7 +226,7 @@ class _LineMap(LinearMap):
         return [jnp.stack(emit(self.of(line).line, columns), axis=-1)]
 
     def _call_from_gpu(self, *arrays, line: Line):
-        if len(self.of(line).line.nodes) <= LARGEST_COMPILED:
+        if len(self.of(line).line.nodes) <= forms.LARGEST_COMPILED:
             return self._compile_operations(*arrays, line=line)
 
         def evaluate(*arrays):

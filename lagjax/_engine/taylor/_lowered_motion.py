@@ -59,7 +59,7 @@ class _LoweredMotion(Motion):
     def solved_acceleration(self, q, qdot, t, params):
         """q̈, NaN where its matrix is singular, and whether that is so."""
         try:
-            program = self.derivation.acceleration.complete
+            program = self.derivation.accelerations.program.complete
         except Unlowerable:
             return super().solved_acceleration(q, qdot, t, params)
         *acceleration, singular = _outputs(program, q, qdot, t, params)

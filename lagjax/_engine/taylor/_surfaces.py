@@ -18,7 +18,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine.taylor._line_functions import outputs
-from lagjax._equations import OPERATION_BUDGET, Derivation
+from lagjax._equations import Derivation, forms
 from lagjax._native import SINGLE_NOISE, Guards
 from lagjax._primitives import differentiable_where
 from lagjax._program import StraightLine, Unlowerable, borders, copy_nodes, distances, tangents_in
@@ -68,7 +68,7 @@ class Surfaces(NamedTuple):
         It takes the outputs of `given` as well, where there is such a program of the same numbers. `code` and
         `structure` are what params hold that is not a number. Raises `Unlowerable`.
         """
-        moving, motion = 2 * derivation.layout.size + 1, derivation.acceleration.complete
+        moving, motion = 2 * derivation.layout.size + 1, derivation.accelerations.program.complete
         y, numbers = jax.ShapeDtypeStruct((moving,), derivation.layout.dtype), derivation.numbers
 
         def values_at(y, numbers, *more):
@@ -77,7 +77,7 @@ class Surfaces(NamedTuple):
         more = () if given is None else (jax.ShapeDtypeStruct((len(given.line.outputs),), jnp.result_type(float)),)
         values = lower(values_at, y, numbers, *more, moving=moving)
         if given is not None:
-            values = compose(values, given, OPERATION_BUDGET, moving)
+            values = compose(values, given, forms.OPERATION_BUDGET, moving)
 
         def sizes_by_rounding(y, numbers):
             floats, others = eqx.partition(numbers, eqx.is_inexact_array)
@@ -111,7 +111,7 @@ def _complete(values: Program, motion: Program, moving: int, rounding: Program |
         more = [] if rounding is None else [rounding.place(expansion, ids)[list(rounding.line.outputs)]]
         return [np.array([nodes[i] for i in outputs]), *(stack(x).ids for x in zip(*found, strict=True)), *more]
 
-    return lower_scalars(scalars, values.shapes, OPERATION_BUDGET, moving)
+    return lower_scalars(scalars, values.shapes, forms.OPERATION_BUDGET, moving)
 
 
 def _followed(values: Program, motion: Program, moving: int, pieces: StraightLine | None) -> Program:
@@ -129,7 +129,7 @@ def _followed(values: Program, motion: Program, moving: int, pieces: StraightLin
         at, moves = (np.array([x for part in parts for x in part]) for parts in zip(*found, strict=True))
         return [at, moves, np.array(rate[:-1])]
 
-    return lower_scalars(scalars, values.shapes, OPERATION_BUDGET, moving)
+    return lower_scalars(scalars, values.shapes, forms.OPERATION_BUDGET, moving)
 
 
 def _rate(motion: Program, expansion, ids: np.ndarray, moving: int) -> Scalars:

@@ -11,7 +11,7 @@ import numpy as np
 
 from lagjax._engine import DEFAULT_RTOL
 from lagjax._equations import has_constraints
-from lagjax._fit.model._inputs import Form, input_functions
+from lagjax._fit.model._inputs import InputForm, input_functions
 from lagjax._fit.model._motions import Manifold, choose_motions
 from lagjax._fit.model._noise import AbstractNoise, Sensor, StudentT, read_sensor
 from lagjax._fit.model._parameters import Parameters
@@ -36,7 +36,7 @@ class GivenSystem(NamedTuple):
     system: Scene
     records: list[Any]
     observe: Callable | Delayed | None
-    form: Form | None
+    form: InputForm | None
     layout: Layout
 
 
@@ -112,7 +112,7 @@ def _require_motion(given: GivenSystem, recordings: list[Record], signals: Signa
         raise ValueError(f"{still[0]} So it is with all signals of all records: nothing moves that could be fitted.")
 
 
-def _read_form(system: Scene, records: list[Record], hold: str) -> Form | None:
+def _read_form(system: Scene, records: list[Record], hold: str) -> InputForm | None:
     asking = input_functions(system)
     if asking and jumps(system):
         raise ValueError(f"{asking[0]} asks for `inputs`; hybrid motion and contacts have none: make it one of `t`.")
@@ -126,10 +126,10 @@ def _read_form(system: Scene, records: list[Record], hold: str) -> Form | None:
     for place, record in enumerate(records):
         require_interpolation(record, hold, f"records[{place}]")
     tree, shapes = structures[0]
-    return Form(tree, shapes, hold)
+    return InputForm(tree, shapes, hold)
 
 
-def _read_layout(system: Scene, records: list[Record], params0, form: Form | None) -> Layout:
+def _read_layout(system: Scene, records: list[Record], params0, form: InputForm | None) -> Layout:
     """The structure of the coordinates: that of a start that a record gives, or else that of its values."""
     place = next((k for k, record in enumerate(records) if record.start is not None), None)
     if place is not None:

@@ -18,11 +18,9 @@ import numpy as np
 from jax.scipy.special import gammaln
 from scipy.special import polygamma
 
-from lagjax._fit.model._noise import AbstractNoise, NoiseScale, StudentT
+from lagjax._fit.model._noise import LEAST_DOF, MOST_DOF, AbstractNoise, NoiseScale, StudentT
 from lagjax._fit.model._residuals import Residuals, Trial
 from lagjax._primitives import accepts_singles
-
-_LEAST_DOF, _MOST_DOF = 1.0, 200.0  # ν is between these, with a flat density of its logarithm
 
 
 class PosteriorUnknowns(NamedTuple):
@@ -56,8 +54,8 @@ class Density:
         self.dtype = np.result_type(*(part.layout.dtype for part in residuals.parts))
         self._tails = np.isfinite(noise.dof)
         self.moves_dof = isinstance(law, StudentT) and law.dof is None
-        share = np.log(np.clip(noise.dof, 1.01 * _LEAST_DOF, 0.99 * _MOST_DOF) / _LEAST_DOF)
-        share = share / math.log(_MOST_DOF / _LEAST_DOF)
+        share = np.log(np.clip(noise.dof, 1.01 * LEAST_DOF, 0.99 * MOST_DOF) / LEAST_DOF)
+        share = share / math.log(MOST_DOF / LEAST_DOF)
         dof = np.log(share / (1 - share)) if self.moves_dof else np.zeros(0)
         moves = np.zeros((len(residuals.pieces), residuals.states), bool)
         for part in residuals.parts:
@@ -93,7 +91,7 @@ class Density:
         dof = jnp.asarray(self.noise.dof, x.dtype)
         if self.moves_dof:
             share = jax.nn.sigmoid(x[self.noise_places.stop :])
-            dof = _LEAST_DOF * jnp.exp(math.log(_MOST_DOF / _LEAST_DOF) * share)
+            dof = LEAST_DOF * jnp.exp(math.log(MOST_DOF / LEAST_DOF) * share)
         return PosteriorUnknowns(u, starts, jnp.exp(x[self.noise_places]), dof)
 
     def params(self, x):
@@ -146,7 +144,7 @@ class Density:
         information = np.diag(samples * np.where(self._tails, 2 * d / (d + 3), 2.0))
         if self.moves_dof:
             share = 1 / (1 + np.exp(-self.first[-count:]))
-            rate = d * math.log(_MOST_DOF / _LEAST_DOF) * share * (1 - share)
+            rate = d * math.log(MOST_DOF / LEAST_DOF) * share * (1 - share)
             own = 0.25 * (polygamma(1, d / 2) - polygamma(1, (d + 1) / 2)) - (d + 5) / (2 * d * (d + 1) * (d + 3))
             both = np.diag(-2 * samples * rate / ((d + 1) * (d + 3)))
             own = np.diag(samples * own * rate**2 + 2 * share * (1 - share))

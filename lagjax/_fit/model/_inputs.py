@@ -51,7 +51,7 @@ class Driven(NamedTuple):
     values: Any
 
 
-class Form(NamedTuple):
+class InputForm(NamedTuple):
     """The structure of an input at one time, and its interpolation between samples, one of `_samples.HOLDS`."""
 
     tree: Any
@@ -96,7 +96,7 @@ class _FunctionOfInputs(eqx.Module):
     """A function of the user, for parameters that are `Driven`."""
 
     function: Function
-    form: Form = eqx.field(static=True)
+    form: InputForm = eqx.field(static=True)
 
     @property
     def __name__(self) -> str:

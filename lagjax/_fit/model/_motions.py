@@ -25,7 +25,7 @@ import numpy as np
 
 from lagjax._engine import Problem, choose
 from lagjax._engine.taylor import Flow, MachineCode, Motions, flow_of, jvp, project_start_tangents, tolerances_of
-from lagjax._fit.model._inputs import Driven, Form, SampleTable, input_functions
+from lagjax._fit.model._inputs import Driven, InputForm, SampleTable, input_functions
 from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._records import start_pair
 from lagjax._interface import ENDED_WELL, Layout, halves
@@ -82,7 +82,7 @@ class AbstractMotions(abc.ABC):
 
 
 def choose_motions(
-    system: Scene, layout: Layout, parameters: Parameters, rtol: float, form: Form | None
+    system: Scene, layout: Layout, parameters: Parameters, rtol: float, form: InputForm | None
 ) -> AbstractMotions:
     if not isinstance(system, System) or jumps(system):
         return _JaxMotions(system, layout, parameters, {"rtol": rtol})

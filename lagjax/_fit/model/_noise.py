@@ -39,7 +39,7 @@ from scipy.stats import t
 
 from lagjax._fit.model._records import Record, real_numbers, spread_over_signals
 
-_WIDEST, _NARROWEST = 200.0, 1.0  # ν: beyond 200 it is a Gaussian to a percent, below 1 there is not even a mean
+MOST_DOF, LEAST_DOF = 200.0, 1.0  # ν: beyond 200 it is a Gaussian to a percent, below 1 there is not even a mean
 _ROUNDS = 30  # of the fixed point for σ, which gains a factor of three or more in each
 
 
@@ -194,7 +194,7 @@ class StudentT(AbstractNoise):
     dof: float | None = None
 
     def __post_init__(self):
-        if self.dof is not None and not (np.ndim(self.dof) == 0 and np.isfinite(self.dof) and self.dof >= _NARROWEST):
+        if self.dof is not None and not (np.ndim(self.dof) == 0 and np.isfinite(self.dof) and self.dof >= LEAST_DOF):
             raise ValueError(f"StudentT(dof) needs a number of degrees of freedom of at least 1; got {self.dof!r}.")
 
     def estimate(self, residuals, weights, least, sides=None):
@@ -208,7 +208,7 @@ class StudentT(AbstractNoise):
             return _sigma(scaled, self.dof, least), float(self.dof)
         # The profile likelihood of log ν has one maximum, or its end.
         cost = lambda x: -t.logpdf(scaled, np.exp(x), scale=_sigma(scaled, np.exp(x), least)).mean()  # noqa: E731
-        ends = np.log(_NARROWEST), np.log(_WIDEST)
+        ends = np.log(LEAST_DOF), np.log(MOST_DOF)
         best: Any = minimize_scalar(cost, bounds=ends, method="bounded", options={"xatol": 3e-3})
         dof = float(np.exp(best.x))
         return _sigma(scaled, dof, least), dof

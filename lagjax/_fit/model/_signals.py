@@ -20,7 +20,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._fit.model._inputs import Form
+from lagjax._fit.model._inputs import InputForm
 from lagjax._fit.model._motions import RecordMotion
 from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._records import Record, restore_structure
@@ -82,7 +82,7 @@ class Signals:
 
     def __init__(
         self, observe: Callable | Delayed | None, layout: Layout, parameters: Parameters, record: Record | None,
-        form: Form | None = None,
+        form: InputForm | None = None,
     ):  # fmt: skip
         self.layout, self.form, self.observe = layout, form, observe
         self.delays: Delays | None = None

@@ -20,7 +20,7 @@ from lagjax._fit.model._sensor_faults import present_samples
 
 _WIDE = 3.0  # rad: a signal of a smaller range is not tried as degrees, which would leave it 0.05
 _WIDEST = 20.0  # rad, three turns: of a larger range degrees are tried first
-_MOST = 4  # signals of which signs, places and origins are tried, and records that are left out: pairs grow as a square
+_MOST_TRIED = 4  # signals by signs, places and origins, and records that are left out: pairs grow as a square
 _BETTER = 0.2  # of what was left before, that the fit without the mistake may leave: chance halves it at best
 _SLOW = 30.0  # times slower than the scene moves, from which milliseconds are tried first: 1000, and a guess is off
 SECONDS = 10.0  # of processor time that tries may take where a fit explains nothing: some ten fits that fail
@@ -38,7 +38,7 @@ def possible_mistakes(
 ) -> Iterator[PossibleMistake]:
     """Possible mistakes in the records, the likeliest first: the data move `slower` times slower than the scene, and
     `worst` are the places of records by what is left of them."""
-    count, some = len(names), range(min(len(names), _MOST))
+    count, some = len(names), range(min(len(names), _MOST_TRIED))
 
     def change(columns: list[int], function: Callable[[np.ndarray], np.ndarray]) -> list[Any]:
         mine = np.isin(np.arange(count), columns)
@@ -52,7 +52,7 @@ def possible_mistakes(
     milliseconds = [PossibleMistake("with the times in milliseconds", by_time)]
     ranges = [max(np.ptp(present_samples(r, k)) for r in records if isinstance(r, Record)) for k in range(count)]
     wide = [k for k in range(count) if ranges[k] > _WIDE]
-    sets = ([wide] if wide else []) + [[k] for k in wide[:_MOST] if len(wide) > 1]
+    sets = ([wide] if wide else []) + [[k] for k in wide[:_MOST_TRIED] if len(wide) > 1]
     degrees = [PossibleMistake(f"with {_list_names(names, x)} in degrees", change(x, np.radians)) for x in sets]
     yield from milliseconds if slower > _SLOW else []
     yield from degrees if max(ranges) > _WIDEST else []
@@ -62,7 +62,7 @@ def possible_mistakes(
         order[[i, j]], text = (j, i), f"with {names[i]} and {names[j]} swapped"
         swaps.append(PossibleMistake(text, _change_signals(records, np.asarray, order)))
     yield from swaps if len(swaps) == 1 else []  # one try tells
-    for place in worst[:_MOST] if len(records) > 2 else []:
+    for place in worst[:_MOST_TRIED] if len(records) > 2 else []:
         yield PossibleMistake(f"without records[{place}]", [*records[:place], *records[place + 1 :]])
     yield from swaps if len(swaps) > 1 else []
     for k in some:

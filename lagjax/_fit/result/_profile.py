@@ -23,7 +23,7 @@ from lagjax._fit.model._noise import KnownNoise
 from lagjax._fit.model._residuals import LostMotion, Point, Residuals
 from lagjax._fit.search._descent import minimise
 
-_STEP, _MOST = 0.5, 14  # of the reported half width, doubling where little changes; values on one side
+_STEP, _MOST_VALUES = 0.5, 14  # of the reported half width, doubling where little changes; values on one side
 _ENOUGH, _TRIALS = 1e-7, 25  # of the deviance, whose roots are wanted; of a search that begins nearby
 _FAR = 3.0  # times |value|, or units of u where that is a logarithm or the like: how far other minima are looked for
 _EXACT = 1e-4  # of the half width, to which an end is found
@@ -134,7 +134,7 @@ def _find_end(line: _ProfileLine, side: float, threshold: float, room: float) ->
     look_out = _FAR * (max(abs(best), 8 * wide) if np.isinf(room) else 1.0 + wide)
     step = _STEP * (wide * np.sqrt(threshold) if np.isfinite(wide) else max(abs(best), 1.0))
     offset, last, end = min(step, room), 0.0, None
-    for _ in range(_MOST):
+    for _ in range(_MOST_VALUES):
         deviance = line.deviance(best + side * offset)
         if end is None and deviance > threshold:
             end = _locate_root(line, best + side * last, best + side * offset, threshold)

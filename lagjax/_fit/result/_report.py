@@ -14,13 +14,13 @@ from lagjax._fit.result._information import LEVEL
 from lagjax._show import even_places, import_package, render_picture, simplify_axes
 
 BLUE, RED, GREY = "#0072B2", "#D55E00", "0.55"
-_MOST = 4000  # samples in one curve: more do not show
+_MOST_DRAWN = 4000  # samples in one curve: more do not show
 
 
 def draw_record(figure, record: Record, residuals: np.ndarray, names: tuple[str, ...], sigma: np.ndarray):
     """Axes (2, S) with data over fit above and residuals (T, S) with ±2σ below, a column for each signal."""
     axes = figure.subplots(2, len(names), squeeze=False, sharex="col", gridspec_kw={"height_ratios": [2, 1]})
-    some = even_places(len(record), _MOST)
+    some = even_places(len(record), _MOST_DRAWN)
     ts, measured, left = record.ts[some], record.matrix[some], residuals[some]
     for s, name in enumerate(names):
         above, below = axes[0][s], axes[1][s]

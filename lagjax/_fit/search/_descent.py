@@ -28,7 +28,7 @@ from lagjax._fit.model._residuals import LostMotion, Point, Residuals, Trial, co
 
 # Damping, relative to the squared norms of the columns. The first step is nearly that of Gauss and Newton; below the
 # least one, damping is below the round-off of derivatives and only keeps columns that nothing depends on from moving.
-_FIRST, _LEAST, _MOST = 1e-4, 1e-14, 1e12
+_FIRST, _LEAST_DAMPING, _MOST_DAMPING = 1e-4, 1e-14, 1e12
 _PATIENCE = 12  # trials that lowered the sum of squares by less than ends a search, while derivatives promised more
 _NEAR = 1e-3  # per sample: where it pays to look at how much the residuals are correlated
 _FLAT = 1e-13  # relative: half the sum of squares is itself rounded to so much
@@ -109,7 +109,7 @@ def minimise(
     damping, trials, falls = _FIRST, 1, [(1, np.inf)]
     while True:
         model = _Model(residuals, trial, law, anchor)
-        gain = model.step(_LEAST).gain
+        gain = model.step(_LEAST_DAMPING).gain
         end = functools.partial(Descent, residuals, trial, model.noise)
         if model.is_enough(gain, enough):
             return end(True, trials, f"The search converged after {trials} trials.")
@@ -132,14 +132,14 @@ def _find_better_trial(model: _Model, damping: float, trials: int, limit: int) -
     growth, at, residuals = 2.0, model.trial, model.residuals
     while trials < limit:
         step = model.step(damping)
-        if step.gain <= _FLAT * model.cost or damping > _MOST:
+        if step.gain <= _FLAT * model.cost or damping > _MOST_DAMPING:
             break
         trials += 1
         with contextlib.suppress(LostMotion):
             trial = residuals.evaluate(Point(residuals.parameters.take_step(at.u, step.u), at.starts + step.starts))
             fall = model.cost - model.cost_of(trial)
             if fall > 0.0:
-                return trial, max(_LEAST, damping * max(0.1, 1.0 - (2.0 * fall / step.gain - 1.0) ** 3)), trials
+                return trial, max(_LEAST_DAMPING, damping * max(0.1, 1.0 - (2.0 * fall / step.gain - 1.0) ** 3)), trials
         damping, growth = damping * growth, 2.0 * growth
     return None, damping, trials
 
@@ -170,7 +170,7 @@ def _limited_step(rest: np.ndarray, of_u: np.ndarray, damping: float, limits) ->
         triangle = qr_triangle(np.concatenate([rest, np.diag(np.append(np.sqrt(each) * of_u, 0.0))[:free]]))
         du = np.linalg.solve(triangle[:free, :free], -triangle[:free, free])
         beyond = (du < limits[0]) | (du > limits[1])
-        if not beyond.any() or each[beyond].min() > _MOST:
+        if not beyond.any() or each[beyond].min() > _MOST_DAMPING:
             return du
         each[beyond] *= 10.0
 

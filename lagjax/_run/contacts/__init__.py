@@ -140,7 +140,7 @@ def _plan(problem: Problem, max_transitions: int | None) -> tuple[ContactPlan, P
         if held.size and (slots := slots_of(closed.derivation.lowered, flat)):
             scene = dataclasses.replace(scene, slots=slots)
             holds = Problem.from_system(scene, wide.layout, inside)
-        if refusal := MachineCode().refuses(free) or holds.derivation.lowered.lacks_elimination:
+        if refusal := MachineCode().refuses(free) or holds.derivation.lowered.accelerations.lacks:
             raise ValueError(f"A scene with contacts needs machine code, and has none: {refusal}.")
         plan, lowered = ContactPlan(scene, *limits), closed.derivation.lowered
         rows = RowPlaces.from_derivation(lowered, flat).normal[shapes.of_gaps :]
@@ -170,7 +170,7 @@ def _require_open(problem: Problem, closed: Problem, free: Problem) -> None:
     gaps, slopes = of["residual"][0, rows], of["jacobian"][0, rows]
     terms = derivation.term_sizes(y0[:n], y0[n:], columns[2 * n], closed.numbers, names=("residual",))
     noise = ROUNDINGS * np.finfo(problem.layout.dtype).eps * (np.asarray(terms)[rows] + np.abs(slopes) @ np.abs(y0[:n]))
-    acceleration = free.derivation.lowered.acceleration.evaluate_many(list(columns))[:n, 0]
+    acceleration = free.derivation.lowered.accelerations.program.evaluate_many(list(columns))[:n, 0]
     ts = np.asarray(closed.ts, float)
     noise = noise + [find_start_width(n, y0, slope, acceleration, ts[0], ts[-1]) for slope in slopes]
     for name, gap, slope, near in zip(shapes.names, gaps, slopes, noise, strict=False):
@@ -221,7 +221,7 @@ def contact_forces(trajectory: Trajectory, name: str):
             whole = derivation_of(scene, layout, inside).lowered
             scene = dataclasses.replace(scene, slots=slots_of(whole, flat))
         derivation = derivation_of(scene, layout, inside).with_numbers().lowered
-        program = line_of(derivation.multipliers)
+        program = line_of(derivation.accelerations.multipliers)
         numbers = eqx.filter(params, eqx.is_array_like)
         given = [jnp.ravel(x) for x in jax.tree.leaves(numbers)]
 

@@ -20,7 +20,7 @@ from lagjax._engine.taylor import (
     require_one_number,
     vector_of,
 )
-from lagjax._equations import OPERATION_BUDGET, Derivation, derivation_of
+from lagjax._equations import Derivation, derivation_of, forms
 from lagjax._interface import Function, Layout, compile_for_one_call, halves
 from lagjax._primitives import attach_derivative, lost_unless
 from lagjax._program import Unlowerable
@@ -234,9 +234,9 @@ def _make_scene(
 
         modes.append(Mode(make, watches, find, make_lines))
     doing, inputs = k + r + r * d + held_size(shapes, n) + 1, len(derivation.scalar_shapes)
-    response = whole.impact_response(places.all, doing, open_derivation)
+    response = whole.accelerations.impact_response(places.all, doing, open_derivation)
     bends = response.select_outputs(range(len(response.line.outputs))[-len(places.all) :][:k])
-    acceleration = line_of((open_derivation if corners is None else derivation).acceleration, n)
+    acceleration = line_of((open_derivation if corners is None else derivation).accelerations.program, n)
     lines = {"RESPONSE": line_of(response), "BENDS": line_of(bends).with_derivative, "ACCELERATION": acceleration}
     if corners is not None:
         lines["SIDES"] = line_of(corners.sides)
@@ -295,7 +295,7 @@ def slots_of(whole: Derivation, flat: Flat) -> tuple[int, int] | None:
     places, shapes, n = RowPlaces.from_derivation(whole, flat), flat.shapes, whole.layout.size
     if not held_size(shapes, n) or shapes.count > flat.gap_count or corners_of(whole, places.all, shapes) is not None:
         return None
-    rows = [sample.toarray() for _, sample in whole.samples]
+    rows = [sample.toarray() for _, sample in whole.accelerations.samples()]
     own = np.setdiff1d(np.arange(len(rows[0])), places.all)
 
     def rank(*some) -> int:
@@ -315,16 +315,16 @@ def slots_of(whole: Derivation, flat: Flat) -> tuple[int, int] | None:
 def _forces_of(derivation: Derivation, scene: ContactScene, flat: Flat) -> Program:
     """All multipliers; with slots those of the contacts, (k + r d,)."""
     if scene.slots is None:
-        return derivation.multipliers
+        return derivation.accelerations.multipliers
     moving, positions = 2 * derivation.layout.size + 1, derivation.position_count
 
     def spread(_, inside, forces):
         return jnp.concatenate([x.ravel() for x in scene.split_forces(flat, forces, positions, inside)[1:]])
 
-    given = (jax.ShapeDtypeStruct((size,), float) for size in (moving, len(derivation.multipliers.line.outputs)))
-    y, forces = given
+    multipliers = derivation.accelerations.multipliers
+    y, forces = (jax.ShapeDtypeStruct((size,), float) for size in (moving, len(multipliers.line.outputs)))
     program = lower(spread, y, derivation.numbers, forces, moving=moving)
-    return compose(program, derivation.multipliers, OPERATION_BUDGET, moving)
+    return compose(program, multipliers, forms.OPERATION_BUDGET, moving)
 
 
 class RowPlaces(NamedTuple):
@@ -388,7 +388,7 @@ def _watches(
         return jnp.concatenate([watches[: shapes.count], of_friction, watches[shapes.count :]])
 
     directions = (-1,) * (shapes.count + rough.size + turns) + (1,) * turns + ways
-    forces = None if scene.is_open else derivation.multipliers
+    forces = None if scene.is_open else derivation.accelerations.multipliers
     forces = forces if corners is None or forces is None else append_sides(forces, corners)
     surfaces = Surfaces.from_function(derivation, values_at, directions, code, structure, given=forces)
     return surfaces._replace(is_rounded=single)

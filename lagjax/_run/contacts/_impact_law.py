@@ -37,7 +37,7 @@ class ImpactRows(NamedTuple):
 
     @classmethod
     def split(cls, numbers, size: int, n: int) -> "ImpactRows":
-        """The rows by the outputs of `Derivation.impact_response` for `size` rows of n coordinates."""
+        """The rows by the outputs of `Accelerations.impact_response` for `size` rows of n coordinates."""
         shapes = (size, n), (size, n), (size, size), (size,), (size,), (size,)
         parts = jnp.split(numbers, np.cumsum([math.prod(shape) for shape in shapes])[:-1])
         return cls(*(part.reshape(shape) for part, shape in zip(parts, shapes, strict=True)))

@@ -17,7 +17,7 @@ import numpy as np
 
 from lagjax._engine import Problem
 from lagjax._engine.taylor import Line, MachineCode, Surfaces, line_of, make_flow, require_one_number
-from lagjax._equations import OPERATION_BUDGET, Derivation, has_constraints, is_inconsistent
+from lagjax._equations import Derivation, forms, has_constraints, is_inconsistent
 from lagjax._interface import Function, Layout, accept, halves, present
 from lagjax._primitives import DOUBLE, SINGLE
 from lagjax._program import Unlowerable
@@ -115,7 +115,7 @@ class ModeParts:
     ):
         self._dtype = SINGLE if is_rounded else DOUBLE
         self.numbers, self.surfaces, self._derivation, self._restore = tuple(leaving), surfaces, derivation, restore
-        n, size = derivation.layout.size, derivation.acceleration.size
+        n, size = derivation.layout.size, derivation.accelerations.program.size
         self.sizes = {"N": n, "NUMBERS": size - 2 * n - 1, "INPUTS": size}
         guards = surfaces and surfaces.guards(remembers=True)
         self.make_flow = functools.partial(make_flow, derivation, system.path, None)
@@ -126,7 +126,7 @@ class ModeParts:
 
     def _lower(self, function: Callable) -> Line:
         y = jax.ShapeDtypeStruct((2 * self._derivation.layout.size + 1,), float)
-        return line_of(lower(function, y, self._derivation.numbers, budget=OPERATION_BUDGET))
+        return line_of(lower(function, y, self._derivation.numbers, budget=forms.OPERATION_BUDGET))
 
     def _lower_reset(self, transition: Transition) -> Line:
         try:
@@ -189,7 +189,7 @@ def _surfaces(derivation: Derivation, system: System, leaving: tuple, code: tupl
     # `code` and `structure` are what params hold that is not a number. Raises `Unlowerable`.
     if not leaving:
         return None
-    layout, multipliers = derivation.layout, derivation.multipliers
+    layout, multipliers = derivation.layout, derivation.accelerations.multipliers
 
     guards = [transition.guard for transition in leaving]
     if multipliers is None and any("multipliers" in guard.extras for guard in guards):

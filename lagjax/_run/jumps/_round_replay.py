@@ -21,7 +21,7 @@ from lagjax._run.jumps._scene_code import SceneCode
 from lagjax._tracing import lower
 
 # Operations of the line of the end of a stretch; instead of a longer one NumPy evaluates its parts.
-LONGEST = 5000
+LONGEST_REPLAYED = 5000
 
 
 def join(*arrays):
@@ -87,7 +87,7 @@ class Replay:
         fixed = [(record,), (), (2 * self.sizes["N"],), (self.sizes["NUMBERS"],)]
         given = [jax.ShapeDtypeStruct(shape, float) for shape in (*fixed, *shapes)]
         try:
-            program = lower(function, *given, budget=LONGEST)
+            program = lower(function, *given, budget=LONGEST_REPLAYED)
         except Unlowerable:
             return None
         return None if program.looks_up else Line(program.line, program.size, program.size, sum(map(math.prod, fixed)))

@@ -16,7 +16,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Float
 
 from lagjax._engine import DEFAULT_RTOL
-from lagjax._equations import LARGEST_DENSE, derivation_of
+from lagjax._equations import derivation_of, forms
 from lagjax._interface import Layout, is_concrete, join_names, not_finite, require_number
 from lagjax._native import ATOL_OVER_MOTION, ATOL_OVER_RTOL
 from lagjax._primitives import accepts_singles
@@ -29,7 +29,7 @@ from lagjax._trust.checks._scene_at_start import CheckedScene
 PyTree = Any
 
 # Units of atol: in a motion that is smaller, the errors that atol allows add up to a hundredth within a hundred steps.
-_SMALLEST = 1e4
+_SMALLEST_COORDINATE = 1e4
 
 
 def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0, params: PyTree = None) -> Findings:
@@ -83,7 +83,7 @@ def check(system: System, q: PyTree, qdot: PyTree, t: Float[ArrayLike, ""] = 0.0
 @accepts_singles(("q", "qdot"), ("t", "params"))
 def _scene_findings(system, q, qdot, t, params) -> tuple[list[Finding], str]:
     layout = Layout.from_state(q, qdot)
-    if layout.size > LARGEST_DENSE and derivation_of(system, layout, params).structure is None:
+    if layout.size > forms.LARGEST_DENSE and not derivation_of(system, layout, params).form.is_sparse:
         system = replace_functions(system, {role: getattr(system, role) for role in ROLES}, "array")
     scene = CheckedScene.from_state(system, layout, q, qdot, t, params)
     reported = _derivative_checks.findings(scene) + _dissipation(scene) + _constraint_checks.findings(scene)
@@ -92,7 +92,7 @@ def _scene_findings(system, q, qdot, t, params) -> tuple[list[Finding], str]:
         reported += [] if any(finding.level == "error" for finding in reported) else _acceleration(scene)
         return [*reported, *_time(scene)], (
             f"Not looked at: time scales, jumps nearby, which constraints follow from others, and derivatives one by "
-            f"one. That would take long for {layout.size} coordinates ({scene.derivation.structure})."
+            f"one. That would take long for {layout.size} coordinates ({scene.derivation.form.structure})."
         )
     if not any(finding.level == "error" for finding in reported):
         known = {finding.where for finding in reported if finding.kind == "kink"}  # one finding for each direction
@@ -122,7 +122,7 @@ def _small(layout: Layout, q) -> list[Finding]:
     largest = max(leaves.values(), default=0.0)
     atol = rtol * min(ATOL_OVER_RTOL, ATOL_OVER_MOTION * largest)
     # What is no more than the rounding of the others stands for zero.
-    small = tuple(name for name, size in leaves.items() if eps * largest < size < _SMALLEST * atol)
+    small = tuple(name for name, size in leaves.items() if eps * largest < size < _SMALLEST_COORDINATE * atol)
     if not small:
         return []
     size = max(leaves[name] for name in small)

@@ -69,7 +69,7 @@ def _sides_of_states(scene: CheckedScene) -> Callable:
         of_motion = borders_of_motion(scene.motion, q, v, t, params)
         return jnp.concatenate([jnp.ravel(side) for _, _, side in of_motion])
 
-    if scene.is_lowered:
+    if scene.derivation.is_lowered:
         try:
             program, numbers = lower(sides_at, *scene.state), numbers_of(params)
             return lambda points: program.evaluate_many([*points.T, *numbers]).T

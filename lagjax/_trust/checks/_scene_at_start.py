@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._equations import Derivation, Sample, Scales, augment, derivation_of, is_lowered, numbers_of, saddle_many
+from lagjax._equations import Derivation, Sample, Scales, augment, derivation_of, numbers_of, saddle_many
 from lagjax._interface import Layout, as_arrays
 from lagjax._program import Unlowerable
 from lagjax._scene import System
@@ -66,7 +66,7 @@ class CheckedScene(NamedTuple):
             "lagrangian_by_q": here.by_q, "given_force": here.extra,
             "dissipation_by_qdot": here.by_v_of_dissipation, "force": here.force,
         }  # fmt: skip
-        if not self.is_lowered:
+        if not self.derivation.is_lowered:
             by_v = here.by_v_of_dissipation
             of_terms = (here.by_q,), (here.momentum[0],), (here.mass[0],), drift.values(), (by_v,), (here.jacobian[0],)
             return Sides(minus, plus, np.zeros_like(here.here), tuple(_rounding(*terms) for terms in of_terms))
@@ -100,13 +100,9 @@ class CheckedScene(NamedTuple):
         return self.sample._replace(q=points[:, :n], qdot=points[:, n:-1], t=points[:, -1])
 
     @property
-    def is_lowered(self) -> bool:
-        return is_lowered(self.derivation)
-
-    @property
     def is_large(self) -> bool:
         """True if M and G are known by products alone: `Measured` holds those with one vector, (…, 1)."""
-        return self.derivation.structure is not None
+        return self.derivation.form.is_sparse
 
     def line(self, direction: np.ndarray, steps: np.ndarray) -> "LineValues":
         """The scene along a `direction` (2n + 1,) of the coordinates, the velocities and the time of the motion."""
@@ -260,8 +256,9 @@ def _measure(here: Sample, offsets: np.ndarray) -> Measured:
     velocity = here.qdot + offsets[:, n:]
     near = here._replace(q=here.q + offsets[:, :n], qdot=velocity)
     acceleration, power = None, np.zeros((len(offsets), 2))
-    of = near.quantities("momentum", *_AT_STATE, *(_MATRICES if here.derivation.structure is None else _PRODUCTS))
-    if here.derivation.structure is not None:
+    large = here.derivation.form.is_sparse
+    of = near.quantities("momentum", *_AT_STATE, *(_PRODUCTS if large else _MATRICES))
+    if large:
         acceleration = of["acceleration"][0]
         of |= {"mass_matrix": of["mass_by_some"][..., None], "jacobian": of["jacobian_by_some"][..., None]}
     if here.derivation.motion.dissipation is not None:

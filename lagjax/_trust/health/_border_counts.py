@@ -18,7 +18,7 @@ from lagjax._run import Members
 from lagjax._scene import System
 from lagjax._trust.health._measurements import path_of
 
-LARGEST_PORTION = 2**22  # numbers of steps that are written down at once
+LARGEST_COUNTED = 2**22  # numbers of steps that are written down at once
 
 
 class Met(NamedTuple):
@@ -53,7 +53,7 @@ def count_borders(members: Members) -> tuple[bool, Met | None]:
     columns = [np.broadcast_to(x, members.count) for x in members.numbers]
     params = np.stack(columns, axis=1) if columns else np.zeros((members.count, 0))
     moved = np.flatnonzero(np.isfinite(start).all(axis=1) & (ts[:, 1] != ts[:, 0]) & (steps > 0))
-    for some in portions(moved, steps * (flow.states + 5 + len(flow.kernel.borders.switches)), LARGEST_PORTION):
+    for some in portions(moved, steps * (flow.states + 5 + len(flow.kernel.borders.switches)), LARGEST_COUNTED):
         tolerances = Tolerances(rtol, atol, 2 * int(steps[some].max()) + 100)
         _count(flow, ts[some], start[some], params[some], tolerances, steps[some], some, nothing)
     return True, nothing

@@ -13,7 +13,17 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._equations import SADDLE, Derivation, Motion, Sample, derivation_of, distances, solve_saddle, unit_diagonal
+from lagjax._equations import (
+    SADDLE,
+    Derivation,
+    Diagonal,
+    Motion,
+    Sample,
+    derivation_of,
+    distances,
+    solve_saddle,
+    unit_diagonal,
+)
 from lagjax._interface import Layout
 from lagjax._program import Unlowerable
 from lagjax._scene import System
@@ -54,8 +64,7 @@ class Law(NamedTuple):
     @property
     def knows_mass(self) -> bool:
         """True if the eigenvalues of M are known: not of a large scene, unless M is diagonal."""
-        structure = self.derivation.structure
-        return structure is None or structure.has_diagonal_mass
+        return not self.derivation.form.is_sparse or isinstance(self.derivation.form.mass, Diagonal)
 
     @classmethod
     def from_system(cls, system: System, layout: Layout, params, mode: str) -> "Law":
@@ -124,7 +133,7 @@ class Law(NamedTuple):
         by_q = jax.jacrev(lambda *state: motion.momentum(*state)[chosen])(*state)
         finite = jnp.all(jnp.stack([jnp.isfinite(leaf).all() for leaf in _slopes_of_all(motion, *state)]))
         of = motion.quantities(*state)
-        if self.derivation.structure is not None:
+        if self.derivation.form.is_sparse:
             units = jnp.zeros((len(momenta), q.size), q.dtype).at[np.arange(len(momenta)), chosen].set(1.0)
             mass = _conditions_of_diagonal(of["mass_diagonal"]) if self.knows_mass else jnp.full(3, jnp.nan, q.dtype)
             of |= {"momenta_by_qdot": jax.vmap(motion.mass_product(*state))(units), "mass": mass}
@@ -234,7 +243,7 @@ def _constants(system: System, derivation: Derivation) -> tuple[bool, tuple[int,
         could_work = any("t" in function.extras for function in functions if function is not None) or any(
             part is not None for part in (motion.forces, motion.dissipation, motion.constraints.on_velocities)
         )
-        free = derivation.structure is not None and not (could_work or motion.constrained)
+        free = derivation.form.is_sparse and not (could_work or motion.constrained)
         cyclic = derivation.cyclic if free else None
         return could_work, None if cyclic is None else cyclic[:_MOMENTA]
 

@@ -16,7 +16,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._equations import Sample, borders_of, is_lowered, map_in_chunks, numbers_of_state
+from lagjax._equations import Sample, borders_of, map_in_chunks, numbers_of_state
 from lagjax._interface import Layout, is_concrete
 from lagjax._primitives import DOUBLE, widen, with_doubles
 from lagjax._run import Members
@@ -87,7 +87,7 @@ def _report_in_doubles(members: Members) -> dict[str, Any] | None:
     """The report of all members, whose laws are those of float64; None where a scene has no programs."""
     layout = dataclasses.replace(members.layout, dtype=DOUBLE)
     laws = _laws(members.trajectory, layout, widen(members.params))
-    if not all(is_lowered(law.derivation) for law in laws):
+    if not all(law.derivation.is_lowered for law in laws):
         return None
     return _report_of(members, laws) | _names(laws, layout)
 

@@ -1,0 +1,410 @@
+"""`Accelerations`: the linear systems of a scene on scalars, and all that is solved for by them.
+
+    M x − Gᵀλ = b,    G x = c
+
+with b and c of the accelerations, or of the steps back to the constraints, for M that is regular (`program`) or need
+not be (`general`), is built by recursion, or need not be positive definite. Each is written down as formulas in JAX on
+scalars, which call the programs of a `Derivation`, and lowered: an elimination that is written in `jnp` costs nothing
+to test, and its derivatives are JAX's.
+"""
+
+import functools
+import threading
+from collections.abc import Callable
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from lagjax._equations import _form as forms
+from lagjax._equations import _saddle
+from lagjax._equations._constraints import velocity_scales
+from lagjax._equations._linear import eigen, is_definite, solve_many
+from lagjax._equations._recursion import RecursiveElimination
+from lagjax._native import Projection
+from lagjax._program import StraightLine, Unlowerable, is_smooth
+from lagjax._tracing import (
+    Program,
+    apply_function,
+    concatenate,
+    lower_formula,
+    lower_solution,
+    multiply,
+    scatter,
+    stack,
+)
+
+if TYPE_CHECKING:
+    from lagjax._equations._derivation import Derivation
+
+# The order of coordinates of states far away, where a force between bodies is weak: its square is then a millionth.
+_FAR = 1e3
+
+# Steps of 0.3, of numbers of order one, to parameters that make M positive definite: eight coordinates take some ten.
+_MOST_CLIMBED = 60
+_INDEFINITE = "its mass matrix is not positive definite and needs pivoting"
+
+
+class _Saddle(NamedTuple):
+    """M x − Gᵀλ = b, G x = c by the names of b (None: zero) and c, the `sign` of c, whether `velocities` are in G."""
+
+    b: str | None
+    c: str
+    sign: int
+    velocities: bool = True
+
+
+_MATRICES = "mass_matrix", "jacobian"
+_ACCELERATION = _Saddle("force", "gamma", 1)
+_VELOCITY_STEP = _Saddle(None, "rates", -1)
+_POSITION_STEP = _Saddle(None, "residual", -1, velocities=False)
+
+
+def lowered_once(make: Callable) -> property:
+    """A property that is made once; what could not be lowered raises the same `Unlowerable` again, without the work."""
+    name = make.__name__
+
+    @functools.wraps(make)
+    def get(self):
+        if name not in self._made:
+            with self._lock:
+                if name not in self._made:
+                    try:
+                        self._made[name] = make(self)
+                    except Unlowerable as reason:
+                        self._made[name] = reason
+        made = self._made[name]
+        if isinstance(made, Unlowerable):
+            raise Unlowerable(str(made)) from None
+        return made
+
+    return property(get)
+
+
+class Accelerations:
+    """The programs of a derivation that solve linear systems. Each is lowered on first use, or raises `Unlowerable`."""
+
+    def __init__(self, derivation: "Derivation"):
+        self.of, self.motion, self.layout = derivation, derivation.motion, derivation.layout
+        self._made: dict[str, Any] = {}
+        self._lock = threading.RLock()
+        self._responses: dict[tuple[int, ...], Program] = {}
+        self._sampled: dict[float, list[tuple[csr_array, csr_array]]] = {}
+
+    @lowered_once
+    def program(self) -> Program:
+        """q̈, then whether M, or its saddle point with the constraints, is singular.
+
+        Where L builds velocities by recursion, and that is shorter, they are eliminated, not M (see `_recursion`): the
+        last output tells where that does not hold.
+
+        With constraints M may be singular (a parameter may make it so) as long as the saddle point is not. To allow for
+        that costs three times the arithmetic. Where M is regular in general the program is therefore the regular-M
+        variant, and its last output tells where that would cost digits; there `otherwise()` is the general variant.
+        Machine code changes over where that comes about, with the numbers of the run at hand; XLA, which has to write
+        the program down before it knows them, takes the one that always holds (`Program.complete`).
+        """
+        mechanics = self._mechanics
+        if (variant := self._recursive_acceleration()) is not None:
+            return replace(variant, otherwise=lambda: self.general, mechanics=mechanics)
+        usual = self.motion.constrained and not self.motion.constraints.held
+        if not usual or self._constant_mass or not self._regular(_ACCELERATION):
+            return self.general
+        variant = self._solution(_ACCELERATION, regular_only=True)
+        return replace(variant, otherwise=lambda: self.general, mechanics=mechanics)
+
+    @lowered_once
+    def general(self) -> Program:
+        program, mechanics = self._solution(_ACCELERATION), self._mechanics
+        return program if mechanics is None else replace(program, mechanics=mechanics)
+
+    @lowered_once
+    def _mechanics(self) -> StraightLine | None:
+        """The quantities that decide where L jumps (`_kick.Mechanics`), as one line; None if nothing is piecewise.
+
+        Constraints that numbers release, those of contacts, are left out: they push, and do not pull.
+        """
+        count, n = self.of.shape("rates")[0], self.layout.size
+        holds = np.arange(count) if self.motion.constraints.held is None else np.flatnonzero(self.of.absent("release"))
+        of = self.of.positions
+        first, rates = [*of("lagrangian"), *of("momentum")], of("rates")[holds]
+        if is_smooth(self.of.whole.select_outputs([*first, *rates]).line):
+            return None
+        rows = of("jacobian").reshape(-1, n)[holds].ravel()
+        outputs = [*first, *of("mass_matrix"), *rows, *rates, *of("driving")[holds]]
+        return self.of.whole.select_outputs(outputs).line
+
+    @lowered_once
+    def multipliers(self) -> Program | None:
+        """λ, those of `constraints` first; redundant ones are zero. None without constraints."""
+        if not self.motion.constrained:
+            return None
+        system, solve = self._system(_ACCELERATION)
+
+        def multipliers(*scalars):
+            _, _, right, factors, _ = system(*scalars)
+            return -solve(factors, right)[self.layout.size :]
+
+        return lower_formula(multipliers, *self.of.scalar_shapes, budget=forms.OPERATION_BUDGET)
+
+    def impact_response(self, rows: tuple[int, ...], states: int, free: "Derivation") -> Program:
+        """The response to impulses at K `rows` of G: G, G M⁻¹ (K, n), G M⁻¹ Gᵀ (K, K), values, rates, G q̈ − γ (K,).
+
+        The last `states` parameters say what is held, and G is that where everything is. The motion where nothing is,
+        with q̈ and M⁻¹, which leaves the other constraints as they are, is that of `free`.
+        """
+        if rows in self._responses:
+            return self._responses[rows]
+        system, solve = free.accelerations._system(_VELOCITY_STEP)
+        n, (m, _), (others, _) = self.layout.size, self.of.shape("jacobian"), free.shape("jacobian")
+        parts, acceleration = self.of.program("jacobian", "residual", "rates", "gamma"), free.accelerations.program
+
+        def response(*scalars):
+            values = parts.vector(*scalars[: len(scalars) - states], *[0.0 * scalars[0] + 1.0] * states)
+            factors, accelerations = system(*scalars)[3], acceleration.vector(*scalars)[:n]
+            gradients = [values[n * i : n * (i + 1)] for i in rows]
+            moved = [solve(factors, scatter(row, np.arange(n), n + others))[:n] for row in gradients]
+            residuals, rates, gammas = (values[[(n + part) * m + i for i in rows]] for part in range(3))
+            bends = multiply(gradients, [accelerations]) - gammas
+            return concatenate([*gradients, *moved, multiply(gradients, moved), residuals, rates, bends])
+
+        self._responses[rows] = lower_formula(response, *self.of.scalar_shapes, budget=forms.OPERATION_BUDGET)
+        return self._responses[rows]
+
+    @lowered_once
+    def projected(self) -> Program | None:
+        """(q, q̇) after one Newton step of each kind back to the constraints, as `Motion.projected`; or None."""
+        if not self.motion.constrained:
+            return None
+        n = self.layout.size
+        velocity = self._solution(_VELOCITY_STEP)
+        position = None if self.motion.constraints.on_positions is None else self._solution(_POSITION_STEP)
+
+        def projected(*scalars):
+            q, v, rest = stack(scalars[:n]), stack(scalars[n : 2 * n]), scalars[n:]
+            if position is not None:
+                q = q + position.vector(*scalars)[:n]
+            return concatenate([q, v + velocity.vector(*(q[i] for i in range(n)), *rest)[:n]])
+
+        return lower_formula(projected, *self.of.scalar_shapes, budget=forms.OPERATION_BUDGET)
+
+    @lowered_once
+    def velocity_scales(self) -> Program | None:
+        """The `velocity_scales` of a state, (n,); None without constraints."""
+        if not self.motion.constrained:
+            return None
+        n, (mass, rows) = self.layout.size, map(self.of.positions, _MATRICES)
+        touched = np.flatnonzero(~self.of.absent("jacobian").all(axis=0))
+        parts = self.of.whole.select_outputs([*mass[:: n + 1], *rows.reshape(-1, n)[:, touched].ravel()])
+
+        def scale_arrays(values, qdot):
+            return velocity_scales(values[:n], values[n:].reshape(-1, len(touched)), qdot, touched)
+
+        def scales(*scalars):
+            of_touched = apply_function(scale_arrays, parts.vector(*scalars), stack(scalars[n : 2 * n]))
+            return scatter(of_touched, touched, n)
+
+        return lower_formula(scales, *self.of.scalar_shapes, budget=forms.OPERATION_BUDGET)
+
+    @lowered_once
+    def projection(self) -> Projection | None:
+        """The programs by which machine code keeps a motion on its constraints; None without any."""
+        return None if self.projected is None else Projection(self.projected, self.velocity_scales)
+
+    def _solution(self, saddle: _Saddle, regular_only: bool = False) -> Program:
+        """x of a linear system, and then whether it is singular."""
+        system, solve = self._system(saddle, regular_only)
+        return lower_solution(system, solve, self.layout.size, *self.of.scalar_shapes, budget=forms.OPERATION_BUDGET)
+
+    @lowered_once
+    def lacks(self) -> str | None:
+        """Why its accelerations are not solved for on scalars, as the end of a sentence; None where they are."""
+        try:
+            self._system(_ACCELERATION)
+        except Unlowerable as why:
+            return str(why)
+
+    def _system(self, saddle: _Saddle, regular_only: bool = False) -> tuple[Callable, Callable]:
+        """A z = r with z = (x, −λ), as two functions of scalars.
+
+        The first gives the entries of A, r, factors of A and whether it is singular; the second z, of factors and r.
+        """
+        n, m, regular = self.layout.size, self._rows(saddle), self._regular(saddle)
+        if regular is None and not self._pivots:
+            raise Unlowerable(_INDEFINITE)
+        zeros = self.of.absent("mass_matrix"), self.of.absent("jacobian")[:m]
+        released = self.motion.constraints.held is not None
+        augmented = self.motion.constrained and not (regular_only or ((self._constant_mass or released) and regular))
+        if n == 2 and not self.motion.constrained:
+            elimination = _saddle.TwoCoordinates(zeros[0], self.layout.dtype)
+        elif regular is None:
+            elimination = _saddle.IndefiniteElimination(zeros[0], self.layout.dtype)
+        else:
+            elimination = _saddle.SaddleElimination(zeros, self.layout.dtype, augmented, regular_only, released)
+            if released and saddle.b is not None:
+                elimination = _saddle.DraggedElimination(elimination, self.of.absent("drag"))
+        if elimination.operations > forms.OPERATION_BUDGET:
+            raise Unlowerable(
+                f"to solve for the accelerations takes some {elimination.operations} operations, more than the "
+                f"{forms.OPERATION_BUDGET} that are expected to fit in memory"
+            )
+        parts = self._parts(saddle, elimination, m)
+        count, places = len(elimination.entries), elimination.entries
+
+        def system(*scalars):
+            values = parts(*scalars)
+            entries, c, b = values[:count], values[count : count + m], values[count + m :]
+            factors, singular = elimination.factors(entries)
+            c = c if saddle.sign > 0 else -c
+            b = scatter(c[:0], np.zeros(0, int), n) if saddle.b is None else b
+            return places, entries, concatenate([b, c]), factors, singular
+
+        return system, elimination.solve
+
+    def _recursive_acceleration(self) -> Program | None:
+        """q̈ by the recursion in L; None where there is none, or where it does not hold at a sampled state."""
+        if self.of.recursion is None or self._regular(_ACCELERATION) is None:
+            return None
+        elimination, n = RecursiveElimination(self.of.recursion, self.layout.dtype), self.layout.size
+        places, count = elimination.entries, len(elimination.entries)
+        positions = [*self.of.positions("recursion"), *self.of.positions("force")]
+        cut = functools.cache(lambda: self.of.whole.select_outputs(positions))
+
+        def system(*scalars):
+            values = cut().vector(*scalars)
+            right = scatter(values[count:], np.arange(n), n + 2 * elimination.velocities)
+            return places, values[:count], right, *elimination.factors(values[:count])
+
+        program = lower_solution(system, elimination.solve, n, *self.of.scalar_shapes, budget=forms.OPERATION_BUDGET)
+        return program if self._agrees(program) else None
+
+    def _agrees(self, program: Program) -> bool:
+        """True if a program for q̈ gives that of M q̈ = F at the sampled states."""
+        columns = self._columns()
+        of = self.of.evaluate(["mass_matrix", "force"], columns)
+        exact = solve_many(of["mass_matrix"], of["force"][:, :, None])[:, :, 0]
+        *found, singular = program.evaluate_many(columns)
+        usable = np.isfinite(exact).all(axis=1)
+        error = np.abs(np.array(found).T - exact)[usable]
+        return not singular[usable].any() and bool((error <= 1e-6 * np.abs(exact[usable]).max(initial=0)).all())
+
+    def _parts(self, saddle: _Saddle, elimination, constraints: int) -> Callable:
+        """A formula for the entries of an elimination, the `constraints` numbers of c, and b, end to end."""
+        n = self.layout.size
+        row, column = elimination.entries.T
+        names = "mass_matrix", "jacobian", "release", "drag"
+        ends = np.cumsum([0, *map(self.of.count, names)])
+        m = self.of.shape("jacobian")[0]
+        place = np.select([column < n, row >= n], [n * row + column, ends[2] + row - n], ends[3] + m * row + column - n)
+        filled = np.concatenate([end + self.of.filled[name] for end, name in zip(ends, names, strict=False)])
+        outputs = np.concatenate([self.of.filled_positions(name) for name in names]).astype(int)
+        at = np.searchsorted(filled, place)
+        found = np.append(filled, -1)[at] == place
+        given = np.where(found, np.append(outputs, 0)[at], 0), self.of.positions(saddle.c)[:constraints]
+        positions = np.concatenate([*given, *([] if saddle.b is None else [self.of.positions(saddle.b)])])
+        cut = functools.cache(lambda: self.of.whole.select_outputs(positions))
+        return lambda *scalars: cut().vector(*scalars)
+
+    def _rows(self, saddle: _Saddle) -> int:
+        return self.of.shape("jacobian")[0] if saddle.velocities else self.of.position_count
+
+    @lowered_once
+    def _constant_mass(self) -> bool:
+        return not self.of.reads("mass_matrix")
+
+    def samples(self, reach: float = 1.0, numbers: Any = None) -> list[tuple[csr_array, csr_array]]:
+        """M and G at a few states that nothing speaks for, where they are finite; `numbers` are those of params."""
+        if numbers is not None:
+            return self._evaluate_matrices([*self._columns(reach)[: 2 * self.layout.size + 1], *numbers])
+        if reach not in self._sampled:
+            self._sampled[reach] = self._evaluate_matrices(self._columns(reach))
+        return self._sampled[reach]
+
+    @functools.cached_property
+    def _entries(self) -> Program:
+        """The numbers of M and G that are not zero as they are derived."""
+        return self.of.whole.select_outputs([k for name in _MATRICES for k in self.of.filled_positions(name)])
+
+    def _evaluate_matrices(self, columns: list) -> list[tuple[csr_array, csr_array]]:
+        shapes, ends = [self.of.shape(name) for name in _MATRICES], [len(self.of.filled["mass_matrix"])]
+        places = [np.divmod(self.of.filled[name], self.layout.size) for name in _MATRICES]
+        samples = [np.split(x, ends) for x in self._entries.evaluate_many(columns).T if np.isfinite(x).all()]
+        make: Any = lambda *matrix: csr_array(matrix[:2], shape=matrix[2])  # noqa: E731
+        return [tuple(map(make, of, places, shapes)) for of in samples]
+
+    def _columns(self, reach: float = 1.0) -> list[np.ndarray]:
+        """The inputs at these states, one array (states,) for each: of order one, but q of this order."""
+        n, columns = self.layout.size, np.random.default_rng(0).uniform(0.3, 1.2, (3, len(self.of.scalar_shapes))).T
+        return [reach * x for x in columns[:n]] + list(columns[n:])
+
+    def _regular(self, saddle: _Saddle) -> bool | None:
+        """True if M is regular in general: at all of the sampled states; None where it need not be positive definite.
+
+        Elimination without pivoting is for positive definite M. With constraints M may be singular, and is then
+        augmented by GᵀG. The choice is between right answers: a wrong guess is caught by the test on the pivots. A mass
+        matrix that is a series in something small, as 1/(c² r) in relativity, is positive definite where that is small:
+        a scene counts as positive definite that is so at all states near, or at all far away.
+        """
+        for reach in (1.0, _FAR):
+            if (regular := self._judge(self.samples(reach), self._rows(saddle))) is not None:
+                return regular
+        samples = self.samples(1.0, self._favorable) if self.of.counts_on_params else None
+        return None if samples is None else self._judge(samples, self._rows(saddle))
+
+    def _judge(self, samples: list[tuple[csr_array, csr_array]], m: int) -> bool | None:
+        """True if M is regular at some states; None where it is not positive definite, on m rows of G at rest."""
+        regular = True
+        for matrix, jacobian in samples:
+            size = abs(matrix).max()
+            if is_definite(matrix, 1e-10 * size):
+                continue
+            regular, rows = False, jacobian[:m]
+            lowest = np.linalg.eigvalsh((matrix + rows.T @ rows).toarray())[0]
+            if (self.layout.size > 2 or m) and not lowest >= -1e-12 * size:
+                return None
+        return regular
+
+    @functools.cached_property
+    def depend_on_params(self) -> bool:
+        """True if nothing pivots, and parameters decide whether M is positive definite."""
+        try:
+            settled = self._pivots or self._regular(_ACCELERATION) is not None
+            return not settled and self._favorable is not None
+        except Unlowerable:
+            return False
+
+    def suit(self, numbers: np.ndarray) -> bool:
+        """True if M is positive definite with these parameters, at all sampled states near or at all far away."""
+        rows = self._rows(_ACCELERATION)
+        return any(self._judge(self.samples(reach, numbers), rows) is not None for reach in (1.0, _FAR))
+
+    @property
+    def _pivots(self) -> bool:
+        return not self.motion.constrained and self.layout.size <= _saddle.LARGEST_INDEFINITE
+
+    @functools.cached_property
+    def _favorable(self) -> np.ndarray | None:
+        """Numbers of params, none negative, that make M, with GᵀG, positive definite; None where none are found.
+
+        From those of the samples it is climbed along the slopes of what is negative in M: couplings, which are numbers
+        of their own, fall to zero.
+        """
+        first = 2 * self.layout.size + 1
+        program, columns = self.of.program("mass_matrix", "jacobian"), [x[:1] for x in self._columns()]
+        for _ in range(_MOST_CLIMBED):
+            samples = self._evaluate_matrices(columns)
+            if not samples:
+                return None
+            matrix, jacobian = (x.toarray() for x in samples[0])
+            values, vectors = eigen(matrix + jacobian.T @ jacobian)
+            if values[0] > 1e-3 * values[-1]:
+                return np.concatenate(columns[first:])
+            low = vectors[:, values <= 1e-3 * values[-1]]
+            slopes = program.line.vjp(columns, [*(low @ low.T).ravel(), *[None] * jacobian.size])[first:]
+            slopes = np.array([0.0 if x is None else x[0] for x in slopes])
+            if not np.isfinite(slopes).all() or not slopes.any():
+                return None
+            climbed = np.concatenate(columns[first:]) + 0.3 * slopes / np.linalg.norm(slopes)
+            columns[first:] = list(np.maximum(climbed, 0.0)[:, None])
+        return None
