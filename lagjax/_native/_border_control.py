@@ -24,9 +24,10 @@ from lagjax._native._saltation import Saltation
 from lagjax._native._step import absolute_tolerance
 from lagjax._native._taylor import TaylorSeries, integer
 from lagjax._native._watch import Border, Crossed, GuardTable, Touch, end_at_border, joint_groups, reaches_border
-from lagjax._program import _borders
-from lagjax._program._borders import BELOW, FALLS, GROWS, SQUARED, UP_TO, Feature
+from lagjax._program._borders import gradient
+from lagjax._program._features import BELOW, FALLS, GROWS, SQUARED, UP_TO, Feature
 from lagjax._program._jump import Jump, Nesting
+from lagjax._program._levels import CONE, SIGN, SLIDE, TABLE, Borders
 from lagjax._program._passes import eliminate_dead_code
 
 NOWHERE = 1e300  # a level that no switching number comes to
@@ -41,9 +42,7 @@ class BorderControl:
     tangents (`nesting`) it has a `jump` of these.
     """
 
-    def __init__(
-        self, motion: TaylorSeries, borders: _borders.Borders, nesting: Nesting, returns: bool, jump: Jump | None
-    ):
+    def __init__(self, motion: TaylorSeries, borders: Borders, nesting: Nesting, returns: bool, jump: Jump | None):
         self.forgotten, base = {"h_before": 0.0} if returns else {}, nesting.base
         self.motion, self.borders, self.guards = motion, borders, borders.guards
         self.pieces, self.roots = motion.pieces, Roots(motion)
@@ -65,7 +64,7 @@ class BorderControl:
         self.cross = self._cross()
 
     @staticmethod
-    def fields(borders: _borders.Borders) -> Fields:
+    def fields(borders: Borders) -> Fields:
         guards, pieces = len(borders.guards), len(borders.switches)
         fields: Fields = {
             "touch": guards,  # the `Touch` of a guard where the step begins
@@ -345,7 +344,7 @@ class BorderControl:
         """The levels of guards that change: entries on both sides of the pieces of tables, and the speeds of cones."""
         code = frame.code
         for g, guard in enumerate(self.guards):
-            if self.borders.kinds[guard.piece] == _borders.CONE:
+            if self.borders.kinds[guard.piece] == CONE:
                 j = integer(code, guard.piece)
                 fall = (0.0 - self.motion.followed_coefficient(frame, j, integer(code, 1))) * frame["forward"]
                 last = fall * (limits.LAST_STEPS * frame["smallest"])  # what is gone in the shortest steps
@@ -353,7 +352,7 @@ class BorderControl:
                 far = self.motion.followed_value(frame, j) > limits.AT_REST * unit
                 least = unit * code.select(far, limits.AT_REST, limits.SETS_OUT)
                 frame["level", g] = code.select(last > least, last, least)
-            if self.borders.kinds[guard.piece] == _borders.TABLE:
+            if self.borders.kinds[guard.piece] == TABLE:
                 index = self.table.piece(frame, guard.piece) + guard.level.offset
                 knot, inside = self._knot(frame, guard.piece, index)
                 frame["level", g] = code.select(inside, knot, NOWHERE if guard.level.offset else -NOWHERE)
@@ -361,7 +360,7 @@ class BorderControl:
     @property
     def slides(self) -> bool:
         """True if the motion may slide along a border that other switching numbers depend on."""
-        return _borders.SLIDE in self.borders.kinds
+        return SLIDE in self.borders.kinds
 
     # ---- narrow features ----
 
@@ -484,7 +483,7 @@ class BorderControl:
         """
         frame, motion, n = self.motion.function("graze"), self.motion, self.motion.n
         code, order, by = frame.code, frame.job("order"), [*range(base), *range(n, n + base)]
-        line = _borders.gradient(self.borders, by)
+        line = gradient(self.borders, by)
         counts = self.table.counts(frame)
         noted, ends = self.table.crosses_any(frame) & counts, self.table.crosses(frame, Crossed.GUARD) & counts
         with code.only_if(code.any_lane(noted)):
@@ -675,7 +674,7 @@ class BorderControl:
         return begins & found & frame.code.compare("==", frame["h"], 0.0)
 
     def _kicks_by_sign(self, j: int) -> bool:
-        return j in self.kicks_in_time and self.borders.kinds[j] == _borders.SIGN
+        return j in self.kicks_in_time and self.borders.kinds[j] == SIGN
 
     def _look_at_end(self, frame: Frame, degree: Value, h: Value) -> None:
         """A step ends, to rounding, where L jumps at the end of the motion: with the velocities behind, in time."""
@@ -745,7 +744,7 @@ class BorderControl:
         by_velocity = [
             j
             for j, node in enumerate(self.borders.switches)
-            if self.borders.kinds[j] != _borders.SLIDE and not self.borders.read_by(node).isdisjoint(velocities)
+            if self.borders.kinds[j] != SLIDE and not self.borders.read_by(node).isdisjoint(velocities)
         ]
         if by_velocity:
             for j in range(self.pieces):

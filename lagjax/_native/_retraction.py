@@ -19,9 +19,9 @@ from lagjax._native._frame import Frame, Index, Vectors
 from lagjax._native._ir import Code, Value
 from lagjax._native._tangent_memory import Directions
 from lagjax._native._taylor import TaylorSeries, integer
-from lagjax._program._borders import SLIDE, Borders
 from lagjax._program._differentiation import pullback_and_entries, pushforward
 from lagjax._program._jump import Nesting
+from lagjax._program._levels import SLIDE, Borders
 
 Numbers = Callable[[Index], Value]
 

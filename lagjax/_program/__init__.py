@@ -25,9 +25,10 @@ Derivatives of a program are those of its operations, programs again that are ma
 
 `_operations` has a row for each operation: its value, its derivatives, its series. `_graph` shares and, by `_simplify`,
 folds; `_scalars` writes formulas on it, `_passes` finish it; `_differentiation` differentiates it. Series: `_series`,
-with `_recurrences` for operations that have one of their own. Pieces: `_borders` (where they meet), `_sliding` (along
-them), `_jump` and `_kick` (over them), `_powers` (where no series helps), `_look_ups` (tables). A program
-consists of a `_line`, with its values in NumPy; `_emit` is for JAX, `_rounding` for their error. `_memory` bounds what
+with `_recurrences` for operations that have one of their own. Pieces: `_levels` (what they are), `_borders` (where they
+meet), `_cones` (of lengths), `_sliding` (along them, by `_small_equations`), `_jump` and `_kick` (over them),
+`_features` and `_powers` (where no series helps), `_look_ups` (tables). A program consists of a `_line`, with its
+values in NumPy; `_emit` is for JAX, `_rounding` for their error. `_memory` bounds what
 a graph may take. `lowering/` turns JAX's operations into scalars.
 """
 
@@ -42,23 +43,12 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from lagjax._program import _scalars as scalar_algebra
-from lagjax._program._borders import (
-    CLOCK,
-    FLOOR,
-    SIGN,
-    TABLE,
-    TRUNC,
-    Borders,
-    borders,
-    distances,
-    find_corners,
-    is_smooth,
-    with_outputs,
-)
+from lagjax._program._borders import borders, distances, find_corners, is_smooth, with_outputs
 from lagjax._program._differentiation import Derivatives, copy_nodes, pullback, pushforward, tangents_in, with_tangents
 from lagjax._program._emit import Rows, apply_in_jax, emit, emit_look_up, emit_rows
 from lagjax._program._graph import INPUTS, Graph, Tape, Unlowerable, find_ancestors
 from lagjax._program._jump import row_places
+from lagjax._program._levels import CLOCK, FLOOR, SIGN, TABLE, TRUNC, Borders
 from lagjax._program._line import StraightLine
 from lagjax._program._look_ups import table_of
 from lagjax._program._memory import lack_of_memory, machine_memory, operations_that_fit
@@ -67,7 +57,8 @@ from lagjax._program._passes import eliminate_dead_code, factor, sink_negations
 from lagjax._program._rounding import rounding
 from lagjax._program._scalars import Scalars, absolute, apply_function, concatenate, fold, multiply, scatter, stack
 from lagjax._program._series import LinearSystem, series
-from lagjax._program._sliding import MOST_COUPLED, eliminate, sparse_row, substitute
+from lagjax._program._sliding import MOST_COUPLED
+from lagjax._program._small_equations import eliminate, sparse_row, substitute
 from lagjax._program.lowering import _complex
 from lagjax._program.lowering._matrices import orthogonalize, row_weights, solve_orthogonalized
 from lagjax._program.lowering._rules import (

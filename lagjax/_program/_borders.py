@@ -23,212 +23,60 @@ a border is no piece but a feature, and a step that is to pass it begins next to
 import functools
 import math
 from collections.abc import Callable, Container, Sequence
-from dataclasses import dataclass
 from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from lagjax._program._cones import find_cones, list_squares, velocity_degrees
 from lagjax._program._differentiation import copy_nodes, gradient_in, pullback
-from lagjax._program._graph import Graph, find_ancestors
+from lagjax._program._features import (
+    BELOW,
+    BESIDE,
+    FALLS,
+    FEATURES,
+    GROWS,
+    UP_TO,
+    Feature,
+)
+from lagjax._program._graph import Graph
 from lagjax._program._kick import Jumping, Kick, Mechanics, kick_line
-from lagjax._program._look_ups import Located, Table
-from lagjax._program._operations import LOOK_UPS, OPERATIONS
+from lagjax._program._levels import (
+    CLOCK,
+    CONE,
+    FLOOR,
+    NOTHING,
+    SIGN,
+    SLIDE,
+    TABLE,
+    TRUNC,
+    Borders,
+    Pieced,
+    inputs_below,
+    list_guards,
+    nodes_below,
+    piece_of,
+)
+from lagjax._program._look_ups import Located
+from lagjax._program._operations import COMPARISONS, GROWING, LOOK_UPS, OPERATIONS
 from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._powers import LEAST_POWER, find_powers
 from lagjax._program._recurrences import LARGEST_WHOLE
 from lagjax._program._rounding import rounding
 from lagjax._program._series import LinearSystem, Recurrent, StraightLine
 from lagjax._program._simplify import is_nonnegative
-from lagjax._program._sliding import FAR, LARGEST_COPIED, MOST_SLIDING, Slide, dot, with_sliding
+from lagjax._program._sliding import FAR, LARGEST_COPIED, MOST_SLIDING, Slide, with_sliding
+from lagjax._program._small_equations import dot
 
 BENT = "a constraint prescribes a speed that jumps"  # a reason to refuse a kick
-# The kinds of pieces; `CLOCK` is the piece of a table that the time itself is on, whose borders are known.
-SIGN, FLOOR, TRUNC, SLIDE, TABLE, CLOCK, CONE = range(7)
 LARGEST_WITH_ROUNDING = 500  # operations of numbers that are watched, and whose rounding is: three times as many
-# What a function is flat like: exp(u) below, exp(−|u|) on both sides, exp(−u²), or zero up to a border; and in which
-# units of its argument. Of powers these are exponents: |u| to the minus `scale` grows as |u| falls, u to the `scale` as
-# it grows from what is nothing.
-BELOW, BESIDE, SQUARED, UP_TO, FALLS, GROWS = range(6)
-_FEATURES = {
-    "exp": (BELOW, 1.0), "exp2": (BELOW, math.log(2.0)), "expm1": (BELOW, 1.0), "logistic": (BESIDE, 1.0),
-    "tanh": (BESIDE, 2.0), "sinh": (BESIDE, 2.0), "cosh": (BESIDE, 2.0), "erf": (SQUARED, 1.0), "erfc": (SQUARED, 1.0),
-}  # fmt: skip
-_EXPONENTIALS = ("exp", "exp2", "expm1", "sinh", "cosh")
-# The length of a vector at rest, whose square is there, and the longest one that a guard against zero may put there.
-_NOTHING, _NO_LENGTH = 2.0**-500, 1e-12
 _BENT = 1e-9  # of a ratio that is the same at all states: a million roundings
 _LARGEST = 10  # operations that one may become: a bound for errors, three are usual
-_COMPARISONS = ("lt", "le", "gt", "ge")
 _PIECEWISE = {
-    *_COMPARISONS, "abs", "max", "min", "sign", "floor", "ceil", "trunc", "round", "rem", "convert", "locate", "atan2"
+    *COMPARISONS, "abs", "max", "min", "sign", "floor", "ceil", "trunc", "round", "rem", "convert", "locate", "atan2"
 }  # fmt: skip
 _WITHOUT_ANY = {"input", "constant", "add", "sub", "neg", "sin", "cos"}  # no piece, no feature
 # Functions without a series where their first operand is zero, or ±1.
 _SINGULAR_AT_ZERO, _SINGULAR_AT_ONE = ("sqrt", "rsqrt", "cbrt", "log", "pow"), ("log1p", "asin", "acos", "acosh")
-
-
-class Affine(NamedTuple):
-    """`slope` p + `offset`, of a piece p."""
-
-    slope: float
-    offset: float
-
-    def __call__(self, piece):
-        return piece * self.slope + self.offset
-
-
-class Level(NamedTuple):
-    """`slope` p + `offset`, of a piece p, and `below` more where p ≤ 0, `above` more where p ≥ 0."""
-
-    slope: float = 0.0
-    offset: float = 0.0
-    below: float = 0.0
-    above: float = 0.0
-
-    def __call__(self, piece, number_where: Callable):
-        """The level of a piece; `number_where(condition, x)` is x where the condition holds, else 0."""
-        level = piece * self.slope + self.offset + number_where(piece <= 0.0, self.below)
-        return level + number_where(piece >= 0.0, self.above)
-
-
-class Guard(NamedTuple):
-    """A border of piece number `piece`: of its switching number u, σ (u − level) > 0, with σ = ±1 the `side`.
-
-    Beyond it the piece is `beyond`, whose border on this side is guard `back`.
-
-    Where both sides push onto the border of `piece`, piece number `slide` becomes 1: the motion slides along it, with
-    α of the acceleration on the upper side and 1 − α of that on the lower one; its piece is the one below, and guard
-    `rest` the border. α is the switching number of `slide`; beyond its guards the motion continues with the guard `on`
-    at a piece that is larger by `gains`. These are −1 where there is none. `order` is that of the rate of u that is
-    zero there (`_sliding.Slide`). Where `of_table` is 1 the level is the entry of that number of the piece's table.
-    """
-
-    piece: int
-    side: Affine
-    level: Level
-    beyond: Affine
-    back: int
-    slide: int = -1
-    on: int = -1
-    order: int = 0
-    rest: int = -1
-    gains: int = 0
-    of_table: int = 0
-
-
-class Feature(NamedTuple):
-    """A narrow feature: what it is flat like, and in which units of its argument, or to which power of it."""
-
-    kind: int
-    scale: float
-
-
-@dataclass(frozen=True, eq=False)
-class Pieced:
-    """A program that takes its pieces as its last inputs, or only some of the numbers of a member (`Recurrent`)."""
-
-    line: StraightLine
-    size: int
-    dtypes: Sequence[np.dtype]
-    linear: Any
-    mechanics: StraightLine | None = None
-
-
-class Borders(NamedTuple):
-    """The borders of a program with m pieces, and its features.
-
-    `program` takes the inputs, then the pieces; `switches` (m,) are the nodes of the switching numbers in it, and
-    `arguments` those of the arguments of `features`, of which alike ones stand side by side. `decide`
-    takes the same and then m flags: it gives the pieces of a state, or the piece that is given where the flag is 1.
-    `nested` says whether switching numbers depend on pieces. `tables` (m,) has that of every piece that is one of a
-    table; those of a `CLOCK` have no guards. `motion` has the borders of the motion alone, where this is one with
-    tangents (`_jump.with_borders_of_tangents`). `kick` is that at borders at which L jumps, None where there are none.
-    `retraction` takes the inputs of the program to the state on the borders that it slides along, None where it may
-    slide along none; `moved` are the coordinates that each moves, `groups` the group of each, and `release` is that of
-    the cones (`_sliding.Sliding`). Along so many borders, `unheld`, it may slide, and that is not followed.
-    """
-
-    program: Pieced
-    switches: tuple[int, ...]
-    kinds: tuple[int, ...]
-    decide: StraightLine
-    guards: tuple[Guard, ...]
-    nested: bool
-    arguments: tuple[int, ...]
-    features: tuple[Feature, ...]
-    tables: tuple[Located | None, ...] = ()
-    motion: "Borders | None" = None
-    kick: Kick | None = None
-    retraction: StraightLine | None = None
-    moved: tuple[frozenset[int], ...] = ()
-    groups: tuple[int, ...] = ()
-    release: StraightLine = StraightLine((), (), ())
-    unheld: int = 0
-
-    @property
-    def groups_of_guards(self) -> list[int]:
-        """The group of each guard of a border by velocity that the motion slides along, and of its shares.
-
-        −1 for others. Those of different groups may be crossed at one instant, in one step.
-        """
-        shares = [j for j, kind in enumerate(self.kinds) if kind == SLIDE]
-        of_shares, found = dict(zip(shares, self.groups, strict=True)), []
-        for guard in self.guards:
-            border = self.guards[guard.on] if guard.on >= 0 else guard
-            known = border.order == 1 and self.kinds[border.piece] != CONE
-            found.append(of_shares[border.slide] if known else -1)
-        return found
-
-    @property
-    def kicking(self) -> tuple[int, ...]:
-        return () if self.kick is None else self.kick.pieces
-
-    @property
-    def releases(self) -> list[int]:
-        kinds = {g: self.kinds[self.guards[guard.on].piece] for g, guard in enumerate(self.guards) if guard.on >= 0}
-        return [g for g, kind in kinds.items() if kind == CONE]
-
-    @property
-    def clocks(self) -> tuple[int, ...]:
-        return tuple(j for j, kind in enumerate(self.kinds) if kind == CLOCK)
-
-    def moving_table(self, j: int) -> Table | None:
-        """The table of parameters whose entries are the levels of piece j; None where it has none."""
-        located = self.tables[j] if self.kinds[j] in (TABLE, CLOCK) else None
-        return None if located is None or located.table.numbers is not None else located.table
-
-    @property
-    def levels_move(self) -> bool:
-        return any(self.moving_table(j) is not None for j in range(len(self.switches)))
-
-    @property
-    def shaken(self) -> tuple[int, ...]:
-        """The pieces whose switching numbers may jump at the next entry of a clock, or where another piece changes."""
-        first = self.program.size - len(self.switches)
-        pieces = {("input", (), first + j) for j, kind in enumerate(self.kinds) if kind != SLIDE}
-        nodes, shaken = self.program.line.nodes, []
-        for j, node in enumerate(self.switches):
-            if self.kinds[j] != SLIDE and any(nodes[i] in pieces for i in _below(self.program.line, [node])):
-                shaken.append(j)
-        return tuple(shaken)
-
-    @property
-    def abrupt(self) -> tuple[int, ...]:
-        """The nodes of what is zero where a root has no series."""
-        return tuple(u for u, of in zip(self.arguments, self.features, strict=True) if of.kind == UP_TO)
-
-    @property
-    def followed(self) -> tuple[int, ...]:
-        return self.switches + self.arguments
-
-    def kicks_in_time(self, states: int) -> list[int]:
-        """The pieces with which L jumps whose switching numbers depend on the time alone, but no clocks."""
-        others = (j for j in self.kicking if self.kinds[j] != CLOCK)
-        return [j for j in others if self.read_by(self.switches[j]).isdisjoint(range(states))]
-
-    def read_by(self, node: int) -> frozenset[int]:
-        """The inputs that a node of the program depends on; pieces are the last ones."""
-        return inputs_below(self.program.line, [node])
 
 
 def borders(program: Recurrent, size: int, slides: bool = True, watched: int = 0) -> Borders | None:
@@ -322,7 +170,7 @@ class _Rewriting:
         self._moves: list[bool] = []
         self.features: dict[tuple[int, int], Feature] = {}  # by the argument, and the kind
         self.abrupt: set[int] = set()
-        self.cones = _find_cones(program.line, size, program.linear) if slides else {}
+        self.cones = find_cones(program.line, size, program.linear) if slides else {}
         self.parts: dict[int, tuple[int, ...]] = {}  # of the vector of a cone, by its piece
         self.decisive = self._decisive()
         comparisons = [i for i in self.decisive if program.line.nodes[i][0] not in ("eq", "ne")]
@@ -332,7 +180,7 @@ class _Rewriting:
         relevant = self.decisive | self.abrupt
         self.powers = find_powers(program.line, relevant, self._of_guards, size)
         if self.powers or any(
-            i in self.cones or self._decides(i) or program.line.nodes[i][0] in (*_FEATURES, "pow") for i in relevant
+            i in self.cones or self._decides(i) or program.line.nodes[i][0] in (*FEATURES, "pow") for i in relevant
         ):
             linear = program.linear
             roots = {*program.line.outputs, *((*linear.right, *linear.entries.values()) if linear else ())}
@@ -351,10 +199,10 @@ class _Rewriting:
         linear, line = self.program.linear, self.program.line
         # What friction of contacts adds to A does not decide: it stops, and turns, by watches of its own.
         roots = line.outputs[: self.size] if linear is None else [*linear.right, *linear.entries.values()]
-        needed = _below(line, roots)
-        self._of_guards = _below(line, self.watched)
+        needed = nodes_below(line, roots)
+        self._of_guards = nodes_below(line, self.watched)
         if self.watched:  # which may read the solution of a linear system, but not decide on its elimination
-            needed |= self._of_guards - (_below(line, line.outputs[: self.size]) - needed)
+            needed |= self._of_guards - (nodes_below(line, line.outputs[: self.size]) - needed)
         self.abrupt = self._find_abrupt(needed)
         return needed - self.abrupt
 
@@ -370,17 +218,17 @@ class _Rewriting:
             return set()
         selects = [i for i in at_zero if nodes[i][0] == "select"]
         below = at_one | at_zero if self.beside else at_one
-        out = _below(self.program.line, [nodes[i][1][0] for i in below if nodes[i][0] == "select"])
+        out = nodes_below(self.program.line, [nodes[i][1][0] for i in below if nodes[i][0] == "select"])
         for i in selects:
             condition, *branches = nodes[i][1]
-            deciding = {j: self._compared(j) for j in _below(self.program.line, [condition])}
+            deciding = {j: self._compared(j) for j in nodes_below(self.program.line, [condition])}
             out |= {j for j, equal in deciding.items() if equal and any(self._vanishes(x, equal) for x in branches)}
             bases = {self._base(x) for x in branches} - at_zero
             at_zero |= bases
             selects += [x for x in bases if nodes[x][0] == "select"]
         for i in needed:
             op, operands, _ = nodes[i]
-            if op in (*_COMPARISONS, "abs", "max", "min", "sign"):
+            if op in (*COMPARISONS, "abs", "max", "min", "sign"):
                 level = [nodes[x][2] for x in operands if nodes[x][0] == "constant"] or [0.0] * (len(operands) == 1)
                 singular = (at_one if level[0] else at_zero) if level else set()
                 if not singular.isdisjoint({i, *(self._base(x) for x in operands)}):
@@ -401,7 +249,7 @@ class _Rewriting:
     def _compared(self, i: int) -> frozenset[int] | None:
         """The numbers that are equal at the border of a node, but for factors and zero; None of other nodes."""
         op, operands, _ = self.program.line.nodes[i]
-        if op not in (*_COMPARISONS, "abs", "max", "min", "sign", "eq", "ne"):
+        if op not in (*COMPARISONS, "abs", "max", "min", "sign", "eq", "ne"):
             return None
         nodes = self.program.line.nodes
         return frozenset(self._base(x) for x in operands if nodes[x][0] != "constant" or nodes[x][2] != 0)
@@ -449,8 +297,8 @@ class _Rewriting:
             return self.graph.apply(op, sign, self.graph.number(0.0))
         if i in self.abrupt and self._decides(i):
             self._note_border(op, of)
-        if op in _FEATURES and i in self.decisive:
-            self._note_feature(of[0], *_FEATURES[op])
+        if op in FEATURES and i in self.decisive:
+            self._note_feature(of[0], *FEATURES[op])
         if op == "pow" and i in self.decisive and self.graph.value(of[1]) is None:
             self._note_exponent(*of)
         if op == "div" and (quotient := self._direction(*of)) is not None:
@@ -495,15 +343,15 @@ class _Rewriting:
     def _place_on_cone(self, i: int, op: str, of: list[int]) -> int:
         """A root of a sum of squares, or what is decided about it: 1 at rest, where the sum is zero."""
         f, number, square = self.graph.apply, lambda x: self.graph.constant(x, "float"), self.places[self.cones[i]]
-        length = f("sqrt", f("add", square, number(_NOTHING**2)))
+        length = f("sqrt", f("add", square, number(NOTHING**2)))
         piece = self._piece(CONE, length)
         assert piece is not None
-        self.parts[piece] = tuple(self.places[x] for x in _squares(self.program.line, self.cones[i]) or ())
+        self.parts[piece] = tuple(self.places[x] for x in list_squares(self.program.line, self.cones[i]) or ())
         moves = f("gt", piece, number(0.0))
         if op == "select":
             return of[1] if self.graph.value(of[1]) is None else of[2]
         if op in ("sqrt", "rsqrt"):
-            return f(op, f("select", moves, self._one, f("add", of[0], number(_NOTHING**2))))
+            return f(op, f("select", moves, self._one, f("add", of[0], number(NOTHING**2))))
         if op == "max":
             return f("select", moves, self._one, of[0] if self.graph.value(of[0]) is None else of[1])
         is_first = self.graph.value(of[0]) is None
@@ -557,11 +405,11 @@ class _Rewriting:
     def _decided(self, op: str, of: list[int], attribute) -> int | None:
         """The result of a piecewise operation by its piece; None where that does not change along the motion."""
         f, number = self.graph.apply, lambda x: self.graph.constant(x, "float")
-        if op in (*_COMPARISONS, "max", "min"):
+        if op in (*COMPARISONS, "max", "min"):
             sign = self._sign(f("sub", *of))
             if sign is None:
                 return None
-            if op in _COMPARISONS:
+            if op in COMPARISONS:
                 self._jumping.add(self._base_of(sign))
                 return f(op, sign, number(0.0))
             return f("select", f("gt" if op == "max" else "lt", sign, number(0.0)), of[1], of[0])
@@ -649,7 +497,9 @@ class _Rewriting:
         Two pieces with one border would each push onto it, or not, as if the other one stayed as it is.
         """
         f, nodes, inputs = self.graph.apply, list(range(len(self.graph.nodes))), inputs_below(self.graph, [x])
-        steps = {"select", *LOOK_UPS, *_PIECEWISE}.intersection(self.graph.nodes[i][0] for i in _below(self.graph, [x]))
+        steps = {"select", *LOOK_UPS, *_PIECEWISE}.intersection(
+            self.graph.nodes[i][0] for i in nodes_below(self.graph, [x])
+        )
         # A few states say nothing of numbers that are chosen.
         if not self._is_moving(x) or (SIGN, x) in self._known or steps or max(inputs) >= self.program.size:
             return None
@@ -694,7 +544,7 @@ class _Rewriting:
         return moves[x]
 
     def _note_border(self, op: str, of: list[int]) -> None:
-        if op in (*_COMPARISONS, "max", "min", "abs", "sign"):
+        if op in (*COMPARISONS, "max", "min", "abs", "sign"):
             u = of[0] if op in ("abs", "sign") else self.graph.apply("sub", *of)
             self._note_feature(self._base_of(u), UP_TO, 1.0)
 
@@ -708,7 +558,7 @@ class _Rewriting:
         """A power of a number: one that is to be large by its square, and sums of exponentials by their arguments."""
         op, operands, _ = self.graph.nodes[base]
         if op in ("exp", "exp2"):
-            self._note_feature(self.graph.scale(exponent, operands[0]), *_FEATURES[op])
+            self._note_feature(self.graph.scale(exponent, operands[0]), *FEATURES[op])
         elif exponent > 0:
             self._note_feature(self.graph.apply("mul", base, base), GROWS, exponent / 2)
         elif arguments := self._exponents(base):
@@ -724,7 +574,7 @@ class _Rewriting:
             parts = [x for x in operands if self._is_moving(x)]
             found = [self._exponents(x) for x in parts]
             return [u for some in found for u in some] if all(found) else []
-        return [operands[0]] if op in _EXPONENTIALS else []
+        return [operands[0]] if op in GROWING else []
 
     def _note_exponent(self, a: int, b: int) -> None:
         """aᵇ = exp(b log |a|), where b is no constant."""
@@ -746,7 +596,7 @@ class _Rewriting:
         line = StraightLine(
             tuple(self.graph.nodes), tuple(self.graph.kinds), tuple(self.places[i] for i in program.line.outputs)
         )
-        nested = not _below(line, self.switches).isdisjoint(self.pieces)
+        nested = not nodes_below(line, self.switches).isdisjoint(self.pieces)
         kicking = self._find_kicking(line) if self.mechanics else {}
         sliding, lost = self._sliding(line, kicking)
         if len(lost) == 1 and self.apart is None and len(line.nodes) <= LARGEST_COPIED:
@@ -770,7 +620,7 @@ class _Rewriting:
         pieced = Pieced(line, program.size + count, dtypes, linear)
         kinds = (*self.kinds, *[SLIDE] * len(sliding))
         return Borders(
-            pieced, tuple(switches), kinds, self._decide(count, sliding), _guards(kinds, sliding), nested,
+            pieced, tuple(switches), kinds, self._decide(count, sliding), list_guards(kinds, sliding), nested,
             tuple(arguments), tuple(features.values()), (*self.tables, *[None] * len(sliding)), None, kick,
             retraction, moved, groups, release, unheld,
         )  # fmt: skip
@@ -882,7 +732,7 @@ class _Rewriting:
         Those that depend on velocities come first, and are all there or none. And those of them that are lost, because
         what other pieces are on their other side is not known.
         """
-        n, acting, orders = self.size, _below(line, line.outputs[: self.size]), {}
+        n, acting, orders = self.size, nodes_below(line, line.outputs[: self.size]), {}
         undefined = self._find_undefined(acting)
         for j, kind in enumerate(self.kinds if self.slides else ()):
             if kind == CLOCK or self.pieces[j] not in acting or j in kicking:
@@ -894,7 +744,7 @@ class _Rewriting:
                 orders[j] = 2 if max(state) < n else 1
         # The sign of a force is a corner where |force| rubs, but the slopes that it is solved by jump. An interpolation
         # has a corner at its entries, and no jump.
-        degrees, lost = _velocity_degrees(line, n) if orders else [], []
+        degrees, lost = velocity_degrees(line, n) if orders else [], []
         others = [
             j
             for j, order in orders.items()
@@ -902,7 +752,7 @@ class _Rewriting:
         ]
         decides, of_pieces = {j: [] for j in orders}, {self.pieces[j]: j for j in orders}
         for switch in self.switches:
-            for i in of_pieces.keys() & _below(line, [switch]):
+            for i in of_pieces.keys() & nodes_below(line, [switch]):
                 decides[of_pieces[i]].append(switch)
         if others or any(decides.values()):
             search = Jumping(line, self._decide(len(self.switches), ()), self.switches, n, self.program.size)
@@ -979,7 +829,7 @@ class _Rewriting:
 
         nodes = copy(decide_or_keep)
         signs = {piece for piece, kind in zip(self.pieces, self.kinds, strict=True) if kind == SIGN}
-        nested = any(slide.order > 1 and _below(line, [self.switches[slide.piece]]) & signs for slide in slides)
+        nested = any(slide.order > 1 and nodes_below(line, [self.switches[slide.piece]]) & signs for slide in slides)
         sides = [copy(functools.partial(decide_ahead, way)) for way in (1.0, -1.0)] if nested else [nodes]
         pieces = [nodes[i] for i in self.pieces]
         for k, slide in enumerate(slides):
@@ -1007,72 +857,6 @@ class _Rewriting:
         return eliminate_dead_code(graph, pieces + goes_on)
 
 
-def _raw(graph: Graph, kind: int, x: int, table: Located | None) -> int:
-    if table is not None:
-        return graph.apply("locate", x, attribute=table)
-    if kind == SIGN:
-        return graph.apply("sign", x)
-    if kind == CONE:
-        moves = graph.apply("gt", x, graph.constant(2 * _NOTHING, "float"))
-        return graph.apply("select", moves, *(graph.constant(p, "float") for p in (-1.0, 1.0)))
-    below = graph.apply("floor", x)
-    if kind == FLOOR:
-        return below
-    return graph.apply("select", graph.apply("lt", x, graph.constant(0.0, "float")), below, graph.apply("ceil", x))
-
-
-def _guards(kinds: Sequence[int], slides: Sequence[Slide]) -> tuple[Guard, ...]:
-    """The guards of all pieces; piece number `slides[k].piece` slides where the k-th of the last ones is 1.
-
-    Those of one piece stand side by side: of several that are violated where no time passes the first one counts, and
-    this many borders that push onto each other come to rest (Murty, Linear Algebra Appl. 9 (1974) 65).
-    """
-    guards: list[Guard] = []
-    as_it_is, zero = Affine(1.0, 0.0), Level()
-    sliding = {slide.piece: k for k, slide in enumerate(slides)}
-    first = len(kinds) - len(sliding)
-    for j, kind in enumerate(kinds[:first]):
-        k = len(guards)
-        if kind == CLOCK or (kind == CONE and j not in sliding):
-            continue
-        if kind == CONE:  # whose level is a speed that counts as none
-            of_piece = [Guard(j, as_it_is, zero, Affine(0.0, -1.0), k, of_table=1)]
-        elif kind == SIGN:
-            of_piece = [Guard(j, as_it_is, zero, Affine(-1.0, 0.0), k)]
-        else:  # between the numbers p and p + 1, or the entries with these indices, or of a `TRUNC` around 0
-            lower, upper = Level(1.0, 0.0), Level(1.0, 1.0)
-            if kind == TRUNC:
-                lower, upper = Level(1.0, below=-1.0), Level(1.0, above=1.0)
-            of_table = int(kind == TABLE)
-            of_piece = [
-                Guard(j, Affine(0.0, 1.0), lower, Affine(1.0, -1.0), k + 1, of_table=of_table),
-                Guard(j, Affine(0.0, -1.0), upper, Affine(1.0, 1.0), k, of_table=of_table),
-            ]
-        if j in sliding:
-            last = k + len(of_piece) - 1  # the upper border of a piece, which that below it slides on
-            slide, (_, order, width, *_) = first + sliding[j], slides[sliding[j]]
-            of_piece = [guard._replace(slide=slide, order=order, rest=last) for guard in of_piece]
-            none = Affine(0.0, 0.0)
-            of_piece += [
-                Guard(slide, as_it_is, zero, none, last + 1, on=last, rest=last),
-                Guard(slide, Affine(-1.0, 0.0), Level(0.0, 1.0), none, last + 2, on=k, rest=last, gains=int(width)),
-            ]
-            if kind == CONE:  # which is left on one side alone
-                of_piece[-2:] = [of_piece[-2]._replace(gains=int(width))]
-        guards += of_piece
-    return tuple(guards)
-
-
-def _below(line: StraightLine | Graph, roots: Sequence[int]) -> set[int]:
-    """The nodes that some nodes depend on, and these."""
-    return set(find_ancestors(line.nodes, roots))
-
-
-def inputs_below(line: StraightLine | Graph, roots: Sequence[int]) -> frozenset[int]:
-    """The inputs that some nodes depend on."""
-    return frozenset(line.nodes[i][2] for i in _below(line, roots) if line.nodes[i][0] == "input")
-
-
 def with_outputs(program: Recurrent, more: StraightLine, moving: int | None = None) -> Pieced:
     """A program with the outputs of another line of the same inputs behind its own; what both compute is shared.
 
@@ -1090,66 +874,6 @@ def with_outputs(program: Recurrent, more: StraightLine, moving: int | None = No
     line = StraightLine(tuple(graph.nodes), tuple(graph.kinds), outputs)
     mechanics = getattr(program, "mechanics", None)
     return Pieced(line, program.size, program.dtypes, program.linear, mechanics)
-
-
-def _squares(line: StraightLine, i: int) -> list[int] | None:
-    """The nodes whose squares, times positive constants, node i is the sum of; None where it is no such sum."""
-    op, operands, _ = line.nodes[i]
-    if op == "add":
-        some = [_squares(line, x) for x in operands]
-        return None if None in some else [u for of in some for u in of or ()]
-    if op == "mul" and operands[0] == operands[1]:
-        return [operands[0]]
-    factors = [line.nodes[x][2] for x in operands if line.nodes[x][0] == "constant"] if op == "mul" else []
-    others = [x for x in operands if line.nodes[x][0] != "constant"]
-    return _squares(line, others[0]) if len(others) == len(factors) == 1 and factors[0] > 0 else None
-
-
-def _velocity_degrees(line: StraightLine, size: int) -> list[int]:
-    """The degree of each node in the velocities; 2 for any that is not 0 or 1."""
-    degrees: list[int] = []
-    for op, operands, attribute in line.nodes:
-        of = [degrees[x] for x in operands]
-        if op == "input":
-            degrees.append(int(size <= attribute < 2 * size))
-        elif op in ("add", "sub", "neg", "select", "mul") or (op == "div" and not of[1]):
-            degrees.append(min(2, sum(of) if op == "mul" else max(of)))
-        else:
-            degrees.append(2 * any(of))
-    return degrees
-
-
-def _find_cones(line: StraightLine, size: int, linear: Any) -> dict[int, int]:
-    """The nodes by which lengths |u| of velocities that something is divided by are known, each with the node of |u|².
-
-    These are roots, also of what `where` or `maximum` puts in the place of |u| = 0, and the comparisons of such guards.
-    What is not linear in the velocities is a force.
-    """
-    nodes, cones = line.nodes, {}
-
-    def guarded(i: int) -> list[int]:
-        """A node, or those that a guard chooses from."""
-        op, operands, _ = nodes[i]
-        some = operands[1:] if op == "select" else operands if op == "max" else ()
-        return [i, *(x for k in some for x in guarded(k))] if some else [i]
-
-    roots = {x for op, of, _ in nodes if op == "div" for x in guarded(of[1]) if nodes[x][0] == "sqrt"}
-    roots |= {i for i, (op, _, _) in enumerate(nodes) if op == "rsqrt"}
-    squares, degrees = {}, _velocity_degrees(line, size) if roots else []
-    for root in roots if linear is not None else ():
-        for x in guarded(nodes[root][1][0]):
-            parts = _squares(line, x)
-            if parts and all(degrees[u] == 1 for u in parts):
-                squares[x] = cones[root] = x
-    squares |= {i: x for i, x in cones.items() if nodes[i][0] == "sqrt"}
-    for i, (op, operands, _) in enumerate(nodes):
-        if op in (*_COMPARISONS, "eq", "ne", "max") and not squares.keys().isdisjoint(operands):
-            others = [x for x in operands if x not in squares]
-            if len(others) == 1 and nodes[others[0]][0] == "constant" and 0 <= nodes[others[0]][2] <= _NO_LENGTH:
-                cones[i] = next(squares[x] for x in operands if x in squares)
-        elif op == "select" and operands[0] in cones and {nodes[x][2] for x in operands[1:] if x not in cones} == {0.0}:
-            cones[i] = cones[operands[0]]  # a length, written so that it has a slope at zero
-    return cones
 
 
 def distances(found: Borders) -> StraightLine:
@@ -1187,7 +911,7 @@ def _copy_deciding(
         j = i - first
         if j < 0:
             return graph.input(i, of_inputs[i])
-        return decide(j, _raw(graph, kinds[j], nodes[switches[j]], tables[j]), nodes)
+        return decide(j, piece_of(graph, kinds[j], nodes[switches[j]], tables[j]), nodes)
 
     return copy_nodes(graph, line, find_input)
 

@@ -26,9 +26,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._program._borders import Borders, Pieced
 from lagjax._program._differentiation import TangentTable, copy_nodes, pullback_and_entries, tangents_in, with_tangents
 from lagjax._program._graph import Graph, Unlowerable
+from lagjax._program._levels import Borders, Pieced
 from lagjax._program._look_ups import Table, shift_look_up
 from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._series import StraightLine

@@ -30,7 +30,7 @@ from lagjax._program._operations import LOOK_UPS
 from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._rounding import rounding
 from lagjax._program._series import StraightLine
-from lagjax._program._sliding import dot, eliminate, sparse_row, substitute
+from lagjax._program._small_equations import dot, eliminate, sparse_row, substitute
 
 _LARGEST = 60  # operations that one may become: a bound for errors
 _STATES = 48  # at which a border is looked for: what jumps does so at nearly all of them

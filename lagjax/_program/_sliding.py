@@ -18,26 +18,32 @@ on either side, the force brings it back at once.
 
 import functools
 from collections import Counter
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from lagjax._program._differentiation import copy_nodes, copy_operation, slopes_in
 from lagjax._program._graph import Graph, find_descendants, find_readers
 from lagjax._program._operations import LOOK_UPS
 from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._series import LinearSystem, StraightLine
+from lagjax._program._small_equations import (
+    SOFT,
+    Equations,
+    Sparse,
+    constants,
+    dot,
+    drop_entry,
+    eliminate,
+    find_groups,
+    transpose,
+)
 
 # Borders that act on each other, whose elimination takes a third of the cube; and borders in all. The first result of
 # 2500 blocks that know nothing of each other takes 6 CPU s, of 10 000 blocks 29, and 2 GB.
 MOST_COUPLED, MOST_SLIDING = 64, 20_000
 MOST_COPIES, LARGEST_COPIED = 4, 4000  # pieces for which all of a program is done once more, and its operations
-# Borders that are not independent share what they hold as if they yielded by so much, relative; what that leaves is
-# mended this many times. The share of what no border holds alone is as exact as rounding, divided by it.
-SOFT, MENDED = 1e-9, 2
 # What moves less off a border, relative to what pushes it there, is held by others: rounding of forces that cancel. It
 # decides on derivatives alone; doubled, nothing that was looked at changes.
 STILL = 1e-9
@@ -47,9 +53,6 @@ _LARGEST = 10_000_000  # operations: a bound for errors
 # The length of the vector of a cone that is as good as none: forces change by so little beside it, and its square is
 # there. What friction does along each of its parts is read off there.
 _TINY = 2.0**-300
-
-
-Sparse = dict[int, int]  # the nodes of a vector by their place in it; what is not there is zero
 
 
 class Slide(NamedTuple):
@@ -171,7 +174,7 @@ class _SlidingForces:
         ends = list(map(self.where, pushed, rates))
         missing = [self.f("sub", end, self._dot(d, self.linear.z)) for end, d in zip(ends, normals, strict=True)]
         unknown = self._unknown(equations, missing)
-        pivots = _choose_pivots([_constants(self.graph, d) for d in slopes])
+        pivots = _choose_pivots([constants(self.graph, d) for d in slopes])
         held = _Held(self.graph, self.n, pushed, slopes, responses, pivots)
         z = self._solve(self._push_right_side(self.linear.right, acts, unknown))
         missed = self._miss_constraints(z)
@@ -181,7 +184,7 @@ class _SlidingForces:
             left = [self.f("sub", end, self._dot(d, z)) for end, d in zip(ends, normals, strict=True)]
             more = equations.solve(self.graph, left)
             unknown = self._add(unknown, more)
-            z = self._add(z, [self._dot(of, more) for of in _transpose(responses, len(z))])
+            z = self._add(z, [self._dot(of, more) for of in transpose(responses, len(z))])
         z = held.hold(z, rates)
         shares = [self._share(k, unknown, slopes, rates, all_pushed[k], z, effects) for k in range(len(self.slides))]
         directions = [
@@ -213,12 +216,12 @@ class _SlidingForces:
         for (i, j), x in matrix.items():
             if x != self.zero:
                 rows[i][j] = x
-        parts = _find_groups(rows, size)
+        parts = find_groups(rows, size)
         of_cones = [rows[0] for rows in self.rows_of for _ in rows]
         touched = [{parts[i]: self.one for i in both} for both in map(dict.__or__, acts, slopes)]
         for row, first in zip(touched, of_cones, strict=True):
             row[size + first] = self.one
-        return _find_groups(touched, size + len(touched))
+        return find_groups(touched, size + len(touched))
 
     def _group_rows(self, of_rows: Sequence) -> list[list]:
         return [[of_rows[m] for m in rows] for rows in self.rows_of]
@@ -238,7 +241,7 @@ class _SlidingForces:
             sizes = [dot(self.graph, slopes[m].values(), slopes[m].values()) for m in rows]
             for numbers in ([f("div", x, length) for x in along], [self.rows[m].offset for m in rows]):
                 parts = [f("div", x, size) for x, size in zip(numbers, sizes, strict=True)]
-                results += [self._dot(of, parts) for of in _transpose([slopes[m] for m in rows], self.n)]
+                results += [self._dot(of, parts) for of in transpose([slopes[m] for m in rows], self.n)]
         return results
 
     @functools.cached_property
@@ -283,7 +286,7 @@ class _SlidingForces:
     def _effects(self, acts: Sequence[Sparse], slopes: Sequence[Sparse]) -> tuple[list[Sparse], list[Sparse]]:
         """The slopes of z by each piece, and ∂u̇/∂p of each border by each piece."""
         responses, effects = self._respond(acts), []
-        of_coordinates = _transpose(responses, len(self.linear.right))
+        of_coordinates = transpose(responses, len(self.linear.right))
         for d in slopes:
             row = {}
             for m in sorted({m for i in d for m in of_coordinates[i]}):
@@ -292,7 +295,7 @@ class _SlidingForces:
             effects.append({m: x for m, x in row.items() if x != self.zero})
         return responses, effects
 
-    def _equations(self, effects: list[Sparse], pushed: Sequence[int], slopes: Sequence[Sparse]) -> "_Equations":
+    def _equations(self, effects: list[Sparse], pushed: Sequence[int], slopes: Sequence[Sparse]) -> "Equations":
         """The linear equations of μ; μ = 0 where there is nothing to do."""
         f, rows = self.f, []
         for k, row in enumerate(effects):
@@ -304,7 +307,7 @@ class _SlidingForces:
             whole = [dict(row) for row in rows]
             for k, row in enumerate(rows):
                 row[k] = f("mul", self.number(1 + SOFT), row[k])
-        return _Equations(eliminate(self.graph, rows), whole)
+        return Equations(eliminate(self.graph, rows), whole)
 
     def _pushes_back(self, j: int, effects, pushed: Sequence[int], slopes, missing: Sequence[int]) -> int:
         """True where border j of positions pushes back what lies beside it; other borders may hold that there, too."""
@@ -322,12 +325,12 @@ class _SlidingForces:
             for k in others:
                 held = f("lt", f("abs", f("add", mu[k], self.number(self.rows[k].below))), self.one)
                 stays = f("and", stays, f("or", f("not", pushed[k]), held))
-            moves = f("abs", f("sub", beside[j], self._dot(_drop_entry(effects[j], j), mu)))
+            moves = f("abs", f("sub", beside[j], self._dot(drop_entry(effects[j], j), mu)))
             own = effects[j].get(j, self.zero)
             stays = f("and", stays, f("le", moves, f("mul", self.number(STILL), f("abs", own))))
         return f("and", pushed[j], f("not", stays))
 
-    def _unknown(self, equations: "_Equations", missing: list[int]) -> list[int]:
+    def _unknown(self, equations: "Equations", missing: list[int]) -> list[int]:
         """μ; where borders share what they hold, μ − 1 is to be small: the distance from the middle of both sides."""
         if not equations.whole:
             return equations.solve(self.graph, missing)
@@ -339,9 +342,9 @@ class _SlidingForces:
     def _are_dependent(self, slopes: Sequence[Sparse]) -> bool:
         """True if the rates of some borders are combinations of others, so that these can share what they hold."""
         some, groups = np.random.default_rng(0), {}
-        constants = [_constants(self.graph, of_one) for of_one in slopes]
-        for k, group in enumerate(_find_groups(slopes, self.n)):
-            groups.setdefault(group, []).append(constants[k])
+        known = [constants(self.graph, of_one) for of_one in slopes]
+        for k, group in enumerate(find_groups(slopes, self.n)):
+            groups.setdefault(group, []).append(known[k])
         for rows in groups.values():
             place = {i: at for at, i in enumerate(sorted({i for row in rows for i in row}))}
             numbers = np.zeros((len(rows), len(place)))
@@ -504,7 +507,7 @@ class _SlidingForces:
             at = {x: inputs[len(system.factors) + i] for i, x in enumerate(read)}
             at |= {x: graph.number(value) for x, value in known.items() if value is not None}
             right, ends = inputs[len(factors) : len(factors) + count], inputs[len(factors) + count :]
-            equations = _Equations(*([{j: at[x] for j, x in row.items()} for row in table] for table in of_unknowns))
+            equations = Equations(*([{j: at[x] for j, x in row.items()} for row in table] for table in of_unknowns))
             inner = system.solve()
 
             def apply_inverse(right):
@@ -532,7 +535,7 @@ class _SlidingForces:
                 of_rows.setdefault(row - count, {})[j] = d
             for k, i, free, inverse in pivots:
                 end = ends[k]
-                for j, d in _drop_entry(of_rows.get(k, {}), i).items():
+                for j, d in drop_entry(of_rows.get(k, {}), i).items():
                     end = graph.apply("sub", end, graph.apply("mul", at[d], z[j]))
                 z[i] = graph.apply("add", graph.apply("mul", at[free], z[i]), graph.apply("mul", at[inverse], end))
             return StraightLine(tuple(graph.nodes), tuple(graph.kinds), (*z, *mu))
@@ -555,7 +558,7 @@ class _Held:
         self.graph, self.n, self.pushed, self.slopes, self.responses = graph, n, pushed, slopes, responses
         self.zero, self.one = (graph.number(x) for x in (0.0, 1.0))
         self.divisors = [(k, i, graph.apply("select", pushed[k], self.one, slopes[k][i])) for k, i in pivots]
-        self.of_coordinates = _transpose(responses, n)
+        self.of_coordinates = transpose(responses, n)
         self.state = {i: graph.input(i, "float") for i in range(2 * n)}
 
     def pivots(self) -> list[tuple[int, int, int, int]]:
@@ -570,7 +573,7 @@ class _Held:
         """Accelerations with those of pivots from Σ ∂u̇/∂q̈ᵢ q̈ᵢ = `rates`."""
         f, z = self.graph.apply, list(z)
         for k, i, divisor in self.divisors:
-            row = _drop_entry(self.slopes[k], i)
+            row = drop_entry(self.slopes[k], i)
             others = dot(self.graph, row.values(), [z[j] for j in row])
             z[i] = f("select", self.pushed[k], z[i], f("div", f("sub", rates[k], others), divisor))
         return z
@@ -614,7 +617,7 @@ class _Held:
         graph = self.graph
         line = eliminate_dead_code(graph, [self.state[i] for i in range(2 * self.n)])
         moved = ({i: x for i, x in response.items() if i < self.n} for response in self.responses)
-        return line, tuple(frozenset(_constants(graph, of)) for of in moved)
+        return line, tuple(frozenset(constants(graph, of)) for of in moved)
 
 
 def _choose_pivots(rows: Sequence[dict[int, float | None]]) -> list[tuple[int, int]]:
@@ -634,91 +637,3 @@ def _choose_pivots(rows: Sequence[dict[int, float | None]]) -> list[tuple[int, i
         behind.append(found)
         times.subtract(left.pop(found[0]).keys())
     return [(k, i) for k, row in left.items() for i in row if len(row) == 1] + behind[::-1]
-
-
-# ---- a few linear equations ------------------------------------------------------------------------------------------
-
-
-class _Equations(NamedTuple):
-    """Linear equations after `eliminate`, and as they are where they are solved softly (`SOFT`)."""
-
-    factors: list[Sparse]
-    whole: list[Sparse]
-
-    def solve(self, graph: Graph, right: Sequence[int]) -> list[int]:
-        x = substitute(graph, self.factors, right)
-        for _ in range(MENDED if self.whole else 0):
-            products = (dot(graph, row.values(), [x[j] for j in row]) for row in self.whole)
-            left = [graph.apply("sub", b, product) for b, product in zip(right, products, strict=True)]
-            more = substitute(graph, self.factors, left)
-            x = [graph.apply("add", a, b) for a, b in zip(x, more, strict=True)]
-        return x
-
-
-def _constants(graph: Graph, row: Sparse) -> dict[int, float | None]:
-    """The numbers that are not zero throughout; None for those that are no constants."""
-    values = {i: graph.value(d) for i, d in row.items()}
-    return {i: value for i, value in values.items() if value != 0}
-
-
-def _drop_entry(row: Sparse, place: int) -> Sparse:
-    return {i: x for i, x in row.items() if i != place}
-
-
-def _transpose(rows: Sequence[Sparse], count: int) -> list[Sparse]:
-    """The first columns of a matrix, `count` of them."""
-    columns: list[Sparse] = [{} for _ in range(count)]
-    for k, row in enumerate(rows):
-        for i, x in row.items():
-            if i < count:
-                columns[i][k] = x
-    return columns
-
-
-def _find_groups(rows: Sequence[Sparse], count: int) -> list[int]:
-    """The group of each row: rows of different groups have no column in common, of `count`."""
-    places = np.array([(k, len(rows) + i) for k, row in enumerate(rows) for i in row], int).reshape(-1, 2).T
-    size = len(rows) + count
-    graph = coo_array((np.ones(places.shape[1]), tuple(places)), (size, size))
-    return connected_components(graph, directed=False)[1][: len(rows)].tolist()
-
-
-def sparse_row(graph: Graph, xs: Iterable[int]) -> Sparse:
-    zero = graph.number(0.0)
-    return {i: x for i, x in enumerate(xs) if x != zero}
-
-
-def dot(graph: Graph, xs: Iterable[int], ys: Iterable[int]) -> int:
-    total = zero = graph.number(0.0)
-    for x, y in zip(xs, ys, strict=True):
-        if zero not in (x, y):  # as nearly all are where many borders know nothing of each other
-            total = graph.apply("add", total, graph.apply("mul", x, y))
-    return total
-
-
-def eliminate(graph: Graph, rows: list[Sparse]) -> list[Sparse]:
-    """L and U in the place of each other's zeros, without the ones of L: A = L U, of the rows of A, in place."""
-    f, zero = graph.apply, graph.number(0.0)
-    readers = [set(column) for column in _transpose(rows, len(rows))]
-    for k, pivot in enumerate(rows):
-        ahead = sorted(j for j in pivot if j > k)
-        for i in sorted(i for i in readers[k] if i > k):
-            row = rows[i]
-            row[k] = factor = f("div", row[k], pivot.get(k, zero))
-            for j in ahead:
-                row[j] = f("sub", row.get(j, zero), f("mul", factor, pivot[j]))
-                readers[j].add(i)
-    return rows
-
-
-def substitute(graph: Graph, rows: Sequence[Sparse], right: Sequence[int]) -> list[int]:
-    """x of A x = b, of what `eliminate` made of A."""
-    f, x, zero = graph.apply, list(right), graph.number(0.0)
-    for i, row in enumerate(rows):
-        for k in sorted(k for k in row if k < i):
-            x[i] = f("sub", x[i], f("mul", row[k], x[k]))
-    for i in range(len(rows) - 1, -1, -1):
-        for j in sorted(j for j in rows[i] if j > i):
-            x[i] = f("sub", x[i], f("mul", rows[i][j], x[j]))
-        x[i] = f("div", x[i], rows[i].get(i, zero))
-    return x
