@@ -27,6 +27,7 @@ from typing import Any, NamedTuple, cast
 
 import numpy as np
 
+from lagjax._program._border_forces import Slide
 from lagjax._program._cones import find_cones, list_squares, velocity_degrees
 from lagjax._program._differentiation import copy_nodes, gradient_in, pullback
 from lagjax._program._features import (
@@ -64,7 +65,7 @@ from lagjax._program._recurrences import LARGEST_WHOLE
 from lagjax._program._rounding import rounding
 from lagjax._program._series import LinearSystem, Recurrent, StraightLine
 from lagjax._program._simplify import is_nonnegative
-from lagjax._program._sliding import FAR, LARGEST_COPIED, MOST_SLIDING, Slide, with_sliding
+from lagjax._program._sliding import FAR, LARGEST_COPIED, MOST_SLIDING, with_sliding
 from lagjax._program._small_equations import dot
 
 BENT = "a constraint prescribes a speed that jumps"  # a reason to refuse a kick

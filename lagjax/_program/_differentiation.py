@@ -59,6 +59,20 @@ def copy_operation(graph: Graph, op: str, operands: Sequence[int], attribute: An
     return graph.apply(op, *operands, attribute=attribute)
 
 
+def replace_nodes(graph: Graph, among: Iterable[int], sides: Sequence[dict[int, int]]) -> None:
+    """Add to each of the `sides`, where some nodes become others, what those `among` the nodes behind them become.
+
+    What becomes the same on both of two sides stays as it is.
+    """
+    for i in among:
+        op, operands, attribute = graph.nodes[i]
+        if any(x in known for known in sides for x in operands):
+            new = [copy_operation(graph, op, [known.get(x, x) for x in operands], attribute) for known in sides]
+            if len(sides) == 1 or new[0] != new[1]:
+                for known, node in zip(sides, new, strict=True):
+                    known[i] = node
+
+
 # ---- nodes of a graph -----------------------------------------------------------------------------------------------
 
 

@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from lagjax._program._border_forces import Slide
 from lagjax._program._features import UP_TO, Feature
 from lagjax._program._graph import Graph, find_ancestors
 from lagjax._program._kick import Kick
 from lagjax._program._look_ups import Located, Table
 from lagjax._program._series import StraightLine
-from lagjax._program._sliding import Slide
 
 # The kinds of pieces; `CLOCK` is the piece of a table that the time itself is on, whose borders are known.
 SIGN, FLOOR, TRUNC, SLIDE, TABLE, CLOCK, CONE = range(7)
