@@ -24,10 +24,10 @@ from lagjax._native._saltation import Saltation
 from lagjax._native._step import absolute_tolerance
 from lagjax._native._taylor import TaylorSeries, integer
 from lagjax._native._watch import Border, Crossed, GuardTable, Touch, end_at_border, joint_groups, reaches_border
-from lagjax._program._borders import gradient
-from lagjax._program._features import BELOW, FALLS, GROWS, SQUARED, UP_TO, Feature
+from lagjax._program._borders import Borders, gradient
+from lagjax._program._features import BELOW, BESIDE, FALLS, GROWS, UP_TO, Feature
 from lagjax._program._jump import Jump, Nesting
-from lagjax._program._levels import CONE, SIGN, SLIDE, TABLE, Borders
+from lagjax._program._levels import CONE, SIGN, SLIDE, TABLE
 from lagjax._program._passes import eliminate_dead_code
 
 NOWHERE = 1e300  # a level that no switching number comes to
@@ -52,7 +52,7 @@ class BorderControl:
         self.table, self.varies = GuardTable(motion, borders), jump is not None
         self.kicks_in_time = borders.kicks_in_time(motion.states)
         self.decide, self.stop = self._decide(), self._stop()
-        self.retraction = borders.retraction and Retraction(motion, borders, nesting)
+        self.retraction = borders.holding.retraction and Retraction(motion, borders, nesting)
         self.retract = self.retraction and self.retraction.apply(is_run=True)
         self.note, self.jump = None, None
         if jump is not None:
@@ -99,8 +99,8 @@ class BorderControl:
         lane["approach"] = 0.0
         if not self.pieces:
             return
-        located = [of.table for of in self.borders.tables if of is not None and of.table.numbers is None]
-        for table in dict.fromkeys(located):  # of entries that do not increase nothing can be made
+        located = [self.borders.moving_table(j) for j in range(self.pieces)]
+        for table in dict.fromkeys(filter(None, located)):  # of entries that do not increase nothing can be made
             first = frame.code.as_integer(lane["first_number"])
             with frame.code.only_if(~self.motion.look_up.increases(frame, table, first)):
                 lane["y", 0] = float("nan")
@@ -296,7 +296,7 @@ class BorderControl:
 
     def _knot(self, frame: Frame, j: int, index: Value) -> tuple[Value, Value]:
         """An entry of the table of piece j, and whether there is one of this number."""
-        located = self.borders.tables[j]
+        located = self.borders.decisions[j].table
         assert located is not None
         inside = (index >= 0.0) & (index <= float(located.table.count - 1))
         return self.motion.look_up.take(frame, located.table, index), inside
@@ -317,7 +317,7 @@ class BorderControl:
             nearest = nearest - self._instant(frame)
         sooner = inside & (left < nearest)
         if j in self.borders.kicking:  # also at the end of the motion, where the velocities are those behind it
-            located = self.borders.tables[j]
+            located = self.borders.decisions[j].table
             assert located is not None
             is_inner = self.table.piece(frame, j) < float(located.table.count - 1 - located.closed)
             at_end = (frame["forward"] > 0.0) & is_inner & code.compare("==", left, nearest) & (size > 0.0)
@@ -344,7 +344,7 @@ class BorderControl:
         """The levels of guards that change: entries on both sides of the pieces of tables, and the speeds of cones."""
         code = frame.code
         for g, guard in enumerate(self.guards):
-            if self.borders.kinds[guard.piece] == CONE:
+            if self.borders.decisions[guard.piece].kind == CONE:
                 j = integer(code, guard.piece)
                 fall = (0.0 - self.motion.followed_coefficient(frame, j, integer(code, 1))) * frame["forward"]
                 last = fall * (limits.LAST_STEPS * frame["smallest"])  # what is gone in the shortest steps
@@ -352,7 +352,7 @@ class BorderControl:
                 far = self.motion.followed_value(frame, j) > limits.AT_REST * unit
                 least = unit * code.select(far, limits.AT_REST, limits.SETS_OUT)
                 frame["level", g] = code.select(last > least, last, least)
-            if self.borders.kinds[guard.piece] == TABLE:
+            if self.borders.decisions[guard.piece].kind == TABLE:
                 index = self.table.piece(frame, guard.piece) + guard.level.offset
                 knot, inside = self._knot(frame, guard.piece, index)
                 frame["level", g] = code.select(inside, knot, NOWHERE if guard.level.offset else -NOWHERE)
@@ -360,7 +360,7 @@ class BorderControl:
     @property
     def slides(self) -> bool:
         """True if the motion may slide along a border that other switching numbers depend on."""
-        return SLIDE in self.borders.kinds
+        return bool(self.borders.holding.groups)
 
     # ---- narrow features ----
 
@@ -375,7 +375,7 @@ class BorderControl:
             # The base of the power may fall by this in a step of the least order.
             fall = max(math.exp(-limits.RISE * (limits.LEAST_ORDER - 1) / feature.scale), limits.LARGEST_FALL)
             near = ~(moves < (1.0 - fall) * size)
-        if feature.kind in (SQUARED, UP_TO, GROWS):  # which change by more than their argument does
+        if feature.kind in (UP_TO, GROWS):  # which change by more than their argument does
             near = frame.constant(0.0) <= 0.0
         with code.only_if(code.any_lane(near)):
             self._find_feature(frame, j, feature, degree, h)
@@ -413,10 +413,6 @@ class BorderControl:
             level = code.maximum(code.library("exp", rise * (1.0 / scale)) * u, faint)
             matters, slope, start = level > 0.0, frame.constant(-1.0), level - u
             absolute = limits.ARGUMENT * level
-        elif kind == SQUARED:
-            near = code.maximum(u * u - rise, 0.0)
-            level = code.intrinsic("sqrt", code.select(near > limits.FAINT, limits.FAINT, near))
-            matters, start = near > 0.0, side * u - level
         else:
             slope = frame.constant(-scale) if kind == BELOW else scale * side
             level = code.maximum(rise - slope * u, -limits.FAINT)
@@ -427,7 +423,7 @@ class BorderControl:
                 high = (above > 0.0) | ((u * scale > limits.STEEP) & falls)
                 slope = code.select(high, scale, slope)
                 start = code.select(high, code.maximum(above, rise), start)
-        if kind <= SQUARED:
+        if kind in (BELOW, BESIDE):
             far = start > limits.FAR
             start = code.select(far, (1.0 - limits.LARGEST_FALL) * start, start)
             of_size = code.select(far, limits.ARGUMENT * limits.LARGEST_FALL, of_size)
@@ -532,7 +528,7 @@ class BorderControl:
             frame.assign(was_cut & reaches_border(frame), longest=longest, h=frame["planned"])
             if self.note is not None:
                 frame.call(self.note)
-            if self.borders.release.outputs:
+            if self.borders.holding.release.outputs:
                 self._release(frame)
             if self.kick is not None:
                 with code.loop(self.pieces) as j:
@@ -556,7 +552,7 @@ class BorderControl:
     def _go_on(self, frame: Frame, going: Value) -> None:
         """Go past borders and knots; the motion slides along no border that jumps there, and touches none such."""
         shaken, code = self.borders.shaken, frame.code
-        line = eliminate_dead_code(self.borders.program.line, [self.borders.switches[j] for j in shaken])
+        line = eliminate_dead_code(self.borders.program.line, [self.borders.decisions[j].switch for j in shaken])
         before = self.motion.evaluate_now(frame, line) if shaken else []
         before = [code.variable(before[k]) for k in range(len(shaken))]
         for border in self.table.each(frame):
@@ -647,17 +643,17 @@ class BorderControl:
 
     def _release(self, frame: Frame) -> None:
         """Let the vectors of cones that hold no longer set out, with a speed that is twice what counts as none."""
-        code, motion, n = frame.code, self.motion, len(self.borders.release.outputs)
+        code, motion, n = frame.code, self.motion, len(self.borders.holding.release.outputs)
         shares = self.borders.releases
         hits = [self.table.crosses(frame, Crossed.GUARD, g) for g in shares]
         base = n // (2 * len(shares))
         with code.only_if(code.any_lane(functools.reduce(Value.__or__, hits))):
-            out = motion.evaluate_now(frame, self.borders.release)
+            out = motion.evaluate_now(frame, self.borders.holding.release)
             speed = code.lanes_of(2.0 * limits.SETS_OUT * absolute_tolerance(frame))
             for k, hit in enumerate(hits):
                 for i in range(base):
                     places = 2 * k * base + i, (2 * k + 1) * base + i
-                    if any(self.borders.release.constant(place) != 0.0 for place in places):
+                    if any(self.borders.holding.release.constant(place) != 0.0 for place in places):
                         y = frame["y", i + motion.n, 0] + (speed * out[places[0]] - out[places[1]])
                         frame.assign(hit, i + motion.n, 0, y=y)
                         frame.assign(hit, i + motion.n, low=0.0)
@@ -674,7 +670,7 @@ class BorderControl:
         return begins & found & frame.code.compare("==", frame["h"], 0.0)
 
     def _kicks_by_sign(self, j: int) -> bool:
-        return j in self.kicks_in_time and self.borders.kinds[j] == SIGN
+        return j in self.kicks_in_time and self.borders.decisions[j].kind == SIGN
 
     def _look_at_end(self, frame: Frame, degree: Value, h: Value) -> None:
         """A step ends, to rounding, where L jumps at the end of the motion: with the velocities behind, in time."""
@@ -744,7 +740,7 @@ class BorderControl:
         by_velocity = [
             j
             for j, node in enumerate(self.borders.switches)
-            if self.borders.kinds[j] != SLIDE and not self.borders.read_by(node).isdisjoint(velocities)
+            if self.borders.decisions[j].kind != SLIDE and not self.borders.read_by(node).isdisjoint(velocities)
         ]
         if by_velocity:
             for j in range(self.pieces):

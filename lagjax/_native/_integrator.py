@@ -60,7 +60,7 @@ class Integrator:
         if borders is not None:
             fields |= BorderControl.fields(borders)
         jump = parts.jump(over_steps=False)
-        more = [line for line in (jump and jump.line, borders and borders.retraction) if line]
+        more = [line for line in (jump and jump.line, borders and borders.holding.retraction) if line]
         large = is_large(program, projection, guards, more=more)
         self.motion = motion = TaylorSeries("motion", parts, JOB, fields, large, width, kept=self.guards)
         self.projector = projection and Projector(motion, projection.state, projection.velocity_scale, self.base_size)

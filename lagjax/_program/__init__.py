@@ -25,9 +25,10 @@ Derivatives of a program are those of its operations, programs again that are ma
 
 `_operations` has a row for each operation: its value, its derivatives, its series. `_graph` shares and, by `_simplify`,
 folds; `_scalars` writes formulas on it, `_passes` finish it; `_differentiation` differentiates it. Series: `_series`,
-with `_recurrences` for operations that have one of their own. Pieces: `_levels` (what they are), `_borders` (where they
-meet), `_cones` (of lengths), `_sliding` (along them, by `_border_forces`, `_held` and `_small_equations`), `_jump` and
-`_kick` (over them), `_features` and `_powers` (where no series helps), `_look_ups` (tables). A program consists of a
+with `_recurrences` for operations that have one of their own. Pieces: `_deciding` (what decides), `_decisions` (by which
+numbers), `_cones` (of lengths), `_levels` (their borders), `_beginnings` (where a motion begins), `_borders` (all of
+that), `_sliding` (along them, by `_border_forces`, `_held` and `_small_equations`), `_jump` and `_kick` (over them, by
+`_jump_search`), `_features` and `_powers` (where no series helps), `_look_ups` (tables). A program consists of a
 `_line`, with its values in NumPy; `_emit` is for JAX, `_rounding` for their error. `_memory` bounds what
 a graph may take. `lowering/` turns JAX's operations into scalars.
 """
@@ -43,12 +44,12 @@ import numpy as np
 from jax.custom_derivatives import SymbolicZero
 
 from lagjax._program import _scalars as scalar_algebra
-from lagjax._program._borders import borders, distances, find_corners, is_smooth, with_outputs
+from lagjax._program._borders import Borders, borders, distances, find_corners, is_smooth, with_outputs
 from lagjax._program._differentiation import Derivatives, copy_nodes, pullback, pushforward, tangents_in, with_tangents
 from lagjax._program._emit import Rows, apply_in_jax, emit, emit_look_up, emit_rows
 from lagjax._program._graph import INPUTS, Graph, Tape, Unlowerable, find_ancestors
 from lagjax._program._jump import row_places
-from lagjax._program._levels import CLOCK, FLOOR, SIGN, TABLE, TRUNC, Borders
+from lagjax._program._levels import CLOCK, FLOOR, SIGN, TABLE, TRUNC
 from lagjax._program._line import StraightLine
 from lagjax._program._look_ups import table_of
 from lagjax._program._memory import lack_of_memory, machine_memory, operations_that_fit

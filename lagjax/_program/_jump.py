@@ -26,9 +26,9 @@ from typing import NamedTuple
 
 import numpy as np
 
+from lagjax._program._borders import Borders, Pieced
 from lagjax._program._differentiation import TangentTable, copy_nodes, pullback_and_entries, tangents_in, with_tangents
 from lagjax._program._graph import Graph, Unlowerable
-from lagjax._program._levels import Borders, Pieced
 from lagjax._program._look_ups import Table, shift_look_up
 from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._series import StraightLine
@@ -161,7 +161,7 @@ def with_borders_of_tangents(borders: Borders, size: int, directions: int, membe
     every = [None, *range(directions)]
     of = [(i, row) for row in every for i in range(n)] + [(n + k, None) for k in range(1 + len(followed))]
     tables = [_table_of_row(row * member) for row in range(1, rows)]
-    retraction = borders.retraction
+    holding, retraction = borders.holding, borders.holding.retraction
     if retraction is not None:
         states = [(half * n + i, row) for half in range(2) for row in every for i in range(n)]
         retraction = with_tangents(retraction, program.dtypes, places, moving, states, tables)
@@ -171,10 +171,12 @@ def with_borders_of_tangents(borders: Borders, size: int, directions: int, membe
     decided = {i: place for i, place in enumerate(places)}
     decided |= {program.size + j: first_piece + pieces + j for j in range(pieces)}
     line = line.replace(outputs=line.outputs[: rows * n + 1])
+    moved = zip(borders.decisions, switches[:pieces], strict=True)
     return borders._replace(
         program=Pieced(line, len(dtypes), dtypes, None),
-        switches=switches[:pieces], arguments=switches[pieces:], decide=_renumber_inputs(borders.decide, decided),
-        motion=borders.motion or borders, retraction=retraction, release=_renumber_inputs(borders.release, decided),
+        decisions=tuple(decision._replace(switch=node) for decision, node in moved), arguments=switches[pieces:],
+        decide=_renumber_inputs(borders.decide, decided), motion=borders.motion or borders,
+        holding=holding._replace(retraction=retraction, release=_renumber_inputs(holding.release, decided)),
     )  # fmt: skip
 
 

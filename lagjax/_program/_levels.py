@@ -1,24 +1,80 @@
-"""The pieces of a program and their borders: the values that stages of `_borders` hand on, and kernels read.
+"""What decides a piece, and its borders: the levels of its switching number, as formulas and as tables of a kernel.
+
+    SIGN     the sign of a switching number u: −1, 0 or 1
+    FLOOR    the whole number below u
+    TRUNC    the whole number between u and zero
+    TABLE    the piece of an increasing table that u is on; CLOCK, where u is the time, whose borders are known
+    CONE     1 where a vector of velocities of length u moves, −1 where it rests
+    SLIDE    1 where the motion slides along the border of another piece
 
 A *guard* is a border of a piece: σ (u − level) > 0 on it, with σ = ±1.
 """
 
+import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 
 from lagjax._program._border_forces import Slide
-from lagjax._program._features import UP_TO, Feature
-from lagjax._program._graph import Graph, find_ancestors
-from lagjax._program._kick import Kick
-from lagjax._program._look_ups import Located, Table
-from lagjax._program._series import StraightLine
+from lagjax._program._graph import Graph
+from lagjax._program._look_ups import Located
 
-# The kinds of pieces; `CLOCK` is the piece of a table that the time itself is on, whose borders are known.
 SIGN, FLOOR, TRUNC, SLIDE, TABLE, CLOCK, CONE = range(7)
 NOTHING = 2.0**-500  # the length of a vector at rest, whose square is there
+FAR = 1e100  # from a border that is not there; a share that is beyond 0 and 1: the search for its roots squares it
+
+
+class Decision(NamedTuple):
+    """What a piece is decided by: its kind, its switching number, a node, and the table of a `TABLE` or `CLOCK`."""
+
+    kind: int
+    switch: int
+    table: Located | None = None
+
+    def piece(self, graph: Graph, x: int) -> int:
+        """The piece that a switching number x is on."""
+        f, number = graph.apply, graph.number
+        if self.table is not None:
+            return f("locate", x, attribute=self.table)
+        if self.kind == SIGN:
+            return f("sign", x)
+        if self.kind == CONE:
+            return f("select", f("gt", x, number(2 * NOTHING)), number(-1.0), number(1.0))
+        below = f("floor", x)
+        return below if self.kind == FLOOR else f("select", f("lt", x, number(0.0)), below, f("ceil", x))
+
+    def level(self, graph: Graph, piece: int) -> int:
+        """The level between a piece and the next one, of the switching number."""
+        f, zero, above = graph.apply, graph.number(0.0), graph.apply("add", piece, graph.number(1.0))
+        if self.kind in (SIGN, CONE):
+            return zero
+        if self.table is not None:  # no piece follows the last one
+            follows = f("lt", above, graph.number(float(self.table.table.count)))
+            return f("select", follows, graph.number(math.inf), f("take", above, attribute=self.table.table))
+        return above if self.kind == FLOOR else f("select", f("lt", piece, zero), above, piece)
+
+    def distances(self, graph: Graph, x: int, piece: int) -> tuple[int, int]:
+        """How far a switching number x, no sign's, is above the border below its piece, and below the one above it."""
+        f, number = graph.apply, graph.number
+        below = f("sub", x, self.level(graph, f("sub", piece, number(1.0))))
+        if self.table is not None:
+            below = f("select", f("lt", piece, number(0.0)), below, number(FAR))
+        return below, f("sub", self.level(graph, piece), x)
+
+    def levels_near(self, u: np.ndarray, entries: Callable, draw: np.random.Generator) -> tuple:
+        """Levels near switching numbers u (S,), and the pieces below and above; `entries(located, index)` of tables."""
+        if self.kind == SIGN:
+            return np.zeros_like(u), -np.ones_like(u), np.ones_like(u)
+        if self.table is not None:
+            inner, count = int(self.table.closed), self.table.table.count  # what is closed is not there outside of it
+            index = draw.integers(inner, max(count - inner, inner + 1), len(u))
+            return np.where(index < count - inner, entries(self.table, index), np.nan), index - 1.0, index + 0.0
+        level = np.round(u)
+        if self.kind == FLOOR:
+            return level, level - 1.0, level
+        level = np.where(level == 0.0, np.where(u < 0.0, -1.0, 1.0), level)
+        return level, np.where(level > 0.0, level - 1.0, level), np.where(level > 0.0, level, level + 1.0)
 
 
 class Affine(NamedTuple):
@@ -70,128 +126,6 @@ class Guard(NamedTuple):
     of_table: int = 0
 
 
-@dataclass(frozen=True, eq=False)
-class Pieced:
-    """A program that takes its pieces as its last inputs, or only some of the numbers of a member (`Recurrent`)."""
-
-    line: StraightLine
-    size: int
-    dtypes: Sequence[np.dtype]
-    linear: Any
-    mechanics: StraightLine | None = None
-
-
-class Borders(NamedTuple):
-    """The borders of a program with m pieces, and its features.
-
-    `program` takes the inputs, then the pieces; `switches` (m,) are the nodes of the switching numbers in it, and
-    `arguments` those of the arguments of `features`, of which alike ones stand side by side. `decide`
-    takes the same and then m flags: it gives the pieces of a state, or the piece that is given where the flag is 1.
-    `nested` says whether switching numbers depend on pieces. `tables` (m,) has that of every piece that is one of a
-    table; those of a `CLOCK` have no guards. `motion` has the borders of the motion alone, where this is one with
-    tangents (`_jump.with_borders_of_tangents`). `kick` is that at borders at which L jumps, None where there are none.
-    `retraction` takes the inputs of the program to the state on the borders that it slides along, None where it may
-    slide along none; `moved` are the coordinates that each moves, `groups` the group of each, and `release` is that of
-    the cones (`_sliding.Sliding`). Along so many borders, `unheld`, it may slide, and that is not followed.
-    """
-
-    program: Pieced
-    switches: tuple[int, ...]
-    kinds: tuple[int, ...]
-    decide: StraightLine
-    guards: tuple[Guard, ...]
-    nested: bool
-    arguments: tuple[int, ...]
-    features: tuple[Feature, ...]
-    tables: tuple[Located | None, ...] = ()
-    motion: "Borders | None" = None
-    kick: Kick | None = None
-    retraction: StraightLine | None = None
-    moved: tuple[frozenset[int], ...] = ()
-    groups: tuple[int, ...] = ()
-    release: StraightLine = StraightLine((), (), ())
-    unheld: int = 0
-
-    @property
-    def groups_of_guards(self) -> list[int]:
-        """The group of each guard of a border by velocity that the motion slides along, and of its shares.
-
-        −1 for others. Those of different groups may be crossed at one instant, in one step.
-        """
-        shares = [j for j, kind in enumerate(self.kinds) if kind == SLIDE]
-        of_shares, found = dict(zip(shares, self.groups, strict=True)), []
-        for guard in self.guards:
-            border = self.guards[guard.on] if guard.on >= 0 else guard
-            known = border.order == 1 and self.kinds[border.piece] != CONE
-            found.append(of_shares[border.slide] if known else -1)
-        return found
-
-    @property
-    def kicking(self) -> tuple[int, ...]:
-        return () if self.kick is None else self.kick.pieces
-
-    @property
-    def releases(self) -> list[int]:
-        kinds = {g: self.kinds[self.guards[guard.on].piece] for g, guard in enumerate(self.guards) if guard.on >= 0}
-        return [g for g, kind in kinds.items() if kind == CONE]
-
-    @property
-    def clocks(self) -> tuple[int, ...]:
-        return tuple(j for j, kind in enumerate(self.kinds) if kind == CLOCK)
-
-    def moving_table(self, j: int) -> Table | None:
-        """The table of parameters whose entries are the levels of piece j; None where it has none."""
-        located = self.tables[j] if self.kinds[j] in (TABLE, CLOCK) else None
-        return None if located is None or located.table.numbers is not None else located.table
-
-    @property
-    def levels_move(self) -> bool:
-        return any(self.moving_table(j) is not None for j in range(len(self.switches)))
-
-    @property
-    def shaken(self) -> tuple[int, ...]:
-        """The pieces whose switching numbers may jump at the next entry of a clock, or where another piece changes."""
-        first = self.program.size - len(self.switches)
-        pieces = {("input", (), first + j) for j, kind in enumerate(self.kinds) if kind != SLIDE}
-        nodes, shaken = self.program.line.nodes, []
-        for j, node in enumerate(self.switches):
-            if self.kinds[j] != SLIDE and any(nodes[i] in pieces for i in nodes_below(self.program.line, [node])):
-                shaken.append(j)
-        return tuple(shaken)
-
-    @property
-    def abrupt(self) -> tuple[int, ...]:
-        """The nodes of what is zero where a root has no series."""
-        return tuple(u for u, of in zip(self.arguments, self.features, strict=True) if of.kind == UP_TO)
-
-    @property
-    def followed(self) -> tuple[int, ...]:
-        return self.switches + self.arguments
-
-    def kicks_in_time(self, states: int) -> list[int]:
-        """The pieces with which L jumps whose switching numbers depend on the time alone, but no clocks."""
-        others = (j for j in self.kicking if self.kinds[j] != CLOCK)
-        return [j for j in others if self.read_by(self.switches[j]).isdisjoint(range(states))]
-
-    def read_by(self, node: int) -> frozenset[int]:
-        """The inputs that a node of the program depends on; pieces are the last ones."""
-        return inputs_below(self.program.line, [node])
-
-
-def piece_of(graph: Graph, kind: int, x: int, table: Located | None) -> int:
-    if table is not None:
-        return graph.apply("locate", x, attribute=table)
-    if kind == SIGN:
-        return graph.apply("sign", x)
-    if kind == CONE:
-        moves = graph.apply("gt", x, graph.constant(2 * NOTHING, "float"))
-        return graph.apply("select", moves, *(graph.constant(p, "float") for p in (-1.0, 1.0)))
-    below = graph.apply("floor", x)
-    if kind == FLOOR:
-        return below
-    return graph.apply("select", graph.apply("lt", x, graph.constant(0.0, "float")), below, graph.apply("ceil", x))
-
-
 def list_guards(kinds: Sequence[int], slides: Sequence[Slide]) -> tuple[Guard, ...]:
     """The guards of all pieces; piece number `slides[k].piece` slides where the k-th of the last ones is 1.
 
@@ -232,13 +166,3 @@ def list_guards(kinds: Sequence[int], slides: Sequence[Slide]) -> tuple[Guard, .
                 of_piece[-2:] = [of_piece[-2]._replace(gains=int(width))]
         guards += of_piece
     return tuple(guards)
-
-
-def nodes_below(line: StraightLine | Graph, roots: Sequence[int]) -> set[int]:
-    """The nodes that some nodes depend on, and these."""
-    return set(find_ancestors(line.nodes, roots))
-
-
-def inputs_below(line: StraightLine | Graph, roots: Sequence[int]) -> frozenset[int]:
-    """The inputs that some nodes depend on."""
-    return frozenset(line.nodes[i][2] for i in nodes_below(line, roots) if line.nodes[i][0] == "input")

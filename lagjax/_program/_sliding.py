@@ -21,6 +21,7 @@ from lagjax._program._border_forces import Rows, Slide
 from lagjax._program._differentiation import copy_nodes, copy_operation
 from lagjax._program._graph import Graph, find_descendants, find_readers
 from lagjax._program._held import Coupled, Held, choose_pivots
+from lagjax._program._levels import FAR
 from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._series import LinearSystem, StraightLine
 from lagjax._program._small_equations import (
@@ -42,27 +43,34 @@ MOST_COPIES, LARGEST_COPIED = 4, 4000  # pieces for which all of a program is do
 # What moves less off a border, relative to what pushes it there, is held by others: rounding of forces that cancel. It
 # decides on derivatives alone; doubled, nothing that was looked at changes.
 STILL = 1e-9
-FAR = 1e100  # of a rate: a share that is beyond 0 and 1; the search for its roots squares it
 _LARGEST = 10_000_000  # operations: a bound for errors
 
 
-class Sliding(NamedTuple):
-    """A program with shares; `places` says where the nodes of the one without them are.
+class Holding(NamedTuple):
+    """What keeps a motion on the borders that it slides along.
 
-    `retraction` takes the same inputs to the state (q, q̇) on the borders that the motion slides along; `moved` are the
-    coordinates that the force of each of these moves; those of different `groups` know nothing of each other as long as
-    no time passes. `release` gives for each cone changes of q̇ (n,): one by which
-    its vector becomes a unit along what it does not hold, and what takes the vector away.
+    `retraction` takes the inputs of the program to the state (q, q̇) on them, None where the motion may slide along
+    none; `moved` are the coordinates that the force of each moves, and those of different `groups` know nothing of each
+    other as long as no time passes. `release` gives for each cone changes of q̇ (n,): one by which its vector becomes a
+    unit along what it does not hold, and what takes the vector away. Along so many borders, `unheld`, the motion may
+    slide, and that is not followed.
     """
+
+    retraction: StraightLine | None = None
+    moved: tuple[frozenset[int], ...] = ()
+    groups: tuple[int, ...] = ()
+    release: StraightLine = StraightLine((), (), ())
+    unheld: int = 0
+
+
+class Sliding(NamedTuple):
+    """A program with shares; `places` says where the nodes of the one without them are."""
 
     line: StraightLine
     places: Sequence[int]
     shares: list[int]
     linear: LinearSystem | None
-    retraction: StraightLine | None
-    moved: tuple[frozenset[int], ...]
-    groups: tuple[int, ...] = ()
-    release: StraightLine = StraightLine((), (), ())
+    holding: Holding
 
 
 def with_sliding(
@@ -73,7 +81,7 @@ def with_sliding(
     `first` is the input of the first piece, `switches` are the nodes of the switching numbers. None if it is too long.
     """
     if not slides:
-        return Sliding(line, range(len(line.nodes)), [], linear, None, ())
+        return Sliding(line, range(len(line.nodes)), [], linear, Holding())
     if linear is not None and (done := _slide(line, n, first, switches, slides, linear)) is not None:
         return done
     is_large = len(slides) > MOST_COPIES or len(line.nodes) > LARGEST_COPIED
@@ -149,7 +157,8 @@ class _SlidingForces:
         retraction, moved = self._retract(held, coupled.equations, effects, pushed, missing)
         of_slides = tuple(frozenset().union(*some) for some in rows.group(moved))
         groups = tuple(self.groups[rows[0]] for rows in rows.of_slides)
-        return Sliding(line, range(len(self.line.nodes)), shares, linear, retraction, of_slides, groups, release)
+        holding = Holding(retraction, of_slides, groups, release)
+        return Sliding(line, range(len(self.line.nodes)), shares, linear, holding)
 
     def _find_pushed(self, effects: Sequence[Sparse]) -> list[int]:
         """Where both sides push onto the border of each row, and onto those of its slide."""

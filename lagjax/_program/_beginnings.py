@@ -1,0 +1,120 @@
+"""On which pieces a motion begins, and how far a state is from their borders."""
+
+import functools
+from collections.abc import Callable, Sequence
+
+from lagjax._program._border_forces import Slide
+from lagjax._program._decisions import LARGEST, Decided, Decision
+from lagjax._program._differentiation import copy_nodes, gradient_in
+from lagjax._program._graph import Graph, find_ancestors
+from lagjax._program._levels import CONE, SIGN
+from lagjax._program._passes import eliminate_dead_code
+from lagjax._program._series import StraightLine
+from lagjax._program._small_equations import dot
+
+
+def copy_deciding(
+    graph: Graph, line: StraightLine, first: int, decisions: Sequence[Decision], decide: Callable | None = None
+) -> list[int]:
+    """The nodes of a line with pieces, its inputs from number `first` on, in a graph.
+
+    Piece j is that of its switching number, or `decide(j, piece, nodes)` of the piece that it is as it is written.
+    """
+    of_inputs = {node[2]: kind for node, kind in zip(line.nodes, line.kinds, strict=True) if node[0] == "input"}
+
+    def find_input(i: int, nodes: list[int]) -> int:
+        if i < first:
+            return graph.input(i, of_inputs[i])
+        piece = decisions[i - first].piece(graph, nodes[decisions[i - first].switch])
+        return piece if decide is None else decide(i - first, piece, nodes)
+
+    return copy_nodes(graph, line, find_input)
+
+
+def signed_distances(line: StraightLine, first: int, decisions: Sequence[Decision], turning: bool) -> StraightLine:
+    """The differences of all switching numbers from the nearest border of their piece; of the inputs but the pieces.
+
+    They are positive on one side of each border or, `turning`, of every other one.
+    """
+    graph, results = Graph(LARGEST * len(line.nodes) + 1000), []
+    f, number = graph.apply, graph.number
+    places = copy_deciding(graph, line, first, decisions)
+    for decision in decisions:
+        x = places[decision.switch]
+        if decision.kind != SIGN:
+            piece = decision.piece(graph, x)
+            below, above = decision.distances(graph, x, piece)
+            is_nearer = f("prefers", above, below)
+            half = f("mul", number(0.5), piece)
+            turn = f("sub", number(1.0), f("mul", number(4.0), f("sub", half, f("floor", half))))
+            x = f("mul", turn, f("select", is_nearer, above, below))
+            x = x if turning else f("select", is_nearer, f("neg", above), below)
+        results.append(x)
+    return eliminate_dead_code(graph, results)
+
+
+def decide_pieces(decided: Decided, slides: Sequence[Slide]) -> StraightLine:
+    """The pieces, from the inputs, the pieces before, and a flag for each that is to stay; those of `slides` are last.
+
+    A motion that begins on a border slides along it, and leaves it at once where it may; on one that depends on
+    positions it has to be at rest. To begin with all of several borders takes few turns until it is known which ones it
+    leaves. A slide continues.
+    """
+    graph, count = Graph(2 * LARGEST * len(decided.line.nodes) + 2000), len(decided.decisions)
+    f, zero, one = graph.apply, graph.number(0.0), graph.number(1.0)
+    given = [graph.input(decided.first + k, "float") for k in range(2 * (count + len(slides)))]
+    stays = [f("gt", flag, graph.number(0.5)) for flag in given[count + len(slides) :]]
+
+    def decide_or_keep(j: int, piece: int, _) -> int:
+        return f("select", stays[j], piece, given[j])
+
+    def decide_ahead(way: float, j: int, piece: int, nodes: list[int]) -> int:
+        """The piece forward or back in time, of what is at its border and has a rate there."""
+        if decided.decisions[j].kind == SIGN:
+            ahead = f("sign", f("mul", graph.number(way), _rate(decided, graph, nodes, j)))
+            piece = f("select", f("eq", piece, zero), piece, ahead)
+        return decide_or_keep(j, piece, nodes)
+
+    copy = functools.partial(copy_deciding, graph, decided.line, decided.first, decided.decisions)
+    nodes = copy(decide_or_keep)
+    signs = {piece for piece, of in zip(decided.pieces, decided.decisions, strict=True) if of.kind == SIGN}
+    by_place = [decided.decisions[slide.piece].switch for slide in slides if slide.order > 1]
+    nested = not signs.isdisjoint(find_ancestors(decided.line.nodes, by_place))
+    sides = [copy(functools.partial(decide_ahead, way)) for way in (1.0, -1.0)] if nested else [nodes]
+    pieces, flags = [nodes[i] for i in decided.pieces], []
+    for slide, flag in zip(slides, given[count : count + len(slides)], strict=True):
+        j, piece = slide.piece, pieces[slide.piece]
+        begins, below = _begin_on_border(decided, graph, nodes, slide, piece)
+        if begins is None:  # it begins on one side, and meets the other one at once
+            flags.append(flag)
+            continue
+        if not slide.parts:  # a border that the motion has left does not hold it
+            begins = f("and", begins, f("not", stays[j]))
+        for side in sides if slide.order > 1 else ():
+            begins = f("and", begins, f("eq", _rate(decided, graph, side, j), zero))
+        flags.append(f("select", begins, flag, one))
+        pieces[j] = f("select", begins, piece, below)
+    sliding = {slide.piece for slide in slides}
+    for j, decision in enumerate(decided.decisions):  # what cannot rest moves
+        if decision.kind == CONE and j not in sliding:
+            pieces[j] = one
+    return eliminate_dead_code(graph, pieces + flags)
+
+
+def _begin_on_border(decided: Decided, graph: Graph, nodes: list[int], slide: Slide, piece: int):
+    """Where a switching number is on a border of its piece, None if that is not asked; and the piece below it."""
+    f, decision, below = graph.apply, decided.decisions[slide.piece], graph.number(-1.0)
+    if decision.kind in (SIGN, CONE):
+        return f("le" if slide.parts else "eq", piece, graph.number(0.0)), below
+    if slide.order == 1:
+        return None, below
+    x, lower = nodes[decision.switch], f("sub", piece, graph.number(1.0))
+    at_lower, at_upper = (f("eq", x, decision.level(graph, i)) for i in (lower, piece))
+    return f("or", at_lower, at_upper), f("select", at_upper, lower, piece)
+
+
+def _rate(decided: Decided, graph: Graph, nodes: list[int], j: int) -> int:
+    """u̇ of the switching number of piece j, in a graph in which the nodes of the program are `nodes`."""
+    n = decided.n
+    slopes = gradient_in(graph, decided.line, nodes, decided.decisions[j].switch, range(2 * n + 1))
+    return graph.apply("add", dot(graph, slopes[:n], [graph.input(n + i, "float") for i in range(n)]), slopes[2 * n])
