@@ -4,7 +4,7 @@ import functools
 from collections.abc import Callable, Sequence
 
 from lagjax._program._border_forces import Slide
-from lagjax._program._decisions import LARGEST, Decided, Decision
+from lagjax._program._decisions import LARGEST, DecidedProgram, Decision
 from lagjax._program._differentiation import copy_nodes, gradient_in
 from lagjax._program._graph import Graph, find_ancestors
 from lagjax._program._levels import CONE, SIGN
@@ -53,7 +53,7 @@ def signed_distances(line: StraightLine, first: int, decisions: Sequence[Decisio
     return eliminate_dead_code(graph, results)
 
 
-def decide_pieces(decided: Decided, slides: Sequence[Slide]) -> StraightLine:
+def decide_pieces(decided: DecidedProgram, slides: Sequence[Slide]) -> StraightLine:
     """The pieces, from the inputs, the pieces before, and a flag for each that is to stay; those of `slides` are last.
 
     A motion that begins on a border slides along it, and leaves it at once where it may; on one that depends on
@@ -101,8 +101,8 @@ def decide_pieces(decided: Decided, slides: Sequence[Slide]) -> StraightLine:
     return eliminate_dead_code(graph, pieces + flags)
 
 
-def _begin_on_border(decided: Decided, graph: Graph, nodes: list[int], slide: Slide, piece: int):
-    """Where a switching number is on a border of its piece, None if that is not asked; and the piece below it."""
+def _begin_on_border(decided: DecidedProgram, graph: Graph, nodes: list[int], slide: Slide, piece: int):
+    """True where a switching number is on a border of its piece, None if that is not asked; and the piece below it."""
     f, decision, below = graph.apply, decided.decisions[slide.piece], graph.number(-1.0)
     if decision.kind in (SIGN, CONE):
         return f("le" if slide.parts else "eq", piece, graph.number(0.0)), below
@@ -113,7 +113,7 @@ def _begin_on_border(decided: Decided, graph: Graph, nodes: list[int], slide: Sl
     return f("or", at_lower, at_upper), f("select", at_upper, lower, piece)
 
 
-def _rate(decided: Decided, graph: Graph, nodes: list[int], j: int) -> int:
+def _rate(decided: DecidedProgram, graph: Graph, nodes: list[int], j: int) -> int:
     """u̇ of the switching number of piece j, in a graph in which the nodes of the program are `nodes`."""
     n = decided.n
     slopes = gradient_in(graph, decided.line, nodes, decided.decisions[j].switch, range(2 * n + 1))

@@ -43,7 +43,7 @@ class Row(NamedTuple):
     below: float
 
 
-class Rows(NamedTuple):
+class SlidingRows(NamedTuple):
     """The numbers that stay zero while a motion slides, `rows` of them; those of each slide are `of_slides`.
 
     `pieces` are those of the slides, and `flags` are true where the motion slides.
@@ -60,7 +60,7 @@ class Rows(NamedTuple):
     @classmethod
     def from_slides(
         cls, line: StraightLine, n: int, first: int, switches: Sequence[int], slides: Sequence[Slide]
-    ) -> "Rows":
+    ) -> "SlidingRows":
         """Those of a program whose pieces, of these switching numbers, are its inputs from the `first` one on."""
         graph, rows, of_slides = Graph.from_line(line, _LARGEST), [], []
         pieces = [graph.input(first + slide.piece, "float") for slide in slides]

@@ -18,7 +18,7 @@ from lagjax._program._beginnings import decide_pieces, signed_distances
 from lagjax._program._border_forces import Slide
 from lagjax._program._cones import velocity_degrees
 from lagjax._program._deciding import PIECEWISE, inputs_below
-from lagjax._program._decisions import LARGEST, Decided, find_decisions
+from lagjax._program._decisions import LARGEST, DecidedProgram, find_decisions
 from lagjax._program._differentiation import copy_nodes, pullback
 from lagjax._program._features import UP_TO, Feature
 from lagjax._program._graph import Graph, find_ancestors
@@ -171,7 +171,12 @@ def _find_borders(program: Recurrent, size: int, slides: bool, watched: int, bes
 
 
 def _build(
-    program: Recurrent, decided: Decided, slides: bool, again: Callable, mechanics: int, kicking: dict[int, str | None]
+    program: Recurrent,
+    decided: DecidedProgram,
+    slides: bool,
+    again: Callable,
+    mechanics: int,
+    kicking: dict[int, str | None],
 ) -> Borders:
     """The borders of what has been decided, or is `again`, with one piece apart.
 
@@ -206,7 +211,7 @@ def _build(
     )  # fmt: skip
 
 
-def _find_slides(decided: Decided, kicking: Container[int]) -> tuple[list[Slide], list[int]]:
+def _find_slides(decided: DecidedProgram, kicking: Container[int]) -> tuple[list[Slide], list[int]]:
     """The borders that a motion may slide along: those that something jumps with, but not L.
 
     Those that depend on velocities come first, and are all there or none. And those of them that are lost, because
@@ -246,7 +251,7 @@ def _find_slides(decided: Decided, kicking: Container[int]) -> tuple[list[Slide]
     return both if len(both) <= MOST_SLIDING else by_velocity if len(by_velocity) <= MOST_SLIDING else [], lost
 
 
-def _find_undefined(decided: Decided, acting: set[int]) -> set[int]:
+def _find_undefined(decided: DecidedProgram, acting: set[int]) -> set[int]:
     """The pieces on one of whose sides nothing is known: `where` has NaN there."""
     nodes, found = decided.line.nodes, set()
     for op, operands, _ in (nodes[i] for i in acting):

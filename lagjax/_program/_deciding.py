@@ -1,4 +1,4 @@
-"""Which operations of a program decide, as it is written: those that become pieces, and those that steps end beside."""
+"""The operations of a program, as it is written, that decide: those that become pieces, or that steps end beside."""
 
 from collections.abc import Sequence
 from typing import NamedTuple

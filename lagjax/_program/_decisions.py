@@ -37,7 +37,7 @@ LARGEST = 10  # operations that one may become: a bound for errors, three are us
 _BENT = 1e-9  # of a ratio that is the same at all states: a million roundings
 
 
-class Decided(NamedTuple):
+class DecidedProgram(NamedTuple):
     """A program of q (n,), q̇, t and parameters that takes its pieces as further inputs, from number `first` on.
 
     `pieces` are the nodes of these inputs, and something jumps with those in `jumping`. Of a cone, by its piece,
@@ -329,7 +329,7 @@ class _Rewriting:
 
     # ---- the end ----
 
-    def finish(self, size: int) -> Decided:
+    def finish(self, size: int) -> DecidedProgram:
         of, graph, switches = self.places, self.graph, self.switches
         line = StraightLine(tuple(graph.nodes), tuple(graph.kinds), tuple(of[i] for i in self.line.outputs))
         linear = self.program.linear
@@ -338,7 +338,7 @@ class _Rewriting:
             entries, others = ({at: of[i] for at, i in some.items()} for some in (linear.entries, linear.others))
             linear = LinearSystem(z, entries, right, factors, linear.solve, others)
         features = sorted(self.features.found.items(), key=lambda item: item[1])
-        return Decided(
+        return DecidedProgram(
             line, size, self.program.size, linear, tuple(switches.decisions), tuple(switches.pieces),
             frozenset(switches.jumping), self.parts, tuple((u, feature) for (u, _), feature in features),
         )  # fmt: skip
@@ -346,7 +346,7 @@ class _Rewriting:
 
 def find_decisions(
     program: Recurrent, size: int, slides: bool, watched: int, beside: bool, apart: int | None = None
-) -> Decided | None:
+) -> DecidedProgram | None:
     """The program with pieces; None where it has neither these nor features. The arguments are those of `Deciding`.
 
     What the piece `apart` jumps with is there for both of its sides, each with pieces of its own.

@@ -31,7 +31,7 @@ class Feature(NamedTuple):
 
 
 class Moving:
-    """Which nodes of a graph change along a motion, not only in steps: those of its first inputs, `count` of them."""
+    """A test which nodes of a graph change along a motion, not only in steps; its first inputs, `count` of them, do."""
 
     def __init__(self, graph: Graph, count: int):
         self.graph, self.count = graph, count

@@ -32,11 +32,13 @@ class Coupled(NamedTuple):
     def rename(self, place: Callable[[int], int]) -> "Coupled":
         """The same of nodes of another graph."""
 
-        def of_rows(rows: list[Sparse]) -> list[Sparse]:
+        def place_rows(rows: list[Sparse]) -> list[Sparse]:
             return [{i: place(x) for i, x in row.items()} for row in rows]
 
         pivots = [(k, i, place(free), place(inverse)) for k, i, free, inverse in self.pivots]
-        return Coupled(of_rows(self.acts), of_rows(self.normals), Equations(*map(of_rows, self.equations)), pivots)
+        return Coupled(
+            place_rows(self.acts), place_rows(self.normals), Equations(*map(place_rows, self.equations)), pivots
+        )
 
     def push(self, graph: Graph, right: Sequence[int], mu: Sequence[int]) -> list[int]:
         """r + Σ μₖ actsₖ."""
@@ -47,7 +49,7 @@ class Coupled(NamedTuple):
         return pushed
 
     def missing(self, graph: Graph, z: Sequence[int], ends: Sequence[int]) -> list[int]:
-        """What the rates of the borders are less than `ends`."""
+        """The `ends` less the rates of the borders."""
         rates = (dot(graph, d.values(), [z[i] for i in d]) for d in self.normals)
         return [graph.apply("sub", end, rate) for end, rate in zip(ends, rates, strict=True)]
 

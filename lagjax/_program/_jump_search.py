@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from lagjax._program._beginnings import decide_pieces
-from lagjax._program._decisions import Decided
+from lagjax._program._decisions import DecidedProgram
 from lagjax._program._differentiation import copy_nodes, gradient_in
 from lagjax._program._graph import Graph
 from lagjax._program._look_ups import BESIDE, shift_look_up, table_of
@@ -22,7 +22,7 @@ _ROUNDS, _STEPS = 4, 6  # of Newton's method, with the pieces of the state decid
 _NOISE, _HIT, _EPS = 1e3, 100.0, float(np.finfo(float).eps)
 
 
-class Sides:
+class BothSides:
     """A line on both sides of a border in one graph: its `size` inputs, the m pieces before it, the m behind it."""
 
     def __init__(self, graph: Graph, line: StraightLine, size: int, m: int):
@@ -81,7 +81,7 @@ class Sides:
 class JumpSearch:
     """The search for the pieces of a program with which some of its numbers jump."""
 
-    def __init__(self, decided: Decided):
+    def __init__(self, decided: DecidedProgram):
         line, decide, self.decisions = decided.line, decide_pieces(decided, ()), decided.decisions
         self.moving, self.size, self.m = 2 * decided.n + 1, decided.first, len(decided.decisions)
         located = [a for op, _, a in (*line.nodes, *decide.nodes) if op in LOOK_UPS]
@@ -185,7 +185,7 @@ class JumpSearch:
     def _differences(self, nodes: Sequence[int]) -> StraightLine:
         """The differences of nodes on both sides, and the rounding errors of these."""
         graph = Graph(_LARGEST * len(self.line.nodes) + 10_000)
-        sides = Sides(graph, self.line, self.size, self.m)
+        sides = BothSides(graph, self.line, self.size, self.m)
         changes = [sides.difference(i) for i in nodes]
         return self._with_rounding(eliminate_dead_code(graph, changes), len(changes))
 

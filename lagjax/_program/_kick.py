@@ -21,10 +21,10 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 from lagjax._program._deciding import inputs_below
-from lagjax._program._decisions import Decided
+from lagjax._program._decisions import DecidedProgram
 from lagjax._program._differentiation import gradient_in
 from lagjax._program._graph import Graph
-from lagjax._program._jump_search import JumpSearch, Sides
+from lagjax._program._jump_search import BothSides, JumpSearch
 from lagjax._program._levels import Decision
 from lagjax._program._passes import eliminate_dead_code
 from lagjax._program._series import StraightLine
@@ -73,7 +73,7 @@ class Kick(NamedTuple):
 # ---- with which pieces L jumps ---------------------------------------------------------------------------------------
 
 
-def find_kicking(decided: Decided, count: int) -> dict[int, str | None]:
+def find_kicking(decided: DecidedProgram, count: int) -> dict[int, str | None]:
     """The pieces with which L or p jumps, each with the reason why no closed form holds there, or None.
 
     The last outputs, so many, are the nodes of `Mechanics`.
@@ -118,7 +118,7 @@ def kick_of(
         return Kick(StraightLine((), (), ()), tuple(kicking), refused)
     mechanics, m = Mechanics.from_nodes(line.outputs[-count:], n), len(decisions)
     graph = Graph(_LARGEST * (len(line.nodes) + (n + len(mechanics.rates)) ** 3) + 10_000)
-    sides = Sides(graph, line, size, m)
+    sides = BothSides(graph, line, size, m)
     f, zero = graph.apply, graph.number(0.0)
     slopes = [zero] * (n + 1)
     for j in spatial:
@@ -135,7 +135,7 @@ def kick_of(
 
 
 def _kick_velocities(
-    graph: Graph, sides: Sides, mechanics: Mechanics, slopes: Sequence[int], passes: int
+    graph: Graph, sides: BothSides, mechanics: Mechanics, slopes: Sequence[int], passes: int
 ) -> tuple[list[int], int]:
     """The velocities behind u = 0, of these `slopes` by positions and time, and 1 if the energy suffices, else 0."""
     n, f, zero, one, behind = len(slopes) - 1, graph.apply, graph.number(0.0), graph.number(1.0), sides.behind

@@ -1,4 +1,4 @@
-"""What decides a piece, and its borders: the levels of its switching number, as formulas and as tables of a kernel.
+"""The levels between the pieces of a switching number, as formulas and as the guards of a kernel.
 
     SIGN     the sign of a switching number u: −1, 0 or 1
     FLOOR    the whole number below u
@@ -26,7 +26,7 @@ FAR = 1e100  # from a border that is not there; a share that is beyond 0 and 1: 
 
 
 class Decision(NamedTuple):
-    """What a piece is decided by: its kind, its switching number, a node, and the table of a `TABLE` or `CLOCK`."""
+    """The decision of a piece: its kind, its switching number, a node, and the table of a `TABLE` or `CLOCK`."""
 
     kind: int
     switch: int
@@ -55,7 +55,7 @@ class Decision(NamedTuple):
         return above if self.kind == FLOOR else f("select", f("lt", piece, zero), above, piece)
 
     def distances(self, graph: Graph, x: int, piece: int) -> tuple[int, int]:
-        """How far a switching number x, no sign's, is above the border below its piece, and below the one above it."""
+        """The distances of a switching number x, no sign's, from the border below its piece, and from the one above it."""
         f, number = graph.apply, graph.number
         below = f("sub", x, self.level(graph, f("sub", piece, number(1.0))))
         if self.table is not None:

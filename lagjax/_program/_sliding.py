@@ -17,7 +17,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from lagjax._program._border_forces import Rows, Slide
+from lagjax._program._border_forces import Slide, SlidingRows
 from lagjax._program._differentiation import copy_nodes, copy_operation
 from lagjax._program._graph import Graph, find_descendants, find_readers
 from lagjax._program._held import Coupled, Held, choose_pivots
@@ -47,7 +47,7 @@ _LARGEST = 10_000_000  # operations: a bound for errors
 
 
 class Holding(NamedTuple):
-    """What keeps a motion on the borders that it slides along.
+    """The means to keep a motion on the borders that it slides along.
 
     `retraction` takes the inputs of the program to the state (q, q̇) on them, None where the motion may slide along
     none; `moved` are the coordinates that the force of each moves, and those of different `groups` know nothing of each
@@ -102,7 +102,7 @@ def _slide(
     line: StraightLine, n: int, first: int, switches: Sequence[int], slides: Sequence[Slide], linear: LinearSystem
 ) -> Sliding | None:
     """The program; None where pieces act on more than the right side, or not each for itself."""
-    rows = Rows.from_slides(line, n, first, switches, slides)
+    rows = SlidingRows.from_slides(line, n, first, switches, slides)
     acts = rows.find_forces(linear)
     if acts is None or rows.bends(linear.right, acts, range(first, first + len(switches))):
         return None
@@ -113,7 +113,7 @@ def _slide(
 class _SlidingForces:
     """The program with μ, one number for each of the rows, as unknowns; `acts` are ∂r/∂μₖ."""
 
-    def __init__(self, line: StraightLine, rows: Rows, linear: LinearSystem, acts: list[Sparse]):
+    def __init__(self, line: StraightLine, rows: SlidingRows, linear: LinearSystem, acts: list[Sparse]):
         self.line, self.rows, self.linear, self.acts = line, rows, linear, acts
         self.graph, self.f = rows.graph, rows.graph.apply
         self.zero, self.one = rows.graph.number(0.0), rows.graph.number(1.0)
@@ -161,7 +161,7 @@ class _SlidingForces:
         return Sliding(line, range(len(self.line.nodes)), shares, linear, holding)
 
     def _find_pushed(self, effects: Sequence[Sparse]) -> list[int]:
-        """Where both sides push onto the border of each row, and onto those of its slide."""
+        """True where both sides push onto the border of each row, and onto all of its slide."""
         pushed = [self.f("lt", row.get(k, self.zero), self.zero) for k, row in enumerate(effects)]
         of_slides = zip(self.rows.flags, self.rows.group(pushed), strict=True)
         every = [functools.reduce(lambda a, b: self.f("and", a, b), of, flag) for flag, of in of_slides]

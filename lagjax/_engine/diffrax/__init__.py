@@ -48,7 +48,7 @@ from lagjax._interface import (
     result_from,
 )
 from lagjax._primitives import DOUBLE, SINGLE, differentiable_where, lost_unless, mark_steps
-from lagjax._program import CLOCK, Unlowerable, lack_of_memory, table_of
+from lagjax._program import Unlowerable, lack_of_memory, table_of
 
 # Solvers reject steps for the round-off of their error estimate where rtol is below some ten units of it.
 LEAST_RTOL = 10
