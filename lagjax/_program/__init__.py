@@ -26,9 +26,9 @@ Derivatives of a program are those of its operations, programs again that are ma
 `_operations` has a row for each operation: its value, its derivatives, its series. `_graph` shares and, by `_simplify`,
 folds; `_scalars` writes formulas on it, `_passes` finish it; `_differentiation` differentiates it. Series: `_series`,
 with `_recurrences` for operations that have one of their own. Pieces: `_deciding` (what decides), `_decisions` (by
-which numbers), `_cones` (of lengths), `_levels` (their borders), `_beginnings` (where a motion begins), `_borders` (all of
-that), `_sliding` (along them, by `_border_forces`, `_held` and `_small_equations`), `_jump` and `_kick` (over them, by
-`_jump_search`), `_features` and `_powers` (where no series helps), `_look_ups` (tables). A program consists of a
+which numbers), `_cones` (of lengths), `_levels` (their borders), `_beginnings` (where a motion begins), `_borders` (all
+of that), `_sliding` (along them, by `_border_forces`, `_held` and `_small_equations`), `_jump` and `_kick` (over them,
+by `_jump_search`), `_features` and `_powers` (where no series helps), `_look_ups` (tables). A program consists of a
 `_line`, with its values in NumPy; `_emit` is for JAX, `_rounding` for their error. `_memory` bounds what
 a graph may take. `lowering/` turns JAX's operations into scalars.
 """

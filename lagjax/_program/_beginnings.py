@@ -1,6 +1,5 @@
 """On which pieces a motion begins, and how far a state is from their borders."""
 
-import functools
 from collections.abc import Callable, Sequence
 
 from lagjax._program._border_forces import Slide
@@ -68,19 +67,7 @@ def decide_pieces(decided: DecidedProgram, slides: Sequence[Slide]) -> StraightL
     def decide_or_keep(j: int, piece: int, _) -> int:
         return f("select", stays[j], piece, given[j])
 
-    def decide_ahead(way: float, j: int, piece: int, nodes: list[int]) -> int:
-        """The piece forward or back in time, of what is at its border and has a rate there."""
-        if decided.decisions[j].kind == SIGN:
-            ahead = f("sign", f("mul", graph.number(way), _rate(decided, graph, nodes, j)))
-            piece = f("select", f("eq", piece, zero), piece, ahead)
-        return decide_or_keep(j, piece, nodes)
-
-    copy = functools.partial(copy_deciding, graph, decided.line, decided.first, decided.decisions)
-    nodes = copy(decide_or_keep)
-    signs = {piece for piece, of in zip(decided.pieces, decided.decisions, strict=True) if of.kind == SIGN}
-    by_place = [decided.decisions[slide.piece].switch for slide in slides if slide.order > 1]
-    nested = not signs.isdisjoint(find_ancestors(decided.line.nodes, by_place))
-    sides = [copy(functools.partial(decide_ahead, way)) for way in (1.0, -1.0)] if nested else [nodes]
+    nodes = copy_deciding(graph, decided.line, decided.first, decided.decisions, decide_or_keep)
     pieces, flags = [nodes[i] for i in decided.pieces], []
     for slide, flag in zip(slides, given[count : count + len(slides)], strict=True):
         j, piece = slide.piece, pieces[slide.piece]
@@ -90,8 +77,11 @@ def decide_pieces(decided: DecidedProgram, slides: Sequence[Slide]) -> StraightL
             continue
         if not slide.parts:  # a border that the motion has left does not hold it
             begins = f("and", begins, f("not", stays[j]))
-        for side in sides if slide.order > 1 else ():
-            begins = f("and", begins, f("eq", _rate(decided, graph, side, j), zero))
+        if slide.order > 1:
+            begins = f("and", begins, f("eq", _rate(decided, graph, nodes, j), zero))
+        for k in _find_bends(decided, slide):  # which are passed where what bends u has a rate
+            rests = f("eq", _rate(decided, graph, nodes, k), zero)
+            begins = f("and", begins, f("or", rests, f("ne", nodes[decided.pieces[k]], zero)))
         flags.append(f("select", begins, flag, one))
         pieces[j] = f("select", begins, piece, below)
     sliding = {slide.piece for slide in slides}
@@ -111,6 +101,13 @@ def _begin_on_border(decided: DecidedProgram, graph: Graph, nodes: list[int], sl
     x, lower = nodes[decision.switch], f("sub", piece, graph.number(1.0))
     at_lower, at_upper = (f("eq", x, decision.level(graph, i)) for i in (lower, piece))
     return f("or", at_lower, at_upper), f("select", at_upper, lower, piece)
+
+
+def _find_bends(decided: DecidedProgram, slide: Slide) -> list[int]:
+    """The pieces of signs that the switching number of a border by position depends on."""
+    below = find_ancestors(decided.line.nodes, [decided.decisions[slide.piece].switch]) if slide.order > 1 else []
+    signs = (k for k, decision in enumerate(decided.decisions) if decision.kind == SIGN)
+    return [k for k in signs if decided.pieces[k] in below]
 
 
 def _rate(decided: DecidedProgram, graph: Graph, nodes: list[int], j: int) -> int:

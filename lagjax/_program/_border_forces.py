@@ -1,4 +1,4 @@
-"""What pieces do to the right side of A z = r, each for itself, between both sides of its border."""
+"""The effect of pieces on the right side of A z = r, each for itself, between both sides of its border."""
 
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
@@ -97,7 +97,7 @@ class SlidingRows(NamedTuple):
         return by_velocity, graph.apply("neg", node), level
 
     def _sides(self, row: Row) -> tuple[dict[int, int], dict[int, int], float]:
-        """What becomes of nodes below and above a border, and the factor of the difference that μ is multiplied with.
+        """The nodes that take the place of others below and above a border, and what part of the difference μ counts.
 
         Of a cone they are where its vector is zero and rests, and where it is tiny and has one part alone.
         """

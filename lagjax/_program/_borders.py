@@ -171,12 +171,7 @@ def _find_borders(program: Recurrent, size: int, slides: bool, watched: int, bes
 
 
 def _build(
-    program: Recurrent,
-    decided: DecidedProgram,
-    slides: bool,
-    again: Callable,
-    mechanics: int,
-    kicking: dict[int, str | None],
+    program: Recurrent, decided: DecidedProgram, slides: bool, again: Callable, mechanics: int, kicking: dict
 ) -> Borders:
     """The borders of what has been decided, or is `again`, with one piece apart.
 

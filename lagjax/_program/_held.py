@@ -1,4 +1,4 @@
-"""What borders hold: the accelerations of a motion along them, and the state where a step begins.
+"""The accelerations of a motion along borders that hold it, and its state on them where a step begins.
 
 What the equations of the shares leave is rounding, which a body at rest would gather to ½ ε t². So the acceleration of
 one coordinate of each border, its *pivot*, follows from u̇ = 0 itself: it is zero where u is a velocity alone. And a
@@ -35,10 +35,9 @@ class Coupled(NamedTuple):
         def place_rows(rows: list[Sparse]) -> list[Sparse]:
             return [{i: place(x) for i, x in row.items()} for row in rows]
 
+        acts, normals, *equations = map(place_rows, (self.acts, self.normals, *self.equations))
         pivots = [(k, i, place(free), place(inverse)) for k, i, free, inverse in self.pivots]
-        return Coupled(
-            place_rows(self.acts), place_rows(self.normals), Equations(*map(place_rows, self.equations)), pivots
-        )
+        return Coupled(acts, normals, Equations(*equations), pivots)
 
     def push(self, graph: Graph, right: Sequence[int], mu: Sequence[int]) -> list[int]:
         """r + Σ μₖ actsₖ."""

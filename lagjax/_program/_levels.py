@@ -55,7 +55,7 @@ class Decision(NamedTuple):
         return above if self.kind == FLOOR else f("select", f("lt", piece, zero), above, piece)
 
     def distances(self, graph: Graph, x: int, piece: int) -> tuple[int, int]:
-        """The distances of a switching number x, no sign's, from the border below its piece, and from the one above it."""
+        """The distances of a switching number x, no sign's, from the borders below and above its piece."""
         f, number = graph.apply, graph.number
         below = f("sub", x, self.level(graph, f("sub", piece, number(1.0))))
         if self.table is not None:
