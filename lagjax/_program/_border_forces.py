@@ -126,8 +126,8 @@ class SlidingRows(NamedTuple):
             for sides in ([below], [above]) if self.slides[row.slide].parts else ([below, above],):
                 replace_nodes(graph, among, sides)
             act = {}
-            for i in sorted(i for x in above for i in entries.get(x, ())):
-                change = graph.apply("sub", above.get(right[i], right[i]), below.get(right[i], right[i]))
+            for i, x in sorted((i, node) for node in above for i in entries.get(node, ())):
+                change = graph.apply("sub", above[x], below.get(x, x))
                 if graph.value(change) != 0:
                     act[i] = graph.apply("mul", graph.number(factor), change)
             acts.append(act)

@@ -357,7 +357,7 @@ class _SlidingForces:
                 nodes = copy_nodes(graph, inner, [*of_system, *right])
                 return [nodes[i] for i in inner.outputs]
 
-            here = coupled.rename(lambda x: at[x] if x in at else graph.number(self.graph.value(x)))
+            here = coupled.rename(lambda x: at[x] if x in at else graph.constant(self.graph.value(x), "float"))
             results = here.solve(graph, apply_inverse, rest[:count], rest[count:])
             return StraightLine(tuple(graph.nodes), tuple(graph.kinds), tuple(results))
 
