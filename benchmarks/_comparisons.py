@@ -30,7 +30,7 @@ from lagjax._equations._derivation import derivation_of
 from lagjax._interface._layout import Layout
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, compile_module, lanes
 from lagjax._native._lanes import emit, sincos_function
-from lagjax._program import lower
+from lagjax._tracing import lower
 
 TOLERANCE = 1e-9
 Rows = list[dict[str, Any]]

@@ -5,6 +5,7 @@ state have different derivatives, or none. Such places are borders of piecewise 
 the force is smooth there all the same, as max(q, 0)**2 is, its values on both sides tell.
 """
 
+import functools
 from typing import NamedTuple
 
 import jax
@@ -13,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool
 
 from lagjax._analysis._scene_state import SceneState
-from lagjax._equations import borders_of_motion, pieces_of_motion
+from lagjax._equations import Derivation, borders_of_motion, pieces_of_motion
 
 # Where forces are compared, in sizes of a coordinate. A border within the first distance is at the state: equilibria
 # are known to the square root of rounding at worst, to 1e-12 as a rule. Friction that is rounded off over ten times as
@@ -35,7 +36,7 @@ class _Rough(NamedTuple):
 
 
 def is_smooth(scene: SceneState) -> Bool[Array, ""]:
-    if not _pieces(scene):
+    if not _pieces(scene.derivation):
         return jnp.asarray(True)
     rough = _rough(scene)
     return ~jnp.any(rough.jumps | rough.kinks)
@@ -43,7 +44,7 @@ def is_smooth(scene: SceneState) -> Bool[Array, ""]:
 
 def require_smooth(scene: SceneState, what: str) -> None:
     """Raise `ValueError` where the force jumps or has a kink at the state, naming the coordinate and the line."""
-    if not scene.concrete or not (pieces := _pieces(scene)):
+    if not scene.concrete or not (pieces := _pieces(scene.derivation)):
         return
     rough = jax.tree.map(np.asarray, _rough(scene))
     names = (*scene.layout.names, *(f"d{name}" for name in scene.layout.names))
@@ -59,9 +60,10 @@ def require_smooth(scene: SceneState, what: str) -> None:
         )
 
 
-def _pieces(scene: SceneState) -> list[tuple[str, str, int]]:
+@functools.lru_cache(maxsize=64)
+def _pieces(derivation: Derivation) -> list[tuple[str, str, int]]:
     """The borders of the functions of a scene: name, place, and how many numbers each compares."""
-    return pieces_of_motion(scene.motion, *_state(scene))
+    return pieces_of_motion(derivation.motion, *derivation.state_shapes)
 
 
 def _state(scene: SceneState) -> tuple:

@@ -18,7 +18,8 @@ from jax.extend import core, source_info_util
 
 from lagjax._equations._motion import Motion
 from lagjax._interface import join_names
-from lagjax._program import OPERATIONS, apply_in_jax, expand_primitive
+from lagjax._program import OPERATIONS
+from lagjax._tracing import apply_in_jax, expand_primitive
 
 _PACKAGE = str(Path(__file__).parents[1])
 

@@ -19,7 +19,8 @@ import jax.numpy as jnp
 import numpy as np
 from jax.interpreters.partial_eval import dce_jaxpr
 
-from lagjax._program import Unlowerable, lower
+from lagjax._program import Unlowerable
+from lagjax._tracing import lower
 
 PyTree = Any
 

@@ -36,22 +36,16 @@ from lagjax._equations._structure import LARGEST_LOWERED, LEAST_COORDINATES, Spa
 from lagjax._interface import Layout, dtype_of, is_concrete
 from lagjax._native import Projection
 from lagjax._primitives import DOUBLE
-from lagjax._program import (
-    Borders,
+from lagjax._program import Borders, StraightLine, Unlowerable, borders, is_smooth, lack_of_memory, operations_that_fit
+from lagjax._tracing import (
     Program,
-    StraightLine,
-    Unlowerable,
     apply_function,
-    borders,
     concatenate,
-    is_smooth,
-    lack_of_memory,
     lower,
     lower_formula,
     lower_scalars,
     lower_solution,
     multiply,
-    operations_that_fit,
     scatter,
     stack,
 )

@@ -19,7 +19,8 @@ from lagjax._equations._linear import factorize, saddle, saddle_many, schur_comp
 from lagjax._equations._motion import Motion
 from lagjax._equations._sparse import Diagonal, Entries
 from lagjax._interface import Layout, halves
-from lagjax._program import Program, Unlowerable
+from lagjax._program import Unlowerable
+from lagjax._tracing import Program
 
 PyTree = Any
 

@@ -16,7 +16,8 @@ from lagjax._equations._coupled_forces import CoupledForces
 from lagjax._equations._motion import Motion
 from lagjax._equations._recursion import Recursion, RecursiveElimination, recursion_of
 from lagjax._equations._saddle import SaddleElimination
-from lagjax._program import Derivatives, Expansion, Tape, copy_nodes, has_own_rules, inputs_of
+from lagjax._program import Derivatives, Tape, copy_nodes
+from lagjax._tracing import Expansion, has_own_rules, inputs_of
 
 PyTree = Any
 Ids = np.ndarray  # scalars of a graph, in the shape of the array that they stand for

@@ -27,7 +27,8 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from lagjax._equations._linear import singular_threshold
-from lagjax._program import Derivatives, Expansion, Graph, Scalars, copy_nodes
+from lagjax._program import Derivatives, Graph, copy_nodes
+from lagjax._tracing import Expansion, Scalars
 
 Form = dict[int, int]  # a linear combination of unknowns: the node of the factor of each
 

@@ -26,8 +26,9 @@ from typing import Any
 import numpy as np
 
 from lagjax._equations._linear import rank_tolerance, singular_threshold
-from lagjax._program import Scalars, eliminate, orthogonalize, row_weights, solve_orthogonalized, sparse_row, substitute
-from lagjax._program import scalar_algebra as xp
+from lagjax._program import eliminate, sparse_row, substitute
+from lagjax._tracing import Scalars, orthogonalize, row_weights, solve_orthogonalized
+from lagjax._tracing import scalar_algebra as xp
 
 # The part of a pivot that elimination has to leave for a matrix to count as regular in the regular-M variant: four
 # digits of an acceleration may be lost, and twelve remain. Twice as large, a few more states take the general variant,
@@ -294,7 +295,7 @@ class TwoCoordinates:
 class IndefiniteElimination:
     """M x = b for an M that need not be positive definite, with no more coordinates than `LARGEST_INDEFINITE`.
 
-    Its columns are made orthogonal (`_program._matrices`), where other matrices are eliminated with pivots. `zeros`
+    Its columns are made orthogonal (`_tracing/lowering`), where other matrices are eliminated with pivots. `zeros`
     (n, n) marks what is zero in M whatever the state; the rest is as in `SaddleElimination`.
     """
 

@@ -16,6 +16,7 @@ from lagjax._native._handler import call, compile_handler, load_at, make_once
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value, compile_module
 from lagjax._native._lanes import emit, sincos_function
 from lagjax._program._graph import Graph
+from lagjax._program._operations import OPERATIONS
 from lagjax._program._rounding import operation_error
 from lagjax._program._series import StraightLine
 
@@ -25,31 +26,38 @@ _SET_ROWS = "set_rows"
 class LineCode:
     """A straight line of `inputs` floats in machine code, for as long as this object lives.
 
-    At its `address` is `evaluate(x, out, rows)`, with x (rows, inputs) and out (rows, outputs). A long line is a walk
-    along rows of integers, for which LLVM takes no longer. Where its first inputs, so many, are `moving`, that gives
-    the running errors of the outputs in their place (`_program._rounding`): a line of them would be five times as long.
-    Raises `Unlowerable`.
+    At its `address` is `evaluate(x, out, rows)`, with x (rows, inputs) and out (rows, outputs). A line of more than
+    `largest` operations is a walk along rows of integers, for which LLVM takes no longer. Where its first inputs, so
+    many, are `moving`, that gives the running errors of the outputs in their place (`_program._rounding`): a line of
+    them would be five times as long. What is written out may take several rows at once, in `lanes`. Raises
+    `Unlowerable`.
     """
 
-    def __init__(self, line: StraightLine, inputs: int, moving: int | None = None):
+    def __init__(
+        self, line: StraightLine, inputs: int, moving: int | None = None, largest: int = LARGEST_LINE, lanes: int = 1
+    ):
         module, outputs = ir.Module("line"), len(line.outputs)
         module.triple = ""
-        turns = any(op in ("sin", "cos") for op, _, _ in line.nodes)
-        sincos = sincos_function(module, 1) if turns else None
         filled = [k for k in range(outputs) if line.constant(k) != 0]
-        long = moving is not None or len(line.nodes) + len(filled) > LARGEST_LINE
+        long = moving is not None or len(line.nodes) + len(filled) > largest
+        lanes = 1 if long else lanes
+        turns = any(op in ("sin", "cos") for op, _, _ in line.nodes)
+        sincos = sincos_function(module, lanes) if turns else None
         write = _RowWalk(line, inputs, filled, moving) if long else None
         room = 1 if write is None else 2 ** math.ceil(math.log2(2 * write.size))
-        code = Code(module, "evaluate", [POINTER, POINTER, INTEGER], 1, public=True)
+        code = Code(module, "evaluate", [POINTER, POINTER, INTEGER], lanes, public=True)
         (x, out, rows), room = code.arguments, code.stack(room)
-        with code.loop(rows) as row:
-            here, there = code.element(x, row * inputs), code.element(out, row * outputs)
-            with code.loop(outputs if len(filled) < outputs else 0) as k:
-                code.store(code.as_value(0.0, DOUBLE), code.element(there, k))
-            if write is not None:
-                write(code, sincos, here, there, room)
-            else:
-                _write_line(code, sincos, line, filled, here, there)
+        if lanes > 1:
+            _write_tiles(code, sincos, line, inputs, filled)
+        else:
+            with code.loop(rows) as row:
+                here, there = code.element(x, row * inputs), code.element(out, row * outputs)
+                with code.loop(outputs if len(filled) < outputs else 0) as k:
+                    code.store(code.as_value(0.0, DOUBLE), code.element(there, k))
+                if write is not None:
+                    write(code, sincos, here, there, room)
+                else:
+                    _write_line(code, sincos, line, filled, here, there)
         code.finish()
         names = ("evaluate",) if write is None else ("evaluate", _SET_ROWS)
         self._engine, places = compile_module(module, names)
@@ -66,6 +74,23 @@ class LineCode:
         return found
 
 
+_QUICK = frozenset(("add", "sub", "mul", "div", "neg", "constant", "input"))
+_WIDE = frozenset(("sin", "cos", "sqrt", "abs"))  # functions that take a vector as a number
+
+
+def compilation_work(line: StraightLine, lanes: int) -> int:
+    """The additions for which LLVM takes as long as for this line, if it is written out.
+
+    Measured: decisions and functions take as long as 4, and functions that the C library evaluates, lane by lane, as
+    40 in eight lanes.
+    """
+    slow = 5 * lanes if lanes > 1 else 4
+    weights = (
+        1 if op in _QUICK else slow if OPERATIONS[op].slopes and op not in _WIDE else 4 for op, _, _ in line.nodes
+    )
+    return sum(weights)
+
+
 def _write_line(code: Code, sincos: Code | None, line: StraightLine, filled: list[int], x: Value, out: Value) -> None:
     """Write the outputs that are `filled` of a line, operation by operation."""
     read = functools.cache(lambda i: code.load(code.element(x, i), code.vector))
@@ -73,6 +98,33 @@ def _write_line(code: Code, sincos: Code | None, line: StraightLine, filled: lis
     for k, i, value in zip(filled, line.outputs, emit(code, line, read, sincos, None), strict=True):
         number = code.as_number(value) if line.kinds[i] == "bool" else value
         code.store(code.lanes_of(number), code.element(out, k))
+
+
+def _write_tiles(code: Code, sincos: Code | None, line: StraightLine, inputs: int, filled: list[int]) -> None:
+    """Write a line for tiles of rows, one in a lane; those beyond the last are that once more."""
+    (x, out, rows), lanes, outputs = code.arguments, code.lanes, len(line.outputs)
+    given, found = code.stack(inputs * lanes, 64), code.stack(outputs * lanes, 64)
+    with code.loop(outputs * lanes) as k:
+        code.store(code.as_value(0.0, DOUBLE), code.element(found, k))
+    first = code.variable(code.as_value(0, INTEGER))
+    with code.repeat_while(lambda: first.value < rows):
+        last = rows - first.value
+        here = code.select(last < lanes, last, code.as_value(lanes, INTEGER))
+        with code.loop(lanes) as j:
+            own = code.select(j < here, j, here - 1)
+            row = code.element(x, (first.value + own) * inputs)
+            with code.loop(inputs) as k:
+                code.store(code.load(code.element(row, k), DOUBLE), code.element(given, k * lanes + j))
+        read = functools.cache(lambda i: code.load(code.element(given, i * lanes), code.vector))
+        rest = line.replace(outputs=tuple(line.outputs[k] for k in filled))
+        for k, i, value in zip(filled, rest.outputs, emit(code, rest, read, sincos, None), strict=True):
+            number = code.as_number(value) if line.kinds[i] == "bool" else value
+            code.store(code.lanes_of(number), code.element(found, k * lanes))
+        with code.loop(here) as j:
+            row = code.element(out, (first.value + j) * outputs)
+            with code.loop(outputs) as k:
+                code.store(code.load(code.element(found, k * lanes + j), DOUBLE), code.element(row, k))
+        first.value = first.value + lanes
 
 
 class _RowWalk:

@@ -19,7 +19,8 @@ from lagjax._engine.taylor import MachineCode
 from lagjax._equations import Derivation, SparseStructure, dependent_rows, pieces_of_motion
 from lagjax._interface import join_names, show_str
 from lagjax._native import Nesting, is_large, pieces_of
-from lagjax._program import CLOCK, FLOOR, SIGN, TABLE, TRUNC, Program, Unlowerable
+from lagjax._program import CLOCK, FLOOR, SIGN, TABLE, TRUNC, Unlowerable
+from lagjax._tracing import Program
 
 _PIECES = {
     SIGN: "the sign of", FLOOR: "the whole part of", TRUNC: "the whole part of", CLOCK: "samples by",

@@ -309,7 +309,7 @@ def _derivative(primals, tangents, *, closed):
     return found, ad.Zero(jax.typeof(found).to_tangent_aval())
 
 
-_locate_p = VaryingPrimitive("lagjax_locate")  # `_program._rules` knows it by this name
+_locate_p = VaryingPrimitive("lagjax_locate")  # `_tracing.lowering._rules` knows it by this name
 _locate_p.def_impl(jax.jit(_search, static_argnames="closed"))
 _locate_p.def_abstract_eval(lambda knots, t, *, closed: ShapedArray(t.shape, np.dtype(np.int32)))
 mlir.register_lowering(_locate_p, mlir.lower_fun(_search, multiple_results=False))

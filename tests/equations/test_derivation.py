@@ -18,8 +18,9 @@ from lagjax._equations import _derivation
 from lagjax._equations import _many_states as many_states
 from lagjax._equations._derivation import Derivation, columns_of, derivation_of, numbers_of
 from lagjax._interface._layout import Layout
-from lagjax._program import OPERATIONS, Unlowerable, lower, pullback
+from lagjax._program import OPERATIONS, Unlowerable, pullback
 from lagjax._program._line import CHUNK
+from lagjax._tracing import lower
 from lagjax._trust.checks import _scene_at_start as of_check
 from lagjax._trust.health import _measurements as of_health
 

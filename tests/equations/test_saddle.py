@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 
 from lagjax._equations._saddle import SaddleElimination, elimination_order
-from lagjax._program import concatenate, lower_formula, stack
+from lagjax._tracing import concatenate, lower_formula, stack
 
 
 def chain(links, rng):

@@ -8,7 +8,7 @@ from sweeps import sweep
 
 from lagjax._engine.taylor._line_functions import Line
 from lagjax._native import LineCode
-from lagjax._program import lower
+from lagjax._tracing import lower
 
 
 def function(x):
@@ -68,16 +68,32 @@ def test_a_long_line_is_what_its_operations_are():
 
     def steps(x):
         y, whole = x, jnp.arange(20)
-        for k in range(25):
+        for k in range(5):
             turned, up = jnp.sin(0.3 * y) * jnp.roll(y, 1), y > 0.1 * k
             whole = jnp.where(up, whole + k, whole // 2) ^ 3
             y = 0.3 * (turned + jnp.where(up & (y < 2.0), jnp.exp(-y), jnp.sqrt(abs(y)))) + 0.2 * jnp.cos(y) ** 3
         return jnp.concatenate([y, jnp.zeros(3), y > 0.2, jnp.array([2.5]), x[:2], whole + 0.0])
 
-    program, rows = lower(steps, jnp.zeros(20)), np.random.default_rng(0).normal(size=(5, 20))
-    code, expected = LineCode(program.line, 20), program.line.evaluate(list(rows.T)).T
-    assert len(program.line.nodes) > 2000
-    np.testing.assert_allclose(code(rows), expected, rtol=1e-13, atol=1e-13)
+    program, rows = lower(steps, jnp.zeros(20)), np.random.default_rng(0).normal(size=(21, 20))
+    expected = program.line.evaluate(list(rows.T)).T
+    assert len(program.line.nodes) > 1700
+    for made in ({}, {"largest": 20_000}, {"largest": 20_000, "lanes": 8}):
+        code = LineCode(program.line, 20, **made)
+        for count in (1, 8, 21):
+            np.testing.assert_allclose(code(rows[:count]), expected[:count], rtol=1e-13, atol=1e-13)
+
+
+@pytest.mark.parametrize("mode", ["jvp", "jacrev", "jacfwd", "forward over reverse", "vmap of grad", "grad of vmap"])
+def test_of_parts_that_stand_still_there_are_no_derivatives(mode):
+    """Where the last ones do not vary, the lines of derivatives know nothing of them."""
+    still = jnp.asarray(X[2:])
+
+    def by_part(call):
+        return lambda x: call(x[:2], jnp.broadcast_to(still, (*x.shape[:-1], 2)))
+
+    found = MODES[mode](lambda x: jnp.pad(by_part(LINE)(x), (0, 0)))
+    right = MODES[mode](lambda x: by_part(lambda x, rest: function(jnp.concatenate([x, rest])))(x))
+    np.testing.assert_allclose(found, right, rtol=1e-13, atol=1e-13)
 
 
 def test_running_errors_of_a_walk_are_those_of_a_program_of_their_own():

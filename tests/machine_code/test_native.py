@@ -20,8 +20,9 @@ from lagjax._engine._problem import Problem
 from lagjax._engine.taylor import flow_of
 from lagjax._interface._layout import Layout
 from lagjax._native import _ir, _kernel, _lanes
-from lagjax._program import OPERATIONS, lower, lower_formula
-from lagjax._program import _scalars as xp
+from lagjax._program import OPERATIONS
+from lagjax._tracing import _scalars as xp
+from lagjax._tracing import lower, lower_formula
 
 EPS = 2.0**-52
 WIDTH = _ir.lanes()

@@ -11,8 +11,8 @@ from lagrangians import free_particle, oscillator, weight
 from scipy.interpolate import CubicHermiteSpline
 
 import lagjax
-from lagjax._program import lower
 from lagjax._program._operations import LOOK_UPS
+from lagjax._tracing import lower
 
 RNG = np.random.default_rng(0)
 KNOTS = np.cumsum(RNG.uniform(0.05, 0.3, 12))

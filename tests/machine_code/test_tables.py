@@ -12,7 +12,8 @@ from lagjax._interface._layout import Layout
 from lagjax._native import _schedule, _taylor
 from lagjax._native._integrator import Integrator
 from lagjax._native._motion_parts import MotionParts
-from lagjax._program import OPERATIONS, Unlowerable, lower
+from lagjax._program import OPERATIONS, Unlowerable
+from lagjax._tracing import lower
 
 MEMBERS, RTOL, ROOM = 3, 1e-9, 300
 # Every operation is rounded as often in both forms. But of two products in a sum the processor rounds one with the sum,

@@ -11,8 +11,8 @@ import lagjax
 from benchmarks import expression_population
 from lagjax._equations import derivation_of
 from lagjax._interface._layout import Layout
-from lagjax._program import lower
 from lagjax._program._differentiation import pullback, pushforward
+from lagjax._tracing import lower
 
 
 @pytest.fixture(autouse=True)

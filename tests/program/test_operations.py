@@ -12,9 +12,10 @@ from scipy import special
 
 from lagjax import _native
 from lagjax._equations._blame import borders
-from lagjax._program import OPERATIONS, Unlowerable, lower
-from lagjax._program._emit import WRITTEN
+from lagjax._program import OPERATIONS, Unlowerable
 from lagjax._program._operations import Operation
+from lagjax._tracing import lower
+from lagjax._tracing._emit import WRITTEN
 
 
 @pytest.fixture(autouse=True)

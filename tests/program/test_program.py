@@ -14,7 +14,8 @@ from sweeps import sweep
 import lagjax
 from lagjax._equations._derivation import derivation_of
 from lagjax._interface._layout import Layout
-from lagjax._program import Unlowerable, lower, pullback
+from lagjax._program import Unlowerable, pullback
+from lagjax._tracing import lower
 
 TOLERANCE = 4e-15
 

@@ -14,16 +14,9 @@ from jax import lax
 from lagjax import scenes
 from lagjax._equations._derivation import derivation_of
 from lagjax._interface._layout import Layout
-from lagjax._program import (
-    OPERATIONS,
-    Unlowerable,
-    emit,
-    lower,
-    lower_solution,
-    pullback,
-    series,
-)
-from lagjax._program._scalars import apply_function, stack
+from lagjax._program import OPERATIONS, Unlowerable, pullback, series
+from lagjax._tracing import emit, lower, lower_solution
+from lagjax._tracing._scalars import apply_function, stack
 
 ORDER = 10
 NAN = float("nan")

@@ -14,7 +14,8 @@ from jax import lax
 from sweeps import sweep
 
 import lagjax
-from lagjax._program import OPERATIONS, Unlowerable, apply_in_jax, lower
+from lagjax._program import OPERATIONS, Unlowerable
+from lagjax._tracing import apply_in_jax, lower
 
 
 @pytest.fixture(autouse=True)

@@ -106,7 +106,7 @@ def test_doors_offer_what_is_used():
         for node in tree_of(door).body:
             for alias in node.names if isinstance(node, ast.ImportFrom) else ():
                 name = alias.asname or alias.name
-                if node.module != "lagjax._program.lowering":  # whose rules are registered by the import
+                if node.module != "lagjax._tracing.lowering":  # whose rules are registered by the import
                     assert (module, name) in taken or name in used | called, f"{module} imports {name} for nobody"
 
 
@@ -129,9 +129,8 @@ class Refused(importlib.abc.MetaPathFinder):
 
 JAX, package = @JAX@, "@PACKAGE@"
 sys.meta_path.insert(0, Refused())
-for name in ("lagjax", "lagjax._program"):  # without what their own first lines import
-    sys.modules[name] = types.ModuleType(name)
-    sys.modules[name].__path__ = [package + name.removeprefix("lagjax").replace(".", "/")]
+sys.modules["lagjax"] = types.ModuleType("lagjax")  # without what its own first lines import
+sys.modules["lagjax"].__path__ = [package]
 
 import numpy as np
 from lagjax import _native

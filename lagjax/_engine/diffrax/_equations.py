@@ -16,7 +16,8 @@ from jaxtyping import Array, Bool, Float
 
 from lagjax._equations import Derivation, Motion
 from lagjax._interface import compiled_once, halves
-from lagjax._program import Program, Unlowerable
+from lagjax._program import Unlowerable
+from lagjax._tracing import Program
 
 PyTree = Any
 Vector = Float[Array, " n"]

@@ -36,7 +36,8 @@ from lagjax._equations import Derivation
 from lagjax._interface import EVENT_OCCURRED, default_platform, has_nvidia_gpu, is_concrete
 from lagjax._native import Guards, Nesting, append_guards, pieces_of
 from lagjax._primitives import compute_in_doubles
-from lagjax._program import Program, Unlowerable
+from lagjax._program import Unlowerable
+from lagjax._tracing import Program
 
 
 # Not an equinox.Module: its methods are pytrees of their own, and to make one takes as long as ten steps.

@@ -21,7 +21,8 @@ from lagjax._engine.taylor._line_functions import Line
 from lagjax._engine.taylor._passages import cut_steps, has_passages, part_passages
 from lagjax._interface import SUCCESSFUL
 from lagjax._native import Projection
-from lagjax._program import Program, pullback, pushforward
+from lagjax._program import pullback, pushforward
+from lagjax._tracing import Program
 
 LARGEST_PORTION = 2**23  # numbers of the steps that are written down at once: 64 MiB
 _ROOM_AGAIN = 2  # times the steps that were taken: those of a first try are written, too

@@ -15,7 +15,8 @@ from lagjax._engine._problem import Solution
 from lagjax._engine._stop_reason import End, what_stopped
 from lagjax._engine.taylor._variational import tangent_programs
 from lagjax._interface import RESULTS, SUCCESSFUL, code_of
-from lagjax._program import Program, Unlowerable, machine_memory, operations_that_fit
+from lagjax._program import Unlowerable, machine_memory, operations_that_fit
+from lagjax._tracing import Program
 
 # Operations of an acceleration: making its kernel takes some 4 KB for each, with the derivatives some 10 KB.
 LARGEST_PROGRAM = operations_that_fit(10_000)

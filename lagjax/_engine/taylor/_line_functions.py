@@ -27,20 +27,10 @@ from jax.core import ShapedArray
 from jax.interpreters import ad, mlir
 
 from lagjax._engine.taylor._call import NO_HANDLER, capsule
-from lagjax._native import LARGEST_LINE, LineCode, line_handler, make_once
-from lagjax._primitives import HostFunction, LinearMap, call_host, compute_on_host, share_rows
-from lagjax._program import (
-    Graph,
-    Program,
-    StraightLine,
-    Unlowerable,
-    copy_nodes,
-    emit,
-    lower,
-    lowers,
-    pullback,
-    pushforward,
-)
+from lagjax._native import LARGEST_LINE, LineCode, compilation_work, line_handler, make_once
+from lagjax._primitives import HostFunction, LinearMap, call_host, compute_on_host, is_zero, share_rows
+from lagjax._program import Graph, StraightLine, Unlowerable, copy_nodes, pullback, pushforward
+from lagjax._tracing import Program, emit, lower, lowers
 
 _TARGET = "lagjax_line"
 # Operations of a line on a GPU that XLA compiles; NumPy on the host evaluates a longer one. Twice as many would cost
@@ -49,6 +39,10 @@ LARGEST_COMPILED = 100
 # Machine code takes some 20 µs a node to make, and NumPy 1 µs a node for a call: that of a line which XLA does not wait
 # for is made after as many calls as take that long, so that one call is not slow, and a thousand are not.
 _CALLS = 20
+# What LLVM may take for a line of a program of XLA, in additions, which take 70 µs each. Behind 4200 of them a call
+# takes 0.5 µs in place of 13; behind 9400 a row 1.4 µs, or 0.3 of many, in place of 40.
+WORK_OF_JIT = 12_000
+LANES = 8  # rows of a line that one call evaluates side by side: as many as there are of numbers in widest registers
 
 
 def outputs(program: Program, count: int, first, numbers):
@@ -56,7 +50,7 @@ def outputs(program: Program, count: int, first, numbers):
     floats = all(dtype.kind == "f" for dtype in program.dtypes) and jnp.result_type(first) == np.dtype(float)
     if program.looks_up or not floats:
         return jnp.stack(program.compute_outputs(first, numbers)[:count], axis=-1)
-    return line_of(program, count)(join_columns(first, numbers))
+    return line_of(program, count)(first, numbers)
 
 
 def join_columns(*parts):
@@ -104,8 +98,20 @@ class Line:
 
     @functools.cached_property
     def code(self) -> LineCode | None:
+        return self._make_code()
+
+    @functools.lru_cache(maxsize=2)  # noqa: B019  # those of a few
+    def code_of_jit(self, is_wide: bool) -> LineCode | None:
+        """The code for a program of XLA, which is called often; LLVM may take longer for it."""
+        for lanes in (LANES, 1) if is_wide else (1,):
+            if compilation_work(self.line, lanes) <= WORK_OF_JIT:
+                return self._make_code(largest=len(self.line.nodes) + self.outputs, lanes=lanes)
+        return self.code
+
+    def _make_code(self, **settings: int) -> LineCode | None:
         try:
-            return None if NO_HANDLER is not None or self.line.looks_up else LineCode(self.line, self.size)
+            makes = NO_HANDLER is None and not self.line.looks_up
+            return LineCode(self.line, self.size, **settings) if makes else None
         except Unlowerable:
             return None
 
@@ -145,9 +151,15 @@ class Line:
         line = differentiate(self.line, [np.dtype(float)] * self.size, by, range(self.outputs))
         return Line(line, self.size + linear, self.size, self.fixed)
 
-    def __call__(self, x):
-        """g(x) of rows x (…, inputs), under every transformation of JAX."""
-        return value_p.bind(x, line=self)[0]
+    def __call__(self, *parts):
+        """g(x) of rows x (…, inputs) in parts (…, some), under every transformation of JAX."""
+        batch = jnp.broadcast_shapes(*(x.shape[:-1] for x in parts))
+        return value_p.bind(*(jnp.broadcast_to(x, (*batch, x.shape[-1])) for x in parts), line=self)[0]
+
+    @functools.lru_cache(maxsize=8)  # noqa: B019  # those of a few
+    def vary_first(self, count: int) -> "Line":
+        """The line whose derivatives are by the first `count` inputs."""
+        return Line(self.line, self.size, count, min(self.fixed, count))
 
 
 # ---- primitives ------------------------------------------------------------------------------------------------------
@@ -161,8 +173,13 @@ class _LineMap(LinearMap):
             return [ShapedArray((*x.shape[:-1], width(line)), np.dtype(float))]
 
         def vary(primals, tangents, _, *, line: Line):
-            along = ad.instantiate_zeros(tangents[0])[..., line.fixed :]
-            return forward_p.bind(jnp.concatenate(primals, axis=-1), along, line=of(line))
+            by = of(line)
+            if len(tangents) > 1:  # parts of x, of which the last ones may stand still
+                moving = 1 + max(i for i, tangent in enumerate(tangents) if not is_zero(tangent))
+                tangents = tangents[:moving]
+                by = by.vary_first(sum(x.shape[-1] for x in primals[:moving]))
+            along = jnp.concatenate(list(map(ad.instantiate_zeros, tangents)), axis=-1)[..., line.fixed :]
+            return forward_p.bind(jnp.concatenate(primals, axis=-1), along, line=by)
 
         super().__init__(f"lagjax_line_{name}", shape, vary, linear, transpose)
         self.of, self.shape = of, shape
@@ -187,7 +204,7 @@ class _LineMap(LinearMap):
     def _lower_on_cpu(self, context, *arrays, line: Line):
         of, call = self.of(line), self._compile_operations
         if not context.module_context.lowering_parameters.for_export:  # where it runs elsewhere
-            code = of.code
+            code = of.code_of_jit(_is_wide(context.avals_in[0].shape[:-1]))
             call = self._call_host if code is None else self._call_code
             if code is not None:
                 _register_handler()
@@ -200,9 +217,10 @@ class _LineMap(LinearMap):
 
     def _call_code(self, *arrays, line: Line):
         x, of = jnp.concatenate(arrays, axis=-1), self.of(line)
-        assert of.code is not None
+        code = of.code_of_jit(_is_wide(x.shape[:-1]))
+        assert code is not None
         rows = jax.ShapeDtypeStruct((math.prod(x.shape[:-1]), of.outputs), np.float64)
-        result = jax.ffi.ffi_call(_TARGET, rows)(x.reshape(-1, x.shape[-1]), line=np.int64(of.code.address))
+        result = jax.ffi.ffi_call(_TARGET, rows)(x.reshape(-1, x.shape[-1]), line=np.int64(code.address))
         return [result.reshape(*x.shape[:-1], of.outputs)]
 
     def _compile_operations(self, *arrays, line: Line):
@@ -218,6 +236,11 @@ class _LineMap(LinearMap):
                 return jax.device_put(self.evaluate(*arrays, line=line))
 
         return jax.pure_callback(evaluate, self.shape(*arrays, line=line), *arrays)
+
+
+def _is_wide(batch: tuple[int, ...]) -> bool:
+    """True for so many rows that a vector of them pays."""
+    return math.prod(batch) >= LANES // 2
 
 
 @make_once

@@ -13,7 +13,8 @@ from jaxtyping import Array
 
 from lagjax._engine.taylor._line_functions import line_of
 from lagjax._equations import Constraints, Derivation, Motion
-from lagjax._program import Program, Unlowerable
+from lagjax._program import Unlowerable
+from lagjax._tracing import Program
 
 
 def lowered_motion(derivation: Derivation) -> Motion:
@@ -72,5 +73,5 @@ def _evaluate(derivation: Derivation, q, qdot, t, params, *names: str) -> list[A
 
 def _outputs(program: Program, q, qdot, t, params) -> Array:
     """The outputs of a program of (q, q̇, t, numbers), (outputs,)."""
-    parts = [q, qdot, jnp.reshape(t, 1), *map(jnp.ravel, jax.tree.leaves(params))]
-    return line_of(program)(jnp.concatenate([part.astype(q.dtype) for part in parts]))
+    numbers = jnp.concatenate([jnp.zeros(0, q.dtype), *(jnp.ravel(x).astype(q.dtype) for x in jax.tree.leaves(params))])
+    return line_of(program)(q, qdot, jnp.reshape(t, 1).astype(q.dtype), numbers)

@@ -56,7 +56,8 @@ from lagjax._primitives import (
     cotangent_of,
     is_zero,
 )
-from lagjax._program import Program, Unlowerable
+from lagjax._program import Unlowerable
+from lagjax._tracing import Program
 
 
 def run(flow: Flow, tolerances: Tolerances, ts, y0, params) -> Solution:

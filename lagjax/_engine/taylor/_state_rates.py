@@ -13,7 +13,7 @@ from jax import lax
 
 from lagjax._engine.taylor._flow import Flow
 from lagjax._engine.taylor._line_functions import join_columns, outputs
-from lagjax._program import Rows, emit_look_up, emit_rows
+from lagjax._tracing import Rows, emit_look_up, emit_rows
 
 INSTANT = 1e-9  # of the time; what a border is off by while a motion slides along it is rounding
 

@@ -21,22 +21,8 @@ from lagjax._engine.taylor._line_functions import outputs
 from lagjax._equations import OPERATION_BUDGET, Derivation
 from lagjax._native import SINGLE_NOISE, Guards
 from lagjax._primitives import differentiable_where
-from lagjax._program import (
-    Program,
-    Scalars,
-    StraightLine,
-    Unlowerable,
-    absolute,
-    borders,
-    compose,
-    copy_nodes,
-    distances,
-    fold,
-    lower,
-    lower_scalars,
-    stack,
-    tangents_in,
-)
+from lagjax._program import StraightLine, Unlowerable, borders, copy_nodes, distances, tangents_in
+from lagjax._tracing import Program, Scalars, absolute, compose, fold, lower, lower_scalars, stack
 
 PyTree = Any
 

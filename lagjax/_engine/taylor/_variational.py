@@ -14,7 +14,8 @@ import jax
 import numpy as np
 
 from lagjax._native import Projection
-from lagjax._program import Program, row_places, with_tangents
+from lagjax._program import row_places, with_tangents
+from lagjax._tracing import Program
 
 
 def from_rows(y):

@@ -23,13 +23,14 @@ from lagjax._engine.taylor import (
 from lagjax._equations import OPERATION_BUDGET, Derivation, derivation_of
 from lagjax._interface import Function, Layout, compile_for_one_call, halves
 from lagjax._primitives import attach_derivative, lost_unless
-from lagjax._program import Program, Unlowerable, compose, lower
+from lagjax._program import Unlowerable
 from lagjax._run.contacts._contact_search import LOOPS
 from lagjax._run.contacts._corners import append_sides, corners_of
 from lagjax._run.contacts._places import ARRAYS, PLACES, sizes_of
 from lagjax._run.contacts._replay import ContactReplay, Played
 from lagjax._run.jumps import Found, JumpLaw, Mode, SceneCode
 from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes
+from lagjax._tracing import Program, compose, lower
 
 PyTree = Any
 

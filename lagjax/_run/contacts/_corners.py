@@ -12,8 +12,9 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._program import Program, Unlowerable, find_corners, is_smooth, with_outputs
+from lagjax._program import Unlowerable, find_corners, is_smooth, with_outputs
 from lagjax._scene import Shapes
+from lagjax._tracing import Program
 
 
 class Corners(NamedTuple):

@@ -20,8 +20,9 @@ from lagjax._engine.taylor import Line, MachineCode, Surfaces, line_of, make_flo
 from lagjax._equations import OPERATION_BUDGET, Derivation, has_constraints, is_inconsistent
 from lagjax._interface import Function, Layout, accept, halves, present
 from lagjax._primitives import DOUBLE, SINGLE
-from lagjax._program import Unlowerable, lower
+from lagjax._program import Unlowerable
 from lagjax._scene import System
+from lagjax._tracing import lower
 
 PyTree = Any
 

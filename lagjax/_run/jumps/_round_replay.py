@@ -16,8 +16,9 @@ import jax.numpy as jnp
 
 from lagjax._engine.taylor import Line
 from lagjax._primitives import Repetition
-from lagjax._program import Unlowerable, lower
+from lagjax._program import Unlowerable
 from lagjax._run.jumps._scene_code import SceneCode
+from lagjax._tracing import lower
 
 # Operations of the line of the end of a stretch; instead of a longer one NumPy evaluates its parts.
 LONGEST = 5000

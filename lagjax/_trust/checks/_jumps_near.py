@@ -13,7 +13,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from lagjax._equations import borders_of_motion, numbers_of, pieces_of_motion
-from lagjax._program import Unlowerable, lower
+from lagjax._program import Unlowerable
+from lagjax._tracing import lower
 from lagjax._trust.checks._findings import Finding
 from lagjax._trust.checks._scene_at_start import CheckedScene
 

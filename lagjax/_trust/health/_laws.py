@@ -15,8 +15,9 @@ import numpy as np
 
 from lagjax._equations import SADDLE, Derivation, Motion, Sample, derivation_of, distances, solve_saddle, unit_diagonal
 from lagjax._interface import Layout
-from lagjax._program import Unlowerable, lower
+from lagjax._program import Unlowerable
 from lagjax._scene import System
+from lagjax._tracing import lower
 
 _CHUNK = 2**21  # numbers that programs return together, 16 MB
 _STORED = 2**20  # values that a transposed derivative stores between its two passes, 8 MB

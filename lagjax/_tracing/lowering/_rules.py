@@ -20,10 +20,8 @@ import numpy as np
 from jax.core import Tracer
 from jax.extend import core
 
-from lagjax._program._graph import INPUTS, PAIRS, Graph, Unlowerable
-from lagjax._program._operations import OPERATIONS
-from lagjax._program._simplify import arctangent, inverse, is_nonnegative
-from lagjax._program.lowering._indexing import are_numbers, count_knots, kind_of_ids, locate_knots, look_up_windows
+from lagjax._program import INPUTS, OPERATIONS, PAIRS, Graph, Unlowerable, arctangent, inverse, is_nonnegative
+from lagjax._tracing.lowering._indexing import are_numbers, count_knots, kind_of_ids, locate_knots, look_up_windows
 
 # Scalars that are looked at for each one that the budget allows, as most of a derivative folds away; and in all, which
 # takes some minutes.

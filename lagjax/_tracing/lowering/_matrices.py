@@ -27,12 +27,10 @@ import numpy as np
 from scipy.sparse.csgraph import connected_components
 
 from lagjax._primitives import solve_composed
-from lagjax._program import _scalars as xp
-from lagjax._program._differentiation import Derivatives, copy_nodes
-from lagjax._program._graph import Graph, Unlowerable
-from lagjax._program._passes import eliminate_dead_code
-from lagjax._program._scalars import Scalars
-from lagjax._program.lowering._rules import LOWER, Expansion, inputs_of, lowers
+from lagjax._program import Derivatives, Graph, Unlowerable, copy_nodes, eliminate_dead_code
+from lagjax._tracing import _scalars as xp
+from lagjax._tracing._scalars import Scalars
+from lagjax._tracing.lowering._rules import LOWER, Expansion, inputs_of, lowers
 
 # The rows of the largest matrix that is written out.
 LARGEST_MATRIX = 8

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from lagjax._program._scalars import Scalars
-from lagjax._program.lowering._rules import COMPLEX, Expansion, lowers, reduction, take_length
+from lagjax._tracing._scalars import Scalars
+from lagjax._tracing.lowering._rules import COMPLEX, Expansion, lowers, reduction, take_length
 
 
 class Pair(NamedTuple):

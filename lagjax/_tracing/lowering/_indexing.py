@@ -11,9 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from lagjax._program._graph import INPUTS, NUMBERS, Graph, Unlowerable
-from lagjax._program._look_ups import Located, Table
-from lagjax._program._operations import OPERATIONS
+from lagjax._program import INPUTS, NUMBERS, OPERATIONS, Graph, Located, Table, Unlowerable
 
 # Entries among which one is chosen by comparisons. With 256 knots and values that are computed a first motion takes
 # 0.9 s of a core, half a second more than with those of `params`, and a step takes 90 µs; both grow with their number.

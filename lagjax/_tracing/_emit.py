@@ -9,9 +9,7 @@ import numpy as np
 from jax import lax
 
 from lagjax._interface import compiled_once
-from lagjax._program._line import StraightLine
-from lagjax._program._look_ups import BESIDE, Table, table_of
-from lagjax._program._operations import LOOK_UPS, OPERATIONS
+from lagjax._program import BESIDE, LOOK_UPS, OPERATIONS, StraightLine, Table, table_of
 
 
 def emit(line: StraightLine, scalars: tuple) -> tuple:
