@@ -19,11 +19,10 @@ def copy_deciding(
 
     Piece j is that of its switching number, or `decide(j, piece, nodes)` of the piece that it is as it is written.
     """
-    of_inputs = {node[2]: kind for node, kind in zip(line.nodes, line.kinds, strict=True) if node[0] == "input"}
 
-    def find_input(i: int, nodes: list[int]) -> int:
+    def find_input(i: int, nodes: list[int]) -> int | None:
         if i < first:
-            return graph.input(i, of_inputs[i])
+            return None
         piece = decisions[i - first].piece(graph, nodes[decisions[i - first].switch])
         return piece if decide is None else decide(i - first, piece, nodes)
 

@@ -304,9 +304,8 @@ def with_outputs(program: Recurrent, more: StraightLine, moving: int | None = No
     (`rounding`); zero for a line that is long.
     """
     graph = Graph.from_line(program.line, len(program.line.nodes) + 2 * LARGEST * len(more.nodes) + 1000)
-    kinds = ["float" if np.issubdtype(dtype, np.floating) else np.dtype(dtype).name for dtype in program.dtypes]
     with np.errstate(all="ignore"):
-        places = copy_nodes(graph, more, [graph.input(i, kind) for i, kind in enumerate(kinds)])
+        places = copy_nodes(graph, more)
         errors = [] if moving is None else [graph.constant(0.0, "float")] * len(more.outputs)
         if moving is not None and len(more.nodes) <= LARGEST_WITH_ROUNDING:
             errors = rounding(graph, more, places, moving)

@@ -35,16 +35,21 @@ _LARGEST = 100  # operations of a derivative for one of a line: a bound for erro
 
 
 def copy_nodes(
-    graph: Graph, line, inputs: Sequence[int] | Callable[[int, list[int]], int], places: Sequence | None = None
+    graph: Graph,
+    line,
+    inputs: Sequence[int] | Callable[[int, list[int]], int | None] = lambda i, nodes: None,
+    places: Sequence | None = None,
 ) -> list[int]:
     """The nodes of a line, of a tape or of another graph in a graph, where `inputs` are its inputs.
 
-    These may follow from the nodes before: `inputs(i, nodes)`. Tables move where `places` says what input i becomes.
+    These may follow from the nodes before, `inputs(i, nodes)`, or stay as they are, None. Tables move where `places`
+    says what input i becomes.
     """
     nodes: list[int] = []
     for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):
         if op == "input":
-            nodes.append(inputs(attribute, nodes) if callable(inputs) else graph.real(inputs[attribute]))
+            place = inputs(attribute, nodes) if callable(inputs) else graph.real(inputs[attribute])
+            nodes.append(graph.input(attribute, kind) if place is None else place)
         elif op == "constant":
             nodes.append(graph.constant(attribute, kind))
         else:

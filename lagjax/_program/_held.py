@@ -135,8 +135,7 @@ class Held:
     def _evaluate(self, nodes: Sequence[int]) -> list[int]:
         graph = self.graph
         line = eliminate_dead_code(graph, nodes)
-        given = {node[2]: i for i, node in enumerate(graph.nodes) if node[0] == "input"} | self.state
-        places = copy_nodes(graph, line, [given.get(i, self.zero) for i in range(1 + max(given))])
+        places = copy_nodes(graph, line, lambda i, _: self.state.get(i))
         return [places[i] for i in line.outputs]
 
     def finish(self) -> tuple[StraightLine, tuple[frozenset[int], ...]]:

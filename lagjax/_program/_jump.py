@@ -128,11 +128,13 @@ class Jump(NamedTuple):
         )
         # All that is read of upper rows is whether a tangent is zero, or a number: as NaN it has every mask.
         graph = Graph(2 * len(line.nodes) + 1000)
-        kinds = {node[2]: kind for node, kind in zip(line.nodes, line.kinds, strict=True) if node[0] == "input"}
-        count, nan = 1 + max(kinds, default=-1), graph.number(math.nan)
-        lower = [graph.input(i, kinds.get(i, "float")) for i in range(first)]
-        rest = [graph.input(i - upper, kinds.get(i, "float")) for i in range(first + upper, count)]
-        places = copy_nodes(graph, line, [*lower, *[nan] * upper, *rest])
+
+        def find_input(i: int, _) -> int | None:
+            if i < first:
+                return None
+            return graph.number(math.nan) if i < first + upper else graph.input(i - upper, "float")
+
+        places = copy_nodes(graph, line, find_input)
         line = eliminate_dead_code(graph, [places[i] for i in line.outputs])
         return line, tables
 
@@ -392,8 +394,7 @@ def _switching_number(borders: Borders, size: int) -> StraightLine:
     program, m = borders.program, len(borders.switches)
     line = eliminate_dead_code(program.line, borders.switches)
     graph = Graph(10 * len(line.nodes) + 1000)
-    kinds = {node[2]: kind for node, kind in zip(line.nodes, line.kinds, strict=True) if node[0] == "input"}
-    nodes = copy_nodes(graph, line, [graph.input(i, kinds.get(i, "float")) for i in range(size)])
+    nodes = copy_nodes(graph, line)
     total = graph.constant(0.0, "float")
     for j, node in enumerate(line.outputs):
         weight, number = graph.input(size + j, "float"), nodes[node]

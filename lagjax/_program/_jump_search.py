@@ -27,10 +27,8 @@ class BothSides:
 
     def __init__(self, graph: Graph, line: StraightLine, size: int, m: int):
         self.graph, self.line = graph, line
-        kinds = {node[2]: kind for node, kind in zip(line.nodes, line.kinds, strict=True) if node[0] == "input"}
-        given = [graph.input(i, kinds.get(i, "float")) for i in range(size + 2 * m)]
-        self.before = copy_nodes(graph, line, given[: size + m])
-        self.behind = copy_nodes(graph, line, [*given[:size], *given[size + m :]])
+        self.before = copy_nodes(graph, line)
+        self.behind = copy_nodes(graph, line, lambda i, _: None if i < size else graph.input(i + m, "float"))
         self._differences: dict[int, int] = {}
 
     def difference(self, i: int) -> int:
@@ -196,9 +194,7 @@ class JumpSearch:
 
     def _with_rounding(self, line: StraightLine, count: int, by: Sequence[int] = ()) -> StraightLine:
         graph = Graph(_LARGEST * len(line.nodes) + 10_000)
-        kinds = {node[2]: kind for node, kind in zip(line.nodes, line.kinds, strict=True) if node[0] == "input"}
-        inputs = [graph.input(i, kinds.get(i, "float")) for i in range(1 + max(kinds, default=-1))]
-        places = copy_nodes(graph, line, inputs)
+        places = copy_nodes(graph, line)
         errors = rounding(graph, line, places, self.moving)
         slopes = gradient_in(graph, line, places, line.outputs[0], by) if by else []
         outputs = [*(places[i] for i in line.outputs), *errors, *slopes]
