@@ -130,6 +130,30 @@ def test_derivatives_of_short_runs_take_no_python(on_host, monkeypatch):
             np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-12, err_msg=name)
 
 
+def test_several_cotangents_of_a_short_run_take_no_python(on_host):
+    """Members have starts, parameters or times of their own; forward mode gives the same by other code."""
+
+    def ends(q, m, ts):
+        found = lagjax.simulate(SCENE.system, q, np.zeros(2), ts, SCENE.params | {"m1": m}, rtol=1e-11)
+        return jnp.concatenate([found.q.ravel(), found.end.qdot])
+
+    q, m, ts = Q[:3], np.array([1.0, 1.3, 0.8]), np.array([[0.0, 0.1, 0.2], [0.0, 0.2, 0.3], [0.0, 0.1, 0.3]])
+
+    def slopes(jacobian):
+        of_all = jax.vmap(jacobian(ends, (0, 1, 2)), (0, 0, None))(q, m, ts[0])
+        return (
+            of_all,
+            jax.vmap(jacobian(ends, (0, 2)), (None, None, 0))(q[0], 1.3, ts),
+            jacobian(ends)(q[0], 1.3, ts[0]),
+        )
+
+    on_host.clear()
+    found = jax.jit(lambda: slopes(jax.jacrev))()
+    assert not on_host
+    for a, b in zip(jax.tree.leaves(found), jax.tree.leaves(jax.jit(lambda: slopes(jax.jacfwd))()), strict=True):
+        np.testing.assert_allclose(a, b, rtol=1e-10, atol=1e-10)
+
+
 @pytest.mark.slow
 def test_a_derivative_inside_of_loops_takes_no_python(on_host):
     def walk(q, m):

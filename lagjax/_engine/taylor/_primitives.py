@@ -401,15 +401,15 @@ def _run_compiled(ts, y0, params, *, flow, tolerances):
         return _restore_batch(run_by_handler(flow, tolerances, finish_run, of_rows, *rows), batch)
 
 
-def _compile_derivative(run_handler, run_on_host, shapes_of, inner, args, settings):
+def _compile_derivative(run_handler, run_on_host, shapes_of, inner, args, settings, copies: int = 1):
     """A derivative in what XLA compiles: by a handler where the motion was a short one, else on the host.
 
-    `run_handler(*rows)` gives the results for rows of members, the sizes of their last terms (`Kernel.jvp`), whether
-    they are done, and what they need to live.
+    `run_handler(*rows)` gives the results for rows of members, each of which it runs in some `copies`, the sizes of
+    their last terms (`Kernel.jvp`), whether they are done, and what they need to live.
     """
     shapes, function = shapes_of(*args, **settings), functools.partial(run_on_host, **settings)
     (ts, y0, params, _, _, *counts, a, b), batch = _rows(args, (*_MOTIONS, *inner), library=jnp)
-    flow, members = settings["flow"], math.prod(batch)
+    flow, members = settings["flow"], copies * math.prod(batch)
 
     def call_handler(*args):
         *results, excess, done, needed = run_handler(ts, y0, params, a, b)
@@ -422,7 +422,7 @@ def _compile_derivative(run_handler, run_on_host, shapes_of, inner, args, settin
         if not derivatives_begin_in_handler(flow, members):
             return host(*args)
         kernel = flow.kernel.select_width(members)
-        is_short = jnp.sum(sum(counts)) <= kernel.rounds_of_rerun * kernel.width
+        is_short = copies * jnp.sum(sum(counts)) <= kernel.rounds_of_rerun * kernel.width
         return cond_alike(is_short, call_handler, host, *args)
 
 
@@ -437,18 +437,23 @@ def _jvp_compiled(*args, **settings):
 
 
 def _vjp_compiled(*args, **settings):
-    """`vjp` of what XLA compiles, of one cotangent."""
+    """`vjp` of what XLA compiles: of several cotangents each is that of a copy of its member."""
+    copies = args[-1].shape[-2]
 
     def run_handler(ts, y0, params, path_ct, end_ct):
+        ts, params = (jnp.repeat(x, copies, axis=0) if len(x) > 1 else x for x in (ts, params))
+        y0 = jnp.repeat(y0, copies, axis=0)
+        path_ct, end_ct = (x.reshape(len(y0), *x.shape[2:]) for x in (path_ct, end_ct))
+
         def go_back(path_ct, end_ct):
             return derivative_by_handler("vjp", **settings, rows=(ts, y0, params, path_ct, end_ct))
 
-        y_ct, params_ct, *more = _derivatives.transpose_outputs(go_back, ts, path_ct[:, 0], end_ct[:, 0], library=jnp)
-        return y_ct[:, None], params_ct[:, None], *more
+        *found, excess, done, needed = _derivatives.transpose_outputs(go_back, ts, path_ct, end_ct, library=jnp)
+        return *(x.reshape(-1, copies, x.shape[-1]) for x in found), excess, done, needed
 
-    if settings["flow"].turns or args[-1].shape[-2] != 1:
+    if settings["flow"].turns:
         return call_host(functools.partial(_vjp_on_host, **settings), _vjp_shapes(*args, **settings), *args)
-    return _compile_derivative(run_handler, _vjp_on_host, _vjp_shapes, (3, 2), args, settings)
+    return _compile_derivative(run_handler, _vjp_on_host, _vjp_shapes, (3, 2), args, settings, copies)
 
 
 # ---- on a GPU --------------------------------------------------------------------------------------------------------
