@@ -126,16 +126,21 @@ class Jump(NamedTuple):
         line, tables = pullback_and_entries(
             self.line, dtypes, by, of, varies=lambda table: table.tangents, is_linear=True
         )
-        # All that is read of upper rows is whether a tangent is zero, or a number: as NaN it has every mask.
-        graph = Graph(2 * len(line.nodes) + 1000)
-
-        def find_input(i: int, _) -> int | None:
-            if i < first:
-                return None
-            return graph.number(math.nan) if i < first + upper else graph.input(i - upper, "float")
-
-        places = copy_nodes(graph, line, find_input)
-        line = eliminate_dead_code(graph, [places[i] for i in line.outputs])
+        nodes, of_upper, places = [], [], []
+        for op, operands, attribute in line.nodes:
+            operands = tuple(places[i] for i in operands)
+            of_upper.append(first <= attribute < first + upper if op == "input" else any(of_upper[i] for i in operands))
+            places.append(len(nodes))
+            if op == "input" and attribute >= first + upper:
+                attribute -= upper
+            # All that is read of them is whether a tangent is zero, or a number: taken for neither, it has every mask.
+            elif op in ("eq", "is_finite") and of_upper[-1]:
+                op, operands, attribute, of_upper[-1] = "constant", (), False, False
+            elif op == "select" and (operands[1] == operands[2] or nodes[operands[0]] == ("constant", (), False)):
+                places[-1], of_upper[-1] = operands[1], of_upper[operands[1]]
+            nodes.append((op, operands, attribute))
+        outputs = tuple(places[i] for i in line.outputs)
+        line = eliminate_dead_code(line.replace(nodes=tuple(nodes)), outputs)
         return line, tables
 
 
