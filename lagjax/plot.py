@@ -125,7 +125,7 @@ def space_time(trajectory: Trajectory, *, label: str | None = None, cmap: str = 
 def phase(trajectory: Trajectory, *coordinates: str, members: int = 30, ax=None):
     """The phase portrait: the velocity of each coordinate against it, from the dot on; a colour for each coordinate.
 
-    The curves are those of `trajectory`: they end at a reset, and go on behind it.
+    The curves are those of `trajectory`: they end at a reset, and continue behind it.
 
     - `coordinates`: their names, as messages and tables have them: "q['theta']", "q[0]"; by default all, the first
       seven of more.
@@ -164,7 +164,7 @@ def _places(layout: Layout, coordinates: tuple[str, ...], most: int = len(COLORS
 def compare(one: Trajectory, other, *coordinates: str, figure=None):
     """Two motions, or a motion and data, above each other, and their difference below; a column for each coordinate.
 
-    - `one`: a motion. Where `other` has other times it follows the cubic through its outputs (Hermite).
+    - `one`: a motion. Where `other` has different times it follows the cubic through its outputs (Hermite).
     - `other`: a `Trajectory`, a `Record`, or a pair (ts, values) with values in the structure of q; NaN is missing.
     - `coordinates`: their names, as in `phase`; by default the first four.
 
@@ -177,7 +177,8 @@ def compare(one: Trajectory, other, *coordinates: str, figure=None):
     t, q, _ = course.curve()
     ts, values, style = _other(other, layout)
     places = _places(layout, coordinates, most=4)
-    axes = _two_rows(figure, len(places))
+    figure = _wide_figure(len(places)) if figure is None else figure
+    axes = figure.subplots(2, len(places), squeeze=False, sharex="col", gridspec_kw={"height_ratios": [2, 1]})
     left = course.states_at(ts)[0] - values
     for (above, below), i in zip(axes.T, places, strict=True):
         _axes(above).plot(t, q[:, i], color=COLORS[0], linewidth=1.5, label="motion")
@@ -196,7 +197,7 @@ def _other(other, layout: Layout) -> tuple[np.ndarray, np.ndarray, str]:
         _require_numbers(other, "other")
         of_other, course = course_of(other)
         if of_other.names != layout.names:
-            raise ValueError("The two motions have other coordinates: there is nothing to compare.")
+            raise ValueError("The two motions have different coordinates: there is nothing to compare.")
         t, q, _ = course.curve()
         q[1:][np.isnan(q[:-1]).any(axis=1)] = np.nan  # at the instant of a jump the difference is that before it
         return t, q, "--"
@@ -415,7 +416,7 @@ def energy_error(trajectory: Trajectory, *, scale: float | None = None, ax=None)
 
 
 def _loses_at_transitions(trajectory: Trajectory, h: np.ndarray) -> bool:
-    """True if a transition changes the energy by more than rounding, in parts of the largest one."""
+    """True if a transition changes the energy by more than rounding, as a fraction of the largest one."""
     if (changes := trajectory.transitions) is None:
         return False
     sides = (changes.q, changes.qdot, changes.source), (changes.q_next, changes.qdot_next, changes.target)
@@ -456,9 +457,8 @@ def fit(fit: Fit, record: int = 0, *, figure=None):
     _require(fit, "fit", Fit, "fit")
     one, columns = fit.records[record], fit.residual_function.columns(record)
     names = fit.residual_function.names[columns]
-    axes = _two_rows(figure, len(names))
-    draw_record(axes, one, fit.residual_matrices[record], names, fit.noise_scale.sigma[columns])
-    return axes
+    figure = _wide_figure(len(names)) if figure is None else figure
+    return draw_record(figure, one, fit.residual_matrices[record], names, fit.noise_scale.sigma[columns])
 
 
 def profile(profile, *, ax=None):
@@ -516,11 +516,8 @@ def _axes(ax):
     return simplify_axes(ax)
 
 
-def _two_rows(figure, columns: int):
-    """Axes (2, columns) of `figure`, or of a new one: curves above, what is left of them below."""
-    if figure is None:
-        figure = _matplotlib().pyplot.figure(figsize=(max(6.4, 3.6 * columns), 4.6), layout="constrained")
-    return figure.subplots(2, columns, squeeze=False, sharex="col", gridspec_kw={"height_ratios": [2, 1]})
+def _wide_figure(columns: int):
+    return _matplotlib().pyplot.figure(figsize=(max(6.4, 3.6 * columns), 4.6), layout="constrained")
 
 
 def _legend(ax, shown: int = 0, layout: Layout | None = None):

@@ -39,6 +39,10 @@ class HeldScene(NamedTuple):
     def names(self) -> tuple[str, ...]:
         return self.flat.shapes.names
 
+    @property
+    def _rows(self) -> np.ndarray:
+        return np.arange(self.own, self.own + len(self.places))
+
     def split(self, multipliers, layout: Layout, params: PyTree) -> tuple:
         """The multipliers of the constraints and the normal forces of all contacts, in the structures of the user."""
         end = self.own + len(self.places)
@@ -50,7 +54,7 @@ class HeldScene(NamedTuple):
 
     def judge(self, scene: SceneState, q, multipliers, ok) -> tuple:
         """The multipliers (m,) of an equilibrium at q (n,), whether it is one of the contacts, and why it is none."""
-        pushes, jacobian = self._pushes(multipliers), scene.jacobian(q, scene.qdot)
+        pushes, jacobian = multipliers[self._rows], scene.jacobian(q, scene.qdot)
         gaps, slopes = _gaps_and_slopes(self.flat, q, scene.params)
         rounding = _UNLOADED * jnp.max(jnp.abs(multipliers), initial=0.0)
         presses, stays_open = pushes >= -rounding, gaps >= -_CLOSED * _sizes(gaps, slopes, q)
@@ -65,7 +69,7 @@ class HeldScene(NamedTuple):
             return multipliers, fine, why
         # Of contacts that depend on each other, as the four feet of a table, other shares of the load may press.
         force = np.asarray(scene.force(q, scene.qdot))
-        if (shares := _pressing_shares(np.asarray(jacobian), force, self._rows())) is not None:
+        if (shares := _pressing_shares(np.asarray(jacobian), force, self._rows)) is not None:
             return jnp.asarray(shares, multipliers.dtype), jnp.asarray(True), ""
         return multipliers, fine, self._opens(pushes, "At the equilibrium that was found")
 
@@ -75,7 +79,7 @@ class HeldScene(NamedTuple):
             return q
         leaves = jax.tree.leaves(self.system.multipliers(q, _velocities(q, qdot), 0.0, params))
         multipliers = jnp.concatenate([jnp.ravel(x) for x in leaves])
-        pushes = self._pushes(multipliers)
+        pushes = multipliers[self._rows]
         loaded = jnp.all(pushes > _UNLOADED * jnp.max(jnp.abs(multipliers)))
         if not is_concrete(loaded):
             return jax.tree.map(lambda x: nan_unless(loaded, jnp.asarray(x, float)), q)
@@ -83,12 +87,6 @@ class HeldScene(NamedTuple):
             one_side = f"{what} next to a contact without load is linear on one side of it alone."
             raise ValueError(f"{self._opens(pushes, 'At this state')} {one_side}")
         return q
-
-    def _rows(self) -> np.ndarray:
-        return np.arange(self.own, self.own + len(self.places))
-
-    def _pushes(self, multipliers):
-        return multipliers[self._rows()]
 
     def _opens(self, pushes, where: str) -> str:
         k = int(np.argmin(np.asarray(pushes)))
@@ -110,6 +108,11 @@ def hold_closed(system: Any, q: PyTree, qdot: PyTree, params: PyTree, what: str)
     system = require_system(system, contacts=True)
     if system.one_way is not None:
         raise ValueError(f"{what} is for contacts without one_way=…: leave out what is open, hold what is closed.")
+    if system.reads_multipliers:
+        raise ValueError(
+            f"{what} of a scene with contacts is for forces that read no multipliers: write the contacts that stay "
+            "closed as constraints=…, whose multipliers they may read there."
+        )
     with jax.ensure_compile_time_eval():
         rest = _velocities(q, qdot)
         layout = Layout.from_state(q, rest)

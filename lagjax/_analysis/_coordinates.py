@@ -106,8 +106,7 @@ def change_coordinates(system: System, old_from_new: Callable) -> ChangedCoordin
 
 
 def restrict_signature(function: Callable, extras: set[str], roles: int = 2) -> Callable:
-    """`function(*roles, t, params)` with a signature that has those of `t`, `params` and `multipliers` in `extras`: a
-    function without `t` is known not to depend on the time."""
+    """`function(*roles, t, params)` with a signature that shows only `extras`: without `t` it is autonomous."""
 
     def restricted(*state, t=0.0, params=None, **more):
         return function(*state, t, params, **more)

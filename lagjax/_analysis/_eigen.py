@@ -67,8 +67,7 @@ def _each(function: Callable, *arrays: np.ndarray) -> list[np.ndarray]:
 
 @jax.custom_jvp
 def symmetric_modes(stiffness: Matrix, mass: Matrix) -> tuple[Float[Array, " n"], Matrix]:
-    """λ (n,), ascending, and X (n, n), a vector a column, with K X = M X Λ, Xᵀ M X = 1, of symmetric K and M. NaN where
-    M is not positive definite."""
+    """λ (n,), ascending, and X (n, n) with K X = M X Λ, XᵀM X = 1; NaN where M is not positive definite."""
     n = len(mass)
     shapes = jax.ShapeDtypeStruct((n,), mass.dtype), jax.ShapeDtypeStruct((n, n), mass.dtype)
     return _call_numpy(lambda *x: _each(_symmetric, *x), shapes, stiffness, mass)  # pyright: ignore[reportReturnType]

@@ -16,8 +16,8 @@ from lagjax._analysis._solve import is_root, levenberg_marquardt, newton, shorte
 from lagjax._analysis._sparse_balance import (
     balance_of,
     constraints_nearby,
+    descend,
     falls,
-    find_root,
     is_balanced,
     multipliers_at_rest,
     singular_direction,
@@ -310,7 +310,7 @@ def _solve_large(scene: SceneState, qdot: PyTree, stable: bool) -> tuple[Vector,
     unit = np.concatenate([unit, np.where(columns[n:] > 0, of_q / np.where(columns[n:] > 0, columns[n:], 1), 1)])
     least = np.abs(start)
     least[n:] = np.maximum(least[n:], _TINY * unit[n:] * (least / unit)[n:].max(initial=0))
-    z = find_root(of, start, least, unit)
+    z = descend(of.residual, of.jacobian, start, least, unit)
     z = np.where(np.abs(z) < np.finfo(float).eps ** 3 * np.abs(start), 0.0, z)
     why = "" if is_balanced(of, z, least) else _sentence(scene, jacobian)
     if not why and stable and falls(of, z, unit[:n]):
@@ -341,6 +341,6 @@ def _sentence(scene: SceneState, gradient: Sparse | None = None) -> str:
         )
     shown = ", ".join(f"{name} = {value:.6g}" for name, value in zip(names[:8], np.asarray(scene.q)[:8], strict=False))
     return (
-        f"No equilibrium was found from {shown}: Newton's method does not come to a point where the forces balance. "
+        f"No equilibrium was found from {shown}: Newton's method reaches no point where the forces balance. "
         "There may be none, or the force is largest at the guess (its slope vanishes): begin nearer to one."
     )

@@ -61,8 +61,7 @@ def gauge_of(scene: SceneState, fields: Fields, weights: np.ndarray, k: int, cha
 
 
 def is_right(gauge: Callable, scene: SceneState, fields: Fields, k: int, changes: Changes, states: FlatState) -> bool:
-    """True if ∂G/∂q and ∂G/∂t are what transformation number k asks for, at some of the states of `changes`. Of a
-    piecewise L each piece may have a G of its own, and there is none for all."""
+    """True if ∂G/∂q and ∂G/∂t are those of transformation k at some states: each piece of L may have its own G."""
     restore, speeds = scene.layout.restore, fields.scale / fields.time
 
     @jax.jit

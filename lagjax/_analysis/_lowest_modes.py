@@ -20,7 +20,7 @@ from lagjax._equations import decide
 
 Sparse = Any  # an array of scipy.sparse, of which type checkers do not know that it has two axes
 
-# The first shift, in parts of the largest entries of K: far above rounding, below the lowest mode of 10⁵ links, 1e-9.
+# The first shift, as a fraction of the largest entries of K: above rounding, below the lowest mode of 10⁵ links, 1e-9.
 # Closer to zero by a factor of ten, zero modes would cost other shapes a digit.
 _SHIFT = 1e-9
 # Trials to come closer; a failure costs as much as a success, which gains a factor of two to eight of the distance.
@@ -45,11 +45,9 @@ NO_MODES = (
 def lowest_modes(
     stiffness: Sparse, mass: Sparse, jacobian: Sparse, count: int | None
 ) -> tuple[Float[np.ndarray, " k"], Float[np.ndarray, "n k"]]:
-    """λ (k,), ascending, and X (n, k), a vector a column, of at least `count` of the lowest modes, with Xᵀ M X = 1.
-
-    K and M are symmetric with diagonals of the order of one. Raises `ValueError` where M is not positive definite, or
-    constraints depend on each other.
-    """
+    """λ (k,), ascending, and X (n, k), a vector a column, of at least `count` of the lowest modes, XᵀM X = 1. The
+    diagonals of K and M are of order one. Raises `ValueError` where M is not positive definite, or constraints depend
+    on each other."""
     if factorize_positive(mass) is None:
         raise ValueError(NO_MODES)
     n, rows = mass.shape[0], jacobian.shape[0]
@@ -62,7 +60,7 @@ def lowest_modes(
         slices = [(shift, factorize_regular(bordered), count, "LM")]
         if slices[0][1] is None:
             raise ValueError(
-                f"The {rows} constraints depend on each other at q, or nearly: of so many coordinates modes are found "
+                f"The {rows} constraints depend on each other at q, or nearly: of large scenes modes are found "
                 "with independent ones. Drop those that follow from others."
             )
     counted = [] if rows else _slices(stiffness, mass, shift, factors, count)
@@ -110,12 +108,9 @@ def _modes_of(stiffness: Sparse, mass: Sparse, against: np.ndarray, shift: float
 def _slices(
     stiffness: Sparse, mass: Sparse, low: float, factors: SuperLU, count: int
 ) -> list[tuple[float, Any, int, str]]:
-    """Shifts, factors and numbers of modes that together are the lowest `count` to twice as many; none if not found.
-
-    Where some modes lie far below a dense band, as that of a heavy mass does, Lanczos's method takes thousands of
-    steps to tell those of the band apart by a shift below all. So one shift lies inside, and those few are found by
-    themselves. By Sylvester's law of inertia K − σM has a negative pivot for each eigenvalue below σ.
-    """
+    """Shifts, factors and numbers of modes that together are the lowest `count` to twice as many; none if not found. A
+    few modes far below a dense band (of a heavy mass) would cost Lanczos's method thousands of steps there: one shift
+    lies inside the band, by Sylvester's law of inertia (a negative pivot of K − σM for each eigenvalue below σ)."""
     far, high, width = (low, factors, 0, "LM"), np.inf, 4 * _SHIFT * (float(abs(stiffness).sum(axis=1).max()) or 1.0)
     for _ in range(2 * _TRIALS):
         trial = low + width if np.isinf(high) else 0.5 * (low + high)
@@ -150,10 +145,8 @@ def _rayleigh_ritz(stiffness: Sparse, mass: Sparse, basis: np.ndarray) -> tuple[
 
 def lowest_shift(stiffness: Sparse, mass: Sparse, jacobian: Sparse = None) -> tuple[float, SuperLU]:
     """σ just below all eigenvalues, and the factors of K − σM, with stiff springs for constraints; M positive definite.
-
-    How fast Lanczos's method converges depends on how far σ is below the lowest eigenvalue, beside how far these are
-    apart. Rayleigh quotients are bounds from above, factors that are positive such from below.
-    """
+    Lanczos's method converges faster the nearer σ is; Rayleigh quotients bound it from above, positive factors from
+    below."""
     size = float(abs(stiffness).sum(axis=1).max()) or 1.0
     shift, held = -_SHIFT * size, stiffness
     if jacobian is not None and jacobian.shape[0]:

@@ -211,8 +211,8 @@ def _modes(cyclic: tuple[int, ...], rank: int, reversible: bool, *arguments) -> 
 
 @compile_for_one_call
 def _restore(layout: Layout, exponents: Array, shapes: Array, weighted: Array, unit: Vector, balanced) -> Modes:
-    """The modes of exponents (k, 2) and shapes (k, n) in the `unit` (n,) of each coordinate; NaN if not `balanced`.
-    `weighted` (k, n) are the M x of the shapes x."""
+    """The modes of exponents (k, 2) and shapes x (k, n) in the `unit` (n,) of coordinates, `weighted` their M x (k, n);
+    NaN if not `balanced`."""
     shapes = _normalise(shapes, weighted)
     order = jnp.argsort(jax.lax.stop_gradient(exponents[:, 0].imag), stable=True)
     shapes = shapes[order] * unit
@@ -282,12 +282,10 @@ def _rank_is(jacobian: Float[Array, "m n"], rank: int) -> Bool[Array, ""]:
 
 
 def _distance(values: Any, slopes: Any, place: Any, stiffness: Any, solve: Callable, force: Callable | None):
-    """The distance of q from an equilibrium, in units of its size, by `values` (n + m,) of forces and constraints.
-
-    All are given in the unit of each coordinate, q being `place`; `slopes` (n + m,) are the lengths of the rows of K
-    and of J, `solve(K, b)` a solution x of K x = b. Zero also where the distance changes no mode: where without
-    constraints the `force`, a function of the place, is linear up to a thousand times as far.
-    """
+    """The distance of q from an equilibrium, in units of its size, by `values` (n + m,) of forces and constraints, in
+    the unit of each coordinate; q is the `place`, `slopes` (n + m,) the lengths of the rows of K and J, `solve(K, b)` a
+    solution of K x = b. Zero also where without constraints the `force` is linear up to a thousand times as far: no
+    mode changes."""
     xp = slopes.__array_namespace__()
     # A row without any gradient may be left with the rounding of the others.
     slopes = xp.where(slopes > 0, slopes, xp.max(slopes, initial=0) * 1e-6)
@@ -363,8 +361,7 @@ def _exponents(squares: Array, zero, ok=True) -> Array:
 
 
 def _general_modes(mass: Matrix, rates: Matrix, stiffness: Matrix) -> tuple[Array, Array]:
-    """Exponents (k, 2) and complex amplitudes (k, k), a mode a column. Velocities are in units of the fastest rate
-    there is: positions and they are then of one size."""
+    """Exponents (k, 2) and complex amplitudes (k, k), a mode a column; velocities are in units of the fastest rate."""
     k, inverse = len(mass), factorize(mass)
     by_q, by_qdot = -inverse.solve_columns(stiffness), -inverse.solve_columns(rates)
     fastest = jax.lax.stop_gradient(jnp.maximum(jnp.sqrt(jnp.max(jnp.abs(by_q))), jnp.max(jnp.abs(by_qdot))))

@@ -21,7 +21,7 @@ from lagjax._scene import System
 
 _NODES = 32  # of Gauss's rule: exact for polynomials of degree 63
 
-# How far beside the straight line curves lead, in parts of its length, into how many parts they are divided, and what
+# How far off the straight line curves lead, as a fraction of its length; into how many parts they are divided; what
 # rules over parts of two lengths may differ by.
 _BESIDE, _PARTS, _RESOLVED = (0.0, 0.5, -0.5), 4, 1e-10
 _CURL = 1e-12  # of forces, by which they may fail to have a potential: some tens of roundings of sums

@@ -15,7 +15,7 @@ from lagjax._interface import compile_for_one_call
 # found in the ready scenes.
 _NEAR = 0.5
 _FAR = 5.0  # times as far those of a piecewise scene are drawn: one piece may have what the next one has not
-_THIRD = 3  # of so many states one is drawn as far off as it takes for the forces not to be linear
+_THIRD = 3  # of this many states one is drawn as far off as it takes for the forces not to be linear
 
 
 def random_states(scene: SceneState, scales: Scales, count: int, seed: int, piecewise: bool) -> FlatState:

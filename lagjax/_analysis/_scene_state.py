@@ -37,7 +37,7 @@ _LARGEST_MATRIX = 1000
 
 
 def require_matrices(size: int, what: str, advice: str) -> None:
-    """Raise `ValueError`, with the `advice`, where `what` takes matrices that are too large for so many coordinates."""
+    """Raise `ValueError`, with the `advice`, where `what` takes matrices too large for this number of coordinates."""
     if size > _LARGEST_MATRIX:
         raise ValueError(
             f"{what}: not tried for {size} coordinates, which takes matrices of n × n numbers, {8e-9 * size**2:.2g} GB "
@@ -147,11 +147,8 @@ class SceneState(NamedTuple):
 
     @property
     def reversible(self) -> bool:
-        """True if nothing but L acts, and no momentum is left at rest: small motions backwards are motions.
-
-        Read off momenta at states, and with parameters, that nothing speaks for: they are zero at rest exactly, or as
-        good as any other number, in whatever units. A wrong guess has to be caught by who relies on it.
-        """
+        """True if nothing but L acts, and no momentum is left at rest: read off momenta at random states and
+        parameters, zero exactly or not. Its user has to catch a wrong guess."""
         motion, n = self.motion, self.layout.size
         acting = motion.forces, motion.dissipation, self.system.velocity_constraints
         if any(function is not None for function in acting) or self.lowered is None:

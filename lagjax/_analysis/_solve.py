@@ -20,8 +20,8 @@ Vector = Float[Array, " n"]
 
 
 def shortest_solution(matrix: Matrix, b: Vector, unit: Vector | float = 1.0) -> Vector:
-    """x with A x = b, the shortest one in these units (n,) where A is singular and b in its range. Linear in b, with
-    derivatives by both. A singular A is one whose pivots, of rows and columns of unit size, say so."""
+    """x of A x = b, the shortest in these units (n,) where pivots of the scaled A say that it is singular. Linear in b,
+    with derivatives by both."""
     matrix = matrix * unit
     rows, columns = (jax.lax.stop_gradient(scale) for scale in _scales(matrix))
     inverse, order, pivots = invert(jax.lax.stop_gradient(rows[:, None] * matrix * columns))
@@ -48,11 +48,8 @@ def shortest_preimage(linear: Callable[[Vector], Vector], right: Vector, unit: V
 
 
 def newton(f: Callable[[Vector], Vector], start: Vector, unit: Vector | float = 1.0) -> Vector:
-    """x with f(x) = 0 that Newton's method reaches from `start` (n,), for `jax.lax.custom_root`; look at f(x).
-
-    A step is halved until f is finite and smaller, or no larger but for rounding. Steps are the shortest ones in `unit`
-    (n,) where the derivatives are singular.
-    """
+    """x with f(x) = 0 that Newton's method reaches from `start` (n,), for `jax.lax.custom_root`; look at f(x). A step
+    is halved until f is finite and no larger but for rounding; steps are the shortest in `unit` (n,) where singular."""
 
     def moves(carry):
         _, moved, count = carry
@@ -73,11 +70,9 @@ def newton(f: Callable[[Vector], Vector], start: Vector, unit: Vector | float = 
 def is_root(
     f: Callable, x: Vector, given: Vector | float = 0.0, *, least: Vector | float = 0.0, power: float = 0.6
 ) -> Bool[Array, ""]:
-    """True if f(x) = 0: each number within eps^`power` of what x makes of it, or of a term that is `given` (n,).
-
-    `least` (n,) are the sizes below which numbers of x do not count. Newton's method comes to some eps; where it has
-    gone astray it is off by more than half of the digits, and where f only fades away with x by all of them.
-    """
+    """True if f(x) = 0: each number within eps^`power` of what x makes of it, or of a term that is `given` (n,);
+    `least` (n,) bounds sizes of x from below. Newton's method ends at some eps; an astray one is off by half of the
+    digits."""
     size = jnp.abs(jax.jacfwd(f)(x)) @ jnp.maximum(least, jnp.abs(x)) + jnp.abs(given)
     return jnp.all(jnp.abs(f(x)) <= jnp.finfo(x.dtype).eps ** power * size)
 
@@ -116,7 +111,7 @@ def levenberg_marquardt(f: Callable, start: Vector, least: Vector, unit: Vector)
         ratio = jnp.where(expected > 0, gain / jnp.where(expected > 0, expected, 1), 0.0)
         better = (gain > 0) & jnp.all(jnp.isfinite(new))
         damping = jnp.where(ratio > 0.75, damping / 4, jnp.where((ratio < 0.25) | ~better, damping * 4, damping))
-        # The most that a step makes of a number of f(z), in parts of what the numbers of z make of it.
+        # The most that a step makes of a number of f(z), as a fraction of what the numbers of z make of it.
         of_f, sizes = jnp.abs(jacobian), jnp.maximum(jnp.maximum(least, jnp.abs(z)), jnp.abs(step))
         length = jnp.max(of_f @ jnp.abs(step) * _reciprocal(of_f @ sizes))
         stuck = ~better & ((length < NO_STEP) | ~jnp.isfinite(length))
@@ -128,7 +123,7 @@ def levenberg_marquardt(f: Callable, start: Vector, least: Vector, unit: Vector)
     return jax.lax.while_loop(moves, once, carry)[0]
 
 
-# A step that is nothing, in parts of the numbers of z. Damped steps: 10 to 30 are usual, and twice as many change
+# A step that is nothing, as a fraction of the numbers of z. Damped steps: 10 to 30 are usual, and twice as many change
 # nothing where there is a solution.
 NO_STEP, DAMPED_STEPS = 1e-10, 200
 

@@ -17,7 +17,7 @@ from scipy.sparse.linalg import splu
 
 from lagjax._analysis._lowest_modes import Sparse, factorize_regular, lowest_shift
 from lagjax._analysis._scene_state import SceneState
-from lagjax._analysis._solve import DAMPED_STEPS, HALVINGS, NO_STEP, STEPS
+from lagjax._analysis._solve import DAMPED_STEPS, NO_STEP
 from lagjax._equations import sparse_jacobian
 
 Unknowns = Float[np.ndarray, " n+m"]
@@ -70,12 +70,6 @@ def multipliers_at_rest(scene: SceneState) -> np.ndarray:
 # ---- roots -----------------------------------------------------------------------------------------------------------
 
 
-def find_root(of: SparseBalance, start: Unknowns, least: Unknowns, unit: Unknowns) -> Unknowns:
-    """z that damped steps from `start` lead to, and Newton's method from there; `least` and `unit` as in `_solve`."""
-    z = descend(of.residual, of.jacobian, start, least, unit)
-    return _polish(of, z, of.residual(z), of.jacobian(z))
-
-
 def constraints_nearby(scene: SceneState, place: np.ndarray, unit: np.ndarray) -> np.ndarray:
     """q (n,) on, or nearer to, the constraints f of a large scene than a `place` (n,)."""
     function = jax.jit(scene.position_constraints)
@@ -112,28 +106,6 @@ def descend(residual: Callable, jacobian_at: Callable, start: Unknowns, least: U
     return z
 
 
-def _polish(of: SparseBalance, z: Unknowns, value: Unknowns, jacobian: Sparse) -> Unknowns:
-    """z after Newton's steps, until the forces do not become less than half."""
-    for _ in range(STEPS):
-        rows = _reciprocal(abs(jacobian).max(axis=1).toarray().ravel())
-        columns = _reciprocal(abs(diags_array(rows) @ jacobian).max(axis=0).toarray().ravel())
-        scaled = diags_array(rows) @ jacobian @ diags_array(columns)
-        factors, error = factorize_regular(scaled), rows * value
-        step = _damped_solution(scaled, error, 1e-15) if factors is None else factors.solve(error)
-        size, step = np.linalg.norm(error), columns * step
-        for _ in range(HALVINGS):
-            new = of.residual(z - step)
-            if np.linalg.norm(rows * new) <= size:
-                break
-            step = 0.5 * step
-        else:
-            break
-        z, value, jacobian = z - step, new, of.jacobian(z - step)
-        if not np.linalg.norm(rows * new) < 0.5 * size:
-            break
-    return z
-
-
 def is_balanced(of: SparseBalance, z: Unknowns, least: Unknowns) -> bool:
     """True if z is a root, each number within half of the digits of what the numbers of z make of it."""
     size = abs(of.jacobian(z)) @ np.maximum(least, np.abs(z))
@@ -148,7 +120,7 @@ def falls(of: SparseBalance, z: Unknowns, unit: np.ndarray) -> bool:
     return shift < -_FALLS * abs(forces).sum(axis=1).max()
 
 
-# The lowest eigenvalue that is none, in parts of the largest: ten times how near its bound comes.
+# The lowest eigenvalue that is none, as a fraction of the largest: ten times how near its bound comes.
 _FALLS = 1e-7
 
 

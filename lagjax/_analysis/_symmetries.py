@@ -352,10 +352,8 @@ def _quantities(
 
 
 def _independent(names: list[str], gradients: np.ndarray) -> list[int]:
-    """The charges to keep of D with these gradients (S, D, 2n): all but combinations and dilations whose gradients are
-    in the space of the others' at every state. So the angular momentum of the centre of mass is left out where its
-    momentum and its start are there.
-    """
+    """The charges to keep of D with these gradients (S, D, 2n): combinations and dilations are dropped whose gradients
+    lie in the span of the others at every state, as the angular momentum of the centre of mass."""
     kept = [k for k, name in enumerate(names) if not name.startswith(_DEPENDENT)]
     for k in range(len(names)):
         if k not in kept and any(_independent_part(of_state[kept], of_state[k]) > 1e-6 for of_state in gradients):

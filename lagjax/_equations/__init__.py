@@ -14,7 +14,7 @@ user's function are not finite or make it piecewise, and in which line.
 from lagjax._equations._blame import borders_of_motion, describe_pieces, offenders, pieces_of_motion, poles
 from lagjax._equations._consistency import has_constraints, inconsistent_members, require_consistent
 from lagjax._equations._constraints import ROUNDINGS, Constraints, distances, is_inconsistent
-from lagjax._equations._coupled_forces import CoupledForces
+from lagjax._equations._coupled_forces import CoupledForces, couple_forces
 from lagjax._equations._derivation import OPERATION_BUDGET, Derivation, derivation_of, numbers_of, once_for_structure
 from lagjax._equations._linear import (
     augment,

@@ -4,12 +4,14 @@ M q̈ = F + Q + Gᵀλ and G q̈ = γ make the multipliers linear in the force, 
 
     λ = λ₀ + R Q(λ),    R = −S⁻¹ G K⁻¹,    S = G K⁻¹ Gᵀ,    K = M + Gᵀ W G        (see `_linear` for W)
 
-What is linear in λ is solved at once. So is what is linear in pieces of a single multiplier, as μ|λ|: as long as R Q
-grows more slowly than λ, the piece is that of λ₀, and none depends on the direction in which friction acts. Else, as
-for the length √(λ₁² + λ₂²) of a bearing's force, that is a few steps of Newton's method, the number of which is bounded
-and the last of which is tested. Where none is found, or a single multiplier has two (Painlevé's paradox), Q is NaN.
+What is linear in λ is solved at once. So is what is linear in pieces of a single multiplier that meet at zero, as μ|λ|:
+as long as R Q grows more slowly than λ, the piece is that of λ₀, and none depends on the direction in which friction
+acts. Else, as for the length √(λ₁² + λ₂²) of a bearing's force, and for min(μ|λ|, Q₁), that is a few steps of Newton's
+method, the number of which is bounded and the last of which is tested. Where none is found, or a single multiplier has
+two (Painlevé's paradox), Q is NaN.
 """
 
+import dataclasses
 from collections.abc import Callable
 from typing import Any
 
@@ -46,22 +48,58 @@ class CoupledForces(eqx.Module):
 
     def solve(self, matrix, force, jacobian, gamma, *state):
         """Q from M, F, G and γ of the free motion."""
-        weights = jnp.trace(matrix) / jnp.sum(jacobian**2, axis=1)
+        squares, held = jnp.sum(jacobian**2, axis=1), self.free.constraints.held
+        released = None if held is None else 1.0 - held(state[-1])  # rows of G that are zero, with no multiplier
+        weights = jnp.trace(matrix) / (squares if released is None else squares + released)
         weighted = weights[:, None] * jacobian
         moved = eliminate(matrix + jacobian.T @ weighted, jacobian.T).T  # G K⁻¹
         right = jnp.concatenate([(gamma - moved @ (force + weighted.T @ gamma))[:, None], -moved], axis=1)
-        solved = eliminate(moved @ jacobian.T, right)
-        read, zero = np.array(_multipliers_read(self.law, *state, solved[:, 0]), int), jnp.zeros_like(solved[:, 0])
+        schur = moved @ jacobian.T
+        solved = eliminate(schur if released is None else schur + jnp.diag(released), right)
+        zero = jnp.zeros_like(solved[:, 0])
+        places, at_zero = _multipliers_read(self.law, *state, zero)
+        read = np.array(places, int)
         law = lambda some: self.law(*state, zero.at[read].set(some))  # noqa: E731
-        return _solve_law(law, solved[read, 0], solved[read, 1:]) if read.size else self.law(*state, zero)
+        return _solve_law(law, solved[read, 0], solved[read, 1:], at_zero) if read.size else self.law(*state, zero)
 
 
-def _solve_law(of_read: Callable, alone, responses):
-    """Q(λ) with λ = λ₀ + R Q(λ), for λ₀ (m,) and R (m, n) of multipliers that are read."""
+def couple_forces(motion, law: Callable, layout, params: PyTree):
+    """The motion with forces by a `law` as of `CoupledForces`, of all multipliers.
+
+    Where rows may be released, as those of contacts, and the law is linear in multipliers, what each brings is a
+    `drag`: one linear system, which leaves out rows that depend on others.
+    """
+    constraints = motion.constraints
+    rest, numbers = jnp.zeros(layout.size, layout.dtype), eqx.filter(params, eqx.is_array_like)
+    state = rest, rest, jnp.zeros((), layout.dtype), numbers
+    zero = jnp.zeros(jax.eval_shape(constraints.residual, *state).size, layout.dtype)
+    if not zero.size:
+        return dataclasses.replace(motion, forces=lambda *state: law(*state, zero))
+    if constraints.held is None:
+        return dataclasses.replace(motion, forces=CoupledForces(law, motion))
+    own = constraints.drag
+    if any(_dependence(lambda some: law(*state, some), zero)):
+        free = dataclasses.replace(motion, constraints=dataclasses.replace(constraints, drag=None))
+        rubbing = law if own is None else (lambda *given: law(*given) + own(*given[:-1]) @ given[-1])
+        return dataclasses.replace(free, forces=CoupledForces(rubbing, free))
+
+    def drag(*state):
+        brought = jax.jacfwd(law, argnums=4)(*state, zero)
+        return brought if own is None else brought + own(*state)
+
+    both = dataclasses.replace(constraints, drag=drag)
+    return dataclasses.replace(motion, forces=lambda *state: law(*state, zero), constraints=both)
+
+
+def _solve_law(of_read: Callable, alone, responses, at_zero: bool):
+    """Q(λ) with λ = λ₀ + R Q(λ), for λ₀ (m,) and R (m, n) of multipliers that are read.
+
+    `at_zero` says that it is one of which all pieces meet at zero.
+    """
     decisive, curved = _dependence(of_read, alone)
     zero, unit, count = jnp.zeros_like(alone), jnp.eye(len(alone), dtype=alone.dtype), len(alone)
     some = alone + responses @ of_read(zero) if decisive else zero
-    before, single = some, count == 1 and not curved
+    before, single = some, count == 1 and at_zero and not curved
     for _ in range(1 if single or not decisive else STEPS if curved else STEPS_OF_PIECES):
         value, slopes = of_read(some), jax.jacfwd(of_read)(some)
         coupling = unit - responses @ slopes
@@ -79,15 +117,26 @@ def _solve_law(of_read: Callable, alone, responses):
     return jnp.where(1.0 + off < 2.0, force, jnp.nan)
 
 
-def _multipliers_read(law: Callable, *arguments) -> list[int]:
-    """The places of the multipliers, the last argument of a law, that it reads; all where it has no program."""
+def _multipliers_read(law: Callable, *arguments) -> tuple[list[int], bool]:
+    """The places of the multipliers, the last argument of a law, that it reads; all where it has no program.
+
+    And whether it is one of which all pieces meet where that is zero.
+    """
     m, inputs = arguments[-1].size, sum(jnp.size(x) for x in jax.tree.leaves(arguments))
     try:
         program = lower(law, *arguments)
     except Unlowerable:
-        return list(range(m))
+        return list(range(m)), False
     read = program.find_inputs(range(len(program.line.outputs)))
-    return [i for i in range(m) if inputs - m + i in read]
+    places = [i for i in range(m) if inputs - m + i in read]
+    if len(places) != 1:
+        return places, False
+    # Of pieces a few sizes tell, at a state that nothing speaks for.
+    sizes, columns = 2.0 ** np.arange(-20, 21), list(np.random.default_rng(0).uniform(0.3, 1.2, (inputs, 1)))
+    columns[inputs - m + places[0]] = sizes = np.concatenate([[0.0], sizes, -sizes])
+    values = program.evaluate_many(columns)
+    slopes = np.stack(np.split((values[:, 1:] - values[:, :1]) / sizes[1:], 2, axis=1))
+    return places, bool((np.ptp(slopes, axis=2) <= 1e-6 * np.abs(slopes).max()).all())
 
 
 def _dependence(law: Callable, multipliers) -> tuple[bool, bool]:

@@ -228,8 +228,7 @@ class _FitSearch(NamedTuple):
                 raise ValueError(f"starts must be 1 where {why}: their search has one beginning.")
 
     def find_mistake(self, given: list[GivenSystem], left: Unexplained, spent: float) -> list[str]:
-        """The mistakes in records of which a fit leaves much, as far as fits of other records tell; `spent` is the
-        processor time that it took, and the tries may take, or more where it explains nothing."""
+        """The first mistake in records that explains a poor fit, as a sentence; `spent` is the fit's processor time."""
         if len(given) > 1 or self.method == "gradient":
             return []
         once, residuals = self._replace(starts=1, progress=False), assemble_residuals(given, self.parameters, self.law)

@@ -36,9 +36,11 @@ class Deciding(NamedTuple):
         Where a root is of what is chosen, steps end `beside` that border, even if the root is not zero there.
         """
         linear, line = program.linear, program.line
-        # What friction of contacts adds to A does not decide: it stops, and turns, by watches of its own.
         roots = line.outputs[:size] if linear is None else [*linear.right, *linear.entries.values()]
-        needed = set(find_ancestors(line.nodes, roots))
+        needed, every = set(find_ancestors(line.nodes, roots)), cls(line, set(), set(), set(), {})
+        if linear is not None and linear.others:
+            # Of what contacts bring into A pieces decide; friction stops, and turns, by watches of its own.
+            needed |= {i for i in find_ancestors(line.nodes, linear.others.values()) if every.decides(i)}
         of_guards = set(find_ancestors(line.nodes, line.outputs[len(line.outputs) - watched :]))
         if watched:  # which may read the solution of a linear system, but not decide on its elimination
             needed |= of_guards - (set(find_ancestors(line.nodes, line.outputs[:size])) - needed)

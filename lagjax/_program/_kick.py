@@ -15,6 +15,7 @@ and u̇⁺ has the sign of u̇⁻. Where the right side is negative the energy d
 is the same with both sides alike and u̇⁺ = −u̇⁻. Source: Gelfand & Fomin, *Calculus of Variations*, §15.
 """
 
+import functools
 import itertools
 import math
 from collections.abc import Sequence
@@ -36,6 +37,9 @@ _NOT_QUADRATIC = (
     "L or the momentum p = dL/dqdot jumps, and L is not quadratic in qdot, so that the velocities behind that are not "
     "known in closed form"
 )
+# The part of its terms by which the rate of a constraint has to jump: less is rounding of where the border is, and
+# the impulse that it asks for changes velocities by no more.
+TURNED = 1e-9
 _LARGEST = 60  # operations that one may become: a bound for errors
 
 
@@ -111,7 +115,7 @@ def kick_of(
 ) -> Kick:
     """The kick of a program of `size` inputs and the pieces, whose last outputs, so many, are those of `Mechanics`."""
     spatial = [j for j in kicking if not inputs_below(line, [decisions[j].switch]).isdisjoint(range(n))]
-    # At corners of a constraint velocities are NaN: no law says with what velocities the motion goes on.
+    # At corners where a constraint's rate jumps velocities are NaN: no law says with which the motion goes on.
     corners = [j for j in spatial if kicking[j] == BENT]
     refused = tuple((j, reason) for j, reason in kicking.items() if reason is not None and j not in corners)
     if refused:
@@ -130,8 +134,23 @@ def kick_of(
         change = f("ne", graph.input(size + j, "float"), graph.input(size + m + j, "float"))
         passes, bent = f("or", passes, change), f("or", bent, change) if j in corners else bent
     kicked, is_enough = _kick_velocities(graph, sides, mechanics, slopes, passes)
+    bent = f("and", bent, _turns(graph, sides, mechanics, n)) if corners else bent
     kicked = [f("select", bent, x, graph.number(math.nan)) for x in kicked]
     return Kick(eliminate_dead_code(graph, [*kicked, is_enough]), tuple(kicking))
+
+
+def _turns(graph: Graph, sides: BothSides, of: Mechanics, n: int) -> int:
+    """True where a rate of a constraint jumps at this state: elsewhere a piece may bend it that is none of it here."""
+    f, turns = graph.apply, graph.constant(False, "bool")
+    for k, rate in enumerate(of.rates):
+        row, v = of.jacobian[k * n : (k + 1) * n], [graph.input(n + i, "float") for i in range(n)]
+        row = [sides.behind[i] for i in row]
+        slope, speed = (
+            functools.reduce(lambda a, x: f("add", a, f("abs", x)), xs, graph.number(0.0)) for xs in (row, v)
+        )
+        bound = f("mul", graph.number(TURNED), f("mul", slope, speed))
+        turns = f("or", turns, f("lt", bound, f("abs", sides.difference(rate))))
+    return turns
 
 
 def _kick_velocities(

@@ -226,6 +226,7 @@ def compare(graph, op, a, b):
 
 # ---- angles ----------------------------------------------------------------------------------------------------------
 
+_MOST_TURNS = 2.0**48  # of 2π: a quarter of a radian is rounding; doubled, a half
 _DEEPEST = 40  # operations one in the other, beyond which no sign and no quotient is looked for: a bound of the work
 _NEVER_NEGATIVE = frozenset(("exp", "exp2", "cosh", "logistic", "erfc", "sqrt", "rsqrt", "abs", "acos"))
 
@@ -298,9 +299,13 @@ def _rest(graph, u: int, period: float) -> int:
 
 
 def _wholes(graph, u: int, period: float) -> int:
-    """The whole periods in u + ½ period; 2⁻⁵¹ of u is taken off, so that ±½ period as they are rounded have none."""
-    turns = graph.apply("mul", graph.constant((1 - 2.0**-51) / period, "float"), u)
-    return graph.apply("floor", graph.apply("add", turns, graph.constant(0.5, "float")))
+    """The whole periods in u + ½ period; 2⁻⁵¹ of u is taken off, so that ±½ period as they are rounded have none.
+
+    NaN where there are so many that u says nothing of what is left.
+    """
+    f, number = graph.apply, lambda x: graph.constant(x, "float")
+    wholes = f("floor", f("add", f("mul", number((1 - 2.0**-51) / period), u), number(0.5)))
+    return f("select", f("lt", f("abs", wholes), number(_MOST_TURNS)), number(math.nan), wholes)
 
 
 def _quotient(graph, i: int, depth: int) -> tuple[int, int | None]:

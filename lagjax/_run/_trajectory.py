@@ -254,7 +254,7 @@ class Trajectory(eqx.Module):
     @property
     def multipliers(self) -> PyTree:
         """λ at every output time, in the structure that the constraint functions return."""
-        return self._map_outputs("multipliers")
+        return self._map_outputs("multipliers") if self.contacts is None else self._forces_in_contact("multipliers")
 
     @property
     def contact_forces(self) -> PyTree:
@@ -264,12 +264,17 @@ class Trajectory(eqx.Module):
         """
         if self.contacts is None:
             raise ValueError("This motion has no contacts: give contacts=... or one_way=... to its System.")
+        return self._forces_in_contact("contact_forces")
+
+    @marks_absent
+    def _forces_in_contact(self, name: str) -> PyTree:
         self._require_present()
-        return import_registered("contact_forces")(self)
+        return import_registered("contact_forces")(self, name)
 
     def constraint_force(self) -> PyTree:
         """(∂f/∂q)ᵀλ + (∂a/∂q̇)ᵀμ at every output time, in the structure of `q`."""
-        return self._map_outputs("constraint_force")
+        name = "constraint_force"
+        return self._map_outputs(name) if self.contacts is None else self._forces_in_contact(name)
 
     def constraint_residual(self) -> PyTree:
         """f and a at every output time, in the structure of `multipliers`: the drift off the constraints."""

@@ -18,9 +18,9 @@ import jax.numpy as jnp
 import numpy as np
 from jax.extend.core import ClosedJaxpr, Jaxpr, Literal, jaxpr_as_fun
 
-from lagjax._equations import Constraints, Motion, once_for_structure
+from lagjax._equations import Constraints, Motion, couple_forces, once_for_structure
 from lagjax._interface import Layout, is_concrete
-from lagjax._scene._system import System
+from lagjax._scene._system import System, name_numbers
 
 PyTree = Any
 
@@ -54,7 +54,7 @@ class ContactScene(eqx.Module):
     """A system with contacts, as machine code follows it: a scene whose parameters are `InContact`.
 
     Where it `is_open` no contact is closed, whatever the parameters say: the motion of the system by itself. A body is
-    held by few independent rows, however many contacts it has: with `slots` there are so many rows, of gaps and of
+    held by few independent rows, however many contacts it has: with `slots` there are this many rows, of gaps and of
     velocities, which are those that `Contacts.held` chooses.
     """
 
@@ -108,12 +108,35 @@ class ContactScene(eqx.Module):
             return jnp.zeros((layout.size, held(p).size), q.dtype).at[:, places].set(forces.T)
 
         drags = drag if flat.rough.size else None, flat.shapes.directions > 1
-        constraints = Constraints(held_positions, held_velocities, held, *drags)
+        constraints, own = Constraints(held_positions, held_velocities, held, *drags), free.constraints
         if self.is_open:
-            own = free.constraints
             constraints = Constraints(ask_user(own.on_positions), ask_user(own.on_velocities))
         lagrangian, forces, dissipation = map(ask_user, (free.lagrangian, free.forces, free.dissipation))
-        return Motion(cast(Callable, lagrangian), forces, dissipation, constraints)
+        motion = Motion(cast(Callable, lagrangian), forces, dissipation, constraints)
+        if not self.system.reads_multipliers:
+            return motion
+        of_user = self.system.multiplier_law(layout, params.params)
+
+        def law(*state_and_multipliers):
+            *state, p, rows = state_and_multipliers
+            if not self.is_open:
+                gaps = flat.gap_count if self.slots is None else self.slots[0]
+                own, normal, _ = self.split_forces(flat, rows, counts(p)[0] + gaps, p)
+                rows = jnp.append(own, normal)
+            return of_user(*state, p.params, rows)
+
+        return couple_forces(motion, law, layout, params)
+
+    def split_forces(self, flat: "Flat", forces, positions: int, p: InContact) -> tuple:
+        """The forces of all rows, `positions` of them on positions: of constraints, normals (k,) and slips (r, d)."""
+        one_way, (r, d) = flat.shapes.count - flat.gap_count, (flat.rough.size, flat.shapes.directions)
+        gaps, velocities = (flat.gap_count, one_way + r * d) if self.slots is None else self.slots
+        first, last = positions - gaps, forces.size - velocities
+        own, normal, along = jnp.append(forces[:first], forces[positions:last]), forces[first:positions], forces[last:]
+        if self.slots is not None:
+            of_gaps, of_velocities = self.rows(flat, p)
+            normal, along = normal @ of_gaps, along @ of_velocities
+        return own, jnp.append(normal, along[:one_way]), along[one_way:].reshape(r, d)
 
     def rows(self, flat: "Flat", p: InContact) -> list:
         """The rows of `slots` as sums over those of all gaps and of all velocities: matrices of 0 and 1."""
@@ -203,7 +226,7 @@ class Flat(NamedTuple):
 class Shapes(NamedTuple):
     """The structure of the contacts of a system: k of them, `of_gaps` with a gap, then those of one-way velocities.
 
-    `rough` (r,) are the places of those with friction, in so many `directions`; `names` (k,) are those of all.
+    `rough` (r,) are the places of those with friction, each in `directions` directions; `names` (k,) are those of all.
     """
 
     trees: tuple  # the structures that `contacts` and `one_way` return, None without any
@@ -268,17 +291,7 @@ class Shapes(NamedTuple):
 
     def name_numbers(self, numbers) -> PyTree:
         """Numbers of all contacts, (…, k), in the structure that the user's functions return."""
-        parts, start = [], 0
-        for tree in self.trees:
-            leaves, structure = jax.tree.flatten(tree)
-            own = []
-            for leaf in leaves:
-                own.append(numbers[..., start : start + leaf.size].reshape(*numbers.shape[:-1], *leaf.shape))
-                start += leaf.size
-            parts += [] if tree is None else [jax.tree.unflatten(structure, own)]
-        if len(parts) == 1:
-            return parts[0]
-        return {**parts[0], **parts[1]} if all(isinstance(part, dict) for part in parts) else tuple(parts)
+        return name_numbers(numbers, tuple(tree for tree in self.trees if tree is not None))
 
 
 def _spread_over(shape: tuple[int, ...], value, role: str):

@@ -44,9 +44,9 @@ def samples(
     "band" is band-limited interpolation: for inputs that were sampled, or generated, below the Nyquist frequency, as
     multisines and filtered noise are. w is Kaiser's window (β = 10) whose weights are scaled to the sum 1, and w sinc
     is in each piece its interpolating polynomial of degree 9. A sinusoid of up to 0.8 of the Nyquist frequency is right
-    to 1e-5 of its size. At the ends, where 16 samples are missing, the input is taken to go on as its reflection in the
-    last sample, 2 v₀ − v₋ⱼ: it is continuous with its slope, and as exact as that is for some samples. Constants and
-    samples themselves are exact. An input with jumps overshoots: for a D/A converter take "zero".
+    to 1e-5 of its size. At the ends, where 16 samples are missing, the input is taken to continue as its reflection
+    in the last sample, 2 v₀ − v₋ⱼ: it is continuous with its slope, and as exact as that is for some samples. Constants
+    and samples are exact. An input with jumps overshoots: for a D/A converter take "zero".
 
     There is no extrapolation: before the first knot u is NaN; after the last knot "zero" keeps the last sample, and u
     is NaN with the others; so it is with "band" between traced knots that are not even. The last knot itself is inside.
@@ -162,11 +162,8 @@ def _spacing(first, last, count: int) -> tuple:
 
 
 def continued(values: np.ndarray, count: int, hold: str) -> np.ndarray:
-    """`count` samples (count, …) behind the last of `values` (K, …), at even instants, which change nothing before it.
-
-    For "band" that takes 16 samples at least. It is what a table is filled up with: a parabola for "cubic", the
-    reflection for "band", else the last sample.
-    """
+    """`count` samples (count, …) behind the last of `values` (K, …), at even instants, which change nothing before it:
+    a parabola for "cubic", the reflection for "band" (of 16 samples at least), else the last sample."""
     last, behind = values[-1], np.arange(1, count + 1)
     if hold == "band":
         return 2.0 * last - values[np.maximum(len(values) - 1 - behind, 0)]

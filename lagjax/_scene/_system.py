@@ -18,7 +18,7 @@ from jaxtyping import Array, Float
 
 from lagjax._engine import Problem
 from lagjax._engine.taylor import lowered_motion
-from lagjax._equations import OF_QUANTITIES, Constraints, CoupledForces, Motion, Sample, derivation_of
+from lagjax._equations import OF_QUANTITIES, Constraints, Motion, Sample, couple_forces, derivation_of
 from lagjax._interface import Function, Layout, ValueNotKnown, accept, as_arrays, is_concrete, present, require_number
 from lagjax._primitives import SINGLE, compute_in_doubles
 from lagjax._program import Unlowerable, lack_of_memory
@@ -58,11 +58,11 @@ class System(eqx.Module):
     - `velocity_constraints(q, qdot)`: a(q, q̇, t) = 0 that cannot be integrated to such an f: rolling, skates.
 
     Each may also take, by name, the time `t` and the parameters `params` (any pytree), and in a scene that is fitted to
-    records their sampled `inputs` (`lagjax.Record`). Forces may also ask for the `multipliers` of the constraints, in
-    the structure of `System.multipliers`, as the friction μ|N| of a bead on a wire or of a bearing does: both are
-    solved for together, of constraints that are independent. No acceleration exists (it is NaN) where none, or of a
-    single multiplier more than one, satisfies the law. At rest such friction holds where its direction is that of a
-    speed, `jnp.sign(tangent @ v)`.
+    records their sampled `inputs` (`lagjax.Record`). Forces may also ask for the `multipliers` of constraints and
+    contacts, in the structure of `System.multipliers`, as the friction μ|N| of a bead on a wire or of a bearing does:
+    both are solved for together, of constraints that are independent. No acceleration exists (it is NaN) where none, or
+    of a single multiplier more than one, satisfies the law. At rest such friction holds where its direction is that of
+    a speed, `jnp.sign(tangent @ v)`.
 
     **Contacts**
 
@@ -75,6 +75,11 @@ class System(eqx.Module):
     - `friction`: Coulomb's μ ≥ 0, likewise: |f| ≤ μλ where the contact sticks, f = −μλ s/|s| where it slides. It needs
       `slip(q, qdot)`, the sliding velocity s at each contact in the structure of the gaps: a number in a plane, an
       array of two in space.
+    - `forces(q, qdot, multipliers)` may read the normal force λ of a contact by its name, beside the multipliers of
+      constraints (one dict where all are dicts, else a tuple): zero while it is open, λ ≥ 0 while it is closed, as
+      rolling resistance −c λ sign(ω) does, and a brake. What is linear in λ joins the equations of the contacts; other
+      laws, with finite slopes at λ = 0, are solved for, of contacts that are independent. An impact is none of a force:
+      its impulse brings nothing of such a law, not even where bounces accumulate.
     - `impacts`: several contacts that touch take a blow together, by the linear complementarity problem of all of them
       ("simultaneous", Moreau and Glocker), or one after the other ("sequential", as Newton's cradle does). "poisson":
       together, and each gives back the part e of the impulse of its compression; without friction, or for one contact
@@ -159,14 +164,10 @@ class System(eqx.Module):
             extras = (*extras, "multipliers") if role == "forces" else extras if ARGUMENTS[role] else ("params",)
             accepted = None if absent else accept(cast(Callable, function), role, ARGUMENTS[role], extras)
             setattr(self, role, accepted)
-        if self.reads_multipliers and (self.touches or not self._constraint_roles):
+        if self.reads_multipliers and not self._multiplier_roles:
             raise ValueError(
-                "forces asks for `multipliers`, and no force may read the normal force of a contact: sliding friction "
-                "is friction=... with slip=.... For rolling resistance or a brake on what stays in touch write that "
-                "contact as one of constraints=..., whose multiplier forces may read."
-                if self.touches
-                else "forces asks for `multipliers`, those of constraints=... and velocity_constraints=..., which this "
-                "System has not."
+                "forces asks for `multipliers`, those of constraints=..., velocity_constraints=..., contacts=... and "
+                "one_way=..., which this System has not."
             )
 
     def __repr__(self) -> str:
@@ -207,7 +208,7 @@ class System(eqx.Module):
 
         The entry of two coordinates a and b has units energy·time²/({a}{b}).
 
-        **Raises** `ValueError` where so many numbers do not fit into memory.
+        **Raises** `ValueError` where n × n numbers do not fit into memory.
         """
         layout = Layout.from_state(q, qdot)
         if lack := lack_of_memory(4 * layout.size**2 * layout.dtype.itemsize):
@@ -236,7 +237,8 @@ class System(eqx.Module):
         """λ, in the structure that the constraint functions return: a dict by name if they return dicts.
 
         With both kinds of constraints: one dict if both return dicts, else the pair (λ, μ). Where constraints are
-        redundant, their forces are shared by the multipliers of least norm. λ has units energy/{f}.
+        redundant, their forces are shared by the multipliers of least norm. λ has units energy/{f}. In a scene with
+        contacts they are those while none is closed; `Trajectory.multipliers` are those of the motion.
 
         **Raises** `ValueError` for a system without constraints.
         """
@@ -310,34 +312,49 @@ class System(eqx.Module):
         """The scene in the flat coordinates of `layout`, after a look at what its functions return there."""
         # The functions of the result take the numbers in `params` alone, with None in the place of everything else.
         self._check_outputs(layout, params)
-        code = eqx.filter(params, eqx.is_array_like, inverse=True)  # functions and strings: no part of the data
-
-        def flatten_function(function: Any, to_array: Callable) -> Any:
-            """The user's function in flat coordinates, the last of which are (t, params); `to_array` flattens it."""
-
-            def flat(*arguments, **more):
-                *vectors, t, numbers = arguments
-                trees = map(layout.restore, vectors)
-                return to_array(function(*trees, t=t, params=eqx.combine(numbers, code), **more))
-
-            return function and flat
 
         def concatenate(tree: PyTree) -> jax.Array:  # of float64, as constants may be, in a scene in float32
             return jnp.concatenate([jnp.ravel(leaf) for leaf in jax.tree.leaves(tree)]).astype(layout.dtype)
 
-        forces = flatten_function(self.forces, layout.flatten)
-        lagrangian, dissipation = (flatten_function(f, lambda x: x) for f in (self.lagrangian, self.dissipation))
-        of_constraints = (flatten_function(f, concatenate) for f in (self.constraints, self.velocity_constraints))
-        given = None if self.reads_multipliers else forces
-        motion = Motion(lagrangian, given, dissipation, Constraints(*of_constraints))
-        if not self.reads_multipliers:
-            return motion
+        def to_scalar(value):
+            return value
+
+        to_arrays = to_scalar, layout.flatten, to_scalar, concatenate, concatenate
+        lagrangian, forces, dissipation, *of_constraints = (
+            self._flat_function(role, layout, params, to_array)
+            for role, to_array in zip(ROLES, to_arrays, strict=False)
+        )
+        motion = Motion(lagrangian, None, dissipation, Constraints(*of_constraints))
+        if self.reads_multipliers:
+            return couple_forces(motion, self.multiplier_law(layout, params), layout, params)
+        return dataclasses.replace(motion, forces=forces)
+
+    def _flat_function(self, role: str, layout: Layout, params: PyTree, to_array: Callable) -> Any:
+        """The user's function in flat coordinates, the last of which are (t, params); `to_array` flattens its value."""
+        function: Any = getattr(self, role)
+        code = eqx.filter(params, eqx.is_array_like, inverse=True)  # functions and strings: no part of the data
+
+        def flat(*arguments, **more):
+            *vectors, t, numbers = arguments
+            trees = map(layout.restore, vectors)
+            return to_array(function(*trees, t=t, params=eqx.combine(numbers, code), **more))
+
+        return function and flat
+
+    def multiplier_law(self, layout: Layout, params: PyTree) -> Callable:
+        """Q(q, qdot, t, params, multipliers) of forces that read multipliers (m,), all flat.
+
+        They are those of constraints, then of contacts, which are open where there are no more.
+        """
+        forces = self._flat_function("forces", layout, params, layout.flatten)
+        trees = self._role_shapes(self._multiplier_roles, layout, params)
+        count = count_numbers(trees)
 
         def law(*state_and_multipliers):
             *state, flat = state_and_multipliers
-            return forces(*state, multipliers=self._split_by_constraint(flat, layout, params))
+            return forces(*state, multipliers=name_numbers(jnp.pad(flat, (0, count - flat.size)), trees))
 
-        return dataclasses.replace(motion, forces=CoupledForces(law, motion))
+        return law
 
     def _require_constraints(self) -> None:
         if not self._constraint_roles:
@@ -351,20 +368,29 @@ class System(eqx.Module):
 
     def _split_by_constraint(self, flat: jax.Array, layout: Layout, params: PyTree) -> PyTree:
         """`flat` (m,), a number for each constraint, in the structure of `multipliers`."""
-        leaves, tree = jax.tree.flatten(self._constraint_structure(layout, params))
-        pieces = jnp.split(flat, np.cumsum([leaf.size for leaf in leaves])[:-1])
-        parts = jax.tree.unflatten(tree, [x.reshape(leaf.shape) for x, leaf in zip(pieces, leaves, strict=True)])
-        if len(parts) == 1:
-            return parts[0]
-        return {**parts[0], **parts[1]} if all(isinstance(part, dict) for part in parts) else parts
+        return name_numbers(flat, self._constraint_structure(layout, params))
 
     def _constraint_structure(self, layout: Layout, params: PyTree) -> tuple:
         """The shapes that the constraint functions return, a tuple of one or two pytrees."""
-        return tuple(self._output_shapes(role, layout, params) for role in self._constraint_roles)
+        return self._role_shapes(self._constraint_roles, layout, params)
+
+    def _role_shapes(self, roles: list[str], layout: Layout, params: PyTree) -> tuple:
+        return tuple(self._output_shapes(role, layout, params) for role in roles)
+
+    def _given(self, *roles: str) -> list[str]:
+        return [role for role in roles if getattr(self, role) is not None]
 
     @property
     def _constraint_roles(self) -> list[str]:
-        return [role for role in ("constraints", "velocity_constraints") if getattr(self, role) is not None]
+        return self._given("constraints", "velocity_constraints")
+
+    @property
+    def _contact_roles(self) -> list[str]:
+        return self._given("contacts", "one_way")
+
+    @property
+    def _multiplier_roles(self) -> list[str]:
+        return self._constraint_roles + self._contact_roles
 
     def constraint_names(self, layout: Layout, params: PyTree) -> list[str]:
         """A name for each of the m constraints, such as constraints['rod'] or velocity_constraints[1]."""
@@ -372,8 +398,7 @@ class System(eqx.Module):
 
     def contact_names(self, layout: Layout, params: PyTree) -> tuple[str, ...]:
         """A name for each gap and one-way velocity, such as contacts['floor'] or one_way[1]."""
-        roles = [role for role in ("contacts", "one_way") if getattr(self, role) is not None]
-        return tuple(self._output_names(roles, layout, params))
+        return tuple(self._output_names(self._contact_roles, layout, params))
 
     def _output_names(self, roles: list[str], layout: Layout, params: PyTree) -> list[str]:
         names = []
@@ -438,8 +463,11 @@ class System(eqx.Module):
                 error.add_note(f"{role} was called with {shown}. Give q, qdot and params the structure that it reads.")
                 raise
             _require_structure(shapes, layout) if role == "forces" else _require_scalar(shapes, role)
+        roles = self._multiplier_roles if self.reads_multipliers else self._constraint_roles
+        shapes = self._role_shapes(roles, layout, params)
         if self._constraint_roles:
-            _require_constraints(self._constraint_structure(layout, params))
+            _require_constraints(shapes[: len(self._constraint_roles)])
+        _require_own_names(shapes)
 
     def _output_shapes(self, role: str, layout: Layout, params: PyTree) -> PyTree:
         """The shapes that the function of a role returns, traced on shapes alone."""
@@ -456,9 +484,28 @@ class System(eqx.Module):
         """The shapes of what the forces are called with beside t and params: of the multipliers, if they read them."""
         if not self.reads_multipliers:
             return {}
-        count = sum(x.size for x in jax.tree.leaves(self._constraint_structure(layout, params)))
-        flat = jnp.zeros(count, layout.dtype)
-        return {"multipliers": jax.eval_shape(lambda x: self._split_by_constraint(x, layout, params), flat)}
+        trees = self._role_shapes(self._multiplier_roles, layout, params)
+        flat = jnp.zeros(count_numbers(trees), layout.dtype)
+        return {"multipliers": jax.eval_shape(lambda x: name_numbers(x, trees), flat)}
+
+
+def count_numbers(trees: PyTree) -> int:
+    """The count of numbers in arrays, or in their shapes."""
+    return sum(x.size for x in jax.tree.leaves(trees))
+
+
+def name_numbers(numbers, trees: tuple) -> PyTree:
+    """Numbers (…, m) in these structures, end to end: one dict where all are dicts, else a tuple of several."""
+    leaves, structure = jax.tree.flatten(trees)
+    ends = np.cumsum([leaf.size for leaf in leaves])
+    pieces = (numbers[..., end - leaf.size : end] for end, leaf in zip(ends, leaves, strict=True))
+    shaped = [x.reshape(*x.shape[:-1], *leaf.shape) for x, leaf in zip(pieces, leaves, strict=True)]
+    parts = structure.unflatten(shaped)
+    if len(parts) == 1:
+        return parts[0]
+    if not all(isinstance(part, dict) for part in parts):
+        return parts
+    return {name: x for part in parts for name, x in part.items()}
 
 
 def _coefficients(contacts, one_way, restitution, friction, slip) -> tuple:
@@ -570,10 +617,13 @@ def _require_constraints(structure: tuple) -> None:
         raise TypeError("constraints must return at least one number that is to be zero.")
     if not all(jnp.issubdtype(leaf.dtype, jnp.floating) for leaf in leaves):
         raise TypeError("constraints must return real floating-point numbers.")
-    names = [set(part) for part in structure if isinstance(part, dict)]
-    if len(names) == 2 and names[0] & names[1]:
-        shared = ", ".join(sorted(names[0] & names[1]))
-        raise ValueError(f"A constraint and a velocity constraint have the same name: {shared}.")
+
+
+def _require_own_names(structure: tuple) -> None:
+    names = [name for part in structure if isinstance(part, dict) for name in part]
+    if shared := sorted({name for name in names if names.count(name) > 1}):
+        two = "Two of constraints, velocity_constraints, contacts and one_way"
+        raise ValueError(f"{two} have the same name: {', '.join(shared)}.")
 
 
 def _require_structure(value: PyTree, layout: Layout) -> None:

@@ -278,8 +278,7 @@ def _draw_film(ax, positions: dict[str, np.ndarray], times: np.ndarray, traces, 
 
 
 def _keep_the_rest(figure, moving: list) -> None:
-    """Draw all but the `moving` artists once and for all: axes with their numbers take ten times as long as these.
-    matplotlib draws a figure up to three times a frame; its own way to draw less, `blit`, is for windows, not files."""
+    """Draw all but the `moving` artists once: axes take ten times as long, and `blit` is for windows only."""
     draw_all, kept = figure.draw, []
     order = figure.axes[0].get_children()
     moving = sorted(sorted(moving, key=order.index), key=lambda artist: artist.get_zorder())

@@ -43,8 +43,7 @@ class Course(NamedTuple):
         return np.where(inside, q, np.nan), np.where(inside, qdot, np.nan)
 
     def curve(self, times: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """t (F,), q and q̇ (F, n) at all knots and at these times, in order; a row of NaN where the state jumps.
-        Without `times` they are evenly between the knots, so that the curve has `POINTS` at least."""
+        """t (F,), q and q̇ (F, n) at all knots and `times`, by default `POINTS` even ones; a row of NaN at jumps."""
         if times is None:
             count = len(self.t) - 1
             parts = np.arange(1, max(2, -(-POINTS // count))) / max(2, -(-POINTS // count))

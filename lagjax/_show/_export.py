@@ -21,7 +21,7 @@ def dataset(trajectory, units: PyTree = None, time_unit: str | None = None):
     """An `xarray.Dataset` of a trajectory: see `Trajectory.to_xarray`."""
     xarray = import_package("to_xarray()", "xarray", "xarray")
     require_numbers(trajectory, "to_xarray() copies")
-    members = _member_axes(trajectory)
+    members = _axis_names(np.ndim(trajectory.ok))
     of_q, of_qdot = _units(trajectory.q, units, time_unit)
     variables: dict[str, tuple] = {"ok": (members, np.asarray(trajectory.ok))}
     trees = [("q", trajectory.q, of_q), ("qdot", trajectory.qdot, of_qdot)]
@@ -58,7 +58,7 @@ def frame(trajectory, units: PyTree = None, time_unit: str | None = None):
     index = pandas.Index(members.shared(trajectory.ts, 1).ravel(), name="t")
     if members.batch:
         places = [place.ravel() for place in np.indices((*members.batch, trajectory.ts.shape[-1]))[:-1]]
-        index = pandas.MultiIndex.from_arrays([*places, index], names=[*_member_axes(trajectory), "t"])
+        index = pandas.MultiIndex.from_arrays([*places, index], names=[*_axis_names(len(members.batch)), "t"])
     table = pandas.DataFrame(columns, index=index)
     of_q, of_qdot = _units(trajectory.q, units, time_unit)
     per_leaf = [math.prod(shape) for shape in members.layout.shapes]
@@ -112,12 +112,8 @@ def columns_of(trees: dict[str, PyTree], lead: int) -> dict[str, np.ndarray]:
     return columns
 
 
-def _member_axes(trajectory) -> tuple[str, ...]:
-    """Names of the axes of the batch: "member", or "member_0", "member_1", … of batches of batches."""
-    return _axis_names(np.ndim(trajectory.result._value))
-
-
 def _axis_names(rank: int) -> tuple[str, ...]:
+    """Names of the axes of a batch: "member", or "member_0", "member_1", … of batches of batches."""
     return ("member",) if rank == 1 else tuple(f"member_{axis}" for axis in range(rank))
 
 

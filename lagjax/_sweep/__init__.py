@@ -199,9 +199,9 @@ def sweep(
     **Where it runs**
 
     - `executor`: any `concurrent.futures.Executor`, such as dask's `client.get_executor()`; a task is a unit. By
-      default this process works, with the machine code's threads on all cores, and writes a unit while it computes the
-      next. A member that kills its process, by memory or by a library of its own, costs a worker of an executor, and
-      the error names its unit: `ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))`.
+      default this process works, with the machine code's threads on all cores. A member that kills its process, by
+      memory or by a library of its own, costs a worker of an executor, and the error names its unit:
+      `ProcessPoolExecutor(1, mp_context=multiprocessing.get_context("spawn"))`.
     - `progress`: a line on stderr.
 
     A store knows the scene and `keep` by their code and by all that this reads: helpers, globals, closures, classes
@@ -213,7 +213,7 @@ def sweep(
     so; a member for which `keep` then raises, or returns another shape, is `keep_failed`. On machines of one kind of
     CPU the numbers are the same, bit for bit, whichever worker computes which unit.
 
-    Memory, beside Python and JAX: two units of kept quantities (128 MiB), and a few times the path of a batch (64 MiB).
+    Memory, beside Python and JAX: a unit of kept quantities (64 MiB), and a few times the path of a batch (64 MiB).
 
     **Raises** `TypeError` or `ValueError` for what cannot be right, before anything is computed, and for a store that
     was begun with another description, saying what differs; `OSError` for a disk that is full or read-only,

@@ -236,8 +236,7 @@ def _call_each(function: Callable[[int], Any], count: int) -> tuple[list[Any], d
 
 
 def _common_quantities(rows: list[dict[str, np.ndarray]]) -> list[Quantity]:
-    """The quantities of the first of some members, of the type that holds what all of them keep: 1 and 1.5 are floats.
-    Where there is no such type it is that of the first; the others then have a misfit."""
+    """The quantities of the first member, each of the type that holds what all keep (1 and 1.5 are floats), if any."""
     common = []
     for name, first in rows[0].items():
         dtype = first.dtype
@@ -327,11 +326,8 @@ def _hybrid_batch(scene: Hybrid, axes: tuple, **tolerances) -> Callable:
 
 
 def run_batch(description: Description, values: dict[str, PyTree], ts, axes: tuple) -> tuple[Trajectory, Any]:
-    """The motions of B members and their crossings: `Crossings`, or a dict of them, None without sections.
-
-    `values` are q0, qdot0 and params by name, and `axes` their `batch_axes` of `simulate_batch`. Every leaf of the
-    crossings has the members in front.
-    """
+    """The motions of B members and their `Crossings` (a dict by name, None without sections), members first; `values`
+    are q0, qdot0 and params by name, `axes` their `batch_axes`."""
     system, settings, sections = description.system, description.settings, description.sections
     q0, qdot0, params = values.values()
     if jumps(system):

@@ -19,7 +19,7 @@ from lagjax._sweep._members import RESERVED, Axis, Grid, points_of
 from lagjax.designs import Design
 
 SECONDS = 20.0  # of a unit, by default: what a worker that dies loses
-UNIT_BYTES = 64 * 2**20  # of what is kept of a unit, by default; two of them are in memory, one being written
+UNIT_BYTES = 64 * 2**20  # of what is kept of a unit, by default
 _PROBED = 4096  # members by which the time of a member is estimated
 
 
@@ -59,10 +59,8 @@ def begin(
     compiled: list[Batches],
     other: Files | None,
 ) -> None:
-    """Make the store, after a look at what a few members take and keep, with what it takes from another one.
-
-    What that look compiles goes to `compiled`.
-    """
+    """Make the store, after a look at a few members, with what it takes from another; `compiled` gets the look's
+    programs."""
     names, shape = [name for axis in axes for name in axis.names], tuple(axis.size for axis in axes)
     later = None if other is None else later_end_of(other, axes, description)
     if later is not None:
@@ -155,8 +153,8 @@ def _require_names(quantities: list[Quantity], axes: tuple[Axis, ...], reduce: d
 def resume(
     store: Files, spec: dict, axes: tuple[Axis, ...], description: Description, other: Files | None
 ) -> Description:
-    """The description, with the names of the starts that a store has. Raises `ValueError`, with the difference, where
-    the store was begun with another one."""
+    """The description with the names of the store's starts. Raises `ValueError` with the difference where it is
+    another."""
     require_versions(store, spec)
     here = compared_entries(axes, description) | {"continues": None}
     if other is not None and not other.exists():  # all that is needed of it was copied

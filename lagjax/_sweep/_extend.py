@@ -1,8 +1,8 @@
 """The part of a new store that another one has: members, or the starts of motions that continue.
 
 **Members**: a member is known where all of its coordinates, bit for bit, are those of a member of the other store that
-is done. In a unit of the new store the known members are those of a product of places along each axis. Units of which
-all are known are written at once; of the others they are copied, and not computed.
+is done. In a unit of the new store the known members are those of a product of places along each axis. They are copied,
+and not computed.
 
 **A later end**: the kept values do not determine how a motion continues; its last state does, where `keep` returns
 `trajectory.end` by some name. The new store has the same members, and output times that begin at the last one of the
@@ -27,7 +27,7 @@ from lagjax._run.hybrid import Hybrid
 from lagjax._sweep._batch import names_of
 from lagjax._sweep._description import MOTION, Description, FinalStates, compared_entries, differences
 from lagjax._sweep._files import RESULT, Copied, Files
-from lagjax._sweep._job import record_of, require_versions
+from lagjax._sweep._job import require_versions
 from lagjax._sweep._members import Axis
 from lagjax.designs import GROWING
 
@@ -78,10 +78,7 @@ def copy_members(old: Files, new: Files) -> None:
         finished = values[RESULT.name] >= 0
         members = np.ravel_multi_index(np.ix_(*inside), grid.box_shape(unit)).ravel()[finished]
         values = {name: x[finished] for name, x in values.items()}
-        if len(members) == grid.size(unit):
-            record = record_of(grid, unit, values[RESULT.name], spec["engine"], {})
-            new.write_unit(spec, unit, values, record | {"seconds": 0.0, "cpu_seconds": 0.0}, b"")
-        elif len(members):
+        if len(members):
             new.write_copied(unit, Copied(members, values, {}))
 
 
@@ -137,8 +134,7 @@ def continues(other: Files, description: Description) -> bool:
 
 
 def later_end_of(other: Files, axes: tuple[Axis, ...], description: Description) -> LaterEnd | None:
-    """The last states in a store, if these motions continue its own; None if they begin at another time. Raises
-    `ValueError` where they continue, and cannot."""
+    """The last states in a store that these motions continue, None where they do not. Raises where they cannot."""
     if not continues(other, description):
         return None
     if isinstance(description.system, Hybrid):

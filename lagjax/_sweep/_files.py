@@ -226,7 +226,7 @@ class Files:
 
     def _damaged_coordinates(self, axis: dict) -> ValueError:
         names = " or ".join(f"{self.path / name}/c" for name in axis["names"])
-        return ValueError(f"{names} has other values than were written: the store is damaged. {_ADVICE}")
+        return ValueError(f"{names} has different values from those written: the store is damaged. {_ADVICE}")
 
     def array(self, name: str):
         return require_zarr().open_array(str(self.path / name), mode="r")

@@ -62,11 +62,8 @@ class Job:
 
 @contextmanager
 def precision(doubles: bool) -> Iterator[None]:
-    """Compute in the precision of the store, in this thread and in those of XLA.
-
-    XLA calls callbacks of `keep` from threads of its own, which see the setting of the process alone: that is changed
-    within this context, where it is another one. Of several stores in one process the first to come decides on it.
-    """
+    """Compute in the precision of the store, in this thread and in those of XLA, which calls callbacks of `keep` from
+    threads that see the setting of the process. Of several stores in one process the first decides on it."""
     with _precision_lock:
         _doubles_before.append(_doubles_in_process())
         if len(_doubles_before) == 1:
@@ -97,8 +94,7 @@ def _set_doubles_in_process(doubles: bool) -> None:
 
 
 def open_job(path: str) -> Job:
-    """The job of a store in a process that knows nothing but its path. Raises where it is not what was begun. A store
-    that was removed and made anew is another one; each is opened once."""
+    """The job of a store known by its path, opened once for each content. Raises where it is not what was begun."""
     return _open_job(path, Files(Path(path)).identity())
 
 

@@ -1,6 +1,6 @@
 """Workers: whoever computes a unit writes it, and the bits are the same.
 
-this process   units one after the other, on all cores; a thread writes the last one while the next is computed
+this process   units one after the other, on all cores
 executors      a task is one unit by its number; the process that gets it opens the store by its path
 
 Who computes a unit is settled before: an executor hands units out, and each task of an array has its `part` of them. A
@@ -12,14 +12,14 @@ import operator
 import time
 import warnings
 from collections.abc import Callable
-from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, Executor, Future, wait
 from itertools import islice
 from typing import Any
 
 import numpy as np
 
 from lagjax._sweep._files import Files
-from lagjax._sweep._job import Job, Unit, compute, open_job, precision
+from lagjax._sweep._job import Job, compute, open_job, precision
 
 # ---- units in this process -------------------------------------------------------------------------------------------
 
@@ -38,8 +38,8 @@ def require_part(part: Any) -> slice:
 
 
 def units_to_compute(job: Job, part: slice) -> list[int]:
-    """The units of a part that are not done, or are damaged. Raises `OSError` where they could not be written. Nothing
-    is written where all are done: a finished store may lie on a disk that is read-only."""
+    """The units of a part that are not done, or damaged. Raises `OSError` where some are and nothing can be written: a
+    finished store may lie on a read-only disk."""
     store, chosen = job.store, set(range(job.grid.units)[part])
     store.require_arrays(job.spec)
     finished = {unit for unit in store.finished_units() if unit in chosen or unit >= job.grid.units}
@@ -57,25 +57,15 @@ def units_to_compute(job: Job, part: slice) -> list[int]:
 
 
 def work(job: Job, units: list[int], notify: Notify = lambda: None) -> int:
-    """Compute these units in this process; return the number of those that no other had done by then."""
-    count, writing = 0, None
-    with ThreadPoolExecutor(1) as writer, precision(bool(job.spec["x64"])):
+    """Compute and write these units in this process; return the number of those that no other had done by then."""
+    count = 0
+    with precision(bool(job.spec["x64"])):
         for unit in units:
-            if job.store.has_finished(unit):
-                continue
-            done = compute(job, unit)
-            if writing is not None:
-                writing.result()  # of two units in memory one is being written; raises what the disk refused
-            writing = writer.submit(_write, job, unit, done, notify)
-            count += 1
-        if writing is not None:
-            writing.result()
+            if not job.store.has_finished(unit):
+                job.store.write_unit(job.spec, unit, *compute(job, unit))
+                notify()
+                count += 1
     return count
-
-
-def _write(job: Job, unit: int, done: Unit, notify: Notify) -> None:
-    job.store.write_unit(job.spec, unit, *done)
-    notify()
 
 
 def run_store(store: Files, notify: Notify = lambda: None, most: int | None = None, part: Any = (0, 1)) -> int:

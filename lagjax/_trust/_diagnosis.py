@@ -36,7 +36,7 @@ from lagjax._interface import RESULTS, Layout, code_of, halves, join_names, not_
 from lagjax._primitives import sentence
 from lagjax._program import MOST_COUPLED, Unlowerable
 from lagjax._run import Trajectory
-from lagjax._scene import System
+from lagjax._scene import Flat, System
 from lagjax._trust.checks import check, describe_direction
 
 LARGEST = 128  # coordinates up to which `check` is called: it takes a second there
@@ -59,8 +59,13 @@ _OVERSTEPPED = (
     "The state itself is not finite, from the first output on that is NaN: a step of a fixed length does not stop "
     "where the motion does. Leave dt out, and the message says what it runs into."
 )
+_NO_MULTIPLIERS = (
+    ". No multipliers satisfy the law of forces there, or several do (Painlevé's paradox, or constraints that depend "
+    "on each other): take less friction, or independent constraints"
+)
+_TOUCHES = 1e-9  # of the largest coordinate, or velocity: a gap of which rounding is left
 _AT_CORNER = (
-    "A constraint has a corner there: its gradient jumps, and no law says with what velocities the motion goes on. "
+    "A constraint has a corner there: its gradient jumps, and no law says with what velocities the motion continues. "
     "Round the corner off over a width w that the motion resolves, as in jnp.sqrt(x**2 + w**2) for abs(x)."
 )
 
@@ -111,9 +116,10 @@ def describe_failure(trajectory: Trajectory, layout: Layout, why: str | None) ->
 def diagnosis(system: System, layout: Layout, params, ended: Ended) -> str:
     """The facts about a failure, as sentences on a line of their own that begins with a line break; or nothing."""
     try:
-        if text := _undefined_gap(system, layout, params, ended):
-            return f"\n{text}"
-        return _find_cause(system, layout, params, ended) if ended.code in _CODES else ""
+        undefined, closed = _describe_gaps(system, layout, params, ended)
+        if undefined or ended.code not in _CODES:
+            return undefined
+        return _find_cause(system, layout, params, ended) + closed
     except Exception as error:  # the message of the failure itself must come out
         return f"\n(No more is known about it: {type(error).__name__}.)"
 
@@ -123,7 +129,8 @@ def _find_cause(system: System, layout: Layout, params, ended: Ended) -> str:
     if derivation.structure is not None:
         ended = ended._replace(scene=(system, params))
     q0, qdot0 = map(layout.restore, halves(ended.y_first))
-    if bad := not_finite(params, "params") + not_finite(q0, "q0") + not_finite(qdot0, "qdot0"):
+    of_start = [] if np.isfinite(ended.y).all() else not_finite(q0, "q0") + not_finite(qdot0, "qdot0")
+    if bad := not_finite(params, "params") + of_start:
         where, value = bad[0]
         return f"\n{where} is {value}: every number must be finite."
     if not np.isfinite(ended.y).all():
@@ -136,18 +143,29 @@ def _find_cause(system: System, layout: Layout, params, ended: Ended) -> str:
     return f"\n{text}" if text else _run_check(system, derivation, params, ended) or _budget(ended)
 
 
-def _undefined_gap(system: System, layout: Layout, params, ended: Ended) -> str:
-    """A sentence about the first gap or one-way velocity that is not finite where the motion ended; or nothing."""
+def _describe_gaps(system: System, layout: Layout, params, ended: Ended) -> tuple[str, str]:
+    """A line about the first gap or one-way velocity that is not finite where the motion ended; one of what touches."""
     if not system.touches or not np.isfinite(ended.y).all():
-        return ""
+        return "", ""
     q, qdot = map(layout.restore, halves(ended.y))
-    called = ((system.contacts, (q,)), (system.one_way, (q, qdot)))
-    values = [function(*state, t=ended.t, params=params) for function, state in called if function]
-    numbers = np.concatenate([np.ravel(leaf) for leaf in jax.tree.leaves(values)])
-    for name, value in zip(system.contact_names(layout, params), numbers, strict=True):
-        if not np.isfinite(value):
-            return f"The gap {name} is {value} there: contacts and one_way must return finite numbers."
-    return ""
+    called, touching = ((system.contacts, (q,), 0), (system.one_way, (q, qdot), 1)), []
+    names = iter(system.contact_names(layout, params))
+    for function, state, part in called:
+        values = jax.tree.leaves(function(*state, t=ended.t, params=params) if function else ())
+        for value in np.concatenate([np.zeros(0), *map(np.ravel, values)]):
+            name = next(names)
+            if not np.isfinite(value):
+                return f"\nThe gap {name} is {value} there: contacts and one_way must return finite numbers.", ""
+            if abs(value) <= _TOUCHES * np.abs(halves(ended.y)[part]).max():
+                touching.append(name)
+    if not touching:
+        return "", ""
+    law = (
+        _NO_MULTIPLIERS.replace("its law", "the law of forces")
+        if system.reads_multipliers and _CODES.get(ended.code) == "nonfinite_state"
+        else ""
+    )
+    return "", f"\nIn touch there: {join_names(touching)}, whose gaps and slips may have corners as L has{law}."
 
 
 def _reset_to_nothing(layout: Layout, ended: Ended) -> str:
@@ -227,10 +245,7 @@ def _offender(derivation: Derivation, role: str, arguments: tuple) -> str:
         return ""
     to_blame = offenders(function, *arguments, derivatives=role != "forces")
     if isinstance(function, CoupledForces) and to_blame and not to_blame[0].place:
-        return (
-            ". No multipliers satisfy its law there, or several do (Painlevé's paradox, or constraints that depend on "
-            "each other): take less friction, or independent constraints"
-        )
+        return _NO_MULTIPLIERS
     return f". It comes from {to_blame[0]}" if to_blame else ""
 
 
@@ -363,7 +378,7 @@ def _run_check(system: System, derivation: Derivation, params, ended: Ended) -> 
     if jumps and (unheld := _count_unheld(derivation)):
         return (
             f"\nIt may rest, or slide, along {unheld} borders there, which dry friction makes: machine code follows at "
-            f"most {MOST_COUPLED} that M couples to each other, and none that change in other ways what others hold. "
+            f"most {MOST_COUPLED} that M couples to each other, and none that change differently what others hold. "
             "Round sign(v) off, as jnp.tanh(v / w) with a speed w that does not matter."
         )
     if ended.scene is None and derivation.layout.size > (LARGEST if is_lowered(derivation) else 16):
@@ -372,7 +387,12 @@ def _run_check(system: System, derivation: Derivation, params, ended: Ended) -> 
     found = {finding.kind: finding for finding in reversed(list(check(system, q, qdot, ended.t, params)))}
     if (kind := next((kind for kind in _EXPLAIN if kind in found), None)) is not None:
         return f"\nThere check says: {found[kind].message}{_budget(ended)}"
-    pieces = describe_pieces(*_short_functions(derivation, params, ended)) if jumps else ""
+    functions, arguments = _short_functions(derivation, params, ended)
+    if system.touches:
+        flat = Flat.from_system(system, derivation.layout, params)
+        of_contacts = (lambda q, qdot, t, p: flat.gaps(q, t, p)), flat.one_way, flat.slips
+        functions += [f for f in of_contacts if _is_short(f, arguments)]
+    pieces = describe_pieces(functions, arguments) if jumps else ""
     return f"\nThe scene is pieced together by {pieces}.{_budget(ended)}" if pieces else ""
 
 

@@ -16,13 +16,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._engine import LEAST_RTOL, Batch, Problem, axes_per_leaf, choose
+from lagjax._engine import LEAST_RTOL
 from lagjax._engine.diffrax import LEAST_RTOL as LEAST_RTOL_OF_DIFFRAX
 from lagjax._engine.diffrax import FineOutput
 from lagjax._engine.taylor import MachineCode
-from lagjax._interface import Layout, as_arrays, show_str
+from lagjax._interface import as_arrays, show_str
 from lagjax._run import Members, Trajectory, simulate, simulate_batch
-from lagjax._scene import System, require_system
+from lagjax._scene import System
 
 PyTree = Any
 
@@ -146,15 +146,13 @@ def work_precision(
     ```
     """
     dtype = np.dtype(jnp.result_type(jnp.float32, *(jnp.asarray(leaf).dtype for leaf in jax.tree.leaves((q0, qdot0)))))
-    measured = {"default": None, **_SOLVERS} if solvers is None else solvers
+    measured: Any = {"default": None, **_SOLVERS} if solvers is None else solvers
     _require_adaptive(measured)
     tolerances = _TOLERANCES[dtype] if tolerances is None else tolerances
     _require_tolerances(tolerances, dtype, measured)
     if isinstance(repeats, bool) or not isinstance(repeats, int) or repeats < 1:
         raise ValueError(f"repeats must be a positive integer; got {repeats!r}.")
 
-    if solvers is None:
-        measured = _default_solvers(_problem(system, q0, qdot0, ts, params, batch_axes))
     scene = as_arrays((q0, qdot0, jnp.asarray(ts), params), dtype, "state")
     precise = as_arrays(scene, jnp.result_type(float))
 
@@ -164,6 +162,9 @@ def work_precision(
             return simulate(system, *arguments, throw=reference, **options)
         return simulate_batch(system, *arguments, batch_axes=batch_axes, **options)
 
+    if solvers is None:  # the first is named after the integrator that `simulate` chooses
+        name = "Taylor (machine code)" if run(None, max(tolerances)).engine == "MachineCode" else _FIRST
+        measured = {f"default: {name}": None} | {other: of for other, of in _SOLVERS.items() if other != name}
     truth, resolution = _reference(partial(run, None, reference=True), jnp.result_type(float))
     rows = []
     for name, solver in measured.items():
@@ -172,25 +173,11 @@ def work_precision(
     return WorkPrecision(tuple(rows), *_median_and_worst(resolution), members=len(truth))
 
 
-def _problem(system: System, q0: PyTree, qdot0: PyTree, ts, params: PyTree, batch_axes) -> Problem:
-    system = require_system(system)
-    if batch_axes is None:
-        return Problem.from_arguments(system, Layout.from_state(q0, qdot0), q0, qdot0, ts, params)
-    values = {"q0": q0, "qdot0": qdot0, "params": params}
-    return Batch.from_values(system, values, *axes_per_leaf(values, batch_axes), ts).member
-
-
-def _default_solvers(problem: Problem) -> dict[str, diffrax.AbstractSolver | None]:
-    """The solvers that are measured by default; the first is that of `simulate`, named after its integrator."""
-    first = "Taylor (machine code)" if isinstance(choose(problem).engine, MachineCode) else _FIRST
-    return {f"default: {first}": None} | {name: solver for name, solver in _SOLVERS.items() if name != first}
-
-
 def _reference(run: Callable[[float], Trajectory], dtype) -> tuple[np.ndarray, np.ndarray]:
     """The path to compare with, shape (members, T, n), and for every member how far it can be trusted."""
     eps = float(jnp.finfo(dtype).eps)
     truth = _path(run(_REFERENCE * eps))
-    resolution = _largest_difference(_path(run(_CHECK * eps)), truth)
+    resolution = np.abs(_path(run(_CHECK * eps)) - truth).max(axis=(1, 2))
     if np.isnan(resolution).all():
         raise ValueError(
             "The reference reached the end for none of the members: look at the result of simulate_batch with a tight "
@@ -211,7 +198,7 @@ def _row(name: str, rtol: float, run: Callable[[], Trajectory], truth: np.ndarra
     counts = "num_accepted_steps", "num_rejected_steps", "num_steps"
     accepted, rejected, steps = (np.atleast_1d(trajectory.stats[key]) for key in counts)
     idle = trajectory.stats.get("num_wasted_lane_steps", 0)  # of a batch only
-    errors = _median_and_worst(_largest_difference(_path(trajectory), truth))
+    errors = _median_and_worst(np.abs(_path(trajectory) - truth).max(axis=(1, 2)))
     shares = map(float, (accepted.mean(), rejected.mean(), np.mean(trajectory.ok), idle / max(steps.sum(), 1)))
     return WorkPrecisionRow(name, float(rtol), seconds, seconds / len(truth), *errors, *shares)
 
@@ -219,11 +206,6 @@ def _row(name: str, rtol: float, run: Callable[[], Trajectory], truth: np.ndarra
 def _path(trajectory: Trajectory) -> np.ndarray:
     """All coordinates at all times, shape (members, T, n); NaN throughout for a member that did not reach its end."""
     return np.where(np.atleast_1d(trajectory.ok)[:, None, None], Members(trajectory).flat(trajectory.q), np.nan)
-
-
-def _largest_difference(path: np.ndarray, truth: np.ndarray) -> np.ndarray:
-    """Per member; NaN where either has not reached its end."""
-    return np.abs(path - truth).max(axis=(1, 2))
 
 
 def _median_and_worst(errors: np.ndarray) -> tuple[float, float]:

@@ -438,15 +438,34 @@ def test_a_law_that_is_linear_in_several_multipliers_needs_no_sign():
     np.testing.assert_allclose([found["phi"], found["x"], found["y"]], exact[:3], rtol=1e-12)
 
 
-def test_forces_ask_for_multipliers_of_constraints_alone():
+def test_forces_ask_for_multipliers_of_what_there_is():
     with pytest.raises(ValueError, match="which this System has not"):
         lagjax.System(gravity, forces=rub)
-    with pytest.raises(ValueError, match="one of constraints="):
-        lagjax.System(gravity, forces=rub, constraints=lambda q: q @ q - 1.0, contacts=lambda q: q[1] + 2.0)
+    both = lagjax.System(
+        gravity,
+        forces=lambda q, v, multipliers: 0 * v,
+        constraints=lambda q: {"a": q[0]},
+        contacts=lambda q: {"a": q[1]},
+    )
+    with pytest.raises(ValueError, match="contacts and one_way have the same name: a"):
+        both.acceleration(jnp.zeros(2), jnp.zeros(2))
 
 
-def test_rolling_resistance_stops_a_disc_whose_floor_is_a_constraint():
-    """c N against the rotation: the disc slows by 2 c g / 3 R, and rests; of a contact no force may read N."""
+@pytest.mark.parametrize("share", [2.0, 1.0, -0.3])
+def test_a_law_whose_piece_ends_beyond_zero(share):
+    """min(λ, 5) of one multiplier: the piece of what is found, and not of the force without the law."""
+
+    def forces(q, v, multipliers):
+        return jnp.array([multipliers, share * jnp.minimum(multipliers, 5.0)])
+
+    pressed = lagjax.System(lambda q, v: 0.5 * v @ v - G * q[1], forces=forces, constraints=lambda q: q[1])
+    exact = G / (1 + share) if G / (1 + share) < 5 else G - 5 * share
+    assert float(pressed.acceleration(jnp.zeros(2), jnp.zeros(2))[0]) == pytest.approx(exact, rel=1e-12)
+
+
+@pytest.mark.parametrize("of_contact", [False, True])
+def test_rolling_resistance_stops_a_disc(of_contact):
+    """c N against the rotation, on a floor that is a constraint, or a contact: it slows by 2 c g / 3 R, and rests."""
 
     def resist(q, v, params, multipliers):
         return jnp.array([0.0, 0.0, -params * multipliers["floor"] * jnp.sign(v[2])])
@@ -454,10 +473,16 @@ def test_rolling_resistance_stops_a_disc_whose_floor_is_a_constraint():
     def disc(q, v):
         return v[:2] @ v[:2] + 0.5 * RADIUS**2 * v[2] ** 2 - 2 * G * q[1]
 
+    def floor(q):
+        return {"floor": q[1] - RADIUS}
+
+    def rolls(q, v):
+        return {"floor" if of_contact else "rolls": v[0] + RADIUS * v[2]}
+
+    held = {"contacts": floor, "friction": 0.4, "slip": rolls}
     rolling = lagjax.System(
-        disc, forces=resist, constraints=lambda q: {"floor": q[1] - RADIUS},
-        velocity_constraints=lambda q, v: {"rolls": v[0] + RADIUS * v[2]},
-    )  # fmt: skip
+        disc, forces=resist, **held if of_contact else {"constraints": floor, "velocity_constraints": rolls}
+    )
 
     def places(c):
         ts, start = jnp.array([0.0, 2.0, 20.0]), (jnp.array([0.0, RADIUS, 0.0]), jnp.array([1.0, 0.0, -1 / RADIUS]))
@@ -465,6 +490,121 @@ def test_rolling_resistance_stops_a_disc_whose_floor_is_a_constraint():
 
     c, slows = 0.003, 2 * 0.003 * G / (3 * RADIUS)
     np.testing.assert_allclose(places(c), [2 - 2 * slows, 1 / (2 * slows)], rtol=1e-12)
-    np.testing.assert_allclose(jax.jacfwd(places)(c), [-2 * slows / c, -1 / (2 * slows * c)], rtol=1e-11)
-    with pytest.raises(ValueError, match=r"no force may read the normal force of a contact.*one of constraints=\.\.\."):
-        lagjax.System(disc, forces=resist, contacts=lambda q: {"floor": q[1] - RADIUS})
+    slopes = [-2 * slows / c, -1 / (2 * slows * c)]
+    np.testing.assert_allclose(jax.jacfwd(places)(c), slopes, rtol=1e-11)
+    if of_contact:
+        np.testing.assert_allclose(jax.jit(jax.jacrev(places))(c), slopes, rtol=1e-11)
+        np.testing.assert_allclose(jax.vmap(places)(jnp.array([c, 2 * c]))[1, 1], 0.25 / slows, rtol=1e-12)
+        np.testing.assert_allclose(jax.hessian(places)(c), [0.0, 1 / (slows * c**2)], rtol=1e-10, atol=1e-8)
+
+
+# ---- normal forces of contacts -----------------------------------------------------------------------------------
+
+ANGLE = 0.3
+
+
+def slope(law, **more):
+    """A block on a slope, x along it and y off it."""
+    down, into = G * np.sin(ANGLE), G * np.cos(ANGLE)
+    return lagjax.System(
+        lambda q, v: 0.5 * v @ v + down * q[0] - into * q[1], forces=law, contacts=lambda q: {"slope": q[1]}, **more
+    )
+
+
+def brake(q, v, params, multipliers):
+    """c N against the motion, and d N off the slope or into it: N depends on the direction."""
+    return -jnp.sign(v[0]) * params * multipliers["slope"]
+
+
+def test_a_brake_that_changes_its_own_normal_force():
+    block, ts = slope(brake), jnp.array([0.0, 2.0])
+
+    def end(params, start=1.0, dtype=jnp.float64):
+        at = [jnp.asarray(x, dtype) for x in (jnp.zeros(2), jnp.array([start, 0.0]), ts, params)]
+        run = lagjax.simulate(block, *at)
+        return jnp.stack([run.q[-1, 0], run.qdot[-1, 0]])
+
+    def slows(params, side=1.0):
+        c, d = params
+        return -G * jnp.sin(ANGLE) + side * c * G * jnp.cos(ANGLE) / (1 - side * d)
+
+    strong, weak = jnp.array([0.5, 0.3]), jnp.array([0.2, 0.3])
+    stops = lambda params: 0.5 / slows(params)  # and rests there
+    np.testing.assert_allclose(end(strong), [stops(strong), 0.0], rtol=1e-11, atol=1e-12)
+    np.testing.assert_allclose(end(strong, dtype=jnp.float32), [stops(strong), 0.0], rtol=1e-6, atol=1e-7)
+    back = -slows(weak) * (2.0 - 1 / -slows(weak, -1.0))  # it turns, and the other force holds
+    assert float(end(weak, -1.0)[1]) == pytest.approx(float(back), rel=1e-11)
+    np.testing.assert_allclose(jax.grad(lambda p: end(p)[0])(strong), jax.grad(stops)(strong), rtol=1e-10)
+    hessian = jax.hessian(lambda p: end(p)[0])(strong)
+    np.testing.assert_allclose(hessian, jax.hessian(stops)(strong), rtol=1e-8)
+    lifted = lagjax.simulate(slope(brake), jnp.zeros(2), jnp.array([1.0, 0.0]), ts, jnp.array([0.0, 1.5]), throw=False)
+    assert not lifted.ok  # 1.5 N into the slope: no N, or any
+
+
+@pytest.mark.parametrize("law", [lambda n: n**2 / 40, lambda n: jnp.minimum(2 * n, 4.0), lambda n: 0.4 * jnp.abs(n)])
+def test_a_law_that_is_not_linear_in_a_normal_force(law):
+    block = slope(lambda q, v, multipliers: jnp.array([-1.0, -1.0]) * 0.5 * law(multipliers["slope"]))
+    run = lagjax.simulate(block, jnp.zeros(2), jnp.zeros(2), jnp.array([0.0, 1.0]))
+    force = run.contact_forces["slope"][-1]
+    assert float(force - 0.5 * law(force)) == pytest.approx(G * np.cos(ANGLE), rel=1e-12)
+    assert float(run.qdot[-1, 0]) == pytest.approx(G * np.sin(ANGLE) - 0.5 * float(law(force)), rel=1e-11)
+
+
+def test_a_normal_force_that_is_read_while_its_contact_opens_and_closes():
+    """Lifted by g + (t − 1)(3 − t) it leaves the floor at 1 and falls upon it at 5; impacts bring none."""
+
+    def forces(q, v, t, params, multipliers):
+        return jnp.array([-params * multipliers["floor"], (t - 1) * (3 - t)])
+
+    block = lagjax.System(lambda q, v: 0.5 * v @ v, forces=forces, contacts=lambda q: {"floor": q[1]})
+    ts = jnp.array([0.0, 0.5, 3.0, 6.0])
+
+    def run(c):
+        return lagjax.simulate(block, jnp.zeros(2), jnp.array([1.0, 0.0]), ts, c)
+
+    found = run(0.03)
+    np.testing.assert_allclose(found.contact_forces["floor"], [3.0, 1.25, 0.0, 15.0], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(found.qdot[1:, 0], [1 - 0.03 * 25 / 24, 0.96, 1 - 0.03 * 38 / 3], rtol=1e-12)
+    assert float(jax.grad(lambda c: run(c).qdot[-1, 0])(0.03)) == pytest.approx(-38 / 3, rel=1e-11)
+    ball = lagjax.System(
+        lambda q, v: 0.5 * v @ v - G * q[1], restitution=1.0, contacts=lambda q: q[1],
+        forces=lambda q, v, multipliers: jnp.array([-0.3 * multipliers, 0.0]),
+    )  # fmt: skip
+    bounced = lagjax.simulate(ball, jnp.array([0.0, 1.0]), jnp.array([1.0, 0.0]), jnp.array([0.0, 4.0]))
+    assert bounced.impacts.count == 4 and bounced.qdot[-1, 0] == 1.0
+
+
+def test_constraints_beside_closed_contacts_have_their_own_multipliers():
+    """A mass that stands on a rod, and the rod on a foot which a brake slows: λ is g of the rod, 2 g of the floor."""
+
+    def forces(q, v, multipliers):
+        torque = -0.1 * multipliers["floor"] + 0.0 * multipliers["rod"]
+        return jnp.array([torque, 0.0, torque, 0.0])
+
+    standing = lagjax.System(
+        lambda q, v: 0.5 * v @ v - G * (q[1] + q[3]), forces=forces,
+        constraints=lambda q: {"rod": q[3] - q[1] - 1.0}, contacts=lambda q: {"floor": q[1]},
+    )  # fmt: skip
+    run = lagjax.simulate(standing, jnp.array([0.0, 0.0, 0.0, 1.0]), jnp.array([1.0, 0, 1.0, 0]), jnp.array([0.0, 1.0]))
+    np.testing.assert_allclose(run.multipliers["rod"], [G, G], rtol=1e-12)
+    np.testing.assert_allclose(run.contact_forces["floor"], [2 * G, 2 * G], rtol=1e-12)
+    np.testing.assert_allclose(run.constraint_force()[1], [0, -G, 0, G], rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(run.qdot[-1], [1 - 0.2 * G, 0, 1 - 0.2 * G, 0], rtol=1e-11, atol=1e-12)
+    with pytest.raises(ValueError, match="for forces that read no multipliers"):
+        lagjax.equilibrium(standing, run.q[0])
+
+
+@pytest.mark.slow
+def test_normal_forces_of_more_contacts_than_a_body_needs():
+    """A box on four corners, of which two touch the floor: their sum is its weight, whichever carries it."""
+
+    def corners(q):
+        c, s = jnp.cos(q[2]), jnp.sin(q[2])
+        return {f"{x}{y}": q[1] + s * x + c * y for x in (-1, 1) for y in (-1, 1)}
+
+    def forces(q, v, multipliers):
+        return jnp.array([-0.2 * sum(multipliers.values()) * jnp.sign(v[0]), 0.0, 0.0])
+
+    box = lagjax.System(lambda q, v: 0.5 * v @ v - G * q[1], forces=forces, contacts=corners)
+    run = lagjax.simulate(box, jnp.array([0.0, 1.0, 0.0]), jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 0.2, 2.0]))
+    np.testing.assert_allclose(run.q[1:, 0], [0.2 - 0.004 * G, 1 / (0.4 * G)], rtol=1e-11)

@@ -532,7 +532,7 @@ def bead(values, **more):
         ([], {}, "at least one lagjax.Record"),
         ([bead(np.full(6, np.nan))], {}, "is NaN, or has no weight, at all times of all records"),
         ([bead(np.zeros(6)), bead(np.full(6, np.nan))], {}, r"records\[1\] holds no sample"),
-        ([bead(np.zeros(6)), bead(np.zeros((6, 2)))], {}, r"records\[1\] has other signals"),
+        ([bead(np.zeros(6)), bead(np.zeros((6, 2)))], {}, r"records\[1\] has different signals"),
         ([bead(np.zeros(6))], dict(free={"l": True}), "free must be one value for all parameters"),
         ([bead(np.zeros(6))], dict(free=1), "True or False"),
         ([bead(np.zeros(6))], dict(transforms=3), "transforms must hold lagjax.positive"),

@@ -297,7 +297,7 @@ def test_what_is_wrong_with_inputs_is_a_sentence():
         lagjax.fit(SCENE, bare, TRUTH)
     with pytest.raises(ValueError, match=r"observe asks for `inputs`, which records.0. has none of"):
         lagjax.fit(lagjax.System(SCENE.lagrangian.code.function), bare, TRUTH, observe=lambda q, qdot, inputs: q)
-    with pytest.raises(ValueError, match=r"records\[1\] has other inputs than records\[0\]"):
+    with pytest.raises(ValueError, match=r"records\[1\] has different inputs from records\[0\]"):
         lagjax.fit(SCENE, [record, bare], TRUTH)
     with pytest.raises(ValueError, match="hold must be one of 'zero', 'linear', 'cubic', 'band'; got 'spline'"):
         lagjax.fit(SCENE, record, TRUTH, hold="spline")

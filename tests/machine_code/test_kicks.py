@@ -355,3 +355,27 @@ def test_jumps_that_are_decided_in_several_steps():
     run = lagjax.simulate(by_time, jnp.zeros(2), jnp.zeros(2), ts)
     np.testing.assert_allclose(run.qdot[:, 1], -values[np.searchsorted(levels, ts - 1)], atol=1e-14)
     np.testing.assert_allclose(run.qdot[:, 0], [0.0, 0.16, 0.36, 0.5, 0.77, 0.99], rtol=1e-14)
+
+
+@pytest.mark.parametrize("rtol", [1e-6, 1e-11])
+def test_a_wire_whose_curvature_jumps_kicks_nothing(rtol):
+    """A bead on a table and around its edge, whose gap has a corner at x = 0 elsewhere: against the angle alone."""
+    radius, g, duration = 0.05, 9.81, 0.09
+
+    def wire(q):
+        return jnp.where(q[0] < 0, q[1], jnp.sqrt(jnp.where(q[0] < 0, 1.0, q @ q))) - radius
+
+    bead = lagjax.System(lambda q, v: 0.5 * v @ v - g * q[1], constraints=wire)
+
+    def angle(speed):
+        start, ts = (jnp.array([-0.06, radius]), jnp.array([speed, 0.0])), jnp.array([0.0, duration])
+        return jnp.arctan2(*lagjax.simulate(bead, *start, ts, rtol=rtol).q[-1])
+
+    def exact(t, y):  # with its derivative by the speed
+        return [y[1], g / radius * np.sin(y[0]), y[3], g / radius * np.cos(y[0]) * y[2]]
+
+    begun = [0.0, 1 / radius, 0.0, 1 / radius]
+    found = solve_ivp(exact, (0.0, duration - 0.06), begun, rtol=1e-12, atol=1e-14).y[:, -1]
+    later = 0.06 * found[1]  # a faster one comes to the edge sooner, by 0.06 dv
+    np.testing.assert_allclose(angle(1.0), found[0], rtol=30 * rtol + 1e-10)
+    np.testing.assert_allclose(jax.grad(angle)(1.0), found[2] + later, rtol=1e3 * rtol + 1e-9)

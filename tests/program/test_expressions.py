@@ -227,3 +227,17 @@ def test_powers_have_mixed_slopes_where_the_exponent_is_zero(exponent):
 def test_random_expressions_agree_with_jax(number):
     scene, verdict, about = expression_population.judge(number, 0, False, 20)
     assert verdict in expression_population.FINE, (scene, verdict, about)
+
+
+@pytest.mark.parametrize("u", [3.0, -1e9, 1e12, 1e16, -1e200])
+def test_an_angle_less_whole_turns_is_right_or_nan(u):
+    """Against NumPy, to the rounding of u; where that leaves nothing of a turn there is no angle."""
+    laws = {
+        "atan2": (lambda q: jnp.arctan2(jnp.sin(q), jnp.cos(q)), np.arctan2(np.sin(u), np.cos(u))),
+        "atan": (lambda q: jnp.arctan(jnp.tan(q)), np.arctan(np.tan(u))),
+        "asin": (lambda q: jnp.arcsin(jnp.sin(q)), np.arcsin(np.sin(u))),
+        "acos": (lambda q: jnp.arccos(jnp.cos(q)), np.arccos(np.cos(u))),
+    }
+    for law, exact in laws.values():
+        found = float(lagjax.System(lambda q, v: 0.5 * v**2, forces=lambda q, v, law=law: law(q)).acceleration(u, 0.0))
+        assert np.isnan(found) if abs(u) > 1e15 else found == pytest.approx(exact, abs=1e-12 + np.spacing(abs(u)))

@@ -7,7 +7,6 @@ import pytest
 from lagrangians import oscillator, radial_fall
 
 import lagjax
-from lagjax._trust import _precision
 
 OSCILLATOR = lagjax.System(oscillator)
 TS = jnp.linspace(0.0, 10.0, 21)
@@ -86,8 +85,8 @@ def test_where_diffrax_runs_by_default_it_is_named_so_and_measured_once():
         (by_arrays, ["default: Dopri8", "Tsit5"]),
         (OSCILLATOR, ["default: Taylor (machine code)", "Dopri8", "Tsit5"]),
     ):
-        problem = _precision._problem(scene, 1.0, 0.0, TS, None, None)
-        assert list(_precision._default_solvers(problem)) == names
+        result = lagjax.work_precision(scene, 1.0, 0.0, TS, tolerances=[1e-4], repeats=1)
+        assert [row.solver for row in result] == names
 
 
 @pytest.mark.slow

@@ -230,3 +230,26 @@ def test_a_reset_that_is_not_finite_is_named():
     said = r"reset of the transition at t = 0.45\d* returned the velocity of q \(nan\): every number must be f"
     with pytest.raises(lagjax.SimulationError, match=said):
         lagjax.simulate(lagjax.Hybrid({"fly": ball}, [bounce], "fly"), 1.0, 0.0, TS)
+
+
+def test_a_motion_that_stops_in_contact_names_what_touches():
+    def forces(q, v, t):
+        return jnp.array([switched(q, v, t), 0.0])
+
+    block = lagjax.System(
+        lambda q, v: 0.5 * v @ v - 9.81 * q[1], forces=forces,
+        contacts=lambda q: {"floor": q[1] - 0.1, "wall": q[0] + 3.0},
+    )  # fmt: skip
+    with pytest.raises(lagjax.SimulationError, match=r"In touch there: contacts\['floor'\], whose gaps"):
+        lagjax.simulate(block, jnp.array([0.0, 0.1]), jnp.array([1.0, 0.0]), TS, **BUDGET)
+
+
+def test_a_law_without_a_normal_force_is_named_and_not_the_start():
+    """λ = 9 + λ²: none."""
+    block = lagjax.System(
+        lambda q, v: 0.5 * v @ v - 9.0 * q[1], contacts=lambda q: {"floor": q[1]},
+        forces=lambda q, v, multipliers: jnp.array([0.0, -multipliers["floor"] ** 2]),
+    )  # fmt: skip
+    with pytest.raises(lagjax.SimulationError, match="No multipliers satisfy the law of forces") as caught:
+        lagjax.simulate(block, jnp.zeros(2), jnp.zeros(2), TS)
+    assert "q0" not in str(caught.value)

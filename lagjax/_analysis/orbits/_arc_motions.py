@@ -53,16 +53,13 @@ class Arc(NamedTuple):
 
     @property
     def ok(self) -> np.ndarray:
-        """True for each row that came to its last time, with finite derivatives, (R,)."""
+        """True for each row that reached its last time, with finite derivatives, (R,)."""
         return (self.result == SUCCESSFUL) & np.isfinite(self.by_start).all(axis=(1, 2))
 
 
 class Units(NamedTuple):
-    """The sizes of states, `state` (R, 2n), and of times, `time` (R,): q and q̇ of all units become comparable by them.
-
-    That of coordinate i is l/√Mᵢᵢ, `length` (R,) being l, which is alike for coordinates of any units, and that of its
-    velocity is as much in a unit of time.
-    """
+    """The sizes of states, `state` (R, 2n), and of times, `time` (R,), which make q and q̇ comparable: that of
+    coordinate i is l/√Mᵢᵢ, `length` (R,) being l, and that of its velocity as much in a unit of time."""
 
     state: np.ndarray
     time: np.ndarray
@@ -132,11 +129,8 @@ class Arcs:
         return self.flow.run(times, y0, self.numbers[None], self.tolerances)
 
     def equal_shares(self, span: np.ndarray, y0: np.ndarray, count: int) -> np.ndarray:
-        """Parts (R, count + 1) of spans of time (R,) from 0 to 1, in which motions take about equally many steps.
-
-        Each begins at the calmest moment near there, where steps are longest: a state in the midst of an encounter is
-        large and changes fast, and Newton's method would have to creep.
-        """
+        """Parts (R, count + 1), from 0 to 1, of spans of time (R,) in which motions take about equally many steps; each
+        begins at the calmest moment near there, where states are small and change slowly."""
         shares = np.tile(np.arange(count + 1) / count, (len(y0), 1))
         times = np.stack([np.zeros_like(span), span], axis=1)
         room = min(_BUDGET * len(y0), _MOST_WRITTEN // (y0.shape[1] + 4))
@@ -173,8 +167,8 @@ class Arcs:
         return Arc(end, self.rate(times[:, 1], end), by_start, by_params, run.result, run.t_end, run.accepted)
 
     def units(self, y0: np.ndarray, time: np.ndarray | None = None) -> "Units":
-        """The units of states (R, 2n), from the largest coordinate and velocity there, in the metric of M. `time` (R,)
-        is that of a change; by default it is read off the velocities and accelerations."""
+        """The units of states (R, 2n), from the largest coordinate and velocity in the metric of M; `time` (R,) is read
+        off the rates by default."""
         n = self.size
         mass = np.abs(self.sample(0.0, y0).quantities("mass_matrix")["mass_matrix"][:, np.arange(n), np.arange(n)])
         root = _or_one(np.sqrt(np.where(mass > 0, mass, mass.max(axis=1, initial=0.0)[:, None])))
@@ -243,11 +237,8 @@ _MOST_WRITTEN = 2**26  # numbers of steps of all motions whose shares are sought
 
 
 def starts(q0: PyTree, qdot0: PyTree, time, name: str) -> tuple[np.ndarray, Layout, np.ndarray]:
-    """The times, () or (N,), the layout of one state, and all states, (1, 2n) or (N, 2n).
-
-    `time`, called `name`, is one number, or an array of as many as there are members on the first axis of every leaf.
-    Raises `TypeError` or `ValueError` where that is not so, or a number is not finite or not there yet.
-    """
+    """The times, () or (N,), the layout of one state, and all states (1 or N, 2n); `time`, called `name`, is a number
+    or one per member. Raises `TypeError` or `ValueError` where that is not so, or a number is not finite, or traced."""
     require_untraced((q0, qdot0, time), "The start")
     if isinstance(time, dict | eqx.Module):
         require_number(time, name)

@@ -10,7 +10,7 @@ corrections damped, as those of `_shooting` are: how they contract is what judge
 
 A step stands if Newton's method contracts, if its first correction is short beside the step, and if the chord lies
 midway between tangents that turned little. An orbit of another family that happens to be near fails one of these, or
-is as near as the family bends; how close each came to its bound says how long the next step may be.
+is as near as the family bends; how close each is to its bound says how long the next step may be.
 
 Source: Allgower & Georg, *Numerical Continuation Methods* (1990), §6.1 (steps by contraction, distance and angle), §8
 (branch points).
@@ -78,11 +78,9 @@ class FamilyUnknowns(NamedTuple):
 
 
 class Follower:
-    """The unknowns along a family: the first state; the period, unless it stays; a parameter, if it has a place.
-
-    All three are in the units of the first orbit, (1, 2n) and (1,), and the parameter in that of its first value.
-    `until` is the value where the family is to end.
-    """
+    """The unknowns along a family: the first state, the period unless it stays, a parameter if it has a place; in units
+    of the first orbit, (1, 2n) and (1,), and of the parameter's first value. `until` is the value where the family
+    ends."""
 
     def __init__(self, arcs: Arcs, place: int | None, y0: np.ndarray, period: np.ndarray, until: float | None = None):
         self.arcs, self.place, self.until = arcs, place, until
@@ -176,11 +174,9 @@ _MOST_ARCS = 128
 def tangent_at(
     follower: Follower, point: FamilyPoint, before: FamilyTangent | None, left_out: int = 0
 ) -> FamilyTangent | None:
-    """The direction of the family at a closed orbit: on from `before`, or at first that of a rising value.
-
-    None where there is none: the orbit is alone. At a branch point, where the smallest `left_out` singular values are
-    zero, it is what is nearest to `before` of all directions.
-    """
+    """The direction of the family at a closed orbit, continued from `before`, at first of a rising value; None where
+    the orbit is alone. At a branch point, where the smallest `left_out` singular values are zero, the direction nearest
+    to `before`."""
     states = point.matrix.shape[0]
     whole, still = decide(point.matrix, _shooting.RANK), decide(point.matrix[:, :states], _shooting.RANK)
     slope, count, rank = follower.slope(point), states - int(still.rank), int(whole.rank)

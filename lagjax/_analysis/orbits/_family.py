@@ -1,6 +1,6 @@
 """`family`: periodic orbits that belong together, by energy or by a parameter; `branch_off`: from one to another.
 
-A family goes on through folds, where its energy or parameter turns back, because it is followed by its own length of
+A family continues through folds, where its energy or parameter turns back, because it is followed by its own length of
 arc. Orbits of a conservative scene form families by energy at fixed parameters, and by a parameter at a fixed period;
 limit cycles and driven orbits form them by a parameter alone.
 
@@ -95,12 +95,12 @@ def family(
     - `by`: "energy"; or the name of a parameter, such as "g" for `params["g"]`, one number.
     - `until`: the energy or the parameter at which the family ends; it also fixes the direction of the first step.
       Without it the family begins towards larger values and ends after `count` orbits.
-    - `step`: the arc length of the first step, in parts of the size of `orbit` (of its coordinates, its velocities, its
-      period over 2π and the parameter); it and later steps adapt to how fast Newton's method contracts, how far it
+    - `step`: the first step's arc length, as a fraction of the size of `orbit` (of its coordinates, its velocities,
+      its period over 2π and the parameter); it and later steps adapt to how fast Newton's method contracts, how far it
       moves an orbit, and how much the family turns.
 
     Folds, branch points and doublings between two orbits are located on the arc between them, as well as multipliers
-    and slopes are known there, and are orbits of the family as others are. `branch_off` goes on from there.
+    and slopes are known there, and are orbits of the family as others are. `branch_off` continues from there.
 
     A nonlinear normal mode is the family by energy that begins at a linear mode: begin with the periodic orbit near
     q + a·shape at rest, whose period is 2π/frequency, for a small amplitude a (`lagjax.normal_modes`).
@@ -141,11 +141,8 @@ def _parameter_index(params: PyTree, name: str) -> int:
 
 
 class _Member(NamedTuple):
-    """An orbit of a family, and what it tells: `found` (of one orbit), its multipliers, and what happens there.
-
-    `symmetries` counts those of the orbit; `tests` (4,) change sign at a fold, at a branch point or fold, at a
-    doubling, and at the value where the family is to end.
-    """
+    """An orbit of a family: `found` (of one orbit), the number of its `symmetries`, and `tests` (4,) that change sign
+    at a fold, at a branch point or fold, at a doubling, and at the value where the family ends."""
 
     point: FamilyPoint
     tangent: FamilyTangent
@@ -192,7 +189,7 @@ def _follow_family(follower: Follower, y0, period, step: float, count: int) -> t
             return members[:count], f"The family was followed until {until:.6g}."
         members.append(_refine_member(follower, following))
         step = next_step(step, there)
-    return members[:count], f"{count} orbits were found; the family goes on: raise count to follow it further."
+    return members[:count], f"{count} orbits were found; the family continues: raise count to follow it further."
 
 
 def _first_point(follower: Follower, y0: np.ndarray, period: np.ndarray, numbers: np.ndarray) -> FamilyPoint:
@@ -223,8 +220,8 @@ def _end(follower: Follower, last: FamilyPoint, stopped: bool) -> str:
 
 _SAME = 1e-3  # of a step: within, a fold and a branch point are one, where both tests change sign
 _NOISE = 1e-9  # of tests, which are of order one: what is all degenerate, as an isotropic oscillator, passes nothing
-# How far from a branch point orbits are computed, in parts of the bracket, and the bracket that ends that, in parts of
-# the step: the inverse polynomial through four orbits is then right to its fourth power.
+# How far from a branch point orbits are computed, as a fraction of the bracket, and the bracket that ends that, of the
+# step: the inverse polynomial through four orbits is then right to its fourth power.
 _BESIDE, _BRACKET = 0.02, 1e-3
 
 
@@ -239,12 +236,9 @@ def _locate_events(follower: Follower, last: _Member, following: _Member, step: 
 
 
 def _locate_event(follower: Follower, last: _Member, following: _Member, step: float, k: int) -> tuple[float, _Member]:
-    """The zero of test k on the arc between two orbits, and the orbit there.
-
-    At a branch point the equations are singular, and about it Newton's method finds orbits of either family. So orbits
-    are computed beside it, nearer and nearer, from cubic guesses that are much nearer than the other family; the one
-    at the zero is then interpolated, and corrected in all directions but the singular one.
-    """
+    """The zero of test k on the arc between two orbits, and the orbit there. About a branch point Newton's method finds
+    orbits of either family: so orbits are computed beside it, ever nearer, from cubic guesses; that at the zero is
+    interpolated and corrected in all directions but the singular one."""
     across, found = last.tangent, {0.0: last, step: following}
     a, b = 0.0, step
     while b - a > _BRACKET * step:
@@ -325,7 +319,7 @@ def branch_off(
     - `index`: of an orbit where `family.branch` or `family.doubling` is True; of the latter the new orbits have twice
       the period.
     - `params`, `by`: those with which `family` was followed.
-    - `size`: how far off the new orbit is, in parts of the size of the old one, as `step` of `family`.
+    - `size`: how far off the new orbit is, as a fraction of the size of the old one, as `step` of `family`.
 
     By symmetry there often are two such families, mirror images, of which this is one.
 
@@ -383,10 +377,8 @@ def _numbers(arcs: Arcs, place: int | None, family: Family, k: int) -> np.ndarra
 
 
 def _branching_orbit(follower: Follower, here: FamilyPoint, before: FamilyTangent, size: float) -> FamilyPoint | None:
-    """The orbit at a distance from a branch point along the null vector that is no symmetry, nor of the old family.
-
-    Symmetries are known from a neighbour: at the branch point singular values do not tell them from the new direction.
-    """
+    """The orbit at a distance from a branch point along the null vector that is neither a symmetry nor of the old
+    family. Symmetries are known from a neighbour: at the branch point singular values do not tell."""
     states, count = here.matrix.shape[0], before.symmetries.shape[1]
     still = decide(here.matrix[:, :states]).right[:, states - count - 1 :]
     null = decide(here.matrix).right[:, before.rank - 1 :]

@@ -64,11 +64,8 @@ def multipliers_of(reduced: Reduced, paired: bool) -> np.ndarray:
 
 
 def passage_determinant(reduced: Reduced, sign: int) -> float:
-    """det(1 − sign·G_(K−1) … G_0): zero where a multiplier passes through 1 (`sign` 1) or −1.
-
-    Of the cyclic matrix of the arcs, not of multipliers: two that meet at 1 are known to half the digits only, their
-    product with those of the others to all.
-    """
+    """det(1 − sign·G_(K−1) … G_0): zero where a multiplier passes through 1 (`sign` 1) or −1. It is that of the cyclic
+    matrix, known to all digits where two multipliers that meet are known to half of them."""
     growth = reduced.growth.copy()
     growth[0] *= sign
     cyclic = _cyclic_matrix(growth)
@@ -96,13 +93,12 @@ def _product_eigenvalues(growth: np.ndarray) -> np.ndarray:
     count, roots = len(growth), np.linalg.eigvals(_cyclic_matrix(growth)).astype(complex)
     if count == 1:
         return roots
-    # The roots of one multiplier stand on a circle, a turn divided by K apart: one of each comes of sorting by power.
+    # The roots of one multiplier stand on a circle, a turn divided by K apart: sorting by power gives one of each.
     return _group_means(np.exp(count * np.log(np.where(roots == 0, 1e-300, roots))), count)
 
 
 def _merge_factors(growth: np.ndarray) -> np.ndarray:
-    """Fewer matrices with the same product: neighbours are multiplied as long as that grows little. The eigenvalues of
-    the cyclic matrix cost the cube of their number."""
+    """Fewer factors of the same product, neighbours multiplied while that grows little: eigenvalues cost their cube."""
     merged = [growth[0]]
     for matrix in growth[1:]:
         product = matrix @ merged[-1]

@@ -1,9 +1,9 @@
 """Lyapunov exponents: how fast motions part that begin side by side.
 
-The whole spectrum comes of the derivatives of short arcs, which are rows of one run, in canonical coordinates: there
+The whole spectrum follows from derivatives of short arcs, which are rows of one run, in canonical coordinates: there
 they are symplectic, and in the order (q1 … qn, pn … p1) their QR decompositions are Iwasawa's, whose diagonals hold
 numbers and their inverses. So exponents come in pairs ±λ at every time, and not in the limit alone. The largest by
-itself comes of one tangent that moves along with the motion, as more coordinates of it.
+itself follows from one tangent that moves along with the motion, as more coordinates of it.
 
 Source: Benettin, Galgani, Giorgilli & Strelcyn, *Lyapunov characteristic exponents for smooth dynamical systems and for
 Hamiltonian systems*, Meccanica 15 (1980) 9; Leimkuhler & Van Vleck, *Orthosymplectic integration of linear Hamiltonian

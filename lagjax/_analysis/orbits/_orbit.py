@@ -35,8 +35,8 @@ class Orbit(NamedTuple):
     - `q0`, `qdot0`: a state of it, in the user's structure; `period` ().
     - `multipliers` (2n,): the eigenvalues of the monodromy matrix, complex, each beside its reciprocal where the energy
       is conserved, the largest first, and last of all those that are 1 by the time shift and by conserved momenta.
-    - `closure` (): the largest defect of its arcs, of a single arc φ(y; T) − y, in parts of the size of the coordinate,
-      or velocity: the largest one at the guess, or what that makes of it in T/2π, alike in the kinetic energy.
+    - `closure` (): the largest defect of its arcs, of a single arc φ(y; T) − y, as a fraction of the size of the
+      coordinate, or velocity: the largest at the guess, or what that makes of it in T/2π, alike in kinetic energy.
     - `stable`: whether no multiplier is larger than 1, so that errors do not grow exponentially; False also where
       rounding leaves that open, because the product of a pair that should be 1 is off by more than 1e-3.
     - `ok`: whether it closes; `message`: a sentence that says why not (all numbers are then those of the best trial),
@@ -102,7 +102,7 @@ def periodic_orbit(
     Solves φ_T(y) = y, with φ_T the motion over the time T, by Newton's method on states at equal parts of the period
     and on T; for a driven scene, one in which anything reads `t`, the period is kept as given. Derivatives of the arcs
     are exact. Where the orbit is one of many (shifted in time, at another energy, or translated or rotated where
-    momenta are conserved), each correction is the one of least norm: of changes of (q, qdot, T) in parts of their
+    momenta are conserved), each correction is the one of least norm: of changes of (q, qdot, T) as fractions of their
     sizes, so that the same orbit is found in any units. The rank of the
     equations is decided by their singular values: those below 1e-8 of the largest count as zero.
 
@@ -225,8 +225,8 @@ def arc_counts(arcs: Arcs, y0, period) -> np.ndarray:
 
 
 def assess_orbits(closing: Closing, chain: Chain, most: int | None = None) -> FlatOrbits:
-    """The orbits that the chains of a search are: multipliers, stability, and a sentence where one is no orbit. At most
-    `most` directions count as symmetries; None counts all that monodromy − 1 sends to zero."""
+    """The orbits that the chains of a search are, with multipliers and a sentence where one is none; at most `most`
+    directions count as symmetries, None for all that monodromy − 1 sends to zero."""
     message = np.array([_sentence(chain, k) for k in range(len(chain.period))], object)
     ok = np.array([not text for text in message])
     multipliers = np.full((len(ok), chain.y.shape[2]), np.nan, complex)
@@ -259,7 +259,7 @@ def _sentence(chain: Chain, k: int) -> str:
         return (
             f"No periodic orbit was found near the guess: after {chain.y.shape[1]} arcs per period and a period of "
             f"{chain.periods()[k]:.6g} the largest defect is {share:.2g} of the size of the state. Begin nearer: "
-            "another state or period. A coordinate that goes on from period to period, as the x of a walker, never "
+            "another state or period. A coordinate that grows from period to period, as the x of a walker, never "
             "closes: give image=lambda q, qdot: (q + step, qdot), or leave it out of L."
         )
     return ""

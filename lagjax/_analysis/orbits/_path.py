@@ -49,8 +49,8 @@ class Path(NamedTuple):
     - `index`: how many independent variations with fixed ends lower the action: the conjugate times before the end.
     - `minimum`: whether the action is least among nearby paths (`index` 0, and the end not conjugate); otherwise it is
       a saddle.
-    - `closure` (): the largest defect, in parts of the size of the ends and of the velocities that join them; `ok`, and
-      `message`, a sentence that says why not.
+    - `closure` (): the largest defect, as a fraction of the size of the ends and the velocities that join them; `ok`,
+      and `message`, a sentence that says why not.
     """
 
     qdot_start: PyTree

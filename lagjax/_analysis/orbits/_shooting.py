@@ -210,8 +210,8 @@ def equations(closing: Closing, chain: Chain) -> NewtonEquations:
 
 
 def correction(closing: Closing, chain: Chain) -> tuple[np.ndarray, np.ndarray]:
-    """The step of Newton's method, shortest in the first state and the period: dy (B, K, 2n) and dT (B,). Zero for a
-    path with conjugate ends."""
+    """Newton's step, shortest in the first state and the period: dy (B, K, 2n), dT (B,); 0 for conjugate ends of a
+    path."""
     condensed, decided, right = equations(closing, chain)
     step, states = -decided.least_norm(right), chain.y.shape[2]
     period = np.zeros(len(step)) if closing.lasts else step[:, -1]
@@ -265,8 +265,8 @@ class Symmetries(NamedTuple):
 
 
 def symmetries(chain: Chain, most: int | None = None) -> list[Symmetries]:
-    """The rank decision about closed chains: which directions are symmetries, at most this many. At a branch point
-    monodromy − 1 sends more to zero, by chance: those of the smallest singular values are chosen."""
+    """The null spaces of closed chains, at most `most` directions: those of the smallest singular values, as a branch
+    point has more by chance."""
     forward, null = _null(chain.growth)
     # ℓ_k = G_kᵀ ℓ_(k+1): the same chain, walked back from the end.
     back, of_transpose = _null(np.swapaxes(chain.growth[:, ::-1], 2, 3))

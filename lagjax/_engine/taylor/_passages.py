@@ -23,6 +23,8 @@ def has_passages(kernel: Kernel) -> bool:
 def part_passages(flow: Flow, steps: Steps, params, end, tolerances: Tolerances) -> Steps:
     """The steps of one member, its passages in parts; `end` (2n,) is the last state."""
     ((_, rows),) = steps.split_members()
+    if not len(rows):  # of one that failed at once
+        return steps
     states = np.concatenate([rows[:, 4 : 4 + flow.states], end[None]])
     t, h = np.append(rows[:, 0], rows[-1, 0] + rows[-1, 1]), rows[:, 1]
     pieces = rows[:, 4 + flow.states : -3] if rows.shape[1] > 4 + flow.states else rows[:, :0]

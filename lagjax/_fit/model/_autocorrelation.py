@@ -28,8 +28,7 @@ def autocorrelations(residuals: Residuals, point: Trial, noise: NoiseScale) -> l
 
 
 def _autocorrelation(residuals: Residuals, point: Trial, noise: NoiseScale, signal: int) -> Correlation:
-    """The correlation of the residuals of one signal, over all pieces, as far as it is larger than chance. It is cut at
-    two standard errors, and tapered by Parzen's window of three times that length."""
+    """The correlation of one signal's residuals, cut at two standard errors and tapered by Parzen's window."""
     dof = noise.dof[signal]
     sums, count = np.zeros(1), 0
     for batch, r in zip(residuals.batches, point.residuals, strict=True):
@@ -64,11 +63,8 @@ _CHANCE = 4.0  # standard errors of a correlation: white residuals show it at on
 
 
 def correlated_power(rows: np.ndarray, counted: np.ndarray) -> float:
-    """The mean square of the correlated part of residuals (N, T); zero where no correlation is beyond chance.
-
-    Motion that changes little from one sample to the next has its whole mean square in the product of neighbours, to
-    which white noise adds nothing.
-    """
+    """The mean square of the correlated part of residuals (N, T): the largest product of neighbours, to which white
+    noise adds nothing; zero where no correlation exceeds chance."""
     count = int(counted.sum())
     sums = lag_products(np.where(counted, rows, 0.0), counted)[: _LAGS + 1]
     if count < 2 or not sums[0] > 0:
@@ -78,8 +74,7 @@ def correlated_power(rows: np.ndarray, counted: np.ndarray) -> float:
 
 
 def close_gaps(rows: np.ndarray, counted: np.ndarray) -> np.ndarray:
-    """The rows (N, T, ...) with what `counted` (N, T) in front, so that lags count samples that are there. Where every
-    tenth sample is measured, or some are missing, the neighbour of one is the next that was measured."""
+    """The rows (N, T, ...) with what `counted` (N, T) in front: the neighbour of a sample is the next measured one."""
     if counted.all():
         return rows
     order = np.argsort(~counted, axis=1, kind="stable")

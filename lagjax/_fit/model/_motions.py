@@ -209,8 +209,7 @@ class Origins:
         self.dtype = layout.dtype
 
     def move(self, starts: np.ndarray, numbers: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The starts (N, 2n) at the parameters `numbers` (P,), and how they move along `directions` (F, P) of these,
-        (N, F, 2n): not at all where they are no function of them."""
+        """The starts (N, 2n) at the parameters `numbers` (P,), and tangents (N, F, 2n) along `directions` (F, P)."""
         starts, moved = starts.copy(), np.zeros((len(starts), len(directions), starts.shape[1]))
         made: dict = {}
         for k, function in self.functions.items():
@@ -238,8 +237,8 @@ class Manifold:
         self.projection, self.dtype = projection, layout.dtype
 
     def project(self, y: np.ndarray, t: np.ndarray, numbers: np.ndarray, directions: np.ndarray) -> tuple:
-        """Consistent states near `y` (N, 2n) at the times `t` (N,), NaN where there is none; how they move with y,
-        (N, 2n, 2n), and along F directions of the parameters, (N, F, 2n)."""
+        """Consistent states near `y` (N, 2n) at the times `t` (N,), NaN without one, with their derivatives by y (N,
+        2n, 2n) and along F directions of the parameters (N, F, 2n)."""
         if self.projection is not None:
             return _project_by_newton(self.projection, y, t, numbers, directions)
         y, t, numbers = (np.asarray(x, self.dtype) for x in (y, t, numbers))

@@ -21,7 +21,7 @@ the motion lies is not known better than that, so over an offset that is equally
 
     E ε(x) = 0,    E ε(x) ε(y) = Σₖ aₖ cos(2πk (x − y)/h),    aₖ = h²/(2π²k²) exp(−(2πk s/h)²),    Σₖ aₖ ≤ h²/12
 
-with s the noise before rounding. At rest all errors are one and the same; where the motion goes on by a step or more
+with s the noise before rounding. At rest all errors are one and the same; where the motion advances by a step or more
 from sample to sample, or the noise is as large as half of one, they are independent. `worths` is what samples are
 worth, and `rounding_square` what least squares with any weights make of such errors: its intervals need no more.
 Source: Widrow & Kollár, *Quantization Noise* (2008), ch. 4 and 11.
@@ -51,8 +51,7 @@ class NoiseScale(NamedTuple):
 
 
 class Sensor(NamedTuple):
-    """The sensors of S signals: the `step` (S,) that they round to, and the limits `low`, `high` (S,) that they cut off
-    at; NaN for none."""
+    """The sensors of S signals: their `step` (S,) of rounding and their limits `low`, `high` (S,); NaN for none."""
 
     step: np.ndarray
     low: np.ndarray
@@ -65,8 +64,7 @@ class Sensor(NamedTuple):
         return (values >= self.high).astype(float) - (values <= self.low)
 
     def bounds_shown(self, values: np.ndarray, weights: np.ndarray, sides: np.ndarray) -> np.ndarray:
-        """Samples (..., S) with those at a limit where the exact values that a rounding sensor shows so begin: half a
-        step before the first of its lines that is at the limit or beyond."""
+        """Samples (..., S) where those at a limit are the exact values from which a rounding sensor shows it."""
         shown = values.copy()
         for k in np.flatnonzero(np.isfinite(self.step)):
             inside = values[..., k][(sides[..., k] == 0) & (weights[..., k] > 0)]
@@ -272,8 +270,7 @@ _HARMONICS = 20  # of the errors' covariance: what they leave, 3 % of step²/12,
 
 
 def harmonics(step: float, sigma: float) -> tuple[np.ndarray, float, float]:
-    """aₖ (K,) for errors of the standard deviation `sigma` in all; the variance of rounding beside them, which counts
-    as independent, and that of the noise before rounding."""
+    """aₖ (K,) for errors of standard deviation `sigma`; the independent variance of rounding; that before rounding."""
     k, before = np.arange(1, _HARMONICS + 1), max(sigma**2 - step**2 / 12, 0.0)
     a = step**2 / (2 * (np.pi * k) ** 2) * np.exp(-((2 * np.pi * k) ** 2) * before / step**2)
     return a, step**2 / 12 - float(a.sum()), before
@@ -297,8 +294,7 @@ def worths(x: np.ndarray, step: float, sigma: float) -> np.ndarray:
 
 
 def rounding_square(rows: list[np.ndarray], x: list[np.ndarray], step: float, sigma: float) -> np.ndarray:
-    """E (Σ Gᵢ εᵢ)(Σ Gᵢ εᵢ)ᵀ of the common part of rounding errors, over rows (N, T, F) of batches whose values are near
-    x (N, T)."""
+    """E (Σ Gᵢ εᵢ)(Σ Gᵢ εᵢ)ᵀ of common rounding errors, over rows (N, T, F) of batches with values near x (N, T)."""
     total = np.zeros((rows[0].shape[-1],) * 2)
     for k, a in enumerate(harmonics(step, sigma)[0], start=1):
         each = [np.einsum("ntf,nt->f", g, np.exp(2j * np.pi * k / step * at)) for g, at in zip(rows, x, strict=True)]
@@ -309,8 +305,8 @@ def rounding_square(rows: list[np.ndarray], x: list[np.ndarray], step: float, si
 
 _LATTICE = 0.02  # of a step that a multiple may be off, in text of few digits or float32; chance is off by 0.25
 _EQUAL = 0.02  # of neighbours that are equal: with fewer, rounding errors are independent anyhow
-# Samples beside a limit at most, over which a motion that is cut off changes by so many times what one that turns does;
-# and the noise in steps from which on a run of so many equal samples at the end of all is none of chance.
+# Samples beside a limit at most, over which a motion that is cut off changes by this factor more than one that turns;
+# and the noise in steps from which on a run of _CUT equal samples at the end of all is none of chance.
 _BESIDE, _SHARP, _NOISY, _CUT = 10, 1.5, 0.4, 6
 _RUN, _AT_LIMIT = 3, 0.01  # equal values in a row at a limit of a sensor, and the share of all samples in such rows
 
@@ -372,11 +368,8 @@ def find_sensor(records: list[Record]) -> Sensor:
 
 
 def read_sensor(records: list[Record], noise: AbstractNoise, names: tuple[str, ...], periods: np.ndarray) -> Sensor:
-    """The sensors of some records, as the law says, and where it says nothing as the records show.
-
-    Wrapped signals turn round at their ends, which are no limits, and Student's t knows none. Raises `ValueError` where
-    values are not what the law says.
-    """
+    """The sensors as the law says and, where it says nothing, as the records show; wrapped signals have no limits,
+    Student's t knows none. Raises `ValueError` where values contradict the law."""
     if not records:
         return Sensor(*np.zeros((3, 0)))
     found, given = find_sensor(records), noise.sensor(records)

@@ -45,8 +45,7 @@ class Parameters:
 
     @classmethod
     def from_pytree(cls, params: PyTree, free: PyTree = None, transforms: PyTree = None) -> "Parameters":
-        """The parameters as the user gives them; `free` and `transforms` are prefixes of the same structure. Raises
-        `TypeError` or `ValueError` with the name of the parameter that cannot be right."""
+        """The parameters of the user; `free` and `transforms` are prefixes. Raises, and names the wrong one."""
         require_finite(params, "params0")
         labels, leaves, tree = labelled_leaves(as_arrays(params, np.float64, "params0"), "params")
         is_free = _broadcast_prefix(True if free is None else free, tree, leaves, "free")
@@ -132,8 +131,7 @@ class Parameters:
         return low, high
 
     def covariance(self, u: np.ndarray, matrix: np.ndarray) -> np.ndarray:
-        """The covariance (X, X) of the free numbers from that of u (F, F). What moves with an unknown of infinite
-        variance has infinite variance, and NaN beside it."""
+        """The covariance (X, X) of free numbers from that of u (F, F): infinite, with NaN beside it, where u's is."""
         jacobian, unseen = self.jacobian(u), ~np.isfinite(np.diag(matrix))
         finite = np.where(unseen[:, None] | unseen, 0.0, matrix)
         moved = jacobian @ finite @ jacobian.T
@@ -204,8 +202,7 @@ class Parameters:
         return rows[0]
 
     def unknown(self, name: str) -> int:
-        """The place of the unknown that moves the free number of this name (`row`) alone. Raises `ValueError` where
-        there is no such number, or where it moves only together with others."""
+        """The place of the unknown that moves the free number of this name (`row`) alone. Raises `ValueError`."""
         row = self.row(name)
         name = self.names[row]
         own, rows, part = next(cut for cut in self._cuts if cut[1].start <= row < cut[1].stop)

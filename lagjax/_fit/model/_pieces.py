@@ -39,10 +39,8 @@ class Samples(NamedTuple):
 
 
 def batch_pieces(records: list[Any], pieces: list[Piece], eps: float = 2.3e-16, hold: str = "zero") -> list[Samples]:
-    """The pieces in batches, none of which is longer than twice its shortest piece: at most half of the room is empty.
-
-    `eps` is the round-off of the numbers that the motion is computed in, `hold` says what inputs are between samples.
-    """
+    """The pieces in batches, none longer than twice its shortest piece, so that at most half of the room is empty;
+    `eps` is the round-off of the motion, `hold` says what inputs are between samples."""
     lengths = np.array([len(piece.places) for piece in pieces])
     order, groups = np.argsort(-lengths, kind="stable"), []
     for row in order.tolist():

@@ -320,11 +320,12 @@ def _require_same_signals(placed: list[tuple[int, Record]]) -> None:
     for place, record in placed:
         if record.structure != first.structure:
             raise ValueError(
-                f"records[{place}] has other signals than records[{begin}]: {record.structure} and {first.structure}."
+                f"records[{place}] has different signals from records[{begin}]: {record.structure} and "
+                f"{first.structure}."
             )
         if record.input_structure != first.input_structure:
             raise ValueError(
-                f"records[{place}] has other inputs than records[{begin}]: {record.input_structure} and "
+                f"records[{place}] has different inputs from records[{begin}]: {record.input_structure} and "
                 f"{first.input_structure}."
             )
     measured = np.any([(record.weight_matrix > 0).any(axis=0) for _, record in placed], axis=0)

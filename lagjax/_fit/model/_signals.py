@@ -152,10 +152,8 @@ class Signals:
         return sensors(self.observe)[0] is None or record.structure == (self.layout.tree, self.layout.shapes)
 
     def positions(self, record: Record, numbers: np.ndarray) -> Record:
-        """The record with the coordinates that make sensors of the structure of q show its values, by Newton's method.
-
-        It is the record itself where these steps do not end: sensors that show a gain, a bias, degrees do with two.
-        Sensors that wrap by themselves, as `atan2`, never show what was made continuous: up to whole periods, then.
+        """The record with coordinates for which sensors of the structure of q show its values, by Newton's method; the
+        record itself where the steps do not end. Sensors that wrap never show continuous values: up to periods, then.
         """
         if self._value_and_jacobians is None:
             return record

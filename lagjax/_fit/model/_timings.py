@@ -16,14 +16,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from lagjax._engine import Problem, Solution
-from lagjax._engine.taylor import MachineCode, Noted, surfaces_of
 from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._records import Guess, MeasuredSignal, real_numbers, require_start
 from lagjax._interface import Layout, halves
 from lagjax._primitives import sentence
-from lagjax._program import Unlowerable
-from lagjax._run import crossings, directions_of, sections_of, simulate
+from lagjax._run import crossings, sections_of, simulate
 from lagjax._run.hybrid import Hybrid, Scene, Transition
 from lagjax._scene import System
 
@@ -209,70 +206,7 @@ class Clock:
 
 def build_clock(scene: Scene, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> Clock:
     """The clock of a scene. Raises `ValueError` for functions of a hybrid one, and for what is of another scene."""
-    first = _sections(timings.section)[1][0]
-    if isinstance(scene, Hybrid):
-        if not isinstance(first, Transition):
-            raise ValueError("Of a lagjax.Hybrid only the times of its transitions are data: Timings(transition, …).")
-        return _build_jump_clock(scene, layout, parameters, timings, rtol, _transitions_in)
-    if isinstance(first, Transition):
-        raise ValueError("Times of transitions are of a lagjax.Hybrid: give that to `fit` in the place of the System.")
-    if scene.touches:
-        find = _impacts_in if isinstance(first, str) else _crossings_in
-        return _build_jump_clock(scene, layout, parameters, timings, rtol, find)
-    if isinstance(first, str):
-        raise ValueError(f"Timings names the contact {first!r}, and this System has none: give it contacts=....")
-    return _build_section_clock(scene, layout, parameters, timings, rtol)
-
-
-def _build_section_clock(
-    system: System, layout: Layout, parameters: Parameters, timings: Timings, rtol: float
-) -> Clock:
-    flat, span, (keys, functions) = timings.flat, (float(timings.t0), _last_time(timings)), sections_of(timings.section)
-    params = parameters.restore(parameters.first)
-    problem = Problem.from_system(system, layout, params, ts=span, rtol=_SHARPER * rtol, max_steps=_BUDGET)
-    directions = directions_of(timings.direction, keys)
-    try:
-        if refusal := MachineCode().refuses(problem):
-            raise Unlowerable(refusal)
-        surfaces = surfaces_of(problem, functions, directions, "A section")
-    except Unlowerable as reason:
-        text = f"Crossing times are found with machine code, and there is none for this scene: {reason}."
-        raise ValueError(text) from None
-    room = int(flat.numbers.max()) + 1
-
-    def crossings(y0, numbers) -> tuple[Solution, Noted]:
-        motion = dataclasses.replace(problem, y0=y0, params=parameters.restore(numbers))
-        return MachineCode().crossings(motion, surfaces, room, 1 / _SHARPER)
-
-    def times(y0, numbers):
-        return crossings(y0, numbers)[1].t[flat.which, flat.numbers]
-
-    def describe_failure(y0, numbers) -> str:
-        solution, noted = crossings(y0, numbers)
-        if text := sentence(solution.result, solution.t_end, span[1], solution.y_end, layout.names):
-            return text
-        missing = ~np.isfinite(noted.t[flat.which, flat.numbers])
-        if not missing.any():
-            return "Its crossings could not be followed."
-        first = int(np.argmax(missing))
-        which = flat.which[first]
-        name = "" if keys is None else f" of section[{keys[which]!r}]"
-        return (
-            f"There are {int(noted.count[which])} crossings{name} up to t = {span[1]:g}, but number "
-            f"{flat.numbers[first]}, counted from 0, was measured."
-        )
-
-    return Clock(times, describe_failure)
-
-
-def _build_jump_clock(
-    scene: Scene, layout: Layout, parameters: Parameters, timings: Timings, rtol: float, find: Callable
-) -> Clock:
-    """The clock of a motion that jumps.
-
-    `find` gives a function of a motion's arguments that returns which of its instants are those of each time (M, K),
-    and when these are; and what was timed as text, before and behind its count.
-    """
+    find = _choose_finder(scene, _sections(timings.section)[1][0])
     flat, span = timings.flat, np.array([float(timings.t0), _last_time(timings)])
     instants, happens, advice = find(scene, layout, parameters, timings, rtol)
 
@@ -296,6 +230,23 @@ def _build_jump_clock(
         )
 
     return Clock(times, describe_failure)
+
+
+def _choose_finder(scene: Scene, first: Callable | Transition | str) -> Callable:
+    """The function that finds the instants of sections like the first one.
+
+    It gives a function of a motion's arguments that returns which of its instants are those of each time (M, K), and
+    when these are; and what was timed as text, before and behind its count.
+    """
+    if isinstance(scene, Hybrid):
+        if not isinstance(first, Transition):
+            raise ValueError("Of a lagjax.Hybrid only the times of its transitions are data: Timings(transition, …).")
+        return _transitions_in
+    if isinstance(first, Transition):
+        raise ValueError("Times of transitions are of a lagjax.Hybrid: give that to `fit` in the place of the System.")
+    if isinstance(first, str) and not scene.touches:
+        raise ValueError(f"Timings names the contact {first!r}, and this System has none: give it contacts=....")
+    return _impacts_in if isinstance(first, str) else _crossings_in
 
 
 def _transitions_in(scene: Hybrid, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> tuple:
@@ -338,16 +289,19 @@ def _impacts_in(system: System, layout: Layout, parameters: Parameters, timings:
 
 def _crossings_in(system: System, layout: Layout, parameters: Parameters, timings: Timings, rtol: float) -> tuple:
     flat, (keys, _) = timings.flat, _sections(timings.section)
-    names = system.contact_names(layout, parameters.restore(parameters.first))
-    room, name = int(flat.numbers.max()) + 1, _shorten(names[0])
+    limits = {"direction": timings.direction, "count": int(flat.numbers.max()) + 1, "rtol": rtol, "throw": False}
+    if not system.touches:
+        limits |= {"rtol": _SHARPER * rtol, "max_steps": _BUDGET}
 
     def instants(*given):
-        limits = {"direction": timings.direction, "count": room, "rtol": rtol}
-        found = crossings(system, timings.section, *given, **limits, throw=False)
+        found = crossings(system, timings.section, *given, **limits)
         t = jnp.stack([of.t for of in ([found] if keys is None else [found[key] for key in keys])])[flat.which]
         return jnp.isfinite(t), t
 
-    advice = f" An impact that closes a gap is no crossing: Timings({name!r}, times, …) are those of a contact."
+    advice = ""
+    if system.touches:
+        name = _shorten(system.contact_names(layout, parameters.restore(parameters.first))[0])
+        advice = f" An impact that closes a gap is no crossing: Timings({name!r}, times, …) are those of a contact."
     return instants, lambda m: "crossings" + ("" if keys is None else f" of section[{keys[flat.which[m]]!r}]"), advice
 
 

@@ -69,10 +69,8 @@ def comparison(fits: dict[str, Any], folds: int) -> Comparison:
 
 
 def _choose_simplest(free: tuple[int, ...], scores: np.ndarray) -> int:
-    """The fit with the fewest free numbers whose scores (fits, groups) are no worse than those of the best.
-
-    Source: Hastie, Tibshirani & Friedman, *The Elements of Statistical Learning* (2009), §7.10: one standard error.
-    """
+    """The fit with the fewest free numbers whose scores (fits, groups) are within one standard error of the best.
+    Source: Hastie, Tibshirani & Friedman, *The Elements of Statistical Learning* (2009), §7.10."""
     means = scores.mean(axis=1)
     if not np.isfinite(means).any():
         return 0
@@ -98,9 +96,8 @@ def _table(names, free, logs, aic, bic, left) -> list[str]:
 
 
 def _cross_validate(fit, folds: int) -> tuple[dict[str, float], np.ndarray]:
-    """The root mean square residuals by signal of records that were left out, and for each group their mean logarithm;
-    both infinite where a record cannot be followed. A signal that only these have is as noisy as the fit of all says.
-    """
+    """RMS residuals by signal of records left out, and for each group their mean logarithm; both infinite where a
+    record cannot be followed. A signal that only these have is as noisy as in the fit of all."""
     residuals, scores = fit.residual_function, np.zeros(folds)
     groups = np.array([piece.record for piece in residuals.pieces]) % folds
     squares, weights = dict.fromkeys(residuals.names, 0.0), dict.fromkeys(residuals.names, 0.0)

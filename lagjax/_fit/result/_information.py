@@ -188,8 +188,7 @@ def _norm(x: np.ndarray, axis) -> np.ndarray:
 
 
 def eliminate_starts(triangles: np.ndarray, slopes: np.ndarray, states: int) -> np.ndarray:
-    """Columns of parameters less what the starts can do instead: `slopes` (N, ..., D) → (N, ..., F). Directions of a
-    start that nothing depends on can do nothing: they are left out."""
+    """Columns of parameters less what starts replace, (N, ..., D) → (N, ..., F); unseen directions replace nothing."""
     of_starts, of_u = triangles[..., :states], triangles[..., states:-1]
     instead = decide(of_starts[:, None], _UNFELT).least_norm(of_u.swapaxes(1, 2)).swapaxes(1, 2)
     shape = (len(slopes), *[1] * (slopes.ndim - 3), *instead.shape[1:])
@@ -199,8 +198,8 @@ def eliminate_starts(triangles: np.ndarray, slopes: np.ndarray, states: int) -> 
 def covariance_of_one_start(
     rows: np.ndarray, states: int, known: Information, share: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The uncertainty of a start by weighted rows (T, S, 2n + F), every sample worth the `share` of an independent one:
-    the covariance (2n, 2n) for fixed parameters, and A⁺B."""
+    """The covariance (2n, 2n) of a start for fixed parameters, and A⁺B, from weighted rows (T, S, 2n + F) of which each
+    sample is worth the `share` of an independent one."""
     flat = rows.reshape(-1, rows.shape[-1])
     decided = decide(flat[:, :states], _UNFELT)
     half = decided.right[:, : int(decided.rank)] / decided.values[: int(decided.rank)]

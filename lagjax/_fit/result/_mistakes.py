@@ -36,8 +36,8 @@ class PossibleMistake(NamedTuple):
 def possible_mistakes(
     records: list[Any], names: tuple[str, ...], worst: list[int], slower: float
 ) -> Iterator[PossibleMistake]:
-    """The mistakes that may be in the records, the likeliest first, where the data move `slower` times slower than the
-    scene does, and `worst` has the places of the records in the order of what is left of them."""
+    """Possible mistakes in the records, the likeliest first: the data move `slower` times slower than the scene, and
+    `worst` are the places of records by what is left of them."""
     count, some = len(names), range(min(len(names), _MOST))
 
     def change(columns: list[int], function: Callable[[np.ndarray], np.ndarray]) -> list[Any]:
@@ -77,8 +77,8 @@ def possible_mistakes(
 def find_mistake(
     share: Callable[[list[Any]], float | None], possible: Iterable[PossibleMistake], left: float, seconds: float
 ) -> list[str]:
-    """A sentence for the first mistake without which a fit follows the records; none where there is no such.
-    `share(records)` is what a fit leaves of the signals, None where it fails; `left` is what the fit of these left."""
+    """A sentence for the first mistake whose removal lets a fit follow the records; `share(records)` is what a fit
+    leaves of the signals, None where it fails, and `left` what the given fit left."""
     until = time.process_time() + seconds
     for suspect in possible:
         now = share(suspect.records)

@@ -72,9 +72,9 @@ def predict_record(fit, record: Record, system: str | None) -> Prediction:
     if not isinstance(record, Record) or first is None:
         raise TypeError("Only a lagjax.Record is predicted, after a fit of some: for times ask lagjax.crossings.")
     if record.structure != first.structure:
-        raise ValueError("The record has other signals than those of the fit.")
+        raise ValueError("The record has different signals from those of the fit.")
     if record.input_structure != first.input_structure:
-        raise ValueError("The record has other inputs than those of the fit.")
+        raise ValueError("The record has different inputs from those of the fit.")
     form, noise = part.signals.form, part.sensor_noise(fit.noise_scale)
     if form is not None:
         require_interpolation(record, form.hold, "the record")

@@ -128,8 +128,8 @@ def profile(fit, name: str, level: float) -> Profile:
 
 
 def _find_end(line: _ProfileLine, side: float, threshold: float, room: float) -> float:
-    """The place where the profile first passes the threshold on one side, ±∞ where it does not within `room`. Its
-    places go on behind the end, as far as other minima are looked for."""
+    """The place where the profile first passes the threshold on one side, ±∞ where it does not within `room`; the
+    places continue beyond it as far as other minima are sought."""
     best, wide = line.places[0].at, line.wide
     look_out = _FAR * (max(abs(best), 8 * wide) if np.isinf(room) else 1.0 + wide)
     step = _STEP * (wide * np.sqrt(threshold) if np.isfinite(wide) else max(abs(best), 1.0))

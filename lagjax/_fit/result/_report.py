@@ -17,8 +17,9 @@ BLUE, RED, GREY = "#0072B2", "#D55E00", "0.55"
 _MOST = 4000  # samples in one curve: more do not show
 
 
-def draw_record(axes, record: Record, residuals: np.ndarray, names: tuple[str, ...], sigma: np.ndarray) -> None:
-    """Data over fit in the first row of `axes` (2, S), residuals (T, S) with ±2σ below, a column for each signal."""
+def draw_record(figure, record: Record, residuals: np.ndarray, names: tuple[str, ...], sigma: np.ndarray):
+    """Axes (2, S) with data over fit above and residuals (T, S) with ±2σ below, a column for each signal."""
+    axes = figure.subplots(2, len(names), squeeze=False, sharex="col", gridspec_kw={"height_ratios": [2, 1]})
     some = even_places(len(record), _MOST)
     ts, measured, left = record.ts[some], record.matrix[some], residuals[some]
     for s, name in enumerate(names):
@@ -32,10 +33,10 @@ def draw_record(axes, record: Record, residuals: np.ndarray, names: tuple[str, .
         for ax in (above, below):
             simplify_axes(ax)
             ax.set_xlim(record.ts[0], record.ts[-1])
-        above.tick_params(labelbottom=False)
     axes[0][0].set_ylabel("signal")
     axes[1][0].set_ylabel("residual")
     axes[0][0].legend(frameon=False, fontsize="small", ncols=2)
+    return axes
 
 
 def draw_waterfall(ax, misfits: np.ndarray) -> None:
@@ -123,8 +124,7 @@ def _draw_records(fit, part: SystemResiduals) -> dict[str, list[str]]:
 
     def draw_one(k: int) -> str:
         def draw(figure):
-            axes = figure.subplots(2, count, squeeze=False, gridspec_kw={"height_ratios": [2, 1]})
-            draw_record(axes, *pairs[k], names[:count], sigma)
+            draw_record(figure, *pairs[k], names[:count], sigma)
             figure.suptitle(f"records[{k}]", fontsize="medium")
 
         return render_picture((max(6.4, 3.6 * count), 4.2), draw, _DPI)

@@ -144,9 +144,7 @@ class Fit:
     def _draw_first(self, figure) -> None:
         parts = self.residual_function.parts
         part, pairs = next((part, pairs) for part in parts if (pairs := recordings(self, part)))
-        names = part.signals.names[:2]
-        axes = figure.subplots(2, len(names), squeeze=False, gridspec_kw={"height_ratios": [2, 1]})
-        draw_record(axes, *pairs[0], names, part.sensor_noise(self.noise_scale).sigma)
+        draw_record(figure, *pairs[0], part.signals.names[:2], part.sensor_noise(self.noise_scale).sigma)
 
     def to_pandas(self, level: float = LEVEL):
         """A `pandas.DataFrame` with a row per free number, by its name: value, and low and high of its interval.
@@ -223,7 +221,7 @@ class Fit:
         give that start to a `Record` of the whole. `system` is the name of the record's system, for a fit of several
         systems.
 
-        Raises `ValueError` where the record has other signals than those of the fit, or its motion fails.
+        Raises `ValueError` where the record has different signals from those of the fit, or its motion fails.
         """
         return predict_record(self, record, system)
 

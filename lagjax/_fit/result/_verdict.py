@@ -45,8 +45,7 @@ _OWN = 0.2  # of the motion left in a record, explained by parameters of its own
 def verdict(
     descent: Descent, unseen: tuple[str, ...], known: Information, left: Unexplained, law: AbstractNoise, starts: int
 ) -> tuple[bool, str]:
-    """A flag that a fit can be relied upon, and the sentences that say why, where the best search from so many `starts`
-    leaves `left`."""
+    """Judge if a fit can be relied upon, and say why; `left` is what the best of `starts` searches left."""
     residuals, parts = descent.residuals, [descent.message]
     strikes = any(jumps(part.scene) for part in residuals.parts)
     more, astray = max(64, 4 * starts), strikes and _leaves_motion(known, left)
@@ -88,8 +87,8 @@ def verdict(
 
 
 def is_doubtful(descent: Descent) -> bool:
-    """True where a search leaves motion, which residuals show that hardly change from one sample to the next, or where
-    nothing depends on a parameter: in motion that sticks, or strikes, other starts may then end elsewhere."""
+    """True where slowly changing residuals show motion that is left, or nothing depends on a parameter: where motion
+    sticks or strikes, another start may then end elsewhere."""
     known = information(descent)
     return bool(known.null.shape[1]) or _leaves_motion(known, measure_unexplained(descent))
 
@@ -99,8 +98,8 @@ def _leaves_motion(known: Information, left: Unexplained) -> bool:
 
 
 def _describe_missed_limits(residuals: Residuals, trial: Trial) -> list[str]:
-    """Sentences for coarse sensors that seem to be at a limit: the motion goes on by more than half a step beyond the
-    last line that they show, where at least every other sample of a sensor without limits would show the next one."""
+    """Sentences for coarse sensors that seem to be at a limit: the motion continues more than half a step beyond the
+    last line shown, where a sensor without limits would show the next one at every other sample."""
     values = np.concatenate([batch.values.reshape(-1, batch.values.shape[-1]) for batch in residuals.batches])
     found, r = [], trial.flat()
     sensor, periods = residuals.sensor, residuals.parts[0].frame.periods
@@ -115,8 +114,8 @@ def _describe_missed_limits(residuals: Residuals, trial: Trial) -> list[str]:
                 beyond[f"{end}={last:.4g}"] = many
         if sum(beyond.values()) >= _FEWEST_BEYOND:
             found.append(
-                f"{name} is coarse, and the fit goes on beyond its last lines at {sum(beyond.values())} samples, where "
-                f"it shows no more: is it at a limit? Then take noise=lagjax.Clipped({', '.join(beyond)})."
+                f"{name} is coarse, and the fit continues beyond its last lines at {sum(beyond.values())} samples, "
+                f"where it shows no more: is it at a limit? Then take noise=lagjax.Clipped({', '.join(beyond)})."
             )
     return found
 
@@ -188,11 +187,8 @@ def _describe_end(name: str, bounds: tuple[float, float], x: float, step: float,
 def _disagreements(
     residuals: Residuals, triangles: np.ndarray, known: Information, inside: np.ndarray, motion: dict[int, float]
 ) -> tuple[list[str], list[str]]:
-    """Sentences for the records of another motion, and for those that show, each in its way, what the scene lacks.
-
-    Only of parameters `inside` (F,) of their sets: at a bound the sum of squares has a slope. `motion` is the sum of
-    squares of what the fit leaves in a record beyond white noise.
-    """
+    """Sentences for records of another motion, and for those that show what the scene lacks, each differently. Only of
+    parameters `inside` (F,) of their sets; `motion` is the sum of squares left in a record beyond white noise."""
     records = np.array([piece.record for piece in residuals.pieces])
     count = len(np.unique(records))
     if known.null.shape[1] or count < 2 or not inside.any():
@@ -226,8 +222,8 @@ def _shift_clause(label: str, shift: float) -> str:
 
 
 class Shift(NamedTuple):
-    """A fit without a record: how far each u moves (F,), in standard deviations of that for records that agree, and by
-    how much parameters of its own would lower the record's sum of squares."""
+    """A fit without a record: how far each u moves (F,), in standard deviations for records that agree, and by how much
+    parameters of its own would lower the record's sum of squares."""
 
     sizes: np.ndarray
     explained: float

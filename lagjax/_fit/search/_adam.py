@@ -21,14 +21,13 @@ from lagjax._show import import_package
 
 _RATE, _WARM = 1e-2, 0.05  # the largest step, in units of each number; the share of steps over which it rises
 _PORTION = 100  # steps in one call: of them the best is kept
-_STILL = 1.0  # what log L may gain over the last tenth of the steps where the descent has come to its end
+_STILL = 1.0  # what log L may gain over the last tenth of the steps where the descent is at its end
 
 
 def descend_gradient(
     residuals: Residuals, point: Point, law: AbstractNoise, steps: int, notify: Callable[[str], None] | None = None
 ) -> tuple[Point, bool]:
-    """The point after this many steps, and whether log L has come to rest. Raises `LostMotion` where the motion from
-    the first trial cannot be followed; later ones are passed over."""
+    """The point after n `steps`, and whether log L is at rest. Raises `LostMotion` where the first trial fails."""
     optax = import_package('method="gradient"', "optax", "lagjax[neural]")
     whole = NoiseScale(residuals.size, np.full(len(residuals.size), np.inf))
     density = Density(residuals, law, Trial(*point, [], []), whole, np.ones(len(residuals.size)))

@@ -127,8 +127,8 @@ def minimise(
 
 
 def _find_better_trial(model: _Model, damping: float, trials: int, limit: int) -> tuple[Trial | None, float, int]:
-    """The first trial that is better, the damping to go on with, and the count of trials. There is none, but None,
-    after `limit` trials, or where steps promise no more than sums of squares are rounded to."""
+    """The first better trial, the next damping and the count of trials; None instead of a trial after `limit` of them,
+    or where steps promise no more than the rounding of sums of squares."""
     growth, at, residuals = 2.0, model.trial, model.residuals
     while trials < limit:
         step = model.step(damping)
@@ -145,11 +145,8 @@ def _find_better_trial(model: _Model, damping: float, trials: int, limit: int) -
 
 
 def eliminate(triangles: np.ndarray, states: int, scale, damping: float, pull, limits=(-np.inf, np.inf)) -> DescentStep:
-    """The damped step for the triangles (N, D + 1, D + 1) of all pieces, whose first `states` columns are starts.
-
-    `scale` holds the norms of the columns (`column_norms`), and `pull` is (weight, residuals), (F,) each, of an anchor
-    of the parameters. A parameter that would step beyond its `limits`, (low, high), is damped more than the others.
-    """
+    """The damped step for triangles (N, D + 1, D + 1) whose first `states` columns are starts. `scale` holds column
+    norms, `pull` the (weight, residuals) of an anchor; steps beyond `limits` (low, high) are damped more."""
     of_starts, of_u = scale
     (pieces, columns, _), free = triangles.shape, len(of_u)
     damped = np.zeros((pieces, states, columns))

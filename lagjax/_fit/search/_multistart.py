@@ -75,7 +75,7 @@ def run_multistart(
     short.watch = None
     trials = sorted((_search_shortly(short, one, point.starts) for one in u), key=lambda trial: trial[0])
     misfits, done, chosen = np.array([trial[0] for trial in trials]), [], []
-    for k in np.flatnonzero(np.isfinite(misfits)).tolist():  # the best that came to different misfits
+    for k in np.flatnonzero(np.isfinite(misfits)).tolist():  # the best of different misfits
         if all(abs(np.log(misfits[k] / misfits[j])) > 1e-3 for j in chosen):
             chosen.append(k)
     for place, begin in [*((k, trials[k][1]) for k in chosen[:_BEST]), (None, point)]:

@@ -21,11 +21,8 @@ _QUARTER = 0.25  # of a period: motion over a segment may be wrong by it; beyond
 
 
 class Reader(NamedTuple):
-    """Positions and velocities of one record from local cubics: each signal is a coordinate.
-
-    `windows` (S,) are the samples in one cubic, `scatter` (S,) what the shortest leave, `periods` (S,) those of signals
-    that are known less whole periods, else infinite.
-    """
+    """Positions and velocities of one record from local cubics, each signal a coordinate: samples of a cubic `windows`
+    (S,), residuals of the shortest `scatter` (S,), and `periods` (S,), infinite without wrapping."""
 
     record: Record
     windows: tuple[int, ...]
@@ -34,8 +31,8 @@ class Reader(NamedTuple):
 
     @classmethod
     def from_record(cls, record: Record, probes: int, periods: np.ndarray) -> "Reader":
-        """A reader with the longest windows whose cubics leave at most `_WORSE_WINDOW` times what the shortest leave.
-        Beyond these they no longer follow the motion. They are tried at `probes` places."""
+        """A reader with the longest windows that leave at most `_WORSE_WINDOW` times what the shortest leave, at
+        `probes` places."""
         places = even_places(len(record), probes)
         windows, scatter = zip(*(_window(record.ts[places], *signal) for signal in _signals(record)), strict=True)
         return cls(record, windows, scatter, tuple(periods.tolist()))
@@ -74,8 +71,7 @@ def _window(ts: np.ndarray, t: np.ndarray, y: np.ndarray) -> tuple[int, float]:
 
 
 def _local_cubics(ts, t, y, window: int):
-    """Cubics through the `window` samples of (t, y) about each of the times `ts`: values, rates, what is left, and
-    the coefficients (M, 4) of the powers of the time since."""
+    """Cubics through `window` samples of (t, y) about each of `ts`: values, rates, residual, coefficients (M, 4)."""
     after = np.searchsorted(t, ts)
     first = np.clip(after - window // 2, 0, len(t) - window)
     places = first[:, None] + np.arange(window)
@@ -93,11 +89,8 @@ def _local_cubics(ts, t, y, window: int):
 
 
 def short_windows(readers: list[Reader], length: float) -> tuple[list[Record], np.ndarray]:
-    """Short records, each `length` long, of the local cubics at some places of all records, and the states there.
-
-    Motions that are shorter than the time between samples see the curvature of the cubics: what a scene says about
-    accelerations, without a second derivative of the data.
-    """
+    """Records of this `length` along local cubics at some places of all records, and the states there. Their motions
+    see the curvature of the cubics, the data's accelerations, without a second derivative of the data."""
     found, states, offsets = [], [], np.linspace(0.0, length, 4)
     for reader in readers:
         places = even_places(len(reader.record), max(4, _WINDOWS_IN_ALL // len(readers)))
@@ -119,11 +112,8 @@ class TimeScales(NamedTuple):
 
 
 def time_scales(readers: list[Reader], motions: AbstractMotions, numbers: np.ndarray) -> TimeScales:
-    """The shortest times over which a motion looks like a straight line, with the parameters `numbers` (P,).
-
-    That of the data is the spread of a coordinate over its rate, about 1/ω, that of the scene the root of the spread
-    over the acceleration there; infinite where nothing moves.
-    """
+    """The shortest times over which a motion looks like a straight line, with the parameters `numbers` (P,): spread
+    over rate in the data, √(spread over acceleration) in the scene; infinite where nothing moves."""
     places = [even_places(len(reader.record), _PROBES) for reader in readers]
     states = [reader.states(some) for reader, some in zip(readers, places, strict=True)]
     times = [reader.record.ts[some] for reader, some in zip(readers, places, strict=True)]

@@ -113,9 +113,8 @@ class Search:
         return Point(u, np.stack([best[k, 0] for k in range(len(self.residuals.records))])), levels_done
 
     def _fit_shortest_segments(self, point: Point, anchor: Anchor) -> "_ShortestSegments":
-        """The search on the shortest segments. Their misfit, positive where they were not fitted, is the mean logarithm
-        of the noise over `_POOR` times the scatter of the data, or over `_COARSE` of the signals where that is larger.
-        """
+        """The search on the shortest segments. Misfit: the mean log of noise over the larger of `_POOR` times the
+        data's scatter and `_COARSE` of the signals; positive where they were not fitted."""
         u, cuts = point.u, self._cut_records(point.u)
         best = {(k, 0): start for k, start in enumerate(point.starts)}
         if not cuts:
@@ -200,14 +199,14 @@ class Search:
         if not at_rest:
             text = (
                 f"The descent by gradients was stopped after {_GRADIENT_STEPS} steps, and the likelihood still grew: "
-                "go on from there, with fit.params in the place of params0."
+                "continue from there, with fit.params in place of params0."
             )
         return Descent(residuals, trial, residuals.noise_scale(trial, self.law), at_rest, _GRADIENT_STEPS, text)
 
 
 def search_again(done: Descent, law: AbstractNoise) -> Descent:
-    """The end of a search where samples that share a rounding error count once; of sensors that do not round the same.
-    Which samples do is known where the motion is, and does not change with the last digits of the parameters."""
+    """The end of a search where samples that share a rounding error count once, at the motion found; unchanged for
+    sensors that do not round."""
     if np.isnan(done.residuals.sensor.step).all():
         return done
     residuals = done.residuals.count_runs_once(done.trial, done.noise)
@@ -226,8 +225,8 @@ class _ShortestSegments(NamedTuple):
 
 
 def _last_followed_level(levels_done: list[Descent]) -> int:
-    """The place of the last level from which on joining did not lose the motion. A scene that lacks something leaves up
-    to three times more at each join, and motion that is lost some ten times."""
+    """The last level from which joining did not lose the motion: what a scene lacks leaves three times more at each
+    join, lost motion ten times."""
     good, last = 0, np.inf
     for k, done in enumerate(levels_done):
         now = misfit(done.noise, done.residuals)
@@ -237,8 +236,8 @@ def _last_followed_level(levels_done: list[Descent]) -> int:
 
 
 def _separation(done: Descent) -> float:
-    """The logarithm of how far motions part that begin side by side, over the longest record: λ times its length. λ is
-    the median over pieces, from the mean squares of derivatives by the start in the first and the last third."""
+    """λ times the length of the longest record; λ is the median over pieces of the growth of derivatives by the start
+    between the first and the last third."""
     rates, states = [], done.residuals.states
     for batch, slopes in zip(done.residuals.batches, done.trial.slopes, strict=True):
         for ts, weights, by_start in zip(batch.ts, batch.weights, slopes[..., :states], strict=True):
@@ -257,11 +256,8 @@ _FEWEST_IN_SEGMENT = 8  # samples
 
 
 def _levels(records: list[Record | None], scales: list[float]) -> list[list[Piece]]:
-    """Cuts of the records, from segments of two time scales to whole records, each twice as long as the one before.
-
-    Each record has its time scale. Without any where records are hardly longer than that; None in the place of a record
-    is left out.
-    """
+    """Cuts of records from segments of two of their time `scales` to whole records, each twice as long as the one
+    before; none where records are hardly longer, and None instead of a record leaves it out."""
     edges = [(k, record, _edges(record, 2.0 * scales[k])) for k, record in enumerate(records) if record is not None]
     most, found, stride = max(len(e) - 1 for *_, e in edges), [], 1
     while stride < most:

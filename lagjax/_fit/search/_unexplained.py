@@ -65,8 +65,8 @@ def _percent(part: float, whole: float) -> str:
 
 
 class _Part(NamedTuple):
-    """Of one signal in one record: the samples that count, and mean squares of the residuals, of what these hold beyond
-    white noise and rounding, and of the signal about its mean."""
+    """Of one signal in one record: the samples that count, and mean squares of residuals, of their part beyond white
+    noise and rounding, and of the signal about its mean."""
 
     samples: float
     left: float

@@ -42,11 +42,8 @@ def identity(value: Any) -> str:
 
 
 class Walk:
-    """Functions, classes and objects in the order in which they are met; each of them is described once.
-
-    Of attributes those with names in `wanted` are read, None: all. A subclass may look on while the walk goes from one
-    place to another (`read`), and keep `held` by its identity what is too large, or has no text.
-    """
+    """Functions, classes and objects in the order in which they are met, each described once; of attributes those in
+    `wanted`, None for all. A subclass may look on (`read`), and keep what is too large or has no text in `held`."""
 
     containers: tuple[type, ...] = (Mapping, list, tuple, set, frozenset, collections.deque)
     most_things = largest_container = math.inf

@@ -22,7 +22,6 @@ from lagjax._engine import Batch, Problem
 from lagjax._engine.taylor import MachineCode, line_of
 from lagjax._equations import ROUNDINGS, derivation_of, has_constraints, require_consistent
 from lagjax._interface import Layout, compile_for_one_call, halves, is_concrete, require_budget, result_from
-from lagjax._native import GUARD_NOISE
 from lagjax._run._trajectory import (
     ContactChanges,
     Impacts,
@@ -43,8 +42,8 @@ from lagjax._run.contacts._contact_motion import (
     follow_known,
     held_size,
     slots_of,
-    spread_forces,
 )
+from lagjax._run.contacts._contact_search import find_start_width
 from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes, System, require_coefficients
 
 CHANGES = 1024  # the budget of changes of a motion whose crossings are asked for; what they record takes memory
@@ -172,7 +171,8 @@ def _require_open(problem: Problem, closed: Problem, free: Problem) -> None:
     terms = derivation.term_sizes(y0[:n], y0[n:], columns[2 * n], closed.numbers, names=("residual",))
     noise = ROUNDINGS * np.finfo(problem.layout.dtype).eps * (np.asarray(terms)[rows] + np.abs(slopes) @ np.abs(y0[:n]))
     acceleration = free.derivation.lowered.acceleration.evaluate_many(list(columns))[:n, 0]
-    noise = noise + start_width(slopes, y0, acceleration, np.asarray(closed.ts))
+    ts = np.asarray(closed.ts, float)
+    noise = noise + [find_start_width(n, y0, slope, acceleration, ts[0], ts[-1]) for slope in slopes]
     for name, gap, slope, near in zip(shapes.names, gaps, slopes, noise, strict=False):
         if gap < -near:
             raise ValueError(
@@ -183,15 +183,6 @@ def _require_open(problem: Problem, closed: Problem, free: Problem) -> None:
                 f"The gap {name} is zero at the start, and so is its gradient there: it has no direction in which it "
                 "pushes. Write it as a distance, q, not as its square."
             )
-
-
-def start_width(slopes, y0, acceleration, ts) -> np.ndarray:
-    """The depths at which gaps (k,) with these `slopes` (k, n) may begin: the rounding of what leads a motion there.
-
-    A gap that is a coordinate is 1e-16 where it closes, and its rounding that of the height from which it fell.
-    """
-    (q, v), span, latest = halves(abs(y0)), ts[-1] - ts[0], np.maximum(abs(ts[0]), abs(ts[-1]))
-    return GUARD_NOISE * (abs(slopes) @ (q.max() + v * latest + abs(acceleration) * span**2 / 8))
 
 
 def _trajectory(
@@ -211,12 +202,17 @@ def _trajectory(
     )  # fmt: skip
 
 
-def contact_forces(trajectory: Trajectory):
-    """The normal forces at every output, by the names of the contacts; NaN where the motion did not come to."""
+def contact_forces(trajectory: Trajectory, name: str):
+    """At every output the `multipliers` of constraints, `constraint_force`, or the normal `contact_forces`, by name.
+
+    NaN where the motion did not come to.
+    """
     system = trajectory.system
     assert isinstance(system, System)
+    if name != "contact_forces":
+        system._require_constraints()
 
-    def normal_forces(q, qdot, times, params, _, contacts: Contacts):
+    def forces_of_member(q, qdot, times, params, _, contacts: Contacts):
         layout = Layout.from_state(*jax.tree.map(lambda x: x[0], (q, qdot)))
         flat = Flat.from_system(system, layout, params)
         inside = InContact(params, jax.tree.map(lambda x: x[0], contacts))
@@ -226,14 +222,23 @@ def contact_forces(trajectory: Trajectory):
             scene = dataclasses.replace(scene, slots=slots_of(whole, flat))
         derivation = derivation_of(scene, layout, inside).with_numbers().lowered
         program = line_of(derivation.multipliers)
-        numbers = [jnp.ravel(x) for x in jax.tree.leaves(eqx.filter(params, eqx.is_array_like))]
+        numbers = eqx.filter(params, eqx.is_array_like)
+        given = [jnp.ravel(x) for x in jax.tree.leaves(numbers)]
 
         def evaluate_output(q, qdot, t, contacts):
-            parts = layout.flatten(q), layout.flatten(qdot), t[None], *numbers, *map(jnp.ravel, contacts)
+            state, inside = (layout.flatten(q), layout.flatten(qdot), t), InContact(params, contacts)
+            parts = [*state[:2], t[None], *given, *map(jnp.ravel, contacts)]
             forces = program(jnp.concatenate([jnp.asarray(x, layout.dtype) for x in parts]))
-            forces, _ = spread_forces(scene, flat, derivation, forces, InContact(params, contacts))
-            return jnp.where(contacts.closed > 0, forces, jnp.where(contacts.closed == 0, 0.0, jnp.nan))
+            own, normal, _ = scene.split_forces(flat, forces, derivation.position_count, inside)
+            if name == "contact_forces":
+                return jnp.where(contacts.closed > 0, normal, jnp.where(contacts.closed == 0, 0.0, jnp.nan))
+            own = jnp.where((contacts.closed >= 0).all(), own, jnp.nan)
+            if name == "multipliers":
+                return system._split_by_constraint(own, layout, params)
+            _, pull = system._motion(layout, params).constraints.products(*state, numbers)
+            return layout.restore(pull(own))
 
-        return flat.shapes.name_numbers(jax.vmap(evaluate_output)(q, qdot, times[0], contacts))
+        found = jax.vmap(evaluate_output)(q, qdot, times[0], contacts)
+        return flat.shapes.name_numbers(found) if name == "contact_forces" else found
 
-    return trajectory.map_members(normal_forces, trajectory.contacts)
+    return trajectory.map_members(forces_of_member, trajectory.contacts)

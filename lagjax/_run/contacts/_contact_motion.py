@@ -312,26 +312,14 @@ def slots_of(whole: Derivation, flat: Flat) -> tuple[int, int] | None:
     return slots if sum(slots) < held_size(shapes, n) else None
 
 
-def spread_forces(scene: ContactScene, flat: Flat, derivation: Derivation, forces, inside: InContact) -> tuple:
-    """The forces of the normals (k,) and of the slips (r, d) among those of all constraints."""
-    if scene.slots is None:
-        places = RowPlaces.from_derivation(derivation, flat)
-        return forces[places.normal], forces[places.tangential]
-    gaps, velocities = scene.rows(flat, inside)
-    end, start = derivation.position_count, len(forces) - len(velocities)
-    normal, along = forces[end - len(gaps) : end] @ gaps, forces[start:] @ velocities
-    one_way = flat.shapes.count - flat.gap_count
-    return jnp.append(normal, along[:one_way]), along[one_way:].reshape(-1, flat.shapes.directions)
-
-
 def _forces_of(derivation: Derivation, scene: ContactScene, flat: Flat) -> Program:
     """All multipliers; with slots those of the contacts, (k + r d,)."""
     if scene.slots is None:
         return derivation.multipliers
-    moving = 2 * derivation.layout.size + 1
+    moving, positions = 2 * derivation.layout.size + 1, derivation.position_count
 
     def spread(_, inside, forces):
-        return jnp.concatenate([x.ravel() for x in spread_forces(scene, flat, derivation, forces, inside)])
+        return jnp.concatenate([x.ravel() for x in scene.split_forces(flat, forces, positions, inside)[1:]])
 
     given = (jax.ShapeDtypeStruct((size,), float) for size in (moving, len(derivation.multipliers.line.outputs)))
     y, forces = given
@@ -380,7 +368,8 @@ def _watches(
         more = [require_one_number(of(*user_state, t=y[-1], params=inside.params), "A section") for of in sections]
         if scene.is_open:
             return jnp.concatenate([open_values, jnp.ones(rough.size + 2 * turns), jnp.array(more)])
-        normal, held = spread_forces(scene, flat, derivation, forces[0], inside._replace(params=user))
+        positions, own = derivation.position_count, len(forces[0]) - (0 if corners is None else turns)
+        _, normal, held = scene.split_forces(flat, forces[0][:own], positions, inside._replace(params=user))
         if corners is not None:
             matters = [1.0 - jnp.prod(1.0 - closed[np.flatnonzero(row)]) for row in corners.touch]
             sides = forces[0][-turns:] * jnp.stack(matters)  # 0 where all that is closed is elsewhere

@@ -283,23 +283,30 @@ def rests_on_corner(scene: Scene, member: Member, room: Room) -> bool:
 
 @loop
 def starts_inside(scene: Scene, member: Member, room: Room) -> bool:
-    """True where a gap is negative at the start, by more than the rounding of what leads a motion there.
-
-    A gap that is a coordinate is 1e-16 where it closes, and its rounding that of the height from which it fell.
-    """
-    n, total, x, rises = scene.n, scene.watches, member.x, room.free
-    first, last, furthest, watches = member.first, member.last, 0.0, room.watched
+    """True where a gap is negative at the start, by more than the rounding of what leads a motion there."""
+    n, total, x, rises, watches = scene.n, scene.watches, member.x, room.free, room.watched
     evaluate(scene.acceleration, x, rises)
-    for j in range(n):
-        furthest = max(furthest, abs(x[j]))
     for i in range(scene.gaps):
-        width = 0.0
-        for j in range(n):
-            reach = abs(x[n + j]) * max(abs(first), abs(last)) + abs(rises[j]) * (last - first) ** 2 / 8.0
-            width += abs(room.gradients[i * n + j]) * (furthest + reach)
-        if watches[i] + watches[2 * total + i] < -GUARD_NOISE * width:
+        width = find_start_width(n, x, room.gradients[i * n :], rises, member.first, member.last)
+        if watches[i] + watches[2 * total + i] < -width:
             return True
     return False
+
+
+@loop
+def find_start_width(n: int, x: Floats, slopes: Floats, rises: Floats, first: float, last: float) -> float:
+    """The depth at which a gap with these `slopes` (n,) may begin: the rounding of what leads a motion there.
+
+    A gap that is a coordinate is 1e-16 where it closes, and its rounding that of the height from which it fell.
+    `rises` (n,) is the acceleration at the start x.
+    """
+    furthest, width = 0.0, 0.0
+    for j in range(n):
+        furthest = max(furthest, abs(x[j]))
+    for j in range(n):
+        reach = abs(x[n + j]) * max(abs(first), abs(last)) + abs(rises[j]) * (last - first) ** 2 / 8.0
+        width += abs(slopes[j]) * (furthest + reach)
+    return GUARD_NOISE * width
 
 
 @loop

@@ -18,7 +18,7 @@ from lagjax._trust.checks._differences import ladder
 
 PyTree = Any
 
-_NEARBY = 4  # states with other positions, and as many with other velocities
+_NEARBY = 4  # states with different positions, and as many with different velocities
 
 
 class CheckedScene(NamedTuple):
@@ -60,7 +60,7 @@ class CheckedScene(NamedTuple):
 
     def sides(self) -> "Sides":
         """The outputs on both sides of the state, along every coordinate and velocity and along the motion."""
-        minus, plus = self.displaced_outputs(np.eye(2 * self.layout.size + 1), self.steps)
+        minus, plus = self.displaced_outputs()
         one, here = self.sample, self.measured
         drift = {
             "lagrangian_by_q": here.by_q, "given_force": here.extra,
@@ -79,17 +79,14 @@ class CheckedScene(NamedTuple):
         )  # fmt: skip
         return Sides(minus, plus, noise, round_off)
 
-    def displaced_outputs(self, directions: np.ndarray, steps: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The outputs of `Measured.here` at steps back and ahead, each (directions, rungs, outputs).
-
-        `directions` (D, 2n + 1) are combinations of the coordinates, the velocities and the motion; `steps` (rungs, D).
-        """
-        here, n = self.point, self.layout.size
+    def displaced_outputs(self) -> tuple[np.ndarray, np.ndarray]:
+        """The outputs of `Measured.here` at steps back and ahead, (2n + 1, rungs, outputs) each."""
+        here, n, steps = self.point, self.layout.size, self.steps
         axes = np.eye(2 * n + 1, dtype=here.dtype)
         axes[-1, :n] = here[n:-1]
-        moves = np.stack([-steps, steps]).transpose(2, 0, 1)[..., None] * (directions @ axes)[:, None, None]
+        moves = np.stack([-steps, steps]).transpose(2, 0, 1)[..., None] * axes[:, None, None]
         along = (here + moves).reshape(-1, 2 * n + 1).astype(here.dtype)
-        sides = self.sample_at(along).flat(*_COMPARED).reshape(len(directions), 2, len(steps), -1)
+        sides = self.sample_at(along).flat(*_COMPARED).reshape(len(axes), 2, len(steps), -1)
         return sides[:, 0], sides[:, 1]
 
     @property

@@ -73,7 +73,7 @@ def _count(flow: Flow, ts, y0, params, tolerances: Tolerances, steps, places, in
     borders = flow.kernel.borders
     assert borders is not None  # without a series there are none, and none are counted
     guards, pieces = borders.guards, len(borders.switches)
-    # The time comes to entries of tables, too, which are no borders.
+    # The time reaches entries of tables, too, which are no borders.
     enters, leaves = (np.array([getattr(guard, name) >= 0 for guard in guards] + [False]) for name in ("slide", "on"))
     slides = sorted({guard.slide for guard in guards if guard.slide >= 0})
     for run in flow.follow(ts, y0, params, tolerances, 2 * int(steps.sum()) + len(places))[1]:

@@ -35,12 +35,12 @@ def require_comparable(trajectory, reference) -> None:
             raise ValueError(f"The reference must have the shapes of the trajectory: {name} is {ours}, there {theirs}.")
     eps = max(float(jnp.finfo(jnp.result_type(one.ts)).eps) for one in (trajectory, reference))
     if not _agree(trajectory.ts, reference.ts, eps):
-        raise ValueError("The reference has other output times: integrate it with ts=trajectory.ts.")
+        raise ValueError("The reference has different output times: integrate it with ts=trajectory.ts.")
     if not eqx.tree_equal(trajectory.system, reference.system):
         raise ValueError("The reference is a motion of another system: integrate it with system=trajectory.system.")
     numbers = [jax.tree.leaves(eqx.filter(one.params, eqx.is_array_like)) for one in (trajectory, reference)]
     if not all(jnp.shape(a) == jnp.shape(b) and _agree(a, b, eps) for a, b in zip(*numbers, strict=True)):
-        raise ValueError("The reference has other parameters: integrate it with params=trajectory.params.")
+        raise ValueError("The reference has different parameters: integrate it with params=trajectory.params.")
     rtols = [one.tolerances and one.tolerances[0] for one in (trajectory, reference)]
     if all(rtol is not None and is_concrete(rtol) for rtol in rtols):
         ours, theirs = (float(np.max(rtol)) for rtol in rtols)

@@ -27,7 +27,7 @@ PyTree = Any
 # The factor on the bound of what N steps may add up to, since the error of a step is estimated; √(2n) comes on top, for
 # solvers that measure a root mean square. Twice as large, drifts of 10 to 20 times the bound would go unreported.
 SLACK = 10.0
-# The drift of a conserved quantity, in parts of its size, that is reported however loose the tolerances were.
+# The drift of a conserved quantity, as a fraction of its size, that is reported however loose the tolerances were.
 VISIBLE = 1e-2
 # Units of round-off that are allowed for one evaluation of a conserved quantity.
 ROUND_OFF = 100.0
@@ -362,67 +362,65 @@ INSIDE = 1e-9  # how far from its ends a piece of the path is asked what its pro
 
 
 def _work(path: SampledPath, samples: Measurements, measurable, between: Rates) -> tuple[Any, Any]:
-    """∫ P dt over every piece, (…, T − 1), and how far the sum of them may be off, (…).
+    """∫ P dt over every piece, (…, T − 1), and the error of their sum, (…).
 
-    Between its ends the motion is replaced by a polynomial. The one of degree five that has their q, q̇ and q̈ is off by
-    order six in q, and so is W. At two points the equations of motion say by how much its second derivative is wrong;
-    the polynomial of degree seven that is right there is off by order eight, and W by it is taken, with twice as many
-    points, so that a power that the four of the others do not resolve is seen. Its difference from W by degree five
-    bounds the error, for that is of the lower order. The cubic through q and q̇ is of order four and the trapezoidal
-    rule of order two. Where the power may jump, as the pieces of the program change, the error is as large as the power
-    varies.
+    Between its ends the motion is replaced by polynomials. The quintic through q, q̇ and q̈ is off by order six in q, and
+    so is W. At two points the equations of motion say how wrong its second derivative is; the polynomial of degree
+    seven that is right there gives W to order eight, with twice as many points, so that a power that four points do not
+    resolve is seen. The difference of both bounds the error. The cubic through q and q̇ is of order four, the
+    trapezoidal rule of order two. Where pieces of the program change, the error is as large as the power varies.
     """
-    xp, until, T, n = path.library, path.take_ends, path.ts.shape[-1], path.q.shape[-1]
-    (q, v, t, a, p), last = (path.q, path.qdot, path.t, samples.acceleration, samples.power), T - 1
-    points, weights, more_points, more_weights, checked, corrections = (
-        x.astype(q.dtype) for x in (_POINTS, _WEIGHTS, _MORE_POINTS, _MORE_WEIGHTS, _CHECKED, _CORRECTIONS)
+    xp, until, last = path.library, path.take_ends, path.ts.shape[-1] - 1
+    (q, v, a, p), dtype = (path.q, path.qdot, samples.acceleration, samples.power), path.q.dtype
+    h = until(path.t) - path.t[..., :last]
+    first, second = h[..., None], (h**2)[..., None]
+    cubic, quintic = _interpolants(
+        *((at(q), first * at(v), second * at(a)) for at in (lambda x: x[..., :last, :], until))
     )
-    h, zero = until(t) - t[..., :last], xp.zeros((), q.dtype)
-    a0, a1 = a[..., :last, :], until(a)
-    mode = xp.maximum(until(path.mode), 0)
-
-    def combine(coefficients, powers):
-        """Σ cₖ pₖ of coefficients (…, T − 1, n) and powers (S,), (…, T − 1, S, n)."""
-        return sum((c[..., None, :] * x[:, None] for c, x in zip(coefficients, powers, strict=False)), start=zero)
-
-    def evaluate_on_curve(coefficients, function, points):
-        """A function of states over a polynomial in s, with coefficients (…, T − 1, n) of s⁰, s¹, …, at these s."""
-        at = combine(coefficients, [points**k for k in range(len(coefficients))])
-        slope = combine(coefficients, [k * points ** max(k - 1, 0) for k in range(len(coefficients))])
-        shape = at.shape[:-3] + (-1,)
-        times = t[..., :last, None] + h[..., None] * points
-        velocities = slope / h[..., None, None]
-        modes = xp.broadcast_to(mode[..., None], times.shape)
-        states = at.reshape(*shape, n), velocities.reshape(*shape, n), times.reshape(shape), modes.reshape(shape)
-        found = function(*states)
-        return found.reshape(times.shape + found.shape[len(shape) :])
+    checked, corrections = _CHECKED.astype(dtype), _CORRECTIONS.astype(dtype)
+    bends = _combine(quintic, [k * (k - 1) * checked ** max(k - 2, 0) for k in range(6)])
+    defects = second[..., None] * _evaluate_on_curves(path, quintic, between.acceleration, checked) - bends
+    fixes = [sum(defects[..., i, :] * corrections[i, k] for i in range(len(corrections))) for k in range(8)]
+    septic = [*(c + fix for c, fix in zip(quintic, fixes, strict=False)), *fixes[6:]]
 
     def integrate(coefficients, points, weights):
         """∫ P from s = 0 to 1."""
-        return h * xp.sum(evaluate_on_curve(coefficients, between.power, points) * weights, axis=-1)
+        powers = _evaluate_on_curves(path, coefficients, between.power, points.astype(dtype))
+        return h * xp.sum(powers * weights.astype(dtype), axis=-1)
 
-    q0, q1, v0, v1 = q[..., :last, :], until(q), h[..., None] * v[..., :last, :], h[..., None] * until(v)
-    cubic, quintic = _interpolants((q0, v0, (h**2)[..., None] * a0), (q1, v1, (h**2)[..., None] * a1))
-    bends = combine(quintic, [k * (k - 1) * checked ** max(k - 2, 0) for k in range(6)])
-    defects = (h**2)[..., None, None] * evaluate_on_curve(quintic, between.acceleration, checked) - bends
-    septic = [
-        (quintic[k] if k < 6 else zero) + sum(defects[..., i, :] * corrections[i, k] for i in range(len(corrections)))
-        for k in range(8)
-    ]
-    second = h / 2 * (p[..., :last] + until(p))
-    fourth, sixth = (integrate(of, points, weights) for of in (cubic, quintic))
-    eighth = integrate(septic, more_points, more_weights)
-    found = xp.stack([second, fourth, sixth, eighth])
+    trapezoidal = h / 2 * (p[..., :last] + until(p))
+    fourth, sixth = (integrate(of, _POINTS, _WEIGHTS) for of in (cubic, quintic))
+    found = xp.stack([trapezoidal, fourth, sixth, integrate(septic, _MORE_POINTS, _MORE_WEIGHTS)])
     smooth = xp.isfinite(found).all(axis=0)  # elsewhere the error is not known
     error = _error_of_work(xp, found)
     if between.decided is not None:
-        inside = np.concatenate([[INSIDE], points, [1 - INSIDE]])
-        pieces = evaluate_on_curve(quintic, between.decided, inside)
+        inside = np.concatenate([[INSIDE], _POINTS.astype(dtype), [1 - INSIDE]])
+        pieces, values = (_evaluate_on_curves(path, quintic, of, inside) for of in (between.decided, between.power))
         jumps = (pieces != pieces[..., :1]).any(axis=-1)
-        values = evaluate_on_curve(quintic, between.power, inside)
         error = xp.where(jumps, h * (values.max(axis=-1) - values.min(axis=-1)), error)
     error = xp.where(smooth, error, math.inf)
-    return xp.where(smooth, eighth, second), xp.sum(xp.where(measurable, error, 0.0), axis=-1)
+    return xp.where(smooth, found[3], trapezoidal), xp.sum(xp.where(measurable, error, 0.0), axis=-1)
+
+
+def _combine(coefficients, powers) -> Any:
+    """Σ cₖ pₖ of coefficients (…, T − 1, n) and powers (S,), (…, T − 1, S, n)."""
+    return sum(c[..., None, :] * x[:, None] for c, x in zip(coefficients, powers, strict=True))
+
+
+def _evaluate_on_curves(path: SampledPath, coefficients, function: Callable, points):
+    """A function of states over polynomials in s with coefficients (…, T − 1, n) of s⁰, s¹, …, at these points (S,)."""
+    xp, until, last = path.library, path.take_ends, path.ts.shape[-1] - 1
+    t, degrees = path.t[..., :last], range(len(coefficients))
+    h = until(path.t) - t
+    at = _combine(coefficients, [points**k for k in degrees])
+    velocities = _combine(coefficients, [k * points ** max(k - 1, 0) for k in degrees]) / h[..., None, None]
+    times = t[..., None] + h[..., None] * points
+    modes = xp.broadcast_to(xp.maximum(until(path.mode), 0)[..., None], times.shape)
+    shape = at.shape[:-3] + (-1,)
+    found = function(
+        *(x.reshape(*shape, x.shape[-1]) for x in (at, velocities)), times.reshape(shape), modes.reshape(shape)
+    )
+    return found.reshape(times.shape + found.shape[len(shape) :])
 
 
 def _interpolants(begin, end) -> tuple[list, list]:
