@@ -18,7 +18,8 @@ one Taylor series, of the order that the tolerance asks for.
     _step                step control
     _watch               numbers that are followed against a level, and what is remembered of each
     _roots               the search along a step: the zeros of a polynomial
-    _border_control      the action of borders: a step ends at the first one, and the next begins on the piece beyond
+    _border_control      the action of borders: a step ends at the first one, at one of the _knots, or before one of the
+                         _narrow_features;  _border_crossing: the piece beyond;  _border_kicks: the velocities there
     _guards              functions of the state that are watched;  _events: their actions, to stop the motion or to note
     _run_records         the outputs, and the record of steps
     _integrator          all of these, round by round

@@ -69,7 +69,7 @@ class Integrator:
         if borders is not None:
             fields |= BorderControl.fields(borders)
         jump = parts.jump(over_steps=False)
-        more = [line for line in (jump and jump.line, borders and borders.retraction) if line]
+        more = [line for line in (jump and jump.line, borders and borders.holding.retraction) if line]
         large = is_large(program, projection, guards, more=more)
         self.motion = motion = TaylorSeries("motion", parts, JOB, fields, large, width, kept=self.guards)
         self.projector = projection and Projector(motion, projection.state, projection.velocity_scale, self.base_size)
@@ -138,9 +138,9 @@ class Integrator:
         kicks = crossings is not None and bool(crossings.borders.kicking)
         with self.motion.rounds(frame, rounds):
             if crossings is not None:
-                frame.call(crossings.decide)
-                if crossings.retract is not None:
-                    frame.call(crossings.retract)
+                frame.call(crossings.crossing.decide)
+                if crossings.crossing.retract is not None:
+                    frame.call(crossings.crossing.retract)
             frame.call(self.motion.coefficients, order)
             self.step.choose(frame, order)
             if borders is not None:
@@ -153,7 +153,7 @@ class Integrator:
             if crossings is not None:
                 crossings.settle(frame)
             with code.only_if(frame.job("room") > 0), code.loop(self.motion.width) as lane:
-                retracts = crossings is not None and crossings.retraction is not None
+                retracts = crossings is not None and crossings.crossing.retraction is not None
                 self.output.record(frame, frame.lane(lane), kicks, "unretracted" if retracts else "y")
             after, rest = self.step.end_time(frame)
             if not self.notes:
@@ -162,7 +162,7 @@ class Integrator:
                 )
             self.step.advance(frame, after, rest, kicks)
             if crossings is not None:
-                frame.call(crossings.cross)
+                frame.call(crossings.crossing.cross)
             if self.projector is not None:
                 _rank_drops.shorten(frame)
             self._finish_members(frame, idle)

@@ -30,13 +30,13 @@ class StepReplay:
     ):
         self.parts, self._jump = parts, parts.jump(over_steps=True)
         more = [] if self._jump is None else [self._jump.line] * jumps
-        more += [line for line in (parts.borders and parts.borders.retraction,) if line]
+        more += [line for line in (parts.borders and parts.borders.holding.retraction,) if line]
         large = is_large(parts.program, parts.projection, times=2, more=more)
         if parts.borders is not None:
             fields = fields | Saltation.fields(parts.borders) | at_borders
         self.motion = motion = TaylorSeries(name, parts, job, fields, large, width, keep_sums=True)
         borders = parts.borders
-        self.retraction = borders and borders.retraction and Retraction(motion, borders, parts.nesting)
+        self.retraction = borders and borders.holding.retraction and Retraction(motion, borders, parts.nesting)
         self._retract = self.retraction and self.retraction.apply(is_run=False)
         self.size = motion.states + RECORDED + motion.recorded_pieces  # of what is recorded of a step
 

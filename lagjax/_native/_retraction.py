@@ -19,9 +19,10 @@ from lagjax._native._frame import Frame, Index, Vectors
 from lagjax._native._ir import Code, Value
 from lagjax._native._tangent_memory import Directions
 from lagjax._native._taylor import TaylorSeries, integer
-from lagjax._program._borders import SLIDE, Borders
+from lagjax._program._borders import Borders
 from lagjax._program._differentiation import pullback_and_entries, pushforward
 from lagjax._program._jump import Nesting
+from lagjax._program._levels import SLIDE
 
 Numbers = Callable[[Index], Value]
 
@@ -30,14 +31,14 @@ class Retraction:
     """The map onto the `borders` of a motion whose coordinates are those of a `nesting`."""
 
     def __init__(self, motion: TaylorSeries, borders: Borders, nesting: Nesting):
-        assert borders.retraction is not None
-        self.motion, self.line, self.dtypes = motion, borders.retraction, borders.program.dtypes
+        assert borders.holding.retraction is not None
+        self.motion, self.line, self.dtypes = motion, borders.holding.retraction, borders.program.dtypes
         self.base, self.rows, self.nesting = nesting.base, nesting.size // nesting.base, nesting
-        self.shares = [j for j, kind in enumerate(borders.kinds) if kind == SLIDE]
+        self.shares = [j for j, decision in enumerate(borders.decisions) if decision.kind == SLIDE]
         groups: dict[int, list[int]] = {}
-        for k, group in enumerate(borders.groups):
+        for k, group in enumerate(borders.holding.groups):
             groups.setdefault(group, []).append(k)
-        self.groups = [(some, frozenset().union(*(borders.moved[k] for k in some))) for some in groups.values()]
+        self.groups = [(some, frozenset().union(*(borders.holding.moved[k] for k in some))) for some in groups.values()]
         motion.layout.extend_by({
             "unretracted": motion.states,  # the argument of the map
             "begins": 1,  # 1 if the step is the first one of its member; of steps that are taken again

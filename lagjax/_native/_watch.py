@@ -19,7 +19,8 @@ from llvmlite import ir
 from lagjax._native._frame import Fields, Frame, Index, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._taylor import TaylorSeries
-from lagjax._program._borders import Affine, Borders, Level
+from lagjax._program._borders import Borders
+from lagjax._program._levels import Affine, Level
 
 # The fields of a thread's memory that say where watches end a step.
 END_OF_STEP: Fields = {
@@ -174,7 +175,8 @@ class Border(Watch):
 
 def joint_groups(borders: Borders) -> list[int]:
     """The groups of guards of which several may be crossed in one step, one of each; none where that is not so."""
-    groups = [] if borders.nested or borders.kicking or len(set(borders.groups)) < 2 else borders.groups_of_guards
+    apart = not (borders.nested or borders.kicking) and len(set(borders.holding.groups)) > 1
+    groups = borders.groups_of_guards if apart else []
     return groups if len({*groups} - {-1}) > 1 else []
 
 

@@ -4,28 +4,19 @@
 
 `_operations` has a row for each operation: its value, its derivatives, its series. `_graph` shares and, by `_simplify`,
 folds; `_passes` finish it; `_differentiation` differentiates it. Series: `_series`, with `_recurrences` for operations
-that have one of their own. Pieces: `_borders` (where they meet), `_sliding` (along them), `_jump` and `_kick` (over
-them), `_powers` (where no series helps), `_look_ups` (tables). A program consists of a `_line`, with its values in
+that have one of their own. Pieces: `_deciding` (what decides), `_decisions` (by which numbers), `_cones` (of lengths),
+`_levels` (their borders), `_beginnings` (where a motion begins), `_borders` (all of that), `_sliding` (along them, by
+`_border_forces`, `_held` and `_small_equations`), `_jump` and `_kick` (over them, by `_jump_search`), `_features` and
+`_powers` (where no series helps), `_look_ups` (tables). A program consists of a `_line`, with its values in
 NumPy; `_rounding` is for their error. `_memory` bounds what a graph may take. What JAX traces becomes a graph in
 `_tracing`.
 """
 
-from lagjax._program._borders import (
-    CLOCK,
-    FLOOR,
-    SIGN,
-    TABLE,
-    TRUNC,
-    Borders,
-    borders,
-    distances,
-    find_corners,
-    is_smooth,
-    with_outputs,
-)
+from lagjax._program._borders import Borders, borders, distances, find_corners, is_smooth, with_outputs
 from lagjax._program._differentiation import Derivatives, copy_nodes, pullback, pushforward, tangents_in, with_tangents
 from lagjax._program._graph import INPUTS, NUMBERS, PAIRS, Graph, Tape, Unlowerable, find_ancestors
 from lagjax._program._jump import row_places
+from lagjax._program._levels import CLOCK, FLOOR, SIGN, TABLE, TRUNC
 from lagjax._program._line import StraightLine
 from lagjax._program._look_ups import BESIDE, Located, Table, table_of
 from lagjax._program._memory import lack_of_memory, machine_memory, operations_that_fit
@@ -34,4 +25,5 @@ from lagjax._program._passes import eliminate_dead_code, factor, sink_negations
 from lagjax._program._rounding import rounding
 from lagjax._program._series import LinearSystem, series
 from lagjax._program._simplify import arctangent, inverse, is_nonnegative
-from lagjax._program._sliding import MOST_COUPLED, eliminate, sparse_row, substitute
+from lagjax._program._sliding import MOST_COUPLED
+from lagjax._program._small_equations import eliminate, sparse_row, substitute

@@ -35,16 +35,21 @@ _LARGEST_DERIVATIVE = 100  # operations of a derivative for one of a line: a bou
 
 
 def copy_nodes(
-    graph: Graph, line, inputs: Sequence[int] | Callable[[int, list[int]], int], places: Sequence | None = None
+    graph: Graph,
+    line,
+    inputs: Sequence[int] | Callable[[int, list[int]], int | None] = lambda i, nodes: None,
+    places: Sequence | None = None,
 ) -> list[int]:
     """The nodes of a line, of a tape or of another graph in a graph, where `inputs` are its inputs.
 
-    These may follow from the nodes before: `inputs(i, nodes)`. Tables move where `places` says what input i becomes.
+    These may follow from the nodes before, `inputs(i, nodes)`, or stay as they are, None. Tables move where `places`
+    says what input i becomes.
     """
     nodes: list[int] = []
     for (op, operands, attribute), kind in zip(line.nodes, line.kinds, strict=True):
         if op == "input":
-            nodes.append(inputs(attribute, nodes) if callable(inputs) else graph.real(inputs[attribute]))
+            place = inputs(attribute, nodes) if callable(inputs) else graph.real(inputs[attribute])
+            nodes.append(graph.input(attribute, kind) if place is None else place)
         elif op == "constant":
             nodes.append(graph.constant(attribute, kind))
         else:
@@ -57,6 +62,20 @@ def copy_operation(graph: Graph, op: str, operands: Sequence[int], attribute: An
     if op == "integer_pow":
         return graph.power(operands[0], attribute)
     return graph.apply(op, *operands, attribute=attribute)
+
+
+def replace_nodes(graph: Graph, among: Iterable[int], sides: Sequence[dict[int, int]]) -> None:
+    """Add to each of the `sides`, where some nodes become others, what those `among` the nodes behind them become.
+
+    What becomes the same on both of two sides stays as it is.
+    """
+    for i in among:
+        op, operands, attribute = graph.nodes[i]
+        if any(x in known for known in sides for x in operands):
+            new = [copy_operation(graph, op, [known.get(x, x) for x in operands], attribute) for known in sides]
+            if len(sides) == 1 or new[0] != new[1]:
+                for known, node in zip(sides, new, strict=True):
+                    known[i] = node
 
 
 # ---- nodes of a graph -----------------------------------------------------------------------------------------------

@@ -161,7 +161,7 @@ def with_borders_of_tangents(borders: Borders, size: int, directions: int, membe
     every = [None, *range(directions)]
     of = [(i, row) for row in every for i in range(n)] + [(n + k, None) for k in range(1 + len(followed))]
     tables = [_table_of_row(row * member) for row in range(1, rows)]
-    retraction = borders.retraction
+    holding, retraction = borders.holding, borders.holding.retraction
     if retraction is not None:
         states = [(half * n + i, row) for half in range(2) for row in every for i in range(n)]
         retraction = with_tangents(retraction, program.dtypes, places, moving, states, tables)
@@ -171,10 +171,12 @@ def with_borders_of_tangents(borders: Borders, size: int, directions: int, membe
     decided = {i: place for i, place in enumerate(places)}
     decided |= {program.size + j: first_piece + pieces + j for j in range(pieces)}
     line = line.replace(outputs=line.outputs[: rows * n + 1])
+    moved = zip(borders.decisions, switches[:pieces], strict=True)
     return borders._replace(
         program=Pieced(line, len(dtypes), dtypes, None),
-        switches=switches[:pieces], arguments=switches[pieces:], decide=_renumber_inputs(borders.decide, decided),
-        motion=borders.motion or borders, retraction=retraction, release=_renumber_inputs(borders.release, decided),
+        decisions=tuple(decision._replace(switch=node) for decision, node in moved), arguments=switches[pieces:],
+        decide=_renumber_inputs(borders.decide, decided), motion=borders.motion or borders,
+        holding=holding._replace(retraction=retraction, release=_renumber_inputs(holding.release, decided)),
     )  # fmt: skip
 
 
@@ -215,77 +217,28 @@ def jump_at_border(
         return _OverBorder(borders, size, directions, member, over_steps).build()
 
 
-class _OverBorder:
-    """One graph, in which numbers are jets: row (i₁, i₂, …) is the derivative along direction i₁ of the first kind, …
+class _Jets:
+    """Numbers with all their derivatives: row (i₁, i₂, …) is that along direction i₁ of the first kind, …
 
     A direction 0 is none. Rows are numbered with i₁ as the first to change.
     """
 
-    def __init__(self, borders: Borders, size: int, directions: tuple[int, ...], member: int, over_steps: bool):
-        program = borders.program
-        self.n, self.pieces, self.directions = size, len(borders.switches), directions
-        self.member, self.over_steps = member, over_steps
-        self.chosen = self.pieces * (2 if borders.levels_move else 1)  # numbers that choose what is zero at the border
-        self.numbers = program.size - 2 * size - 1 - self.pieces
-        self.moving = 2 * size + 1 + self.numbers  # inputs of a row
-        self.indices = [index[::-1] for index in itertools.product(*(range(1 + d) for d in directions[::-1]))]
-        self.rows = len(self.indices)
-        self.orders = tuple(sum(i > 0 for i in index) for index in self.indices)
-        self.lower = self.rows // (1 + directions[-1])
-        self.terms = self._leibniz()
-        self.stages = _STAGES[len(directions) - 1]
-        dtypes = [*program.dtypes[: self.moving], *[np.dtype(float)] * (self.pieces + self.chosen)]
-        line = eliminate_dead_code(program.line, program.line.outputs[:size])
-        self.switch = _switching_number(borders, program.size)
-        fixed = self.pieces + self.chosen
-        self.field, self.switches = (self._add_rows(line, dtypes, fixed) for line in (line, self.switch))
-        largest = len(self.field.nodes) + len(self.switches.nodes) + len(line.nodes)
-        self.kick = None
-        if borders.kicking and borders.kick is not None:
-            line = borders.kick.line.replace(outputs=borders.kick.line.outputs[:size])
-            kinds = [*program.dtypes[: self.moving], *[np.dtype(float)] * (self.pieces + fixed)]
-            self.kick = self._add_rows(line, kinds, self.pieces + fixed)
-            largest += len(self.kick.nodes)
-        self.graph = Graph(_LARGEST_JUMP * largest + 10_000)
-
-    def _leibniz(self) -> list[list[tuple[int, int]]]:
-        """The pairs of rows whose products sum up to each row of a product of two numbers."""
-        place = {index: row for row, index in enumerate(self.indices)}
-        terms = []
-        for index in self.indices:
+    def __init__(self, directions: tuple[int, ...]):
+        indices = [index[::-1] for index in itertools.product(*(range(1 + d) for d in directions[::-1]))]
+        self.directions, self.rows = directions, len(indices)
+        self.orders = tuple(sum(i > 0 for i in index) for index in indices)
+        self.graph = Graph(0)
+        self._terms: list[list[tuple[int, int]]] = []  # the rows whose products sum up to each row of a product
+        place = {index: row for row, index in enumerate(indices)}
+        for index in indices:
             parts = itertools.product(*((0, i) if i else (0,) for i in index))
             pairs = [(part, tuple(i - p for i, p in zip(index, part, strict=True))) for part in parts]
-            terms.append([(place[a], place[b]) for a, b in pairs])
-        return terms
+            self._terms.append([(place[a], place[b]) for a, b in pairs])
 
-    def _add_rows(self, line: StraightLine, dtypes: Sequence, fixed: int) -> StraightLine:
-        """A line of inputs that move, and `fixed` others, with all rows of its outputs; rows of inputs alike."""
-        outputs, rows, first = len(line.outputs), 1, self.rows * self.moving
-        kinds = [np.dtype(float)] * (first + fixed)
-        kinds[: self.moving] = dtypes[: self.moving]
-        line = _renumber_inputs(
-            line, {i: i if i < self.moving else i - self.moving + first for i in range(len(dtypes))}
-        )
-        for level, count in enumerate(self.directions):
-            tables = [_table_of_row(row * rows * self.member) for row in range(1, 1 + count)]
-            if self.over_steps and level == len(self.directions) - 1:
-                tables = [lambda table: table._replace(tangents=True)]
-            moving = [
-                {row * self.moving + i: (row + d * rows) * self.moving + i
-                 for row in range(rows) for i in range(self.moving)}
-                for d in range(1, 1 + count)
-            ]  # fmt: skip
-            of = [(i, d) for d in (None, *range(count)) for i in range(rows * outputs)]
-            line = with_tangents(line, kinds, range(len(kinds)), moving, of, tables)
-            rows *= 1 + count
-        return line
-
-    # ---- jets ----
-
-    def _product(self, a: Jet, b: Jet) -> Jet:
+    def multiply(self, a: Jet, b: Jet) -> Jet:
         """Their product, by Leibniz's rule."""
         apply, result = self.graph.apply, []
-        for terms in self.terms:
+        for terms in self._terms:
             total = None
             for i, j in terms:
                 if a[i] is not None and b[j] is not None:
@@ -294,64 +247,117 @@ class _OverBorder:
             result.append(total)
         return result
 
-    def _sum(self, a: Jet, b: Jet, factor: float = 1.0) -> Jet:
+    def add(self, a: Jet, b: Jet, factor: float = 1.0) -> Jet:
         """a + factor · b."""
         graph, result = self.graph, []
         for x, y in zip(a, b, strict=True):
-            scaled = None if y is None else graph.apply("mul", graph.constant(factor, "float"), y)
+            scaled = None if y is None else graph.apply("mul", graph.number(factor), y)
             result.append(x if scaled is None else scaled if x is None else graph.apply("add", x, scaled))
         return result
 
+
+class _OverBorder:
+    """The jump in one graph, in which numbers are jets."""
+
+    def __init__(self, borders: Borders, size: int, directions: tuple[int, ...], member: int, over_steps: bool):
+        program = borders.program
+        self.jets, self.n, self.pieces = _Jets(directions), size, len(borders.decisions)
+        self.member, self.over_steps = member, over_steps
+        self.chosen = self.pieces * (2 if borders.levels_move else 1)  # numbers that choose what is zero at the border
+        self.numbers = program.size - 2 * size - 1 - self.pieces
+        fixed, dtypes = self.pieces + self.chosen, program.dtypes[: self.moving]
+        line = eliminate_dead_code(program.line, program.line.outputs[:size])
+        self.switch, self.kick = _switching_number(borders, program.size), None
+        self.field, self.switches = (self._add_rows(line, dtypes, fixed) for line in (line, self.switch))
+        largest = len(self.field.nodes) + len(self.switches.nodes) + len(line.nodes)
+        if borders.kicking and borders.kick is not None:
+            line = borders.kick.line.replace(outputs=borders.kick.line.outputs[:size])
+            self.kick = self._add_rows(line, dtypes, self.pieces + fixed)
+            largest += len(self.kick.nodes)
+        self.jets.graph = Graph(_LARGEST_JUMP * largest + 10_000)
+
+    @property
+    def graph(self) -> Graph:
+        return self.jets.graph
+
+    @property
+    def moving(self) -> int:
+        """The count of the inputs of a row."""
+        return 2 * self.n + 1 + self.numbers
+
+    def _add_rows(self, line: StraightLine, dtypes: Sequence, fixed: int) -> StraightLine:
+        """A line of inputs that move, and `fixed` others, with all rows of its outputs; rows of inputs alike."""
+        outputs, rows, moving = len(line.outputs), 1, self.moving
+        first, directions = self.jets.rows * moving, self.jets.directions
+        kinds = [*dtypes, *[np.dtype(float)] * (first - moving + fixed)]
+        line = _renumber_inputs(line, {i: i if i < moving else i - moving + first for i in range(moving + fixed)})
+        for level, count in enumerate(directions):
+            tables = [_table_of_row(row * rows * self.member) for row in range(1, 1 + count)]
+            if self.over_steps and level == len(directions) - 1:
+                tables = [lambda table: table._replace(tangents=True)]
+            places = [
+                {row * moving + i: (row + d * rows) * moving + i for row in range(rows) for i in range(moving)}
+                for d in range(1, 1 + count)
+            ]
+            of = [(i, d) for d in (None, *range(count)) for i in range(rows * outputs)]
+            line = with_tangents(line, kinds, range(len(kinds)), places, of, tables)
+            rows *= 1 + count
+        return line
+
     def _values(self, line: StraightLine, place: list[Jet], fixed: Sequence[int]) -> list[Jet]:
         """The outputs of one of the lines with rows at a place; `fixed` are the inputs that do not move."""
-        zero = self.graph.constant(0.0, "float")
-        inputs = [zero if jet[row] is None else jet[row] for row in range(self.rows) for jet in place]
+        zero = self.graph.number(0.0)
+        inputs = [zero if jet[row] is None else jet[row] for row in range(self.jets.rows) for jet in place]
         nodes = copy_nodes(self.graph, line, [*inputs, *fixed])
-        count = len(line.outputs) // self.rows
-        return [[nodes[line.outputs[row * count + i]] for row in range(self.rows)] for i in range(count)]
+        count = len(line.outputs) // self.jets.rows
+        return [[nodes[line.outputs[row * count + i]] for row in range(self.jets.rows)] for i in range(count)]
 
     # ---- flows ----
 
     def _rates(self, place: list[Jet], pieces: Sequence[int]) -> list[Jet]:
         """The rates of all that moves: q̇, q̈, 1 of the time, 0 of parameters."""
-        unused = [self.graph.constant(0.0, "float")] * self.chosen
-        none: Jet = [None] * self.rows
-        one: Jet = [self.graph.constant(1.0, "float"), *none[1:]]
+        unused = [self.graph.number(0.0)] * self.chosen
+        none: Jet = [None] * self.jets.rows
+        one: Jet = [self.graph.number(1.0), *none[1:]]
         acceleration = self._values(self.field, place, [*pieces, *unused])
         return [*place[self.n : 2 * self.n], *acceleration, one, *[none] * self.numbers]
 
     def _flow(self, place: list[Jet], pieces: Sequence[int], delay: Jet) -> list[Jet]:
-        rates: list[list[Jet]] = []
-        for weights in self.stages:
+        jets, rates, stages = self.jets, [], _STAGES[len(self.jets.directions) - 1]
+        for weights in stages:
             here = place
             for weight, rate in zip(weights, rates, strict=True):
                 if weight:
-                    here = [self._sum(x, self._product(delay, r), weight) for x, r in zip(here, rate, strict=True)]
-            if len(weights) == len(self.stages) - 1:
+                    here = [jets.add(x, jets.multiply(delay, r), weight) for x, r in zip(here, rate, strict=True)]
+            if len(weights) == len(stages) - 1:
                 return here
             rates.append(self._rates(here, pieces))
         raise AssertionError
 
     def _delay(self, place: list[Jet], before: Sequence[int], hit: Sequence[int], rate: int) -> Jet:
         """δ, order by order: what is left of u is due to the highest one."""
-        delay: Jet = [None] * self.rows
-        for order in range(1, 1 + max(self.orders)):
+        delay: Jet = [None] * self.jets.rows
+        for order in range(1, 1 + max(self.jets.orders)):
             there = place if order == 1 else self._flow(place, before, delay)
             (left,) = self._values(self.switches, there, [*before, *hit])
-            for row in range(self.rows):
-                if self.orders[row] == order:
+            for row in range(self.jets.rows):
+                if self.jets.orders[row] == order:
                     delay[row] = self.graph.apply("neg", self.graph.apply("div", left[row], rate))
         return delay
 
+    @property
+    def _lower(self) -> int:
+        return self.jets.rows // (1 + self.jets.directions[-1])
+
     def build(self) -> Jump:
-        graph, n, zero = self.graph, self.n, self.graph.constant(0.0, "float")
+        graph, n, zero = self.graph, self.n, self.graph.number(0.0)
         place, before, behind, hit = self._inputs()
         base = [jet[0] for jet in place]
         first = self._rates(place, before)
         a_before = [first[n + i][0] for i in range(n)]
         a_behind = [jet[0] for jet in self._rates(place, behind)[n : 2 * n]]
         nodes = copy_nodes(graph, self.switch, [*base, *before, *hit])
-        rates = [*base[n : 2 * n], *a_before, graph.constant(1.0, "float")]
+        rates = [*base[n : 2 * n], *a_before, graph.number(1.0)]
         rate = tangents_in(graph, self.switch, nodes, dict(enumerate(rates)), {}).get(self.switch.outputs[0], zero)
         delay = self._delay(place, before, hit, rate)
         there = self._flow(place, before, delay)
@@ -359,16 +365,17 @@ class _OverBorder:
             there[n : 2 * n] = self._values(self.kick, there, [*before, *behind, *hit])
         back = self._flow(there, behind, [None if x is None else graph.apply("neg", x) for x in delay])
         results = []
-        for row in range(1, self.rows):
+        for row in range(1, self.jets.rows):
             for x, y in zip(place[: 2 * n], back[: 2 * n], strict=True):
                 results.append(zero if y[row] is None else graph.apply("sub", y[row], x[row]))
         line = eliminate_dead_code(graph, [*results, *a_before, *a_behind])
-        return Jump(line, self.orders, self.lower, 2 * self.pieces + self.chosen)
+        return Jump(line, self.jets.orders, self._lower, 2 * self.pieces + self.chosen)
 
     def _inputs(self) -> tuple[list[Jet], list[int], list[int], list[int]]:
         """The inputs of the result, in the order of `Jump`: the jets of all that moves, and pieces."""
-        n, numbers, lower, m = self.n, self.numbers, self.lower, self.pieces
-        upper, count = self.rows - lower, itertools.count()
+        n, numbers, lower, m = self.n, self.numbers, self._lower, self.pieces
+        rows, count = self.jets.rows, itertools.count()
+        upper = rows - lower
 
         def some(size):
             return [self.graph.input(next(count), "float") for _ in range(size)]
@@ -376,11 +383,11 @@ class _OverBorder:
         q, v, (t,), p = some(lower * n), some(lower * n), some(1), some(lower * numbers)
         before, behind, hit = some(m), some(m), some(self.chosen)
         q, v, p = q + some(upper * n), v + some(upper * n), p + some(upper * numbers)
-        time: Jet = [t, *[None] * (self.rows - 1)]
-        jets: list[Jet] = [[q[row * n + i] for row in range(self.rows)] for i in range(n)]
-        jets += [[v[row * n + i] for row in range(self.rows)] for i in range(n)]
+        time: Jet = [t, *[None] * (rows - 1)]
+        jets: list[Jet] = [[q[row * n + i] for row in range(self.jets.rows)] for i in range(n)]
+        jets += [[v[row * n + i] for row in range(self.jets.rows)] for i in range(n)]
         jets += [time]
-        jets += [[p[row * numbers + i] for row in range(self.rows)] for i in range(numbers)]
+        jets += [[p[row * numbers + i] for row in range(self.jets.rows)] for i in range(numbers)]
         return jets, before, behind, hit
 
 
@@ -392,8 +399,7 @@ def _switching_number(borders: Borders, size: int) -> StraightLine:
     program, m = borders.program, len(borders.switches)
     line = eliminate_dead_code(program.line, borders.switches)
     graph = Graph(10 * len(line.nodes) + 1000)
-    kinds = {node[2]: kind for node, kind in zip(line.nodes, line.kinds, strict=True) if node[0] == "input"}
-    nodes = copy_nodes(graph, line, [graph.input(i, kinds.get(i, "float")) for i in range(size)])
+    nodes = copy_nodes(graph, line)
     total = graph.constant(0.0, "float")
     for j, node in enumerate(line.outputs):
         weight, number = graph.input(size + j, "float"), nodes[node]

@@ -13,35 +13,34 @@ velocities for μ = 0, and M n = ∇u + Gᵀν, G n = 0,
 
 and u̇⁺ has the sign of u̇⁻. Where the right side is negative the energy does not suffice: the motion is reflected, which
 is the same with both sides alike and u̇⁺ = −u̇⁻. Source: Gelfand & Fomin, *Calculus of Variations*, §15.
-
-With which pieces L jumps is found at random states of their borders: there a corner is zero to rounding, a jump not.
 """
 
 import functools
+import itertools
 import math
-from collections.abc import Callable, Container, Sequence
+from collections.abc import Sequence
 from typing import NamedTuple
 
-import numpy as np
-
-from lagjax._program._differentiation import copy_nodes, gradient_in
+from lagjax._program._deciding import inputs_below
+from lagjax._program._decisions import DecidedProgram
+from lagjax._program._differentiation import gradient_in
 from lagjax._program._graph import Graph
-from lagjax._program._look_ups import BESIDE, shift_look_up, table_of
-from lagjax._program._operations import LOOK_UPS
+from lagjax._program._jump_search import BothSides, JumpSearch
+from lagjax._program._levels import Decision
 from lagjax._program._passes import eliminate_dead_code
-from lagjax._program._rounding import rounding
 from lagjax._program._series import StraightLine
-from lagjax._program._sliding import dot, eliminate, sparse_row, substitute
+from lagjax._program._small_equations import dot, eliminate, sparse_row, substitute
 
-_LARGEST_KICK = 60  # operations that one may become: a bound for errors
-_STATES = 48  # at which a border is looked for: what jumps does so at nearly all of them
-_ROUNDS, _STEPS = 4, 6  # of Newton's method, with the pieces of the state decided anew in between
-# A difference of both sides counts as a jump where it is this many times as large as its rounding. The bound of the
-# rounding is to first order, and the border is hit to some roundings: a corner was seen at 4 at most.
+BENT = "a constraint prescribes a speed that jumps"  # a reason to refuse a kick
+_BY_VELOCITY = "L or the momentum p = dL/dqdot jumps, and no law says with what velocities the motion goes on"
+_NOT_QUADRATIC = (
+    "L or the momentum p = dL/dqdot jumps, and L is not quadratic in qdot, so that the velocities behind that are not "
+    "known in closed form"
+)
 # The part of its terms by which the rate of a constraint has to jump: less is rounding of where the border is, and
 # the impulse that it asks for changes velocities by no more.
 TURNED = 1e-9
-_NOISE, _HIT, _EPS = 1e3, 100.0, float(np.finfo(float).eps)
+_LARGEST_KICK = 60  # operations that one may become: a bound for errors
 
 
 class Mechanics(NamedTuple):
@@ -57,8 +56,8 @@ class Mechanics(NamedTuple):
     @classmethod
     def from_nodes(cls, nodes: Sequence[int], n: int) -> "Mechanics":
         m = (len(nodes) - 1 - n - n * n) // (n + 2)
-        ends = np.cumsum([1, n, n * n, m * n, m, m]).tolist()
-        first, *parts = (tuple(nodes[a:b]) for a, b in zip([0, *ends], ends, strict=False))
+        ends = itertools.accumulate([1, n, n * n, m * n, m, m])
+        first, *parts = (tuple(nodes[a:b]) for a, b in itertools.pairwise([0, *ends]))
         return cls(first[0], *parts)
 
 
@@ -75,74 +74,77 @@ class Kick(NamedTuple):
     refused: tuple[tuple[int, str], ...] = ()
 
 
+# ---- with which pieces L jumps ---------------------------------------------------------------------------------------
+
+
+def find_kicking(decided: DecidedProgram, count: int) -> dict[int, str | None]:
+    """The pieces with which L or p jumps, each with the reason why no closed form holds there, or None.
+
+    The last outputs, so many, are the nodes of `Mechanics`.
+    """
+    line, n, first = decided.line, decided.n, decided.first
+    of, search, jumping = Mechanics.from_nodes(line.outputs[-count:], n), JumpSearch(decided), {}
+    for nodes in ([of.lagrangian, *of.momentum], of.rates):
+        read = inputs_below(line, nodes)
+        candidates = [j for j in range(len(decided.decisions)) if first + j in read]
+        found = search.find(candidates, nodes) if candidates else {}
+        jumping |= {j: nodes is of.rates for j, jumps in found.items() if jumps}
+    for j in sorted(jumping, reverse=True):  # beyond a piece that others are decided by, these may be other ones
+        decided_by = {i - first for i in inputs_below(line, [decided.decisions[j].switch]) if i >= first}
+        jumping |= {k: jumping[j] for k in decided_by if k not in jumping}
+
+    def reads_velocity(nodes):
+        return not inputs_below(line, nodes).isdisjoint(range(n, 2 * n))
+
+    is_quadratic = not reads_velocity([*of.mass_matrix, *of.jacobian])
+    reasons: dict[int, str | None] = {}
+    for j, by_constraint in jumping.items():
+        reasons[j] = None if is_quadratic else _NOT_QUADRATIC
+        if by_constraint:
+            reasons[j] = BENT
+        elif reads_velocity([decided.decisions[j].switch]):
+            reasons[j] = _BY_VELOCITY
+    return reasons
+
+
 # ---- the closed form -------------------------------------------------------------------------------------------------
 
 
-def kick_line(
-    line: StraightLine,
-    mechanics: Mechanics,
-    switches: Sequence[int],
-    spatial: Sequence[int],
-    corners: Container[int],
-    n: int,
-    size: int,
-    more: int,
-) -> StraightLine:
-    """The line of a `Kick`. That of the program takes `size` inputs and the pieces; `more` numbers stand behind the hⱼ.
-
-    The pieces `spatial` are those that jump where u depends on positions. At `corners` of a constraint velocities are
-    NaN behind it where its rate jumps there: no law says with what velocities the motion goes on.
-    """
-    m, graph = len(switches), Graph(_LARGEST_KICK * (len(line.nodes) + (n + len(mechanics.rates)) ** 3) + 10_000)
-    sides = _Sides(graph, line, size, m)
-    f, zero, one = graph.apply, graph.constant(0.0, "float"), graph.constant(1.0, "float")
-    before, behind = sides.before, sides.behind
-    v = [graph.input(n + i, "float") for i in range(n)]
-    hit = [graph.input(size + 2 * m + j, "float") for j in range(m + more)]
+def kick_of(
+    line: StraightLine, n: int, size: int, decisions: Sequence[Decision], count: int, kicking: dict[int, str | None]
+) -> Kick:
+    """The kick of a program of `size` inputs and the pieces, whose last outputs, so many, are those of `Mechanics`."""
+    spatial = [j for j in kicking if not inputs_below(line, [decisions[j].switch]).isdisjoint(range(n))]
+    # At corners where a constraint's rate jumps velocities are NaN: no law says with which the motion goes on.
+    corners = [j for j in spatial if kicking[j] == BENT]
+    refused = tuple((j, reason) for j, reason in kicking.items() if reason is not None and j not in corners)
+    if refused:
+        return Kick(StraightLine((), (), ()), tuple(kicking), refused)
+    mechanics, m = Mechanics.from_nodes(line.outputs[-count:], n), len(decisions)
+    graph = Graph(_LARGEST_KICK * (len(line.nodes) + (n + len(mechanics.rates)) ** 3) + 10_000)
+    sides = BothSides(graph, line, size, m)
+    f, zero = graph.apply, graph.number(0.0)
     slopes = [zero] * (n + 1)
     for j in spatial:
-        of_one = gradient_in(graph, line, before, switches[j], [*range(n), 2 * n])
-        slopes = [f("add", x, f("mul", hit[j], g)) for x, g in zip(slopes, of_one, strict=True)]
-    normal, by_time = slopes[:n], slopes[n]
-    change_p, change_l = [sides.difference(i) for i in mechanics.momentum], sides.difference(mechanics.lagrangian)
-    rates = [behind[i] for i in mechanics.rates]
-    solve = _saddle(graph, [behind[i] for i in mechanics.mass_matrix], [behind[i] for i in mechanics.jacobian], n)
-    impulse, still = [f("neg", x) for x in change_p], [zero] * len(rates)
-    d, minus_lambda = solve(impulse, [f("neg", x) for x in rates])
-    w = [f("add", x, y) for x, y in zip(v, d, strict=True)]
-    across, _ = solve(normal, still)
-    # h⁺(w) − h⁻ + λ·d from differences of both sides alone.
-    middle = [f("add", x, f("mul", graph.constant(0.5, "float"), y)) for x, y in zip(v, d, strict=True)]
-    mass = mechanics.mass_matrix
-    moved = [dot(graph, [behind[mass[i * n + k]] for k in range(n)], d) for i in range(n)]
-    gained = f("add", f("sub", dot(graph, change_p, v), change_l), dot(graph, middle, moved))
-    gained = f("sub", gained, dot(graph, minus_lambda, [behind[i] for i in mechanics.driving]))
-    b, c = f("add", dot(graph, normal, w), by_time), dot(graph, normal, across)
-    rate = f("add", dot(graph, normal, v), by_time)
-    in_space = f("gt", c, zero)
-    c = f("select", in_space, one, c)
-    squared = f("sub", f("mul", b, b), f("mul", graph.constant(2.0, "float"), f("mul", c, gained)))
-    squared = f("select", in_space, one, squared)
-    speed = f("sqrt", squared)
-    changes = [f("ne", graph.input(size + j, "float"), graph.input(size + m + j, "float")) for j in spatial]
+        of_one = gradient_in(graph, line, sides.before, decisions[j].switch, [*range(n), 2 * n])
+        hit = graph.input(size + 2 * m + j, "float")
+        slopes = [f("add", x, f("mul", hit, g)) for x, g in zip(slopes, of_one, strict=True)]
     passes = bent = graph.constant(False, "bool")
-    for j, change in zip(spatial, changes, strict=True):
+    for j in spatial:
+        change = f("ne", graph.input(size + j, "float"), graph.input(size + m + j, "float"))
         passes, bent = f("or", passes, change), f("or", bent, change) if j in corners else bent
-    forward = f("eq", f("gt", rate, zero), passes)
-    speed = f("select", forward, f("neg", speed), speed)
-    mu = f("select", in_space, zero, f("div", f("sub", speed, b), c))
-    kicked = [f("add", x, f("mul", mu, y)) for x, y in zip(w, across, strict=True)]
-    bent = f("and", bent, _turns(graph, sides, mechanics, v)) if corners else bent
+    kicked, is_enough = _kick_velocities(graph, sides, mechanics, slopes, passes)
+    bent = f("and", bent, _turns(graph, sides, mechanics, n)) if corners else bent
     kicked = [f("select", bent, x, graph.number(math.nan)) for x in kicked]
-    lacks = f("lt", squared, zero)
-    return eliminate_dead_code(graph, [*kicked, f("select", lacks, one, zero)])
+    return Kick(eliminate_dead_code(graph, [*kicked, is_enough]), tuple(kicking))
 
 
-def _turns(graph: Graph, sides: "_Sides", of: Mechanics, v: list[int]) -> int:
+def _turns(graph: Graph, sides: BothSides, of: Mechanics, n: int) -> int:
     """True where a rate of a constraint jumps at this state: elsewhere a piece may bend it that is none of it here."""
     f, turns = graph.apply, graph.constant(False, "bool")
     for k, rate in enumerate(of.rates):
-        row = [sides.behind[i] for i in of.jacobian[k * len(v) : (k + 1) * len(v)]]
+        row, v = of.jacobian[k * n : (k + 1) * n], [graph.input(n + i, "float") for i in range(n)]
+        row = [sides.behind[i] for i in row]
         slope, speed = (
             functools.reduce(lambda a, x: f("add", a, f("abs", x)), xs, graph.number(0.0)) for xs in (row, v)
         )
@@ -151,60 +153,34 @@ def _turns(graph: Graph, sides: "_Sides", of: Mechanics, v: list[int]) -> int:
     return turns
 
 
-class _Sides:
-    """A line on both sides of a border in one graph: its `size` inputs, the m pieces before it, the m behind it."""
-
-    def __init__(self, graph: Graph, line: StraightLine, size: int, m: int):
-        self.graph, self.line = graph, line
-        kinds = {node[2]: kind for node, kind in zip(line.nodes, line.kinds, strict=True) if node[0] == "input"}
-        given = [graph.input(i, kinds.get(i, "float")) for i in range(size + 2 * m)]
-        self.before = copy_nodes(graph, line, given[: size + m])
-        self.behind = copy_nodes(graph, line, [*given[:size], *given[size + m :]])
-        self._differences: dict[int, int] = {}
-
-    def difference(self, i: int) -> int:
-        """The node behind the border less that before it: terms that are alike do not cost its digits."""
-        stack = [i]
-        while stack:
-            k = stack[-1]
-            if k in self._differences:
-                stack.pop()
-                continue
-            missing = [x for x in self._parts(k) if x not in self._differences]
-            if missing:
-                stack += missing
-            else:
-                self._differences[k] = self._subtract(k)
-                stack.pop()
-        return self._differences[i]
-
-    def _parts(self, k: int) -> list[int]:
-        """The operands from whose differences that of a node follows."""
-        (op, operands, _), same = self.line.nodes[k], self._same
-        if same(k):
-            return []
-        if op in ("add", "sub", "neg", "mul"):
-            return list(operands)
-        if op == "div" and same(operands[1]):
-            return [operands[0]]
-        return list(operands[1:]) if op == "select" and same(operands[0]) else []
-
-    def _same(self, k: int) -> bool:
-        return self.before[k] == self.behind[k]
-
-    def _subtract(self, k: int) -> int:
-        f, (op, operands, _), parts = self.graph.apply, self.line.nodes[k], self._parts(k)
-        if self._same(k):
-            return self.graph.constant(0.0, "float")
-        if not parts:
-            return f("sub", self.behind[k], self.before[k])
-        changes = [self._differences[x] for x in parts]
-        if op == "mul":
-            a, b = operands
-            return f("add", f("mul", changes[0], self.behind[b]), f("mul", self.before[a], changes[1]))
-        if op == "div":
-            return f("div", changes[0], self.behind[operands[1]])
-        return f("select", self.behind[operands[0]], *changes) if op == "select" else f(op, *changes)
+def _kick_velocities(
+    graph: Graph, sides: BothSides, mechanics: Mechanics, slopes: Sequence[int], passes: int
+) -> tuple[list[int], int]:
+    """The velocities behind u = 0, of these `slopes` by positions and time, and 1 if the energy suffices, else 0."""
+    n, f, zero, one, behind = len(slopes) - 1, graph.apply, graph.number(0.0), graph.number(1.0), sides.behind
+    v, normal, by_time = [graph.input(n + i, "float") for i in range(n)], slopes[:n], slopes[n]
+    change_p, change_l = [sides.difference(i) for i in mechanics.momentum], sides.difference(mechanics.lagrangian)
+    rates, mass = [behind[i] for i in mechanics.rates], [behind[i] for i in mechanics.mass_matrix]
+    solve = _saddle(graph, mass, [behind[i] for i in mechanics.jacobian], n)
+    d, minus_lambda = solve([f("neg", x) for x in change_p], [f("neg", x) for x in rates])
+    w = [f("add", x, y) for x, y in zip(v, d, strict=True)]
+    across, _ = solve(normal, [zero] * len(rates))
+    # h⁺(w) − h⁻ + λ·d from differences of both sides alone.
+    middle = [f("add", x, f("mul", graph.number(0.5), y)) for x, y in zip(v, d, strict=True)]
+    moved = [dot(graph, mass[i * n : (i + 1) * n], d) for i in range(n)]
+    gained = f("add", f("sub", dot(graph, change_p, v), change_l), dot(graph, middle, moved))
+    gained = f("sub", gained, dot(graph, minus_lambda, [behind[i] for i in mechanics.driving]))
+    b, c = f("add", dot(graph, normal, w), by_time), dot(graph, normal, across)
+    rate = f("add", dot(graph, normal, v), by_time)
+    in_space = f("gt", c, zero)
+    c = f("select", in_space, one, c)
+    squared = f("sub", f("mul", b, b), f("mul", graph.number(2.0), f("mul", c, gained)))
+    squared = f("select", in_space, one, squared)
+    speed = f("sqrt", squared)
+    speed = f("select", f("eq", f("gt", rate, zero), passes), f("neg", speed), speed)
+    mu = f("select", in_space, zero, f("div", f("sub", speed, b), c))
+    kicked = [f("add", x, f("mul", mu, y)) for x, y in zip(w, across, strict=True)]
+    return kicked, f("select", f("lt", squared, zero), one, zero)
 
 
 def _saddle(graph: Graph, mass: Sequence[int], jacobian: Sequence[int], n: int):
@@ -219,140 +195,3 @@ def _saddle(graph: Graph, mass: Sequence[int], jacobian: Sequence[int], n: int):
         return x[:n], x[n:]
 
     return solve
-
-
-# ---- with which pieces L jumps ---------------------------------------------------------------------------------------
-
-
-class Jumping:
-    """The search for the pieces of a program with which some of its numbers jump.
-
-    `line` takes `size` inputs, of which q, q̇ and t come first, and the pieces, whose switching numbers are `switches`;
-    `decide` takes the same and then a flag for each piece (`Borders.decide`).
-    """
-
-    def __init__(self, line: StraightLine, decide: StraightLine, switches: Sequence[int], n: int, size: int):
-        self.moving, self.size, self.m, self.switches = 2 * n + 1, size, len(switches), switches
-        located = [a for op, _, a in (*line.nodes, *decide.nodes) if op in LOOK_UPS]
-        tables = [table for table in map(table_of, located) if table.numbers is None]
-        self.beside = size + 3 * self.m  # where numbers that are only looked up stand, behind all other inputs
-        self.line, self.decide = self._shift(line), self._shift(decide)
-        self.draw, self.tables = np.random.default_rng(0), [self._near(table) for table in dict.fromkeys(tables)]
-
-    def _near(self, attribute):
-        """A look-up in the columns of this search."""
-        table = table_of(attribute)
-        beside = table.numbers is None and table.first >= BESIDE
-        return shift_look_up(attribute, self.beside - BESIDE) if beside else attribute
-
-    def _shift(self, line: StraightLine) -> StraightLine:
-        nodes = ((op, of, self._near(a) if op in LOOK_UPS else a) for op, of, a in line.nodes)
-        return line.replace(nodes=tuple(nodes))
-
-    def _states(self, count: int) -> np.ndarray:
-        """States that nothing speaks for; entries of tables that are parameters increase."""
-        ends = [1 + max(table.positions) for table in self.tables]
-        columns = self.draw.uniform(0.3, 1.2, (max([self.beside, *ends]), count))
-        columns[: self.moving] *= self.draw.choice([-1.0, 1.0], (self.moving, count))
-        for table in self.tables:
-            columns[table.positions] = np.sort(self.draw.uniform(-1.5, 1.5, (table.count, count)), axis=0)
-        return columns
-
-    def _decide(self, columns: np.ndarray, given: np.ndarray, pieces: np.ndarray) -> np.ndarray:
-        """The pieces (m, S) of states; piece `given` (S,) of each is one of `pieces` (S,), where that is not NaN."""
-        m, first, states = self.m, self.size, np.arange(columns.shape[1])
-        columns = columns.copy()
-        columns[first : first + 2 * m] = 0.0
-        columns[first + given, states] = np.nan_to_num(pieces)
-        columns[first + m + given, states] = ~np.isnan(pieces)
-        found = np.array(self.decide.evaluate(list(columns)))[:m]
-        found[given, states] = np.where(np.isnan(pieces), found[given, states], pieces)
-        return found
-
-    def find(self, candidates: Sequence[int], nodes: Sequence[int], levels: Callable) -> dict[int, bool | None]:
-        """For each of these pieces: whether any of the nodes jumps with it; None where no state is on its border.
-
-        `levels(j, u, entries, draw)` gives levels near the switching number u (S,) of piece j, and the pieces below
-        and above, with `entries(located, index)` those of a table.
-        """
-        with np.errstate(all="ignore"):
-            columns, near, blocks = self._locate_borders(candidates, levels)
-            values = np.array(self._differences(nodes).evaluate(list(columns)))
-        change, noise = np.abs(values[: len(nodes)]), values[len(nodes) :]
-        known = near & np.isfinite(change).all(axis=0) & np.isfinite(noise).all(axis=0)
-        jumps = known & (change > _NOISE * _EPS * noise).any(axis=0)
-        return {
-            j: bool(jumps[block].any()) if known[block].any() else None
-            for j, block in zip(candidates, blocks, strict=True)
-        }
-
-    def find_zeros(self, candidates: Sequence[int], node: int, levels: Callable) -> list[bool]:
-        """For each of these pieces: whether the node is zero on one side of its border, wherever that is found."""
-        line = self._with_rounding(eliminate_dead_code(self.line, [node]), 1)
-        with np.errstate(all="ignore"):
-            columns, near, blocks = self._locate_borders(candidates, levels)
-            m, size = self.m, self.size
-            behind = np.concatenate([columns[:size], columns[size + m : size + 2 * m], columns[size + 2 * m :]])
-            zero = []
-            for inputs in (columns, behind):
-                value, error = line.evaluate(list(inputs))
-                zero.append(
-                    ~near | (np.abs(value) <= _HIT * _EPS * (error + np.abs(inputs[: self.moving]).max(axis=0)))
-                )
-        return [bool(near[block].any() and any(side[block].all() for side in zero)) for block in blocks]
-
-    def _locate_borders(self, candidates, levels) -> tuple[np.ndarray, np.ndarray, list[slice]]:
-        """States on the borders of pieces, with the pieces of both sides; which are there, and which are of each."""
-        m, size = self.m, self.size
-        columns, given = self._states(_STATES * len(candidates)), np.repeat(candidates, _STATES)
-        lines, target = [self._distance(j) for j in candidates], np.full((3, len(given)), np.nan)
-        blocks = [slice(k * _STATES, (k + 1) * _STATES) for k in range(len(candidates))]
-        for turn in range(_ROUNDS):
-            columns[size : size + m] = self._decide(columns, given, np.full(len(given), np.nan))
-            for j, line, block in zip(candidates, lines, blocks, strict=True):
-                here = columns[:, block]
-                if not turn:
-                    target[:, block] = levels(j, line.evaluate(list(here))[0], self._entries(here), self.draw)
-                for _ in range(_STEPS):
-                    u, _, *slopes = line.evaluate(list(here))
-                    step = (u - target[0, block]) / sum(s * s for s in slopes)
-                    here[: self.moving] -= np.where(np.isfinite(step), step, 0.0) * np.array(slopes)
-        near = np.zeros(len(given), bool)
-        for line, block in zip(lines, blocks, strict=True):
-            u, error, *_ = line.evaluate(list(columns[:, block]))
-            near[block] = np.abs(u - target[0, block]) <= _HIT * _EPS * (error + np.abs(target[0, block]))
-        for side in range(2):
-            columns[size + side * m : size + (side + 1) * m] = self._decide(columns, given, target[1 + side])
-        return columns, near, blocks
-
-    def _entries(self, columns: np.ndarray) -> Callable:
-        def entries(located, index: np.ndarray) -> np.ndarray:
-            table = self._near(table_of(located))
-            if table.numbers is not None:
-                return table.entries[index]
-            return columns[table.first + table.stride * index, np.arange(len(index))]
-
-        return entries
-
-    def _differences(self, nodes: Sequence[int]) -> StraightLine:
-        """The differences of nodes on both sides, and the rounding errors of these."""
-        graph = Graph(_LARGEST_KICK * len(self.line.nodes) + 10_000)
-        sides = _Sides(graph, self.line, self.size, self.m)
-        changes = [sides.difference(i) for i in nodes]
-        return self._with_rounding(eliminate_dead_code(graph, changes), len(changes))
-
-    def _distance(self, j: int) -> StraightLine:
-        """Switching number j, its rounding error, and its slopes by q, q̇ and t."""
-        line = eliminate_dead_code(self.line, [self.switches[j]])
-        return self._with_rounding(line, 1, range(self.moving))
-
-    def _with_rounding(self, line: StraightLine, count: int, by: Sequence[int] = ()) -> StraightLine:
-        graph = Graph(_LARGEST_KICK * len(line.nodes) + 10_000)
-        kinds = {node[2]: kind for node, kind in zip(line.nodes, line.kinds, strict=True) if node[0] == "input"}
-        inputs = [graph.input(i, kinds.get(i, "float")) for i in range(1 + max(kinds, default=-1))]
-        places = copy_nodes(graph, line, inputs)
-        errors = rounding(graph, line, places, self.moving)
-        slopes = gradient_in(graph, line, places, line.outputs[0], by) if by else []
-        outputs = [*(places[i] for i in line.outputs), *errors, *slopes]
-        assert len(line.outputs) == count
-        return eliminate_dead_code(graph, outputs)

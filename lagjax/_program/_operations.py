@@ -366,6 +366,7 @@ _ROWS = (
 )  # fmt: skip
 
 # What may come near the largest double where nothing else does, and what does not whatever its operand is.
+COMPARISONS = ("lt", "le", "gt", "ge")
 GROWING = frozenset(("exp", "exp2", "expm1", "sinh", "cosh"))
 BOUNDED = frozenset(("sin", "cos", "tanh", "logistic", "erf", "erfc", "atan", "atan2", "log", "log1p", "asinh"))
 # What may be infinite, or no number, besides what is `steep`.

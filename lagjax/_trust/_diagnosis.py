@@ -400,7 +400,7 @@ def _run_check(system: System, derivation: Derivation, params, ended: Ended) -> 
 def _count_unheld(derivation: Derivation) -> int:
     """The borders that the motion may slide along, and machine code does not."""
     try:
-        return 0 if derivation.lowered.borders is None else derivation.lowered.borders.unheld
+        return 0 if derivation.lowered.borders is None else derivation.lowered.borders.holding.unheld
     except Unlowerable:
         return 0
 

@@ -48,7 +48,7 @@ from lagjax._interface import (
     result_from,
 )
 from lagjax._primitives import DOUBLE, SINGLE, differentiable_where, lost_unless, mark_steps
-from lagjax._program import CLOCK, Unlowerable, lack_of_memory, table_of
+from lagjax._program import Unlowerable, lack_of_memory, table_of
 
 # Solvers reject steps for the round-off of their error estimate where rtol is below some ten units of it.
 LEAST_RTOL_OF_DIFFRAX = 10
@@ -190,10 +190,10 @@ def _jumps(problem: Problem) -> Jumps | None:
         borders = problem.derivation.borders
     except Unlowerable:
         return None
-    if borders is None or CLOCK not in borders.kinds:
+    if borders is None or not borders.clocks:
         return None
     numbers, first = jnp.asarray(problem.vector), 2 * problem.layout.size + 1
-    located = (table for kind, table in zip(borders.kinds, borders.tables, strict=True) if kind == CLOCK)
+    located = (borders.decisions[j].table for j in borders.clocks)
     knots = jnp.concatenate([
         jnp.asarray(table.entries, numbers.dtype) if table.numbers is not None
         else numbers[table.first - first :: table.stride][: table.count]

@@ -80,7 +80,7 @@ def _pieces(borders, rows: Rows, n: int) -> list[Any]:
 def _level(borders, guard, rows: Rows, piece):
     if guard.of_table:
         index = guard.level.slope * piece + guard.level.offset
-        table = borders.tables[guard.piece].table
+        table = borders.decisions[guard.piece].table.table
         entry = emit_look_up("take", table, rows.entries, piece.dtype, index)
         return jnp.where((index >= 0) & (index < table.count), entry, jnp.inf)
     return guard.level(piece, lambda where, x: jnp.where(where, x, 0.0))
