@@ -21,7 +21,7 @@ from lagjax._engine.diffrax import LEAST_RTOL_OF_DIFFRAX, FineOutput
 from lagjax._engine.taylor import MachineCode
 from lagjax._interface import as_arrays, show_str
 from lagjax._run import Members, Trajectory, simulate, simulate_batch
-from lagjax._scene import System
+from lagjax._scene import System, require_system
 
 PyTree = Any
 
@@ -144,6 +144,7 @@ def work_precision(
     print(lagjax.work_precision(scene, 1.0, 0.0, jnp.linspace(0, 10, 101), tolerances=[1e-6, 1e-9]))
     ```
     """
+    system = require_system(system, contacts=True)
     dtype = np.dtype(jnp.result_type(jnp.float32, *(jnp.asarray(leaf).dtype for leaf in jax.tree.leaves((q0, qdot0)))))
     measured: Any = {"default": None, **_SOLVERS} if solvers is None else solvers
     _require_adaptive(measured)
