@@ -64,4 +64,4 @@ from lagjax._native._loops import Floats, Loop, Struct, Wholes, compile_loops, e
 from lagjax._native._motion_parts import Projection, pieces_of, recurrences
 from lagjax._native._taylor import is_large, order_for
 from lagjax._native._watch import Crossed
-from lagjax._program._jump import Nesting
+from lagjax._program import Nesting

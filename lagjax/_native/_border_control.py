@@ -23,9 +23,7 @@ from lagjax._native._saltation import Saltation
 from lagjax._native._step import absolute_tolerance
 from lagjax._native._taylor import TaylorSeries, integer
 from lagjax._native._watch import Border, Crossed, GuardTable, Touch, end_at_border, joint_groups, reaches_border
-from lagjax._program._borders import Borders, gradient
-from lagjax._program._jump import Jump, Nesting
-from lagjax._program._levels import CONE, TABLE
+from lagjax._program import CONE, TABLE, Borders, Jump, Nesting, gradient
 
 NOWHERE = 1e300  # a level that no switching number comes to
 _AT_ONCE = 16.0  # roundings of the time by which two instants may differ that are one

@@ -13,10 +13,7 @@ from lagjax._native._saltation import Saltation
 from lagjax._native._step import absolute_tolerance
 from lagjax._native._taylor import TaylorSeries
 from lagjax._native._watch import Border, Crossed, Touch, end_at_border, reaches_border
-from lagjax._program._borders import Borders
-from lagjax._program._jump import Jump, Nesting
-from lagjax._program._levels import SLIDE
-from lagjax._program._passes import eliminate_dead_code
+from lagjax._program import SLIDE, Borders, Jump, Nesting, eliminate_dead_code
 
 _UNHELD = 1e6  # a share of a border that both sides do not push onto: those of others are near 0 … 1
 

@@ -6,8 +6,7 @@ from lagjax._native._ir import Code, Value
 from lagjax._native._roots import Roots
 from lagjax._native._taylor import TaylorSeries, integer
 from lagjax._native._watch import Border, Crossed, GuardTable, Touch
-from lagjax._program._borders import Borders
-from lagjax._program._levels import SIGN
+from lagjax._program import SIGN, Borders
 
 _AT_END = 16.0  # roundings of the time by which the end of a motion may miss an instant and is still taken to be there
 

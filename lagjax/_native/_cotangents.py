@@ -6,7 +6,7 @@ from lagjax._native._ir import DOUBLE
 from lagjax._native._motion_parts import MotionParts
 from lagjax._native._table_reads import lane_of
 from lagjax._native._taylor import TaylorSeries, integer
-from lagjax._program._look_ups import Table
+from lagjax._program import Table
 
 
 class Cotangents:

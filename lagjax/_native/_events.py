@@ -20,7 +20,7 @@ from lagjax._native._run_records import Output
 from lagjax._native._step import StepControl
 from lagjax._native._taylor import TaylorSeries, double
 from lagjax._native._watch import END_OF_STEP, Columns, Touch, Watch, reaches_border
-from lagjax._program._deciding import inputs_below
+from lagjax._program import inputs_below
 
 
 class Change(IntEnum):

@@ -28,7 +28,7 @@ from lagjax._native._constants import LEAST_ORDER
 from lagjax._native._gpu_entry import MOTION, TRANSPOSE, Entry, GpuForm, OneLane, motion_entry, transpose_entry
 from lagjax._native._ir import DOUBLE, Code
 from lagjax._native._taylor import TaylorSeries, order_for
-from lagjax._program._graph import Unlowerable
+from lagjax._program import Unlowerable
 
 # Threads of a block, and blocks: a motion has as many as 132 multiprocessors hold with all registers of a thread, for
 # others would wait. With half as many, what a transpose spills stays in the caches, by `benchmarks.gpu_estimate`.

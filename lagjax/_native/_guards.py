@@ -4,9 +4,7 @@ import functools
 from typing import NamedTuple
 
 from lagjax._native._lanes import INTEGERS
-from lagjax._program._borders import Borders, borders, with_outputs
-from lagjax._program._graph import Unlowerable
-from lagjax._program._series import Recurrent, Series, StraightLine, series
+from lagjax._program import Borders, Recurrent, Series, StraightLine, Unlowerable, borders, series, with_outputs
 
 
 class Guards(NamedTuple):

@@ -24,9 +24,7 @@ from lagjax._native._table_reads import SET_NUMBERS
 from lagjax._native._tangent import Tangent
 from lagjax._native._taylor import TaylorSeries, order_for, size_of_series
 from lagjax._native._threads import SLICE, run_in_slices, run_on_threads
-from lagjax._program._borders import Borders
-from lagjax._program._jump import Nesting
-from lagjax._program._series import Recurrent
+from lagjax._program import Borders, Nesting, Recurrent
 
 # What a round takes for each operation of the acceleration: 0.03 to 0.1 µs, more where members go back over steps.
 # It decides the length of the first slice, for which a rough value is enough.

@@ -5,7 +5,7 @@ from lagjax._native._frame import Frame
 from lagjax._native._ir import Value
 from lagjax._native._taylor import TaylorSeries
 from lagjax._native._watch import Crossed, GuardTable
-from lagjax._program._borders import Borders
+from lagjax._program import Borders
 
 
 class Knots:

@@ -9,9 +9,7 @@ from llvmlite import ir
 from lagjax._native._constants import LARGEST_ANGLE
 from lagjax._native._frame import Frame, Numbers, Vectors
 from lagjax._native._ir import BIT, DOUBLE, INTEGER, POINTER, Code, Value
-from lagjax._program._graph import Unlowerable
-from lagjax._program._operations import LOOK_UPS, OPERATIONS
-from lagjax._program._series import StraightLine
+from lagjax._program import LOOK_UPS, OPERATIONS, StraightLine, Unlowerable
 
 
 class Lines:

@@ -15,10 +15,7 @@ from lagjax._native._constants import LARGEST_LINE
 from lagjax._native._handler import call, compile_handler, load_at, make_once
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value, compile_module
 from lagjax._native._lanes import emit, sincos_function
-from lagjax._program._graph import Graph
-from lagjax._program._operations import OPERATIONS
-from lagjax._program._rounding import operation_error
-from lagjax._program._series import StraightLine
+from lagjax._program import OPERATIONS, Graph, StraightLine, operation_error
 
 _SET_ROWS = "set_rows"
 

@@ -26,7 +26,7 @@ from lagjax._native._motion_parts import MotionParts
 from lagjax._native._run_records import instant_about
 from lagjax._native._tangent_memory import Directions
 from lagjax._native._taylor import TaylorSeries, double
-from lagjax._program._differentiation import pullback, pullback_and_entries, pushforward
+from lagjax._program import pullback, pullback_and_entries, pushforward
 
 
 class ZerothOrder:

@@ -5,12 +5,22 @@ from dataclasses import replace
 from typing import NamedTuple
 
 from lagjax._native._guards import Guards, append_guards, require_lanes
-from lagjax._program._borders import Borders, Pieced, borders
-from lagjax._program._graph import Unlowerable
-from lagjax._program._jump import Jump, Nesting, jump_at_border, with_borders_of_tangents
-from lagjax._program._look_ups import BESIDE, shift_look_up
-from lagjax._program._operations import LOOK_UPS
-from lagjax._program._series import Recurrent, Series, series
+from lagjax._program import (
+    BESIDE,
+    LOOK_UPS,
+    Borders,
+    Jump,
+    Nesting,
+    Pieced,
+    Recurrent,
+    Series,
+    Unlowerable,
+    borders,
+    jump_at_border,
+    series,
+    shift_look_up,
+    with_borders_of_tangents,
+)
 
 
 class Projection(NamedTuple):

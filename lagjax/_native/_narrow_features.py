@@ -9,7 +9,7 @@ from lagjax._native._ir import Value
 from lagjax._native._roots import Roots
 from lagjax._native._taylor import TaylorSeries, integer
 from lagjax._native._watch import Crossed
-from lagjax._program._features import BELOW, BESIDE, FALLS, GROWS, UP_TO, Feature
+from lagjax._program import BELOW, BESIDE, FALLS, GROWS, UP_TO, Feature
 
 
 class NarrowFeatures:

@@ -10,7 +10,7 @@ from lagjax._native._frame import Fields, Frame, Index, Numbers
 from lagjax._native._ir import Code, Value
 from lagjax._native._taylor import TaylorSeries
 from lagjax._native._watch import reaches_border
-from lagjax._program._series import Recurrent
+from lagjax._program import Recurrent
 
 
 class Projector:

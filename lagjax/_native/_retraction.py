@@ -19,10 +19,7 @@ from lagjax._native._frame import Frame, Index, Vectors
 from lagjax._native._ir import Code, Value
 from lagjax._native._tangent_memory import Directions
 from lagjax._native._taylor import TaylorSeries, integer
-from lagjax._program._borders import Borders
-from lagjax._program._differentiation import pullback_and_entries, pushforward
-from lagjax._program._jump import Nesting
-from lagjax._program._levels import SLIDE
+from lagjax._program import SLIDE, Borders, Nesting, pullback_and_entries, pushforward
 
 Numbers = Callable[[Index], Value]
 

@@ -15,9 +15,7 @@ from lagjax._native._ir import Code, Value
 from lagjax._native._tangent_memory import Directions
 from lagjax._native._taylor import TaylorSeries
 from lagjax._native._watch import Crossed, GuardTable, Hit
-from lagjax._program._borders import Borders
-from lagjax._program._jump import Jump
-from lagjax._program._look_ups import Table
+from lagjax._program import Borders, Jump, Table
 
 
 class Saltation:

@@ -12,8 +12,7 @@ from collections import Counter
 from typing import NamedTuple
 
 from lagjax._native._constants import LARGEST_TREE, OFTEN, ROUNDS
-from lagjax._program._passes import count_uses
-from lagjax._program._series import StraightLine
+from lagjax._program import StraightLine, count_uses
 
 # What one operation may consist of; operands and results of these are of one kind.
 _JOINED = frozenset(("add", "sub", "mul", "neg", "div", "sqrt"))

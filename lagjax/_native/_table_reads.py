@@ -15,7 +15,7 @@ from llvmlite import ir
 
 from lagjax._native._frame import Frame
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value
-from lagjax._program._look_ups import BESIDE, Located, Table
+from lagjax._program import BESIDE, Located, Table
 
 SET_NUMBERS = "set_numbers"
 

@@ -21,8 +21,7 @@ from lagjax._native._frame import Frame, Numbers, Vectors, integers
 from lagjax._native._ir import DOUBLE, INTEGER, POINTER, Code, Value
 from lagjax._native._lanes import apply, sines_and_cosines
 from lagjax._native._schedule import OperationKind, Schedule, ScheduledOperation, schedule
-from lagjax._program._operations import LOOK_UPS
-from lagjax._program._series import StraightLine
+from lagjax._program import LOOK_UPS, StraightLine
 
 WORD = ir.IntType(32)  # an entry of a table: a kind, or a distance in the memory, in doubles
 

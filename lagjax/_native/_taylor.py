@@ -21,7 +21,7 @@ from lagjax._native._lanes import Lines, sincos_function
 from lagjax._native._motion_parts import MotionParts
 from lagjax._native._table_reads import LookUps
 from lagjax._native._tables import Tables
-from lagjax._program._series import Recurrent, Series, StraightLine
+from lagjax._program import Recurrent, Series, StraightLine
 
 AT_BORDER = "crossed", "crossed_number", "grazes"  # what is recorded of the border that a step ends at, and its pieces
 

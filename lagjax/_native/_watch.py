@@ -19,8 +19,7 @@ from llvmlite import ir
 from lagjax._native._frame import Fields, Frame, Index, integers
 from lagjax._native._ir import DOUBLE, INTEGER, Code, Value
 from lagjax._native._taylor import TaylorSeries
-from lagjax._program._borders import Borders
-from lagjax._program._levels import Affine, Level
+from lagjax._program import Affine, Borders, Level
 
 # The fields of a thread's memory that say where watches end a step.
 END_OF_STEP: Fields = {

@@ -12,18 +12,37 @@ NumPy; `_rounding` is for their error. `_memory` bounds what a graph may take. W
 `_tracing`.
 """
 
-from lagjax._program._borders import Borders, borders, distances, find_corners, is_smooth, with_outputs
-from lagjax._program._differentiation import Derivatives, copy_nodes, pullback, pushforward, tangents_in, with_tangents
+from lagjax._program._borders import (
+    Borders,
+    Pieced,
+    borders,
+    distances,
+    find_corners,
+    gradient,
+    is_smooth,
+    with_outputs,
+)
+from lagjax._program._deciding import inputs_below
+from lagjax._program._differentiation import (
+    Derivatives,
+    copy_nodes,
+    pullback,
+    pullback_and_entries,
+    pushforward,
+    tangents_in,
+    with_tangents,
+)
+from lagjax._program._features import BELOW, FALLS, GROWS, UP_TO, Feature
 from lagjax._program._graph import INPUTS, NUMBERS, PAIRS, Graph, Tape, Unlowerable, find_ancestors
-from lagjax._program._jump import row_places
-from lagjax._program._levels import CLOCK, FLOOR, SIGN, TABLE, TRUNC
+from lagjax._program._jump import Jump, Nesting, jump_at_border, row_places, with_borders_of_tangents
+from lagjax._program._levels import CLOCK, CONE, FLOOR, SIGN, SLIDE, TABLE, TRUNC, Affine, Level
 from lagjax._program._line import StraightLine
-from lagjax._program._look_ups import BESIDE, Located, Table, table_of
+from lagjax._program._look_ups import BESIDE, Located, Table, shift_look_up, table_of
 from lagjax._program._memory import lack_of_memory, machine_memory, operations_that_fit
 from lagjax._program._operations import LOOK_UPS, OPERATIONS
-from lagjax._program._passes import eliminate_dead_code, factor, sink_negations
-from lagjax._program._rounding import rounding
-from lagjax._program._series import LinearSystem, series
+from lagjax._program._passes import count_uses, eliminate_dead_code, factor, sink_negations
+from lagjax._program._rounding import operation_error, rounding
+from lagjax._program._series import LinearSystem, Recurrent, Series, series
 from lagjax._program._simplify import arctangent, inverse, is_nonnegative
 from lagjax._program._sliding import MOST_COUPLED
 from lagjax._program._small_equations import eliminate, sparse_row, substitute

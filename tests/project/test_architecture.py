@@ -81,13 +81,12 @@ print(run, run.health())
 
 def test_packages_have_doors():
     # What a room uses of another stands in the `__init__` of a package there, and an underscore name does not cross.
-    # `_native` reads the files of `_program` one by one, since it runs without JAX.
     for path in PACKAGE.rglob("*.py"):
         for node in nodes_of(path):
             if not isinstance(node, ast.ImportFrom) or not (node.module or "").startswith("lagjax."):
                 continue
             there = node.module.split(".")[1]
-            if there == place(path) or (place(path), there) == ("_native", "_program"):
+            if there == place(path):
                 continue
             private = [alias.name for alias in node.names if alias.name.startswith("_")]
             is_file = (PACKAGE.parent / (node.module.replace(".", "/") + ".py")).exists()
@@ -162,7 +161,7 @@ def test_machine_code_stands_alone():
             names = [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
             names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             assert not JAX & {name.split(".")[0] for name in names}, path
-            files = {PACKAGE.parent / (name.replace(".", "/") + ".py") for name in names}
+            files = {PACKAGE.parent / (name.replace(".", "/") + end) for name in names for end in (".py", "/__init__.py")}
             queue += [file for file in files if file.exists() and PACKAGE in file.parents]
     assert PACKAGE / "_program" / "_operations.py" in seen
     # And it runs so, forward and back.
