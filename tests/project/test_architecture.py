@@ -161,7 +161,8 @@ def test_machine_code_stands_alone():
             names = [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
             names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             assert not JAX & {name.split(".")[0] for name in names}, path
-            files = {PACKAGE.parent / (name.replace(".", "/") + end) for name in names for end in (".py", "/__init__.py")}
+            ends = ".py", "/__init__.py"
+            files = {PACKAGE.parent / (name.replace(".", "/") + end) for name in names for end in ends}
             queue += [file for file in files if file.exists() and PACKAGE in file.parents]
     assert PACKAGE / "_program" / "_operations.py" in seen
     # And it runs so, forward and back.
