@@ -77,10 +77,12 @@ def lanes() -> int:
 _PASSES = ("sroa", "dead_code_elimination")
 
 
-def compile_module(module: ir.Module, functions: tuple[str, ...]) -> tuple[llvm.ExecutionEngine, dict[str, int]]:
+def compile_module(
+    module: ir.Module, functions: tuple[str, ...], level: int | None = None
+) -> tuple[llvm.ExecutionEngine, dict[str, int]]:
     """Machine code for a module, and where its functions are. It lives as long as the engine."""
     text = str(module)
-    return compile_text(lambda: text, functions, text, LEVELS[len(text) > _LARGE])
+    return compile_text(lambda: text, functions, text, LEVELS[len(text) > _LARGE] if level is None else level)
 
 
 def compile_text(

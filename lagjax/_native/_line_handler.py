@@ -56,7 +56,8 @@ class LineCode:
                     _write_line(code, sincos, line, filled, here, there)
         code.finish()
         names = ("evaluate",) if write is None else ("evaluate", _SET_ROWS)
-        self._engine, places = compile_module(module, names)
+        level = 0 if write is None and compilation_work(line, lanes) > WORK_OPTIMISED else None
+        self._engine, places = compile_module(module, names, level)
         if write is not None:
             self._numbers = write.numbers
             ctypes.CFUNCTYPE(None, ctypes.c_void_p)(places[_SET_ROWS])(self._numbers.ctypes.data)
@@ -72,6 +73,11 @@ class LineCode:
 
 _QUICK = frozenset(("add", "sub", "mul", "div", "neg", "constant", "input"))
 _WIDE = frozenset(("sin", "cos", "sqrt", "abs"))  # functions that take a vector as a number
+
+
+# Beyond this work LLVM does not optimise a line that is written out. For 39 000 operations it takes 1.6 s so, else 5 s,
+# and a row of many then 6 µs, else 2.
+WORK_OPTIMISED = 12_000
 
 
 def compilation_work(line: StraightLine, lanes: int) -> int:

@@ -37,9 +37,9 @@ _TARGET = "lagjax_line"
 # Machine code takes some 20 µs a node to make, and NumPy 1 µs a node for a call: that of a line which XLA does not wait
 # for is made after as many calls as take that long, so that one call is not slow, and a thousand are not.
 _CALLS = 20
-# What LLVM may take for a line of a program of XLA, in additions, which take 70 µs each. Behind 4200 of them a call
-# takes 0.5 µs in place of 13; behind 9400 a row 1.4 µs, or 0.3 of many, in place of 40.
-WORK_OF_JIT = 12_000
+# What LLVM may take for a line of a program of XLA, in additions, which take 70 µs each, beyond 12 000 of them 40.
+# Behind 4200 of them a call takes 0.5 µs in place of 13; behind 39 000 a row of many 6 in place of 100.
+WORK_OF_JIT = 60_000
 LANES = 8  # rows of a line that one call evaluates side by side: as many as there are of numbers in widest registers
 
 
