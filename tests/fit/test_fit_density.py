@@ -82,12 +82,12 @@ def test_the_density_of_several_systems_and_its_derivatives_are_those_of_closed_
     rng, width = np.random.default_rng(1), np.sqrt(np.diag(density.covariance()))
     value_and_grad = jax.jit(jax.value_and_grad(density))
     for x in density.first + 2 * width * rng.normal(size=(3, len(density))):
-        expected, slope = jax.jit(jax.value_and_grad(by_hand))(jnp.asarray(x), density.shares)
+        expected, slope = jax.value_and_grad(by_hand)(jnp.asarray(x), density.shares)
         value, gradient = value_and_grad(x)
         # Motions are right to rtol 1e-9, residuals of σ = 0.05 to 1e-7 of it.
         assert value == pytest.approx(float(expected), rel=1e-6)
         np.testing.assert_allclose(gradient * width, slope * width, rtol=1e-5, atol=1e-5)
-    hessian = jax.jit(jax.hessian(by_hand))(np.asarray(density.first), density.shares)
+    hessian = jax.hessian(by_hand)(np.asarray(density.first), density.shares)
     # Expected and observed information differ by what residuals and curvature have in common: a few times 1/√31.
     scale = np.outer(width, width)
     np.testing.assert_allclose(density.covariance() / scale, np.linalg.inv(-hessian) / scale, atol=0.2)
