@@ -4,7 +4,6 @@ import gc
 import hashlib
 import itertools
 import os
-import threading
 from importlib.metadata import version
 from pathlib import Path
 
@@ -28,7 +27,6 @@ if version("jaxlib").startswith("0.10."):
 import jax
 import llvmlite.binding
 import pytest
-from jax._src.interpreters import mlir
 
 from lagjax._native import _ir
 
@@ -53,21 +51,6 @@ os.environ["LAGJAX_CACHE"] = str(COMPILED.parent.parent / "objects")
 jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
 jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
-
-# Half of what lowers a small program, and a fifth of all that it takes, is a context of MLIR that knows all dialects: a
-# hundred programs of a thread share one.
-_make_context, _contexts, _SHARERS = mlir.make_ir_context, threading.local(), 100
-
-
-def _shared_context():
-    if getattr(_contexts, "left", 0) == 0:
-        _contexts.kept, _contexts.left = _make_context(), _SHARERS
-    _contexts.left -= 1
-    return _contexts.kept
-
-
-if version("jax").startswith("0.10."):  # where the name is JAX's own
-    mlir.make_ir_context = _shared_context
 
 # Machine code is made fast instead of well, too. What selects instructions is what does at other levels, since LLVM's
 # fast one leaves sums of products uncontracted in the code of a single member: the bits stay, as sweeps in other
