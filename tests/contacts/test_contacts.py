@@ -781,3 +781,19 @@ def test_derivatives_of_thirty_contacts():
     value, slope = jax.jit(jax.value_and_grad(last))(e)
     np.testing.assert_allclose(value, ((1 + e) / 2) ** blows, rtol=1e-12)
     np.testing.assert_allclose(slope, blows / 2 * ((1 + e) / 2) ** (blows - 1), rtol=1e-10)
+
+
+@pytest.mark.parametrize("up", [0.0, -1.0])
+def test_outputs_at_the_start_vary_where_a_contact_closes_there(up):
+    """At rest on a floor, or moving into it: the first output is behind what happens at the start."""
+    ball = lagjax.System(
+        lambda q, v: 0.5 * v @ v - 9.81 * q[1], contacts=lambda q: {"floor": q[1]}, restitution=lambda params: params
+    )
+
+    def first(x, along, e):
+        run = lagjax.simulate(ball, jnp.stack([x, 0.0]), jnp.stack([along, up]), np.array([0.0, 0.05, 0.1]), e)
+        return jnp.concatenate([run.q[0], run.qdot[0]])
+
+    expected = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -up]])
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(np.stack(derivative(first, (0, 1, 2))(0.3, 1.5, 0.6), 1), expected, atol=1e-14)
