@@ -72,23 +72,28 @@ def couple_forces(motion, law: Callable, layout, params: PyTree):
     constraints = motion.constraints
     rest, numbers = jnp.zeros(layout.size, layout.dtype), eqx.filter(params, eqx.is_array_like)
     state = rest, rest, jnp.zeros((), layout.dtype), numbers
-    zero = jnp.zeros(jax.eval_shape(constraints.residual, *state).size, layout.dtype)
+    # A number of no trace: the laws below outlive the one, as of `jit`, in which they are made.
+    zero = np.zeros(jax.eval_shape(constraints.residual, *state).size, layout.dtype)
+
+    def without(*state):
+        return law(*state, jnp.asarray(zero))
+
     if not zero.size:
-        return dataclasses.replace(motion, forces=lambda *state: law(*state, zero))
+        return dataclasses.replace(motion, forces=without)
     if constraints.held is None:
         return dataclasses.replace(motion, forces=CoupledForces(law, motion))
     own = constraints.drag
-    if any(_dependence(lambda some: law(*state, some), zero)):
+    if any(_dependence(lambda some: law(*state, some), jnp.asarray(zero))):
         free = dataclasses.replace(motion, constraints=dataclasses.replace(constraints, drag=None))
         rubbing = law if own is None else (lambda *given: law(*given) + own(*given[:-1]) @ given[-1])
         return dataclasses.replace(free, forces=CoupledForces(rubbing, free))
 
     def drag(*state):
-        brought = jax.jacfwd(law, argnums=4)(*state, zero)
+        brought = jax.jacfwd(law, argnums=4)(*state, jnp.asarray(zero))
         return brought if own is None else brought + own(*state)
 
     both = dataclasses.replace(constraints, drag=drag)
-    return dataclasses.replace(motion, forces=lambda *state: law(*state, zero), constraints=both)
+    return dataclasses.replace(motion, forces=without, constraints=both)
 
 
 def _solve_law(of_read: Callable, alone, responses, at_zero: bool):

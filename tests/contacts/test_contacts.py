@@ -781,3 +781,40 @@ def test_derivatives_of_thirty_contacts():
     value, slope = jax.jit(jax.value_and_grad(last))(e)
     np.testing.assert_allclose(value, ((1 + e) / 2) ** blows, rtol=1e-12)
     np.testing.assert_allclose(slope, blows / 2 * ((1 + e) / 2) ** (blows - 1), rtol=1e-10)
+
+
+@pytest.mark.parametrize("up", [0.0, -1.0])
+def test_outputs_at_the_start_vary_where_a_contact_closes_there(up):
+    """At rest on a floor, or moving into it: the first output is behind what happens at the start."""
+    ball = lagjax.System(
+        lambda q, v: 0.5 * v @ v - 9.81 * q[1], contacts=lambda q: {"floor": q[1]}, restitution=lambda params: params
+    )
+
+    def first(x, along, e):
+        run = lagjax.simulate(ball, jnp.stack([x, 0.0]), jnp.stack([along, up]), np.array([0.0, 0.05, 0.1]), e)
+        return jnp.concatenate([run.q[0], run.qdot[0]])
+
+    expected = np.array([[1.0, 0.0, 0.0], [0.0, 0.0, 0.0], [0.0, 1.0, 0.0], [0.0, 0.0, -up]])
+    for derivative in (jax.jacfwd, jax.jacrev):
+        np.testing.assert_allclose(np.stack(derivative(first, (0, 1, 2))(0.3, 1.5, 0.6), 1), expected, atol=1e-14)
+
+
+@pytest.mark.parametrize("law", ["linear", "pieces"])
+def test_forces_read_normal_forces_in_a_scene_whose_first_motion_is_traced(law):
+    """It falls and slides on against a drag c N ẋ: x = t₁ + (1 − exp(−c g (2 − t₁))) / (c g)."""
+
+    def drag(q, v, params, multipliers):
+        n = multipliers["floor"]
+        return jnp.array([-params * (n if law == "linear" else jnp.minimum(n, 20.0)) * v[0], 0.0])
+
+    block = lagjax.System(lambda q, v: 0.5 * v @ v - 9.81 * q[1], forces=drag, contacts=lambda q: {"floor": q[1]})
+
+    def last(c):
+        return lagjax.simulate(block, np.array([0.0, 1.0]), np.array([1.0, 0.0]), np.array([0.0, 2.0]), c).q[-1, 0]
+
+    def closed(c):
+        fall = jnp.sqrt(2 / 9.81)
+        return fall + (1 - jnp.exp(-c * 9.81 * (2 - fall))) / (c * 9.81)
+
+    found, expected = (jax.jit(jax.value_and_grad(f))(0.3) for f in (last, closed))
+    np.testing.assert_allclose(found, expected, rtol=1e-10)

@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 
 from lagjax._engine.taylor import Line
-from lagjax._primitives import Repetition
+from lagjax._primitives import Repetition, differentiable_where
 from lagjax._program import Unlowerable
 from lagjax._run.jumps._scene_code import SceneCode
 from lagjax._tracing import lower
@@ -62,7 +62,8 @@ class Replay:
         before = (ts <= begun[-1]) & ((begun[-1] > ts[0]) | (count == 0))  # one at the start is the first round's
         path, varying = jnp.where(before[:, None], y, 0.0), (ts, y0, *given)[: self._rounds.inputs]
         (t, y), (said, behind), (more,) = self._rounds(varying, (t, y), (found.record,), count)
-        return path + more, said, behind, t, y
+        known = (ts > ts[0]) | (count == 0) | (t > ts[0])  # no round gives those at the start where none goes on
+        return differentiable_where(known[:, None], path + more), said, behind, t, y
 
     def _read(self, record):
         return self.code.read(record, self.code.law.places.record)
@@ -70,12 +71,14 @@ class Replay:
     def _play(self, given, carry, _, rows):
         ts, (t, y), (record,), still = given[0], carry, rows, jax.lax.stop_gradient
         row, begun = self._read(record), still(t)
-        ahead = (ts > begun) | (ts == jnp.where(begun == ts[0], begun, jnp.nan))
+        ahead = (ts > begun) | (ts == jnp.where((begun == ts[0]) & (row.end > begun), begun, jnp.nan))
         end = jnp.where((row.happens == 0) & (row.end == still(ts[-1])), ts[-1], row.end)
         end = jnp.where(row.ran > 0, end, begun)
         times = jnp.concatenate([t[None], jnp.where(ahead, ts, begun), ts[-1:]])
         event = end, row.stop, row.watch.astype(int), row.crosses > 0
         path, said, behind, later = self.pass_stretch(given, (t, y), row, record, ahead, times, event)
+        is_last = (begun == ts[0]) & (row.end <= begun) & (still(later) > begun)  # of those at the start
+        path = jnp.where((is_last & (ts == begun))[:, None], y, path)
         return [later, behind], [said, behind], [path]
 
     def line_of_end(self, function: Callable, *shapes: tuple[int, ...]) -> Line | None:
