@@ -75,11 +75,11 @@ def couple_forces(motion, law: Callable, layout, params: PyTree):
     # A number of no trace: the laws below outlive the one, as of `jit`, in which they are made.
     zero = np.zeros(jax.eval_shape(constraints.residual, *state).size, layout.dtype)
 
-    def without(*state):
+    def force_alone(*state):
         return law(*state, jnp.asarray(zero))
 
     if not zero.size:
-        return dataclasses.replace(motion, forces=without)
+        return dataclasses.replace(motion, forces=force_alone)
     if constraints.held is None:
         return dataclasses.replace(motion, forces=CoupledForces(law, motion))
     own = constraints.drag
@@ -93,7 +93,7 @@ def couple_forces(motion, law: Callable, layout, params: PyTree):
         return brought if own is None else brought + own(*state)
 
     both = dataclasses.replace(constraints, drag=drag)
-    return dataclasses.replace(motion, forces=without, constraints=both)
+    return dataclasses.replace(motion, forces=force_alone, constraints=both)
 
 
 def _solve_law(of_read: Callable, alone, responses, at_zero: bool):
