@@ -94,12 +94,13 @@ def compilation_work(line: StraightLine, lanes: int) -> int:
 
 
 def _write_line(code: Code, sincos: Code | None, line: StraightLine, filled: list[int], x: Value, out: Value) -> None:
-    """Write the outputs that are `filled` of a line, operation by operation."""
-    read = functools.cache(lambda i: code.load(code.element(x, i), code.vector))
+    """Write the outputs that are `filled` of a line, operation by operation; a number of x and `out` has all lanes."""
+    lanes = code.lanes
+    read = functools.cache(lambda i: code.load(code.element(x, i * lanes), code.vector))
     line = line.replace(outputs=tuple(line.outputs[k] for k in filled))
     for k, i, value in zip(filled, line.outputs, emit(code, line, read, sincos, None), strict=True):
         number = code.as_number(value) if line.kinds[i] == "bool" else value
-        code.store(code.lanes_of(number), code.element(out, k))
+        code.store(code.lanes_of(number), code.element(out, k * lanes))
 
 
 def _write_tiles(code: Code, sincos: Code | None, line: StraightLine, inputs: int, filled: list[int]) -> None:
@@ -117,11 +118,7 @@ def _write_tiles(code: Code, sincos: Code | None, line: StraightLine, inputs: in
             row = code.element(x, (first.value + own) * inputs)
             with code.loop(inputs) as k:
                 code.store(code.load(code.element(row, k), DOUBLE), code.element(given, k * lanes + j))
-        read = functools.cache(lambda i: code.load(code.element(given, i * lanes), code.vector))
-        rest = line.replace(outputs=tuple(line.outputs[k] for k in filled))
-        for k, i, value in zip(filled, rest.outputs, emit(code, rest, read, sincos, None), strict=True):
-            number = code.as_number(value) if line.kinds[i] == "bool" else value
-            code.store(code.lanes_of(number), code.element(found, k * lanes))
+        _write_line(code, sincos, line, filled, given, found)
         with code.loop(here) as j:
             row = code.element(out, (first.value + j) * outputs)
             with code.loop(outputs) as k:

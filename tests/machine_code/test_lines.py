@@ -124,3 +124,11 @@ def test_long_runs_of_one_output_are_written_by_a_loop():
     assert code is not None
     inputs = np.array([[0.3, 1.1, 0.4], [0.7, -2.0, 3.0]])
     np.testing.assert_array_equal(code(inputs), [rows(x) for x in inputs])
+
+
+def test_rows_of_many_numbers_stay_off_the_stack_of_a_thread():
+    program = lower(lambda x, more: x * jnp.sin(x[0]) + more[7], jnp.ones(3), jnp.ones(100_000))
+    line = Line(program.line, program.size, 3)
+    rows = np.concatenate([np.random.default_rng(0).normal(size=(9, 3)), np.ones((9, 100_000))], axis=1)
+    found = jax.jit(lambda x: line(x))(rows)
+    np.testing.assert_allclose(found, rows[:, :3] * np.sin(rows[:, :1]) + 1.0, rtol=1e-14)

@@ -41,6 +41,7 @@ _CALLS = 20
 # Behind 4200 of them a call takes 0.5 µs in place of 13; behind 39 000 a row of many 6 in place of 100.
 WORK_OF_JIT = 60_000
 LANES = 8  # rows of a line that one call evaluates side by side: as many as there are of numbers in widest registers
+MOST_IN_LANES = 2048  # numbers of a row, in all lanes 128 kB of the stack of a thread
 
 
 def outputs(program: Program, count: int, first, numbers):
@@ -101,7 +102,7 @@ class Line:
     @functools.lru_cache(maxsize=2)  # noqa: B019  # those of a few
     def code_of_jit(self, is_wide: bool) -> LineCode | None:
         """The code for a program of XLA, which is called often; LLVM may take longer for it."""
-        for lanes in (LANES, 1) if is_wide else (1,):
+        for lanes in (LANES, 1) if is_wide and self.size + self.outputs <= MOST_IN_LANES else (1,):
             if compilation_work(self.line, lanes) <= WORK_OF_JIT:
                 return self._make_code(largest=len(self.line.nodes) + self.outputs, lanes=lanes)
         return self.code
