@@ -250,7 +250,7 @@ class DraggedElimination:
         if of_drag:
             columns, coupling = of_drag
             graph = z.expansion.graph
-            rows = [sparse_row(graph, row) for row in coupling.ids.tolist()]
+            rows = [sparse_row(graph, row) for row in z.expansion.real(coupling.ids).tolist()]
             multipliers = substitute(graph, rows, (-z[n + self.dragged]).ids.tolist())
             for k, multiplier in enumerate(multipliers):
                 z = z + columns[k] * Scalars(z.expansion, np.array(multiplier))

@@ -608,3 +608,16 @@ def test_normal_forces_of_more_contacts_than_a_body_needs():
     box = lagjax.System(lambda q, v: 0.5 * v @ v - G * q[1], forces=forces, contacts=corners)
     run = lagjax.simulate(box, jnp.array([0.0, 1.0, 0.0]), jnp.array([1.0, 0.0, 0.0]), jnp.array([0.0, 0.2, 2.0]))
     np.testing.assert_allclose(run.q[1:, 0], [0.2 - 0.004 * G, 1 / (0.4 * G)], rtol=1e-11)
+
+
+def test_many_contacts_each_with_a_drag_by_its_own_force():
+    """Twenty bodies that fall and then slide, v = exp(−k (t − t₁)) with k = c g: more than a table has of one array."""
+    n, c, height = 20, 0.3, np.linspace(0.1, 1.0, 20)
+    bodies = lagjax.System(
+        lambda q, v: 0.5 * jnp.sum(v**2) - 9.81 * jnp.sum(q[n:]), contacts=lambda q: {"floor": q[n:]},
+        forces=lambda q, v, multipliers: jnp.concatenate([-c * multipliers["floor"] * v[:n], jnp.zeros(n)]),
+    )  # fmt: skip
+    start = np.concatenate([np.zeros(n), height]), np.concatenate([np.ones(n), np.zeros(n)])
+    run = lagjax.simulate(bodies, *start, np.array([0.0, 2.0]))
+    landed, k = np.sqrt(2 * height / 9.81), c * 9.81
+    np.testing.assert_allclose(run.q[-1, :n], landed + (1 - np.exp(-k * (2 - landed))) / k, rtol=1e-10)
