@@ -18,16 +18,15 @@ TOO_MANY, INCONSISTENT, ZENO, IN_TURN, NOT_FINITE = map(
 )  # fmt: skip
 BY_TARGET, BEYOND, CROSSING = range(3)  # how a transition fires
 EPS = 2.0**-52
-# How far the logarithms of two ratios of a geometric sequence may differ, as a part of them. Times of a Zeno motion
-# approach a geometric sequence; twice this would take a slowly changing rhythm for one.
+# The relative difference that is allowed between the logarithms of two ratios of a geometric sequence. Times of a Zeno
+# motion approach a geometric sequence; doubled, a slowly changing rhythm would count as one.
 STEADY = 0.05
-# Transitions at one instant that are said to go back and forth: a chain of as many is longer than any that passes on a
-# blow among a few balls. And how long before it the last other one was, in parts of the time: bounces that pile up come
-# as near to their end as rounding lets them.
+# This many transitions at one instant alternate for ever: a chain of blows among a few balls is shorter. `APART` is the
+# minimal pause before them, relative to t; shorter pauses mean accumulating bounces.
 IN_ONE_PLACE, APART = 8, 1e-9
-# Blows at one instant that are followed in both orders of the list, and by how much of its largest value a number of
-# the state may differ behind them: far more than rounding of some thirty blows. Twice as many blows settle more of
-# those of restitution below one, whose last ones are small.
+# Up to this many blows at one instant are computed in both orders of the list. `SAME` is the difference of a number of
+# the state after them that is allowed, relative to its largest value: far more than the rounding of thirty blows. Twice
+# as many blows would settle more cases of restitution below one, whose last blows are small.
 MOST_BLOWS, SAME = 32, 1e-9
 INFINITY, MISSING = float("inf"), float("nan")
 watch, write_times, write_outputs = bind_loops(globals())
