@@ -267,11 +267,8 @@ def _keep_unused(residuals: Residuals, point: Point) -> tuple[Residuals, Point]:
     states, unknowns, kept = residuals.states, residuals.unknowns, np.zeros(len(residuals.parameters), bool)
     if unknowns.own and len(residuals.parts) > 1:
         with contextlib.suppress(LostMotion):
-            slopes, columns = iter(residuals.evaluate(point).slopes), slice(states, states + unknowns.own)
-            each = [
-                [np.any(next(slopes)[..., columns], axis=(0, 1, 2)) for _ in part.batches] for part in residuals.parts
-            ]
-            uses = np.array([np.any(one, axis=0) for one in each])
+            own = (x[..., states : states + unknowns.own].any(axis=(0, 1, 2)) for x in residuals.evaluate(point).slopes)
+            uses = np.array([np.any([next(own) for _ in part.batches], axis=0) for part in residuals.parts])
             for part, used in zip(residuals.parts, uses, strict=True):
                 kept[unknowns.columns[part.frame.rows, : unknowns.own][:, ~used & uses.any(axis=0)]] = True
     if not kept.any():

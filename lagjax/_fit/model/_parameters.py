@@ -201,11 +201,9 @@ class Parameters:
 
     def directions(self, u: np.ndarray) -> np.ndarray:
         """The derivatives of the numbers of every record by the unknowns that these depend on, (R, L, P)."""
-        found, (record, column, number, which) = (
-            np.zeros((*self.unknowns.columns.shape, self.places.shape[1])),
-            self._seen,
-        )
-        found[record, column, number] = self._slopes(u)[2][which]
+        found = np.zeros((*self.unknowns.columns.shape, self.places.shape[1]))
+        *places, which = self._seen
+        found[tuple(places)] = self._slopes(u)[2][which]
         return found
 
     def ends(self, u: np.ndarray, spread: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -218,10 +218,10 @@ class Fit:
         """The motion of the fitted scene over a record, which need not be one of those that were fitted.
 
         It begins at the record's start if that is known, else at the start that fits the record's values best with the
-        parameters kept. So are the numbers that are `lagjax.per_record`, of a record that was not fitted; one of
-        `Fit.records` has those of the fit. To predict from the first samples alone, let `predict` find the start of a short record, and
-        give that start to a `Record` of the whole. `system` is the name of the record's system, for a fit of several
-        systems.
+        parameters kept. Numbers that are `lagjax.per_record` are those of the fit for one of `records`, and for another
+        record those that fit its values best. To predict from the first samples alone, let `predict` find the start of
+        a short record, and give that start to a `Record` of the whole. `system` is the name of the record's system, for
+        a fit of several systems.
 
         Raises `ValueError` where the record has different signals from those of the fit, or its motion fails.
         """
