@@ -25,7 +25,7 @@ from lagjax._native._taylor import TaylorSeries, integer
 from lagjax._native._watch import Border, Crossed, GuardTable, Touch, end_at_border, joint_groups, reaches_border
 from lagjax._program import CONE, TABLE, Borders, Jump, Nesting, gradient
 
-NOWHERE = 1e300  # a level that no switching number comes to
+NOWHERE = 1e300  # a level that no switching number reaches
 _AT_ONCE = 16.0  # roundings of the time by which two instants may differ that are one
 
 
@@ -68,7 +68,7 @@ class BorderControl:
             "approach": 1,  # the step from which on others ended before a border without a series; 0 if that is over
             "next_approach": 1,  # the same behind this step
             "slides": 1,  # 1 if the motion slides along any border
-            "stops": 1,  # 1 if the step ends at a border that it comes to with no speed, to rounding
+            "stops": 1,  # 1 if the step ends at a border that it reaches with no speed, to rounding
             "level": guards if any(guard.of_table for guard in borders.guards) else 0,  # a level that changes
         }
         if groups := joint_groups(borders):

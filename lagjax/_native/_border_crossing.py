@@ -170,10 +170,10 @@ class BorderCrossing:
         self._leave(frame, border, hit, again)
 
     def _leave(self, frame: Frame, border: Border, hit: Value, again: Value) -> None:
-        """Let a sliding motion go on along one side, where its share of that side comes to 0 or 1.
+        """Let a sliding motion continue on one side, when its share of that side reaches 0 or 1.
 
         The rate of u that was kept at zero is zero there after a slide, and not where it did not slide at all. Where
-        both sides do not push onto the border, it goes on as the function is written at the border itself.
+        both sides do not push onto the border, it continues as the function is written at the border itself.
         """
         code, on = frame.code, Border(frame, self.table, border["on"])
         with code.only_if(on.g >= 0):

@@ -93,15 +93,14 @@ class Events:
     def _begin_sides(self) -> Code:
         """`(order)`: for lanes at the start of a run, the side of each surface they are on, into `side`.
 
-        On the surface, to rounding, that is the side from which the motion comes: what is remembered, as large as
-        rounding may have made the guard before it came near zero, or else that from which it can change in the
-        direction of the guard. To note what changes, it begins here. Where it goes to the other side, and does so in
-        the direction of the guard, that is a change at the start, into `met`. Otherwise, and where nobody knows from
-        where it comes, it is the side that the motion goes to. Where it goes its rate says or, where that is zero to
-        rounding too, the first term of its series that is not. A start is rounded as the numbers that came in.
+        A guard that is zero to rounding takes its previous side: the remembered one, at least as large as the rounding
+        of the guard before it came near zero, or else the one from which it can change in the direction of the guard.
+        If the motion leaves that side, in the direction of the guard, that is a change at the start, noted in `met`. If
+        the previous side is unknown, use the side that the motion moves to: the sign of the first derivative that
+        exceeds rounding. Starts have the rounding of the numbers that were given.
 
-        A motion that remembers may begin beyond the surface, on the other side than it comes from. Where it goes on
-        that is a change at the start, too, and where the side is infinite it is one wherever the motion goes.
+        A motion with a memory may begin beyond the surface, opposite to its previous side. If it moves on, that is a
+        change at the start as well; if the remembered side is infinite, it is one wherever the motion moves.
         """
         frame = self.motion.function("begin_sides", INTEGER)
         code, (order,), count = frame.code, frame.arguments, self.count

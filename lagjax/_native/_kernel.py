@@ -81,7 +81,7 @@ class Kernel:
 
     The outputs of the program are the n accelerations, then whether the mass matrix is singular. `projection` is
     applied to the state after every step, and to the outputs after the first. `guards`, again from the same inputs, end
-    the motion of a member with the code `EVENT`; or they are noted and the motion goes on: then there are notes in the
+    the motion of a member with the code `EVENT`; or they are noted and the motion continues: then notes take the
     place of states at output times. Errors are relative to each coordinate, or to the largest one of those with the
     same number in `error_groups` (n,). The coordinates may be those of a motion with its tangents (`nesting`); then
     `motion` is the program of the motion alone. Vectors have `width` lanes, by default those of the processor. Raises
@@ -262,7 +262,7 @@ class Kernel:
     def _go_over(
         self, kernel: "tuple[_Compiled, int]", ts, params, record: StepRecord, arrays: dict, **numbers: float
     ) -> None:
-        """Let a kernel of derivatives, and so many threads, go over the steps of a record; `arrays` are its own."""
+        """Run a kernel of derivatives, with its number of threads, over the steps of a record; `arrays` are its own."""
         names = ("ts", "params", "record", *arrays)
         arrays = dict(zip(names, _contiguous(ts, params, record.table, *arrays.values()), strict=True))
         ts, params = arrays["ts"], arrays["params"]

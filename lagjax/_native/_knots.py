@@ -1,4 +1,4 @@
-"""Knots: entries of tables that the time is on. When the motion comes to the next one is known without a search."""
+"""Time knots: entries of tables over the time. The instant of the next one is known without a search."""
 
 from lagjax._native import _constants as limits
 from lagjax._native._frame import Frame

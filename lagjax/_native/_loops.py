@@ -10,8 +10,8 @@
 A loop knows doubles, integers, arrays of both with one index, of which `x[3:]` is the part from there on, and the
 constants of its module. It has `if`, `while`, `for` over a range, arithmetic, comparisons, `and`, `or`, `not`, what
 stands in `_FUNCTIONS`, and calls of other loops. A variable keeps the kind that it begins with. It stays a function of
-Python, too, which on arrays of NumPy computes the same: so it is tested, and there an index outside of its array is an
-error, which in machine code nobody sees. Integers divide as those of C do.
+Python, too, which computes the same on arrays of NumPy: so it is tested, and there an index outside of its array is an
+error, which machine code does not detect. Integers divide as those of C do.
 """
 
 import ast

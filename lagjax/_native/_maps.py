@@ -280,8 +280,8 @@ class SeriesSum:
 class ProjectedEnd:
     """The state at the end of a step on the constraints, from the end of its series.
 
-    At a border from which the motion goes on, derivatives are those of the series: the curvature of a constraint may
-    jump there, and rounding would decide of which side the projection is.
+    At a border that the motion crosses, derivatives are those of the series: the curvature of a constraint may jump
+    there, and rounding would decide to which side the projection belongs.
     """
 
     def __init__(self, motion: TaylorSeries, parts: MotionParts):

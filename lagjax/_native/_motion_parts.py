@@ -35,7 +35,7 @@ class Projection(NamedTuple):
 
 
 class Chosen(NamedTuple):
-    """The numbers of a member that a motion computes with, those at `positions` `of` so many; others are looked up."""
+    """The numbers of a member that a motion computes with: those at `positions`, of a total of `of`."""
 
     positions: tuple[int, ...]
     of: int
@@ -182,7 +182,7 @@ def pieces_of(
 ) -> "tuple[Borders, Series] | None":
     """The borders of a piecewise program, and the series of its motion along a piece; None where there are none.
 
-    With tangents they are those of the `motion` alone, which has so many of the numbers of a `member`, moved along.
+    With tangents they are those of the `motion` alone, which has `member` numbers of a member; these are shifted.
     """
     size = nesting.size
     if nesting.directions:

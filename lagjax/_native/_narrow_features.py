@@ -104,7 +104,7 @@ class NarrowFeatures:
             level = code.maximum(rise - slope * u, -limits.FAINT)
             matters = level < (float("inf") if kind == BELOW else 0.0)
             start = level + slope * u
-            if kind == BELOW:  # from above it comes to where there is a series again, and then is told in parts
+            if kind == BELOW:  # from above it first reaches arguments that have a series
                 above, falls = u * scale - limits.BEYOND, self.motion.followed_coefficient(frame, j, 1) * h < 0.0
                 high = (above > 0.0) | ((u * scale > limits.STEEP) & falls)
                 slope = code.select(high, scale, slope)

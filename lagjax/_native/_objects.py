@@ -7,7 +7,7 @@ short or damaged is not what its first bytes say, and is made anew. Where files 
 kept, and nothing fails.
 
 They lie in the user's folder for caches. The environment variable `LAGJAX_CACHE` names another one; `off` keeps none.
-What is read is run. So a folder is used only if it is the user's own and nobody else may write to it; in another one,
+What is read is run. So a folder is used only if it is the user's own and no other user may write to it; in another one,
 such as /tmp, a folder of its own is made, and without that nothing is kept, which one warning says. A file is read only
 if it is a regular one of the user's, with no link followed.
 """
@@ -63,7 +63,7 @@ def private_folder(place: Path) -> Path | None:
 
 
 def _is_private(status: os.stat_result) -> bool:
-    """True if a file or folder is the user's own, and nobody else may write to it."""
+    """True if a file or folder is the user's own, and no other user may write to it."""
     if not hasattr(os, "geteuid"):  # Windows, where the folder for caches is the user's
         return True
     return status.st_uid == os.geteuid() and not status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)

@@ -44,7 +44,7 @@ class Roots:
             "unsure": 1,  # the rounding of P
             "doubt": 1,  # what P leaves out, as the factor of the power after its last one
             "instant": 1,  # what is closer is one place
-            "closer": 1,  # 1 to end the search where P comes to zero to its rounding, and may go through it unseen
+            "closer": 1,  # 1 to end the search where P is zero to its rounding, and may cross it undetected
             "part": 1,  # of the step that [0, 1] is
             "falls": 1,  # Σ of the negative coefficients but P(0), as a size
             "rises": 1,  # Σ of the positive ones
@@ -109,7 +109,7 @@ class Roots:
             power.value = power.value * part
 
     def divide(self, frame: Frame, degree: Value, powers: Value) -> None:
-        """Divide by so many powers, those of a zero at 0, which is no root to be found; and by all that vanish next."""
+        """Divide by `powers` powers of s, for a zero at 0 that is no root to be found, and by all that vanish next."""
         code, left = frame.code, frame.code.variable(powers)
         frame["divided"] = 0.0
         with code.repeat_while(lambda: code.any_lane(left.value > 0.0), at_most=MAX_ORDER):

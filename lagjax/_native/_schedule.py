@@ -130,7 +130,7 @@ def _outputs(
     return outputs, copies
 
 
-# ---- what often comes together ---------------------------------------------------------------------------------------
+# ---- pairs that are fused --------------------------------------------------------------------------------------------
 
 
 def _join_pairs(operations: list[ScheduledOperation], uses: list[int], kinds: _Kinds) -> list[ScheduledOperation]:

@@ -1,7 +1,7 @@
 """Watches: numbers that are followed along a step against a level, and what is remembered of each.
 
-A watch looks for the instant at which its number comes to the level from its side. Where a motion begins on the level,
-or moves along it, that is remembered as a `Touch`: rounding must not decide on which side the next step begins. What
+A watch looks for the instant at which its number reaches the level from its side. If a motion begins on the level, or
+moves along it, that is remembered as a `Touch`: rounding must not decide on which side the next step begins. What
 happens at the instant is one of three things: the motion takes the piece beyond (`Border`, `_border_control`), it stops
 there, or a note is made and it continues (`_events`).
 """
