@@ -120,8 +120,8 @@ __all__ = [
     "SimulationError", "Statistics", "Store", "StudentT", "Sweep", "System", "Timings", "Transition", "action", "angle",
     "between", "branch_off", "change_coordinates", "check", "conserved_quantities", "crossings", "cyclic_coordinates",
     "designs", "equilibrium", "family", "find_path", "fit", "hamiltonian", "inertia", "linearize", "lyapunov_exponent",
-    "lyapunov_spectrum", "noether_charge", "normal_modes", "per_record", "periodic_orbit", "plot", "positive", "results", "routhian",
-    "same_motion", "samples", "scenes", "simplex", "simulate", "simulate_batch", "sweep",
+    "lyapunov_spectrum", "noether_charge", "normal_modes", "per_record", "periodic_orbit", "plot", "positive",
+    "results", "routhian", "same_motion", "samples", "scenes", "simplex", "simulate", "simulate_batch", "sweep",
     "work_precision", "wrapped",
 ]  # fmt: skip
 

@@ -198,12 +198,7 @@ class _FitSearch(NamedTuple):
             descent = search.descend_gradient(point)
         else:
             descent, waterfall = run_multistart(residuals, search, point, self.starts, self.seed)
-            may = (
-                looks_further
-                and self.starts == 1
-                and len(parameters)
-                and not any(p.clocks for p in residuals.parts)
-            )
+            may = looks_further and self.starts == 1 and len(parameters) and not any(p.clocks for p in residuals.parts)
             for starts in _MORE_STARTS if may and any(jumps(part.scene) for part in residuals.parts) else ():
                 if not is_doubtful(descent):
                     break

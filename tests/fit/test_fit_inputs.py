@@ -101,7 +101,12 @@ def test_machine_code_and_diffrax_agree_and_derivatives_are_those_of_differences
     one, other = (motions.follow(ts, y0, numbers, *along, table) for motions in (fast, plain))
     np.testing.assert_allclose(one.path, other.path, atol=1e-8)
     np.testing.assert_allclose(one.tangents, other.tangents, atol=1e-7)
-    at = pieces[0][0], np.repeat(y0[:1], 9, axis=0), np.repeat(numbers[:1], 9, axis=0), _inputs.constant_tables(*pieces[0])
+    at = (
+        pieces[0][0],
+        np.repeat(y0[:1], 9, axis=0),
+        np.repeat(numbers[:1], 9, axis=0),
+        _inputs.constant_tables(*pieces[0]),
+    )
     np.testing.assert_allclose(fast.rate(*at), plain.rate(*at), rtol=1e-12)
     for k, step in enumerate(1e-5 * np.eye(3)):
         after, before = (fast.follow(ts, y0, numbers + way * step, *along, table).path for way in (1, -1))

@@ -200,7 +200,10 @@ class Parameters:
 
     def directions(self, u: np.ndarray) -> np.ndarray:
         """The derivatives of the numbers of every record by the unknowns that these depend on, (R, L, P)."""
-        found, (record, column, number, which) = np.zeros((*self.unknowns.columns.shape, self.places.shape[1])), self._seen
+        found, (record, column, number, which) = (
+            np.zeros((*self.unknowns.columns.shape, self.places.shape[1])),
+            self._seen,
+        )
         found[record, column, number] = self._slopes(u)[2][which]
         return found
 

@@ -138,9 +138,7 @@ class SystemResiduals:
 
     def with_records(self, records: list[Any], fitted: np.ndarray, manifold: Manifold | None = None):
         """The residuals of other records of the system with the same signals, each in one piece."""
-        return replace(
-            self, records=records, pieces=whole_pieces(records), fitted=fitted, clocks={}, manifold=manifold
-        )
+        return replace(self, records=records, pieces=whole_pieces(records), fitted=fitted, clocks={}, manifold=manifold)
 
     def columns(self, record: int) -> slice:
         first, last = self.frame.first, self.frame.first + len(self.signals.names)
