@@ -62,3 +62,79 @@ def test_what_cannot_be_with_starts_on_constraints_is_a_sentence():
     record, _ = measured(1e-3)
     with pytest.raises(ValueError, match="starts must be 1 where starts on constraints are fitted"):
         lagjax.fit(SCENE, record, TRUTH, free=FREE, starts=4)
+
+
+# ---- driven, between walls, and in modes -----------------------------------------------------------------------------
+
+SWING = np.linspace(0.0, 3.0, 301)
+
+
+def on_circle(q):
+    return q @ q - 1.0
+
+
+def weight(q, qdot, params):
+    return 0.5 * qdot @ qdot - params["g"] * q[1]
+
+
+def bob(q, qdot, params):
+    """The same weight by its angle, which has no constraint: the truth."""
+    return 0.5 * qdot**2 + params["g"] * jnp.cos(q)
+
+
+def fit_swing(scene, angle_scene, truth, params0, **more):
+    theta = np.asarray(lagjax.simulate(angle_scene, 1.0, 0.0, SWING, truth).q)
+    values = np.stack([np.sin(theta), -np.cos(theta)], axis=1)
+    noise = 1e-3 * np.random.default_rng(0).normal(size=values.shape)
+    guess = lagjax.Guess(np.array([0.8, -0.5]), np.zeros(2))
+    record = lagjax.Record(SWING, values + noise, start=guess, **more)
+    fit = lagjax.fit(scene, record, params0, hold="cubic")
+    low, high = fit.intervals(0.999)
+    assert fit.ok and all(low[key] < value < high[key] for key, value in truth.items())
+    [(q, qdot)] = fit.starts
+    assert abs(q @ q - 1.0) < 1e-12 and abs(q @ qdot) < 1e-12
+    np.testing.assert_allclose(q, [np.sin(1.0), -np.cos(1.0)], atol=2e-3)
+    assert np.std(fit.predict(record).residuals) == pytest.approx(1e-3, rel=0.1)
+
+
+@pytest.mark.slow
+def test_a_start_on_a_constraint_of_a_driven_scene():
+    push = lambda q, qdot, params, inputs: params["gain"] * inputs * jnp.array([1.0, 0.0])
+    pushed = lambda q, qdot, t, params: params["gain"] * 2.0 * jnp.sin(3.0 * t) * jnp.cos(q)
+    scene = lagjax.System(weight, forces=push, constraints=on_circle)
+    truth, u = {"g": 9.81, "gain": 0.8}, 2.0 * np.sin(3.0 * SWING)
+    fit_swing(scene, lagjax.System(bob, forces=pushed), truth, {"g": 9.7, "gain": 0.5}, inputs=u)
+
+
+@pytest.mark.slow
+def test_a_start_on_a_constraint_beside_a_contact():
+    laws = {"restitution": lambda params: params["e"]}
+    scene = lagjax.System(weight, constraints=on_circle, contacts=lambda q: {"wall": q[0] + 0.3}, **laws)
+    by_angle = lagjax.System(bob, contacts=lambda q: {"wall": jnp.sin(q) + 0.3}, **laws)
+    fit_swing(scene, by_angle, {"g": 9.81, "e": 0.8}, {"g": 9.7, "e": 0.78})
+
+
+@pytest.mark.slow
+def test_a_start_on_a_constraint_of_hybrid_motion():
+    drag = {"forces": lambda q, qdot, params: -params["c"] * qdot}
+    scene = lagjax.Hybrid(
+        {
+            "air": lagjax.System(weight, constraints=on_circle),
+            "oil": lagjax.System(weight, constraints=on_circle, **drag),
+        },
+        [lagjax.Transition("air", "oil", lambda q, qdot: q[0])],
+        "air",
+    )
+    by_angle = lagjax.Hybrid(
+        {"air": lagjax.System(bob), "oil": lagjax.System(bob, **drag)},
+        [lagjax.Transition("air", "oil", lambda q, qdot: q)],
+        "air",
+    )
+    fit_swing(scene, by_angle, {"g": 9.81, "c": 0.5}, {"g": 9.7, "c": 0.4})
+
+
+def test_a_start_on_a_constraint_that_is_driven_is_refused():
+    moved = lagjax.System(weight, constraints=lambda q, inputs: (q[0] - inputs) ** 2 + q[1] ** 2 - 1.0)
+    record = lagjax.Record(SWING, np.stack([np.sin(SWING), -np.cos(SWING)], axis=1), inputs=0.1 * np.sin(SWING))
+    with pytest.raises(ValueError, match="A start on constraints that ask for `inputs` cannot be fitted"):
+        lagjax.fit(moved, record, {"g": 9.81}, hold="cubic")

@@ -187,7 +187,7 @@ class Parameters:
         return matrix
 
     @functools.cached_property
-    def _seen(self) -> tuple[np.ndarray, ...]:
+    def _derivative_places(self) -> tuple[np.ndarray, ...]:
         """The places of derivatives in `directions`, (record, column, number), and which of `_slopes` each is."""
         rows, columns, _ = self._slopes(self.inverse(self.first))
         found = []
@@ -202,7 +202,7 @@ class Parameters:
     def directions(self, u: np.ndarray) -> np.ndarray:
         """The derivatives of the numbers of every record by the unknowns that these depend on, (R, L, P)."""
         found = np.zeros((*self.unknowns.columns.shape, self.places.shape[1]))
-        *places, which = self._seen
+        *places, which = self._derivative_places
         found[tuple(places)] = self._slopes(u)[2][which]
         return found
 
