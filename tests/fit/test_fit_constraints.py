@@ -97,44 +97,58 @@ def fit_swing(scene, angle_scene, truth, params0, **more):
     assert np.std(fit.predict(record).residuals) == pytest.approx(1e-3, rel=0.1)
 
 
+def push(q, qdot, params, inputs):
+    return params["gain"] * inputs * jnp.array([1.0, 0.0])
+
+
+def push_angle(q, qdot, t, params):
+    return params["gain"] * 2.0 * jnp.sin(3.0 * t) * jnp.cos(q)
+
+
+def drag(q, qdot, params):
+    return -params["c"] * qdot
+
+
+def bounce(params):
+    return params["e"]
+
+
+DRIVEN = lagjax.System(weight, forces=push, constraints=on_circle), lagjax.System(bob, forces=push_angle)
+WALLED = (
+    lagjax.System(weight, constraints=on_circle, contacts=lambda q: {"wall": q[0] + 0.3}, restitution=bounce),
+    lagjax.System(bob, contacts=lambda q: {"wall": jnp.sin(q) + 0.3}, restitution=bounce),
+)
+MODES = tuple(
+    lagjax.Hybrid({"air": air, "oil": oil}, [lagjax.Transition("air", "oil", guard)], "air")
+    for air, oil, guard in (
+        (
+            lagjax.System(weight, constraints=on_circle),
+            lagjax.System(weight, constraints=on_circle, forces=drag),
+            lambda q, qdot: q[0],
+        ),
+        (lagjax.System(bob), lagjax.System(bob, forces=drag), lambda q, qdot: q),
+    )
+)
+MOVED = lagjax.System(weight, constraints=lambda q, inputs: (q[0] - inputs) ** 2 + q[1] ** 2 - 1.0)
+
+
 @pytest.mark.slow
 def test_a_start_on_a_constraint_of_a_driven_scene():
-    push = lambda q, qdot, params, inputs: params["gain"] * inputs * jnp.array([1.0, 0.0])
-    pushed = lambda q, qdot, t, params: params["gain"] * 2.0 * jnp.sin(3.0 * t) * jnp.cos(q)
-    scene = lagjax.System(weight, forces=push, constraints=on_circle)
-    truth, u = {"g": 9.81, "gain": 0.8}, 2.0 * np.sin(3.0 * SWING)
-    fit_swing(scene, lagjax.System(bob, forces=pushed), truth, {"g": 9.7, "gain": 0.5}, inputs=u)
+    u = 2.0 * np.sin(3.0 * SWING)
+    fit_swing(*DRIVEN, {"g": 9.81, "gain": 0.8}, {"g": 9.7, "gain": 0.5}, inputs=u)
 
 
 @pytest.mark.slow
 def test_a_start_on_a_constraint_beside_a_contact():
-    laws = {"restitution": lambda params: params["e"]}
-    scene = lagjax.System(weight, constraints=on_circle, contacts=lambda q: {"wall": q[0] + 0.3}, **laws)
-    by_angle = lagjax.System(bob, contacts=lambda q: {"wall": jnp.sin(q) + 0.3}, **laws)
-    fit_swing(scene, by_angle, {"g": 9.81, "e": 0.8}, {"g": 9.7, "e": 0.78})
+    fit_swing(*WALLED, {"g": 9.81, "e": 0.8}, {"g": 9.7, "e": 0.78})
 
 
 @pytest.mark.slow
 def test_a_start_on_a_constraint_of_hybrid_motion():
-    drag = {"forces": lambda q, qdot, params: -params["c"] * qdot}
-    scene = lagjax.Hybrid(
-        {
-            "air": lagjax.System(weight, constraints=on_circle),
-            "oil": lagjax.System(weight, constraints=on_circle, **drag),
-        },
-        [lagjax.Transition("air", "oil", lambda q, qdot: q[0])],
-        "air",
-    )
-    by_angle = lagjax.Hybrid(
-        {"air": lagjax.System(bob), "oil": lagjax.System(bob, **drag)},
-        [lagjax.Transition("air", "oil", lambda q, qdot: q)],
-        "air",
-    )
-    fit_swing(scene, by_angle, {"g": 9.81, "c": 0.5}, {"g": 9.7, "c": 0.4})
+    fit_swing(*MODES, {"g": 9.81, "c": 0.5}, {"g": 9.7, "c": 0.4})
 
 
 def test_a_start_on_a_constraint_that_is_driven_is_refused():
-    moved = lagjax.System(weight, constraints=lambda q, inputs: (q[0] - inputs) ** 2 + q[1] ** 2 - 1.0)
     record = lagjax.Record(SWING, np.stack([np.sin(SWING), -np.cos(SWING)], axis=1), inputs=0.1 * np.sin(SWING))
     with pytest.raises(ValueError, match="A start on constraints that ask for `inputs` cannot be fitted"):
-        lagjax.fit(moved, record, {"g": 9.81}, hold="cubic")
+        lagjax.fit(MOVED, record, {"g": 9.81}, hold="cubic")

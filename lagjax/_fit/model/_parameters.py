@@ -413,7 +413,7 @@ class Unknowns(NamedTuple):
         return found.reshape(len(owners), -1, rows.shape[-1])
 
     @property
-    def of_owners(self) -> np.ndarray:
+    def owner_columns(self) -> np.ndarray:
         """The columns of each owner (O, own), in the order of `stack_by_owner`."""
         return self.columns[np.unique(self.owners, return_index=True)[1], : self.own]
 
