@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax._analysis._closed_contacts import hold_closed
+from lagjax._analysis._closed_contacts import hold_closed, one_sided
 from lagjax._analysis._equilibrium import least_multipliers
 from lagjax._analysis._scene_state import SceneState, require_matrices
 from lagjax._analysis._smoothness import is_smooth, require_smooth
@@ -87,7 +87,7 @@ def linearize(system: System, q: PyTree, qdot: PyTree = None, params: PyTree = N
         "acceleration of one deviation.",
     )
     if held := hold_closed(system, q, qdot, params, "A linearization"):
-        system, q = held.system, held.require_loaded(q, qdot, params, "A motion")
+        system, q = held.system, held.require_loaded(q, qdot, params, one_sided("A motion"))
     scene = SceneState.from_state(system, q, qdot, params)
     scene.require_autonomous("A linearization")
     require_smooth(scene, "A linearization")

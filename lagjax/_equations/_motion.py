@@ -110,6 +110,24 @@ class Motion(eqx.Module):
         _, pull = self.constraints.products(q, qdot, t, params)
         return pull(self.multipliers(q, qdot, t, params))
 
+    def required_force(
+        self, q: Vector, qdot: Vector, t: Time, params: PyTree, qddot: Vector, terms=0.0
+    ) -> tuple[Vector, Bool[Array, " m"]]:
+        """τ of M q̈ = F + τ + Gᵀλ, the shortest in the metric of M⁻¹, and which constraints q̈ violates.
+
+        `terms` (m,) are the sizes of the terms of γ, of which rounding is left.
+        """
+        state, once = (q, qdot, t, params), jnp.ones_like(t)
+        if not self.constrained:
+            momentum = lambda *of: self.momentum(*of, params)  # noqa: E731
+            _, rate = jax.jvp(momentum, state[:3], (qdot, qddot, once))
+            return rate - self.generalized_force(*state), jnp.zeros(0, bool)
+        # λ of the shortest τ is that of the motion by itself: G M⁻¹τ = 0 leaves both equations as they are.
+        acceleration, unit = self.acceleration(*state), self.unit(*state)
+        left = jnp.abs(self.constraints.products(*state)[0](qddot) - self.constraints.gamma(*state))
+        violates = _constraints.exceeds(left, self.row_lengths(unit, *state), terms, unit, qddot, acceleration)
+        return self.mass_product(*state)(qddot - acceleration), violates
+
     def schur_complement(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Float[Array, "m m"]:
         """G M⁻¹ Gᵀ, or G K⁻¹ Gᵀ of the same rank (see `_linear`): its rank is the number of independent constraints."""
         jacobian = self.constraints.jacobian(q, qdot, t, params)
