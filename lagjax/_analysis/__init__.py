@@ -9,8 +9,8 @@ enter by `_scene_state`. `orbits/` holds motions that close, chaos, and paths be
 
 from lagjax._analysis._coordinates import ChangedCoordinates, change_coordinates
 from lagjax._analysis._equilibrium import Equilibrium, equilibrium
-from lagjax._analysis._inverse_dynamics import inverse_dynamics
 from lagjax._analysis._hamiltonian import CanonicalTrajectory, Hamiltonian, hamiltonian
+from lagjax._analysis._inverse_dynamics import inverse_dynamics
 from lagjax._analysis._linearize import Linearization, linearize
 from lagjax._analysis._modes import Modes, normal_modes
 from lagjax._analysis._noether import cyclic_coordinates, noether_charge

@@ -59,7 +59,7 @@ from lagjax._native._guards import Guards, append_guards
 from lagjax._native._handler import Plan, handler, make_once, unavailable
 from lagjax._native._ir import lanes
 from lagjax._native._kernel import Begun, Kernel, StepRecord, cores, floor_of
-from lagjax._native._line_handler import LineCode, compilation_work, line_handler
+from lagjax._native._line_handler import LineCode, compilation_work, line_function, line_handler
 from lagjax._native._loops import Floats, Loop, Struct, Wholes, compile_loops, evaluate, integrate, loop
 from lagjax._native._motion_parts import Projection, pieces_of, recurrences
 from lagjax._native._taylor import is_large, order_for

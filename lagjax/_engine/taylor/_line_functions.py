@@ -19,6 +19,7 @@ operation: derivatives of a motion by its duration compiled for 14 s longer with
 import functools
 import math
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -100,14 +101,14 @@ class Line:
         return self._make_code()
 
     @functools.lru_cache(maxsize=2)  # noqa: B019  # those of a few
-    def code_of_jit(self, is_wide: bool) -> LineCode | None:
+    def code_of_jit(self, is_wide: bool, shared: tuple[int, ...] = ()) -> LineCode | None:
         """The code for a program of XLA, which is called often; LLVM may take longer for it."""
         for lanes in (LANES, 1) if is_wide and self.size + self.outputs <= MOST_IN_LANES else (1,):
             if compilation_work(self.line, lanes) <= WORK_OF_JIT:
-                return self._make_code(largest=len(self.line.nodes) + self.outputs, lanes=lanes)
+                return self._make_code(largest=len(self.line.nodes) + self.outputs, lanes=lanes, shared=shared)
         return self.code
 
-    def _make_code(self, **settings: int) -> LineCode | None:
+    def _make_code(self, **settings: Any) -> LineCode | None:
         try:
             makes = NO_HANDLER is None and not self.line.looks_up
             return LineCode(self.line, self.size, **settings) if makes else None
@@ -152,8 +153,8 @@ class Line:
 
     def __call__(self, *parts):
         """g(x) of rows x (…, inputs) in parts (…, some), under every transformation of JAX."""
-        batch = jnp.broadcast_shapes(*(x.shape[:-1] for x in parts))
-        return value_p.bind(*(jnp.broadcast_to(x, (*batch, x.shape[-1])) for x in parts), line=self)[0]
+        rank = max(x.ndim for x in parts)
+        return value_p.bind(*(x.reshape((*[1] * (rank - x.ndim), *x.shape)) for x in parts), line=self)[0]
 
     @functools.lru_cache(maxsize=8)  # noqa: B019  # those of a few
     def vary_first(self, count: int) -> "Line":
@@ -165,11 +166,14 @@ class Line:
 
 
 class _LineMap(LinearMap):
-    """The line `of(line)` of rows of arrays that stand side by side, with `width(line)` results a row."""
+    """The line `of(line)` of rows of arrays that stand side by side, with `width(line)` results a row.
+
+    Axes of rows broadcast: an array that all rows of an axis share has 1 there.
+    """
 
     def __init__(self, name: str, of: Callable, width: Callable, linear: int = 0, transpose: Callable | None = None):
-        def shape(x, *_, line: Line):
-            return [ShapedArray((*x.shape[:-1], width(line)), np.dtype(float))]
+        def shape(*arrays, line: Line):
+            return [ShapedArray((*_rows_of(arrays), width(line)), np.dtype(float))]
 
         def vary(primals, tangents, _, *, line: Line):
             by = of(line)
@@ -177,8 +181,8 @@ class _LineMap(LinearMap):
                 moving = 1 + max(i for i, tangent in enumerate(tangents) if not is_zero(tangent))
                 tangents = tangents[:moving]
                 by = by.vary_first(sum(x.shape[-1] for x in primals[:moving]))
-            along = jnp.concatenate(list(map(ad.instantiate_zeros, tangents)), axis=-1)[..., line.fixed :]
-            return forward_p.bind(jnp.concatenate(primals, axis=-1), along, line=by)
+            along = join_columns(*map(ad.instantiate_zeros, tangents))[..., line.fixed :]
+            return forward_p.bind(*primals, along, line=by)
 
         super().__init__(f"lagjax_line_{name}", shape, vary, linear, transpose)
         self.of, self.shape = of, shape
@@ -189,8 +193,9 @@ class _LineMap(LinearMap):
 
     def _place(self, expansion, params: dict, *arrays):
         """Its nodes in the graph of a function that is lowered."""
-        of, batch = self.of(params["line"]), arrays[0].shape[:-1]
-        rows = np.concatenate([expansion.real(x).reshape(math.prod(batch), -1) for x in arrays], axis=1)
+        of, batch = self.of(params["line"]), _rows_of(arrays)
+        arrays = [np.broadcast_to(expansion.real(x), (*batch, x.shape[-1])) for x in arrays]
+        rows = np.concatenate([x.reshape(math.prod(batch), -1) for x in arrays], axis=1)
         expansion.work(len(rows) * len(of.line.nodes))
         nodes = [copy_nodes(expansion.graph, of.line, row.tolist()) for row in rows]
         found = np.array([[of_row[i] for i in of.line.outputs] for of_row in nodes], dtype=np.int64)
@@ -203,7 +208,7 @@ class _LineMap(LinearMap):
     def _lower_on_cpu(self, context, *arrays, line: Line):
         of, call = self.of(line), self._compile_operations
         if not context.module_context.lowering_parameters.for_export:  # where it runs elsewhere
-            code = of.code_of_jit(_is_wide(context.avals_in[0].shape[:-1]))
+            code = self._code_for(context.avals_in, of)[0]
             call = self._call_host if code is None else self._call_code
             if code is not None:
                 _register_handler()
@@ -214,13 +219,42 @@ class _LineMap(LinearMap):
     def _call_host(self, *arrays, line: Line):
         return call_host(functools.partial(self.evaluate, line=line), self.shape(*arrays, line=line), *arrays)
 
+    def _code_for(self, arrays, of: Line) -> tuple[LineCode | None, list[int], list[int]]:
+        """The code for arrays of these shapes; which of them rows share, and the axes of these rows."""
+        batch = _rows_of(arrays)
+        missing = [frozenset(i for i, size in enumerate(x.shape[:-1]) if size < batch[i]) for x in arrays]
+        axes = sorted(frozenset.intersection(*filter(None, missing))) if any(missing) else []
+        if not axes:  # of a single row the longest array: the numbers of a scene, which are often constants to XLA
+            axes, longest = list(range(len(batch))), max(range(len(arrays)), key=lambda k: arrays[k].shape[-1])
+            given = [longest] if math.prod(batch) == 1 < len(arrays) else []
+        else:
+            given = [k for k, absent in enumerate(missing) if absent]
+        ends = np.cumsum([0, *(x.shape[-1] for x in arrays)]).tolist()
+        shared = tuple(i for k in given for i in range(ends[k], ends[k + 1]))
+        code = of.code_of_jit(math.prod(batch[i] for i in axes) >= LANES // 2, shared)
+        return code, given if code is not None and code.shared else [], axes
+
     def _call_code(self, *arrays, line: Line):
-        x, of = jnp.concatenate(arrays, axis=-1), self.of(line)
-        code = of.code_of_jit(_is_wide(x.shape[:-1]))
+        of, batch = self.of(line), _rows_of(arrays)
+        code, given, axes = self._code_for(arrays, of)
         assert code is not None
-        rows = jax.ShapeDtypeStruct((math.prod(x.shape[:-1]), of.outputs), np.float64)
-        result = jax.ffi.ffi_call(_TARGET, rows)(x.reshape(-1, x.shape[-1]), line=np.int64(code.address))
-        return [result.reshape(*x.shape[:-1], of.outputs)]
+        outer = [i for i in range(len(batch)) if i not in axes]
+        times, rows = (math.prod(batch[i] for i in some) for some in (outer, axes))
+
+        def place(some: list, sizes: list[int], count: int):
+            some = [jnp.broadcast_to(x, (*sizes, x.shape[-1])) for x in some] or [jnp.zeros((*sizes, 0))]
+            return jnp.concatenate(some, axis=-1).transpose(*outer, *axes, len(batch)).reshape(times, count, -1)
+
+        still = place([arrays[k] for k in given], [1 if i in axes else size for i, size in enumerate(batch)], 1)
+        moving = place([x for k, x in enumerate(arrays) if k not in given], list(batch), rows)
+        result = jax.ShapeDtypeStruct((times, rows, of.outputs), np.float64)
+        result = jax.ffi.ffi_call(_TARGET, result)(moving, still, line=np.int64(code.address))
+        back = np.argsort([*outer, *axes, len(batch)]).tolist()
+        return [result.reshape(*(batch[i] for i in (*outer, *axes)), of.outputs).transpose(*back)]
+
+    def _batch(self, arrays, axes, **settings):
+        arrays = [x[None] if at is None else jnp.moveaxis(x, at, 0) for x, at in zip(arrays, axes, strict=True)]
+        return self.bind(*arrays, **settings), [0]
 
     def _compile_operations(self, *arrays, line: Line):
         columns = tuple(x[..., i] for x in arrays for i in range(x.shape[-1]))
@@ -237,9 +271,9 @@ class _LineMap(LinearMap):
         return jax.pure_callback(evaluate, self.shape(*arrays, line=line), *arrays)
 
 
-def _is_wide(batch: tuple[int, ...]) -> bool:
-    """True for so many rows that a vector of them pays."""
-    return math.prod(batch) >= LANES // 2
+def _rows_of(arrays) -> tuple[int, ...]:
+    """The axes of rows of arrays, which broadcast."""
+    return np.broadcast_shapes(*(x.shape[:-1] for x in arrays))
 
 
 @make_once
