@@ -19,7 +19,7 @@ operation: derivatives of a motion by its duration compiled for 14 s longer with
 import functools
 import math
 from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +31,16 @@ from lagjax._engine.taylor._call import NO_HANDLER, capsule
 from lagjax._equations import forms
 from lagjax._native import LARGEST_LINE, LineCode, compilation_work, line_handler, make_once
 from lagjax._primitives import HostFunction, LinearMap, call_host, compute_on_host, is_zero, share_rows
-from lagjax._program import Graph, StraightLine, Unlowerable, copy_nodes, pullback, pushforward
+from lagjax._program import (
+    Graph,
+    LinearSystem,
+    StraightLine,
+    Unlowerable,
+    copy_nodes,
+    eliminate_dead_code,
+    pullback,
+    pushforward,
+)
 from lagjax._tracing import Program, emit, lower, lowers
 
 _TARGET = "lagjax_line"
@@ -61,12 +70,13 @@ def join_columns(*parts):
 
 def line_of(program: Program, count: int | None = None) -> "Line":
     """The first `count` outputs of a program, by default all; other inputs than floats are given as floats."""
-    return _line_of(program.line, count, program.dtypes)
+    return _line_of(program, count)
 
 
 @functools.lru_cache(maxsize=64)
-def _line_of(line: StraightLine, count: int | None, dtypes: tuple[np.dtype, ...]) -> "Line":
-    line = line.replace(outputs=line.outputs[:count])
+def _line_of(program: Program, count: int | None) -> "Line":
+    line, dtypes = program.line.replace(outputs=program.line.outputs[:count]), program.dtypes
+    root, linear = None, program.linear
     if any(dtype.kind != "f" for dtype in dtypes):
         graph, ids = Graph(3 * len(line.nodes) + len(dtypes)), []
         for i, dtype in enumerate(dtypes):
@@ -74,18 +84,53 @@ def _line_of(line: StraightLine, count: int | None, dtypes: tuple[np.dtype, ...]
             ids.append(x if dtype.kind == "f" else graph.apply("convert", x, attribute=dtype.name))
         nodes = copy_nodes(graph, line, ids)
         line = StraightLine(tuple(graph.nodes), tuple(graph.kinds), tuple(nodes[i] for i in line.outputs))
-    return Line(line, len(dtypes), len(dtypes))
+    elif program.residual is not None and linear is not None and not linear.others and count is None:
+        root = Root(linear, program.residual)
+    return Line(line, len(dtypes), len(dtypes), root=root)
+
+
+class Root(NamedTuple):
+    """The outputs z of a line but its last, which is constant, as the root of r(x, z) = 0, with ∂r/∂z = A of `linear`.
+
+    A dz = −dr: a derivative of r takes a third of the operations of one of the elimination.
+    """
+
+    linear: LinearSystem
+    residual: Callable[[], Program]
+
+    def derive(self, of: "Line", differentiate: Callable, by: range) -> StraightLine:
+        """`differentiate(line, types, by, outputs)`, `pushforward` or `pullback`, of the line."""
+        n, is_forward = of.outputs - 1, differentiate is pushforward
+        of_residual = differentiate(self.residual().line, [np.dtype(float)] * (of.size + n), by, range(n))
+        solve, moved = self.linear.solve(), len(by) if is_forward else of.outputs
+        graph = Graph(2 * (len(of.line.nodes) + len(of_residual.nodes) + len(solve.nodes)) + of.size + moved)
+        x, along = ([graph.input(i, "float") for i in some] for some in np.split(np.arange(of.size + moved), [of.size]))
+        nodes, zero = copy_nodes(graph, of.line, x), graph.number(0.0)
+        z, factors = [nodes[i] for i in of.line.outputs[:n]], [nodes[i] for i in self.linear.factors]
+
+        def place(line: StraightLine, inputs: list[int]) -> list[int]:
+            found = copy_nodes(graph, line, inputs)
+            return [found[i] for i in line.outputs]
+
+        def solve_negative(right: list[int]) -> list[int]:
+            right = [graph.apply("neg", i) for i in right] + [zero] * (len(self.linear.right) - n)
+            return place(solve, [*factors, *right])[:n]
+
+        with np.errstate(all="ignore"):
+            if is_forward:
+                return eliminate_dead_code(graph, [*solve_negative(place(of_residual, [*x, *z, *along])), zero])
+            return eliminate_dead_code(graph, place(of_residual, [*x, *z, *solve_negative(along[:n])]))
 
 
 class Line:
     """A straight line from `size` floats x, with the lines of its derivatives by the first `count`; by identity.
 
     What a line of derivatives is linear in comes after its first `count` inputs. By the first that are `fixed` there
-    are no derivatives.
+    are no derivatives. Where it is the `root` of an equation, they are those of that.
     """
 
-    def __init__(self, line: StraightLine, size: int, count: int, fixed: int = 0):
-        self.line, self.size, self.count, self.fixed, self._calls = line, size, count, fixed, 0
+    def __init__(self, line: StraightLine, size: int, count: int, fixed: int = 0, root: Root | None = None):
+        self.line, self.size, self.count, self.fixed, self.root, self._calls = line, size, count, fixed, root, 0
 
     @property
     def outputs(self) -> int:
@@ -148,7 +193,12 @@ class Line:
 
     def _derivative(self, differentiate: Callable, linear: int) -> "Line":
         by = range(self.fixed, self.count)
-        line = differentiate(self.line, [np.dtype(float)] * self.size, by, range(self.outputs))
+        try:
+            line = self.root and self.root.derive(self, differentiate, by)
+        except Unlowerable:
+            line = None
+        if line is None:
+            line = differentiate(self.line, [np.dtype(float)] * self.size, by, range(self.outputs))
         return Line(line, self.size + linear, self.size, self.fixed)
 
     def __call__(self, *parts):
@@ -159,7 +209,7 @@ class Line:
     @functools.lru_cache(maxsize=8)  # noqa: B019  # those of a few
     def vary_first(self, count: int) -> "Line":
         """The line whose derivatives are by the first `count` inputs."""
-        return Line(self.line, self.size, count, min(self.fixed, count))
+        return Line(self.line, self.size, count, min(self.fixed, count), self.root)
 
 
 # ---- primitives ------------------------------------------------------------------------------------------------------
