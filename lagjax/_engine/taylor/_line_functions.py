@@ -17,6 +17,7 @@ operation: derivatives of a motion by its duration compiled for 14 s longer with
 """
 
 import functools
+import itertools
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
@@ -85,61 +86,76 @@ def _line_of(program: Program, count: int | None) -> "Line":
         nodes = copy_nodes(graph, line, ids)
         line = StraightLine(tuple(graph.nodes), tuple(graph.kinds), tuple(nodes[i] for i in line.outputs))
     elif program.residual is not None and linear is not None and not linear.others and count is None:
-        root = Root(linear, program.residual)
+        root, line = Root(linear, program.residual), line.replace(outputs=(*line.outputs, *linear.factors))
     return Line(line, len(dtypes), len(dtypes), root=root)
 
 
 class Root(NamedTuple):
     """The outputs z of a line but its last, which is constant, as the root of r(x, z) = 0, with ∂r/∂z = A of `linear`.
 
-    A dz = −dr: a derivative of r takes a third of the operations of one of the elimination.
+    A dz = −dr: a derivative of r takes a third of the operations of one of the elimination. Its line takes the outputs
+    and the factors of A, which that of the values leaves, in its stead.
     """
 
     linear: LinearSystem
     residual: Callable[[], Program]
 
-    def derive(self, of: "Line", differentiate: Callable, by: range) -> StraightLine:
-        """`differentiate(line, types, by, outputs)`, `pushforward` or `pullback`, of the line."""
-        n, is_forward = of.outputs - 1, differentiate is pushforward
+    def derive(self, of: "Line", differentiate: Callable, by: range, linear: int) -> StraightLine:
+        """`differentiate(line, types, by, outputs)`, `pushforward` or `pullback`, from (x, outputs, factors, v)."""
+        n, memo = of.outputs - 1, of.outputs + len(self.linear.factors)
         of_residual = differentiate(self.residual().line, [np.dtype(float)] * (of.size + n), by, range(n))
-        solve, moved = self.linear.solve(), len(by) if is_forward else of.outputs
-        graph = Graph(2 * (len(of.line.nodes) + len(of_residual.nodes) + len(solve.nodes)) + of.size + moved)
-        x, along = ([graph.input(i, "float") for i in some] for some in np.split(np.arange(of.size + moved), [of.size]))
-        nodes, zero = copy_nodes(graph, of.line, x), graph.number(0.0)
-        z, factors = [nodes[i] for i in of.line.outputs[:n]], [nodes[i] for i in self.linear.factors]
-
-        def place(line: StraightLine, inputs: list[int]) -> list[int]:
-            found = copy_nodes(graph, line, inputs)
-            return [found[i] for i in line.outputs]
+        solve = self.linear.solve()
+        graph = Graph(2 * (len(of_residual.nodes) + len(solve.nodes)) + of.size + memo + linear)
+        x, left, along = _inputs_of(graph, of.size, memo, linear)
+        zero, factors = graph.number(0.0), left[of.outputs :]
 
         def solve_negative(right: list[int]) -> list[int]:
             right = [graph.apply("neg", i) for i in right] + [zero] * (len(self.linear.right) - n)
-            return place(solve, [*factors, *right])[:n]
+            return _place_line(graph, solve, [*factors, *right])[:n]
 
         with np.errstate(all="ignore"):
-            if is_forward:
-                return eliminate_dead_code(graph, [*solve_negative(place(of_residual, [*x, *z, *along])), zero])
-            return eliminate_dead_code(graph, place(of_residual, [*x, *z, *solve_negative(along[:n])]))
+            if differentiate is pushforward:
+                found = [*solve_negative(_place_line(graph, of_residual, [*x, *left[:n], *along])), zero]
+            else:
+                found = _place_line(graph, of_residual, [*x, *left[:n], *solve_negative(along[:n])])
+            return eliminate_dead_code(graph, found)
+
+
+def _inputs_of(graph: Graph, *counts: int) -> list[list[int]]:
+    ends = np.cumsum([0, *counts]).tolist()
+    return [[graph.input(i, "float") for i in range(*pair)] for pair in itertools.pairwise(ends)]
+
+
+def _place_line(graph: Graph, line: StraightLine, inputs: list[int]) -> list[int]:
+    """The outputs of a line as nodes of a graph, where it has these inputs."""
+    found = copy_nodes(graph, line, inputs)
+    return [found[i] for i in line.outputs]
 
 
 class Line:
     """A straight line from `size` floats x, with the lines of its derivatives by the first `count`; by identity.
 
     What a line of derivatives is linear in comes after its first `count` inputs. By the first that are `fixed` there
-    are no derivatives. Where it is the `root` of an equation, they are those of that.
+    are no derivatives. Where it is the `root` of an equation, they are those of that, and a `memo` of numbers for them
+    comes after the outputs; lines of derivatives take both after x, and what is `plain` does not.
     """
 
     def __init__(self, line: StraightLine, size: int, count: int, fixed: int = 0, root: Root | None = None):
         self.line, self.size, self.count, self.fixed, self.root, self._calls = line, size, count, fixed, root, 0
+        self.memo, self.make_plain = len(root.linear.factors) if root else 0, lambda: self
 
     @property
     def outputs(self) -> int:
-        return len(self.line.outputs)
+        return len(self.line.outputs) - self.memo
 
     @property
     def width(self) -> int:
         """The number of inputs by which there are derivatives."""
         return self.count - self.fixed
+
+    @functools.cached_property
+    def plain(self) -> "Line":
+        return self.make_plain()
 
     @functools.cached_property
     def code(self) -> LineCode | None:
@@ -148,9 +164,9 @@ class Line:
     @functools.lru_cache(maxsize=2)  # noqa: B019  # those of a few
     def code_of_jit(self, is_wide: bool, shared: tuple[int, ...] = ()) -> LineCode | None:
         """The code for a program of XLA, which is called often; LLVM may take longer for it."""
-        for lanes in (LANES, 1) if is_wide and self.size + self.outputs <= MOST_IN_LANES else (1,):
+        for lanes in (LANES, 1) if is_wide and self.size + len(self.line.outputs) <= MOST_IN_LANES else (1,):
             if compilation_work(self.line, lanes) <= WORK_OF_JIT:
-                return self._make_code(largest=len(self.line.nodes) + self.outputs, lanes=lanes, shared=shared)
+                return self._make_code(largest=len(self.line.nodes) + len(self.line.outputs), lanes=lanes, shared=shared)
         return self.code
 
     def _make_code(self, **settings: Any) -> LineCode | None:
@@ -169,7 +185,7 @@ class Line:
         is_short = len(self.line.nodes) <= LARGEST_LINE
         code = self.code if is_short and self._calls >= _CALLS else None
         found = self.line.evaluate(list(rows.T)).T if code is None else code(rows)
-        return found.reshape(*batch, self.outputs)
+        return found.reshape(*batch, self.outputs + self.memo)
 
     @functools.cached_property
     def forward(self) -> "Line":
@@ -184,22 +200,28 @@ class Line:
     @functools.cached_property
     def with_derivative(self) -> "Line":
         """(x, v) ↦ g(x), D(x) v, one behind the other."""
-        line, size = self.forward.line, self.forward.size
+        line, size = self.forward.plain.line, self.forward.plain.size
         graph = Graph(2 * len(line.nodes) + len(self.line.nodes) + size)
-        ids = [graph.input(i, "float") for i in range(size)]
-        copies = [(of, copy_nodes(graph, of, ids[:count])) for of, count in ((self.line, self.size), (line, size))]
-        found = tuple(nodes[i] for of, nodes in copies for i in of.outputs)
+        (ids,) = _inputs_of(graph, size)
+        found = *_place_line(graph, self.line, ids[: self.size])[: self.outputs], *_place_line(graph, line, ids)
         return Line(StraightLine(tuple(graph.nodes), tuple(graph.kinds), found), size, size)
 
     def _derivative(self, differentiate: Callable, linear: int) -> "Line":
         by = range(self.fixed, self.count)
-        try:
-            line = self.root and self.root.derive(self, differentiate, by)
-        except Unlowerable:
-            line = None
-        if line is None:
+        if self.root is None:
             line = differentiate(self.line, [np.dtype(float)] * self.size, by, range(self.outputs))
-        return Line(line, self.size + linear, self.size, self.fixed)
+            return Line(line, self.size + linear, self.size, self.fixed)
+        line = self.root.derive(self, differentiate, by, linear)
+        found = Line(line, self.size + len(self.line.outputs) + linear, self.size, self.fixed)
+
+        def compose() -> Line:
+            graph = Graph(2 * (len(self.line.nodes) + len(line.nodes)) + self.size + linear)
+            x, along = _inputs_of(graph, self.size, linear)
+            outputs = _place_line(graph, line, [*x, *_place_line(graph, self.line, x), *along])
+            return Line(eliminate_dead_code(graph, outputs), self.size + linear, self.size, self.fixed)
+
+        found.make_plain = compose
+        return found
 
     def __call__(self, *parts):
         """g(x) of rows x (…, inputs) in parts (…, some), under every transformation of JAX."""
@@ -216,26 +238,30 @@ class Line:
 
 
 class _LineMap(LinearMap):
-    """The line `of(line)` of rows of arrays that stand side by side, with `width(line)` results a row.
+    """The line `of(line)` of rows of arrays that stand side by side, with results of these `widths(line)` a row.
 
     Axes of rows broadcast: an array that all rows of an axis share has 1 there.
     """
 
-    def __init__(self, name: str, of: Callable, width: Callable, linear: int = 0, transpose: Callable | None = None):
+    def __init__(self, name: str, of: Callable, widths: Callable, linear: int = 0, transpose: Callable | None = None):
         def shape(*arrays, line: Line):
-            return [ShapedArray((*_rows_of(arrays), width(line)), np.dtype(float))]
+            return [ShapedArray((*_rows_of(arrays), width), np.dtype(float)) for width in widths(line) if width]
 
-        def vary(primals, tangents, _, *, line: Line):
-            by = of(line)
+        def vary(primals, tangents, results, *, line: Line):
+            by = of(line).plain
+            if line.root is not None and linear:  # the derivative of one is by x alone
+                first = len(primals) - linear - 2
+                primals, tangents = [*primals[:first], *primals[first + 2 :]], tangents[:first]
             if len(tangents) > 1:  # parts of x, of which the last ones may stand still
                 moving = 1 + max(i for i, tangent in enumerate(tangents) if not is_zero(tangent))
                 tangents = tangents[:moving]
                 by = by.vary_first(sum(x.shape[-1] for x in primals[:moving]))
             along = join_columns(*map(ad.instantiate_zeros, tangents))[..., line.fixed :]
-            return forward_p.bind(*primals, along, line=by)
+            left = map(jax.lax.stop_gradient, results if by.root is not None else ())
+            return [*forward_p.bind(*primals, *left, along, line=by), *[None] * (len(results) - 1)]
 
         super().__init__(f"lagjax_line_{name}", shape, vary, linear, transpose)
-        self.of, self.shape = of, shape
+        self.of, self.shape, self.widths = of, shape, widths
         compute_on_host(self, self.evaluate)
         lowers(self.name)(self._place)
         mlir.register_lowering(self, self._lower_on_cpu, platform="cpu")
@@ -249,11 +275,15 @@ class _LineMap(LinearMap):
         expansion.work(len(rows) * len(of.line.nodes))
         nodes = [copy_nodes(expansion.graph, of.line, row.tolist()) for row in rows]
         found = np.array([[of_row[i] for i in of.line.outputs] for of_row in nodes], dtype=np.int64)
-        return [found.reshape(*batch, of.outputs)]
+        return self._split(found.reshape(*batch, -1), params["line"])
+
+    def _split(self, found, line: Line) -> list:
+        ends = np.cumsum([0, *self.widths(line)]).tolist()
+        return [found[..., begin:end] for begin, end in itertools.pairwise(ends)]
 
     def evaluate(self, *arrays, line: Line):
         """By NumPy, or machine code, at once."""
-        return [self.of(line).evaluate(*map(np.asarray, arrays))]
+        return self._split(self.of(line).evaluate(*map(np.asarray, arrays)), line)
 
     def _lower_on_cpu(self, context, *arrays, line: Line):
         of, call = self.of(line), self._compile_operations
@@ -297,18 +327,19 @@ class _LineMap(LinearMap):
 
         still = place([arrays[k] for k in given], [1 if i in axes else size for i, size in enumerate(batch)], 1)
         moving = place([x for k, x in enumerate(arrays) if k not in given], list(batch), rows)
-        result = jax.ShapeDtypeStruct((times, rows, of.outputs), np.float64)
+        result = jax.ShapeDtypeStruct((times, rows, len(of.line.outputs)), np.float64)
         result = jax.ffi.ffi_call(_TARGET, result)(moving, still, line=np.int64(code.address))
         back = np.argsort([*outer, *axes, len(batch)]).tolist()
-        return [result.reshape(*(batch[i] for i in (*outer, *axes)), of.outputs).transpose(*back)]
+        return self._split(result.reshape(*(batch[i] for i in (*outer, *axes)), -1).transpose(*back), line)
 
     def _batch(self, arrays, axes, **settings):
         arrays = [x[None] if at is None else jnp.moveaxis(x, at, 0) for x, at in zip(arrays, axes, strict=True)]
-        return self.bind(*arrays, **settings), [0]
+        outs = self.bind(*arrays, **settings)
+        return outs, [0] * len(outs)
 
     def _compile_operations(self, *arrays, line: Line):
         columns = tuple(x[..., i] for x in arrays for i in range(x.shape[-1]))
-        return [jnp.stack(emit(self.of(line).line, columns), axis=-1)]
+        return self._split(jnp.stack(emit(self.of(line).line, columns), axis=-1), line)
 
     def _call_from_gpu(self, *arrays, line: Line):
         if len(self.of(line).line.nodes) <= forms.LARGEST_COMPILED:
@@ -339,9 +370,9 @@ def _pull(x, w, _, line: Line):
     return back_p.bind(*x, *w, line=line)
 
 
-value_p = _LineMap("value", lambda line: line, lambda line: line.outputs)
-forward_p = _LineMap("forward", lambda line: line.forward, lambda line: line.outputs, 1, _pull)
-back_p = _LineMap("back", lambda line: line.back, lambda line: line.width, 1, _push)
+value_p = _LineMap("value", lambda line: line, lambda line: [line.outputs, *filter(None, [line.memo])])
+forward_p = _LineMap("forward", lambda line: line.forward, lambda line: [line.outputs], 1, _pull)
+back_p = _LineMap("back", lambda line: line.back, lambda line: [line.width], 1, _push)
 
 
 # ---- operations of functions on the host -----------------------------------------------------------------------------
