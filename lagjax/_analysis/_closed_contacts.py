@@ -99,7 +99,7 @@ class HeldScene(NamedTuple):
         )
 
 
-def one_sided(what: str) -> str:
+def one_sided_reason(what: str) -> str:
     return f"{what} next to a contact without load is linear on one side of it alone."
 
 

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from lagjax._analysis._closed_contacts import hold_closed, one_sided
+from lagjax._analysis._closed_contacts import hold_closed, one_sided_reason
 from lagjax._analysis._equilibrium import least_multipliers
 from lagjax._analysis._scene_state import SceneState, require_matrices
 from lagjax._analysis._smoothness import is_smooth, require_smooth
@@ -87,7 +87,7 @@ def linearize(system: System, q: PyTree, qdot: PyTree = None, params: PyTree = N
         "acceleration of one deviation.",
     )
     if held := hold_closed(system, q, qdot, params, "A linearization"):
-        system, q = held.system, held.require_loaded(q, qdot, params, one_sided("A motion"))
+        system, q = held.system, held.require_loaded(q, qdot, params, one_sided_reason("A motion"))
     scene = SceneState.from_state(system, q, qdot, params)
     scene.require_autonomous("A linearization")
     require_smooth(scene, "A linearization")
@@ -99,8 +99,9 @@ def _linearize(*arguments) -> tuple:
     scene = SceneState.from_arguments(*arguments)
     n, state = scene.layout.size, (scene.q, scene.qdot, jnp.zeros((), scene.q.dtype), scene.numbers)
     zero, one = jnp.zeros((n, n), scene.q.dtype), jnp.eye(n, dtype=scene.q.dtype)
-    mass, force = scene.motion.mass_matrix_and_force(*state)
-    constraints = scene.motion.constraints
+    unbalanced, constraints = scene.motion.unbalanced_force, scene.motion.constraints
+    force, mass = jax.linearize(lambda a: -unbalanced(*state[:2], a, *state[2:]), zero[0])
+    mass = -jax.vmap(mass, out_axes=1)(one)
     jacobian, gamma = constraints.jacobian(*state), constraints.gamma(*state)
     if scene.constrained:
         solve = jax.vmap(lambda b, c: saddle(mass, b, jacobian, c)[0], in_axes=1, out_axes=1)
@@ -114,9 +115,9 @@ def _linearize(*arguments) -> tuple:
 
     def balance(q, qdot):
         """F + Gᵀλ − M q̈ and γ − G q̈ at fixed q̈ and λ."""
-        mass, force = scene.motion.mass_matrix_and_force(q, qdot, *state[2:])
         jacobian, gamma = (of(q, qdot, *state[2:]) for of in (constraints.jacobian, constraints.gamma))
-        return force + jacobian.T @ multipliers - mass @ acceleration, gamma - jacobian @ acceleration
+        force = unbalanced(q, qdot, acceleration, *state[2:])
+        return jacobian.T @ multipliers - force, gamma - jacobian @ acceleration
 
     smooth = is_smooth(scene)
     of_balance, of_rows = jax.jacfwd(balance, argnums=(0, 1))(*state[:2])

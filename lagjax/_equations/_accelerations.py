@@ -117,7 +117,7 @@ class Accelerations:
     @lowered_once
     def general(self) -> Program:
         program, mechanics = self._solution(_ACCELERATION), self._mechanics
-        residual = None if self.motion.constrained or self.of.has_rules else lambda: self.of.required_force
+        residual = None if self.motion.constrained or self.of.has_rules else lambda: self.of.unbalanced_force
         return replace(program, mechanics=mechanics, residual=residual)
 
     @lowered_once

@@ -26,7 +26,7 @@ from lagjax._equations._coupled_forces import CoupledForces
 from lagjax._equations._form import SCALAR, Form, derived_form, form_in_xla
 from lagjax._equations._motion import Motion
 from lagjax._equations._patterns import gradient_memory, jacobian_pattern
-from lagjax._equations._quantities import OwnRules, quantities, required_force
+from lagjax._equations._quantities import OwnRules, quantities, unbalanced_force
 from lagjax._equations._recursion import Recursion
 from lagjax._equations._sparse import MOST_COLORS
 from lagjax._equations._structure import SparseMotion
@@ -176,15 +176,15 @@ class Derivation:
             return lower(trace_arrays, *leaves, budget=forms.OPERATION_BUDGET, moving=2 * self.layout.size + 1)
 
     @lowered_once
-    def required_force(self) -> Program:
-        """`Motion.required_force` of a scene without constraints; its last inputs are q̈ (n,)."""
-        if self.form.reason is not None:
-            raise Unlowerable(self.form.reason)
+    def unbalanced_force(self) -> Program:
+        """`Motion.unbalanced_force`; its last inputs are q̈ (n,)."""
+        if self.form.reason is not None or isinstance(self.motion.forces, CoupledForces):
+            raise Unlowerable(self.form.reason or "forces read multipliers")
         shapes, moving = (*self.state_shapes, self.state_shapes[0]), 2 * self.layout.size + 1
         leaves, _ = jax.tree.flatten(shapes)
 
         def trace_scalars(expansion, leaves):
-            return [required_force(self.motion, expansion, shapes[:-1], leaves[:-1], expansion.real(leaves[-1]))]
+            return [unbalanced_force(self.motion, expansion, shapes[:-1], leaves[:-1], expansion.real(leaves[-1]))]
 
         try:
             return lower_scalars(trace_scalars, tuple(leaves), forms.OPERATION_BUDGET, moving)
@@ -350,9 +350,9 @@ class Derivation:
         return self._may_be_differentiated("whole")
 
     @property
-    def differentiates_forces(self) -> bool:
-        """True if those of `required_force` are."""
-        return self._may_be_differentiated("required_force")
+    def differentiates_force(self) -> bool:
+        """True if those of `unbalanced_force` are."""
+        return self._may_be_differentiated("unbalanced_force")
 
     def _may_be_differentiated(self, name: str) -> bool:
         try:

@@ -76,6 +76,12 @@ class Motion(eqx.Module):
         matrix = self.mass_matrix(q, qdot, t, params)
         return lambda x: matrix @ x
 
+    def unbalanced_force(self, q: Vector, qdot: Vector, qddot: Vector, t: Time, params: PyTree) -> Vector:
+        """M q̈ − F, as dp/dt − ∂L/∂q − Q: the forces that an acceleration takes beside those of the scene."""
+        along = qdot, qddot, jnp.ones_like(t)
+        _, rate = jax.jvp(lambda *state: self.momentum(*state, params), (q, qdot, t), along)
+        return rate - self.generalized_force(q, qdot, t, params)
+
     def energy(self, q: Vector, qdot: Vector, t: Time, params: PyTree) -> Scalar:
         """h = p·q̇ − L, with dh/dt = −∂L/∂t + Q·q̇ along the motion."""
         return self.momentum(q, qdot, t, params) @ qdot - self.lagrangian(q, qdot, t, params)
@@ -117,11 +123,9 @@ class Motion(eqx.Module):
 
         `terms` (m,) are the sizes of the terms of γ, of which rounding is left.
         """
-        state, once = (q, qdot, t, params), jnp.ones_like(t)
+        state = q, qdot, t, params
         if not self.constrained:
-            momentum = lambda *of: self.momentum(*of, params)  # noqa: E731
-            _, rate = jax.jvp(momentum, state[:3], (qdot, qddot, once))
-            return rate - self.generalized_force(*state), jnp.zeros(0, bool)
+            return self.unbalanced_force(q, qdot, qddot, t, params), jnp.zeros(0, bool)
         # λ of the shortest τ is that of the motion by itself: G M⁻¹τ = 0 leaves both equations as they are.
         acceleration, unit = self.acceleration(*state), self.unit(*state)
         left = jnp.abs(self.constraints.products(*state)[0](qddot) - self.constraints.gamma(*state))

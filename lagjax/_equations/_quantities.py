@@ -207,8 +207,8 @@ def _entries(state: _ScalarState, recursion: Recursion) -> Ids:
     return np.array([minus if i is None else i for i in recursion.entries.values()])
 
 
-def required_force(motion: Motion, expansion: Expansion, shapes: tuple, leaves: list, qddot: Ids) -> Ids:
-    """d/dt (∂L/∂q̇) − ∂L/∂q − Q at an acceleration, as ids (n,), of a scene without constraints. Raises `OwnRules`."""
+def unbalanced_force(motion: Motion, expansion: Expansion, shapes: tuple, leaves: list, qddot: Ids) -> Ids:
+    """`Motion.unbalanced_force` at an acceleration of ids (n,), as ids. Raises `OwnRules`."""
     state = _ScalarState(expansion, shapes, leaves)
     lagrangian = state.taped(motion.lagrangian)
 
@@ -255,7 +255,7 @@ def _derivatives(state: _ScalarState, lagrangian: _Taped, rates: dict) -> tuple[
 
 
 def _derive_shorter(state: _ScalarState, lagrangian: _Taped, derive: Callable[[bool], tuple[Any, Ids]]) -> tuple:
-    """What `derive(together)` gives and the scalars that it consists of, in the form that takes fewer operations."""
+    """A derivation and the scalars that it consists of, by `derive(together)`: the form that takes fewer operations."""
     # In a kinetic energy of rotations the terms of ∂L/∂q cancel with those of (∂p/∂q) q̇. Where the cotangents of equal
     # scalars are added up at once, that is not seen: where cos q is in the kinetic and in the potential energy, one
     # term cancels and the other does not. For forces between many bodies to add them up at once is a quarter shorter.

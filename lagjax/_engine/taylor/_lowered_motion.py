@@ -33,7 +33,7 @@ def lowered_motion(derivation: Derivation) -> Motion:
     return _LoweredMotion(*functions, constraints, derivation=derivation)
 
 
-def _by_programs(as_written: Callable) -> Callable:
+def _lowered(as_written: Callable) -> Callable:
     """A decorator: the method is that of the scene `as_written` where its programs may not be differentiated."""
 
     def decorate(method: Callable) -> Callable:
@@ -47,7 +47,7 @@ def _by_programs(as_written: Callable) -> Callable:
 
 
 def _quantity(as_written: Callable) -> Callable:
-    @_by_programs(as_written)
+    @_lowered(as_written)
     def evaluate(self, *state):
         return _evaluate(self.derivation, *state, as_written.__name__)[0]
 
@@ -59,7 +59,7 @@ class _LoweredConstraints(Constraints):
     residual, rates = map(_quantity, (Constraints.residual, Constraints.rates))
     jacobian, gamma = map(_quantity, (Constraints.jacobian, Constraints.gamma))
 
-    @_by_programs(Constraints.f)
+    @_lowered(Constraints.f)
     def f(self, q, t, params):
         return self.residual(q, jnp.zeros_like(q), t, params)[: self.derivation.position_count]
 
@@ -69,26 +69,30 @@ class _LoweredMotion(Motion):
     momentum, mass_matrix = map(_quantity, (Motion.momentum, Motion.mass_matrix))
     generalized_force = _quantity(Motion.generalized_force)
 
-    @_by_programs(Motion.mass_matrix_and_force)
+    @_lowered(Motion.mass_matrix_and_force)
     def mass_matrix_and_force(self, q, qdot, t, params):
         """M and F of M q̈ = F + Gᵀλ."""
         return tuple(_evaluate(self.derivation, q, qdot, t, params, "mass_matrix", "force"))
 
-    @_by_programs(Motion.energy)
+    @_lowered(Motion.energy)
     def energy(self, q, qdot, t, params):
         momentum, value = _evaluate(self.derivation, q, qdot, t, params, "momentum", "lagrangian")
         return momentum @ qdot - value
 
+    def unbalanced_force(self, q, qdot, qddot, t, params):
+        """M q̈ − F, by a program of its own."""
+        if self.derivation.differentiates_force:
+            return _outputs(self.derivation.unbalanced_force, q, qdot, t, params, qddot)
+        return super().unbalanced_force(q, qdot, qddot, t, params)
+
     def required_force(self, q, qdot, t, params, qddot, terms=0.0):
-        """τ at an acceleration, and which constraints that violates: without constraints by a program of its own."""
+        """τ at an acceleration, and which constraints that violates beyond rounding."""
         state, of = (q, qdot, t, params), self.derivation
         if self.constrained and of.differentiates:
             terms = jax.lax.stop_gradient(_outputs(of.term_program(("gamma",)), *state))
-        elif not self.constrained and of.differentiates_forces:
-            return _outputs(of.required_force, *state, qddot), jnp.zeros(0, bool)
         return super().required_force(*state, qddot, terms)
 
-    @_by_programs(Motion.solved_acceleration)
+    @_lowered(Motion.solved_acceleration)
     def solved_acceleration(self, q, qdot, t, params):
         """q̈, NaN where its matrix is singular, and whether that is so."""
         try:
