@@ -51,7 +51,7 @@ class LineCode:
         lanes, self.shared = (1, ()) if long else (lanes, tuple(shared))
         write = _RowWalk(line, inputs, filled, moving) if long else None
         common, rest = (None, line) if long else _split_line(line, inputs, filled, self.shared)
-        own, begin = inputs - len(self.shared), common and _write_common(module, common)
+        own, begin = inputs - len(self.shared), common and _write_common(module, common, len(self.shared))
         room = len(common.outputs) if common else 1 if write is None else 2 ** math.ceil(math.log2(2 * write.size))
         code, sincos = Code(module, "evaluate", LINE_ARGUMENTS, lanes, public=True), _sincos_of(module, rest, lanes)
         (x, out, rows, given, times), room = code.arguments, code.stack(max(1, room))
@@ -151,14 +151,14 @@ def _sincos_of(module: ir.Module, line: StraightLine, lanes: int) -> Code | None
     return sincos_function(module, lanes, f"sincos{lanes}") if turns else None
 
 
-def _write_common(module: ir.Module, line: StraightLine) -> Code:
+def _write_common(module: ir.Module, line: StraightLine, inputs: int) -> Code:
     """The function (inputs, outputs) of a line."""
     code, sincos = Code(module, "common", [POINTER, POINTER], 1), _sincos_of(module, line, 1)
     given, out = code.arguments
     if compilation_work(line, 1) > WORK_OPTIMISED:
         for attribute in ("noinline", "optnone"):
             code.function.attributes.add(attribute)
-    _write_line(code, sincos, line, len(line.nodes), list(range(len(line.outputs))), given, out, given)
+    _write_line(code, sincos, line, inputs, list(range(len(line.outputs))), given, out, given)
     return code.finish()
 
 
