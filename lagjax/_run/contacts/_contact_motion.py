@@ -26,7 +26,7 @@ from lagjax._primitives import attach_derivative, lost_unless
 from lagjax._program import Unlowerable
 from lagjax._run.contacts._contact_search import LOOPS
 from lagjax._run.contacts._corners import append_sides, corners_of
-from lagjax._run.contacts._places import ARRAYS, PLACES, sizes_of
+from lagjax._run.contacts._places import ARRAYS, PLACES
 from lagjax._run.contacts._replay import ContactReplay, Played
 from lagjax._run.jumps import Found, JumpLaw, Mode, SceneCode
 from lagjax._scene import Contacts, ContactScene, Flat, InContact, Shapes
@@ -34,7 +34,7 @@ from lagjax._tracing import Program, compose, lower
 
 PyTree = Any
 
-LAW = JumpLaw(PLACES, LOOPS, sizes_of, ("RESTITUTION", "MU"), ("DOUBTS", "DOUBTED"))
+LAW = JumpLaw(PLACES, LOOPS, ("RESTITUTION", "MU"), ("DOUBTS", "DOUBTED"))
 LAWS = "simultaneous", "sequential", "poisson"
 # Operations that have a series everywhere, which hides nothing.
 _SEEN = frozenset(("input", "constant", "convert", "add", "sub", "mul", "neg", "sin", "cos", "exp", "tanh"))

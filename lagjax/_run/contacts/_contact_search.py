@@ -424,8 +424,8 @@ def finish(
 
     `fell` (G,) says which watches fell or rose, if it is an `event`; `result` is that of a run without one.
     """
-    n, k, total, times, x = scene.n, scene.k, scene.watches, scene.times, member.x
-    row, doing = record[int(member.rounds) * scene.row :], scene.doing
+    n, k, total, x = scene.n, scene.k, scene.watches, member.x
+    row = record[int(member.rounds) * scene.row :]
     deciding, start, begun = total - scene.sections, x[2 * n], x[2 * n + 1 + scene.numbers :]
     for i in range(scene.row):
         row[i] = 0.0
@@ -433,7 +433,7 @@ def finish(
     for g in range(deciding):
         decides = decides or (happens and fell[g] > 0)
     if not happens and result == SUCCESSFUL:
-        t_end = ts[times - 1]
+        t_end = ts[scene.times - 1]
     at_once = t_end == start
     write_outputs(scene, ts, start, t_end, found[2 * n :], begun, path, did)
     if decides:
@@ -445,7 +445,7 @@ def finish(
     row.end, row.watch, row.crosses = t_end, float(first), float(crosses)
     row.happens, row.decides = float(happens), float(decides)
     row.ran, row.t_impact = 1.0, MISSING
-    copy(begun, row.did, doing)
+    copy(begun, row.did, scene.doing)
     if crosses or not happens:
         copy(y_end, x, 2 * n)
         x[2 * n] = t_end
@@ -462,17 +462,24 @@ def finish(
         member.came[first - deciding] = 2.0 * fell[first] - 3.0
         row.contact, row.change = float(k + first - deciding), -1.0
     copy(x, row.behind, 2 * n)
-    if scene.corners > 0 and happens:  # time itself may go beyond its corner
-        for j in range(times):
-            if ts[j] <= x[2 * n] and did[j * doing] < 0:
-                copy(x, path[j * 2 * n :], 2 * n)
-                copy(row.did, did[j * doing :], doing)
+    if scene.corners > 0 and happens:
+        write_passed_outputs(scene, member, ts, path, did, row)
     member.rounds += float(happens)
     member.rows += 1.0
     reached = find_result(scene, member, reached, happens)
     member.result = float(reached)
     if reached == SUCCESSFUL:
         check_outputs(scene, member, ts, path, did, room)
+
+
+@loop
+def write_passed_outputs(scene: Scene, member: Member, ts: Floats, path: Floats, did: Floats, row: Entry):
+    """Put the outputs at which a motion is that continues beyond a corner, also of time."""
+    n, x, doing = scene.n, member.x, scene.doing
+    for j in range(scene.times):
+        if ts[j] <= x[2 * n] and did[j * doing] < 0:
+            copy(x, path[j * 2 * n :], 2 * n)
+            copy(row.did, did[j * doing :], doing)
 
 
 @loop
@@ -813,9 +820,9 @@ def find_change(scene: Scene, member: Member, hits: bool, row: Entry, room: Room
         stuck[c] = (1.0 - stuck[c]) * push[rough[c]] if hits else 0.0  # from here on those that slide
     add_rates(rates, coupling, impulses, room.apart, size)
     for j in range(n):
-        room.change[j] = 0.0
+        room.jump[j] = 0.0
         for i in range(size):
-            room.change[j] += impulses[i] * room.responses[i * n + j]
+            room.jump[j] += impulses[i] * room.responses[i * n + j]
     return wrong
 
 
@@ -951,7 +958,7 @@ def stay_closed(scene: Scene, member: Member, hits: bool, room: Room):
             return
     copy(member.opened, x, scene.inputs)
     for j in range(n):
-        x[n + j] += room.change[j]
+        x[n + j] += room.jump[j]
     evaluate(scene.response, x, behind)
     bends = behind[2 * k * n + k * k + 2 * k :]
     find_pattern(
@@ -974,7 +981,7 @@ def rub(scene: Scene, member: Member, first: int, hits: bool, room: Room):
     if first >= k and first < k + r and was_stuck[first - k] > 0:
         write_held_force(scene, member, first - k, v, room)
     for j in range(n):
-        v[j] = x[n + j] + room.change[j]
+        v[j] = x[n + j] + room.jump[j]
     measure_slips(scene, member, apart, v, behind, room)
     lasts = member.longest if member.longest > 0 else member.last - member.first
     for c in range(r):
@@ -1044,7 +1051,7 @@ def move(scene: Scene, member: Member, first: int, meets: Floats, row: Entry, ro
     """
     n, k, size, x = scene.n, scene.k, scene.k + scene.r * scene.d, member.x
     responses, coupling, largest = room.responses, room.coupling, member.largest
-    offset, change, lost = row.offset, room.change, 0.0
+    offset, change, lost = row.offset, room.jump, 0.0
     for i in range(size):
         for j in range(n):
             part = room.impulses[i] * room.gradients[i * n + j]
@@ -1083,7 +1090,7 @@ def note_force_noise(scene: Scene, member: Member, first: int, room: Room):
     for i in range(scene.k):
         own, fast = room.coupling[i * (scene.k + scene.r * scene.d) + i], 0.0
         for j in range(n):
-            fast += abs(room.gradients[i * n + j]) * max(abs(x[n + j]), abs(x[n + j] + room.change[j]))
+            fast += abs(room.gradients[i * n + j]) * max(abs(x[n + j]), abs(x[n + j] + room.jump[j]))
         if longest > 0:
             least = FORCELESS * (fast / own) / longest
             values[total + i] = max(values[total + i], least)

@@ -18,7 +18,7 @@ from lagjax._interface import Layout, compile_for_one_call, halves
 from lagjax._primitives import attach_derivative, lost_unless
 from lagjax._run._trajectory import State, Transitions
 from lagjax._run.hybrid._mode import FIRES, ModeParts, Transition, make_mode
-from lagjax._run.hybrid._transition_places import PLACES, sizes_of
+from lagjax._run.hybrid._transition_places import PLACES
 from lagjax._run.hybrid._transition_replay import HybridReplay, PlayedModes
 from lagjax._run.hybrid._transition_search import LOOPS
 from lagjax._run.jumps import Found, JumpLaw, Mode, SceneCode
@@ -26,7 +26,7 @@ from lagjax._scene import System
 
 PyTree = Any
 
-LAW = JumpLaw(PLACES, LOOPS, sizes_of, ("MODE",), ("LET_OUT", "MODE"))
+LAW = JumpLaw(PLACES, LOOPS, ("MODE",), ("LET_OUT", "MODE"))
 
 
 class HybridPlan(eqx.Module):

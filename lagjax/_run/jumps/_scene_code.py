@@ -30,23 +30,15 @@ _ROUNDS = 10**6  # of a kernel, for a stretch: beyond that it continues on the h
 
 
 class JumpLaw(NamedTuple):
-    """A law of what happens where a watch falls: `loops` over numbers at `places`; `sizes_of` gives the doubles.
+    """A law of what happens where a watch falls: `loops` over numbers at `places`.
 
     A search is `given` fields of a member's memory beside the state, and tells those of its `ending`.
     """
 
     places: Places
     loops: tuple[Loop, ...]  # those of `bind_law`
-    sizes_of: Callable[[dict[str, int]], dict[str, int]]
     given: tuple[str, ...]
     ending: tuple[str, ...]
-
-    def fields(self, sizes: dict[str, int]) -> dict[str, int]:
-        """The count of doubles in each field of a memory, of the room of a thread and of a row."""
-        n, watches = sizes["N"], sizes["WATCHES"]
-        fields = dict.fromkeys((*self.places.memory, *self.places.work, *self.places.record), 1)
-        fields |= {"X": sizes["INPUTS"], "WIDTHS": sizes["INPUTS"], "BEGUN": 2 * n + 1, "GUARDS": 5 * watches}
-        return fields | {"STOP": 2 * n, "ORDER": 0, "JOBS": 0} | self.sizes_of(sizes)
 
 
 class Mode(NamedTuple):
@@ -89,7 +81,7 @@ class SceneCode:
         self.sizes = sizes | {"MODES": len(modes), "WATCHES": int(counts.max())}
         empty = dict.fromkeys(("WATCH", "ERRORS", "SLOPES"), np.zeros(len(modes)))
         empty |= dict.fromkeys(("PLANS", "RESTS"), np.zeros(2 * len(modes)))
-        self.arrays, self.fields = {"COUNTS": counts, **empty, **arrays}, law.fields(self.sizes)
+        self.arrays, self.fields = {"COUNTS": counts, **empty, **arrays}, law.places.count_doubles(self.sizes)
         self._keep = []  # what the addresses point to
         self.flow_of = functools.cache(lambda mode: modes[mode].make())
         self.scene = functools.cache(self._scene)
@@ -150,8 +142,8 @@ class SceneCode:
         ends = np.cumsum([self.fields[name] for name in names])
         parts = [rows[..., end - self.fields[name] : end] for name, end in zip(names, ends, strict=True)]
         of = collections.namedtuple("Rows", [name.lower() for name in names])
-        scalars = self.law.places.scalars
-        return of(*(x[..., 0] if name in scalars else x for name, x in zip(names, parts, strict=True)))
+        counts = self.law.places.fields
+        return of(*(x if counts[name] else x[..., 0] for name, x in zip(names, parts, strict=True)))
 
     def read_ending(self, ending) -> Any:
         """The fields of the `ending` of a search, but for t and y in front."""
@@ -166,7 +158,7 @@ class SceneCode:
         """
         given = map(jnp.asarray, (ts, y0, numbers, *given))
         places = self.law.places
-        return Found(*search_p.bind(*given, code=self, names=places.record if is_replayed else places.said))
+        return Found(*search_p.bind(*given, code=self, names=tuple(places.record if is_replayed else places.said)))
 
     def run(self, ts, y0, numbers, *given, room: int | None) -> Found:
         """`search` on arrays of NumPy with members in front; with no `room` its records are as long as the longest."""
