@@ -38,7 +38,7 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
   `Experiments`, a `Comparison`
 - `Record`, `Timings`, `Guess`, `Delayed`, `wrapped`: what was measured, and how
 - `Gaussian`, `StudentT`, `Quantised`, `Clipped`: the noise
-- `positive`, `between`, `angle`, `simplex`, `inertia`: what parameters may be
+- `positive`, `between`, `angle`, `simplex`, `inertia`: what parameters may be; `per_record`: one value a record
 
 **Many members, few numbers of each**
 
@@ -100,6 +100,7 @@ if TYPE_CHECKING:  # each is imported on first use: all of them take as long as 
         between,
         fit,
         inertia,
+        per_record,
         positive,
         simplex,
         wrapped,
@@ -119,8 +120,8 @@ __all__ = [
     "SimulationError", "Statistics", "Store", "StudentT", "Sweep", "System", "Timings", "Transition", "action", "angle",
     "between", "branch_off", "change_coordinates", "check", "conserved_quantities", "crossings", "cyclic_coordinates",
     "designs", "equilibrium", "family", "find_path", "fit", "hamiltonian", "inertia", "linearize", "lyapunov_exponent",
-    "lyapunov_spectrum", "noether_charge", "normal_modes", "periodic_orbit", "plot", "positive", "results", "routhian",
-    "same_motion", "samples", "scenes", "simplex", "simulate", "simulate_batch", "sweep",
+    "lyapunov_spectrum", "noether_charge", "normal_modes", "per_record", "periodic_orbit", "plot", "positive",
+    "results", "routhian", "same_motion", "samples", "scenes", "simplex", "simulate", "simulate_batch", "sweep",
     "work_precision", "wrapped",
 ]  # fmt: skip
 

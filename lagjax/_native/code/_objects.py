@@ -26,6 +26,10 @@ from pathlib import Path
 # Bytes of all files, beyond which the ones that were not used for longest go until a quarter is free. A double pendulum
 # takes 60 kB, a chain of 16 half a megabyte.
 LARGEST_CACHE = 2**28
+# Bytes that this process may write into a folder until it looks at all files there again: a sixteenth of the largest
+# sum, since a look at 6400 files takes 25 ms, which each of them took when every new object looked. So the folder may
+# exceed that sum by a sixteenth for every process that writes. A process looks at its first object.
+_LEFT: dict[Path, int] = {}
 _MAGIC = b"lagjax object 1\n"
 _DIGEST = hashlib.sha256
 # A link may lead to another file than the one that is looked at, and a named pipe waits for a writer for ever.
@@ -94,7 +98,10 @@ def load_or_make(make: Callable[[], bytes], *made_from: str) -> bytes:
     made = make()
     with contextlib.suppress(OSError):
         _write(file, made)
-        _remove_oldest(place)
+        _LEFT[place] = _LEFT.get(place, 0) - len(made)
+        if _LEFT[place] <= 0:
+            _remove_oldest(place)
+            _LEFT[place] = LARGEST_CACHE // 16
     return made
 
 
@@ -133,7 +140,7 @@ def _write(file: Path, body: bytes) -> None:
 def _remove_oldest(place: Path) -> None:
     """Remove the files that were not used for longest where all together are too large."""
     files = []
-    with os.scandir(place) as entries:  # there may be thousands, and each object that is written looks at all
+    with os.scandir(place) as entries:
         for entry in entries:
             with contextlib.suppress(OSError):  # another process removed it
                 status = entry.stat()
