@@ -842,7 +842,12 @@ def ask_rates(scene: Scene, member: Member, hits: bool, row: Entry, room: Room):
         for i in range(k):
             targets[i] = -e[i] * room.rates[i]
     elif scene.r > 0:
-        construct(e[0], member.mu[0], room.coupling, room.rates, targets, row.direction)
+        x = room.free
+        copy(room.coupling, x, 4)
+        copy(room.rates, x[4:], 2)
+        x[6], x[7] = e[0], member.mu[0]
+        evaluate(scene.construct, x, x[8:])
+        targets[0], row.direction[0] = x[8], x[9]
 
 
 @loop
@@ -863,32 +868,6 @@ def is_violated(scene: Scene, member: Member, row: Entry, room: Room) -> bool:
         if flags[i] > 0:
             return True
     return False
-
-
-@loop
-def construct(e: float, mu: float, coupling: Floats, rates: Floats, target: Floats, direction: Floats):
-    """Put the rate behind an impact of one contact in a plane, and −F/μΛ, by Routh's construction.
-
-    As the normal impulse Λ grows, friction acts against the slip of that moment. Where that has stopped the contact
-    sticks, if friction suffices, or slides on the other way. Compression ends where the rate is zero, the impact at
-    1 + e times its impulse (Wang & Mason, J. Appl. Mech. 59 (1992) 635).
-    """
-    normal, mixed, tangential, rate, slip = coupling[0], coupling[1], coupling[3], rates[0], rates[1]
-    side = -1.0 if slip < 0 else 1.0
-    slows = mu * tangential - side * mixed  # of the slip, by Λ; it is positive where friction could jam
-    stops = INFINITY
-    if slip == 0 or slows > 0:
-        stops = abs(slip) / (slows if slows > 0 else 1.0)
-    held = min(max(mixed / tangential, -mu), mu)  # −dF/dΛ from there on
-    slope, then = normal - mu * side * mixed, normal - held * mixed
-    compression = -rate / slope
-    if not slope * stops >= -rate:  # the slip ends before compression does
-        compression = stops + (-rate - slope * stops) / then
-    impulse = (1.0 + e) * compression
-    slides = min(impulse, stops)
-    force = -mu * side * slides - held * (impulse - slides)
-    target[0] = rate + normal * impulse + mixed * force
-    direction[0] = -force / (mu * impulse) if mu * impulse > 0 else 0.0
 
 
 @loop

@@ -12,7 +12,7 @@ SIZES = (
     "MAY_MISS",  # 1 if an operation of the watches may hide a corner from a series
     "HEIGHT", "MULTIPLIERS_COUNT",  # rows of contacts, and of all constraints
     "GAP_SLOTS", "SLOTS",  # rows of gaps and of velocities for which there is room; 0 where rows are as they are
-    "RESPONSE", "BENDS", "ACCELERATION", "MULTIPLIERS", "SIDES", "SIDE_SLOPES",  # addresses of lines
+    "RESPONSE", "BENDS", "ACCELERATION", "MULTIPLIERS", "SIDES", "SIDE_SLOPES", "CONSTRUCT",  # addresses of lines
 )  # fmt: skip
 ARRAYS = (
     "ROUGH",  # (r,), the contacts with friction

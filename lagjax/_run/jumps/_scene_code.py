@@ -8,7 +8,7 @@ import collections
 import ctypes
 import functools
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, NamedTuple
 
@@ -133,11 +133,11 @@ class SceneCode:
             place = self.law.places.of[name] if isinstance(name, str) else scene[self.law.places.of[name[0]]] + name[1]
             scene[place] = address
 
-    def width(self, names: Sequence[str]) -> int:
+    def width(self, names: Collection[str]) -> int:
         """The count of doubles of these fields."""
         return sum(self.fields[name] for name in names)
 
-    def read(self, rows, names: Sequence[str]) -> Any:
+    def read(self, rows, names: Collection[str]) -> Any:
         """The fields of rows (…, doubles) by their names in small letters, those of one double without an axis."""
         ends = np.cumsum([self.fields[name] for name in names])
         parts = [rows[..., end - self.fields[name] : end] for name, end in zip(names, ends, strict=True)]
