@@ -325,7 +325,7 @@ class Events:
         self._see(frame, searching(), frame["begin"] * frame["part"])
 
     def _see(self, frame: Frame, where: Value, seen: Value) -> None:
-        """Note, in some lanes, that a guard is seen only up to a part of the step."""
+        """Note, in some lanes, that a guard is seen only up to a fraction of the step."""
         frame.assign(where & (seen < frame["seen"]), seen=seen)
 
     def _waits(self, watch: Watch) -> Value:
@@ -366,7 +366,7 @@ class Events:
         return code.select(lost, 0.0, at)  # time does not move
 
     def _take(self, watch: Watch, order: Value, changes: Value, s: Value, ahead: Variable) -> Value:
-        """Changes at the times s: the event, or a note, where they are in the direction; which lanes go on beyond."""
+        """Changes at the times s: the event, or a note, where the direction is right; which lanes continue."""
         frame, code, side, size = watch.frame, watch.code, ahead.value, abs(s)
         counts = changes & ~(side * watch.number("direction") > 0.0)
         if self.guards.notes:

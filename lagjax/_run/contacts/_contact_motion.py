@@ -47,9 +47,7 @@ class ContactPlan(eqx.Module):
     """
 
     scene: ContactScene
-    rtol: float = eqx.field(static=True)
-    atol: float | None = eqx.field(static=True)
-    max_steps: int = eqx.field(static=True)
+    tolerances: Tolerances = eqx.field(static=True)
     max_transitions: int = eqx.field(static=True)
     is_single: bool = eqx.field(static=True)
     sections: tuple[Function, ...] = ()
@@ -179,9 +177,8 @@ def scene_of(plan: ContactPlan, layout: Layout, params: PyTree, times: int) -> S
         for of in (plan.scene, ContactScene(system, is_open=True), ContactScene(system))
     )
     code, structure = jax.tree.flatten(eqx.filter(inside, eqx.is_array_like, inverse=True))
-    tolerances = Tolerances(plan.rtol, plan.atol or 0.0, plan.max_steps)
     given = plan.max_transitions, plan.is_single, plan.sections, plan.directions, tuple(code), structure, times
-    return _make_scene(closed, other, whole, plan.scene, tolerances, *given)
+    return _make_scene(closed, other, whole, plan.scene, plan.tolerances, *given)
 
 
 @functools.lru_cache(maxsize=64)
@@ -262,8 +259,8 @@ def held_size(shapes: Shapes, n: int) -> int:
 def slots_of(whole: Derivation, flat: Flat) -> tuple[int, int] | None:
     """The most independent rows of gaps, and of velocities, that hold at once; None to hold all rows as they are.
 
-    They are ranks at states that nothing speaks for, where rows have no corners. The slips of few contacts may hold
-    more beside their gaps than those of all do: all sets are looked at whose gaps leave some rank.
+    They are ranks at random states, where rows have no corners. The slips of few contacts may hold
+    more in addition to their gaps than those of all do: all sets are looked at whose gaps leave some rank.
     """
     places, shapes, n = RowPlaces.from_derivation(whole, flat), flat.shapes, whole.layout.size
     if not held_size(shapes, n) or shapes.count > flat.gap_count or corners_of(whole, places.all, shapes) is not None:

@@ -559,7 +559,7 @@ def find_first(scene: Scene, fell: Floats, at_once: bool, did: Floats) -> int:
 
 @loop
 def decide(scene: Scene, member: Member, first: int, row: Entry, room: Room) -> int:
-    """The result behind watch `first`, which fell: state and contacts of the member go on there, as the row says."""
+    """The result behind watch `first`, which fell: the member continues from there, as the row says."""
     n, k, r, x, meets, opening = scene.n, scene.k, scene.r, member.x, row.meets, room.opening
     closed = x[2 * n + 1 + scene.numbers :]
     copy(closed, room.closed, k)
@@ -640,7 +640,7 @@ def note_changes(scene: Scene, member: Member, first: int, hits: bool, row: Entr
 
 @loop
 def meet_corners(scene: Scene, member: Member, first: int, meets: Floats, room: Room) -> int:
-    """Put which contacts come to a corner where watch `first` fell, and open there; the state and time go beyond it.
+    """Put which contacts reach a corner where watch `first` fell, and open there; state and time continue beyond it.
 
     Returns 2 where one is struck at its corner, or stays there, 1 where one meets behind its corner, else 0.
     """

@@ -35,9 +35,7 @@ class HybridPlan(eqx.Module):
     systems: tuple[System, ...]
     transitions: tuple[Transition, ...]
     max_transitions: int = eqx.field(static=True)
-    rtol: float = eqx.field(static=True)
-    atol: float | None = eqx.field(static=True)
-    max_steps: int = eqx.field(static=True)
+    tolerances: Tolerances = eqx.field(static=True)
     is_single: bool = eqx.field(static=True)  # whether the start came in float32
 
 
@@ -105,7 +103,8 @@ def replay_of(plan: HybridPlan, layout: Layout, params: PyTree, times: int) -> H
 
     Raises `ValueError` without machine code.
     """
-    limits = {"rtol": plan.rtol, "atol": plan.atol, "max_steps": plan.max_steps}
+    rtol, atol, max_steps, *_ = plan.tolerances
+    limits = {"rtol": rtol, "atol": atol or None, "max_steps": max_steps}
     made = (Problem.from_system(system, layout, params, **limits) for system in plan.systems)
     problems = [dataclasses.replace(problem, is_rounded=plan.is_single) for problem in made]
     modes = (make_mode(name, plan.transitions, of) for name, of in zip(plan.names, problems, strict=True))
@@ -131,5 +130,4 @@ def _make_scene(plan: HybridPlan, parts: tuple[ModeParts, ...], times: int) -> H
         "K": len(leaving), "TIMES": times, "DOING": 1, "MOST": plan.max_transitions + 1, "SINGLE": int(plan.is_single),
     }  # fmt: skip
     modes = [Mode(mode.make_guarded, len(mode.numbers), lambda mode=mode: mode.surfaces) for mode in parts]
-    tolerances = Tolerances(plan.rtol, plan.atol or 0.0, plan.max_steps)
-    return HybridReplay(SceneCode(LAW, sizes, arrays, modes, lines, tolerances, first=len(modes)), parts)
+    return HybridReplay(SceneCode(LAW, sizes, arrays, modes, lines, plan.tolerances, first=len(modes)), parts)

@@ -17,8 +17,9 @@ import numpy as np
 from jax.core import ShapedArray
 from jax.interpreters import mlir
 
-from lagjax._engine.taylor import Line, Surfaces, line_of, rate_errors
-from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL
+from lagjax._engine import Problem
+from lagjax._engine.taylor import Line, MachineCode, Surfaces, Tolerances, line_of, rate_errors
+from lagjax._interface import EVENT_OCCURRED, SUCCESSFUL, is_concrete
 from lagjax._native import LARGEST_LINE, SINGLE_NOISE, LineCode, Loop, compile_loops, cores, handler
 from lagjax._primitives import LinearMap, call_host, compute_on_host
 from lagjax._run.jumps._driver import ASKS, GOING, NEW
@@ -29,10 +30,23 @@ _ROOM = 32  # rows of a record, at first
 _ROUNDS = 10**6  # of a kernel, for a stretch: beyond that it continues on the host, where it can be interrupted
 
 
+def tolerances_of(problem: Problem, scene: str, what: str) -> Tolerances:
+    """rtol and atol of a motion that jumps. Raises `ValueError` if they are traced, or the motion goes back in time.
+
+    The errors name the `scene`, and `what` cannot be undone.
+    """
+    if not all(map(is_concrete, problem.tolerances)):
+        raise ValueError(f"rtol and atol of {scene} must be numbers: they decide the order of the method.")
+    if is_concrete(problem.ts) and np.asarray(problem.ts)[-1] < np.asarray(problem.ts)[0]:
+        raise ValueError(f"The motion of {scene} goes forward in time: {what} cannot be undone; ts must increase.")
+    wide = problem.double_precision if problem.is_single else problem
+    return Tolerances(float(MachineCode().rtol(wide)), float(problem.tolerances[1] or 0.0), problem.max_steps)
+
+
 class JumpLaw(NamedTuple):
     """A law of what happens where a watch falls: `loops` over numbers at `places`.
 
-    A search is `given` fields of a member's memory beside the state, and tells those of its `ending`.
+    A search is `given` fields of a member's memory in addition to the state, and tells those of its `ending`.
     """
 
     places: Places
