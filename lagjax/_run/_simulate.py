@@ -9,16 +9,14 @@ import dataclasses
 import functools
 import os
 from collections.abc import Callable
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
-import diffrax
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from lagjax._engine import AbstractEngine, Batch, Problem, Solution, axes_per_leaf, choose, requested_engine
-from lagjax._engine.diffrax import Diffrax
 from lagjax._engine.taylor import MachineCode
 from lagjax._equations import has_constraints, inconsistent_members, require_consistent
 from lagjax._interface import ENDED_WELL, RESULTS, Layout, advice, as_arrays, halves, require_flag, result_from
@@ -27,6 +25,9 @@ from lagjax._run._trajectory import State, Trajectory, raise_unless_ok, step_cou
 from lagjax._run.contacts import follow_contacts, follow_contacts_batch
 from lagjax._run.hybrid import Hybrid, follow_modes
 from lagjax._scene import System, lift_batch, lift_problem, require_system
+
+if TYPE_CHECKING:
+    import diffrax
 
 PyTree = Any
 
@@ -65,16 +66,16 @@ def simulate(
     ts: jax.Array | np.ndarray,
     params: PyTree = None,
     *,
-    solver: diffrax.AbstractSolver | MachineCode | None = None,
+    solver: "diffrax.AbstractSolver | MachineCode | None" = None,
     rtol: float | None = None,
     atol: float | None = None,
     dt: float | None = None,
     max_steps: int = 65_536,
     max_transitions: int | None = None,
-    event: Callable | diffrax.Event | None = None,
-    adjoint: diffrax.AbstractAdjoint | None = None,
+    event: "Callable | diffrax.Event | None" = None,
+    adjoint: "diffrax.AbstractAdjoint | None" = None,
     throw: bool = True,
-    progress: bool | diffrax.AbstractProgressMeter = False,
+    progress: "bool | diffrax.AbstractProgressMeter" = False,
 ) -> Trajectory:
     r"""The motion of `system` from (q0, qdot0) at `ts[0]`, at the times `ts`.
 
@@ -192,8 +193,7 @@ def simulate(
     trajectory = trajectory_of(given, engine, solution, given.y0, given.params)
     if not throw or (isinstance(solution.result, np.integer) and solution.result in ENDED_WELL):
         return trajectory
-    implicit = isinstance(engine, Diffrax) and isinstance(engine.solver, diffrax.AbstractImplicitSolver)
-    return raise_unless_ok(trajectory, layout, lambda: advice(trajectory.result, implicit))
+    return raise_unless_ok(trajectory, layout, lambda: advice(trajectory.result, engine.is_implicit))
 
 
 @_translate_keywords
@@ -206,15 +206,15 @@ def simulate_batch(
     params: PyTree = None,
     *,
     batch_axes: tuple[PyTree, PyTree, PyTree] = (0, 0, None),
-    solver: diffrax.AbstractSolver | MachineCode | None = None,
+    solver: "diffrax.AbstractSolver | MachineCode | None" = None,
     rtol: float | None = None,
     atol: float | None = None,
     dt: float | None = None,
     max_steps: int = 65_536,
     max_transitions: int | None = None,
-    event: Callable | diffrax.Event | None = None,
-    adjoint: diffrax.AbstractAdjoint | None = None,
-    progress: bool | diffrax.AbstractProgressMeter = False,
+    event: "Callable | diffrax.Event | None" = None,
+    adjoint: "diffrax.AbstractAdjoint | None" = None,
+    progress: "bool | diffrax.AbstractProgressMeter" = False,
 ) -> Trajectory:
     """The motion of many members of one scene at once: the same numbers as `jax.vmap` over `simulate`.
 
@@ -280,14 +280,14 @@ def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, 
     stats = step_counts(solution.accepted, solution.rejected)
     if solution.idle is not None:
         stats["num_wasted_lane_steps"] = solution.idle
-    fixed_steps, event = isinstance(engine, Diffrax) and engine.dt is not None, None
+    event = None
     if problem.event is not None:
-        of, ended = jax.tree.structure(problem.event.cond_fn, is_leaf=callable), jnp.asarray(solution.event)
+        of, ended = jax.tree.structure(problem.event.conditions, is_leaf=callable), jnp.asarray(solution.event)
         event = of.unflatten([ended[..., k] for k in range(of.num_leaves)])
     return Trajectory.from_fields(
         ts=ts, q=q, qdot=qdot, result=result_from(result), end=State(solution.t_end, restore(q_end), restore(qdot_end)),
         stats=stats, system=problem.system, params=params, params_axes=params_axes, engine=type(engine).__name__,
-        tolerances=None if fixed_steps else engine.tolerances(problem, y0), event=event,
+        tolerances=engine.tolerances(problem, y0), event=event,
     )  # fmt: skip
 
 

@@ -473,7 +473,7 @@ class System(eqx.Module):
         """The shapes that the function of a role returns, traced on shapes alone."""
         numbers, code = eqx.partition(params, eqx.is_array_like)
         function, count = getattr(self, role), len(ARGUMENTS[role])
-        state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
+        state, t = layout.restore(np.zeros(layout.size, layout.dtype)), np.zeros((), layout.dtype)
         more = self.multiplier_shapes(layout, params) if role == "forces" else {}
         return jax.eval_shape(
             lambda q, t, p, more: function(*[q] * count, t=t, params=eqx.combine(p, code), **more),
@@ -485,7 +485,7 @@ class System(eqx.Module):
         if not self.reads_multipliers:
             return {}
         trees = self._role_shapes(self._multiplier_roles, layout, params)
-        flat = jnp.zeros(count_numbers(trees), layout.dtype)
+        flat = np.zeros(count_numbers(trees), layout.dtype)
         return {"multipliers": jax.eval_shape(lambda x: name_numbers(x, trees), flat)}
 
 
