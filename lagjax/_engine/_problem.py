@@ -192,13 +192,15 @@ def solve_in_doubles(solve: Callable, problem: Problem):
 
 
 class Batch(eqx.Module):
-    """Many problems of one scene, which differ in their initial states and in numbers of their parameters.
+    """Many problems of one scene, which differ in their initial states, in numbers of their parameters, and in times.
 
-    `member` is a problem of the structure of all; `y0` (N, 2n) holds the initial states, and `params` the parameters,
-    with the members as first axis of every leaf whose entry in `axes` is 0. Those whose entry is None are for all.
+    `member` is a problem of the structure of all. `ts` (N, T) are their output times, or (1, T) those of all; `y0`
+    (N, 2n) holds the initial states, and `params` the parameters, with the members as first axis of every leaf whose
+    entry in `axes` is 0. Those whose entry is None are for all.
     """
 
     member: Problem
+    ts: Float[Numbers, "times_of T"]
     y0: Float[Numbers, "N states"]
     params: PyTree
     axes: tuple[int | None, ...] = eqx.field(static=True)
@@ -209,11 +211,16 @@ class Batch(eqx.Module):
     ) -> "Batch":
         """The batch of `values` by name, q0, qdot0, params, with the axis of members of every leaf (`axes_per_leaf`).
 
+        `ts` are the output times (T,) of all, or (N, T) of each.
+
         Raises `TypeError` or `ValueError` as `Problem.from_arguments`; a number of one member alone may be NaN.
         """
         member = {name: jax.tree.map(_shape_of_one, value, axes[name]) for name, value in values.items()}
         layout = Layout.from_state(member["q0"], member["qdot0"])
-        one = Problem.from_system(system, layout, member["params"], ts, rtol, atol, max_steps, event)
+        times = output_times(ts, layout.dtype, rows=True)
+        each = times if times.ndim == 2 else times[None]
+        first = np.asarray(each)[0] if _is_on_host(each) else each[0]
+        one = Problem.from_system(system, layout, member["params"], first, rtol, atol, max_steps, event)
         arrays = {name: as_arrays(value, layout.dtype, name) for name, value in values.items()}
         for name, value in arrays.items():
             require_finite(jax.tree.map(lambda leaf, axis: leaf if axis is None else None, value, axes[name]), name)
@@ -225,7 +232,7 @@ class Batch(eqx.Module):
         of_state = (jax.tree.structure(values[name]).flatten_up_to(axes[name]) for name in ("q0", "qdot0"))
         y0 = rows(state, itertools.chain(*of_state), size, layout.dtype)
         spread = tuple(None if axis is None else 0 for axis in of_params)
-        return cls(one, y0, structure.unflatten(in_front), spread)
+        return cls(one, each, y0, structure.unflatten(in_front), spread)
 
     def __len__(self) -> int:
         return len(self.y0)
@@ -234,10 +241,11 @@ class Batch(eqx.Module):
         """`solve` under `jax.vmap` over the members; of `more`, that comes behind a problem, each has its own."""
         axes = jax.tree.unflatten(jax.tree.structure(self.params), self.axes)
 
-        def solve_member(y0, params, *more):
-            return solve(replace(self.member, y0=y0, params=params), *more)
+        def solve_member(ts, y0, params, *more):
+            return solve(replace(self.member, ts=ts, y0=y0, params=params), *more)
 
-        return jax.vmap(solve_member, in_axes=(0, axes, *[0] * len(more)))(self.y0, self.params, *more)
+        ts, of_ts = (self.member.ts, None) if self.shares_times else (self.ts, 0)
+        return jax.vmap(solve_member, in_axes=(of_ts, 0, axes, *[0] * len(more)))(ts, self.y0, self.params, *more)
 
     def map_in_turn(self, solve: Callable[[Problem], "Solution"]) -> "Solution":
         """`solve` of one member after the other."""
@@ -246,14 +254,24 @@ class Batch(eqx.Module):
         def solve_member(i):
             leaves = zip(jax.tree.leaves(self.params), self.axes, strict=True)
             params = structure.unflatten([x if axis is None else jnp.asarray(x)[i] for x, axis in leaves])
-            return solve(replace(self.member, y0=jnp.asarray(self.y0)[i], params=params))
+            ts = self.member.ts if self.shares_times else jnp.asarray(self.ts)[i]
+            return solve(replace(self.member, ts=ts, y0=jnp.asarray(self.y0)[i], params=params))
 
         return jax.lax.map(solve_member, jnp.arange(len(self)))
 
     @property
     def is_known(self) -> bool:
         numbers = eqx.filter(self.params, eqx.is_array_like)
-        return all(is_concrete(leaf) for leaf in jax.tree.leaves((self.member.ts, self.y0, numbers)))
+        return all(is_concrete(leaf) for leaf in jax.tree.leaves((self.ts, self.y0, numbers)))
+
+    @property
+    def shares_times(self) -> bool:
+        return len(self.ts) == 1
+
+    @property
+    def whole(self) -> Problem:
+        """The problem of one member with the times of all, as a trajectory of the batch has them."""
+        return self.member if self.shares_times else replace(self.member, ts=self.ts)
 
     @property
     def vectors(self) -> Float[Numbers, "members P"]:
@@ -308,7 +326,7 @@ class AbstractEngine(abc.ABC):
         # Within `jit` an operation on an array of JAX is traced, even where its numbers are known.
         ts, relative = library.asarray(ts), library.asarray(rtol)
         far, fast = (library.abs(half).max(axis=-1) for half in halves(library.asarray(y0)))
-        far = library.where(far > 0, far, fast * abs(ts[-1] - ts[0]))
+        far = library.where(far > 0, far, fast * abs(ts[..., -1] - ts[..., 0]))
         size = library.minimum(*(library.where(x > 0, x, library.inf) for x in (far, fast))).min(initial=library.inf)
         return rtol, relative * library.minimum(ATOL_OVER_RTOL, ATOL_OVER_MOTION * size)
 
@@ -377,11 +395,14 @@ def _zeros(shape: tuple[int, ...], dtype: np.dtype) -> np.ndarray:
     return np.broadcast_to(np.zeros((), dtype), shape)
 
 
-def axes_per_leaf(values: dict[str, PyTree], batch_axes) -> tuple[dict[str, PyTree], int]:
-    """`batch_axes` spread over every leaf, and the size of the batch, which must be the same everywhere."""
+def axes_per_leaf(values: dict[str, PyTree], batch_axes, ts=()) -> tuple[dict[str, PyTree], int]:
+    """`batch_axes` spread over every leaf, and the size of the batch, which must be the same everywhere.
+
+    Members may have times of their own, `ts` (N, T).
+    """
     if not isinstance(batch_axes, tuple) or len(batch_axes) != 3:
         raise ValueError(f"batch_axes must be a tuple of three, for (q0, qdot0, params); got {batch_axes!r}.")
-    axes, sizes = {}, {}
+    axes, sizes = {}, {"ts": np.shape(ts)[0]} if np.ndim(ts) == 2 else {}
     for (name, value), prefix in zip(values.items(), batch_axes, strict=True):
         labels, leaves, tree = labelled_leaves(value, name)
         try:

@@ -8,7 +8,7 @@ import jax
 import numpy as np
 
 from lagjax._interface import Layout, numbers_at
-from lagjax._run._trajectory import Trajectory
+from lagjax._run._trajectory import EACH, Trajectory
 
 PyTree = Any
 
@@ -22,8 +22,8 @@ class Members:
         self.count, rank = math.prod(self.batch), len(self.batch)
         first = jax.tree.map(lambda leaf: numbers_at(leaf, (0,) * (rank + 1)), (trajectory.q, trajectory.qdot))
         self.layout, self.trajectory = Layout.from_state(*first), trajectory
-        # Of the axes of a batch, the innermost shares times and some parameters (`Trajectory.map_members`).
-        self._outer = rank - (rank > 0 and np.ndim(trajectory.ts) < 1 + rank)
+        # Of the axes of a batch, the innermost may share some parameters (`Trajectory.map_members`).
+        self._outer = rank - (rank > 0 and trajectory.params_axes != EACH)
         self.numbers, self.params = self._parameters()
 
     def _parameters(self) -> tuple[list[np.ndarray], PyTree]:

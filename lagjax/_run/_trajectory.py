@@ -28,6 +28,9 @@ PyTree = Any
 Number = jax.Array | np.ndarray
 
 
+EACH = "each"  # in place of axes of params: every motion has its own, as under `jax.vmap(simulate)`
+
+
 class State(NamedTuple):
     """A time and the state at it."""
 
@@ -199,7 +202,7 @@ class Trajectory(eqx.Module):
     stats: dict[str, jax.Array]
     system: System | dict[str, System]
     params: PyTree
-    params_axes: PyTree = eqx.field(static=True, default=None)  # how `simulate_batch` mapped over params
+    params_axes: PyTree = eqx.field(static=True, default=EACH)  # how `simulate_batch` mapped over params
     mode: jax.Array | None = None
     transitions: "Transitions | None" = None
     mode_names: tuple[str, ...] = eqx.field(static=True, default=())
@@ -380,10 +383,11 @@ class Trajectory(eqx.Module):
             return function(q, qdot, times_and_tolerances, eqx.combine(numbers, code), mode, *more)
 
         for outer in range(rank):
-            # The innermost batch axis of `simulate_batch` shares its times and some parameters; axes that the user's
-            # own `jax.vmap(simulate)` added are on everything.
-            shared = outer == 0 and self.ts.ndim < 1 + rank
-            axes = (None, self.params_axes) if shared else (0, 0)
+            # The innermost batch axis of `simulate_batch` shares its tolerances, some parameters, and mostly its times;
+            # axes that the user's own `jax.vmap(simulate)` added are on everything.
+            axes = (0, 0), 0
+            if outer == 0 and self.params_axes != EACH:
+                axes = (0 if self.ts.ndim == 1 + rank else None, None), self.params_axes
             mapped = jax.vmap(mapped, in_axes=(0, 0, *axes, 0, *[0] * len(more)))
         return mapped(self.q, self.qdot, (self.ts, self.tolerances), numbers, self.mode, *more)
 
@@ -453,21 +457,22 @@ def follow_in_doubles(motion: Callable, problem: Problem, *more) -> Any:
 
 def follow_in_numbers(follow: Callable, problem: Problem, *more) -> Any:
     """`follow_rows` of the one member of a problem, without the axis of members."""
-    found = follow_rows(follow, problem, np.asarray(problem.y0)[None], np.asarray(problem.vector)[None], *more)
+    rows = (np.asarray(x)[None] for x in (problem.ts, problem.y0, problem.vector))
+    found = follow_rows(follow, problem, *rows, *more)
     return jax.tree.map(lambda x: np.asarray(x)[0], found)
 
 
-def follow_rows(follow: Callable, member: Problem, y0, vectors, *more) -> Any:
+def follow_rows(follow: Callable, member: Problem, ts, y0, vectors, *more) -> Any:
     """`follow(layout, params, ts, y0, vectors, *more)` of members whose numbers are known, in the own precision.
 
-    There are `y0` (N, 2n) and `vectors` (N, P), or (1, P); the rest is that of one `member`.
+    There are `ts` (N, T) or (1, T), `y0` (N, 2n), `vectors` (N, P) or (1, P); the rest is that of one `member`.
     """
 
     def run(ts, y0, vectors):
         wide = member.double_precision if member.is_single else member
         return follow(wide.layout, wide.params, ts, y0, vectors, *more)
 
-    given = np.asarray(member.ts), np.asarray(y0), np.asarray(vectors)
+    given = tuple(map(np.asarray, (ts, y0, vectors)))
     return compute_in_doubles(run, *given) if member.is_single else run(*given)
 
 

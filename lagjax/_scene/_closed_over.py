@@ -95,7 +95,7 @@ def lift_batch(batch: Batch) -> Batch:
     if member is batch.member:
         return batch
     values = member.params.values
-    return Batch(member, batch.y0, Lifted(batch.params, values), (*batch.axes, *[None] * len(values)))
+    return Batch(member, batch.ts, batch.y0, Lifted(batch.params, values), (*batch.axes, *[None] * len(values)))
 
 
 def _is_function(x: Any) -> bool:

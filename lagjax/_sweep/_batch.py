@@ -158,7 +158,7 @@ class Batches:
         modes = dict(scene.modes) if isinstance(scene, Hybrid) else None
         return Trajectory.from_fields(
             **{name: x for name, x in arrays.items() if name != "code"}, result=result_from(code), engine="",
-            ts=jnp.asarray(self.description.ts), tolerances=self._tolerances, system=modes or scene, params_axes=None,
+            ts=jnp.asarray(self.description.ts), tolerances=self._tolerances, system=modes or scene,
             params=self.description.params if self._axes[2] is None else params, mode_names=tuple(modes or ()),
             contact_names=(),
         )  # fmt: skip
@@ -358,8 +358,8 @@ def _follow_crossings(batch: Batch, sections: Sections) -> tuple[Solution, Noted
     surfaces = surfaces_in(batch.member, sections_of(section)[1], sections.directions, sections.names)
     problem = dataclasses.replace(batch.member, guards=surfaces.guards(notes=True))
     tolerances = tolerances_of(problem)._replace(notes=sections.count)
-    ts, y0, params = (np.asarray(x) for x in (problem.ts, batch.y0, batch.vectors))
-    solution = flow_of(problem).run(ts[None], y0, params, tolerances)
+    ts, y0, params = (np.asarray(x) for x in (batch.ts, batch.y0, batch.vectors))
+    solution = flow_of(problem).run(ts, y0, params, tolerances)
     path = solution.path.reshape(len(y0), len(sections.functions), sections.count + 1, -1)
     rows = np.moveaxis(path, 1, 0)
     return solution, Noted(rows[:, :, :-1, 0], rows[:, :, :-1, 1:], rows[:, :, -1, 0])

@@ -23,6 +23,7 @@ from lagjax._engine.taylor import MachineCode, line_of
 from lagjax._equations import ROUNDINGS, derivation_of, has_constraints, require_consistent
 from lagjax._interface import Layout, compile_for_one_call, halves, is_concrete, require_budget, result_from
 from lagjax._run._trajectory import (
+    EACH,
     ContactChanges,
     Impacts,
     Names,
@@ -78,13 +79,13 @@ def _put_on_device(trajectory: Trajectory) -> Trajectory:
 
 def follow_contacts_batch(given: Batch, batch: Batch, max_transitions: int | None, params, params_axes) -> Trajectory:
     """The motions of a batch whose system has contacts."""
-    plan, *_ = _plan(batch.member, max_transitions)
+    plan, *_ = _plan(batch.whole, max_transitions)
     if batch.is_known:
-        found = follow_rows(functools.partial(follow_known, plan), batch.member, batch.y0, batch.vectors)
+        found = follow_rows(functools.partial(follow_known, plan), batch.member, batch.ts, batch.y0, batch.vectors)
     else:
         found = batch.map_members(lambda problem: follow_in_doubles(functools.partial(contact_motion, plan), problem))
     ending, record, impacts = found
-    trajectory = _trajectory(given.member, batch.member, ending, record, impacts, None, params_axes)
+    trajectory = _trajectory(given.whole, batch.whole, ending, record, impacts, None, params_axes)
     return dataclasses.replace(_put_on_device(trajectory), params=params)
 
 
@@ -117,7 +118,7 @@ def _plan(problem: Problem, max_transitions: int | None) -> tuple[ContactPlan, P
     require_budget(max_transitions, "max_transitions")
     if not all(map(is_concrete, problem.tolerances)):
         raise ValueError("rtol and atol of a scene with contacts must be numbers: they decide the order of the method.")
-    if is_concrete(problem.ts) and np.asarray(problem.ts)[-1] < np.asarray(problem.ts)[0]:
+    if is_concrete(problem.ts) and (np.asarray(problem.ts)[..., -1] < np.asarray(problem.ts)[..., 0]).any():
         raise ValueError("A scene with contacts goes forward in time: an impact cannot be undone; ts must increase.")
     wide = problem.double_precision if problem.is_single else problem
     rtol, atol = float(MachineCode().rtol(wide)), problem.tolerances[1]
@@ -186,7 +187,7 @@ def _require_open(problem: Problem, closed: Problem, free: Problem) -> None:
 
 
 def _trajectory(
-    given: Problem, problem: Problem, ending: ContactEnding, record: RoundRecord, impacts, params, axes=None
+    given: Problem, problem: Problem, ending: ContactEnding, record: RoundRecord, impacts, params, axes=EACH
 ) -> Trajectory:
     restore = problem.layout.restore
     (q, qdot), end, (at, behind) = (tuple(map(restore, halves(y))) for y in (ending.path, ending.y, record.y_next))
