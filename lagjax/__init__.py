@@ -129,6 +129,7 @@ __all__ = [
 PLACES.update(dict.fromkeys(("dataset", "frame", "impact_frame", "change_frame"), "lagjax._show"))
 PLACES.update(dict.fromkeys(("make_animation", "summary", "trajectory_html"), "lagjax._show"))
 PLACES.update(describe_failure="lagjax._trust", examine="lagjax._trust.health", contact_forces="lagjax._run.contacts")
+PLACES.update(find_states="lagjax._run")
 
 
 def __getattr__(name: str) -> Any:

@@ -21,7 +21,7 @@ from lagjax._engine.taylor import MachineCode
 from lagjax._equations import has_constraints, inconsistent_members, require_consistent
 from lagjax._interface import ENDED_WELL, RESULTS, Layout, advice, as_arrays, halves, require_flag, result_from
 from lagjax._primitives import marks_absent
-from lagjax._run._trajectory import EACH, State, Trajectory, raise_unless_ok, step_counts
+from lagjax._run._trajectory import EACH, RunSettings, State, Trajectory, raise_unless_ok, step_counts
 from lagjax._run.contacts import follow_contacts, follow_contacts_batch
 from lagjax._run.hybrid import Hybrid, follow_modes
 from lagjax._scene import System, lift_batch, lift_problem, require_system
@@ -291,7 +291,8 @@ def trajectory_of(problem: Problem, engine: AbstractEngine, solution: Solution, 
         event = of.unflatten([ended[..., k] for k in range(of.num_leaves)])
     return Trajectory.from_fields(
         ts=ts, q=q, qdot=qdot, result=result_from(result), end=State(solution.t_end, restore(q_end), restore(qdot_end)),
-        stats=stats, system=problem.system, params=params, params_axes=params_axes, engine=type(engine).__name__,
+        stats=stats, system=problem.system, params=params, params_axes=params_axes,
+        settings=RunSettings.from_problem(problem, engine),
         tolerances=engine.tolerances(problem, y0), event=event,
     )  # fmt: skip
 
