@@ -2,8 +2,8 @@
 
     form                  by whom                                decided by
     scalar, line          machine code, operation by operation   `derived_form`
-    scalar, table         machine code, from tables              `LARGEST_LINE` (`_native/_constants`)
-    scalar, registers     a thread of a GPU                      `_native/_gpu`
+    scalar, table         machine code, from tables              `LARGEST_LINE` (`_native/code/_constants`)
+    scalar, registers     a thread of a GPU                      `_native/motions/_gpu`
     scalar                XLA, a program                         `form_in_xla`
     arrays                XLA: M and G as matrices               `form_in_xla`
     sparse                XLA: products, solved by patterns      `derived_form`

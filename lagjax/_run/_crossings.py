@@ -1,6 +1,6 @@
 """`crossings`: where a function of the state changes sign along a motion.
 
-The motion is one run of machine code, which writes every crossing down and continues (`_native._events`).
+The motion is one run of machine code, which writes every crossing down and continues (`_native.steps._events`).
 """
 
 import functools

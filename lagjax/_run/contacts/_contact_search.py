@@ -10,9 +10,9 @@ contacts, whatever they do (`InContact`). Where a watch falls,
     what friction has left    it slides, against the force that held it
 
 A guess that is wrong is a watch that begins beyond zero, or whose first coefficient that is not rounding is negative:
-it falls at once, and the next round takes it back (`_native._events`). That is Murty's principal pivoting, over series
-in place of numbers (Murty, Linear Algebra Appl. 5 (1972) 65; Heemels, Schumacher & Weiland, ibid. 294 (1999) 93).
-Bounces that accumulate end at a closed form of their limit (`end_bounces`).
+it falls at once, and the next round takes it back (`_native.steps._events`). That is Murty's principal pivoting, over
+series in place of numbers (Murty, Linear Algebra Appl. 5 (1972) 65; Heemels, Schumacher & Weiland, ibid. 294 (1999)
+93). Bounces that accumulate end at a closed form of their limit (`end_bounces`).
 
     follow ─► begin ─► prepare: sides and rounding of all watches ─► the kernel ─► finish ─► decide: a row of the record
                           ▲                                                                     │
