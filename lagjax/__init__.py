@@ -151,6 +151,12 @@ def _load_contacts():
     return contacts
 
 
+def _load_run():
+    from lagjax import _run
+
+    return _run
+
+
 register(
     Registered(
         summary=lambda run: _load_show().summary(run),
@@ -162,6 +168,7 @@ register(
         make_animation=lambda run, points, *look: _load_show().make_animation(run, points, *look),
         examine=lambda run, reference: _load_health().examine(run, reference),
         contact_forces=lambda run, name: _load_contacts().contact_forces(run, name),
+        find_states=lambda run, t: _load_run().find_states(run, t),
         describe_failure=lambda run, layout, why: _load_trust().describe_failure(run, layout, why),
     )
 )

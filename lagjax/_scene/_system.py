@@ -485,7 +485,7 @@ class System(eqx.Module):
         if not self.reads_multipliers:
             return {}
         trees = self._role_shapes(self._multiplier_roles, layout, params)
-        flat = jnp.zeros(count_numbers(trees), layout.dtype)
+        flat = np.zeros(count_numbers(trees), layout.dtype)
         return {"multipliers": jax.eval_shape(lambda x: name_numbers(x, trees), flat)}
 
 

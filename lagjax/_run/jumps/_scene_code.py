@@ -37,7 +37,7 @@ def tolerances_of(problem: Problem, scene: str, what: str) -> Tolerances:
     """
     if not all(map(is_concrete, problem.tolerances)):
         raise ValueError(f"rtol and atol of {scene} must be numbers: they decide the order of the method.")
-    if is_concrete(problem.ts) and np.asarray(problem.ts)[-1] < np.asarray(problem.ts)[0]:
+    if is_concrete(problem.ts) and (np.asarray(problem.ts)[..., -1] < np.asarray(problem.ts)[..., 0]).any():
         raise ValueError(f"The motion of {scene} goes forward in time: {what} cannot be undone; ts must increase.")
     wide = problem.double_precision if problem.is_single else problem
     return Tolerances(float(MachineCode().rtol(wide)), float(problem.tolerances[1] or 0.0), problem.max_steps)
