@@ -11,10 +11,11 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from lagjax._analysis._closed_contacts import hold_closed
+from lagjax._analysis._eigen import tangent_basis
 from lagjax._analysis._equilibrium import least_multipliers
 from lagjax._analysis._scene_state import SceneState, require_matrices
 from lagjax._analysis._smoothness import is_smooth, require_smooth
-from lagjax._equations import diagonal_scale, factorize, saddle
+from lagjax._equations import diagonal_scale, factorize, null_space, saddle
 from lagjax._interface import (
     Function,
     Layout,
@@ -84,16 +85,33 @@ class Linearization(NamedTuple):
 
     @property
     def Phi(self) -> Float[Array, "2n 2n"]:
-        return self._require_sampled()[0]
+        return _require_sampled(self)[0]
 
     @property
     def Gamma(self) -> Float[Array, "2n m"]:
-        return self._require_sampled()[1]
+        return _require_sampled(self)[1]
 
-    def _require_sampled(self) -> tuple[Array, Array]:
-        if self.sampled is None:
-            raise AttributeError("Phi and Gamma are those of a sample time: call linearize(…, dt=…).")
-        return self.sampled
+    def reduced(self, motion: Any = None) -> "ReducedLinearization":
+        """The linear equations in the fewest numbers x (s,): those of deviations that constraints allow.
+
+        - `motion`: the `SteadyMotion` that this linearization is about. Deviations along cyclic coordinates are then
+          left out, and the others are seen from where it turns: A is constant along it, and its eigenvalues are the
+          exponents of its small motions. A zero is that of a steady motion next to it.
+
+        Constraints that depend on each other count once; inside `jit` all are taken as independent.
+        """
+        n, a, rows = len(self.names), self.A, self.allowed
+        if motion is not None:
+            cyclic = np.concatenate([np.ravel(x) for x in jax.tree.leaves(motion.cyclic)])
+            rate = jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(motion.qdot)])
+            turns = jnp.asarray(motion.turns, a.dtype)
+            a = a - jnp.kron(jnp.eye(2, dtype=a.dtype), jnp.einsum("i,ijk", jnp.where(cyclic, rate, 0), turns))
+            along = jnp.hstack([jnp.eye(n, dtype=a.dtype), turns @ rate])[np.flatnonzero(cyclic)]
+            rows = jnp.concatenate([rows, along])
+        rank = 2 * n - null_space(np.asarray(rows)).shape[1] if is_known(rows) else len(rows)
+        basis = tangent_basis(rows, rank)
+        sampled = self.sampled and (basis.T @ self.sampled[0] @ basis, basis.T @ self.sampled[1])
+        return ReducedLinearization(basis.T @ a @ basis, basis.T @ self.B, self.C @ basis, self.D, basis, sampled)
 
     def __str__(self) -> str:
         if not is_known(self.A) or np.ndim(self.A) != 2:
@@ -103,6 +121,36 @@ class Linearization(NamedTuple):
         if self.names.outputs != self.names.states:
             lines += _equations([f"δ{name}" for name in self.names.outputs], np.hstack([self.C, self.D]), of)
         return "\n".join(lines)
+
+
+class ReducedLinearization(NamedTuple):
+    """The linear equations of deviations (δq, δq̇) = `basis` x from a state, as LQR and Kalman filters take them.
+
+    - `A` (s, s), `B` (s, m), `C` (p, s), `D` (p, m): dx/dt = A x + B u, y = C x + D u.
+    - `basis` (2n, s), of orthonormal columns: x = basisᵀ (δq, δq̇) of a deviation that constraints allow.
+    - `sampled`: with a sample time `Phi` (s, s) and `Gamma` (s, m).
+    """
+
+    A: Float[Array, "s s"]
+    B: Float[Array, "s m"]
+    C: Float[Array, "p s"]
+    D: Float[Array, "p m"]
+    basis: Float[Array, "2n s"]
+    sampled: tuple[Array, Array] | None
+
+    @property
+    def Phi(self) -> Float[Array, "s s"]:
+        return _require_sampled(self)[0]
+
+    @property
+    def Gamma(self) -> Float[Array, "s m"]:
+        return _require_sampled(self)[1]
+
+
+def _require_sampled(linear: Linearization | ReducedLinearization) -> tuple[Array, Array]:
+    if linear.sampled is None:
+        raise AttributeError("Phi and Gamma are those of a sample time: call linearize(…, dt=…).")
+    return linear.sampled
 
 
 def _equations(left: list[str], rows: np.ndarray, of: list[str]) -> list[str]:
