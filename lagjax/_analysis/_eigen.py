@@ -18,7 +18,7 @@ import numpy as np
 from jax.experimental.buffer_callback import buffer_callback
 from jaxtyping import Array, Float
 
-from lagjax._equations import decide, least_norm
+from lagjax._equations import decide, factorize, least_norm
 
 Matrix = Float[Array, "n n"]
 
@@ -179,5 +179,7 @@ def tangent_basis(jacobian: Float[Array, "m n"], rank: int) -> Float[Array, "n n
         return jnp.eye(jacobian.shape[1], dtype=jacobian.dtype)
     basis = _null_space(jacobian, rank)
     # Zero in value, as `jacobian @ basis` is; its derivative keeps the basis on the tangent space.
-    correct = jax.vmap(lambda b: jacobian.T @ least_norm(jacobian @ jacobian.T, b), in_axes=1, out_axes=1)
-    return basis - correct(jacobian @ basis)
+    gram, off = jacobian @ jacobian.T, jacobian @ basis
+    if rank == len(jacobian):
+        return basis - jacobian.T @ factorize(gram).solve_columns(off)
+    return basis - jacobian.T @ jax.vmap(lambda b: least_norm(gram, b), in_axes=1, out_axes=1)(off)

@@ -102,16 +102,13 @@ class Linearization(NamedTuple):
         """
         n, a, rows = len(self.names), self.A, self.allowed
         if motion is not None:
+            layout = Layout.from_state(motion.q, motion.qdot)
+            a, rows = _remove_symmetries(a, rows, layout.flatten(motion.qdot), motion.turns)
             cyclic = np.concatenate([np.ravel(x) for x in jax.tree.leaves(motion.cyclic)])
-            rate = jnp.concatenate([jnp.ravel(x) for x in jax.tree.leaves(motion.qdot)])
-            turns = jnp.asarray(motion.turns, a.dtype)
-            a = a - jnp.kron(jnp.eye(2, dtype=a.dtype), jnp.einsum("i,ijk", jnp.where(cyclic, rate, 0), turns))
-            along = jnp.hstack([jnp.eye(n, dtype=a.dtype), turns @ rate])[np.flatnonzero(cyclic)]
-            rows = jnp.concatenate([rows, along])
+            rows = rows[np.append(np.ones(len(self.allowed), bool), cyclic)]
         rank = 2 * n - null_space(np.asarray(rows)).shape[1] if is_known(rows) else len(rows)
-        basis = tangent_basis(rows, rank)
-        sampled = self.sampled and (basis.T @ self.sampled[0] @ basis, basis.T @ self.sampled[1])
-        return ReducedLinearization(basis.T @ a @ basis, basis.T @ self.B, self.C @ basis, self.D, basis, sampled)
+        *matrices, basis, phi, gamma = _reduce(rank, rows, a, self.B, self.C, self.sampled)
+        return ReducedLinearization(*matrices, self.D, basis, None if phi is None else (phi, gamma))
 
     def __str__(self) -> str:
         if not is_known(self.A) or np.ndim(self.A) != 2:
@@ -145,6 +142,24 @@ class ReducedLinearization(NamedTuple):
     @property
     def Gamma(self) -> Float[Array, "s m"]:
         return _require_sampled(self)[1]
+
+
+@compile_for_one_call
+def _remove_symmetries(a: Array, rows: Array, qdot: Vector, turns: Array) -> tuple[Array, Array]:
+    """A in a frame that turns with a steady motion, and rows (k + n, 2n) whose last ones, one for each coordinate that
+    is cyclic, are zero for what is orthogonal to a deviation along it."""
+    spin = jnp.einsum("i,ijk", qdot, turns.astype(a.dtype))
+    moved = jnp.hstack([jnp.eye(len(qdot), dtype=a.dtype), turns.astype(a.dtype) @ qdot])
+    return a - jnp.kron(jnp.eye(2, dtype=a.dtype), spin), jnp.concatenate([rows, moved])
+
+
+@compile_for_one_call
+def _reduce(rank: int, rows: Array, a: Array, b: Array, c: Array, sampled: tuple | None) -> tuple:
+    """A, B, C, a basis, Φ and Γ of what the `rows`, of this rank, send to zero."""
+    basis = tangent_basis(rows, rank)
+    inverse = factorize(basis.T @ basis).solve_columns(basis.T)  # orthonormal columns, but for derivatives
+    phi, gamma = (None, None) if sampled is None else (inverse @ sampled[0] @ basis, inverse @ sampled[1])
+    return inverse @ a @ basis, inverse @ b, c @ basis, basis, phi, gamma
 
 
 def _require_sampled(linear: Linearization | ReducedLinearization) -> tuple[Array, Array]:
