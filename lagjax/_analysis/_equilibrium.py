@@ -175,7 +175,8 @@ def require_steady(scene: SceneState) -> None:
     if wrong := [scene.layout.names[i] for i in np.flatnonzero(np.asarray(scene.qdot)) if i not in cyclic]:
         raise ValueError(
             f"{', '.join(wrong)}: has a velocity, but is not cyclic (L, a force or a constraint depends on it or acts "
-            "on it), so that it cannot move steadily. Give velocities to cyclic coordinates alone."
+            "on it), so that it cannot move steadily. Give velocities to cyclic coordinates alone. What rolls is for "
+            "lagjax.steady_motion, and its small motions for linearize(…).reduced(motion)."
         )
 
 

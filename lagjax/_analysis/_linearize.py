@@ -49,6 +49,15 @@ class LinearNames(tuple):
         names.inputs, names.outputs = inputs, names.states if outputs is None else outputs
         return names
 
+    def __getnewargs__(self) -> tuple:
+        return tuple(self), self.inputs, self.outputs
+
+    def __eq__(self, other: object) -> bool:
+        same = not isinstance(other, LinearNames) or self.__getnewargs__()[1:] == other.__getnewargs__()[1:]
+        return same and tuple(self) == other
+
+    __hash__ = tuple.__hash__  # pyright: ignore[reportAssignmentType]
+
     @property
     def states(self) -> tuple[str, ...]:
         return *(f"δ{name}" for name in self), *(f"δ{name}'" for name in self)
@@ -85,11 +94,17 @@ class Linearization(NamedTuple):
 
     @property
     def Phi(self) -> Float[Array, "2n 2n"]:
-        return _require_sampled(self)[0]
+        return self._sampled_pair[0]
 
     @property
     def Gamma(self) -> Float[Array, "2n m"]:
-        return _require_sampled(self)[1]
+        return self._sampled_pair[1]
+
+    @property
+    def _sampled_pair(self) -> tuple[Array, Array]:
+        if self.sampled is None:
+            raise AttributeError("Phi and Gamma are those of a sample time: call linearize(…, dt=…).")
+        return self.sampled
 
     def reduced(self, motion: Any = None) -> "ReducedLinearization":
         """The linear equations in the fewest numbers x (s,): those of deviations that constraints allow.
@@ -107,8 +122,7 @@ class Linearization(NamedTuple):
             cyclic = np.concatenate([np.ravel(x) for x in jax.tree.leaves(motion.cyclic)])
             rows = rows[np.append(np.ones(len(self.allowed), bool), cyclic)]
         rank = 2 * n - null_space(np.asarray(rows)).shape[1] if is_known(rows) else len(rows)
-        *matrices, basis, phi, gamma = _reduce(rank, rows, a, self.B, self.C, self.sampled)
-        return ReducedLinearization(*matrices, self.D, basis, None if phi is None else (phi, gamma))
+        return ReducedLinearization._make(_reduce(rank, rows, a, self.B, self.C, self.D, self.sampled))
 
     def __str__(self) -> str:
         if not is_known(self.A) or np.ndim(self.A) != 2:
@@ -125,7 +139,7 @@ class ReducedLinearization(NamedTuple):
 
     - `A` (s, s), `B` (s, m), `C` (p, s), `D` (p, m): dx/dt = A x + B u, y = C x + D u.
     - `basis` (2n, s), of orthonormal columns: x = basisᵀ (δq, δq̇) of a deviation that constraints allow.
-    - `sampled`: with a sample time `Phi` (s, s) and `Gamma` (s, m).
+    - `Phi` (s, s) and `Gamma` (s, m) of a sample time; None without one.
     """
 
     A: Float[Array, "s s"]
@@ -133,15 +147,8 @@ class ReducedLinearization(NamedTuple):
     C: Float[Array, "p s"]
     D: Float[Array, "p m"]
     basis: Float[Array, "2n s"]
-    sampled: tuple[Array, Array] | None
-
-    @property
-    def Phi(self) -> Float[Array, "s s"]:
-        return _require_sampled(self)[0]
-
-    @property
-    def Gamma(self) -> Float[Array, "s m"]:
-        return _require_sampled(self)[1]
+    Phi: Float[Array, "s s"] | None
+    Gamma: Float[Array, "s m"] | None
 
 
 @compile_for_one_call
@@ -154,18 +161,12 @@ def _remove_symmetries(a: Array, rows: Array, qdot: Vector, turns: Array) -> tup
 
 
 @compile_for_one_call
-def _reduce(rank: int, rows: Array, a: Array, b: Array, c: Array, sampled: tuple | None) -> tuple:
-    """A, B, C, a basis, Φ and Γ of what the `rows`, of this rank, send to zero."""
+def _reduce(rank: int, rows: Array, a: Array, b: Array, c: Array, d: Array, sampled: tuple | None) -> tuple:
+    """The fields of a `ReducedLinearization` to what the `rows`, of this rank, send to zero."""
     basis = tangent_basis(rows, rank)
     inverse = factorize(basis.T @ basis).solve_columns(basis.T)  # orthonormal columns, but for derivatives
     phi, gamma = (None, None) if sampled is None else (inverse @ sampled[0] @ basis, inverse @ sampled[1])
-    return inverse @ a @ basis, inverse @ b, c @ basis, basis, phi, gamma
-
-
-def _require_sampled(linear: Linearization | ReducedLinearization) -> tuple[Array, Array]:
-    if linear.sampled is None:
-        raise AttributeError("Phi and Gamma are those of a sample time: call linearize(…, dt=…).")
-    return linear.sampled
+    return inverse @ a @ basis, inverse @ b, c @ basis, d, basis, phi, gamma
 
 
 def _equations(left: list[str], rows: np.ndarray, of: list[str]) -> list[str]:

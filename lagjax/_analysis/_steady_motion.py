@@ -56,7 +56,7 @@ def steady_motion(
     qdot: PyTree,
     params: PyTree = None,
     *,
-    hold: str | tuple[str, ...] = (),
+    hold: str | tuple[str, ...] | None = None,
     throw: bool = True,
 ) -> SteadyMotion:
     r"""The steady motion of `system` near the state (q, q̇), also of what rolls.
@@ -110,12 +110,12 @@ def steady_motion(
     return SteadyMotion(restore(place), restore(rate), of_user, ok, restore(cyclic), turns)
 
 
-def _held(scene: SceneState, cyclic: np.ndarray, hold: str | tuple[str, ...]) -> np.ndarray:
+def _held(scene: SceneState, cyclic: np.ndarray, hold: Any) -> np.ndarray:
     """The unknowns (n,) that are held: velocities of `cyclic` coordinates, places of the others."""
     names = scene.layout.names
     rates = tuple(f"qdot{name.removeprefix('q')}" for name in names)
     held = np.zeros(len(names), bool)
-    for wanted in (hold,) if isinstance(hold, str) else hold:
+    for wanted in (hold,) if isinstance(hold, str) else hold or ():
         chosen = [[_names(name, wanted) for name in of] for of in (names, rates)]
         if not isinstance(wanted, str) or not np.any(chosen):
             raise ValueError(f"hold names {wanted!r}, and the numbers are {', '.join((*names, *rates)[:24])}.")
