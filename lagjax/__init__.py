@@ -23,7 +23,8 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 
 **What a scene does**
 
-- `equilibrium`, `linearize`, `normal_modes`: at rest and near it: `Equilibrium`, `Linearization`, `Modes`
+- `equilibrium`, `steady_motion`, `linearize`, `normal_modes`: at rest or rolling on, and near it: `Equilibrium`,
+  `SteadyMotion`, `Linearization` (`ReducedLinearization`), `Modes`
 - `conserved_quantities`, `noether_charge`, `cyclic_coordinates`: symmetries: `ConservedQuantities`, each `Conserved`
 - `same_motion`: whether two Lagrangians have one motion, as `SameMotion`
 - `change_coordinates`, `hamiltonian`, `routhian`: the scene written otherwise: `ChangedCoordinates`, `Hamiltonian` with
@@ -75,6 +76,7 @@ if TYPE_CHECKING:  # each is imported on first use: all of them take as long as 
         normal_modes,
         routhian,
         same_motion,
+        steady_motion,
     )
     from lagjax._analysis.orbits import (
         action,
@@ -121,8 +123,8 @@ __all__ = [
     "between", "branch_off", "change_coordinates", "check", "conserved_quantities", "crossings", "cyclic_coordinates",
     "designs", "equilibrium", "family", "find_path", "fit", "hamiltonian", "inertia", "linearize", "lyapunov_exponent",
     "lyapunov_spectrum", "noether_charge", "normal_modes", "per_record", "periodic_orbit", "plot", "positive",
-    "results", "routhian", "same_motion", "samples", "scenes", "simplex", "simulate", "simulate_batch", "sweep",
-    "work_precision", "wrapped",
+    "results", "routhian", "same_motion", "samples", "scenes", "simplex", "simulate", "simulate_batch",
+    "steady_motion", "sweep", "work_precision", "wrapped",
 ]  # fmt: skip
 
 
