@@ -33,7 +33,7 @@ def values(tree):
 
 @pytest.mark.parametrize("derivative", [jax.jacfwd, jax.jacrev])
 def test_first_derivatives_are_those_of_a_start_on_the_border(derivative):
-    q, v = derivative(ends)(X)
+    q, v = jax.jit(derivative(ends))(X)
     decay = np.exp(-T)
     for of_q, of_v, exact in (
         # q = u T; e^(−c T) and −c e^(−c T), whatever the velocity is at the start.
