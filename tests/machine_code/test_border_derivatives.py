@@ -98,6 +98,11 @@ THROWN = lagjax.System(
     lambda q, v: 0.5 * v * v - q,
     forces=lambda q, v, params: -params[0] * jnp.where(q > 1.0, 1.0, 0.0) - params[1] * jnp.maximum(q - 1.0, 0.0),
 )
+BLOCK = lagjax.System(lambda q, v: 0.5 * (v * v - q * q), forces=lambda q, v: -0.3 * jnp.sign(v))
+BELT = lagjax.System(
+    lambda q, v: 0.5 * (v * v - q * q),
+    forces=lambda q, v, params: -params[0] * jnp.sign(v - params[1]) / (1 + jnp.abs(v - params[1])),
+)
 PULLED, SPRUNG = np.array([0.7, 0.0]), np.array([0.0, 0.7])
 
 
@@ -148,8 +153,7 @@ def test_health_says_where_borders_are_not_located():
 
 
 def test_health_counts_where_a_motion_comes_to_rest():
-    block = lagjax.System(lambda q, v: 0.5 * (v * v - q * q), forces=lambda q, v: -0.3 * jnp.sign(v))
-    health = lagjax.simulate(block, 2.0, 0.0, np.linspace(0.0, 20.0, 5)).health()
+    health = lagjax.simulate(BLOCK, 2.0, 0.0, np.linspace(0.0, 20.0, 5)).health()
     assert (health.borders.crossed, health.borders.slid, health.borders.grazed) == (2, 1, 0)
     assert "2 crossed; 1 slid along" in str(health) and not health.suspicious
 
@@ -172,18 +176,14 @@ def test_output_times_of_a_motion_that_slides():
 @pytest.mark.slow
 def test_a_fit_through_stick_and_slip():
     # A block on a belt, held by a spring: the coefficient of friction and the speed of the belt, from where it was.
-    belt = lagjax.System(
-        lambda q, v: 0.5 * (v * v - q * q),
-        forces=lambda q, v, params: -params[0] * jnp.sign(v - params[1]) / (1 + jnp.abs(v - params[1])),
-    )
     ts = np.linspace(0.0, 12.0, 25)
 
     def places(params):
-        return lagjax.simulate(belt, 0.5, 0.0, ts, params).q
+        return lagjax.simulate(BELT, 0.5, 0.0, ts, params).q
 
     truth, params = jnp.array([1.1, 0.2]), jnp.array([0.9, 0.26])
     observed = places(truth)
-    assert lagjax.simulate(belt, 0.5, 0.0, ts, truth).health().borders.slid > 1
+    assert lagjax.simulate(BELT, 0.5, 0.0, ts, truth).health().borders.slid > 1
 
     @jax.jit
     def loss_and_slope(params):

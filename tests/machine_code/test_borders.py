@@ -323,6 +323,11 @@ def test_second_derivatives_where_the_force_is_continuous(name):
 # ---- sliding and sticking --------------------------------------------------------------------------------------------
 
 BLOCK = particle(lambda q, params: 0.5 * q * q, lambda q, v, params: -params * jnp.sign(v))
+CARTESIAN = lagjax.System(
+    lambda q, v: 0.5 * v @ v - 9.81 * q[1], constraints=lambda q: {"rod": q @ q - 1.0},
+    forces=lambda q, v: -0.5 * jnp.sign(v[0]) * jnp.array([1.0, 0.0]),
+)  # fmt: skip
+ANGLE = lagjax.System(lambda a, w: 0.5 * w * w + 9.81 * jnp.cos(a), forces=lambda a, w: -0.5 * jnp.sign(w) * jnp.cos(a))
 
 
 def two_blocks():
@@ -424,16 +429,9 @@ def test_back_in_time_through_borders():
 
 def test_friction_on_a_constrained_motion():
     # A pendulum in Cartesian coordinates, with dry friction in x; and by its angle.
-    cartesian = lagjax.System(
-        lambda q, v: 0.5 * v @ v - 9.81 * q[1], constraints=lambda q: {"rod": q @ q - 1.0},
-        forces=lambda q, v: -0.5 * jnp.sign(v[0]) * jnp.array([1.0, 0.0]),
-    )  # fmt: skip
-    angle = lagjax.System(
-        lambda a, w: 0.5 * w * w + 9.81 * jnp.cos(a), forces=lambda a, w: -0.5 * jnp.sign(w) * jnp.cos(a)
-    )
     ts = np.array([0.0, 5.0, 30.0])
-    one = lagjax.simulate(cartesian, np.array([0.6, -0.8]), np.zeros(2), ts)
-    other = lagjax.simulate(angle, np.arcsin(0.6), 0.0, ts)
+    one = lagjax.simulate(CARTESIAN, np.array([0.6, -0.8]), np.zeros(2), ts)
+    other = lagjax.simulate(ANGLE, np.arcsin(0.6), 0.0, ts)
     np.testing.assert_allclose(one.q[:, 0], np.sin(other.q), atol=1e-7)
     assert abs(one.qdot[-1]).max() < 1e-12 and one.stats["num_steps"] < 150
 

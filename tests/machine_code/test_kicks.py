@@ -184,6 +184,13 @@ STEPS = {
     "floor": lambda q, h: h * jnp.floor(q / 5),
     "samples": lambda q, h: lagjax.samples(np.array([-9.0, 0.0]), jnp.stack([0.0 * h, h]), hold="zero")(q),
 }
+RATCHET = lagjax.System(lambda q, v: 0.5 * v**2 - 0.1 * (q - jnp.floor(q)) + 0.05 * q)
+WELL = lagjax.System(
+    lambda q, v: 0.5 * v**2 + jnp.where(jnp.abs(q) < 1, 0.5, 0.0), forces=lambda q, v: -0.02 * jnp.sign(v)
+)
+SMOOTH = lagjax.System(lambda q, v: -jnp.sqrt(1 - v**2) - 0.15 * (1 + jnp.tanh(q / 0.01)))
+WIRE = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q: q[1] - jnp.abs(q[0]))
+PUSHED = lagjax.System(lambda q, v: 0.5 * v @ v - 0.4 * q[0], constraints=lambda q: q[1] - jnp.maximum(q[0], 0.0))
 
 
 @functools.cache
@@ -260,14 +267,10 @@ def test_other_jumps_by_place():
 
 def test_well_and_ratchet_keep_their_energy():
     """A thousand steps of a ratchet down a slope, friction at the walls of a well: nothing is lost at borders."""
-    ratchet = lagjax.System(lambda q, v: 0.5 * v**2 - 0.1 * (q - jnp.floor(q)) + 0.05 * q)
-    found = lagjax.simulate(ratchet, 0.5, 0.6, np.linspace(0, 150, 40))
+    found = lagjax.simulate(RATCHET, 0.5, 0.6, np.linspace(0, 150, 40))
     assert found.q[-1] > 500
     np.testing.assert_allclose(found.energy(), found.energy()[0], rtol=1e-9)
-    well = lagjax.System(
-        lambda q, v: 0.5 * v**2 + jnp.where(jnp.abs(q) < 1, 0.5, 0.0), forces=lambda q, v: -0.02 * jnp.sign(v)
-    )
-    found = lagjax.simulate(well, 0.0, 0.9, np.linspace(0, 60, 7))
+    found = lagjax.simulate(WELL, 0.0, 0.9, np.linspace(0, 60, 7))
     way = (0.81 / 2) / 0.02  # until friction has taken all of it: it stays inside, and rests
     assert np.abs(found.q).max() < 1
     np.testing.assert_allclose(found.qdot[-1], 0.0, atol=1e-12)
@@ -299,8 +302,7 @@ def test_refused_before_the_run():
     ):
         with pytest.raises(ValueError, match=what):
             lagjax.simulate(lagjax.System(lagrangian), -1.0, 0.5, ts)
-    smooth = lagjax.System(lambda q, v: -jnp.sqrt(1 - v**2) - 0.15 * (1 + jnp.tanh(q / 0.01)))
-    found = lagjax.simulate(smooth, -1.0, 0.9, np.array([0.0, 3.0]))
+    found = lagjax.simulate(SMOOTH, -1.0, 0.9, np.array([0.0, 3.0]))
     np.testing.assert_allclose(found.energy()[-1], found.energy()[0], rtol=1e-8)
 
 
@@ -321,15 +323,13 @@ def test_constraint_with_a_speed_that_jumps():
 
 def test_a_corner_of_a_constraint_ends_the_motion_that_comes_to_it():
     """A bead on y = |x| slides from x = −1 at speed √2 without a force, and reaches the corner after t = 1."""
-    wire = lagjax.System(lambda q, v: 0.5 * v @ v, constraints=lambda q: q[1] - jnp.abs(q[0]))
     q, v = np.array([-1.0, 1.0]), np.array([1.0, -1.0])
-    run = lagjax.simulate(wire, q, v, np.array([0.0, 0.75]))
+    run = lagjax.simulate(WIRE, q, v, np.array([0.0, 0.75]))
     np.testing.assert_allclose(run.q[-1], [-0.25, 0.25], rtol=1e-9)
     with pytest.raises(lagjax.SimulationError, match=r"beyond t = 1 of 2"):
-        lagjax.simulate(wire, q, v, np.array([0.0, 2.0]))
-    pushed = lagjax.System(lambda q, v: 0.5 * v @ v - 0.4 * q[0], constraints=lambda q: q[1] - jnp.maximum(q[0], 0.0))
+        lagjax.simulate(WIRE, q, v, np.array([0.0, 2.0]))
     with pytest.raises(lagjax.SimulationError, match=r"(?s)beyond t = 0.56350\d* of 2.*constraint has a corner"):
-        lagjax.simulate(pushed, np.array([-0.5, 0.0]), np.array([1.0, 0.0]), np.array([0.0, 2.0]))
+        lagjax.simulate(PUSHED, np.array([-0.5, 0.0]), np.array([1.0, 0.0]), np.array([0.0, 2.0]))
 
 
 @pytest.mark.parametrize("spelling", STEPS)
