@@ -10,16 +10,16 @@ contacts, whatever they do (`InContact`). Where a watch falls,
     what friction has left    it slides, against the force that held it
 
 A guess that is wrong is a watch that begins beyond zero, or whose first coefficient that is not rounding is negative:
-it falls at once, and the next round takes it back (`_native._events`). That is Murty's principal pivoting, over series
-in place of numbers (Murty, Linear Algebra Appl. 5 (1972) 65; Heemels, Schumacher & Weiland, ibid. 294 (1999) 93).
-Bounces that accumulate end at a closed form of their limit (`end_bounces`).
+it falls at once, and the next round takes it back (`_native.steps._events`). That is Murty's principal pivoting, over
+series in place of numbers (Murty, Linear Algebra Appl. 5 (1972) 65; Heemels, Schumacher & Weiland, ibid. 294 (1999)
+93). Bounces that accumulate end at a closed form of their limit (`end_bounces`).
 
     follow ─► begin ─► prepare: sides and rounding of all watches ─► the kernel ─► finish ─► decide: a row of the record
                           ▲                                                                     │
                           └─────────────────────────────────────────────────────────────────────┘
 
 `scene` holds sizes, addresses of machine code, and the places of what is remembered of a member, its `member`, and of
-what a `row` of the record says; they are declared in `_places`. A flag is 0 or 1. `work` is room that nobody else has.
+what a `row` of the record says; they are declared in `_places`. A flag is 0 or 1. `work` is scratch memory.
 """
 
 from math import isfinite, sqrt
@@ -54,31 +54,32 @@ from lagjax._run.jumps import GOING, LEAST, bind_law, bind_loops, copy, find_sig
 )  # fmt: skip
 CLOSES, OPENS, BOUNCES, STICKS, SLIDES = range(5)  # the kinds of `ContactChanges`
 SEQUENTIAL, POISSON = 1, 2
-# The time that bounces still take, in parts of a step of the motion between them, below which they end in closed form,
-# and what that leaves out: twice as long, heights of 4e-9 of those of a step are left out.
+# Remaining bounce time, as a fraction of a step, below which a sequence of bounces is replaced by its limit, and the
+# error of that, 1e-14 of a height in a step; doubling `SHORT` gives 4e-9.
 SHORT, LEFT_OUT = 1e-4, 1e-14
-# Forces that are none, in parts of those that stop the bodies within a step: some fifty roundings.
+# Forces that count as zero, as a fraction of those that stop the bodies within a step: some fifty roundings.
 FORCELESS = 1e-14
-# How far below zero a gap counts as gone through: a hundred local errors, of its largest terms.
+# A gap counts as passed if it is this many local errors of its largest terms below zero.
 THROUGH = 100.0
-# What sliding leaves of a contact's response at which it is lost: a paradox, to rounding.
+# The response of a contact to its normal force, relative to that without sliding, below which it is zero to rounding:
+# Painlevé's paradox.
 PARADOX = 1e-12
-# How many of its roundings a gap may move in a step by a force that counts as none, where no other choice is left.
+# A gap may move by this many of its roundings in a step by a force that counts as zero, if no other choice is left.
 TIED_MOVES = 1e3
-# The slip in space that has no direction of its own, in parts of the largest one; and in parts of what a force that
-# breaks away brings about in a step. Half of that takes √2 times the steps, of some ten thousand: at rest friction
-# turns a slip at once, and steps are as short as that takes.
+# Below `NO_SLIP` of the largest slip, a spatial slip has no reliable direction. `AT_REST` is the same for a slip caused
+# within one step by a force that exceeds friction. Halving `AT_REST` takes √2 times the steps, of some ten thousand:
+# near rest friction turns a slip at once, and steps have to resolve that.
 NO_SLIP, AT_REST = 1e-11, 1e-8
-# By how much what happens at one instant may vary apart, for a tangent of length one: rounding.
+# Instants of two simultaneous changes may differ in their derivatives by this much, for a tangent of length one.
 TOGETHER = 1e-8
 HARDLY = 1e-6  # of the largest velocities so far: a contact that moves apart slower may close
 GAINED = 1e-12  # of the room of an impact: a gain of energy beyond rounding
 # Of the largest slip so far: what is more, where the slip along its first direction ends, has turned.
 TURNED = 1e-6
-# How far beyond a corner a motion goes on, in parts of the terms that say where it is; and how many of the smallest
-# steps before it an event stops it: steps that end at a border may be refused, and halve what is left.
+# After a corner a motion continues from this fraction of the terms of its switching number beyond it. An event stops
+# it `BEFORE` the corner: steps that end at a border may be rejected, and halve the rest.
 BEYOND, BEFORE = 16.0 * EPS, 64.0 * SMALLEST_STEP
-# The time that it takes to go beyond, in parts of the motion, from which on a contact rests on its corner.
+# If crossing a corner takes more than this fraction of the time of the motion, the contact rests on the corner.
 ON_CORNER = 1e-10
 INFINITY, MISSING = float("inf"), float("nan")
 OPEN, HELD = range(2)  # the modes
@@ -164,9 +165,9 @@ def measure_slips(scene: Scene, member: Member, rates: Floats, v: Floats, slips:
 
 @loop
 def locate_corners(scene: Scene, member: Member, x: Floats, room: Room) -> float:
-    """Put the sides of corners at inputs x, their rates, and how far beyond them it goes on: (corners,) each.
+    """Put the sides of corners at inputs x, their rates, and the distance to continue beyond: (corners,) each.
 
-    Returns how near they count.
+    Returns the distance below which a state counts as on a corner.
     """
     n, count, inputs, found = scene.n, scene.corners, scene.inputs, room.corner
     t, largest, near = x[2 * n], member.largest, 0.0
@@ -745,11 +746,11 @@ def find_pushes(scene: Scene, member: Member, row: Entry, room: Room):
 
 @loop
 def close_contacts(scene: Scene, member: Member, first: int, hits: bool, meets: Floats, room: Room):
-    """Close and open what watch `first` says, and stick and slide; of contacts that meet, `PARTS` are those that go on.
+    """Update which contacts are closed, stick and slide after watch `first`; `PARTS` are those that separate.
 
-    A gap that falls while it moves apart is zero to more than the rounding of its terms: it goes on beyond that. Where
-    it hardly moves, as at the end of many bounces, it closes. A slip in space that has turned goes on. Where one stops
-    others of the same body may, which then stick as well. Where parts align, a slip that gaps hold passes through zero,
+    A gap that falls although its contacts separate is zero to more than the rounding of its terms: it continues. If it
+    hardly moves, as at the end of many bounces, it closes. A spatial slip that has turned continues. If one stops,
+    others of the same body may, and stick as well. When parts align, a slip that gaps determine passes through zero,
     and turns.
     """
     n, k, r, d, x, rough = scene.n, scene.k, scene.r, scene.d, member.x, scene.rough
