@@ -73,6 +73,8 @@ def test_path(single):
 
 
 SPEEDS, FALL = np.linspace(0.1, 1.3, 20), np.linspace(0.0, 2.2, 12)
+CHAIN = lagjax.System(lambda q, qdot: 0.5 * qdot @ qdot - 0.5 * jnp.sum(jnp.diff(q) ** 2))
+SADDLE = lagjax.System(lambda q, v: 0.5 * v @ v + 0.5 * q[0] ** 2 - 2 * q[1] ** 2)
 
 
 @pytest.fixture(scope="module")
@@ -235,8 +237,7 @@ def test_phase_portraits_by_name(single, batch):
 
 
 def test_of_many_coordinates_some_are_drawn_and_the_legend_says_so():
-    chain = lagjax.System(lambda q, qdot: 0.5 * qdot @ qdot - 0.5 * jnp.sum(jnp.diff(q) ** 2))
-    run = lagjax.simulate(chain, jnp.zeros(100).at[50].set(1.0), jnp.zeros(100), TS)
+    run = lagjax.simulate(CHAIN, jnp.zeros(100).at[50].set(1.0), jnp.zeros(100), TS)
     for draw in (lagjax.plot.phase, lagjax.plot.trajectory):
         assert draw(run).get_legend().get_title().get_text() == "7 of 100 coordinates"
     ax = lagjax.plot.space_time(run)
@@ -297,8 +298,7 @@ def test_members_are_drawn_at_times_of_their_own():
 
 @pytest.mark.slow
 def test_modes_tell_what_grows_and_are_drawn_at_their_largest():
-    saddle = lagjax.System(lambda q, v: 0.5 * v @ v + 0.5 * q[0] ** 2 - 2 * q[1] ** 2)
-    modes = lagjax.normal_modes(saddle, np.zeros(2))
+    modes = lagjax.normal_modes(SADDLE, np.zeros(2))
     titles = [ax.get_title() for ax in lagjax.plot.modes(modes)]
     assert titles == ["grows as exp(1 t)", "ω = 2"]
     # The phase of a complex shape is anybody's choice: i times a shape is the shape.
