@@ -25,7 +25,7 @@ import numpy as np
 
 from lagjax._engine import Problem, choose
 from lagjax._engine.taylor import Flow, MachineCode, Motions, flow_of, jvp, project_start_tangents, tolerances_of
-from lagjax._fit.model._inputs import Driven, InputForm, SampleTable, input_functions
+from lagjax._fit.model._inputs import InputForm, SampleTable, input_functions
 from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._records import start_pair
 from lagjax._interface import ENDED_WELL, Layout, halves
@@ -33,7 +33,7 @@ from lagjax._native import Projection
 from lagjax._primitives import sentence
 from lagjax._run import simulate
 from lagjax._run.hybrid import Scene, first_law, jumps
-from lagjax._scene import System
+from lagjax._scene import Driven, System
 
 PyTree = Any
 
@@ -164,7 +164,7 @@ def _programs_once(scene: Scene, layout: Layout, tree, leaves: tuple, options: t
 
     def scene_params(numbers, table):
         params = restore(numbers)
-        return Driven(params, *table) if is_driven else params
+        return Driven(params, table) if is_driven else params
 
     def run(state, ts, table):
         y0, numbers = state

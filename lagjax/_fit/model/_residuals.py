@@ -26,7 +26,7 @@ import jax.numpy as jnp
 import numpy as np
 from scipy.special import log_ndtr
 
-from lagjax._fit.model._inputs import Driven, constant_tables, input_functions, inputs_at
+from lagjax._fit.model._inputs import constant_tables, input_functions, inputs_at
 from lagjax._fit.model._motions import AbstractMotions, Manifold, Origins, RecordMotion
 from lagjax._fit.model._noise import AbstractNoise, NoiseScale, Sensor, counts, log_likelihood, scores, worths
 from lagjax._fit.model._parameters import Parameters
@@ -38,7 +38,7 @@ from lagjax._fit.model._timings import Clock
 from lagjax._interface import Layout, halves
 from lagjax._run import simulate
 from lagjax._run.hybrid import Scene
-from lagjax._scene import System
+from lagjax._scene import Driven, System
 
 
 class Point(NamedTuple):
@@ -315,13 +315,13 @@ class SystemResiduals:
 
         def sense(ts, y0, inputs, table):
             q, qdot = map(layout.restore, halves(y0))
-            own = params if form is None else Driven(params, *table)
+            own = params if form is None else Driven(params, table)
             motion = simulate(scene, q, qdot, ts, own, rtol=self.rtol, throw=False)
             rows = jax.vmap(lambda q, v: jnp.concatenate([layout.flatten(q), layout.flatten(v)]))(motion.q, motion.qdot)
             return jax.vmap(lambda y, t, i: signals.evaluate_state(y, t, numbers, i))(rows, ts, inputs)
 
         ts, values, inputs = (jnp.asarray(x, u.dtype) for x in (batch.ts, batch.values, batch.inputs))
-        table = None if batch.table is None else tuple(jnp.asarray(x, u.dtype) for x in batch.table)
+        table = jax.tree.map(lambda x: jnp.asarray(x, u.dtype), batch.table)
         if record in self.clocks:
             shown = self.clocks[record].times(starts[0], numbers)[None, :, None]
         else:
