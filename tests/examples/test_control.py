@@ -10,6 +10,7 @@ matplotlib.use("agg")
 import numpy as np
 import pytest
 from scipy.integrate import solve_ivp
+from scipy.stats import chi2
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 
@@ -63,3 +64,56 @@ def test_bounds_hold_and_cost_effort(example, tmp_path, capsys):
     np.testing.assert_allclose(swing_up.replay(bound.u), swing_up.GOAL, atol=1e-8)
     finer, _ = swing_up.swing_up(intervals=100)  # each of whose forces may be one of the fifty, twice
     assert 0.02 * finer.u @ finer.u < 0.04 * free.u @ free.u
+
+
+def test_three_links_balance_on_a_cart(example):
+    regulator = example("regulator")
+    above, m, length, g = np.array([2.0, 1.0, 0.0]), 0.2, 0.5, 9.81  # rods above each
+    mass, stiffness = np.zeros((2, 4, 4))  # of the angles, then the place
+    later = np.maximum.outer(np.arange(3), np.arange(3))
+    mass[:3, :3] = m * length**2 * (0.5 + above[later]) - m * length**2 / 6 * np.eye(3)
+    mass[3, :3] = mass[:3, 3] = m * length * (0.5 + above)
+    mass[3, 3], stiffness[:3, :3] = 1.0 + 3 * m, -m * g * length * np.diag(0.5 + above)
+    np.testing.assert_allclose(regulator.model.A[4:, :4], -np.linalg.solve(mass, stiffness), rtol=1e-12, atol=1e-12)
+    np.testing.assert_allclose(regulator.model.B[4:, 0], np.linalg.solve(mass, [0.0, 0.0, 0.0, 1.0]), rtol=1e-12)
+    K, small = regulator.gain(), 1e-6 * regulator.START["angles"]
+    (q, qdot), forces = regulator.balance({"angles": small, "place": 0.0}, K)
+    x = np.append(small, np.zeros(5))
+    for k in range(50):  # the closed loop is linear up to cubes of angles; a run is good to 1e-9 of its size a step
+        now = np.concatenate([q["angles"][k], [q["place"][k]], qdot["angles"][k], [qdot["place"][k]]])
+        np.testing.assert_allclose(now, x, atol=1e-11)
+        x = np.asarray(regulator.model.Phi @ x + regulator.model.Gamma[:, 0] * forces[k])
+    (q, _), _ = regulator.balance(regulator.START, K)
+    assert np.abs(q["angles"][-1]).max() < 1e-3 and np.abs(q["angles"]).max() < 0.5
+
+
+def test_innovations_of_the_filter_are_what_it_says(example, monkeypatch):
+    kalman_filter = example("kalman_filter")
+    monkeypatch.setattr(kalman_filter, "STEPS", 40)
+    _, states, estimates, covariances, distances = map(np.asarray, kalman_filter.filtered(50))
+    low, high = chi2.ppf([0.001, 0.999], 2 * distances.size)
+    assert low < distances.sum() < high
+    errors = estimates - states
+    normed = np.einsum("bti,btij,btj->bt", errors, np.linalg.inv(covariances), errors)
+    low, high = chi2.ppf([0.001, 0.999], 4 * 50) / 50  # of one instant, whose members are independent
+    assert low < normed[:, -1].mean() < high
+
+
+def test_a_plan_holds_the_pole_where_a_clipped_regulator_drops_it(example, monkeypatch):
+    control = example("predictive_control")
+    small = np.array([2e-4, -1e-4, 3e-4, 1e-4])
+    # Without active bounds the plan is that of the regulator, whose cost it has, up to terms of third order.
+    first = control.plan(small, control.plan(small, np.zeros(control.HORIZON)))[0]
+    np.testing.assert_allclose(first, -control.GAIN @ small, rtol=1e-5)
+    monkeypatch.setattr(control, "DURATION", 4.0)
+    tilted = np.array([0.0, np.radians(25.0), 0.0, 0.0])
+    states, forces = control.controlled(tilted)
+    assert np.abs(states[-1]).max() < 0.02 and np.abs(states[:, 1]).max() < 0.45 and np.abs(forces).max() == 8.0
+    dropped, _ = control.controlled(tilted, predictive=False)
+    assert np.abs(dropped[:, 1]).max() > np.pi
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", ["regulator", "kalman_filter", "predictive_control"])
+def test_the_whole_example_runs(example, name, tmp_path, capsys):
+    assert_main_draws(example(name), tmp_path, capsys)
