@@ -11,7 +11,7 @@ import jax
 import numpy as np
 
 from lagjax._interface import RESULTS, Layout, numbers_at
-from lagjax._run import Members
+from lagjax._run import CHANGE_WORDS, Members
 
 # Points of a curve, at least: four times as many as dots of a figure that is printed, because a planet passes its
 # perihelion in a fraction of them. Half as many show corners there.
@@ -61,6 +61,61 @@ def join_curve(x: np.ndarray, y: np.ndarray) -> np.ndarray:
     xy = np.stack([x, y])
     gaps = 1 + np.flatnonzero(np.isnan(y[1:-1]))
     return np.delete(xy, gaps[(xy[:, gaps - 1] == xy[:, gaps + 1]).all(axis=0)], axis=1)
+
+
+def wrap_curve(x: np.ndarray, y: np.ndarray, of_x: float | None, of_y: float | None = None) -> tuple:
+    """A curve with x and y in −P/2 … P/2 for a period P each, None without one: it leaves at an edge, and comes in at
+    the other after a gap."""
+    if of_x is not None:
+        x, y = _wrap_one(x, y, of_x)
+    return (x, y) if of_y is None else _wrap_one(y, x, of_y)[::-1]
+
+
+def _wrap_one(angle: np.ndarray, other: np.ndarray, period: float) -> tuple[np.ndarray, np.ndarray]:
+    turns = np.floor(angle / period + 0.5)
+    steps = np.nan_to_num(np.diff(turns))
+    left = np.flatnonzero(steps)
+    edge = period * (np.maximum(turns[left], turns[left + 1]) - 0.5)
+    at = other[left] + (edge - angle[left]) / (angle[left + 1] - angle[left]) * (other[left + 1] - other[left])
+    side, gap = period / 2 * np.sign(steps[left]), np.full(len(left), np.nan)
+    places = np.repeat(left + 1, 3)
+    wrapped = np.insert(angle - period * turns, places, np.stack([side, gap, -side], axis=1).ravel())
+    return wrapped, np.insert(other, places, np.stack([at, gap, at], axis=1).ravel())
+
+
+def spans_of(trajectory) -> dict[str, list[tuple[float, float]]]:
+    """The times of one motion in each of its modes, or with each contact closed: pairs (from, to), by name."""
+    place, spans = (0,) * np.ndim(trajectory.ok), {}
+    begin, end = numbers_at(trajectory.ts, (0,) * np.ndim(trajectory.ts)), numbers_at(trajectory.end.t, place)
+    for name in (*trajectory.mode_names, *trajectory.contact_names):
+        spans[name] = []
+
+    def known(record, *names):
+        columns = [numbers_at(getattr(record, name), place) for name in ("t", *names)]
+        return [column[np.isfinite(columns[0])] for column in columns]
+
+    if trajectory.transitions is not None:
+        t, source, target = known(trajectory.transitions, "source", "target")
+        modes = [*source[:1], *target] if len(t) else [numbers_at(trajectory.mode, place)[0]]
+        changes = [k for k in range(1, len(modes)) if modes[k] != modes[k - 1]]
+        times = [begin, *t[[k - 1 for k in changes]], end]
+        names = [trajectory.mode_names[modes[k]] for k in [0, *changes]]
+        found = zip(names, times[:-1], times[1:], strict=True)
+    elif trajectory.contact_changes is not None:
+        t, contact, change = known(trajectory.contact_changes, "contact", "change")
+        since, found = {}, []
+        for when, k, what in zip(t, contact, map(CHANGE_WORDS.__getitem__, change), strict=True):
+            if what == "closes":
+                since.setdefault(k, when)
+            elif what == "opens" and k in since:
+                found.append((trajectory.contact_names[k], since.pop(k), when))
+        found += [(trajectory.contact_names[k], when, end) for k, when in since.items()]
+    else:
+        found = []
+    for name, first, last in found:
+        if first != last:
+            spans[name].append((float(first), float(last)))
+    return spans
 
 
 def courses_of(trajectory, places) -> tuple[Layout, list[Course]]:
