@@ -24,7 +24,7 @@ from lagjax._interface._platform import (
     is_known,
     numbers_at,
 )
-from lagjax._interface._registered import PLACES, import_registered
+from lagjax._interface._registered import Registered, register, registered
 from lagjax._interface._results import (
     ENDED_WELL,
     EVENT_OCCURRED,

@@ -473,7 +473,7 @@ class System(eqx.Module):
         """The shapes that the function of a role returns, traced on shapes alone."""
         numbers, code = eqx.partition(params, eqx.is_array_like)
         function, count = getattr(self, role), len(ARGUMENTS[role])
-        state, t = layout.restore(jnp.zeros(layout.size, layout.dtype)), jnp.zeros((), layout.dtype)
+        state, t = layout.restore(np.zeros(layout.size, layout.dtype)), np.zeros((), layout.dtype)
         more = self.multiplier_shapes(layout, params) if role == "forces" else {}
         return jax.eval_shape(
             lambda q, t, p, more: function(*[q] * count, t=t, params=eqx.combine(p, code), **more),
