@@ -476,7 +476,7 @@ def _stroboscopic_points(scene, over, start: tuple, value: Callable | None, tran
         strobe, q0, qdot0, params = (of(point) if callable(of) else of for of in start)
         if isinstance(params, dict) and not callable(start[3]):
             params = params | {name: x for name, x in point.items() if name in params}
-        ts = strobe * jnp.concatenate([jnp.zeros(1), times])
+        ts = jnp.asarray(strobe) * jnp.concatenate([jnp.zeros(1), times])
         run = simulate(scene, q0, qdot0, ts, params, throw=False)
         seen = jax.tree.map(lambda x: x[1:], (run.q, run.qdot))
         if value is not None:
@@ -638,6 +638,7 @@ def _periods(layout: Layout, period) -> list[float | None]:
 
 def _pair_of_periods(period, ax) -> tuple[float | None, float | None]:
     """The periods of x and y, whose axes get ticks of angles."""
+    given = period if isinstance(period, tuple) and len(period) == 2 else (period, None)
     pair = tuple(
         x if x is None else _require_period(x) for x in (period if isinstance(period, tuple) else (period, None))
     )
