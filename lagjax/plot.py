@@ -639,12 +639,10 @@ def _periods(layout: Layout, period) -> list[float | None]:
 def _pair_of_periods(period, ax) -> tuple[float | None, float | None]:
     """The periods of x and y, whose axes get ticks of angles."""
     given = period if isinstance(period, tuple) and len(period) == 2 else (period, None)
-    pair = tuple(
-        x if x is None else _require_period(x) for x in (period if isinstance(period, tuple) else (period, None))
-    )
-    for axis, one in zip((ax.xaxis, ax.yaxis), pair, strict=True):
+    of_x, of_y = (None if one is None else _require_period(one) for one in given)
+    for axis, one in ((ax.xaxis, of_x), (ax.yaxis, of_y)):
         _draw_angles(axis, [one])
-    return pair
+    return of_x, of_y
 
 
 def _wrap(x, period: float | None):
