@@ -32,6 +32,7 @@ from lagjax._show import (
     columns_of,
     course_of,
     courses_of,
+    draw_curves,
     even_places,
     import_package,
     join_curve,
@@ -79,18 +80,16 @@ def trajectory(trajectory: Trajectory, projection: Callable | None = None, *, me
 
     >>> lagjax.plot.trajectory(trajectory); lagjax.plot.trajectory(trajectory, lambda q, qdot: (q[0], qdot[0]))
     """
-    layout, curves = _curves(trajectory, members)
-    ax, opacity = _axes(ax), max(0.15, len(curves) ** -0.5)
+    (layout, curves), ax = _curves(trajectory, members), _axes(ax)
     if projection is not None:
         periods = _pair_of_periods(period, ax)
-        for x, y in _project(layout, curves, projection):
-            ax.plot(*join_curve(*wrap_curve(x, y, *periods)), color=COLORS[0], alpha=opacity, linewidth=1.2)
+        projected = _project(layout, curves, projection)
+        draw_curves(ax, [join_curve(*wrap_curve(*line, *periods)) for line in projected], COLORS[0])
         return ax
     shown, periods = _places(layout, ()), _periods(layout, period)
     for color, i in zip(COLORS, shown, strict=False):
-        for t, q, _ in curves:
-            ax.plot(*join_curve(*wrap_curve(t, q[:, i], None, periods[i])), color=color, alpha=opacity, linewidth=1.5)
-        ax.lines[-len(curves)].set_label(layout.names[i])
+        lines = [join_curve(*wrap_curve(t, q[:, i], None, periods[i])) for t, q, _ in curves]
+        draw_curves(ax, lines, color, layout.names[i], 1.5)
     _draw_angles(ax.yaxis, [periods[i] for i in shown])
     ax.set_xlabel("t")
     shaded = _shade_spans(ax, trajectory)
@@ -171,14 +170,11 @@ def phase(trajectory: Trajectory, *coordinates: str, members: int = 30, period: 
 
     >>> lagjax.plot.phase(trajectory, "q['theta']")
     """
-    layout, curves = _curves(trajectory, members)
+    (layout, curves), ax = _curves(trajectory, members), _axes(ax)
     places, periods = _places(layout, coordinates), _periods(layout, period)
-    ax, opacity = _axes(ax), max(0.15, len(curves) ** -0.5)
     for color, i in zip(COLORS, places, strict=False):
         lines = [wrap_curve(q[:, i], qdot[:, i], periods[i]) for _, q, qdot in curves]
-        for line in lines:
-            ax.plot(*line, color=color, alpha=opacity, linewidth=1.2)
-        ax.lines[-len(curves)].set_label(layout.names[i])
+        draw_curves(ax, lines, color, layout.names[i])
         ax.plot(*np.array([(x[0], y[0]) for x, y in lines]).T, ".", color=color, markersize=5)
     _draw_angles(ax.xaxis, [periods[i] for i in places])
     if len(places) == 1:
@@ -382,12 +378,10 @@ def poincare(crossings: Crossings, projection: Callable, *, values=None, label: 
     x, y, members = _section_points(crossings, projection)
     ax = _axes(ax)
     x, y = map(_wrap, (x, y), _pair_of_periods(period, ax))
-    size = _point_size(x) if size is None else size
-    style: dict[str, Any] = dict(s=size, linewidths=0, rasterized=True)
     if values is None:
-        ax.scatter(x, y, c=np.array(COLORS)[members % len(COLORS)], **style)
+        _scatter(ax, x, y, np.array(COLORS)[members % len(COLORS)], size)
         return ax
-    points = ax.scatter(x, y, c=np.asarray(values)[members], cmap="viridis", **style)
+    points = _scatter(ax, x, y, np.asarray(values)[members], size, cmap="viridis")
     _colorbar(points, ax, label)
     return ax
 
@@ -402,7 +396,7 @@ def return_map(crossings: Crossings, value: Callable, *, ax=None):
     ax = _axes(ax)
     x, _, members = _section_points(crossings, lambda q, qdot: (value(q, qdot), value(q, qdot)))
     same = members[1:] == members[:-1]
-    ax.scatter(x[:-1][same], x[1:][same], s=_point_size(x), color=COLORS[0], linewidths=0)
+    _scatter(ax, x[:-1][same], x[1:][same], COLORS[0])
     low, high = (float(end) for end in (x.min(initial=0.0), x.max(initial=0.0)))
     ax.plot([low, high], [low, high], color=GREY, linewidth=0.8)
     ax.set(xlabel="at one crossing", ylabel="at the next")
@@ -445,7 +439,8 @@ def bifurcation(system, over, strobe=None, q0=0.0, qdot0=0.0, params=None, *, va
     if isinstance(system, System | Hybrid):
         x, y, names = _stroboscopic_points(system, over, (strobe, q0, qdot0, params), value, transient, points)
     else:
-        x, y, names = np.asarray(system, float), np.asarray(over, float), ("parameter", "value")
+        names = [getattr(of, "name", None) or name for of, name in ((system, "parameter"), (over, "value"))]
+        x, y = np.asarray(system, float), np.asarray(over, float)
         if x.ndim != 1 or y.shape[:1] != x.shape:
             raise ValueError(f"Points (V, …) belong to values (V,) of a parameter; got {y.shape} and {x.shape}.")
     x, y = np.broadcast_to(x[:, None], (len(x), y[0].size)).ravel(), y.ravel()
@@ -453,8 +448,7 @@ def bifurcation(system, over, strobe=None, q0=0.0, qdot0=0.0, params=None, *, va
     if not len(x):
         raise ValueError("No member has a finite point: simulate one of them, whose message says why.")
     ax = _axes(ax)
-    ax.scatter(x, _wrap(y, period), s=_point_size(x), color=COLORS[len(ax.collections) % len(COLORS)], linewidths=0,
-               rasterized=True)  # fmt: skip
+    _scatter(ax, x, _wrap(y, period), COLORS[len(ax.collections) % len(COLORS)])
     _draw_angles(ax.yaxis, [period if period is None else _require_period(period)])
     ax.set(xlabel=names[0], ylabel=names[1])
     return ax
@@ -470,7 +464,7 @@ def _stroboscopic_points(scene, over, start: tuple, value: Callable | None, tran
         raise ValueError("strobe is the period of the drive, 2π/ω: give it, or a function of the point.")
     if not any(map(callable, start)) and not (isinstance(start[3], dict) and {*names} & {*start[3]}):
         raise ValueError(f"Nothing depends on {join_names(names)}: give params as a dict with that name, or functions.")
-    columns = np.concatenate([values for _, values in axes[0].pieces()]).T
+    columns, shown = np.concatenate([values for _, values in axes[0].pieces()]).T, []
 
     def follow(point):
         strobe, q0, qdot0, params = (of(point) if callable(of) else of for of in start)
@@ -481,12 +475,13 @@ def _stroboscopic_points(scene, over, start: tuple, value: Callable | None, tran
         seen = jax.tree.map(lambda x: x[1:], (run.q, run.qdot))
         if value is not None:
             return jax.vmap(value)(*seen)
+        shown.append(Layout.from_state(*jax.tree.map(lambda x: x[0], seen)).names[0])
         return jax.tree.leaves(seen[0])[0].reshape(len(times), -1)[:, 0]
 
     found = jax.jit(jax.vmap(follow))(dict(zip(names, columns, strict=True)))
     if found.shape != (columns.shape[1], len(times)):
         raise ValueError(f"value must return one number for one state; got shape {found.shape[2:]}.")
-    return columns[0], np.asarray(found), (names[0], "q" if value is None else "value")
+    return columns[0], np.asarray(found), (names[0], *(shown or ["value"]))
 
 
 def energy_error(trajectory: Trajectory, *, scale: float | None = None, ax=None):
@@ -670,8 +665,10 @@ def _name_angle(part: Fraction) -> str:
     return f"{'−' * (part < 0)}{whole}π{'' if part.denominator == 1 else f'/{part.denominator}'}"
 
 
-def _point_size(x) -> float:
-    return float(np.clip(2e4 / max(1, len(x)), 0.02, 9.0))
+def _scatter(ax, x, y, colors, size: float | None = None, **more):
+    """Points whose `size` is by default what suits how many there are."""
+    size = float(np.clip(2e4 / max(1, len(x)), 0.02, 9.0)) if size is None else size
+    return ax.scatter(x, y, c=colors, s=size, linewidths=0, rasterized=True, **more)
 
 
 def _wide_figure(columns: int):

@@ -85,37 +85,26 @@ def _wrap_one(angle: np.ndarray, other: np.ndarray, period: float) -> tuple[np.n
 
 def spans_of(trajectory) -> dict[str, list[tuple[float, float]]]:
     """The times of one motion in each of its modes, or with each contact closed: pairs (from, to), by name."""
-    place, spans = (0,) * np.ndim(trajectory.ok), {}
-    begin, end = numbers_at(trajectory.ts, (0,) * np.ndim(trajectory.ts)), numbers_at(trajectory.end.t, place)
-    for name in (*trajectory.mode_names, *trajectory.contact_names):
-        spans[name] = []
-
-    def known(record, *names):
-        columns = [numbers_at(getattr(record, name), place) for name in ("t", *names)]
-        return [column[np.isfinite(columns[0])] for column in columns]
-
-    if trajectory.transitions is not None:
-        t, source, target = known(trajectory.transitions, "source", "target")
-        modes = [*source[:1], *target] if len(t) else [numbers_at(trajectory.mode, place)[0]]
-        changes = [k for k in range(1, len(modes)) if modes[k] != modes[k - 1]]
-        times = [begin, *t[[k - 1 for k in changes]], end]
-        names = [trajectory.mode_names[modes[k]] for k in [0, *changes]]
-        found = zip(names, times[:-1], times[1:], strict=True)
-    elif trajectory.contact_changes is not None:
-        t, contact, change = known(trajectory.contact_changes, "contact", "change")
-        since, found = {}, []
-        for when, k, what in zip(t, contact, map(CHANGE_WORDS.__getitem__, change), strict=True):
-            if what == "closes":
-                since.setdefault(k, when)
-            elif what == "opens" and k in since:
-                found.append((trajectory.contact_names[k], since.pop(k), when))
-        found += [(trajectory.contact_names[k], when, end) for k, when in since.items()]
+    names = trajectory.mode_names or trajectory.contact_names
+    begin, end = (float(np.ravel(x)[0]) for x in (trajectory.ts, trajectory.end.t))
+    since, spans = {}, {name: [] for name in names}
+    if not names:
+        return spans
+    if (changes := trajectory.transitions) is not None:
+        t, left, entered = (np.ravel(x) for x in (changes.t, changes.source, changes.target))
+        since[next((mode for mode in left if mode >= 0), np.ravel(trajectory.mode)[0])] = begin
     else:
-        found = []
-    for name, first, last in found:
-        if first != last:
-            spans[name].append((float(first), float(last)))
-    return spans
+        changes = trajectory.contact_changes
+        t, contact, words = np.ravel(changes.t), np.ravel(changes.contact), np.array(CHANGE_WORDS)[changes.change]
+        left, entered = (np.where(np.ravel(words) == word, contact, -1) for word in ("opens", "closes"))
+    for when, one, other in zip(t, left, entered, strict=True):
+        if one != other and one in since:
+            spans[names[one]].append((since.pop(one), float(when)))
+        if one != other and other >= 0:
+            since.setdefault(other, float(when))
+    for k, first in since.items():
+        spans[names[k]].append((first, end))
+    return {name: [(first, last) for first, last in found if first != last] for name, found in spans.items()}
 
 
 def courses_of(trajectory, places) -> tuple[Layout, list[Course]]:
