@@ -96,14 +96,13 @@ def solve_conditions(point, hessian, gradient):
     within[:, 1:5, 5:] = within[:, 5:, 1:5] = -np.eye(4)
     within[:-1, 5:, 5:], within[-1, 5:] = hessian[1:, :4, :4], np.eye(9)[5:]
     before[:, 1:5, 5:] = point.slopes[:, :, :4]
-    matrix, k = np.zeros((N, 9, N, 9)), np.arange(N)
-    matrix[k, :, k], matrix[k[1:], :, k[:-1]] = within, before[1:]
-    matrix[k[:-1], :, k[1:]] = before[1:].swapaxes(1, 2)
-    matrix, bands = matrix.reshape(9 * N, 9 * N), np.zeros((2 * BAND + 1, 9 * N))
-    for d in range(-BAND, BAND + 1):
-        bands[BAND - d, max(d, 0) : 9 * N + min(d, 0)] = np.diagonal(matrix, d)
-    right = np.column_stack([-gradient, -point.defects, np.zeros((N, 4))])
-    step = solve_banded((BAND, BAND), bands, right.ravel()).reshape(N, 9)
+    bands, (i, j), (above, right) = np.zeros((2 * BAND + 1, N, 9)), np.indices((9, 9)), np.triu_indices(9, 1)
+    bands[BAND + i - j, :, j] = within.transpose(1, 2, 0)
+    bands[BAND + 9 + above - right, :-1, right] = bands[BAND - 9 - above + right, 1:, above] = before[
+        1:, above, right
+    ].T
+    sides = np.column_stack([-gradient, -point.defects, np.zeros((N, 4))])
+    step = solve_banded((BAND, BAND), bands.reshape(2 * BAND + 1, 9 * N), sides.ravel()).reshape(N, 9)
     return np.concatenate([np.zeros((1, 4)), step[:, 5:]]), step[:, 0], step[:, 1:5]
 
 
@@ -132,12 +131,13 @@ def swing_up(strongest=20.0, intervals=50, tolerance=1e-8, most=100):
         for hessian in (plain + point.hessians, plain):
             dz, du, λ = step = solve_conditions(point, hessian, gradient)
             full = min(1.0, 0.995 / max(1e-9, (-SIDES * du / here).max()))  # some room to the bounds is left
+            if hessian is plain:
+                weight = max(weight, 2 * np.abs(λ).max())
+                new = lower_merit(point, step, full, room, barrier, weight)
+                break
             new = evaluate(point.z + full * dz, point.u + full * du, point.λ + full * (λ - point.λ))
             if new.residual(room, barrier) < point.residual(room, barrier):
                 break
-        else:
-            weight = max(weight, 2 * np.abs(λ).max())
-            new = lower_merit(point, step, full, room, barrier, weight)
         rise = barrier / here - forces - forces * SIDES * du / here
         forces = forces + min(1.0, 0.995 / max(1e-9, (-rise / forces).max())) * rise
         point, error = new, max(np.abs(du).max(), np.abs(new.defects).max())
