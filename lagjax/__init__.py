@@ -128,6 +128,7 @@ __all__ = [
 # What judges and shows a motion stands above it, and is imported when a method of `Trajectory` calls it.
 PLACES.update(dict.fromkeys(("dataset", "frame", "impact_frame", "change_frame"), "lagjax._show"))
 PLACES.update(dict.fromkeys(("make_animation", "summary", "trajectory_html"), "lagjax._show"))
+PLACES.update(dict.fromkeys(("write_c", "write_equations"), "lagjax._show"))
 PLACES.update(describe_failure="lagjax._trust", examine="lagjax._trust.health", contact_forces="lagjax._run.contacts")
 
 

@@ -8,7 +8,7 @@ what to try, and the exception; `_platform` the kind of device that JAX computes
 """
 
 from lagjax._interface._arguments import Function, ValueNotKnown, accept, find_params_expression, present
-from lagjax._interface._layout import Layout, describe_numbers, dtype_of, flatten_numbers, halves, labelled_leaves
+from lagjax._interface._layout import Layout, describe_numbers, dtype_of, flatten_numbers, halves, labelled_leaves, number_names
 from lagjax._interface._platform import (
     compile_for_one_call,
     compiled_once,

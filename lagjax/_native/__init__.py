@@ -30,7 +30,7 @@ one Taylor series, of the order that the tolerance asks for.
     _recorded_steps      recorded steps once more;  _tangent, _adjoint: their maps forward and back
     _kernel              motions and derivatives as functions of arrays;  _threads: on several cores, interruptible
     _handler             the motion as a call of XLA;  _derivative_handler: derivatives of short motions
-    _line_handler        any straight line as a call of XLA
+    _line_handler        any straight line as a call of XLA;  _c_lines: the same as text in C
     _loops               loops and decisions over numbers, written in Python, as machine code
     _gpu                 the modules of one lane as programs for NVIDIA GPUs;  _gpu_entry: what a thread of these does
 
@@ -38,6 +38,7 @@ Nothing here knows JAX: arrays are NumPy's, and a program is data (`_program._se
 """
 
 from lagjax._native import _gpu as gpu
+from lagjax._native._c_lines import CNumbers, write_function
 from lagjax._native._constants import (
     ATOL_OVER_MOTION,
     ATOL_OVER_RTOL,

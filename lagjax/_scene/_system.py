@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from lagjax._engine import Problem
 from lagjax._engine.taylor import lowered_motion
 from lagjax._equations import OF_QUANTITIES, Constraints, Motion, Sample, couple_forces, derivation_of
-from lagjax._interface import Function, Layout, ValueNotKnown, accept, as_arrays, is_concrete, present, require_number
+from lagjax._interface import Function, Layout, ValueNotKnown, accept, as_arrays, import_registered, is_concrete, number_names, present, require_number
 from lagjax._primitives import SINGLE, compute_in_doubles
 from lagjax._program import Unlowerable, lack_of_memory
 from lagjax._scene._explanation import Explanation, explain
@@ -307,6 +307,29 @@ class System(eqx.Module):
             return facts.with_constraints(names, None)
         schur = self._evaluate_quantity(Motion.schur_complement, q, qdot, t, params)
         return facts.with_constraints(names, np.asarray(schur) if is_concrete(schur) else None)
+
+    def equations(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None) -> Any:
+        """The equations of motion to read."""
+        require_number(t, "t")
+        self, layout = present_system(self), Layout.from_state(q, qdot)
+        names = self.constraint_names(layout, params) if self._constraint_roles else []
+        return import_registered("write_equations")(self, layout, params, number_names(params, "params"), names)
+
+    def to_c(
+        self,
+        q: PyTree,
+        qdot: PyTree,
+        t: Time = 0.0,
+        params: PyTree = None,
+        *,
+        inputs: PyTree = None,
+        name: str = "scene",
+        dtype: Literal["float64", "float32"] = "float64",
+    ) -> str:
+        """The equations of this scene as C."""
+        require_number(t, "t")
+        self, layout = present_system(self), Layout.from_state(q, qdot)
+        return import_registered("write_c")(self, layout, params, inputs, name, dtype)
 
     def _motion(self, layout: Layout, params: PyTree = None) -> Motion:
         """The scene in the flat coordinates of `layout`, after a look at what its functions return there."""
