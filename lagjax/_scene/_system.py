@@ -622,7 +622,7 @@ def _evaluate(system: System, quantity: Callable, q, qdot, t, params, **more):
     layout = Layout.from_state(q, qdot)
     numbers, derivation = eqx.filter(params, eqx.is_array), derivation_of(system, layout, params)
     motion = derivation.motion if system.path == "array" else lowered_motion(derivation)
-    return quantity(motion, layout.flatten(q), layout.flatten(qdot), t, numbers, **more)
+    return getattr(motion, quantity.__name__)(layout.flatten(q), layout.flatten(qdot), t, numbers, **more)
 
 
 def _require_scalar(value: PyTree, role: str) -> None:
