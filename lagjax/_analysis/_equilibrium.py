@@ -9,7 +9,6 @@ from jaxtyping import Array, Bool, Float
 from scipy.sparse import diags_array
 
 from lagjax._analysis._closed_contacts import hold_closed
-from lagjax._analysis._coordinates import restrict_signature
 from lagjax._analysis._lowest_modes import Sparse
 from lagjax._analysis._scene_state import SceneState
 from lagjax._analysis._solve import is_root, levenberg_marquardt, newton, shortest_preimage
@@ -23,7 +22,15 @@ from lagjax._analysis._sparse_balance import (
     singular_direction,
 )
 from lagjax._equations import ROUNDINGS, least_norm
-from lagjax._interface import SimulationError, compile_for_one_call, describe_numbers, is_known, require_flag, show_str
+from lagjax._interface import (
+    SimulationError,
+    compile_for_one_call,
+    describe_numbers,
+    is_known,
+    require_flag,
+    restrict_signature,
+    show_str,
+)
 from lagjax._primitives import accepts_singles, nan_unless
 from lagjax._run import simulate
 from lagjax._scene import ROLES, System

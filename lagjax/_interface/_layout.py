@@ -49,6 +49,12 @@ class Layout:
             raise TypeError(f"Coordinates must be float32 or float64; got {dtype}.")
         return cls(tree, shapes, paths, np.dtype(dtype))
 
+    @classmethod
+    def from_numbers(cls, tree: PyTree, name: str, dtype) -> "Layout":
+        """The layout of any pytree of real floats; `TypeError`, with the `name` of the leaf, for anything else."""
+        paths, structure, shapes, _ = _structure(tree, name)
+        return cls(structure, shapes, paths, np.dtype(dtype))
+
     @property
     def size(self) -> int:
         return sum(math.prod(shape) for shape in self.shapes)

@@ -114,7 +114,7 @@ class Formulas:
         return multiply(*(x if len(x) == 1 else self._factor(x, 1) for x in (a, b)))
 
     def _factor(self, x: Sum, power: float) -> Sum:
-        """A sum in a power, as one atom: without what all of its coefficients have in common, and first terms positive."""
+        """A sum in a power, as one atom, without what its coefficients have in common: its first term is positive."""
         if len(x := self._shortest(x)) == 1:
             return self._raise(x, power)
         sizes = {abs(c) for c in x.values()}

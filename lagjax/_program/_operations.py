@@ -19,7 +19,7 @@ applies an operation, `c(x)` makes a number, `w` is the result and `u`, `v` (or 
 
 Two operations carry an attribute: `round` (1: ties to even, 0: away from zero) and `convert` (the kind of the result).
 `convert` has no code here because it depends on both kinds. Sine and cosine of one angle are computed together by
-`_native._lanes` and by `_emit`. What is looked up in a table is no elementwise operation: see `_look_ups`.
+`_native.series._lanes` and by `_emit`. What is looked up in a table is no elementwise operation: see `_look_ups`.
 """
 
 import math
@@ -40,7 +40,7 @@ class Operation:
     - `value(*xs)`: the result in NumPy, for numbers and for arrays of one shape; with the attribute as the last
       argument where a node has one.
     - `llvm`: the name of a function of the C library, called lane by lane; or `(code, *xs)` → value, with a
-      `_native._ir.Code`, whose values are vectors with the operators of Python. None: this is done elsewhere.
+      `_native.code._ir.Code`, whose values are vectors with the operators of Python. None: this is done elsewhere.
     - `c`, `text`, `latex`: the expression in C, in Python and in LaTeX, with {0}, {1}, … for its operands; None: a
       function, by the name that it has in the C library, or here.
     - `lax`: the name of the function in `jax.lax`, if it is not `name`; `_emit` writes what is not there.

@@ -49,10 +49,10 @@ class Holding(NamedTuple):
     """The means to keep a motion on the borders that it slides along.
 
     `retraction` takes the inputs of the program to the state (q, q̇) on them, None where the motion may slide along
-    none; `moved` are the coordinates that the force of each moves, and those of different `groups` know nothing of each
-    other as long as no time passes. `release` gives for each cone changes of q̇ (n,): one by which its vector becomes a
-    unit along what it does not hold, and what takes the vector away. Along so many borders, `unheld`, the motion may
-    slide, and that is not followed.
+    none; `moved` are the coordinates that the force of each moves; borders of different `groups` do not act on each
+    other at one instant. `release` gives for each cone two changes of q̇ (n,): one makes its vector a unit vector along
+    what it does not hold, one makes it zero. `unheld` counts the borders along which the motion may slide without being
+    followed.
     """
 
     retraction: StraightLine | None = None

@@ -2,7 +2,7 @@
 
 Time is the first axis of `q` and `qdot`; the members of a batch are an axis before it. Quantities derived from the
 states are methods: they cost nothing until they are called, and they are differentiable. What judges and shows a
-motion (`_trust`, `_show`) stands above it: its methods import it when they are called (`_interface._registered`).
+motion (`_trust`, `_show`) stands above it: its methods call it through `_interface._registered`.
 """
 
 import dataclasses
@@ -17,7 +17,7 @@ import numpy as np
 
 from lagjax._engine import Problem
 from lagjax._equations import has_constraints
-from lagjax._interface import ENDED_WELL, RESULTS, Layout, SimulationError, import_registered, is_known, show_str
+from lagjax._interface import ENDED_WELL, RESULTS, Layout, SimulationError, is_known, registered, show_str
 from lagjax._primitives import DOUBLE, compute_in_doubles, marks_absent, raise_where_failed
 from lagjax._scene import System
 
@@ -94,7 +94,7 @@ class Impacts(NamedTuple):
 
         The index is `t`, or (member, t) for a batch. Raises `ImportError` when pandas is not installed.
         """
-        return import_registered("impact_frame")(self)
+        return registered().impact_frame(self)
 
 
 def _list_first(record: Any, what: str, joint: str, describe: Callable, numbers: tuple, between: str = ", ") -> str:
@@ -166,7 +166,7 @@ class ContactChanges(NamedTuple):
         The states have the columns q['x'], …, qdot['x'], … just before it, and q_next['x'], …, qdot_next['x'], … just
         behind it. The index is `t`, or (member, t) for a batch. Raises `ImportError` when pandas is not installed.
         """
-        return import_registered("change_frame")(self)
+        return registered().change_frame(self)
 
 
 class Trajectory(eqx.Module):
@@ -231,11 +231,11 @@ class Trajectory(eqx.Module):
 
     def __repr__(self) -> str:
         """Three lines; `equinox.tree_pprint` prints the fields."""
-        return import_registered("summary")(self)
+        return registered().summary(self)
 
     def _repr_html_(self) -> str | None:
         """The three lines and a small figure, for notebooks; None, and they show the lines, where there is none."""
-        return import_registered("trajectory_html")(self)
+        return registered().trajectory_html(self)
 
     @property
     def ok(self) -> jax.Array:
@@ -269,7 +269,7 @@ class Trajectory(eqx.Module):
     @marks_absent
     def _forces_in_contact(self, name: str) -> PyTree:
         self._require_present()
-        return import_registered("contact_forces")(self, name)
+        return registered().contact_forces(self, name)
 
     def constraint_force(self) -> PyTree:
         """(∂f/∂q)ᵀλ + (∂a/∂q̇)ᵀμ at every output time, in the structure of `q`."""
@@ -300,7 +300,7 @@ class Trajectory(eqx.Module):
         ```
         """
         self._require_present()
-        return import_registered("examine")(self, reference)
+        return registered().examine(self, reference)
 
     def to_xarray(self, units: PyTree = None, time_unit: str | None = None):
         """An `xarray.Dataset` with a variable per leaf of `q` and `qdot` and the dimensions (member,) time, ...
@@ -317,7 +317,7 @@ class Trajectory(eqx.Module):
 
         Raises `ImportError` when xarray is not installed.
         """
-        return import_registered("dataset")(self, units, time_unit)
+        return registered().dataset(self, units, time_unit)
 
     def to_pandas(self, units: PyTree = None, time_unit: str | None = None):
         """A `pandas.DataFrame` with a row per output and a column per number: q['x'], q[1], …, qdot['x'], ….
@@ -339,7 +339,7 @@ class Trajectory(eqx.Module):
         print(table["q['x']"].max(), table.attrs["units"])
         ```
         """
-        return import_registered("frame")(self, units, time_unit)
+        return registered().frame(self, units, time_unit)
 
     def animate(
         self, points: Callable, trace: Any = None, *, speed: float = 1.0, fps: float = 30.0
@@ -369,7 +369,7 @@ class Trajectory(eqx.Module):
         film.save("pendulum.gif")
         ```
         """
-        return import_registered("make_animation")(self, points, trace, speed, fps)
+        return registered().make_animation(self, points, trace, speed, fps)
 
     def map_members(self, function, *more) -> PyTree:
         """Map `function(q, qdot, (ts, tolerances), params, mode, *more)` over the batch axes, those of `more` too."""
@@ -487,4 +487,4 @@ def raise_unless_ok(trajectory: Trajectory, layout: Layout, why: Callable[[], st
         states = trajectory.q, trajectory.qdot, end
         states = raise_where_failed(states, code, (end.t, y_end), t_last, layout.names)
         return eqx.tree_at(lambda t: (t.q, t.qdot, t.end), trajectory, states)
-    raise SimulationError(import_registered("describe_failure")(trajectory, layout, why()), trajectory)
+    raise SimulationError(registered().describe_failure(trajectory, layout, why()), trajectory)

@@ -6,8 +6,9 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from lagjax._equations import Derivation, derivation_of
-from lagjax._interface import Layout, show_str
+from lagjax._interface import Layout, number_names, show_str
 from lagjax._program import Formulas, Sum, Unlowerable
+from lagjax._scene import Driven, drive_scene, held_inputs
 from lagjax._show._formula_text import LATEX, PYTHON, FormulaWriter, Name, input_names, shared_parts, short_names
 
 if TYPE_CHECKING:
@@ -71,8 +72,12 @@ def _key(key: str | tuple[str, str]) -> str:
     return key if isinstance(key, str) else ", ".join(key)
 
 
-def write_equations(system: "System", layout: Layout, params: PyTree, numbers: list[str], names: list[str]) -> Equations:
-    """What `System.equations` returns; `numbers` label those of params, `names` the constraints."""
+def write_equations(system: "System", layout: Layout, params: PyTree, inputs: PyTree) -> Equations:
+    """What `System.equations` returns."""
+    names = system.constraint_names(layout, params) if system.constraints or system.velocity_constraints else []
+    numbers = [*number_names(params, "params"), *number_names(inputs, "inputs")]
+    if inputs is not None:
+        system, params = drive_scene(system, held_inputs), Driven(params, inputs)
     quantities = ("mass_matrix", "force", "residual", "jacobian", "gamma")
     try:
         derivation = derivation_of(system, layout, params).lowered

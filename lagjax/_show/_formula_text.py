@@ -127,8 +127,10 @@ class FormulaWriter:
             base = style.group(inner)
         else:
             sums = [self.write(dict(x)) for x in of.operands]
-            return style.root(style.call(self._called(of), sums, "")) if power == 0.5 else style.call(
-                self._called(of), sums, exponent
+            return (
+                style.root(style.call(self._called(of), sums, ""))
+                if power == 0.5
+                else style.call(self._called(of), sums, exponent)
             )
         if power == 0.5:
             return style.root(base)
@@ -228,8 +230,8 @@ def _identifier(label: str) -> str:
 
 
 _LETTERS = (
-    "alpha beta gamma delta epsilon zeta eta theta iota kappa lambda mu nu xi pi rho sigma tau upsilon phi chi psi omega "
-    "Gamma Delta Theta Lambda Xi Pi Sigma Upsilon Phi Psi Omega"
+    "alpha beta gamma delta epsilon zeta eta theta iota kappa lambda mu nu xi pi rho sigma tau upsilon phi chi psi "
+    "omega Gamma Delta Theta Lambda Xi Pi Sigma Upsilon Phi Psi Omega"
 ).split()
 
 

@@ -1,4 +1,4 @@
-"""`System.to_c`, compiled by the C compiler of this machine: the numbers of lagjax to the last bit, steps, what is refused."""
+"""`System.to_c`, compiled by this machine's C compiler: accelerations to the last bit, steps, and what is refused."""
 
 import ctypes
 import shutil
@@ -24,7 +24,10 @@ def built(tmp_path):
     """Functions of a scene in C, of arrays: `function(name, size)(q, qdot, t, *numbers)` gives `size` numbers."""
 
     def build(text, kind=np.float64):
-        source, library = tmp_path / f"{len(list(tmp_path.iterdir()))}.c", tmp_path / f"{len(list(tmp_path.iterdir()))}.so"
+        source, library = (
+            tmp_path / f"{len(list(tmp_path.iterdir()))}.c",
+            tmp_path / f"{len(list(tmp_path.iterdir()))}.so",
+        )
         source.write_text(text)
         flags = ["-std=c99", "-O2", "-ffp-contract=off", "-Wall", "-Werror", "-shared", "-fPIC"]
         subprocess.run([COMPILER, *flags, str(source), "-o", str(library), "-lm"], check=True)
@@ -105,7 +108,9 @@ def test_accelerations_of_all_scenes_in_c_have_the_same_bits(built, make):
 
 def test_branches_functions_and_large_angles_have_the_same_bits(built):
     def lagrangian(q, v):
-        smooth = jnp.tanh(q[0]) + jnp.exp(-q[1] ** 2) + jnp.cbrt(q[2]) + jnp.arctan2(q[0], q[1]) + jnp.log1p(q[2] ** 2)
+        smooth = (
+            jnp.tanh(q[0]) + jnp.exp(-(q[1] ** 2)) + jnp.cbrt(q[2]) + jnp.arctan2(q[0], q[1]) + jnp.log1p(q[2] ** 2)
+        )
         pieces = jnp.abs(q[0]) + jnp.maximum(q[1], q[2]) + jnp.where(q[0] > q[1], jnp.sinh(q[2]), q[2] ** 3)
         return 0.5 * jnp.sum((1.5 + jnp.sin(q)) * v**2) - smooth - pieces - jnp.abs(q[1]) ** 2.5
 
@@ -125,7 +130,9 @@ def test_zero_rest_and_what_is_not_finite(built):
     for q in (0.0, -0.0, np.inf, np.nan, 1e300):
         exact = jax.jit(PENDULUM_IN_GRAVITY.acceleration)(q, 0.0, 0.0, {"g": 9.81})
         found = call([q], [0.0], 0.0, [9.81])[0]
-        assert np.array_equal(found, exact, equal_nan=True) and (np.isnan(found) or np.signbit(found) == np.signbit(exact))
+        assert np.array_equal(found, exact, equal_nan=True) and (
+            np.isnan(found) or np.signbit(found) == np.signbit(exact)
+        )
     singular = lagjax.System(lambda q, v: 0.5 * q**2 * v**2)
     assert np.isnan(built(singular.to_c(1.0, 0.0))[0]("scene_acceleration", 1)([0.0], [0.0], 0.0))
 
@@ -195,7 +202,9 @@ def test_single_precision(built):
     found = function("arm_acceleration", 2)(scene.q0, scene.qdot0, 0.0, *numbers)
     np.testing.assert_allclose(found, exact, rtol=2e-5)
     end = lagjax.simulate(scene.system, scene.q0, scene.qdot0, np.array([0.0, 0.1]), scene.params)
-    np.testing.assert_allclose(step("arm_step", scene.q0, scene.qdot0, 0.0, 0.01, 10, *numbers)[0], end.q[-1], rtol=1e-4)
+    np.testing.assert_allclose(
+        step("arm_step", scene.q0, scene.qdot0, 0.0, 0.01, 10, *numbers)[0], end.q[-1], rtol=1e-4
+    )
 
 
 def test_long_lines_are_several_functions(built, monkeypatch):
@@ -217,6 +226,8 @@ def test_what_c_cannot_follow_is_said():
         RELAY.to_c(0.1, 0.2, name="my scene")
     with pytest.raises(ValueError, match="must agree"):
         RELAY.to_c(0.1, np.ones(2))
-    refused = lagjax.System(lambda q, v: 0.5 * v @ v - jnp.sum(jnp.sort(q) ** 2) - jnp.linalg.svd(jnp.outer(q, q))[1][0])
+    refused = lagjax.System(
+        lambda q, v: 0.5 * v @ v - jnp.sum(jnp.sort(q) ** 2) - jnp.linalg.svd(jnp.outer(q, q))[1][0]
+    )
     with pytest.raises(ValueError, match="no scalar program, and therefore no C"):
         refused.to_c(np.ones(40), np.ones(40))

@@ -1,6 +1,5 @@
-"""`System.equations`: what a textbook prints for what it prints, and formulas that evaluate to the numbers of a scene."""
+"""`System.equations`: scenes look as in a textbook, and the formulas evaluate to the numbers of a scene."""
 
-import inspect
 import math
 
 import jax
@@ -165,7 +164,10 @@ def test_known_scenes_look_as_in_a_textbook():
         "F[x] = B*e*y_dot", "F[y] = -B*e*x_dot", "F[z] = E*e",
     ]  # fmt: skip
     rubbed = lagjax.System(damped, dissipation=lambda q, v, params: 0.5 * params["c"] * v**2)
-    assert lines_of(rubbed, 1.0, {"m": 1.0, "k": 2.0, "l": 0.5, "c": 0.1}) == ["M[q, q] = m", "F[q] = -k*(q - l) - c*q_dot"]
+    assert lines_of(rubbed, 1.0, {"m": 1.0, "k": 2.0, "l": 0.5, "c": 0.1}) == [
+        "M[q, q] = m",
+        "F[q] = -k*(q - l) - c*q_dot",
+    ]
     driven = lagjax.System(lambda q, v, t: 0.5 * v**2 + jnp.cos(q), forces=lambda q, v, t: 0.5 * jnp.cos(2 * t) - v / 3)
     assert lines_of(driven, 1.0) == ["M[q, q] = 1", "F[q] = 0.5*cos(2*t) - sin(q) - q_dot/3"]
     rod = scenes.cartesian_pendulum()
@@ -182,7 +184,9 @@ def test_known_scenes_look_as_in_a_textbook():
 
 
 def test_parts_that_come_twice_have_names():
-    equations = scenes.figure_eight().system.equations(np.ones((3, 2)), np.ones((3, 2)), params=scenes.figure_eight().params)
+    equations = scenes.figure_eight().system.equations(
+        np.ones((3, 2)), np.ones((3, 2)), params=scenes.figure_eight().params
+    )
     assert equations.parts["x1"] == "(q00 - q10)**2 + (q01 - q11)**2"
     assert "x1**(3/2)" in equations.force["q00"]
 
@@ -208,7 +212,11 @@ def test_names_that_coincide_are_told_apart():
 
 def test_q_may_be_any_pytree_and_params_may_hold_whole_numbers():
     def lagrangian(q, v, params):
-        return 0.5 * v[0]["a"] @ v[0]["a"] + v[1] ** 2 * q[0]["a"][1] ** params["n"] - q[1] ** 2 * params["of"][params["i"]]
+        return (
+            0.5 * v[0]["a"] @ v[0]["a"]
+            + v[1] ** 2 * q[0]["a"][1] ** params["n"]
+            - q[1] ** 2 * params["of"][params["i"]]
+        )
 
     q = ({"a": np.array([1.1, 0.7])}, 0.4)
     system = lagjax.System(lambda q, v, params: lagrangian(q, v, params | {"i": 1}))
@@ -218,7 +226,9 @@ def test_q_may_be_any_pytree_and_params_may_hold_whole_numbers():
 
 def test_numbers_print_short_and_come_back():
     """0.1 · 3 is 0.30000000000000004, a third is a fraction, and large and small ones have exponents."""
-    system = lagjax.System(lambda q, v: 0.5 * v**2 - 3 * 0.1 * q - q**2 / 6 + 1e-9 * q**3 + 2.5e12 * q**4 - np.pi * q**5)
+    system = lagjax.System(
+        lambda q, v: 0.5 * v**2 - 3 * 0.1 * q - q**2 / 6 + 1e-9 * q**3 + 2.5e12 * q**4 - np.pi * q**5
+    )
     (force,) = system.equations(1.0, 1.0).force.values()
     assert force == "3e-9*q**2 + 1e13*q**3 - q/3 - 15.707963267948966*q**4 - 0.3"
     require_equal(system, 1.0, 1.0)
@@ -230,14 +240,18 @@ def test_a_notebook_shows_them_in_latex():
     assert r"\left(m_{1} + m_{2}\right) \, l_{1}^{2}" in text and r"\dot{\theta}_{2}^{2}" in text
     assert r"\cos\left(\theta_{1} - \theta_{2}\right)" in text
     kepler = scenes.kepler()
-    assert r"\frac{\mathrm{GM} \, q_{0}}" in kepler.system.equations(kepler.q0, kepler.qdot0, params=kepler.params).latex
+    assert (
+        r"\frac{\mathrm{GM} \, q_{0}}" in kepler.system.equations(kepler.q0, kepler.qdot0, params=kepler.params).latex
+    )
 
 
 def test_what_is_not_read_is_said():
     chain = scenes.chain(12)
     note = str(chain.system.equations(chain.q0, chain.qdot0, params=chain.params))
     assert "operations" in note and "to_c" in note
-    large = lagjax.System(lambda q, v: 0.5 * v @ v - 0.5 * jnp.sum(jnp.linalg.qr(jnp.outer(q, q) + jnp.eye(40))[0] ** 2))
+    large = lagjax.System(
+        lambda q, v: 0.5 * v @ v - 0.5 * jnp.sum(jnp.linalg.qr(jnp.outer(q, q) + jnp.eye(40))[0] ** 2)
+    )
     assert str(large.equations(np.ones(40), np.ones(40)))  # a sentence, whichever it is
     with pytest.raises(TypeError, match="one scalar"):
         lagjax.System(lambda q, v: 0.5 * v**2).equations(np.ones(2), np.ones(2))

@@ -375,7 +375,7 @@ def test_derivatives_of_a_motion_that_sticks():
 def test_two_pieces_slide_in_both_forms(monkeypatch):
     ts, start = np.array([0.0, 40.0]), (np.array([1.0, 3.0]), np.zeros(2))
     by_line = lagjax.simulate(two_blocks(), *start, ts, np.array([0.2, 0.1]))
-    monkeypatch.setattr(lagjax._native._taylor, "LARGEST_LINE", -1)
+    monkeypatch.setattr(lagjax._native.series._taylor, "LARGEST_LINE", -1)
     scene = two_blocks()
 
     def at_end(mu):
@@ -401,7 +401,7 @@ def test_borders_and_features_in_tables(monkeypatch):
     for of in scenes.values():
         with monkeypatch.context() as patch:
             by_line = end(of(), 1.0, 0.1, 10.0, 0.1)[0]
-            patch.setattr(lagjax._native._taylor, "LARGEST_LINE", -1)
+            patch.setattr(lagjax._native.series._taylor, "LARGEST_LINE", -1)
             np.testing.assert_allclose(end(of(), 1.0, 0.1, 10.0, 0.1)[0], by_line, atol=1e-10)
 
 

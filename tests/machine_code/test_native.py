@@ -19,7 +19,9 @@ from lagjax import _native, scenes
 from lagjax._engine import Problem
 from lagjax._engine.taylor import flow_of
 from lagjax._interface import Layout
-from lagjax._native import _ir, _kernel, _lanes
+from lagjax._native.code import _ir
+from lagjax._native.motions import _kernel
+from lagjax._native.series import _lanes
 from lagjax._program import OPERATIONS
 from lagjax._tracing import _scalars as xp
 from lagjax._tracing import lower, lower_formula

@@ -9,9 +9,9 @@ import lagjax
 from lagjax import _native
 from lagjax._equations import derivation_of, numbers_of
 from lagjax._interface import Layout
-from lagjax._native import _schedule, _taylor
-from lagjax._native._integrator import Integrator
-from lagjax._native._motion_parts import MotionParts
+from lagjax._native.motions._integrator import Integrator
+from lagjax._native.series import _schedule, _taylor
+from lagjax._native.series._motion_parts import MotionParts
 from lagjax._program import OPERATIONS, Unlowerable
 from lagjax._tracing import lower
 

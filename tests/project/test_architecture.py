@@ -62,6 +62,19 @@ def test_imports_point_up_the_street():
             assert STREET.index(there) < STREET.index(here), f"{path} imports {there} from below"
 
 
+def test_storeys_of_the_machine_code_stand_on_each_other():
+    """What `_native/__init__` lists: a file imports from its own storey and from those above it in the list."""
+    native = PACKAGE / "_native"
+    storeys = re.findall(r"^    (\w+)/ ", ast.get_docstring(tree_of(native / "__init__.py")) or "", flags=re.MULTILINE)
+    assert sorted(storeys) == sorted(path.parent.name for path in native.glob("*/__init__.py"))
+    for path in native.glob("*/*.py"):
+        here = path.parent.name
+        for node in nodes_of(path):
+            if isinstance(node, ast.ImportFrom) and (node.module or "").startswith("lagjax._native"):
+                there = node.module.split(".")[2]
+                assert storeys.index(there) <= storeys.index(here), f"{path} imports {node.module} from above it"
+
+
 def test_a_trajectory_carries_no_judgement():
     # What judges and shows a motion stands above it: `lagjax/__init__` says where, and the method that calls it imports
     # it.
@@ -98,7 +111,7 @@ def test_doors_offer_what_is_used():
     """Every name that a door imports is used in it, or imported from it by another file."""
     nodes = [node for folder in (PACKAGE, TESTS) for path in folder.rglob("*.py") for node in nodes_of(path)]
     taken = {(node.module, alias.name) for node in nodes if isinstance(node, ast.ImportFrom) for alias in node.names}
-    called = {node.attr for node in nodes if isinstance(node, ast.Attribute)} | set(lagjax._interface.PLACES)
+    called = {node.attr for node in nodes if isinstance(node, ast.Attribute)}
     for door in PACKAGE.glob("_*/**/__init__.py"):
         module = ".".join(door.parent.relative_to(PACKAGE.parent).parts)
         used = {node.id for node in nodes_of(door) if isinstance(node, ast.Name)}
@@ -151,7 +164,7 @@ np.testing.assert_allclose(numbers, [[-1.5 * np.sin(3.0)]], atol=1e-11)  # of co
 
 def test_machine_code_stands_alone():
     # Files that it is built on, and their own; the packages' first lines are for those who have JAX.
-    queue, seen = [path for path in (PACKAGE / "_native").glob("*.py")], set()
+    queue, seen = [path for path in (PACKAGE / "_native").rglob("*.py")], set()
     while queue:
         path = queue.pop()
         if path in seen:

@@ -212,7 +212,7 @@ _CHECKPOINT_BYTES = 2**28  # of states that a gradient keeps; half of it lets ea
 
 
 def _checkpoints(y0, max_steps: int) -> diffrax.RecursiveCheckpointAdjoint:
-    """Checkpoints as diffrax has them, some √(2 max_steps), but of a large state so many as fit."""
+    """Checkpoints as diffrax has them, some √(2 max_steps), but of a large state as many as fit."""
     usual, fit = int(np.ceil(np.sqrt(2 * max_steps))), _CHECKPOINT_BYTES // (y0.size * y0.dtype.itemsize)
     return diffrax.RecursiveCheckpointAdjoint(checkpoints=None if usual <= fit else max(fit, 2))
 

@@ -1,9 +1,9 @@
 """First derivatives of a flow map, for rows of members: `jvp` along directions, `vjp` from cotangents.
 
 Both go over the steps of the motion itself, which is run once more for them: forward along each direction
-(`_native._tangent`), back with each step transposed (`_native._adjoint`). They are transposes of each other to
-round-off, and as accurate as the motion as long as its steps suit its tangents: where they do not, they are divided
-(`_divide_steps`). The cost of `vjp` does not grow with the number of parameters. A name that ends in `_ct` is a
+(`_native.motions._tangent`), back with each step transposed (`_native.motions._adjoint`). They are transposes of each
+other to round-off, and as accurate as the motion as long as its steps suit its tangents: where they do not, they are
+divided (`_divide_steps`). The cost of `vjp` does not grow with the number of parameters. A name that ends in `_ct` is a
 cotangent, one that ends in `_dot` a tangent.
 """
 

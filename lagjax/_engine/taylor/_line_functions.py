@@ -238,7 +238,7 @@ class _LineMap(LinearMap):
 
 
 def _is_wide(batch: tuple[int, ...]) -> bool:
-    """True for so many rows that a vector of them pays."""
+    """True if there are enough rows for a vector of lanes to pay."""
     return math.prod(batch) >= LANES // 2
 
 

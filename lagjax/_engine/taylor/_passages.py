@@ -13,7 +13,7 @@ from lagjax._program import eliminate_dead_code
 
 # The parts of a passage grow by `GROWTH`; of the first one, `NEAREST` of the passage, the slope is nothing either.
 GROWTH, NEAREST = 1.6, 1e-6
-_ROUNDING = 64 * np.finfo(float).eps  # parts of the time, or of coordinates, within which nobody knows where it is
+_ROUNDING = 64 * np.finfo(float).eps  # of the time, or of coordinates: rounding of a passage
 
 
 def has_passages(kernel: Kernel) -> bool:

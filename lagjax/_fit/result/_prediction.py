@@ -12,6 +12,7 @@ import numpy as np
 from scipy.special import ndtri, stdtrit
 
 from lagjax._fit.model._noise import KnownNoise, NoiseScale
+from lagjax._fit.model._parameters import Parameters
 from lagjax._fit.model._records import (
     Guess,
     Record,
@@ -78,27 +79,31 @@ def predict_record(fit, record: Record, system: str | None) -> Prediction:
     form, noise = part.signals.form, part.sensor_noise(fit.noise_scale)
     if form is not None:
         require_interpolation(record, form.hold, "the record")
-    layout, n = part.layout, part.layout.size
-    state = known_start(record, layout, 0, fit.params)
+    layout, n, parameters = part.layout, part.layout.size, _parameters_of(fit, record)
+    numbers = parameters.numbers(fit.u)[parameters.places[0]]
+    params = parameters.restore(numbers)
+    state = known_start(record, layout, 0, params)
     is_fitted = state is None or isinstance(record.start, Guess)
     if state is None:
-        state = read_start(build_reader(record, part, fit.parameters.numbers(fit.u)), record, part, "This record")
-    fixed = part.with_records([record], np.array([is_fitted]), fit.parameters.fix(fit.u), part.manifold)
-    residuals, point = Residuals([fixed]), Point(np.zeros(0), state[None])
+        state = read_start(build_reader(record, part, numbers), record, part, "This record")
+    fixed = part.with_records([record], np.array([is_fitted]), part.manifold)
+    residuals = Residuals([fixed], parameters.fix(fit.u, np.ones(len(fit.u), bool)))
+    point = Point(np.zeros(0), state[None])
     trial = minimise(residuals, point, KnownNoise(noise), 1e-3).trial if is_fitted else residuals.evaluate(point)
     state = trial.starts[0]
     start = layout.restore(state[:n]), layout.restore(state[n:])
     q0, qdot0, ts = jax.tree.map(lambda x: np.asarray(x, layout.dtype), (*start, record.ts))
-    scene, params = part.scene, fit.params
+    scene = part.scene
     if form is not None:
         scene, params = form.bind_samples(scene, params, record.sampled_at, record.input_samples)
     trajectory = simulate(scene, q0, qdot0, ts, params)
-    planned, slopes = _follow_record(fit, part, record, state)
-    own, follows = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, len(fit.u)))
+    planned, slopes = _follow_record(fit, part, parameters, record, state)
+    known = fit.information.select(parameters.unknowns.columns[0])
+    own, follows = np.zeros((2 * n, 2 * n)), np.zeros((2 * n, len(known.covariance)))
     if is_fitted:
         rows = np.sqrt(record.weight_matrix)[..., None] / noise.sigma[:, None] * slopes
-        own, follows = covariance_of_one_start(rows, 2 * n, fit.information, effective_share(fit))
-    deviation = signal_deviations(slopes, 2 * n, own, follows, fit.information)
+        own, follows = covariance_of_one_start(rows, 2 * n, known, effective_share(fit))
+    deviation = signal_deviations(slopes, 2 * n, own, follows, known)
     missed = wrap_residuals(planned.matrix - record.matrix, part.signals.periods)
     missed = np.where(record.weight_matrix > 0, missed, np.nan)
     values, missed, deviation = (restore_structure(x, record) for x in (planned.matrix, missed, deviation))
@@ -106,10 +111,21 @@ def predict_record(fit, record: Record, system: str | None) -> Prediction:
     return Prediction(trajectory, values, missed, start, deviation, noise)
 
 
-def _follow_record(fit, system: SystemResiduals, record: Record, state: np.ndarray) -> tuple[Record, np.ndarray]:
+def _parameters_of(fit, record: Record) -> Parameters:
+    """The parameters of a fit for one record. Raises `ValueError` where they are not those of another record."""
+    parameters, own = fit.parameters, [k for k, one in enumerate(fit.records) if one is record]
+    if not own and (parameters.places != parameters.places[0]).any():
+        raise ValueError(
+            "This fit has numbers of every record (lagjax.per_record), and this record is none of fit.records: give one "
+            "of these, or fit it with the numbers that all share kept, free=lagjax.per_record for its own alone."
+        )
+    return parameters.select(own[:1] or [0])
+
+
+def _follow_record(fit, system: SystemResiduals, parameters: Parameters, record: Record, state: np.ndarray):
     """A record with what sensors would show for its values, from a state (2n,), and their derivatives (T, S, D)."""
     everywhere = replace(record, values=restore_structure(np.zeros_like(record.matrix), record), weights=None)
-    residuals = Residuals([system.with_records([everywhere], np.array([True]), fit.parameters)])
+    residuals = Residuals([system.with_records([everywhere], np.array([True]))], parameters)
     trial = residuals.evaluate(Point(fit.u, state[None]))
     shown = np.where(residuals.weights.reshape(record.matrix.shape) > 0, trial.residuals[0][0], np.nan)  # of a delay
     return replace(record, values=restore_structure(shown, record)), trial.slopes[0][0]
@@ -121,9 +137,10 @@ def planned_rows(fit, part: SystemResiduals, name: str, record: Record) -> np.nd
         raise ValueError(
             f"The planned record {name} needs a start: (q0, qdot0), or lagjax.Guess(q0, qdot0) to be fitted."
         )
-    state = known_start(record, part.layout, 0, fit.params)
+    parameters = _parameters_of(fit, record)
+    state = known_start(record, part.layout, 0, parameters.restore(parameters.numbers(fit.u)[parameters.places[0]]))
     assert state is not None
-    planned, slopes = _follow_record(fit, part, record, state)
+    planned, slopes = _follow_record(fit, part, parameters, record, state)
     sigma = part.sensor_noise(fit.noise_scale).sigma[:, None]
     weights = planned.weight_matrix[..., None] * (effective_share(fit) / sigma**2)
     rows, states = np.sqrt(weights) * slopes, part.states

@@ -121,7 +121,7 @@ class Fit:
         columns = noise.sigma, noise.dof, samples, known.effective, 2 * (1 - known.correlation)
         signals = [SignalNoise(*(x.item() for x in one)) for one in zip(*columns, strict=True)]
         fit = cls(
-            params=parameters.restore(parameters.numbers(trial.u)), starts=residuals.group_by_system(starts),
+            params=parameters.restore_records(parameters.numbers(trial.u)), starts=residuals.group_by_system(starts),
             covariance=Covariance(parameters.names, parameters.covariance(trial.u, known.covariance)),
             noise=dict(zip(residuals.names, signals, strict=True)),
             residuals=residuals.group_by_system(list(map(restore_structure, matrices, residuals.records))),
@@ -172,8 +172,8 @@ class Fit:
         ends = []
         for values in (low, high):
             numbers = self.parameters.numbers(self.u)
-            numbers[self.parameters.places] = values
-            ends.append(self.parameters.restore(numbers))
+            numbers[self.parameters.free_places] = values
+            ends.append(self.parameters.restore_records(numbers))
         return ends[0], ends[1]
 
     @with_doubles

@@ -199,7 +199,7 @@ def _arrange(scene: SearchedScene, found: Found, row, played: Played, inputs: tu
 
 
 def scene_of(plan: ContactPlan, layout: Layout, params: PyTree, times: int) -> SearchedScene:
-    """The scene for parameters of this structure and so many outputs."""
+    """The scene for parameters of this structure and a number of outputs."""
     flat = Flat.from_system(plan.scene.system, layout, params)
     inside = InContact(params, opened(flat, layout.size))
     numbers = vector_of(eqx.filter(inside, eqx.is_array_like))

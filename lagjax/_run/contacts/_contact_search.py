@@ -10,9 +10,9 @@ contacts, whatever they do (`InContact`). Where a watch falls,
     what friction has left    it slides, against the force that held it
 
 A guess that is wrong is a watch that begins beyond zero, or whose first coefficient that is not rounding is negative:
-it falls at once, and the next round takes it back (`_native._events`). That is Murty's principal pivoting, over series
-in place of numbers (Murty, Linear Algebra Appl. 5 (1972) 65; Heemels, Schumacher & Weiland, ibid. 294 (1999) 93).
-Bounces that accumulate end at a closed form of their limit (`end_bounces`).
+it falls at once, and the next round takes it back (`_native.steps._events`). That is Murty's principal pivoting, over
+series in place of numbers (Murty, Linear Algebra Appl. 5 (1972) 65; Heemels, Schumacher & Weiland, ibid. 294 (1999)
+93). Bounces that accumulate end at a closed form of their limit (`end_bounces`).
 
     follow ─► begin ─► prepare: sides and rounding of all watches ─► the kernel ─► finish ─► decide: a row of the record
                           ▲                                                                     │
@@ -165,9 +165,9 @@ def measure_slips(scene: Scene, member: Member, rates: Floats, v: Floats, slips:
 
 @loop
 def locate_corners(scene: Scene, member: Member, x: Floats, room: Room) -> float:
-    """Put the sides of corners at inputs x, their rates, and how far beyond them it goes on: (corners,) each.
+    """Put the sides of corners at inputs x, their rates, and the distance to continue beyond: (corners,) each.
 
-    Returns how near they count.
+    Returns the distance below which a state counts as on a corner.
     """
     n, count, inputs, found = scene.n, scene.corners, scene.inputs, room.corner
     t, largest, near = x[2 * n], member.largest, 0.0
@@ -746,11 +746,11 @@ def find_pushes(scene: Scene, member: Member, row: Entry, room: Room):
 
 @loop
 def close_contacts(scene: Scene, member: Member, first: int, hits: bool, meets: Floats, room: Room):
-    """Close and open what watch `first` says, and stick and slide; of contacts that meet, `PARTS` are those that go on.
+    """Update which contacts are closed, stick and slide after watch `first`; `PARTS` are those that separate.
 
-    A gap that falls while it moves apart is zero to more than the rounding of its terms: it goes on beyond that. Where
-    it hardly moves, as at the end of many bounces, it closes. A slip in space that has turned goes on. Where one stops
-    others of the same body may, which then stick as well. Where parts align, a slip that gaps hold passes through zero,
+    A gap that falls although its contacts separate is zero to more than the rounding of its terms: it continues. If it
+    hardly moves, as at the end of many bounces, it closes. A spatial slip that has turned continues. If one stops,
+    others of the same body may, and stick as well. When parts align, a slip that gaps determine passes through zero,
     and turns.
     """
     n, k, r, d, x, rough = scene.n, scene.k, scene.r, scene.d, member.x, scene.rough

@@ -61,7 +61,7 @@ class Hybrid:
       that are beyond it. What a stretch knows the next one remembers: from which side a guard comes that the reset has
       not moved, and that one without a reset has been crossed.
     - `start`: the name of the mode in which every motion begins, or its place in `modes`: an integer, which may be
-      traced. So a motion goes on in a `jax.lax.scan` of short ones, from `Hybrid(modes, transitions, run.mode[-1])`.
+      traced. So a `jax.lax.scan` over short motions continues each from `Hybrid(modes, transitions, run.mode[-1])`.
     - `max_transitions`: the budget of transitions. A motion that needs more ends there, with the result
       `max_transitions_reached`; or with `zeno` where no budget is enough because the times accumulate, as the bounces
       of a ball do. Intervals that shrink steadily to a sum before `ts[-1]`, or below the rounding of the time, count as

@@ -124,7 +124,7 @@ def _arrange(
 
 
 def scene_of(plan: HybridPlan, layout: Layout, params: PyTree, times: int) -> SearchedModes:
-    """The scene for parameters of this structure and so many outputs. Raises `ValueError` without machine code."""
+    """The scene for parameters of this structure and a number of outputs. Raises `ValueError` without machine code."""
     limits = {"rtol": plan.rtol, "atol": plan.atol, "max_steps": plan.max_steps}
     made = (Problem.from_system(system, layout, params, **limits) for system in plan.systems)
     problems = [dataclasses.replace(problem, is_rounded=plan.is_single) for problem in made]

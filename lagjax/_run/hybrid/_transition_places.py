@@ -9,7 +9,7 @@ ARRAYS = (
     "FIRST_OF",  # (modes,), the place of the first transition that leaves a mode
     "NUMBER", "TARGET", "WAY",  # the place in the list, the mode that it leads to, the direction of its guard
     "FIRES",  # 0 by the target, 1 beyond zero, 2 where it crosses
-    "PASSES",  # 1 if the motion goes on to the other side of the guard though this has no rate: no reset, or a jump
+    "PASSES",  # 1 if the motion continues to the other side though the guard has no rate: no reset, or a jump
     "ALIKE",  # 1 if the guard says something in other modes
     "RESETS",  # addresses of lines, 0 of those that keep the state
     "CHECKS",  # (modes,), addresses of lines that give 1 for a state off the constraints, 0 of modes without any

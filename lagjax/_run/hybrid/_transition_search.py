@@ -208,7 +208,7 @@ def finish(
 def pass_transition(
     scene: Scene, member: Member, mode: int, k: int, turns: bool, result: int, row: Entry, room: Room
 ) -> int:
-    """The result behind guard k, whose transition happens, or none if it is −1: the member goes on there.
+    """The result behind guard k, whose transition happens (none if k is −1), from which the member continues.
 
     Where that `turns` a guard at once, against its rate, the motion that does so is lost in rounding.
     """
@@ -296,9 +296,9 @@ def has_orders(scene: Scene, member: Member, mode: int, room: Room) -> bool:
 
 @loop
 def follow_blows(scene: Scene, member: Member, mode: int, backwards: bool, x: Floats, room: Room):
-    """Put the inputs behind the blows of guards that are there, each as long as its guard goes on in its direction.
+    """Apply the blows of the guards at zero to the inputs x, each while its guard still moves in its direction.
 
-    Each comes once before its guard has been turned.
+    Each is applied at least once.
     """
     total, first, watches = scene.counts[mode], scene.first_of[mode], room.other
     armed, goes = room.armed, room.goes

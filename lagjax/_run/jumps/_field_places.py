@@ -16,7 +16,7 @@ SIZES = (
     "WATCHES",  # the most of a mode
     "NUMBERS", "INPUTS",  # of the user's parameters; of lines: the state, the time, the numbers, and what a law adds
     "TIMES", "STRIDE",  # outputs, and from those of one member to those of the next
-    "DOING",  # numbers that say what goes on at an output
+    "DOING",  # numbers that say what happens at an output
     "ROOM",  # rounds that a record has room for
     "MOST",  # rounds of a whole motion
     "SINGLE",  # 1 if the start came in float32

@@ -62,7 +62,7 @@ class Replay:
         before = (ts <= begun[-1]) & ((begun[-1] > ts[0]) | (count == 0))  # one at the start is the first round's
         path, varying = jnp.where(before[:, None], y, 0.0), (ts, y0, *given)[: self._rounds.inputs]
         (t, y), (said, behind), (more,) = self._rounds(varying, (t, y), (found.record,), count)
-        known = (ts > ts[0]) | (count == 0) | (t > ts[0])  # no round gives those at the start where none goes on
+        known = (ts > ts[0]) | (count == 0) | (t > ts[0])  # no round gives outputs at a start that is an end
         return differentiable_where(known[:, None], path + more), said, behind, t, y
 
     def _read(self, record):

@@ -210,7 +210,7 @@ def _call_numpy(line: Line) -> tuple[Any, int]:
 
 
 class _Run:
-    """A run of members, which is followed until none goes on."""
+    """A run of members, followed until all have ended."""
 
     def __init__(self, code: SceneCode, scene, ts, memory, path, did, room: int | None):
         self.code, self.scene, self.ts, self.memory, self.path, self.did = code, scene, ts, memory, path, did
