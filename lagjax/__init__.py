@@ -6,7 +6,8 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 
 **Motion**
 
-- `System`: L, constraints, forces, dissipation, contacts; `System.explain` tells what is in it
+- `System`: L, constraints, forces, dissipation, contacts; `System.explain` tells what is in it,
+  `System.equations` prints its `Equations`, `System.to_c` writes them in C
 - `simulate`, `simulate_batch`: one motion, or many at once, as a `Trajectory` of `State`s; with contacts its `Impacts`
   and `ContactChanges`
 - `samples`: an input that was measured, as a function of time

@@ -43,7 +43,7 @@ from lagjax._trust.health import Health
 __all__ = [
     "Animation", "CanonicalTrajectory", "ChangedCoordinates", "Comparison", "Conserved", "ConservedQuantities",
     "ContactChanges", "Crossings", "Equations", "Equilibrium", "Experiments", "Explanation", "Family", "Finding",
-    "Findings", "Fit", "Hamiltonian", "Health", "Impacts", "Linearization", "LyapunovExponent", "Modes", "Orbit", "Path", "Prediction",
-    "Profile", "Routhian",
+    "Findings", "Fit", "Hamiltonian", "Health", "Impacts", "Linearization", "LyapunovExponent", "Modes", "Orbit", "Path",
+    "Prediction", "Profile", "Routhian",
     "SameMotion", "State", "Status", "Summary", "Trajectory", "Transitions", "WorkPrecision", "WorkPrecisionRow",
 ]  # fmt: skip

@@ -125,7 +125,7 @@ class Formulas:
         return {((self._atom("sum", -1, (freeze(unit),)), power),): size**power}
 
     def _lead(self, product: Product) -> tuple:
-        """Where a term stands: coordinates, numbers, others."""
+        """The place of a term in a sum: coordinates, numbers, others."""
         moves = any(self.atoms[a].kind == "input" and not self._is_parameter(a) for a, _ in product)
         return not moves, product != ONE, product
 

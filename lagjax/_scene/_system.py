@@ -7,7 +7,7 @@ first meet a state. `System._motion(layout)` is the same scene in flat coordinat
 import dataclasses
 import operator
 from collections.abc import Callable
-from typing import TYPE_CHECKING, Any, Literal, cast
+from typing import Any, Literal, cast
 
 import equinox as eqx
 import jax
@@ -33,9 +33,6 @@ from lagjax._interface import (
 from lagjax._primitives import SINGLE, compute_in_doubles
 from lagjax._program import Unlowerable, lack_of_memory
 from lagjax._scene._explanation import Explanation, explain
-
-if TYPE_CHECKING:
-    from lagjax._show import Equations
 
 PyTree = Any
 # The functions of a scene by their roles, and the arguments of each that come by position.
@@ -321,15 +318,13 @@ class System(eqx.Module):
         schur = self._evaluate_quantity(Motion.schur_complement, q, qdot, t, params)
         return facts.with_constraints(names, np.asarray(schur) if is_concrete(schur) else None)
 
-    def equations(
-        self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None, *, inputs: PyTree = None
-    ) -> "Equations":
+    def equations(self, q: PyTree, qdot: PyTree, t: Time = 0.0, params: PyTree = None, *, inputs: PyTree = None) -> Any:
         """The equations of motion to read, M q̈ = F + Gᵀλ and G q̈ = γ: print them, or show them in a notebook.
 
-        They are formulas in the names of the leaves of `q` and `params`: q["theta"] is theta, its velocity theta_dot,
-        params["m"] is m, q[0] is q0. All of them hold for every state, time and parameters, of which only the structure
-        is read here; so are `inputs` of functions that ask for them. Of a scene that takes more than 500 operations, or
-        has no scalar program, the result holds a sentence.
+        They are `lagjax.results.Equations`, formulas in the names of the leaves of `q` and `params`: q["theta"] is
+        theta, its velocity theta_dot, params["m"] is m, q[0] is q0. All of them hold for every state, time and
+        parameters, of which only the structure is read here; so are `inputs` of functions that ask for them. Of a scene
+        that takes more than 500 operations, or has no scalar program, the result holds a sentence.
 
         **Raises** the errors of `System` for invalid coordinates and functions.
 

@@ -68,7 +68,7 @@ _NO_STEP = """\
 
 
 def write_c(system: "System", layout: Layout, params: PyTree, inputs: PyTree, name: str, dtype: str) -> str:
-    """What `System.to_c` returns."""
+    """The text of `System.to_c`."""
     if dtype not in ("float64", "float32"):
         raise ValueError(f"dtype must be 'float64' or 'float32'; got {dtype!r}.")
     if not (isinstance(name, str) and name.isidentifier() and name.isascii()):

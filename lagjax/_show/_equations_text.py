@@ -19,7 +19,7 @@ PyTree = Any
 # Operations of M, F, G and γ that are read: a double pendulum has 40, three links in space 400. Four times as many fill
 # ten pages, and take a second to put together.
 MOST_READ = 500
-_WIDEST = 4  # coordinates up to which LaTeX shows matrices
+_MOST_IN_MATRICES = 4  # coordinates up to which LaTeX shows matrices
 
 
 @dataclass(frozen=True)
@@ -73,7 +73,7 @@ def _key(key: str | tuple[str, str]) -> str:
 
 
 def write_equations(system: "System", layout: Layout, params: PyTree, inputs: PyTree) -> Equations:
-    """What `System.equations` returns."""
+    """The result of `System.equations`."""
     names = system.constraint_names(layout, params) if system.constraints or system.velocity_constraints else []
     numbers = [*number_names(params, "params"), *number_names(inputs, "inputs")]
     if inputs is not None:
@@ -128,15 +128,15 @@ class _Page:
             "gamma": {rows[i]: write(x) for i, x in enumerate(self.sums["gamma"]) if x},
             "parts": {self.text.parts[atom]: self.text.write_part(atom) for atom in self.shared},
         }  # fmt: skip
-        return Equations(**each, variables=tuple(name.text for name in self.names), latex=self._in_latex())
+        return Equations(**each, variables=tuple(name.text for name in self.names), latex=self._write_latex())
 
-    def _in_latex(self) -> str:
+    def _write_latex(self) -> str:
         lines = [rf"{self.latex.parts[atom]} &= {self.latex.write_part(atom)}" for atom in self.shared]
         shown = {"M": "mass_matrix", "F": "force", "f": "residual", "G": "jacobian", r"\gamma": "gamma"}
         law = r"M \ddot{q} &= F" + (r" + G^{\mathsf{T}} \lambda, \quad G \ddot{q} = \gamma" if self.constraints else "")
         for sign, name in shown.items():
             of = self.sums[name]
-            if of.size and self.n <= _WIDEST:
+            if of.size and self.n <= _MOST_IN_MATRICES:
                 rows = r" \\ ".join(" & ".join(map(self.latex.write, np.atleast_1d(row))) for row in of)
                 lines.append(rf"{sign} &= \begin{{pmatrix}} {rows} \end{{pmatrix}}")
             elif of.size:

@@ -20,7 +20,7 @@ _PARAMETER, _COORDINATE, _FUNCTION, _VELOCITY = range(4)
 
 
 class Style(NamedTuple):
-    """How a formula is written: signs of operations, and functions of what is written already."""
+    """The look of a formula: signs of operations, and functions of what is written already."""
 
     times: str
     power: Callable[[str, str], str]
@@ -91,7 +91,7 @@ class FormulaWriter:
         return text or "0"
 
     def write_part(self, atom: int) -> str:
-        """What the name of a part stands for."""
+        """The formula that the name of a part stands for."""
         of = self.formulas.atoms[atom]
         sums = [self.write(dict(x)) for x in of.operands]
         return sums[0] if of.kind == "sum" else self.style.call(self._called(of), sums, "")
@@ -139,7 +139,7 @@ class FormulaWriter:
     # ---- the order of a textbook ----
 
     def _place(self, atom: int) -> tuple:
-        """Where a factor stands in a product."""
+        """The place of a factor in a product."""
         of = self.formulas.atoms[atom]
         if of.kind == "input":
             name = self.names[of.position]
@@ -154,7 +154,7 @@ class FormulaWriter:
         return max(largest, _FUNCTION), 0, of.kind, atom
 
     def _order(self, product: Product) -> tuple:
-        """Where a term stands in a sum: by its factors, those with velocities behind others, constants last."""
+        """The place of a term in a sum, by its factors: those with velocities stand behind others, constants last."""
         places = sorted(self._place(atom) for atom, _ in product)
         return not product, bool(places) and places[-1][0] == _VELOCITY, [str(place) for place in places]
 

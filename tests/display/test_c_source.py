@@ -44,7 +44,7 @@ def built(tmp_path):
             return call
 
         def step(name, q, qdot, t, dt, steps, *numbers):
-            q, qdot, *given = (np.array(x, kind) for x in (q, qdot, *numbers))
+            q, qdot, *given = (np.array(x, kind, order="C") for x in (q, qdot, *numbers))
             places = [ctypes.c_void_p(x.ctypes.data) for x in (q, qdot, *given)]
             getattr(loaded, name)(*places[:2], scalar(t), *places[2:], scalar(dt), ctypes.c_long(steps))
             return q, qdot
@@ -208,10 +208,10 @@ def test_single_precision(built):
 
 
 def test_long_lines_are_several_functions(built, monkeypatch):
-    monkeypatch.setattr("lagjax._native._c_lines.LONGEST_FUNCTION", 20)
+    monkeypatch.setattr("lagjax._native.motions._c_lines.LONGEST_IN_C", 20)
     scene = scenes.slider_crank()
     text = scene.system.to_c(scene.q0, scene.qdot0, params=scene.params)
-    assert "static void scene_acceleration_3(" in text
+    assert "void scene_acceleration_3(" in text
     require_bits(built, scene.system, scene.q0, scene.qdot0, scene.params, spread=0.05)
 
 
