@@ -231,3 +231,25 @@ def test_what_c_cannot_follow_is_said():
     )
     with pytest.raises(ValueError, match="no scalar program, and therefore no C"):
         refused.to_c(np.ones(40), np.ones(40))
+
+
+PUSHED = lagjax.System(
+    lambda q, v, params: 0.5 * params["m"] * v**2, forces=lambda q, v, t, inputs: inputs["u"] * jnp.cos(t)
+)
+
+
+def test_inputs_are_an_array_of_their_own(built):
+    given = {"q": 0.1, "qdot": 0.2, "params": {"m": 2.0}, "inputs": {"u": 3.0}}
+    function, step = built(PUSHED.to_c(**given))
+    assert function("scene_acceleration", 1)([0.1], [0.2], 0.0, [2.0], [3.0]) == 1.5
+    _, v = step("scene_step", [0.1], [0.2], 0.0, 0.1, 10, [2.0], [3.0])
+    np.testing.assert_allclose(v, 0.2 + 1.5 * np.sin(1.0), rtol=1e-6)
+    assert PUSHED.equations(**given).force == {"q": "u*cos(t)"}
+    with pytest.raises(TypeError, match="asks for `inputs`"):
+        PUSHED.to_c(0.1, 0.2, params={"m": 2.0})
+
+
+def test_a_state_in_single_precision_is_exported_too(built):
+    text = PENDULUM_IN_GRAVITY.to_c(np.float32(0.1), np.float32(0.2), params={"g": np.float32(9.81)})
+    found = built(text)[0]("scene_acceleration", 1)([0.1], [0.2], 0.0, [9.81])
+    np.testing.assert_allclose(found, -9.81 * np.sin(0.1), rtol=1e-15)
