@@ -6,7 +6,8 @@ What there is, by what it is for; `python -m pydoc lagjax.simulate` prints one o
 
 **Motion**
 
-- `System`: L, constraints, forces, dissipation, contacts; `System.explain` tells what is in it
+- `System`: L, constraints, forces, dissipation, contacts; `System.explain` tells what is in it,
+  `System.equations` prints its `Equations`, `System.to_c` writes them in C
 - `simulate`, `simulate_batch`: one motion, or many at once, as a `Trajectory` of `State`s; with contacts its `Impacts`
   and `ContactChanges`
 - `samples`: an input that was measured, as a function of time
@@ -167,6 +168,8 @@ register(
         frame=lambda run, units, time_unit: _load_show().frame(run, units, time_unit),
         impact_frame=lambda impacts: _load_show().impact_frame(impacts),
         change_frame=lambda changes: _load_show().change_frame(changes),
+        write_equations=lambda *scene: _load_show().write_equations(*scene),
+        write_c=lambda *scene: _load_show().write_c(*scene),
         make_animation=lambda run, points, *look: _load_show().make_animation(run, points, *look),
         examine=lambda run, reference: _load_health().examine(run, reference),
         contact_forces=lambda run, name: _load_contacts().contact_forces(run, name),

@@ -15,7 +15,7 @@ SOFT, MENDED = 1e-9, 2
 Sparse = dict[int, int]  # the nodes of a vector by their place in it; what is not there is zero
 
 
-class Equations(NamedTuple):
+class Eliminated(NamedTuple):
     """Linear equations after `eliminate`, and as they are where they are solved softly (`SOFT`)."""
 
     factors: list[Sparse]
